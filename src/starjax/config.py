@@ -1,0 +1,106 @@
+"""Settings of a run as frozen dataclasses. Standard library only: `--help` must not import jax."""
+
+import dataclasses
+from typing import Literal, NamedTuple
+
+
+class Method(NamedTuple):
+    """One row of Table II.
+
+    Attributes:
+      action_space: key of `starjax.rcm.ACTION_SPACES`.
+      sees_trocar: whether the diffusion model is conditioned on the trocar.
+      projects: whether poses are projected onto the RCM manifold at execution.
+      hierarchical: diffusion for (position, gripper) and a network for the roll, else one model.
+      weights_of: the method whose weights it shares (its own name if it trains its own).
+      label: name in tables.
+      group: group in Tables II and III.
+    """
+
+    action_space: Literal["se3", "rcm1", "rcm2", "rcm3", "rcm4"]
+    sees_trocar: bool
+    projects: bool
+    hierarchical: bool
+    weights_of: str
+    label: str
+    group: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DemosConfig:
+    """Demonstrations: how many, and what is recorded."""
+
+    per_trocar: int = 30  # successful demonstrations a seen trocar (V-A3)
+    seen_trocars: int = 8  # the first n of the eight seen trocars
+    keep_failures: bool = False
+    max_steps: int = 600  # control steps at 30 Hz an expert may take
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PolicyConfig:
+    """Networks and diffusion (IV-G)."""
+
+    observation: Literal["image", "state"] = "image"
+    image_size: int = 256  # pixels a side
+    obs_horizon: int = 2  # T_o
+    horizon: int = 16  # H, commands predicted: t+1 .. t+H
+    execute: int = 8  # commands executed before re-planning
+    encoder: Literal["resnet18", "small"] = "resnet18"
+    encoder_weights: str = ""  # path of torchvision .pth or .safetensors; empty: from scratch
+    vision_dim: int = 512  # d_v
+    state_dim: int = 256  # d_s
+    unet_channels: tuple[int, ...] = (256, 512, 1024, 2048)
+    kernel_size: int = 5
+    groups: int = 8
+    time_dim: int = 128
+    roll_width: int = 256
+    roll_blocks: int = 3
+    diffusion_steps: int = 100  # K
+    ddim_steps: int = 10
+    roll_loss_weight: float = 0.1  # lambda of Eq. 15
+    dtype: Literal["float32", "bfloat16"] = "float32"  # of the networks' arithmetic
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Optimisation (IV-G; warm-up, betas and EMA are Diffusion Policy's)."""
+
+    steps: int = 100_000
+    batch_size: int = 256
+    learning_rate: float = 1e-4
+    weight_decay: float = 1e-6
+    warmup_steps: int = 500
+    ema_max: float = 0.9999
+    crop_fraction: float = 0.9  # side of the random crop over the image's side
+    jitter: float = 0.1  # brightness, contrast, saturation: +- this
+    image_noise: float = 0.02  # standard deviation, of [0, 1]
+    state_noise: float = 0.02  # standard deviation, of normalised low-dimensional inputs
+    steps_per_call: int = 100  # train steps in one compiled scan
+    checkpoint_every: int = 5_000
+    keep_checkpoints: int = 2
+    log_every: int = 100
+    holdout_demos: int = 8  # demonstrations kept out of training, for the action error
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EvalConfig:
+    """Closed-loop evaluation (V-A4)."""
+
+    trials: int = 30  # a trocar
+    time_limit_s: float = 60.0
+    chunk: int = 0  # environments simulated at once; 0: as many as memory allows
+    video_trials: int = 4  # trials recorded for the video and the figures
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """One run of `python -m starjax.experiments.run`."""
+
+    method: str = "stardiff"
+    preset: str = "auto"
+    seed: int = 0
+    out: str = "runs"
+    demos: DemosConfig = dataclasses.field(default_factory=DemosConfig)
+    policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
+    train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
+    eval: EvalConfig = dataclasses.field(default_factory=EvalConfig)
