@@ -1,0 +1,17 @@
+"""Where the MJCF parts are: inside an installed wheel, or beside `src/` in a checkout."""
+
+import pathlib
+
+
+def path(name: str) -> pathlib.Path:
+    """The file of one MJCF part, e.g. `robots/fr5/fr5.xml`.
+
+    Raises:
+      FileNotFoundError: the part is in neither place; both are named.
+    """
+    package = pathlib.Path(__file__).resolve().parents[1]
+    places = [package / "mjcf" / name, package.parents[1] / "mjcf" / name]
+    for place in places:
+        if place.is_file():
+            return place
+    raise FileNotFoundError(f"MJCF part {name!r} is not in {places[0]} nor in {places[1]}")
