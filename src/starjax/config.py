@@ -1,7 +1,15 @@
 """Settings of a run as frozen dataclasses. Standard library only: `--help` must not import jax."""
 
 import dataclasses
-from typing import Literal, NamedTuple
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple, TypeVar
+
+SettingsT = TypeVar("SettingsT")
+
+
+class UsageError(ValueError):
+    """A mistake of whoever typed the command: shown as one line, without a traceback."""
 
 
 class Method(NamedTuple):
@@ -96,11 +104,29 @@ class EvalConfig:
 class RunConfig:
     """One run of `python -m starjax.experiments.run`."""
 
-    method: str = "stardiff"
-    preset: str = "auto"
-    seed: int = 0
-    out: str = "runs"
+    method: str = "stardiff"  # a row of Table II, or all
+    preset: Literal["auto", "smoke", "cpu", "gpu", "paper"] = "auto"  # starting values
+    seed: int = 0  # of everything random
+    out: str = "runs"  # folder of the demonstrations and of one folder a method
     demos: DemosConfig = dataclasses.field(default_factory=DemosConfig)
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     eval: EvalConfig = dataclasses.field(default_factory=EvalConfig)
+
+
+def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT:
+    """Inverse of `dataclasses.asdict`, also after a trip through JSON (which knows no tuples).
+
+    Fields that `values` lacks keep their default; names that `settings` lacks raise ValueError.
+    """
+    hints = typing.get_type_hints(settings)
+    unknown = sorted(set(values) - set(hints))
+    if unknown:
+        raise ValueError(f"{settings.__name__}: expected {sorted(hints)}, got {unknown}")
+    fields = {}
+    for name, value in values.items():
+        if dataclasses.is_dataclass(hints[name]):
+            fields[name] = from_dict(hints[name], value)
+        else:
+            fields[name] = tuple(value) if isinstance(value, list) else value
+    return settings(**fields)

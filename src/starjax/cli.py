@@ -1,0 +1,73 @@
+"""The console script `starjax`: one subcommand, one module, imported only when it is called."""
+
+import errno
+import importlib
+import sys
+from collections.abc import Callable, Sequence
+
+from starjax import __version__
+from starjax import config as config_lib
+from starjax.experiments import options
+
+# Subcommand -> (module with `main(argv) -> exit code`, one line of help).
+COMMANDS: dict[str, tuple[str, str]] = {
+    "run": ("starjax.experiments.run", "collect, train, evaluate and report: the whole of it"),
+    "collect": ("starjax.experiments.collect", "demonstrations only"),
+    "train": ("starjax.experiments.train", "demonstrations and training, no evaluation"),
+    "evaluate": ("starjax.experiments.evaluate", "score a trained policy on the twelve trocars"),
+    "sweep": ("starjax.experiments.sweep", "score a trained policy on a grid or sample of trocars"),
+    "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)"),
+    "report": (
+        "starjax.experiments.report_command",
+        "tables, figures, video and page from results",
+    ),
+    "doctor": ("starjax.doctor", "what of this machine and installation works, and what to do"),
+}
+
+
+def main() -> int:
+    """Entry of the console script."""
+    return guard(_dispatch, sys.argv[1:])
+
+
+def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
+    """Runs a command; what its user can mend becomes one line and an exit code, no traceback.
+
+    Returns 2 for a mistake on the command line, 74 for a disk that is full or cannot be written,
+    130 after Ctrl-C (whatever was running has saved by then, and says how to go on).
+    """
+    try:
+        return command(argv)
+    except config_lib.UsageError as error:
+        return _fail(error, 2)
+    except KeyboardInterrupt:
+        return _fail("stopped; the same command goes on from what is saved", 130)
+    except OSError as error:
+        # Imported late: it brings numpy, and `--help` need not wait for it.
+        from starjax.runtime import files
+
+        if isinstance(error, files.StorageError):
+            return _fail(error, 74)
+        if error.errno not in (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT, errno.EPERM):
+            raise
+        place = f": {error.filename}" if error.filename else ""
+        return _fail(f"cannot write{place}: {error.strerror}; choose another folder by --out", 74)
+
+
+def _dispatch(argv: Sequence[str]) -> int:
+    name = argv[0] if argv else "--help"
+    if name in ("-h", "--help"):
+        width = max(map(len, COMMANDS))
+        print("usage: starjax COMMAND [OPTIONS]      (starjax COMMAND --help for its options)\n")
+        print("\n".join(f"  {name:{width}}  {text}" for name, (_, text) in COMMANDS.items()))
+        return 0
+    if name == "--version":
+        print(__version__)
+        return 0
+    options.choice("COMMAND", name, COMMANDS)
+    return importlib.import_module(COMMANDS[name][0]).main(argv[1:])
+
+
+def _fail(message: object, code: int) -> int:
+    print(f"starjax: {message}", file=sys.stderr)
+    return code

@@ -1,0 +1,106 @@
+"""Presets: starting values of a run, any field of which the command line can override.
+
+Data, not code: what a preset changes from `config.RunConfig()` (the paper) stands in one literal.
+"""
+
+import importlib.util
+import os
+import pathlib
+
+from starjax.config import DemosConfig, EvalConfig, PolicyConfig, RunConfig, TrainConfig
+
+PRESETS: dict[str, RunConfig] = {
+    # Every stage once, too short to learn anything.
+    "smoke": RunConfig(
+        preset="smoke",
+        out="runs/smoke",
+        demos=DemosConfig(per_trocar=1),
+        policy=PolicyConfig(
+            observation="state",
+            image_size=64,
+            encoder="small",
+            vision_dim=64,
+            state_dim=64,
+            unet_channels=(32, 64),
+            time_dim=32,
+            roll_width=64,
+        ),
+        train=TrainConfig(
+            steps=40,
+            batch_size=32,
+            learning_rate=3e-4,
+            warmup_steps=10,
+            steps_per_call=20,
+            checkpoint_every=20,
+            log_every=20,
+            holdout_demos=1,
+        ),
+        eval=EvalConfig(trials=1, time_limit_s=4.0, video_trials=1),
+    ),
+    # Two cores, a quarter of an hour, a policy that works. Pixels do not get there in that time.
+    "cpu": RunConfig(
+        preset="cpu",
+        out="runs/cpu",
+        policy=PolicyConfig(
+            observation="state",
+            image_size=96,
+            encoder="small",
+            vision_dim=128,
+            unet_channels=(64, 128, 256),
+            time_dim=64,
+        ),
+        train=TrainConfig(
+            steps=16_000,
+            batch_size=64,
+            learning_rate=5e-4,
+            ema_max=0.999,
+            checkpoint_every=2_000,
+            log_every=100,
+        ),
+        eval=EvalConfig(trials=6, time_limit_s=30.0, video_trials=4),
+    ),
+    # One modern GPU, ten minutes, from pixels.
+    "gpu": RunConfig(
+        preset="gpu",
+        out="runs/gpu",
+        policy=PolicyConfig(
+            image_size=128,
+            unet_channels=(256, 512, 1024),
+            dtype="bfloat16",
+        ),
+        train=TrainConfig(
+            steps=16_000,
+            learning_rate=3e-4,
+            ema_max=0.9995,
+            checkpoint_every=4_000,
+        ),
+    ),
+    # The paper: 100k iterations, batch 256, 256 x 256 pixels.
+    "paper": RunConfig(preset="paper", out="runs/paper"),
+}
+
+
+def resolve(name: str) -> RunConfig:
+    """Returns the values of a preset; `auto` is `gpu` where jax can use one, else `cpu`."""
+    return PRESETS[("gpu" if has_gpu() else "cpu") if name == "auto" else name]
+
+
+def has_gpu() -> bool:
+    """Whether jax would run on a GPU: its plugin is installed, a device is there, none forbids it.
+
+    Asked without importing jax, which takes seconds.
+    """
+    platforms = os.environ.get("JAX_PLATFORMS", "")
+    allowed = not platforms or any(name in platforms for name in ("cuda", "gpu"))
+    return allowed and has_gpu_device() and has_gpu_plugin()
+
+
+def has_gpu_device() -> bool:
+    """Whether the system shows an NVIDIA device."""
+    return pathlib.Path("/dev/nvidiactl").exists()
+
+
+def has_gpu_plugin() -> bool:
+    """Whether one of jax's CUDA plugins is installed."""
+    names = ("jax_cuda12_plugin", "jax_cuda13_plugin")
+    return any(importlib.util.find_spec(name) for name in names)

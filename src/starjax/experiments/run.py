@@ -1,0 +1,40 @@
+"""The main command, `python -m starjax.experiments.run`: from trocar to table."""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+
+from starjax import cli
+from starjax import config as config_lib
+from starjax.experiments import checks, options, presets
+
+DESCRIPTION = """Collects demonstrations, trains, evaluates and writes the report.
+
+The same command again goes on from what is saved. Values below are those of the chosen preset."""
+
+
+def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.RunConfig:
+    """Settings of a run from its command line: the preset's values under what was typed."""
+    name = options.value_of("--preset", argv) or "auto"
+    options.choice("--preset", name, ["auto", *presets.PRESETS])
+    default = presets.resolve(name)
+    config = options.parse(
+        config_lib.RunConfig, argv, prog=prog, description=description, default=default
+    )
+    config = dataclasses.replace(config, preset=default.preset)
+    checks.check(config)
+    return config
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs every stage that is not already done."""
+    config = settings(argv, "starjax run", DESCRIPTION)
+    # Imported late: `--help` and mistakes answer before jax loads.
+    from starjax.experiments import pipeline
+
+    pipeline.run(config, pipeline.STAGES)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(cli.guard(main, sys.argv[1:]))

@@ -1,0 +1,80 @@
+"""Promises of the package as a whole: no pickle, no hosts, no machine's paths, a quick --help."""
+
+import ast
+import pathlib
+import re
+import subprocess
+import sys
+import time
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[1]
+PYTHON = sorted((ROOT / "src").rglob("*.py"))
+TEXT = [
+    path
+    for folder in ("src", "tests", "mjcf", "benchmarks", "experiments")
+    for path in (ROOT / folder).rglob("*")
+    if path.suffix in {".py", ".md", ".xml", ".txt", ".toml", ".json"}
+] + [path for path in ROOT.iterdir() if path.suffix in {".md", ".toml", ".yaml"}]
+COMMANDS = ["run", "collect", "train", "evaluate", "sweep", "bench", "report"]
+HEAVY = ("jax", "mujoco", "flax", "numpy", "matplotlib")
+
+
+def python(*args: str, **kwargs) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, *args], capture_output=True, text=True, **kwargs)
+
+
+@pytest.mark.parametrize("path", PYTHON, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_pickle(path):
+    """Neither the module, nor numpy's use of it; a restricted unpickler says so by its name."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            assert called not in {"pickle.load", "pickle.loads", "pickle.dump", "pickle.dumps"}
+            assert called not in {"torch.load", "eval", "exec"}
+            if called in {"np.load", "numpy.load"}:
+                settings = {word.arg: ast.unparse(word.value) for word in node.keywords}
+                assert settings.get("allow_pickle") == "False", f"{path}:{node.lineno}"
+
+
+@pytest.mark.parametrize("path", TEXT, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_hosts_and_no_paths_of_one_machine(path):
+    text = path.read_text()
+    hosts = set(re.findall(r"https?://([\w.-]+)", text)) - {"www.apache.org", "www.w3.org"}
+    paths = re.findall(r"(?<![\w./-])/(?:home|root|tmp|work|Users)/\w+", text)
+    assert not hosts and not paths
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)], ids=str)
+def test_help_is_quick_and_imports_nothing_heavy(command):
+    program = (
+        "import sys\n"
+        "from starjax import cli\n"
+        f"sys.argv = ['starjax', *{command}, '--help']\n"
+        "try:\n"
+        "    cli.main()\n"
+        "finally:\n"
+        f"    print('HEAVY', sorted(set({HEAVY}) & set(sys.modules)))\n"
+    )
+    start = time.perf_counter()
+    done = python("-c", program)
+    seconds = time.perf_counter() - start
+    assert done.returncode == 0, done.stderr
+    assert "HEAVY []" in done.stdout
+    assert seconds < 1.0 or min(_timed(program) for _ in range(3)) < 1.0
+
+
+def _timed(program: str) -> float:
+    start = time.perf_counter()
+    python("-c", program)
+    return time.perf_counter() - start
+
+
+def test_import_of_the_package_is_light():
+    assert python("-X", "importtime", "-c", "import starjax").stderr.count("jax.") <= 1
+
+
+def test_module_entry_prints_help():
+    done = python("-m", "starjax.experiments.run", "--help")
+    assert done.returncode == 0 and "--policy.observation" in done.stdout
