@@ -1,0 +1,162 @@
+"""Files that survive a kill: atomic writes, committed folders, hashes, free space, a folder's lock.
+
+A reader sees a file or folder whole or not at all. Temporary names are fixed, one a target, so the
+next run writes over what a killed one left behind; the lock makes sure that there is only one.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import io
+import json
+import os
+import shutil
+import socket
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_BLOCK = 1 << 22
+
+
+class StorageError(OSError):
+    """A file or folder that cannot be used; the message is one line, meant for the user."""
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes `path` atomically: after a crash it holds all of the old content or all of `data`."""
+    staged = path.with_name(f".{path.name}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write_synced(staged, data)
+        os.replace(staged, path)
+        _sync_directory(path.parent)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            staged.unlink()
+        raise _explained(error, path, len(data)) from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes `value` as indented JSON, atomically. NaN and infinities are refused: not JSON."""
+    write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Writes a compressed .npz atomically; the same arrays always give the same bytes."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def npy_bytes(array: np.ndarray) -> bytes:
+    """`array` in numpy's .npy format."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def commit_directory(final: Path, staged: Path, contents: Mapping[str, bytes]) -> None:
+    """Makes folder `final` appear at once with all its files, in the given order.
+
+    Args:
+      final: must not exist.
+      staged: where it is built, on the same file system; whatever is there is removed.
+      contents: bytes of each file by name.
+    """
+    try:
+        shutil.rmtree(staged, ignore_errors=True)
+        staged.mkdir(parents=True)
+        for name, data in contents.items():
+            _write_synced(staged / name, data)
+        _sync_directory(staged)
+        os.rename(staged, final)
+        _sync_directory(final.parent)
+    except OSError as error:
+        shutil.rmtree(staged, ignore_errors=True)
+        raise _explained(error, final, sum(map(len, contents.values()))) from error
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def require_writable(directory: Path, free_bytes: int = 0) -> None:
+    """Creates `directory` and makes sure that files can be written there and will fit.
+
+    Raises:
+      StorageError: it cannot be created or written, or the disk has less than `free_bytes` free.
+    """
+    probe = directory / ".writable"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        probe.write_bytes(b"x")
+        probe.unlink()
+    except OSError as error:
+        raise _explained(error, directory, 1) from error
+    free = shutil.disk_usage(directory).free
+    if free < free_bytes:
+        raise StorageError(
+            f"{directory}: about {size(free_bytes)} will be written, the disk has {size(free)} free"
+        )
+
+
+@contextlib.contextmanager
+def lock(directory: Path) -> Iterator[None]:
+    """Holds `directory` for this process; the kernel lets go of it however the process ends.
+
+    Raises:
+      StorageError: another process holds it, or the folder cannot be written.
+    """
+    require_writable(directory)
+    with open(directory / ".lock", "a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            holder = file.read().strip() or "another process"
+            raise StorageError(
+                f"{directory} is in use by {holder}: wait for it, or choose another folder"
+            ) from error
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}")
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)
+
+
+def size(count: float) -> str:
+    """A number of bytes for people, e.g. `14.2 GB`."""
+    for unit in ("B", "kB", "MB"):
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.1f} GB"
+
+
+def _write_synced(path: Path, data: bytes) -> None:
+    with open(path, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync_directory(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _explained(error: OSError, path: Path, count: int) -> StorageError:
+    return StorageError(f"cannot write {path} ({size(count)}): {error.strerror or error}")

@@ -1,0 +1,116 @@
+"""Progress of anything long: how far, how fast, until when. A bar on a terminal, else lines."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import TextIO
+
+PLAIN_EVERY_S = 10.0
+
+Advance = Callable[..., None]
+
+
+@contextlib.contextmanager
+def track(
+    description: str,
+    total: int,
+    *,
+    unit: str = "it",
+    done: int = 0,
+    stream: TextIO | None = None,
+) -> Iterator[Advance]:
+    """Shows progress towards `total` units.
+
+    Args:
+      description: what is being done.
+      total: units in all.
+      unit: their name, as in "episodes".
+      done: units that an earlier run finished; they do not count for the throughput.
+      stream: where to show it; the standard error stream unless given.
+
+    Yields:
+      `advance(count, note="")`: `count` more units are done; `note` is shown beside the bar.
+    """
+    stream = stream or sys.stderr
+    show = _terminal if stream.isatty() else _plain
+    with show(description, total, unit, done, stream) as advance:
+        yield advance
+
+
+@contextlib.contextmanager
+def _terminal(
+    description: str, total: int, unit: str, done: int, stream: TextIO
+) -> Iterator[Advance]:
+    # Imported here: `--help` need not pay for it.
+    import rich.console
+    import rich.progress
+
+    bar = rich.progress.Progress(
+        rich.progress.TextColumn("{task.description}"),
+        rich.progress.BarColumn(),
+        rich.progress.TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}"),
+        rich.progress.TextColumn("{task.fields[rate]}"),
+        rich.progress.TimeElapsedColumn(),
+        rich.progress.TextColumn("{task.fields[eta]}"),
+        rich.progress.TextColumn("{task.fields[note]}"),
+        console=rich.console.Console(file=stream),
+    )
+    meter = _Meter(total, done)
+    with bar:
+        task = bar.add_task(
+            description, total=total, completed=done, unit=unit, rate="", eta="", note=""
+        )
+
+        def advance(count: float = 1, note: str = "") -> None:
+            meter.add(count)
+            fields = {"note": note, "eta": meter.eta(), "rate": meter.rate(unit)}
+            bar.update(task, completed=meter.done, **fields)
+
+        yield advance
+
+
+@contextlib.contextmanager
+def _plain(description: str, total: int, unit: str, done: int, stream: TextIO) -> Iterator[Advance]:
+    meter = _Meter(total, done)
+    shown = time.monotonic()
+
+    def advance(count: float = 1, note: str = "") -> None:
+        nonlocal shown
+        meter.add(count)
+        now = time.monotonic()
+        if now - shown < PLAIN_EVERY_S and meter.done < total:
+            return
+        shown = now
+        count = f"{description}: {meter.done:.0f}/{total} {unit}"
+        parts = filter(None, [count, meter.rate(unit), meter.eta(), note])
+        print("  ".join(parts), file=stream, flush=True)
+
+    yield advance
+
+
+class _Meter:
+    """Units done, their rate and the time left, counted from its creation."""
+
+    def __init__(self, total: int, done: float):
+        self.total, self.done, self._first, self._start = total, done, done, time.monotonic()
+
+    def add(self, count: float) -> None:
+        self.done += count
+
+    def per_second(self) -> float:
+        return (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
+
+    def rate(self, unit: str) -> str:
+        rate = self.per_second()
+        return f"{rate:.3g} {unit}/s" if rate >= 0.1 else f"{60 * rate:.3g} {unit}/min"
+
+    def eta(self) -> str:
+        """Time left in words; empty before the first unit and after the last."""
+        rate = self.per_second()
+        if rate <= 0 or self.done >= self.total:
+            return ""
+        minutes, seconds = divmod(round((self.total - self.done) / rate), 60)
+        hours, minutes = divmod(minutes, 60)
+        left = f"{hours}:{minutes:02d}" if hours else f"{minutes}"
+        return f"ETA {left}:{seconds:02d}"

@@ -1,0 +1,106 @@
+"""XLA settings for this machine, set before jax starts, and what the machine is. Imports no jax."""
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+_FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
+_PACKAGES = (
+    "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "numpy", "scipy",
+)  # fmt: skip
+
+
+def prepare_xla() -> None:
+    """Sets XLA flags and the persistent compilation cache; call it before the first jax array.
+
+    With jaxlib < 0.11 on CPU, XLA's fusion emitters recompute the kinematic chain and make one
+    physics step about 300 times slower, so they are turned off; later versions need no flag, and
+    abort on it. Flags that the user has in XLA_FLAGS stay, and win. Compiled programs are kept in
+    `cache_directory()`, unless JAX_COMPILATION_CACHE_DIR already names a place.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if _jaxlib_version() < (0, 11) and _FUSION_FLAG not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {_FUSION_FLAG}=false".strip()
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    cache = cache_directory() / "xla" / _machine()
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # no cache: every start compiles again, nothing else changes
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache)
+    if "jax" in sys.modules:  # it has read the environment already
+        sys.modules["jax"].config.update("jax_compilation_cache_dir", str(cache))
+
+
+def cache_directory() -> Path:
+    """Folder for what can be made again: STARJAX_CACHE, else the user's cache directory."""
+    if chosen := os.environ.get("STARJAX_CACHE"):
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "starjax"
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, starjax and the packages that decide numbers."""
+    import starjax
+
+    found = {"python": platform.python_version(), "starjax": starjax.__version__}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def hardware() -> dict[str, Any]:
+    """Processor, cores this process may use, memory, and jax's devices if jax has been imported."""
+    info: dict[str, Any] = {
+        "platform": platform.platform(),
+        "cpu": _cpuinfo("model name") or platform.processor() or platform.machine(),
+        "cores": cores(),
+        "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
+    }
+    if jax := sys.modules.get("jax"):
+        info["backend"] = jax.default_backend()
+        info["devices"] = [device.device_kind for device in jax.devices()]
+    return info
+
+
+def cores() -> int:
+    """Processor cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _jaxlib_version() -> tuple[int, ...]:
+    try:
+        version = importlib.metadata.version("jaxlib")
+    except importlib.metadata.PackageNotFoundError:
+        return (0, 11)
+    return tuple(int(part) for part in version.split(".")[:2])
+
+
+def _machine() -> str:
+    # A home directory may be shared by machines whose processors differ: code compiled for one
+    # can stop another with an illegal instruction.
+    said = f"{platform.machine()} {_cpuinfo('model name')} {_cpuinfo('flags')} {_jaxlib_version()}"
+    return hashlib.sha256(said.encode()).hexdigest()[:12]
+
+
+def _cpuinfo(name: str) -> str:
+    try:
+        with open("/proc/cpuinfo") as file:
+            for line in file:
+                key, _, value = line.partition(":")
+                if key.strip() == name:
+                    return value.strip()
+    except OSError:
+        pass
+    return ""

@@ -1,0 +1,95 @@
+"""Files survive kills, say clearly what is wrong, and one run holds a folder."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from starjax.runtime import files
+
+
+def test_a_failed_write_leaves_the_old_content(tmp_path, monkeypatch):
+    path = tmp_path / "a.json"
+    files.write_json(path, {"x": 1})
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(files.StorageError, match=r"cannot write .*a\.json.*No space left"):
+        files.write_json(path, {"x": 2})
+    assert path.read_text() == '{\n "x": 1\n}\n'
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_a_directory_appears_whole_or_not_at_all(tmp_path, monkeypatch):
+    final, staged = tmp_path / "final", tmp_path / "staged"
+    contents = {"one": b"1", "two": b"22"}
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rename", lambda *_: (_ for _ in ()).throw(OSError(13, "denied")))
+        with pytest.raises(files.StorageError, match="denied"):
+            files.commit_directory(final, staged, contents)
+    assert not final.exists()
+    files.commit_directory(final, staged, contents)
+    assert {p.name: p.read_bytes() for p in final.iterdir()} == contents
+
+
+def test_npz_bytes_are_a_function_of_the_arrays(tmp_path, monkeypatch):
+    arrays = {"a": np.arange(10.0), "b": np.zeros((3, 2), np.uint8)}
+    files.write_npz(tmp_path / "1.npz", arrays)
+    monkeypatch.setattr("time.time", lambda: 2e9)
+    files.write_npz(tmp_path / "2.npz", arrays)
+    assert files.sha256(tmp_path / "1.npz") == files.sha256(tmp_path / "2.npz")
+    with np.load(tmp_path / "1.npz", allow_pickle=False) as loaded:
+        np.testing.assert_array_equal(loaded["a"], arrays["a"])
+
+
+def test_objects_and_nan_are_refused(tmp_path):
+    with pytest.raises(ValueError):
+        files.npy_bytes(np.array([object()]))
+    with pytest.raises(ValueError):
+        files.write_json(tmp_path / "x.json", float("nan"))
+
+
+def test_space_is_checked_before_it_is_needed(tmp_path):
+    with pytest.raises(files.StorageError, match="the disk has"):
+        files.require_writable(tmp_path, free_bytes=1 << 60)
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(files.StorageError) as caught:
+        files.require_writable(tmp_path / "file" / "sub")
+    assert "\n" not in str(caught.value) and "sub" in str(caught.value)
+
+
+_HOLD = """
+import sys, pathlib
+from starjax.runtime import files
+with files.lock(pathlib.Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_second_run_is_refused_until_the_first_is_killed(tmp_path):
+    holder = subprocess.Popen(
+        [sys.executable, "-c", _HOLD, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert holder.stdout.readline() == b"held\n"
+    with (
+        pytest.raises(files.StorageError, match=f"in use by process {holder.pid}"),
+        files.lock(tmp_path),
+    ):
+        pass
+    holder.kill()
+    holder.wait()
+    holder.stdin.close()
+    holder.stdout.close()
+    with files.lock(tmp_path):
+        pass

@@ -1,0 +1,42 @@
+"""Progress shows counts, throughput and time left, with and without a terminal."""
+
+import io
+
+from starjax.runtime import progress
+
+
+def _shown(stream, monkeypatch, every=0.0, done=0):
+    monkeypatch.setattr(progress, "PLAIN_EVERY_S", every)
+    with progress.track("Collect", 4, unit="episodes", done=done, stream=stream) as advance:
+        for _ in range(4 - done):
+            advance(1, note="30 of 30 succeeded")
+    return stream.getvalue()
+
+
+def test_plain_lines_off_a_terminal(monkeypatch):
+    shown = _shown(io.StringIO(), monkeypatch).splitlines()
+    assert len(shown) == 4
+    assert shown[0].startswith("Collect: 1/4 episodes") and "ETA" in shown[0]
+    assert "episodes/s" in shown[-1] and "ETA" not in shown[-1] and shown[-1].endswith("succeeded")
+
+
+def test_plain_lines_are_rare_but_the_last_is_shown(monkeypatch):
+    assert len(_shown(io.StringIO(), monkeypatch, every=1e9).splitlines()) == 1
+
+
+def test_a_bar_on_a_terminal(monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    shown = _shown(Terminal(), monkeypatch)
+    assert "Collect" in shown and "4/4 episodes" in shown
+
+
+def test_earlier_work_does_not_count_for_the_rate(monkeypatch):
+    clock = iter(range(100))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock)))
+    meter = progress._Meter(1000, 900)
+    meter.add(10)
+    assert meter.per_second() == 10.0
+    assert meter.eta() == "ETA 0:18"

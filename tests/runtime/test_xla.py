@@ -1,0 +1,61 @@
+"""XLA is prepared once, for the jaxlib at hand, without taking anything from the user."""
+
+import os
+import subprocess
+import sys
+
+from starjax.runtime import xla
+
+FLAG = "--xla_cpu_use_fusion_emitters=false"
+
+
+def _prepared(monkeypatch, tmp_path, version, **environment):
+    for name in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("STARJAX_CACHE", str(tmp_path))
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(xla, "_jaxlib_version", lambda: version)
+    monkeypatch.delitem(sys.modules, "jax", raising=False)
+    xla.prepare_xla()
+    return os.environ.get("XLA_FLAGS", ""), os.environ.get("JAX_COMPILATION_CACHE_DIR")
+
+
+def test_the_flag_is_only_for_old_jaxlib(monkeypatch, tmp_path):
+    assert _prepared(monkeypatch, tmp_path, (0, 10))[0] == FLAG
+    assert _prepared(monkeypatch, tmp_path, (0, 11))[0] == ""
+
+
+def test_the_users_flags_stay_and_win(monkeypatch, tmp_path):
+    flags, _ = _prepared(monkeypatch, tmp_path, (0, 10), XLA_FLAGS="--a=1")
+    assert flags == f"--a=1 {FLAG}"
+    own = "--xla_cpu_use_fusion_emitters=true"
+    assert _prepared(monkeypatch, tmp_path, (0, 10), XLA_FLAGS=own)[0] == own
+
+
+def test_the_cache_is_on_unless_the_user_chose_one(monkeypatch, tmp_path):
+    assert str(tmp_path) in _prepared(monkeypatch, tmp_path, (0, 10))[1]
+    chosen = _prepared(monkeypatch, tmp_path, (0, 10), JAX_COMPILATION_CACHE_DIR="/x")[1]
+    assert chosen == "/x"
+
+
+def test_no_cache_where_none_can_be_made(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert _prepared(monkeypatch, tmp_path / "file", (0, 10))[1] is None
+
+
+def test_jax_is_not_imported():
+    code = "import sys, starjax.runtime as r; r.prepare_xla(); r.xla.hardware(); r.xla.versions();"
+    code += "assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, env=_env())
+
+
+def test_jax_accepts_what_is_set(tmp_path):
+    code = "import starjax.runtime as r; r.prepare_xla(); import jax; jax.numpy.ones(3).sum();"
+    code += "h = r.xla.hardware(); assert h['backend'] == 'cpu' and h['memory_gb'] > 0"
+    subprocess.run([sys.executable, "-c", code], check=True, env=_env(STARJAX_CACHE=str(tmp_path)))
+
+
+def _env(**more):
+    env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_PLATFORMS")}
+    return {**env, "PYTHONPATH": os.pathsep.join(sys.path), "JAX_PLATFORMS": "cpu", **more}
