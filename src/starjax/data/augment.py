@@ -1,0 +1,117 @@
+"""Image augmentation on the device: crop, colour jitter, noise and normalisation in one pass.
+
+All of it is element-wise after the crop, so the compiler reads the uint8 frames once and writes the
+network's input once. The noise comes from hashing the pixel's number, not from a random-number
+array that would have to be written and read.
+"""
+
+import jax
+import jax.numpy as jnp
+
+# Of ImageNet, which the pretrained encoder expects; good enough from scratch.
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
+LUMINANCE = (0.299, 0.587, 0.114)
+
+
+def augment(
+    key: jax.Array,
+    images: jax.Array,
+    *,
+    crop: int,
+    jitter: float = 0.1,
+    noise: float = 0.02,
+    dtype: jnp.dtype = jnp.float32,
+) -> tuple[jax.Array, jax.Array]:
+    """Random crop, colour jitter and Gaussian noise, another draw for each frame.
+
+    Contrast turns about mid-grey, not about the frame's mean, and values are clipped once at the
+    end: both spare a pass over the frames.
+
+    Args:
+      key: one typed key for the whole batch.
+      images: uint8 `[..., h, w, 3]`.
+      crop: side of the crop in pixels.
+      jitter: brightness, contrast and saturation factors are uniform within 1 +- this.
+      noise: standard deviation, of values in [0, 1].
+      dtype: of the result.
+
+    Returns:
+      Normalised frames `[..., crop, crop, 3]`, and the float32 `[..., 2]` displacement (row,
+      column) in pixels of each crop from the centre crop, for the encoder.
+    """
+    lead, (height, width) = images.shape[:-3], _check(images, crop)
+    frames = images.reshape((-1, height, width, 3))
+    key_crop, key_jitter, key_noise = jax.random.split(key, 3)
+    spans = jnp.array([height - crop + 1, width - crop + 1])
+    corner = jax.random.randint(key_crop, (len(frames), 2), 0, spans)
+    x = jax.vmap(lambda f, c: jax.lax.dynamic_slice(f, (c[0], c[1], 0), (crop, crop, 3)))(
+        frames, corner
+    )
+    factors = jax.random.uniform(key_jitter, (3, len(frames)), minval=1 - jitter, maxval=1 + jitter)
+    x = _jitter(x.astype(jnp.float32) / 255.0, *factors)
+    x = jnp.clip(x + noise * hash_normal(key_noise, x.shape), 0.0, 1.0)
+    offset = (corner - jnp.array(_centre(height, width, crop))).astype(jnp.float32)
+    return _normalize(x, dtype).reshape((*lead, crop, crop, 3)), offset.reshape((*lead, 2))
+
+
+def center(images: jax.Array, *, crop: int, dtype: jnp.dtype = jnp.float32) -> jax.Array:
+    """Centre crop and normalisation, for evaluation: uint8 `[..., h, w, 3] -> [..., c, c, 3]`."""
+    top, left = _centre(*_check(images, crop), crop)
+    x = images[..., top : top + crop, left : left + crop, :]
+    return _normalize(x.astype(jnp.float32) / 255.0, dtype)
+
+
+def hash_normal(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Nearly normal noise (mean 0, deviation 1), float32 `shape`, a few integer operations each.
+
+    Each value is the sum of the four bytes of a hashed counter (Irwin-Hall: within +-3.5, excess
+    kurtosis -0.3). Not for sampling from a model; for pixels nobody can tell.
+    """
+    per_row = 1
+    for size in shape[1:]:
+        per_row *= size
+    seeds = jax.random.bits(key, (shape[0], 1), jnp.uint32)
+    bits = _mix(seeds ^ _mix(jax.lax.broadcasted_iota(jnp.uint32, (shape[0], per_row), 1)))
+    low, high = bits & 0x00FF00FF, (bits >> 8) & 0x00FF00FF
+    pairs = low + high
+    total = (pairs & 0xFFFF) + (pairs >> 16)
+    deviation = ((256.0**2 - 1.0) / 3.0) ** 0.5
+    return ((total.astype(jnp.float32) - 510.0) / deviation).reshape(shape)
+
+
+def _jitter(x: jax.Array, brightness: jax.Array, contrast: jax.Array, saturation: jax.Array):
+    """Colour jitter of `[N, c, c, 3]` in [0, 1] by factors `[N]`; not clipped."""
+    brightness, contrast, saturation = (
+        factor[:, None, None, None] for factor in (brightness, contrast, saturation)
+    )
+    x = (x * brightness - 0.5) * contrast + 0.5
+    grey = sum(weight * x[..., i : i + 1] for i, weight in enumerate(LUMINANCE))
+    return grey + (x - grey) * saturation
+
+
+def _normalize(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    return ((x - jnp.array(MEAN)) / jnp.array(STD)).astype(dtype)
+
+
+def _mix(x: jax.Array) -> jax.Array:
+    """A 32-bit integer hash (lowbias32 of C. Wellons): every input bit flips half the outputs."""
+    x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
+    x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
+    return x ^ (x >> 16)
+
+
+def _centre(height: int, width: int, crop: int) -> tuple[int, int]:
+    return (height - crop) // 2, (width - crop) // 2
+
+
+def _check(images: jax.Array, crop: int) -> tuple[int, int]:
+    """Height and width, once `images` is known to be uint8 frames that hold the crop."""
+    if images.ndim < 3 or images.shape[-1] != 3 or images.dtype != jnp.uint8:
+        raise ValueError(
+            f"images: expected uint8 [..., h, w, 3], got {images.dtype} {images.shape}"
+        )
+    height, width = images.shape[-3:-1]
+    if not 1 <= crop <= min(height, width):
+        raise ValueError(f"crop: expected 1..{min(height, width)} pixels, got {crop}")
+    return height, width

@@ -1,0 +1,1 @@
+"""Networks and diffusion. flax.linen lives here only, and nothing here knows a robot."""

@@ -1,0 +1,87 @@
+"""What turns observations into the condition: images to keypoints (Eq. 10), histories to a vector.
+
+Both image encoders are a trunk, one map per keypoint, spatial softmax and a linear layer, and are
+called alike; they see one frame at a time.
+"""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from starjax.models import layers, resnet, spatial_softmax
+
+
+class ImageEncoder(nn.Module):
+    """Eq. 10: a frame to `features` numbers, half as many keypoints with two coordinates each.
+
+    The paper's SpatialSoftmax(ResNet(I)) with d_v = 512 is read as 256 keypoints from a 1x1
+    convolution, and a linear layer after it, which Diffusion Policy has too.
+
+    Attributes:
+      trunk: "resnet18" (GroupNorm) or "small" (8 layers with the keypoints', for CPU).
+      features: d_v, even.
+      width: channels of the trunk's first layer, divisible by 16; 0: 64 for resnet18, 16 for small.
+      dtype: of the trunk; spatial softmax, parameters and the output are float32.
+    """
+
+    trunk: str = "resnet18"
+    features: int = 512
+    width: int = 0
+    dtype: jnp.dtype = jnp.float32
+
+    @nn.compact
+    def __call__(self, image: jax.Array, offset: jax.Array | None = None) -> jax.Array:
+        """`[N, h, w, 3]` normalised frames to float32 `[N, features]`.
+
+        `offset` `[N, 2]` (row, column) is the crop's displacement from the centre crop in pixels,
+        from `data.augment`; None means centre crops.
+        """
+        if self.trunk not in TRUNKS:
+            raise ValueError(f"trunk: expected one of {sorted(TRUNKS)}, got {self.trunk!r}")
+        make, default_width = TRUNKS[self.trunk]
+        maps = make(self.width or default_width, self.dtype, name="trunk")(image)
+        # Rounded logits would move a keypoint by a fraction of a cell, which is millimetres.
+        kernel = self.param(
+            "keypoints", layers.uniform_init(maps.shape[-1]), (maps.shape[-1], self.features // 2)
+        )
+        logits = jnp.matmul(maps, kernel.astype(maps.dtype), preferred_element_type=jnp.float32)
+        points = spatial_softmax.spatial_softmax(logits, image.shape[1:3], offset)
+        return layers.Dense(self.features, name="out")(points.reshape(len(points), -1))
+
+
+class SmallTrunk(nn.Module):
+    """Seven 3x3 convolutions to maps 8 times smaller, `4 * width` channels: an encoder for CPU."""
+
+    width: int = 16
+    dtype: jnp.dtype = jnp.float32
+
+    @nn.compact
+    def __call__(self, image: jax.Array) -> jax.Array:
+        """`[N, h, w, 3]` normalised -> `[N, ceil(h/8), ceil(w/8), 4 width]`."""
+        x = image.astype(self.dtype)
+        for doubling, stride in ((0, 2), (0, 1), (1, 2), (1, 1), (2, 2), (2, 1), (2, 1)):
+            x = resnet.Conv2d(self.width << doubling, 3, stride)(x)
+            x = nn.relu(layers.GroupNorm(x.shape[-1] // 8)(x))
+        return x
+
+
+class StateEncoder(nn.Module):
+    """Eq. 11: a history `[B, O, S]` to `[B, features]` by three 1-D convolutions.
+
+    The third has the history's length and no padding, so it sees all of it at once.
+    """
+
+    features: int = 256
+    dtype: jnp.dtype = jnp.float32
+
+    @nn.compact
+    def __call__(self, history: jax.Array) -> jax.Array:
+        """float32 `[B, features]`; `history` normalised."""
+        x = history.astype(self.dtype)
+        x = layers.mish(layers.Conv1d(self.features // 4, 3)(x))
+        x = layers.mish(layers.Conv1d(self.features // 2, 3)(x))
+        x = layers.Conv1d(self.features, x.shape[1], padding=0)(x)
+        return x[:, 0].astype(jnp.float32)
+
+
+TRUNKS = {"resnet18": (resnet.ResNet18, 64), "small": (SmallTrunk, 16)}

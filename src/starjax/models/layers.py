@@ -1,0 +1,147 @@
+"""Layers shared by the networks: Conv1d as one matrix product, GroupNorm, Mish, Dense.
+
+Parameters are float32; arithmetic runs in the dtype of the input (float32 or bfloat16), while
+statistics are always float32. Initial values follow torch's defaults, as Diffusion Policy's do.
+"""
+
+import math
+from collections.abc import Callable
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+
+def mish(x: jax.Array) -> jax.Array:
+    """x tanh(softplus(x)), with one exponential: tanh(log(1 + e)) = e (e + 2) / (e (e + 2) + 2)."""
+    wide = x.astype(jnp.float32)
+    # Above 20 the ratio is 1 in float32; the clamp keeps the square from overflowing.
+    e = jnp.exp(jnp.minimum(wide, 20.0))
+    n = e * (e + 2.0)
+    return (wide * (n / (n + 2.0))).astype(x.dtype)
+
+
+def uniform_init(fan_in: int) -> Callable[..., jax.Array]:
+    """Uniform within +-1/sqrt(fan_in)."""
+    bound = 1.0 / math.sqrt(fan_in)
+
+    def init(key: jax.Array, shape: tuple[int, ...], dtype=jnp.float32) -> jax.Array:
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return init
+
+
+class Dense(nn.Module):
+    """Affine map of the last axis. `zero` starts it as the zero map."""
+
+    features: int
+    zero: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[..., C] -> [..., features]`."""
+        init = nn.initializers.zeros if self.zero else uniform_init(x.shape[-1])
+        kernel = self.param("kernel", init, (x.shape[-1], self.features))
+        bias = self.param("bias", init, (self.features,))
+        return x @ kernel.astype(x.dtype) + bias.astype(x.dtype)
+
+
+class GroupNorm(nn.Module):
+    """Normalise each sample over groups of channels and all positions (epsilon 1e-5)."""
+
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[B, ..., C] -> [B, ..., C]`."""
+        batch, channels = x.shape[0], x.shape[-1]
+        if channels % self.groups:
+            raise ValueError(
+                f"groups: expected a divisor of {channels} channels, got {self.groups}"
+            )
+        scale = self.param("scale", nn.initializers.ones, (channels,))
+        bias = self.param("bias", nn.initializers.zeros, (channels,))
+        wide = x.astype(jnp.float32)
+        positions = tuple(range(1, x.ndim - 1))
+        # Positions first, channels after: both reductions then run along contiguous memory, and
+        # what remains is one multiply-add for each element.
+        per_group = (batch, self.groups, channels // self.groups)
+        mean = wide.mean(positions).reshape(per_group).mean(-1)
+        square = (wide * wide).mean(positions).reshape(per_group).mean(-1)
+        inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + 1e-5)
+        gain = jnp.repeat(inverse, channels // self.groups, axis=1) * scale
+        shift = bias - jnp.repeat(mean, channels // self.groups, axis=1) * gain
+        shape = (batch,) + (1,) * len(positions) + (channels,)
+        return (wide * gain.reshape(shape) + shift.reshape(shape)).astype(x.dtype)
+
+
+class Conv1d(nn.Module):
+    """1-D convolution over `[B, L, C]` as one matrix product of the shifted inputs.
+
+    Taps that only ever meet the padding at this length are not made at all: at length 2 a kernel
+    of 5 is exactly its centred 3, and the others would never get a gradient.
+    """
+
+    features: int
+    kernel_size: int
+    stride: int = 1
+    padding: int | None = None  # on either side; None: kernel_size // 2
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[B, L, C] -> [B, (L + 2 padding - kernel_size) // stride + 1, features]`."""
+        batch, length, channels = x.shape
+        padding = self.kernel_size // 2 if self.padding is None else self.padding
+        out = (length + 2 * padding - self.kernel_size) // self.stride + 1
+        if out < 1:
+            raise ValueError(
+                f"x: expected a length that kernel {self.kernel_size} fits, got {length}"
+            )
+        taps = _live_taps(self.kernel_size, self.stride, padding, length, out)
+        # The fan-in counts the dropped taps, so that the start is distributed as with them.
+        init = uniform_init(self.kernel_size * channels)
+        kernel = self.param("kernel", init, (len(taps), channels, self.features))
+        bias = self.param("bias", init, (self.features,))
+
+        span = (out - 1) * self.stride + 1
+        left = padding - taps[0]
+        right = max(0, (out - 1) * self.stride + taps[-1] - padding - (length - 1))
+        padded = jnp.pad(x, ((0, 0), (left, right), (0, 0)))
+        shifted = [padded[:, j : j + span : self.stride] for j in range(len(taps))]
+        stacked = jnp.concatenate(shifted, -1) if len(taps) > 1 else shifted[0]
+        flat = stacked.reshape(batch * out, len(taps) * channels)
+        y = flat @ kernel.astype(x.dtype).reshape(len(taps) * channels, self.features)
+        return y.reshape(batch, out, self.features) + bias.astype(x.dtype)
+
+
+class Upsample1d(nn.Module):
+    """Transposed convolution, kernel 4, stride 2, padding 1, as one matrix product.
+
+    Output 2i is x[i] w1 + x[i-1] w3 and output 2i + 1 is x[i+1] w0 + x[i] w2: each pair of outputs
+    reads three inputs.
+    """
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[B, L, C] -> [B, 2 L, C]`."""
+        batch, length, channels = x.shape
+        init = uniform_init(4 * channels)
+        kernel = self.param("kernel", init, (4, channels, channels)).astype(x.dtype)
+        bias = self.param("bias", init, (channels,)).astype(x.dtype)
+        padded = jnp.pad(x, ((0, 0), (1, 1), (0, 0)))
+        before, here, after = padded[:, :-2], x, padded[:, 2:]
+        even = jnp.concatenate([before, here], -1).reshape(batch * length, 2 * channels)
+        odd = jnp.concatenate([here, after], -1).reshape(batch * length, 2 * channels)
+        even = even @ jnp.concatenate([kernel[3], kernel[1]])
+        odd = odd @ jnp.concatenate([kernel[2], kernel[0]])
+        return jnp.stack([even, odd], 1).reshape(batch, 2 * length, channels) + bias
+
+
+def _live_taps(kernel_size: int, stride: int, padding: int, length: int, out: int) -> range:
+    """Taps that meet the input at one output position at least; they are always contiguous."""
+    live = [
+        tap
+        for tap in range(kernel_size)
+        if any(0 <= i * stride + tap - padding < length for i in range(out))
+    ]
+    return range(live[0], live[-1] + 1)

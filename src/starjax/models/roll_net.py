@@ -1,0 +1,53 @@
+"""The relative roll network: future tip positions and the trocar give the roll (Eq. 13, 14)."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from starjax.models import layers
+
+
+class RollNet(nn.Module):
+    """A residual MLP from (positions, trocar, roll history) to the rolls of the horizon.
+
+    It predicts the roll itself, as the paper does, not its change since the last measured one. Its
+    last layer starts at zero, so that an untrained network says "no roll" and not a random one.
+    Inputs should be of order one.
+
+    Attributes:
+      width: of the hidden layers.
+      blocks: residual blocks (LayerNorm, Linear, GELU, Linear).
+      embed_dim: width of the trocar's embedding.
+      dtype: of the arithmetic; parameters, LayerNorm statistics and the output are float32.
+    """
+
+    width: int = 256
+    blocks: int = 3
+    embed_dim: int = 64
+    dtype: jnp.dtype = jnp.float32
+
+    @nn.compact
+    def __call__(self, p: jax.Array, trocar: jax.Array, roll_history: jax.Array) -> jax.Array:
+        """Eq. 13: one roll for each future position.
+
+        The paper's Embed(lambda) is a linear layer with GELU: the trocar is continuous, and a table
+        of embeddings could not serve an unseen one.
+
+        Args:
+          p: `[B, H, 3]` future tip positions, normalised.
+          trocar: `[B, F]` features of the trocar.
+          roll_history: `[B, O]` measured rolls, in the unit of the output.
+
+        Returns:
+          Rolls float32 `[B, H]`.
+        """
+        batch, horizon = p.shape[:2]
+        embedded = nn.gelu(layers.Dense(self.embed_dim, name="embed")(trocar.astype(self.dtype)))
+        inputs = [p.reshape(batch, -1), embedded, roll_history]
+        x = jnp.concatenate([part.astype(self.dtype) for part in inputs], -1)
+        x = layers.Dense(self.width, name="project")(x)
+        for _ in range(self.blocks):
+            h = nn.LayerNorm(dtype=self.dtype)(x)
+            h = nn.gelu(layers.Dense(self.width)(h))
+            x = x + layers.Dense(self.width)(h)
+        return layers.Dense(horizon, zero=True, name="out")(x).astype(jnp.float32)

@@ -1,0 +1,98 @@
+"""The squared-cosine noise schedule and the time steps that DDIM visits.
+
+Indices are zero-based: `k = 0` is the paper's k = 1 (least noise), `k = K - 1` its k = K. Tables
+are computed in float64 and rounded once: at `k = 99`, 1 - beta is 1e-3 and sqrt(alpha_bar) 4.9e-4,
+where a float32 running product has lost its last digits.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+
+class Schedule(NamedTuple):
+    """Tables over the diffusion steps, all float32 `[K]`.
+
+    Attributes:
+      beta: variance added at step k (Eq. 6).
+      sqrt_alpha_bar: what is left of the clean action after step k (Eq. 7).
+      sqrt_one_minus_alpha_bar: standard deviation of the noise after step k.
+      posterior_x0: weight of the clean action in the mean of q(a_{k-1} | a_k, a_0).
+      posterior_xk: weight of a_k in that mean.
+      posterior_std: its standard deviation, sigma_k of Eq. 12; exactly 0 at k = 0.
+    """
+
+    beta: np.ndarray | jax.Array
+    sqrt_alpha_bar: np.ndarray | jax.Array
+    sqrt_one_minus_alpha_bar: np.ndarray | jax.Array
+    posterior_x0: np.ndarray | jax.Array
+    posterior_xk: np.ndarray | jax.Array
+    posterior_std: np.ndarray | jax.Array
+
+    @property
+    def steps(self) -> int:
+        """K, the number of diffusion steps."""
+        return self.beta.shape[0]
+
+
+class DdimTable(NamedTuple):
+    """What each of the n DDIM steps needs, in the order in which they run, `[n]` each.
+
+    Attributes:
+      k: int32 diffusion step whose noise is predicted, descending.
+      sqrt_alpha_bar: at k.
+      sqrt_one_minus_alpha_bar: at k.
+      sqrt_alpha_bar_next: after the step; 1 for the last.
+      sqrt_one_minus_alpha_bar_next: after the step; 0 for the last.
+    """
+
+    k: np.ndarray
+    sqrt_alpha_bar: np.ndarray
+    sqrt_one_minus_alpha_bar: np.ndarray
+    sqrt_alpha_bar_next: np.ndarray
+    sqrt_one_minus_alpha_bar_next: np.ndarray
+
+
+def cosine(steps: int = 100) -> Schedule:
+    """Squared-cosine schedule of K steps: alpha_bar(t) = cos^2((t + 0.008) / 1.008 * pi / 2).
+
+    Each beta is capped at 0.999, as the paper's reference and Diffusion Policy do.
+    """
+    beta, alpha_bar = _beta_and_alpha_bar(steps)
+    previous = np.concatenate([[1.0], alpha_bar[:-1]])
+    variance = beta * (1.0 - previous) / (1.0 - alpha_bar)
+    tables = (
+        beta,
+        np.sqrt(alpha_bar),
+        np.sqrt(1.0 - alpha_bar),
+        beta * np.sqrt(previous) / (1.0 - alpha_bar),
+        np.sqrt(1.0 - beta) * (1.0 - previous) / (1.0 - alpha_bar),
+        np.sqrt(variance),
+    )
+    return Schedule(*(table.astype(np.float32) for table in tables))
+
+
+def ddim_table(diffusion_steps: int, steps: int) -> DdimTable:
+    """The 'leading' spacing of `steps` DDIM steps over a `cosine(diffusion_steps)` schedule.
+
+    With 100 and 10 they are k = 90, 80, .., 0. One step alone is k = 0, where the input counts as
+    nearly clean: 'leading' needs a few steps to mean anything.
+    """
+    if not 1 <= steps <= diffusion_steps:
+        raise ValueError(f"steps: expected 1..{diffusion_steps} (the diffusion steps), got {steps}")
+    _, alpha_bar = _beta_and_alpha_bar(diffusion_steps)
+    k = np.arange(steps)[::-1] * (diffusion_steps // steps)
+    following = np.append(alpha_bar[k[1:]], 1.0)
+    tables = (alpha_bar[k], 1.0 - alpha_bar[k], following, 1.0 - following)
+    return DdimTable(k.astype(np.int32), *(np.sqrt(table).astype(np.float32) for table in tables))
+
+
+def _beta_and_alpha_bar(steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """float64 `[K]` each."""
+    if steps < 1:
+        raise ValueError(f"steps: expected at least 1 diffusion step, got {steps}")
+    cosines = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * math.pi / 2) ** 2
+    beta = np.minimum(1.0 - cosines[1:] / cosines[:-1], 0.999)
+    return beta, np.cumprod(1.0 - beta)
