@@ -1,0 +1,71 @@
+"""Action spaces on the remote-centre-of-motion manifold of a laparoscopic tool. Needs jax only.
+
+>>> action_space = rcm.ACTION_SPACES["rcm4"]
+>>> pose, valid = action_space.decode(action, trocar, p_world_ref)
+"""
+
+from starjax.rcm.actions import ACTION_SPACES, MAX_REACH, ActionSpace
+from starjax.rcm.manifold import (
+    HOLD_DEPTH,
+    MAX_DEPTH,
+    MIN_DEPTH,
+    insertion_depth,
+    pose_at_depth,
+    pose_on_manifold,
+    project,
+    rcm_error,
+)
+from starjax.rcm.rotations import (
+    roll_of,
+    rot6d_decode,
+    rot6d_encode,
+    rotation_align,
+    rotation_from_axis_roll,
+    rotation_z,
+)
+from starjax.rcm.trocar import (
+    AZIMUTH_RANGE,
+    IS_SEEN,
+    POLAR_RANGE,
+    POLAR_RANGE_WIDE,
+    RADIUS_RANGE,
+    TROCARS,
+    Trocar,
+    check_trocar,
+    sample_trocar,
+    trocar_position,
+    trocar_rotation,
+)
+from starjax.types import Pose
+
+__all__ = [
+    "ACTION_SPACES",
+    "AZIMUTH_RANGE",
+    "HOLD_DEPTH",
+    "IS_SEEN",
+    "MAX_DEPTH",
+    "MAX_REACH",
+    "MIN_DEPTH",
+    "POLAR_RANGE",
+    "POLAR_RANGE_WIDE",
+    "RADIUS_RANGE",
+    "TROCARS",
+    "ActionSpace",
+    "Pose",
+    "Trocar",
+    "check_trocar",
+    "insertion_depth",
+    "pose_at_depth",
+    "pose_on_manifold",
+    "project",
+    "rcm_error",
+    "roll_of",
+    "rot6d_decode",
+    "rot6d_encode",
+    "rotation_align",
+    "rotation_from_axis_roll",
+    "rotation_z",
+    "sample_trocar",
+    "trocar_position",
+    "trocar_rotation",
+]

@@ -1,0 +1,178 @@
+"""The action spaces: SE(3) and the four parameterisations of the RCM manifold (Eq. 5), both ways.
+
+`decode` is total. Whatever the numbers, its pose is finite, its rotation a rotation, and in the
+four RCM spaces the shaft passes through the trocar. If an input (action, trocar or reference)
+is not finite, the flag `valid` is False and the pose is the **hold pose**: tool straight down,
+roll 0, tip `HOLD_DEPTH` below the trocar (below the reference where the trocar is not finite,
+below the world's origin where that is not either). Finite inputs are always valid: depths are
+clipped to [MIN_DEPTH, MAX_DEPTH], a tip at the trocar takes the axis straight down, degenerate
+6-D columns are completed, and SE(3) positions are clipped to +-MAX_REACH.
+
+`encode` describes measured poses too, which are a little off the manifold: its depth is the
+signed one of Eq. 3, its roll and rotation those of the pose. It propagates NaN.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from starjax import types
+from starjax.rcm import arrays, manifold, rotations
+from starjax.rcm import trocar as trocars
+
+MAX_REACH = 10.0  # m; bound of a decoded SE(3) position's coordinates
+
+Encode = Callable[[types.Pose, trocars.Trocar, jax.Array], jax.Array]
+Decode = Callable[[jax.Array, trocars.Trocar, jax.Array], tuple[types.Pose, jax.Array]]
+
+
+class ActionSpace(NamedTuple):
+    """One way to write a tip pose as a vector.
+
+    Attributes:
+      name: key in `ACTION_SPACES`.
+      dim: length A of the vector.
+      encode: (pose_world_tip `[...]`, trocar `[...]`, p_world_ref `[..., 3]` m) to `[..., A]`.
+      decode: (action `[..., A]`, trocar, p_world_ref) to (pose_world_tip, valid bool `[...]`).
+      slices: where the parts are: "p" m, "R" 6-D, "depth" m, "roll" rad.
+    """
+
+    name: str
+    dim: int
+    encode: Encode
+    decode: Decode
+    slices: dict[str, slice]
+
+
+def _encode_se3(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
+    return [pose.p, rotations.rot6d_encode(pose.R)]
+
+
+def _decode_se3(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+    R = rotations.rot6d_decode(parts["R"])
+    return types.Pose(R=R, p=jnp.clip(parts["p"], -MAX_REACH, MAX_REACH))
+
+
+def _encode_rcm1(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
+    depth = manifold.insertion_depth(pose, frame.p)
+    R_trocar_tip = arrays.matmul(frame.R.mT, pose.R)
+    return [depth[..., None], rotations.rot6d_encode(R_trocar_tip)]
+
+
+def _decode_rcm1(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+    R = arrays.matmul(frame.R, rotations.rot6d_decode(parts["R"]))
+    return manifold.pose_at_depth(R, parts["depth"][..., 0], frame.p)
+
+
+def _encode_rcm2(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
+    p_trocar_tip = arrays.matvec(frame.R.mT, pose.p - frame.p)
+    return [rotations.roll_of(pose.R)[..., None], p_trocar_tip]
+
+
+def _decode_rcm2(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+    offset_world = arrays.matvec(frame.R, parts["p"])
+    axis, depth = manifold.axis_and_depth(offset_world, jnp.zeros_like(offset_world))
+    return manifold.pose_on_manifold(axis, parts["roll"][..., 0], depth, frame.p)
+
+
+def _encode_rcm3(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
+    depth = manifold.insertion_depth(pose, frame.p)
+    return [depth[..., None], rotations.rot6d_encode(pose.R)]
+
+
+def _decode_rcm3(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+    R = rotations.rot6d_decode(parts["R"])
+    return manifold.pose_at_depth(R, parts["depth"][..., 0], frame.p)
+
+
+def _encode_rcm4(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
+    return [rotations.roll_of(pose.R)[..., None], pose.p]
+
+
+def _decode_rcm4(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+    """Algorithm 1, its alignment taken from the z-down frame (`rotation_from_axis_roll`)."""
+    axis, depth = manifold.axis_and_depth(parts["p"], frame.p)
+    return manifold.pose_on_manifold(axis, parts["roll"][..., 0], depth, frame.p)
+
+
+class _Frame(NamedTuple):
+    """The trocar frame {T}, pose_world_trocar."""
+
+    R: jax.Array
+    p: jax.Array
+
+
+def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> ActionSpace:
+    """Wrap a pair of maps: inputs checked, broadcast and bounded, the hold pose put in."""
+    slices, dim = {}, 0
+    for part, size in sizes.items():
+        slices[part] = slice(dim, dim + size)
+        dim += size
+
+    def encode_pose(pose: types.Pose, trocar: trocars.Trocar, p_world_ref: jax.Array) -> jax.Array:
+        R, p, *rest = arrays.checked(
+            **{"pose.R": (pose.R, (3, 3)), "pose.p": (pose.p, (3,))},
+            **_trocar_arguments(trocar, p_world_ref),
+        )
+        parts = encode(types.Pose(R=R, p=p), _frame(*rest))
+        batch = jnp.broadcast_shapes(R.shape[:-2], p.shape[:-1], *_batch_shapes(*rest))
+        return jnp.concatenate(
+            [jnp.broadcast_to(part, (*batch, part.shape[-1])) for part in parts], axis=-1
+        )
+
+    def decode_action(
+        action: jax.Array, trocar: trocars.Trocar, p_world_ref: jax.Array
+    ) -> tuple[types.Pose, jax.Array]:
+        action, *rest = arrays.checked(
+            action=(action, (dim,)), **_trocar_arguments(trocar, p_world_ref)
+        )
+        radius, polar, azimuth, p_ref = rest
+        valid = (
+            jnp.isfinite(action).all(axis=-1)
+            & jnp.isfinite(p_ref).all(axis=-1)
+            & jnp.isfinite(radius)
+            & jnp.isfinite(polar)
+            & jnp.isfinite(azimuth)
+        )
+        frame = _frame(*(arrays.bounded(value) for value in rest))
+        bounded = arrays.bounded(action)
+        pose = decode({part: bounded[..., where] for part, where in slices.items()}, frame)
+        hold = _hold_pose(frame.p)
+        R = jnp.where(valid[..., None, None], pose.R, hold.R)
+        p = jnp.where(valid[..., None], pose.p, hold.p)
+        return types.Pose(R=R, p=p), valid
+
+    return ActionSpace(name, dim, encode_pose, decode_action, slices)
+
+
+def _trocar_arguments(trocar: trocars.Trocar, p_world_ref: jax.Array) -> dict:
+    return {**trocars.named_fields(trocar), "p_world_ref": (p_world_ref, (3,))}
+
+
+def _frame(
+    radius: jax.Array, polar: jax.Array, azimuth: jax.Array, p_world_ref: jax.Array
+) -> _Frame:
+    trocar = trocars.Trocar(radius, polar, azimuth)
+    return _Frame(trocars.trocar_rotation(trocar), trocars.trocar_position(trocar, p_world_ref))
+
+
+def _batch_shapes(*trocar_and_ref: jax.Array) -> list[tuple[int, ...]]:
+    *fields, p_ref = trocar_and_ref
+    return [*(field.shape for field in fields), p_ref.shape[:-1]]
+
+
+def _hold_pose(p_world_trocar: jax.Array) -> types.Pose:
+    """Tool straight down, roll 0 (`rotation_from_axis_roll` gives diag(1, -1, -1) there)."""
+    R = jnp.diag(jnp.array([1.0, -1.0, -1.0], p_world_trocar.dtype))
+    return manifold.pose_at_depth(R, jnp.asarray(manifold.HOLD_DEPTH), p_world_trocar)
+
+
+ACTION_SPACES: dict[str, ActionSpace] = {
+    "se3": _space("se3", _encode_se3, _decode_se3, p=3, R=6),
+    "rcm1": _space("rcm1", _encode_rcm1, _decode_rcm1, depth=1, R=6),
+    "rcm2": _space("rcm2", _encode_rcm2, _decode_rcm2, roll=1, p=3),
+    "rcm3": _space("rcm3", _encode_rcm3, _decode_rcm3, depth=1, R=6),
+    "rcm4": _space("rcm4", _encode_rcm4, _decode_rcm4, roll=1, p=3),
+}

@@ -1,0 +1,96 @@
+"""What every RCM map needs of its inputs: one float type, checked shapes, safe directions."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+_BOUND = 1e30  # finite inputs are clipped to +-this, so that sums and squares cannot overflow
+
+
+def checked(**named: tuple[Any, tuple[int, ...]]) -> list[jax.Array]:
+    """Convert inputs to one float type of at least 32 bits and check their shapes.
+
+    Args:
+      named: argument name to `(value, trailing shape)`; the leading axes must broadcast.
+
+    Returns:
+      The values as arrays, in the order given.
+
+    Raises:
+      ValueError: a trailing shape differs, or the leading axes do not broadcast.
+    """
+    values = {name: jnp.asarray(value) for name, (value, _) in named.items()}
+    leading = {}
+    for name, (_, trailing) in named.items():
+        shape, n = values[name].shape, len(trailing)
+        if len(shape) < n or shape[len(shape) - n :] != trailing:
+            expected = ", ".join(["...", *map(str, trailing)])
+            raise ValueError(f"{name}: expected shape [{expected}], got {list(shape)}")
+        leading[name] = shape[: len(shape) - n]
+    try:
+        jnp.broadcast_shapes(*leading.values())
+    except ValueError:
+        got = ", ".join(f"{name} {list(shape)}" for name, shape in leading.items())
+        raise ValueError(
+            f"{', '.join(named)}: expected leading axes that broadcast, got {got}"
+        ) from None
+    dtype = jnp.result_type(jnp.float32, *values.values())
+    return [value.astype(dtype) for value in values.values()]
+
+
+def bounded(x: jax.Array) -> jax.Array:
+    """`x` with non-finite entries set to 0 and the others clipped to where sums stay finite."""
+    return jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), -_BOUND, _BOUND)
+
+
+def epsilon(dtype: Any) -> float:
+    """Below this length (m, or sine of an angle) a direction counts as undefined.
+
+    It also bounds derivatives: they grow like 1 / length towards a singular point.
+    """
+    return 1e-6 if jnp.finfo(dtype).bits == 32 else 1e-12
+
+
+def direction(v: jax.Array, fallback: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Unit vector along `v` and its length, for any finite `v`.
+
+    Args:
+      v: `[..., 3]`.
+      fallback: `[..., 3]` unit vector returned where `v` is shorter than `epsilon`.
+
+    Returns:
+      `[..., 3]` unit vector; `[...]` length, 0 where the fallback was taken.
+    """
+    # The quotient does not depend on the scale, which therefore needs no derivative.
+    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(v), axis=-1, keepdims=True))
+    is_defined = scale > epsilon(v.dtype)
+    scaled = jnp.where(is_defined, v / jnp.where(is_defined, scale, 1.0), fallback)
+    length = jnp.sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True))
+    return scaled / length, jnp.where(is_defined, scale * length, 0.0)[..., 0]
+
+
+def norm(v: jax.Array) -> jax.Array:
+    """Length of `v` `[..., 3]` as `[...]`; the derivative at zero is zero, nothing overflows."""
+    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(v), axis=-1, keepdims=True))
+    # Not `scale > tiny`: a NaN has to come through.
+    is_zero = scale <= jnp.finfo(v.dtype).tiny
+    scaled = jnp.where(is_zero, 1.0, v) / jnp.where(is_zero, 1.0, scale)
+    return jnp.where(is_zero, 0.0, scale * jnp.sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True)))[
+        ..., 0
+    ]
+
+
+def dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Inner product over the last axis, kept as an axis of length 1: `[..., 1]`."""
+    return jnp.sum(a * b, axis=-1, keepdims=True)
+
+
+def matmul(A: jax.Array, B: jax.Array) -> jax.Array:
+    """`A @ B` of 3 x 3 matrices in full precision: GPUs round matrix products to TF32."""
+    return jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2)
+
+
+def matvec(A: jax.Array, v: jax.Array) -> jax.Array:
+    """`A @ v` for `[..., 3, 3]` and `[..., 3]`, in full precision like `matmul`."""
+    return jnp.sum(A * v[..., None, :], axis=-1)

@@ -1,0 +1,115 @@
+"""The RCM manifold: distance from it and depth (Eq. 3), its chart (Eq. 4), projection onto it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import types
+from starjax.rcm import arrays, rotations
+
+MIN_DEPTH = 0.005  # m; poses nearer to the trocar are moved to this depth along the tool's axis
+MAX_DEPTH = 0.4  # m; the length of shaft there can be below the trocar
+HOLD_DEPTH = 0.05  # m; of the hold pose
+
+_STRAIGHT_DOWN = np.array([0.0, 0.0, -1.0], np.float32)
+
+
+def rcm_error(pose: types.Pose, p_world_trocar: jax.Array) -> jax.Array:
+    """Distance of the trocar from the line of the shaft (Eq. 3).
+
+    Args:
+      pose: pose_world_tip `[...]`.
+      p_world_trocar: `[..., 3]` m.
+
+    Returns:
+      `[...]` m; its derivative on the line, where it has a kink, is zero.
+    """
+    R, p, p_world_trocar = _checked(pose, p_world_trocar)
+    return arrays.norm(jnp.cross(p - p_world_trocar, R[..., :, 2]))
+
+
+def insertion_depth(pose: types.Pose, p_world_trocar: jax.Array) -> jax.Array:
+    """Signed depth d of the tip beyond the trocar, along the tool's axis (Eq. 3): `[...]` m."""
+    R, p, p_world_trocar = _checked(pose, p_world_trocar)
+    return arrays.dot(p - p_world_trocar, R[..., :, 2])[..., 0]
+
+
+def pose_on_manifold(
+    axis_world: jax.Array, roll: jax.Array, depth: jax.Array, p_world_trocar: jax.Array
+) -> types.Pose:
+    """Pose at coordinates (axis, roll, depth) of the chart S2 x S1 x R (Eq. 4, 18).
+
+    Args:
+      axis_world: `[..., 3]` tool axis, distal; a zero vector counts as straight down.
+      roll: `[...]` rad.
+      depth: `[...]` m, clipped to [MIN_DEPTH, MAX_DEPTH].
+      p_world_trocar: `[..., 3]` m.
+
+    Returns:
+      pose_world_tip `[...]`.
+    """
+    R = rotations.rotation_from_axis_roll(axis_world, roll)
+    return pose_at_depth(R, depth, p_world_trocar)
+
+
+def pose_at_depth(
+    R_world_tip: jax.Array, depth: jax.Array, p_world_trocar: jax.Array
+) -> types.Pose:
+    """Pose of the manifold with a given rotation and depth (Eq. 3).
+
+    The tip is built from the axis that the rotation really has, so that it lies on the shaft's
+    line to the last bit, whatever the rounding of the rotation.
+
+    Args:
+      R_world_tip: `[..., 3, 3]`.
+      depth: `[...]` m, clipped to [MIN_DEPTH, MAX_DEPTH].
+      p_world_trocar: `[..., 3]` m.
+    """
+    R, depth, p_world_trocar = arrays.checked(
+        R_world_tip=(R_world_tip, (3, 3)), depth=(depth, ()), p_world_trocar=(p_world_trocar, (3,))
+    )
+    depth = jnp.clip(depth, MIN_DEPTH, MAX_DEPTH)[..., None]
+    p = p_world_trocar + depth * R[..., :, 2]
+    return types.Pose(R=jnp.broadcast_to(R, (*p.shape, 3)), p=p)
+
+
+def axis_and_depth(
+    p_world_tip: jax.Array, p_world_trocar: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Direction and distance from the trocar to the tip (Alg. 1, line 2).
+
+    Returns:
+      `[..., 3]` unit axis, straight down where the tip is at the trocar; `[...]` m.
+    """
+    p, p_world_trocar = arrays.checked(
+        p_world_tip=(p_world_tip, (3,)), p_world_trocar=(p_world_trocar, (3,))
+    )
+    return arrays.direction(p - p_world_trocar, _STRAIGHT_DOWN)
+
+
+def project(pose: types.Pose, p_world_trocar: jax.Array) -> types.Pose:
+    """Post-hoc projection onto the manifold, for DP-EE-Proj.
+
+    The tip is kept and the tool turned by the smallest rotation that puts its axis through the
+    trocar with the tip on the far side (depth positive, Eq. 18). A tip at the trocar is on the
+    manifold whichever way the tool points: that pose is returned as it is.
+
+    Args:
+      pose: pose_world_tip `[...]`.
+      p_world_trocar: `[..., 3]` m.
+
+    Returns:
+      pose_world_tip `[...]`.
+    """
+    R, p, p_world_trocar = _checked(pose, p_world_trocar)
+    axis = R[..., :, 2]
+    target, _ = arrays.direction(p - p_world_trocar, axis)
+    R = arrays.matmul(rotations.rotation_align(axis, target), R)
+    return types.Pose(R=R, p=jnp.broadcast_to(p, R.shape[:-1]))
+
+
+def _checked(pose: types.Pose, p_world_trocar: jax.Array) -> list[jax.Array]:
+    return arrays.checked(
+        **{"pose.R": (pose.R, (3, 3)), "pose.p": (pose.p, (3,))},
+        p_world_trocar=(p_world_trocar, (3,)),
+    )

@@ -1,0 +1,160 @@
+"""Rotations the RCM maps are built from: alignment (Eq. 16), axial roll, 6-D representation.
+
+Everything broadcasts over leading axes, is defined for every finite input and has finite
+derivatives there. `R_a_b` takes coordinates in frame b to coordinates in frame a.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.rcm import arrays
+
+# World to the fixed-yaw frame whose z points down, G = diag(1, -1, -1); it is its own inverse.
+_DOWN = np.array([1.0, -1.0, -1.0], np.float32)
+_E_X = np.array([1.0, 0.0, 0.0], np.float32)
+_E_Z = np.array([0.0, 0.0, 1.0], np.float32)
+
+
+def rotation_align(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Smallest rotation that turns the direction of `a` into that of `b` (Eq. 16, total).
+
+    Eq. 16 divides by `1 + a.b`, which cancels as `b` nears `-a`. Here the part of `b` across
+    `a` spans the plane of rotation; where the two oppose, it is made orthogonal to `a` again
+    before it is scaled up. At `b = -a` (to within `epsilon`) the plane is undefined and a fixed
+    one is taken: half a turn, about -x for `a = e_z`.
+
+    Args:
+      a: `[..., 3]`, of any length; a zero or non-finite vector counts as e_z.
+      b: `[..., 3]`, likewise.
+
+    Returns:
+      `[..., 3, 3]` rotations `R` with `R a = b` (for unit vectors).
+    """
+    a, b = arrays.checked(a=(a, (3,)), b=(b, (3,)))
+    a, _ = arrays.direction(arrays.bounded(a), _E_Z)
+    b, _ = arrays.direction(arrays.bounded(b), _E_Z)
+    return _align_unit(a, b)
+
+
+def _align_unit(a: jax.Array, b: jax.Array) -> jax.Array:
+    cos = arrays.dot(a, b)
+    across = b - cos * a  # sin(angle) times a unit vector orthogonal to a
+    in_plane, sin = arrays.direction(across, _orthogonal(a))
+    in_plane = in_plane - arrays.dot(in_plane, a) * a
+    in_plane, _ = arrays.direction(in_plane, _orthogonal(a))
+    is_obtuse = cos < 0.0
+    w = jnp.where(is_obtuse, sin[..., None] * in_plane, across)
+    # w w' / (1 + cos), which is (1 - cos) times the outer product of the unit vector.
+    root = jnp.where(
+        is_obtuse,
+        jnp.sqrt(jnp.where(is_obtuse, 1.0 - cos, 1.0)) * in_plane,
+        across / jnp.sqrt(1.0 + jnp.where(is_obtuse, 0.0, cos)),
+    )
+    eye = jnp.eye(3, dtype=a.dtype)
+    turn = _outer(w, a) - _outer(a, w)
+    return eye + turn - (1.0 - cos)[..., None] * _outer(a, a) - _outer(root, root)
+
+
+def rotation_z(angle: jax.Array) -> jax.Array:
+    """Rotation by `angle` `[...]` rad about the z axis: `[..., 3, 3]`."""
+    (angle,) = arrays.checked(angle=(angle, ()))
+    cos, sin = cos_sin(angle)
+    zero, one = jnp.zeros_like(cos), jnp.ones_like(cos)
+    rows = ([cos, -sin, zero], [sin, cos, zero], [zero, zero, one])
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def cos_sin(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Cosine and sine of `angle` `[...]` rad, whole turns removed first: huge angles are safe."""
+    angle = jax.lax.rem(angle, jnp.asarray(2.0 * np.pi, angle.dtype))
+    return jnp.cos(angle), jnp.sin(angle)
+
+
+def rotation_from_axis_roll(axis_world: jax.Array, roll: jax.Array) -> jax.Array:
+    """Tool rotation with a given axis and roll (Alg. 1, lines 3-6).
+
+    `R_world_tip = G @ align(e_z, G' @ axis_world) @ R_z(roll)` with G = diag(1, -1, -1): the
+    base rotation is taken from a z-down frame of fixed yaw. Alg. 1 reads as if it were taken
+    from the world's up-axis, which is singular where every laparoscopic tool points. The
+    singular direction is here a tool that points straight up.
+
+    Args:
+      axis_world: `[..., 3]` tool axis, distal; any length.
+      roll: `[...]` rad.
+
+    Returns:
+      `[..., 3, 3]` R_world_tip, whose third column is the unit axis.
+    """
+    axis_world, roll = arrays.checked(axis_world=(axis_world, (3,)), roll=(roll, ()))
+    base = _base_rotation(axis_world)
+    cos, sin = (value[..., None] for value in cos_sin(roll))
+    x, y, z = base[..., :, 0], base[..., :, 1], base[..., :, 2]
+    x, y, z = jnp.broadcast_arrays(cos * x + sin * y, cos * y - sin * x, z)
+    return jnp.stack([x, y, z], axis=-1)
+
+
+def roll_of(R_world_tip: jax.Array) -> jax.Array:
+    """Roll `[...]` in (-pi, pi] rad such that `rotation_from_axis_roll(axis, roll)` is R.
+
+    Continuous in R except for a tool that points straight up, and at half a turn.
+
+    Args:
+      R_world_tip: `[..., 3, 3]`.
+    """
+    (R_world_tip,) = arrays.checked(R_world_tip=(R_world_tip, (3, 3)))
+    base = _base_rotation(R_world_tip[..., :, 2])
+    x = R_world_tip[..., :, 0]
+    cos = arrays.dot(base[..., :, 0], x)[..., 0]
+    sin = arrays.dot(base[..., :, 1], x)[..., 0]
+    # Only a matrix that is no rotation gives (0, 0), where arctan2 has no derivative.
+    is_degenerate = cos**2 + sin**2 <= arrays.epsilon(x.dtype) ** 2
+    return jnp.arctan2(sin, jnp.where(is_degenerate, 1.0, cos))
+
+
+def rot6d_encode(R: jax.Array) -> jax.Array:
+    """First two columns of `R` `[..., 3, 3]`, one after the other: `[..., 6]`."""
+    (R,) = arrays.checked(R=(R, (3, 3)))
+    return jnp.concatenate([R[..., :, 0], R[..., :, 1]], axis=-1)
+
+
+def rot6d_decode(rot6d: jax.Array) -> jax.Array:
+    """Rotation from two columns by Gram-Schmidt, for any input.
+
+    Args:
+      rot6d: `[..., 6]`, columns of any length and angle. A first column that is zero counts as
+        e_x; a second one that is zero or parallel to the first is replaced by a fixed one
+        orthogonal to it. Non-finite entries count as zero.
+
+    Returns:
+      `[..., 3, 3]`.
+    """
+    (rot6d,) = arrays.checked(rot6d=(rot6d, (6,)))
+    rot6d = arrays.bounded(rot6d)
+    x, _ = arrays.direction(rot6d[..., :3], _E_X)
+    spare = _orthogonal(x)
+    y, _ = arrays.direction(rot6d[..., 3:], spare)
+    # Twice: what is left of nearly parallel columns is small, and then no longer orthogonal.
+    for _ in range(2):
+        y, _ = arrays.direction(y - arrays.dot(x, y) * x, spare)
+    return jnp.stack([x, y, jnp.cross(x, y)], axis=-1)
+
+
+def _base_rotation(axis_world: jax.Array) -> jax.Array:
+    """`G @ align(e_z, G' @ axis_world)`: `[..., 3]` to `[..., 3, 3]`."""
+    down = jnp.asarray(_DOWN, axis_world.dtype)
+    axis, _ = arrays.direction(arrays.bounded(axis_world * down), _E_Z)
+    e_z = jnp.broadcast_to(jnp.asarray(_E_Z, axis.dtype), axis.shape)
+    return down[:, None] * _align_unit(e_z, axis)
+
+
+def _orthogonal(a: jax.Array) -> jax.Array:
+    """A unit vector orthogonal to unit `a`, made from the x axis unless `a` is close to it."""
+    e_y = np.array([0.0, 1.0, 0.0], np.float32)
+    other = jnp.where(jnp.abs(a[..., :1]) < 0.7, _E_X, e_y).astype(a.dtype)
+    across = jnp.cross(a, other)
+    return across / jnp.sqrt(arrays.dot(across, across))
+
+
+def _outer(a: jax.Array, b: jax.Array) -> jax.Array:
+    return a[..., :, None] * b[..., None, :]
