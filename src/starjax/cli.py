@@ -19,7 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)"),
     "report": (
         "starjax.experiments.report_command",
-        "tables, figures, video and page from results",
+        "tables, figures, video, page from results",
     ),
     "doctor": ("starjax.doctor", "what of this machine and installation works, and what to do"),
 }

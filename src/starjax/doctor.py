@@ -1,0 +1,170 @@
+"""`starjax doctor`: what of this machine and installation works; one remedy for each fault."""
+
+import importlib.metadata
+import os
+import pathlib
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from starjax import cli
+from starjax import config as config_lib
+from starjax.experiments import presets
+from starjax.runtime import files, xla
+
+NEEDED_MEMORY = 4e9  # bytes free for the preset `cpu`
+NEEDED_DISK = 2e9
+
+
+class Finding(NamedTuple):
+    """One line of the answer.
+
+    Attributes:
+      name: what was looked at.
+      value: what was found.
+      remedy: what to do about it; empty if nothing is wrong.
+    """
+
+    name: str
+    value: str
+    remedy: str = ""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Prints every finding; returns 1 if there is a fault."""
+    if set(argv) & {"-h", "--help"}:
+        print(f"usage: starjax doctor\n\n{__doc__}\nThe exit code is 1 if there is a fault.")
+        return 0
+    if argv:
+        raise config_lib.UsageError(f"{argv[0]}: expected no argument")
+    # The order matters: a wrong XLA flag ends the process as soon as jax starts.
+    checks: list[Callable[[], list[Finding]]] = [packages, xla_flags, storage, memory]
+    findings = [finding for check in checks for finding in _shown(check)]
+    if any(finding.name == "XLA_FLAGS" and finding.remedy for finding in findings):
+        print("       the checks that start jax were left out: it would abort")
+    else:
+        findings += [finding for check in (devices, scene, video) for finding in _shown(check)]
+    faults = sum(bool(finding.remedy) for finding in findings)
+    print(f"\n{faults} fault(s)" if faults else "\nno fault found")
+    return 1 if faults else 0
+
+
+def packages() -> list[Finding]:
+    """Versions, and whether they fit together."""
+    found = xla.versions()
+    text = "  ".join(f"{name} {version}" for name, version in found.items())
+    remedy = ""
+    missing = [name for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx") if name not in found]
+    if missing:
+        remedy = f"{', '.join(missing)} not installed: pip install -e . in starjax's folder"
+    elif found["jax"] != found["jaxlib"]:
+        remedy = f"jax and jaxlib differ: pip install jax=={found['jax']} jaxlib=={found['jax']}"
+    elif not (0, 10) <= _numbers(found["jax"])[:2] < (0, 12):
+        remedy = f"jax {found['jax']} is untested: pip install 'jax>=0.10.2,<0.12'"
+    return [Finding("versions", text, remedy)]
+
+
+def xla_flags() -> list[Finding]:
+    """Whether XLA_FLAGS suits this jaxlib: the flag that speeds up 0.10 makes 0.11 abort."""
+    flag = "--xla_cpu_use_fusion_emitters"
+    typed = os.environ.get("XLA_FLAGS", "")
+    recent = _numbers(importlib.metadata.version("jaxlib"))[:2] >= (0, 11)
+    if recent and flag in typed:
+        return [Finding("XLA_FLAGS", typed, f"jaxlib >= 0.11 aborts on {flag}: take it out")]
+    if not recent and f"{flag}=true" in typed:
+        return [Finding("XLA_FLAGS", typed, f"physics is 300 times slower so: set {flag}=false")]
+    xla.prepare_xla()
+    return [Finding("XLA_FLAGS", os.environ.get("XLA_FLAGS", "") or "(none needed)")]
+
+
+def storage() -> list[Finding]:
+    """Room and rights in the working folder and in the cache."""
+    findings = []
+    for name, place in (("folder", pathlib.Path.cwd()), ("cache", xla.cache_directory())):
+        try:
+            files.require_writable(place)
+        except OSError as error:
+            variable = "another working folder" if name == "folder" else "STARJAX_CACHE"
+            findings.append(Finding(name, str(error), f"choose a writable place by {variable}"))
+            continue
+        free = shutil.disk_usage(place).free
+        short = free < NEEDED_DISK
+        remedy = f"make {files.size(NEEDED_DISK)} free, or use another disk by --out"
+        findings.append(Finding(name, f"{place}, {files.size(free)} free", remedy if short else ""))
+    return findings
+
+
+def memory() -> list[Finding]:
+    """Free memory of the host."""
+    try:
+        pages = os.sysconf("SC_AVPHYS_PAGES")
+        lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
+    except (OSError, ValueError):
+        return []
+    sizes = {line.split(":")[0]: 1024 * int(line.split()[1]) for line in lines}
+    free = sizes.get("MemAvailable", pages * os.sysconf("SC_PAGE_SIZE"))
+    value = f"{files.size(free)} free of {files.size(sizes['MemTotal'])}"
+    remedy = f"close programs, or lower --eval.chunk: {files.size(NEEDED_MEMORY)} are wanted"
+    return [Finding("memory", value, remedy if free < NEEDED_MEMORY else "")]
+
+
+def devices() -> list[Finding]:
+    """What jax runs on, and whether it can compile and run a program there."""
+    if presets.has_gpu_device() and not presets.has_gpu_plugin():
+        remedy = "jax cannot use this GPU yet: pip install -e '.[cuda]'"
+        gpu = [Finding("GPU", "an NVIDIA device, no CUDA plugin of jax", remedy)]
+    else:
+        gpu = []
+    import jax
+    import jax.numpy as jnp
+
+    try:
+        kinds = [device.device_kind for device in jax.devices()]
+        total = float(jax.jit(jnp.sum)(jnp.arange(5.0)))
+    except RuntimeError as error:
+        remedy = "start with JAX_PLATFORMS=cpu, then see to the GPU's driver (nvidia-smi)"
+        return [*gpu, Finding("jax", str(error).splitlines()[0], remedy)]
+    if total != 10.0:
+        return [*gpu, Finding("jax", f"0+1+2+3+4 = {total}", "reinstall jax and jaxlib")]
+    value = f"{jax.default_backend()}, {len(kinds)} x {kinds[0]}, {xla.cores()} cores"
+    preset = presets.resolve("auto").preset
+    return [*gpu, Finding("jax", value), Finding("preset", f"auto means {preset}")]
+
+
+def scene() -> list[Finding]:
+    """Whether the MJCF parts are found and compile."""
+    from starjax.sim import model
+
+    try:
+        made = model.compose()
+    except (OSError, ValueError) as error:
+        return [Finding("scene", str(error), "reinstall starjax: parts of its scene are missing")]
+    return [Finding("scene", f"{made.ngeom} geoms, {made.nq} coordinates")]
+
+
+def video() -> list[Finding]:
+    """Whether the report can write videos."""
+    import imageio_ffmpeg
+
+    try:
+        return [Finding("ffmpeg", imageio_ffmpeg.get_ffmpeg_version())]
+    except RuntimeError as error:
+        return [Finding("ffmpeg", str(error).splitlines()[0], "pip install imageio-ffmpeg")]
+
+
+def _shown(check: Callable[[], list[Finding]]) -> list[Finding]:
+    findings = check()
+    for finding in findings:
+        print(f"{'FAULT' if finding.remedy else 'ok':6} {finding.name:9} {finding.value}")
+        if finding.remedy:
+            print(f"       -> {finding.remedy}")
+    return findings
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in version.split(".")[:3] if part.isdigit())
+
+
+if __name__ == "__main__":
+    sys.exit(cli.guard(main, sys.argv[1:]))

@@ -1,0 +1,71 @@
+"""The doctor finds what is planted, and gives each fault one remedy."""
+
+import importlib.metadata
+
+from starjax import doctor
+
+
+def faults(findings):
+    return [finding for finding in findings if finding.remedy]
+
+
+def test_a_sound_installation_has_no_fault():
+    assert not faults(doctor.packages() + doctor.xla_flags() + doctor.devices() + doctor.scene())
+
+
+def test_flag_that_aborts_jaxlib_is_found(monkeypatch):
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.11.2")
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+    (fault,) = faults(doctor.xla_flags())
+    assert "take it out" in fault.remedy
+
+
+def test_flag_that_slows_physics_is_found(monkeypatch):
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.10.2")
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true")
+    assert faults(doctor.xla_flags())
+
+
+def test_versions_that_do_not_fit_are_found(monkeypatch):
+    found = {"jax": "0.10.2", "jaxlib": "0.10.1", "mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}
+    monkeypatch.setattr(doctor.xla, "versions", lambda: found)
+    (fault,) = faults(doctor.packages())
+    assert "jaxlib==0.10.2" in fault.remedy
+    found["jax"] = found["jaxlib"] = "0.12.0"
+    assert "untested" in faults(doctor.packages())[0].remedy
+    del found["mujoco"]
+    assert "mujoco not installed" in faults(doctor.packages())[0].remedy
+
+
+def test_unwritable_cache_and_little_memory_are_found(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("STARJAX_CACHE", str(tmp_path / "file" / "below"))
+    assert any("STARJAX_CACHE" in fault.remedy for fault in faults(doctor.storage()))
+    monkeypatch.setattr(doctor, "NEEDED_MEMORY", 1e15)
+    assert faults(doctor.memory())
+
+
+def test_a_gpu_without_its_plugin_is_found(monkeypatch):
+    monkeypatch.setattr(doctor.presets, "has_gpu_device", lambda: True)
+    monkeypatch.setattr(doctor.presets, "has_gpu_plugin", lambda: False)
+    assert "cuda" in faults(doctor.devices())[0].remedy
+
+
+def test_a_missing_scene_is_found(monkeypatch):
+    from starjax.sim import assets
+
+    def absent(name):
+        raise FileNotFoundError("MJCF part 'x' is not there")
+
+    monkeypatch.setattr(assets, "path", absent)
+    assert faults(doctor.scene())
+
+
+def test_exit_code_and_one_remedy_a_fault(monkeypatch, capsys):
+    bad = [doctor.Finding("disk", "full", "make room")]
+    for name in ("packages", "xla_flags", "storage", "memory", "devices", "scene", "video"):
+        monkeypatch.setattr(doctor, name, lambda: [])
+    assert doctor.main([]) == 0
+    monkeypatch.setattr(doctor, "storage", lambda: bad)
+    assert doctor.main([]) == 1
+    assert capsys.readouterr().out.count("-> make room") == 1
