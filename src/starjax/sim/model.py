@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from mujoco import mjx
+
 
 from starjax.sim import assets, ik
+from starjax.sim.engine import mjx
 
 # Which MJCF parts exist. Adding one: a file and a line.
 ROBOTS = {"fr5": "robots/fr5/fr5.xml"}
@@ -33,7 +34,7 @@ class SimModel(NamedTuple):
       p_world_ref: `[3]` m, the nominal port o_ref.
       arm_q, jaw, block: where the arm's, the jaws' and the block's coordinates start in qpos;
         `arm_dof`, `block_dof`: in qvel.
-      geom_rgb: `[G, 3]` colours; `seat_geoms`, `peg_geoms`: `[P]` geom ids.
+      geom_rgb: `[G, 3]` colours; `peg_geoms`, `seat_geoms`: `[P]` geom ids; `pad_geoms`, `wall_geoms`.
       pegs: `[P, 2]` m, the pegs' axes on the board.
     """
 
@@ -51,7 +52,8 @@ class SimModel(NamedTuple):
     geom_rgb: np.ndarray
     peg_geoms: np.ndarray
     seat_geoms: np.ndarray
-    port_geom: int
+    pad_geoms: np.ndarray
+    wall_geoms: np.ndarray
     pegs: np.ndarray
 
 
@@ -97,6 +99,7 @@ def load(robot: str = "fr5", tool: str = "grasper", task: str = "peg_transfer") 
         geom_rgb=rgb,
         peg_geoms=peg_geoms,
         seat_geoms=np.array([m.geom(f"seat{i}").id for i in range(numbered)]),
-        port_geom=m.geom("port").id,
+        pad_geoms=np.array([m.geom(f"robot/tool/pad_{side}").id for side in ("left", "right")]),
+        wall_geoms=np.array([m.geom(f"wall{i}").id for i in range(3)]),
         pegs=np.array(m.geom_pos[peg_geoms, :2], np.float32),
     )

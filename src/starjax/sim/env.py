@@ -1,0 +1,214 @@
+"""The environment: reset, step(Command), observe, as single-sample pure functions; vmap at the caller.
+
+It takes poses and knows no method. What varies per episode is in `EnvParams` and the key, so a
+batch of trocars is one vmapped axis.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import rcm
+from starjax.sim import collision, ik, model, physics, render
+from starjax.sim.tasks import peg_transfer
+from starjax.sim.types import Observation
+from starjax.types import Command, Pose
+
+CONTROL_HZ = 30.0
+RESET_IK_ITERATIONS = 40
+STEP_IK_ITERATIONS = 4
+# FR5 data sheet, the slower joints; a further command is followed at this speed (rad/s).
+MAX_JOINT_SPEED = 3.15
+
+
+@flax.struct.dataclass
+class EnvParams:
+    """What the caller chooses for an episode: where the port is, a `Trocar` of scalars."""
+
+    trocar: rcm.Trocar
+
+
+@flax.struct.dataclass
+class EnvState:
+    """One episode. Every array is `[]` or as said; batches come from vmap.
+
+    Attributes:
+      sim: joint positions, velocities, warm start.
+      q_target: `[6]` rad, joint target of the last command; gripper_target: [-1, 1].
+      trocar, source, target: the episode's port and its pegs (int32).
+      target_peg: `[2]` m, the target's axis. p_world_ref: `[3]` m, the nominal port.
+      step: int32, control steps taken. settled: consecutive steps that look like success.
+      done: nothing moves any more: success, or invalid.
+      success: strict, see `peg_transfer`. loose: SurRoL's test was met at some step.
+      invalid: the simulation diverged; the last sound state is kept.
+      collided: arm, shaft or jaws were where they have no modelled contact.
+      rcm_error: m, executed: distance of the port from the measured tool axis.
+      ik_error: m, residual of the inverse kinematics.
+      jaw_contact: the jaws touch the block.
+      pose, block_pose: measured tip and block in the world. gripper: measured opening, [-1, 1].
+    """
+
+    sim: physics.PhysicsState
+    q_target: jax.Array
+    gripper_target: jax.Array
+    trocar: rcm.Trocar
+    source: jax.Array
+    target: jax.Array
+    target_peg: jax.Array
+    p_world_ref: jax.Array
+    step: jax.Array
+    settled: jax.Array
+    done: jax.Array
+    success: jax.Array
+    loose: jax.Array
+    invalid: jax.Array
+    collided: jax.Array
+    rcm_error: jax.Array
+    ik_error: jax.Array
+    jaw_contact: jax.Array
+    pose: Pose
+    gripper: jax.Array
+    block_pose: Pose
+
+
+class Env(NamedTuple):
+    """The simulation as pure functions of one episode.
+
+    Attributes:
+      reset: (key, EnvParams) -> EnvState
+      step: (EnvState, Command) -> EnvState, one control period; the state of a done episode stays.
+      observe: EnvState -> Observation
+      camera: EnvState -> render.Frame, what the camera sees at the observation's size.
+      p_world_ref: `[3]` m, the nominal port o_ref.
+      model: the static model; control_hz: commands a second.
+    """
+
+    reset: Callable[[jax.Array, EnvParams], EnvState]
+    step: Callable[[EnvState, Command], EnvState]
+    observe: Callable[[EnvState], Observation]
+    camera: Callable[[EnvState], "render.Frame"]
+    p_world_ref: np.ndarray
+    model: model.SimModel
+    control_hz: float
+
+
+def make(policy_observation: str = "image", image_size: int = 256, shadow: bool = True) -> Env:
+    """Builds the peg-transfer environment.
+
+    Args:
+      policy_observation: "image" (pixels) or "state" (block pose and target position instead).
+      image_size: pixels a side of the camera's square picture.
+
+    Raises:
+      ValueError: an unknown observation or an unusable size.
+    """
+    if policy_observation not in ("image", "state"):
+        raise ValueError(f"policy_observation: expected 'image' or 'state', got {policy_observation!r}")
+    if image_size < 16:
+        raise ValueError(f"image_size: expected at least 16 pixels, got {image_size}")
+    sim = model.load()
+    draw = render.make(sim.mj_model, "camera", image_size, image_size, shadow=shadow)
+    pegs = jnp.asarray(sim.pegs)
+
+    def reset(key: jax.Array, params: EnvParams) -> EnvState:
+        layout = peg_transfer.sample_layout(key, pegs)
+        start = jnp.concatenate([jnp.zeros(1), layout.tip])
+        pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, params.trocar, sim.p_world_ref)
+        q, ik_error = ik.solve(sim.arm, pose, jnp.asarray(sim.home), RESET_IK_ITERATIONS)
+        no = jnp.zeros((), bool)
+        state = EnvState(
+            sim=physics.initial(sim, q, layout.block),
+            q_target=q,
+            gripper_target=jnp.ones(()),
+            trocar=params.trocar,
+            source=layout.source,
+            target=layout.target,
+            target_peg=pegs[layout.target],
+            p_world_ref=jnp.asarray(sim.p_world_ref),
+            step=jnp.zeros((), jnp.int32),
+            settled=jnp.zeros((), jnp.int32),
+            done=no,
+            success=no,
+            loose=no,
+            invalid=no,
+            collided=no,
+            rcm_error=jnp.zeros(()),
+            ik_error=ik_error,
+            jaw_contact=no,
+            pose=pose,
+            gripper=jnp.ones(()),
+            block_pose=layout.block,
+        )
+        return _measure(state)
+
+    def step(state: EnvState, command: Command) -> EnvState:
+        q, ik_error = ik.solve(sim.arm, command.pose, state.q_target, STEP_IK_ITERATIONS)
+        usable = _is_finite(command) & jnp.all(jnp.isfinite(q))
+        dq = jnp.where(usable, q - state.q_target, 0.0)
+        dq = dq * jnp.minimum(1.0, MAX_JOINT_SPEED / CONTROL_HZ / jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9))
+        gripper = jnp.where(usable, jnp.clip(command.gripper, -1.0, 1.0), state.gripper_target)
+        after, jaw_contact = physics.advance(sim, state.sim, state.q_target, dq, gripper, 1.0 / CONTROL_HZ)
+        moved = state.replace(
+            sim=after,
+            q_target=state.q_target + dq,
+            gripper_target=gripper,
+            step=state.step + 1,
+            ik_error=jnp.where(usable, ik_error, state.ik_error),
+            jaw_contact=jaw_contact,
+        )
+        moved = _judge(_measure(moved))
+        stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
+        moved = _select(physics.is_sound(sim, after), moved, stopped)
+        return _select(state.done, state, moved)
+
+    def _measure(state: EnvState) -> EnvState:
+        q = state.sim.qpos[sim.arm_q : sim.arm_q + 6]
+        pose, origins, _ = ik.forward(sim.arm, q)
+        block = physics.block_pose(sim, state.sim)
+        hit = collision.detect(pose, origins, block, pegs)
+        port = rcm.trocar_position(state.trocar, sim.p_world_ref)
+        return state.replace(
+            pose=pose,
+            block_pose=block,
+            gripper=physics.opening(sim, state.sim),
+            rcm_error=rcm.rcm_error(pose, port),
+            collided=state.collided | hit,
+        )
+
+    def _judge(state: EnvState) -> EnvState:
+        velocity = state.sim.qvel[sim.block_dof : sim.block_dof + 6]
+        good = peg_transfer.is_threaded(state.block_pose, state.target_peg) & peg_transfer.is_at_rest(velocity)
+        settled = jnp.where(good & ~state.jaw_contact, state.settled + 1, 0)
+        success = settled >= peg_transfer.SETTLE_STEPS
+        loose = state.loose | peg_transfer.is_near(state.block_pose, state.target_peg)
+        return state.replace(settled=settled, success=success, loose=loose, done=success)
+
+    def camera(state: EnvState) -> render.Frame:
+        xpos, xmat = physics.geom_poses(
+            sim, state.sim.qpos, rcm.trocar_position(state.trocar, sim.p_world_ref)
+        )
+        return draw(xpos, xmat, physics.colours(sim, state.target))
+
+    def observe(state: EnvState) -> Observation:
+        image = task_state = None
+        if policy_observation == "image":
+            image = camera(state).rgb
+        else:
+            goal = jnp.append(state.target_peg, peg_transfer.RIM_HEIGHT)
+            block = state.block_pose
+            task_state = jnp.concatenate([block.p, rcm.rot6d_encode(block.R), goal])
+        return Observation(pose=state.pose, gripper=state.gripper, image=image, state=task_state)
+
+    return Env(reset, step, observe, camera, sim.p_world_ref, sim, CONTROL_HZ)
+
+
+def _is_finite(command: Command) -> jax.Array:
+    return jax.tree.reduce(lambda ok, x: ok & jnp.all(jnp.isfinite(x)), command, jnp.ones((), bool))
+
+
+def _select(which: jax.Array, a: EnvState, b: EnvState) -> EnvState:
+    return jax.tree.map(lambda x, y: jnp.where(which, x, y), a, b)

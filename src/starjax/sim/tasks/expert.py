@@ -1,0 +1,209 @@
+"""Scripted expert of peg transfer: a phase machine that looks at the block, in pure JAX.
+
+It grasps one of two walls at random (which ones depends on the block's yaw, never on the trocar),
+at its own pace, is disturbed on purpose, and starts over when the block is not where it should be.
+The roll follows from tip positions and trocar alone: the tool turns only once the coming positions
+hold the grasp point, and the jaws' axis then stays on the wall's normal.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from starjax import rcm
+from starjax.sim import env
+from starjax.sim.tasks import peg_transfer as task
+from starjax.types import Command, Pose
+
+RAISE, APPROACH, DESCEND, CLOSE, LIFT, CARRY, LOWER, OPEN, RETREAT, WAIT = range(10)
+
+# Least duration (s) and mean speed (m/s) of each phase, and jaws: +1 open, -1 closed at its end.
+DURATION = (0.5, 1.2, 0.9, 0.4, 0.6, 0.9, 0.7, 0.4, 0.5, 1.0)
+SPEED = (0.06, 0.05, 0.024, 1.0, 0.035, 0.04, 0.024, 1.0, 0.06, 1.0)
+JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
+# How much of the disturbance acts in each phase.
+DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.6, 0.3, 0.0, 0.3, 0.0)
+
+TEMPO = (0.85, 1.2)  # range of an episode's pace
+JAW_TIME = 0.25  # s to close or open
+TURN_LEAD = 0.25  # s before the end of the approach at which the tool begins to turn
+TURN_TIME = 0.80  # s the turn takes
+
+HOVER = 0.026  # m above the grasp point
+GRASP_DROP = 0.001  # m below the rim's centre line
+RELEASE_HEIGHT = 0.002  # m above its rest at which the block is let go
+RELEASE_SHIFT = 0.0005  # m further out along the grasped wall's normal: room for the inner pad
+HELD = 0.006  # m from the tip within which the grasped wall counts as held
+CANDIDATES = 2  # walls to choose from
+
+NOISE_POSITION = 0.0008  # m, standard deviation of the disturbance
+NOISE_ROLL = 0.05  # rad
+NOISE_TIME = 0.3  # s, correlation time
+HOVER_SPREAD = 0.002  # m, standard deviation of where it hovers
+NOISE_STREAM = 1 << 20  # folded into the key: apart from every attempt's stream
+
+
+@flax.struct.dataclass
+class ExpertState:
+    """Where the script stands; single episode.
+
+    Attributes:
+      key: typed key, folded with the step for everything random.
+      phase: int32. elapsed, duration: s. attempt: int32, grasps begun.
+      start, goal: `[3]` m, label positions at the phase's ends.
+      wall: int32, the wall grasped. normal: `[3]`, its direction, or the opposite: jaws are
+        symmetric, and this keeps the roll on one branch.
+      roll_from: rad, the roll that the next turn begins at. jaws_from: jaws at the phase's start.
+      tempo: pace. noise: `[4]` disturbance of position (m) and roll (rad).
+      label: the undisturbed command, which is what demonstrations record.
+    """
+
+    key: jax.Array
+    phase: jax.Array
+    elapsed: jax.Array
+    duration: jax.Array
+    attempt: jax.Array
+    start: jax.Array
+    goal: jax.Array
+    wall: jax.Array
+    normal: jax.Array
+    roll_from: jax.Array
+    jaws_from: jax.Array
+    tempo: jax.Array
+    noise: jax.Array
+    label: Command
+
+
+def init(key: jax.Array, state: env.EnvState) -> ExpertState:
+    """The script at the start of an episode."""
+    key_tempo, key = jax.random.split(key)
+    tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
+    expert = ExpertState(
+        key=key,
+        phase=jnp.asarray(RAISE, jnp.int32),
+        elapsed=jnp.zeros(()),
+        duration=jnp.zeros(()),
+        attempt=jnp.zeros((), jnp.int32),
+        start=state.pose.p,
+        goal=state.pose.p,
+        wall=jnp.zeros((), jnp.int32),
+        normal=jnp.array([0.0, -1.0, 0.0]),
+        roll_from=jnp.zeros(()),
+        jaws_from=jnp.ones(()),
+        tempo=tempo,
+        noise=jnp.zeros(4),
+        label=Command(state.pose, jnp.ones(())),
+    )
+    return _enter(expert, jnp.asarray(APPROACH, jnp.int32), state, jnp.zeros(()))
+
+
+def act(expert: ExpertState, state: env.EnvState) -> tuple[Command, ExpertState]:
+    """The disturbed command to execute now; the next state, whose `label` is the clean one."""
+    dt = 1.0 / env.CONTROL_HZ
+    roll = _roll_of(expert, state)
+    is_over = expert.elapsed >= expert.duration - 1e-6
+    following = _enter(expert, _following(expert, state), state, roll)
+    expert = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), following, expert)
+    expert = expert.replace(elapsed=expert.elapsed + dt)
+
+    s = jnp.clip(expert.elapsed / expert.duration, 0.0, 1.0)
+    p = expert.start + _minimum_jerk(s) * (expert.goal - expert.start)
+    expert = expert.replace(label=Command(expert.label.pose._replace(p=p), expert.label.gripper))
+    roll = _roll_of(expert, state)
+    jaws = jnp.asarray(JAWS)[expert.phase]
+    gripper = expert.jaws_from + jnp.clip(expert.elapsed / JAW_TIME, 0.0, 1.0) * (jaws - expert.jaws_from)
+
+    weight = jnp.asarray(DISTURBANCE)[expert.phase]
+    noise = _disturb(expert, state.step, dt)
+    moved = weight * noise * jnp.where(expert.phase == DESCEND, 1.0 - s, 1.0)
+    decode = rcm.ACTION_SPACES["rcm4"].decode
+    clean, _ = decode(jnp.append(roll, p), state.trocar, state.p_world_ref)
+    rough, _ = decode(jnp.append(roll + moved[3], p + moved[:3]), state.trocar, state.p_world_ref)
+    expert = expert.replace(noise=noise, label=Command(clean, gripper))
+    return Command(rough, gripper), expert
+
+
+def _following(expert: ExpertState, state: env.EnvState) -> jax.Array:
+    """The phase after the present one, given what the world looks like now."""
+    phase = expert.phase
+    grasped = state.block_pose.p + task.RIM_RADIUS * task.wall_normals(state.block_pose)[expert.wall]
+    is_held = jnp.sum((grasped - state.pose.p) ** 2) < HELD**2
+    is_lost = (phase >= LIFT) & (phase <= CARRY) & ~is_held
+    return jnp.where(is_lost | (phase == WAIT), RAISE, phase + 1).astype(jnp.int32)
+
+
+def _enter(expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax.Array) -> ExpertState:
+    """Begins `phase`: choose the wall if it is an approach, set goal and duration."""
+    block, tip = state.block_pose, expert.label.pose.p
+    is_approach = phase == APPROACH
+    attempt = expert.attempt + is_approach
+    key_wall, key_hover = jax.random.split(jax.random.fold_in(expert.key, attempt))
+    normals = task.wall_normals(block)
+    # The jaws' axis stays within 60 degrees of the world's y: the roll then never meets its wrap.
+    order = jnp.argsort(jnp.abs(normals[:, 0]))
+    chosen = order[jax.random.randint(key_wall, (), 0, CANDIDATES)]
+    wall = jnp.where(is_approach, chosen, expert.wall)
+    out = normals[wall] * jnp.array([1.0, 1.0, 0.0])
+    out = out / jnp.maximum(jnp.linalg.norm(out), 1e-6)
+    normal = jnp.where(phase <= DESCEND, out * jnp.where(out[1] > 0, -1.0, 1.0), expert.normal)
+
+    grasp = block.p + task.RIM_RADIUS * normals[wall] - jnp.array([0.0, 0.0, GRASP_DROP])
+    spread = HOVER_SPREAD * jax.random.normal(key_hover, (3,)) * jnp.array([1.0, 1.0, 0.5])
+    hover = task.RIM_HEIGHT - GRASP_DROP + HOVER
+    # Where the tip must be so that the block, held as it is now, is over the target peg.
+    peg = state.target_peg + RELEASE_SHIFT * out[:2]
+    over = peg + (state.pose.p - block.p)[:2]
+    low = state.pose.p[2] - block.p[2] + task.RIM_HEIGHT + RELEASE_HEIGHT
+    goals = jnp.stack(
+        [
+            tip.at[2].set(jnp.maximum(tip[2], hover)),
+            grasp.at[2].set(hover) + spread,
+            grasp,
+            tip,
+            tip.at[2].set(hover),
+            jnp.append(over, hover),
+            jnp.append(over, low),
+            tip,
+            tip.at[2].set(tip[2] + HOVER),
+            tip,
+        ]
+    )
+    goal = goals[phase]
+    least = jnp.maximum(jnp.asarray(DURATION)[phase], jnp.linalg.norm(goal - tip) / jnp.asarray(SPEED)[phase])
+    return expert.replace(
+        phase=phase,
+        elapsed=jnp.zeros(()),
+        duration=least / expert.tempo,
+        attempt=attempt,
+        start=tip,
+        goal=goal,
+        wall=wall,
+        normal=normal,
+        roll_from=jnp.where(phase <= APPROACH, roll, expert.roll_from),
+        jaws_from=expert.label.gripper,
+    )
+
+
+def _roll_of(expert: ExpertState, state: env.EnvState) -> jax.Array:
+    """Roll (rad) at the label's position: turning towards, or on, the wall's normal."""
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(
+        jnp.append(0.0, expert.label.pose.p), state.trocar, state.p_world_ref
+    )
+    on_wall = jnp.arctan2(-expert.normal @ pose.R[:, 0], expert.normal @ pose.R[:, 1])
+    lead = TURN_LEAD + jnp.where(expert.phase == APPROACH, expert.elapsed - expert.duration, expert.elapsed)
+    turned = jnp.clip(lead * expert.tempo / TURN_TIME, 0.0, 1.0)
+    turned = jnp.where(expert.phase > DESCEND, 1.0, jnp.where(expert.phase == RAISE, 0.0, turned))
+    weight = 0.5 - 0.5 * jnp.cos(jnp.pi * turned)
+    return expert.roll_from + weight * (on_wall - expert.roll_from)
+
+
+def _disturb(expert: ExpertState, step: jax.Array, dt: float) -> jax.Array:
+    """The next value of a stationary Ornstein-Uhlenbeck process, `[4]`."""
+    keep = jnp.exp(-dt / NOISE_TIME)
+    scale = jnp.array([NOISE_POSITION] * 3 + [NOISE_ROLL]) * jnp.sqrt(1.0 - keep**2)
+    key = jax.random.fold_in(jax.random.fold_in(expert.key, NOISE_STREAM), step)
+    return keep * expert.noise + scale * jax.random.normal(key, (4,))
+
+
+def _minimum_jerk(s: jax.Array) -> jax.Array:
+    return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
