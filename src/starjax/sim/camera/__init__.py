@@ -1,0 +1,1 @@
+"""Parts of the ray caster: scene (host constants), shapes (rays), tiles (culling), shade (colour)."""

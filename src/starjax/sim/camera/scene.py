@@ -1,0 +1,261 @@
+"""What never changes between two pictures, read once from the MuJoCo model on the host (numpy)."""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+CAPSULE, CYLINDER, BOX, PLANE = range(4)  # kinds, in slot order; a sphere is a capsule of length 0
+_KIND_OF = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): CAPSULE,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): CAPSULE,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): CYLINDER,
+    int(mujoco.mjtGeom.mjGEOM_BOX): BOX,
+    int(mujoco.mjtGeom.mjGEOM_PLANE): PLANE,
+}
+
+
+class Light(NamedTuple):
+    """A directional light; colours are RGB in [0, 1].
+
+    Attributes:
+      direction: `[3]` unit vector along which the light travels, in the camera frame.
+    """
+
+    direction: np.ndarray
+    ambient: np.ndarray
+    diffuse: np.ndarray
+    specular: np.ndarray
+
+
+class Texture(NamedTuple):
+    """A checkered texture with optional grid lines, as MuJoCo's builtin "checker" and "flat".
+
+    Attributes:
+      slot: the geom that wears it.
+      repeat: `[2]` repeats per metre along the geom's local x and y.
+      origin: `[2]` texture coordinate at the geom's centre.
+      colours: `[2, 3]` the two cells' RGB.
+      line: `[3]` RGB of the grid line at the edge of every repeat.
+      line_width: of that line over the size of a repeat, 0 for none.
+    """
+
+    slot: int
+    repeat: np.ndarray
+    origin: np.ndarray
+    colours: np.ndarray
+    line: np.ndarray
+    line_width: float
+
+
+class Scene(NamedTuple):
+    """Drawn geoms in slots sorted by kind, the camera and its light.
+
+    Attributes:
+      ids: `[N]` geom id of every slot.
+      kind: `[N]` CAPSULE, CYLINDER, BOX or PLANE.
+      axes: `[N, 3]` half-sizes of the box that, rounded by `rounding`, holds the shape; m.
+      rounding: `[N]` m.
+      size: `[N, 3]` radius, half-length and 0, or the half-sizes of a box or plane; m.
+      rgb, specular, exponent, emission: `[N, 3]` and `[N]` material, as MuJoCo defines it.
+      textures: of the textured slots.
+      R_world_cam, p_world_cam: camera pose (x right, y up, it looks along -z); m.
+      left, right, bottom, top: the picture's sides in the plane at depth 1.
+      sun: the first directional light, or None.
+      headlight: shines along the view.
+      background: `[3]` RGB where no geom is hit.
+    """
+
+    ids: np.ndarray
+    kind: np.ndarray
+    axes: np.ndarray
+    rounding: np.ndarray
+    size: np.ndarray
+    rgb: np.ndarray
+    specular: np.ndarray
+    exponent: np.ndarray
+    emission: np.ndarray
+    textures: tuple[Texture, ...]
+    R_world_cam: np.ndarray
+    p_world_cam: np.ndarray
+    left: float
+    right: float
+    bottom: float
+    top: float
+    sun: Light | None
+    headlight: Light
+    background: np.ndarray
+
+    def slots(self, kind: int) -> range:
+        """Slots of one kind; they are consecutive."""
+        start = int(np.searchsorted(self.kind, kind))
+        return range(start, int(np.searchsorted(self.kind, kind, side="right")))
+
+
+def read(mj_model: mujoco.MjModel, camera: str, aspect: float) -> Scene:
+    """Reads the scene; `aspect` is width over height, for cameras given by `fovy` alone."""
+    cam = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
+    if cam < 0:
+        names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
+        raise ValueError(f"camera: expected one of {names}, got {camera!r}")
+    if mj_model.cam_bodyid[cam] != 0:
+        raise ValueError(f"camera: expected one fixed in the world, got {camera!r} on a body")
+    data = mujoco.MjData(mj_model)
+    mujoco.mj_kinematics(mj_model, data)
+    mujoco.mj_camlight(mj_model, data)
+    R_world_cam = data.cam_xmat[cam].reshape(3, 3)
+
+    alpha = _rgba(mj_model)[:, 3]
+    drawn = [g for g in range(mj_model.ngeom) if mj_model.geom_group[g] < 3 and alpha[g] > 0]
+    for g in drawn:
+        if int(mj_model.geom_type[g]) not in _KIND_OF:
+            shape = mujoco.mjtGeom(mj_model.geom_type[g]).name
+            raise ValueError(f"geom {mj_model.geom(g).name!r}: cannot draw a {shape}")
+    kind_of = {g: _KIND_OF[int(mj_model.geom_type[g])] for g in drawn}
+    ids = np.array(sorted(drawn, key=lambda g: (kind_of[g], g)), int)
+    kind = np.array([kind_of[g] for g in ids])
+    size, axes, rounding = _sizes(mj_model, ids, kind)
+    specular, shininess, emission = _materials(mj_model, ids)
+    left, right, bottom, top = _frustum(mj_model, cam, aspect)
+    head = mj_model.vis.headlight
+    lit = np.float32(head.active != 0)
+    return Scene(
+        ids=ids,
+        kind=kind,
+        axes=axes,
+        rounding=rounding,
+        size=size,
+        rgb=_rgba(mj_model)[ids, :3],
+        specular=specular,
+        exponent=128 * shininess,
+        emission=emission,
+        textures=_textures(mj_model, ids),
+        R_world_cam=R_world_cam,
+        p_world_cam=data.cam_xpos[cam].copy(),
+        left=left,
+        right=right,
+        bottom=bottom,
+        top=top,
+        sun=_sun(mj_model, data, R_world_cam),
+        headlight=Light(
+            np.array([0.0, 0.0, -1.0]), lit * head.ambient, lit * head.diffuse, lit * head.specular
+        ),
+        background=_sky(mj_model),
+    )
+
+
+def geom_rgb(mj_model: mujoco.MjModel) -> np.ndarray:
+    """Colour of every geom as the MJCF gives it, `[G, 3]` float32 in [0, 1]."""
+    return _rgba(mj_model)[:, :3].astype(np.float32)
+
+
+def _rgba(mj_model: mujoco.MjModel) -> np.ndarray:
+    """MuJoCo's rule: a geom's own rgba wins over its material's unless it is the default grey."""
+    rgba = mj_model.geom_rgba.copy()
+    default = np.isclose(rgba, [0.5, 0.5, 0.5, 1.0]).all(1) & (mj_model.geom_matid >= 0)
+    rgba[default] = mj_model.mat_rgba[mj_model.geom_matid[default]]
+    return rgba
+
+
+def _sizes(mj_model, ids, kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sizes by slot, and the rounded box that holds each shape."""
+    size = mj_model.geom_size[ids].copy()
+    size[mj_model.geom_type[ids] == mujoco.mjtGeom.mjGEOM_SPHERE, 1] = 0
+    size[np.isin(kind, (CAPSULE, CYLINDER)), 2] = 0
+    plane = kind == PLANE
+    size[plane, :2] = np.where(size[plane, :2] > 0, size[plane, :2], 1e3)  # 0 means infinite
+    size[plane, 2] = 0
+    radius, half = size[:, 0], size[:, 1]
+    zero = np.zeros_like(radius)
+    long = np.stack([np.where(kind == CYLINDER, radius, 0)] * 2 + [half], axis=1)
+    axes = np.where(np.isin(kind, (CAPSULE, CYLINDER))[:, None], long, size)
+    return size, axes, np.where(kind == CAPSULE, radius, zero)
+
+
+def _materials(mj_model, ids) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Specular, shininess and emission by slot; MuJoCo's defaults without a material."""
+    mat = mj_model.geom_matid[ids]
+    if mj_model.nmat == 0:
+        return np.full(len(ids), 0.5), np.full(len(ids), 0.5), np.zeros(len(ids))
+    return (
+        np.where(mat >= 0, mj_model.mat_specular[mat], 0.5),
+        np.where(mat >= 0, mj_model.mat_shininess[mat], 0.5),
+        np.where(mat >= 0, mj_model.mat_emission[mat], 0.0),
+    )
+
+
+def _frustum(mj_model, cam: int, aspect: float) -> tuple[float, float, float, float]:
+    """Sides of the picture at depth 1, with the shifted principal point of a sensor if given."""
+    width, height = mj_model.cam_sensorsize[cam]
+    if height > 0:
+        fx, fy, cx, cy = mj_model.cam_intrinsic[cam]
+        return (
+            -(width / 2 - cx) / fx,
+            (width / 2 + cx) / fx,
+            -(height / 2 + cy) / fy,
+            (height / 2 - cy) / fy,
+        )
+    top = float(np.tan(np.radians(mj_model.cam_fovy[cam]) / 2))
+    return -top * aspect, top * aspect, -top, top
+
+
+def _sun(mj_model, data, R_world_cam) -> Light | None:
+    """The first active directional light."""
+    for i in range(mj_model.nlight):
+        directional = mj_model.light_type[i] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        if mj_model.light_active[i] and directional:
+            return Light(
+                R_world_cam.T @ data.light_xdir[i],
+                mj_model.light_ambient[i].copy(),
+                mj_model.light_diffuse[i].copy(),
+                mj_model.light_specular[i].copy(),
+            )
+    return None
+
+
+def _texels(mj_model, tex: int) -> np.ndarray:
+    """A texture's RGB, `[h, w, 3]` in [0, 1]."""
+    h, w, c = mj_model.tex_height[tex], mj_model.tex_width[tex], mj_model.tex_nchannel[tex]
+    start = mj_model.tex_adr[tex]
+    texels = mj_model.tex_data[start : start + h * w * c].reshape(h, w, c)
+    return texels[..., :3].astype(np.float64) / 255
+
+
+def _sky(mj_model) -> np.ndarray:
+    """Mean colour of the skybox, black without one."""
+    for tex in range(mj_model.ntex):
+        if mj_model.tex_type[tex] == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            return _texels(mj_model, tex).mean((0, 1))
+    return np.zeros(3)
+
+
+def _textures(mj_model, ids) -> tuple[Texture, ...]:
+    """Textures of the slots whose material has one."""
+    found = []
+    for slot, g in enumerate(ids):
+        mat = mj_model.geom_matid[g]
+        tex = mj_model.mat_texid[mat, mujoco.mjtTextureRole.mjTEXROLE_RGB] if mat >= 0 else -1
+        if tex < 0:
+            continue
+        texels = _texels(mj_model, tex)
+        h, w, _ = texels.shape
+        colours = np.stack([texels[h // 4, w // 4], texels[h // 4, 3 * w // 4]])
+        line = texels[0, w // 4]
+        width = 0.0 if np.allclose(line, colours[0]) else 2 / w
+        v, u = np.mgrid[:h, :w]
+        expected = colours[((v >= h // 2) ^ (u >= w // 2)).astype(int)]
+        if width:
+            expected[np.isin(v, (0, h - 1)) | np.isin(u, (0, w - 1))] = line
+        name = mj_model.texture(tex).name
+        if mj_model.tex_type[tex] != mujoco.mjtTexture.mjTEXTURE_2D or h != w:
+            raise ValueError(f"texture {name!r}: expected a square 2d texture")
+        if np.abs(expected - texels).max() > 2 / 255:
+            raise ValueError(f"texture {name!r}: expected checker or flat, marked 'edge' or not")
+        repeat = 0.5 * mj_model.mat_texrepeat[mat]
+        if not mj_model.mat_texuniform[mat]:
+            repeat = repeat / mj_model.geom_size[g, :2]
+        origin = np.array([-0.5, -0.5])
+        found.append(
+            Texture(slot, repeat * np.array([1, -1]), origin, colours, line, float(width))
+        )
+    return tuple(found)

@@ -1,0 +1,163 @@
+"""The picture in tiles, and a loop over just the geoms that can matter to each tile.
+
+Every tile keeps its geoms as bits of a 32-bit word. The loop takes the lowest bit of every tile at
+once until no word has any left: as many rounds as the fullest tile has geoms, and no list whose
+length could be too short. Bounds are conservative, so the picture is that of testing all geoms.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.sim.camera import scene as scenes
+
+SIDE = 16  # samples along the side of a tile
+_SLACK = 1e-5  # m, and relative: keeps float32 rounding on the safe side
+
+Array = jax.Array
+
+
+class Grid(NamedTuple):
+    """Rays through (x, y, -1), tile by tile. T tiles of Q samples, V by U tiles of them.
+
+    Attributes:
+      x, y: `[T, Q]`.
+      edges_x: `[U + 1]`, edges_y: `[V + 1]` sides of the tiles in the plane at depth 1.
+      height, width: of the picture in samples, which the last tiles may overhang.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    edges_x: np.ndarray
+    edges_y: np.ndarray
+    height: int
+    width: int
+
+
+def grid(scene: scenes.Scene, height: int, width: int) -> Grid:
+    """Tiles for a picture of `height` by `width` samples."""
+    rows, cols = -(-height // SIDE), -(-width // SIDE)
+    step_x, step_y = (scene.right - scene.left) / width, (scene.bottom - scene.top) / height
+    x = scene.left + (np.arange(cols * SIDE) + 0.5) * step_x
+    y = scene.top + (np.arange(rows * SIDE) + 0.5) * step_y
+    ones = np.ones((rows, cols, SIDE, SIDE))
+    return Grid(
+        x=(ones * x.reshape(1, cols, 1, SIDE)).reshape(rows * cols, -1).astype(np.float32),
+        y=(ones * y.reshape(rows, 1, SIDE, 1)).reshape(rows * cols, -1).astype(np.float32),
+        edges_x=(scene.left + np.arange(cols + 1) * SIDE * step_x).astype(np.float32),
+        edges_y=(scene.top + np.arange(rows + 1) * SIDE * step_y).astype(np.float32),
+        height=height,
+        width=width,
+    )
+
+
+def picture(grid: Grid, tiled: Array, samples: int) -> Array:
+    """From `[T, Q, ...]` to `[h, w, samples, samples, ...]`, the overhang cut off."""
+    rows, cols, n = len(grid.edges_y) - 1, len(grid.edges_x) - 1, SIDE // samples
+    rest = tiled.shape[2:]
+    parts = tiled.reshape(rows, cols, n, samples, n, samples, *rest)
+    order = (0, 2, 1, 4, 3, 5, *range(6, 6 + len(rest)))
+    whole = parts.transpose(order).reshape(rows * n, cols * n, samples, samples, *rest)
+    return whole[: grid.height // samples, : grid.width // samples]
+
+
+def in_view(grid: Grid, c: Array, R: Array, axes: Array, rounding: Array) -> Array:
+    """Which geoms can be seen in which tile: `[T, N]` bool.
+
+    Args:
+      c, R: `[N, 3]` m and `[N, 3, 3]` in the camera frame.
+      axes, rounding: the rounded box that holds each geom, as in `Scene`; m.
+    """
+    rounding = rounding * (1 + _SLACK) + _SLACK
+    depth_range = _reach(R[:, 2], axes) + rounding
+    nearest = -c[:, 2] - depth_range
+
+    def sides(edges: np.ndarray, axis: int) -> Array:
+        """Between the planes through the camera and two neighbouring tile edges: `[U, N]`."""
+        e = edges[:, None]
+        middle = c[:, axis] + e * c[:, 2]
+        spread = _reach(R[:, axis] + e[..., None] * R[:, 2], axes) + rounding * jnp.hypot(1.0, e)
+        above, below = middle + spread >= 0, middle - spread <= 0
+        ascending = edges[1] > edges[0]
+        low, high = (above, below) if ascending else (below, above)
+        return low[:-1] & high[1:]
+
+    # A long geom across the picture: only tiles near the plane through the camera and its axis.
+    u = _long_axis(R, axes)
+    normal = jnp.cross(c, u)
+    normal /= jnp.maximum(jnp.linalg.norm(normal, axis=-1, keepdims=True), _SLACK)
+    spread = _reach(jnp.einsum("gi,gij->gj", normal, R, precision="highest"), axes) + rounding
+    limit = jnp.where(nearest > _SLACK, spread / jnp.maximum(nearest, _SLACK), jnp.inf)
+    across = normal[:, 0] * grid.edges_x[:, None], normal[:, 1] * grid.edges_y[:, None]
+    (low_x, high_x), (low_y, high_y) = [
+        (jnp.minimum(v[:-1], v[1:]), jnp.maximum(v[:-1], v[1:])) for v in across
+    ]
+    low = low_x[None] + low_y[:, None] - normal[:, 2]
+    high = high_x[None] + high_y[:, None] - normal[:, 2]
+    by_plane = (low <= limit) & (high >= -limit)
+
+    in_front = c[:, 2] - depth_range < 0
+    seen = sides(grid.edges_x, 0)[None] & sides(grid.edges_y, 1)[:, None] & by_plane & in_front
+    return seen.reshape(-1, c.shape[0])
+
+
+def over(low: Array, high: Array, c: Array, R: Array, axes: Array, rounding: Array) -> Array:
+    """Which geoms can throw a shadow into boxes of points, in the light frame: `[T, N]` bool.
+
+    Args:
+      low, high: `[T, 3]` corners of each tile's points in m; low > high for an empty tile.
+      c, R, axes, rounding: as for `in_view`, but in the light frame (third axis to the light).
+    """
+    rounding = rounding * (1 + _SLACK) + _SLACK
+    spread = jnp.stack([_reach(R[:, k], axes) for k in range(3)], -1) + rounding[:, None]
+    middle, half = (low + high)[:, None] / 2, (high - low)[:, None] / 2
+    offset = jnp.abs(c - middle) - half - spread
+    near = jnp.all(offset[..., :2] <= 0, -1) & (c[:, 2] + spread[:, 2] >= low[:, 2:])
+    u = _long_axis(R, axes)
+    flat = jnp.hypot(u[:, 0], u[:, 1])[:, None]
+    normal = jnp.stack([-u[:, 1], u[:, 0]], -1) / jnp.maximum(flat, _SLACK)
+    reach = jnp.einsum("gi,gij->gj", normal, R[:, :2], precision="highest")
+    limit = _reach(reach, axes) + rounding + jnp.sum(jnp.abs(normal) * half[..., :2], -1)
+    aside = jnp.abs(jnp.sum(normal * (c[:, :2] - middle[..., :2]), -1))
+    return near & (aside <= limit)
+
+
+def each(
+    overlap: Array, table: Array, start: int, visit: Callable[[Array, Array, list[Array]], Array],
+    carry: Array,
+) -> Array:  # fmt: skip
+    """Folds `carry = visit(carry, slot, features)` over the overlapping geoms of every tile.
+
+    Args:
+      overlap: `[T, N]` bool; table: `[N, F]`; start: slot of the first row.
+      visit: sees slot `[T, 1]` (-1 where a tile has none left) and F features `[T, 1]`.
+    """
+    for first in range(0, overlap.shape[1], 32):
+        part = overlap[:, first : first + 32]
+        bits = jnp.uint32(1) << jnp.arange(part.shape[1], dtype=jnp.uint32)
+        words = jnp.sum(jnp.where(part, bits, jnp.uint32(0)), -1, dtype=jnp.uint32)
+
+        def take(state, first=first):
+            words, carry = state
+            lowest = words & (~words + jnp.uint32(1))
+            index = first + 31 - jax.lax.clz(lowest).astype(jnp.int32)
+            row = table[jnp.maximum(index, 0)]
+            slot = jnp.where(words > 0, index + start, -1)
+            columns = [row[:, k, None] for k in range(table.shape[1])]
+            return words ^ lowest, visit(carry, slot[:, None], columns)
+
+        _, carry = jax.lax.while_loop(lambda state: jnp.any(state[0] > 0), take, (words, carry))
+    return carry
+
+
+def _reach(direction: Array, axes: Array) -> Array:
+    """Half the extent of a box along a direction given in its own frame: `[..., N]`."""
+    return jnp.sum(jnp.abs(direction) * axes, -1)
+
+
+def _long_axis(R: Array, axes: Array) -> Array:
+    """Direction of the longest axis of each box, `[N, 3]`."""
+    return jnp.take_along_axis(R, jnp.argmax(axes, -1)[:, None, None], axis=2)[..., 0]
