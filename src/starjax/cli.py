@@ -27,7 +27,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 def main() -> int:
     """Entry of the console script."""
-    return guard(_dispatch, sys.argv[1:])
+    return guard(dispatch, sys.argv[1:])
 
 
 def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
@@ -40,8 +40,8 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         return command(argv)
     except config_lib.UsageError as error:
         return _fail(error, 2)
-    except KeyboardInterrupt:
-        return _fail("stopped; the same command goes on from what is saved", 130)
+    except KeyboardInterrupt as stop:
+        return _fail(str(stop) or "stopped; the same command goes on from what is saved", 130)
     except OSError as error:
         # Imported late: it brings numpy, and `--help` need not wait for it.
         from starjax.runtime import files
@@ -54,7 +54,8 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         return _fail(f"cannot write{place}: {error.strerror}; choose another folder by --out", 74)
 
 
-def _dispatch(argv: Sequence[str]) -> int:
+def dispatch(argv: Sequence[str]) -> int:
+    """Runs the subcommand that `argv` begins with."""
     name = argv[0] if argv else "--help"
     if name in ("-h", "--help"):
         width = max(map(len, COMMANDS))

@@ -97,14 +97,8 @@ def storage() -> list[Finding]:
 
 def memory() -> list[Finding]:
     """Free memory of the host."""
-    try:
-        pages = os.sysconf("SC_AVPHYS_PAGES")
-        lines = pathlib.Path("/proc/meminfo").read_text().splitlines()
-    except (OSError, ValueError):
-        return []
-    sizes = {line.split(":")[0]: 1024 * int(line.split()[1]) for line in lines}
-    free = sizes.get("MemAvailable", pages * os.sysconf("SC_PAGE_SIZE"))
-    value = f"{files.size(free)} free of {files.size(sizes['MemTotal'])}"
+    free = xla.available_bytes()
+    value = f"{files.size(free)} free of {files.size(xla.memory_bytes())}"
     remedy = f"close programs, or lower --eval.chunk: {files.size(NEEDED_MEMORY)} are wanted"
     return [Finding("memory", value, remedy if free < NEEDED_MEMORY else "")]
 

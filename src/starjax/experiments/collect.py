@@ -1,0 +1,18 @@
+"""`starjax collect`: the demonstrations of a run and nothing else."""
+
+from collections.abc import Sequence
+
+from starjax.experiments import run
+
+DESCRIPTION = """Collects the demonstrations of a run (the flags are those of `starjax run`).
+
+Episodes are committed one by one: the same command again goes on from what is there."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Collects what is missing."""
+    config = run.settings(argv, "starjax collect", DESCRIPTION)
+    from starjax.experiments import pipeline
+
+    pipeline.run(config, stages=("collect",))
+    return 0

@@ -1,0 +1,18 @@
+"""`starjax train`: demonstrations and weights of a run, no evaluation."""
+
+from collections.abc import Sequence
+
+from starjax.experiments import run
+
+DESCRIPTION = """Collects and trains, without evaluation (the flags are those of `starjax run`).
+
+The same command again goes on from the last checkpoint."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Collects and trains what is missing."""
+    config = run.settings(argv, "starjax train", DESCRIPTION)
+    from starjax.experiments import pipeline
+
+    pipeline.run(config, stages=("collect", "train"))
+    return 0
