@@ -1,0 +1,46 @@
+"""One program over a batch of lanes (episodes), split over devices that never talk to each other."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+SHARED = PartitionSpec()
+LANE = PartitionSpec("lane")
+TIME_LANE = PartitionSpec(None, "lane")
+
+
+def split(
+    fn: Callable[..., Any],
+    devices: Sequence[jax.Device] | None,
+    in_specs: Any,
+    out_specs: Any,
+    donate: tuple[int, ...] = (),
+) -> Callable[..., Any]:
+    """Compiles `fn` for the devices: each runs it on its own lanes and stops when these are done.
+
+    Args:
+      fn: acts on lanes independently; shapes inside are those of one device's share.
+      devices: None for the default one.
+      in_specs: SHARED, LANE (leading axis) or TIME_LANE (second axis) for each argument.
+      out_specs: the same for the result.
+      donate: arguments whose memory may be reused.
+    """
+    if devices is None or len(devices) == 1:
+        return jax.jit(fn, donate_argnums=donate)
+    # shard_map, not sharded jit: that would put a reduction over all devices into every loop's
+    # condition, the solver's included. MJX's loops carry values that its check cannot follow.
+    mesh = Mesh(np.array(devices), ("lane",))
+    mapped = jax.shard_map(fn, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
+    return jax.jit(mapped, donate_argnums=donate)
+
+
+def where(mask: jax.Array, a: Any, b: Any) -> Any:
+    """Lane by lane `a` or `b`; mask `[N]`, leaves `[N, ...]`."""
+
+    def choose(x, y):
+        return jax.numpy.where(mask.reshape(mask.shape + (1,) * (x.ndim - mask.ndim)), x, y)
+
+    return jax.tree.map(choose, a, b)

@@ -1,0 +1,158 @@
+"""Reads collected demonstrations: checked, and placed where they fit (device, host, or disk)."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+
+from starjax.data import store, windows
+from starjax.rcm.trocar import Trocar
+from starjax.runtime import files, xla
+from starjax.sim.types import Observation
+from starjax.types import Command, Pose
+
+Residency = Literal["auto", "device", "host", "disk"]
+
+DEVICE_SHARE = 0.5  # of the device's free memory that demonstrations may take
+HOST_SHARE = 0.6  # of the host's
+
+
+class Demos(NamedTuple):
+    """A dataset, and what it is.
+
+    Attributes:
+      dataset: the frames, as `windows.Dataset`.
+      digest: hash that names the content on disk.
+      residency: where the frames are.
+      bytes: memory they take there (on the disk: what is read from there).
+      description: dataset.json.
+    """
+
+    dataset: windows.Dataset
+    digest: str
+    residency: str
+    bytes: int
+    description: dict[str, Any]
+
+
+def load(
+    root: Path,
+    *,
+    residency: Residency = "auto",
+    report: Callable[[str], None] = print,
+) -> Demos:
+    """Loads the successful episodes of a sealed dataset, after checking every byte of them.
+
+    Args:
+      root: folder of the dataset.
+      residency: "auto" takes the device if the frames fit there, else the host, else leaves
+        pictures on disk, memory-mapped.
+      report: gets one line with the place and the bytes, before any is allocated.
+
+    Raises:
+      DamagedEpisode: names the file that is not as it was written.
+      ValueError: no dataset, or not complete.
+    """
+    root = Path(root)
+    description = store.read_description(root)
+    sealed = store.read_seal(root)
+    records = []
+    for key, found in store.verify_all(root, sealed["episodes"]).items():
+        if isinstance(found, store.DamagedEpisode):
+            raise found
+        if found["digest"] != sealed["episodes"][key]:
+            where = root / "episodes" / key / "episode.json"
+            raise store.DamagedEpisode(f"{where}: is not the episode that SEALED.json lists")
+        if found["success"]:
+            records.append(found)
+    total = sum(file["bytes"] for record in records for file in _read(record).values())
+    place = _place(total) if residency == "auto" else residency
+    report(f"{len(records)} demonstrations, {files.size(total)}: {_WHERE[place]}")
+    dataset = _dataset(root, records, place)
+    return Demos(dataset, sealed["digest"], place, total, description)
+
+
+_WHERE = {
+    "device": "resident on the device",
+    "host": "in host memory (they do not fit the device)",
+    "disk": "memory-mapped from disk (they fit neither the device nor host memory)",
+}
+_FIELDS = (
+    "p", "R", "gripper", "image", "state", "command_p", "command_R", "command_gripper",
+)  # fmt: skip
+
+
+def _read(record: store.Record) -> dict[str, Any]:
+    """The files of an episode that training reads, by field."""
+    names = {name: record["files"].get(f"{name}.npy") for name in _FIELDS}
+    return {name: file for name, file in names.items() if file is not None}
+
+
+def _place(total: int) -> str:
+    device = jax.devices()[0]
+    host = xla.available_bytes()
+    stats = device.memory_stats() or {}
+    free = stats.get("bytes_limit", 2 * host) - stats.get("bytes_in_use", 0)
+    if device.platform == "cpu":
+        free = host
+    # Frames pass through host memory on their way to the device.
+    if total <= DEVICE_SHARE * free and total <= HOST_SHARE * host:
+        return "device"
+    return "host" if total <= HOST_SHARE * host else "disk"
+
+
+def _dataset(root: Path, records: list[store.Record], place: str) -> windows.Dataset:
+    length = np.array([record["length"] for record in records], np.int32)
+    start = (np.cumsum(length) - length).astype(np.int32)
+    fields: dict[str, Any] = dict.fromkeys(_FIELDS)
+    for name in _read(records[0]):
+        paths = [root / "episodes" / record["key"] / f"{name}.npy" for record in records]
+        # Only pictures are large; everything else is read in any case.
+        joined = Frames(paths, start, length)
+        fields[name] = joined if place == "disk" and name == "image" else joined.read()
+    dataset = windows.Dataset(
+        observation=Observation(
+            pose=Pose(fields["R"], fields["p"]),
+            gripper=fields["gripper"],
+            image=fields["image"],
+            state=fields["state"],
+        ),
+        command=Command(
+            pose=Pose(fields["command_R"], fields["command_p"]), gripper=fields["command_gripper"]
+        ),
+        trocar=Trocar(
+            *(np.array([r[name] for r in records], np.float32) for name in Trocar._fields)
+        ),
+        episode=np.repeat(np.arange(len(records), dtype=np.int32), length),
+        start=start,
+        length=length,
+    )
+    return jax.device_put(dataset) if place == "device" else dataset
+
+
+class Frames:
+    """One field of all episodes as if it were one array `[F, ...]`, read from disk when indexed."""
+
+    def __init__(self, paths: list[Path], start: np.ndarray, length: np.ndarray):
+        self._arrays = [np.load(path, mmap_mode="r", allow_pickle=False) for path in paths]
+        self._start = start
+        self.shape = (int(length.sum()), *self._arrays[0].shape[1:])
+        self.dtype = self._arrays[0].dtype
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        """Frames at `index`, `[N]` integers, as `[N, ...]` in memory."""
+        index = np.asarray(index)
+        out = np.zeros((*index.shape, *self.shape[1:]), self.dtype)
+        episode = np.searchsorted(self._start, index, side="right") - 1
+        for i in np.ndindex(index.shape):
+            out[i] = self._arrays[episode[i]][index[i] - self._start[episode[i]]]
+        return out
+
+    def read(self) -> np.ndarray:
+        """All frames in memory."""
+        out = np.zeros(self.shape, self.dtype)
+        for array, first in zip(self._arrays, self._start, strict=True):
+            out[first : first + len(array)] = array
+        return out

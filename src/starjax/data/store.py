@@ -1,0 +1,210 @@
+"""Demonstrations on disk: one committed folder an episode, hashed, so that damage is seen and named.
+
+    <root>/dataset.json            what the dataset is; never changes
+    <root>/episodes/<key>/*.npy    one array a field, `[T, ...]`, T the episode's control steps
+    <root>/episodes/<key>/episode.json   outcome, and each file's hash
+    <root>/SEALED.json             written when complete: every episode's hash, one for all of them
+
+Knows no jax and no robot. An episode appears by one rename, so after a kill each is there or not;
+a trial that failed and is not kept has a folder with an episode.json alone.
+"""
+
+import concurrent.futures
+import hashlib
+import json
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starjax.runtime import files, xla
+
+SCHEMA = 1
+
+Record = dict[str, Any]  # the content of an episode.json
+
+
+class DamagedEpisode(ValueError):
+    """A file of an episode is missing, cut short or altered; the message names it."""
+
+
+def key(trocar: int, trial: int, seed: int) -> str:
+    """Name of a trial's folder."""
+    return f"{trocar:04d}-{trial:04d}-{seed}"
+
+
+def digest(description: Mapping[str, Any]) -> str:
+    """Twelve hexadecimal digits that name a dataset by what it is, versions of software aside."""
+    return _hash({k: v for k, v in description.items() if k != "versions"})[:12]
+
+
+def create(root: Path, description: Mapping[str, Any]) -> None:
+    """Starts a dataset, or makes sure that the one at `root` is the one described.
+
+    Raises:
+      StorageError: `root` holds another dataset, or an unfinished one of other software versions.
+    """
+    description = json.loads(json.dumps({"schema": SCHEMA, **description}))
+    path = root / "dataset.json"
+    if not path.exists():
+        files.write_json(path, description)
+        return
+    found = read_description(root)
+    differing = [k for k in description if description[k] != found.get(k)]
+    if is_sealed(root):
+        differing = [k for k in differing if k != "versions"]
+    if differing:
+        name = differing[0]
+        raise files.StorageError(
+            f"{root} holds another dataset: its {name} is {found.get(name)}, not "
+            f"{description[name]}; choose another folder, or remove this one"
+        )
+
+
+def read_description(root: Path) -> dict[str, Any]:
+    """The content of dataset.json.
+
+    Raises:
+      ValueError: there is none, or its schema is not one that this version reads.
+    """
+    path = root / "dataset.json"
+    try:
+        description = json.loads(path.read_text())
+        schema = description["schema"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"root: expected a folder of demonstrations, got {root}: {error}"
+        ) from error
+    if schema != SCHEMA:
+        raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}")
+    return description
+
+
+def commit(root: Path, key: str, outcome: Record, arrays: Mapping[str, np.ndarray]) -> Record:
+    """Writes one episode; it is on disk, whole, when this returns.
+
+    Args:
+      outcome: JSON values, e.g. success, trocar, seed.
+      arrays: fields `[T, ...]`; none for a trial that is not kept.
+    """
+    contents = {f"{name}.npy": files.npy_bytes(array) for name, array in arrays.items()}
+    listed = {
+        f"{name}.npy": {
+            "shape": list(array.shape),
+            "dtype": array.dtype.str,
+            "bytes": len(contents[f"{name}.npy"]),
+            "sha256": hashlib.sha256(contents[f"{name}.npy"]).hexdigest(),
+        }
+        for name, array in arrays.items()
+    }
+    record = json.loads(json.dumps({"key": key, **outcome, "files": listed}))
+    record["digest"] = _hash(record)
+    # Last, so that a folder with an episode.json is whole even where renames are not atomic.
+    contents["episode.json"] = (json.dumps(record, indent=1) + "\n").encode()
+    (root / "episodes").mkdir(parents=True, exist_ok=True)
+    files.commit_directory(root / "episodes" / key, root / "staging" / key, contents)
+    return record
+
+
+def verify(root: Path, key: str) -> Record:
+    """Reads an episode's record after checking every byte of its files.
+
+    Raises:
+      DamagedEpisode: naming the first file that is not as it was written.
+    """
+    folder = root / "episodes" / key
+    path = folder / "episode.json"
+    try:
+        record = json.loads(path.read_bytes())
+        said = record.pop("digest")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DamagedEpisode(f"{path}: {_reason(error)}") from error
+    if _hash(record) != said or record["key"] != key:
+        raise DamagedEpisode(f"{path}: expected content with hash {said}, got {_hash(record)}")
+    for name, file in record["files"].items():
+        try:
+            got = files.sha256(folder / name)
+        except OSError as error:
+            raise DamagedEpisode(f"{folder / name}: {_reason(error)}") from error
+        if got != file["sha256"]:
+            raise DamagedEpisode(f"{folder / name}: expected sha256 {file['sha256']}, got {got}")
+    return {**record, "digest": said}
+
+
+def verify_all(root: Path, keys: Iterable[str]) -> dict[str, Record | DamagedEpisode]:
+    """`verify` of many episodes, on all cores; damage is a value here, not raised."""
+
+    def one(key: str) -> Record | DamagedEpisode:
+        try:
+            return verify(root, key)
+        except DamagedEpisode as error:
+            return error
+
+    keys = list(keys)
+    with concurrent.futures.ThreadPoolExecutor(xla.cores()) as pool:
+        return dict(zip(keys, pool.map(one, keys), strict=True))
+
+
+def keys(root: Path) -> list[str]:
+    """Committed episodes, in order of trocar, trial and seed."""
+    folder = root / "episodes"
+    return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+
+
+def clean(root: Path) -> None:
+    """Removes what a killed run was writing."""
+    shutil.rmtree(root / "staging", ignore_errors=True)
+
+
+def remove(root: Path, key: str) -> None:
+    """Removes one episode."""
+    shutil.rmtree(root / "episodes" / key)
+
+
+def is_sealed(root: Path) -> bool:
+    """Whether the dataset is complete."""
+    return (root / "SEALED.json").exists()
+
+
+def seal(root: Path, records: Mapping[str, Record]) -> str:
+    """Declares the dataset complete; returns the one hash that names its content."""
+    episodes = {key: records[key]["digest"] for key in sorted(records)}
+    described = files.sha256(root / "dataset.json")
+    sealed = {"schema": SCHEMA, "dataset.json": described, "episodes": episodes}
+    files.write_json(root / "SEALED.json", {**sealed, "digest": _hash(sealed)})
+    return _hash(sealed)
+
+
+def read_seal(root: Path) -> dict[str, Any]:
+    """The content of SEALED.json after checking it and dataset.json.
+
+    Raises:
+      ValueError: the dataset is not complete, or one of the two files is damaged.
+    """
+    path = root / "SEALED.json"
+    if not path.exists():
+        raise ValueError(f"{root}: the demonstrations are not complete; run the collection again")
+    try:
+        sealed = json.loads(path.read_bytes())
+        said = sealed.pop("digest")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: {_reason(error)}") from error
+    if _hash(sealed) != said:
+        raise ValueError(f"{path}: expected content with hash {said}, got {_hash(sealed)}")
+    got = files.sha256(root / "dataset.json")
+    if got != sealed["dataset.json"]:
+        where = root / "dataset.json"
+        raise ValueError(f"{where}: expected sha256 {sealed['dataset.json']}, got {got}")
+    return {**sealed, "digest": said}
+
+
+def _hash(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    return f"cannot be read ({type(error).__name__}: {error})"

@@ -1,0 +1,1 @@
+"""Closed-loop evaluation of a trained policy: rollouts, statistics, sweeps."""

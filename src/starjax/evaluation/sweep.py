@@ -1,0 +1,89 @@
+"""Other trocars than the twelve: grids and samples, and success against distance to training's."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from starjax import rcm
+from starjax.evaluation import metrics
+from starjax.evaluation import table as tables
+from starjax.rcm.trocar import Trocar
+
+
+def sample(seed: int, count: int, polar_range: tuple[float, float] | None = None) -> Trocar:
+    """`count` trocars drawn as in Eq. 19.
+
+    Args:
+      polar_range: rad; section V-A2's unless given.
+    """
+    if count < 1:
+        raise ValueError(f"count: expected 1 or more, got {count}")
+    ranges = {"polar_range": polar_range} if polar_range else {}
+    drawn = rcm.sample_trocar(jax.random.key(seed), (count,), **ranges)
+    return Trocar(*(np.asarray(field) for field in drawn))
+
+
+def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray) -> Trocar:
+    """Every combination of the given radii (m), polar angles and azimuths (rad), `[C]`.
+
+    Points that coincide (radius 0) are there once.
+    """
+    fields = (np.asarray(x, np.float32).reshape(-1) for x in (radii, polars, azimuths))
+    combined = np.stack(np.meshgrid(*fields, indexing="ij"), -1).reshape(-1, 3)
+    centre = np.flatnonzero(combined[:, 0] == 0.0)
+    return rcm.check_trocar(Trocar(*np.delete(combined, centre[1:], axis=0).T))
+
+
+def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: np.ndarray) -> np.ndarray:
+    """Distance `[C]` in m of each port to the nearest one of training."""
+    here = np.asarray(rcm.trocar_position(trocars, p_world_ref))
+    there = np.asarray(rcm.trocar_position(training, p_world_ref))
+    return np.linalg.norm(here[:, None] - there[None], axis=-1).min(axis=1)
+
+
+def compose(
+    table: tables.Table,
+    training: Trocar,
+    p_world_ref: np.ndarray,
+    *,
+    seed: int,
+    bin_width: float = 0.01,
+) -> dict[str, Any]:
+    """A sweep's result as JSON values: figures over all, over distance, and every trial.
+
+    Args:
+      table: trials at any trocars.
+      training: fields `[K]`, the trocars trained on.
+      p_world_ref: `[3]` m.
+      seed: of the trials.
+      bin_width: m, of the distance to the nearest training trocar.
+
+    Returns:
+      {strict, loose, safe: as in result.json, by_distance: list of {low_m, high_m, successes,
+      trials, rate, ci95}, rcm_error_mm, trials: as in result.json, with distance_m}.
+    """
+    if bin_width <= 0:
+        raise ValueError(f"bin_width: expected more than 0 m, got {bin_width}")
+    ports = Trocar(table.radius, table.polar, table.azimuth)
+    distance = distance_to_nearest(ports, training, p_world_ref)
+    bins = np.floor(distance / bin_width).astype(int)
+    seen = distance < 1e-6
+    trials = metrics.trials(table, seen, seed)
+    return {
+        "strict": metrics.rate(table.success),
+        "loose": metrics.rate(table.loose),
+        "safe": metrics.rate(table.safe),
+        "by_distance": [
+            {
+                "low_m": float(b * bin_width),
+                "high_m": float((b + 1) * bin_width),
+                **metrics.rate(table.success[bins == b]),
+            }
+            for b in np.unique(bins)
+        ],
+        "rcm_error_mm": metrics.rcm_error_mm(table),
+        "trials": [
+            {**trial, "distance_m": d} for trial, d in zip(trials, distance.tolist(), strict=True)
+        ],
+    }
