@@ -45,15 +45,12 @@ def _align_unit(a: jax.Array, b: jax.Array) -> jax.Array:
     in_plane, _ = arrays.direction(in_plane, _orthogonal(a))
     is_obtuse = cos < 0.0
     w = jnp.where(is_obtuse, sin[..., None] * in_plane, across)
-    # w w' / (1 + cos), which is (1 - cos) times the outer product of the unit vector.
-    root = jnp.where(
-        is_obtuse,
-        jnp.sqrt(jnp.where(is_obtuse, 1.0 - cos, 1.0)) * in_plane,
-        across / jnp.sqrt(1.0 + jnp.where(is_obtuse, 0.0, cos)),
-    )
+    # 1 - cos times the outer product of the unit vector in the plane, in two ways.
+    spanning = jnp.where(is_obtuse, in_plane, across)
+    factor = jnp.where(is_obtuse, 1.0 - cos, 1.0 / (1.0 + jnp.where(is_obtuse, 0.0, cos)))
     eye = jnp.eye(3, dtype=a.dtype)
     turn = _outer(w, a) - _outer(a, w)
-    return eye + turn - (1.0 - cos)[..., None] * _outer(a, a) - _outer(root, root)
+    return eye + turn - _outer((1.0 - cos) * a, a) - _outer(factor * spanning, spanning)
 
 
 def rotation_z(angle: jax.Array) -> jax.Array:

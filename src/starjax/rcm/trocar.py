@@ -33,7 +33,12 @@ class Trocar(NamedTuple):
 def _degrees(rows: list[tuple[float, float, float]]) -> Trocar:
     centimetres, polar, azimuth = np.array(rows, np.float64).T
     fields = (centimetres / 100.0, np.deg2rad(polar), np.deg2rad(azimuth))
-    return Trocar(*(field.astype(np.float32) for field in fields))
+    return Trocar(*(_constant(field.astype(np.float32)) for field in fields))
+
+
+def _constant(array: np.ndarray) -> np.ndarray:
+    array.setflags(write=False)
+    return array
 
 
 # The twelve configurations of section V-A2, `(cm, deg, deg)`. The paper gives their number and
@@ -54,7 +59,7 @@ TROCARS: Trocar = _degrees(
         (0, 90, 0),
     ]
 )
-IS_SEEN: np.ndarray = np.arange(12) < 8
+IS_SEEN: np.ndarray = _constant(np.arange(12) < 8)
 
 
 def trocar_position(trocar: Trocar, p_world_ref: jax.Array) -> jax.Array:

@@ -1,0 +1,246 @@
+"""Every action space: total for any input, on the manifold, invertible, differentiable."""
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial import transform
+
+from starjax import rcm
+
+SPACES = pytest.mark.parametrize("space", rcm.ACTION_SPACES.values(), ids=rcm.ACTION_SPACES.keys())
+MANIFOLD_SPACES = pytest.mark.parametrize("name", ["rcm1", "rcm2", "rcm3", "rcm4"])
+MILLION = 1_000_000
+
+
+def sample_trocars(n):
+    return rcm.sample_trocar(jax.random.key(0), (n,))
+
+
+def sample_poses(rng, n, p_world_trocar):
+    """Poses of the manifold with the tool anywhere but within 15 degrees of straight up."""
+    axis = rng.normal(size=(3 * n, 3))
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    axis = axis[axis[:, 2] < 0.965][:n].astype(np.float32)
+    roll = rng.uniform(-3, 3, n).astype(np.float32)
+    depth = rng.uniform(0.01, 0.39, n).astype(np.float32)
+    return jax.jit(rcm.pose_on_manifold)(axis, roll, depth, p_world_trocar)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@SPACES
+def test_a_million_hostile_actions(space, rng, oracle, p_world_ref):
+    trocar = sample_trocars(MILLION)
+    p_world_trocar = oracle.trocar_position(trocar, p_world_ref)
+    action = oracle.hostile_actions(rng, space, p_world_trocar)
+    decode = jax.jit(jax.vmap(space.decode, (0, 0, None)))
+    pose, valid = jax.tree.map(np.asarray, decode(action, trocar, p_world_ref))
+    assert np.isfinite(pose.R).all() and np.isfinite(pose.p).all()
+    oracle.check_rotations(pose.R)
+    is_finite = np.isfinite(action).all(axis=-1)
+    np.testing.assert_array_equal(valid, is_finite)
+    assert 0.02 < np.mean(~valid) < 0.5
+    if space.name != "se3":
+        assert oracle.rcm_error(pose.R, pose.p, p_world_trocar).max() <= 1e-6
+        depth = np.linalg.norm(pose.p - p_world_trocar, axis=-1)
+        assert depth.min() >= rcm.MIN_DEPTH - 1e-6 and depth.max() <= rcm.MAX_DEPTH + 1e-6
+    np.testing.assert_array_equal(pose.R[~valid], np.broadcast_to(HOLD_R, pose.R[~valid].shape))
+    hold = p_world_trocar[~valid] - [0, 0, rcm.HOLD_DEPTH]
+    np.testing.assert_allclose(pose.p[~valid], hold, atol=1e-7)
+
+
+HOLD_R = np.diag([1.0, -1.0, -1.0])
+
+
+@SPACES
+def test_hostile_trocars(space, rng, oracle):
+    n = 20_000
+    trocar = rcm.Trocar(*(oracle.hostile(rng, n) for _ in range(3)))
+    p_world_ref = oracle.hostile(rng, (n, 3))
+    action = rng.normal(size=(n, space.dim)).astype(np.float32)
+    pose, valid = jax.jit(space.decode)(action, trocar, p_world_ref)
+    assert np.isfinite(pose.R).all() and np.isfinite(pose.p).all()
+    oracle.check_rotations(pose.R)
+    everything = np.concatenate([np.stack(trocar, axis=-1), p_world_ref], axis=-1)
+    np.testing.assert_array_equal(valid, np.isfinite(everything).all(axis=-1))
+
+
+@SPACES
+def test_hold_pose_without_a_trocar(space, p_world_ref):
+    """Below the nominal port if the trocar is not finite, below the origin if that is not."""
+    trocar = rcm.Trocar(np.float32(np.nan), 1.5, 0.0)
+    down = np.array([0, 0, -rcm.HOLD_DEPTH])
+    pose, valid = space.decode(np.zeros(space.dim), trocar, p_world_ref)
+    assert not valid
+    np.testing.assert_allclose(pose.p, p_world_ref + down, atol=1e-7)
+    pose, _ = space.decode(np.zeros(space.dim), trocar, np.full(3, np.inf))
+    np.testing.assert_allclose(pose.p, down, atol=1e-7)
+    np.testing.assert_array_equal(pose.R, HOLD_R)
+
+
+@pytest.mark.parametrize("name", ["rcm2", "rcm4"])
+def test_tip_at_the_trocar_takes_the_axis_straight_down(name, p_world_ref):
+    trocar = jax.tree.map(lambda field: field[0], rcm.TROCARS)
+    p_world_trocar = np.asarray(rcm.trocar_position(trocar, p_world_ref))
+    tip = np.zeros(3) if name == "rcm2" else p_world_trocar
+    pose, valid = rcm.ACTION_SPACES[name].decode(np.append(0.4, tip), trocar, p_world_ref)
+    assert valid
+    np.testing.assert_allclose(pose.p, p_world_trocar - [0, 0, rcm.MIN_DEPTH], atol=1e-7)
+    np.testing.assert_allclose(rcm.roll_of(pose.R), 0.4, atol=1e-6)
+
+
+@SPACES
+def test_derivatives_are_finite_at_hostile_actions(space, rng, oracle, p_world_ref):
+    n = 20_000
+    trocar = sample_trocars(n)
+    action = oracle.hostile_actions(rng, space, oracle.trocar_position(trocar, p_world_ref))
+    weights = rng.normal(size=12).astype(np.float32)
+
+    def total(action, trocar, p_world_ref):
+        pose, _ = space.decode(action, trocar, p_world_ref)
+        return pose.R.ravel() @ weights[:9] + pose.p @ weights[9:]
+
+    def again(action, trocar, p_world_ref):
+        pose, _ = space.decode(action, trocar, p_world_ref)
+        return space.encode(pose, trocar, p_world_ref)
+
+    arguments = (action, trocar, p_world_ref)
+    for derivative in (jax.grad(total, (0, 1, 2)), jax.jacfwd(total), jax.jacrev(again)):
+        values = jax.jit(jax.vmap(derivative, (0, 0, None)))(*arguments)
+        assert all(np.isfinite(value).all() for value in jax.tree.leaves(values))
+
+
+@SPACES
+def test_derivatives_equal_finite_differences(space, rng, oracle, p_world_ref):
+    trocar = sample_trocars(64)
+    pose = sample_poses(rng, 64, oracle.trocar_position(trocar, p_world_ref))
+    with jax.enable_x64(True):
+        trocar, pose = jax.tree.map(lambda value: np.asarray(value, np.float64), (trocar, pose))
+        action = np.asarray(space.encode(pose, trocar, p_world_ref))
+
+        @jax.jit
+        def flat(action):
+            pose, _ = space.decode(action, trocar, p_world_ref)
+            return jax.numpy.concatenate([pose.R.reshape(64, 9), pose.p], axis=-1)
+
+        push = jax.jit(lambda action, tangent: jax.jvp(flat, (action,), (tangent,)))
+        for direction in np.eye(space.dim):
+            tangent = np.broadcast_to(direction, action.shape)
+            _, slope = push(action, tangent)
+            numeric = (flat(action + 1e-6 * tangent) - flat(action - 1e-6 * tangent)) / 2e-6
+            np.testing.assert_allclose(slope, numeric, atol=1e-6, rtol=1e-6)
+
+
+@SPACES
+def test_round_trips(space, rng, oracle, p_world_ref):
+    n = 50_000
+    trocar = sample_trocars(n)
+    pose = sample_poses(rng, n, np.asarray(rcm.trocar_position(trocar, p_world_ref)))
+    encode, decode = jax.jit(space.encode), jax.jit(space.decode)
+    action = encode(pose, trocar, p_world_ref)
+    assert action.shape == (n, space.dim)
+    back, valid = decode(action, trocar, p_world_ref)
+    assert valid.all()
+    np.testing.assert_allclose(back.R, pose.R, atol=1e-5)
+    np.testing.assert_allclose(back.p, pose.p, atol=1e-6)
+    np.testing.assert_allclose(encode(back, trocar, p_world_ref), action, atol=1e-5)
+
+
+@SPACES
+def test_decode_equals_the_paper_in_float64(space, rng, oracle, p_world_ref):
+    n = 20_000
+    trocar = sample_trocars(n)
+    pose = sample_poses(rng, n, np.asarray(rcm.trocar_position(trocar, p_world_ref)))
+    action = np.asarray(space.encode(pose, trocar, p_world_ref))
+    R, p = oracle.decode(space.name, action, trocar, p_world_ref)
+    decoded, _ = jax.jit(space.decode)(action, trocar, p_world_ref)
+    np.testing.assert_allclose(decoded.R, R, atol=1e-5)
+    np.testing.assert_allclose(decoded.p, p, atol=1e-6)
+    with jax.enable_x64(True):
+        wide = jax.tree.map(lambda value: np.asarray(value, np.float64), (action, trocar))
+        decoded, _ = jax.jit(space.decode)(*wide, p_world_ref)
+        assert decoded.R.dtype == decoded.p.dtype == np.float64
+        np.testing.assert_allclose(decoded.R, R, atol=1e-12)
+        np.testing.assert_allclose(decoded.p, p, atol=1e-12)
+
+
+@SPACES
+def test_parts_are_what_their_names_say(space, rng, oracle, p_world_ref):
+    trocar = jax.tree.map(lambda field: field[3], rcm.TROCARS)
+    p_world_trocar = np.asarray(rcm.trocar_position(trocar, p_world_ref))
+    pose = jax.tree.map(lambda value: value[0], sample_poses(rng, 1, p_world_trocar))
+    R_trocar = oracle.trocar_rotation(trocar).astype(np.float32)
+    is_relative = space.name in ("rcm1", "rcm2")
+    R = R_trocar.T @ pose.R if is_relative else pose.R
+    p = R_trocar.T @ (pose.p - p_world_trocar) if is_relative else pose.p
+    expected = {
+        "p": p,
+        "R": np.concatenate([R[:, 0], R[:, 1]]),
+        "depth": np.linalg.norm(pose.p - p_world_trocar),
+        "roll": rcm.roll_of(pose.R),
+    }
+    action = np.asarray(space.encode(pose, trocar, p_world_ref))
+    covered = np.zeros(space.dim, int)
+    for part, where in space.slices.items():
+        np.testing.assert_allclose(action[where], np.atleast_1d(expected[part]), atol=1e-6)
+        covered[where] += 1
+    assert (covered == 1).all()
+
+
+@SPACES
+def test_broadcasting_vmap_and_dtypes_agree(space, rng, p_world_ref):
+    action = rng.normal(scale=0.2, size=(5, 12, space.dim)).astype(np.float32)
+    decode = jax.jit(space.decode)
+    pose, valid = decode(action, rcm.TROCARS, p_world_ref)
+    assert pose.R.shape == (5, 12, 3, 3) and pose.p.shape == (5, 12, 3) and valid.shape == (5, 12)
+    assert pose.R.dtype == pose.p.dtype == np.float32 and valid.dtype == bool
+    assert not pose.R.weak_type and not pose.p.weak_type
+    mapped = jax.jit(jax.vmap(jax.vmap(space.decode, (0, 0, None)), (0, None, None)))
+    for one, other in zip(pose, mapped(action, rcm.TROCARS, p_world_ref)[0], strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    # One pose seen from twelve trocars, and one trocar for many poses.
+    single = jax.tree.map(lambda value: value[0, 0], pose)
+    assert space.encode(single, rcm.TROCARS, p_world_ref).shape == (12, space.dim)
+    one_trocar = rcm.Trocar(0.02, 1.5, 0.3)
+    assert decode(action[0, 0], one_trocar, p_world_ref)[0].p.shape == (3,)
+    # Low precision and integers are computed in float32; float64 stays float64.
+    half = jax.numpy.asarray(action, jax.numpy.bfloat16)
+    assert decode(half, rcm.TROCARS, p_world_ref)[0].R.dtype == np.float32
+    assert decode(np.ones(space.dim, int), one_trocar, p_world_ref)[0].R.dtype == np.float32
+
+
+@SPACES
+def test_wrong_shapes_are_named(space, p_world_ref):
+    trocar = rcm.Trocar(0.02, 1.5, 0.3)
+    with pytest.raises(ValueError, match=rf"action: expected .*{space.dim}\], got \[2, 3\]"):
+        space.decode(np.zeros((2, 3)), trocar, p_world_ref)
+    with pytest.raises(ValueError, match=r"p_world_ref: expected .*3\], got \[\]"):
+        space.decode(np.zeros(space.dim), trocar, 0.15)
+    with pytest.raises(ValueError, match=r"leading axes .* got action \[5\], trocar.radius \[12\]"):
+        space.decode(np.zeros((5, space.dim)), rcm.TROCARS, p_world_ref)
+    with pytest.raises(ValueError, match=r"pose.p: expected .*3\], got \[2\]"):
+        space.encode(rcm.Pose(R=np.eye(3), p=np.zeros(2)), trocar, p_world_ref)
+
+
+@MANIFOLD_SPACES
+def test_encode_describes_poses_off_the_manifold(name, rng, p_world_ref):
+    """A measured pose, its shaft 1 mm from the trocar: signed depth, and the pose's own roll."""
+    space = rcm.ACTION_SPACES[name]
+    trocar = rcm.Trocar(0.02, 1.5, 0.3)
+    R = transform.Rotation.from_euler("xyz", [2.9, 0.2, 0.5]).as_matrix().astype(np.float32)
+    p_world_trocar = np.asarray(rcm.trocar_position(trocar, p_world_ref))
+    pose = rcm.Pose(R=R, p=p_world_trocar + np.float32(-0.02) * R[:, 2] + 1e-3 * R[:, 0])
+    action = np.asarray(space.encode(pose, trocar, p_world_ref))
+    if "depth" in space.slices:
+        np.testing.assert_allclose(action[space.slices["depth"]], -0.02, atol=1e-7)
+    else:
+        np.testing.assert_allclose(action[space.slices["roll"]], rcm.roll_of(R), atol=1e-6)
+
+
+def test_encode_propagates_nan(p_world_ref):
+    pose = rcm.Pose(R=np.full((3, 3), np.nan), p=np.full(3, np.nan))
+    for space in rcm.ACTION_SPACES.values():
+        assert np.isnan(space.encode(pose, rcm.Trocar(0.02, 1.5, 0.3), p_world_ref)).all()
