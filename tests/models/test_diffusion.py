@@ -1,0 +1,136 @@
+"""Noising and denoising: statistics, a perfect oracle, and independence from the batch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax.models import diffusion, schedule
+
+SCHEDULE = schedule.cosine(100)
+
+
+def perfect(x0):
+    """The noise that a perfect network would see in `x`, when the data is the single point x0."""
+
+    def eps_fn(x, k):
+        signal = jnp.asarray(SCHEDULE.sqrt_alpha_bar)[k]
+        return (x - signal * x0) / jnp.asarray(SCHEDULE.sqrt_one_minus_alpha_bar)[k]
+
+    return eps_fn
+
+
+def clean(shape):
+    return jax.random.uniform(jax.random.key(1), shape, minval=-1.0, maxval=1.0)
+
+
+@pytest.mark.parametrize("k", [0, 37, 99])
+def test_noised_samples_have_the_mean_and_deviation_of_eq_7(k):
+    noise = jax.random.normal(jax.random.key(0), (20_000, 1))
+    x = diffusion.add_noise(SCHEDULE, jnp.full((20_000, 1), 0.7), jnp.full(20_000, k), noise)
+    signal = float(SCHEDULE.sqrt_alpha_bar[k])
+    spread = float(SCHEDULE.sqrt_one_minus_alpha_bar[k])
+    assert float(x.mean()) == pytest.approx(0.7 * signal, abs=4 * spread / 141)
+    assert float(x.std()) == pytest.approx(spread, rel=0.02)
+
+
+def test_add_noise_takes_each_samples_own_step():
+    x0, noise, k = clean((3, 4, 2)), jnp.ones((3, 4, 2)), jnp.array([0, 50, 99])
+    together = diffusion.add_noise(SCHEDULE, x0, k, noise)
+    for i in range(3):
+        alone = diffusion.add_noise(SCHEDULE, x0[i], k[i], noise[i])
+        np.testing.assert_allclose(together[i], alone, rtol=1e-6)
+
+
+def test_predict_x0_inverts_add_noise():
+    x0, noise = clean((95, 8)), jax.random.normal(jax.random.key(2), (95, 8))
+    k = jnp.arange(95)
+    back = diffusion.predict_x0(SCHEDULE, diffusion.add_noise(SCHEDULE, x0, k, noise), k, noise)
+    np.testing.assert_allclose(back, x0, atol=2e-5)
+
+
+def test_predict_x0_is_clipped():
+    x = jnp.full((1, 2), 3.0)
+    assert float(diffusion.predict_x0(SCHEDULE, x, jnp.array([99]), -x).max()) == 1.0
+
+
+@pytest.mark.parametrize("steps", [1, 2, 10, 100])
+def test_ddim_with_a_perfect_network_returns_the_clean_sequence(steps):
+    x0 = clean((2, 16, 4))
+    noise = diffusion.sample_noise(jax.random.split(jax.random.key(3), 2), (16, 4))
+    x = diffusion.ddim_sample(perfect(x0), noise, steps=steps)
+    np.testing.assert_allclose(x, x0, atol=1e-5)
+
+
+def test_ddim_step_is_the_papers_formula():
+    """Two steps of Song et al. (12) with sigma = 0, in float64, for an imperfect network."""
+    noise = diffusion.sample_noise(jax.random.key(4)[None], (8, 2))
+    eps_fn = lambda x, k: 0.4 * jnp.sin(3.0 * x) + 0.001 * k  # noqa: E731
+    x = np.asarray(noise, float)
+    for k, after in ((50, 0), (0, None)):
+        alpha = float(SCHEDULE.sqrt_alpha_bar[k]) ** 2
+        following = 1.0 if after is None else float(SCHEDULE.sqrt_alpha_bar[after]) ** 2
+        eps = 0.4 * np.sin(3.0 * x) + 0.001 * k
+        x0 = np.clip((x - np.sqrt(1 - alpha) * eps) / np.sqrt(alpha), -1, 1)
+        x = np.sqrt(following) * x0 + np.sqrt(1 - following) * eps
+    np.testing.assert_allclose(diffusion.ddim_sample(eps_fn, noise, steps=2), x, atol=3e-6)
+
+
+def test_ddim_prepares_every_step_once():
+    calls = []
+
+    def prepare(k):
+        calls.append(k.shape)
+        return {"double": 2 * k}
+
+    noise = jnp.ones((1, 4, 2))
+    eps_fn = lambda x, k: 0.01 * k * x  # noqa: E731
+    prepared = diffusion.ddim_sample(
+        lambda x, at_k: eps_fn(x, at_k["double"] // 2), noise, steps=5, prepare=prepare
+    )
+    assert calls == [(5,)]
+    np.testing.assert_allclose(prepared, diffusion.ddim_sample(eps_fn, noise, steps=5), rtol=1e-6)
+
+
+def test_ddpm_with_a_perfect_network_returns_the_clean_sequence():
+    x0 = clean((1, 16, 4))
+    x = jax.random.normal(jax.random.key(5), x0.shape)
+    for k in range(99, -1, -1):
+        z = jax.random.normal(jax.random.fold_in(jax.random.key(6), k), x0.shape)
+        x = diffusion.ddpm_step(SCHEDULE, x, jnp.array(k), perfect(x0)(x, k), z)
+    np.testing.assert_allclose(x, x0, atol=1e-5)
+
+
+@pytest.mark.parametrize("k", [1, 40, 80])
+def test_ddpm_step_is_eq_12_where_nothing_is_clipped(k):
+    x0, eps, z = 0.3, 0.8, -1.1
+    alpha_bar = np.asarray(SCHEDULE.sqrt_alpha_bar, float) ** 2
+    beta = float(SCHEDULE.beta[k])
+    x = np.sqrt(alpha_bar[k]) * x0 + np.sqrt(1 - alpha_bar[k]) * eps
+    mean = (x - beta / np.sqrt(1 - alpha_bar[k]) * eps) / np.sqrt(1 - beta)
+    sigma = np.sqrt(beta * (1 - alpha_bar[k - 1]) / (1 - alpha_bar[k]))
+    one = lambda value: jnp.full((1, 1), value)  # noqa: E731
+    step = diffusion.ddpm_step(SCHEDULE, one(x), jnp.array([k]), one(eps), one(z))
+    assert float(step[0, 0]) == pytest.approx(mean + sigma * z, abs=2e-6)
+
+
+def test_noise_of_a_sample_depends_on_its_key_alone():
+    keys = jax.random.split(jax.random.key(7), 5)
+    full = diffusion.sample_noise(keys, (16, 4))
+    np.testing.assert_array_equal(full[2:3], diffusion.sample_noise(keys[2:3], (16, 4)))
+    assert not np.array_equal(full[0], full[1])
+
+
+def test_loss_is_zero_for_the_right_noise_and_one_for_none():
+    x0 = clean((512, 4, 2))
+    loss = lambda eps_fn: diffusion.eps_loss(eps_fn, SCHEDULE, jax.random.key(8), x0)  # noqa: E731
+    assert float(loss(lambda x, k: jax.vmap(lambda x, x0, k: perfect(x0)(x, k))(x, x0, k))) < 1e-3
+    assert float(loss(lambda x, k: jnp.zeros_like(x))) == pytest.approx(1.0, abs=0.07)
+
+
+def test_loss_draws_every_step():
+    seen = []
+    diffusion.eps_loss(
+        lambda x, k: seen.append(np.asarray(k)) or x, SCHEDULE, jax.random.key(9), clean((4096, 1))
+    )
+    assert set(seen[0].tolist()) == set(range(100))

@@ -1,0 +1,116 @@
+"""Encoders: keypoints in the uncropped picture, per-frame independence, shapes, gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax.models import encoders, resnet, spatial_softmax
+
+KEY = jax.random.key(0)
+
+
+def make(trunk, **changes):
+    settings = {"features": 8, "width": 16}
+    return encoders.ImageEncoder(trunk, **{**settings, **changes})
+
+
+def frames(n=2, size=32):
+    return jax.random.normal(jax.random.key(1), (n, size, size, 3))
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 0), (2, 5), (3, 7)])
+def test_a_peak_is_at_its_cells_centre(row, column):
+    logits = jnp.zeros((1, 4, 8, 1)).at[0, row, column, 0].set(100.0)
+    point = spatial_softmax.spatial_softmax(logits, (64, 128))[0, 0]
+    # In pixels of a 64 x 128 image, cells are 16 pixels: the centre of cell i is at 16 i + 8.
+    pixel = (np.asarray(point) + 1.0) / 2.0 * np.array([64, 128])
+    np.testing.assert_allclose(pixel, [16 * row + 8, 16 * column + 8], atol=1e-3)
+
+
+def test_flat_maps_look_at_the_centre():
+    points = spatial_softmax.spatial_softmax(jnp.ones((2, 5, 5, 3)), (10, 10))
+    np.testing.assert_allclose(points, 0.0, atol=1e-6)
+
+
+def test_a_crop_does_not_move_a_keypoint():
+    """A peak in an 8 x 8 map of 64 pixels, seen through crops of 32 pixels."""
+    full = jnp.zeros((8, 8)).at[3, 4].set(100.0)
+    seen = []
+    for top, left in ((0, 1), (2, 2), (3, 3), (0, 4)):
+        crop = full[top : top + 4, left : left + 4][None, ..., None]
+        offset = jnp.array([[8.0 * top - 16.0, 8.0 * left - 16.0]])
+        seen.append(spatial_softmax.spatial_softmax(crop, (32, 32), offset)[0, 0])
+    for point in seen[1:]:
+        np.testing.assert_allclose(point, seen[0], atol=1e-5)
+    np.testing.assert_allclose(seen[0], [(3 * 8 + 4 - 32) / 16, (4 * 8 + 4 - 32) / 16], atol=1e-5)
+
+
+@pytest.mark.parametrize("trunk", sorted(encoders.TRUNKS))
+class TestImageEncoder:
+    def test_shape_and_gradient(self, trunk):
+        module = make(trunk)
+        offset = jnp.zeros((2, 2))
+        params = jax.jit(module.init)(KEY, frames())
+        value, gradient = jax.jit(
+            jax.value_and_grad(lambda p: (module.apply(p, frames(), offset) ** 2).sum())
+        )(params)
+        assert jnp.isfinite(value)
+        assert module.apply(params, frames(), offset).shape == (2, 8)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+            assert jnp.isfinite(leaf).all(), path
+            assert (leaf != 0).any(), path
+
+    def test_frames_do_not_see_each_other(self, trunk):
+        module = make(trunk)
+        params = jax.jit(module.init)(KEY, frames())
+        apply = jax.jit(module.apply)
+        before, after = apply(params, frames()), apply(params, frames().at[1].set(5.0))
+        np.testing.assert_array_equal(before[0], after[0])
+        assert not np.array_equal(before[1], after[1])
+
+    def test_bfloat16_is_close(self, trunk):
+        params = jax.jit(make(trunk).init)(KEY, frames())
+        exact = jax.jit(make(trunk).apply)(params, frames())
+        rough = jax.jit(make(trunk, dtype=jnp.bfloat16).apply)(params, frames())
+        assert rough.dtype == jnp.float32
+        assert 0 < float(jnp.abs(rough - exact).max()) < 0.1 * float(jnp.abs(exact).max())
+
+
+def test_resnet18_has_torchvisions_size():
+    shapes = jax.eval_shape(resnet.ResNet18().init, KEY, jnp.zeros((1, 224, 224, 3)))
+    convolutions = sum(leaf.size for leaf in jax.tree.leaves(shapes) if leaf.ndim == 4)
+    norms = sum(leaf.size for leaf in jax.tree.leaves(shapes) if leaf.ndim == 1)
+    # torchvision: 11,689,512 with the classifier of 513,000; 20 norms have 9,600 parameters.
+    assert norms == 9_600
+    assert convolutions == 11_689_512 - 513_000 - 9_600
+
+
+def test_resnet18_shrinks_by_32():
+    shape = jax.eval_shape(
+        lambda x: resnet.ResNet18().init_with_output(KEY, x)[0], jnp.zeros((2, 224, 230, 3))
+    ).shape
+    assert shape == (2, 7, 8, 512)
+
+
+def test_max_pool_is_jaxs():
+    x = jax.nn.relu(frames(size=9))
+    expected = jax.lax.reduce_window(
+        x, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), [(0, 0), (1, 1), (1, 1), (0, 0)]
+    )
+    np.testing.assert_array_equal(resnet.max_pool(x), expected)
+
+
+def test_unknown_trunk_is_named():
+    with pytest.raises(ValueError, match=r"trunk: expected one of .*'small'.*got 'vit'"):
+        make("vit").init(KEY, frames())
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 4])
+def test_state_encoder_sees_all_of_the_history(horizon):
+    module = encoders.StateEncoder(16)
+    history = jax.random.normal(KEY, (3, horizon, 5))
+    params = module.init(KEY, history)
+    assert module.apply(params, history).shape == (3, 16)
+    gradient = jax.grad(lambda h: module.apply(params, h).sum())(history)
+    assert (jnp.abs(gradient).max(-1) > 0).all()

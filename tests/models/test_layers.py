@@ -1,0 +1,98 @@
+"""Layers against jax's own convolutions and closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax.models import layers
+
+
+def run(module, x, seed=0):
+    variables = module.init(jax.random.key(seed), x)
+    return variables["params"], module.apply(variables, x)
+
+
+def inputs(*shape, seed=1):
+    return jax.random.normal(jax.random.key(seed), shape)
+
+
+def reference_conv(x, kernel, bias, stride, padding):
+    dimensions = ("NWC", "WIO", "NWC")
+    y = jax.lax.conv_general_dilated(
+        x, kernel, (stride,), [(padding, padding)], dimension_numbers=dimensions
+    )
+    return y + bias
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stride", "length"), [(5, 1, 16), (3, 2, 16), (1, 1, 4), (5, 1, 3)]
+)
+def test_conv_is_jaxs_convolution(kernel, stride, length):
+    x = inputs(2, length, 6)
+    params, y = run(layers.Conv1d(4, kernel, stride=stride), x)
+    assert params["kernel"].shape[0] == kernel  # nothing is dropped at these lengths
+    expected = reference_conv(x, params["kernel"], params["bias"], stride, kernel // 2)
+    np.testing.assert_allclose(y, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stride", "length", "live"),
+    [
+        (5, 1, 2, slice(1, 4)),
+        (5, 1, 1, slice(2, 3)),
+        (3, 2, 2, slice(1, 3)),
+        (7, 1, 3, slice(1, 6)),
+    ],
+)
+def test_dropped_taps_change_nothing(kernel, stride, length, live):
+    """The full kernel gives the same function whatever its dead taps are."""
+    x = inputs(2, length, 6)
+    params, y = run(layers.Conv1d(4, kernel, stride=stride), x)
+    assert params["kernel"].shape[0] == live.stop - live.start
+    full = 100.0 * inputs(kernel, 6, 4, seed=2).at[live].set(0.0)
+    full = full.at[live].set(params["kernel"])
+    expected = reference_conv(x, full, params["bias"], stride, kernel // 2)
+    np.testing.assert_allclose(y, expected, atol=1e-5)
+
+
+def test_upsample_is_the_transpose_of_a_strided_convolution():
+    """<up(x), y> = <x, down(y)> for the convolution of kernel 4, stride 2, padding 1."""
+    x, y = inputs(2, 4, 3), inputs(2, 8, 3, seed=2)
+    params, up = run(layers.Upsample1d(), x)
+    up = up - params["bias"]
+    down = reference_conv(y, params["kernel"].transpose(0, 2, 1), 0.0, 2, 1)
+    assert float((up * y).sum()) == pytest.approx(float((x * down).sum()), rel=1e-4)
+
+
+def test_mish_is_its_definition_and_never_overflows():
+    x = jnp.concatenate([jnp.linspace(-30, 30, 601), jnp.array([-1e30, 1e30])])
+    wide = np.asarray(x, float)
+    with np.errstate(over="ignore"):
+        expected = wide * np.tanh(np.logaddexp(0.0, wide))
+    np.testing.assert_allclose(layers.mish(x), expected, rtol=1e-5, atol=1e-9)
+    assert jnp.isfinite(jax.vmap(jax.grad(layers.mish))(x)).all()
+
+
+@pytest.mark.parametrize("shape", [(3, 5, 12), (3, 4, 5, 12)])
+def test_group_norm_normalises_each_sample_and_group(shape):
+    x = 3.0 * inputs(*shape) + 2.0
+    _, y = run(layers.GroupNorm(4), x)
+    grouped = np.asarray(y, float).reshape(shape[0], -1, 4, 3)
+    np.testing.assert_allclose(grouped.mean((1, 3)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(grouped.std((1, 3)), 1.0, atol=1e-4)
+
+
+def test_group_norm_of_a_constant_is_finite_with_its_gradient():
+    module, x = layers.GroupNorm(2), jnp.full((2, 3, 4), 5.0)
+    variables = module.init(jax.random.key(0), x)
+    y, gradient = jax.value_and_grad(
+        lambda x: (module.apply(variables, x) * inputs(2, 3, 4)).sum()
+    )(x)
+    assert jnp.isfinite(y)
+    assert jnp.isfinite(gradient).all()
+
+
+def test_groups_must_divide_the_channels():
+    with pytest.raises(ValueError, match="groups: expected a divisor of 6 channels, got 4"):
+        layers.GroupNorm(4).init(jax.random.key(0), jnp.ones((1, 2, 6)))

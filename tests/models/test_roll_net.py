@@ -1,0 +1,72 @@
+"""The roll network: Eq. 13's inputs all matter, and it starts by saying "no roll"."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from starjax.models import roll_net
+
+KEY = jax.random.key(0)
+MODULE = roll_net.RollNet(width=32, embed_dim=8)
+
+
+def inputs(batch=64):
+    keys = jax.random.split(jax.random.key(1), 3)
+    shapes = ((batch, 16, 3), (batch, 7), (batch, 2))
+    return tuple(jax.random.uniform(k, s, minval=-1.0) for k, s in zip(keys, shapes))
+
+
+def target(p, trocar, history):
+    """A roll that needs each of the inputs."""
+    return 0.5 * p[..., 0] * trocar[:, :1] + 0.3 * history[:, -1:]
+
+
+@pytest.fixture(scope="module")
+def trained():
+    params = MODULE.init(KEY, *inputs())
+    optimizer = optax.adam(3e-3)
+
+    @jax.jit
+    def step(carry, _):
+        params, state = carry
+        loss, gradient = jax.value_and_grad(
+            lambda p: ((MODULE.apply(p, *inputs()) - target(*inputs())) ** 2).mean()
+        )(params)
+        updates, state = optimizer.update(gradient, state)
+        return (optax.apply_updates(params, updates), state), loss
+
+    (params, _), losses = jax.lax.scan(step, (params, optimizer.init(params)), None, 200)
+    return params, losses
+
+
+def test_starts_at_zero():
+    rolls = MODULE.apply(MODULE.init(KEY, *inputs()), *inputs())
+    assert rolls.shape == (64, 16)
+    np.testing.assert_array_equal(rolls, 0.0)
+
+
+def test_learns_and_uses_every_input(trained):
+    params, losses = trained
+    assert float(losses[-1]) < 0.02 * float(losses[0])
+    gradients = jax.grad(lambda *x: MODULE.apply(params, *x).sum(), (0, 1, 2))(*inputs())
+    for gradient in gradients:
+        assert jnp.isfinite(gradient).all()
+        assert float(jnp.abs(gradient).max()) > 1e-3
+
+
+def test_bfloat16_is_close(trained):
+    params, _ = trained
+    half = roll_net.RollNet(width=32, embed_dim=8, dtype=jnp.bfloat16)
+    rough = half.apply(params, *inputs())
+    assert rough.dtype == jnp.float32
+    assert 0 < float(jnp.abs(rough - MODULE.apply(params, *inputs())).max()) < 0.05
+
+
+def test_size_of_the_papers_network():
+    shapes = jax.eval_shape(roll_net.RollNet().init, KEY, *inputs(1))
+    size = sum(leaf.size for leaf in jax.tree.leaves(shapes))
+    linear = lambda a, b: a * b + b  # noqa: E731
+    block = 2 * 256 + 2 * linear(256, 256)
+    assert size == linear(7, 64) + linear(48 + 64 + 2, 256) + 3 * block + linear(256, 16)

@@ -1,0 +1,66 @@
+"""The noise schedule against its closed form in float64."""
+
+import math
+
+import numpy as np
+import pytest
+
+from starjax.models import schedule
+
+
+def alpha_bar_closed_form(k: int, steps: int) -> float:
+    """cos^2 at (k + 1) / K over cos^2 at 0: what the product of (1 - beta) telescopes to."""
+    cosine = math.cos(((k + 1) / steps + 0.008) / 1.008 * math.pi / 2) ** 2
+    return cosine / math.cos(0.008 / 1.008 * math.pi / 2) ** 2
+
+
+def test_alpha_bar_is_the_closed_form():
+    table = schedule.cosine(100)
+    # The last beta is capped, so the closed form (0) holds for all steps but that one.
+    expected = [alpha_bar_closed_form(k, 100) for k in range(99)]
+    np.testing.assert_allclose(table.sqrt_alpha_bar[:99].astype(float) ** 2, expected, rtol=3e-7)
+    assert table.beta[99] == np.float32(0.999)
+    assert table.sqrt_alpha_bar[99] == pytest.approx(4.9e-4, rel=0.02)
+
+
+def test_signal_and_noise_have_unit_variance_together():
+    table = schedule.cosine(100)
+    total = (
+        table.sqrt_alpha_bar.astype(float) ** 2 + table.sqrt_one_minus_alpha_bar.astype(float) ** 2
+    )
+    np.testing.assert_allclose(total, 1.0, atol=2e-7)
+    assert (np.diff(table.sqrt_alpha_bar) < 0).all()
+
+
+def test_posterior_is_bayes_rule():
+    """Means and variances of q(a_{k-1} | a_k, a_0), from the product of two Gaussians."""
+    table = schedule.cosine(50)
+    alpha_bar = np.array([alpha_bar_closed_form(k, 50) for k in range(49)])
+    for k in range(1, 49):
+        alpha = alpha_bar[k] / alpha_bar[k - 1]
+        precision = alpha / (1 - alpha) + 1 / (1 - alpha_bar[k - 1])
+        assert table.posterior_std[k] ** 2 == pytest.approx(1 / precision, rel=1e-5)
+        from_xk = math.sqrt(alpha) / (1 - alpha) / precision
+        from_x0 = math.sqrt(alpha_bar[k - 1]) / (1 - alpha_bar[k - 1]) / precision
+        assert table.posterior_xk[k] == pytest.approx(from_xk, rel=1e-5)
+        assert table.posterior_x0[k] == pytest.approx(from_x0, rel=1e-5)
+    assert table.posterior_std[0] == 0.0
+    assert table.posterior_x0[0] == 1.0
+
+
+@pytest.mark.parametrize(("steps", "first", "stride"), [(10, 90, 10), (100, 99, 1), (1, 0, 100)])
+def test_ddim_steps_are_leading(steps, first, stride):
+    table = schedule.ddim_table(100, steps)
+    np.testing.assert_array_equal(table.k, first - stride * np.arange(steps))
+    assert table.sqrt_alpha_bar_next[-1] == 1.0
+    assert table.sqrt_one_minus_alpha_bar_next[-1] == 0.0
+    np.testing.assert_array_equal(table.sqrt_alpha_bar_next[:-1], table.sqrt_alpha_bar[1:])
+    np.testing.assert_array_equal(
+        table.sqrt_alpha_bar, schedule.cosine(100).sqrt_alpha_bar[table.k]
+    )
+
+
+@pytest.mark.parametrize("steps", [0, 101])
+def test_ddim_steps_out_of_range(steps):
+    with pytest.raises(ValueError, match=rf"steps: expected 1\.\.100.*got {steps}"):
+        schedule.ddim_table(100, steps)
