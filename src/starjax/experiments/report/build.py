@@ -1,0 +1,90 @@
+"""Builds the report of one or many runs: tables.md, figures, rollout.mp4, index.html."""
+
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from starjax.experiments import methods
+from starjax.experiments.report import figures, page, results, style, tables, trajectories, video
+from starjax.runtime import files
+
+
+def build(
+    runs: Sequence[pathlib.Path],
+    out: pathlib.Path,
+    with_video: bool = True,
+    report: Callable[[str], None] = print,
+) -> pathlib.Path:
+    """Writes the report of the run directories `runs` into `out`; returns its index.html.
+
+    Each directory holds what `results.load` reads; whatever a run did not produce is left out of
+    the report. Without a recorded rollout, or with `with_video` off, there is no video.
+
+    Raises:
+      ValueError: no runs, or a directory without a result.
+    """
+    if not runs:
+        raise ValueError("runs: expected at least one run directory, got none")
+    loaded = sorted((results.load(path) for path in runs), key=_order)
+    focus = _focus(loaded)
+    out.mkdir(parents=True, exist_ok=True)
+    files.write_bytes(out / "tables.md", tables.markdown(loaded).encode())
+    sim = _model() if any(run.rollouts for run in loaded) else None
+    pictures = _figures(loaded, focus, sim, out)
+    clip = _video(loaded, sim, out, report) if with_video and sim else None
+    index = out / "index.html"
+    files.write_bytes(index, page.render(loaded, focus, pictures, clip).encode())
+    return index
+
+
+def _order(run: results.Run) -> int:
+    return list(methods.METHODS).index(run.result["method"])
+
+
+def _focus(runs: Sequence[results.Run]) -> results.Run:
+    """The run whose numbers head the page: the paper's own method if it is there."""
+    return next((run for run in runs if run.result["method"] == "stardiff"), runs[-1])
+
+
+def _model() -> Any:
+    """The simulated scene, which figures and video are drawn from."""
+    from starjax.sim import model
+
+    return model.load()
+
+
+def _figures(
+    runs: Sequence[results.Run], focus: results.Run, sim: Any, out: pathlib.Path
+) -> dict[str, tuple[bytes, bytes]]:
+    """Draws each figure on light and on dark paper; the light one also goes to files."""
+    drawings: dict[str, Callable[[bool], Any]] = {
+        "training": lambda dark: figures.training(runs, dark),
+    }
+    evaluated = [run for run in runs if run.trials]
+    if evaluated and focus.trials:
+        drawings["fig4"] = lambda dark: figures.distance(evaluated, focus, dark)
+    if sim is not None:
+        shown = results.representatives(runs)
+        drawings["fig3"] = lambda dark: trajectories.draw(shown, sim.pegs, dark)
+    pictures = {}
+    for name, draw in drawings.items():
+        light, dark = draw(False), draw(True)
+        if light is not None:
+            pictures[name] = style.save(light, "png"), style.save(dark, "png")
+            files.write_bytes(out / f"{name}.png", pictures[name][0])
+            if name != "training":
+                files.write_bytes(out / f"{name}.pdf", style.save(light, "pdf"))
+    return pictures
+
+
+def _video(
+    runs: Sequence[results.Run], sim: Any, out: pathlib.Path, report: Callable[[str], None]
+) -> bytes | None:
+    chosen = video.choose(results.representatives(runs))
+    if not chosen:
+        return None
+    report(f"drawing {len(chosen)} rollouts for the video")
+    path = out / "rollout.mp4"
+    several = len({method for method, _ in chosen}) > 1
+    video.write(video.frames(chosen, video.renderer(sim), several), path)
+    return path.read_bytes()

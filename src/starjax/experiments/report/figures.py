@@ -1,0 +1,153 @@
+"""Fig. 4 (success against distance from the training trocars, map of the disc) and loss curves."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from starjax.experiments.report import results, stats, style
+
+_BIN = 0.005  # m of distance pooled in one point
+_SMOOTH = 0.008  # m, width of the kernel behind the heat map
+_DISC = 0.05  # m, radius of Eq. 19's disc
+
+
+def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False) -> Any:
+    """Fig. 4: success against distance to the nearest training trocar; beside it `focus`'s map."""
+    from matplotlib.figure import Figure
+
+    with style.use(dark) as shades:
+        figure = Figure((7.4, 3.4), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
+        for i, run in enumerate(runs):
+            if len(runs) == 1:
+                _band(left, run, shades)
+            else:
+                _whiskers(left, run, (i - (len(runs) - 1) / 2) * 0.35)
+        left.set_xlabel("distance to the nearest training trocar (mm)")
+        left.set_ylabel("success rate")
+        left.set_title(f"{focus.label if len(runs) == 1 else 'All methods'}, 95% Wilson intervals")
+        style.percent_axis(left)
+        if len(runs) > 1:
+            figure.legend(loc="outside lower left", fontsize=7, ncols=4)
+        _disc(figure, right, focus, shades)
+    return figure
+
+
+def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
+    """Training loss and held-out action error against steps, or None if nothing was logged."""
+    from matplotlib import ticker
+    from matplotlib.figure import Figure
+
+    panels = [
+        (name, title)
+        for name, title in CURVES.items()
+        if any(name in line for run in runs for line in run.curves)
+    ]
+    if not panels:
+        return None
+    with style.use(dark):
+        figure = Figure((2.6 * len(panels), 2.4), layout="constrained")
+        for axis, (name, title) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
+            for run in runs:
+                points = [(line["step"], line[name]) for line in run.curves if name in line]
+                color, _ = style.method(run.result["method"])
+                if points:
+                    axis.plot(*np.array(points).T, color=color, linewidth=1.3, label=run.label)
+            axis.set_title(title)
+            axis.set_xlabel("training step")
+            axis.set_yscale("log")
+            axis.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+            axis.yaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.yaxis.set_minor_locator(ticker.NullLocator())
+        if len(runs) > 1:
+            figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+# Keys of metrics.jsonl that are drawn.
+CURVES = {
+    "loss": "Training loss",
+    "position_error_mm": "Held-out position error (mm)",
+    "roll_error_deg": "Held-out roll error (deg)",
+}
+
+
+def _pooled(run: results.Run) -> list[tuple[float, stats.Rate]]:
+    """(mean distance in mm, score) of the trials whose distance falls in one bin."""
+    trials = [*run.trials, *run.sweep]
+    apart = results.distances(trials, results.training_trocars(run))
+    bins = np.round(apart / _BIN).astype(int)
+    inside = [np.flatnonzero(bins == b) for b in np.unique(bins)]
+    return [(1e3 * apart[i].mean(), results.tally(trials[j] for j in i)) for i in inside]
+
+
+def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
+    """One method: pooled rates in their band, the trials behind each, single trocars as dots."""
+    points, color = _pooled(run), style.SUCCESS
+    x, scores = [at for at, _ in points], [score for _, score in points]
+    if not run.sweep:
+        groups = results.by_trocar(run.trials)
+        apart = results.distances([g[0] for g in groups], results.training_trocars(run))
+        rates = [results.tally(g).rate for g in groups]
+        axis.plot(1e3 * apart, rates, "o", color=color, alpha=0.35, markersize=4)
+    low, high = [s.low for s in scores], [s.high for s in scores]
+    axis.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
+    axis.plot(x, [s.rate for s in scores], "o-", color=color, markersize=5)
+    for at, score in points:
+        text = f"n {score.trials}"
+        axis.text(at, -0.01, text, ha="center", va="bottom", fontsize=6.5, color=shades["muted"])
+
+
+def _whiskers(axis: Any, run: results.Run, offset: float) -> None:
+    """One of several methods: a line with whiskers, `offset` mm aside to hide no other."""
+    points, (color, marker) = _pooled(run), style.method(run.result["method"])
+    x, rates = [at + offset for at, _ in points], [score.rate for _, score in points]
+    below, above = [s.rate - s.low for _, s in points], [s.high - s.rate for _, s in points]
+    axis.plot(x, rates, color=color, linewidth=1.2, marker=marker, markersize=4, label=run.label)
+    axis.errorbar(x, rates, [below, above], color=color, linewidth=0.8, linestyle="")
+
+
+def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> None:
+    """Ports from above: a smoothed map where a sweep filled the disc, else a dot a trocar."""
+    trials = run.sweep or run.trials
+    groups = results.by_trocar(trials)
+    at = 1e3 * results.positions([group[0] for group in groups])[:, :2]
+    rates = np.array([results.tally(group).rate for group in groups])
+    if run.sweep:
+        shown = _heat(axis, at, rates, np.array([len(group) for group in groups]))
+        axis.plot(*at.T, ".", color=shades["paper"], markersize=1.2, alpha=0.3)
+        ports = 1e3 * results.positions(results.training_trocars(run))[:, :2]
+        axis.plot(*ports.T, "x", color=style.FAILURE, markersize=6, label="training trocar")
+        axis.legend(loc="upper left", bbox_to_anchor=(0, -0.12), fontsize=7)
+    else:
+        edge = [shades["ink"] if group[0]["seen"] else style.FAILURE for group in groups]
+        shown = axis.scatter(
+            *at.T, c=rates, cmap=style.MAP, vmin=0, vmax=1, s=330, edgecolors=edge, linewidths=1.6
+        )
+        for place, value in zip(at, rates):
+            ink = "black" if value > 0.5 else "white"
+            axis.text(*place, f"{100 * value:.0f}", ha="center", va="center", fontsize=7, color=ink)
+        axis.text(
+            0, -1.5e3 * _DISC, "orange rim: unseen", ha="center", fontsize=7, color=style.FAILURE
+        )
+    turn = np.linspace(0, 2 * np.pi, 181)
+    axis.plot(1e3 * _DISC * np.cos(turn), 1e3 * _DISC * np.sin(turn), color=shades["muted"], lw=0.8)
+    axis.set_aspect("equal")
+    axis.grid(False)
+    axis.set_title(f"{run.label} by port, from above (mm)")
+    bar = figure.colorbar(shown, ax=axis, shrink=0.8, ticks=[0, 0.5, 1])
+    bar.ax.set_yticklabels(["0", "50", "100%"])
+    bar.outline.set_visible(False)
+
+
+def _heat(axis: Any, at: np.ndarray, rates: np.ndarray, weights: np.ndarray) -> Any:
+    """Kernel mean of `rates [N]` at `at [N, 2]` mm over the disc, weighed by trials."""
+    line = 1e3 * np.linspace(-_DISC, _DISC, 161)
+    x, y = np.meshgrid(line, line)
+    near = ((x[..., None] - at[:, 0]) ** 2 + (y[..., None] - at[:, 1]) ** 2) / (1e3 * _SMOOTH) ** 2
+    kernel = np.exp(-near / 2) * weights
+    mean = (kernel @ rates) / np.maximum(kernel.sum(-1), 1e-12)
+    mean[np.hypot(x, y) > 1e3 * _DISC] = np.nan
+    edges = (line[0], line[-1], line[0], line[-1])
+    return axis.imshow(mean, extent=edges, origin="lower", cmap=style.MAP, vmin=0, vmax=1)

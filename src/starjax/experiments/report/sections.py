@@ -1,0 +1,204 @@
+"""The parts of the HTML page, each empty where a run left nothing to say."""
+
+import statistics
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from starjax.experiments.report import markup, results, stats, tables, words
+from starjax.experiments.report.markup import Cell
+
+_SCORES = (Cell("Seen"), Cell(""), Cell("Unseen"), Cell(""))
+
+
+def facts(runs: Sequence[results.Run], focus: results.Run) -> str:
+    """What was run, on what."""
+    result, config = focus.result, focus.result.get("config") or {}
+    trials, trocars = len(focus.trials), len(results.by_trocar(focus.trials))
+    items = {
+        "Observation": result.get("observation"),
+        "Trials" if len(runs) == 1 else "Trials a method": (
+            f"{trials} over {trocars} trocars" if trials else None
+        ),
+        "Preset": config.get("preset"),
+        "Seed": result.get("seed"),
+        "Hardware": result.get("hardware"),
+    }
+    shown = [(name, value) for name, value in items.items() if value not in (None, "", {})]
+    inner = "".join(
+        f"<div><dt>{name}</dt><dd>{markup.escape(words.listing(value))}</dd></div>"
+        for name, value in shown
+    )
+    return f'<dl class="facts">{inner}</dl>'
+
+
+def notes(runs: Sequence[results.Run]) -> str:
+    """Warnings, each once."""
+    texts = dict.fromkeys(text for run in runs for text in run.result.get("warnings") or [])
+    return "\n".join(f'<p class="note">{markup.escape(text)}</p>' for text in texts)
+
+
+def cards(run: results.Run) -> str:
+    """Headline numbers with their intervals."""
+    inner = "".join(
+        f'<div class="card"><div class="name">{name}</div>'
+        f'<div class="value">{value}<small>{unit}</small></div><div class="more">{more}</div></div>'
+        for name, value, unit, more in _headlines(run)
+    )
+    return f'<div class="cards">{inner}</div>' if inner else ""
+
+
+def _headlines(run: results.Run) -> Iterator[tuple[str, str, str, str]]:
+    """(name, value, unit, more) of each headline number that the run has."""
+    scores = [results.tally(t) if t else None for t in results.split(run.trials)]
+    for name, score in zip(("seen", "unseen"), scores):
+        if score:
+            more = f"{score.successes} of {score.trials}, {words.interval(score)}"
+            bar = markup.interval(score, name)
+            yield f"Success, {name} trocars", f"{100 * score.rate:.0f}", "%", bar + more
+    seen, unseen = scores
+    if seen and unseen:
+        middle, low, high = (100 * x for x in stats.gap(seen, unseen))
+        more = f"seen minus unseen, 95% interval {low:+.0f} to {high:+.0f}"
+        yield "Generalization gap", f"{middle:+.0f}", " points", more
+    executed = (run.result.get("rcm_error_mm") or {}).get("executed") or {}
+    if executed.get("p99") is not None:
+        more = f"99th percentile; worst {tables.millimetres(executed['max'])} mm"
+        yield "Shaft off the trocar", tables.millimetres(executed["p99"]), " mm", more
+    seconds = results.transfer_times(run.trials)
+    if seconds:
+        more = f"median of {len(seconds)} successes"
+        yield "Time a transfer", f"{statistics.median(seconds):.1f}", " s", more
+    if run.result.get("inference_ms"):
+        ms = run.result["inference_ms"]
+        more = f"median; 99th percentile {ms['p99']:.1f} ms"
+        yield "One policy call", f"{ms['p50']:.1f}", " ms", more
+
+
+def tests(run: results.Run) -> str:
+    """One method: success by three tests."""
+    if not run.trials:
+        return ""
+    rows = []
+    for name, (test, meaning) in tables.OUTCOMES.items():
+        rows.append([Cell(f"<b>{name.capitalize()}</b><br>{markup.escape(meaning)}")])
+        for part, trials in zip(("seen", "unseen"), results.split(run.trials)):
+            rows[-1] += markup.score(results.tally(trials, test) if trials else None, part)
+    return "<h2>Success</h2>\n" + markup.table([Cell("Test"), *_SCORES], rows)
+
+
+def comparison(runs: Sequence[results.Run]) -> str:
+    """Several methods: Table III with its intervals drawn, paired tests, the other tests."""
+    rows, group = [], None
+    for run in runs:
+        if run.trials:
+            if run.group != group:
+                group = run.group
+                rows.append([Cell(markup.escape(group), "group"), *[Cell("", "group")] * 5])
+            scores = [results.tally(t) if t else None for t in results.split(run.trials)]
+            seen, unseen = scores
+            gap = tables.points(stats.gap(seen, unseen)) if seen and unseen else "–"
+            rows.append([Cell(markup.escape(run.label)), *markup.score(seen, "seen")])
+            rows[-1] += [*markup.score(unseen, "unseen"), markup.number(gap)]
+    if not rows:
+        return ""
+    header = [Cell("Method"), *_SCORES, markup.number("Gap (points)")]
+    text = "<h2>Success</h2>\n" + markup.table(header, rows) + markup.small(tables.SUCCESS_NOTE)
+    pairs = tables.paired(runs)
+    if len(pairs) > 1:
+        text += "<h2>Paired with STAR-Diff</h2>\n" + markup.plain(pairs, tables.PAIRED_NOTE)
+    others = markup.plain(tables.outcomes(runs, _brief), tables.OUTCOMES_NOTE)
+    return text + "<h2>Success by three tests (%)</h2>\n" + others
+
+
+def per_trocar(run: results.Run) -> str:
+    """One method: a row a trocar."""
+    rows = []
+    for group in results.by_trocar(run.trials):
+        part = "seen" if group[0]["seen"] else "unseen"
+        times = results.transfer_times(group)
+        worst = max(
+            (t["rcm_max_mm"] for t in group if t.get("rcm_max_mm") is not None), default=None
+        )
+        row = [Cell(f"{group[0]['trocar']}"), Cell(part)]
+        row += [markup.number(text) for text in results.place(group[0])]
+        row += markup.score(results.tally(group), part)
+        row.append(markup.number(f"{statistics.median(times):.1f} s" if times else "–"))
+        row.append(markup.number("–" if worst is None else f"{tables.millimetres(worst)} mm"))
+        rows.append(row)
+    if not rows:
+        return ""
+    right = [markup.number(text) for text in ("r", "θ", "φ")]
+    header = [Cell("Trocar"), Cell(""), *right, Cell("Success"), Cell("")]
+    header += [markup.number("Median time"), markup.number("Worst RCM error")]
+    return "<h2>Trocar by trocar</h2>\n" + markup.table(header, rows)
+
+
+def matrix(runs: Sequence[results.Run]) -> str:
+    """Several methods: success in percent, a row a method and a column a trocar."""
+    columns = results.by_trocar([trial for run in runs for trial in run.trials])
+    if not columns:
+        return ""
+    header, rows = [Cell("Method")], []
+    for group in columns:
+        header.append(Cell(f"{group[0]['trocar']}{'' if group[0]['seen'] else '*'}", "tint"))
+    for run in runs:
+        rates = {g[0]["trocar"]: results.tally(g) for g in results.by_trocar(run.trials)}
+        cells = [markup.tint(rates.get(group[0]["trocar"])) for group in columns]
+        rows.append([Cell(markup.escape(run.label)), *cells])
+    note = "Success in percent of the trials at each trocar; * marks trocars not trained on."
+    return "<h2>Trocar by trocar</h2>\n" + markup.table(header, rows) + markup.small(note)
+
+
+def failures(runs: Sequence[results.Run]) -> str:
+    """How the failed trials failed: bars for one method, a table for several."""
+    if len(runs) > 1:
+        table = tables.failures(runs)
+        said = markup.plain(table, tables.FAILURES_NOTE)
+        return f"<h2>Failed trials</h2>\n{said}" if len(table) > 1 else ""
+    found = results.failures(runs[0].trials)
+    if not found:
+        return ""
+    lines = "".join(
+        f"<div>{results.FAILURES[key]}</div>"
+        f'<span class="unseen"><i style="width:{80 * n / max(found.values()):.1f}%"></i>{n}</span>'
+        for key, n in found.items()
+    )
+    said = f"{sum(found.values())} of {len(runs[0].trials)} trials failed."
+    note = markup.small(tables.FAILURES_NOTE)
+    return f'<h2>How it failed</h2>\n<p>{said}</p><div class="bars">{lines}</div>{note}'
+
+
+def measurements(runs: Sequence[results.Run]) -> str:
+    """RCM error, inference time (Table IV), wall-clock time a phase."""
+    parts = (
+        ("RCM error (mm)", tables.rcm(runs), tables.RCM_NOTE),
+        ("Inference time", tables.inference(runs), tables.INFERENCE_NOTE),
+        ("Where the time went", tables.phases(runs), tables.PHASES_NOTE),
+    )
+    return "\n".join(f"<h2>{h}</h2>\n{markup.plain(t, n)}" for h, t, n in parts if len(t) > 1)
+
+
+def reproduce(runs: Sequence[results.Run]) -> str:
+    """Commands, settings, versions."""
+    commands = dict.fromkeys(run.result["command"] for run in runs if run.result.get("command"))
+    text = "<h2>Run it again</h2>\n" if commands else ""
+    text += "".join(f"<pre>{markup.escape(command)}</pre>" for command in commands)
+    for run in runs:
+        lines = "\n".join(_flat(run.result.get("config") or {}))
+        if lines:
+            summary = f"<summary>Settings of {markup.escape(run.label)}</summary>"
+            text += f"<details>{summary}<pre>{markup.escape(lines)}</pre></details>\n"
+    versions = runs[0].result.get("versions")
+    return text + (f"<footer>{markup.escape(words.listing(versions))}</footer>" if versions else "")
+
+
+def _brief(rate: stats.Rate) -> str:
+    return f"{100 * rate.rate:.0f} ({rate.successes}/{rate.trials})"
+
+
+def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for name, value in config.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name} = {words.listing(value)}"

@@ -1,0 +1,74 @@
+"""One look for every figure: colour-blind safe (Okabe-Ito), thin axes, on light or on dark paper.
+
+Figures are made as `matplotlib.figure.Figure`, never through pyplot, so no backend is ever chosen.
+"""
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from starjax.experiments import methods
+
+SUCCESS, FAILURE = "#0072B2", "#D55E00"
+# In the order of the methods' table, so that a method keeps its colour in every figure.
+_METHODS = ("#D55E00", "#E69F00", "#CC79A7", "#8C6D4F", "#7F7F7F", "#56B4E9", "#009E73", "#0072B2")
+_MARKERS = "sD^v<>Po"
+MAP = "cividis"  # perceptually even, the same to every kind of colour vision
+
+_LIGHT = {"ink": "#1d2329", "muted": "#6b7480", "line": "#d9dee3", "paper": "#ffffff"}
+_DARK = {"ink": "#e6e9ec", "muted": "#98a2ad", "line": "#39424c", "paper": "#171b20"}
+
+
+@contextmanager
+def use(dark: bool = False) -> Iterator[dict[str, str]]:
+    """Draws under the report's style; yields the shades `ink`, `muted`, `line` and `paper`."""
+    import matplotlib
+
+    shades = _DARK if dark else _LIGHT
+    settings: dict[str, Any] = {
+        "figure.facecolor": shades["paper"],
+        "axes.facecolor": shades["paper"],
+        "text.color": shades["ink"],
+        "axes.labelcolor": shades["ink"],
+        "axes.edgecolor": shades["muted"],
+        "xtick.color": shades["muted"],
+        "ytick.color": shades["muted"],
+        "grid.color": shades["line"],
+        "axes.grid": True,
+        "axes.axisbelow": True,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.linewidth": 0.8,
+        "grid.linewidth": 0.6,
+        "lines.linewidth": 1.8,
+        "font.size": 9.0,
+        "axes.titlesize": 9.5,
+        "axes.titlelocation": "left",
+        "legend.frameon": False,
+    }
+    with matplotlib.rc_context(settings):
+        yield shades
+
+
+def method(name: str) -> tuple[str, str]:
+    """Colour and marker of a method."""
+    index = list(methods.METHODS).index(name) % len(_METHODS)
+    return _METHODS[index], _MARKERS[index]
+
+
+def save(figure: Any, kind: str) -> bytes:
+    """The figure as the bytes of a png or a pdf file, the same bytes for the same figure."""
+    import matplotlib
+
+    stream = io.BytesIO()
+    meta = {"CreationDate": None} if kind == "pdf" else {"Software": None}
+    with matplotlib.rc_context({"pdf.fonttype": 42}):  # text stays text, as journals ask
+        figure.savefig(stream, format=kind, dpi=180, metadata=meta)
+    return stream.getvalue()
+
+
+def percent_axis(axis: Any) -> None:
+    """Makes a y axis of fractions read 0-100%."""
+    axis.set_ylim(-0.03, 1.03)
+    axis.set_yticks([0, 0.25, 0.5, 0.75, 1], ["0", "25", "50", "75", "100%"])

@@ -1,0 +1,184 @@
+"""The paper's tables as markdown: success (III), paired tests, RCM error, inference time (IV)."""
+
+from collections.abc import Callable, Sequence
+
+from starjax.experiments.report import results, stats, words
+
+Table = list[list[str]]  # header first
+# Test of success -> (function of a trial, meaning).
+OUTCOMES: dict[str, tuple[Callable[[results.Trial], bool], str]] = {
+    "strict": (results.strict, "on the target peg, released, at rest, in time"),
+    "loose": (results.loose, "SurRoL's test: the block was near its place on the target peg"),
+    "safe": (results.safe, "strict, and the executed RCM error never passed 2 mm"),
+}
+
+
+def markdown(runs: Sequence[results.Run]) -> str:
+    """tables.md: every table that the runs have numbers for, each with a line on how to read it."""
+    parts = [
+        ("Table III. Task success on peg transfer (%)", success(runs), SUCCESS_NOTE),
+        ("Success by three tests (%)", outcomes(runs), OUTCOMES_NOTE),
+        ("Paired comparison with STAR-Diff", paired(runs), PAIRED_NOTE),
+        ("Failed trials", failures(runs), FAILURES_NOTE),
+        ("RCM error (mm)", rcm(runs), RCM_NOTE),
+        ("Table IV. Inference time", inference(runs), INFERENCE_NOTE),
+    ]
+    filled = [f"## {title}\n\n{render(t)}\n\n{note}\n" for title, t, note in parts if len(t) > 1]
+    return f"# {headline(runs)}\n\n" + "\n".join(filled)
+
+
+SUCCESS_NOTE = (
+    "Successes/trials and the 95% Wilson interval in brackets; the gap is seen minus unseen in "
+    "percentage points with Newcombe's 95% interval, and means little where both are low."
+)
+OUTCOMES_NOTE = (
+    ". ".join(f"{name.capitalize()}: {what}" for name, (_, what) in OUTCOMES.items()) + "."
+)
+PAIRED_NOTE = (
+    "McNemar's exact test on trials with the same trocar and seed; Holm corrects for the number "
+    "of comparisons."
+)
+FAILURES_NOTE = "Each failed trial is counted under the first class that applies."
+RCM_NOTE = (
+    "Distance of the shaft's axis from the trocar. Commanded: as the policy asked for it. "
+    "Executed: as the simulated arm did it."
+)
+PHASES_NOTE = "Wall-clock time; a stage that was already done counts nothing."
+INFERENCE_NOTE = (
+    "One call for one environment: encoder, DDIM and, where there is one, roll network."
+)
+
+
+def headline(runs: Sequence[results.Run]) -> str:
+    """What the tables are about, in a few words."""
+    observed = sorted({run.result["observation"] for run in runs})
+    return f"Peg transfer from {' and '.join(observed)} observations"
+
+
+def rate(score: stats.Rate) -> str:
+    """E.g. `74.0 (71/96) [64.4, 81.7]`."""
+    percent = [100 * x for x in (score.rate, score.low, score.high)]
+    counts = f"{score.successes}/{score.trials}"
+    return f"{percent[0]:.1f} ({counts}) [{percent[1]:.1f}, {percent[2]:.1f}]"
+
+
+def success(runs: Sequence[results.Run]) -> Table:
+    """Table III."""
+    table = [["Group", "Method", "Seen ↑", "Unseen ↑", "Gap ↓"]]
+    scores = [(run, *_seen_unseen(run, results.strict)) for run in runs if run.trials]
+    best = [max((s[part].rate for s in scores if s[part]), default=0.0) for part in (1, 2)]
+    for run, seen, unseen in scores:
+        cells = [rate(score) if score else "–" for score in (seen, unseen)]
+        for part, score in enumerate((seen, unseen)):
+            if len(scores) > 1 and score and score.rate == best[part]:
+                cells[part] = f"**{cells[part]}**"
+        cells.append(points(stats.gap(seen, unseen)) if seen and unseen else "–")
+        table.append([run.group, run.label, *cells])
+    return table
+
+
+def outcomes(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = rate) -> Table:
+    """Strict, loose and safe success, seen and unseen."""
+    header = [f"{name.capitalize()}, {part}" for name in OUTCOMES for part in ("seen", "unseen")]
+    table = [["Method", *header]]
+    for run in runs:
+        if run.trials:
+            scores = [s for test, _ in OUTCOMES.values() for s in _seen_unseen(run, test)]
+            table.append([run.label, *(cell(s) if s else "–" for s in scores)])
+    return table
+
+
+def failures(runs: Sequence[results.Run]) -> Table:
+    """Failed trials by class, classes that never occurred left out."""
+    counts = {run.label: results.failures(run.trials) for run in runs if run.trials}
+    classes = [key for key in results.FAILURES if any(key in found for found in counts.values())]
+    table = [["Method", *(results.SHORT[key].capitalize() for key in classes)]]
+    if classes:
+        table += [
+            [label, *(str(found.get(k, 0)) for k in classes)] for label, found in counts.items()
+        ]
+    return table
+
+
+def paired(runs: Sequence[results.Run]) -> Table:
+    """McNemar's test of STAR-Diff against every other method."""
+    table = [["Against", "Pairs", "Only STAR-Diff", "Only the other", "p", "p (Holm)"]]
+    first = next((run for run in runs if run.result["method"] == results.OURS), None)
+    tests = [(run, results.pair(first, run)) for run in runs if first and run is not first]
+    found = [(run, test) for run, test in tests if test]
+    corrected = stats.holm([test.p for _, test in found])
+    for (run, test), p in zip(found, corrected):
+        counts = [str(n) for n in (test.pairs, test.only_a, test.only_b)]
+        table.append([run.label, *counts, p_value(test.p), p_value(p)])
+    return table
+
+
+def rcm(runs: Sequence[results.Run]) -> Table:
+    """Commanded and executed RCM error."""
+    keys = (("commanded", "max"), ("executed", "mean"), ("executed", "p99"), ("executed", "max"))
+    table = [["Method", *(f"{kind.capitalize()} {what}" for kind, what in keys)]]
+    for run in runs:
+        errors = run.result.get("rcm_error_mm") or {}
+        values = [(errors.get(kind) or {}).get(what) for kind, what in keys]
+        if any(v is not None for v in values):
+            table.append([run.label, *("–" if v is None else millimetres(v) for v in values)])
+    return table
+
+
+def inference(runs: Sequence[results.Run]) -> Table:
+    """Table IV: latency in ms and the rate it allows, a row per method and number of DDIM steps."""
+    table = [["Method", "DDIM steps", "p50 (ms)", "p95 (ms)", "p99 (ms)", "p50 (Hz)", "p99 (Hz)"]]
+    for run in runs:
+        for steps, ms in results.latencies(run):
+            times = [f"{ms[q]:.1f}" for q in ("p50", "p95", "p99")]
+            table.append(
+                [run.label, str(steps), *times, *(f"{1e3 / ms[q]:.0f}" for q in ("p50", "p99"))]
+            )
+    return table
+
+
+def phases(runs: Sequence[results.Run]) -> Table:
+    """How long each phase of a run took."""
+    times = {run.label: run.result.get("timings_s") or {} for run in runs}
+    names = list(dict.fromkeys(name for found in times.values() for name in found))
+    table = [["Method", *(name.replace("_", " ").capitalize() for name in names), "Total"]]
+    for label, found in times.items():
+        spent = [found.get(name) for name in names]
+        if any(s is not None for s in spent):
+            total = words.duration(sum(s for s in spent if s is not None))
+            table.append([label, *("–" if s is None else words.duration(s) for s in spent), total])
+    return table
+
+
+def render(table: Table) -> str:
+    """A table as markdown; columns after the names are set to the right."""
+    names = names_in(table[0])
+    rule = ["---"] * names + ["---:"] * (len(table[0]) - names)
+    return "\n".join("| " + " | ".join(row) + " |" for row in [table[0], rule, *table[1:]])
+
+
+def names_in(header: Sequence[str]) -> int:
+    """How many of the first columns hold names, not numbers."""
+    return sum(title in ("Group", "Method", "Against") for title in header)
+
+
+def points(difference: tuple[float, float, float]) -> str:
+    """E.g. `+13.5 [-2.7, 29.9]`, percentage points."""
+    middle, low, high = (100 * x for x in difference)
+    return f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]"
+
+
+def millimetres(value: float) -> str:
+    """Three decimals, four below a hundredth, and no claim of less than 1e-4 mm."""
+    return "<0.0001" if 0 < value < 1e-4 else f"{value:.4f}" if value < 0.01 else f"{value:.3f}"
+
+
+def p_value(p: float) -> str:
+    """Two digits, and no claim of more than 1e-4."""
+    return "<0.0001" if p < 1e-4 else f"{p:.4f}" if p < 0.01 else f"{p:.2f}"
+
+
+def _seen_unseen(
+    run: results.Run, test: Callable[[results.Trial], bool]
+) -> list[stats.Rate | None]:
+    return [results.tally(t, test) if t else None for t in results.split(run.trials)]

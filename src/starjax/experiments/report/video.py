@@ -1,0 +1,182 @@
+"""The rollout video: recorded joint positions drawn again by the simulator's own camera."""
+
+import itertools
+import pathlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from starjax.experiments.report import results
+
+Draw = Callable[[results.Rollout, int], np.ndarray]
+
+FPS = 30  # a picture a control step: real time
+SIZE = 384  # pixels a side of one rollout's picture
+_BAR = 32  # pixels of the caption under it
+_HOLD = 1.5  # s that the last picture stays
+_LONGEST = 15.0  # s shown of a rollout
+_BATCH = 16  # pictures drawn in one call
+
+
+def choose(runs: Sequence[results.Run], most: int = 4) -> list[tuple[str, results.Rollout]]:
+    """(method, rollout) to show side by side, an even number if there are two or more.
+
+    One run: half of them at seen and half at unseen trocars, spread over these. Several runs:
+    one trial that all of them recorded, at an unseen trocar if there is one. The choice does not
+    look at how a rollout ended.
+    """
+    if len(runs) > 1:
+        return _same_trial(runs, most)
+    pool = [r for run in runs for r in run.rollouts if r.qpos is not None]
+    seen = _spread([r for r in pool if r.trial["seen"]], most // 2)
+    unseen = _spread([r for r in pool if not r.trial["seen"]], most - len(seen))
+    chosen = [*_spread([r for r in pool if r.trial["seen"]], most - len(unseen)), *unseen]
+    even = len(chosen) if len(chosen) < 2 else len(chosen) // 2 * 2
+    return [(runs[0].label, r) for r in chosen[:even]]
+
+
+def frames(
+    chosen: Sequence[tuple[str, results.Rollout]], draw: Draw, several: bool = False
+) -> Iterator[np.ndarray]:
+    """Pictures `[h, w, 3]` uint8 of the chosen rollouts in real time, two in a row, captions under.
+
+    Drawn while they are asked for: a whole video would not fit the memory of a small machine.
+
+    Args:
+      chosen: from `choose`.
+      draw: from `renderer`.
+      several: whether captions name the method.
+    """
+    clips = [_clip(draw, method if several else "", rollout) for method, rollout in chosen]
+    last: list[np.ndarray] = []
+    for now in itertools.zip_longest(*clips):
+        # A clip that ends early stays as it ended.
+        last = [old if new is None else new for new, old in zip(now, last or now)]
+        yield _grid(last)
+    for _ in range(round(_HOLD * FPS)):
+        yield _grid(last)
+
+
+def renderer(sim: Any, size: int = SIZE) -> Draw:
+    """Builds `draw(rollout, first) -> [_BATCH, size, size, 3]` uint8 from step `first` on.
+
+    Args:
+      sim: `sim.model.SimModel`, what `Env.model` is.
+    """
+    import jax
+
+    from starjax.sim import physics, render
+
+    # Smooth outlines cost four times as much: a matter of seconds on a GPU, of minutes on a CPU.
+    samples = 1 if jax.default_backend() == "cpu" else 2
+    camera = render.make(sim.mj_model, "camera", size, size, samples=samples)
+
+    @jax.jit
+    def batch(qpos: jax.Array, port: jax.Array, target: jax.Array) -> jax.Array:
+        rgb = physics.colours(sim, target)
+
+        def one(q: jax.Array) -> jax.Array:
+            return camera(*physics.geom_poses(sim, q, port), rgb).rgb
+
+        return jax.lax.map(one, qpos)
+
+    def draw(rollout: results.Rollout, first: int) -> np.ndarray:
+        if rollout.qpos is None:
+            raise ValueError("rollout: expected one with joint positions, got none")
+        rows = np.minimum(np.arange(first, first + _BATCH), len(rollout.qpos) - 1)
+        port, target = rollout.p_world_trocar.astype(np.float32), np.int32(rollout.target_peg)
+        return np.asarray(batch(rollout.qpos[rows].astype(np.float32), port, target))
+
+    return draw
+
+
+def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) -> None:
+    """Writes `[h, w, 3]` uint8 pictures as H.264 in yuv420p, which every browser plays."""
+    import imageio_ffmpeg
+
+    stream = iter(pictures)
+    first = next(stream)
+    if first.dtype != np.uint8 or first.ndim != 3 or any(n % 2 for n in first.shape[:2]):
+        said = f"{first.dtype} {list(first.shape)}"
+        raise ValueError(f"pictures: expected uint8 [h, w, 3] with h and w even, got {said}")
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        (first.shape[1], first.shape[0]),
+        fps=fps,
+        codec="libx264",
+        pix_fmt_out="yuv420p",
+        macro_block_size=2,
+        output_params=["-crf", "23", "-movflags", "+faststart"],
+        ffmpeg_log_level="error",
+    )
+    writer.send(None)
+    try:
+        for picture in itertools.chain([first], stream):
+            writer.send(np.ascontiguousarray(picture))
+    finally:
+        writer.close()
+
+
+def caption(texts: Sequence[tuple[str, str]], width: int, height: int = _BAR) -> np.ndarray:
+    """`[height, width, 3]` uint8: a dark bar with (text, colour) at its left and its right."""
+    from matplotlib import font_manager
+    from PIL import Image, ImageDraw, ImageFont
+
+    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), round(0.4 * height))
+    image = Image.new("RGB", (width, height), "#14181c")
+    pen, middle, margin = ImageDraw.Draw(image), height / 2, round(0.3 * height)
+    for (text, color), (x, anchor) in zip(texts, ((margin, "lm"), (width - margin, "rm"))):
+        pen.text((x, middle), text, fill=color, font=font, anchor=anchor)
+    return np.asarray(image)
+
+
+def _clip(draw: Draw, method: str, rollout: results.Rollout) -> Iterator[np.ndarray]:
+    """Pictures of one rollout over a bar: what is shown, the clock, and at the end the outcome."""
+    kind, index = "seen" if rollout.trial["seen"] else "unseen", rollout.trial["trocar"]
+    name = (f"{method}, {kind} trocar" if method else f"{kind} trocar {index}", "#e6e9ec")
+    steps = min(len(rollout.p_world_tip), round(_LONGEST * FPS))
+    for first in range(0, steps, _BATCH):
+        for step, picture in enumerate(draw(rollout, first)[: steps - first], start=first):
+            clock = (f"{step // FPS} s", "#98a2ad")
+            right = _outcome(rollout, steps) if step == steps - 1 else clock
+            yield np.concatenate([picture, caption([name, right], picture.shape[1])])
+
+
+def _outcome(rollout: results.Rollout, steps: int) -> tuple[str, str]:
+    """(text, colour) of the last caption."""
+    won = results.strict(rollout.trial)
+    text = "success" if won else results.SHORT[results.failure(rollout.trial)]
+    total = len(rollout.p_world_tip) / FPS
+    shown = "" if steps == len(rollout.p_world_tip) else f" (first {steps // FPS} s shown)"
+    return f"{text}, {total:.1f} s{shown}", "#5ab4e8" if won else "#f09a5a"
+
+
+def _grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
+    rows = [np.concatenate(tiles[i : i + 2], axis=1) for i in range(0, len(tiles), 2)]
+    return np.concatenate(rows)
+
+
+def _spread(rollouts: list[results.Rollout], most: int) -> list[results.Rollout]:
+    """Up to `most` of them, spread evenly; each trocar's first trial before any second one."""
+    ordered = sorted(rollouts, key=lambda r: (r.trial["trial"], r.trial["trocar"]))
+    first = [r for r in ordered if r.trial["trial"] == ordered[0].trial["trial"]]
+    pool = first if len(first) >= most else ordered
+    picks = np.linspace(0, len(pool) - 1, min(most, len(pool))).round().astype(int)
+    return [pool[i] for i in picks]
+
+
+def _same_trial(runs: Sequence[results.Run], most: int) -> list[tuple[str, results.Rollout]]:
+    """The same trial of up to `most` runs; the last ones where there are more."""
+    kept = [
+        {(r.trial["trocar"], r.trial["trial"]): r for r in run.rollouts if r.qpos is not None}
+        for run in runs
+    ]
+    found = [(run.label, rollouts) for run, rollouts in zip(runs, kept) if rollouts][-most:]
+    if not found:
+        return []
+    common = set.intersection(*(set(rollouts) for _, rollouts in found))
+    if not common:
+        return []
+    pick = min(common, key=lambda key: (found[0][1][key].trial["seen"], *key))
+    return [(label, rollouts[pick]) for label, rollouts in found]

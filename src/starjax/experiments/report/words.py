@@ -1,0 +1,82 @@
+"""What the numbers say, in plain words."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from starjax.experiments.report import results, stats
+
+
+def title(runs: Sequence[results.Run]) -> str:
+    """Heading of the page."""
+    if len(runs) == 1:
+        return f"{runs[0].label} on peg transfer"
+    return f"{len(runs)} methods on peg transfer"
+
+
+def verdict(runs: Sequence[results.Run], focus: results.Run) -> str:
+    """One or two sentences that a reader in a hurry may stop after."""
+    seen, unseen = (results.tally(t) if t else None for t in results.split(focus.trials))
+    if seen is None and unseen is None:
+        return f"{focus.label} was trained but not evaluated."
+    known = f"Through trocars it was trained on, {focus.label} moved the block to its peg in "
+    text = known + fraction(seen) if seen else ""
+    if unseen and seen:
+        percent = f"{100 * unseen.rate:.0f}%"
+        text += f"; through trocars it had never met, in {unseen.successes} of {unseen.trials} "
+        text += f"({percent}). {_gap(seen, unseen)}"
+    elif unseen:
+        text += known.replace("it was trained on", "it had never met") + fraction(unseen) + "."
+    else:
+        text += "."
+    return f"{text} {_rank(runs, focus)}".rstrip()
+
+
+def fraction(score: stats.Rate) -> str:
+    """E.g. `40 of 48 trials (83%)`."""
+    return f"{score.successes} of {score.trials} trials ({100 * score.rate:.0f}%)"
+
+
+def interval(score: stats.Rate) -> str:
+    """E.g. `95% interval 70-91%`."""
+    return f"95% interval {100 * score.low:.0f}–{100 * score.high:.0f}%"
+
+
+def duration(seconds: float) -> str:
+    """E.g. `42 s`, `7 min 2 s`, `3 h 12 min`."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def listing(value: Any) -> str:
+    """A small JSON value as a phrase."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {listing(part)}" for key, part in value.items())
+    if isinstance(value, list):
+        return ", ".join(listing(part) for part in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _gap(seen: stats.Rate, unseen: stats.Rate) -> str:
+    middle, low, high = (100 * x for x in stats.gap(seen, unseen))
+    if low >= 0.5:
+        lost = f"{middle:.0f} points (95% interval {low:.0f} to {high:.0f})"
+        return f"A new trocar costs it {lost}."
+    if high <= -0.5:
+        return f"It does better on the new ones, by {-middle:.0f} points."
+    bounds = f"{low:+.0f} to {high:+.0f} points"
+    return f"The difference between the two may be chance (95% interval {bounds})."
+
+
+def _rank(runs: Sequence[results.Run], focus: results.Run) -> str:
+    """How the others do on unseen trocars, where methods are meant to differ."""
+    scores = []
+    for run in runs:
+        unseen = results.split(run.trials)[1]
+        if run is not focus and unseen:
+            scores.append((results.tally(unseen).rate, run.label))
+    if not scores:
+        return ""
+    best, label = max(scores)
+    return f"The best of the others on new trocars, {label}, reached {100 * best:.0f}%."
