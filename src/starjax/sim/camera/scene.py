@@ -5,7 +5,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-CAPSULE, CYLINDER, BOX, PLANE = range(4)  # kinds, in slot order; a sphere is a capsule of length 0
+CAPSULE, CYLINDER, BOX, PLANE = range(4)  # kinds, in this order; a sphere is a capsule of length 0
+FACES = (1, 2, 3, 1)  # faces that the camera can see of one: round; side, disc; x, y, z; top
 _KIND_OF = {
     int(mujoco.mjtGeom.mjGEOM_SPHERE): CAPSULE,
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): CAPSULE,
@@ -29,36 +30,33 @@ class Light(NamedTuple):
 
 
 class Texture(NamedTuple):
-    """A checkered texture with optional grid lines, as MuJoCo's builtin "checker" and "flat".
+    """A picture on the top of a plane or box that is fixed in the world.
 
     Attributes:
-      slot: the geom that wears it.
-      repeat: `[2]` repeats per metre along the geom's local x and y.
-      origin: `[2]` texture coordinate at the geom's centre.
-      colours: `[2, 3]` the two cells' RGB.
-      line: `[3]` RGB of the grid line at the edge of every repeat.
-      line_width: of that line over the size of a repeat, 0 for none.
+      texels: `[h, w, 3]` RGB.
+      scale: `[2]` texture coordinates per metre along the geom's x and y.
+      R_cam_geom, p_cam_top: `[3, 3]` and `[3]` m, pose of the textured face.
     """
 
-    slot: int
-    repeat: np.ndarray
-    origin: np.ndarray
-    colours: np.ndarray
-    line: np.ndarray
-    line_width: float
+    texels: np.ndarray
+    scale: np.ndarray
+    R_cam_geom: np.ndarray
+    p_cam_top: np.ndarray
 
 
 class Scene(NamedTuple):
-    """Drawn geoms in slots sorted by kind, the camera and its light.
+    """Drawn geoms in rows sorted by kind, the camera and its lights.
+
+    Pixels name the face they see: faces are numbered row by row, `FACES[kind]` for each.
 
     Attributes:
-      ids: `[N]` geom id of every slot.
+      ids: `[N]` geom id of every row.
       kind: `[N]` CAPSULE, CYLINDER, BOX or PLANE.
       axes: `[N, 3]` half-sizes of the box that, rounded by `rounding`, holds the shape; m.
       rounding: `[N]` m.
       size: `[N, 3]` radius, half-length and 0, or the half-sizes of a box or plane; m.
       rgb, specular, exponent, emission: `[N, 3]` and `[N]` material, as MuJoCo defines it.
-      textures: of the textured slots.
+      textures: by row.
       R_world_cam, p_world_cam: camera pose (x right, y up, it looks along -z); m.
       left, right, bottom, top: the picture's sides in the plane at depth 1.
       sun: the first directional light, or None.
@@ -75,7 +73,7 @@ class Scene(NamedTuple):
     specular: np.ndarray
     exponent: np.ndarray
     emission: np.ndarray
-    textures: tuple[Texture, ...]
+    textures: dict[int, Texture]
     R_world_cam: np.ndarray
     p_world_cam: np.ndarray
     left: float
@@ -86,10 +84,18 @@ class Scene(NamedTuple):
     headlight: Light
     background: np.ndarray
 
-    def slots(self, kind: int) -> range:
-        """Slots of one kind; they are consecutive."""
-        start = int(np.searchsorted(self.kind, kind))
-        return range(start, int(np.searchsorted(self.kind, kind, side="right")))
+    def rows(self, kind: int) -> slice:
+        """Rows of one kind."""
+        start, stop = np.searchsorted(self.kind, (kind, kind + 1))
+        return slice(int(start), int(stop))
+
+    def first_face(self, kind: int) -> int:
+        """Number of the first face of a kind."""
+        return int(np.sum(np.take(FACES, self.kind[self.kind < kind])))
+
+    def row_of_face(self) -> np.ndarray:
+        """`[F]` row of every face."""
+        return np.repeat(np.arange(len(self.kind)), np.take(FACES, self.kind))
 
 
 def read(mj_model: mujoco.MjModel, camera: str, aspect: float) -> Scene:
@@ -129,7 +135,7 @@ def read(mj_model: mujoco.MjModel, camera: str, aspect: float) -> Scene:
         specular=specular,
         exponent=128 * shininess,
         emission=emission,
-        textures=_textures(mj_model, ids),
+        textures=_textures(mj_model, data, ids, R_world_cam, data.cam_xpos[cam]),
         R_world_cam=R_world_cam,
         p_world_cam=data.cam_xpos[cam].copy(),
         left=left,
@@ -158,7 +164,7 @@ def _rgba(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def _sizes(mj_model, ids, kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sizes by slot, and the rounded box that holds each shape."""
+    """Sizes by row, and the rounded box that holds each shape."""
     size = mj_model.geom_size[ids].copy()
     size[mj_model.geom_type[ids] == mujoco.mjtGeom.mjGEOM_SPHERE, 1] = 0
     size[np.isin(kind, (CAPSULE, CYLINDER)), 2] = 0
@@ -173,7 +179,7 @@ def _sizes(mj_model, ids, kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _materials(mj_model, ids) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Specular, shininess and emission by slot; MuJoCo's defaults without a material."""
+    """Specular, shininess and emission by row; MuJoCo's defaults without a material."""
     mat = mj_model.geom_matid[ids]
     if mj_model.nmat == 0:
         return np.full(len(ids), 0.5), np.full(len(ids), 0.5), np.zeros(len(ids))
@@ -229,33 +235,27 @@ def _sky(mj_model) -> np.ndarray:
     return np.zeros(3)
 
 
-def _textures(mj_model, ids) -> tuple[Texture, ...]:
-    """Textures of the slots whose material has one."""
-    found = []
-    for slot, g in enumerate(ids):
+def _textures(mj_model, data, ids, R_world_cam, p_world_cam) -> dict[int, Texture]:
+    """Textures of the rows whose material has one, mapped as MuJoCo maps 2d textures."""
+    found = {}
+    for row, g in enumerate(ids):
         mat = mj_model.geom_matid[g]
         tex = mj_model.mat_texid[mat, mujoco.mjtTextureRole.mjTEXROLE_RGB] if mat >= 0 else -1
         if tex < 0:
             continue
-        texels = _texels(mj_model, tex)
-        h, w, _ = texels.shape
-        colours = np.stack([texels[h // 4, w // 4], texels[h // 4, 3 * w // 4]])
-        line = texels[0, w // 4]
-        width = 0.0 if np.allclose(line, colours[0]) else 2 / w
-        v, u = np.mgrid[:h, :w]
-        expected = colours[((v >= h // 2) ^ (u >= w // 2)).astype(int)]
-        if width:
-            expected[np.isin(v, (0, h - 1)) | np.isin(u, (0, w - 1))] = line
-        name = mj_model.texture(tex).name
-        if mj_model.tex_type[tex] != mujoco.mjtTexture.mjTEXTURE_2D or h != w:
-            raise ValueError(f"texture {name!r}: expected a square 2d texture")
-        if np.abs(expected - texels).max() > 2 / 255:
-            raise ValueError(f"texture {name!r}: expected checker or flat, marked 'edge' or not")
-        repeat = 0.5 * mj_model.mat_texrepeat[mat]
+        name, shape = mj_model.geom(g).name, _KIND_OF[int(mj_model.geom_type[g])]
+        flat = mj_model.tex_type[tex] == mujoco.mjtTexture.mjTEXTURE_2D
+        if not flat or shape not in (BOX, PLANE) or mj_model.geom_bodyid[g] != 0:
+            raise ValueError(
+                f"geom {name!r}: expected a 2d texture on a plane or box of the world body"
+            )
+        scale = 0.5 * mj_model.mat_texrepeat[mat] * np.array([1, -1])
         if not mj_model.mat_texuniform[mat]:
-            repeat = repeat / mj_model.geom_size[g, :2]
-        origin = np.array([-0.5, -0.5])
-        found.append(
-            Texture(slot, repeat * np.array([1, -1]), origin, colours, line, float(width))
-        )
-    return tuple(found)
+            scale = scale / mj_model.geom_size[g, :2]
+        R_world_geom = data.geom_xmat[g].reshape(3, 3)
+        top = data.geom_xpos[g] + R_world_geom[:, 2] * mj_model.geom_size[g, 2] * (shape == BOX)
+        found[row] = Texture(
+            _texels(mj_model, tex), scale, R_world_cam.T @ R_world_geom,
+            R_world_cam.T @ (top - p_world_cam),
+        )  # fmt: skip
+    return found

@@ -15,6 +15,7 @@ FAR = 2.0**20  # m, depth of a miss; a power of two survives the packing with a 
 NEAR = 1e-4  # m, nothing closer to the camera is drawn
 SKIN = 2e-5  # m, a shadow ray starts this far above its surface
 _TINY = 1e-9
+_DISTANT = 1e6  # m, the centre of the ball that stands for a flat face
 
 Array = jax.Array
 
@@ -38,14 +39,44 @@ def features(kind: int, c: Array, R: Array, size: Array) -> Array:
     return jnp.pad(table, ((0, 0), (0, 16 - table.shape[1])))
 
 
-def view(kind: int, x: Array, y: Array, f: list[Array]) -> Array:
-    """Depth in m at which the rays through (x, y, -1) meet a geom of one kind, FAR for a miss."""
+def view(kind: int, x: Array, y: Array, f: list[Array]) -> tuple[Array, Array | int]:
+    """Where the rays through (x, y, -1) meet a geom: depth in m, FAR for a miss, and which face."""
     return (_view_capsule, _view_cylinder, _view_box, _view_plane)[kind](x, y, f)
 
 
 def shadow(kind: int, p: list[Array], f: list[Array]) -> Array:
     """Whether a capsule, cylinder or box lies above the points `p`, given in the light frame."""
     return (_shadow_capsule, _shadow_cylinder, _shadow_box)[kind](p, f)
+
+
+def normals(kind: int, c: Array, R: Array, size: Array) -> Array:
+    """The field of normals of every face: `[N * FACES[kind], 7]` as (c, u, half) of `normal`.
+
+    Args:
+      c, R, size: as for `features`, in the camera frame.
+    """
+    u, half = R[:, :, 2], size[:, 1]
+    if kind == scenes.CAPSULE:
+        return jnp.concatenate([c, u, half[:, None]], -1)
+    facing = R * jnp.where(jnp.einsum("gij,gi->gj", R, c) < 0, 1.0, -1.0)[:, None]
+    flat = -_DISTANT * jnp.swapaxes(facing, 1, 2)  # `[N, 3, 3]`, one row a face
+    flat = jnp.pad(flat, ((0, 0), (0, 0), (0, 4)))
+    if kind == scenes.CYLINDER:
+        side = jnp.concatenate([c, u, jnp.full_like(half, FAR)[:, None]], -1)
+        return jnp.stack([side, flat[:, 2]], 1).reshape(-1, 7)
+    return flat[:, 2] if kind == scenes.PLANE else flat.reshape(-1, 7)
+
+
+def normal(p: list[Array], f: list[Array]) -> list[Array]:
+    """Unit normal at the points `p` of a face: away from the nearest point of its axis.
+
+    Capsule and cylinder differ in how far the axis reaches; a flat face is a ball far behind it.
+    """
+    w = [p[k] - f[k] for k in range(3)]
+    along = jnp.clip(w[0] * f[3] + w[1] * f[4] + w[2] * f[5], -f[6], f[6])
+    w = [w[k] - along * f[3 + k] for k in range(3)]
+    scale = jax.lax.rsqrt(jnp.maximum(w[0] * w[0] + w[1] * w[1] + w[2] * w[2], 1e-18))
+    return [v * scale for v in w]
 
 
 def _round(x, y, f):
@@ -73,7 +104,7 @@ def _view_capsule(x, y, f):
     t = jnp.where(
         (h > 0) & (jnp.abs(along) <= half), t, jnp.where((h > 0) & (h_end > 0), t_end, FAR)
     )
-    return jnp.where(t > NEAR, t, FAR)
+    return jnp.where(t > NEAR, t, FAR), 0
 
 
 def _view_cylinder(x, y, f):
@@ -84,7 +115,7 @@ def _view_cylinder(x, y, f):
     t_disc = (-jnp.sign(m) * half - n) / m
     across = a * t_disc + b
     on_disc = (across * across + s * s <= a * r * r) & (t_disc > NEAR)
-    return jnp.where(on_side, t, jnp.where(on_disc, t_disc, FAR))
+    return jnp.where(on_side, t, jnp.where(on_disc, t_disc, FAR)), jnp.where(on_side, 0, 1)
 
 
 def _local(x, y, f):
@@ -97,19 +128,21 @@ def _inverse(v):
 
 
 def _view_box(x, y, f):
-    near, far = -FAR, FAR
+    near, far, face = -FAR, FAR, 0
     for k, v in enumerate(_local(x, y, f)):
         inverse = _inverse(v)
         middle, width = -f[k] * inverse, jnp.abs(inverse) * f[12 + k]
-        near, far = jnp.maximum(near, middle - width), jnp.minimum(far, middle + width)
-    return jnp.where((near <= far) & (near > NEAR), near, FAR)
+        enter = middle - width
+        face = jnp.where(enter > near, k, face)
+        near, far = jnp.maximum(near, enter), jnp.minimum(far, middle + width)
+    return jnp.where((near <= far) & (near > NEAR), near, FAR), face
 
 
 def _view_plane(x, y, f):
     v = _local(x, y, f)
     t = -f[2] * _inverse(v[2])
     inside = (jnp.abs(f[0] + t * v[0]) <= f[12]) & (jnp.abs(f[1] + t * v[1]) <= f[13])
-    return jnp.where((v[2] < 0) & (t > NEAR) & inside, t, FAR)
+    return jnp.where((v[2] < 0) & (t > NEAR) & inside, t, FAR), 0
 
 
 def _shadow_capsule(p, f):

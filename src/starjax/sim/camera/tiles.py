@@ -54,14 +54,18 @@ def grid(scene: scenes.Scene, height: int, width: int) -> Grid:
     )
 
 
-def picture(grid: Grid, tiled: Array, samples: int) -> Array:
-    """From `[T, Q, ...]` to `[h, w, samples, samples, ...]`, the overhang cut off."""
-    rows, cols, n = len(grid.edges_y) - 1, len(grid.edges_x) - 1, SIDE // samples
-    rest = tiled.shape[2:]
-    parts = tiled.reshape(rows, cols, n, samples, n, samples, *rest)
-    order = (0, 2, 1, 4, 3, 5, *range(6, 6 + len(rest)))
-    whole = parts.transpose(order).reshape(rows * n, cols * n, samples, samples, *rest)
-    return whole[: grid.height // samples, : grid.width // samples]
+def picture(grid: Grid, tiled: Array) -> Array:
+    """From `[T, n * n]`, n a divisor of SIDE, to `[h, w]`, the overhang cut off."""
+    rows, cols, n = len(grid.edges_y) - 1, len(grid.edges_x) - 1, int(tiled.shape[1] ** 0.5)
+    whole = tiled.reshape(rows, cols, n, n).swapaxes(1, 2).reshape(rows * n, cols * n)
+    return whole[: grid.height * n // SIDE, : grid.width * n // SIDE]
+
+
+def pixels(tiled: Array, samples: int) -> Array:
+    """The samples of every pixel apart: from `[T, Q]` to `[T, q, samples * samples]`."""
+    n = SIDE // samples
+    parts = tiled.reshape(-1, n, samples, n, samples).swapaxes(2, 3)
+    return parts.reshape(-1, n * n, samples * samples)
 
 
 def in_view(grid: Grid, c: Array, R: Array, axes: Array, rounding: Array) -> Array:
@@ -126,14 +130,13 @@ def over(low: Array, high: Array, c: Array, R: Array, axes: Array, rounding: Arr
 
 
 def each(
-    overlap: Array, table: Array, start: int, visit: Callable[[Array, Array, list[Array]], Array],
-    carry: Array,
-) -> Array:  # fmt: skip
-    """Folds `carry = visit(carry, slot, features)` over the overlapping geoms of every tile.
+    overlap: Array, table: Array, visit: Callable[[Array, Array, list[Array]], Array], carry: Array
+) -> Array:
+    """Folds `carry = visit(carry, row, features)` over the overlapping geoms of every tile.
 
     Args:
-      overlap: `[T, N]` bool; table: `[N, F]`; start: slot of the first row.
-      visit: sees slot `[T, 1]` (-1 where a tile has none left) and F features `[T, 1]`.
+      overlap: `[T, N]` bool; table: `[N, F]`.
+      visit: sees row `[T, 1]` (-1 where a tile has none left) and F features `[T, 1]`.
     """
     for first in range(0, overlap.shape[1], 32):
         part = overlap[:, first : first + 32]
@@ -144,10 +147,11 @@ def each(
             words, carry = state
             lowest = words & (~words + jnp.uint32(1))
             index = first + 31 - jax.lax.clz(lowest).astype(jnp.int32)
-            row = table[jnp.maximum(index, 0)]
-            slot = jnp.where(words > 0, index + start, -1)
-            columns = [row[:, k, None] for k in range(table.shape[1])]
-            return words ^ lowest, visit(carry, slot[:, None], columns)
+            columns = list(table.T[:, jnp.maximum(index, 0)])
+            row = jnp.where(words > 0, index, -1)
+            # Without the barrier XLA looks every feature up again for every pixel.
+            row, *columns = jax.lax.optimization_barrier([row, *columns])
+            return words ^ lowest, visit(carry, row[:, None], [v[:, None] for v in columns])
 
         _, carry = jax.lax.while_loop(lambda state: jnp.any(state[0] > 0), take, (words, carry))
     return carry
