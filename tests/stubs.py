@@ -61,7 +61,6 @@ def make_env(observation: str = "state", unlucky: float = 0.25) -> Env:
         goal = jax.random.uniform(key_goal, (3,), minval=-0.05, maxval=0.05)
         fate = jnp.where(jax.random.uniform(key_luck) < unlucky, 5.0, jnp.inf)
         p = jnp.array([0.0, 0.0, 0.02])
-        port = rcm.trocar_position(params.trocar, P_WORLD_REF)
         no = jnp.zeros((), bool)
         return State(
             sim=Physics(jnp.concatenate([p, fate[None]])),
@@ -76,12 +75,11 @@ def make_env(observation: str = "state", unlucky: float = 0.25) -> Env:
             invalid=no,
             collided=no,
             rcm_error=jnp.zeros(()),
-            pose=rcm.project(Pose(jnp.eye(3), p), port),
+            pose=Pose(jnp.eye(3), p),
             gripper=jnp.ones(()),
         )
 
     def step(state, command):
-        port = rcm.trocar_position(state.trocar, P_WORLD_REF)
         delta = command.pose.p - state.pose.p
         p = state.pose.p + delta * jnp.minimum(
             1.0, SPEED / jnp.maximum(jnp.linalg.norm(delta), 1e-9)
@@ -97,7 +95,7 @@ def make_env(observation: str = "state", unlucky: float = 0.25) -> Env:
             done=success | invalid,
             collided=state.collided | (p[2] < -0.03),
             rcm_error=0.1 * jnp.linalg.norm(delta),
-            pose=rcm.project(Pose(command.pose.R, p), port),
+            pose=Pose(command.pose.R, p),
             gripper=command.gripper,
         )
         return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, after)
@@ -126,8 +124,7 @@ def _act(key, state):
     noise = 0.002 * jax.random.normal(key_noise, (3,))
     delta = state.goal + noise - state.pose.p
     p = state.pose.p + delta * jnp.minimum(1.0, SPEED / jnp.maximum(jnp.linalg.norm(delta), 1e-9))
-    port = rcm.trocar_position(state.trocar, P_WORLD_REF)
-    return Command(rcm.project(Pose(state.pose.R, p), port), jnp.ones(())), key
+    return Command(Pose(state.pose.R, p), jnp.ones(())), key
 
 
 class Policy(NamedTuple):
@@ -155,8 +152,7 @@ def make_policy(horizon: int = 6, width: int = 64) -> tuple[Policy, object]:
         delta = (last.state[:, :3] + error - last.pose.p)[:, None]
         far = jnp.linalg.norm(delta, axis=-1, keepdims=True)
         p = last.pose.p[:, None] + delta * jnp.minimum(1.0, SPEED * ahead / jnp.maximum(far, 1e-9))
-        port = rcm.trocar_position(trocar, P_WORLD_REF)[:, None]
         R = jnp.broadcast_to(last.pose.R[:, None], (count, horizon, 3, 3))
-        return Command(rcm.project(Pose(R, p), port), jnp.ones((count, horizon)))
+        return Command(Pose(R, p), jnp.ones((count, horizon)))
 
     return Policy(sample), params

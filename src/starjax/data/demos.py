@@ -1,4 +1,4 @@
-"""Collects demonstrations: the scripted expert in every trocar, as one program over (trocar, trial).
+"""Collects demonstrations: the expert in every trocar, as one program over (trocar, trial).
 
 What ends up on disk is a function of the description and the seed alone. Trials are drawn in waves:
 `per_trocar` at each trocar, then as many as failed, until every trocar has its successes; so the
@@ -7,6 +7,7 @@ run, and a chunk with a missing episode is simulated again as a whole: after any
 same command ends in the same bytes.
 """
 
+import concurrent.futures
 import hashlib
 import math
 from collections.abc import Callable, Sequence
@@ -27,7 +28,7 @@ SEGMENT = 64  # control steps between two looks at the host: bounds the memory o
 MIN_SUCCESS_RATE = 0.5  # below it at some trocar, the expert is broken and collecting stops
 # Demonstrations never start from the states that an evaluation with the same seed draws.
 _STREAM = 0x64656D6F
-
+COMMITS = 8  # episodes written at once
 FRAME_GUESS = 300  # control steps of a typical demonstration, for the estimate of disk space
 
 FIELDS = {
@@ -145,6 +146,7 @@ def collect(
     trocars = Trocar(*(np.asarray(field, np.float32) for field in trocars))
     frame_bytes = sum(math.prod(x.shape) * x.dtype.itemsize for x in _frame(env).values())
     total = per_trocar * len(trocars.radius)
+
     with files.lock(root):
         description = describe(
             env,
@@ -157,26 +159,33 @@ def collect(
         store.create(root, description)
         store.clean(root)
         records = _sound(root, report)
-        missing = max(total - sum(r["success"] for r in records.values()), 0)
-        files.require_writable(root, missing * min(max_steps, FRAME_GUESS) * frame_bytes)
+        done = sum(r["success"] for r in records.values())
+        files.require_writable(
+            root, max(total - done, 0) * min(max_steps, FRAME_GUESS) * frame_bytes
+        )
         chunk = chunk or _chunk(total, frame_bytes, devices)
         chunk = -(-chunk // len(devices or [0])) * len(devices or [0])
-        simulate = _simulator(env, expert, seed, max_steps, chunk, devices)
-        with progress.track(
-            "Demonstrations", total, unit="episodes", done=total - missing
-        ) as advance:
+        simulate = _simulator(env, expert, trocars, seed, max_steps, chunk, devices)
+        shown = progress.track("Demonstrations", total, unit="episodes", done=done)
+        with shown as advance, concurrent.futures.ThreadPoolExecutor(COMMITS) as pool:
             drawn = np.zeros(len(trocars.radius), int)
             while wave := _wave(records, drawn, per_trocar, seed):
                 for group in (wave[i : i + chunk] for i in range(0, len(wave), chunk)):
-                    if all(store.key(*trial, seed) in records for trial in group):
+                    missing = [i for i, t in enumerate(group) if store.key(*t, seed) not in records]
+                    if not missing:
                         continue
-                    for trial, outcome, arrays in simulate(group, trocars):
-                        name = store.key(*trial, seed)
-                        if name in records:
-                            continue
+                    episode = simulate(group)
+
+                    def commit(lane: int, episode=episode) -> store.Record:
+                        outcome, arrays = episode(lane)
+                        key = store.key(outcome["trocar"], outcome["trial"], seed)
                         kept = outcome["success"] or keep_failures
-                        records[name] = store.commit(root, name, outcome, arrays if kept else {})
-                        advance(int(outcome["success"]))
+                        return store.commit(root, key, outcome, arrays if kept else {})
+
+                    # In threads: most of a commit is waiting for the disk.
+                    for record in pool.map(commit, missing):
+                        records[record["key"]] = record
+                        advance(int(record["success"]))
         digest = store.seal(root, records)
     return {
         "digest": digest,
@@ -223,12 +232,13 @@ def _wave(
 def _simulator(
     env: Any,
     expert: Any,
+    trocars: Trocar,
     seed: int,
     max_steps: int,
     chunk: int,
     devices: Sequence[jax.Device] | None,
 ) -> Callable[..., Any]:
-    """The compiled programs as `(group, trocars) -> list of (trial, outcome, arrays)`."""
+    """The compiled programs as `group -> (lane -> (outcome, arrays))`."""
     key = jax.random.fold_in(jax.random.key(seed), _STREAM)
     start = lanes.split(_starter(env, expert), devices, (lanes.SHARED, lanes.LANE), lanes.LANE)
     advance = lanes.split(
@@ -239,7 +249,7 @@ def _simulator(
         donate=(0,),
     )
 
-    def simulate(group: list[tuple[int, int]], trocars: Trocar) -> list[Any]:
+    def simulate(group: list[tuple[int, int]]) -> Callable[[int], Any]:
         count = len(group)
         index, trial = np.array(group + [group[0]] * (chunk - count), np.int32).T
         trials = _Trials(Trocar(*(field[index] for field in trocars)), index, trial)
@@ -253,9 +263,7 @@ def _simulator(
             if np.all(np.asarray(carry.env.done) | ~np.asarray(carry.wanted)):
                 break
         final = jax.device_get((carry.length, _outcome(carry.env)))
-        return [
-            _episode(lane, group[lane], trocars, seed, segments, final) for lane in range(count)
-        ]
+        return lambda lane: _episode(lane, group[lane], trocars, seed, segments, final)
 
     return simulate
 
@@ -353,7 +361,7 @@ def _episode(
     seed: int,
     segments: list[dict[str, np.ndarray]],
     final: tuple[np.ndarray, dict[str, np.ndarray]],
-) -> tuple[tuple[int, int], store.Record, dict[str, np.ndarray]]:
+) -> tuple[store.Record, dict[str, np.ndarray]]:
     lengths, outcomes = final
     length = int(lengths[lane])
     outcome = {
@@ -370,7 +378,7 @@ def _episode(
         name: np.concatenate([segment[name][:, lane] for segment in segments])[:length]
         for name in segments[0]
     }
-    return trial, outcome, arrays
+    return outcome, arrays
 
 
 def _chunk(total: int, frame_bytes: int, devices: Sequence[jax.Device] | None) -> int:

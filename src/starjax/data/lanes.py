@@ -1,4 +1,4 @@
-"""One program over a batch of lanes (episodes), split over devices that never talk to each other."""
+"""One program over a batch of lanes (episodes), split over devices that never wait for others."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -35,12 +35,3 @@ def split(
     mesh = Mesh(np.array(devices), ("lane",))
     mapped = jax.shard_map(fn, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
     return jax.jit(mapped, donate_argnums=donate)
-
-
-def where(mask: jax.Array, a: Any, b: Any) -> Any:
-    """Lane by lane `a` or `b`; mask `[N]`, leaves `[N, ...]`."""
-
-    def choose(x, y):
-        return jax.numpy.where(mask.reshape(mask.shape + (1,) * (x.ndim - mask.ndim)), x, y)
-
-    return jax.tree.map(choose, a, b)

@@ -41,6 +41,7 @@ def load(
     root: Path,
     *,
     residency: Residency = "auto",
+    verify: bool = True,
     report: Callable[[str], None] = print,
 ) -> Demos:
     """Loads the successful episodes of a sealed dataset, after checking every byte of them.
@@ -49,6 +50,8 @@ def load(
       root: folder of the dataset.
       residency: "auto" takes the device if the frames fit there, else the host, else leaves
         pictures on disk, memory-mapped.
+      verify: without it only the episodes' records are checked, not their arrays: for a caller
+        that has just run `demos.collect`, which checks all.
       report: gets one line with the place and the bytes, before any is allocated.
 
     Raises:
@@ -59,7 +62,7 @@ def load(
     description = store.read_description(root)
     sealed = store.read_seal(root)
     records = []
-    for key, found in store.verify_all(root, sealed["episodes"]).items():
+    for key, found in store.verify_all(root, sealed["episodes"], verify).items():
         if isinstance(found, store.DamagedEpisode):
             raise found
         if found["digest"] != sealed["episodes"][key]:

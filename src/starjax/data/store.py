@@ -1,4 +1,4 @@
-"""Demonstrations on disk: one committed folder an episode, hashed, so that damage is seen and named.
+"""Demonstrations on disk: one committed folder an episode, hashed, so that damage is noticed.
 
     <root>/dataset.json            what the dataset is; never changes
     <root>/episodes/<key>/*.npy    one array a field, `[T, ...]`, T the episode's control steps
@@ -108,8 +108,8 @@ def commit(root: Path, key: str, outcome: Record, arrays: Mapping[str, np.ndarra
     return record
 
 
-def verify(root: Path, key: str) -> Record:
-    """Reads an episode's record after checking every byte of its files.
+def verify(root: Path, key: str, arrays: bool = True) -> Record:
+    """Reads an episode's record after checking it and, with `arrays`, every byte of its files.
 
     Raises:
       DamagedEpisode: naming the first file that is not as it was written.
@@ -123,7 +123,7 @@ def verify(root: Path, key: str) -> Record:
         raise DamagedEpisode(f"{path}: {_reason(error)}") from error
     if _hash(record) != said or record["key"] != key:
         raise DamagedEpisode(f"{path}: expected content with hash {said}, got {_hash(record)}")
-    for name, file in record["files"].items():
+    for name, file in record["files"].items() if arrays else ():
         try:
             got = files.sha256(folder / name)
         except OSError as error:
@@ -133,12 +133,14 @@ def verify(root: Path, key: str) -> Record:
     return {**record, "digest": said}
 
 
-def verify_all(root: Path, keys: Iterable[str]) -> dict[str, Record | DamagedEpisode]:
+def verify_all(
+    root: Path, keys: Iterable[str], arrays: bool = True
+) -> dict[str, Record | DamagedEpisode]:
     """`verify` of many episodes, on all cores; damage is a value here, not raised."""
 
     def one(key: str) -> Record | DamagedEpisode:
         try:
-            return verify(root, key)
+            return verify(root, key, arrays)
         except DamagedEpisode as error:
             return error
 

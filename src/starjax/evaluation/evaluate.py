@@ -165,8 +165,7 @@ def _resume(
         report(f"{directory}: {len(old)} chunks of another evaluation are replaced")
     for file in [path, directory / "recorded.npz", *old]:
         file.unlink(missing_ok=True)
-    most = chunk or _most(devices)
-    even = -(-total // -(-total // most)) if not chunk else chunk
+    even = chunk or -(-total // -(-total // _most(devices)))
     chunk = -(-even // per) * per
     files.write_json(path, {**plan, "chunk": chunk})
     return chunk

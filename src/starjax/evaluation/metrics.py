@@ -12,8 +12,8 @@ Written by `compose`, figures in SI units unless the name says otherwise, interv
                           all control steps of all trials
     steps                 {mean, median} control steps of the strictly successful trials
     invalid, collided     number of trials
-    trials                list of {trocar, radius, polar, azimuth, seen, trial, seed, success, loose,
-                          safe, invalid, collided, steps, source, target, rcm_max_mm,
+    trials                list of {trocar, radius, polar, azimuth, seen, trial, seed, success,
+                          loose, safe, invalid, collided, steps, source, target, rcm_max_mm,
                           rcm_commanded_max_mm}
 
 Rates and intervals without trials are null.
@@ -33,8 +33,10 @@ CONFIDENCE = 0.95
 def wilson(successes: int, trials: int) -> tuple[float, float]:
     """Wilson's interval of a success rate."""
     if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(f"successes, trials: expected 0 <= successes <= trials, trials > 0, got "
-                         f"{successes}, {trials}")  # fmt: skip
+        raise ValueError(
+            "successes, trials: expected 0 <= successes <= trials and trials > 0, "
+            f"got {successes}, {trials}"
+        )
     interval = scipy.stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, "wilson")
     return float(interval.low), float(interval.high)
 
@@ -144,8 +146,10 @@ def compose(
 
 def trials(table: tables.Table, seen: np.ndarray, seed: int) -> list[dict[str, Any]]:
     """One JSON record a trial; `seen` `[M]` bool."""
-    fields = ("trocar", "radius", "polar", "azimuth", "trial", "success", "loose", "safe", "invalid",
-              "collided", "steps", "source", "target")  # fmt: skip
+    fields = (
+        "trocar", "radius", "polar", "azimuth", "trial", "success", "loose", "safe", "invalid",
+        "collided", "steps", "source", "target",
+    )  # fmt: skip
     columns = {name: getattr(table, name).tolist() for name in fields}
     columns["rcm_max_mm"] = (1e3 * table.rcm_max.astype(np.float64)).tolist()
     columns["rcm_commanded_max_mm"] = (1e3 * table.rcm_commanded_max.astype(np.float64)).tolist()

@@ -1,0 +1,209 @@
+"""Demonstrations: what is collected, that it survives kills and shows damage, and loading."""
+
+import json
+import os
+import shutil
+import stat
+
+import jax
+import kill
+import numpy as np
+import pytest
+import stubs
+
+from starjax import rcm
+from starjax.data import demos, load, store
+from starjax.runtime import files
+
+TROCARS = rcm.Trocar(*(field[[0, 8]] for field in rcm.TROCARS))
+KWARGS = {"per_trocar": 4, "seed": 0, "max_steps": 100}
+
+
+def collect(root, observation="state", chunk=5, trocars=TROCARS, **kwargs):
+    env = stubs.make_env(observation, unlucky=0.4)
+    return demos.collect(root, env, stubs.Expert(), trocars, chunk=chunk, **{**KWARGS, **kwargs})
+
+
+def job(root):
+    """What the kill test runs."""
+    collect(root)
+
+
+@pytest.fixture(scope="module")
+def sealed(tmp_path_factory):
+    root = tmp_path_factory.mktemp("demos") / "d"
+    return root, collect(root)
+
+
+@pytest.fixture
+def copy(sealed, tmp_path):
+    return shutil.copytree(sealed[0], tmp_path / "d")
+
+
+def test_the_first_successes_of_every_trocar_are_kept(sealed):
+    root, summary = sealed
+    records = store.verify_all(root, store.keys(root)).values()
+    assert summary["episodes"] == 8 < summary["trials"]  # some failed: the law below is not empty
+    for trocar in range(2):
+        here = [r for r in records if r["trocar"] == trocar]
+        assert [r["trial"] for r in here] == list(range(len(here)))
+        assert sum(r["success"] for r in here) == 4 and here[-1]["success"]
+        assert all(bool(r["files"]) == r["success"] for r in here)
+
+
+def test_an_episode_is_what_the_expert_did(sealed):
+    root, _ = sealed
+    demo = load.load(root, report=lambda _: None).dataset
+    first, last = int(demo.start[1]), int(demo.start[1] + demo.length[1] - 1)
+    p, command = np.asarray(demo.observation.pose.p), np.asarray(demo.command.pose.p)
+    np.testing.assert_allclose(p[first + 1 : last + 1], command[first:last], atol=1e-5)
+    goal = np.asarray(demo.observation.state)[first, :3]
+    assert np.linalg.norm(command[last] - goal) < 0.004 < np.linalg.norm(p[last] - goal)
+    np.testing.assert_allclose(demo.trocar.radius, np.repeat(TROCARS.radius, 4))
+    assert int(demo.length.sum()) == len(p) == len(demo.episode)
+
+
+def test_kills_leave_no_trace(tmp_path):
+    survived = kill.survive(__file__, "job", tmp_path, kills=12)
+    assert survived.kills == 12
+    assert survived.killed == survived.whole
+    assert len(survived.whole) > 50
+
+
+def test_the_chunk_does_not_matter(sealed, tmp_path):
+    collect(tmp_path / "other", chunk=3)
+    assert kill.tree(tmp_path / "other") == kill.tree(sealed[0])
+
+
+def test_failures_are_kept_on_request(tmp_path, sealed):
+    summary = collect(tmp_path / "d", keep_failures=True)
+    assert summary["trials"] == sealed[1]["trials"] and summary["frames"] > sealed[1]["frames"]
+    records = store.verify_all(tmp_path / "d", store.keys(tmp_path / "d")).values()
+    assert all(record["files"] for record in records)
+    kept = load.load(tmp_path / "d", report=lambda _: None)
+    assert len(kept.dataset.length) == 8
+
+
+def _flip(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+
+
+DAMAGE = {
+    "flipped": _flip,
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[:-7]),
+    "emptied": lambda path: path.write_bytes(b""),
+    "removed": lambda path: path.unlink(),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("name", ["command_p.npy", "episode.json"])
+def test_damage_is_named_and_repaired(copy, sealed, damage, name):
+    key = next(k for k in store.keys(copy) if store.verify(copy, k)["success"])
+    path = copy / "episodes" / key / name
+    DAMAGE[damage](path)
+    with pytest.raises(store.DamagedEpisode, match=f"{key}/{name}"):
+        load.load(copy, report=lambda _: None)
+    said = []
+    collect(copy, report=said.append)
+    assert key in said[0] and "damaged" in said[0]
+    assert kill.tree(copy) == kill.tree(sealed[0])
+
+
+@pytest.mark.parametrize("name", ["SEALED.json", "dataset.json"])
+def test_damaged_lists_are_noticed(copy, name):
+    _flip(copy / name)
+    with pytest.raises(ValueError, match=name):
+        load.load(copy, report=lambda _: None)
+
+
+def test_an_episode_of_another_dataset_is_noticed(copy, tmp_path):
+    collect(tmp_path / "other", max_steps=99)
+    key = store.keys(copy)[0]
+    record = json.loads((copy / "episodes" / key / "episode.json").read_text())
+    store.remove(copy, key)
+    store.commit(copy, key, {**record, "loose": not record["loose"]}, {})
+    with pytest.raises(store.DamagedEpisode, match=key):
+        load.load(copy, report=lambda _: None)
+
+
+def test_an_incomplete_dataset_is_not_loaded(copy):
+    (copy / "SEALED.json").unlink()
+    with pytest.raises(ValueError, match="not complete"):
+        load.load(copy)
+    with pytest.raises(ValueError, match="expected a folder of demonstrations"):
+        load.load(copy / "nothing")
+
+
+def test_another_dataset_is_not_mixed_in(copy):
+    with pytest.raises(files.StorageError, match="its max_steps is 100, not 7"):
+        collect(copy, max_steps=7)
+
+
+@pytest.mark.parametrize("bad", [{"per_trocar": 0}, {"max_steps": 0}, {"chunk": -1}])
+def test_bad_arguments_are_named(tmp_path, bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        collect(tmp_path / "d", **bad)
+
+
+def test_a_hopeless_expert_is_an_error(tmp_path):
+    env = stubs.make_env(unlucky=1.0)
+    with pytest.raises(ValueError, match="expert: expected a success rate above 50%"):
+        demos.collect(tmp_path, env, stubs.Expert(), TROCARS, chunk=8, **{**KWARGS, "max_steps": 9})
+
+
+def test_no_space_is_said_before_anything_runs(tmp_path, monkeypatch):
+    usage = files.shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(files.shutil, "disk_usage", lambda _: usage)
+    monkeypatch.setattr(demos, "_simulator", lambda *_: pytest.fail("it was about to compile"))
+    with pytest.raises(files.StorageError, match=r"will be written, the disk has 1 kB free"):
+        collect(tmp_path / "d")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_a_read_only_folder_is_said_before_anything_runs(tmp_path, monkeypatch):
+    tmp_path.chmod(stat.S_IREAD | stat.S_IEXEC)
+    monkeypatch.setattr(demos, "_simulator", lambda *_: pytest.fail("it was about to compile"))
+    with pytest.raises(files.StorageError, match="cannot write"):
+        collect(tmp_path / "d")
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    root = tmp_path_factory.mktemp("pictures") / "d"
+    collect(root, "image", per_trocar=2)
+    return root
+
+
+@pytest.mark.parametrize("residency", ["device", "host", "disk"])
+def test_all_residencies_hold_the_same(pictures, residency):
+    said = []
+    loaded = load.load(pictures, residency=residency, report=said.append)
+    reference = load.load(pictures, report=said.append)
+    assert reference.residency == "device" and "resident on the device" in said[1]
+    assert f"{files.size(loaded.bytes)}" in said[0]
+    image = loaded.dataset.observation.image
+    assert isinstance(image, jax.Array) == (residency == "device")
+    assert isinstance(image, load.Frames) == (residency == "disk")
+    order = np.array([7, 0, 3, 3, image.shape[0] - 1])
+    np.testing.assert_array_equal(image[order], reference.dataset.observation.image[order])
+    assert image[order].dtype == np.uint8 and image.shape[1:] == (6, 6, 3)
+    for ours, theirs in zip(
+        jax.tree.leaves(loaded.dataset.command), jax.tree.leaves(reference.dataset.command)
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_place_depends_on_what_is_free(monkeypatch):
+    monkeypatch.setattr(load.xla, "available_bytes", lambda: 1000)
+    assert [load._place(n) for n in (499, 599, 700)] == ["device", "host", "disk"]
+
+
+def test_nothing_is_unpickled(pictures, tmp_path):
+    root = shutil.copytree(pictures, tmp_path / "d")
+    key = next(k for k in store.keys(root) if store.verify(root, k)["success"])
+    np.save(root / "episodes" / key / "p.npy", np.array([{}]), allow_pickle=True)
+    with pytest.raises(ValueError, match=r"pickle|Python objects"):
+        load.load(root, verify=False, report=lambda _: None)
