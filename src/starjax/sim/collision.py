@@ -21,7 +21,7 @@ SHAFT_REACH = 0.036
 SHAFT_POINTS = 7
 # Radius of the arm's links (m).
 LINK_RADIUS = 0.05
-PEG_RADIUS = 0.00125
+PEG_RADIUS = 0.001125
 
 
 def detect(pose: Pose, origins: jax.Array, block: Pose, pegs: jax.Array) -> jax.Array:

@@ -10,9 +10,9 @@ from starjax.types import Pose
 
 # Jaw targets at gripper -1 and +1 (m a side): past closed, so that the servo squeezes.
 JAW_CLOSED = -0.001
-JAW_OPEN = 0.0033
-# Velocity fed forward by this many seconds: 2 / wn of the joint servos (wn = 100 rad/s).
-SERVO_LAG = 0.02
+JAW_OPEN = 0.0032
+# Natural frequency of the critically damped joint servos (rad/s), as in fr5.xml.
+SERVO_FREQUENCY = 100.0
 # Beyond these the solver has diverged.
 MAX_ARM_SPEED = 20.0  # rad/s
 MAX_BLOCK_SPEED = 5.0  # m/s
@@ -52,24 +52,34 @@ def advance(
     state: PhysicsState,
     q: jax.Array,
     dq: jax.Array,
+    velocity: jax.Array,
     gripper: jax.Array,
     period: float,
 ) -> tuple[PhysicsState, jax.Array]:
-    """One control period: the joint target moves from `q` to `q + dq` and is fed forward.
+    """One control period: the joint target moves smoothly from `q` to `q + dq`.
+
+    The target follows the cubic that begins at `velocity` and ends at `dq / period`; velocity and
+    acceleration are fed forward, or each change of speed would swing the long tool off its port.
 
     Args:
-      q, dq: `[6]` rad. gripper: `[]` in [-1, 1]. period: s.
+      q, dq: `[6]` rad. velocity: `[6]` rad/s, of the target before. gripper: `[]` in [-1, 1].
+      period: s.
 
     Returns:
       the state after; whether a pad touches a wall of the block in the last substep.
     """
     substeps = round(period / sim.mj_model.opt.timestep)
     jaw = JAW_CLOSED + 0.5 * (gripper + 1.0) * (JAW_OPEN - JAW_CLOSED)
-    feed = SERVO_LAG / period * dq
+    turn = period * velocity - dq
 
     def substep(i, carry):
         state, _ = carry
-        target = q + (i + 1) / substeps * dq + feed
+        s = (i + 1) / substeps
+        # Cubic Hermite: the straight line, and the bend that its first slope asks for.
+        x = q + s * dq + s * (1 - s) ** 2 * turn
+        v = (dq + (1 - s) * (1 - 3 * s) * turn) / period
+        a = (6 * s - 4) * turn / period**2
+        target = x + 2.0 / SERVO_FREQUENCY * v + a / SERVO_FREQUENCY**2
         data = sim.mjx_data.replace(
             qpos=state.qpos,
             qvel=state.qvel,

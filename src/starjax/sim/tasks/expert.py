@@ -29,17 +29,19 @@ JAW_TIME = 0.25  # s to close or open
 TURN_LEAD = 0.25  # s before the end of the approach at which the tool begins to turn
 TURN_TIME = 0.80  # s the turn takes
 
+ALIGNED = 0.6  # share of a descent after which it goes straight down
 HOVER = 0.026  # m above the grasp point
 GRASP_DROP = 0.001  # m below the rim's centre line
-RELEASE_HEIGHT = 0.002  # m above its rest at which the block is let go
+RELEASE_HEIGHT = 0.0007  # m above the grasp's height at which the block is let go
 RELEASE_SHIFT = 0.0005  # m further out along the grasped wall's normal: room for the inner pad
 HELD = 0.006  # m from the tip within which the grasped wall counts as held
 CANDIDATES = 2  # walls to choose from
 
-NOISE_POSITION = 0.0008  # m, standard deviation of the disturbance
-NOISE_ROLL = 0.05  # rad
-NOISE_TIME = 0.3  # s, correlation time
-HOVER_SPREAD = 0.002  # m, standard deviation of where it hovers
+NOISE_POSITION = 0.0012  # m, standard deviation of the disturbance
+NOISE_ROLL = 0.07  # rad
+NOISE_TIME = 0.4  # s, correlation time
+NOISE_SMOOTHING = 0.15  # s, low-pass: an arm's tool does not jump
+HOVER_SPREAD = 0.0015  # m, standard deviation of where it hovers
 NOISE_STREAM = 1 << 20  # folded into the key: apart from every attempt's stream
 
 
@@ -54,7 +56,7 @@ class ExpertState:
       wall: int32, the wall grasped. normal: `[3]`, its direction, or the opposite: jaws are
         symmetric, and this keeps the roll on one branch.
       roll_from: rad, the roll that the next turn begins at. jaws_from: jaws at the phase's start.
-      tempo: pace. noise: `[4]` disturbance of position (m) and roll (rad).
+      tempo: pace. noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
       label: the undisturbed command, which is what demonstrations record.
     """
 
@@ -91,7 +93,7 @@ def init(key: jax.Array, state: env.EnvState) -> ExpertState:
         roll_from=jnp.zeros(()),
         jaws_from=jnp.ones(()),
         tempo=tempo,
-        noise=jnp.zeros(4),
+        noise=jnp.zeros((2, 4)),
         label=Command(state.pose, jnp.ones(())),
     )
     return _enter(expert, jnp.asarray(APPROACH, jnp.int32), state, jnp.zeros(()))
@@ -107,7 +109,11 @@ def act(expert: ExpertState, state: env.EnvState) -> tuple[Command, ExpertState]
     expert = expert.replace(elapsed=expert.elapsed + dt)
 
     s = jnp.clip(expert.elapsed / expert.duration, 0.0, 1.0)
-    p = expert.start + _minimum_jerk(s) * (expert.goal - expert.start)
+    # On the way down it is over its goal by the time anything can touch.
+    is_down = (expert.phase == DESCEND) | (expert.phase == LOWER)
+    aside = _minimum_jerk(jnp.minimum(s / jnp.where(is_down, ALIGNED, 1.0), 1.0))
+    share = jnp.stack([aside, aside, _minimum_jerk(s)])
+    p = expert.start + share * (expert.goal - expert.start)
     expert = expert.replace(label=Command(expert.label.pose._replace(p=p), expert.label.gripper))
     roll = _roll_of(expert, state)
     jaws = jnp.asarray(JAWS)[expert.phase]
@@ -115,7 +121,7 @@ def act(expert: ExpertState, state: env.EnvState) -> tuple[Command, ExpertState]
 
     weight = jnp.asarray(DISTURBANCE)[expert.phase]
     noise = _disturb(expert, state.step, dt)
-    moved = weight * noise * jnp.where(expert.phase == DESCEND, 1.0 - s, 1.0)
+    moved = weight * noise[1] * jnp.where(expert.phase == DESCEND, 1.0 - s, 1.0)
     decode = rcm.ACTION_SPACES["rcm4"].decode
     clean, _ = decode(jnp.append(roll, p), state.trocar, state.p_world_ref)
     rough, _ = decode(jnp.append(roll + moved[3], p + moved[:3]), state.trocar, state.p_world_ref)
@@ -150,10 +156,12 @@ def _enter(expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax
     grasp = block.p + task.RIM_RADIUS * normals[wall] - jnp.array([0.0, 0.0, GRASP_DROP])
     spread = HOVER_SPREAD * jax.random.normal(key_hover, (3,)) * jnp.array([1.0, 1.0, 0.5])
     hover = task.RIM_HEIGHT - GRASP_DROP + HOVER
-    # Where the tip must be so that the block, held as it is now, is over the target peg.
-    peg = state.target_peg + RELEASE_SHIFT * out[:2]
-    over = peg + (state.pose.p - block.p)[:2]
-    low = state.pose.p[2] - block.p[2] + task.RIM_HEIGHT + RELEASE_HEIGHT
+    # Where the tip must be once the block, tilted by now, is pressed upright over the target peg:
+    # on its wall, as far along it as the grasp is.
+    along = jnp.array([-out[1], out[0]])
+    aside = ((state.pose.p - block.p)[:2] @ along) * along
+    over = state.target_peg + (task.RIM_RADIUS + RELEASE_SHIFT) * out[:2] + aside
+    low = task.RIM_HEIGHT - GRASP_DROP + RELEASE_HEIGHT
     goals = jnp.stack(
         [
             tip.at[2].set(jnp.maximum(tip[2], hover)),
@@ -198,11 +206,13 @@ def _roll_of(expert: ExpertState, state: env.EnvState) -> jax.Array:
 
 
 def _disturb(expert: ExpertState, step: jax.Array, dt: float) -> jax.Array:
-    """The next value of a stationary Ornstein-Uhlenbeck process, `[4]`."""
+    """The next value of an Ornstein-Uhlenbeck process and of its low-passed copy, `[2, 4]`."""
     keep = jnp.exp(-dt / NOISE_TIME)
     scale = jnp.array([NOISE_POSITION] * 3 + [NOISE_ROLL]) * jnp.sqrt(1.0 - keep**2)
     key = jax.random.fold_in(jax.random.fold_in(expert.key, NOISE_STREAM), step)
-    return keep * expert.noise + scale * jax.random.normal(key, (4,))
+    rough = keep * expert.noise[0] + scale * jax.random.normal(key, (4,))
+    smooth = expert.noise[1] + dt / NOISE_SMOOTHING * (rough - expert.noise[1])
+    return jnp.stack([rough, smooth])
 
 
 def _minimum_jerk(s: jax.Array) -> jax.Array:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from starjax.types import Pose
 
 # The block, as in peg_transfer.xml (a test holds these to the compiled model).
-RIM_RADIUS = 0.0078  # from the axis to a wall's centre line
+RIM_RADIUS = 0.007  # from the axis to a wall's centre line
 WALL_RADIUS = 0.0015  # of the capsules
 RIM_HEIGHT = 0.009  # above the board when it stands
 WALLS = 3
