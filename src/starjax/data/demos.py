@@ -50,7 +50,8 @@ class Expert(NamedTuple):
 
     Attributes:
       init: (key, EnvState) -> expert state.
-      act: (expert state, EnvState) -> (Command, expert state).
+      act: (expert state, EnvState) -> (Command to execute, expert state); the state's `label`, if
+        it has one, is the Command that is recorded.
     """
 
     init: Callable[..., Any]
@@ -290,7 +291,9 @@ def _advancer(env: Any, expert: Any) -> Callable[..., tuple[_Carry, dict[str, ja
     def step_one(carry: _Carry) -> tuple[_Carry, dict[str, jax.Array]]:
         command, expert_state = expert.act(carry.expert, carry.env)
         after = env.step(carry.env, command)
-        record = _record(env.observe(carry.env), command, carry.env, after)
+        # An expert that disturbs itself has the undisturbed command in its state: the one to learn.
+        wanted = getattr(expert_state, "label", command)
+        record = _record(env.observe(carry.env), wanted, carry.env, after)
         length = carry.length + ~carry.env.done
         return _Carry(after, expert_state, length, carry.wanted), record
 
