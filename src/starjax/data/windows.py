@@ -1,0 +1,155 @@
+"""Demonstrations as one flat dataset, and the windows of it that a training step sees.
+
+A window is named by its frame: sampling draws frame numbers, and the same index arithmetic serves
+a dataset that is resident on the device (arrays, inside jit) and one in host memory or on disk.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import rcm
+from starjax.sim.types import Observation
+from starjax.types import Command
+
+_CHUNK = 1 << 16
+
+
+@flax.struct.dataclass
+class Dataset:
+    """D demonstrations, F frames in all, one after another.
+
+    The leaves are jax arrays, or on the host: numpy arrays, memory maps, or anything with `shape`,
+    `dtype` and `[int array [N]] -> numpy array [N, ...]`.
+
+    Attributes:
+      observation: Observation `[F]`.
+      command: Command `[F]`; the one issued at frame t is the pose for t + 1.
+      trocar: Trocar `[D]`.
+      episode: `[F]` int32, which demonstration a frame belongs to.
+      start: `[D]` int32, first frame of each demonstration.
+      length: `[D]` int32, its number of frames.
+    """
+
+    observation: Observation
+    command: Command
+    trocar: rcm.Trocar
+    episode: Any
+    start: Any
+    length: Any
+
+
+@flax.struct.dataclass
+class Batch:
+    """B windows.
+
+    Attributes:
+      observation: Observation `[B, O]` of frames t - O + 1 .. t.
+      command: Command `[B, H]` issued at frames t .. t + H - 1.
+      trocar: Trocar `[B]`.
+    """
+
+    observation: Observation
+    command: Command
+    trocar: rcm.Trocar
+
+
+def split_holdout(start: Any, length: Any, holdout: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frames to train on and frames kept out, by whole demonstrations.
+
+    Args:
+      start: `[D]` first frame of each demonstration.
+      length: `[D]` frames in each.
+      holdout: demonstrations to keep out, spread evenly over the dataset so that every trocar
+        gets its share; at most a quarter of them all.
+
+    Returns:
+      `[F_train]` and `[F_holdout]` int32 frame numbers.
+    """
+    start, length = np.asarray(start), np.asarray(length)
+    count = min(holdout, len(start) // 4)
+    kept_out = ((np.arange(count) + 0.5) * len(start) / max(count, 1)).astype(int)
+    frames = [np.arange(s, s + n, dtype=np.int32) for s, n in zip(start, length, strict=True)]
+    train = [frames[d] for d in range(len(frames)) if d not in set(kept_out.tolist())]
+    if not train:
+        raise ValueError("dataset: expected at least one demonstration, got none")
+    held = [frames[d] for d in kept_out]
+    return np.concatenate(train), np.concatenate(held or [np.zeros(0, np.int32)])
+
+
+def sample_frames(key: jax.Array, frames: jax.Array, batch_size: int) -> jax.Array:
+    """Uniformly drawn training frames `[batch_size]`, with replacement: a function of the key."""
+    return frames[jax.random.randint(key, (batch_size,), 0, frames.shape[0])]
+
+
+def window_frames(frame: Any, first: Any, last: Any, obs_horizon: int, horizon: int):
+    """Frame numbers of each window; the first and last frames of a demonstration repeat.
+
+    Args:
+      frame: `[B]` frame t of each window; works on numpy and on jax arrays alike.
+      first: `[B]` first frame of its demonstration.
+      last: `[B]` last frame of its demonstration.
+      obs_horizon: O.
+      horizon: H.
+
+    Returns:
+      observed `[B, O]` and commanded `[B, H]` frame numbers.
+    """
+    np_ = jnp if isinstance(frame, jax.Array) else np
+    observed = frame[:, None] + np.arange(1 - obs_horizon, 1, dtype=np.int32)
+    commanded = frame[:, None] + np.arange(horizon, dtype=np.int32)
+    return (
+        np_.maximum(observed, first[:, None]),
+        np_.minimum(commanded, last[:, None]),
+    )
+
+
+def gather(dataset: Dataset, frame: Any, obs_horizon: int, horizon: int) -> Batch:
+    """The windows at frames `[...]`, as arrays of the dataset's own kind (numpy or jax)."""
+    shape = frame.shape
+    frame = frame.reshape(-1)
+    episode = dataset.episode[frame]
+    first = dataset.start[episode]
+    last = first + dataset.length[episode] - 1
+    observed, commanded = window_frames(frame, first, last, obs_horizon, horizon)
+
+    def take(tree, index):
+        flat = index.reshape(-1)
+        return jax.tree.map(
+            lambda leaf: leaf[flat].reshape((*shape, *index.shape[1:], *leaf.shape[1:])),
+            tree,
+        )
+
+    return Batch(
+        observation=take(dataset.observation, observed),
+        command=take(dataset.command, commanded),
+        trocar=take(dataset.trocar, episode),
+    )
+
+
+def over_frames(dataset: Dataset, frames: np.ndarray, fn: Callable[..., np.ndarray]) -> np.ndarray:
+    """`fn(observation, command, trocar)` of every given frame, in chunks, as one numpy array.
+
+    Pictures are left out: what is computed over a whole dataset is low-dimensional.
+    """
+    low = (dataset.observation.replace(image=None), dataset.command)
+    parts = []
+    for i in range(0, len(frames), _CHUNK):
+        frame = frames[i : i + _CHUNK]
+        observation, command = _take(low, frame)
+        trocar = _take(dataset.trocar, np.asarray(dataset.episode[frame]))
+        parts.append(np.asarray(fn(observation, command, trocar)))
+    return np.concatenate(parts)
+
+
+def on_device(dataset: Dataset) -> bool:
+    """Whether the frames are jax arrays, so that a compiled step may gather from them."""
+    return isinstance(dataset.episode, jax.Array)
+
+
+def _take(tree: Any, index: np.ndarray) -> Any:
+    return jax.tree.map(lambda leaf: np.asarray(leaf[index]), tree)

@@ -1,0 +1,1 @@
+"""The methods of Table II: pure functions from observations to commands."""

@@ -1,0 +1,112 @@
+"""Encoders and U-Net put together: a conditional diffusion model over `[H, A]` sequences."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from starjax import config
+from starjax.models import diffusion, encoders, schedule, unet1d
+from starjax.policies import features
+
+Params = dict[str, Any]
+
+
+class Diffuser(NamedTuple):
+    """Pure functions of one model.
+
+    Attributes:
+      init: `key -> params`.
+      loss: `(params, key, inputs, extra [B, E], x0 [B, H, A]) -> scalar` of Eq. 9.
+      sample: `(params, keys [B], inputs, extra [B, E]) -> [B, H, A]` in [-1, 1], by DDIM.
+    """
+
+    init: Callable[[jax.Array], Params]
+    loss: Callable[[Params, jax.Array, features.Inputs, jax.Array, jax.Array], jax.Array]
+    sample: Callable[[Params, jax.Array, features.Inputs, jax.Array], jax.Array]
+
+
+def make(
+    policy_config: config.PolicyConfig, action_dim: int, history_dim: int, extra_dim: int
+) -> Diffuser:
+    """The model of `policy_config` for vectors of A entries.
+
+    Args:
+      policy_config: networks and diffusion.
+      action_dim: A.
+      history_dim: width of `Inputs.history`.
+      extra_dim: E, numbers appended to the condition (trocar features), possibly 0.
+    """
+    dtype = jnp.dtype(policy_config.dtype)
+    sees_image = policy_config.observation == "image"
+    vision_dim = policy_config.obs_horizon * policy_config.vision_dim if sees_image else 0
+    vision = encoders.ImageEncoder(
+        trunk=policy_config.encoder, features=policy_config.vision_dim, dtype=dtype
+    )
+    state = encoders.StateEncoder(features=policy_config.state_dim, dtype=dtype)
+    unet = unet1d.ConditionalUnet1D(
+        action_dim=action_dim,
+        cond_dim=vision_dim + policy_config.state_dim + extra_dim,
+        channels=tuple(policy_config.unet_channels),
+        kernel_size=policy_config.kernel_size,
+        groups=policy_config.groups,
+        time_dim=policy_config.time_dim,
+        dtype=dtype,
+    )
+    noise_schedule = schedule.cosine(policy_config.diffusion_steps)
+    shape = (policy_config.horizon, action_dim)
+
+    def init(key: jax.Array) -> Params:
+        key_vision, key_state, key_unet = jax.random.split(key, 3)
+        history = jnp.zeros((1, policy_config.obs_horizon, history_dim))
+        params = {
+            "state": state.init(key_state, history),
+            "unet": unet.init(
+                key_unet, jnp.zeros((1, *shape)), jnp.zeros(1, jnp.int32), _zeros(unet.cond_dim)
+            ),
+        }
+        if sees_image:
+            size = policy_config.image_size
+            params["vision"] = vision.init(key_vision, jnp.zeros((1, size, size, 3)))
+        return params
+
+    def condition(params: Params, inputs: features.Inputs, extra: jax.Array) -> jax.Array:
+        parts = [state.apply(params["state"], inputs.history), extra]
+        if inputs.image is not None:
+            batch, horizon = inputs.image.shape[:2]
+            offset = inputs.offset
+            seen = vision.apply(
+                params["vision"],
+                inputs.image.reshape(batch * horizon, *inputs.image.shape[2:]),
+                None if offset is None else offset.reshape(batch * horizon, 2),
+            )
+            parts.insert(0, seen.reshape(batch, -1))
+        return jnp.concatenate(parts, axis=-1)
+
+    def loss(
+        params: Params, key: jax.Array, inputs: features.Inputs, extra: jax.Array, x0: jax.Array
+    ) -> jax.Array:
+        cond = condition(params, inputs, extra)
+        return diffusion.eps_loss(
+            lambda x, k: unet.apply(params["unet"], x, k, cond), noise_schedule, key, x0
+        )
+
+    def sample(
+        params: Params, keys: jax.Array, inputs: features.Inputs, extra: jax.Array
+    ) -> jax.Array:
+        cond = condition(params, inputs, extra)
+        film = unet.apply(params["unet"], cond, method="condition")
+        return diffusion.ddim_sample(
+            lambda x, film_k: unet.apply(params["unet"], x, film + film_k, method="denoise"),
+            diffusion.sample_noise(keys, shape),
+            diffusion_steps=policy_config.diffusion_steps,
+            steps=policy_config.ddim_steps,
+            prepare=lambda k: unet.apply(params["unet"], k, method="embed_step"),
+        )
+
+    return Diffuser(init, loss, sample)
+
+
+def _zeros(width: int) -> jax.Array:
+    return jnp.zeros((1, width))

@@ -1,0 +1,112 @@
+"""STAR-Diff: diffusion for (position, gripper), blind to the trocar, and a network for the roll."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from starjax import config, rcm
+from starjax.data import normalizer, windows
+from starjax.models import roll_net
+from starjax.policies import diffuser, execution, features
+from starjax.policies.policy import Params, Policy
+from starjax.sim.types import Observation
+from starjax.types import Command
+
+# Demonstrated positions and rolls are exact, sampled and measured ones are not: noise on the roll
+# network's inputs (standard deviation, normalised units) keeps small errors from feeding on
+# themselves, and a history that cannot be trusted keeps it from copying the last roll.
+POSITION_NOISE = 0.02
+ROLL_NOISE = 0.05
+
+
+def make(
+    method: config.Method,
+    policy_config: config.PolicyConfig,
+    p_world_ref: Any,
+    train_config: config.TrainConfig,
+) -> Policy:
+    """The hierarchical policy in an action space of (roll, position); see `policy.make`."""
+    space = rcm.ACTION_SPACES[method.action_space]
+    if set(space.slices) != {"roll", "p"}:
+        raise ValueError(
+            f"method.action_space: expected one of roll and position, got {method.action_space!r}"
+        )
+    roll = space.slices["roll"].start
+    # what is diffused: the position and, after the whole space, the gripper
+    diffused = jnp.r_[space.slices["p"], space.dim]
+    task_dim = features.TASK_STATE if policy_config.observation == "state" else 0
+    model = diffuser.make(policy_config, len(diffused), len(diffused) + task_dim, 0)
+    rolls = roll_net.RollNet(
+        width=policy_config.roll_width,
+        blocks=policy_config.roll_blocks,
+        dtype=jnp.dtype(policy_config.dtype),
+    )
+
+    def init(key: jax.Array) -> Params:
+        key_model, key_roll = jax.random.split(key)
+        p = jnp.zeros((1, policy_config.horizon, 3))
+        trocar = jnp.zeros((1, features.TROCAR_FEATURES))
+        history = jnp.zeros((1, policy_config.obs_horizon))
+        return {"diffuser": model.init(key_model), "roll": rolls.init(key_roll, p, trocar, history)}
+
+    def loss(
+        params: Params, stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Eq. 15."""
+        key_inputs, key_diffusion, key_p, key_roll = jax.random.split(key, 4)
+        action = features.demonstrated(stats, method.action_space, batch, p_world_ref)
+        measured = _measured(stats, batch.observation, batch.trocar)
+        inputs = features.for_training(
+            policy_config,
+            train_config,
+            stats,
+            key_inputs,
+            batch.observation,
+            measured[..., diffused],
+        )
+        x0 = action[..., diffused]
+        position_loss = model.loss(
+            params["diffuser"], key_diffusion, inputs, jnp.zeros((len(x0), 0)), x0
+        )
+        p, history = action[..., space.slices["p"]], measured[..., roll]
+        predicted = rolls.apply(
+            params["roll"],
+            p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
+            features.trocar_features(batch.trocar, p_world_ref),
+            history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
+        )
+        roll_loss = jnp.mean((action[..., roll] - predicted) ** 2)  # Eq. 14
+        total = position_loss + policy_config.roll_loss_weight * roll_loss
+        return total, {"position_loss": position_loss, "roll_loss": roll_loss}
+
+    def sample(
+        params: Params,
+        stats: normalizer.Normalizer,
+        keys: jax.Array,
+        observation: Observation,
+        trocar: rcm.Trocar,
+    ) -> Command:
+        measured = _measured(stats, observation, trocar)
+        inputs = features.for_sampling(
+            policy_config, train_config, stats, observation, measured[..., diffused]
+        )
+        x0 = model.sample(params["diffuser"], keys, inputs, jnp.zeros((keys.shape[0], 0)))
+        p, gripper = x0[..., :3], x0[..., 3:]
+        gamma = rolls.apply(
+            params["roll"],
+            p,
+            features.trocar_features(trocar, p_world_ref),
+            measured[..., roll],
+        )
+        # within the demonstrated range, as the diffused part is
+        gamma = jnp.clip(gamma, -1.0, 1.0)[..., None]
+        parts = {"roll": gamma, "p": p}
+        ordered = sorted(parts, key=lambda name: space.slices[name].start)
+        action = jnp.concatenate([*(parts[name] for name in ordered), gripper], axis=-1)
+        return execution.command(method, stats, action, trocar, p_world_ref)
+
+    def _measured(stats, observation, trocar):
+        return features.measured(stats, method.action_space, observation, trocar, p_world_ref)
+
+    return Policy(init, loss, sample)

@@ -1,0 +1,55 @@
+"""A policy of Table II: three pure functions, made from a method's row."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+from starjax import config
+from starjax.data import normalizer, windows
+from starjax.sim.types import Observation
+from starjax.types import Command
+
+Params = dict[str, Any]
+
+
+class Policy(NamedTuple):
+    """What training and evaluation know of a method.
+
+    Attributes:
+      init: `key -> params`.
+      loss: `(params, stats, key, batch) -> (scalar, metrics)`; metrics are named scalars.
+      sample: `(params, stats, keys [B], Observation [B, O], Trocar [B]) -> Command [B, H]`, finite
+        whatever the networks say. What sample i draws depends on `keys[i]` alone.
+    """
+
+    init: Callable[[jax.Array], Params]
+    loss: Callable[
+        [Params, normalizer.Normalizer, jax.Array, windows.Batch],
+        tuple[jax.Array, dict[str, jax.Array]],
+    ]
+    sample: Callable[
+        [Params, normalizer.Normalizer, jax.Array, Observation, Any],
+        Command,
+    ]
+
+
+def make(
+    method: config.Method,
+    policy_config: config.PolicyConfig,
+    p_world_ref: Any,
+    train_config: config.TrainConfig | None = None,
+) -> Policy:
+    """The policy of a method.
+
+    Args:
+      method: a row of Table II.
+      policy_config: networks and diffusion.
+      p_world_ref: `[3]` m, the nominal port.
+      train_config: augmentation; its crop also decides what inference sees.
+    """
+    # imported here because both of them build on this module's Policy
+    from starjax.policies import hierarchical, single
+
+    build = hierarchical.make if method.hierarchical else single.make
+    return build(method, policy_config, p_world_ref, train_config or config.TrainConfig())

@@ -1,0 +1,69 @@
+"""One diffusion model for the whole action: every row of Table II but the hierarchical one."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from starjax import config, rcm
+from starjax.data import normalizer, windows
+from starjax.policies import diffuser, execution, features
+from starjax.policies.policy import Params, Policy
+from starjax.sim.types import Observation
+from starjax.types import Command
+
+
+def make(
+    method: config.Method,
+    policy_config: config.PolicyConfig,
+    p_world_ref: Any,
+    train_config: config.TrainConfig,
+) -> Policy:
+    """Diffusion over (pose in the method's action space, gripper); see `policy.make`."""
+    dim = rcm.ACTION_SPACES[method.action_space].dim + 1
+    task_dim = features.TASK_STATE if policy_config.observation == "state" else 0
+    extra_dim = features.TROCAR_FEATURES if method.sees_trocar else 0
+    model = diffuser.make(policy_config, dim, dim + task_dim, extra_dim)
+
+    def loss(
+        params: Params, stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        key_inputs, key_diffusion = jax.random.split(key)
+        x0 = features.demonstrated(stats, method.action_space, batch, p_world_ref)
+        inputs = features.for_training(
+            policy_config,
+            train_config,
+            stats,
+            key_inputs,
+            batch.observation,
+            _proprioception(stats, batch.observation, batch.trocar),
+        )
+        value = model.loss(params, key_diffusion, inputs, _extra(batch.trocar, len(x0)), x0)
+        return value, {}
+
+    def sample(
+        params: Params,
+        stats: normalizer.Normalizer,
+        keys: jax.Array,
+        observation: Observation,
+        trocar: rcm.Trocar,
+    ) -> Command:
+        inputs = features.for_sampling(
+            policy_config,
+            train_config,
+            stats,
+            observation,
+            _proprioception(stats, observation, trocar),
+        )
+        action = model.sample(params, keys, inputs, _extra(trocar, keys.shape[0]))
+        return execution.command(method, stats, action, trocar, p_world_ref)
+
+    def _proprioception(stats, observation, trocar):
+        return features.measured(stats, method.action_space, observation, trocar, p_world_ref)
+
+    def _extra(trocar: rcm.Trocar, batch: int) -> jax.Array:
+        if not method.sees_trocar:
+            return jnp.zeros((batch, 0))
+        return features.trocar_features(trocar, p_world_ref)
+
+    return Policy(model.init, loss, sample)

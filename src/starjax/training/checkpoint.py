@@ -1,0 +1,206 @@
+"""Checkpoints that notice their own damage. The only importer of orbax.
+
+orbax writes the arrays; it restores most flipped bits silently, so every step also carries a
+manifest of sha256 hashes. A step is written to a temporary directory and becomes visible by one
+rename, with its manifest inside: there are no half steps.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import pathlib
+import shutil
+import warnings
+from typing import Any
+
+import jax
+from orbax.checkpoint import v1 as ocp
+
+from starjax.runtime import files
+
+_MANIFEST = "manifest.json"
+_STATE = "state"
+_PREFIX = "step_"
+_TEMPORARY = ".writing-"
+
+
+class DamagedCheckpoint(Exception):
+    """A file of a checkpoint is missing, cut short or altered; the message names it."""
+
+
+def steps(directory: str | os.PathLike) -> list[int]:
+    """Steps with a committed checkpoint, oldest first."""
+    root = pathlib.Path(directory)
+    if not root.is_dir():
+        return []
+    names = [path.name.removeprefix(_PREFIX) for path in root.glob(f"{_PREFIX}*")]
+    return sorted(int(name) for name in names if name.isdigit())
+
+
+def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> pathlib.Path:
+    """Writes a step, and afterwards removes all but the newest `keep`.
+
+    Raises:
+      files.StorageError: the disk is full, in one plain sentence.
+    """
+    if keep < 1:
+        raise ValueError(f"keep: expected at least 1 checkpoint, got {keep}")
+    root = pathlib.Path(directory).absolute()
+    root.mkdir(parents=True, exist_ok=True)
+    _remove_leftovers(root)
+    writing = root / f"{_TEMPORARY}{step}"
+    try:
+        _require_space(root, _bytes(state))
+        ocp.save(writing / _STATE, state)
+        _write_manifest(writing, step, state)
+    except Exception as error:
+        shutil.rmtree(writing, ignore_errors=True)
+        if _is_disk_full(error):
+            raise files.StorageError(
+                f"no space left in {root} for the checkpoint of step {step} "
+                f"({files.size(_bytes(state))}); free some and run the same command again, it "
+                f"continues from step {max(steps(root), default=0)}"
+            ) from error
+        raise
+    final = path_of(root, step)
+    shutil.rmtree(final, ignore_errors=True)  # a damaged one that was trained past again
+    writing.rename(final)
+    _sync(root)
+    for old in steps(root)[:-keep]:
+        _remove(path_of(root, old))
+    return final
+
+
+def restore(directory: str | os.PathLike, like: Any) -> tuple[int, Any] | None:
+    """The newest undamaged step, or None where there is none.
+
+    Args:
+      directory: where `save` wrote.
+      like: a state of the same structure, of arrays or `jax.ShapeDtypeStruct` with shardings.
+
+    Returns:
+      the step and the state, placed like `like`.
+
+    Raises:
+      ValueError: the checkpoint is sound but holds another structure, shape or type: it was made
+        with other settings.
+    """
+    for step in reversed(steps(directory)):
+        path = path_of(directory, step)
+        try:
+            manifest = verify(path)
+        except DamagedCheckpoint as damage:
+            warnings.warn(f"checkpoint of step {step} is damaged: {damage}", stacklevel=2)
+            continue
+        _check_leaves(path, manifest["leaves"], _leaves(like))
+        return step, ocp.load(path / _STATE, jax.tree.map(_abstract, like))
+    return None
+
+
+def verify(path: str | os.PathLike) -> dict[str, Any]:
+    """The manifest of a step after comparing every file with it; raises DamagedCheckpoint."""
+    root = pathlib.Path(path)
+    try:
+        envelope = json.loads((root / _MANIFEST).read_text())
+        manifest = envelope["manifest"]
+        sound = envelope["sha256"] == _hash_of_manifest(manifest)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DamagedCheckpoint(f"{root / _MANIFEST} cannot be read ({error})") from error
+    if not sound:
+        raise DamagedCheckpoint(f"{root / _MANIFEST} does not match its own hash")
+    for name, expected in manifest["files"].items():
+        file = root / name
+        if not file.is_file():
+            raise DamagedCheckpoint(f"{file} is missing")
+        if file.stat().st_size != expected["bytes"]:
+            raise DamagedCheckpoint(
+                f"{file} has {file.stat().st_size} bytes, expected {expected['bytes']}"
+            )
+        if files.sha256(file) != expected["sha256"]:
+            raise DamagedCheckpoint(f"{file} has another content than was written (sha256)")
+    return manifest
+
+
+def path_of(directory: str | os.PathLike, step: int) -> pathlib.Path:
+    return pathlib.Path(directory).absolute() / f"{_PREFIX}{step:08d}"
+
+
+def _write_manifest(root: pathlib.Path, step: int, state: Any) -> None:
+    hashes = {
+        file.relative_to(root).as_posix(): {
+            "bytes": file.stat().st_size,
+            "sha256": files.sha256(file),
+        }
+        for file in sorted(root.rglob("*"))
+        if file.is_file()
+    }
+    manifest = {"step": step, "files": hashes, "leaves": _leaves(state)}
+    text = json.dumps({"manifest": manifest, "sha256": _hash_of_manifest(manifest)}, indent=1)
+    with open(root / _MANIFEST, "w") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+    _sync(root)
+
+
+def _hash_of_manifest(manifest: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+
+
+def _leaves(tree: Any) -> dict[str, str]:
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
+
+
+def _check_leaves(path: pathlib.Path, found: dict[str, str], wanted: dict[str, str]) -> None:
+    # orbax would cast another dtype silently
+    for name in sorted(found.keys() | wanted.keys()):
+        if found.get(name) != wanted.get(name):
+            raise ValueError(
+                f"checkpoint {path} was made with other settings: {name} is "
+                f"{found.get(name, 'absent')} there, expected {wanted.get(name, 'absent')}"
+            )
+
+
+def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
+
+
+def _bytes(state: Any) -> int:
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(state))
+
+
+def _require_space(root: pathlib.Path, needed: int) -> None:
+    if shutil.disk_usage(root).free < needed:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _is_disk_full(error: BaseException | None) -> bool:
+    while error is not None:
+        if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        if "No space left" in str(error) or "quota exceeded" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _remove_leftovers(root: pathlib.Path) -> None:
+    for leftover in root.glob(f"{_TEMPORARY}*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _remove(path: pathlib.Path) -> None:
+    # hidden before it is emptied, so that a kill in between cannot leave a damaged step
+    hidden = path.with_name(f"{_TEMPORARY}old-{path.name}")
+    path.rename(hidden)
+    shutil.rmtree(hidden, ignore_errors=True)
+
+
+def _sync(directory: pathlib.Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,224 @@
+"""Training from a dataset to a finished state: resume, log, checkpoint, stop."""
+
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import config
+from starjax.data import normalizer, windows
+from starjax.policies import policy as policies
+from starjax.runtime import progress
+from starjax.training import checkpoint, devices, feed, holdout, metrics
+from starjax.training import state as states
+from starjax.training import step as steps
+
+_CALL_SECONDS = 1.0  # aim of one compiled call: how long Ctrl-C waits, how often the bar moves
+
+
+class Interrupted(KeyboardInterrupt):
+    """Training was asked to stop; its checkpoint is written and the same command goes on."""
+
+
+class TrainingFailed(RuntimeError):
+    """Training cannot go on; the message says why and what to change."""
+
+
+class Result(NamedTuple):
+    """What training leaves.
+
+    Attributes:
+      state: after the last step.
+      samples_per_second: of this process, compilation aside; 0 if there was nothing left to do.
+      skipped: steps left out because their loss or gradient was not finite.
+      holdout: last errors on demonstrations kept out; empty if none were.
+    """
+
+    state: states.TrainState
+    samples_per_second: float
+    skipped: int
+    holdout: dict[str, float]
+
+
+def run(
+    method: config.Method,
+    policy_config: config.PolicyConfig,
+    train_config: config.TrainConfig,
+    dataset: windows.Dataset,
+    p_world_ref: Any,
+    directory: pathlib.Path | str,
+    seed: int,
+    *,
+    mesh_devices: Sequence[jax.Device] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    description: str = "train",
+) -> Result:
+    """Trains a method, going on from the newest sound checkpoint in the directory.
+
+    Interrupted and resumed, or run through: the result is the same to the last bit.
+
+    Args:
+      method: row of Table II, whose own weights are trained.
+      policy_config: networks and diffusion.
+      train_config: optimisation.
+      dataset: on the device (jax arrays) or on the host, see `windows.Dataset`.
+      p_world_ref: `[3]` m, the nominal port.
+      directory: gets `checkpoints/` and `metrics.jsonl`.
+      seed: of everything random.
+      mesh_devices: all of jax's by default.
+      should_stop: asked about once a second; True saves and raises Interrupted.
+      description: name of the progress bar.
+
+    Raises:
+      Interrupted: after `should_stop`.
+      TrainingFailed: no step of a whole stretch of the log was finite.
+      StorageError: the disk is full.
+    """
+    directory = pathlib.Path(directory)
+    log = directory / "metrics.jsonl"
+    mesh = devices.make_mesh(train_config.batch_size, mesh_devices)
+    p_world_ref = np.asarray(p_world_ref, np.float32)
+    policy = policies.make(method, policy_config, p_world_ref, train_config)
+    optimizer = states.make_optimizer(train_config)
+    train, held_out = windows.split_holdout(
+        dataset.start, dataset.length, train_config.holdout_demos
+    )
+    state = _restored_or_new(
+        method, policy, optimizer, policy_config, dataset, p_world_ref, train, directory, seed, mesh
+    )
+    step = first = int(state.step)
+    metrics.resume(log, step)
+    judge = holdout.make(policy, policy_config, dataset, held_out)
+    errors = judge(state) if judge and step == train_config.steps else {}
+    advance = _advance(policy, optimizer, policy_config, train_config, mesh, dataset, train, state)
+    rate = _Rate(train_config.batch_size)
+    with progress.track(description, train_config.steps, unit="steps", done=step) as show:
+        note, call = "", 1
+        while step < train_config.steps:
+            if should_stop():
+                if step > first:
+                    _save(directory, state, train_config)
+                raise Interrupted(
+                    f"stopped at step {step} of {train_config.steps}, which is saved in "
+                    f"{directory}; the same command goes on from there"
+                )
+            count = min(call, *(_until(step, n) for n in _stops(train_config)))
+            count = min(count, train_config.steps - step)
+            start = time.monotonic()
+            state = advance(state, count)
+            jax.block_until_ready(state.step)
+            call = rate.next_call(count, time.monotonic() - start, train_config.steps_per_call)
+            step += count
+            last = step == train_config.steps
+            if step % train_config.log_every == 0 or last:
+                state, note = _log(log, step, state, train_config)
+            if step % train_config.checkpoint_every == 0 or last:
+                if judge:
+                    errors = judge(state)
+                    metrics.append(log, step, "holdout", errors)
+                _save(directory, state, train_config)
+            show(count, note=note)
+    return Result(state, rate.samples_per_second, int(state.skipped), errors)
+
+
+def _restored_or_new(
+    method, policy, optimizer, policy_config, dataset, p_world_ref, frames, directory, seed, mesh
+) -> states.TrainState:
+    example = windows.gather(
+        dataset,
+        frames[:1] if not windows.on_device(dataset) else jnp.asarray(frames[:1]),
+        policy_config.obs_horizon,
+        policy_config.horizon,
+    )
+    stats = normalizer.fit(method, dataset, p_world_ref, frames)
+    state = states.create(policy, optimizer, stats, jax.tree.map(jnp.asarray, example), seed)
+    state = devices.replicate(state, mesh)
+    restored = checkpoint.restore(directory / "checkpoints", state)
+    return state if restored is None else restored[1]
+
+
+def _advance(policy, optimizer, policy_config, train_config, mesh, dataset, frames, state):
+    """`(state, count) -> state`; the given state's memory is reused."""
+    if windows.on_device(dataset):
+        resident = devices.replicate((dataset, jnp.asarray(frames)), mesh)
+        run_steps = jax.jit(
+            lambda state, dataset, frames, count: steps.resident_steps(
+                policy, optimizer, policy_config, train_config, mesh, state, dataset, frames, count
+            ),
+            donate_argnums=0,
+            out_shardings=devices.replicated(mesh),
+        )
+        return lambda state, count: run_steps(state, *resident, jnp.int32(count))
+
+    one = jax.jit(
+        lambda state, batch: steps.train_step(policy, optimizer, train_config, state, batch),
+        donate_argnums=0,
+        out_shardings=devices.replicated(mesh),
+    )
+    stream = feed.batches(
+        dataset, frames, policy_config, train_config, mesh, jnp.copy(state.key), int(state.step)
+    )
+
+    def advance(state, count):
+        for _ in range(count):
+            state = one(state, next(stream))
+        return state
+
+    return advance
+
+
+def _log(log, step, state, train_config) -> tuple[states.TrainState, str]:
+    """Writes the means since the last line and starts the sums afresh."""
+    sums = {name: float(value) for name, value in state.sums.items()}
+    skipped = int(sums.pop("skipped"))
+    taken = (step - 1) % train_config.log_every + 1 - skipped
+    if taken == 0:
+        raise TrainingFailed(
+            f"the loss was not finite in any of the {skipped} steps before step {step}: "
+            f"lower --train.learning-rate (now {train_config.learning_rate:g}) or use "
+            "--policy.dtype float32"
+        )
+    values = {name: value / taken for name, value in sums.items()}
+    values["learning_rate"] = float(states.learning_rate(train_config)(step - 1))
+    values["skipped"] = skipped
+    metrics.append(log, step, "train", values)
+    note = f"loss {values['loss']:.4f}" + (f", {skipped} steps skipped" if skipped else "")
+    return state.replace(sums=jax.tree.map(jnp.zeros_like, state.sums)), note
+
+
+def _save(directory, state, train_config) -> None:
+    checkpoint.save(
+        directory / "checkpoints", int(state.step), state, keep=train_config.keep_checkpoints
+    )
+
+
+def _stops(train_config: config.TrainConfig) -> tuple[int, int]:
+    return train_config.log_every, train_config.checkpoint_every
+
+
+def _until(step: int, every: int) -> int:
+    """Steps from `step` to the next multiple of `every`."""
+    return every - step % every
+
+
+class _Rate:
+    """Throughput without the first call (which compiles), and how long the next call should be."""
+
+    def __init__(self, batch_size: int):
+        self._batch_size, self._steps, self._seconds, self._calls = batch_size, 0, 0.0, 0
+
+    def next_call(self, count: int, seconds: float, most: int) -> int:
+        self._calls += 1
+        if self._calls == 1:
+            return 1
+        self._steps += count
+        self._seconds += seconds
+        return int(np.clip(_CALL_SECONDS / max(seconds / count, 1e-6), 1, most))
+
+    @property
+    def samples_per_second(self) -> float:
+        return self._batch_size * self._steps / self._seconds if self._seconds else 0.0

@@ -1,0 +1,37 @@
+"""The training log: one JSON object a line, the same bytes after a resume as without one."""
+
+import json
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+
+def resume(path: str | os.PathLike, step: int) -> None:
+    """Drops what a run wrote after the step that it now goes on from, half lines included."""
+    file = pathlib.Path(path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    lines = file.read_bytes().splitlines(keepends=True) if file.exists() else []
+    kept = b"".join(line for line in lines if _is_until(line, step))
+    staged = file.with_name(f".{file.name}.tmp")
+    staged.write_bytes(kept)
+    os.replace(staged, file)
+
+
+def append(path: str | os.PathLike, step: int, kind: str, values: Mapping[str, Any]) -> None:
+    """Adds a line `{"step", "kind", **values}`; no clock times, so that equal runs log equally."""
+    line = json.dumps({"step": step, "kind": kind, **values})
+    with open(path, "a") as stream:
+        stream.write(line + "\n")
+
+
+def read(path: str | os.PathLike) -> list[dict[str, Any]]:
+    """All lines, oldest first."""
+    return [json.loads(line) for line in pathlib.Path(path).read_text().splitlines()]
+
+
+def _is_until(line: bytes, step: int) -> bool:
+    try:
+        return line.endswith(b"\n") and json.loads(line)["step"] <= step
+    except (ValueError, KeyError, TypeError):
+        return False

@@ -1,0 +1,97 @@
+"""Everything that training carries from step to step, and so everything that a checkpoint holds."""
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+
+from starjax import config
+from starjax.data import normalizer, windows
+from starjax.policies.policy import Policy
+
+
+@flax.struct.dataclass
+class TrainState:
+    """A pure function of (settings, data, seed, step).
+
+    Attributes:
+      step: int32 `[]`, steps taken.
+      params: of the policy.
+      ema_params: their exponential moving average, what is evaluated.
+      opt_state: of the optimiser.
+      normalizer: fitted once, never recomputed on resume.
+      key: typed key; step s uses `fold_in(key, s)` and nothing else.
+      skipped: int32 `[]`, steps whose loss or gradient was not finite.
+      sums: named float32 scalars, added up since the last line of the log.
+    """
+
+    step: Any
+    params: Any
+    ema_params: Any
+    opt_state: Any
+    normalizer: normalizer.Normalizer
+    key: Any
+    skipped: Any
+    sums: dict[str, Any]
+
+
+def learning_rate(train_config: config.TrainConfig) -> optax.Schedule:
+    """Linear warm-up, then half a cosine down to zero."""
+    warmup = min(train_config.warmup_steps, train_config.steps // 2)
+    return optax.warmup_cosine_decay_schedule(
+        init_value=0.0,
+        peak_value=train_config.learning_rate,
+        warmup_steps=warmup,
+        decay_steps=max(train_config.steps, 1),
+    )
+
+
+def make_optimizer(train_config: config.TrainConfig) -> optax.GradientTransformation:
+    """AdamW with Diffusion Policy's betas."""
+    return optax.adamw(
+        learning_rate(train_config), b1=0.95, b2=0.999, weight_decay=train_config.weight_decay
+    )
+
+
+def create(
+    policy: Policy,
+    optimizer: optax.GradientTransformation,
+    stats: normalizer.Normalizer,
+    batch: windows.Batch,
+    seed: int,
+) -> TrainState:
+    """The state before the first step.
+
+    Args:
+      policy: to be trained.
+      optimizer: from `make_optimizer`.
+      stats: fitted to the training frames.
+      batch: of any values; its shapes tell which metrics there will be.
+      seed: of everything random.
+    """
+    key_init, key_steps = jax.random.split(jax.random.key(seed))
+    params = _compiled_fast(policy.init)(key_init)
+    _, metrics = jax.eval_shape(policy.loss, params, stats, key_steps, batch)
+    names = ["loss", "gradient_norm", "skipped", *metrics]
+    return TrainState(
+        step=jnp.int32(0),
+        params=params,
+        ema_params=jax.tree.map(jnp.copy, params),
+        opt_state=optimizer.init(params),
+        normalizer=stats,
+        key=key_steps,
+        skipped=jnp.int32(0),
+        sums={name: jnp.float32(0.0) for name in names},
+    )
+
+
+def ema_decay(step: jax.Array, ema_max: float) -> jax.Array:
+    """1 - (1 + s)^-0.75, at most `ema_max`: young averages forget fast."""
+    return jnp.minimum(1.0 - (1.0 + step) ** -0.75, ema_max)
+
+
+def _compiled_fast(fn):
+    # runs once: optimising the code of a hundred small random draws would take longer than they do
+    return jax.jit(fn, compiler_options={"xla_backend_optimization_level": 0})

@@ -1,0 +1,94 @@
+"""One pure training step, and many of them in one compiled call."""
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.sharding import Mesh
+
+from starjax import config
+from starjax.data import windows
+from starjax.policies.policy import Policy
+from starjax.training import devices
+from starjax.training import state as states
+from starjax.training.state import TrainState
+
+
+def step_keys(key: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Keys of a step: which frames it sees, and its noise."""
+    key_frames, key_loss = jax.random.split(jax.random.fold_in(key, step))
+    return key_frames, key_loss
+
+
+def train_step(
+    policy: Policy,
+    optimizer: optax.GradientTransformation,
+    train_config: config.TrainConfig,
+    state: TrainState,
+    batch: windows.Batch,
+) -> TrainState:
+    """One step of AdamW and of the average; left out, and counted, if it is not finite."""
+    _, key_loss = step_keys(state.key, state.step)
+    (loss, metrics), gradients = jax.value_and_grad(policy.loss, has_aux=True)(
+        state.params, state.normalizer, key_loss, batch
+    )
+    norm = optax.global_norm(gradients)
+    finite = jnp.isfinite(loss) & jnp.isfinite(norm)
+    # zeros in place of NaN keep the arithmetic below harmless; its results are dropped
+    gradients = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradients)
+    updates, opt_state = optimizer.update(gradients, state.opt_state, state.params)
+    params = optax.apply_updates(state.params, updates)
+    decay = states.ema_decay(state.step, train_config.ema_max)
+    ema_params = optax.incremental_update(params, state.ema_params, 1.0 - decay)
+
+    taken = {"loss": loss, "gradient_norm": norm, **metrics}
+    sums = {name: state.sums[name] + jnp.where(finite, taken[name], 0.0) for name in taken}
+    sums["skipped"] = state.sums["skipped"] + jnp.where(finite, 0.0, 1.0)
+
+    def keep(new, old):
+        return jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, old)
+
+    return state.replace(
+        step=state.step + 1,
+        params=keep(params, state.params),
+        ema_params=keep(ema_params, state.ema_params),
+        opt_state=keep(opt_state, state.opt_state),
+        skipped=state.skipped + jnp.where(finite, 0, 1),
+        sums=sums,
+    )
+
+
+def resident_steps(
+    policy: Policy,
+    optimizer: optax.GradientTransformation,
+    policy_config: config.PolicyConfig,
+    train_config: config.TrainConfig,
+    mesh: Mesh,
+    state: TrainState,
+    dataset: windows.Dataset,
+    frames: jax.Array,
+    count: jax.Array,
+) -> TrainState:
+    """`count` steps on a dataset that is on the device, in one program for any count.
+
+    Args:
+      policy: to be trained.
+      optimizer: from `state.make_optimizer`.
+      policy_config: the horizons of a window.
+      train_config: batch size and averaging.
+      mesh: the batch is split over it.
+      state: donated by the caller.
+      dataset: leaves are jax arrays, on every device of the mesh.
+      frames: `[n]` int32 frames to draw from.
+      count: int32 `[]`, a traced number, so that logging and checkpoints may stop anywhere
+        without another compilation.
+    """
+    split = devices.batch_sharding(mesh)
+
+    def one(_, state):
+        key_frames, _ = step_keys(state.key, state.step)
+        frame = windows.sample_frames(key_frames, frames, train_config.batch_size)
+        frame = jax.lax.with_sharding_constraint(frame, split)
+        batch = windows.gather(dataset, frame, policy_config.obs_horizon, policy_config.horizon)
+        return train_step(policy, optimizer, train_config, state, batch)
+
+    return jax.lax.fori_loop(0, count, one, state)
