@@ -3,10 +3,10 @@
 `decode` is total. Whatever the numbers, its pose is finite, its rotation a rotation, and in the
 four RCM spaces the shaft passes through the trocar. If an input (action, trocar or reference)
 is not finite, the flag `valid` is False and the pose is the **hold pose**: tool straight down,
-roll 0, tip `HOLD_DEPTH` below the trocar (below the reference where the trocar is not finite,
-below the world's origin where that is not either). Finite inputs are always valid: depths are
-clipped to [MIN_DEPTH, MAX_DEPTH], a tip at the trocar takes the axis straight down, degenerate
-6-D columns are completed, and SE(3) positions are clipped to +-MAX_REACH.
+roll 0, tip `HOLD_DEPTH` below the trocar (whose own non-finite numbers count as zero: below the
+reference if the radius is not finite). Finite inputs are always valid: depths are clipped to
+[MIN_DEPTH, MAX_DEPTH], a tip at the trocar takes the axis straight down, degenerate 6-D columns
+are completed, and SE(3) positions are clipped to +-MAX_REACH.
 
 `encode` describes measured poses too, which are a little off the manifold: its depth is the
 signed one of Eq. 3, its roll and rotation those of the pose. It propagates NaN.
@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from starjax import types
 from starjax.rcm import arrays, manifold, rotations
@@ -24,8 +25,8 @@ from starjax.rcm import trocar as trocars
 
 MAX_REACH = 10.0  # m; bound of a decoded SE(3) position's coordinates
 
-Encode = Callable[[types.Pose, trocars.Trocar, jax.Array], jax.Array]
-Decode = Callable[[jax.Array, trocars.Trocar, jax.Array], tuple[types.Pose, jax.Array]]
+Encode = Callable[[types.Pose, trocars.Trocar, ArrayLike], jax.Array]
+Decode = Callable[[ArrayLike, trocars.Trocar, ArrayLike], tuple[types.Pose, jax.Array]]
 
 
 class ActionSpace(NamedTuple):
@@ -111,7 +112,7 @@ def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> Actio
         slices[part] = slice(dim, dim + size)
         dim += size
 
-    def encode_pose(pose: types.Pose, trocar: trocars.Trocar, p_world_ref: jax.Array) -> jax.Array:
+    def encode_pose(pose: types.Pose, trocar: trocars.Trocar, p_world_ref: ArrayLike) -> jax.Array:
         R, p, *rest = arrays.checked(
             **{"pose.R": (pose.R, (3, 3)), "pose.p": (pose.p, (3,))},
             **_trocar_arguments(trocar, p_world_ref),
@@ -123,7 +124,7 @@ def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> Actio
         )
 
     def decode_action(
-        action: jax.Array, trocar: trocars.Trocar, p_world_ref: jax.Array
+        action: ArrayLike, trocar: trocars.Trocar, p_world_ref: ArrayLike
     ) -> tuple[types.Pose, jax.Array]:
         action, *rest = arrays.checked(
             action=(action, (dim,)), **_trocar_arguments(trocar, p_world_ref)
@@ -147,7 +148,7 @@ def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> Actio
     return ActionSpace(name, dim, encode_pose, decode_action, slices)
 
 
-def _trocar_arguments(trocar: trocars.Trocar, p_world_ref: jax.Array) -> dict:
+def _trocar_arguments(trocar: trocars.Trocar, p_world_ref: ArrayLike) -> dict:
     return {**trocars.named_fields(trocar), "p_world_ref": (p_world_ref, (3,))}
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 _BOUND = 1e30  # finite inputs are clipped to +-this, so that sums and squares cannot overflow
 
@@ -52,7 +53,7 @@ def epsilon(dtype: Any) -> float:
     return 1e-6 if jnp.finfo(dtype).bits == 32 else 1e-12
 
 
-def direction(v: jax.Array, fallback: jax.Array) -> tuple[jax.Array, jax.Array]:
+def direction(v: jax.Array, fallback: ArrayLike) -> tuple[jax.Array, jax.Array]:
     """Unit vector along `v` and its length, for any finite `v`.
 
     Args:
@@ -76,9 +77,8 @@ def norm(v: jax.Array) -> jax.Array:
     # Not `scale > tiny`: a NaN has to come through.
     is_zero = scale <= jnp.finfo(v.dtype).tiny
     scaled = jnp.where(is_zero, 1.0, v) / jnp.where(is_zero, 1.0, scale)
-    return jnp.where(is_zero, 0.0, scale * jnp.sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True)))[
-        ..., 0
-    ]
+    length = scale * jnp.sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True))
+    return jnp.where(is_zero, 0.0, length)[..., 0]
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:

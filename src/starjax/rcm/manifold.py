@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax import types
 from starjax.rcm import arrays, rotations
@@ -14,7 +15,7 @@ HOLD_DEPTH = 0.05  # m; of the hold pose
 _STRAIGHT_DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 
 
-def rcm_error(pose: types.Pose, p_world_trocar: jax.Array) -> jax.Array:
+def rcm_error(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
     """Distance of the trocar from the line of the shaft (Eq. 3).
 
     Args:
@@ -28,14 +29,14 @@ def rcm_error(pose: types.Pose, p_world_trocar: jax.Array) -> jax.Array:
     return arrays.norm(jnp.cross(p - p_world_trocar, R[..., :, 2]))
 
 
-def insertion_depth(pose: types.Pose, p_world_trocar: jax.Array) -> jax.Array:
+def insertion_depth(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
     """Signed depth d of the tip beyond the trocar, along the tool's axis (Eq. 3): `[...]` m."""
     R, p, p_world_trocar = _checked(pose, p_world_trocar)
     return arrays.dot(p - p_world_trocar, R[..., :, 2])[..., 0]
 
 
 def pose_on_manifold(
-    axis_world: jax.Array, roll: jax.Array, depth: jax.Array, p_world_trocar: jax.Array
+    axis_world: ArrayLike, roll: ArrayLike, depth: ArrayLike, p_world_trocar: ArrayLike
 ) -> types.Pose:
     """Pose at coordinates (axis, roll, depth) of the chart S2 x S1 x R (Eq. 4, 18).
 
@@ -53,7 +54,7 @@ def pose_on_manifold(
 
 
 def pose_at_depth(
-    R_world_tip: jax.Array, depth: jax.Array, p_world_trocar: jax.Array
+    R_world_tip: ArrayLike, depth: ArrayLike, p_world_trocar: ArrayLike
 ) -> types.Pose:
     """Pose of the manifold with a given rotation and depth (Eq. 3).
 
@@ -74,7 +75,7 @@ def pose_at_depth(
 
 
 def axis_and_depth(
-    p_world_tip: jax.Array, p_world_trocar: jax.Array
+    p_world_tip: ArrayLike, p_world_trocar: ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
     """Direction and distance from the trocar to the tip (Alg. 1, line 2).
 
@@ -87,7 +88,7 @@ def axis_and_depth(
     return arrays.direction(p - p_world_trocar, _STRAIGHT_DOWN)
 
 
-def project(pose: types.Pose, p_world_trocar: jax.Array) -> types.Pose:
+def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
     """Post-hoc projection onto the manifold, for DP-EE-Proj.
 
     The tip is kept and the tool turned by the smallest rotation that puts its axis through the
@@ -109,7 +110,7 @@ def project(pose: types.Pose, p_world_trocar: jax.Array) -> types.Pose:
     return types.Pose(R=R, p=jnp.broadcast_to(p, R.shape[:-1]))
 
 
-def _checked(pose: types.Pose, p_world_trocar: jax.Array) -> list[jax.Array]:
+def _checked(pose: types.Pose, p_world_trocar: ArrayLike) -> list[jax.Array]:
     return arrays.checked(
         **{"pose.R": (pose.R, (3, 3)), "pose.p": (pose.p, (3,))},
         p_world_trocar=(p_world_trocar, (3,)),

@@ -7,6 +7,7 @@ derivatives there. `R_a_b` takes coordinates in frame b to coordinates in frame 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax.rcm import arrays
 
@@ -16,16 +17,16 @@ _E_X = np.array([1.0, 0.0, 0.0], np.float32)
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
 
 
-def rotation_align(a: jax.Array, b: jax.Array) -> jax.Array:
+def rotation_align(a: ArrayLike, b: ArrayLike) -> jax.Array:
     """Smallest rotation that turns the direction of `a` into that of `b` (Eq. 16, total).
 
     Eq. 16 divides by `1 + a.b`, which cancels as `b` nears `-a`. Here the part of `b` across
     `a` spans the plane of rotation; where the two oppose, it is made orthogonal to `a` again
     before it is scaled up. At `b = -a` (to within `epsilon`) the plane is undefined and a fixed
-    one is taken: half a turn, about -x for `a = e_z`.
+    one is taken: half a turn, about x for `a = e_z`.
 
     Args:
-      a: `[..., 3]`, of any length; a zero or non-finite vector counts as e_z.
+      a: `[..., 3]`, of any length. Zero counts as e_z, non-finite entries count as zero.
       b: `[..., 3]`, likewise.
 
     Returns:
@@ -53,7 +54,7 @@ def _align_unit(a: jax.Array, b: jax.Array) -> jax.Array:
     return eye + turn - _outer((1.0 - cos) * a, a) - _outer(factor * spanning, spanning)
 
 
-def rotation_z(angle: jax.Array) -> jax.Array:
+def rotation_z(angle: ArrayLike) -> jax.Array:
     """Rotation by `angle` `[...]` rad about the z axis: `[..., 3, 3]`."""
     (angle,) = arrays.checked(angle=(angle, ()))
     cos, sin = cos_sin(angle)
@@ -68,7 +69,7 @@ def cos_sin(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.cos(angle), jnp.sin(angle)
 
 
-def rotation_from_axis_roll(axis_world: jax.Array, roll: jax.Array) -> jax.Array:
+def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array:
     """Tool rotation with a given axis and roll (Alg. 1, lines 3-6).
 
     `R_world_tip = G @ align(e_z, G' @ axis_world) @ R_z(roll)` with G = diag(1, -1, -1): the
@@ -91,7 +92,7 @@ def rotation_from_axis_roll(axis_world: jax.Array, roll: jax.Array) -> jax.Array
     return jnp.stack([x, y, z], axis=-1)
 
 
-def roll_of(R_world_tip: jax.Array) -> jax.Array:
+def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     """Roll `[...]` in (-pi, pi] rad such that `rotation_from_axis_roll(axis, roll)` is R.
 
     Continuous in R except for a tool that points straight up, and at half a turn.
@@ -109,13 +110,13 @@ def roll_of(R_world_tip: jax.Array) -> jax.Array:
     return jnp.arctan2(sin, jnp.where(is_degenerate, 1.0, cos))
 
 
-def rot6d_encode(R: jax.Array) -> jax.Array:
+def rot6d_encode(R: ArrayLike) -> jax.Array:
     """First two columns of `R` `[..., 3, 3]`, one after the other: `[..., 6]`."""
     (R,) = arrays.checked(R=(R, (3, 3)))
     return jnp.concatenate([R[..., :, 0], R[..., :, 1]], axis=-1)
 
 
-def rot6d_decode(rot6d: jax.Array) -> jax.Array:
+def rot6d_decode(rot6d: ArrayLike) -> jax.Array:
     """Rotation from two columns by Gram-Schmidt, for any input.
 
     Args:

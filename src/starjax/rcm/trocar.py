@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import core
+from jax.typing import ArrayLike
 
 from starjax.rcm import arrays, rotations
 
@@ -62,7 +64,7 @@ TROCARS: Trocar = _degrees(
 IS_SEEN: np.ndarray = _constant(np.arange(12) < 8)
 
 
-def trocar_position(trocar: Trocar, p_world_ref: jax.Array) -> jax.Array:
+def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
     """Position of the trocar in the world frame (Eq. 2).
 
     Args:
@@ -137,7 +139,7 @@ def check_trocar(trocar: Trocar) -> Trocar:
         polar angle lies outside [0, pi].
     """
     arrays.checked(**named_fields(trocar))
-    if any(isinstance(field, jax.core.Tracer) for field in trocar):
+    if any(isinstance(field, core.Tracer) for field in trocar):
         return trocar
     limits = {"radius": (0.0, np.inf), "polar": (0.0, np.pi), "azimuth": (-np.inf, np.inf)}
     for name, (low, high) in limits.items():
