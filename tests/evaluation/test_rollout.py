@@ -1,0 +1,308 @@
+"""Closed-loop rollouts: what a trial is, and that neither its neighbours nor kills change it."""
+
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import kill
+import numpy as np
+import pytest
+import stubs
+
+from starjax import rcm
+from starjax.evaluation import evaluate, metrics, rollout, table
+from starjax.runtime import files
+from starjax.types import Command, Pose
+
+TROCARS = rcm.Trocar(*(field[[0, 4, 8]] for field in rcm.TROCARS))
+KWARGS = {"trials": 2, "seed": 0, "obs_horizon": 2, "execute": 4, "time_limit_s": 1.0, "lanes": 2}
+
+
+def run(directory, policy=None, params=None, env=None, report=lambda _: None, **kwargs):
+    stub, weights = stubs.make_policy(width=32)
+    return evaluate.evaluate(
+        directory,
+        env or stubs.make_env(),
+        policy or stub,
+        weights if params is None else params,
+        jnp.float32(1.0),
+        kwargs.pop("trocars", TROCARS),
+        report=report,
+        **{**KWARGS, **kwargs},
+    )
+
+
+def job(directory):
+    """What the kill test runs."""
+    found = run(directory, chunk=1, video_trials=2)
+    seen = np.ones(len(found.trocar), bool)
+    files.write_json(directory / "trials.json", metrics.trials(found, seen, 0))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("evaluation")
+    return directory, run(directory, chunk=6, video_trials=4)
+
+
+def assert_same(a, b):
+    for name in table.Table._fields:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
+
+
+def test_outcomes_are_those_of_the_environment(whole):
+    _, found = whole
+    assert found.success.any() and not found.success.all() and found.invalid.any()
+    assert not (found.success & found.invalid).any()
+    np.testing.assert_array_equal(found.trocar, [0, 0, 1, 1, 2, 2])
+    np.testing.assert_array_equal(found.trial, [0, 1, 0, 1, 0, 1])
+    np.testing.assert_array_equal(found.radius, np.repeat(TROCARS.radius, 2))
+    timeout = ~found.success & ~found.invalid
+    assert (found.steps[timeout] == 30).all() and (found.steps[~timeout] < 30).all()
+
+
+@pytest.mark.parametrize("chunk", [2, 4])
+def test_the_chunk_does_not_change_a_bit(whole, tmp_path, chunk):
+    assert_same(run(tmp_path, chunk=chunk), whole[1])
+
+
+def test_trials_depend_on_the_seed_and_on_nothing_else(whole, tmp_path):
+    assert_same(run(tmp_path / "a", chunk=6, trials=1, trocars=TROCARS), _first_trials(whole[1]))
+    other = run(tmp_path / "b", chunk=6, seed=1)
+    assert not np.array_equal(other.steps, whole[1].steps)
+
+
+def _first_trials(found):
+    return table.select(found, found.trial == 0)
+
+
+def test_kills_leave_no_trace(tmp_path):
+    survived = kill.survive(__file__, "job", tmp_path, kills=10)
+    assert survived.kills == 10
+    assert survived.killed == survived.whole
+    assert {"trials.json", "recorded.npz", "chunk_0005.npz"} <= set(survived.whole)
+
+
+def test_finished_chunks_are_not_run_again(tmp_path, whole, monkeypatch):
+    first = run(tmp_path, chunk=3)
+    monkeypatch.setattr(rollout, "make", lambda *_: None)
+    assert_same(run(tmp_path, chunk=3), first)
+    assert_same(run(tmp_path), first)  # chunk 0: what the folder has
+
+
+def test_other_weights_start_afresh(tmp_path, whole):
+    run(tmp_path, chunk=3)
+    _, params = stubs.make_policy(width=32)
+    said = []
+    other = run(tmp_path, chunk=3, params=[2.0 * p for p in params], report=said.append)
+    assert "2 chunks of another evaluation" in said[0]
+    assert not np.array_equal(other.rcm_error_mm, whole[1].rcm_error_mm)
+
+
+def test_a_damaged_chunk_is_named_and_run_again(tmp_path, whole):
+    first = run(tmp_path, chunk=3)
+    path = tmp_path / "chunk_0001.npz"
+    good = path.read_bytes()
+    for bad in (good[:-50], b"", good.replace(b"success", b"succass")):
+        path.write_bytes(bad)
+        said = []
+        assert_same(run(tmp_path, chunk=3, report=said.append), first)
+        assert "chunk_0001.npz" in said[0]
+        assert path.read_bytes() == good
+
+
+def test_no_flipped_bit_of_a_chunk_gets_into_the_table(tmp_path, whole):
+    run(tmp_path, chunk=6)
+    path = tmp_path / "chunk_0000.npz"
+    good = path.read_bytes()
+    rng = np.random.default_rng(0)
+    noticed = 0
+    for bit in rng.integers(0, 8 * len(good), 200):
+        bad = bytearray(good)
+        bad[bit // 8] ^= 1 << (bit % 8)
+        path.write_bytes(bad)
+        found = evaluate._read(path, lambda _: None)
+        noticed += found is None
+        if found is not None:  # a byte that means nothing, such as a date
+            assert_same(found[0], whole[1])
+    assert noticed > 100
+
+
+def test_recorded_trajectories_are_those_of_the_trials(whole):
+    directory, found = whole
+    with np.load(directory / "recorded.npz", allow_pickle=False) as archive:
+        recorded = dict(archive)
+    assert sorted(zip(recorded["trocar"], recorded["trial"])) == [(0, 0), (0, 1), (1, 0), (2, 0)]
+    for row, (trocar, trial) in enumerate(zip(recorded["trocar"], recorded["trial"])):
+        at = np.flatnonzero((found.trocar == trocar) & (found.trial == trial))[0]
+        length = recorded["length"][row]
+        assert length == found.steps[at]
+        path = recorded["p_world_tip"][row]
+        assert np.isfinite(path[:length]).all() and np.isnan(path[length:]).all()
+        speed = np.linalg.norm(np.diff(path[:length], axis=0), axis=-1)
+        assert (speed <= stubs.SPEED + 1e-6).all()
+        np.testing.assert_allclose(recorded["qpos"][row, :length, :3], path[:length])
+        assert recorded["target_peg"][row] == found.target[at]
+        start = found.steps[:at].sum()
+        np.testing.assert_allclose(
+            1e3 * recorded["rcm_error"][row, :length],
+            found.rcm_error_mm[start : start + length],
+            rtol=1e-3,
+        )
+        np.testing.assert_allclose(1e3 * found.rcm_max[at], recorded_max(recorded, row), rtol=1e-6)
+
+
+def recorded_max(recorded, row):
+    return 1e3 * np.nanmax(recorded["rcm_error"][row])
+
+
+def test_few_of_many_trocars_are_recorded_evenly():
+    mask = evaluate._recorded(100, 2, 5).reshape(100, 2)
+    assert list(np.flatnonzero(mask[:, 0])) == [0, 25, 50, 74, 99] and not mask[:, 1].any()
+    assert not evaluate._recorded(3, 2, 0).any()
+    assert evaluate._recorded(3, 2, 50).all()
+
+
+def _spy(horizon):
+    """A policy whose commands spell the first and last step that it saw, and its plan's key."""
+
+    def sample(params, normalizer, keys, observation, trocar):
+        seen = observation.gripper  # what the environment below shows: the step's number
+        p = jnp.stack([seen[:, 0], seen[:, -1], jax.vmap(jax.random.uniform)(keys)], -1)
+        count = p.shape[0]
+        poses = Pose(
+            jnp.broadcast_to(jnp.eye(3), (count, horizon, 3, 3)),
+            jnp.broadcast_to(p[:, None], (count, horizon, 3)),
+        )
+        return Command(poses, jnp.broadcast_to(jnp.arange(float(horizon)), (count, horizon)))
+
+    return stubs.Policy(sample)
+
+
+def _counting():
+    """An environment that never ends and logs the commands that it gets in qpos."""
+    base = stubs.make_env(unlucky=0.0)
+
+    def reset(key, params):
+        state = base.reset(key, params)
+        return state.replace(sim=stubs.Physics(jnp.zeros(4)), gripper=jnp.zeros(()))
+
+    def step(state, command):
+        log = jnp.concatenate([command.pose.p, command.gripper[None]])
+        number = state.step + 1
+        return state.replace(
+            sim=stubs.Physics(log), step=number, gripper=number.astype(jnp.float32)
+        )
+
+    return base._replace(reset=reset, step=step)
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 3])
+def test_history_and_plans_follow_the_paper(tmp_path, horizon):
+    """Observes steps t - O + 1 .. t, executes the plan's first commands, then plans anew."""
+    run(
+        tmp_path,
+        policy=_spy(6),
+        env=_counting(),
+        obs_horizon=horizon,
+        trocars=rcm.Trocar(*(f[:1] for f in rcm.TROCARS)),
+        trials=1,
+        time_limit_s=10 / 30,
+        video_trials=1,
+    )
+    with np.load(tmp_path / "recorded.npz", allow_pickle=False) as archive:
+        log = archive["qpos"][0]
+    t = np.array([0, 0, 0, 0, 4, 4, 4, 4, 8, 8])
+    np.testing.assert_array_equal(log[:, 3], [0, 1, 2, 3, 0, 1, 2, 3, 0, 1])
+    np.testing.assert_array_equal(log[:, 1], t)
+    np.testing.assert_array_equal(log[:, 0], np.maximum(t - horizon + 1, 0))
+    assert len(np.unique(log[:, 2])) == 3  # fresh noise for every plan
+
+
+def test_commanded_error_counts_executed_commands_only(whole):
+    """The stub's commands keep R = 1, so the error of a command is its distance to the vertical."""
+    _, found = whole
+    assert (found.rcm_commanded_max > 1e-4).all()
+    env, (policy, params) = stubs.make_env(), stubs.make_policy(width=32)
+    settings = rollout.Settings(2, 4, 30, 2)
+    trials = rollout.Trials(
+        trocar=rcm.Trocar(*(f[:1] for f in TROCARS)),
+        index=np.zeros(1, np.int32),
+        trial=np.zeros(1, np.int32),
+        wanted=np.ones(1, bool),
+    )
+    done = rollout.make(env, policy, settings, 0)(params, jnp.float32(1.0), trials, lambda _: None)
+    port = np.asarray(rcm.trocar_position(trials.trocar, stubs.P_WORLD_REF))[0]
+    # Where the plan is followed exactly, the tip has been at every command that was executed.
+    path = done.steps.p_world_tip[: done.length[0], 0]
+    far = np.linalg.norm(path[:, :2] - port[:2], axis=-1).max()
+    np.testing.assert_allclose(done.commanded_max[0], far, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("bad", "name"),
+    [
+        ({"trials": 0}, "trials"),
+        ({"time_limit_s": 0.0}, "time_limit_s"),
+        ({"chunk": -1}, "chunk"),
+        ({"execute": 0}, "settings"),
+        ({"obs_horizon": 6}, "obs_horizon"),
+    ],
+)
+def test_bad_arguments_are_named(tmp_path, bad, name):
+    with pytest.raises(ValueError, match=name):
+        run(tmp_path, **bad)
+
+
+def test_each_program_is_traced_once(tmp_path):
+    traces = []
+    policy, _ = stubs.make_policy(width=32)
+
+    def sample(*args):
+        traces.append(1)
+        return policy.sample(*args)
+
+    run(tmp_path, policy=stubs.Policy(sample), chunk=2, time_limit_s=5.0)
+    assert len(traces) == 2  # for the shape of a plan, and for the program
+
+
+_DEVICES = """
+import sys, json, pathlib
+import jax, numpy as np
+import test_rollout
+out = pathlib.Path(sys.argv[1])
+assert len(jax.devices()) == 2
+one = test_rollout.run(out / "1", chunk=4, devices=jax.devices()[:1])
+two = test_rollout.run(out / "2", chunk=4, devices=jax.devices())
+test_rollout.assert_same(one, two)
+from starjax.data import demos
+import stubs, kill
+for count in (1, 2):
+    demos.collect(out / f"demos{count}", stubs.make_env(), stubs.Expert(), test_rollout.TROCARS,
+                  per_trocar=2, seed=0, max_steps=100, chunk=4, devices=jax.devices()[:count])
+assert kill.tree(out / "demos1") == kill.tree(out / "demos2")
+print("same")
+"""
+
+
+def test_two_devices_give_the_same_bits(tmp_path):
+    import os
+    import pathlib
+
+    here = pathlib.Path(__file__).parent
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+    environment = {
+        **os.environ,
+        "XLA_FLAGS": flags,
+        "PYTHONPATH": os.pathsep.join([str(here), *filter(None, sys.path)]),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", _DEVICES, str(tmp_path)],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0 and "same" in done.stdout, done.stderr[-3000:]
+    assert json.loads((tmp_path / "1" / "plan.json").read_text())["chunk"] == 4
