@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from starjax.experiments import run
+from starjax.experiments import options, run
 
 DESCRIPTION = """Collects the demonstrations of a run (the flags are those of `starjax run`).
 
@@ -14,5 +14,5 @@ def main(argv: Sequence[str]) -> int:
     config = run.settings(argv, "starjax collect", DESCRIPTION)
     from starjax.experiments import pipeline
 
-    pipeline.run(config, stages=("collect",))
+    pipeline.run(config, stages=("collect",), command=options.typed("collect", argv))
     return 0

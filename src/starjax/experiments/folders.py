@@ -1,4 +1,4 @@
-"""What lies where in a run's folder, whose settings it was made with, and how long each stage took.
+"""What lies where in a run's folder, and whose settings it was made with.
 
 <out>/demos-<digest>/      demonstrations, shared by all methods
 <out>/timings.json         seconds a stage, summed over every start
@@ -7,11 +7,9 @@
 <out>/report/              tables, figures, video, page
 """
 
-import contextlib
 import dataclasses
 import json
-import time
-from collections.abc import Iterator
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,24 +17,34 @@ from starjax import config as config_lib
 from starjax.experiments import methods
 from starjax.runtime import files
 
-# Settings that decide a stage's outcome; the others may change between two starts.
+# What decides the weights; the rest may change between two starts.
 TRAINED_WITH = ("seed", "demos", "policy", "train")
-# Settings of those that only decide how often something is written.
-_FREE = {"train.keep-checkpoints"}
+# Of those, what leaves the weights alone.
+_FREE = {"--train.keep-checkpoints", "--train.checkpoint-every", "--train.steps-per-call"}
 
 
-def weights(config: config_lib.RunConfig, method: str) -> Path:
-    """Folder of the weights that `method` runs on: those of another method for some."""
-    return Path(config.out) / methods.METHODS[method].weights_of
+def weights(out: Path, method: str) -> Path:
+    """The file of the weights that `method` runs on: those of another method for some."""
+    return out / methods.METHODS[method].weights_of / "policy.safetensors"
 
 
-def twin(method: str) -> str:
-    """The first method of Table II that behaves as `method` does, so that both are scored once."""
+def twins(method: str) -> list[str]:
+    """Other methods that behave just as `method` does, so that one evaluation serves both."""
+    return [
+        name for name in methods.METHODS if name != method and behaviour(name) == behaviour(method)
+    ]
 
-    def behaviour(name: str) -> config_lib.Method:
-        return methods.METHODS[name]._replace(label="", group="")
 
-    return next(name for name in methods.METHODS if behaviour(name) == behaviour(method))
+def adopt_twin(out: Path, method: str) -> None:
+    """Takes over the evaluation of a twin that was scored before, chunk by chunk."""
+    for name in twins(method):
+        if (out / name / "evaluation").is_dir() and not (out / method / "evaluation").exists():
+            shutil.copytree(out / name / "evaluation", out / method / "evaluation")
+
+
+def behaviour(method: str) -> config_lib.Method:
+    """A row of Table II without its names."""
+    return methods.METHODS[method]._replace(label="", group="")
 
 
 def selected(config: config_lib.RunConfig) -> list[str]:
@@ -44,24 +52,23 @@ def selected(config: config_lib.RunConfig) -> list[str]:
     return list(methods.METHODS) if config.method == "all" else [config.method]
 
 
-def claim(folder: Path, config: config_lib.RunConfig, parts: tuple[str, ...]) -> None:
-    """Writes a folder's config.json, or makes sure that the one there has the same `parts`.
+def claim(folder: Path, config: config_lib.RunConfig, dataset: str) -> None:
+    """Writes the config.json of a folder of weights, or makes sure that they are trained likewise.
+
+    Args:
+      folder: of one method.
+      config: settings of this run.
+      dataset: name of its demonstrations, which also tells the scene that they were made in.
 
     Raises:
       config.UsageError: naming the first setting that differs.
     """
     path = folder / "config.json"
-    wanted = json.loads(json.dumps(dataclasses.asdict(config)))
-    if path.exists():
-        found = json.loads(path.read_text())
-        for name in (name for part in parts for name in _flat(wanted[part], part)):
-            before, now = _flat_value(found, name), _flat_value(wanted, name)
-            if before != now and name not in _FREE:
-                raise config_lib.UsageError(
-                    f"--{name}: {folder} was made with {before}, got {now}; "
-                    "choose another folder by --out, or remove that one"
-                )
-        wanted = {**wanted, **{part: found[part] for part in wanted if part not in parts}}
+    wanted = {**json.loads(json.dumps(dataclasses.asdict(config))), "dataset": dataset}
+    found = json.loads(path.read_text()) if path.exists() else wanted
+    for name in (name for part in TRAINED_WITH for name in _flat(wanted[part], part)):
+        _refuse(folder, f"--{name}", _value(found, name), _value(wanted, name))
+    _refuse(folder, "demonstrations", found.get("dataset"), dataset)
     files.write_json(path, wanted)
 
 
@@ -72,25 +79,17 @@ def read_config(folder: Path) -> config_lib.RunConfig:
         raise config_lib.UsageError(
             f"{folder}: expected a run's method folder such as runs/cpu/stardiff, no config.json"
         )
-    return config_lib.from_dict(config_lib.RunConfig, json.loads(path.read_text()))
+    values = json.loads(path.read_text())
+    values.pop("dataset")
+    return config_lib.from_dict(config_lib.RunConfig, values)
 
 
-@contextlib.contextmanager
-def timed(out: Path, stage: str) -> Iterator[None]:
-    """Adds the seconds spent inside to `stage` of timings.json, also after Ctrl-C."""
-    start = time.monotonic()
-    try:
-        yield
-    finally:
-        spent = timings(out)
-        spent[stage] = round(spent.get(stage, 0.0) + time.monotonic() - start, 2)
-        files.write_json(out / "timings.json", spent)
-
-
-def timings(out: Path) -> dict[str, float]:
-    """Seconds a stage so far."""
-    path = out / "timings.json"
-    return json.loads(path.read_text()) if path.exists() else {}
+def _refuse(folder: Path, name: str, before: Any, now: Any) -> None:
+    if before != now and name not in _FREE:
+        raise config_lib.UsageError(
+            f"{name}: {folder} was made with {before}, got {now}; choose another folder by --out, "
+            "or remove that one"
+        )
 
 
 def _flat(value: Any, prefix: str) -> list[str]:
@@ -99,7 +98,6 @@ def _flat(value: Any, prefix: str) -> list[str]:
     return [f"{prefix}.{name.replace('_', '-')}" for name in value]
 
 
-def _flat_value(values: dict[str, Any], name: str) -> Any:
+def _value(values: dict[str, Any], name: str) -> Any:
     part, _, field = name.partition(".")
-    found = values.get(part)
-    return found.get(field.replace("-", "_")) if field and found is not None else found
+    return values[part][field.replace("-", "_")] if field else values[part]

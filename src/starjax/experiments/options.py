@@ -6,6 +6,7 @@ argument, what was expected, what came. Imports neither jax nor numpy.
 
 import dataclasses
 import difflib
+import shlex
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,9 +33,9 @@ def parse(
       config.UsageError: one line that names the argument, what was expected and what came.
     """
     if not {"-h", "--help"} & set(argv):
-        _check(flags(settings), argv)
-    kwargs = {} if default is None else {"default": default}
-    return tyro.cli(settings, args=list(argv), prog=prog, description=description, **kwargs)
+        _check(flags(settings), argv[_count_positional(settings, argv) :])
+    start = tyro.MISSING_NONPROP if default is None else default
+    return tyro.cli(settings, args=list(argv), prog=prog, description=description, default=start)
 
 
 def flags(settings: type, prefix: str = "") -> dict[str, Any]:
@@ -45,6 +46,8 @@ def flags(settings: type, prefix: str = "") -> dict[str, Any]:
         hint, name = hints[field.name], prefix + field.name.replace("_", "-")
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
             found |= flags(hint, f"{name}.")
+        elif _is_positional(settings, field.name):
+            continue
         elif hint is bool:
             found |= {f"--{name}": None, f"--{prefix}no-{field.name.replace('_', '-')}": None}
         else:
@@ -62,6 +65,11 @@ def value_of(flag: str, argv: Sequence[str]) -> str | None:
     return None
 
 
+def typed(name: str, argv: Sequence[str]) -> str:
+    """The command line, for the record in result.json."""
+    return shlex.join(["starjax", name, *argv])
+
+
 def suggest(word: str, known: Iterable[str]) -> str:
     """`; did you mean ...?` for the nearest known word, else nothing."""
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
@@ -75,6 +83,25 @@ def choice(argument: str, value: str, known: Iterable[str]) -> None:
         raise config_lib.UsageError(
             f"{argument}: expected one of {', '.join(names)}, got {value!r}{suggest(value, names)}"
         )
+
+
+def _is_positional(settings: type, name: str) -> bool:
+    hint = typing.get_type_hints(settings, include_extras=True)[name]
+    return tyro.conf.Positional in getattr(hint, "__metadata__", ())
+
+
+def _count_positional(settings: type, argv: Sequence[str]) -> int:
+    """Words before the first flag; UsageError unless they are as many as `settings` asks for."""
+    given = next((i for i, token in enumerate(argv) if token.startswith("--")), len(argv))
+    hints = typing.get_type_hints(settings)
+    names = [f.name for f in dataclasses.fields(settings) if _is_positional(settings, f.name)]
+    several = any(typing.get_origin(hints[name]) is tuple for name in names)
+    if names and (given < len(names) or (given > len(names) and not several)):
+        got = " ".join(argv[:given]) or "none"
+        raise config_lib.UsageError(
+            f"{' '.join(names).upper()}: expected before any flag, got {got}"
+        )
+    return given if names else 0
 
 
 def _check(known: Mapping[str, Any], argv: Sequence[str]) -> None:

@@ -1,129 +1,127 @@
 """The stages of a run, one after another, each skipped when its result is there."""
 
 import contextlib
+import dataclasses
+import functools
+import json
 import signal
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import starjax
 from starjax import config as config_lib
-from starjax.experiments import folders, methods
+from starjax.experiments import clock, folders, methods, words
 from starjax.runtime import files, xla
 
-STAGES = ("collect", "train", "evaluate", "report")
+STAGES = words.STAGES
 
 
-def run(config: config_lib.RunConfig, stages: Sequence[str]) -> None:
-    """Does what is missing of the given stages, in the order of `STAGES`."""
+def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> None:
+    """Does what is missing of the given stages, in the order of `STAGES`.
+
+    Args:
+      config: settings.
+      stages: some of `STAGES`; one needs those before it.
+      command: what was typed, for the record.
+    """
     xla.prepare_xla()
     out = Path(config.out)
     files.require_writable(out)
     names = folders.selected(config)
+    trained = list(dict.fromkeys(methods.METHODS[name].weights_of for name in names))
     with files.lock(out):
-        _claim(config, names, stages)
+        print(words.plan(config, stages), flush=True)
         env = _environment(config)
-        print(plan(config, stages), flush=True)
-        demos = _collect(config, env)
+        root, collect = _demonstrations(config, env)
         if "train" in stages:
-            for name in dict.fromkeys(methods.METHODS[name].weights_of for name in names):
+            for name in dict.fromkeys([*trained, *names]):
+                folders.claim(out / name, config, root.name)
+        # Loaded once, and only if something is still to be trained with them.
+        demos = functools.cache(lambda: _load(root, collect))
+        if "train" not in stages:
+            collect()
+        else:
+            for name in trained:
                 _train(config, name, demos, env)
-
-
-def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
-    """What is going to happen, for the start of a run."""
-    import jax
-
-    demos, policy, train, evaluation = config.demos, config.policy, config.train, config.eval
-    devices = jax.devices()
-    channels = "-".join(map(str, policy.unet_channels))
-    dtype = "" if policy.dtype == "float32" else f", {policy.dtype}"
-    lines = [
-        f"starjax {starjax.__version__}: method {config.method}, preset {config.preset}, "
-        f"seed {config.seed}, folder {config.out}",
-        f"device         {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores",
-        f"observation    {observation(policy)}",
-        f"demonstrations {demos.per_trocar * demos.seen_trocars} "
-        f"({demos.per_trocar} x {demos.seen_trocars} seen trocars)",
-    ]
-    if "train" in stages:
-        lines.append(
-            f"training       {train.steps} steps of {train.batch_size}, U-Net {channels}{dtype}"
-        )
-    if "evaluate" in stages:
-        lines.append(
-            f"evaluation     12 trocars x {evaluation.trials} trials, "
-            f"at most {evaluation.time_limit_s:g} s each"
-        )
-    return "\n".join(lines)
-
-
-def observation(policy: config_lib.PolicyConfig) -> str:
-    """What the policy sees, in words that stand at the start of a run and in its report."""
-    if policy.observation == "state":
-        return (
-            "state (block pose and target position in the place of pixels; "
-            "--policy.observation image turns the camera on)"
-        )
-    weights = policy.encoder_weights or "trained from scratch"
-    return f"image, {policy.image_size} px ({policy.encoder}, {weights})"
-
-
-def _claim(config: config_lib.RunConfig, names: Sequence[str], stages: Sequence[str]) -> None:
-    """Every folder this run will write, refused at once if it belongs to other settings."""
-    if "train" not in stages:
-        return
-    for name in dict.fromkeys(methods.METHODS[name].weights_of for name in names):
-        folders.claim(Path(config.out) / name, config, folders.TRAINED_WITH)
+        if "evaluate" in stages:
+            for name in names:
+                _evaluate(config, name, env, command)
+        if "report" in stages:
+            _report(out, names)
 
 
 def _environment(config: config_lib.RunConfig) -> Any:
+    # Here and below, what brings jax is imported where it is used, after XLA has been prepared.
     from starjax.sim import env
 
     return env.make(config.policy.observation, config.policy.image_size)
 
 
-def _collect(config: config_lib.RunConfig, env: Any) -> Any:
-    """The demonstrations, collected if they are not there, loaded."""
-    import jax
-
+def _demonstrations(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
+    """The folder of a run's demonstrations, and a function that collects what it lacks."""
     from starjax import rcm
-    from starjax.data import demos, load, store
+    from starjax.data import demos, store
     from starjax.sim.tasks import expert
 
-    trocars = jax.tree.map(lambda leaf: leaf[: config.demos.seen_trocars], rcm.TROCARS)
+    trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
     wanted = {
         "per_trocar": config.demos.per_trocar,
         "seed": config.seed,
         "max_steps": config.demos.max_steps,
         "keep_failures": config.demos.keep_failures,
     }
-    root = Path(config.out) / f"demos-{store.digest(demos.describe(env, trocars, **wanted))}"
-    if not store.is_sealed(root):
-        say("collect", f"into {root}")
-        with folders.timed(Path(config.out), "collect"):
-            demos.collect(root, env, expert, trocars, report=_indented, **wanted)
-    else:
-        say("collect", f"done before, {root}")
-    return load.load(root, report=_indented)
+    out = Path(config.out)
+    root = out / f"demos-{store.digest(demos.describe(env, trocars, **wanted))}"
+
+    def collect() -> None:
+        if store.is_sealed(root):
+            words.stage("collect", f"done before, {root}")
+            return
+        words.stage("collect", f"into {root}")
+        with clock.timed(out, "collect"):
+            found = demos.collect(
+                root, env, expert, trocars, devices=_devices(), report=words.indented, **wanted
+            )
+        words.indented(
+            "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
+        )
+
+    return root, collect
 
 
-def _train(config: config_lib.RunConfig, name: str, demos: Any, env: Any) -> None:
+def _load(root: Path, collect: Callable[[], None]) -> Any:
+    from starjax.data import load, store
+
+    collect()
+    try:
+        return load.load(root, report=words.indented)
+    except store.DamagedEpisode as error:
+        words.indented(f"damaged, collected again: {error}")
+        (root / "SEALED.json").unlink()
+        collect()
+        return load.load(root, report=words.indented)
+
+
+def _train(config: config_lib.RunConfig, name: str, demos: Callable[[], Any], env: Any) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
-    from starjax.training import loop
+    from starjax.training import export, loop
 
-    folder = Path(config.out) / name
-    if (folder / "policy.safetensors").exists():
-        say("train", f"{name}: done before, {folder}")
+    out = Path(config.out)
+    folder = out / name
+    weights = folders.weights(out, name)
+    if weights.exists():
+        words.stage("train", f"{name}: done before, {weights}")
         return
-    say("train", f"{name}, into {folder}")
-    with folders.timed(Path(config.out), f"train {name}"), stop_signals() as should_stop:
+    dataset = demos().dataset
+    words.stage("train", f"{name}, into {folder}")
+    with clock.timed(out, f"train {name}"), stop_signals() as should_stop:
         try:
             result = loop.run(
                 methods.METHODS[name],
                 config.policy,
                 config.train,
-                demos.dataset,
+                dataset,
                 env.p_world_ref,
                 folder,
                 config.seed,
@@ -132,13 +130,89 @@ def _train(config: config_lib.RunConfig, name: str, demos: Any, env: Any) -> Non
             )
         except loop.TrainingFailed as error:
             raise config_lib.UsageError(str(error)) from error
-    if result.samples_per_second:
-        _indented(f"{result.samples_per_second:.0f} samples/s")
+    state = result.state
+    export.save(
+        weights,
+        export.Trained(name, config.policy, config.train, state.ema_params, state.normalizer),
+    )
+    errors = ", ".join(f"{key} {value:.3g}" for key, value in result.holdout.items())
+    words.indented(f"{result.samples_per_second:.0f} samples/s; held-out {errors or 'none'}")
+
+
+def _evaluate(config: config_lib.RunConfig, name: str, env: Any, command: str) -> None:
+    """Closed-loop trials of one method; `result.json` is its last file."""
+    from starjax import rcm
+    from starjax.experiments import scoring
+
+    out = Path(config.out)
+    folder, weights = out / name, folders.weights(out, name)
+    settings = json.loads(json.dumps(dataclasses.asdict(config)))
+    if _is_scored(folder, settings):
+        words.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
+        return
+    words.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
+    folders.adopt_twin(out, name)
+    with clock.timed(out, f"evaluate {name}"):
+        who = scoring.subject(name, weights, env)
+        table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, config.eval, config.seed)
+    scoring.write_result(folder, who, table, config, command, _timings(out, name))
+
+
+def _is_scored(folder: Path, settings: dict[str, Any]) -> bool:
+    """Whether result.json is there and of these settings."""
+    path = folder / "result.json"
+    if not path.exists():
+        return False
+    found = json.loads(path.read_text())["config"]
+    return all(found[part] == settings[part] for part in (*folders.TRAINED_WITH, "eval"))
+
+
+def _timings(out: Path, name: str) -> dict[str, float]:
+    """Seconds of the stages that a method's result rests on, compilation apart."""
+    stages = {
+        "collect": "collect",
+        "train": f"train {methods.METHODS[name].weights_of}",
+        "evaluate": f"evaluate {name}",
+    }
+    spent = clock.timings(out)
+    return {
+        f"{stage}{part}": spent[f"{key}{part}"]
+        for stage, key in stages.items()
+        for part in ("", ": compile")
+        if f"{key}{part}" in spent
+    }
+
+
+def _report(out: Path, names: Sequence[str]) -> None:
+    """The report of every method in the folder, and the outcome of this run's."""
+    scored = [out / name for name in methods.METHODS if (out / name / "result.json").exists()]
+    words.stage("report", f"of {', '.join(path.name for path in scored)}, into {out / 'report'}")
+    with clock.timed(out, "report"):
+        page = draw(scored, out / "report")
+    results = [json.loads((out / name / "result.json").read_text()) for name in names]
+    print(f"\n{words.outcome(results)}\n\nreport: {page}", flush=True)
+
+
+def draw(runs: Sequence[Path], out: Path, with_video: bool = True) -> Path:
+    """Builds a report and returns its page."""
+    from starjax.experiments.report import build
+
+    with warnings.catch_warnings():
+        # The video's encoder is a child process; it is started, not forked into more of jax.
+        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+        return build.build(runs, out, with_video=with_video, report=words.indented)
+
+
+def _devices() -> Any:
+    """All devices if there are several, None (the default one) otherwise."""
+    import jax
+
+    return jax.devices() if len(jax.devices()) > 1 else None
 
 
 @contextlib.contextmanager
 def stop_signals() -> Iterator[Callable[[], bool]]:
-    """Yields `should_stop`: true after Ctrl-C or a termination signal; a second one ends at once."""
+    """Yields `should_stop`: true after Ctrl-C or SIGTERM; the second one ends at once."""
     asked = False
 
     def ask(number: int, frame: Any) -> None:
@@ -153,12 +227,3 @@ def stop_signals() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def say(stage: str, text: str) -> None:
-    """One line that begins a stage."""
-    print(f"\n[{STAGES.index(stage) + 1}/{len(STAGES)}] {stage}: {text}", flush=True)
-
-
-def _indented(text: str) -> None:
-    print(f"      {text}", flush=True)

@@ -32,7 +32,7 @@ def main(argv: Sequence[str]) -> int:
     # Imported late: `--help` and mistakes answer before jax loads.
     from starjax.experiments import pipeline
 
-    pipeline.run(config, pipeline.STAGES)
+    pipeline.run(config, pipeline.STAGES, options.typed("run", argv))
     return 0
 
 

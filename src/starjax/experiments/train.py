@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from starjax.experiments import run
+from starjax.experiments import options, run
 
 DESCRIPTION = """Collects and trains, without evaluation (the flags are those of `starjax run`).
 
@@ -14,5 +14,5 @@ def main(argv: Sequence[str]) -> int:
     config = run.settings(argv, "starjax train", DESCRIPTION)
     from starjax.experiments import pipeline
 
-    pipeline.run(config, stages=("collect", "train"))
+    pipeline.run(config, stages=("collect", "train"), command=options.typed("train", argv))
     return 0

@@ -1,0 +1,67 @@
+"""`starjax bench RUN`: inference latency of a trained policy (Table IV)."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from starjax import config as config_lib
+from starjax.experiments import folders, options
+from starjax.runtime import files, xla
+
+DESCRIPTION = """Times one decision at batch 1: observation in, commands out, compilation apart.
+
+RUN is a method's folder, such as runs/cpu/stardiff; the figures join its result.json, and so
+the report's Table IV."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    run: tyro.conf.Positional[str]
+    ddim_steps: tuple[int, ...] = (1, 2, 5, 10, 20, 50, 100)
+    repeats: int = 100  # decisions timed for each
+
+
+def main(argv: Sequence[str]) -> int:
+    """Times, prints and records."""
+    chosen = options.parse(Options, argv, prog="starjax bench", description=DESCRIPTION)
+    run = Path(chosen.run)
+    config = folders.read_config(run)
+    result_file = run / "result.json"
+    if not result_file.is_file():
+        raise config_lib.UsageError(f"{run}: expected a scored method, no result.json there")
+    for count in chosen.ddim_steps:
+        if not 1 <= count <= config.policy.diffusion_steps:
+            most = config.policy.diffusion_steps
+            raise config_lib.UsageError(f"--ddim-steps: expected 1 to {most}, got {count}")
+    xla.prepare_xla()
+
+    from starjax.experiments import latency
+    from starjax.sim import model
+    from starjax.training import export
+
+    trained = export.load(folders.weights(run.parent, run.name))
+    p_world_ref = model.load().p_world_ref
+    found = {}
+    print("  DDIM steps      p50      p95      p99 ms       Hz")
+    for count in chosen.ddim_steps:
+        ms = latency.decision(run.name, trained, p_world_ref, chosen.repeats, count)
+        found[str(count)] = ms  # JSON's names are words
+        print(_row(str(count), ms), flush=True)
+    roll = latency.roll_network(trained, p_world_ref, chosen.repeats)
+    if roll:
+        print(_row("roll net", roll))
+    result = json.loads(result_file.read_text())
+    result |= {"inference_ms_by_ddim_steps": found, "roll_network_ms": roll}
+    files.write_json(result_file, result)
+    return 0
+
+
+def _row(name: str, ms: dict[str, float]) -> str:
+    return (
+        f"  {name:10} {ms['p50']:8.3f} {ms['p95']:8.3f} {ms['p99']:8.3f}    {1e3 / ms['p50']:8.1f}"
+    )

@@ -1,0 +1,60 @@
+"""How long each stage took, compilation apart, summed over every start of the same run."""
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from starjax.runtime import files
+
+# Tracing is left out: its events nest, so that their sum says nothing.
+_COMPILE_EVENTS = (
+    "/jax/core/compile/backend_compile_duration",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration",
+)
+
+
+@contextlib.contextmanager
+def timed(out: Path, stage: str) -> Iterator[None]:
+    """Adds the seconds spent inside to `<out>/timings.json`, also after Ctrl-C.
+
+    `stage` is all of them, `stage: compile` those in which jax compiled.
+    """
+    start, compiling = time.monotonic(), _CompileSeconds()
+    try:
+        with compiling:
+            yield
+    finally:
+        spent = timings(out)
+        total = time.monotonic() - start
+        for name, seconds in ((stage, total), (f"{stage}: compile", compiling.seconds)):
+            spent[name] = round(spent.get(name, 0.0) + seconds, 2)
+        files.write_json(out / "timings.json", spent)
+
+
+def timings(out: Path) -> dict[str, float]:
+    """Seconds a stage so far."""
+    path = out / "timings.json"
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+class _CompileSeconds:
+    """Adds up what jax reports of its compilations while it is entered."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def _add(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event in _COMPILE_EVENTS:
+            self.seconds += duration_secs
+
+    def __enter__(self) -> None:
+        import jax.monitoring
+
+        jax.monitoring.register_event_duration_secs_listener(self._add)
+
+    def __exit__(self, *_: object) -> None:
+        import jax.monitoring
+
+        jax.monitoring.unregister_event_duration_listener(self._add)

@@ -1,0 +1,46 @@
+"""`starjax report RUN...`: tables, figures, video and page from results that are there."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from starjax import config as config_lib
+from starjax.experiments import options
+from starjax.runtime import files, xla
+
+DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
+
+RUN is a method's folder, such as runs/cpu/stardiff, or a folder of them, such as runs/cpu."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    runs: tyro.conf.Positional[tuple[str, ...]]
+    out: str = ""  # folder of the report; `report` beside the first method's folder if empty
+    video: bool = True
+
+
+def main(argv: Sequence[str]) -> int:
+    """Builds the report."""
+    chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
+    runs = [found for name in chosen.runs for found in _with_results(Path(name))]
+    out = Path(chosen.out or runs[0].parent / "report")
+    xla.prepare_xla()
+    files.require_writable(out)
+
+    from starjax.experiments import pipeline
+
+    print(f"report: {pipeline.draw(runs, out, with_video=chosen.video)}")
+    return 0
+
+
+def _with_results(path: Path) -> list[Path]:
+    """A method's folder, or those inside a folder."""
+    found = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
+    if not found:
+        raise config_lib.UsageError(f"{path}: expected a folder with a result.json, or of such")
+    return [file if file.is_dir() else file.parent for file in found]

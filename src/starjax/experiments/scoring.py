@@ -1,0 +1,114 @@
+"""A trained policy in closed loop: rollouts of a method, and the result.json that they become."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from starjax import config as config_lib
+from starjax import rcm
+from starjax.evaluation import evaluate, metrics, table
+from starjax.experiments import folders, latency, methods, words
+from starjax.policies import policy as policies
+from starjax.runtime import files, xla
+from starjax.sim import env as sim_env
+from starjax.training import export
+
+REPEATS = 50  # decisions timed for result.json; `starjax bench` takes more
+
+
+class Subject(NamedTuple):
+    """A method with its weights, in its environment.
+
+    Attributes:
+      method: its name.
+      env: with the observation that it was trained on.
+      policy: its functions.
+      trained: its weights and what they were trained with.
+    """
+
+    method: str
+    env: sim_env.Env
+    policy: policies.Policy
+    trained: export.Trained
+
+
+def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subject:
+    """Loads a method's weights.
+
+    Args:
+      method: a row of Table II.
+      weights: policy.safetensors.
+      env: built from what the weights were trained on unless given.
+    """
+    trained = export.load(weights)
+    env = env or sim_env.make(trained.policy.observation, trained.policy.image_size)
+    row = methods.METHODS[method]
+    policy = policies.make(row, trained.policy, env.p_world_ref, trained.train)
+    return Subject(method, env, policy, trained)
+
+
+def rollouts(
+    directory: Path, who: Subject, trocars: rcm.Trocar, settings: config_lib.EvalConfig, seed: int
+) -> table.Table:
+    """Runs what is missing of an evaluation, on all devices."""
+    devices = jax.devices()
+    return evaluate.evaluate(
+        directory,
+        who.env,
+        who.policy,
+        who.trained.params,
+        who.trained.normalizer,
+        trocars,
+        trials=settings.trials,
+        seed=seed,
+        obs_horizon=who.trained.policy.obs_horizon,
+        execute=who.trained.policy.execute,
+        time_limit_s=settings.time_limit_s,
+        chunk=settings.chunk,
+        video_trials=settings.video_trials,
+        devices=devices if len(devices) > 1 else None,
+        identity=folders.behaviour(who.method)._asdict(),
+        report=words.indented,
+    )
+
+
+def write_result(
+    folder: Path,
+    who: Subject,
+    trials: table.Table,
+    config: config_lib.RunConfig,
+    command: str,
+    timings_s: dict[str, float] | None = None,
+) -> dict[str, Any]:
+    """Writes and returns `<folder>/result.json`: `metrics.compose`'s figures and what made them.
+
+    Args:
+      folder: of the result.
+      who: was evaluated.
+      trials: of the twelve trocars.
+      config: settings of the run and of this evaluation.
+      command: what was typed.
+      timings_s: seconds by stage.
+    """
+    is_seen = np.arange(len(rcm.IS_SEEN)) < config.demos.seen_trocars
+    observation = who.trained.policy.observation
+    figures = metrics.compose(
+        trials, is_seen, method=who.method, observation=observation, seed=config.seed
+    )
+    result = {
+        **figures,
+        "inference_ms": latency.decision(who.method, who.trained, who.env.p_world_ref, REPEATS),
+        "preset": config.preset,
+        "config": json.loads(json.dumps(dataclasses.asdict(config))),
+        "command": command,
+        "timings_s": timings_s or {},
+        "warnings": words.warnings(config, figures),
+        "versions": xla.versions(),
+        "hardware": xla.hardware(),
+    }
+    files.write_json(folder / "result.json", result)
+    return result

@@ -1,0 +1,87 @@
+"""`starjax sweep RUN`: a trained policy over any sample or grid of trocars."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from starjax import config as config_lib
+from starjax.experiments import folders, options
+from starjax.runtime import files, xla
+
+DESCRIPTION = """Scores a trained policy on a random sample (Eq. 19) or a grid of trocars.
+
+RUN is a method's folder, such as runs/cpu/stardiff; RUN/sweep.json is what the report draws
+as the success map and as Fig. 4."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    run: tyro.conf.Positional[str]
+    trocars: int = 200  # how many to draw; not used with a grid
+    radii_cm: tuple[float, ...] = ()  # of a grid; 0 is one point
+    polars_deg: tuple[float, ...] = (90.0,)  # of a grid
+    azimuths: int = 12  # of a grid, evenly around
+    seed: int = 0  # of the sample and of the trials
+    eval: config_lib.EvalConfig = dataclasses.field(
+        default_factory=lambda: config_lib.EvalConfig(trials=1, video_trials=0)
+    )
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs the trials that are missing and writes sweep.json."""
+    chosen = options.parse(Options, argv, prog="starjax sweep", description=DESCRIPTION)
+    run = Path(chosen.run)
+    config = folders.read_config(run)
+    xla.prepare_xla()
+    files.require_writable(run)
+
+    from starjax import rcm
+    from starjax.evaluation import sweep
+    from starjax.experiments import scoring
+
+    trocars = _trocars(chosen)
+    who = scoring.subject(run.name, folders.weights(run.parent, run.name))
+    table = scoring.rollouts(run / "sweep", who, trocars, chosen.eval, chosen.seed)
+    seen = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
+    figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)
+    about = {
+        "method": who.method,
+        "observation": who.trained.policy.observation,
+        "command": options.typed("sweep", argv),
+        "versions": xla.versions(),
+        "hardware": xla.hardware(),
+    }
+    files.write_json(run / "sweep.json", {**about, **figures})
+    print(_outcome(figures))
+    print(f"\nresult: {run / 'sweep.json'}; starjax report {run} draws it")
+    return 0
+
+
+def _trocars(chosen: Options) -> Any:
+    """The trocars that the flags describe."""
+    import numpy as np
+
+    from starjax.evaluation import sweep
+
+    try:
+        if not chosen.radii_cm:
+            return sweep.sample(chosen.seed, chosen.trocars)
+        azimuths = 2 * np.pi * np.arange(chosen.azimuths) / max(chosen.azimuths, 1)
+        radii = np.array(chosen.radii_cm) / 100
+        return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths)
+    except ValueError as error:
+        raise config_lib.UsageError(f"trocars: {error}") from error
+
+
+def _outcome(figures: dict[str, Any]) -> str:
+    """Success by distance to the nearest training trocar."""
+    lines = ["", "  distance to the nearest training trocar   success"]
+    for row in figures["by_distance"]:
+        span = f"{1e3 * row['low_m']:.0f} to {1e3 * row['high_m']:.0f} mm"
+        lines.append(f"  {span:40}  {row['successes']}/{row['trials']} = {100 * row['rate']:.0f}%")
+    return "\n".join(lines)

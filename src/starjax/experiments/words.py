@@ -1,0 +1,108 @@
+"""What a run tells its user: the plan, the stages, the outcome."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import starjax
+from starjax import config as config_lib
+from starjax.experiments import methods
+from starjax.runtime import xla
+
+STAGES = ("collect", "train", "evaluate", "report")
+
+
+def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
+    """What is going to happen, for the start of a run."""
+    import jax
+
+    demos, policy, train, evaluation = config.demos, config.policy, config.train, config.eval
+    devices = jax.devices()
+    channels = "-".join(map(str, policy.unet_channels))
+    dtype = "" if policy.dtype == "float32" else f", {policy.dtype}"
+    lines = [
+        f"starjax {starjax.__version__}: method {config.method}, preset {config.preset}, "
+        f"seed {config.seed}, folder {config.out}",
+        f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores",
+        f"  observation     {observation(policy)}",
+        f"  demonstrations  {demos.per_trocar * demos.seen_trocars} "
+        f"({demos.per_trocar} x {demos.seen_trocars} seen trocars)",
+    ]
+    if "train" in stages:
+        steps = f"{train.steps} steps of {train.batch_size}"
+        lines.append(f"  training        {steps}, U-Net {channels}{dtype}")
+    if "evaluate" in stages:
+        limit = f"at most {evaluation.time_limit_s:g} s each"
+        lines.append(f"  evaluation      12 trocars x {evaluation.trials} trials, {limit}")
+    return "\n".join(lines)
+
+
+def observation(policy: config_lib.PolicyConfig) -> str:
+    """What the policy sees, in one line."""
+    if policy.observation == "state":
+        return (
+            "state: block pose and target position in the place of pixels "
+            "(--policy.observation image turns the camera on)"
+        )
+    return f"image, {policy.image_size} px; {encoder(policy)}"
+
+
+def encoder(policy: config_lib.PolicyConfig) -> str:
+    """Which image encoder, and where its weights began."""
+    start = f"from {policy.encoder_weights}" if policy.encoder_weights else "from scratch"
+    return f"encoder {policy.encoder} trained {start}"
+
+
+def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[str]:
+    """What a reader of the result must know, one sentence each."""
+    found = []
+    if config.policy.observation == "state":
+        found.append(
+            "The policy observes the simulator's state (block pose, target position), not pixels "
+            "as in the paper; --policy.observation image turns the camera on."
+        )
+    else:
+        found.append(f"Image {encoder(config.policy)}, {config.policy.image_size} px.")
+    if config.preset == "smoke":
+        found.append("Preset smoke is too short to learn anything: its rates mean nothing.")
+    if figures["invalid"]:
+        found.append(f"{figures['invalid']} trial(s) diverged in simulation; they count as failed.")
+    return found
+
+
+def outcome(results: Sequence[Mapping[str, Any]]) -> str:
+    """Seen against unseen trocars, one line a method, for the end of a run."""
+    rows = [("", "seen", "unseen", "safe", "RCM executed")]
+    for result in results:
+        error = result["rcm_error_mm"]["executed"]
+        rows.append(
+            (
+                methods.METHODS[result["method"]].label,
+                _rate(result["seen"]),
+                _rate(result["unseen"]),
+                _rate(result["safe"]["all"]),
+                f"{error['mean']:.3f} mm, at most {error['max']:.2f}",
+            )
+        )
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join(
+        "  " + "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths)).rstrip()
+        for row in rows
+    )
+
+
+def stage(name: str, text: str) -> None:
+    """Prints the line that begins a stage."""
+    print(f"\n[{STAGES.index(name) + 1}/{len(STAGES)}] {name}: {text}", flush=True)
+
+
+def indented(text: str) -> None:
+    """Prints a line that belongs to the stage above it."""
+    print(f"      {text}", flush=True)
+
+
+def _rate(rate: Mapping[str, Any]) -> str:
+    if not rate["trials"]:
+        return "-"
+    low, high = (100 * bound for bound in rate["ci95"])
+    count = f"{rate['successes']}/{rate['trials']}"
+    return f"{count} = {100 * rate['rate']:.0f}% [{low:.0f}, {high:.0f}]"
