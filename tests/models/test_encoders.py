@@ -15,7 +15,7 @@ def make(trunk, **changes):
     return encoders.ImageEncoder(trunk, **{**settings, **changes})
 
 
-def frames(n=2, size=32):
+def frames(n=2, size=64):
     return jax.random.normal(jax.random.key(1), (n, size, size, 3))
 
 
@@ -46,35 +46,40 @@ def test_a_crop_does_not_move_a_keypoint():
     np.testing.assert_allclose(seen[0], [(3 * 8 + 4 - 32) / 16, (4 * 8 + 4 - 32) / 16], atol=1e-5)
 
 
-@pytest.mark.parametrize("trunk", sorted(encoders.TRUNKS))
-class TestImageEncoder:
-    def test_shape_and_gradient(self, trunk):
-        module = make(trunk)
-        offset = jnp.zeros((2, 2))
-        params = jax.jit(module.init)(KEY, frames())
-        value, gradient = jax.jit(
-            jax.value_and_grad(lambda p: (module.apply(p, frames(), offset) ** 2).sum())
-        )(params)
-        assert jnp.isfinite(value)
-        assert module.apply(params, frames(), offset).shape == (2, 8)
-        for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
-            assert jnp.isfinite(leaf).all(), path
-            assert (leaf != 0).any(), path
+@pytest.fixture(scope="module", params=sorted(encoders.TRUNKS))
+def encoder(request):
+    """An encoder's parameters, its output and the gradient of its first frame's output."""
+    module = make(request.param)
+    params = jax.jit(module.init)(KEY, frames())
 
-    def test_frames_do_not_see_each_other(self, trunk):
-        module = make(trunk)
-        params = jax.jit(module.init)(KEY, frames())
-        apply = jax.jit(module.apply)
-        before, after = apply(params, frames()), apply(params, frames().at[1].set(5.0))
-        np.testing.assert_array_equal(before[0], after[0])
-        assert not np.array_equal(before[1], after[1])
+    def first(params, images):
+        out = module.apply(params, images, jnp.zeros((2, 2)))
+        return (out[0] ** 2).sum(), out
 
-    def test_bfloat16_is_close(self, trunk):
-        params = jax.jit(make(trunk).init)(KEY, frames())
-        exact = jax.jit(make(trunk).apply)(params, frames())
-        rough = jax.jit(make(trunk, dtype=jnp.bfloat16).apply)(params, frames())
-        assert rough.dtype == jnp.float32
-        assert 0 < float(jnp.abs(rough - exact).max()) < 0.1 * float(jnp.abs(exact).max())
+    program = jax.jit(jax.value_and_grad(first, (0, 1), has_aux=True))
+    (_, out), gradients = program(params, frames())
+    return request.param, params, out, gradients
+
+
+def test_every_parameter_gets_a_gradient(encoder):
+    _, _, out, (gradient, _) = encoder
+    assert out.shape == (2, 8)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradient):
+        assert jnp.isfinite(leaf).all(), path
+        assert (leaf != 0).any(), path
+
+
+def test_frames_do_not_see_each_other(encoder):
+    _, _, _, (_, by_image) = encoder
+    assert (by_image[0] != 0).any()
+    np.testing.assert_array_equal(by_image[1], 0.0)
+
+
+def test_bfloat16_is_close(encoder):
+    trunk, params, exact, _ = encoder
+    rough = jax.jit(make(trunk, dtype=jnp.bfloat16).apply)(params, frames())
+    assert rough.dtype == jnp.float32
+    assert 0 < float(jnp.abs(rough - exact).max()) < 0.1 * float(jnp.abs(exact).max())
 
 
 def test_resnet18_has_torchvisions_size():
@@ -104,6 +109,11 @@ def test_max_pool_is_jaxs():
 def test_unknown_trunk_is_named():
     with pytest.raises(ValueError, match=r"trunk: expected one of .*'small'.*got 'vit'"):
         make("vit").init(KEY, frames())
+
+
+def test_an_image_that_shrinks_to_one_cell_has_no_keypoints():
+    with pytest.raises(ValueError, match=r"image: expected more than one cell.*got 32 x 32"):
+        jax.eval_shape(make("resnet18").init, KEY, frames(size=32))
 
 
 @pytest.mark.parametrize("horizon", [1, 2, 4])

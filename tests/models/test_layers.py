@@ -96,3 +96,14 @@ def test_group_norm_of_a_constant_is_finite_with_its_gradient():
 def test_groups_must_divide_the_channels():
     with pytest.raises(ValueError, match="groups: expected a divisor of 6 channels, got 4"):
         layers.GroupNorm(4).init(jax.random.key(0), jnp.ones((1, 2, 6)))
+
+
+def test_initial_values_are_uniform_and_of_their_own_key():
+    draw = layers.uniform_init(16)
+    x = np.asarray(draw(jax.random.key(3), (400, 500)), float) * 4.0
+    counts, _ = np.histogram(x, 20, (-1.0, 1.0))
+    assert counts.sum() == x.size
+    assert (np.abs(counts - 10_000) < 500).all()
+    other = np.asarray(draw(jax.random.fold_in(jax.random.key(3), 1), (400, 500)), float) * 4.0
+    for a, b in ((x, other), (x[1:], x[:-1]), (x[:, 1:], x[:, :-1])):
+        assert abs((a * b).mean()) < 0.003  # the deviation of such a mean is 0.0008

@@ -5,6 +5,8 @@ network's input once. The noise comes from hashing the pixel's number, not from 
 array that would have to be written and read.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -42,15 +44,16 @@ def augment(
     """
     lead, (height, width) = images.shape[:-3], _check(images, crop)
     frames = images.reshape((-1, height, width, 3))
-    key_crop, key_jitter, key_noise = jax.random.split(key, 3)
-    spans = jnp.array([height - crop + 1, width - crop + 1])
-    corner = jax.random.randint(key_crop, (len(frames), 2), 0, spans)
+    # One draw for all: each would cost XLA on CPU a second of compilation.
+    bits = jax.random.bits(key, (len(frames), 6), jnp.uint32)
+    spans = jnp.array([height - crop + 1, width - crop + 1], jnp.uint32)
+    corner = (bits[:, :2] % spans).astype(jnp.int32)
+    factors = 1.0 + jitter * ((bits[:, 2:5] >> 8).astype(jnp.float32) * 2.0**-23 - 1.0)
     x = jax.vmap(lambda f, c: jax.lax.dynamic_slice(f, (c[0], c[1], 0), (crop, crop, 3)))(
         frames, corner
     )
-    factors = jax.random.uniform(key_jitter, (3, len(frames)), minval=1 - jitter, maxval=1 + jitter)
-    x = _jitter(x.astype(jnp.float32) / 255.0, *factors)
-    x = jnp.clip(x + noise * hash_normal(key_noise, x.shape), 0.0, 1.0)
+    x = _jitter(x.astype(jnp.float32) / 255.0, *factors.T)
+    x = jnp.clip(x + noise * hash_normal(bits[:, 5], x.shape[1:]), 0.0, 1.0)
     offset = (corner - jnp.array(_centre(height, width, crop))).astype(jnp.float32)
     return _normalize(x, dtype).reshape((*lead, crop, crop, 3)), offset.reshape((*lead, 2))
 
@@ -62,22 +65,26 @@ def center(images: jax.Array, *, crop: int, dtype: jnp.dtype = jnp.float32) -> j
     return _normalize(x.astype(jnp.float32) / 255.0, dtype)
 
 
-def hash_normal(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Nearly normal noise (mean 0, deviation 1), float32 `shape`, a few integer operations each.
+def hash_normal(seed: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Nearly normal noise (mean 0, deviation 1), a few integer operations for each value.
 
     Each value is the sum of the four bytes of a hashed counter (Irwin-Hall: within +-3.5, excess
     kurtosis -0.3). Not for sampling from a model; for pixels nobody can tell.
+
+    Args:
+      seed: random uint32 `[N]`.
+      shape: of one frame.
+
+    Returns:
+      float32 `[N, *shape]`.
     """
-    per_row = 1
-    for size in shape[1:]:
-        per_row *= size
-    seeds = jax.random.bits(key, (shape[0], 1), jnp.uint32)
-    bits = _mix(seeds ^ _mix(jax.lax.broadcasted_iota(jnp.uint32, (shape[0], per_row), 1)))
+    counter = _mix(jnp.arange(math.prod(shape), dtype=jnp.uint32))
+    bits = _mix(seed[:, None] ^ counter)
     low, high = bits & 0x00FF00FF, (bits >> 8) & 0x00FF00FF
     pairs = low + high
     total = (pairs & 0xFFFF) + (pairs >> 16)
     deviation = ((256.0**2 - 1.0) / 3.0) ** 0.5
-    return ((total.astype(jnp.float32) - 510.0) / deviation).reshape(shape)
+    return ((total.astype(jnp.float32) - 510.0) / deviation).reshape((-1, *shape))
 
 
 def _jitter(x: jax.Array, brightness: jax.Array, contrast: jax.Array, saturation: jax.Array):

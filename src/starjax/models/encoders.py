@@ -40,6 +40,11 @@ class ImageEncoder(nn.Module):
             raise ValueError(f"trunk: expected one of {sorted(TRUNKS)}, got {self.trunk!r}")
         make, default_width = TRUNKS[self.trunk]
         maps = make(self.width or default_width, self.dtype, name="trunk")(image)
+        if maps.shape[1] * maps.shape[2] == 1:
+            raise ValueError(
+                f"image: expected more than one cell after {self.trunk}, "
+                f"got {image.shape[1]} x {image.shape[2]} pixels"
+            )
         # Rounded logits would move a keypoint by a fraction of a cell, which is millimetres.
         kernel = self.param(
             "keypoints", layers.uniform_init(maps.shape[-1]), (maps.shape[-1], self.features // 2)

@@ -3,7 +3,7 @@
 Names and shapes follow torchvision's, so that `pretrained` can fill in its ImageNet weights.
 """
 
-from collections.abc import Callable
+import math
 
 import flax.linen as nn
 import jax
@@ -60,13 +60,14 @@ class Conv2d(nn.Module):
     features: int
     kernel_size: int
     stride: int = 1
-    init: Callable[..., jax.Array] = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[N, h, w, C] -> [N, ceil(h/stride), ceil(w/stride), features]`."""
         size, pad = self.kernel_size, self.kernel_size // 2
-        kernel = self.param("kernel", self.init, (size, size, x.shape[-1], self.features))
+        # Variance 2 / fan-out, as torchvision's.
+        init = layers.uniform_init(size * size * self.features, gain=math.sqrt(6.0))
+        kernel = self.param("kernel", init, (size, size, x.shape[-1], self.features))
         return jax.lax.conv_general_dilated(
             x,
             kernel.astype(x.dtype),
