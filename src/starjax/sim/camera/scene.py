@@ -35,11 +35,13 @@ class Texture(NamedTuple):
     Attributes:
       texels: `[h, w, 3]` RGB.
       scale: `[2]` texture coordinates per metre along the geom's x and y.
+      corner: `[2]` m, where both are 0.
       R_cam_geom, p_cam_top: `[3, 3]` and `[3]` m, pose of the textured face.
     """
 
     texels: np.ndarray
     scale: np.ndarray
+    corner: np.ndarray
     R_cam_geom: np.ndarray
     p_cam_top: np.ndarray
 
@@ -249,13 +251,14 @@ def _textures(mj_model, data, ids, R_world_cam, p_world_cam) -> dict[int, Textur
             raise ValueError(
                 f"geom {name!r}: expected a 2d texture on a plane or box of the world body"
             )
-        scale = 0.5 * mj_model.mat_texrepeat[mat] * np.array([1, -1])
+        size, signs = mj_model.geom_size[g], np.array([1, -1])
+        scale = 0.5 * mj_model.mat_texrepeat[mat] * signs
         if not mj_model.mat_texuniform[mat]:
-            scale = scale / mj_model.geom_size[g, :2]
+            scale = scale / size[:2]
         R_world_geom = data.geom_xmat[g].reshape(3, 3)
-        top = data.geom_xpos[g] + R_world_geom[:, 2] * mj_model.geom_size[g, 2] * (shape == BOX)
+        top = data.geom_xpos[g] + R_world_geom[:, 2] * size[2] * (shape == BOX)
         found[row] = Texture(
-            _texels(mj_model, tex), scale, R_world_cam.T @ R_world_geom,
+            _texels(mj_model, tex), scale, -size[:2] * signs, R_world_cam.T @ R_world_geom,
             R_world_cam.T @ (top - p_world_cam),
         )  # fmt: skip
     return found

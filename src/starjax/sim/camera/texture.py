@@ -32,8 +32,7 @@ def _look(texture: scenes.Texture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     origin = -texture.p_cam_top @ texture.R_cam_geom
     t = -origin[2] / np.where(np.abs(ray[..., 2]) < 1e-9, 1e-9, ray[..., 2])
     h, w, _ = texture.texels.shape
-    u = (origin[0] + t * ray[..., 0]) * texture.scale[0] - 0.5
-    v = (origin[1] + t * ray[..., 1]) * texture.scale[1] - 0.5
+    u, v = [(origin[k] + t * ray[..., k] - texture.corner[k]) * texture.scale[k] for k in range(2)]
     column = np.floor((u - np.floor(u)) * w).astype(int) % w
     line = np.floor((v - np.floor(v)) * h).astype(int) % h
     return np.moveaxis(texture.texels[line, column], -1, 0)
