@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from starjax.experiments.report import results, stats, style
+from starjax.experiments.report import outcomes, results, stats, style
 
 _BIN = 0.005  # m of distance pooled in one point
 _SMOOTH = 0.008  # m, width of the kernel behind the heat map
@@ -26,7 +26,8 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
                 _whiskers(left, run, (i - (len(runs) - 1) / 2) * 0.35)
         left.set_xlabel("distance to the nearest training trocar (mm)")
         left.set_ylabel("success rate")
-        left.set_title(f"{focus.label if len(runs) == 1 else 'All methods'}, 95% Wilson intervals")
+        name = focus.label if len(runs) == 1 else "All methods"
+        left.set_title(f"{name} from {results.observed(runs)}, 95% Wilson intervals")
         style.percent_axis(left)
         if len(runs) > 1:
             figure.legend(loc="outside lower left", fontsize=7, ncols=4)
@@ -35,10 +36,14 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
 
 
 def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
-    """Training loss and held-out action error against steps, or None if nothing was logged."""
+    """Training loss and held-out action error against steps, or None if nothing was logged.
+
+    Methods that share their weights share a curve.
+    """
     from matplotlib import ticker
     from matplotlib.figure import Figure
 
+    runs = list({run.weights_of: run for run in reversed(runs)}.values())[::-1]
     panels = [
         (name, title)
         for name, title in CURVES.items()
@@ -55,7 +60,7 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
                 if points:
                     axis.plot(*np.array(points).T, color=color, linewidth=1.3, label=run.label)
             axis.set_title(title)
-            axis.set_xlabel("training step")
+            axis.set_xlabel(f"training step (from {results.observed(runs)})")
             axis.set_yscale("log")
             axis.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
             axis.yaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
@@ -76,10 +81,10 @@ CURVES = {
 def _pooled(run: results.Run) -> list[tuple[float, stats.Rate]]:
     """(mean distance in mm, score) of the trials whose distance falls in one bin."""
     trials = [*run.trials, *run.sweep]
-    apart = results.distances(trials, results.training_trocars(run))
+    apart = outcomes.distances(trials, results.training_trocars(run))
     bins = np.round(apart / _BIN).astype(int)
     inside = [np.flatnonzero(bins == b) for b in np.unique(bins)]
-    return [(1e3 * apart[i].mean(), results.tally(trials[j] for j in i)) for i in inside]
+    return [(1e3 * apart[i].mean(), outcomes.tally(trials[j] for j in i)) for i in inside]
 
 
 def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
@@ -87,9 +92,9 @@ def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
     points, color = _pooled(run), style.SUCCESS
     x, scores = [at for at, _ in points], [score for _, score in points]
     if not run.sweep:
-        groups = results.by_trocar(run.trials)
-        apart = results.distances([g[0] for g in groups], results.training_trocars(run))
-        rates = [results.tally(g).rate for g in groups]
+        groups = outcomes.by_trocar(run.trials)
+        apart = outcomes.distances([g[0] for g in groups], results.training_trocars(run))
+        rates = [outcomes.tally(g).rate for g in groups]
         axis.plot(1e3 * apart, rates, "o", color=color, alpha=0.35, markersize=4)
     low, high = [s.low for s in scores], [s.high for s in scores]
     axis.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
@@ -111,13 +116,13 @@ def _whiskers(axis: Any, run: results.Run, offset: float) -> None:
 def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> None:
     """Ports from above: a smoothed map where a sweep filled the disc, else a dot a trocar."""
     trials = run.sweep or run.trials
-    groups = results.by_trocar(trials)
-    at = 1e3 * results.positions([group[0] for group in groups])[:, :2]
-    rates = np.array([results.tally(group).rate for group in groups])
+    groups = outcomes.by_trocar(trials)
+    at = 1e3 * outcomes.positions([group[0] for group in groups])[:, :2]
+    rates = np.array([outcomes.tally(group).rate for group in groups])
     if run.sweep:
         shown = _heat(axis, at, rates, np.array([len(group) for group in groups]))
         axis.plot(*at.T, ".", color=shades["paper"], markersize=1.2, alpha=0.3)
-        ports = 1e3 * results.positions(results.training_trocars(run))[:, :2]
+        ports = 1e3 * outcomes.positions(results.training_trocars(run))[:, :2]
         axis.plot(*ports.T, "x", color=style.FAILURE, markersize=6, label="training trocar")
         axis.legend(loc="upper left", bbox_to_anchor=(0, -0.12), fontsize=7)
     else:

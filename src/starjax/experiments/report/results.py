@@ -1,19 +1,16 @@
 """What a finished run left on disk, read for the report: results, rollouts, loss curves, sweep."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import rcm
 from starjax.experiments import methods
-from starjax.experiments.report import stats
+from starjax.experiments.report import outcomes, stats
 
 OURS = "stardiff"  # the method that the others are compared with
-CONTROL_HZ = 30.0  # of the environment; a test holds the two together
-Trial = dict[str, Any]  # one entry of result.json's `trials`
 
 
 class Rollout(NamedTuple):
@@ -27,7 +24,7 @@ class Rollout(NamedTuple):
       target_peg: index of the peg the block belongs on, -1 if unknown.
     """
 
-    trial: Trial
+    trial: outcomes.Trial
     p_world_tip: np.ndarray
     p_world_trocar: np.ndarray
     qpos: np.ndarray | None
@@ -42,8 +39,9 @@ class Run(NamedTuple):
       result: result.json.
       label: name of the method in tables.
       group: its group in Table III.
+      weights_of: the method whose weights it runs on.
       rollouts: recorded trials, empty if none were.
-      curves: lines of metrics.jsonl.
+      curves: lines of metrics.jsonl, of the training of its weights.
       sweep: trials of a sweep over other trocars, empty if none was made.
     """
 
@@ -51,98 +49,29 @@ class Run(NamedTuple):
     result: dict[str, Any]
     label: str
     group: str
+    weights_of: str
     rollouts: list[Rollout]
     curves: list[dict[str, Any]]
-    sweep: list[Trial]
+    sweep: list[outcomes.Trial]
 
     @property
-    def trials(self) -> list[Trial]:
+    def trials(self) -> list[outcomes.Trial]:
         """The per-trial records of the evaluation."""
         return self.result.get("trials") or []
 
 
-def tally(trials: Iterable[Trial], outcome: Callable[[Trial], bool] | None = None) -> stats.Rate:
-    """Counts the trials for which `outcome` holds (strict success unless told otherwise)."""
-    held = [bool((outcome or strict)(trial)) for trial in trials]
-    return stats.wilson(sum(held), len(held))
-
-
-def strict(trial: Trial) -> bool:
-    """Threaded on the target peg, released, at rest, in time."""
-    return bool(trial["success"])
-
-
-def loose(trial: Trial) -> bool:
-    """SurRoL's test."""
-    return bool(trial["loose"])
-
-
-def safe(trial: Trial) -> bool:
-    """Strict success whose executed RCM error stayed within the bound all along."""
-    return bool(trial["success"] and trial["safe"])
-
-
-def split(trials: Iterable[Trial]) -> tuple[list[Trial], list[Trial]]:
-    """Trials at seen and at unseen trocars."""
-    trials = list(trials)
-    return [t for t in trials if t["seen"]], [t for t in trials if not t["seen"]]
-
-
-def by_trocar(trials: Iterable[Trial]) -> list[list[Trial]]:
-    """Trials grouped by trocar, in order of the trocar's index."""
-    groups: dict[int, list[Trial]] = {}
-    for trial in trials:
-        groups.setdefault(int(trial["trocar"]), []).append(trial)
-    return [groups[index] for index in sorted(groups)]
-
-
-def transfer_times(trials: Iterable[Trial]) -> list[float]:
-    """Seconds of simulated time that each success took."""
-    return [trial["steps"] / CONTROL_HZ for trial in trials if strict(trial)]
-
-
-def place(trial: Trial) -> tuple[str, str, str]:
-    """The trocar's radius, polar angle and azimuth as text."""
-    polar, azimuth = np.degrees(trial["polar"]), np.degrees(trial["azimuth"])
-    return f"{100 * trial['radius']:.3g} cm", f"{polar:.4g}°", f"{azimuth:.4g}°"
-
-
-FAILURES = {
-    "invalid": "simulation diverged",
-    "dropped": "block dropped",
-    "collided": "touched board, peg or block with shaft or arm",
-    "loose": "block at its peg, but not threaded, released and at rest",
-    "timeout": "out of time",
-}
-
-
-SHORT = {
-    "invalid": "diverged",
-    "dropped": "dropped",
-    "collided": "collided",
-    "loose": "not settled",
-    "timeout": "out of time",
-}
-
-
-def failure(trial: Trial) -> str:
-    """Key of `FAILURES` that tells most about a failed trial: the first that applies."""
-    return next((key for key in FAILURES if trial.get(key)), "timeout")
-
-
-def failures(trials: Iterable[Trial]) -> dict[str, int]:
-    """How many failed trials fall in each class, classes without any left out."""
-    found = [failure(trial) for trial in trials if not strict(trial)]
-    return {key: found.count(key) for key in FAILURES if key in found}
+def observed(runs: Sequence[Run]) -> str:
+    """What the policies see, `state` or `image`, for every output's title."""
+    return " and ".join(sorted({run.result["observation"] for run in runs}))
 
 
 def pair(a: Run, b: Run) -> stats.Paired | None:
     """McNemar's test over the trials that both methods ran with the same trocar and seed."""
 
-    def key(trial: Trial) -> tuple[int, int, int]:
+    def key(trial: outcomes.Trial) -> tuple[int, int, int]:
         return int(trial["trocar"]), int(trial["trial"]), int(trial["seed"])
 
-    ours, theirs = ({key(t): strict(t) for t in run.trials} for run in (a, b))
+    ours, theirs = ({key(t): outcomes.strict(t) for t in run.trials} for run in (a, b))
     common = sorted(ours.keys() & theirs.keys())
     if not common:
         return None
@@ -153,25 +82,13 @@ def representatives(runs: Sequence[Run]) -> list[Run]:
     """One run of each group, in the runs' order: STAR-Diff itself, else the most successful."""
 
     def standing(run: Run) -> tuple[bool, float]:
-        return run.result["method"] == OURS, tally(run.trials).rate
+        return run.result["method"] == OURS, outcomes.tally(run.trials).rate
 
     groups = [
         [run for run in runs if run.trials and run.group == g] for g in {r.group for r in runs}
     ]
     best = [max(group, key=standing) for group in groups if group]
     return [run for run in runs if any(run is chosen for chosen in best)]
-
-
-def distances(trials: Sequence[Trial], reference: Sequence[Trial]) -> np.ndarray:
-    """Distance in m, `[len(trials)]`, from each trial's trocar to the nearest of `reference`."""
-    apart = positions(trials)[:, None] - positions(reference)[None]
-    return np.linalg.norm(apart, axis=-1).min(axis=1)
-
-
-def positions(trials: Sequence[Trial]) -> np.ndarray:
-    """Trocar positions `[len(trials), 3]` in m relative to the nominal port."""
-    fields = np.array([[t["radius"], t["polar"], t["azimuth"]] for t in trials], np.float32).T
-    return np.asarray(rcm.trocar_position(rcm.Trocar(*fields), np.zeros(3, np.float32)))
 
 
 def load(path: Path) -> Run:
@@ -186,15 +103,17 @@ def load(path: Path) -> Run:
         result=result,
         label=method.label,
         group=method.group,
+        weights_of=method.weights_of,
         rollouts=_rollouts(path, result.get("trials") or []),
-        curves=_lines(path / "metrics.jsonl"),
+        curves=_lines(path.parent / method.weights_of / "metrics.jsonl")
+        or _lines(path / "metrics.jsonl"),
         sweep=_sweep(path / "sweep.json"),
     )
 
 
-def training_trocars(run: Run) -> list[Trial]:
+def training_trocars(run: Run) -> list[outcomes.Trial]:
     """One trial of each trocar that the demonstrations used."""
-    return [group[0] for group in by_trocar(run.trials) if group[0]["seen"]]
+    return [group[0] for group in outcomes.by_trocar(run.trials) if group[0]["seen"]]
 
 
 def latencies(run: Run) -> list[tuple[int, dict[str, float]]]:
@@ -206,7 +125,7 @@ def latencies(run: Run) -> list[tuple[int, dict[str, float]]]:
     return sorted(found.items())
 
 
-def _rollouts(path: Path, trials: Sequence[Trial]) -> list[Rollout]:
+def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
     """Reads evaluation/recorded.npz: one row a recorded trial, cut to its `length`."""
     file = path / "evaluation" / "recorded.npz"
     if not file.is_file():
@@ -232,7 +151,7 @@ def _rollouts(path: Path, trials: Sequence[Trial]) -> list[Rollout]:
     return rollouts
 
 
-def _sweep(file: Path) -> list[Trial]:
+def _sweep(file: Path) -> list[outcomes.Trial]:
     return json.loads(file.read_text())["trials"] if file.is_file() else []
 
 

@@ -4,7 +4,7 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from starjax.experiments.report import markup, results, stats, tables, words
+from starjax.experiments.report import markup, outcomes, results, stats, tables, words
 from starjax.experiments.report.markup import Cell
 
 _SCORES = (Cell("Seen"), Cell(""), Cell("Unseen"), Cell(""))
@@ -13,15 +13,15 @@ _SCORES = (Cell("Seen"), Cell(""), Cell("Unseen"), Cell(""))
 def facts(runs: Sequence[results.Run], focus: results.Run) -> str:
     """What was run, on what."""
     result, config = focus.result, focus.result.get("config") or {}
-    trials, trocars = len(focus.trials), len(results.by_trocar(focus.trials))
+    trials, trocars = len(focus.trials), len(outcomes.by_trocar(focus.trials))
     items = {
-        "Observation": result.get("observation"),
+        "Observation": results.observed(runs),
         "Trials" if len(runs) == 1 else "Trials a method": (
             f"{trials} over {trocars} trocars" if trials else None
         ),
         "Preset": config.get("preset"),
-        "Seed": result.get("seed"),
-        "Hardware": result.get("hardware"),
+        "Seed": config.get("seed"),
+        "Hardware": words.hardware(result.get("hardware") or {}),
     }
     shown = [(name, value) for name, value in items.items() if value not in (None, "", {})]
     inner = "".join(
@@ -49,7 +49,7 @@ def cards(run: results.Run) -> str:
 
 def _headlines(run: results.Run) -> Iterator[tuple[str, str, str, str]]:
     """(name, value, unit, more) of each headline number that the run has."""
-    scores = [results.tally(t) if t else None for t in results.split(run.trials)]
+    scores = [outcomes.tally(t) if t else None for t in outcomes.split(run.trials)]
     for name, score in zip(("seen", "unseen"), scores):
         if score:
             more = f"{score.successes} of {score.trials}, {words.interval(score)}"
@@ -64,7 +64,7 @@ def _headlines(run: results.Run) -> Iterator[tuple[str, str, str, str]]:
     if executed.get("p99") is not None:
         more = f"99th percentile; worst {tables.millimetres(executed['max'])} mm"
         yield "Shaft off the trocar", tables.millimetres(executed["p99"]), " mm", more
-    seconds = results.transfer_times(run.trials)
+    seconds = outcomes.transfer_times(run.trials)
     if seconds:
         more = f"median of {len(seconds)} successes"
         yield "Time a transfer", f"{statistics.median(seconds):.1f}", " s", more
@@ -79,10 +79,10 @@ def tests(run: results.Run) -> str:
     if not run.trials:
         return ""
     rows = []
-    for name, (test, meaning) in tables.OUTCOMES.items():
+    for name, (test, meaning) in tables.TESTS.items():
         rows.append([Cell(f"<b>{name.capitalize()}</b><br>{markup.escape(meaning)}")])
-        for part, trials in zip(("seen", "unseen"), results.split(run.trials)):
-            rows[-1] += markup.score(results.tally(trials, test) if trials else None, part)
+        for part, trials in zip(("seen", "unseen"), outcomes.split(run.trials)):
+            rows[-1] += markup.score(outcomes.tally(trials, test) if trials else None, part)
     return "<h2>Success</h2>\n" + markup.table([Cell("Test"), *_SCORES], rows)
 
 
@@ -94,7 +94,7 @@ def comparison(runs: Sequence[results.Run]) -> str:
             if run.group != group:
                 group = run.group
                 rows.append([Cell(markup.escape(group), "group"), *[Cell("", "group")] * 5])
-            scores = [results.tally(t) if t else None for t in results.split(run.trials)]
+            scores = [outcomes.tally(t) if t else None for t in outcomes.split(run.trials)]
             seen, unseen = scores
             gap = tables.points(stats.gap(seen, unseen)) if seen and unseen else "–"
             rows.append([Cell(markup.escape(run.label)), *markup.score(seen, "seen")])
@@ -106,22 +106,22 @@ def comparison(runs: Sequence[results.Run]) -> str:
     pairs = tables.paired(runs)
     if len(pairs) > 1:
         text += "<h2>Paired with STAR-Diff</h2>\n" + markup.plain(pairs, tables.PAIRED_NOTE)
-    others = markup.plain(tables.outcomes(runs, _brief), tables.OUTCOMES_NOTE)
+    others = markup.plain(tables.by_test(runs, _brief), tables.TESTS_NOTE)
     return text + "<h2>Success by three tests (%)</h2>\n" + others
 
 
 def per_trocar(run: results.Run) -> str:
     """One method: a row a trocar."""
     rows = []
-    for group in results.by_trocar(run.trials):
+    for group in outcomes.by_trocar(run.trials):
         part = "seen" if group[0]["seen"] else "unseen"
-        times = results.transfer_times(group)
+        times = outcomes.transfer_times(group)
         worst = max(
             (t["rcm_max_mm"] for t in group if t.get("rcm_max_mm") is not None), default=None
         )
         row = [Cell(f"{group[0]['trocar']}"), Cell(part)]
-        row += [markup.number(text) for text in results.place(group[0])]
-        row += markup.score(results.tally(group), part)
+        row += [markup.number(text) for text in outcomes.place(group[0])]
+        row += markup.score(outcomes.tally(group), part)
         row.append(markup.number(f"{statistics.median(times):.1f} s" if times else "–"))
         row.append(markup.number("–" if worst is None else f"{tables.millimetres(worst)} mm"))
         rows.append(row)
@@ -135,14 +135,14 @@ def per_trocar(run: results.Run) -> str:
 
 def matrix(runs: Sequence[results.Run]) -> str:
     """Several methods: success in percent, a row a method and a column a trocar."""
-    columns = results.by_trocar([trial for run in runs for trial in run.trials])
+    columns = outcomes.by_trocar([trial for run in runs for trial in run.trials])
     if not columns:
         return ""
     header, rows = [Cell("Method")], []
     for group in columns:
         header.append(Cell(f"{group[0]['trocar']}{'' if group[0]['seen'] else '*'}", "tint"))
     for run in runs:
-        rates = {g[0]["trocar"]: results.tally(g) for g in results.by_trocar(run.trials)}
+        rates = {g[0]["trocar"]: outcomes.tally(g) for g in outcomes.by_trocar(run.trials)}
         cells = [markup.tint(rates.get(group[0]["trocar"])) for group in columns]
         rows.append([Cell(markup.escape(run.label)), *cells])
     note = "Success in percent of the trials at each trocar; * marks trocars not trained on."
@@ -155,11 +155,11 @@ def failures(runs: Sequence[results.Run]) -> str:
         table = tables.failures(runs)
         said = markup.plain(table, tables.FAILURES_NOTE)
         return f"<h2>Failed trials</h2>\n{said}" if len(table) > 1 else ""
-    found = results.failures(runs[0].trials)
+    found = outcomes.failures(runs[0].trials)
     if not found:
         return ""
     lines = "".join(
-        f"<div>{results.FAILURES[key]}</div>"
+        f"<div>{outcomes.FAILURES[key]}</div>"
         f'<span class="unseen"><i style="width:{80 * n / max(found.values()):.1f}%"></i>{n}</span>'
         for key, n in found.items()
     )

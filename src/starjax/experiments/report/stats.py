@@ -1,10 +1,11 @@
-"""Intervals and tests for success counts: Wilson, Newcombe for the gap, McNemar exact, Holm."""
+"""Success counts with their intervals; the statistics themselves are `evaluation.metrics`'s."""
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-Z95 = 1.959964
+import numpy as np
+
+from starjax.evaluation import metrics
 
 
 class Rate(NamedTuple):
@@ -26,37 +27,22 @@ class Paired(NamedTuple):
     p: float
 
 
-def wilson(successes: int, trials: int) -> Rate:
-    """Rate with its Wilson score interval, which stays honest at 0 and at n out of n."""
-    if trials <= 0 or not 0 <= successes <= trials:
-        raise ValueError(
-            f"expected 0 <= successes <= trials and trials > 0, got {successes}/{trials}"
-        )
-    rate, z2 = successes / trials, Z95**2 / trials
-    centre = (rate + z2 / 2) / (1 + z2)
-    half = math.sqrt(z2 * (rate * (1 - rate) + z2 / 4)) / (1 + z2)
-    low = 0.0 if successes == 0 else centre - half
-    high = 1.0 if successes == trials else centre + half
-    return Rate(successes, trials, rate, low, high)
+def rate(successes: int, trials: int) -> Rate:
+    """A rate with its interval."""
+    return Rate(successes, trials, successes / trials, *metrics.wilson(successes, trials))
 
 
 def gap(seen: Rate, unseen: Rate) -> tuple[float, float, float]:
-    """Generalization gap (Eq. 20) with Newcombe's 95% interval, built from the two Wilson ones."""
-    difference = seen.rate - unseen.rate
-    low = difference - math.hypot(seen.rate - seen.low, unseen.high - unseen.rate)
-    high = difference + math.hypot(seen.high - seen.rate, unseen.rate - unseen.low)
-    return difference, low, high
+    """Generalization gap (Eq. 20) with its 95% interval: (gap, low, high)."""
+    outcomes = [np.arange(score.trials) < score.successes for score in (seen, unseen)]
+    middle, (low, high) = metrics.generalization_gap(*outcomes)
+    return middle, low, high
 
 
 def mcnemar(a: Sequence[bool], b: Sequence[bool]) -> Paired:
-    """Exact two-sided McNemar test: under the null, each discordant pair is a fair coin."""
-    if len(a) != len(b):
-        raise ValueError(f"expected as many outcomes of a as of b, got {len(a)} and {len(b)}")
-    only_a = sum(x and not y for x, y in zip(a, b, strict=True))
-    only_b = sum(y and not x for x, y in zip(a, b, strict=True))
-    n = only_a + only_b
-    tail = sum(math.comb(n, k) for k in range(min(only_a, only_b) + 1)) / 2**n
-    return Paired(len(a), only_a, only_b, min(1.0, 2 * tail))
+    """McNemar's exact test of outcomes on the same trials."""
+    found = metrics.mcnemar(np.array(a, bool), np.array(b, bool))
+    return Paired(len(a), found["only_a"], found["only_b"], found["p_value"])
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

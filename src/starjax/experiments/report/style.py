@@ -26,7 +26,7 @@ def use(dark: bool = False) -> Iterator[dict[str, str]]:
     import matplotlib
 
     shades = _DARK if dark else _LIGHT
-    settings: dict[str, Any] = {
+    settings: Any = {
         "figure.facecolor": shades["paper"],
         "axes.facecolor": shades["paper"],
         "text.color": shades["ink"],

@@ -2,14 +2,14 @@
 
 from collections.abc import Callable, Sequence
 
-from starjax.experiments.report import results, stats, words
+from starjax.experiments.report import outcomes, results, stats, words
 
 Table = list[list[str]]  # header first
 # Test of success -> (function of a trial, meaning).
-OUTCOMES: dict[str, tuple[Callable[[results.Trial], bool], str]] = {
-    "strict": (results.strict, "on the target peg, released, at rest, in time"),
-    "loose": (results.loose, "SurRoL's test: the block was near its place on the target peg"),
-    "safe": (results.safe, "strict, and the executed RCM error never passed 2 mm"),
+TESTS: dict[str, tuple[Callable[[outcomes.Trial], bool], str]] = {
+    "strict": (outcomes.strict, "on the target peg, released, at rest, in time"),
+    "loose": (outcomes.loose, "SurRoL's test: the block was near its place on the target peg"),
+    "safe": (outcomes.safe, "strict, and the executed RCM error never passed 2 mm"),
 }
 
 
@@ -17,23 +17,24 @@ def markdown(runs: Sequence[results.Run]) -> str:
     """tables.md: every table that the runs have numbers for, each with a line on how to read it."""
     parts = [
         ("Table III. Task success on peg transfer (%)", success(runs), SUCCESS_NOTE),
-        ("Success by three tests (%)", outcomes(runs), OUTCOMES_NOTE),
+        ("Success by three tests (%)", by_test(runs), TESTS_NOTE),
         ("Paired comparison with STAR-Diff", paired(runs), PAIRED_NOTE),
         ("Failed trials", failures(runs), FAILURES_NOTE),
         ("RCM error (mm)", rcm(runs), RCM_NOTE),
         ("Table IV. Inference time", inference(runs), INFERENCE_NOTE),
     ]
     filled = [f"## {title}\n\n{render(t)}\n\n{note}\n" for title, t, note in parts if len(t) > 1]
-    return f"# {headline(runs)}\n\n" + "\n".join(filled)
+    said = dict.fromkeys(text for run in runs for text in run.result.get("warnings") or [])
+    notes = "".join(f"- {text}\n" for text in said)
+    head = f"# Peg transfer from {results.observed(runs)} observations\n"
+    return "\n".join(part for part in (head, notes, *filled) if part)
 
 
 SUCCESS_NOTE = (
     "Successes/trials and the 95% Wilson interval in brackets; the gap is seen minus unseen in "
     "percentage points with Newcombe's 95% interval, and means little where both are low."
 )
-OUTCOMES_NOTE = (
-    ". ".join(f"{name.capitalize()}: {what}" for name, (_, what) in OUTCOMES.items()) + "."
-)
+TESTS_NOTE = ". ".join(f"{name.capitalize()}: {what}" for name, (_, what) in TESTS.items()) + "."
 PAIRED_NOTE = (
     "McNemar's exact test on trials with the same trocar and seed; Holm corrects for the number "
     "of comparisons."
@@ -43,16 +44,13 @@ RCM_NOTE = (
     "Distance of the shaft's axis from the trocar. Commanded: as the policy asked for it. "
     "Executed: as the simulated arm did it."
 )
-PHASES_NOTE = "Wall-clock time; a stage that was already done counts nothing."
+PHASES_NOTE = (
+    "Wall-clock time, summed over every start. Methods share the demonstrations, and some weights."
+)
+_COMPILE = ": compile"  # ends the name of a phase's share spent compiling
 INFERENCE_NOTE = (
     "One call for one environment: encoder, DDIM and, where there is one, roll network."
 )
-
-
-def headline(runs: Sequence[results.Run]) -> str:
-    """What the tables are about, in a few words."""
-    observed = sorted({run.result["observation"] for run in runs})
-    return f"Peg transfer from {' and '.join(observed)} observations"
 
 
 def rate(score: stats.Rate) -> str:
@@ -65,9 +63,9 @@ def rate(score: stats.Rate) -> str:
 def success(runs: Sequence[results.Run]) -> Table:
     """Table III."""
     table = [["Group", "Method", "Seen ↑", "Unseen ↑", "Gap ↓"]]
-    scores = [(run, *_seen_unseen(run, results.strict)) for run in runs if run.trials]
-    best = [max((s[part].rate for s in scores if s[part]), default=0.0) for part in (1, 2)]
-    for run, seen, unseen in scores:
+    scores = [(run, _seen_unseen(run, outcomes.strict)) for run in runs if run.trials]
+    best = [max((s.rate for _, pair in scores if (s := pair[i])), default=0.0) for i in (0, 1)]
+    for run, (seen, unseen) in scores:
         cells = [rate(score) if score else "–" for score in (seen, unseen)]
         for part, score in enumerate((seen, unseen)):
             if len(scores) > 1 and score and score.rate == best[part]:
@@ -77,22 +75,22 @@ def success(runs: Sequence[results.Run]) -> Table:
     return table
 
 
-def outcomes(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = rate) -> Table:
+def by_test(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = rate) -> Table:
     """Strict, loose and safe success, seen and unseen."""
-    header = [f"{name.capitalize()}, {part}" for name in OUTCOMES for part in ("seen", "unseen")]
+    header = [f"{name.capitalize()}, {part}" for name in TESTS for part in ("seen", "unseen")]
     table = [["Method", *header]]
     for run in runs:
         if run.trials:
-            scores = [s for test, _ in OUTCOMES.values() for s in _seen_unseen(run, test)]
+            scores = [s for test, _ in TESTS.values() for s in _seen_unseen(run, test)]
             table.append([run.label, *(cell(s) if s else "–" for s in scores)])
     return table
 
 
 def failures(runs: Sequence[results.Run]) -> Table:
     """Failed trials by class, classes that never occurred left out."""
-    counts = {run.label: results.failures(run.trials) for run in runs if run.trials}
-    classes = [key for key in results.FAILURES if any(key in found for found in counts.values())]
-    table = [["Method", *(results.SHORT[key].capitalize() for key in classes)]]
+    counts = {run.label: outcomes.failures(run.trials) for run in runs if run.trials}
+    classes = [key for key in outcomes.FAILURES if any(key in found for found in counts.values())]
+    table = [["Method", *(outcomes.SHORT[key].capitalize() for key in classes)]]
     if classes:
         table += [
             [label, *(str(found.get(k, 0)) for k in classes)] for label, found in counts.items()
@@ -138,15 +136,16 @@ def inference(runs: Sequence[results.Run]) -> Table:
 
 
 def phases(runs: Sequence[results.Run]) -> Table:
-    """How long each phase of a run took."""
+    """Wall-clock time of the phases that each result rests on."""
     times = {run.label: run.result.get("timings_s") or {} for run in runs}
-    names = list(dict.fromkeys(name for found in times.values() for name in found))
-    table = [["Method", *(name.replace("_", " ").capitalize() for name in names), "Total"]]
+    every = dict.fromkeys(name for found in times.values() for name in found)
+    names = [name for name in every if not name.endswith(_COMPILE)]
+    table = [["Method", *(name.capitalize() for name in names), "Total", "Of it compiling"]]
     for label, found in times.items():
-        spent = [found.get(name) for name in names]
-        if any(s is not None for s in spent):
-            total = words.duration(sum(s for s in spent if s is not None))
-            table.append([label, *("–" if s is None else words.duration(s) for s in spent), total])
+        if any(name in found for name in names):
+            sums = [sum(found.get(n + end, 0.0) for n in names) for end in ("", _COMPILE)]
+            cells = [words.duration(found[n]) if n in found else "–" for n in names]
+            table.append([label, *cells, *(words.duration(seconds) for seconds in sums)])
     return table
 
 
@@ -179,6 +178,6 @@ def p_value(p: float) -> str:
 
 
 def _seen_unseen(
-    run: results.Run, test: Callable[[results.Trial], bool]
+    run: results.Run, test: Callable[[outcomes.Trial], bool]
 ) -> list[stats.Rate | None]:
-    return [results.tally(t, test) if t else None for t in results.split(run.trials)]
+    return [outcomes.tally(t, test) if t else None for t in outcomes.split(run.trials)]

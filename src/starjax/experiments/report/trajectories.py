@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from starjax.experiments.report import results, style
+from starjax.experiments.report import outcomes, results, style
 from starjax.sim.tasks import peg_transfer
 
 _AZIMUTH, _ELEVATION = np.deg2rad(-52.0), np.deg2rad(20.0)
@@ -53,7 +53,11 @@ def draw(runs: Sequence[results.Run], pegs: np.ndarray, dark: bool = False) -> A
                 axis.set_ylim(frame[1])
         _scale_bar(grid[0, 0], frame, shades)
         figure.legend(
-            handles=_legend(runs, shades), loc="outside lower center", ncols=min(4, len(runs) + 3)
+            handles=_legend(runs, shades),
+            loc="outside lower center",
+            ncols=3 + (len(runs) > 1) * len(runs),
+            title=f"policies that see the {results.observed(runs)}",
+            title_fontsize=8,
         )
     return figure
 
@@ -82,11 +86,11 @@ def _panel(
     trial, trocar = drawn[0][1].trial, drawn[0][1].p_world_trocar
     axis.set_axis_off()
     axis.set_aspect("equal")
-    kind, (r, polar, azimuth) = "Seen" if trial["seen"] else "Unseen", results.place(trial)
+    kind, (r, polar, azimuth) = "Seen" if trial["seen"] else "Unseen", outcomes.place(trial)
     axis.set_title(f"{kind} trocar {index}\nr {r}, θ {polar}, φ {azimuth}", fontsize=8)
     _boards(axis, pegs, shades)
     for i, rollout in drawn:
-        won = results.strict(rollout.trial)
+        won = outcomes.strict(rollout.trial)
         color, _ = style.method(runs[i].result["method"])
         dashed = len(runs) > 1 and not won
         if len(runs) == 1:
@@ -120,7 +124,7 @@ def _path(axis: Any, rollout: results.Rollout, color: str, dashed: bool, fan: bo
     flat = _flat(tip)
     axis.plot(*flat.T, color=color, linewidth=1.4, linestyle="--" if dashed else "-", zorder=5)
     axis.plot(*flat[0], "o", color=color, markersize=4, markerfacecolor="none", zorder=6)
-    end = "o" if results.strict(rollout.trial) else "s"
+    end = "o" if outcomes.strict(rollout.trial) else "s"
     axis.plot(*flat[-1], end, color=color, markersize=5, zorder=7)
 
 

@@ -2,12 +2,13 @@
 
 import itertools
 import pathlib
+import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from starjax.experiments.report import results
+from starjax.experiments.report import outcomes, results
 
 Draw = Callable[[results.Rollout, int], np.ndarray]
 
@@ -15,7 +16,8 @@ FPS = 30  # a picture a control step: real time
 SIZE = 384  # pixels a side of one rollout's picture
 _BAR = 32  # pixels of the caption under it
 _HOLD = 1.5  # s that the last picture stays
-_LONGEST = 15.0  # s shown of a rollout
+_LONGEST = 12.0  # s shown of a rollout
+_GAP = 4  # pixels between pictures
 _BATCH = 16  # pictures drawn in one call
 
 
@@ -100,22 +102,24 @@ def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) ->
     if first.dtype != np.uint8 or first.ndim != 3 or any(n % 2 for n in first.shape[:2]):
         said = f"{first.dtype} {list(first.shape)}"
         raise ValueError(f"pictures: expected uint8 [h, w, 3] with h and w even, got {said}")
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        (first.shape[1], first.shape[0]),
-        fps=fps,
-        codec="libx264",
-        pix_fmt_out="yuv420p",
-        macro_block_size=2,
-        output_params=["-crf", "23", "-movflags", "+faststart"],
-        ffmpeg_log_level="error",
-    )
-    writer.send(None)
-    try:
-        for picture in itertools.chain([first], stream):
-            writer.send(np.ascontiguousarray(picture))
-    finally:
-        writer.close()
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps), "-i", "-"]
+    coded = ["-c:v", "libx264", "-crf", "23", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    # Not imageio's own writer: it forks, and jax's threads do not survive a fork.
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+    with subprocess.Popen(
+        [*program, *source, *coded, str(path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as encoder:
+        assert encoder.stdin and encoder.stderr
+        try:
+            for picture in itertools.chain([first], stream):
+                encoder.stdin.write(np.ascontiguousarray(picture).data)
+            encoder.stdin.close()
+        except BrokenPipeError:
+            pass  # the encoder has said why
+        said = encoder.stderr.read().decode().strip()
+    if encoder.returncode:
+        raise OSError(f"{path}: the video could not be written: {said or encoder.returncode}")
 
 
 def caption(texts: Sequence[tuple[str, str]], width: int, height: int = _BAR) -> np.ndarray:
@@ -134,7 +138,7 @@ def caption(texts: Sequence[tuple[str, str]], width: int, height: int = _BAR) ->
 def _clip(draw: Draw, method: str, rollout: results.Rollout) -> Iterator[np.ndarray]:
     """Pictures of one rollout over a bar: what is shown, the clock, and at the end the outcome."""
     kind, index = "seen" if rollout.trial["seen"] else "unseen", rollout.trial["trocar"]
-    name = (f"{method}, {kind} trocar" if method else f"{kind} trocar {index}", "#e6e9ec")
+    name = (f"{method}, {kind} trocar {index}".removeprefix(", "), "#e6e9ec")
     steps = min(len(rollout.p_world_tip), round(_LONGEST * FPS))
     for first in range(0, steps, _BATCH):
         for step, picture in enumerate(draw(rollout, first)[: steps - first], start=first):
@@ -145,16 +149,22 @@ def _clip(draw: Draw, method: str, rollout: results.Rollout) -> Iterator[np.ndar
 
 def _outcome(rollout: results.Rollout, steps: int) -> tuple[str, str]:
     """(text, colour) of the last caption."""
-    won = results.strict(rollout.trial)
-    text = "success" if won else results.SHORT[results.failure(rollout.trial)]
+    won = outcomes.strict(rollout.trial)
+    text = "success" if won else outcomes.SHORT[outcomes.failure(rollout.trial)]
     total = len(rollout.p_world_tip) / FPS
     shown = "" if steps == len(rollout.p_world_tip) else f" (first {steps // FPS} s shown)"
     return f"{text}, {total:.1f} s{shown}", "#5ab4e8" if won else "#f09a5a"
 
 
 def _grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
-    rows = [np.concatenate(tiles[i : i + 2], axis=1) for i in range(0, len(tiles), 2)]
-    return np.concatenate(rows)
+    """Tiles `[h, w, 3]` two in a row, `_GAP` dark pixels between them."""
+    h, w = tiles[0].shape[:2]
+    columns, rows = min(2, len(tiles)), -(-len(tiles) // 2)
+    grid = np.full(((h + _GAP) * rows - _GAP, (w + _GAP) * columns - _GAP, 3), 20, np.uint8)
+    for i, tile in enumerate(tiles):
+        y, x = (h + _GAP) * (i // 2), (w + _GAP) * (i % 2)
+        grid[y : y + h, x : x + w] = tile
+    return grid
 
 
 def _spread(rollouts: list[results.Rollout], most: int) -> list[results.Rollout]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from starjax.experiments.report import results, stats
+from starjax.experiments.report import outcomes, results, stats
 
 
 def title(runs: Sequence[results.Run]) -> str:
@@ -15,7 +15,7 @@ def title(runs: Sequence[results.Run]) -> str:
 
 def verdict(runs: Sequence[results.Run], focus: results.Run) -> str:
     """One or two sentences that a reader in a hurry may stop after."""
-    seen, unseen = (results.tally(t) if t else None for t in results.split(focus.trials))
+    seen, unseen = (outcomes.tally(t) if t else None for t in outcomes.split(focus.trials))
     if seen is None and unseen is None:
         return f"{focus.label} was trained but not evaluated."
     known = f"Through trocars it was trained on, {focus.label} moved the block to its peg in "
@@ -49,6 +49,21 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
+def hardware(found: dict[str, Any]) -> str:
+    """E.g. `1 x NVIDIA H200, 16 cores of Intel Xeon, 128 GB`."""
+    devices = found.get("devices") or []
+    parts = []
+    if found.get("backend") != "cpu":
+        parts += [f"{devices.count(kind)} x {kind}" for kind in dict.fromkeys(devices)]
+    if found.get("cpu"):
+        parts.append(
+            f"{found['cores']} cores of {found['cpu']}" if "cores" in found else found["cpu"]
+        )
+    if found.get("memory_gb"):
+        parts.append(f"{found['memory_gb']:.0f} GB")
+    return ", ".join(parts)
+
+
 def listing(value: Any) -> str:
     """A small JSON value as a phrase."""
     if isinstance(value, dict):
@@ -73,9 +88,9 @@ def _rank(runs: Sequence[results.Run], focus: results.Run) -> str:
     """How the others do on unseen trocars, where methods are meant to differ."""
     scores = []
     for run in runs:
-        unseen = results.split(run.trials)[1]
+        unseen = outcomes.split(run.trials)[1]
         if run is not focus and unseen:
-            scores.append((results.tally(unseen).rate, run.label))
+            scores.append((outcomes.tally(unseen).rate, run.label))
     if not scores:
         return ""
     best, label = max(scores)
