@@ -86,9 +86,9 @@ class Steps(NamedTuple):
       qpos: `[T, N, Q]` after the step.
     """
 
-    rcm_error: jax.Array
-    p_world_tip: jax.Array
-    qpos: jax.Array
+    rcm_error: Any
+    p_world_tip: Any
+    qpos: Any
 
 
 class Rollouts(NamedTuple):

@@ -32,9 +32,9 @@ def track(
     Yields:
       `advance(count, note="")`: `count` more units are done; `note` is shown beside the bar.
     """
-    stream = stream or sys.stderr
-    show = _terminal if stream.isatty() else _plain
-    with show(description, total, unit, done, stream) as advance:
+    shown = stream or sys.stderr
+    show = _terminal if shown.isatty() else _plain
+    with show(description, total, unit, done, shown) as advance:
         yield advance
 
 
@@ -64,8 +64,8 @@ def _terminal(
 
         def advance(count: float = 1, note: str = "") -> None:
             meter.add(count)
-            fields = {"note": note, "eta": meter.eta(), "rate": meter.rate(unit)}
-            bar.update(task, completed=meter.done, **fields)
+            left, rate = meter.eta(), meter.rate(unit)
+            bar.update(task, completed=meter.done, note=note, eta=left, rate=rate)
 
         yield advance
 
@@ -82,9 +82,9 @@ def _plain(description: str, total: int, unit: str, done: int, stream: TextIO) -
         if now - shown < PLAIN_EVERY_S and meter.done < total:
             return
         shown = now
-        count = f"{description}: {meter.done:.0f}/{total} {unit}"
-        parts = filter(None, [count, meter.rate(unit), meter.eta(), note])
-        print("  ".join(parts), file=stream, flush=True)
+        so_far = f"{description}: {meter.done:.0f}/{total} {unit}"
+        parts = [so_far, meter.rate(unit), meter.eta(), note]
+        print("  ".join(part for part in parts if part), file=stream, flush=True)
 
     yield advance
 
