@@ -1,0 +1,88 @@
+"""A run's folder: settings that may and may not change, twins, time by stage."""
+
+import dataclasses
+import json
+
+import pytest
+
+from starjax import config
+from starjax.experiments import clock, folders, methods, presets
+
+SMOKE = presets.PRESETS["smoke"]
+
+
+def changed(**parts):
+    fields = {
+        name: dataclasses.replace(getattr(SMOKE, name), **value) if name != "seed" else value
+        for name, value in parts.items()
+    }
+    return dataclasses.replace(SMOKE, **fields)
+
+
+@pytest.mark.parametrize(
+    ("parts", "word"),
+    [
+        ({"train": {"steps": 41}}, "--train.steps"),
+        ({"policy": {"image_size": 65}}, "--policy.image-size"),
+        ({"demos": {"per_trocar": 2}}, "--demos.per-trocar"),
+        ({"seed": 1}, "--seed"),
+    ],
+)
+def test_weights_of_other_settings_are_refused_by_name(tmp_path, parts, word):
+    folders.claim(tmp_path, SMOKE, "demos-a")
+    with pytest.raises(config.UsageError, match="--out") as caught:
+        folders.claim(tmp_path, changed(**parts), "demos-a")
+    assert str(caught.value).startswith(f"{word}: ")
+
+
+def test_weights_of_another_scene_are_refused(tmp_path):
+    folders.claim(tmp_path, SMOKE, "demos-a")
+    with pytest.raises(config.UsageError, match="demos-a, got demos-b"):
+        folders.claim(tmp_path, SMOKE, "demos-b")
+
+
+@pytest.mark.parametrize("parts", [{"eval": {"trials": 9}}, {"train": {"keep_checkpoints": 9}}])
+def test_what_leaves_the_weights_alone_may_change(tmp_path, parts):
+    folders.claim(tmp_path, SMOKE, "demos-a")
+    folders.claim(tmp_path, changed(**parts), "demos-a")
+    assert folders.read_config(tmp_path) == changed(**parts)
+
+
+def test_a_folder_without_a_run_is_one_line(tmp_path):
+    with pytest.raises(config.UsageError, match="method folder"):
+        folders.read_config(tmp_path)
+
+
+def test_eight_methods_have_six_sets_of_weights(tmp_path):
+    files = {folders.weights(tmp_path, name) for name in methods.METHODS}
+    assert len(methods.METHODS) == 8 and len(files) == 6
+
+
+def test_stardiff_single_is_dp_rcm4_and_nothing_else_is_a_twin():
+    pairs = {name: folders.twins(name) for name in methods.METHODS if folders.twins(name)}
+    assert pairs == {"dp_rcm4": ["stardiff_single"], "stardiff_single": ["dp_rcm4"]}
+
+
+def test_a_twin_takes_over_the_evaluation_once(tmp_path):
+    chunk = tmp_path / "dp_rcm4" / "evaluation" / "chunk_0000.npz"
+    chunk.parent.mkdir(parents=True)
+    chunk.write_bytes(b"first")
+    folders.adopt_twin(tmp_path, "stardiff")
+    folders.adopt_twin(tmp_path, "stardiff_single")
+    taken = tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz"
+    assert taken.read_bytes() == b"first" and not (tmp_path / "stardiff").exists()
+    chunk.write_bytes(b"second")
+    folders.adopt_twin(tmp_path, "stardiff_single")
+    assert taken.read_bytes() == b"first"
+
+
+def test_time_adds_up_over_starts_also_after_an_interruption(tmp_path):
+    import jax
+
+    (tmp_path / "timings.json").write_text(json.dumps({"train x": 100.0}))
+    with pytest.raises(KeyboardInterrupt), clock.timed(tmp_path, "train x"):
+        jax.block_until_ready(jax.jit(lambda x: x * 3.7 - 1.3)(2.0))
+        raise KeyboardInterrupt
+    spent = clock.timings(tmp_path)
+    assert 100.0 < spent["train x"] < 160.0
+    assert 0.0 < spent["train x: compile"] < spent["train x"] - 100.0

@@ -1,0 +1,109 @@
+"""The order of a run's stages, what is skipped, and how it stops. The stages are stubs."""
+
+import dataclasses
+import json
+import os
+import signal
+
+import pytest
+
+from starjax import config
+from starjax.experiments import methods, pipeline, presets, words
+from starjax.runtime import files
+
+
+@pytest.fixture
+def done(monkeypatch):
+    """Stages replaced by stubs that write down their names."""
+    calls = []
+
+    def demonstrations(settings, env):
+        return pipeline.Path(settings.out) / "demos-a", lambda: calls.append("collect")
+
+    def train(settings, name, demos, env):
+        demos()
+        calls.append(f"train {name}")
+
+    monkeypatch.setattr(pipeline, "_environment", lambda settings: None)
+    monkeypatch.setattr(pipeline, "_demonstrations", demonstrations)
+    monkeypatch.setattr(pipeline, "_load", lambda root, collect: collect())
+    monkeypatch.setattr(pipeline, "_train", train)
+    monkeypatch.setattr(pipeline, "_evaluate", lambda c, name, *_: calls.append(f"score {name}"))
+    monkeypatch.setattr(pipeline, "_report", lambda out, names: calls.append("report"))
+    return calls
+
+
+def smoke(out, method):
+    return dataclasses.replace(presets.PRESETS["smoke"], out=str(out), method=method)
+
+
+def test_all_collects_once_trains_six_and_scores_eight(tmp_path, done):
+    pipeline.run(smoke(tmp_path, "all"), pipeline.STAGES, "")
+    trained = [call for call in done if call.startswith("train")]
+    assert done.count("collect") == 1 and done[0] == "collect" and done[-1] == "report"
+    assert len(trained) == len(set(trained)) == 6
+    assert done[7:-1] == [f"score {name}" for name in methods.METHODS]
+
+
+@pytest.mark.parametrize(
+    ("method", "weights"), [("dp_ee_proj", "dp_ee"), ("stardiff_single", "dp_rcm4")]
+)
+def test_a_method_without_weights_of_its_own_trains_the_others(tmp_path, done, method, weights):
+    pipeline.run(smoke(tmp_path, method), pipeline.STAGES, "")
+    assert done == ["collect", f"train {weights}", f"score {method}", "report"]
+    assert (tmp_path / weights / "config.json").exists()
+    assert (tmp_path / method / "config.json").exists()
+
+
+def test_stages_can_end_early(tmp_path, done):
+    pipeline.run(smoke(tmp_path, "stardiff"), ("collect",), "")
+    pipeline.run(smoke(tmp_path, "stardiff"), ("collect", "train"), "")
+    assert done == ["collect", "collect", "train stardiff"]
+
+
+def test_a_folder_in_use_is_refused_early(tmp_path, done):
+    with files.lock(tmp_path), pytest.raises(files.StorageError, match="in use"):
+        pipeline.run(smoke(tmp_path, "stardiff"), pipeline.STAGES, "")
+    assert not done
+
+
+def test_a_folder_that_cannot_be_made_is_refused_early(tmp_path, done):
+    (tmp_path / "file").touch()
+    with pytest.raises(files.StorageError, match="file"):
+        pipeline.run(smoke(tmp_path / "file" / "below", "stardiff"), pipeline.STAGES, "")
+    assert not done
+
+
+def test_first_signal_asks_and_second_ends():
+    with pipeline.stop_signals() as should_stop:
+        assert not should_stop()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert should_stop()
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_plan_names_the_observation_and_the_flag(tmp_path):
+    preset = presets.PRESETS["cpu"]
+    said = words.plan(preset, pipeline.STAGES)
+    assert "state" in said and "--policy.observation image" in said and "preset cpu" in said
+    policy = dataclasses.replace(preset.policy, observation="image")
+    said = words.plan(dataclasses.replace(preset, policy=policy), pipeline.STAGES)
+    assert "image, 96 px" in said and "from scratch" in said and "state" not in said
+
+
+def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
+    settings = json.loads(json.dumps(dataclasses.asdict(presets.PRESETS["smoke"])))
+    assert not pipeline._is_scored(tmp_path, settings)
+    files.write_json(tmp_path / "result.json", {"config": settings})
+    assert pipeline._is_scored(tmp_path, settings)
+    more = {**settings, "eval": {**settings["eval"], "trials": 9}}
+    assert not pipeline._is_scored(tmp_path, more)
+
+
+def test_warnings_name_what_a_reader_must_know():
+    smoke_words = " ".join(words.warnings(presets.PRESETS["smoke"], {"invalid": 2}))
+    assert "not pixels" in smoke_words and "too short" in smoke_words and "2 trial" in smoke_words
+    (paper,) = words.warnings(config.RunConfig(), {"invalid": 0})
+    assert "resnet18 trained from scratch" in paper
