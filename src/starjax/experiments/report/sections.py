@@ -7,6 +7,10 @@ from typing import Any
 from starjax.experiments.report import markup, outcomes, results, stats, tables, words
 from starjax.experiments.report.markup import Cell
 
+_BARS_NOTE = (
+    "Bars are 95% Wilson intervals, ticks the rates. The gap is seen minus unseen with Newcombe's "
+    "95% interval; it means little where both are low."
+)
 _SCORES = (Cell("Seen"), Cell(""), Cell("Unseen"), Cell(""))
 
 
@@ -80,7 +84,7 @@ def tests(run: results.Run) -> str:
         return ""
     rows = []
     for name, (test, meaning) in tables.TESTS.items():
-        rows.append([Cell(f"<b>{name.capitalize()}</b><br>{markup.escape(meaning)}")])
+        rows.append([Cell(f"<b>{name.capitalize()}</b><br>{markup.escape(meaning)}", "wide")])
         for part, trials in zip(("seen", "unseen"), outcomes.split(run.trials)):
             rows[-1] += markup.score(outcomes.tally(trials, test) if trials else None, part)
     return "<h2>Success</h2>\n" + markup.table([Cell("Test"), *_SCORES], rows)
@@ -102,7 +106,7 @@ def comparison(runs: Sequence[results.Run]) -> str:
     if not rows:
         return ""
     header = [Cell("Method"), *_SCORES, markup.number("Gap (points)")]
-    text = "<h2>Success</h2>\n" + markup.table(header, rows) + markup.small(tables.SUCCESS_NOTE)
+    text = "<h2>Success</h2>\n" + markup.table(header, rows) + markup.small(_BARS_NOTE)
     pairs = tables.paired(runs)
     if len(pairs) > 1:
         text += "<h2>Paired with STAR-Diff</h2>\n" + markup.plain(pairs, tables.PAIRED_NOTE)

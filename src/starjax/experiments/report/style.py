@@ -10,9 +10,9 @@ from typing import Any
 
 from starjax.experiments import methods
 
-SUCCESS, FAILURE = "#0072B2", "#D55E00"
+SUCCESS, FAILURE = "#2083C5", "#D55E00"
 # In the order of the methods' table, so that a method keeps its colour in every figure.
-_METHODS = ("#D55E00", "#E69F00", "#CC79A7", "#8C6D4F", "#7F7F7F", "#56B4E9", "#009E73", "#0072B2")
+_METHODS = ("#D55E00", "#E69F00", "#CC79A7", "#8C6D4F", "#7F7F7F", "#56B4E9", "#009E73", "#2083C5")
 _MARKERS = "sD^v<>Po"
 MAP = "cividis"  # perceptually even, the same to every kind of colour vision
 

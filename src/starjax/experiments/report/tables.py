@@ -47,9 +47,10 @@ RCM_NOTE = (
 PHASES_NOTE = (
     "Wall-clock time, summed over every start. Methods share the demonstrations, and some weights."
 )
+_QUANTILES = ("p50", "p95", "p99")
 _COMPILE = ": compile"  # ends the name of a phase's share spent compiling
 INFERENCE_NOTE = (
-    "One call for one environment: encoder, DDIM and, where there is one, roll network."
+    "One decision for one environment: observation in, commands out; compiling is not counted."
 )
 
 
@@ -127,11 +128,13 @@ def inference(runs: Sequence[results.Run]) -> Table:
     """Table IV: latency in ms and the rate it allows, a row per method and number of DDIM steps."""
     table = [["Method", "DDIM steps", "p50 (ms)", "p95 (ms)", "p99 (ms)", "p50 (Hz)", "p99 (Hz)"]]
     for run in runs:
-        for steps, ms in results.latencies(run):
-            times = [f"{ms[q]:.1f}" for q in ("p50", "p95", "p99")]
-            table.append(
-                [run.label, str(steps), *times, *(f"{1e3 / ms[q]:.0f}" for q in ("p50", "p99"))]
-            )
+        rows = [(run.label, str(steps), ms) for steps, ms in results.latencies(run)]
+        if run.result.get("roll_network_ms"):
+            rows.append((f"{run.label}, roll network alone", "–", run.result["roll_network_ms"]))
+        for name, steps, ms in rows:
+            times = [f"{ms[q]:.3f}" if ms["p50"] < 1 else f"{ms[q]:.1f}" for q in _QUANTILES]
+            hertz = [f"{1e3 / ms[q]:.0f}" for q in ("p50", "p99")]
+            table.append([name, steps, *times, *hertz])
     return table
 
 

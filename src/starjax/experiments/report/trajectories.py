@@ -118,7 +118,7 @@ def _path(axis: Any, rollout: results.Rollout, color: str, dashed: bool, fan: bo
     if fan:
         for point in tip[np.linspace(0, len(tip) - 1, _FAN).round().astype(int)]:
             beyond = trocar + 0.02 * (trocar - point) / max(np.linalg.norm(trocar - point), 1e-9)
-            axis.plot(*_flat(np.stack([beyond, point])).T, color=color, linewidth=0.6, alpha=0.28)
+            axis.plot(*_flat(np.stack([beyond, point])).T, color=color, linewidth=0.6, alpha=0.34)
     shadow = _flat(tip * np.array([1.0, 1.0, 0.0]))
     axis.plot(*shadow.T, color="black", linewidth=1.0, alpha=0.12, zorder=1)
     flat = _flat(tip)

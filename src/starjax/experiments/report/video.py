@@ -14,7 +14,7 @@ Draw = Callable[[results.Rollout, int], np.ndarray]
 
 FPS = 30  # a picture a control step: real time
 SIZE = 384  # pixels a side of one rollout's picture
-_BAR = 32  # pixels of the caption under it
+_BAR = 32  # pixels of the caption over it
 _HOLD = 1.5  # s that the last picture stays
 _LONGEST = 12.0  # s shown of a rollout
 _GAP = 4  # pixels between pictures
@@ -41,7 +41,7 @@ def choose(runs: Sequence[results.Run], most: int = 4) -> list[tuple[str, result
 def frames(
     chosen: Sequence[tuple[str, results.Rollout]], draw: Draw, several: bool = False
 ) -> Iterator[np.ndarray]:
-    """Pictures `[h, w, 3]` uint8 of the chosen rollouts in real time, two in a row, captions under.
+    """Pictures `[h, w, 3]` uint8 of the chosen rollouts in real time, two in a row, captions over.
 
     Drawn while they are asked for: a whole video would not fit the memory of a small machine.
 
@@ -136,7 +136,7 @@ def caption(texts: Sequence[tuple[str, str]], width: int, height: int = _BAR) ->
 
 
 def _clip(draw: Draw, method: str, rollout: results.Rollout) -> Iterator[np.ndarray]:
-    """Pictures of one rollout over a bar: what is shown, the clock, and at the end the outcome."""
+    """Pictures of one rollout under a bar: what is shown, the clock, and at the end the outcome."""
     kind, index = "seen" if rollout.trial["seen"] else "unseen", rollout.trial["trocar"]
     name = (f"{method}, {kind} trocar {index}".removeprefix(", "), "#e6e9ec")
     steps = min(len(rollout.p_world_tip), round(_LONGEST * FPS))
@@ -144,7 +144,7 @@ def _clip(draw: Draw, method: str, rollout: results.Rollout) -> Iterator[np.ndar
         for step, picture in enumerate(draw(rollout, first)[: steps - first], start=first):
             clock = (f"{step // FPS} s", "#98a2ad")
             right = _outcome(rollout, steps) if step == steps - 1 else clock
-            yield np.concatenate([picture, caption([name, right], picture.shape[1])])
+            yield np.concatenate([caption([name, right], picture.shape[1]), picture])
 
 
 def _outcome(rollout: results.Rollout, steps: int) -> tuple[str, str]:

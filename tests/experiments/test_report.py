@@ -1,0 +1,299 @@
+"""The report: numbers against hand counts, nothing invented, nothing left empty."""
+
+import json
+import re
+import subprocess
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import synthetic
+
+from starjax.experiments.report import (
+    build,
+    figures,
+    markup,
+    outcomes,
+    page,
+    results,
+    stats,
+    tables,
+    video,
+    words,
+)
+from starjax.sim import env
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory):
+    return results.load(synthetic.run(tmp_path_factory.mktemp("one") / "stardiff"))
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory):
+    out = tmp_path_factory.mktemp("several")
+    skills = {"dp_ee": (0.5, 0.1), "dp_rcm4": (0.8, 0.5), "stardiff": (0.95, 0.9)}
+    return [
+        results.load(synthetic.run(out / name, name, skill, seed=seed))
+        for seed, (name, skill) in enumerate(skills.items())
+    ]
+
+
+def edited(run, **changes):
+    return run._replace(result={**run.result, **changes})
+
+
+def test_tallies_are_those_of_result_json(one):
+    seen, unseen = (outcomes.tally(t) for t in outcomes.split(one.trials))
+    for rate, said in ((seen, one.result["seen"]), (unseen, one.result["unseen"])):
+        assert (rate.successes, rate.trials) == (said["successes"], said["trials"])
+        np.testing.assert_allclose([rate.low, rate.high], said["ci95"])
+    safe = outcomes.tally(one.trials, outcomes.safe)
+    assert safe.successes == one.result["safe"]["all"]["successes"]
+    assert stats.gap(seen, unseen)[0] == pytest.approx(one.result["generalization_gap"])
+
+
+def test_holm_steps_down():
+    # Sorted 0.01, 0.02, 0.04 are multiplied by 3, 2, 1 and never decrease.
+    assert stats.holm([0.02, 0.01, 0.04]) == pytest.approx([0.04, 0.03, 0.04])
+    assert stats.holm([0.6, 0.7]) == [1.0, 1.0]
+
+
+def test_seconds_are_the_environments():
+    assert outcomes.CONTROL_HZ == env.CONTROL_HZ
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ({}, "timeout"),
+        ({"loose": True}, "loose"),
+        ({"collided": True, "loose": True}, "collided"),
+        ({"invalid": True, "collided": True}, "invalid"),
+    ],
+)
+def test_a_failure_has_one_class(flags, expected):
+    trial = {"success": False, "loose": False, "collided": False, "invalid": False, **flags}
+    assert outcomes.failure(trial) == expected
+    assert outcomes.failures([trial, {**trial, "success": True}]) == {expected: 1}
+
+
+def test_distances_to_the_training_trocars(one):
+    groups = [group[0] for group in outcomes.by_trocar(one.trials)]
+    apart = 1e3 * outcomes.distances(groups, results.training_trocars(one))
+    np.testing.assert_allclose(apart[:8], 0, atol=1e-4)
+    np.testing.assert_allclose(apart[8:], [30.29, 21.04, 21.46, 20.0], atol=0.01)
+
+
+def test_pairs_are_trials_both_ran(several):
+    first, second = several[0], several[2]
+    cut = edited(second, trials=[*second.trials[5:], {**second.trials[0], "seed": 9}])
+    found = results.pair(first, cut)
+    both = list(zip(first.trials[5:], second.trials[5:]))
+    assert found.pairs == len(both)
+    assert found.only_a == sum(a["success"] and not b["success"] for a, b in both)
+    assert results.pair(first, edited(second, trials=[])) is None
+
+
+def test_table_three_counts_and_marks_the_best(several):
+    text = tables.markdown(several)
+    for run in several:
+        seen = sum(t["success"] for t in run.trials if t["seen"])
+        assert re.search(rf"\| {run.label} \| \**{100 * seen / 48:.1f} \({seen}/48\)", text)
+    assert text.count("**") == 4 and text.index("**") > text.index("| STAR-Diff |")
+    assert "state observations" in text and "Holm" in text
+
+
+def test_one_method_has_no_empty_comparison(one):
+    text = tables.markdown([one])
+    assert "Paired" not in text and "**" not in text and "–" not in text
+
+
+def test_table_four_joins_what_was_benchmarked(one):
+    ms = {"p50": 2.0, "p95": 4.0, "p99": 5.0}
+    quick = {"p50": 0.25, "p95": 0.3, "p99": 0.5}
+    run = edited(one, inference_ms_by_ddim_steps={"100": ms, "1": ms}, roll_network_ms=quick)
+    rows = tables.inference([run])[1:]
+    assert [row[1] for row in rows] == ["1", "10", "100", "–"]
+    assert rows[0][2:] == ["2.0", "4.0", "5.0", "500", "200"]
+    assert rows[3][0].endswith("roll network alone") and rows[3][2] == "0.250"
+
+
+@pytest.mark.parametrize("value", [0.0, 3e-5, 0.0041, 0.23, 12.0])
+def test_small_errors_are_never_shown_as_zero(value):
+    text = tables.millimetres(value)
+    assert "e" not in text and (value == 0 or float(text.removeprefix("<")) > 0)
+
+
+def test_the_verdict_says_what_is_sure(one):
+    def trials(seen, unseen):
+        return [
+            {**one.trials[0], "seen": s, "success": i < k, "trial": i}
+            for s, k in ((True, seen), (False, unseen))
+            for i in range(50)
+        ]
+
+    def said(seen, unseen):
+        return words.verdict([one], edited(one, trials=trials(seen, unseen)))
+
+    assert "costs it 60 points" in said(45, 15)
+    assert "may be chance" in said(25, 24)
+    assert "better on the new ones" in said(15, 45)
+    assert "not evaluated" in words.verdict([one], edited(one, trials=[]))
+
+
+def test_the_page_stands_alone(several):
+    text = page.render(several, several[-1], {"fig4": (b"light", b"dark")}, b"mp4")
+    assert "<script" not in text and "http" not in text
+    assert all(
+        url.startswith("data:") for url in re.findall(r'(?:src|href|srcset)="([^"]*)"', text)
+    )
+    assert words.verdict(several, several[-1]) in text
+    assert all(run.label in text for run in several)
+
+
+def test_the_page_escapes_what_it_shows(one):
+    run = edited(one, command="run --out '<b>&'", warnings=["<i>"])
+    text = page.render([run], run, {}, None)
+    assert "&lt;b&gt;&amp;" in text and "&lt;i&gt;" in text and "<b>&" not in text
+
+
+def test_a_stage_that_did_not_run_leaves_no_trace(one):
+    parts = ("trials", "inference_ms", "rcm_error_mm", "timings_s", "warnings", "command")
+    run = edited(one, **dict.fromkeys(parts), versions=None, hardware=None, config={})
+    text = page.render([run], run, {}, None)
+    assert "<h2>" not in text and "None" not in text and "<video" not in text
+    assert tables.markdown([run]).count("|") == 0
+    assert figures.training([run._replace(curves=[])]) is None
+
+
+def test_the_interval_bar_is_where_the_rate_is():
+    bar = markup.interval(stats.rate(3, 4), "seen")
+    left, width, tick = (float(x) for x in re.findall(r"(?:left|width):([\d.]+)%", bar))
+    assert tick == 75 and left < 75 < left + width <= 100.01
+
+
+def test_build_writes_every_file(tmp_path):
+    run = synthetic.run(tmp_path / "stardiff", sweep_of=40)
+    index = build.build([run], tmp_path / "report", with_video=False)
+    files = {path.name: path.read_bytes() for path in (tmp_path / "report").iterdir()}
+    assert sorted(files) == sorted(
+        ["tables.md", "fig3.png", "fig3.pdf", "fig4.png", "fig4.pdf", "training.png", "index.html"]
+    )
+    for name, data in files.items():
+        magic = {"png": b"\x89PNG", "pdf": b"%PDF"}.get(name.split(".")[1], b"")
+        assert data.startswith(magic) and len(data) > 500
+    build.build([run], tmp_path / "report", with_video=False)
+    assert index.read_bytes() == files["index.html"]
+
+
+def test_build_without_rollouts_or_results(tmp_path):
+    run = synthetic.run(tmp_path / "dp_ee", "dp_ee")
+    (run / "evaluation" / "recorded.npz").unlink()
+    build.build([run], tmp_path / "report")
+    assert {"fig3.png", "rollout.mp4"}.isdisjoint(p.name for p in (tmp_path / "report").iterdir())
+    (run / "result.json").unlink()
+    with pytest.raises(ValueError, match=r"result\.json"):
+        build.build([run], tmp_path / "report")
+    with pytest.raises(ValueError, match="at least one"):
+        build.build([], tmp_path / "report")
+
+
+def test_weights_that_are_shared_bring_their_curves(tmp_path):
+    owner = synthetic.run(tmp_path / "dp_ee", "dp_ee")
+    borrower = synthetic.run(tmp_path / "dp_ee_proj", "dp_ee_proj")
+    (borrower / "metrics.jsonl").unlink()
+    assert results.load(borrower).curves == results.load(owner).curves != []
+
+
+def test_recorded_rollouts_end_where_the_trial_did(one):
+    assert len(one.rollouts) == 36
+    for rollout in one.rollouts:
+        assert len(rollout.p_world_tip) == rollout.trial["steps"]
+        assert np.isfinite(rollout.p_world_tip).all()
+
+
+def with_qpos(run):
+    rollouts = [r._replace(qpos=np.zeros((len(r.p_world_tip), 2))) for r in run.rollouts]
+    return run._replace(rollouts=rollouts)
+
+
+def test_the_video_shows_seen_and_unseen_whatever_their_outcome(one):
+    def chosen(run):
+        return [(r.trial["trocar"], r.trial["trial"]) for _, r in video.choose([run])]
+
+    run = with_qpos(one)
+    assert [trocar < 8 for trocar, _ in chosen(run)] == [True, True, False, False]
+    assert len(set(chosen(run))) == 4
+    turned = [
+        r._replace(trial={**r.trial, "success": not r.trial["success"]}) for r in run.rollouts
+    ]
+    assert chosen(run._replace(rollouts=turned)) == chosen(run)
+    assert chosen(one) == []
+
+
+def test_several_methods_are_shown_at_the_same_trial(several):
+    chosen = video.choose([with_qpos(run) for run in several])
+    assert [method for method, _ in chosen] == [run.label for run in several]
+    trials = {(r.trial["trocar"], r.trial["trial"], r.trial["seen"]) for _, r in chosen}
+    assert len(trials) == 1 and not trials.pop()[2]
+
+
+def test_a_clip_that_ends_early_stays_as_it_ended(one):
+    short, long = (
+        r._replace(p_world_tip=r.p_world_tip[:n], qpos=np.zeros((n, 2)))
+        for r, n in zip(one.rollouts, (5, 20))
+    )
+
+    def draw(rollout, first):
+        steps = np.arange(first, first + 16, dtype=np.uint8)
+        return np.broadcast_to(steps[:, None, None, None], (16, 64, 64, 3))
+
+    pictures = list(video.frames([("a", short), ("b", long)], draw))
+    assert len(pictures) == 20 + 45
+    pixels = np.array([[p[-1, 0, 0], p[-1, -1, 0]] for p in pictures])
+    np.testing.assert_array_equal(pixels[:, 0], np.minimum(np.arange(65), 4))
+    np.testing.assert_array_equal(pixels[:, 1], np.minimum(np.arange(65), 19))
+
+
+def test_the_video_plays_everywhere(tmp_path):
+    ramp = (np.full((48, 64, 3), 8 * i, np.uint8) for i in range(30))
+    video.write(ramp, tmp_path / "ramp.mp4")
+    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(tmp_path / "ramp.mp4")]
+    said = subprocess.run(program, capture_output=True, text=True).stderr
+    assert "h264" in said and "yuv420p" in said and "64x48" in said and "30 fps" in said
+    raw = [*program, "-f", "rawvideo", "-pix_fmt", "rgb24", "-loglevel", "error", "-"]
+    back = np.frombuffer(subprocess.run(raw, capture_output=True).stdout, np.uint8)
+    means = back.reshape(30, 48, 64, 3).mean((1, 2, 3))
+    np.testing.assert_allclose(means, 8 * np.arange(30), atol=3)
+
+
+@pytest.mark.parametrize("bad", [np.zeros((8, 8, 3)), np.zeros((7, 8, 3), np.uint8)])
+def test_pictures_that_cannot_be_coded_are_refused(tmp_path, bad):
+    with pytest.raises(ValueError, match="pictures: expected uint8"):
+        video.write([bad], tmp_path / "bad.mp4")
+
+
+def test_an_encoder_that_fails_says_so(tmp_path):
+    with pytest.raises(OSError, match=r"none/clip\.mp4"):
+        video.write([np.zeros((8, 8, 3), np.uint8)] * 3, tmp_path / "none" / "clip.mp4")
+
+
+def test_the_renderer_draws_the_recorded_configuration(one):
+    made = env.model.load()
+    qpos = np.tile(made.mj_model.qpos0, (3, 1))
+    near = one.rollouts[0]._replace(qpos=qpos, p_world_trocar=made.p_world_ref, target_peg=7)
+    far = near._replace(p_world_trocar=made.p_world_ref + np.array([0, 0.04, 0], np.float32))
+    draw = video.renderer(made, size=64)
+    here, there = draw(near, 0), draw(far, 0)
+    assert here.shape[1:] == (64, 64, 3) and here.dtype == np.uint8
+    assert (here[0] == here[2]).all() and (here[0] != there[0]).any()
+    assert (draw(near._replace(target_peg=8), 0)[0] != here[0]).any()
+    with pytest.raises(ValueError, match="joint positions"):
+        draw(near._replace(qpos=None), 0)
+
+
+def test_a_result_alone_is_enough_to_load(one, tmp_path):
+    (tmp_path / "stardiff").mkdir()
+    (tmp_path / "stardiff" / "result.json").write_text(json.dumps(one.result))
+    assert results.load(tmp_path / "stardiff").trials == one.trials
