@@ -23,7 +23,7 @@ class Options:
 
     run: tyro.conf.Positional[str]
     ddim_steps: tuple[int, ...] = (1, 2, 5, 10, 20, 50, 100)
-    repeats: int = 100  # decisions timed for each
+    calls: int = 100  # decisions timed for each
 
 
 def main(argv: Sequence[str]) -> int:
@@ -40,20 +40,30 @@ def main(argv: Sequence[str]) -> int:
             raise config_lib.UsageError(f"--ddim-steps: expected 1 to {most}, got {count}")
     xla.prepare_xla()
 
-    from starjax.experiments import latency
-    from starjax.sim import model
-    from starjax.training import export
+    from starjax.evaluation import latency
+    from starjax.experiments import methods, scoring
 
-    trained = export.load(folders.weights(run.parent, run.name))
-    p_world_ref = model.load().p_world_ref
-    found = {}
+    who = scoring.subject(run.name, folders.weights(run.parent, run.name))
+    trained = who.trained
     print("  DDIM steps      p50      p95      p99 ms       Hz")
+    found = {}
     for count in chosen.ddim_steps:
-        ms = latency.decision(run.name, trained, p_world_ref, chosen.repeats, count)
+        (ms,) = latency.table(
+            methods.METHODS[run.name],
+            trained.policy,
+            trained.train,
+            trained.params,
+            trained.normalizer,
+            who.env.p_world_ref,
+            ddim_steps=[count],
+            batches=[1],
+            calls=chosen.calls,
+        )
         found[str(count)] = ms  # JSON's names are words
         print(_row(str(count), ms), flush=True)
-    roll = latency.roll_network(trained, p_world_ref, chosen.repeats)
-    if roll:
+    roll = None
+    if methods.METHODS[run.name].hierarchical:
+        roll = latency.roll_ms(trained.policy, calls=chosen.calls)
         print(_row("roll net", roll))
     result = json.loads(result_file.read_text())
     result |= {"inference_ms_by_ddim_steps": found, "roll_network_ms": roll}
@@ -62,6 +72,5 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _row(name: str, ms: dict[str, float]) -> str:
-    return (
-        f"  {name:10} {ms['p50']:8.3f} {ms['p95']:8.3f} {ms['p99']:8.3f}    {1e3 / ms['p50']:8.1f}"
-    )
+    times = " ".join(f"{ms[key]:8.3f}" for key in ("p50", "p95", "p99"))
+    return f"  {name:10} {times}    {1e3 / ms['p50']:8.1f}"

@@ -131,10 +131,9 @@ def _train(config: config_lib.RunConfig, name: str, demos: Callable[[], Any], en
         except loop.TrainingFailed as error:
             raise config_lib.UsageError(str(error)) from error
     state = result.state
-    export.save(
-        weights,
-        export.Trained(name, config.policy, config.train, state.ema_params, state.normalizer),
-    )
+    port = tuple(float(x) for x in env.p_world_ref)
+    made = (name, config.policy, config.train, state.ema_params, state.normalizer, port)
+    export.save(weights, export.Trained(*made))
     errors = ", ".join(f"{key} {value:.3g}" for key, value in result.holdout.items())
     words.indented(f"{result.samples_per_second:.0f} samples/s; held-out {errors or 'none'}")
 

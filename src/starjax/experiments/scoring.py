@@ -10,14 +10,12 @@ import numpy as np
 
 from starjax import config as config_lib
 from starjax import rcm
-from starjax.evaluation import evaluate, metrics, table
-from starjax.experiments import folders, latency, methods, words
+from starjax.evaluation import evaluate, latency, metrics, table
+from starjax.experiments import folders, methods, words
 from starjax.policies import policy as policies
 from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
 from starjax.training import export
-
-REPEATS = 50  # decisions timed for result.json; `starjax bench` takes more
 
 
 class Subject(NamedTuple):
@@ -43,8 +41,16 @@ def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subje
       method: a row of Table II.
       weights: policy.safetensors.
       env: built from what the weights were trained on unless given.
+
+    Raises:
+      config.UsageError: the file is missing or damaged.
     """
-    trained = export.load(weights)
+    try:
+        trained = export.load(weights)
+    except ValueError as error:
+        raise config_lib.UsageError(
+            f"{error}; remove it, and run the same command again"
+        ) from error
     env = env or sim_env.make(trained.policy.observation, trained.policy.image_size)
     row = methods.METHODS[method]
     policy = policies.make(row, trained.policy, env.p_world_ref, trained.train)
@@ -76,6 +82,14 @@ def rollouts(
     )
 
 
+def decision_ms(who: Subject) -> dict[str, float]:
+    """Time of one decision at batch 1: observation in, commands out, compilation apart."""
+    params, stats = jax.device_put((who.trained.params, who.trained.normalizer))
+    return latency.policy_ms(
+        who.policy, who.trained.policy, params, stats, who.env.p_world_ref, seconds=5.0
+    )
+
+
 def write_result(
     folder: Path,
     who: Subject,
@@ -101,7 +115,7 @@ def write_result(
     )
     result = {
         **figures,
-        "inference_ms": latency.decision(who.method, who.trained, who.env.p_world_ref, REPEATS),
+        "inference_ms": decision_ms(who),
         "preset": config.preset,
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "command": command,
