@@ -297,3 +297,10 @@ def test_a_result_alone_is_enough_to_load(one, tmp_path):
     (tmp_path / "stardiff").mkdir()
     (tmp_path / "stardiff" / "result.json").write_text(json.dumps(one.result))
     assert results.load(tmp_path / "stardiff").trials == one.trials
+
+
+def test_runs_of_one_method_are_told_apart(tmp_path):
+    paths = [synthetic.run(tmp_path / name / "stardiff", seed=i) for i, name in enumerate("ab")]
+    build.build(paths, tmp_path / "report", with_video=False)
+    text = (tmp_path / "report" / "tables.md").read_text()
+    assert "STAR-Diff (a/stardiff)" in text and "STAR-Diff (b/stardiff)" in text

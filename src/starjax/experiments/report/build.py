@@ -25,7 +25,7 @@ def build(
     """
     if not runs:
         raise ValueError("runs: expected at least one run directory, got none")
-    loaded = sorted((results.load(path) for path in runs), key=_order)
+    loaded = _named_apart(sorted((results.load(path) for path in runs), key=_order))
     focus = _focus(loaded)
     out.mkdir(parents=True, exist_ok=True)
     files.write_bytes(out / "tables.md", tables.markdown(loaded).encode())
@@ -39,6 +39,17 @@ def build(
 
 def _order(run: results.Run) -> int:
     return list(methods.METHODS).index(run.result["method"])
+
+
+def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
+    """Runs of one method, say with other seeds, get their folder's name beside the method's."""
+    labels = [run.label for run in runs]
+    return [
+        run._replace(label=f"{run.label} ({run.path.parent.name}/{run.path.name})")
+        if labels.count(run.label) > 1
+        else run
+        for run in runs
+    ]
 
 
 def _focus(runs: Sequence[results.Run]) -> results.Run:
