@@ -1,107 +1,137 @@
-"""A trained policy as one file, `policy.safetensors`: averaged weights, normaliser, settings.
+"""The finished policy as one file, policy.safetensors: weights, statistics and settings, no pickle.
 
-No pickle, readable without starjax: arrays are named by their path, the one metadata entry is JSON.
+The same policy always gives the same bytes.
 """
 
 import dataclasses
+import hashlib
 import json
-from collections.abc import Mapping
-from pathlib import Path
+import pathlib
 from typing import Any, NamedTuple
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import safetensors
 import safetensors.numpy
 
 from starjax import config
 from starjax.data import normalizer
+from starjax.policies.policy import Params
 from starjax.runtime import files
 
-_ENTRY = "starjax"  # a single one: several have no fixed order in the file
-_NETWORK, _SCALING = "params", "normalizer"
+SCHEMA = 1
+_KEY = "starjax"  # one metadata entry: the format does not keep the order of several
+_SEPARATOR = "/"
 
 
 class Trained(NamedTuple):
-    """What evaluation needs of a training.
+    """What inference needs.
 
     Attributes:
-      weights_of: the row of Table II that was trained.
-      policy: its networks.
-      train: its settings, of which inference uses the crop.
-      params: averaged weights.
-      normalizer: fitted to the training frames.
+      method: its name, a row of Table II.
+      policy: networks and diffusion.
+      train: augmentation decides what inference sees (the crop); the rest is for the record.
+      params: the averaged (EMA) parameters.
+      normalizer: fitted to the training demonstrations.
+      p_world_ref: `[3]` m, the nominal port, if it was given.
     """
 
-    weights_of: str
+    method: str
     policy: config.PolicyConfig
     train: config.TrainConfig
-    params: dict[str, Any]
+    params: Params
     normalizer: normalizer.Normalizer
+    p_world_ref: tuple[float, ...] | None = None
 
 
-def save(path: Path, trained: Trained) -> None:
-    """Writes the file atomically; the same policy gives the same bytes."""
-    arrays = {f"{_NETWORK}.{name}": leaf for name, leaf in _flat(trained.params).items()}
-    for part in dataclasses.fields(trained.normalizer):
-        scaling = getattr(trained.normalizer, part.name)
-        if scaling is not None:
-            arrays[f"{_SCALING}.{part.name}.low"] = np.asarray(scaling.low)
-            arrays[f"{_SCALING}.{part.name}.high"] = np.asarray(scaling.high)
-    about = {
-        "weights_of": trained.weights_of,
-        "policy": dataclasses.asdict(trained.policy),
-        "train": dataclasses.asdict(trained.train),
-    }
-    metadata = {_ENTRY: json.dumps(about, sort_keys=True)}
-    files.write_bytes(path, safetensors.numpy.save(arrays, metadata))
-
-
-def load(path: Path) -> Trained:
-    """Reads what `save` wrote.
+def save(path: pathlib.Path | str, trained: Trained) -> None:
+    """Writes the file atomically.
 
     Raises:
-      ValueError: not such a file, or a damaged one.
+      ValueError: a parameter is not finite.
+      StorageError: the file cannot be written.
     """
+    stats = {
+        name: {"low": part.low, "high": part.high}
+        for name in ("action", "state")
+        if (part := getattr(trained.normalizer, name)) is not None
+    }
+    arrays = dict(_flatten({"params": trained.params, "normalizer": stats}))
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"params: expected finite values, got others in {name}")
+    port = trained.p_world_ref
+    about = {
+        "schema": SCHEMA,
+        "method": trained.method,
+        "policy": dataclasses.asdict(trained.policy),
+        "train": dataclasses.asdict(trained.train),
+        "p_world_ref": None if port is None else [float(x) for x in port],
+    }
+    envelope = {"about": about, "sha256": _hash(about, arrays)}
+    data = safetensors.numpy.save(arrays, {_KEY: json.dumps(envelope, sort_keys=True)})
+    files.write_bytes(pathlib.Path(path), data)
+
+
+def load(path: pathlib.Path | str) -> Trained:
+    """Reads such a file.
+
+    Raises:
+      ValueError: it is missing, damaged, or not one of this schema; the message names it.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise ValueError(f"policy: expected a file, got {path}")
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            about = json.loads(file.metadata()[_ENTRY])
+            envelope = json.loads((file.metadata() or {})[_KEY])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (safetensors.SafetensorError, OSError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: expected a policy written by starjax: {error}") from error
-    network = {name: leaf for name, leaf in arrays.items() if name.startswith(f"{_NETWORK}.")}
-    scalings = {
-        part.name: normalizer.MinMax(arrays[f"{_SCALING}.{part.name}.low"], arrays[key])
-        if (key := f"{_SCALING}.{part.name}.high") in arrays
-        else None
-        for part in dataclasses.fields(normalizer.Normalizer)
-    }
+        about, expected = envelope["about"], envelope["sha256"]
+        schema = about["schema"]
+    except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a readable starjax policy: {error}") from error
+    if schema != SCHEMA:
+        raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}")
+    if _hash(about, arrays) != expected:
+        raise ValueError(f"{path}: damaged, its content is not what was written (sha256)")
+    tree = _unflatten(arrays)
+    stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
+    port = about["p_world_ref"]
     return Trained(
-        weights_of=about["weights_of"],
+        method=about["method"],
         policy=config.from_dict(config.PolicyConfig, about["policy"]),
         train=config.from_dict(config.TrainConfig, about["train"]),
-        params=_nested(network)[_NETWORK],
-        normalizer=normalizer.Normalizer(**scalings),
+        params=tree["params"],
+        normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
+        p_world_ref=None if port is None else tuple(port),
     )
 
 
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
-    """Leaves of nested dictionaries by their dotted path; no name contains a dot."""
-    found = {}
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            found |= _flat(value, f"{prefix}{name}.")
+def _flatten(tree: Any, prefix: str = ""):
+    """(path, numpy array) of every leaf of nested dicts."""
+    for name in sorted(tree):
+        value, path = tree[name], f"{prefix}{name}"
+        if isinstance(value, dict):
+            yield from _flatten(value, path + _SEPARATOR)
         else:
-            found[prefix + name] = np.ascontiguousarray(jax.device_get(value))
-    return found
+            yield path, np.ascontiguousarray(value)
 
 
-def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+def _unflatten(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
-    for name, value in flat.items():
-        *parents, leaf = name.split(".")
-        place = tree
+    for path, array in arrays.items():
+        *parents, name = path.split(_SEPARATOR)
+        node = tree
         for parent in parents:
-            place = place.setdefault(parent, {})
-        place[leaf] = value
+            node = node.setdefault(parent, {})
+        node[name] = jnp.asarray(array)
     return tree
+
+
+def _hash(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Iterator
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
@@ -30,6 +31,7 @@ def batches(
 
     Close the iterator (or let it go) to end its thread.
     """
+    on_device = jnp.asarray(frames)
     waiting: queue.Queue = queue.Queue(maxsize=_AHEAD)
     closed = threading.Event()
 
@@ -37,9 +39,9 @@ def batches(
     def chosen(first_step):
         def of(step):
             key_frames, _ = steps.step_keys(key, step)
-            return windows.sample_frames(key_frames, frames, train_config.batch_size)
+            return windows.sample_frames(key_frames, on_device, train_config.batch_size)
 
-        return jax.vmap(of)(first_step + jax.numpy.arange(_CHUNK))
+        return jax.vmap(of)(first_step + jnp.arange(_CHUNK))
 
     def produce() -> None:
         try:

@@ -82,6 +82,7 @@ def run(
     log = directory / "metrics.jsonl"
     mesh = devices.make_mesh(train_config.batch_size, mesh_devices)
     p_world_ref = np.asarray(p_world_ref, np.float32)
+    dataset = _observed(dataset, policy_config)
     policy = policies.make(method, policy_config, p_world_ref, train_config)
     optimizer = states.make_optimizer(train_config)
     train, held_out = windows.split_holdout(
@@ -123,6 +124,12 @@ def run(
                 _save(directory, state, train_config)
             show(count, note=note)
     return Result(state, rate.samples_per_second, int(state.skipped), errors)
+
+
+def _observed(dataset: windows.Dataset, policy_config: config.PolicyConfig) -> windows.Dataset:
+    """The dataset without what the policy does not look at, so that nobody gathers it."""
+    unseen = "image" if policy_config.observation == "state" else "state"
+    return dataset.replace(observation=dataset.observation.replace(**{unseen: None}))
 
 
 def _restored_or_new(

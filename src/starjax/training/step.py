@@ -31,7 +31,7 @@ def train_step(
     (loss, metrics), gradients = jax.value_and_grad(policy.loss, has_aux=True)(
         state.params, state.normalizer, key_loss, batch
     )
-    norm = optax.global_norm(gradients)
+    norm = optax.tree.norm(gradients)
     finite = jnp.isfinite(loss) & jnp.isfinite(norm)
     # zeros in place of NaN keep the arithmetic below harmless; its results are dropped
     gradients = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradients)

@@ -1,0 +1,182 @@
+"""Every method of Table II: what its loss trains, what its samples promise."""
+
+import dataclasses
+import functools
+
+import fakes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import config, rcm
+from starjax.data import normalizer, windows
+from starjax.experiments.methods import METHODS
+from starjax.policies import execution, features, hierarchical
+from starjax.policies import policy as policies
+
+TRAIN = config.TrainConfig(state_noise=0.0)
+B = 3
+
+
+def jit(fn):
+    # these programs run once: compiling them badly is fast
+    return jax.jit(fn, compiler_options={"xla_backend_optimization_level": 0})
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return fakes.dataset(seed=0, demos=4, length=20, image_size=fakes.TINY.image_size)
+
+
+class Made:
+    """A policy with random weights, and compiled functions of it."""
+
+    def __init__(self, name, dataset, observation="state"):
+        self.method = METHODS[name]
+        settings = dataclasses.replace(fakes.TINY, observation=observation)
+        self.policy = policies.make(self.method, settings, fakes.P_WORLD_REF, TRAIN)
+        self.stats = normalizer.fit(self.method, dataset, fakes.P_WORLD_REF, np.arange(80))
+        self.params = jit(self.policy.init)(jax.random.key(0))
+        self.batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
+        self.sample = jit(self.policy.sample)
+        self.gradient = jit(jax.value_and_grad(self.policy.loss, has_aux=True))
+
+    def commands(self, keys=None, trocar=None, params=None):
+        return self.sample(
+            self.params if params is None else params,
+            self.stats,
+            jax.random.split(jax.random.key(1), B) if keys is None else keys,
+            self.batch.observation,
+            self.batch.trocar if trocar is None else trocar,
+        )
+
+
+@pytest.fixture(scope="module")
+def made(dataset):
+    return functools.cache(lambda name, observation="state": Made(name, dataset, observation))
+
+
+@pytest.mark.parametrize("name", ["dp_ee", "dp_rcm1", "stardiff"])
+def test_every_parameter_learns(made, name):
+    it = made(name)
+    key = jax.random.key(0)
+    (loss, _), gradient = it.gradient(it.params, it.stats, key, it.batch)
+    assert np.isfinite(loss) and 0.2 < loss < 5.0
+    flat = jax.tree_util.tree_flatten_with_path(gradient)[0]
+    for path, g in flat:
+        assert np.isfinite(g).all(), path
+        # the roll network starts at zero: only its last layer feels the first step
+        if "roll" not in jax.tree_util.keystr(path):
+            assert np.abs(g).max() > 0, path
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_samples_are_finite_and_respect_the_manifold(made, name):
+    it = made(name)
+    command = it.commands()
+    assert command.pose.R.shape == (B, 16, 3, 3)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(command))
+    assert np.abs(command.gripper).max() <= 1.0
+    port = rcm.trocar_position(it.batch.trocar, fakes.P_WORLD_REF)[:, None]
+    error = np.asarray(rcm.rcm_error(command.pose, port)).max()
+    assert (error <= 1e-6) == (name != "dp_ee")
+
+
+@pytest.mark.parametrize("name", ["stardiff", "dp_ee", "dp_ee_proj"])
+def test_samples_are_finite_with_broken_weights(made, name):
+    it = made(name)
+    command = it.commands(params=jax.tree.map(lambda x: x * jnp.nan, it.params))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(command))
+
+
+@pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
+def test_a_sample_depends_on_its_own_key_alone(made, name):
+    it = made(name)
+    keys = jax.random.split(jax.random.key(1), B)
+    first = it.commands(keys)
+    second = it.commands(keys.at[1].set(jax.random.key(99)))
+    same = np.asarray(jnp.abs(first.pose.p - second.pose.p).max((1, 2)))
+    np.testing.assert_array_equal(same == 0.0, [True, False, True])
+
+
+def test_hierarchical_positions_do_not_know_the_trocar(made):
+    it = made("stardiff")
+    other = jax.tree.map(lambda x: jnp.roll(x, 1), it.batch.trocar)
+    here, there = it.commands(), it.commands(trocar=other)
+    np.testing.assert_allclose(here.pose.p, there.pose.p, atol=1e-6)
+    np.testing.assert_allclose(here.gripper, there.gripper, atol=1e-6)
+    assert np.abs(here.pose.R - there.pose.R).max() > 1e-3
+
+
+def test_trocar_conditioned_positions_do_know_it(made):
+    it = made("dp_rcm4")
+    other = jax.tree.map(lambda x: jnp.roll(x, 1), it.batch.trocar)
+    assert np.abs(it.commands().pose.p - it.commands(trocar=other).pose.p).max() > 1e-5
+
+
+def test_projection_keeps_the_tip(made):
+    free, projected = made("dp_ee").commands(), made("dp_ee_proj").commands()
+    np.testing.assert_allclose(free.pose.p, projected.pose.p, atol=1e-6)
+    np.testing.assert_allclose(free.gripper, projected.gripper, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["stardiff", "dp_rcm1"])
+def test_images_work(made, name):
+    it = made(name, "image")
+    (loss, _), gradient = it.gradient(it.params, it.stats, jax.random.key(0), it.batch)
+    assert np.isfinite(loss)
+    vision = gradient["diffuser"] if name == "stardiff" else gradient
+    assert all(np.abs(g).max() > 0 for g in jax.tree.leaves(vision["vision"]))
+    assert np.isfinite(it.commands().pose.p).all()
+
+
+def test_a_missing_observation_is_named(made, dataset):
+    it = made("stardiff")
+    blind = it.batch.replace(observation=it.batch.observation.replace(state=None))
+    with pytest.raises(ValueError, match=r"observation.state: expected"):
+        it.policy.loss(it.params, it.stats, jax.random.key(0), blind)
+
+
+def test_hierarchy_needs_a_roll():
+    method = METHODS["dp_rcm1"]._replace(hierarchical=True)
+    with pytest.raises(ValueError, match=r"method.action_space: expected one of roll and position"):
+        hierarchical.make(method, fakes.TINY, fakes.P_WORLD_REF, TRAIN)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_demonstrated_actions_become_the_demonstrated_commands(made, name, dataset):
+    it = made(name)
+    action = features.demonstrated(it.stats, it.method.action_space, it.batch, fakes.P_WORLD_REF)
+    command = execution.command(it.method, it.stats, action, it.batch.trocar, fakes.P_WORLD_REF)
+    np.testing.assert_allclose(command.pose.p, it.batch.command.pose.p, atol=2e-6)
+    np.testing.assert_allclose(command.pose.R, it.batch.command.pose.R, atol=2e-5)
+    np.testing.assert_allclose(command.gripper, it.batch.command.gripper, atol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e38])
+@pytest.mark.parametrize("name", METHODS)
+def test_no_action_breaks_a_command(made, name, bad):
+    it = made(name)
+    dim = it.stats.action.low.shape[0]
+    action = jnp.zeros((B, dim, dim)).at[:, jnp.arange(dim), jnp.arange(dim)].set(bad)
+    command = execution.command(it.method, it.stats, action, it.batch.trocar, fakes.P_WORLD_REF)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(command))
+    assert np.abs(command.gripper).max() <= 1.0
+
+
+def test_trocar_features():
+    trocar = rcm.Trocar(jnp.float32(0.05), jnp.float32(np.pi / 2), jnp.float32(np.pi))
+    found = features.trocar_features(trocar, fakes.P_WORLD_REF)
+    np.testing.assert_allclose(found, [1, 0, -1, 0, -1, 0, 0], atol=1e-6)
+
+
+def test_noise_is_in_normalised_units(made):
+    it = made("stardiff")
+    noisy = dataclasses.replace(TRAIN, state_noise=0.5)
+    clean = jnp.zeros((B, 2, 4))
+    args = (fakes.TINY, noisy, it.stats)
+    drawn = features.for_training(*args, jax.random.key(0), it.batch.observation, clean)
+    exact = features.for_sampling(*args, it.batch.observation, clean)
+    spread = float(jnp.std(drawn.history - exact.history))
+    assert 0.4 < spread < 0.6

@@ -1,0 +1,148 @@
+"""Training as a whole: resume to the last bit, kills, devices, residency, broken losses."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import kill
+import numpy as np
+import pytest
+
+from starjax.training import checkpoint, loop, metrics, state, step
+
+sys.path.insert(0, str(Path(__file__).parent))
+import jobs  # it lies beside this file, for processes to run
+
+
+def leaves(tree):
+    return [
+        np.asarray(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+        for x in jax.tree.leaves(tree)
+    ]
+
+
+def assert_same_bytes(a, b):
+    for x, y in zip(leaves(a), leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """One uninterrupted run: its directory and result."""
+    directory = tmp_path_factory.mktemp("whole")
+    return directory, jobs.train(directory)
+
+
+def test_a_run_leaves_its_log_and_checkpoints(whole):
+    directory, result = whole
+    lines = metrics.read(directory / "metrics.jsonl")
+    train = [line["step"] for line in lines if line["kind"] == "train"]
+    held = [line for line in lines if line["kind"] == "holdout"]
+    assert train == list(range(3, 25, 3))
+    assert [line["step"] for line in held] == list(range(4, 25, 4))
+    assert {"position_error_mm", "roll_error_deg", "gripper_error"} <= held[0].keys()
+    assert result.holdout == {k: v for k, v in held[-1].items() if k not in ("step", "kind")}
+    first = next(line for line in lines if line["kind"] == "train")
+    assert {"loss", "gradient_norm", "learning_rate", "skipped", "roll_loss"} <= first.keys()
+    assert checkpoint.steps(directory / "checkpoints") == [20, 24]
+    assert int(result.state.step) == 24 and result.skipped == 0
+
+
+def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
+    directory, result = whole
+    asked = iter(range(100))
+    with pytest.raises(loop.Interrupted, match=r"stopped at step .*same command goes on"):
+        jobs.train(tmp_path, should_stop=lambda: next(asked) == 3)
+    stopped = checkpoint.steps(tmp_path / "checkpoints")[-1]
+    assert 0 < stopped < 24 and stopped % 4  # not where it would have saved anyway
+    again = jobs.train(tmp_path)
+    assert_same_bytes(again.state, result.state)
+    assert again.holdout == result.holdout
+    log = (tmp_path / "metrics.jsonl").read_bytes()
+    assert log == (directory / "metrics.jsonl").read_bytes()
+
+
+def test_a_finished_run_is_only_loaded(whole):
+    directory, result = whole
+    before = (directory / "metrics.jsonl").read_bytes()
+    again = jobs.train(directory)
+    assert_same_bytes(again.state, result.state)
+    assert again.holdout == result.holdout and again.samples_per_second == 0.0
+    assert (directory / "metrics.jsonl").read_bytes() == before
+
+
+def test_damaged_checkpoint_costs_only_its_steps(whole, tmp_path):
+    _, result = whole
+    jobs.train(tmp_path)
+    newest = checkpoint.path_of(tmp_path / "checkpoints", 24)
+    victim = max((f for f in newest.rglob("*") if f.is_file()), key=lambda f: f.stat().st_size)
+    victim.write_bytes(victim.read_bytes()[:-7])
+    with pytest.warns(UserWarning, match="step 24 is damaged"):
+        again = jobs.train(tmp_path)
+    assert_same_bytes(again.state, result.state)
+
+
+def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
+    directory, result = whole
+    hosted = jobs.train(tmp_path, host=True)
+    for x, y in zip(leaves(hosted.state), leaves(result.state), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
+    ours, theirs = (metrics.read(d / "metrics.jsonl") for d in (tmp_path, directory))
+    assert [line["step"] for line in ours] == [line["step"] for line in theirs]
+    losses = [[line["loss"] for line in log if "loss" in line] for log in (ours, theirs)]
+    np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
+
+
+def test_training_learns(tmp_path):
+    settings = dataclasses.replace(
+        jobs.SETTINGS, steps=300, log_every=50, checkpoint_every=300, steps_per_call=50
+    )
+    result = jobs.train(tmp_path, settings)
+    losses = [x["loss"] for x in metrics.read(tmp_path / "metrics.jsonl") if x["kind"] == "train"]
+    assert losses[-1] < 0.6 * losses[0]
+    assert result.samples_per_second > 0
+
+
+def test_killed_again_and_again_ends_the_same(tmp_path):
+    found = kill.survive(jobs.__file__, "train_and_export", tmp_path, kills=10)
+    assert found.kills >= 10
+    for name in ("policy.safetensors", "metrics.jsonl"):
+        assert found.killed[name] == found.whole[name]
+    last = {name.split("/")[1] for name in found.killed if name.startswith("checkpoints/step")}
+    assert last == {"step_00000020", "step_00000024"}
+
+
+@pytest.mark.parametrize("count", [2, 8])
+def test_many_devices_give_the_numbers_of_one(whole, tmp_path, count):
+    _, result = whole
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
+    environment = {
+        **os.environ,
+        "XLA_FLAGS": flags,
+        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+    }
+    subprocess.run(
+        [sys.executable, jobs.__file__, str(count), str(tmp_path)], env=environment, check=True
+    )
+    with np.load(tmp_path / "found.npz", allow_pickle=False) as found:
+        key_frames, _ = step.step_keys(result.state.key, 5)
+        drawn = jax.random.randint(key_frames, (16,), 0, 100)
+        np.testing.assert_array_equal(found["frames"], drawn)
+        for i, x in enumerate(leaves(result.state.params)):
+            np.testing.assert_allclose(found[str(i)], x, rtol=1e-3, atol=2e-5)
+
+
+def test_learning_rate_and_average():
+    settings = dataclasses.replace(jobs.SETTINGS, steps=1000, warmup_steps=100)
+    rate = state.learning_rate(settings)
+    assert float(rate(0)) == 0.0
+    np.testing.assert_allclose(float(rate(100)), settings.learning_rate, rtol=1e-6)
+    np.testing.assert_allclose(float(rate(550)), settings.learning_rate / 2, rtol=1e-3)
+    np.testing.assert_allclose(float(rate(1000)), 0.0, atol=1e-9)
+    assert float(state.ema_decay(jnp.int32(0), 0.999)) == 0.0
+    np.testing.assert_allclose(float(state.ema_decay(jnp.int32(15), 0.999)), 1 - 16**-0.75)
+    assert float(state.ema_decay(jnp.int32(10**6), 0.999)) == np.float32(0.999)

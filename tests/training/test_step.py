@@ -1,0 +1,109 @@
+"""The training step: one program, nothing lost to a broken loss, the right frames."""
+
+import chex
+import fakes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import config
+from starjax.data import normalizer, windows
+from starjax.policies.policy import Policy
+from starjax.training import devices, state, step
+
+SETTINGS = config.TrainConfig(
+    steps=50, batch_size=8, learning_rate=0.1, warmup_steps=0, weight_decay=0.0
+)
+
+
+def regression():
+    """A policy of one parameter that learns the mean position; its loss is NaN where told."""
+
+    def init(key):
+        return {"w": jax.random.normal(key, (3,))}
+
+    def loss(params, stats, key, batch):
+        error = jnp.mean((params["w"] - batch.command.pose.p) ** 2)
+        broken = jnp.mean(batch.observation.gripper) > 1.5
+        return jnp.where(broken, jnp.nan, error), {"error": error}
+
+    return Policy(init, loss, lambda *_: None)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return fakes.dataset(seed=0, demos=4, length=20)
+
+
+@pytest.fixture
+def start(dataset):
+    policy, optimizer = regression(), state.make_optimizer(SETTINGS)
+    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
+    batch = windows.gather(dataset, jnp.zeros(1, jnp.int32), 2, 16)
+    stats = normalizer.Normalizer(box, None)
+    return policy, optimizer, state.create(policy, optimizer, stats, batch, seed=0)
+
+
+def program(policy, optimizer):
+    mesh = devices.make_mesh(SETTINGS.batch_size)
+
+    def run(state, dataset, frames, count):
+        return step.resident_steps(
+            policy, optimizer, fakes.TINY, SETTINGS, mesh, state, dataset, frames, count
+        )
+
+    return run
+
+
+def test_any_number_of_steps_is_one_trace(start, dataset):
+    policy, optimizer, first = start
+    run = chex.assert_max_traces(program(policy, optimizer), n=1)
+    run = jax.jit(run, donate_argnums=0)
+    now = first
+    for count in (1, 3, 7):
+        now = run(now, dataset, jnp.arange(80), jnp.int32(count))
+    assert int(now.step) == 11
+    with pytest.raises(RuntimeError, match="deleted"):
+        np.asarray(first.params["w"])  # its memory was given away
+
+
+def test_steps_do_not_depend_on_how_they_are_called(start, dataset):
+    policy, optimizer, first = start
+    run = jax.jit(program(policy, optimizer))
+    once = run(first, dataset, jnp.arange(80), jnp.int32(6))
+    twice = run(first, dataset, jnp.arange(80), jnp.int32(2))
+    twice = run(twice, dataset, jnp.arange(80), jnp.int32(4))
+    chex.assert_trees_all_equal(once.params, twice.params)
+    chex.assert_trees_all_equal(once.sums, twice.sums)
+
+
+def test_it_learns_the_given_frames_only(start, dataset):
+    policy, optimizer, first = start
+    run = jax.jit(program(policy, optimizer))
+    last = run(first, dataset, jnp.arange(20, 40), jnp.int32(50))
+    wanted = np.asarray(dataset.command.pose.p[20:40]).mean(0)
+    np.testing.assert_allclose(last.params["w"], wanted, atol=0.05)
+
+
+def test_a_broken_loss_is_left_out_and_counted(start, dataset):
+    policy, optimizer, first = start
+    once = jax.jit(lambda s, b: step.train_step(policy, optimizer, SETTINGS, s, b))
+    good = windows.gather(dataset, jnp.arange(8), 2, 16)
+    bad = good.replace(observation=good.observation.replace(gripper=jnp.full((8, 2), 2.0)))
+    before = once(first, good)
+    after = once(before, bad)
+    assert int(after.step) == 2 and int(after.skipped) == 1
+    chex.assert_trees_all_equal(after.params, before.params)
+    chex.assert_trees_all_equal(after.ema_params, before.ema_params)
+    chex.assert_trees_all_equal(after.opt_state, before.opt_state)
+    assert float(after.sums["skipped"]) == 1.0
+    assert float(after.sums["loss"]) == float(before.sums["loss"])
+    again = once(after, good)
+    assert np.isfinite(again.params["w"]).all()
+    assert not np.array_equal(again.params["w"], after.params["w"])
+
+
+def test_mesh_divides_the_batch():
+    assert devices.make_mesh(8).size == 1
+    assert devices.make_mesh(7, jax.devices()).size == 1
