@@ -22,8 +22,11 @@ from starjax.types import Command, Pose
 CONTROL_HZ = 30.0
 RESET_IK_ITERATIONS = 40
 STEP_IK_ITERATIONS = 4
-# FR5 data sheet, the slower joints; a further command is followed at this speed (rad/s).
-MAX_JOINT_SPEED = 3.15
+# A command further away than these allow in one period is approached at these speeds: the joints'
+# are the FR5's (data sheet, the slower ones), the tool's keep a leap from unsettling the IK.
+MAX_JOINT_SPEED = 3.15  # rad/s
+MAX_TIP_SPEED = 0.3  # m/s
+MAX_TIP_SPIN = 6.0  # rad/s
 
 
 @flax.struct.dataclass
@@ -49,7 +52,7 @@ class EnvState:
       invalid: the simulation diverged; the last sound state is kept.
       collided: arm, shaft or jaws were where they have no modelled contact.
       rcm_error: m, executed: distance of the port from the measured tool axis.
-      ik_error: m, residual of the inverse kinematics.
+      ik_error: m, how far the joint target is from the command, rotations weighed; inf if unusable.
       jaw_contact: the jaws touch the block.
       pose, block_pose: measured tip and block in the world. gripper: measured opening, [-1, 1].
     """
@@ -150,7 +153,8 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         return _measure(state)
 
     def step(state: EnvState, command: Command) -> EnvState:
-        q, ik_error = ik.solve(sim.arm, command.pose, state.q_target, STEP_IK_ITERATIONS)
+        target = _within_reach(ik.forward(sim.arm, state.q_target)[0], command.pose)
+        q, _ = ik.solve(sim.arm, target, state.q_target, STEP_IK_ITERATIONS)
         usable = _is_finite(command) & jnp.all(jnp.isfinite(q))
         dq = jnp.where(usable, q - state.q_target, 0.0)
         dq = dq * jnp.minimum(1.0, MAX_JOINT_SPEED / CONTROL_HZ / jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9))
@@ -164,7 +168,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             q_velocity=CONTROL_HZ * dq,
             gripper_target=gripper,
             step=state.step + 1,
-            ik_error=jnp.where(usable, ik_error, state.ik_error),
+            ik_error=jnp.where(usable, ik.residual(sim.arm, command.pose, state.q_target + dq), jnp.inf),
             jaw_contact=jaw_contact,
         )
         moved = _judge(_measure(moved))
@@ -223,6 +227,19 @@ def _precisely(f: Callable) -> Callable:
             return f(*args)
 
     return wrapped
+
+
+def _within_reach(present: Pose, wanted: Pose) -> Pose:
+    """The pose on the way from `present` to `wanted` that one control period allows."""
+    shift = wanted.p - present.p
+    turn = ik.rotation_between(present.R, wanted.R)
+    times = jnp.maximum(
+        jnp.linalg.norm(shift) * (CONTROL_HZ / MAX_TIP_SPEED),
+        jnp.linalg.norm(turn) * (CONTROL_HZ / MAX_TIP_SPIN),
+    )
+    share = 1.0 / jnp.maximum(times, 1.0)
+    part = Pose(ik.rotation_of(share * turn) @ present.R, present.p + share * shift)
+    return jax.tree.map(lambda a, b: jnp.where(times > 1.0, a, b), part, wanted)
 
 
 def _is_finite(command: Command) -> jax.Array:

@@ -97,24 +97,19 @@ def solve(chain: Chain, target: Pose, q: jax.Array, iterations: int) -> tuple[ja
     low = chain.limits[:, 0] + LIMIT_MARGIN
     high = chain.limits[:, 1] - LIMIT_MARGIN
 
-    def error(q):
-        pose, origins, axes = forward(chain, q)
-        e = jnp.concatenate([target.p - pose.p, ROTATION_WEIGHT * _rotation_between(pose.R, target.R)])
-        return e, pose, origins, axes
-
     def iterate(_, q):
-        e, pose, origins, axes = error(q)
+        pose, origins, axes = forward(chain, q)
         J = jnp.concatenate([jnp.cross(axes, pose.p - origins).T, ROTATION_WEIGHT * axes.T])
         H = J @ J.T + DAMPING**2 * jnp.eye(6)
-        dq = J.T @ jax.scipy.linalg.solve(H, e, assume_a="pos")
+        dq = J.T @ jax.scipy.linalg.solve(H, _error(pose, target), assume_a="pos")
         dq = dq * jnp.minimum(1.0, MAX_STEP / jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9))
         return jnp.clip(q + dq, low, high)
 
     q = jax.lax.fori_loop(0, iterations, iterate, q)
-    return q, jnp.linalg.norm(error(q)[0])
+    return q, residual(chain, target, q)
 
 
-def _rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
+def rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
     """Rotation vector `[3]` rad, in the world, that takes `R` to `R_target`; exact below pi."""
     E = R_target @ R.T
     v = 0.5 * jnp.stack([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
@@ -123,6 +118,31 @@ def _rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
     sine = jnp.sqrt(jnp.where(is_small, 1.0, sine_sq))
     angle = jnp.arctan2(sine, 0.5 * (jnp.trace(E) - 1.0))
     return v * jnp.where(is_small, 1.0, angle / sine)
+
+
+def rotation_of(vector: jax.Array) -> jax.Array:
+    """`[3, 3]` rotation by a rotation vector `[3]` rad."""
+    angle_sq = jnp.sum(vector * vector)
+    is_small = angle_sq < 1e-12
+    angle = jnp.sqrt(jnp.where(is_small, 1.0, angle_sq))
+    a = jnp.where(is_small, 1.0, jnp.sin(angle) / angle)
+    b = jnp.where(is_small, 0.5, (1.0 - jnp.cos(angle)) / angle**2)
+    x, y, z = vector
+    zero = jnp.zeros(())
+    K = jnp.stack([jnp.stack(row) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])])
+    return jnp.eye(3) + a * K + b * K @ K
+
+
+def residual(chain: Chain, target: Pose, q: jax.Array) -> jax.Array:
+    """Distance (m) of configuration `q` from `target`, rotation weighed by `ROTATION_WEIGHT`."""
+    pose, _, _ = forward(chain, q)
+    return jnp.linalg.norm(_error(pose, target))
+
+
+def _error(pose: Pose, target: Pose) -> jax.Array:
+    """`[6]` m: what is missing from `pose` to `target`, rotation weighed."""
+    turn = rotation_between(pose.R, target.R)
+    return jnp.concatenate([target.p - pose.p, ROTATION_WEIGHT * turn])
 
 
 def _matrix(wxyz: np.ndarray) -> np.ndarray:

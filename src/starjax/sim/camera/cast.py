@@ -47,13 +47,13 @@ def _nearest(scene: scenes.Scene, grid: tiles.Grid, c: Array, R: Array) -> tuple
     for kind in (scenes.CAPSULE, scenes.CYLINDER, scenes.BOX, scenes.PLANE):
         rows, first = scene.rows(kind), scene.first_face(kind)
 
-        def meet(key, row, features, kind=kind, first=first):
+        def meet(key, row, features, x, y, kind=kind, first=first):
             t, part = shapes.view(kind, x, y, features)
             hit = pack(t, first + scenes.FACES[kind] * row + part)
             return jnp.minimum(key, jnp.where(row >= 0, hit, key))
 
         table = shapes.features(kind, c[rows], R[rows], size[rows])
-        key = tiles.each(seen[:, rows], table, meet, key)
+        key = tiles.each(seen[:, rows], table, meet, key, x, y)
     t = jax.lax.bitcast_convert_type(key & ~room, jnp.float32)
     return t, jnp.where(t < shapes.FAR, key & room, -1)
 
@@ -77,13 +77,13 @@ def _shaded(
     for kind in (scenes.CAPSULE, scenes.CYLINDER, scenes.BOX):
         rows, first, parts = scene.rows(kind), scene.first_face(kind), scenes.FACES[kind]
 
-        def hide(shaded, row, features, kind=kind, first=first, parts=parts):
+        def hide(shaded, row, features, face, *q, kind=kind, first=first, parts=parts):
             part = face - (first + parts * row)
             other = (row >= 0) & ((part < 0) | (part >= parts))
             return shaded | (shapes.shadow(kind, q, features) & other)
 
         table = shapes.features(kind, c[rows], R[rows], size[rows])
-        shaded = tiles.each(hides[:, rows], table, hide, shaded)
+        shaded = tiles.each(hides[:, rows], table, hide, shaded, face, *q)
     return shaded
 
 

@@ -18,6 +18,7 @@ SIDE = 16  # samples along the side of a tile
 _SLACK = 1e-5  # m, and relative: keeps float32 rounding on the safe side
 
 Array = jax.Array
+Visit = Callable[..., Array]
 
 
 class Grid(NamedTuple):
@@ -129,32 +130,43 @@ def over(low: Array, high: Array, c: Array, R: Array, axes: Array, rounding: Arr
     return near & (aside <= limit)
 
 
-def each(
-    overlap: Array, table: Array, visit: Callable[[Array, Array, list[Array]], Array], carry: Array
-) -> Array:
-    """Folds `carry = visit(carry, row, features)` over the overlapping geoms of every tile.
+def each(overlap: Array, table: Array, visit: Visit, carry: Array, *pixels: Array) -> Array:
+    """Folds `carry = visit(carry, row, features, *pixels)` over the overlapping geoms of each tile.
 
     Args:
       overlap: `[T, N]` bool; table: `[N, F]`.
       visit: sees row `[T, 1]` (-1 where a tile has none left) and F features `[T, 1]`.
+      carry, pixels: `[T, Q]`, or the rows of fewer tiles.
     """
     for first in range(0, overlap.shape[1], 32):
         part = overlap[:, first : first + 32]
         bits = jnp.uint32(1) << jnp.arange(part.shape[1], dtype=jnp.uint32)
         words = jnp.sum(jnp.where(part, bits, jnp.uint32(0)), -1, dtype=jnp.uint32)
-
-        def take(state, first=first):
-            words, carry = state
-            lowest = words & (~words + jnp.uint32(1))
-            index = first + 31 - jax.lax.clz(lowest).astype(jnp.int32)
-            columns = list(table.T[:, jnp.maximum(index, 0)])
-            row = jnp.where(words > 0, index, -1)
-            # Without the barrier XLA looks every feature up again for every pixel.
-            row, *columns = jax.lax.optimization_barrier([row, *columns])
-            return words ^ lowest, visit(carry, row[:, None], [v[:, None] for v in columns])
-
-        _, carry = jax.lax.while_loop(lambda state: jnp.any(state[0] > 0), take, (words, carry))
+        carry = _rounds(words, table[first : first + 32], first, visit, carry, pixels)
     return carry
+
+
+def _rounds(
+    words: Array, table: Array, first: int, visit: Visit, carry: Array, pixels: tuple[Array, ...]
+) -> Array:
+    """Rounds over all tiles while many have geoms left, then over the quarter that still has."""
+    few = len(words) // 4 if len(words) >= 16 else 0
+
+    def one(state):
+        words, carry = state
+        lowest = words & (~words + jnp.uint32(1))
+        index = 31 - jax.lax.clz(lowest).astype(jnp.int32)
+        columns = table.T[:, jnp.maximum(index, 0)]
+        row = jnp.where(words > 0, first + index, -1)
+        return words ^ lowest, visit(carry, row[:, None], list(columns[:, :, None]), *pixels)
+
+    words, carry = jax.lax.while_loop(lambda s: jnp.sum(s[0] > 0) > few, one, (words, carry))
+    if few == 0:
+        return carry
+    busy = jnp.argsort(words == 0)[:few]
+    mine = [v.at[busy].get(mode="promise_in_bounds") for v in (words, carry, *pixels)]
+    done = _rounds(mine[0], table, first, visit, mine[1], tuple(mine[2:]))
+    return carry.at[busy].set(done, mode="promise_in_bounds", unique_indices=True)
 
 
 def _reach(direction: Array, axes: Array) -> Array:

@@ -1,7 +1,7 @@
 """Scripted expert of peg transfer: a phase machine that looks at the block, in pure JAX.
 
-It grasps one of two walls at random (which ones depends on the block's yaw, never on the trocar),
-at its own pace, is disturbed on purpose, and starts over when the block is not where it should be.
+It grasps a wall, to the left or right of its middle, at random (which walls it prefers depends on
+the block's yaw, never on the trocar), at its own pace, is disturbed on purpose, and starts over when the block is not where it should be.
 The roll follows from tip positions and trocar alone: the tool turns only once the coming positions
 hold the grasp point, and the jaws' axis then stays on the wall's normal.
 """
@@ -35,7 +35,9 @@ GRASP_DROP = 0.001  # m below the rim's centre line
 RELEASE_HEIGHT = 0.0007  # m above the grasp's height at which the block is let go
 RELEASE_SHIFT = 0.0005  # m further out along the grasped wall's normal: room for the inner pad
 HELD = 0.006  # m from the tip within which the grasped wall counts as held
+GRASP_SIDE = 0.0015  # m along the wall, to either side of its middle
 CANDIDATES = 2  # walls to choose from
+INDIFFERENCE = 0.05  # difference of their costs at which the choice is still nearly open
 
 NOISE_POSITION = 0.0012  # m, standard deviation of the disturbance
 NOISE_ROLL = 0.07  # rad
@@ -53,7 +55,7 @@ class ExpertState:
       key: typed key, folded with the step for everything random.
       phase: int32. elapsed, duration: s. attempt: int32, grasps begun.
       start, goal: `[3]` m, label positions at the phase's ends.
-      wall: int32, the wall grasped. normal: `[3]`, its direction, or the opposite: jaws are
+      wall: int32, the wall grasped; side: -1 or 1, on which side of its middle. normal: `[3]`, its direction, or the opposite: jaws are
         symmetric, and this keeps the roll on one branch.
       roll_from: rad, the roll that the next turn begins at. jaws_from: jaws at the phase's start.
       tempo: pace. noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
@@ -68,6 +70,7 @@ class ExpertState:
     start: jax.Array
     goal: jax.Array
     wall: jax.Array
+    side: jax.Array
     normal: jax.Array
     roll_from: jax.Array
     jaws_from: jax.Array
@@ -89,6 +92,7 @@ def init(key: jax.Array, state: env.EnvState) -> ExpertState:
         start=state.pose.p,
         goal=state.pose.p,
         wall=jnp.zeros((), jnp.int32),
+        side=jnp.ones(()),
         normal=jnp.array([0.0, -1.0, 0.0]),
         roll_from=jnp.zeros(()),
         jaws_from=jnp.ones(()),
@@ -143,17 +147,22 @@ def _enter(expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax
     block, tip = state.block_pose, expert.label.pose.p
     is_approach = phase == APPROACH
     attempt = expert.attempt + is_approach
-    key_wall, key_hover = jax.random.split(jax.random.fold_in(expert.key, attempt))
+    keys = jax.random.split(jax.random.fold_in(expert.key, attempt), 3)
+    key_wall, key_side, key_hover = keys
     normals = task.wall_normals(block)
     # The jaws' axis stays within 60 degrees of the world's y: the roll then never meets its wrap.
-    order = jnp.argsort(jnp.abs(normals[:, 0]))
-    chosen = order[jax.random.randint(key_wall, (), 0, CANDIDATES)]
+    cost = jnp.abs(normals[:, 0])
+    cost = jnp.where(cost > jnp.sort(cost)[CANDIDATES - 1], jnp.inf, cost)
+    chosen = jax.random.categorical(key_wall, -cost / INDIFFERENCE)
     wall = jnp.where(is_approach, chosen, expert.wall)
     out = normals[wall] * jnp.array([1.0, 1.0, 0.0])
     out = out / jnp.maximum(jnp.linalg.norm(out), 1e-6)
     normal = jnp.where(phase <= DESCEND, out * jnp.where(out[1] > 0, -1.0, 1.0), expert.normal)
 
-    grasp = block.p + task.RIM_RADIUS * normals[wall] - jnp.array([0.0, 0.0, GRASP_DROP])
+    side = jnp.where(is_approach, jax.random.rademacher(key_side, (), jnp.float32), expert.side)
+    tangent = jnp.cross(block.R[:, 2], normals[wall])
+    grasp = block.p + task.RIM_RADIUS * normals[wall] + side * GRASP_SIDE * tangent
+    grasp = grasp - jnp.array([0.0, 0.0, GRASP_DROP])
     spread = HOVER_SPREAD * jax.random.normal(key_hover, (3,)) * jnp.array([1.0, 1.0, 0.5])
     hover = task.RIM_HEIGHT - GRASP_DROP + HOVER
     # Where the tip must be once the block, tilted by now, is pressed upright over the target peg:
@@ -186,6 +195,7 @@ def _enter(expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax
         start=tip,
         goal=goal,
         wall=wall,
+        side=side,
         normal=normal,
         roll_from=jnp.where(phase <= APPROACH, roll, expert.roll_from),
         jaws_from=expert.label.gripper,
