@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from starjax.models import schedule as schedules
 from starjax.models.schedule import Schedule
@@ -109,7 +110,7 @@ def ddim_sample(
     return x
 
 
-def _at(table: jax.Array, k: jax.Array, ndim: int) -> jax.Array:
+def _at(table: np.ndarray, k: jax.Array, ndim: int) -> jax.Array:
     """`table[k]` with the axes that broadcast against `[B, ...]` of `ndim` axes."""
     row = jnp.asarray(table)[k]
     return row.reshape(row.shape + (1,) * (ndim - row.ndim)) if row.ndim else row

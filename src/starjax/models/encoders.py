@@ -50,7 +50,7 @@ class ImageEncoder(nn.Module):
             "keypoints", layers.uniform_init(maps.shape[-1]), (maps.shape[-1], self.features // 2)
         )
         logits = jnp.matmul(maps, kernel.astype(maps.dtype), preferred_element_type=jnp.float32)
-        points = spatial_softmax.spatial_softmax(logits, image.shape[1:3], offset)
+        points = spatial_softmax.spatial_softmax(logits, (image.shape[1], image.shape[2]), offset)
         return layers.Dense(self.features, name="out")(points.reshape(len(points), -1))
 
 

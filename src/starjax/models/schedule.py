@@ -8,7 +8,6 @@ where a float32 running product has lost its last digits.
 import math
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 
@@ -24,12 +23,12 @@ class Schedule(NamedTuple):
       posterior_std: its standard deviation, sigma_k of Eq. 12; exactly 0 at k = 0.
     """
 
-    beta: np.ndarray | jax.Array
-    sqrt_alpha_bar: np.ndarray | jax.Array
-    sqrt_one_minus_alpha_bar: np.ndarray | jax.Array
-    posterior_x0: np.ndarray | jax.Array
-    posterior_xk: np.ndarray | jax.Array
-    posterior_std: np.ndarray | jax.Array
+    beta: np.ndarray
+    sqrt_alpha_bar: np.ndarray
+    sqrt_one_minus_alpha_bar: np.ndarray
+    posterior_x0: np.ndarray
+    posterior_xk: np.ndarray
+    posterior_std: np.ndarray
 
     @property
     def steps(self) -> int:
