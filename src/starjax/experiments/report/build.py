@@ -96,6 +96,6 @@ def _video(
         return None
     report(f"drawing {len(chosen)} rollouts for the video")
     path = out / "rollout.mp4"
-    several = len({method for method, _ in chosen}) > 1
-    video.write(video.frames(chosen, video.renderer(sim), several), path)
+    draw, note = video.renderer(sim), f"sees the {results.observed(runs)}"
+    video.write(video.frames(chosen, draw, note), path)
     return path.read_bytes()

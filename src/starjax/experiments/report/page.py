@@ -40,7 +40,7 @@ def render(
         sections.facts(runs, focus),
         sections.notes(runs),
         sections.cards(focus),
-        _video(video),
+        _video(video, results.observed(runs)),
         sections.comparison(runs) if several else sections.tests(focus),
         _figure("fig3", figures),
         _figure("fig4", figures),
@@ -73,12 +73,12 @@ def _figure(name: str, figures: Figures) -> str:
     )
 
 
-def _video(video: bytes | None) -> str:
+def _video(video: bytes | None, observed: str) -> str:
     if video is None:
         return ""
     source = markup.uri("video/mp4", video)
     return (
         f'<figure><video controls loop muted autoplay playsinline src="{source}"></video>'
-        "<figcaption>The policy at work, as its camera sees it, in real time. The disc on the "
+        f"<figcaption>The policy, which sees the {observed}, at work in real time. The disc on the "
         "shaft is the trocar; the block belongs on the marked peg.</figcaption></figure>"
     )

@@ -14,10 +14,11 @@ Draw = Callable[[results.Rollout, int], np.ndarray]
 
 FPS = 30  # a picture a control step: real time
 SIZE = 384  # pixels a side of one rollout's picture
-_BAR = 32  # pixels of the caption over it
+_BAR = 44  # pixels of the caption over it
 _HOLD = 1.5  # s that the last picture stays
 _LONGEST = 12.0  # s shown of a rollout
 _GAP = 4  # pixels between pictures
+_MUTED = "#98a2ad"
 _BATCH = 16  # pictures drawn in one call
 
 
@@ -39,7 +40,7 @@ def choose(runs: Sequence[results.Run], most: int = 4) -> list[tuple[str, result
 
 
 def frames(
-    chosen: Sequence[tuple[str, results.Rollout]], draw: Draw, several: bool = False
+    chosen: Sequence[tuple[str, results.Rollout]], draw: Draw, note: str = ""
 ) -> Iterator[np.ndarray]:
     """Pictures `[h, w, 3]` uint8 of the chosen rollouts in real time, two in a row, captions over.
 
@@ -48,9 +49,9 @@ def frames(
     Args:
       chosen: from `choose`.
       draw: from `renderer`.
-      several: whether captions name the method.
+      note: said in every caption, such as what the policy observes.
     """
-    clips = [_clip(draw, method if several else "", rollout) for method, rollout in chosen]
+    clips = [_clip(draw, method, rollout, note) for method, rollout in chosen]
     last: list[np.ndarray] = []
     for now in itertools.zip_longest(*clips):
         # A clip that ends early stays as it ended.
@@ -122,38 +123,36 @@ def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) ->
         raise OSError(f"{path}: the video could not be written: {said or encoder.returncode}")
 
 
-def caption(texts: Sequence[tuple[str, str]], width: int, height: int = _BAR) -> np.ndarray:
-    """`[height, width, 3]` uint8: a dark bar with (text, colour) at its left and its right."""
+def caption(rows: Sequence[Sequence[tuple[str, str]]], width: int) -> np.ndarray:
+    """`[_BAR, width, 3]` uint8: a dark bar with rows of two (text, colour), left and right."""
     from matplotlib import font_manager
     from PIL import Image, ImageDraw, ImageFont
 
-    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), round(0.4 * height))
-    image = Image.new("RGB", (width, height), "#14181c")
-    pen, middle, margin = ImageDraw.Draw(image), height / 2, round(0.3 * height)
-    for (text, color), (x, anchor) in zip(texts, ((margin, "lm"), (width - margin, "rm"))):
-        pen.text((x, middle), text, fill=color, font=font, anchor=anchor)
+    line = _BAR / len(rows)
+    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), round(0.58 * line))
+    image = Image.new("RGB", (width, _BAR), "#14181c")
+    pen = ImageDraw.Draw(image)
+    for i, row in enumerate(rows):
+        for (text, color), (x, anchor) in zip(row, ((10, "lm"), (width - 10, "rm"))):
+            pen.text((x, line * (i + 0.55)), text, fill=color, font=font, anchor=anchor)
     return np.asarray(image)
 
 
-def _clip(draw: Draw, method: str, rollout: results.Rollout) -> Iterator[np.ndarray]:
+def _clip(draw: Draw, method: str, rollout: results.Rollout, note: str) -> Iterator[np.ndarray]:
     """Pictures of one rollout under a bar: what is shown, the clock, and at the end the outcome."""
     kind, index = "seen" if rollout.trial["seen"] else "unseen", rollout.trial["trocar"]
-    name = (f"{method}, {kind} trocar {index}".removeprefix(", "), "#e6e9ec")
-    steps = min(len(rollout.p_world_tip), round(_LONGEST * FPS))
+    total = len(rollout.p_world_tip)
+    steps = min(total, round(_LONGEST * FPS))
+    won = outcomes.strict(rollout.trial)
+    end = "success" if won else outcomes.SHORT[outcomes.failure(rollout.trial)]
+    outcome = (f"{end}, {total / FPS:.1f} s", "#5ab4e8" if won else "#f09a5a")
+    cut = "" if steps == total else f"first {steps // FPS} s shown"
+    about = (f"{kind} trocar {index}" + (f", {note}" if note else ""), _MUTED), (cut, _MUTED)
     for first in range(0, steps, _BATCH):
         for step, picture in enumerate(draw(rollout, first)[: steps - first], start=first):
-            clock = (f"{step // FPS} s", "#98a2ad")
-            right = _outcome(rollout, steps) if step == steps - 1 else clock
-            yield np.concatenate([caption([name, right], picture.shape[1]), picture])
-
-
-def _outcome(rollout: results.Rollout, steps: int) -> tuple[str, str]:
-    """(text, colour) of the last caption."""
-    won = outcomes.strict(rollout.trial)
-    text = "success" if won else outcomes.SHORT[outcomes.failure(rollout.trial)]
-    total = len(rollout.p_world_tip) / FPS
-    shown = "" if steps == len(rollout.p_world_tip) else f" (first {steps // FPS} s shown)"
-    return f"{text}, {total:.1f} s{shown}", "#5ab4e8" if won else "#f09a5a"
+            now = outcome if step == steps - 1 else (f"{step // FPS} s", _MUTED)
+            bar = caption([[(method, "#e6e9ec"), now], about], picture.shape[1])
+            yield np.concatenate([bar, picture])
 
 
 def _grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
