@@ -42,7 +42,7 @@ def choose(runs: Sequence[results.Run], most: int = 4) -> list[tuple[str, result
 def frames(
     chosen: Sequence[tuple[str, results.Rollout]], draw: Draw, note: str = ""
 ) -> Iterator[np.ndarray]:
-    """Pictures `[h, w, 3]` uint8 of the chosen rollouts in real time, two in a row, captions over.
+    """Pictures `[h, w, 3]` uint8 of the chosen rollouts side by side in real time, captions over.
 
     Drawn while they are asked for: a whole video would not fit the memory of a small machine.
 
@@ -156,12 +156,13 @@ def _clip(draw: Draw, method: str, rollout: results.Rollout, note: str) -> Itera
 
 
 def _grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
-    """Tiles `[h, w, 3]` two in a row, `_GAP` dark pixels between them."""
+    """Tiles `[h, w, 3]` in rows of two, three in one row, `_GAP` dark pixels between them."""
     h, w = tiles[0].shape[:2]
-    columns, rows = min(2, len(tiles)), -(-len(tiles) // 2)
+    columns = len(tiles) if len(tiles) <= 3 else 2
+    rows = -(-len(tiles) // columns)
     grid = np.full(((h + _GAP) * rows - _GAP, (w + _GAP) * columns - _GAP, 3), 20, np.uint8)
     for i, tile in enumerate(tiles):
-        y, x = (h + _GAP) * (i // 2), (w + _GAP) * (i % 2)
+        y, x = (h + _GAP) * (i // columns), (w + _GAP) * (i % columns)
         grid[y : y + h, x : x + w] = tile
     return grid
 
