@@ -157,7 +157,9 @@ def test_a_hopeless_expert_is_an_error(tmp_path):
 def test_no_space_is_said_before_anything_runs(tmp_path, monkeypatch):
     usage = files.shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr(files.shutil, "disk_usage", lambda _: usage)
-    monkeypatch.setattr(demos, "_simulator", lambda *_: pytest.fail("it was about to compile"))
+    monkeypatch.setattr(
+        demos.recorder, "simulator", lambda *_: pytest.fail("it was about to compile")
+    )
     with pytest.raises(files.StorageError, match=r"will be written, the disk has 1 kB free"):
         collect(tmp_path / "d")
 
@@ -165,7 +167,9 @@ def test_no_space_is_said_before_anything_runs(tmp_path, monkeypatch):
 @pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write everywhere")
 def test_a_read_only_folder_is_said_before_anything_runs(tmp_path, monkeypatch):
     tmp_path.chmod(stat.S_IREAD | stat.S_IEXEC)
-    monkeypatch.setattr(demos, "_simulator", lambda *_: pytest.fail("it was about to compile"))
+    monkeypatch.setattr(
+        demos.recorder, "simulator", lambda *_: pytest.fail("it was about to compile")
+    )
     with pytest.raises(files.StorageError, match="cannot write"):
         collect(tmp_path / "d")
 

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 
+import fakes
 import jax
 import jax.numpy as jnp
 import kill
@@ -12,7 +13,10 @@ import pytest
 import stubs
 
 from starjax import rcm
-from starjax.evaluation import evaluate, metrics, rollout, table
+from starjax.data import normalizer
+from starjax.evaluation import evaluate, metrics, recorded, rollout, table
+from starjax.experiments.methods import METHODS
+from starjax.policies import policy as policies
 from starjax.runtime import files
 from starjax.types import Command, Pose
 
@@ -66,6 +70,33 @@ def test_outcomes_are_those_of_the_environment(whole):
 @pytest.mark.parametrize("chunk", [2, 4])
 def test_the_chunk_does_not_change_a_bit(whole, tmp_path, chunk):
     assert_same(run(tmp_path, chunk=chunk), whole[1])
+
+
+def test_the_chunk_does_not_change_a_bit_of_a_network(tmp_path):
+    """The same with convolutions and matrix products, whose last bits may depend on the batch."""
+    row, p_world_ref = METHODS["stardiff"], stubs.P_WORLD_REF
+    policy = policies.make(row, fakes.TINY, p_world_ref)
+    dataset = fakes.dataset(seed=0, demos=4, length=20, image_size=fakes.TINY.image_size)
+    stats = normalizer.fit(row, dataset, p_world_ref, np.arange(80))
+    params = jax.jit(policy.init)(jax.random.key(0))
+    tables = [
+        evaluate.evaluate(
+            tmp_path / str(chunk),
+            stubs.make_env(),
+            policy,
+            params,
+            stats,
+            TROCARS,
+            chunk=chunk,
+            video_trials=6,
+            **{**KWARGS, "lanes": 4},
+        )
+        for chunk in (2, 3, 6)
+    ]
+    assert_same(tables[0], tables[2])
+    assert_same(tables[1], tables[2])
+    paths = [(tmp_path / chunk / "recorded.npz").read_bytes() for chunk in "236"]
+    assert paths[0] == paths[1] == paths[2]
 
 
 def test_trials_depend_on_the_seed_and_on_nothing_else(whole, tmp_path):
@@ -133,36 +164,36 @@ def test_no_flipped_bit_of_a_chunk_gets_into_the_table(tmp_path, whole):
 def test_recorded_trajectories_are_those_of_the_trials(whole):
     directory, found = whole
     with np.load(directory / "recorded.npz", allow_pickle=False) as archive:
-        recorded = dict(archive)
-    assert sorted(zip(recorded["trocar"], recorded["trial"])) == [(0, 0), (0, 1), (1, 0), (2, 0)]
-    for row, (trocar, trial) in enumerate(zip(recorded["trocar"], recorded["trial"])):
+        kept = dict(archive)
+    assert sorted(zip(kept["trocar"], kept["trial"])) == [(0, 0), (0, 1), (1, 0), (2, 0)]
+    for row, (trocar, trial) in enumerate(zip(kept["trocar"], kept["trial"])):
         at = np.flatnonzero((found.trocar == trocar) & (found.trial == trial))[0]
-        length = recorded["length"][row]
+        length = kept["length"][row]
         assert length == found.steps[at]
-        path = recorded["p_world_tip"][row]
+        path = kept["p_world_tip"][row]
         assert np.isfinite(path[:length]).all() and np.isnan(path[length:]).all()
         speed = np.linalg.norm(np.diff(path[:length], axis=0), axis=-1)
         assert (speed <= stubs.SPEED + 1e-6).all()
-        np.testing.assert_allclose(recorded["qpos"][row, :length, :3], path[:length])
-        assert recorded["target_peg"][row] == found.target[at]
+        np.testing.assert_allclose(kept["qpos"][row, :length, :3], path[:length])
+        assert kept["target_peg"][row] == found.target[at]
         start = found.steps[:at].sum()
         np.testing.assert_allclose(
-            1e3 * recorded["rcm_error"][row, :length],
+            1e3 * kept["rcm_error"][row, :length],
             found.rcm_error_mm[start : start + length],
             rtol=1e-3,
         )
-        np.testing.assert_allclose(1e3 * found.rcm_max[at], recorded_max(recorded, row), rtol=1e-6)
+        np.testing.assert_allclose(1e3 * found.rcm_max[at], recorded_max(kept, row), rtol=1e-6)
 
 
-def recorded_max(recorded, row):
-    return 1e3 * np.nanmax(recorded["rcm_error"][row])
+def recorded_max(kept, row):
+    return 1e3 * np.nanmax(kept["rcm_error"][row])
 
 
 def test_few_of_many_trocars_are_recorded_evenly():
-    mask = evaluate._recorded(100, 2, 5).reshape(100, 2)
+    mask = recorded.choose(100, 2, 5).reshape(100, 2)
     assert list(np.flatnonzero(mask[:, 0])) == [0, 25, 50, 74, 99] and not mask[:, 1].any()
-    assert not evaluate._recorded(3, 2, 0).any()
-    assert evaluate._recorded(3, 2, 50).all()
+    assert not recorded.choose(3, 2, 0).any()
+    assert recorded.choose(3, 2, 50).all()
 
 
 def _spy(horizon):

@@ -12,67 +12,18 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from starjax.data import lanes, store
+from starjax.data import recorder, store
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files, progress, xla
-from starjax.sim.types import Observation
-from starjax.types import Command
 
-SEGMENT = 64  # control steps between two looks at the host: bounds the memory of recorded pictures
 MIN_SUCCESS_RATE = 0.5  # below it at some trocar, the expert is broken and collecting stops
-# Demonstrations never start from the states that an evaluation with the same seed draws.
-_STREAM = 0x64656D6F
 COMMITS = 8  # episodes written at once
 FRAME_GUESS = 300  # control steps of a typical demonstration, for the estimate of disk space
-
-FIELDS = {
-    "p": "m, measured tip position, world frame",
-    "R": "measured tip rotation R_world_tip",
-    "gripper": "measured opening, -1 closed to +1 open",
-    "image": "uint8 RGB",
-    "state": "block position (m), block 6-D rotation, target peg position (m), world frame",
-    "command_p": "m, commanded tip position, world frame",
-    "command_R": "commanded R_world_tip",
-    "command_gripper": "-1 squeeze to +1 open",
-    "qpos": "generalised coordinates of the model, before the command",
-    "rcm_error": "m, executed by the command",
-}
-
-
-class Expert(NamedTuple):
-    """A scripted demonstrator, as single-sample pure functions.
-
-    Attributes:
-      init: (key, EnvState) -> expert state.
-      act: (expert state, EnvState) -> (Command to execute, expert state); the state's `label`, if
-        it has one, is the Command that is recorded.
-    """
-
-    init: Callable[..., Any]
-    act: Callable[..., Any]
-
-
-class _Trials(NamedTuple):
-    """N trials: `trocar` of fields `[N]`, `index` `[N]` of that trocar, `trial` `[N]`."""
-
-    trocar: Trocar
-    index: Any
-    trial: Any
-
-
-class _Carry(NamedTuple):
-    """N episodes under way: `length` `[N]` control steps so far, `wanted` `[N]` bool."""
-
-    env: Any
-    expert: Any
-    length: jax.Array
-    wanted: jax.Array
 
 
 def describe(
@@ -85,9 +36,13 @@ def describe(
     keep_failures: bool = False,
 ) -> dict[str, Any]:
     """What a dataset is: the content of dataset.json, and by `store.digest` its name."""
-    frame = _frame(env)
+    frame = recorder.frame(env)
     features = {
-        name: {"shape": list(leaf.shape), "dtype": np.dtype(leaf.dtype).str, "what": FIELDS[name]}
+        name: {
+            "shape": list(leaf.shape),
+            "dtype": np.dtype(leaf.dtype).str,
+            "what": recorder.FIELDS[name],
+        }
         for name, leaf in frame.items()
     }
     return {
@@ -100,7 +55,7 @@ def describe(
         "control_hz": env.control_hz,
         "features": features,
         "scene": _scene_hash(env.model),
-        "seed_rule": f"fold_in(fold_in(fold_in(key(seed), {_STREAM}), trocar), trial)",
+        "seed_rule": f"fold_in(fold_in(fold_in(key(seed), {recorder.STREAM}), trocar), trial)",
         "versions": xla.versions(),
     }
 
@@ -124,7 +79,7 @@ def collect(
     Args:
       root: folder of the dataset.
       env: `sim.env.Env`; its observation decides whether pictures or task states are stored.
-      expert: has the functions of `Expert`.
+      expert: has the functions of `recorder.Expert`.
       trocars: fields `[C]`.
       per_trocar: successful episodes wanted at each.
       max_steps: control steps after which an episode has failed.
@@ -145,10 +100,10 @@ def collect(
         got = {"per_trocar": per_trocar, "max_steps": max_steps, "chunk": chunk}
         raise ValueError(f"per_trocar, max_steps: expected 1 or more, chunk: 0 or more, got {got}")
     trocars = Trocar(*(np.asarray(field, np.float32) for field in trocars))
-    frame_bytes = sum(math.prod(x.shape) * x.dtype.itemsize for x in _frame(env).values())
     total = per_trocar * len(trocars.radius)
-
     with files.lock(root):
+        frame = recorder.frame(env)
+        frame_bytes = sum(math.prod(x.shape) * x.dtype.itemsize for x in frame.values())
         description = describe(
             env,
             trocars,
@@ -166,7 +121,7 @@ def collect(
         )
         chunk = chunk or _chunk(total, frame_bytes, devices)
         chunk = -(-chunk // len(devices or [0])) * len(devices or [0])
-        simulate = _simulator(env, expert, trocars, seed, max_steps, chunk, devices)
+        simulate = recorder.simulator(env, expert, trocars, seed, max_steps, chunk, devices)
         shown = progress.track("Demonstrations", total, unit="episodes", done=done)
         with shown as advance, concurrent.futures.ThreadPoolExecutor(COMMITS) as pool:
             drawn = np.zeros(len(trocars.radius), int)
@@ -228,160 +183,6 @@ def _wave(
         wave += [(trocar, first + i) for i in range(missing)]
         drawn[trocar] += missing
     return wave
-
-
-def _simulator(
-    env: Any,
-    expert: Any,
-    trocars: Trocar,
-    seed: int,
-    max_steps: int,
-    chunk: int,
-    devices: Sequence[jax.Device] | None,
-) -> Callable[..., Any]:
-    """The compiled programs as `group -> (lane -> (outcome, arrays))`."""
-    key = jax.random.fold_in(jax.random.key(seed), _STREAM)
-    start = lanes.split(_starter(env, expert), devices, (lanes.SHARED, lanes.LANE), lanes.LANE)
-    advance = lanes.split(
-        _advancer(env, expert),
-        devices,
-        (lanes.LANE, lanes.SHARED),
-        (lanes.LANE, lanes.TIME_LANE),
-        donate=(0,),
-    )
-
-    def simulate(group: list[tuple[int, int]]) -> Callable[[int], Any]:
-        count = len(group)
-        index, trial = np.array(group + [group[0]] * (chunk - count), np.int32).T
-        trials = _Trials(Trocar(*(field[index] for field in trocars)), index, trial)
-        carry = start(key, trials)
-        carry = carry._replace(wanted=carry.wanted & (np.arange(chunk) < count))
-        segments = []
-        for first in range(0, max_steps, SEGMENT):
-            steps = min(SEGMENT, max_steps - first)
-            carry, segment = advance(carry, np.int32(steps))
-            segments.append(jax.tree.map(np.asarray, segment))
-            if np.all(np.asarray(carry.env.done) | ~np.asarray(carry.wanted)):
-                break
-        final = jax.device_get((carry.length, _outcome(carry.env)))
-        return lambda lane: _episode(lane, group[lane], trocars, seed, segments, final)
-
-    return simulate
-
-
-def _starter(env: Any, expert: Any) -> Callable[..., _Carry]:
-    # Imported here, as only programs need it: reading a dataset does not load the simulator.
-    from starjax.sim import env as sim_env
-
-    def start_one(key: jax.Array, trials: _Trials) -> _Carry:
-        key = jax.random.fold_in(jax.random.fold_in(key, trials.index), trials.trial)
-        key_env, key_expert = jax.random.split(key)
-        state = env.reset(key_env, sim_env.EnvParams(trials.trocar))
-        return _Carry(
-            env=state,
-            expert=expert.init(key_expert, state),
-            length=jnp.zeros((), jnp.int32),
-            wanted=jnp.ones((), bool),
-        )
-
-    return jax.vmap(start_one, in_axes=(None, 0))
-
-
-def _advancer(env: Any, expert: Any) -> Callable[..., tuple[_Carry, dict[str, jax.Array]]]:
-    def step_one(carry: _Carry) -> tuple[_Carry, dict[str, jax.Array]]:
-        command, expert_state = expert.act(carry.expert, carry.env)
-        after = env.step(carry.env, command)
-        # An expert that disturbs itself has the undisturbed command in its state: the one to learn.
-        wanted = getattr(expert_state, "label", command)
-        record = _record(env.observe(carry.env), wanted, carry.env, after)
-        length = carry.length + ~carry.env.done
-        return _Carry(after, expert_state, length, carry.wanted), record
-
-    step = jax.vmap(step_one)
-
-    def advance(carry: _Carry, steps: jax.Array) -> tuple[_Carry, dict[str, jax.Array]]:
-        """Up to `steps` control steps, fewer when all episodes are over; records `[SEGMENT, N]`."""
-        shapes = jax.eval_shape(step, carry)[1]
-        blank = jax.tree.map(lambda s: jnp.zeros((SEGMENT, *s.shape), s.dtype), shapes)
-
-        def is_running(loop):
-            t, carry, _ = loop
-            return (t < steps) & jnp.any(carry.wanted & ~carry.env.done)
-
-        def body(loop):
-            t, carry, records = loop
-            carry, record = step(carry)
-            records = jax.tree.map(lambda all_, one: all_.at[t].set(one), records, record)
-            return t + 1, carry, records
-
-        _, carry, records = jax.lax.while_loop(is_running, body, (jnp.int32(0), carry, blank))
-        return carry, records
-
-    return advance
-
-
-def _record(observation: Observation, command: Command, before: Any, after: Any) -> dict[str, Any]:
-    frame = {
-        "p": observation.pose.p,
-        "R": observation.pose.R,
-        "gripper": observation.gripper,
-        "image": observation.image,
-        "state": observation.state,
-        "command_p": command.pose.p,
-        "command_R": command.pose.R,
-        "command_gripper": command.gripper,
-        "qpos": before.sim.qpos,
-        "rcm_error": after.rcm_error,
-    }
-    return {name: leaf for name, leaf in frame.items() if leaf is not None}
-
-
-def _frame(env: Any) -> dict[str, jax.ShapeDtypeStruct]:
-    """Shapes of one recorded frame, without computing anything."""
-    from starjax.sim import env as sim_env
-
-    def one(key):
-        state = env.reset(key, sim_env.EnvParams(Trocar(*jnp.zeros(3))))
-        observation = env.observe(state)
-        return _record(observation, Command(observation.pose, observation.gripper), state, state)
-
-    return jax.eval_shape(one, jax.random.key(0))
-
-
-def _outcome(state: Any) -> dict[str, jax.Array]:
-    return {
-        "success": state.success & ~state.invalid,
-        "loose": state.loose,
-        "invalid": state.invalid,
-        "collided": state.collided,
-    }
-
-
-def _episode(
-    lane: int,
-    trial: tuple[int, int],
-    trocars: Trocar,
-    seed: int,
-    segments: list[dict[str, np.ndarray]],
-    final: tuple[np.ndarray, dict[str, np.ndarray]],
-) -> tuple[store.Record, dict[str, np.ndarray]]:
-    lengths, outcomes = final
-    length = int(lengths[lane])
-    outcome = {
-        "trocar": trial[0],
-        "radius": float(trocars.radius[trial[0]]),
-        "polar": float(trocars.polar[trial[0]]),
-        "azimuth": float(trocars.azimuth[trial[0]]),
-        "trial": trial[1],
-        "seed": seed,
-        "length": length,
-        **{name: bool(value[lane]) for name, value in outcomes.items()},
-    }
-    arrays = {
-        name: np.concatenate([segment[name][:, lane] for segment in segments])[:length]
-        for name in segments[0]
-    }
-    return outcome, arrays
 
 
 def _chunk(total: int, frame_bytes: int, devices: Sequence[jax.Device] | None) -> int:

@@ -15,15 +15,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from starjax import rcm
-from starjax.evaluation import rollout, table
+from starjax.evaluation import recorded, rollout, table
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files, progress
 
 # Trials at once: a CPU is busy with 32; a GPU takes hundreds, as far as memory goes.
 CPU_CHUNK, GPU_CHUNK, GPU_TRIAL_BYTES = 32, 1024, 32 << 20
-# One trajectory a trocar is recorded for figures, unless there are more trocars than this.
-FIGURE_TROCARS = 16
 
 
 def evaluate(
@@ -85,14 +82,14 @@ def evaluate(
     )
     count = len(trocars.radius)
     index, trial = (x.reshape(-1) for x in np.divmod(np.arange(count * trials), trials))
-    recorded = _recorded(count, trials, video_trials)
+    chosen = recorded.choose(count, trials, video_trials)
     with files.lock(directory):
         plan = {
             "seed": seed,
             "trials": trials,
             "trocars": np.stack(trocars, -1).astype(float).tolist(),
             **settings._asdict(),
-            "recorded": int(recorded.sum()),
+            "recorded": int(chosen.sum()),
             "weights": fingerprint((params, normalizer)),
             "identity": dict(identity or {}),
         }
@@ -110,7 +107,7 @@ def evaluate(
                     done = run(params, normalizer, here, told)
                     found = (
                         table.from_rollouts(done, index[rows], trial[rows]),
-                        _trajectories(done, here, recorded[rows], env.p_world_ref),
+                        recorded.take(done, here, chosen[rows], env.p_world_ref),
                     )
                     _write(path, *found)
                     told(1.0)
@@ -118,8 +115,8 @@ def evaluate(
                     advance(rows.stop - rows.start)
                 tables.append(found[0])
                 kept.append(found[1])
-        if recorded.any():
-            files.write_npz(directory / "recorded.npz", _padded(kept))
+        if chosen.any():
+            files.write_npz(directory / "recorded.npz", recorded.join(kept))
     return table.join(tables)
 
 
@@ -191,44 +188,10 @@ def _fill(trocars: Trocar, index: np.ndarray, trial: np.ndarray, chunk: int) -> 
     )
 
 
-def _recorded(count: int, trials: int, video_trials: int) -> np.ndarray:
-    """Which of the `[count * trials]` trials are recorded: the first of every trocar, and so on."""
-    if not video_trials:
-        return np.zeros(count * trials, bool)
-    wanted = min(max(video_trials, count if count <= FIGURE_TROCARS else 0), count * trials)
-    first = np.arange(wanted)
-    if wanted < count:  # spread over the trocars
-        trocar, trial = np.linspace(0, count - 1, wanted).round().astype(int), 0 * first
-    else:
-        trial, trocar = np.divmod(first, count)
-    mask = np.zeros((count, trials), bool)
-    mask[trocar, trial] = True
-    return mask.reshape(-1)
-
-
-def _trajectories(
-    done: rollout.Rollouts, here: rollout.Trials, recorded: np.ndarray, p_world_ref: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Recorded trials R of a chunk, `[R, T]`, each meaningful up to its `length`."""
-    rows = np.flatnonzero(recorded)
-    trocar = jax.tree.map(lambda x: x[rows], done.env.trocar)
-    steps = max(int(done.length[rows].max(initial=1)), 1)
-    return {
-        "trocar": here.index[rows],
-        "trial": here.trial[rows],
-        "length": done.length[rows],
-        "p_world_tip": np.moveaxis(done.steps.p_world_tip[:steps, rows], 0, 1),
-        "rcm_error": np.moveaxis(done.steps.rcm_error[:steps, rows], 0, 1),
-        "qpos": np.moveaxis(done.steps.qpos[:steps, rows], 0, 1),
-        "p_world_trocar": np.asarray(rcm.trocar_position(trocar, p_world_ref)),
-        "source_peg": done.env.source[rows],
-        "target_peg": done.env.target[rows],
-    }
-
-
 def _write(path: Path, rows: table.Table, kept: dict[str, np.ndarray]) -> None:
-    recorded = {f"recorded.{name}": value for name, value in kept.items()}
-    files.write_npz(path, {**rows._asdict(), **recorded})
+    files.write_npz(
+        path, {**rows._asdict(), **{f"recorded.{name}": value for name, value in kept.items()}}
+    )
 
 
 def _read(
@@ -245,21 +208,3 @@ def _read(
         report(f"damaged, evaluated again: {path}: {error}")
         return None
     return rows, {name.removeprefix("recorded."): value for name, value in arrays.items()}
-
-
-def _padded(kept: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Trajectories of all chunks, NaN after each trial's end."""
-    length = np.concatenate([part["length"] for part in kept])
-    longest = int(length.max())
-    joined = {}
-    for name in kept[0]:
-        parts = [part[name] for part in kept]
-        if name in ("p_world_tip", "rcm_error", "qpos"):
-            shape = (len(length), longest, *parts[0].shape[2:])
-            rows = (row for part in parts for row in part)
-            joined[name] = np.full(shape, np.nan, np.float32)
-            for out, n, row in zip(joined[name], length, rows, strict=True):
-                out[:n] = row[:n]
-        else:
-            joined[name] = np.concatenate(parts)
-    return joined
