@@ -25,8 +25,8 @@ STEP_IK_ITERATIONS = 4
 # A command further away than these allow in one period is approached at these speeds: the joints'
 # are the FR5's (data sheet, the slower ones), the tool's keep a leap from unsettling the IK.
 MAX_JOINT_SPEED = 3.15  # rad/s
-MAX_TIP_SPEED = 0.3  # m/s
-MAX_TIP_SPIN = 6.0  # rad/s
+MAX_TIP_SPEED = 0.2  # m/s
+MAX_TIP_SPIN = 4.0  # rad/s
 
 
 @flax.struct.dataclass
@@ -113,12 +113,16 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
       ValueError: an unknown observation or an unusable size.
     """
     if policy_observation not in ("image", "state"):
-        raise ValueError(f"policy_observation: expected 'image' or 'state', got {policy_observation!r}")
+        raise ValueError(
+            f"policy_observation: expected 'image' or 'state', got {policy_observation!r}"
+        )
     if image_size < 16:
         raise ValueError(f"image_size: expected at least 16 pixels, got {image_size}")
     sim = model.load()
     draw = render.make(sim.mj_model, "camera", image_size, image_size, shadow=shadow)
     pegs = jnp.asarray(sim.pegs)
+    # Per period, so that the servos' torque is enough to follow.
+    max_change = jnp.asarray(physics.max_speed_change(sim, 1.0 / CONTROL_HZ) / CONTROL_HZ)
 
     def reset(key: jax.Array, params: EnvParams) -> EnvState:
         layout = peg_transfer.sample_layout(key, pegs)
@@ -157,7 +161,11 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         q, _ = ik.solve(sim.arm, target, state.q_target, STEP_IK_ITERATIONS)
         usable = _is_finite(command) & jnp.all(jnp.isfinite(q))
         dq = jnp.where(usable, q - state.q_target, 0.0)
-        dq = dq * jnp.minimum(1.0, MAX_JOINT_SPEED / CONTROL_HZ / jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9))
+        dq = dq * jnp.minimum(
+            1.0, MAX_JOINT_SPEED / CONTROL_HZ / jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9)
+        )
+        coast = state.q_velocity / CONTROL_HZ
+        dq = coast + jnp.clip(dq - coast, -max_change, max_change)
         gripper = jnp.where(usable, jnp.clip(command.gripper, -1.0, 1.0), state.gripper_target)
         after, jaw_contact = physics.advance(
             sim, state.sim, state.q_target, dq, state.q_velocity, gripper, 1.0 / CONTROL_HZ
@@ -168,7 +176,9 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             q_velocity=CONTROL_HZ * dq,
             gripper_target=gripper,
             step=state.step + 1,
-            ik_error=jnp.where(usable, ik.residual(sim.arm, command.pose, state.q_target + dq), jnp.inf),
+            ik_error=jnp.where(
+                usable, ik.residual(sim.arm, command.pose, state.q_target + dq), jnp.inf
+            ),
             jaw_contact=jaw_contact,
         )
         moved = _judge(_measure(moved))
@@ -192,7 +202,9 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
 
     def _judge(state: EnvState) -> EnvState:
         velocity = state.sim.qvel[sim.block_dof : sim.block_dof + 6]
-        good = peg_transfer.is_threaded(state.block_pose, state.target_peg) & peg_transfer.is_at_rest(velocity)
+        good = peg_transfer.is_threaded(
+            state.block_pose, state.target_peg
+        ) & peg_transfer.is_at_rest(velocity)
         settled = jnp.where(good & ~state.jaw_contact, state.settled + 1, 0)
         success = settled >= peg_transfer.SETTLE_STEPS
         loose = state.loose | peg_transfer.is_near(state.block_pose, state.target_peg)

@@ -57,9 +57,15 @@ class SimModel(NamedTuple):
     pegs: np.ndarray
 
 
-def compose(robot: str = "fr5", tool: str = "grasper", task: str = "peg_transfer") -> mujoco.MjModel:
+def compose(
+    robot: str = "fr5", tool: str = "grasper", task: str = "peg_transfer"
+) -> mujoco.MjModel:
     """The C model of `robot` holding `tool` in `task`; ValueError for an unknown name."""
-    for kind, name, known in (("robot", robot, ROBOTS), ("tool", tool, TOOLS), ("task", task, TASKS)):
+    for kind, name, known in (
+        ("robot", robot, ROBOTS),
+        ("tool", tool, TOOLS),
+        ("task", task, TASKS),
+    ):
         if name not in known:
             raise ValueError(f"{kind}: expected one of {sorted(known)}, got {name!r}")
     scene = mujoco.MjSpec.from_file(str(assets.path(TASKS[task])))

@@ -76,8 +76,8 @@ def make(
                 f"geom_xpos, geom_xmat, geom_rgb: expected {[n, 3]}, {[n, 3, 3]}, {[n, 3]}, "
                 f"got {shape}"
             )
-        t, face, rgb = cast.cast(scene, grid, textures, shadow, geom_xpos, geom_xmat, geom_rgb)
-        frame = Frame(rgb=_bytes(grid, [tiles.pixels(v, samples).mean(-1) for v in rgb]))
+        t, face, word = cast.cast(scene, grid, textures, shadow, geom_xpos, geom_xmat, geom_rgb)
+        frame = Frame(rgb=_bytes(grid, word, samples))
         if depth:
             frame = frame.replace(depth=tiles.picture(grid, tiles.pixels(t, samples)[..., -1]))
         if segmentation:
@@ -91,8 +91,10 @@ def make(
     return render
 
 
-def _bytes(grid: tiles.Grid, rgb: list[jax.Array]) -> jax.Array:
-    """Red, green and blue `[T, q]` in [0, 1] to a picture `[h, w, 3]` uint8."""
-    red, green, blue = [(v * 255 + 0.5).astype(jnp.uint32) for v in rgb]
-    word = tiles.picture(grid, red | green << 8 | blue << 16)  # one pass, four bytes a pixel
-    return jax.lax.bitcast_convert_type(word, jnp.uint8)[..., :3]
+def _bytes(grid: tiles.Grid, word: jax.Array, samples: int) -> jax.Array:
+    """The samples' mean colour as a picture, `[h, w, 3]` uint8."""
+    if samples > 1:
+        parts = jax.lax.bitcast_convert_type(tiles.pixels(word, samples), jnp.uint8)
+        mean = (parts.astype(jnp.float32).mean(-2) + 0.5).astype(jnp.uint8)
+        word = jax.lax.bitcast_convert_type(mean, jnp.int32)
+    return jax.lax.bitcast_convert_type(tiles.picture(grid, word), jnp.uint8)[..., :3]

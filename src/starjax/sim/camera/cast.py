@@ -13,20 +13,18 @@ Array = jax.Array
 def cast(
     scene: scenes.Scene, grid: tiles.Grid, textures: dict[int, np.ndarray], shadow: bool,
     geom_xpos: Array, geom_xmat: Array, geom_rgb: Array,
-) -> tuple[Array, Array, list[Array]]:  # fmt: skip
-    """Depth in m, face (-1 background), and red, green, blue in [0, 1]; each `[T, Q]`."""
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Depth in m, face (-1 background) and colour (bytes of an int32); each `[T, Q]`."""
     R_cam_world = jnp.asarray(scene.R_world_cam.T, jnp.float32)
     offset = geom_xpos[scene.ids] - jnp.asarray(scene.p_world_cam, jnp.float32)
     c = jnp.einsum("ij,gj->gi", R_cam_world, offset, precision="highest")
     R = jnp.einsum("ij,gjk->gik", R_cam_world, geom_xmat[scene.ids], precision="highest")
     t, face = _nearest(scene, grid, c, R)
-    depth = jnp.where(face >= 0, t, 1.0)
-    p = [grid.x * depth, grid.y * depth, -depth]
-    shaded = None
+    shaded = jnp.zeros_like(face, bool)
     if shadow and scene.sun is not None:
-        shaded = _shaded(scene, scene.sun, c, R, p, face)
+        shaded = _shaded(scene, grid, scene.sun, c, R, t, face)
     rgb = geom_rgb[scene.ids]
-    return t, face, shade.light(scene, textures, rgb, c, R, p, face, shaded)
+    return t, face, shade.light(scene, grid, textures, rgb, c, R, t, face, shaded)
 
 
 def _nearest(scene: scenes.Scene, grid: tiles.Grid, c: Array, R: Array) -> tuple[Array, Array]:
@@ -53,37 +51,41 @@ def _nearest(scene: scenes.Scene, grid: tiles.Grid, c: Array, R: Array) -> tuple
             return jnp.minimum(key, jnp.where(row >= 0, hit, key))
 
         table = shapes.features(kind, c[rows], R[rows], size[rows])
-        key = tiles.each(seen[:, rows], table, meet, key, x, y)
+        key = tiles.each(tiles.words(seen[:, rows]), table, meet, key, x, y)
     t = jax.lax.bitcast_convert_type(key & ~room, jnp.float32)
     return t, jnp.where(t < shapes.FAR, key & room, -1)
 
 
 def _shaded(
-    scene: scenes.Scene, sun: scenes.Light, c: Array, R: Array, p: list[Array], face: Array
-) -> Array:
+    scene: scenes.Scene, grid: tiles.Grid, sun: scenes.Light, c: Array, R: Array, t: Array,
+    face: Array,
+) -> Array:  # fmt: skip
     """Which visible points another geom hides from the sun. No convex shape hides itself."""
     R_light_cam = _frame(-sun.direction)
     c = jnp.einsum("ij,gj->gi", R_light_cam, c, precision="highest")
     R = jnp.einsum("ij,gjk->gik", R_light_cam, R, precision="highest")
-    q = [sum(R_light_cam[i, k] * p[k] for k in range(3)) for i in range(3)]
-    seen = face >= 0
+    x, y = jnp.asarray(grid.x), jnp.asarray(grid.y)
+
+    def points(t, x, y):
+        return [t * (i * x + j * y - k) for i, j, k in R_light_cam]
+
     low, high = [
-        jnp.stack([edge(jnp.where(seen, v, far), -1) for v in q], -1)
+        jnp.stack([edge(jnp.where(face >= 0, q, far), -1) for q in points(t, x, y)], -1)
         for edge, far in ((jnp.min, shapes.FAR), (jnp.max, -shapes.FAR))
     ]
     hides = tiles.over(low, high, c, R, *_bounds(scene))
     size = jnp.asarray(scene.size, jnp.float32)
-    shaded = jnp.zeros_like(seen)
+    shaded = jnp.zeros_like(face, bool)
     for kind in (scenes.CAPSULE, scenes.CYLINDER, scenes.BOX):
         rows, first, parts = scene.rows(kind), scene.first_face(kind), scenes.FACES[kind]
 
-        def hide(shaded, row, features, face, *q, kind=kind, first=first, parts=parts):
+        def hide(shaded, row, features, face, t, x, y, kind=kind, first=first, parts=parts):
             part = face - (first + parts * row)
             other = (row >= 0) & ((part < 0) | (part >= parts))
-            return shaded | (shapes.shadow(kind, q, features) & other)
+            return shaded | (shapes.shadow(kind, points(t, x, y), features) & other)
 
         table = shapes.features(kind, c[rows], R[rows], size[rows])
-        shaded = tiles.each(hides[:, rows], table, hide, shaded, face, *q)
+        shaded = tiles.each(tiles.words(hides[:, rows]), table, hide, shaded, face, t, x, y)
     return shaded
 
 

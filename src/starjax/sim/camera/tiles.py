@@ -130,19 +130,36 @@ def over(low: Array, high: Array, c: Array, R: Array, axes: Array, rounding: Arr
     return near & (aside <= limit)
 
 
-def each(overlap: Array, table: Array, visit: Visit, carry: Array, *pixels: Array) -> Array:
-    """Folds `carry = visit(carry, row, features, *pixels)` over the overlapping geoms of each tile.
+def words(overlap: Array) -> Array:
+    """The bits of `[T, N]` bool in words of 32: `[W, T]` uint32."""
+    count = -(-overlap.shape[1] // 32)
+    parts = jnp.pad(overlap, ((0, 0), (0, 32 * count - overlap.shape[1]))).reshape(-1, count, 32)
+    bits = jnp.uint32(1) << jnp.arange(32, dtype=jnp.uint32)
+    return jnp.sum(jnp.where(parts, bits, jnp.uint32(0)), -1, dtype=jnp.uint32).T
+
+
+def present(index: Array, count: int) -> Array:
+    """Which of `count` numbers occur in the rows of `index [T, Q]`, as `words`; -1 is none."""
+    found = []
+    for first in range(0, count, 32):
+        mine = (index >= first) & (index < first + 32)
+        bits = jnp.where(mine, jnp.uint32(1) << ((index - first) & 31).astype(jnp.uint32), 0)
+        found.append(jax.lax.reduce(bits, np.uint32(0), jax.lax.bitwise_or, (1,)))
+    return jnp.stack(found)
+
+
+def each(words: Array, table: Array, visit: Visit, carry: Array, *pixels: Array) -> Array:
+    """Folds `carry = visit(carry, row, features, *pixels)` over the marked rows for each tile.
 
     Args:
-      overlap: `[T, N]` bool; table: `[N, F]`.
+      words: `[W, T]` bits of the rows that matter to each tile.
+      table: `[N, F]`.
       visit: sees row `[T, 1]` (-1 where a tile has none left) and F features `[T, 1]`.
-      carry, pixels: `[T, Q]`, or the rows of fewer tiles.
+      carry, pixels: `[T, Q]`; in `visit` perhaps those of fewer tiles.
     """
-    for first in range(0, overlap.shape[1], 32):
-        part = overlap[:, first : first + 32]
-        bits = jnp.uint32(1) << jnp.arange(part.shape[1], dtype=jnp.uint32)
-        words = jnp.sum(jnp.where(part, bits, jnp.uint32(0)), -1, dtype=jnp.uint32)
-        carry = _rounds(words, table[first : first + 32], first, visit, carry, pixels)
+    for w, word in enumerate(words):
+        part = table[32 * w : 32 * w + 32]
+        carry = _rounds(word, part, 32 * w, visit, carry, pixels)
     return carry
 
 
@@ -150,7 +167,7 @@ def _rounds(
     words: Array, table: Array, first: int, visit: Visit, carry: Array, pixels: tuple[Array, ...]
 ) -> Array:
     """Rounds over all tiles while many have geoms left, then over the quarter that still has."""
-    few = len(words) // 4 if len(words) >= 16 else 0
+    few = len(words) // 4 if len(words) >= 64 else 0
 
     def one(state):
         words, carry = state

@@ -37,7 +37,7 @@ RELEASE_SHIFT = 0.0005  # m further out along the grasped wall's normal: room fo
 HELD = 0.006  # m from the tip within which the grasped wall counts as held
 GRASP_SIDE = 0.0015  # m along the wall, to either side of its middle
 CANDIDATES = 2  # walls to choose from
-INDIFFERENCE = 0.05  # difference of their costs at which the choice is still nearly open
+OUTWARD = 0.003  # m off the middle row at which a preference shows
 
 NOISE_POSITION = 0.0012  # m, standard deviation of the disturbance
 NOISE_ROLL = 0.07  # rad
@@ -121,7 +121,9 @@ def act(expert: ExpertState, state: env.EnvState) -> tuple[Command, ExpertState]
     expert = expert.replace(label=Command(expert.label.pose._replace(p=p), expert.label.gripper))
     roll = _roll_of(expert, state)
     jaws = jnp.asarray(JAWS)[expert.phase]
-    gripper = expert.jaws_from + jnp.clip(expert.elapsed / JAW_TIME, 0.0, 1.0) * (jaws - expert.jaws_from)
+    gripper = expert.jaws_from + jnp.clip(expert.elapsed / JAW_TIME, 0.0, 1.0) * (
+        jaws - expert.jaws_from
+    )
 
     weight = jnp.asarray(DISTURBANCE)[expert.phase]
     noise = _disturb(expert, state.step, dt)
@@ -136,13 +138,17 @@ def act(expert: ExpertState, state: env.EnvState) -> tuple[Command, ExpertState]
 def _following(expert: ExpertState, state: env.EnvState) -> jax.Array:
     """The phase after the present one, given what the world looks like now."""
     phase = expert.phase
-    grasped = state.block_pose.p + task.RIM_RADIUS * task.wall_normals(state.block_pose)[expert.wall]
+    grasped = (
+        state.block_pose.p + task.RIM_RADIUS * task.wall_normals(state.block_pose)[expert.wall]
+    )
     is_held = jnp.sum((grasped - state.pose.p) ** 2) < HELD**2
     is_lost = (phase >= LIFT) & (phase <= CARRY) & ~is_held
     return jnp.where(is_lost | (phase == WAIT), RAISE, phase + 1).astype(jnp.int32)
 
 
-def _enter(expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax.Array) -> ExpertState:
+def _enter(
+    expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax.Array
+) -> ExpertState:
     """Begins `phase`: choose the wall if it is an approach, set goal and duration."""
     block, tip = state.block_pose, expert.label.pose.p
     is_approach = phase == APPROACH
@@ -151,9 +157,12 @@ def _enter(expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax
     key_wall, key_side, key_hover = keys
     normals = task.wall_normals(block)
     # The jaws' axis stays within 60 degrees of the world's y: the roll then never meets its wrap.
-    cost = jnp.abs(normals[:, 0])
-    cost = jnp.where(cost > jnp.sort(cost)[CANDIDATES - 1], jnp.inf, cost)
-    chosen = jax.random.categorical(key_wall, -cost / INDIFFERENCE)
+    skew = jnp.abs(normals[:, 0])
+    is_candidate = skew <= jnp.sort(skew)[CANDIDATES - 1]
+    # Of these, the one towards the board's middle, where the shaft leans away from the peg; on the
+    # middle row either will do.
+    outward = normals[:, 1] * block.p[1] / OUTWARD
+    chosen = jax.random.categorical(key_wall, jnp.where(is_candidate, -outward, -jnp.inf))
     wall = jnp.where(is_approach, chosen, expert.wall)
     out = normals[wall] * jnp.array([1.0, 1.0, 0.0])
     out = out / jnp.maximum(jnp.linalg.norm(out), 1e-6)
@@ -186,7 +195,9 @@ def _enter(expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax
         ]
     )
     goal = goals[phase]
-    least = jnp.maximum(jnp.asarray(DURATION)[phase], jnp.linalg.norm(goal - tip) / jnp.asarray(SPEED)[phase])
+    least = jnp.maximum(
+        jnp.asarray(DURATION)[phase], jnp.linalg.norm(goal - tip) / jnp.asarray(SPEED)[phase]
+    )
     return expert.replace(
         phase=phase,
         elapsed=jnp.zeros(()),
@@ -208,7 +219,9 @@ def _roll_of(expert: ExpertState, state: env.EnvState) -> jax.Array:
         jnp.append(0.0, expert.label.pose.p), state.trocar, state.p_world_ref
     )
     on_wall = jnp.arctan2(-expert.normal @ pose.R[:, 0], expert.normal @ pose.R[:, 1])
-    lead = TURN_LEAD + jnp.where(expert.phase == APPROACH, expert.elapsed - expert.duration, expert.elapsed)
+    lead = TURN_LEAD + jnp.where(
+        expert.phase == APPROACH, expert.elapsed - expert.duration, expert.elapsed
+    )
     turned = jnp.clip(lead * expert.tempo / TURN_TIME, 0.0, 1.0)
     turned = jnp.where(expert.phase > DESCEND, 1.0, jnp.where(expert.phase == RAISE, 0.0, turned))
     weight = 0.5 - 0.5 * jnp.cos(jnp.pi * turned)

@@ -19,6 +19,7 @@ PEG_HEIGHT = 0.012
 
 # Where an episode begins.
 BLOCK_OFFSET = 0.001  # block's centre from its peg, each axis, at most
+BLOCK_YAW = 0.5236  # rad, either way: half of all that can be told apart, the rim being triangular
 TIP_HOME = (0.0, 0.0, 0.05)
 TIP_SPREAD = 0.01  # each axis, at most
 
@@ -60,10 +61,13 @@ def sample_layout(key: jax.Array, pegs: jax.Array) -> Layout:
     half = pegs.shape[0] // 2
     source = jax.random.randint(key_source, (), 0, half)
     target = jax.random.randint(key_target, (), half, 2 * half)
-    xy = pegs[source] + jax.random.uniform(key_offset, (2,), minval=-BLOCK_OFFSET, maxval=BLOCK_OFFSET)
-    # The rim looks the same every 120 degrees: one such sector is every yaw.
-    yaw = jax.random.uniform(key_yaw, minval=-jnp.pi / WALLS, maxval=jnp.pi / WALLS)
-    tip = jnp.array(TIP_HOME) + jax.random.uniform(key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD)
+    xy = pegs[source] + jax.random.uniform(
+        key_offset, (2,), minval=-BLOCK_OFFSET, maxval=BLOCK_OFFSET
+    )
+    yaw = jax.random.uniform(key_yaw, minval=-BLOCK_YAW, maxval=BLOCK_YAW)
+    tip = jnp.array(TIP_HOME) + jax.random.uniform(
+        key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD
+    )
     c, s, o, one = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros(()), jnp.ones(())
     R = jnp.stack([jnp.stack([c, -s, o]), jnp.stack([s, c, o]), jnp.stack([o, o, one])])
     block = Pose(R, jnp.append(xy, RIM_HEIGHT))
