@@ -17,7 +17,7 @@ def p_world_ref():
 def hostile(rng, shape):
     """float32 numbers of every kind: any bit pattern, and the values that sit on branches."""
     bits = rng.integers(0, 2**32, shape, np.uint32).view(np.float32)
-    near_zero = [0, -0.0, 1e-45, -1e-45, 1e-38, 1e-7, -1e-6, 1e-6, 1.1e-6, 1e-4]
+    near_zero = [0, -0.0, 1e-45, -1e-45, 1e-38, 1e-7, -5e-7, 5.1e-7, 1e-6, 1e-4]
     ordinary = [0.005, 0.15, 0.4, 1, -1, np.pi, -np.pi, 2 * np.pi]
     huge = [1e4, 1e20, -1e20, 1e30, 1e38, -1e38, 3.4e38, -3.4e38, np.inf, -np.inf, np.nan]
     special = np.array([*near_zero, *ordinary, *huge], np.float32)

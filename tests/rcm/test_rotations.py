@@ -92,6 +92,18 @@ def test_axis_and_roll_come_back(rng, oracle):
     np.testing.assert_allclose(jax.jit(rcm.roll_of)(R), roll, atol=1e-5)
 
 
+def test_base_rotation_is_the_alignment_from_the_z_down_frame(rng, oracle):
+    """Roll 0 is `G @ rotation_align(e_z, G' @ axis)`, at the singular axis too."""
+    (axis,) = as_float32(np.concatenate([oracle.unit(rng, N), [[0, 0, 1], [0, 0, -1], [1, 0, 0]]]))
+    G = np.array([1, -1, -1], np.float32)
+    e_z = np.array([0, 0, 1], np.float32)
+    expected = G[:, None] * jax.jit(rcm.rotation_align)(e_z, G * axis)
+    R = jax.jit(rcm.rotation_from_axis_roll)(axis, np.float32(0))
+    steady = axis[:, 2] < 0.999
+    np.testing.assert_allclose(R[steady], expected[steady], atol=1e-5)
+    np.testing.assert_allclose(R[-3], expected[-3], atol=3e-7)
+
+
 def test_roll_is_the_twist_of_jaxlies_quaternion(rng):
     """Swing-twist of G R about z: the roll is twice the angle of (w, z)."""
     R = transform.Rotation.random(N, rng=rng).as_matrix().astype(np.float32)

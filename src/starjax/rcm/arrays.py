@@ -1,5 +1,7 @@
 """What every RCM map needs of its inputs: one float type, checked shapes, safe directions."""
 
+import functools
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -50,7 +52,7 @@ def epsilon(dtype: Any) -> float:
 
     It also bounds derivatives: they grow like 1 / length towards a singular point.
     """
-    return 1e-6 if jnp.finfo(dtype).bits == 32 else 1e-12
+    return 5e-7 if jnp.finfo(dtype).bits == 32 else 1e-12
 
 
 def direction(v: jax.Array, fallback: ArrayLike) -> tuple[jax.Array, jax.Array]:
@@ -67,7 +69,7 @@ def direction(v: jax.Array, fallback: ArrayLike) -> tuple[jax.Array, jax.Array]:
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(v), axis=-1, keepdims=True))
     is_defined = scale > epsilon(v.dtype)
     scaled = jnp.where(is_defined, v / jnp.where(is_defined, scale, 1.0), fallback)
-    length = jnp.sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True))
+    length = jnp.sqrt(dot(scaled, scaled))
     return scaled / length, jnp.where(is_defined, scale * length, 0.0)[..., 0]
 
 
@@ -77,20 +79,28 @@ def norm(v: jax.Array) -> jax.Array:
     # Not `scale > tiny`: a NaN has to come through.
     is_zero = scale <= jnp.finfo(v.dtype).tiny
     scaled = jnp.where(is_zero, 1.0, v) / jnp.where(is_zero, 1.0, scale)
-    length = scale * jnp.sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True))
+    length = scale * jnp.sqrt(dot(scaled, scaled))
     return jnp.where(is_zero, 0.0, length)[..., 0]
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     """Inner product over the last axis, kept as an axis of length 1: `[..., 1]`."""
-    return jnp.sum(a * b, axis=-1, keepdims=True)
+    return _sum(a[..., i : i + 1] * b[..., i : i + 1] for i in range(a.shape[-1]))
+
+
+# Products are written out: as reductions they would not fuse into what follows on a CPU, and as
+# matrix products they would be rounded to TF32 on a GPU.
 
 
 def matmul(A: jax.Array, B: jax.Array) -> jax.Array:
-    """`A @ B` of 3 x 3 matrices in full precision: GPUs round matrix products to TF32."""
-    return jnp.sum(A[..., :, :, None] * B[..., None, :, :], axis=-2)
+    """`A @ B` of `[..., 3, 3]` matrices in full precision."""
+    return _sum(A[..., :, i : i + 1] * B[..., i : i + 1, :] for i in range(3))
 
 
 def matvec(A: jax.Array, v: jax.Array) -> jax.Array:
-    """`A @ v` for `[..., 3, 3]` and `[..., 3]`, in full precision like `matmul`."""
-    return jnp.sum(A * v[..., None, :], axis=-1)
+    """`A @ v` for `[..., 3, 3]` and `[..., 3]` in full precision."""
+    return _sum(A[..., :, i] * v[..., i : i + 1] for i in range(3))
+
+
+def _sum(terms: Iterable[jax.Array]) -> jax.Array:
+    return functools.reduce(jnp.add, terms)

@@ -104,9 +104,7 @@ def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
     """
     R, p, p_world_trocar = _checked(pose, p_world_trocar)
     target, _ = arrays.direction(p - p_world_trocar, R[..., :, 2])
-    # The second, tiny turn takes back what the first lost by rounding where it is near pi.
-    for _ in range(2):
-        R = arrays.matmul(rotations.rotation_align(R[..., :, 2], target), R)
+    R = arrays.matmul(rotations.rotation_align(R[..., :, 2], target), R)
     return types.Pose(R=R, p=jnp.broadcast_to(p, R.shape[:-1]))
 
 

@@ -14,6 +14,7 @@ from starjax.rcm import arrays
 # World to the fixed-yaw frame whose z points down, G = diag(1, -1, -1); it is its own inverse.
 _DOWN = np.array([1.0, -1.0, -1.0], np.float32)
 _E_X = np.array([1.0, 0.0, 0.0], np.float32)
+_E_Y = np.array([0.0, 1.0, 0.0], np.float32)
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
 
 
@@ -139,17 +140,25 @@ def rot6d_decode(rot6d: ArrayLike) -> jax.Array:
 
 
 def _base_rotation(axis_world: jax.Array) -> jax.Array:
-    """`G @ align(e_z, G' @ axis_world)`: `[..., 3]` to `[..., 3, 3]`."""
-    down = jnp.asarray(_DOWN, axis_world.dtype)
-    axis, _ = arrays.direction(arrays.bounded(axis_world * down), _E_Z)
-    e_z = jnp.broadcast_to(jnp.asarray(_E_Z, axis.dtype), axis.shape)
-    return down[:, None] * _align_unit(e_z, axis)
+    """`G @ rotation_align(e_z, G' @ axis_world)` written out: `[..., 3]` to `[..., 3, 3]`."""
+    axis, _ = arrays.direction(arrays.bounded(axis_world * _DOWN.astype(axis_world.dtype)), _E_Z)
+    across, z = axis[..., :2], axis[..., 2]
+    unit, sin = arrays.direction(across, _E_Y[:2])
+    is_obtuse = z < 0.0
+    spanning = jnp.where(is_obtuse[..., None], unit, across)
+    factor = jnp.where(is_obtuse, 1.0 - z, 1.0 / (1.0 + jnp.where(is_obtuse, 0.0, z)))
+    # Up to rounding `across`, but zero where the tool points straight up.
+    across = jnp.where(is_obtuse[..., None], sin[..., None] * unit, across)
+    x, y = across[..., 0], across[..., 1]
+    u, v = spanning[..., 0], spanning[..., 1]
+    shear = factor * u * v
+    rows = ([1.0 - factor * u * u, -shear, x], [shear, factor * v * v - 1.0, -y], [x, y, -z])
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _orthogonal(a: jax.Array) -> jax.Array:
     """A unit vector orthogonal to unit `a`, made from the x axis unless `a` is close to it."""
-    e_y = np.array([0.0, 1.0, 0.0], np.float32)
-    other = jnp.where(jnp.abs(a[..., :1]) < 0.7, _E_X, e_y).astype(a.dtype)
+    other = jnp.where(jnp.abs(a[..., :1]) < 0.7, _E_X, _E_Y).astype(a.dtype)
     across = jnp.cross(a, other)
     return across / jnp.sqrt(arrays.dot(across, across))
 
