@@ -175,7 +175,7 @@ def test_broken_and_hostile_pickles_are_value_errors(program, message, tmp_path)
         ((2,), (4,), 0, 4),
         ((4,), (-1,), 3, 4),
         ((1,), (1,), -1, 4),
-        ((2**30,), (0,), 0, 4),  # one element shown a billion times
+        ((2**20,), (0,), 0, 4),  # one element shown a million times
         ((2, 2), (1,), 0, 4),
         ((8,), (1,), 0, 8),  # the storage claims more than the file holds
     ],
@@ -253,7 +253,7 @@ def test_a_filled_convolution_is_torchs_cross_correlation(trunk, weights, tmp_pa
     image = jnp.zeros((1, 16, 16, 3)).at[0, 8, 6, 1].set(1.0)
     out = resnet.Conv2d(16, 7, 2).apply({"params": filled["conv1"]}, image)
     kernel = weights["conv1.weight"]
-    for row, column in ((4, 3), (3, 2), (5, 4)):
+    for row, column in ((4, 2), (3, 3), (5, 4)):
         tap = kernel[:, 1, 8 - (2 * row - 3), 6 - (2 * column - 3)]
         np.testing.assert_allclose(out[0, row, column], tap, rtol=1e-6)
 
