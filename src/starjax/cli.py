@@ -2,6 +2,7 @@
 
 import errno
 import importlib
+import os
 import sys
 from collections.abc import Callable, Sequence
 
@@ -42,6 +43,10 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         return _fail(error, 2)
     except KeyboardInterrupt as stop:
         return _fail(str(stop) or "stopped; the same command goes on from what is saved", 130)
+    except BrokenPipeError:
+        # Whoever read our output has seen enough (`| head`); nothing more may be written there.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except OSError as error:
         # Imported late: it brings numpy, and `--help` need not wait for it.
         from starjax.runtime import files

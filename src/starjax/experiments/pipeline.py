@@ -15,6 +15,7 @@ from starjax.experiments import clock, folders, methods, words
 from starjax.runtime import files, xla
 
 STAGES = words.STAGES
+LEAST_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints ask for their own
 
 
 def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> None:
@@ -27,7 +28,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     """
     xla.prepare_xla()
     out = Path(config.out)
-    files.require_writable(out)
+    files.require_writable(out, LEAST_FREE_BYTES)
     names = folders.selected(config)
     trained = list(dict.fromkeys(methods.METHODS[name].weights_of for name in names))
     with files.lock(out):
