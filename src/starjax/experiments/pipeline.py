@@ -5,7 +5,6 @@ import dataclasses
 import functools
 import json
 import signal
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -185,22 +184,14 @@ def _timings(out: Path, name: str) -> dict[str, float]:
 
 def _report(out: Path, names: Sequence[str]) -> None:
     """The report of every method in the folder, and the outcome of this run's."""
+    from starjax.experiments.report import build
+
     scored = [out / name for name in methods.METHODS if (out / name / "result.json").exists()]
     words.stage("report", f"of {', '.join(path.name for path in scored)}, into {out / 'report'}")
     with clock.timed(out, "report"):
-        page = draw(scored, out / "report")
+        page = build.build(scored, out / "report", report=words.indented)
     results = [json.loads((out / name / "result.json").read_text()) for name in names]
     print(f"\n{words.outcome(results)}\n\nreport: {page}", flush=True)
-
-
-def draw(runs: Sequence[Path], out: Path, with_video: bool = True) -> Path:
-    """Builds a report and returns its page."""
-    from starjax.experiments.report import build
-
-    with warnings.catch_warnings():
-        # The video's encoder is a child process; it is started, not forked into more of jax.
-        warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
-        return build.build(runs, out, with_video=with_video, report=words.indented)
 
 
 def _devices() -> Any:

@@ -32,9 +32,9 @@ def main(argv: Sequence[str]) -> int:
     xla.prepare_xla()
     files.require_writable(out)
 
-    from starjax.experiments import pipeline
+    from starjax.experiments.report import build
 
-    print(f"report: {pipeline.draw(runs, out, with_video=chosen.video)}")
+    print(f"report: {build.build(runs, out, with_video=chosen.video)}")
     return 0
 
 
