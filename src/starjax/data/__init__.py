@@ -1,0 +1,1 @@
+"""Demonstrations: on disk, as windows for training, normalised and augmented."""
