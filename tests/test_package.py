@@ -67,6 +67,11 @@ def test_help_is_quick_and_imports_nothing_heavy(command):
     assert busy - before.children_user - before.children_system < 1.0
 
 
+def test_every_folder_of_the_package_is_one():
+    folders = {path.parent for path in PYTHON}
+    assert all((folder / "__init__.py").exists() for folder in folders)
+
+
 def test_import_of_the_package_is_light():
     assert python("-X", "importtime", "-c", "import starjax").stderr.count("jax.") <= 1
 
