@@ -1,4 +1,4 @@
-"""The environment: reset, step(Command), observe, as single-sample pure functions; vmap at the caller.
+"""The environment: reset, step(Command), observe, as single-sample pure functions.
 
 It takes poses and knows no method. What varies per episode is in `EnvParams` and the key, so a
 batch of trocars is one vmapped axis.
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import collision, ik, model, physics, render
+from starjax.sim import collision, ik, model, physics, render, tracking
 from starjax.sim.tasks import peg_transfer
 from starjax.sim.types import Observation
 from starjax.types import Command, Pose
@@ -22,11 +22,8 @@ from starjax.types import Command, Pose
 CONTROL_HZ = 30.0
 RESET_IK_ITERATIONS = 40
 STEP_IK_ITERATIONS = 4
-# A command further away than these allow in one period is approached at these speeds: the joints'
-# are the FR5's (data sheet, the slower ones), the tool's keep a leap from unsettling the IK.
-MAX_JOINT_SPEED = 3.15  # rad/s
-MAX_TIP_SPEED = 0.2  # m/s
-MAX_TIP_SPIN = 4.0  # rad/s
+# FR5 data sheet, the slower joints (rad/s).
+MAX_JOINT_SPEED = 3.15
 
 
 @flax.struct.dataclass
@@ -43,7 +40,7 @@ class EnvState:
     Attributes:
       sim: joint positions, velocities, warm start.
       q_target: `[6]` rad, joint target of the last command; q_velocity: `[6]` rad/s, the target's;
-        gripper_target: [-1, 1].
+        velocity: `[4]` of the reference pose, see `tracking`; gripper_target: [-1, 1].
       trocar, source, target: the episode's port and its pegs (int32).
       target_peg: `[2]` m, the target's axis. p_world_ref: `[3]` m, the nominal port.
       step: int32, control steps taken. settled: consecutive steps that look like success.
@@ -52,7 +49,7 @@ class EnvState:
       invalid: the simulation diverged; the last sound state is kept.
       collided: arm, shaft or jaws were where they have no modelled contact.
       rcm_error: m, executed: distance of the port from the measured tool axis.
-      ik_error: m, how far the joint target is from the command, rotations weighed; inf if unusable.
+      ik_error: m, residual of the IK, rotations weighed; inf after a command that is not finite.
       jaw_contact: the jaws touch the block.
       pose, block_pose: measured tip and block in the world. gripper: measured opening, [-1, 1].
     """
@@ -60,6 +57,7 @@ class EnvState:
     sim: physics.PhysicsState
     q_target: jax.Array
     q_velocity: jax.Array
+    velocity: jax.Array
     gripper_target: jax.Array
     trocar: rcm.Trocar
     source: jax.Array
@@ -121,8 +119,6 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
     sim = model.load()
     draw = render.make(sim.mj_model, "camera", image_size, image_size, shadow=shadow)
     pegs = jnp.asarray(sim.pegs)
-    # Per period, so that the servos' torque is enough to follow.
-    max_change = jnp.asarray(physics.max_speed_change(sim, 1.0 / CONTROL_HZ) / CONTROL_HZ)
 
     def reset(key: jax.Array, params: EnvParams) -> EnvState:
         layout = peg_transfer.sample_layout(key, pegs)
@@ -134,6 +130,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             sim=physics.initial(sim, q, layout.block),
             q_target=q,
             q_velocity=jnp.zeros_like(q),
+            velocity=jnp.zeros(4),
             gripper_target=jnp.ones(()),
             trocar=params.trocar,
             source=layout.source,
@@ -157,15 +154,16 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         return _measure(state)
 
     def step(state: EnvState, command: Command) -> EnvState:
-        target = _within_reach(ik.forward(sim.arm, state.q_target)[0], command.pose)
+        present, _, _ = ik.forward(sim.arm, state.q_target)
+        port = rcm.trocar_position(state.trocar, sim.p_world_ref)
+        target, velocity = tracking.toward(
+            present, state.velocity, command.pose, port, 1.0 / CONTROL_HZ
+        )
         q, _ = ik.solve(sim.arm, target, state.q_target, STEP_IK_ITERATIONS)
         usable = _is_finite(command) & jnp.all(jnp.isfinite(q))
         dq = jnp.where(usable, q - state.q_target, 0.0)
-        dq = dq * jnp.minimum(
-            1.0, MAX_JOINT_SPEED / CONTROL_HZ / jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9)
-        )
-        coast = state.q_velocity / CONTROL_HZ
-        dq = coast + jnp.clip(dq - coast, -max_change, max_change)
+        fastest = jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9)
+        dq = dq * jnp.minimum(1.0, MAX_JOINT_SPEED / CONTROL_HZ / fastest)
         gripper = jnp.where(usable, jnp.clip(command.gripper, -1.0, 1.0), state.gripper_target)
         after, jaw_contact = physics.advance(
             sim, state.sim, state.q_target, dq, state.q_velocity, gripper, 1.0 / CONTROL_HZ
@@ -174,6 +172,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             sim=after,
             q_target=state.q_target + dq,
             q_velocity=CONTROL_HZ * dq,
+            velocity=jnp.where(usable, velocity, 0.0),
             gripper_target=gripper,
             step=state.step + 1,
             ik_error=jnp.where(
@@ -239,19 +238,6 @@ def _precisely(f: Callable) -> Callable:
             return f(*args)
 
     return wrapped
-
-
-def _within_reach(present: Pose, wanted: Pose) -> Pose:
-    """The pose on the way from `present` to `wanted` that one control period allows."""
-    shift = wanted.p - present.p
-    turn = ik.rotation_between(present.R, wanted.R)
-    times = jnp.maximum(
-        jnp.linalg.norm(shift) * (CONTROL_HZ / MAX_TIP_SPEED),
-        jnp.linalg.norm(turn) * (CONTROL_HZ / MAX_TIP_SPIN),
-    )
-    share = 1.0 / jnp.maximum(times, 1.0)
-    part = Pose(ik.rotation_of(share * turn) @ present.R, present.p + share * shift)
-    return jax.tree.map(lambda a, b: jnp.where(times > 1.0, a, b), part, wanted)
 
 
 def _is_finite(command: Command) -> jax.Array:

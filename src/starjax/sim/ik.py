@@ -53,15 +53,14 @@ def chain_of(m: mujoco.MjModel, first: str, site: str) -> Chain:
         bodies.append(int(m.body_parentid[bodies[-1]]))
     bodies = bodies[::-1]
     root = int(m.body_parentid[bodies[0]])
-    f32 = lambda x: np.asarray(x, np.float32)
     return Chain(
-        p_base=f32(data.xpos[root]),
-        R_base=f32(data.xmat[root].reshape(3, 3)),
-        offsets=f32(m.body_pos[bodies]),
-        rotations=f32([_matrix(m.body_quat[b]) for b in bodies]),
-        p_tip=f32(p_tip),
-        R_tip=f32(R_tip),
-        limits=f32([m.jnt_range[m.body_jntadr[b]] for b in bodies]),
+        p_base=_float32(data.xpos[root]),
+        R_base=_float32(data.xmat[root].reshape(3, 3)),
+        offsets=_float32(m.body_pos[bodies]),
+        rotations=_float32([_matrix(m.body_quat[b]) for b in bodies]),
+        p_tip=_float32(p_tip),
+        R_tip=_float32(R_tip),
+        limits=_float32([m.jnt_range[m.body_jntadr[b]] for b in bodies]),
     )
 
 
@@ -109,7 +108,7 @@ def solve(chain: Chain, target: Pose, q: jax.Array, iterations: int) -> tuple[ja
     return q, residual(chain, target, q)
 
 
-def rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
+def _rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
     """Rotation vector `[3]` rad, in the world, that takes `R` to `R_target`; exact below pi."""
     E = R_target @ R.T
     v = 0.5 * jnp.stack([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
@@ -120,19 +119,6 @@ def rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
     return v * jnp.where(is_small, 1.0, angle / sine)
 
 
-def rotation_of(vector: jax.Array) -> jax.Array:
-    """`[3, 3]` rotation by a rotation vector `[3]` rad."""
-    angle_sq = jnp.sum(vector * vector)
-    is_small = angle_sq < 1e-12
-    angle = jnp.sqrt(jnp.where(is_small, 1.0, angle_sq))
-    a = jnp.where(is_small, 1.0, jnp.sin(angle) / angle)
-    b = jnp.where(is_small, 0.5, (1.0 - jnp.cos(angle)) / angle**2)
-    x, y, z = vector
-    zero = jnp.zeros(())
-    K = jnp.stack([jnp.stack(row) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])])
-    return jnp.eye(3) + a * K + b * K @ K
-
-
 def residual(chain: Chain, target: Pose, q: jax.Array) -> jax.Array:
     """Distance (m) of configuration `q` from `target`, rotation weighed by `ROTATION_WEIGHT`."""
     pose, _, _ = forward(chain, q)
@@ -141,8 +127,12 @@ def residual(chain: Chain, target: Pose, q: jax.Array) -> jax.Array:
 
 def _error(pose: Pose, target: Pose) -> jax.Array:
     """`[6]` m: what is missing from `pose` to `target`, rotation weighed."""
-    turn = rotation_between(pose.R, target.R)
+    turn = _rotation_between(pose.R, target.R)
     return jnp.concatenate([target.p - pose.p, ROTATION_WEIGHT * turn])
+
+
+def _float32(x: object) -> np.ndarray:
+    return np.asarray(x, np.float32)
 
 
 def _matrix(wxyz: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-
 from starjax.sim import assets, ik
 from starjax.sim.engine import mjx
 

@@ -3,7 +3,6 @@
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from starjax.sim.engine import mjx
 from starjax.sim.model import SimModel
@@ -14,8 +13,6 @@ JAW_CLOSED = -0.001
 JAW_OPEN = 0.0032
 # Natural frequency of the critically damped joint servos (rad/s), as in fr5.xml.
 SERVO_FREQUENCY = 100.0
-# Share of the joints' torque that a change of speed may take.
-TORQUE_SHARE = 0.8
 # Beyond these the solver has diverged.
 MAX_ARM_SPEED = 20.0  # rad/s
 MAX_BLOCK_SPEED = 5.0  # m/s
@@ -94,18 +91,6 @@ def advance(
         return state, _jaw_contact(sim, data)
 
     return jax.lax.fori_loop(0, substeps, substep, (state, jnp.zeros((), bool)))
-
-
-def max_speed_change(sim: SimModel, period: float) -> np.ndarray:
-    """`[6]` rad/s by which the joints' targets may change speed in one period.
-
-    The cubic of `advance` asks for four times the mean acceleration at its start; the inertia is
-    the one that the servos' gains are made for, gain / frequency^2.
-    """
-    gain = sim.mj_model.actuator_gainprm[:6, 0]
-    torque = sim.mj_model.actuator_forcerange[:6, 1]
-    acceleration = torque / (gain / SERVO_FREQUENCY**2)
-    return (TORQUE_SHARE * acceleration * period / 4.0).astype(np.float32)
 
 
 def is_sound(sim: SimModel, state: PhysicsState) -> jax.Array:

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from starjax import rcm
 from starjax.sim import env
 from starjax.sim.tasks import peg_transfer as task
-from starjax.types import Command, Pose
+from starjax.types import Command
 
 RAISE, APPROACH, DESCEND, CLOSE, LIFT, CARRY, LOWER, OPEN, RETREAT, WAIT = range(10)
 
 # Least duration (s) and mean speed (m/s) of each phase, and jaws: +1 open, -1 closed at its end.
 DURATION = (0.5, 1.2, 0.9, 0.4, 0.6, 0.9, 0.7, 0.4, 0.5, 1.0)
-SPEED = (0.06, 0.05, 0.024, 1.0, 0.035, 0.04, 0.024, 1.0, 0.06, 1.0)
+SPEED = (0.04, 0.04, 0.024, 1.0, 0.035, 0.038, 0.024, 1.0, 0.04, 1.0)
 JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
 # How much of the disturbance acts in each phase.
 DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.6, 0.3, 0.0, 0.3, 0.0)
