@@ -1,0 +1,78 @@
+"""The low-level controller between two commands: bounded speed and acceleration, about the port.
+
+A command far from where the tool is (a policy's next plan rarely begins where the last one ended)
+is approached, not leapt at. On the way the tool's axis keeps to the port as well as both ends do: a
+command on the RCM manifold is reached along the manifold, one that misses the port by d misses it
+by a share of d.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from starjax import rcm
+from starjax.types import Pose
+
+# Of the tip (m/s, m/s^2) and of the roll about the tool's axis (rad/s, rad/s^2): what the FR5's
+# joints follow with the torque they have.
+MAX_SPEED = 0.2
+MAX_ACCELERATION = 2.7
+MAX_SPIN = 4.0
+MAX_SPIN_ACCELERATION = 54.0
+
+
+def toward(
+    present: Pose, velocity: jax.Array, wanted: Pose, port: jax.Array, period: float
+) -> tuple[Pose, jax.Array]:
+    """The pose to be at after `period` s, single-sample.
+
+    Args:
+      present: reference pose of the tip now.
+      velocity: `[4]`, of the reference: tip (3) m/s, roll rad/s.
+      wanted: the commanded pose.
+      port: `[3]` m.
+
+    Returns:
+      the next reference pose, equal to `wanted` if that is near enough; its velocity `[4]`.
+    """
+    speed = MAX_SPEED * period
+    step = _step(wanted.p - present.p, velocity[:3] * period, speed, MAX_ACCELERATION * period**2)
+    p = present.p + step
+    length = jnp.sum((wanted.p - present.p) ** 2)
+    share = jnp.sum(step * (wanted.p - present.p)) / jnp.where(length > 0, length, 1.0)
+    share = jnp.where(length > 0, jnp.clip(share, 0.0, 1.0), 1.0)
+
+    z_present, z_wanted = present.R[:, 2], wanted.R[:, 2]
+    through = (1.0 - share) * _nearest(present, port) + share * _nearest(wanted, port)
+    axis = p - through
+    z = axis / jnp.maximum(jnp.linalg.norm(axis), 1e-6)
+    carried = rcm.rotation_align(z_present, z_wanted) @ present.R
+    twist = jnp.arctan2(carried[:, 1] @ wanted.R[:, 0], carried[:, 0] @ wanted.R[:, 0])
+    spin = _step(
+        twist[None], velocity[3:] * period, MAX_SPIN * period, MAX_SPIN_ACCELERATION * period**2
+    )
+    R = rcm.rotation_align(z_present, z) @ present.R @ rcm.rotation_z(spin[0])
+
+    is_there = jnp.all(step == wanted.p - present.p) & (spin[0] == twist)
+    pose = jax.tree.map(lambda a, b: jnp.where(is_there, a, b), wanted, Pose(R, p))
+    return pose, jnp.concatenate([step, spin]) / period
+
+
+def _step(way: jax.Array, last: jax.Array, most: float, change: float) -> jax.Array:
+    """Displacement in one period towards `way`, given the `last` one.
+
+    No longer than `most`, no more than `change` from the last, and short enough to stop in time.
+    """
+    square = jnp.sum(way**2)
+    length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    can_stop = 0.5 * (jnp.sqrt(change**2 + 8.0 * change * length) - change)
+    target = way * jnp.minimum(1.0, jnp.minimum(most, can_stop) / length)
+    bend = target - last
+    square = jnp.sum(bend**2)
+    size = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    return jnp.where(size <= change, target, last + bend * (change / size))
+
+
+def _nearest(pose: Pose, port: jax.Array) -> jax.Array:
+    """The point `[3]` of the tool's axis nearest to the port."""
+    z = pose.R[:, 2]
+    return pose.p + ((port - pose.p) @ z) * z
