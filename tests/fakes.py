@@ -18,12 +18,12 @@ TINY = config.PolicyConfig(
     encoder="small",
     vision_dim=16,
     state_dim=16,
-    unet_channels=(16, 32),
+    unet_channels=(16,),
     time_dim=16,
     groups=4,
     roll_width=16,
     roll_blocks=1,
-    ddim_steps=3,
+    ddim_steps=2,
 )
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -34,7 +35,13 @@ def assert_same_bytes(a, b):
 def whole(tmp_path_factory):
     """One uninterrupted run: its directory and result."""
     directory = tmp_path_factory.mktemp("whole")
-    return directory, jobs.train(directory)
+    traces = []
+    with pytest.MonkeyPatch.context() as patch:
+        traced = step.resident_steps
+        patch.setattr(step, "resident_steps", lambda *a: traces.append(0) or traced(*a))
+        result = jobs.train(directory)
+    assert len(traces) == 1
+    return directory, result
 
 
 def test_a_run_leaves_its_log_and_checkpoints(whole):
@@ -42,23 +49,23 @@ def test_a_run_leaves_its_log_and_checkpoints(whole):
     lines = metrics.read(directory / "metrics.jsonl")
     train = [line["step"] for line in lines if line["kind"] == "train"]
     held = [line for line in lines if line["kind"] == "holdout"]
-    assert train == list(range(3, 25, 3))
-    assert [line["step"] for line in held] == list(range(4, 25, 4))
+    assert train == list(range(3, 13, 3))
+    assert [line["step"] for line in held] == list(range(4, 13, 4))
     assert {"position_error_mm", "roll_error_deg", "gripper_error"} <= held[0].keys()
     assert result.holdout == {k: v for k, v in held[-1].items() if k not in ("step", "kind")}
     first = next(line for line in lines if line["kind"] == "train")
     assert {"loss", "gradient_norm", "learning_rate", "skipped", "roll_loss"} <= first.keys()
-    assert checkpoint.steps(directory / "checkpoints") == [20, 24]
-    assert int(result.state.step) == 24 and result.skipped == 0
+    assert checkpoint.steps(directory / "checkpoints") == [8, 12]
+    assert int(result.state.step) == 12 and result.skipped == 0
 
 
 def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
     directory, result = whole
     asked = iter(range(100))
     with pytest.raises(loop.Interrupted, match=r"stopped at step .*same command goes on"):
-        jobs.train(tmp_path, should_stop=lambda: next(asked) == 3)
+        jobs.train(tmp_path, should_stop=lambda: next(asked) == 2)
     stopped = checkpoint.steps(tmp_path / "checkpoints")[-1]
-    assert 0 < stopped < 24 and stopped % 4  # not where it would have saved anyway
+    assert 0 < stopped < 12 and stopped % 4  # not where it would have saved anyway
     again = jobs.train(tmp_path)
     assert_same_bytes(again.state, result.state)
     assert again.holdout == result.holdout
@@ -76,12 +83,12 @@ def test_a_finished_run_is_only_loaded(whole):
 
 
 def test_damaged_checkpoint_costs_only_its_steps(whole, tmp_path):
-    _, result = whole
-    jobs.train(tmp_path)
-    newest = checkpoint.path_of(tmp_path / "checkpoints", 24)
+    directory, result = whole
+    shutil.copytree(directory, tmp_path, dirs_exist_ok=True)
+    newest = checkpoint.path_of(tmp_path / "checkpoints", 12)
     victim = max((f for f in newest.rglob("*") if f.is_file()), key=lambda f: f.stat().st_size)
     victim.write_bytes(victim.read_bytes()[:-7])
-    with pytest.warns(UserWarning, match="step 24 is damaged"):
+    with pytest.warns(UserWarning, match="step 12 is damaged"):
         again = jobs.train(tmp_path)
     assert_same_bytes(again.state, result.state)
 
@@ -113,7 +120,7 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
     for name in ("policy.safetensors", "metrics.jsonl"):
         assert found.killed[name] == found.whole[name]
     last = {name.split("/")[1] for name in found.killed if name.startswith("checkpoints/step")}
-    assert last == {"step_00000020", "step_00000024"}
+    assert last == {"step_00000008", "step_00000012"}
 
 
 @pytest.mark.parametrize("count", [2, 8])

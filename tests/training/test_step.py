@@ -13,7 +13,7 @@ from starjax.policies.policy import Policy
 from starjax.training import devices, state, step
 
 SETTINGS = config.TrainConfig(
-    steps=50, batch_size=8, learning_rate=0.1, warmup_steps=0, weight_decay=0.0
+    steps=300, batch_size=8, learning_rate=0.1, warmup_steps=0, weight_decay=0.0
 )
 
 
@@ -42,7 +42,8 @@ def start(dataset):
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
     batch = windows.gather(dataset, jnp.zeros(1, jnp.int32), 2, 16)
     stats = normalizer.Normalizer(box, None)
-    return policy, optimizer, state.create(policy, optimizer, stats, batch, seed=0)
+    first = state.create(policy, optimizer, stats, batch, seed=0)
+    return policy, optimizer, devices.replicate(first, devices.make_mesh(SETTINGS.batch_size))
 
 
 def program(policy, optimizer):
@@ -81,7 +82,7 @@ def test_steps_do_not_depend_on_how_they_are_called(start, dataset):
 def test_it_learns_the_given_frames_only(start, dataset):
     policy, optimizer, first = start
     run = jax.jit(program(policy, optimizer))
-    last = run(first, dataset, jnp.arange(20, 40), jnp.int32(50))
+    last = run(first, dataset, jnp.arange(20, 40), jnp.int32(300))
     wanted = np.asarray(dataset.command.pose.p[20:40]).mean(0)
     np.testing.assert_allclose(last.params["w"], wanted, atol=0.05)
 

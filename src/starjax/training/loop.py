@@ -194,7 +194,9 @@ def _log(log, step, state, train_config) -> tuple[states.TrainState, str]:
     values["skipped"] = skipped
     metrics.append(log, step, "train", values)
     note = f"loss {values['loss']:.4f}" + (f", {skipped} steps skipped" if skipped else "")
-    return state.replace(sums=jax.tree.map(jnp.zeros_like, state.sums)), note
+    # placed as they were: another placement would be another program
+    fresh = jax.tree.map(lambda x: jax.device_put(jnp.zeros_like(x), x.sharding), state.sums)
+    return state.replace(sums=fresh), note
 
 
 def _save(directory, state, train_config) -> None:
