@@ -64,6 +64,14 @@ def test_flags_override_the_preset_and_nothing_else():
     assert changed == expected
 
 
+def test_other_observations_and_seeds_have_folders_of_their_own():
+    assert settings("--preset", "cpu").out == "runs/cpu"
+    assert settings("--preset", "cpu", "--seed=3").out == "runs/cpu-seed3"
+    typed = ["--preset", "cpu", "--policy.observation", "image", "--seed", "3"]
+    assert settings(*typed).out == "runs/cpu-image-seed3"
+    assert settings(*typed, "--out", "runs/cpu").out == "runs/cpu"
+
+
 def test_auto_is_named_by_what_it_picked(monkeypatch):
     monkeypatch.setattr(presets, "has_gpu", lambda: False)
     assert settings().preset == settings("--preset", "auto").preset == "cpu"

@@ -21,9 +21,21 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
     config = options.parse(
         config_lib.RunConfig, argv, prog=prog, description=description, default=default
     )
-    config = dataclasses.replace(config, preset=default.preset)
+    out = config.out
+    if options.value_of("--out", argv) is None:
+        out = _folder(config, default)
+    config = dataclasses.replace(config, preset=default.preset, out=out)
     checks.check(config)
     return config
+
+
+def _folder(config: config_lib.RunConfig, default: config_lib.RunConfig) -> str:
+    """Folder of a run that names none: other observations and seeds do not meet in one."""
+    observation = config.policy.observation
+    parts = [default.out]
+    parts += [observation] if observation != default.policy.observation else []
+    parts += [f"seed{config.seed}"] if config.seed != default.seed else []
+    return "-".join(parts)
 
 
 def main(argv: Sequence[str]) -> int:
