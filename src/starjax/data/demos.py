@@ -119,7 +119,7 @@ def collect(
         files.require_writable(
             root, max(total - done, 0) * min(max_steps, FRAME_GUESS) * frame_bytes
         )
-        chunk = chunk or _chunk(total, frame_bytes, devices)
+        chunk = chunk or _chunk(frame_bytes, devices)
         chunk = -(-chunk // len(devices or [0])) * len(devices or [0])
         simulate = recorder.simulator(env, expert, trocars, seed, max_steps, chunk, devices)
         shown = progress.track("Demonstrations", total, unit="episodes", done=done)
@@ -185,11 +185,14 @@ def _wave(
     return wave
 
 
-def _chunk(total: int, frame_bytes: int, devices: Sequence[jax.Device] | None) -> int:
-    """Episodes at once: 16 fill a CPU, a GPU takes hundreds; pictures of all must fit the host."""
+def _chunk(frame_bytes: int, devices: Sequence[jax.Device] | None) -> int:
+    """Episodes at once: 16 fill a CPU, a GPU takes hundreds; pictures of all must fit the host.
+
+    A function of the machine alone, as the size of a batch may change last bits.
+    """
     fast = 16 if jax.default_backend() == "cpu" else 256 * len(devices or [0])
     fits = int(0.25 * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
-    return max(1, min(fast, fits, total))
+    return max(1, min(fast, fits))
 
 
 def _scene_hash(model: Any) -> str:

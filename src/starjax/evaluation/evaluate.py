@@ -19,9 +19,6 @@ from starjax.evaluation import recorded, rollout, table
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files, progress
 
-# Trials at once: a CPU is busy with 32; a GPU takes hundreds, as far as memory goes.
-CPU_CHUNK, GPU_CHUNK, GPU_TRIAL_BYTES = 32, 1024, 32 << 20
-
 
 def evaluate(
     directory: Path,
@@ -57,8 +54,10 @@ def evaluate(
       obs_horizon: observations the policy sees.
       execute: commands executed before re-planning.
       time_limit_s: of a trial, simulated.
-      chunk: trials simulated at once; 0 for what suits the machine. Does not change the result.
-      lanes: trials in one call of the network; 0 for `rollout.POLICY_LANES`. May change last bits.
+      chunk: trials simulated at once, at most; 0 for what suits the machine. Does not change the
+        result.
+      lanes: size of the compiled batch on each device, 0 for `rollout.lanes_per_device`: it is what
+        decides memory, and may change last bits.
       video_trials: how many trials get their joint positions recorded, at least.
       devices: to split a chunk over. Does not change the result.
       identity: JSON values that tell this policy from others with the same weights.
@@ -78,8 +77,9 @@ def evaluate(
         obs_horizon=obs_horizon,
         execute=execute,
         max_steps=math.ceil(time_limit_s * env.control_hz - 1e-6),
-        lanes=lanes or rollout.POLICY_LANES.get(jax.default_backend(), 128),
     )
+    lanes = lanes or rollout.lanes_per_device((devices or jax.devices())[0])
+    batch = lanes * len(devices or [0])
     count = len(trocars.radius)
     index, trial = (x.reshape(-1) for x in np.divmod(np.arange(count * trials), trials))
     chosen = recorded.choose(count, trials, video_trials)
@@ -89,11 +89,12 @@ def evaluate(
             "trials": trials,
             "trocars": np.stack(trocars, -1).astype(float).tolist(),
             **settings._asdict(),
+            "lanes": lanes,
             "recorded": int(chosen.sum()),
             "weights": fingerprint((params, normalizer)),
             "identity": dict(identity or {}),
         }
-        chunk = _resume(directory, plan, chunk, len(index), devices, report)
+        chunk = _resume(directory, plan, min(chunk or batch, batch), batch, report)
         run = rollout.make(env, policy, settings, seed, devices)
         tables, kept = [], []
         with progress.track("Evaluation", len(index), unit="trials") as advance:
@@ -102,7 +103,7 @@ def evaluate(
                 path = directory / f"chunk_{number:04d}.npz"
                 found = _read(path, report)
                 if found is None:
-                    here = _fill(trocars, index[rows], trial[rows], chunk)
+                    here = _fill(trocars, index[rows], trial[rows], batch)
                     told = _Told(advance, rows.stop - rows.start)
                     done = run(params, normalizer, here, told)
                     found = (
@@ -145,46 +146,34 @@ def _resume(
     directory: Path,
     plan: dict[str, Any],
     chunk: int,
-    total: int,
-    devices: Sequence[jax.Device] | None,
+    batch: int,
     report: Callable[[str], None],
 ) -> int:
-    """Keeps the chunks of an earlier run of the same plan, removes others; returns the chunk."""
+    """Keeps the chunks of an earlier run of the same plan, removes others; returns their size."""
     path = directory / "plan.json"
     found = json.loads(path.read_text()) if path.exists() else {}
     same = {k: v for k, v in found.items() if k != "chunk"} == json.loads(json.dumps(plan))
-    per = len(devices or [0])
-    if same and chunk in (0, found["chunk"]) and found["chunk"] % per == 0:
+    if same and found["chunk"] <= batch:
         return found["chunk"]
-    old = sorted(directory.glob("chunk_*.npz"))
+    old = len(list(directory.glob("chunk_*.npz")))
     if old:
-        report(f"{directory}: {len(old)} chunks of another evaluation are replaced")
-    for file in [path, directory / "recorded.npz", *old]:
+        report(f"{directory}: {old} chunks of another evaluation are replaced")
+    # The plan goes first: chunks without one belong to nothing.
+    for file in [path, directory / "recorded.npz", *directory.glob("chunk_*.npz")]:
         file.unlink(missing_ok=True)
-    even = chunk or -(-total // -(-total // _most(devices)))
-    chunk = -(-even // per) * per
     files.write_json(path, {**plan, "chunk": chunk})
     return chunk
 
 
-def _most(devices: Sequence[jax.Device] | None) -> int:
-    if jax.default_backend() == "cpu":
-        return CPU_CHUNK
-    chosen = list(devices or jax.devices()[:1])
-    stats = chosen[0].memory_stats() or {}
-    free = stats.get("bytes_limit", 8 << 30) - stats.get("bytes_in_use", 0)
-    return len(chosen) * max(1, min(GPU_CHUNK, int(0.5 * free) // GPU_TRIAL_BYTES))
-
-
-def _fill(trocars: Trocar, index: np.ndarray, trial: np.ndarray, chunk: int) -> rollout.Trials:
-    """A full chunk: the first trial repeats, unwanted, where there are too few."""
+def _fill(trocars: Trocar, index: np.ndarray, trial: np.ndarray, batch: int) -> rollout.Trials:
+    """A full batch: the first trial repeats, unwanted, where there are too few."""
     count = len(index)
-    rows = np.where(np.arange(chunk) < count, np.arange(chunk) % count, 0)
+    rows = np.where(np.arange(batch) < count, np.arange(batch) % count, 0)
     return rollout.Trials(
         trocar=Trocar(*(field[index[rows]] for field in trocars)),
         index=index[rows].astype(np.int32),
         trial=trial[rows].astype(np.int32),
-        wanted=np.arange(chunk) < count,
+        wanted=np.arange(batch) < count,
     )
 
 

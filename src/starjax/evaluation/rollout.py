@@ -2,10 +2,9 @@
 
 A trial is named by (trocar, trial). Its key is `fold_in(fold_in(key(seed), trocar), trial)`: one
 half resets the environment, the other is folded with the number of the re-plan for the policy's
-noise. So a trial does not know in which chunk, on which device or beside whom it runs. Only matrix
-products may: their last bit can depend on the number of rows. The policy therefore always runs on
-groups of a fixed number of trials (`POLICY_LANES`), and the result is the same to the bit for every
-chunk and number of devices of one platform.
+noise. So a trial does not know in which batch, on which device or beside whom it runs. Only the
+size of the compiled batch may change last bits (of matrix products, and of the simulator when it is
+small), so each device always runs `LANES` trials, some of them idle if there are fewer.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +21,9 @@ from starjax.sim import env as sim_env
 from starjax.types import Command
 
 SEGMENT = 25  # re-plans between two looks at the host
-POLICY_LANES = {"cpu": 8, "gpu": 128}  # trials in one call of the network
+# Trials at once on each device. A CPU is at its best with 16; a GPU takes hundreds in the time of
+# one, as far as its memory goes.
+CPU_LANES, GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 16, 512, 128, 40 << 30
 
 
 class Settings(NamedTuple):
@@ -32,13 +33,11 @@ class Settings(NamedTuple):
       obs_horizon: O, observations it sees; the first one repeats at the start.
       execute: commands executed before the next plan.
       max_steps: control steps after which a trial has failed.
-      lanes: trials in one call of the network.
     """
 
     obs_horizon: int
     execute: int
     max_steps: int
-    lanes: int
 
 
 class Trials(NamedTuple):
@@ -166,6 +165,14 @@ def make(
     return run
 
 
+def lanes_per_device(device: jax.Device) -> int:
+    """Trials that a device of this kind runs at once."""
+    if device.platform == "cpu":
+        return CPU_LANES
+    limit = (device.memory_stats() or {}).get("bytes_limit", 0)
+    return GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
+
+
 def _check(settings: Settings) -> None:
     if min(settings) < 1:
         raise ValueError(f"settings: expected 1 or more everywhere, got {settings}")
@@ -266,28 +273,13 @@ def _advancer(env: Any, policy: Any, settings: Settings) -> Callable[..., tuple[
 
             (carry, kept), seen = execute_and_observe(carry, count, record, kept)
             keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(carry.key, r)
-            command = in_groups(
-                lambda *batch: policy.sample(params, normalizer, *batch), settings.lanes
-            )(keys, seen, carry.env.trocar)
+            command = policy.sample(params, normalizer, keys, seen, carry.env.trocar)
             return r + 1, carry._replace(command=command), kept
 
         _, carry, kept = jax.lax.while_loop(is_running, body, (first, carry, kept))
         return carry, kept
 
     return advance
-
-
-def in_groups(fn: Callable[..., Any], lanes: int) -> Callable[..., Any]:
-    """`fn` over batches of any size, computed `lanes` rows at a time; the last group is padded."""
-
-    def grouped(*batch: Any) -> Any:
-        count = jax.tree.leaves(batch)[0].shape[0]
-        groups = -(-count // lanes)
-        rows = jnp.minimum(jnp.arange(groups * lanes), count - 1).reshape(groups, lanes)
-        out = jax.lax.map(lambda batch: fn(*batch), jax.tree.map(lambda x: x[rows], batch))
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], out)
-
-    return grouped
 
 
 def _steps(carry: Carry) -> Steps:
