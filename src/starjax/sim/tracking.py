@@ -15,9 +15,9 @@ from starjax.types import Pose
 # Of the tip (m/s, m/s^2) and of the roll about the tool's axis (rad/s, rad/s^2): what the FR5's
 # joints follow with the torque they have.
 MAX_SPEED = 0.2
-MAX_ACCELERATION = 2.7
+MAX_ACCELERATION = 1.8
 MAX_SPIN = 4.0
-MAX_SPIN_ACCELERATION = 54.0
+MAX_SPIN_ACCELERATION = 40.0
 
 
 def toward(
