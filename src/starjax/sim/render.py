@@ -79,12 +79,14 @@ def make(
         t, face, word = cast.cast(scene, grid, textures, shadow, geom_xpos, geom_xmat, geom_rgb)
         frame = Frame(rgb=_bytes(grid, word, samples))
         if depth:
-            frame = frame.replace(depth=tiles.picture(grid, tiles.pixels(t, samples)[..., -1]))
+            frame = frame.replace(
+                depth=tiles.picture(grid, tiles.pixels(grid, t, samples)[..., -1])
+            )
         if segmentation:
             ids = jnp.append(jnp.asarray(scene.ids[scene.row_of_face()]), -1)[face].astype(
                 jnp.int32
             )
-            one = tiles.pixels(ids, samples)[..., -1]
+            one = tiles.pixels(grid, ids, samples)[..., -1]
             frame = frame.replace(segmentation=tiles.picture(grid, one))
         return frame
 
@@ -94,7 +96,7 @@ def make(
 def _bytes(grid: tiles.Grid, word: jax.Array, samples: int) -> jax.Array:
     """The samples' mean colour as a picture, `[h, w, 3]` uint8."""
     if samples > 1:
-        parts = jax.lax.bitcast_convert_type(tiles.pixels(word, samples), jnp.uint8)
+        parts = jax.lax.bitcast_convert_type(tiles.pixels(grid, word, samples), jnp.uint8)
         mean = (parts.astype(jnp.float32).mean(-2) + 0.5).astype(jnp.uint8)
         word = jax.lax.bitcast_convert_type(mean, jnp.int32)
     return jax.lax.bitcast_convert_type(tiles.picture(grid, word), jnp.uint8)[..., :3]

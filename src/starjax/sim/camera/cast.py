@@ -23,8 +23,9 @@ def cast(
     shaded = jnp.zeros_like(face, bool)
     if shadow and scene.sun is not None:
         shaded = _shaded(scene, grid, scene.sun, c, R, t, face)
-    rgb = geom_rgb[scene.ids]
-    return t, face, shade.light(scene, grid, textures, rgb, c, R, t, face, shaded)
+    depth = jnp.where(face >= 0, t, 1.0)
+    p = [grid.x * depth, grid.y * depth, -depth]
+    return t, face, shade.light(scene, textures, geom_rgb[scene.ids], c, R, p, face, shaded)
 
 
 def _nearest(scene: scenes.Scene, grid: tiles.Grid, c: Array, R: Array) -> tuple[Array, Array]:
@@ -48,10 +49,14 @@ def _nearest(scene: scenes.Scene, grid: tiles.Grid, c: Array, R: Array) -> tuple
         def meet(key, row, features, x, y, kind=kind, first=first):
             t, part = shapes.view(kind, x, y, features)
             hit = pack(t, first + scenes.FACES[kind] * row + part)
-            return jnp.minimum(key, jnp.where(row >= 0, hit, key))
+            return jnp.where((row >= 0) & (hit < key), hit, key)
 
         table = shapes.features(kind, c[rows], R[rows], size[rows])
-        key = tiles.each(tiles.words(seen[:, rows]), table, meet, key, x, y)
+        if kind == scenes.PLANE:  # few and everywhere
+            for row, features in enumerate(table):
+                key = meet(key, row, list(features), x, y)
+        else:
+            key = tiles.each(seen[:, rows], table, meet, key, x, y)
     t = jax.lax.bitcast_convert_type(key & ~room, jnp.float32)
     return t, jnp.where(t < shapes.FAR, key & room, -1)
 
@@ -85,7 +90,7 @@ def _shaded(
             return shaded | (shapes.shadow(kind, points(t, x, y), features) & other)
 
         table = shapes.features(kind, c[rows], R[rows], size[rows])
-        shaded = tiles.each(tiles.words(hides[:, rows]), table, hide, shaded, face, t, x, y)
+        shaded = tiles.each(hides[:, rows], table, hide, shaded, face, t, x, y)
     return shaded
 
 

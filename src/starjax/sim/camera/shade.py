@@ -5,65 +5,74 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim.camera import scene as scenes
-from starjax.sim.camera import shapes, tiles
+from starjax.sim.camera import shapes
 
 Array = jax.Array
 
 
 def light(
-    scene: scenes.Scene, grid: tiles.Grid, textures: dict[int, np.ndarray], rgb: Array, c: Array,
-    R: Array, t: Array, face: Array, shaded: Array,
+    scene: scenes.Scene, textures: dict[int, np.ndarray], rgb: Array, c: Array, R: Array,
+    p: list[Array], face: Array, shaded: Array,
 ) -> Array:  # fmt: skip
     """Lit colour of every sample, `[T, Q]` int32 with red in the lowest byte.
-
-    Each tile paints the faces that it sees one after the other, so that nothing is looked up by
-    sample and the whole of the lighting is one pass over memory.
 
     Args:
       textures: by row, its texture as every sample sees it, `[3, T, Q]`.
       rgb: `[N, 3]` colour of every row.
       c, R: `[N, 3]` m and `[N, 3, 3]` geom poses in the camera frame.
-      t, face: `[T, Q]` depth in m and visible face, -1 for the background.
+      p: x, y, z of the visible points in the camera frame; `[T, Q]` m each.
+      face: `[T, Q]` visible face, -1 for the background.
       shaded: `[T, Q]` bool, in the sun's shadow.
     """
-    row = scene.row_of_face()
-    looks = np.stack([scene.specular, scene.exponent, scene.emission], 1).astype(np.float32)
-    table = jnp.concatenate([_normals(scene, c, R), rgb[row], jnp.asarray(looks[row])], -1)
+    row, at = scene.row_of_face(), jnp.maximum(face, 0)
+    field = _normals(scene, c, R)
+    normal = shapes.normal(p, [_pick(field[:, k], at) for k in range(7)])
+    specular, exponent, emission = [
+        _constant(v[row]) for v in (scene.specular, scene.exponent, scene.emission)
+    ]
+    lights = [source for source in (scene.headlight, scene.sun) if source is not None]
+    terms = [_reflect(source, p, normal, _pick(exponent, at)) for source in lights]
+    on = {r: _between(face, np.flatnonzero(row == r)) for r in textures}
+    # Where fusion would compute them for each of the three colours, the barrier shares them.
+    at, terms = jax.lax.optimization_barrier((at, terms))
 
-    def paint(word, mine, f, face, shaded, t, x, y, *texels):
-        p = [x * t, y * t, -t]
-        lit = _lit(scene, p, shapes.normal(p, f[:7]), shaded, f[7:10], f[10:])
-        for i, r in enumerate(textures):
-            on = (mine >= np.argmax(row == r)) & (mine < np.argmax(row == r) + np.sum(row == r))
-            lit = [jnp.where(on, v * texels[3 * i + k], v) for k, v in enumerate(lit)]
-        return jnp.where((face == mine) & (mine >= 0), _word(lit), word)
-
-    texels = [jnp.asarray(component) for texture in textures.values() for component in texture]
-    x, y = jnp.asarray(grid.x), jnp.asarray(grid.y)
-    background = jnp.broadcast_to(_word([jnp.float32(v) for v in scene.background]), t.shape)
-    words = tiles.present(face, len(row))
-    return tiles.each(words, table, paint, background, face, shaded, t, x, y, *texels)
-
-
-def _lit(
-    scene: scenes.Scene, p: list[Array], normal: list[Array], shaded: Array, colour: list[Array],
-    look: list[Array],
-) -> list[Array]:  # fmt: skip
-    """Red, green and blue in [0, 1]; each light is clipped at 1, as by GL's passes."""
-    specular, exponent, emission = look
-    lit = [emission * base for base in colour]
-    for source in (scene.headlight, scene.sun):
-        if source is None:
-            continue
-        diffuse, shine = _reflect(source, p, normal, exponent)
-        for k, base in enumerate(colour):
+    word = jnp.zeros_like(face)
+    for k in range(3):
+        base = _pick(rgb[row, k], at)
+        lit = _pick(emission, at) * base
+        for source, (diffuse, shine) in zip(lights, terms):
             part = base * (float(source.ambient[k]) + float(source.diffuse[k]) * diffuse)
             if shine is not None:
-                part += specular * float(source.specular[k]) * shine
+                part += _pick(specular, at) * float(source.specular[k]) * shine
             if source is scene.sun:
                 part = jnp.where(shaded, 0.0, part)
-            lit[k] = jnp.minimum(lit[k] + part, 1.0)
-    return lit
+            lit = jnp.minimum(lit + part, 1.0)  # light by light, as GL's passes clip
+        for r, texture in textures.items():
+            lit = jnp.where(on[r], lit * texture[k], lit)
+        lit = jnp.where(face < 0, float(scene.background[k]), lit)
+        word |= (lit * 255 + 0.5).astype(jnp.int32) << (8 * k)
+    return word
+
+
+def _normals(scene: scenes.Scene, c: Array, R: Array) -> Array:
+    """`shapes.normals` of all faces in their order, `[F, 7]`."""
+    size = jnp.asarray(scene.size, jnp.float32)
+    kinds = [(kind, scene.rows(kind)) for kind in range(4)]
+    return jnp.concatenate([shapes.normals(k, c[rows], R[rows], size[rows]) for k, rows in kinds])
+
+
+def _between(face: Array, faces: np.ndarray) -> Array:
+    return (face >= int(faces[0])) & (face <= int(faces[-1]))
+
+
+def _pick(column: Array, at: Array) -> Array:
+    """A value by face; a column with one value for all costs nothing."""
+    return column.at[at].get(mode="promise_in_bounds") if column.ndim else column
+
+
+def _constant(column: np.ndarray) -> Array:
+    same = np.all(column == column[0])
+    return jnp.asarray(column[0] if same else column, jnp.float32)
 
 
 def _reflect(
@@ -79,16 +88,3 @@ def _reflect(
     norm = jax.lax.rsqrt(jnp.maximum(sum(h * h for h in half), 1e-12))
     cosine = jnp.clip(sum(n * h for n, h in zip(normal, half)) * norm, 1e-6, 1.0)
     return diffuse, jnp.where(diffuse > 0, jnp.exp2(exponent * jnp.log2(cosine)), 0.0)
-
-
-def _normals(scene: scenes.Scene, c: Array, R: Array) -> Array:
-    """`shapes.normals` of all faces in their order, `[F, 7]`."""
-    size = jnp.asarray(scene.size, jnp.float32)
-    kinds = [(kind, scene.rows(kind)) for kind in range(4)]
-    return jnp.concatenate([shapes.normals(k, c[rows], R[rows], size[rows]) for k, rows in kinds])
-
-
-def _word(rgb: list[Array]) -> Array:
-    """Red, green and blue in [0, 1] as the bytes of an int32."""
-    red, green, blue = [(v * 255 + 0.5).astype(jnp.int32) for v in rgb]
-    return red | green << 8 | blue << 16
