@@ -76,7 +76,8 @@ def make(
                 f"geom_xpos, geom_xmat, geom_rgb: expected {[n, 3]}, {[n, 3, 3]}, {[n, 3]}, "
                 f"got {shape}"
             )
-        t, face, word = cast.cast(scene, grid, textures, shadow, geom_xpos, geom_xmat, geom_rgb)
+        inputs = [jnp.asarray(v, jnp.float32) for v in (geom_xpos, geom_xmat, geom_rgb)]
+        t, face, word = cast.cast(scene, grid, textures, shadow, *inputs)
         frame = Frame(rgb=_bytes(grid, word, samples))
         if depth:
             frame = frame.replace(

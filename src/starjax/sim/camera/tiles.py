@@ -166,7 +166,7 @@ def _rounds(
         words, carry = state
         lowest = 31 - jax.lax.clz(words & (~words + jnp.uint32(1))).astype(jnp.int32)
         row = jnp.min(jnp.where(words > 0, 32 * order + lowest, 32 * len(order)), -1)
-        words ^= jnp.where(order == row[:, None] // 32, _bit(row[:, None] % 32), 0)
+        words ^= jnp.where(order == row[:, None] >> 5, _bit(row[:, None] & 31), 0)
         columns = table.T[:, jnp.minimum(row, len(table) - 1)]
         row = jnp.where(row < len(table), row, -1)
         return words, visit(carry, row[:, None], list(columns[:, :, None]), *pixels)

@@ -1,0 +1,112 @@
+"""Camera pictures per second at three sizes, against MuJoCo's C renderer (software GL here).
+
+    python benchmarks/bench_render.py [--batch 16]
+
+Ours draw inside one program, as collection and evaluation do: a scan of steps over a batch of
+environments, shadows on. The C renderer draws the same poses one by one in a process of its own.
+"""
+
+import argparse
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+import _timing
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from starjax import runtime
+from starjax.sim import model, render
+
+GL_RENDERER = pathlib.Path(__file__).parents[1] / "tests/sim/gl_renderer.py"
+SIZES = (96, 128, 256)
+STEPS = 4
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--batch", type=int, default=16, help="environments drawn at once")
+    batch = parser.parse_args().batch
+    runtime.prepare_xla()
+    mj_model = model.compose()
+    qpos = states(mj_model, STEPS * batch)
+    geoms = poses(mj_model, qpos, batch)
+    print(f"{mj_model.ngeom} geoms, batch {batch}, pictures/s")
+    print("size  starjax  C renderer  ratio  compile s")
+    rows = {}
+    for size in SIZES:
+        time_ours = _timing.time_jitted(program(mj_model, size), *geoms)
+        rate = STEPS * batch / time_ours.median_s
+        peer = c_rate(mj_model, qpos[:16], size)
+        rows[str(size)] = {
+            "pictures_per_s": rate,
+            "best_pictures_per_s": STEPS * batch / time_ours.min_s,
+            "c_renderer_pictures_per_s": peer,
+            "ratio_to_c_renderer": rate / peer if peer else None,
+            "compile_s": time_ours.compile_s,
+        }
+        ratio = f"{rate / peer:6.1f}" if peer else "  none"
+        print(f"{size:4} {rate:8.0f} {peer or 0:11.0f} {ratio} {time_ours.compile_s:10.1f}")
+    path = _timing.write("render", {"batch": batch, "geoms": mj_model.ngeom, "results": rows})
+    print(f"wrote {path}")
+
+
+def states(mj_model: mujoco.MjModel, n: int) -> np.ndarray:
+    """`[n, nq]` configurations: the tool somewhere over the boards, the block on them."""
+    rng = np.random.default_rng(0)
+    qpos = np.tile(mj_model.qpos0, (n, 1))
+    for k, home in enumerate(model.HOME):
+        joint = mj_model.joint(f"robot/j{k + 1}").qposadr[0]
+        qpos[:, joint] = home + rng.normal(scale=0.05, size=n)
+    block = mj_model.joint("block").qposadr[0]
+    qpos[:, block : block + 2] = rng.uniform(-0.03, 0.03, (n, 2))
+    return qpos
+
+
+def poses(mj_model: mujoco.MjModel, qpos: np.ndarray, batch: int) -> tuple[jax.Array, jax.Array]:
+    """Poses of all geoms, `[STEPS, batch, G, 3]` and `[STEPS, batch, G, 3, 3]`."""
+    data, xpos, xmat = mujoco.MjData(mj_model), [], []
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(mj_model, data)
+        xpos.append(data.geom_xpos.copy())
+        xmat.append(data.geom_xmat.copy())
+    shape = (STEPS, batch, mj_model.ngeom)
+    return (
+        jnp.asarray(xpos, jnp.float32).reshape(*shape, 3),
+        jnp.asarray(xmat, jnp.float32).reshape(*shape, 3, 3),
+    )
+
+
+def program(mj_model: mujoco.MjModel, size: int):
+    """All steps of all environments, `[STEPS, batch, size, size, 3]` uint8."""
+    take = jax.vmap(render.make(mj_model, height=size, width=size), in_axes=(0, 0, None))
+    rgb = render.geom_rgb(mj_model)
+
+    def run(xpos, xmat):
+        return jax.lax.scan(lambda _, x: (None, take(*x, rgb).rgb), None, (xpos, xmat))[1]
+
+    return run
+
+
+def c_rate(mj_model: mujoco.MjModel, qpos: np.ndarray, size: int) -> float | None:
+    """Pictures per second of MuJoCo's own renderer; None where there is no GL."""
+    with tempfile.TemporaryDirectory() as folder:
+        files = [f"{folder}/{name}" for name in ("model.mjb", "qpos.npz", "out.npz")]
+        mujoco.mj_saveModel(mj_model, files[0], None)
+        np.savez(files[1], qpos=qpos)
+        command = [sys.executable, str(GL_RENDERER), *files, "camera", str(size), str(size)]
+        for backend in ("egl", "osmesa"):
+            environment = {**os.environ, "MUJOCO_GL": backend}
+            if subprocess.run(command, env=environment, capture_output=True).returncode == 0:
+                with np.load(files[2]) as out:
+                    return 1 / float(np.median(out["seconds"][1:]))
+    return None
+
+
+if __name__ == "__main__":
+    main()
