@@ -42,7 +42,7 @@ def start(dataset):
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
     batch = windows.gather(dataset, jnp.zeros(1, jnp.int32), 2, 16)
     stats = normalizer.Normalizer(box, None)
-    first = state.create(policy, optimizer, stats, batch, seed=0)
+    first = state.create(policy, optimizer, state.init_params(policy, 0), stats, batch, seed=0)
     return policy, optimizer, devices.replicate(first, devices.make_mesh(SETTINGS.batch_size))
 
 

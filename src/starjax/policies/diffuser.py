@@ -54,6 +54,8 @@ def make(
         time_dim=policy_config.time_dim,
         dtype=dtype,
     )
+    # linen's `apply` may return changed variables too; ours never does
+    denoise: Callable[..., jax.Array] = unet.apply  # pyright: ignore[reportAssignmentType]
     noise_schedule = schedule.cosine(policy_config.diffusion_steps)
     shape = (policy_config.horizon, action_dim)
 
@@ -89,7 +91,7 @@ def make(
     ) -> jax.Array:
         cond = condition(params, inputs, extra)
         return diffusion.eps_loss(
-            lambda x, k: unet.apply(params["unet"], x, k, cond), noise_schedule, key, x0
+            lambda x, k: denoise(params["unet"], x, k, cond), noise_schedule, key, x0
         )
 
     def sample(
@@ -98,7 +100,7 @@ def make(
         cond = condition(params, inputs, extra)
         film = unet.apply(params["unet"], cond, method="condition")
         return diffusion.ddim_sample(
-            lambda x, film_k: unet.apply(params["unet"], x, film + film_k, method="denoise"),
+            lambda x, film_k: denoise(params["unet"], x, film + film_k, method="denoise"),
             diffusion.sample_noise(keys, shape),
             diffusion_steps=policy_config.diffusion_steps,
             steps=policy_config.ddim_steps,

@@ -1,5 +1,6 @@
 """STAR-Diff: diffusion for (position, gripper), blind to the trocar, and a network for the roll."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -42,6 +43,8 @@ def make(
         blocks=policy_config.roll_blocks,
         dtype=jnp.dtype(policy_config.dtype),
     )
+    # linen's `apply` may return changed variables too; ours never does
+    predict: Callable[..., jax.Array] = rolls.apply  # pyright: ignore[reportAssignmentType]
 
     def init(key: jax.Array) -> Params:
         key_model, key_roll = jax.random.split(key)
@@ -70,7 +73,7 @@ def make(
             params["diffuser"], key_diffusion, inputs, jnp.zeros((len(x0), 0)), x0
         )
         p, history = action[..., space.slices["p"]], measured[..., roll]
-        predicted = rolls.apply(
+        predicted = predict(
             params["roll"],
             p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
             features.trocar_features(batch.trocar, p_world_ref),
@@ -93,7 +96,7 @@ def make(
         )
         x0 = model.sample(params["diffuser"], keys, inputs, jnp.zeros((keys.shape[0], 0)))
         p, gripper = x0[..., :3], x0[..., 3:]
-        gamma = rolls.apply(
+        gamma = predict(
             params["roll"],
             p,
             features.trocar_features(trocar, p_world_ref),

@@ -7,6 +7,7 @@ import jax
 
 from starjax import config
 from starjax.data import normalizer, windows
+from starjax.models import pretrained
 from starjax.sim.types import Observation
 from starjax.types import Command
 
@@ -32,6 +33,15 @@ class Policy(NamedTuple):
         [Params, normalizer.Normalizer, jax.Array, Observation, Any],
         Command,
     ]
+
+
+def with_encoder(params: Params, path: str) -> Params:
+    """Parameters whose ResNet-18 trunk is filled from the user's weight file."""
+    if "diffuser" in params:
+        return {**params, "diffuser": with_encoder(params["diffuser"], path)}
+    vision = params["vision"]["params"]
+    filled = {**vision, "trunk": pretrained.load_resnet18(vision["trunk"], path)}
+    return {**params, "vision": {"params": filled}}
 
 
 def make(

@@ -52,7 +52,7 @@ def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> p
     writing = root / f"{_TEMPORARY}{step}"
     try:
         _require_space(root, _bytes(state))
-        ocp.save(writing / _STATE, state)
+        ocp.save(str(writing / _STATE), state)
         _write_manifest(writing, step, state)
     except Exception as error:
         shutil.rmtree(writing, ignore_errors=True)
@@ -94,7 +94,7 @@ def restore(directory: str | os.PathLike, like: Any) -> tuple[int, Any] | None:
             warnings.warn(f"checkpoint of step {step} is damaged: {damage}", stacklevel=2)
             continue
         _check_leaves(path, manifest["leaves"], _leaves(like))
-        return step, ocp.load(path / _STATE, jax.tree.map(_abstract, like))
+        return step, ocp.load(str(path / _STATE), jax.tree.map(_abstract, like))
     return None
 
 

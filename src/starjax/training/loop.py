@@ -104,8 +104,8 @@ def run(
                 if step > first:
                     _save(directory, state, train_config)
                 raise Interrupted(
-                    f"stopped at step {step} of {train_config.steps}, which is saved in "
-                    f"{directory}; the same command goes on from there"
+                    f"stopped after step {step} of {train_config.steps}; what is done is in "
+                    f"{directory}, the same command goes on from there"
                 )
             count = min(call, *(_until(step, n) for n in _stops(train_config)))
             count = min(count, train_config.steps - step)
@@ -141,17 +141,30 @@ def _restored_or_new(
         policy_config.obs_horizon,
         policy_config.horizon,
     )
+    example = jax.tree.map(jnp.asarray, example)
     stats = normalizer.fit(method, dataset, p_world_ref, frames)
-    state = states.create(policy, optimizer, stats, jax.tree.map(jnp.asarray, example), seed)
-    state = devices.replicate(state, mesh)
-    restored = checkpoint.restore(directory / "checkpoints", state)
-    return state if restored is None else restored[1]
+
+    def around(params):
+        return states.create(policy, optimizer, params, stats, example, seed)
+
+    placed = devices.replicated(mesh)
+    like = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
+        jax.eval_shape(lambda: around(policy.init(jax.random.key(seed)))),
+    )
+    restored = checkpoint.restore(directory / "checkpoints", like)
+    if restored is not None:
+        return restored[1]
+    params = states.init_params(policy, seed)
+    if policy_config.observation == "image" and policy_config.encoder_weights:
+        params = policies.with_encoder(params, policy_config.encoder_weights)
+    return devices.replicate(around(params), mesh)
 
 
 def _advance(policy, optimizer, policy_config, train_config, mesh, dataset, frames, state):
     """`(state, count) -> state`; the given state's memory is reused."""
     if windows.on_device(dataset):
-        resident = devices.replicate((dataset, jnp.asarray(frames)), mesh)
+        resident = jax.device_put((dataset, jnp.asarray(frames)), devices.replicated(mesh))
         run_steps = jax.jit(
             lambda state, dataset, frames, count: steps.resident_steps(
                 policy, optimizer, policy_config, train_config, mesh, state, dataset, frames, count
@@ -190,7 +203,7 @@ def _log(log, step, state, train_config) -> tuple[states.TrainState, str]:
             "--policy.dtype float32"
         )
     values = {name: value / taken for name, value in sums.items()}
-    values["learning_rate"] = float(states.learning_rate(train_config)(step - 1))
+    values["learning_rate"] = float(jnp.asarray(states.learning_rate(train_config)(step - 1)))
     values["skipped"] = skipped
     metrics.append(log, step, "train", values)
     note = f"loss {values['loss']:.4f}" + (f", {skipped} steps skipped" if skipped else "")

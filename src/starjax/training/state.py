@@ -9,7 +9,7 @@ import optax
 
 from starjax import config
 from starjax.data import normalizer, windows
-from starjax.policies.policy import Policy
+from starjax.policies.policy import Params, Policy
 
 
 @flax.struct.dataclass
@@ -55,9 +55,17 @@ def make_optimizer(train_config: config.TrainConfig) -> optax.GradientTransforma
     )
 
 
+def init_params(policy: Policy, seed: int) -> Params:
+    """The policy's parameters before the first step."""
+    # Runs once: to optimise the code of a hundred small random draws takes longer than they do.
+    options = {"xla_backend_optimization_level": 0}
+    return jax.jit(policy.init, compiler_options=options)(_keys(seed)[0])
+
+
 def create(
     policy: Policy,
     optimizer: optax.GradientTransformation,
+    params: Params,
     stats: normalizer.Normalizer,
     batch: windows.Batch,
     seed: int,
@@ -67,13 +75,13 @@ def create(
     Args:
       policy: to be trained.
       optimizer: from `make_optimizer`.
+      params: from `init_params`.
       stats: fitted to the training frames.
       batch: of any values; its shapes tell which metrics there will be.
       seed: of everything random.
     """
-    key_init, key_steps = jax.random.split(jax.random.key(seed))
-    params = _compiled_fast(policy.init)(key_init)
-    _, metrics = jax.eval_shape(policy.loss, params, stats, key_steps, batch)
+    _, key = _keys(seed)
+    _, metrics = jax.eval_shape(policy.loss, params, stats, key, batch)
     names = ["loss", "gradient_norm", "skipped", *metrics]
     return TrainState(
         step=jnp.int32(0),
@@ -81,7 +89,7 @@ def create(
         ema_params=jax.tree.map(jnp.copy, params),
         opt_state=optimizer.init(params),
         normalizer=stats,
-        key=key_steps,
+        key=key,
         skipped=jnp.int32(0),
         sums={name: jnp.float32(0.0) for name in names},
     )
@@ -92,6 +100,6 @@ def ema_decay(step: jax.Array, ema_max: float) -> jax.Array:
     return jnp.minimum(1.0 - (1.0 + step) ** -0.75, ema_max)
 
 
-def _compiled_fast(fn):
-    # runs once: optimising the code of a hundred small random draws would take longer than they do
-    return jax.jit(fn, compiler_options={"xla_backend_optimization_level": 0})
+def _keys(seed: int) -> jax.Array:
+    """Keys of the parameters and of the steps."""
+    return jax.random.split(jax.random.key(seed))
