@@ -12,10 +12,11 @@ import jax.numpy as jnp
 from starjax import rcm
 from starjax.types import Pose
 
-# Of the tip (m/s, m/s^2) and of the roll about the tool's axis (rad/s, rad/s^2): what the FR5's
-# joints follow with the torque they have.
+# Of the tip (m/s, m/s^2), of the axis about the port (rad/s^2) and of the roll about the axis
+# (rad/s, rad/s^2): what the FR5's joints follow with the torque they have.
 MAX_SPEED = 0.2
 MAX_ACCELERATION = 1.8
+MAX_TILT_ACCELERATION = 12.0
 MAX_SPIN = 4.0
 MAX_SPIN_ACCELERATION = 40.0
 
@@ -57,7 +58,7 @@ def toward(
     return pose, jnp.concatenate([step, spin]) / period
 
 
-def _step(way: jax.Array, last: jax.Array, most: float, change: float) -> jax.Array:
+def _step(way: jax.Array, last: jax.Array, most: float, change: jax.Array | float) -> jax.Array:
     """Displacement in one period towards `way`, given the `last` one.
 
     No longer than `most`, no more than `change` from the last, and short enough to stop in time.

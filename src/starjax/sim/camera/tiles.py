@@ -5,6 +5,7 @@ once until no word has any left: as many rounds as the fullest tile has geoms, a
 length could be too short. Bounds are conservative, so the picture is that of testing all geoms.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -60,7 +61,7 @@ def grid(scene: scenes.Scene, height: int, width: int) -> Grid:
 
 def picture(grid: Grid, tiled: Array) -> Array:
     """From `[T, n * n]`, n a divisor of the side, to `[h, w]`, the overhang cut off."""
-    rows, cols, n = len(grid.edges_y) - 1, len(grid.edges_x) - 1, int(tiled.shape[1] ** 0.5)
+    rows, cols, n = len(grid.edges_y) - 1, len(grid.edges_x) - 1, math.isqrt(tiled.shape[1])
     whole = tiled.reshape(rows, cols, n, n).swapaxes(1, 2).reshape(rows * n, cols * n)
     return whole[: grid.height * n // grid.side, : grid.width * n // grid.side]
 
