@@ -167,7 +167,7 @@ def test_shadow_agrees_with_mujoco_rays():
         hidden, _ = cast(mj_model, q, points, np.broadcast_to(to_light, points.shape))
         dark = frames.rgb[i].reshape(-1, 3)[seen].max(-1) == 0
         assert 0.05 < dark.mean() < 0.7, "too little shadow to compare"
-        assert np.mean(dark == (hidden >= 0)) >= 0.995
+        assert np.mean(dark == (hidden >= 0)) >= 0.998
 
 
 @pytest.fixture(scope="module")
@@ -256,9 +256,8 @@ def test_one_picture_is_the_same_alone_as_in_a_batch():
     mj_model = pile()
     qpos = poses(mj_model, 3)
     xpos, xmat = geoms(mj_model, qpos)
-    alone = jax.jit(render.make(mj_model, height=60, width=80))(
-        xpos[1], xmat[1], render.geom_rgb(mj_model)
-    )
+    take, rgb = render.make(mj_model, height=60, width=80), render.geom_rgb(mj_model)
+    alone = jax.jit(lambda xpos, xmat: take(xpos, xmat, rgb))(xpos[1], xmat[1])
     assert alone.depth is None and alone.segmentation is None and alone.rgb.dtype == np.uint8
     difference = np.abs(draw(mj_model, qpos).rgb[1].astype(int) - alone.rgb)
     assert np.mean(difference > 1) < 1e-3  # fused otherwise, an outline may fall otherwise
