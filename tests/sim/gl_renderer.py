@@ -14,6 +14,8 @@ def main(model: str, states: str, out: str, camera: str, height: int, width: int
     import numpy as np
 
     mj_model = mujoco.MjModel.from_binary_path(model)
+    # Round shapes closer to round: 28 slices a turn cut 0.6% off the radius.
+    mj_model.vis.quality.numslices, mj_model.vis.quality.numstacks = 128, 64
     data = mujoco.MjData(mj_model)
     renderer = mujoco.Renderer(mj_model, height, width)
     option = mujoco.MjvOption()

@@ -203,8 +203,7 @@ def test_agrees_with_the_gl_renderer(gl_pictures, compose, camera, height, width
     ours = draw(mj_model, qpos, camera=camera, height=height, width=width)
     same = ours.segmentation == theirs["segmentation"]
     both = same & (ours.segmentation >= 0)
-    # GL tessellates round shapes: its outlines lie a little inside ours.
-    assert same.mean() >= 0.999
+    assert same.mean((1, 2)).min() >= 0.999
     assert np.abs(ours.depth - theirs["depth"])[both].mean() <= 5e-5
     assert np.abs(ours.rgb.astype(float) - theirs["rgb"]).mean() <= 3.0
 

@@ -33,7 +33,7 @@ class SimModel(NamedTuple):
       p_world_ref: `[3]` m, the nominal port o_ref.
       arm_q, jaw, block: where the arm's, the jaws' and the block's coordinates start in qpos;
         `arm_dof`, `block_dof`: in qvel.
-      geom_rgb: `[G, 3]` colours; `peg_geoms`, `seat_geoms`: `[P]` geom ids; `pad_geoms`, `wall_geoms`.
+      geom_rgb: `[G, 3]` colours; peg_geoms, seat_geoms: `[P]` geom ids; pad_geoms, wall_geoms.
       pegs: `[P, 2]` m, the pegs' axes on the board.
     """
 

@@ -1,7 +1,8 @@
 """Scripted expert of peg transfer: a phase machine that looks at the block, in pure JAX.
 
-It grasps a wall, to the left or right of its middle, at random (which walls it prefers depends on
-the block's yaw, never on the trocar), at its own pace, is disturbed on purpose, and starts over when the block is not where it should be.
+It grasps a wall to the left or right of its middle, on the middle row either of two walls, at
+random (never by the trocar), at its own pace, is disturbed on purpose, and starts over when the
+block is not where it should be.
 The roll follows from tip positions and trocar alone: the tool turns only once the coming positions
 hold the grasp point, and the jaws' axis then stays on the wall's normal.
 """
@@ -55,8 +56,9 @@ class ExpertState:
       key: typed key, folded with the step for everything random.
       phase: int32. elapsed, duration: s. attempt: int32, grasps begun.
       start, goal: `[3]` m, label positions at the phase's ends.
-      wall: int32, the wall grasped; side: -1 or 1, on which side of its middle. normal: `[3]`, its direction, or the opposite: jaws are
-        symmetric, and this keeps the roll on one branch.
+      wall: int32, the wall grasped; side: -1 or 1, on which side of its middle.
+      normal: `[3]`, the wall's direction, or the opposite: jaws are symmetric, and this keeps the
+        roll on one branch.
       roll_from: rad, the roll that the next turn begins at. jaws_from: jaws at the phase's start.
       tempo: pace. noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
       label: the undisturbed command, which is what demonstrations record.

@@ -1,0 +1,48 @@
+"""One environment and one compiled step, shared by the tests of the simulation."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from starjax import rcm
+from starjax.sim import env as envs
+from starjax.sim import model
+from starjax.sim.tasks import expert
+
+LANES = 12  # one episode a trocar
+
+
+@pytest.fixture(scope="session")
+def sim() -> model.SimModel:
+    return model.load()
+
+
+@pytest.fixture(scope="session")
+def environment() -> envs.Env:
+    return envs.make("state")
+
+
+@pytest.fixture(scope="session")
+def reset(environment):
+    """`seed -> EnvState` of the twelve trocars."""
+    params = envs.EnvParams(rcm.Trocar(*(jnp.asarray(field) for field in rcm.TROCARS)))
+    compiled = jax.jit(jax.vmap(environment.reset))
+    return lambda seed: compiled(jax.random.split(jax.random.key(seed), LANES), params)
+
+
+@pytest.fixture(scope="session")
+def drive(environment):
+    """`(state, expert state) -> the same after one control step under the expert`."""
+
+    def one(state, script):
+        command, script = expert.act(script, state)
+        return environment.step(state, command), script
+
+    return jax.jit(jax.vmap(one))
+
+
+@pytest.fixture(scope="session")
+def begin():
+    """`(state, seed) -> expert state`."""
+    compiled = jax.jit(jax.vmap(expert.init))
+    return lambda state, seed: compiled(jax.random.split(jax.random.key(seed), LANES), state)

@@ -1,0 +1,145 @@
+"""The environment under the expert: success on every trocar, and trouble that stays where it is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import rcm
+from starjax.sim import env as envs
+from starjax.sim import physics
+from starjax.sim.tasks import expert, peg_transfer
+from starjax.types import Command
+
+STEPS = 330  # control steps: 11 s, longer than the expert takes
+
+
+@pytest.fixture(scope="module")
+def episodes(reset, begin, drive):
+    """Final states of twelve expert episodes; executed RCM errors and labels' rolls on the way."""
+    state = reset(7)
+    script = begin(state, 8)
+    errors, labels, running = [], [], []
+    for _ in range(STEPS):
+        running.append(np.asarray(~state.done))
+        state, script = drive(state, script)
+        errors.append(np.asarray(state.rcm_error))
+        labels.append(jax.tree.map(np.asarray, script.label))
+        if bool(state.done.all()):
+            break
+    rolls = [rcm.roll_of(jnp.asarray(label.pose.R)) for label in labels]
+    return state, np.array(errors), np.array(rolls), np.array(running), labels
+
+
+def test_the_expert_succeeds_on_every_trocar(episodes):
+    state, *_ = episodes
+    assert state.success.sum() >= 11, state.success
+    assert not state.invalid.any()
+    assert np.all(state.success <= state.loose), "strict success implies the looser test"
+    assert float(jnp.median(state.step)) / envs.CONTROL_HZ < 8.1  # s, real dVRK automation
+
+
+def test_executed_rcm_error_is_small(episodes):
+    _, errors, _, running, _ = episodes
+    live = errors[running]
+    assert live.max() > 0
+    assert np.quantile(live, 0.99) < 0.2e-3
+    assert live.max() < 2e-3
+
+
+def test_labels_are_on_the_manifold_and_their_roll_never_wraps(episodes):
+    state, _, rolls, running, labels = episodes
+    port = rcm.trocar_position(state.trocar, state.p_world_ref)
+    worst = max(float(rcm.rcm_error(label.pose, port).max()) for label in labels)
+    assert worst < 1e-6
+    assert np.abs(rolls[running]).max() < np.pi / 2
+    steps = np.abs(np.diff(rolls, axis=0))[running[1:]]
+    assert steps.max() < 0.2, "the roll stays on one branch"
+
+
+def test_a_released_block_is_threaded_and_at_rest(episodes, sim):
+    state, *_ = episodes
+    for lane in np.flatnonzero(state.success):
+        block = jax.tree.map(lambda leaf, i=lane: leaf[i], state.block_pose)
+        assert peg_transfer.is_threaded(block, state.target_peg[lane])
+    assert not state.jaw_contact[state.success].any()
+
+
+def test_a_diverged_lane_is_frozen_and_leaves_its_neighbours_alone(reset, begin, drive):
+    """Bit-identical neighbours, beside NaN, infinity and a body at 1e20 m/s."""
+    state = reset(3)
+    script = begin(state, 4)
+    broken = state.replace(
+        sim=state.sim.replace(
+            qpos=state.sim.qpos.at[2, 0].set(jnp.nan),
+            qvel=state.sim.qvel.at[5, 0].set(1e20).at[7, 9].set(jnp.inf),
+        )
+    )
+    for _ in range(3):
+        state, script_after = drive(state, script)
+        broken, _ = drive(broken, script)
+        script = script_after
+    sick = np.zeros(12, bool)
+    sick[[2, 5, 7]] = True
+    np.testing.assert_array_equal(broken.invalid, sick)
+    assert np.all(np.asarray(broken.done)[sick]) and not np.asarray(broken.success)[sick].any()
+    for name in ("qpos", "qvel"):
+        ours, theirs = (np.asarray(getattr(s.sim, name))[~sick] for s in (state, broken))
+        np.testing.assert_array_equal(ours, theirs)
+    assert int(broken.step[2]) == 0, "the last sound state is kept"
+
+
+def test_a_command_that_is_not_finite_holds_the_arm(environment, reset):
+    state = jax.tree.map(lambda leaf: leaf[0], reset(1))
+    held = Command(jax.tree.map(lambda x: x * jnp.nan, state.pose), jnp.ones(()))
+    after = jax.jit(environment.step)(state, held)
+    assert not after.invalid
+    np.testing.assert_array_equal(after.q_target, state.q_target)
+    assert np.isinf(after.ik_error)
+    assert float(jnp.linalg.norm(after.pose.p - state.pose.p)) < 1e-4
+
+
+def test_the_same_key_gives_the_same_episode_and_another_another(reset):
+    first, again, other = reset(11), reset(11), reset(12)
+    np.testing.assert_array_equal(first.sim.qpos, again.sim.qpos)
+    assert not np.array_equal(first.sim.qpos, other.sim.qpos)
+
+
+def test_observations_hold_what_they_say(environment, reset):
+    state = jax.tree.map(lambda leaf: leaf[4], reset(2))
+    seen = environment.observe(state)
+    assert seen.image is None and seen.state.shape == (12,)
+    np.testing.assert_allclose(seen.state[:3], state.block_pose.p)
+    np.testing.assert_allclose(rcm.rot6d_decode(seen.state[3:9]), state.block_pose.R, atol=1e-6)
+    np.testing.assert_allclose(seen.state[9:11], environment.model.pegs[int(state.target)])
+
+
+def test_the_target_peg_is_marked_in_the_picture(sim):
+    plain, marked = (np.asarray(physics.colours(sim, jnp.asarray(peg))) for peg in (6, 9))
+    changed = np.flatnonzero(np.any(plain != marked, axis=1))
+    assert set(changed) == {
+        sim.peg_geoms[6],
+        sim.peg_geoms[9],
+        sim.seat_geoms[6],
+        sim.seat_geoms[9],
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [(("pixels",), "policy_observation"), (("image", 8), "image_size")],
+)
+def test_unusable_settings_are_named(arguments, named):
+    with pytest.raises(ValueError, match=named):
+        envs.make(*arguments)
+
+
+def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
+    """What is multimodal never depends on the trocar, or positions would not be invariant."""
+    state = reset(5)
+    one = jax.tree.map(lambda leaf: jnp.stack([leaf[0]] * 12), state)
+    moved = one.replace(trocar=state.trocar)
+    begin = jax.jit(jax.vmap(expert.init, in_axes=(None, 0)))
+    script = begin(jax.random.key(0), moved)
+    assert len(np.unique(script.wall)) == 1 and len(np.unique(script.side)) == 1
+    assert float(jnp.ptp(script.goal, axis=0).max()) == 0.0

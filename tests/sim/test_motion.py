@@ -1,0 +1,90 @@
+"""Kinematics of the arm, and the controller between two commands."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from starjax import rcm
+from starjax.sim import ik, tracking
+from starjax.types import Pose
+
+PERIOD = 1 / 30
+
+
+def on_manifold(trocar, p, roll):
+    action = jnp.concatenate([jnp.atleast_1d(roll), p])
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, trocar, jnp.array([0.0, 0.0, 0.15]))
+    return pose
+
+
+def first_trocar():
+    return rcm.Trocar(*(jnp.asarray(field[0]) for field in rcm.TROCARS))
+
+
+def test_forward_kinematics_are_those_of_mujoco(sim):
+    rng = np.random.default_rng(1)
+    data = mujoco.MjData(sim.mj_model)
+    for _ in range(4):
+        q = sim.home + rng.normal(0, 0.4, 6)
+        data.qpos[sim.arm_q : sim.arm_q + 6] = q
+        mujoco.mj_kinematics(sim.mj_model, data)
+        pose, origins, _ = ik.forward(sim.arm, jnp.asarray(q, jnp.float32))
+        tcp = data.site("robot/tool/tcp")
+        np.testing.assert_allclose(pose.p, tcp.xpos, atol=1e-6)
+        np.testing.assert_allclose(pose.R, tcp.xmat.reshape(3, 3), atol=1e-6)
+        np.testing.assert_allclose(origins[5], data.body("robot/wrist3").xpos, atol=1e-6)
+
+
+def test_inverse_kinematics_reach_every_trocar_and_peg(sim):
+    trocars = rcm.Trocar(*(jnp.asarray(field) for field in rcm.TROCARS))
+    tips = jnp.array([[x, y, 0.008] for x, y in sim.pegs])
+
+    def reach(trocar, p, roll):
+        q, residual = ik.solve(sim.arm, on_manifold(trocar, p, roll), jnp.asarray(sim.home), 40)
+        low, high = sim.arm.limits[:, 0], sim.arm.limits[:, 1]
+        return residual, jnp.min(jnp.minimum(q - low, high - q))
+
+    grid = jax.vmap(jax.vmap(jax.vmap(reach, (None, None, 0)), (None, 0, None)), (0, None, None))
+    residual, margin = jax.jit(grid)(trocars, tips, jnp.array([-1.2, 0.0, 1.2]))
+    assert residual.max() < 1e-5
+    assert margin.min() > 0.1  # rad
+
+
+def test_a_near_command_is_reached_at_once():
+    trocar = first_trocar()
+    here = on_manifold(trocar, jnp.array([0.01, 0.0, 0.03]), 0.1)
+    there = on_manifold(trocar, jnp.array([0.0105, 0.0003, 0.0298]), 0.12)
+    port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
+    pose, _ = tracking.toward(here, jnp.zeros(4), there, port, PERIOD)
+    np.testing.assert_array_equal(pose.R, there.R)
+    np.testing.assert_array_equal(pose.p, there.p)
+
+
+def test_a_far_command_is_approached_along_the_manifold():
+    trocar = first_trocar()
+    port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
+    pose = on_manifold(trocar, jnp.array([-0.04, 0.02, 0.05]), -1.0)
+    goal = on_manifold(trocar, jnp.array([0.04, -0.03, 0.01]), 1.0)
+    velocity, toward = jnp.zeros(4), jax.jit(tracking.toward, static_argnums=4)
+    for _ in range(60):
+        before, last = pose, velocity
+        pose, velocity = toward(pose, velocity, goal, port, PERIOD)
+        assert float(rcm.rcm_error(pose, port)) < 1e-6
+        change = jnp.linalg.norm(velocity[:3] - last[:3]) / PERIOD
+        assert float(change) <= tracking.MAX_ACCELERATION * 1.001
+        assert float(jnp.linalg.norm(pose.p - before.p)) <= tracking.MAX_SPEED * PERIOD * 1.001
+    np.testing.assert_allclose(pose.p, goal.p, atol=1e-4)
+    np.testing.assert_allclose(pose.R, goal.R, atol=2e-2)
+
+
+def test_a_command_off_the_manifold_stays_off_it():
+    """The controller is no projection: what a naive method violates, it keeps violating."""
+    trocar = first_trocar()
+    port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
+    good = on_manifold(trocar, jnp.array([0.0, 0.0, 0.03]), 0.0)
+    bad = Pose(good.R, good.p + 0.02 * good.R[:, 0])
+    pose, velocity = bad, jnp.zeros(4)
+    for _ in range(5):
+        pose, velocity = tracking.toward(pose, velocity, bad, port, PERIOD)
+    np.testing.assert_allclose(rcm.rcm_error(pose, port), 0.02, atol=1e-5)
