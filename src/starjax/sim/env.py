@@ -225,8 +225,15 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             task_state = jnp.concatenate([block.p, rcm.rot6d_encode(block.R), goal])
         return Observation(pose=state.pose, gripper=state.gripper, image=image, state=task_state)
 
-    functions = [_precisely(f) for f in (reset, step, observe, camera)]
-    return Env(*functions, sim.p_world_ref, sim, CONTROL_HZ)
+    return Env(
+        reset=_precisely(reset),
+        step=_precisely(step),
+        observe=_precisely(observe),
+        camera=_precisely(camera),
+        p_world_ref=sim.p_world_ref,
+        model=sim,
+        control_hz=CONTROL_HZ,
+    )
 
 
 def _precisely(f: Callable) -> Callable:
