@@ -180,7 +180,7 @@ def gl_pictures(tmp_path_factory):
         np.savez(folder / "qpos.npz", qpos=qpos)
         script = pathlib.Path(__file__).with_name("gl_renderer.py")
         files = [str(folder / name) for name in ("model.mjb", "qpos.npz", "out.npz")]
-        command = [sys.executable, str(script), *files, camera, str(height), str(width)]
+        command = [sys.executable, str(script), *files, camera, str(height), str(width), "128"]
         for backend in ("egl", "osmesa"):
             environment = {**os.environ, "MUJOCO_GL": backend}
             done = subprocess.run(command, env=environment, capture_output=True, text=True)
