@@ -1,24 +1,33 @@
 """The matrix products and convolutions inside a program, counted from its trace."""
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 
+class Product(NamedTuple):
+    """A matrix product `[rows, contracted] @ [contracted, columns]`, done `times` times."""
+
+    rows: int
+    contracted: int
+    columns: int
+    times: int
+
+
 def operations(function: Callable, *arguments: Any) -> float:
-    """Floating-point operations of all products and convolutions; loops count once."""
-    return sum(2.0 * m * k * n for m, k, n in products(function, *arguments))
+    """Floating-point operations of all products and convolutions; `while` loops count once."""
+    return sum(2.0 * m * k * n * times for m, k, n, times in products(function, *arguments))
 
 
-def products(function: Callable, *arguments: Any) -> list[tuple[int, int, int]]:
-    """(rows, contracted, columns) of every product; a convolution as the product it amounts to."""
+def products(function: Callable, *arguments: Any) -> list[Product]:
+    """Every product; a convolution as the one it amounts to."""
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
-    return [shape for equation in _equations(jaxpr) if (shape := _product(equation))]
+    return [p for equation, times in _equations(jaxpr, 1) if (p := _product(equation, times))]
 
 
-def _equations(jaxpr: Any) -> Iterator[Any]:
+def _equations(jaxpr: Any, times: int) -> Iterator[tuple[Any, int]]:
     for equation in jaxpr.eqns:
         nested = [
             getattr(value, "jaxpr", value)
@@ -27,12 +36,13 @@ def _equations(jaxpr: Any) -> Iterator[Any]:
             if hasattr(value, "eqns") or hasattr(value, "jaxpr")
         ]
         if not nested:
-            yield equation
+            yield equation, times
+        inside = times * equation.params["length"] if equation.primitive.name == "scan" else times
         for inner in nested:
-            yield from _equations(inner)
+            yield from _equations(inner, inside)
 
 
-def _product(equation: Any) -> tuple[int, int, int] | None:
+def _product(equation: Any, times: int) -> Product | None:
     name, out = equation.primitive.name, equation.outvars[0].aval
     if name == "dot_general":
         (contracted, _), _ = equation.params["dimension_numbers"]
@@ -44,4 +54,4 @@ def _product(equation: Any) -> tuple[int, int, int] | None:
     else:
         return None
     columns = out.shape[-1] if out.ndim else 1
-    return out.size // columns, inner, columns
+    return Product(out.size // columns, inner, columns, times)

@@ -19,14 +19,14 @@ from starjax.sim import model, physics
 from starjax.sim.tasks import peg_transfer
 from starjax.types import Pose
 
-PERIODS = 8  # control periods a call
+PERIODS = 1  # control periods a call
 PERIOD = 1 / 30  # s
 
 
 def main() -> None:
     runtime.prepare_xla()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--batches", type=int, nargs="+", default=[1, 16, 256])
+    parser.add_argument("--batches", type=int, nargs="+", default=[1, 16])
     batches = parser.parse_args().batches
     sim = model.load()
     block = Pose(jnp.eye(3), jnp.array([*sim.pegs[4], peg_transfer.RIM_HEIGHT]))
@@ -53,7 +53,7 @@ def main() -> None:
     rows = {}
     for batch in batches:
         states = jax.tree.map(lambda leaf, n=batch: jnp.stack([leaf] * n), start)
-        timing = _timing.time_jitted(jax.vmap(run), states, repeats=5)
+        timing = _timing.time_jitted(jax.vmap(run), states, repeats=3)
         rate = batch * PERIODS * substeps / timing.median_s
         rows[str(batch)] = {
             "steps_per_s": rate,
