@@ -83,13 +83,16 @@ def measure(policy_config: PolicyConfig, batch: int, flops: float, bandwidth: fl
     first = state.create(policy, optimizer, state.init_params(policy, 0), stats, example, seed=0)
     mesh = devices.make_mesh(batch, jax.devices()[:1])
 
+    settings = (policy, optimizer, policy_config, train_config, mesh)
+    looped = step.runs_in_a_loop(policy_config, mesh)
+    count = 10 if looped else 1
+
     def steps(first, dataset, count):
         drawn = jnp.arange(FRAMES)
-        return step.resident_steps(
-            policy, optimizer, policy_config, train_config, mesh, first, dataset, drawn, count
-        ).params
+        if looped:
+            return step.resident_steps(*settings, first, dataset, drawn, count).params
+        return step.resident_step(*settings, first, dataset, drawn).params
 
-    count = 4 if batch > 64 or policy_config.observation == "image" else 10
     timing = _timing.time_jitted(steps, first, dataset, jnp.int32(count), repeats=3)
     seconds = timing.min_s / count
     parameters = sum(leaf.size for leaf in jax.tree.leaves(first.params))

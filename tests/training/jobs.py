@@ -1,5 +1,6 @@
 """Training jobs for tests that run them in processes of their own. Runs nothing on import."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -20,19 +21,20 @@ SETTINGS = config.TrainConfig(
 )
 
 
-def train(directory, settings=SETTINGS, host=False, method="stardiff", **kwargs):
+def train(directory, settings=SETTINGS, host=False, observation="state", **kwargs):
     """A whole training run on fake demonstrations."""
     import jax
     import numpy as np
 
     from starjax.training import loop
 
-    dataset = fakes.dataset(seed=0)
+    size = fakes.TINY.image_size if observation == "image" else 0
+    dataset = fakes.dataset(seed=0, image_size=size)
     if host:
         dataset = jax.tree.map(np.asarray, dataset)
     return loop.run(
-        METHODS[method],
-        fakes.TINY,
+        METHODS["stardiff"],
+        dataclasses.replace(fakes.TINY, observation=observation),
         settings,
         dataset,
         fakes.P_WORLD_REF,
@@ -94,7 +96,7 @@ def devices_main(count: int, out: str) -> None:
     from starjax.training import metrics, step
 
     assert len(jax.devices()) == count
-    settings = SETTINGS
+    settings = dataclasses.replace(SETTINGS, holdout_demos=0)
     state = train(Path(out) / "run", settings).state
     key_frames, _ = step.step_keys(state.key, 5)
     frames = windows.sample_frames(key_frames, jnp.arange(100), settings.batch_size)

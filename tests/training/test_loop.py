@@ -37,11 +37,18 @@ def whole(tmp_path_factory):
     directory = tmp_path_factory.mktemp("whole")
     traces = []
     with pytest.MonkeyPatch.context() as patch:
-        traced = step.resident_steps
-        patch.setattr(step, "resident_steps", lambda *a: traces.append(0) or traced(*a))
+        traced = step.resident_step
+        patch.setattr(step, "resident_step", lambda *a: traces.append(0) or traced(*a))
         result = jobs.train(directory)
     assert len(traces) == 1
     return directory, result
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """A run of `jobs.devices_main`'s settings on one device."""
+    settings = dataclasses.replace(jobs.SETTINGS, holdout_demos=0)
+    return jobs.train(tmp_path_factory.mktemp("alone"), settings)
 
 
 def test_a_run_leaves_its_log_and_checkpoints(whole):
@@ -104,6 +111,18 @@ def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
     np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
 
 
+def test_pictures_train_too_and_resume(tmp_path):
+    settings = dataclasses.replace(jobs.SETTINGS, steps=2, holdout_demos=0)
+    whole = jobs.train(tmp_path / "a", settings, observation="image")
+    asked = iter(range(100))
+    with pytest.raises(loop.Interrupted):
+        jobs.train(
+            tmp_path / "b", settings, observation="image", should_stop=lambda: next(asked) == 1
+        )
+    again = jobs.train(tmp_path / "b", settings, observation="image")
+    assert_same_bytes(again.state, whole.state)
+
+
 def test_training_learns(tmp_path):
     settings = dataclasses.replace(
         jobs.SETTINGS, steps=300, log_every=50, checkpoint_every=300, steps_per_call=50
@@ -124,8 +143,8 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
 
 
 @pytest.mark.parametrize("count", [2, 8])
-def test_many_devices_give_the_numbers_of_one(whole, tmp_path, count):
-    _, result = whole
+def test_many_devices_give_the_numbers_of_one(alone, tmp_path, count):
+    result = alone
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
     environment = {
         **os.environ,

@@ -1,5 +1,6 @@
 """Training from a dataset to a finished state: resume, log, checkpoint, stop."""
 
+import functools
 import pathlib
 import time
 from collections.abc import Callable, Sequence
@@ -163,29 +164,39 @@ def _restored_or_new(
 
 def _advance(policy, optimizer, policy_config, train_config, mesh, dataset, frames, state):
     """`(state, count) -> state`; the given state's memory is reused."""
+    settings = (policy, optimizer, policy_config, train_config, mesh)
+    placed = devices.replicated(mesh)
     if windows.on_device(dataset):
-        resident = jax.device_put((dataset, jnp.asarray(frames)), devices.replicated(mesh))
-        run_steps = jax.jit(
-            lambda state, dataset, frames, count: steps.resident_steps(
-                policy, optimizer, policy_config, train_config, mesh, state, dataset, frames, count
-            ),
+        resident = jax.device_put((dataset, jnp.asarray(frames)), placed)
+        if steps.runs_in_a_loop(policy_config, mesh):
+            many = jax.jit(
+                functools.partial(steps.resident_steps, *settings),
+                donate_argnums=0,
+                out_shardings=placed,
+            )
+            return lambda state, count: many(state, *resident, jnp.int32(count))
+        one = jax.jit(
+            functools.partial(steps.resident_step, *settings),
             donate_argnums=0,
-            out_shardings=devices.replicated(mesh),
+            out_shardings=placed,
         )
-        return lambda state, count: run_steps(state, *resident, jnp.int32(count))
+        return _repeated(lambda state: one(state, *resident))
 
     one = jax.jit(
-        lambda state, batch: steps.train_step(policy, optimizer, train_config, state, batch),
+        functools.partial(steps.train_step, policy, optimizer, train_config),
         donate_argnums=0,
-        out_shardings=devices.replicated(mesh),
+        out_shardings=placed,
     )
     stream = feed.batches(
         dataset, frames, policy_config, train_config, mesh, jnp.copy(state.key), int(state.step)
     )
+    return _repeated(lambda state: one(state, next(stream)))
 
+
+def _repeated(one):
     def advance(state, count):
         for _ in range(count):
-            state = one(state, next(stream))
+            state = one(state)
         return state
 
     return advance
@@ -194,8 +205,7 @@ def _advance(policy, optimizer, policy_config, train_config, mesh, dataset, fram
 def _log(log, step, state, train_config) -> tuple[states.TrainState, str]:
     """Writes the means since the last line and starts the sums afresh."""
     sums = {name: float(value) for name, value in state.sums.items()}
-    skipped = int(sums.pop("skipped"))
-    taken = (step - 1) % train_config.log_every + 1 - skipped
+    taken, skipped = int(sums.pop("taken")), int(sums.pop("skipped"))
     if taken == 0:
         raise TrainingFailed(
             f"the loss was not finite in any of the {skipped} steps before step {step}: "

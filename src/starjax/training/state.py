@@ -82,7 +82,7 @@ def create(
     """
     _, key = _keys(seed)
     _, metrics = jax.eval_shape(policy.loss, params, stats, key, batch)
-    names = ["loss", "gradient_norm", "skipped", *metrics]
+    names = ["loss", "gradient_norm", "taken", "skipped", *metrics]
     return TrainState(
         step=jnp.int32(0),
         params=params,

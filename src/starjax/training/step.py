@@ -40,8 +40,9 @@ def train_step(
     decay = states.ema_decay(state.step, train_config.ema_max)
     ema_params = optax.incremental_update(params, state.ema_params, 1.0 - decay)
 
-    taken = {"loss": loss, "gradient_norm": norm, **metrics}
-    sums = {name: state.sums[name] + jnp.where(finite, taken[name], 0.0) for name in taken}
+    said = {"loss": loss, "gradient_norm": norm, **metrics}
+    sums = {name: state.sums[name] + jnp.where(finite, said[name], 0.0) for name in said}
+    sums["taken"] = state.sums["taken"] + jnp.where(finite, 1.0, 0.0)
     sums["skipped"] = state.sums["skipped"] + jnp.where(finite, 0.0, 1.0)
 
     def keep(new, old):
@@ -57,6 +58,35 @@ def train_step(
     )
 
 
+def resident_step(
+    policy: Policy,
+    optimizer: optax.GradientTransformation,
+    policy_config: config.PolicyConfig,
+    train_config: config.TrainConfig,
+    mesh: Mesh,
+    state: TrainState,
+    dataset: windows.Dataset,
+    frames: jax.Array,
+) -> TrainState:
+    """One step on a dataset that is on the device.
+
+    Args:
+      policy: to be trained.
+      optimizer: from `state.make_optimizer`.
+      policy_config: the horizons of a window.
+      train_config: batch size and averaging.
+      mesh: the batch is split over it.
+      state: donated by the caller.
+      dataset: leaves are jax arrays, on every device of the mesh.
+      frames: `[n]` int32 frames to draw from.
+    """
+    key_frames, _ = step_keys(state.key, state.step)
+    frame = windows.sample_frames(key_frames, frames, train_config.batch_size)
+    frame = jax.lax.with_sharding_constraint(frame, devices.batch_sharding(mesh))
+    batch = windows.gather(dataset, frame, policy_config.obs_horizon, policy_config.horizon)
+    return train_step(policy, optimizer, train_config, state, batch)
+
+
 def resident_steps(
     policy: Policy,
     optimizer: optax.GradientTransformation,
@@ -68,27 +98,24 @@ def resident_steps(
     frames: jax.Array,
     count: jax.Array,
 ) -> TrainState:
-    """`count` steps on a dataset that is on the device, in one program for any count.
+    """`count` times `resident_step`, in one program for any count.
 
-    Args:
-      policy: to be trained.
-      optimizer: from `state.make_optimizer`.
-      policy_config: the horizons of a window.
-      train_config: batch size and averaging.
-      mesh: the batch is split over it.
-      state: donated by the caller.
-      dataset: leaves are jax arrays, on every device of the mesh.
-      frames: `[n]` int32 frames to draw from.
-      count: int32 `[]`, a traced number, so that logging and checkpoints may stop anywhere
-        without another compilation.
+    `count`, int32 `[]`, is a traced number, so that logging and checkpoints may stop anywhere
+    without another compilation.
     """
-    split = devices.batch_sharding(mesh)
 
     def one(_, state):
-        key_frames, _ = step_keys(state.key, state.step)
-        frame = windows.sample_frames(key_frames, frames, train_config.batch_size)
-        frame = jax.lax.with_sharding_constraint(frame, split)
-        batch = windows.gather(dataset, frame, policy_config.obs_horizon, policy_config.horizon)
-        return train_step(policy, optimizer, train_config, state, batch)
+        return resident_step(
+            policy, optimizer, policy_config, train_config, mesh, state, dataset, frames
+        )
 
     return jax.lax.fori_loop(0, count, one, state)
+
+
+def runs_in_a_loop(policy_config: config.PolicyConfig, mesh: Mesh) -> bool:
+    """Whether many steps in one call are faster than one: everywhere but for pictures on a CPU.
+
+    XLA's CPU compiler gives convolutions the layout that its fast kernels need only outside of
+    loops; inside, those of the gradient run 12 times slower.
+    """
+    return policy_config.observation != "image" or mesh.devices.flat[0].platform != "cpu"
