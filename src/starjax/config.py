@@ -65,6 +65,7 @@ class PolicyConfig:
     roll_blocks: int = 3
     diffusion_steps: int = 100  # K
     ddim_steps: int = 10
+    temperature: float = 1.0  # of the noise a sample starts from; lower is nearer to the likeliest
     roll_loss_weight: float = 0.1  # lambda of Eq. 15
     dtype: Literal["float32", "bfloat16"] = "float32"  # of the networks' arithmetic
 

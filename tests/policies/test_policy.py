@@ -180,3 +180,21 @@ def test_noise_is_in_normalised_units(made):
     exact = features.for_sampling(*args, it.batch.observation, clean)
     spread = float(jnp.std(drawn.history - exact.history))
     assert 0.4 < spread < 0.6
+
+
+def test_state_features_tell_block_and_target_from_the_tip(made):
+    it = made("stardiff")
+    tip = it.batch.observation.pose.p
+    quarter_turn = jnp.array([0.0, 1.0, 0.0, -1.0, 0.0, 0.0])
+    state = jnp.concatenate(
+        [
+            tip + jnp.array([0.03, 0.0, 0.0]),
+            jnp.broadcast_to(quarter_turn, (B, 2, 6)),
+            tip - jnp.array([0.0, 0.0, 0.06]),
+        ],
+        axis=-1,
+    )
+    observation = it.batch.observation.replace(state=state)
+    inputs = features.for_sampling(fakes.TINY, TRAIN, it.stats, observation, jnp.zeros((B, 2, 4)))
+    expected = np.broadcast_to([1, 0, 0, 0, -1, 0, 0, 0, -2], (B, 2, 9))
+    np.testing.assert_allclose(inputs.history[..., -9:], expected, atol=1e-5)

@@ -48,6 +48,7 @@ PRESETS: dict[str, RunConfig] = {
             vision_dim=128,
             unet_channels=(32, 64, 128),
             time_dim=64,
+            temperature=0.5,
         ),
         train=TrainConfig(
             steps=9_000,

@@ -101,7 +101,7 @@ def make(
         film = unet.apply(params["unet"], cond, method="condition")
         return diffusion.ddim_sample(
             lambda x, film_k: denoise(params["unet"], x, film + film_k, method="denoise"),
-            diffusion.sample_noise(keys, shape),
+            policy_config.temperature * diffusion.sample_noise(keys, shape),
             diffusion_steps=policy_config.diffusion_steps,
             steps=policy_config.ddim_steps,
             prepare=lambda k: unet.apply(params["unet"], k, method="embed_step"),

@@ -10,8 +10,10 @@ from starjax.data import augment, normalizer, windows
 from starjax.sim.types import Observation
 
 TROCAR_FEATURES = 7
-TASK_STATE = 12
+TASK_STATE = 12  # numbers that a "state" observation has in the place of pixels
+TASK_FEATURES = TASK_STATE + 9  # that the networks are fed of it
 
+_NEAR = 0.03  # m, the distance at which the tool works on the block
 _LENGTH = 0.05  # m, the largest port displacement of Eq. 19: features are of order one
 
 
@@ -132,7 +134,22 @@ def _history(
         raise ValueError(
             'observation.state: expected [..., 12] for a policy with observation="state", got None'
         )
-    return jnp.concatenate([proprioception, stats.state.normalize(observation.state)], axis=-1)
+    task = jnp.concatenate([stats.state.normalize(observation.state), _relative(observation)], -1)
+    return jnp.concatenate([proprioception, task], axis=-1)
+
+
+def _relative(observation: Observation) -> jax.Array:
+    """Tip to block, in the world's frame and in the block's, and tip to target: `[..., 9]`.
+
+    The workspace is 20 times as wide as a grasp is accurate: a small network would have to learn
+    these differences to a hundredth before anything else.
+    """
+    state = jnp.asarray(observation.state)
+    tip = observation.pose.p
+    to_block, to_target = state[..., :3] - tip, state[..., 9:12] - tip
+    block = rcm.rot6d_decode(state[..., 3:9])
+    turned = jnp.einsum("...ji,...j->...i", block, to_block, precision="highest")
+    return jnp.concatenate([to_block, turned, to_target], axis=-1) / _NEAR
 
 
 def _frames(observation: Observation) -> jax.Array:

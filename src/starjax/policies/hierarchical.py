@@ -36,7 +36,7 @@ def make(
     roll = space.slices["roll"].start
     # what is diffused: the position and, after the whole space, the gripper
     diffused = jnp.r_[space.slices["p"], space.dim]
-    task_dim = features.TASK_STATE if policy_config.observation == "state" else 0
+    task_dim = features.TASK_FEATURES if policy_config.observation == "state" else 0
     model = diffuser.make(policy_config, len(diffused), len(diffused) + task_dim, 0)
     rolls = roll_net.RollNet(
         width=policy_config.roll_width,

@@ -21,7 +21,7 @@ def make(
 ) -> Policy:
     """Diffusion over (pose in the method's action space, gripper); see `policy.make`."""
     dim = rcm.ACTION_SPACES[method.action_space].dim + 1
-    task_dim = features.TASK_STATE if policy_config.observation == "state" else 0
+    task_dim = features.TASK_FEATURES if policy_config.observation == "state" else 0
     extra_dim = features.TROCAR_FEATURES if method.sees_trocar else 0
     model = diffuser.make(policy_config, dim, dim + task_dim, extra_dim)
 

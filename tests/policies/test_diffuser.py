@@ -1,0 +1,72 @@
+"""The conditional diffusion model as a whole: what its loss learns, its samples return."""
+
+import dataclasses
+
+import fakes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from starjax.policies import diffuser, features
+
+ACTION = 2
+STEPS = 400
+PRESENT = jnp.array([[0.7, -0.6], [-0.5, 0.8]])  # of two samples
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """A model with the parameters that repeat two sequences, the sequences, and their inputs."""
+    settings = dataclasses.replace(fakes.TINY, observation="state")
+    model = diffuser.make(settings, ACTION, ACTION, 0)
+    ramp = jnp.linspace(0.0, 0.2, settings.horizon)[:, None]
+    wanted = PRESENT[:, None] + ramp * jnp.array([1.0, -1.0])
+    history = jnp.repeat(PRESENT[:, None], settings.obs_horizon, axis=1)
+    optimizer = optax.adam(optax.cosine_decay_schedule(1e-2, STEPS))
+
+    def repeated(x):
+        return jnp.repeat(x, 16, axis=0)
+
+    def step(i, carry):
+        params, state = carry
+        inputs = features.Inputs(repeated(history), None, None)
+        gradient = jax.grad(model.loss)(
+            params,
+            jax.random.fold_in(jax.random.key(1), i),
+            inputs,
+            jnp.zeros((32, 0)),
+            repeated(wanted),
+        )
+        updates, state = optimizer.update(gradient, state, params)
+        return optax.apply_updates(params, updates), state
+
+    @jax.jit
+    def train(key):
+        params = model.init(key)
+        return jax.lax.fori_loop(0, STEPS, step, (params, optimizer.init(params)))[0]
+
+    return settings, train(jax.random.key(0)), wanted, features.Inputs(history, None, None)
+
+
+def sampled(settings, params, inputs, seed=2):
+    model = diffuser.make(settings, ACTION, ACTION, 0)
+    keys = jax.random.split(jax.random.key(seed), len(PRESENT))
+    return np.asarray(jax.jit(model.sample)(params, keys, inputs, jnp.zeros((len(PRESENT), 0))))
+
+
+def test_samples_are_what_was_learned(learned):
+    settings, params, wanted, inputs = learned
+    found = sampled(dataclasses.replace(settings, ddim_steps=10), params, inputs)
+    assert np.abs(found - wanted).mean() < 0.05
+
+
+def test_at_temperature_zero_no_sample_depends_on_its_key(learned):
+    settings, params, _, inputs = learned
+    cold = dataclasses.replace(settings, ddim_steps=10, temperature=0.0)
+    np.testing.assert_array_equal(
+        sampled(cold, params, inputs, 2), sampled(cold, params, inputs, 3)
+    )
+    warm = dataclasses.replace(cold, temperature=1.0)
+    assert np.abs(sampled(warm, params, inputs, 2) - sampled(warm, params, inputs, 3)).max() > 1e-4
