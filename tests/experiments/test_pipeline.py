@@ -20,13 +20,13 @@ def done(monkeypatch):
     def demonstrations(settings, env):
         return pipeline.Path(settings.out) / "demos-a", lambda: calls.append("collect")
 
-    def train(settings, name, demos, env):
+    def train(settings, name, demos, env, encoder):
         demos()
         calls.append(f"train {name}")
 
     monkeypatch.setattr(pipeline, "_environment", lambda settings: None)
     monkeypatch.setattr(pipeline, "_demonstrations", demonstrations)
-    monkeypatch.setattr(pipeline, "_load", lambda root, collect: collect())
+    monkeypatch.setattr(pipeline, "_load", lambda _, root, collect, encoder: collect())
     monkeypatch.setattr(pipeline, "_train", train)
     monkeypatch.setattr(pipeline, "_evaluate", lambda c, name, *_: calls.append(f"score {name}"))
     monkeypatch.setattr(pipeline, "_report", lambda out, names: calls.append("report"))
@@ -108,4 +108,4 @@ def test_warnings_name_what_a_reader_must_know():
     smoke_words = " ".join(words.warnings(presets.PRESETS["smoke"], {"invalid": 2}))
     assert "not pixels" in smoke_words and "too short" in smoke_words and "2 trial" in smoke_words
     (paper,) = words.warnings(config.RunConfig(), {"invalid": 0})
-    assert "resnet18 trained from scratch" in paper
+    assert "Image encoder: trained from scratch; resnet18, 256 px" in paper

@@ -23,7 +23,7 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
         f"starjax {starjax.__version__}: method {config.method}, preset {config.preset}, "
         f"seed {config.seed}, folder {config.out}",
         f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores",
-        f"  observation     {observation(policy)}",
+        *seeing(policy),
         f"  demonstrations  {demos.per_trocar * demos.seen_trocars} "
         f"({demos.per_trocar} x {demos.seen_trocars} seen trocars)",
     ]
@@ -36,20 +36,34 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def observation(policy: config_lib.PolicyConfig) -> str:
-    """What the policy sees, in one line."""
+def seeing(policy: config_lib.PolicyConfig) -> list[str]:
+    """Lines that say what the policy sees, and with which encoder."""
     if policy.observation == "state":
-        return (
-            "state: block pose and target position in the place of pixels "
+        return [
+            "  observation     state: block pose and target position in the place of pixels "
             "(--policy.observation image turns the camera on)"
-        )
-    return f"image, {policy.image_size} px; {encoder(policy)}"
+        ]
+    return [
+        f"  observation     image, {policy.image_size} px",
+        f"  encoder         {encoder(policy)}; {policy.encoder}",
+    ]
 
 
 def encoder(policy: config_lib.PolicyConfig) -> str:
-    """Which image encoder, and where its weights began."""
-    start = f"from {policy.encoder_weights}" if policy.encoder_weights else "from scratch"
-    return f"encoder {policy.encoder} trained {start}"
+    """Where the weights of the image encoder come from, and whether they still learn."""
+    name = policy.encoder_weights
+    if not name:
+        return "trained from scratch"
+    known = " (pretrained on this task)" if _is_of_this_task(policy) else ""
+    return f"{'frozen' if policy.freeze_encoder else 'trained further'}, from {name}{known}"
+
+
+def _is_of_this_task(policy: config_lib.PolicyConfig) -> bool:
+    """Whether the encoder began in a policy of ours; where its file is gone, as far as we know."""
+    from starjax.policies import weights
+    from starjax.training import export
+
+    return policy.freeze_encoder or export.is_policy(weights.resolve(policy.encoder_weights))
 
 
 def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[str]:
@@ -61,7 +75,8 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
             "as in the paper; --policy.observation image turns the camera on."
         )
     else:
-        found.append(f"Image {encoder(config.policy)}, {config.policy.image_size} px.")
+        policy = config.policy
+        found.append(f"Image encoder: {encoder(policy)}; {policy.encoder}, {policy.image_size} px.")
     if config.preset == "smoke":
         found.append("Preset smoke is too short to learn anything: its rates mean nothing.")
     if figures["invalid"]:
