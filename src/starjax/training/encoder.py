@@ -34,10 +34,7 @@ def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -
         not the one that the settings describe.
     """
     name = policy_config.encoder_weights
-    path = weights.resolve(name)
-    if not path.is_file():
-        packaged = "".join(f" or {known}" for known in weights.names())
-        raise config.UsageError(f"--policy.encoder-weights: expected a file{packaged}, got {name}")
+    path = weights.find("--policy.encoder-weights", name)
     if not export.is_policy(path):
         _check_torchvision(policy_config)
         return None

@@ -53,10 +53,10 @@ def features(
     """
     folder = root / "features" / _key(encoder, policy_config, train_config, digest)
     spans = [(first, min(first + PART, count)) for first in range(0, count, PART)]
+    paths = [folder / f"part_{number:04d}.npz" for number in range(len(spans))]
     parts: dict[Path, np.ndarray] = {}
     missing = []
-    for number, (first, last) in enumerate(spans):
-        path = folder / f"part_{number:04d}.npz"
+    for path, (first, last) in zip(paths, spans):
         found = _read(path, (last - first, policy_config.vision_dim), report)
         if found is None:
             missing.append((path, first, last))
@@ -74,7 +74,7 @@ def features(
                     advance(len(seen[-1]))
                 parts[path] = np.concatenate(seen)
                 files.write_npz(path, {"features": parts[path]})
-    joined = np.concatenate([parts[path] for path in sorted(parts)])
+    joined = np.concatenate([parts[path] for path in paths])
     said = "in" if missing else "done before,"
     report(f"features of {count} frames, {files.size(joined.nbytes)}: {said} {folder}")
     return joined

@@ -6,13 +6,27 @@ Standard library only: settings are checked before jax loads.
 import importlib.resources
 from pathlib import Path
 
+from starjax import config
+
 _SUFFIX = ".safetensors"
 
 
 def resolve(name: str) -> Path:
     """The file of packaged weights of this name, else `name` as a path; it may not exist."""
-    packaged = _folder() / f"{name}{_SUFFIX}"
-    return packaged if name in names() else Path(name)
+    return _folder() / f"{name}{_SUFFIX}" if name in names() else Path(name)
+
+
+def find(argument: str, name: str) -> Path:
+    """The file that `resolve` names.
+
+    Raises:
+      config.UsageError: there is none; the message begins with `argument`.
+    """
+    path = resolve(name)
+    if not path.is_file():
+        known = ", ".join([*names(), "a file"])
+        raise config.UsageError(f"{argument}: expected {known.replace(', a', ' or a')}, got {name}")
+    return path
 
 
 def names() -> list[str]:
