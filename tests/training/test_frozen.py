@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from starjax import config
-from starjax.data import normalizer, windows
+from starjax.data import load, normalizer, windows
 from starjax.experiments import folders, pipeline, presets
 from starjax.experiments.methods import METHODS
 from starjax.policies import diffuser
@@ -210,6 +210,22 @@ def test_a_single_model_trains_on_features_too(source, seen):
     found, _ = gradient(params, stats, jax.random.key(1), batch)
     assert set(found) == {"state", "unet"}
     assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(found))
+
+
+def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, monkeypatch):
+    def without_pictures(root, pictures, report):
+        assert not pictures
+        blind = dataset.replace(observation=dataset.observation.replace(image=None))
+        return load.Demos(blind, "digest", "device", 0, {})
+
+    monkeypatch.setattr(load, "load", without_pictures)
+    monkeypatch.setattr(load, "frames", lambda root: np.asarray(dataset.observation.image))
+    settings, found = source
+    loaded = pipeline._load(run_config(settings, tmp_path), tmp_path, lambda: None, found)
+    assert loaded.observation.image is None and windows.on_device(loaded)
+    wanted = features(source, dataset, tmp_path / "other")
+    np.testing.assert_array_equal(loaded.observation.features, wanted)
+    assert "features" in pipeline.clock.timings(tmp_path)
 
 
 def test_pictures_in_the_place_of_features_are_an_error(source, dataset, tmp_path):
