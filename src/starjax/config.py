@@ -54,7 +54,9 @@ class PolicyConfig:
     horizon: int = 16  # H, commands predicted: t+1 .. t+H
     execute: int = 8  # commands executed before re-planning
     encoder: Literal["resnet18", "small"] = "resnet18"
-    encoder_weights: str = ""  # path of torchvision .pth or .safetensors; empty: from scratch
+    # A starjax policy.safetensors, torchvision's .pth or .safetensors; empty: from scratch
+    encoder_weights: str = ""
+    freeze_encoder: bool = False  # train the rest only, on features computed once a frame
     vision_dim: int = 512  # d_v
     state_dim: int = 256  # d_s
     unet_channels: tuple[int, ...] = (256, 512, 1024, 2048)

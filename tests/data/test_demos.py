@@ -200,6 +200,24 @@ def test_all_residencies_hold_the_same(pictures, residency):
         np.testing.assert_array_equal(ours, theirs)
 
 
+def test_pictures_may_stay_on_disk_and_are_found_there(pictures):
+    said = []
+    whole = load.load(pictures, report=said.append)
+    without = load.load(pictures, pictures=False, report=said.append)
+    assert without.dataset.observation.image is None and without.bytes < whole.bytes
+    assert "without pictures" in said[1]
+    observation = whole.dataset.observation.replace(image=None)
+    jax.tree.map(np.testing.assert_array_equal, without.dataset.observation, observation)
+    frames = load.frames(pictures)
+    some = np.array([0, 7, frames.shape[0] - 1])
+    np.testing.assert_array_equal(frames[some], np.asarray(whole.dataset.observation.image)[some])
+
+
+def test_demonstrations_without_pictures_have_no_frames(sealed):
+    with pytest.raises(ValueError, match="root: expected demonstrations with pictures"):
+        load.frames(sealed[0])
+
+
 def test_place_depends_on_what_is_free(monkeypatch):
     monkeypatch.setattr(load.xla, "available_bytes", lambda: 1000)
     assert [load._place(n) for n in (499, 599, 700)] == ["device", "host", "disk"]

@@ -41,6 +41,24 @@ def test_weights_of_another_scene_are_refused(tmp_path):
         folders.claim(tmp_path, SMOKE, "demos-b")
 
 
+def test_weights_of_another_frozen_encoder_are_refused(tmp_path):
+    folders.claim(tmp_path, SMOKE, "demos-a", "aaaa")
+    folders.claim(tmp_path, SMOKE, "demos-a")  # trained by now: the encoder may be gone
+    with pytest.raises(config.UsageError, match=r"--policy.encoder-weights: .*aaaa, got bbbb"):
+        folders.claim(tmp_path, SMOKE, "demos-a", "bbbb")
+    assert folders.read_config(tmp_path) == SMOKE
+
+
+def test_a_folder_from_before_a_setting_existed_goes_on(tmp_path):
+    folders.claim(tmp_path, SMOKE, "demos-a")
+    path = tmp_path / "config.json"
+    old = json.loads(path.read_text())
+    del old["policy"]["freeze_encoder"]
+    path.write_text(json.dumps(old))
+    folders.claim(tmp_path, SMOKE, "demos-a")
+    assert folders.read_config(tmp_path) == SMOKE
+
+
 @pytest.mark.parametrize("parts", [{"eval": {"trials": 9}}, {"train": {"keep_checkpoints": 9}}])
 def test_what_leaves_the_weights_alone_may_change(tmp_path, parts):
     folders.claim(tmp_path, SMOKE, "demos-a")

@@ -30,6 +30,12 @@ def settings(*argv: str) -> config.RunConfig:
         (["--train.steps", "0"], ["--train.steps", "more than 0", "0"]),
         (["--demos.seen-trocars=9"], ["--demos.seen-trocars", "1 to 8", "9"]),
         (["--demos.keep-failures", "yes"], ["--demos.keep-failures", "0 value", "yes"]),
+        (["--policy.freeze-encoder", "yes"], ["--policy.freeze-encoder", "0 value", "yes"]),
+        (["--policy.freeze-encoder"], ["--policy.freeze-encoder", "--policy.observation image"]),
+        (
+            ["--policy.freeze-encoder", "--policy.observation", "image"],
+            ["--policy.freeze-encoder", "--policy.encoder-weights", "got none"],
+        ),
         (["stardiff"], ["stardiff", "flag"]),
     ],
 )
@@ -70,6 +76,34 @@ def test_other_observations_and_seeds_have_folders_of_their_own():
     typed = ["--preset", "cpu", "--policy.observation", "image", "--seed", "3"]
     assert settings(*typed).out == "runs/cpu-image-seed3"
     assert settings(*typed, "--out", "runs/cpu").out == "runs/cpu"
+
+
+@pytest.fixture
+def frozen(monkeypatch):
+    """A preset whose vision encoder is frozen."""
+    cpu = presets.PRESETS["cpu"]
+    seeing = dataclasses.replace(
+        cpu.policy, observation="image", encoder_weights="compact", freeze_encoder=True
+    )
+    changed = dataclasses.replace(cpu, policy=seeing)
+    monkeypatch.setitem(presets.PRESETS, "cpu", changed)
+    return changed
+
+
+def test_a_frozen_encoder_is_left_out_where_the_state_is_observed(frozen):
+    assert settings("--preset", "cpu") == frozen
+    blind = settings("--preset", "cpu", "--policy.observation", "state")
+    assert blind.policy.encoder_weights == "" and not blind.policy.freeze_encoder
+    assert blind.out == "runs/cpu-state"
+    with pytest.raises(config.UsageError, match=r"--policy.freeze-encoder: expected"):
+        settings("--preset", "cpu", "--policy.observation=state", "--policy.freeze_encoder")
+
+
+def test_frozen_and_learning_encoders_have_folders_of_their_own(frozen):
+    assert settings("--preset", "cpu", "--policy.no-freeze-encoder").out == "runs/cpu-unfrozen"
+    typed = ["--policy.observation", "image", "--policy.freeze-encoder"]
+    typed += ["--policy.encoder-weights", "x"]
+    assert settings("--preset", "smoke", *typed).out == "runs/smoke-image-frozen"
 
 
 def test_auto_is_named_by_what_it_picked(monkeypatch):
@@ -121,7 +155,7 @@ def test_every_field_has_its_flag():
         len(dataclasses.fields(part))
         for part in (config.DemosConfig, config.PolicyConfig, config.TrainConfig, config.EvalConfig)
     )
-    assert len(flags) == leaves + 4 + 1  # method, preset, seed, out; one flag has its no- twin
+    assert len(flags) == leaves + 4 + 2  # method, preset, seed, out; two flags have a no- twin
 
 
 @pytest.mark.parametrize(

@@ -20,13 +20,13 @@ def done(monkeypatch):
     def demonstrations(settings, env):
         return pipeline.Path(settings.out) / "demos-a", lambda: calls.append("collect")
 
-    def train(settings, name, demos, env):
+    def train(settings, name, demos, env, encoder):
         demos()
         calls.append(f"train {name}")
 
     monkeypatch.setattr(pipeline, "_environment", lambda settings: None)
     monkeypatch.setattr(pipeline, "_demonstrations", demonstrations)
-    monkeypatch.setattr(pipeline, "_load", lambda root, collect: collect())
+    monkeypatch.setattr(pipeline, "_load", lambda _, root, collect, encoder: collect())
     monkeypatch.setattr(pipeline, "_train", train)
     monkeypatch.setattr(pipeline, "_evaluate", lambda c, name, *_: calls.append(f"score {name}"))
     monkeypatch.setattr(pipeline, "_report", lambda out, names: calls.append("report"))
@@ -95,17 +95,62 @@ def test_plan_names_the_observation_and_the_flag(tmp_path):
     assert "image, 96 px" in said and "from scratch" in said and "state" not in said
 
 
+def test_plan_and_warnings_say_that_an_encoder_is_frozen():
+    cpu = presets.PRESETS["cpu"]
+    policy = dataclasses.replace(
+        cpu.policy, observation="image", encoder_weights="compact", freeze_encoder=True
+    )
+    seeing = dataclasses.replace(cpu, policy=policy)
+    said = "frozen, from compact (pretrained on this task); small"
+    assert f"  encoder         {said}\n" in words.plan(seeing, pipeline.STAGES)
+    assert words.warnings(seeing, {"invalid": 0}) == [f"Image encoder: {said}, 96 px."]
+
+
+def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):
+    path = str(tmp_path / "resnet18.pth")
+    policy = config.PolicyConfig(encoder_weights=path)
+    assert words.encoder(policy) == f"trained further, from {path}"
+
+
+def test_a_wrong_encoder_is_found_before_anything_is_collected(tmp_path, done):
+    preset = smoke(tmp_path, "stardiff")
+    policy = dataclasses.replace(
+        preset.policy, observation="image", encoder_weights="nowhere", freeze_encoder=True
+    )
+    with pytest.raises(config.UsageError, match=r"--policy.encoder-weights: expected"):
+        pipeline.run(dataclasses.replace(preset, policy=policy), pipeline.STAGES, "")
+    assert not done
+
+
+def test_a_finished_run_needs_its_encoder_no_more(tmp_path, done):
+    preset = smoke(tmp_path, "stardiff")
+    policy = dataclasses.replace(
+        preset.policy, observation="image", encoder_weights="nowhere", freeze_encoder=True
+    )
+    (tmp_path / "stardiff").mkdir()
+    (tmp_path / "stardiff" / "policy.safetensors").touch()
+    pipeline.run(dataclasses.replace(preset, policy=policy), pipeline.STAGES, "")
+    assert done[-2:] == ["score stardiff", "report"]
+
+
 def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
-    settings = json.loads(json.dumps(dataclasses.asdict(presets.PRESETS["smoke"])))
+    settings = _json(presets.PRESETS["smoke"])
     assert not pipeline._is_scored(tmp_path, settings)
     files.write_json(tmp_path / "result.json", {"config": settings})
     assert pipeline._is_scored(tmp_path, settings)
+    del settings["policy"]["freeze_encoder"]  # a result that is older than this setting
+    files.write_json(tmp_path / "result.json", {"config": settings})
+    assert pipeline._is_scored(tmp_path, _json(presets.PRESETS["smoke"]))
     more = {**settings, "eval": {**settings["eval"], "trials": 9}}
     assert not pipeline._is_scored(tmp_path, more)
+
+
+def _json(settings):
+    return json.loads(json.dumps(dataclasses.asdict(settings)))
 
 
 def test_warnings_name_what_a_reader_must_know():
     smoke_words = " ".join(words.warnings(presets.PRESETS["smoke"], {"invalid": 2}))
     assert "not pixels" in smoke_words and "too short" in smoke_words and "2 trial" in smoke_words
     (paper,) = words.warnings(config.RunConfig(), {"invalid": 0})
-    assert "resnet18 trained from scratch" in paper
+    assert "Image encoder: trained from scratch; resnet18, 256 px" in paper

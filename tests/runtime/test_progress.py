@@ -24,6 +24,14 @@ def test_plain_lines_are_rare_but_the_last_is_shown(monkeypatch):
     assert len(_shown(io.StringIO(), monkeypatch, every=1e9).splitlines()) == 1
 
 
+def test_the_last_plain_line_is_shown_once():
+    stream = io.StringIO()
+    with progress.track("Collect", 4, stream=stream) as advance:
+        advance(4)
+        advance(0)
+    assert len(stream.getvalue().splitlines()) == 1
+
+
 def test_a_bar_on_a_terminal(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):

@@ -1,6 +1,6 @@
 """Reads collected demonstrations: checked, and placed where they fit (device, host, or disk)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -42,6 +42,7 @@ def load(
     *,
     residency: Residency = "auto",
     verify: bool = True,
+    pictures: bool = True,
     report: Callable[[str], None] = print,
 ) -> Demos:
     """Loads the successful episodes of a sealed dataset, after checking every byte of them.
@@ -52,6 +53,7 @@ def load(
         pictures on disk, memory-mapped.
       verify: without it only the episodes' records are checked, not their arrays: for a caller
         that has just run `demos.collect`, which checks all.
+      pictures: without them they stay on disk, whatever the residency; `frames` reads them.
       report: gets one line with the place and the bytes, before any is allocated.
 
     Raises:
@@ -61,20 +63,30 @@ def load(
     root = Path(root)
     description = store.read_description(root)
     sealed = store.read_seal(root)
-    records = []
-    for key, found in store.verify_all(root, sealed["episodes"], verify).items():
-        if isinstance(found, store.DamagedEpisode):
-            raise found
-        if found["digest"] != sealed["episodes"][key]:
-            where = root / "episodes" / key / "episode.json"
-            raise store.DamagedEpisode(f"{where}: is not the episode that SEALED.json lists")
-        if found["success"]:
-            records.append(found)
-    total = sum(file["bytes"] for record in records for file in _read(record).values())
+    records = _successful(root, sealed, verify)
+    names = [name for name in _FIELDS if pictures or name != "image"]
+    total = sum(file["bytes"] for r in records for file in _read(r, names).values())
     place = _place(total) if residency == "auto" else residency
-    report(f"{len(records)} demonstrations, {files.size(total)}: {_WHERE[place]}")
-    dataset = _dataset(root, records, place)
+    without = "" if pictures else " without pictures"
+    report(f"{len(records)} demonstrations, {files.size(total)}{without}: {_WHERE[place]}")
+    dataset = _dataset(root, records, place, names)
     return Demos(dataset, sealed["digest"], place, total, description)
+
+
+def frames(root: Path) -> "Frames":
+    """The pictures of the successful episodes, memory-mapped, in the order of `load`'s frames.
+
+    Only the episodes' records are checked.
+
+    Raises:
+      DamagedEpisode, ValueError: as `load`; also where no pictures were recorded.
+    """
+    root = Path(root)
+    records = _successful(root, store.read_seal(root), verify=False)
+    if any("image.npy" not in record["files"] for record in records):
+        raise ValueError(f"root: expected demonstrations with pictures, got {root}")
+    length, start = _spans(records)
+    return Frames(_paths(root, records, "image"), start, length)
 
 
 _WHERE = {
@@ -87,10 +99,34 @@ _FIELDS = (
 )  # fmt: skip
 
 
-def _read(record: store.Record) -> dict[str, Any]:
+def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.Record]:
+    """Records of the successful episodes, once all are known to be those that were sealed."""
+    records = []
+    for key, found in store.verify_all(root, sealed["episodes"], verify).items():
+        if isinstance(found, store.DamagedEpisode):
+            raise found
+        if found["digest"] != sealed["episodes"][key]:
+            where = root / "episodes" / key / "episode.json"
+            raise store.DamagedEpisode(f"{where}: is not the episode that SEALED.json lists")
+        if found["success"]:
+            records.append(found)
+    return records
+
+
+def _read(record: store.Record, names: Sequence[str]) -> dict[str, Any]:
     """The files of an episode that training reads, by field."""
-    names = {name: record["files"].get(f"{name}.npy") for name in _FIELDS}
-    return {name: file for name, file in names.items() if file is not None}
+    found = {name: record["files"].get(f"{name}.npy") for name in names}
+    return {name: file for name, file in found.items() if file is not None}
+
+
+def _spans(records: list[store.Record]) -> tuple[np.ndarray, np.ndarray]:
+    """`[D]` number of frames of each episode, and `[D]` its first frame."""
+    length = np.array([record["length"] for record in records], np.int32)
+    return length, (np.cumsum(length) - length).astype(np.int32)
+
+
+def _paths(root: Path, records: list[store.Record], name: str) -> list[Path]:
+    return [root / "episodes" / record["key"] / f"{name}.npy" for record in records]
 
 
 def _place(total: int) -> str:
@@ -106,14 +142,14 @@ def _place(total: int) -> str:
     return "host" if total <= HOST_SHARE * host else "disk"
 
 
-def _dataset(root: Path, records: list[store.Record], place: str) -> windows.Dataset:
-    length = np.array([record["length"] for record in records], np.int32)
-    start = (np.cumsum(length) - length).astype(np.int32)
+def _dataset(
+    root: Path, records: list[store.Record], place: str, names: Sequence[str]
+) -> windows.Dataset:
+    length, start = _spans(records)
     fields: dict[str, Any] = dict.fromkeys(_FIELDS)
-    for name in _read(records[0]):
-        paths = [root / "episodes" / record["key"] / f"{name}.npy" for record in records]
+    for name in _read(records[0], names):
         # Only pictures are large; everything else is read in any case.
-        joined = Frames(paths, start, length)
+        joined = Frames(_paths(root, records, name), start, length)
         fields[name] = joined if place == "disk" and name == "image" else joined.read()
     dataset = windows.Dataset(
         observation=Observation(

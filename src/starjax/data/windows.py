@@ -134,9 +134,9 @@ def gather(dataset: Dataset, frame: Any, obs_horizon: int, horizon: int) -> Batc
 def over_frames(dataset: Dataset, frames: np.ndarray, fn: Callable[..., np.ndarray]) -> np.ndarray:
     """`fn(observation, command, trocar)` of every given frame, in chunks, as one numpy array.
 
-    Pictures are left out: what is computed over a whole dataset is low-dimensional.
+    Pictures and their features are left out: what is computed over all frames is low-dimensional.
     """
-    low = (dataset.observation.replace(image=None), dataset.command)
+    low = (dataset.observation.replace(image=None, features=None), dataset.command)
     parts = []
     for i in range(0, len(frames), _CHUNK):
         frame = frames[i : i + _CHUNK]

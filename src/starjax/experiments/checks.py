@@ -60,6 +60,19 @@ def check(config: config_lib.RunConfig) -> None:
         policy.ddim_steps,
     )
     _expect(0 <= policy.temperature <= 1, "policy.temperature", "in [0, 1]", policy.temperature)
+    if policy.freeze_encoder:
+        _expect(
+            policy.observation == "image",
+            "policy.freeze-encoder",
+            "--policy.observation image",
+            policy.observation,
+        )
+        _expect(
+            bool(policy.encoder_weights),
+            "policy.freeze-encoder",
+            "--policy.encoder-weights with a trained policy",
+            "none",
+        )
     _expect(0 < train.crop_fraction <= 1, "train.crop-fraction", "in (0, 1]", train.crop_fraction)
     _expect(0 <= train.ema_max < 1, "train.ema-max", "in [0, 1)", train.ema_max)
     _expect(train.holdout_demos >= 0, "train.holdout-demos", "0 or more", train.holdout_demos)

@@ -1,44 +1,118 @@
-"""`starjax evaluate RUN`: the twelve trocars again, other trials, seed or time limit."""
+"""`starjax evaluate`: a trained policy on the twelve trocars; a file of weights is enough."""
 
 import dataclasses
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from starjax import config as config_lib
-from starjax.experiments import folders, options, words
+from starjax.experiments import checks, clock, folders, methods, options, presets, words
+from starjax.policies import weights
 from starjax.runtime import files, xla
 
-DESCRIPTION = """Scores a trained policy on the twelve trocars, into a folder of its own.
+DESCRIPTION = """Scores a trained policy on the twelve trocars, and films it.
 
-RUN is a method's folder, such as runs/cpu/stardiff."""
+RUN is a method's folder, such as runs/cpu/stardiff; or --policy names a policy.safetensors, from
+anywhere. The same command again goes on from the trials that are done."""
+
+_CONTROL_HZ = 30.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Flags of the command."""
 
-    run: tyro.conf.Positional[str]
+    run: tyro.conf.Positional[str] = ""  # a method's folder, such as runs/cpu/stardiff
+    policy: str = ""  # a policy.safetensors, or the name of weights that come with starjax
     seed: int = 0  # of the trials
-    out: str = ""  # folder of the result; RUN/evaluate-seed<seed> if empty
+    out: str = ""  # folder of the result; if empty, in RUN or in runs/evaluate
+    video: bool = True  # rollout.mp4
     eval: config_lib.EvalConfig = dataclasses.field(default_factory=config_lib.EvalConfig)
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the trials that are missing and writes result.json."""
-    chosen = options.parse(Options, argv, prog="starjax evaluate", description=DESCRIPTION)
+    """Runs the trials that are missing; writes result.json and rollout.mp4."""
+    chosen = options.parse(
+        Options, argv, prog="starjax evaluate", description=DESCRIPTION, default=_default()
+    )
+    if bool(chosen.run) == bool(chosen.policy):
+        got = "both" if chosen.run else "none"
+        raise config_lib.UsageError(f"RUN or --policy: expected one of the two, got {got}")
+    # A mistake should not wait for jax.
+    checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
     run = Path(chosen.run)
-    config = dataclasses.replace(folders.read_config(run), eval=chosen.eval, seed=chosen.seed)
-    folder = Path(chosen.out or run / f"evaluate-seed{chosen.seed}")
+    if chosen.policy:
+        file = weights.find("--policy", chosen.policy)
+        default = Path("runs/evaluate") / f"{_label(file)}-seed{chosen.seed}"
+        config = None
+    else:
+        config = folders.read_config(run)
+        file = folders.weights(run.parent, run.name)
+        default = run / f"evaluate-seed{chosen.seed}"
+    folder = Path(chosen.out or default)
     xla.prepare_xla()
     files.require_writable(folder)
 
     from starjax import rcm
     from starjax.experiments import scoring
 
-    who = scoring.subject(run.name, folders.weights(run.parent, run.name))
-    table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed)
-    result = scoring.write_result(folder, who, table, config, options.typed("evaluate", argv))
-    print(f"\n{words.outcome([result])}\n\nresult: {folder / 'result.json'}")
+    who = scoring.subject(run.name, file) if config else scoring.from_file(file)
+    config = dataclasses.replace(
+        config or _config(who.trained), seed=chosen.seed, out=str(folder), eval=chosen.eval
+    )
+    print(f"{words.about(config, chosen.policy or chosen.run)}, into {folder}\n", flush=True)
+    with clock.timed(folder, "evaluate"):
+        table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed)
+    command = options.typed("evaluate", argv)
+    result = scoring.write_result(folder, who, table, config, command, clock.timings(folder))
+    print(f"\n{words.outcome([result])}\n{_times(result)}\n")
+    if chosen.video:
+        print(_film(folder, who))
+    print(f"result: {folder / 'result.json'}; starjax report {folder} draws tables and figures")
     return 0
+
+
+def _default() -> Options:
+    """Two cores get through 48 trials in the time of a coffee, a GPU through the paper's 360."""
+    if presets.has_gpu():
+        return Options()
+    return Options(eval=config_lib.EvalConfig(trials=4, time_limit_s=30.0))
+
+
+def _label(file: Path) -> str:
+    """A name for a file of weights: that of its folder where its own says nothing."""
+    return file.resolve().parent.name if file.stem == "policy" else file.stem
+
+
+def _config(trained: Any) -> config_lib.RunConfig:
+    """Settings of the run that a policy comes from, as far as its file knows them."""
+    known = {
+        "method": trained.method,
+        "preset": trained.preset or "auto",
+        "policy": dataclasses.asdict(trained.policy),
+        "train": dataclasses.asdict(trained.train),
+        "demos": dataclasses.asdict(trained.demos or config_lib.DemosConfig()),
+    }
+    return config_lib.from_dict(config_lib.RunConfig, known)
+
+
+def _times(result: dict[str, Any]) -> str:
+    """How long a transfer and a decision take."""
+    taken = [trial["steps"] for trial in result["trials"] if trial["success"]]
+    transfer = f"{statistics.median(taken) / _CONTROL_HZ:.1f} s" if taken else "-"
+    return f"  median transfer {transfer}, decision {result['inference_ms']['p50']:.1f} ms"
+
+
+def _film(folder: Path, who: Any) -> str:
+    """Writes the video of the recorded trials; says where, or why not."""
+    from starjax.experiments.report import results, video
+
+    try:
+        path = video.record([results.load(folder)], who.env.model, folder / "rollout.mp4")
+    except (OSError, RuntimeError) as error:  # the encoder is a program of its own
+        return f"no video: {error}"
+    method = methods.METHODS[who.method].label
+    return f"video: {path}" if path else f"no video: no trial of {method} was recorded"

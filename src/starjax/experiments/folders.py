@@ -52,24 +52,31 @@ def selected(config: config_lib.RunConfig) -> list[str]:
     return list(methods.METHODS) if config.method == "all" else [config.method]
 
 
-def claim(folder: Path, config: config_lib.RunConfig, dataset: str) -> None:
+def claim(
+    folder: Path, config: config_lib.RunConfig, dataset: str, encoder: str | None = None
+) -> None:
     """Writes the config.json of a folder of weights, or makes sure that they are trained likewise.
 
     Args:
       folder: of one method.
       config: settings of this run.
       dataset: name of its demonstrations, which also tells the scene that they were made in.
+      encoder: fingerprint of its frozen vision encoder; None if it has none, or is trained.
 
     Raises:
       config.UsageError: naming the first setting that differs.
     """
     path = folder / "config.json"
-    wanted = {**json.loads(json.dumps(dataclasses.asdict(config))), "dataset": dataset}
-    found = json.loads(path.read_text()) if path.exists() else wanted
+    wanted = _as_json(config)
+    found = json.loads(path.read_text()) if path.exists() else {}
+    before = _as_json(_settings(found)) if found else wanted
     for name in (name for part in TRAINED_WITH for name in _flat(wanted[part], part)):
-        _refuse(folder, f"--{name}", _value(found, name), _value(wanted, name))
-    _refuse(folder, "demonstrations", found.get("dataset"), dataset)
-    files.write_json(path, wanted)
+        _refuse(folder, f"--{name}", _value(before, name), _value(wanted, name))
+    _refuse(folder, "demonstrations", found.get("dataset", dataset), dataset)
+    encoder_before = found.get("encoder") or encoder
+    _refuse(folder, "--policy.encoder-weights", encoder_before, encoder or encoder_before)
+    extra = {"dataset": dataset} | ({"encoder": encoder_before} if encoder_before else {})
+    files.write_json(path, {**wanted, **extra})
 
 
 def read_config(folder: Path) -> config_lib.RunConfig:
@@ -79,9 +86,26 @@ def read_config(folder: Path) -> config_lib.RunConfig:
         raise config_lib.UsageError(
             f"{folder}: expected a run's method folder such as runs/cpu/stardiff, no config.json"
         )
-    values = json.loads(path.read_text())
-    values.pop("dataset")
-    return config_lib.from_dict(config_lib.RunConfig, values)
+    return _settings(json.loads(path.read_text()))
+
+
+def trained_alike(one: dict[str, Any], other: dict[str, Any], *parts: str) -> bool:
+    """Whether two configurations from JSON agree on what decides the weights, and on `parts`.
+
+    Settings that did not exist yet when one of them was written have their default.
+    """
+    one, other = (_as_json(_settings(values)) for values in (one, other))
+    return all(one[part] == other[part] for part in (*TRAINED_WITH, *parts))
+
+
+def _settings(values: dict[str, Any]) -> config_lib.RunConfig:
+    """Settings from a config.json, without what else it records."""
+    kept = {name: value for name, value in values.items() if name not in ("dataset", "encoder")}
+    return config_lib.from_dict(config_lib.RunConfig, kept)
+
+
+def _as_json(config: config_lib.RunConfig) -> dict[str, Any]:
+    return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
 def _refuse(folder: Path, name: str, before: Any, now: Any) -> None:

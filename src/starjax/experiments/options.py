@@ -94,9 +94,11 @@ def _count_positional(settings: type, argv: Sequence[str]) -> int:
     """Words before the first flag; UsageError unless they are as many as `settings` asks for."""
     given = next((i for i, token in enumerate(argv) if token.startswith("--")), len(argv))
     hints = typing.get_type_hints(settings)
-    names = [f.name for f in dataclasses.fields(settings) if _is_positional(settings, f.name)]
+    fields = [f for f in dataclasses.fields(settings) if _is_positional(settings, f.name)]
+    names = [field.name for field in fields]
+    needed = sum(field.default is dataclasses.MISSING for field in fields)
     several = any(typing.get_origin(hints[name]) is tuple for name in names)
-    if names and (given < len(names) or (given > len(names) and not several)):
+    if names and (given < needed or (given > len(names) and not several)):
         got = " ".join(argv[:given]) or "none"
         raise config_lib.UsageError(
             f"{' '.join(names).upper()}: expected before any flag, got {got}"

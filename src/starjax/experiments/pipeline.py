@@ -32,18 +32,20 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     trained = list(dict.fromkeys(methods.METHODS[name].weights_of for name in names))
     with files.lock(out):
         print(words.plan(config, stages), flush=True)
+        untrained = any(not folders.weights(out, name).exists() for name in trained)
+        encoder = _encoder(config) if "train" in stages and untrained else None
         env = _environment(config)
         root, collect = _demonstrations(config, env)
         if "train" in stages:
             for name in dict.fromkeys([*trained, *names]):
-                folders.claim(out / name, config, root.name)
+                folders.claim(out / name, config, root.name, encoder and encoder.fingerprint)
         # Loaded once, and only if something is still to be trained with them.
-        demos = functools.cache(lambda: _load(root, collect))
+        demos = functools.cache(lambda: _load(config, root, collect, encoder))
         if "train" not in stages:
             collect()
         else:
             for name in trained:
-                _train(config, name, demos, env)
+                _train(config, name, demos, env, encoder)
         if "evaluate" in stages:
             for name in names:
                 _evaluate(config, name, env, command)
@@ -51,8 +53,18 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
             _report(out, names)
 
 
-def _environment(config: config_lib.RunConfig) -> Any:
+def _encoder(config: config_lib.RunConfig) -> Any:
+    """The vision encoder that stays frozen, None for other runs; mistakes are found here."""
     # Here and below, what brings jax is imported where it is used, after XLA has been prepared.
+    if config.policy.observation != "image" or not config.policy.encoder_weights:
+        return None
+    from starjax.training import encoder
+
+    found = encoder.read(config.policy, config.train)
+    return found if config.policy.freeze_encoder else None
+
+
+def _environment(config: config_lib.RunConfig) -> Any:
     from starjax.sim import env
 
     return env.make(config.policy.observation, config.policy.image_size)
@@ -90,21 +102,51 @@ def _demonstrations(config: config_lib.RunConfig, env: Any) -> tuple[Path, Calla
     return root, collect
 
 
-def _load(root: Path, collect: Callable[[], None]) -> Any:
+def _load(
+    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], encoder: Any
+) -> Any:
+    """The dataset to train on, with what a frozen encoder sees in the place of pictures."""
     from starjax.data import load, store
 
     collect()
+    settings = {"pictures": encoder is None, "report": words.indented}
     try:
-        return load.load(root, report=words.indented)
+        found = load.load(root, **settings)
     except store.DamagedEpisode as error:
         words.indented(f"damaged, collected again: {error}")
         (root / "SEALED.json").unlink()
         collect()
-        return load.load(root, report=words.indented)
+        found = load.load(root, **settings)
+    return found.dataset if encoder is None else _with_features(config, root, found, encoder)
 
 
-def _train(config: config_lib.RunConfig, name: str, demos: Callable[[], Any], env: Any) -> None:
+def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder: Any) -> Any:
+    import jax
+
+    from starjax.data import load, windows
+    from starjax.training import frozen
+
+    dataset = demos.dataset
+    with clock.timed(Path(config.out), "features"):
+        found = frozen.features(
+            encoder,
+            config.policy,
+            config.train,
+            root,
+            demos.digest,
+            len(dataset.episode),
+            lambda: load.frames(root),
+            words.indented,
+        )
+    features = jax.device_put(found) if windows.on_device(dataset) else found
+    return dataset.replace(observation=dataset.observation.replace(features=features))
+
+
+def _train(
+    config: config_lib.RunConfig, name: str, demos: Callable[[], Any], env: Any, encoder: Any
+) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
+    from starjax.policies import policy as policies
     from starjax.training import export, loop
 
     out = Path(config.out)
@@ -113,7 +155,7 @@ def _train(config: config_lib.RunConfig, name: str, demos: Callable[[], Any], en
     if weights.exists():
         words.stage("train", f"{name}: done before, {weights}")
         return
-    dataset = demos().dataset
+    dataset = demos()
     words.stage("train", f"{name}, into {folder}")
     with clock.timed(out, f"train {name}"), stop_signals() as should_stop:
         try:
@@ -130,10 +172,18 @@ def _train(config: config_lib.RunConfig, name: str, demos: Callable[[], Any], en
             )
         except loop.TrainingFailed as error:
             raise config_lib.UsageError(str(error)) from error
-    state = result.state
-    port = tuple(float(x) for x in env.p_world_ref)
-    made = (name, config.policy, config.train, state.ema_params, state.normalizer, port)
-    export.save(weights, export.Trained(*made))
+    params = result.state.ema_params
+    made = export.Trained(
+        method=name,
+        policy=config.policy,
+        train=config.train,
+        params=policies.with_vision(params, encoder.params) if encoder else params,
+        normalizer=result.state.normalizer,
+        p_world_ref=tuple(float(x) for x in env.p_world_ref),
+        demos=config.demos,
+        preset=config.preset,
+    )
+    export.save(weights, made)
     errors = ", ".join(f"{key} {value:.3g}" for key, value in result.holdout.items())
     words.indented(f"{result.samples_per_second:.0f} samples/s; held-out {errors or 'none'}")
 
@@ -163,13 +213,14 @@ def _is_scored(folder: Path, settings: dict[str, Any]) -> bool:
     if not path.exists():
         return False
     found = json.loads(path.read_text())["config"]
-    return all(found[part] == settings[part] for part in (*folders.TRAINED_WITH, "eval"))
+    return folders.trained_alike(found, settings, "eval")
 
 
 def _timings(out: Path, name: str) -> dict[str, float]:
     """Seconds of the stages that a method's result rests on, compilation apart."""
     stages = {
         "collect": "collect",
+        "features": "features",
         "train": f"train {methods.METHODS[name].weights_of}",
         "evaluate": f"evaluate {name}",
     }

@@ -11,7 +11,7 @@ import numpy as np
 from starjax import config as config_lib
 from starjax import rcm
 from starjax.evaluation import evaluate, latency, metrics, table
-from starjax.experiments import folders, methods, words
+from starjax.experiments import folders, methods, options, words
 from starjax.policies import policy as policies
 from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
@@ -51,6 +51,24 @@ def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subje
         raise config_lib.UsageError(
             f"{error}; remove it, and run the same command again"
         ) from error
+    return _subject(method, trained, env)
+
+
+def from_file(path: Path) -> Subject:
+    """Loads a policy that says itself which method it is.
+
+    Raises:
+      config.UsageError: the file is damaged, or not a policy of this version.
+    """
+    try:
+        trained = export.load(path)
+    except ValueError as error:
+        raise config_lib.UsageError(f"--policy: {error}") from error
+    options.choice(f"{path}: method", trained.method, methods.METHODS)
+    return _subject(trained.method, trained, None)
+
+
+def _subject(method: str, trained: export.Trained, env: sim_env.Env | None) -> Subject:
     env = env or sim_env.make(trained.policy.observation, trained.policy.image_size)
     row = methods.METHODS[method]
     policy = policies.make(row, trained.policy, env.p_world_ref, trained.train)

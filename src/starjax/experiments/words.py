@@ -13,43 +13,84 @@ STAGES = ("collect", "train", "evaluate", "report")
 
 def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
     """What is going to happen, for the start of a run."""
-    import jax
-
-    demos, policy, train, evaluation = config.demos, config.policy, config.train, config.eval
-    devices = jax.devices()
-    channels = "-".join(map(str, policy.unet_channels))
-    dtype = "" if policy.dtype == "float32" else f", {policy.dtype}"
     lines = [
         f"starjax {starjax.__version__}: method {config.method}, preset {config.preset}, "
         f"seed {config.seed}, folder {config.out}",
-        f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores",
-        f"  observation     {observation(policy)}",
-        f"  demonstrations  {demos.per_trocar * demos.seen_trocars} "
-        f"({demos.per_trocar} x {demos.seen_trocars} seen trocars)",
+        _device(),
+        *_seeing(config.policy),
+        _learning_from(config.demos),
     ]
-    if "train" in stages:
-        steps = f"{train.steps} steps of {train.batch_size}"
-        lines.append(f"  training        {steps}, U-Net {channels}{dtype}")
-    if "evaluate" in stages:
-        limit = f"at most {evaluation.time_limit_s:g} s each"
-        lines.append(f"  evaluation      12 trocars x {evaluation.trials} trials, {limit}")
+    lines += [_training(config)] if "train" in stages else []
+    lines += [_evaluation(config.eval)] if "evaluate" in stages else []
     return "\n".join(lines)
 
 
-def observation(policy: config_lib.PolicyConfig) -> str:
-    """What the policy sees, in one line."""
+def about(config: config_lib.RunConfig, name: str) -> str:
+    """What is going to be scored: the policy `name`, and how it was made."""
+    lines = [
+        f"starjax {starjax.__version__}: {methods.METHODS[config.method].label} of {name}",
+        _device(),
+        *_seeing(config.policy),
+        _learning_from(config.demos),
+        _training(config),
+        f"{_evaluation(config.eval)}, seed {config.seed}",
+    ]
+    return "\n".join(lines)
+
+
+def _device() -> str:
+    import jax
+
+    devices = jax.devices()
+    return f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores"
+
+
+def _learning_from(demos: config_lib.DemosConfig) -> str:
+    count = demos.per_trocar * demos.seen_trocars
+    return f"  demonstrations  {count} ({demos.per_trocar} x {demos.seen_trocars} seen trocars)"
+
+
+def _training(config: config_lib.RunConfig) -> str:
+    policy, train = config.policy, config.train
+    channels = "-".join(map(str, policy.unet_channels))
+    dtype = "" if policy.dtype == "float32" else f", {policy.dtype}"
+    steps = f"{train.steps} steps of {train.batch_size}"
+    return f"  training        {steps}, U-Net {channels}{dtype}"
+
+
+def _evaluation(evaluation: config_lib.EvalConfig) -> str:
+    limit = f"at most {evaluation.time_limit_s:g} s each"
+    return f"  evaluation      12 trocars x {evaluation.trials} trials, {limit}"
+
+
+def _seeing(policy: config_lib.PolicyConfig) -> list[str]:
+    """Lines that say what the policy sees, and with which encoder."""
     if policy.observation == "state":
-        return (
-            "state: block pose and target position in the place of pixels "
+        return [
+            "  observation     state: block pose and target position in the place of pixels "
             "(--policy.observation image turns the camera on)"
-        )
-    return f"image, {policy.image_size} px; {encoder(policy)}"
+        ]
+    return [
+        f"  observation     image, {policy.image_size} px",
+        f"  encoder         {encoder(policy)}; {policy.encoder}",
+    ]
 
 
 def encoder(policy: config_lib.PolicyConfig) -> str:
-    """Which image encoder, and where its weights began."""
-    start = f"from {policy.encoder_weights}" if policy.encoder_weights else "from scratch"
-    return f"encoder {policy.encoder} trained {start}"
+    """Where the weights of the image encoder come from, and whether they still learn."""
+    name = policy.encoder_weights
+    if not name:
+        return "trained from scratch"
+    known = " (pretrained on this task)" if _is_of_this_task(policy) else ""
+    return f"{'frozen' if policy.freeze_encoder else 'trained further'}, from {name}{known}"
+
+
+def _is_of_this_task(policy: config_lib.PolicyConfig) -> bool:
+    """Whether the encoder began in a policy of ours; where its file is gone, as far as we know."""
+    from starjax.policies import weights
+    from starjax.training import export
+
+    return policy.freeze_encoder or export.is_policy(weights.resolve(policy.encoder_weights))
 
 
 def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[str]:
@@ -61,7 +102,8 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
             "as in the paper; --policy.observation image turns the camera on."
         )
     else:
-        found.append(f"Image {encoder(config.policy)}, {config.policy.image_size} px.")
+        policy = config.policy
+        found.append(f"Image encoder: {encoder(policy)}; {policy.encoder}, {policy.image_size} px.")
     if config.preset == "smoke":
         found.append("Preset smoke is too short to learn anything: its rates mean nothing.")
     if figures["invalid"]:
@@ -71,7 +113,7 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
 
 def outcome(results: Sequence[Mapping[str, Any]]) -> str:
     """Seen against unseen trocars, one line a method, for the end of a run."""
-    rows = [("", "seen", "unseen", "safe", "RCM executed")]
+    rows = [("success [95% interval]", "seen", "unseen", "safe", "RCM executed")]
     for result in results:
         error = result["rcm_error_mm"]["executed"]
         rows.append(

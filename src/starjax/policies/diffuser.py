@@ -17,7 +17,7 @@ class Diffuser(NamedTuple):
     """Pure functions of one model.
 
     Attributes:
-      init: `key -> params`.
+      init: `key -> params`, those that training changes: none for a frozen vision encoder.
       loss: `(params, key, inputs, extra [B, E], x0 [B, H, A]) -> scalar` of Eq. 9.
       sample: `(params, keys [B], inputs, extra [B, E]) -> [B, H, A]` in [-1, 1], by DDIM.
     """
@@ -41,9 +41,7 @@ def make(
     dtype = jnp.dtype(policy_config.dtype)
     sees_image = policy_config.observation == "image"
     vision_dim = policy_config.obs_horizon * policy_config.vision_dim if sees_image else 0
-    vision = encoders.ImageEncoder(
-        trunk=policy_config.encoder, features=policy_config.vision_dim, dtype=dtype
-    )
+    vision = vision_encoder(policy_config)
     state = encoders.StateEncoder(features=policy_config.state_dim, dtype=dtype)
     unet = unet1d.ConditionalUnet1D(
         action_dim=action_dim,
@@ -68,14 +66,16 @@ def make(
                 key_unet, jnp.zeros((1, *shape)), jnp.zeros(1, jnp.int32), _zeros(unet.cond_dim)
             ),
         }
-        if sees_image:
+        if sees_image and not policy_config.freeze_encoder:
             size = policy_config.image_size
             params["vision"] = vision.init(key_vision, jnp.zeros((1, size, size, 3)))
         return params
 
     def condition(params: Params, inputs: features.Inputs, extra: jax.Array) -> jax.Array:
         parts = [state.apply(params["state"], inputs.history), extra]
-        if inputs.image is not None:
+        if inputs.features is not None:
+            parts.insert(0, inputs.features.reshape(len(inputs.features), -1))
+        elif inputs.image is not None:
             batch, horizon = inputs.image.shape[:2]
             offset = inputs.offset
             seen = vision.apply(
@@ -108,6 +108,15 @@ def make(
         )
 
     return Diffuser(init, loss, sample)
+
+
+def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:
+    """The network that sees pictures, whose parameters are `params["vision"]`."""
+    return encoders.ImageEncoder(
+        trunk=policy_config.encoder,
+        features=policy_config.vision_dim,
+        dtype=jnp.dtype(policy_config.dtype),
+    )
 
 
 def _zeros(width: int) -> jax.Array:

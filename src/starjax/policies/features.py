@@ -24,11 +24,13 @@ class Inputs(NamedTuple):
       history: `[B, O, S]` normalised low-dimensional measurements.
       image: `[B, O, c, c, 3]` cropped and normalised frames, or None.
       offset: `[B, O, 2]` pixels from the centre crop, or None for centre crops.
+      features: `[B, O, d_v]` of the vision encoder, computed before, in the place of `image`.
     """
 
     history: jax.Array
-    image: jax.Array | None
-    offset: jax.Array | None
+    image: jax.Array | None = None
+    offset: jax.Array | None = None
+    features: jax.Array | None = None
 
 
 def trocar_features(trocar: rcm.Trocar, p_world_ref: jax.Array) -> jax.Array:
@@ -82,13 +84,10 @@ def for_sampling(
     """Inputs as they are at inference: centre crops, no noise."""
     history = _history(policy_config, stats, observation, proprioception)
     if policy_config.observation == "state":
-        return Inputs(history, None, None)
-    image = augment.center(
-        _frames(observation),
-        crop=crop_size(policy_config, train_config),
-        dtype=jnp.dtype(policy_config.dtype),
-    )
-    return Inputs(history, image, None)
+        return Inputs(history)
+    if observation.features is not None:
+        return Inputs(history, features=observation.features)
+    return Inputs(history, centre_crop(policy_config, train_config, _frames(observation)))
 
 
 def for_training(
@@ -99,13 +98,18 @@ def for_training(
     observation: Observation,
     proprioception: jax.Array,
 ) -> Inputs:
-    """Augmented inputs: noise on every low-dimensional number; crop, jitter, noise on pictures."""
+    """Augmented inputs: noise on every low-dimensional number; crop, jitter, noise on pictures.
+
+    What a frozen encoder saw in centre crops stays as it is, so that inference sees the same.
+    """
     key_history, key_image = jax.random.split(key)
     history = _history(policy_config, stats, observation, proprioception)
     noise = jax.random.normal(key_history, history.shape, history.dtype)
     history = history + train_config.state_noise * noise
     if policy_config.observation == "state":
-        return Inputs(history, None, None)
+        return Inputs(history)
+    if policy_config.freeze_encoder:
+        return Inputs(history, features=_features(observation))
     image, offset = augment.augment(
         key_image,
         _frames(observation),
@@ -115,6 +119,17 @@ def for_training(
         dtype=jnp.dtype(policy_config.dtype),
     )
     return Inputs(history, image, offset)
+
+
+def centre_crop(
+    policy_config: config.PolicyConfig, train_config: config.TrainConfig, frames: jax.Array
+) -> jax.Array:
+    """Frames `[..., h, w, 3]` uint8 as the vision encoder sees them at inference."""
+    return augment.center(
+        frames,
+        crop=crop_size(policy_config, train_config),
+        dtype=jnp.dtype(policy_config.dtype),
+    )
 
 
 def crop_size(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -> int:
@@ -159,3 +174,12 @@ def _frames(observation: Observation) -> jax.Array:
             'observation="image", got None'
         )
     return observation.image
+
+
+def _features(observation: Observation) -> jax.Array:
+    if observation.features is None:
+        raise ValueError(
+            "observation.features: expected [..., d_v] to train a policy with a frozen encoder, "
+            "got None"
+        )
+    return observation.features

@@ -1,5 +1,6 @@
 """A policy of Table II: three pure functions, made from a method's row."""
 
+import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,7 +19,8 @@ class Policy(NamedTuple):
     """What training and evaluation know of a method.
 
     Attributes:
-      init: `key -> params`.
+      init: `key -> params`, those that training changes: a frozen vision encoder's are missing,
+        and `with_vision` adds them for `sample` to see pictures.
       loss: `(params, stats, key, batch) -> (scalar, metrics)`; metrics are named scalars.
       sample: `(params, stats, keys [B], Observation [B, O], Trocar [B]) -> Command [B, H]`, finite
         whatever the networks say. What sample i draws depends on `keys[i]` alone.
@@ -35,13 +37,23 @@ class Policy(NamedTuple):
     ]
 
 
-def with_encoder(params: Params, path: str) -> Params:
-    """Parameters whose ResNet-18 trunk is filled from the user's weight file."""
+def vision_of(params: Params) -> Params:
+    """The vision encoder's part of a policy's parameters."""
+    return params.get("diffuser", params)["vision"]
+
+
+def with_vision(params: Params, vision: Params) -> Params:
+    """Parameters with the given vision encoder in them, in the place of theirs if they have one."""
     if "diffuser" in params:
-        return {**params, "diffuser": with_encoder(params["diffuser"], path)}
-    vision = params["vision"]["params"]
+        return {**params, "diffuser": with_vision(params["diffuser"], vision)}
+    return {**params, "vision": vision}
+
+
+def with_resnet18(params: Params, path: str | pathlib.Path) -> Params:
+    """Parameters whose ResNet-18 trunk is filled from torchvision's weight file."""
+    vision = vision_of(params)["params"]
     filled = {**vision, "trunk": pretrained.load_resnet18(vision["trunk"], path)}
-    return {**params, "vision": {"params": filled}}
+    return with_vision(params, {"params": filled})
 
 
 def make(

@@ -77,6 +77,8 @@ def _plain(description: str, total: int, unit: str, done: int, stream: TextIO) -
 
     def advance(count: float = 1, note: str = "") -> None:
         nonlocal shown
+        if not count and meter.done >= total:
+            return  # the last line is out
         meter.add(count)
         now = time.monotonic()
         if now - shown < PLAIN_EVERY_S and meter.done < total:

@@ -34,6 +34,8 @@ class Trained(NamedTuple):
       params: the averaged (EMA) parameters.
       normalizer: fitted to the training demonstrations.
       p_world_ref: `[3]` m, the nominal port, if it was given.
+      demos: what it learned from, if it was given; for the record, and for what it has seen.
+      preset: the preset of its run, if it was given; for the record.
     """
 
     method: str
@@ -42,6 +44,8 @@ class Trained(NamedTuple):
     params: Params
     normalizer: normalizer.Normalizer
     p_world_ref: tuple[float, ...] | None = None
+    demos: config.DemosConfig | None = None
+    preset: str | None = None
 
 
 def save(path: pathlib.Path | str, trained: Trained) -> None:
@@ -67,6 +71,8 @@ def save(path: pathlib.Path | str, trained: Trained) -> None:
         "policy": dataclasses.asdict(trained.policy),
         "train": dataclasses.asdict(trained.train),
         "p_world_ref": None if port is None else [float(x) for x in port],
+        "demos": None if trained.demos is None else dataclasses.asdict(trained.demos),
+        "preset": trained.preset,
     }
     envelope = {"about": about, "sha256": _hash(about, arrays)}
     data = safetensors.numpy.save(arrays, {_KEY: json.dumps(envelope, sort_keys=True)})
@@ -96,7 +102,7 @@ def load(path: pathlib.Path | str) -> Trained:
         raise ValueError(f"{path}: damaged, its content is not what was written (sha256)")
     tree = _unflatten(arrays)
     stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
-    port = about["p_world_ref"]
+    port, demos = about["p_world_ref"], about.get("demos")
     return Trained(
         method=about["method"],
         policy=config.from_dict(config.PolicyConfig, about["policy"]),
@@ -104,7 +110,23 @@ def load(path: pathlib.Path | str) -> Trained:
         params=tree["params"],
         normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
         p_world_ref=None if port is None else tuple(port),
+        demos=None if demos is None else config.from_dict(config.DemosConfig, demos),
+        preset=about.get("preset"),
     )
+
+
+def is_policy(path: pathlib.Path | str) -> bool:
+    """Whether a file begins as `save` begins one; it may still be damaged."""
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            return _KEY in (file.metadata() or {})
+    except (safetensors.SafetensorError, OSError):
+        return False
+
+
+def fingerprint(params: Params) -> str:
+    """SHA-256 of parameters and of their names."""
+    return _hash({}, dict(_flatten(params)))
 
 
 def _flatten(tree: Any, prefix: str = ""):

@@ -14,7 +14,7 @@ from starjax import config
 from starjax.data import normalizer, windows
 from starjax.policies import policy as policies
 from starjax.runtime import progress
-from starjax.training import checkpoint, devices, feed, holdout, metrics
+from starjax.training import checkpoint, devices, encoder, feed, holdout, metrics
 from starjax.training import state as states
 from starjax.training import step as steps
 
@@ -66,7 +66,8 @@ def run(
       method: row of Table II, whose own weights are trained.
       policy_config: networks and diffusion.
       train_config: optimisation.
-      dataset: on the device (jax arrays) or on the host, see `windows.Dataset`.
+      dataset: on the device (jax arrays) or on the host, see `windows.Dataset`; with features in
+        the place of pictures for a frozen vision encoder, whose parameters stay out of the state.
       p_world_ref: `[3]` m, the nominal port.
       directory: gets `checkpoints/` and `metrics.jsonl`.
       seed: of everything random.
@@ -90,7 +91,17 @@ def run(
         dataset.start, dataset.length, train_config.holdout_demos
     )
     state = _restored_or_new(
-        method, policy, optimizer, policy_config, dataset, p_world_ref, train, directory, seed, mesh
+        method,
+        policy,
+        optimizer,
+        policy_config,
+        train_config,
+        dataset,
+        p_world_ref,
+        train,
+        directory,
+        seed,
+        mesh,
     )
     step = first = int(state.step)
     metrics.resume(log, step)
@@ -129,12 +140,23 @@ def run(
 
 def _observed(dataset: windows.Dataset, policy_config: config.PolicyConfig) -> windows.Dataset:
     """The dataset without what the policy does not look at, so that nobody gathers it."""
-    unseen = "image" if policy_config.observation == "state" else "state"
-    return dataset.replace(observation=dataset.observation.replace(**{unseen: None}))
+    seen = "features" if policy_config.freeze_encoder else policy_config.observation
+    unseen = {name: None for name in ("image", "state", "features") if name != seen}
+    return dataset.replace(observation=dataset.observation.replace(**unseen))
 
 
 def _restored_or_new(
-    method, policy, optimizer, policy_config, dataset, p_world_ref, frames, directory, seed, mesh
+    method,
+    policy,
+    optimizer,
+    policy_config,
+    train_config,
+    dataset,
+    p_world_ref,
+    frames,
+    directory,
+    seed,
+    mesh,
 ) -> states.TrainState:
     example = windows.gather(
         dataset,
@@ -157,8 +179,9 @@ def _restored_or_new(
     if restored is not None:
         return restored[1]
     params = states.init_params(policy, seed)
-    if policy_config.observation == "image" and policy_config.encoder_weights:
-        params = policies.with_encoder(params, policy_config.encoder_weights)
+    begins = policy_config.observation == "image" and not policy_config.freeze_encoder
+    if begins and policy_config.encoder_weights:
+        params = encoder.start(params, policy_config, train_config)
     return devices.replicate(around(params), mesh)
 
 

@@ -118,4 +118,5 @@ def runs_in_a_loop(policy_config: config.PolicyConfig, mesh: Mesh) -> bool:
     XLA's CPU compiler gives convolutions the layout that its fast kernels need only outside of
     loops; inside, those of the gradient run 12 times slower.
     """
-    return policy_config.observation != "image" or mesh.devices.flat[0].platform != "cpu"
+    sees_pictures = policy_config.observation == "image" and not policy_config.freeze_encoder
+    return not sees_pictures or mesh.devices.flat[0].platform != "cpu"

@@ -31,7 +31,8 @@ def build(
     files.write_bytes(out / "tables.md", tables.markdown(loaded).encode())
     sim = _model() if any(run.rollouts for run in loaded) else None
     pictures = _figures(loaded, focus, sim, out)
-    clip = _video(loaded, sim, out, report) if with_video and sim else None
+    film = video.record(loaded, sim, out / "rollout.mp4", report) if with_video and sim else None
+    clip = film.read_bytes() if film else None
     index = out / "index.html"
     files.write_bytes(index, page.render(loaded, focus, pictures, clip).encode())
     return index
@@ -86,16 +87,3 @@ def _figures(
             if name != "training":
                 files.write_bytes(out / f"{name}.pdf", style.save(light, "pdf"))
     return pictures
-
-
-def _video(
-    runs: Sequence[results.Run], sim: Any, out: pathlib.Path, report: Callable[[str], None]
-) -> bytes | None:
-    chosen = video.choose(results.representatives(runs))
-    if not chosen:
-        return None
-    report(f"drawing {len(chosen)} rollouts for the video")
-    path = out / "rollout.mp4"
-    draw, note = video.renderer(sim), f"sees the {results.observed(runs)}"
-    video.write(video.frames(chosen, draw, note), path)
-    return path.read_bytes()

@@ -22,6 +22,31 @@ _MUTED = "#98a2ad"
 _BATCH = 16  # pictures drawn in one call
 
 
+def record(
+    runs: Sequence[results.Run],
+    sim: Any,
+    path: pathlib.Path,
+    report: Callable[[str], None] = print,
+) -> pathlib.Path | None:
+    """Draws a few recorded rollouts into the file `path`; returns None if there are none.
+
+    Args:
+      runs: of whose representatives `choose` picks.
+      sim: `sim.model.SimModel`, what `Env.model` is.
+      path: of the mp4.
+      report: gets a line for the user.
+
+    Raises:
+      OSError, RuntimeError: the encoder failed, or there is none for this machine.
+    """
+    chosen = choose(results.representatives(runs))
+    if not chosen:
+        return None
+    report(f"drawing {len(chosen)} rollouts for the video")
+    write(frames(chosen, renderer(sim), f"sees the {results.observed(runs)}"), path)
+    return path
+
+
 def choose(runs: Sequence[results.Run], most: int = 4) -> list[tuple[str, results.Rollout]]:
     """(method, rollout) to show side by side, an even number if there are two or more.
 

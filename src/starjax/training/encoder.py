@@ -1,0 +1,115 @@
+"""The vision encoder of another policy: where a new policy's begins, or what stays frozen in it."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from starjax import config
+from starjax.policies import diffuser, features, weights
+from starjax.policies import policy as policies
+from starjax.training import export
+
+
+class Encoder(NamedTuple):
+    """A trained vision encoder.
+
+    Attributes:
+      params: of `models.encoders.ImageEncoder`.
+      fingerprint: start of the hash of the parameters, in hexadecimal.
+    """
+
+    params: policies.Params
+    fingerprint: str
+
+
+def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -> Encoder | None:
+    """The encoder that the settings name, if a starjax policy holds it.
+
+    Returns None for torchvision's weights, which fill the ResNet's trunk and nothing else.
+
+    Raises:
+      config.UsageError: one line; there is no such file, it is damaged, or the encoder in it is
+        not the one that the settings describe.
+    """
+    name = policy_config.encoder_weights
+    path = weights.find("--policy.encoder-weights", name)
+    if not export.is_policy(path):
+        _check_torchvision(policy_config)
+        return None
+    try:
+        trained = export.load(path)
+    except ValueError as error:
+        raise config.UsageError(f"--policy.encoder-weights: {error}") from error
+    if differing := _differing(policy_config, train_config, trained):
+        raise config.UsageError(
+            f"--policy.encoder-weights: the encoder of {name} was made with "
+            f"{', '.join(differing)}: use the same, or other weights"
+        )
+    params = policies.vision_of(trained.params)
+    _check_shapes(policy_config, params, name)
+    return Encoder(params, export.fingerprint(params)[:16])
+
+
+def start(
+    params: policies.Params, policy_config: config.PolicyConfig, train_config: config.TrainConfig
+) -> policies.Params:
+    """A policy's parameters before the first step, with the encoder that the settings name."""
+    found = read(policy_config, train_config)
+    if found is None:
+        return policies.with_resnet18(params, weights.resolve(policy_config.encoder_weights))
+    return policies.with_vision(params, found.params)
+
+
+def _differing(
+    policy_config: config.PolicyConfig, train_config: config.TrainConfig, trained: export.Trained
+) -> list[str]:
+    """Settings of the encoder that are not as they were: `--policy.vision-dim 64 (here 128)`."""
+    names = ["observation", "encoder", "vision_dim"]
+    # Where it goes on learning, it may get used to another picture.
+    names += ["image_size"] if policy_config.freeze_encoder else []
+    ours, theirs = policy_config, trained.policy
+    found = [
+        f"--policy.{name.replace('_', '-')} {getattr(theirs, name)} (here {getattr(ours, name)})"
+        for name in names
+        if getattr(ours, name) != getattr(theirs, name)
+    ]
+    fractions = trained.train.crop_fraction, train_config.crop_fraction
+    if policy_config.freeze_encoder and (
+        features.crop_size(theirs, trained.train) != features.crop_size(theirs, train_config)
+    ):
+        found.append("--train.crop-fraction {:g} (here {:g})".format(*fractions))
+    return found
+
+
+def _check_torchvision(policy_config: config.PolicyConfig) -> None:
+    name = policy_config.encoder_weights
+    if policy_config.freeze_encoder:
+        raise config.UsageError(
+            "--policy.freeze-encoder: expected --policy.encoder-weights of a trained starjax "
+            f"policy, got {name}, which would leave the keypoints untrained"
+        )
+    if policy_config.encoder != "resnet18":
+        raise config.UsageError(
+            f"--policy.encoder: expected resnet18 with weights of torchvision ({name}), "
+            f"got {policy_config.encoder}"
+        )
+
+
+def _check_shapes(
+    policy_config: config.PolicyConfig, params: policies.Params, name: str | Path
+) -> None:
+    """UsageError unless the network of today has these parameters."""
+    vision, size = diffuser.vision_encoder(policy_config), policy_config.image_size
+    wanted = jax.eval_shape(vision.init, jax.random.key(0), jnp.zeros((1, size, size, 3)))
+    shapes = [
+        {jax.tree_util.keystr(path): leaf.shape for path, leaf in leaves}
+        for leaves in map(jax.tree_util.tree_leaves_with_path, (wanted, params))
+    ]
+    for key in sorted({*shapes[0], *shapes[1]}):
+        want, got = (shape.get(key, "no such parameter") for shape in shapes)
+        if want != got:
+            raise config.UsageError(
+                f"--policy.encoder-weights: {name}: {key}: expected {want}, got {got}"
+            )

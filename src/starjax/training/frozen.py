@@ -1,0 +1,128 @@
+"""What a frozen vision encoder sees in every demonstrated frame, computed once and kept on disk.
+
+    <root>/features/<key>/part_<n>.npz    `[PART, d_v]` float32, of consecutive frames
+
+The key is a hash of all that decides the features, so that a resumed run, or another method with
+the same encoder, finds them. Archives have checksums: a damaged part is noticed and made again.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from starjax import config
+from starjax.policies import diffuser
+from starjax.policies import features as inputs
+from starjax.runtime import files, progress
+from starjax.training.encoder import Encoder
+
+PART = 1024  # frames a file: what a kill may cost
+BATCH = 64  # frames a call: always as many, since the size of a batch may change last bits
+
+
+def features(
+    encoder: Encoder,
+    policy_config: config.PolicyConfig,
+    train_config: config.TrainConfig,
+    root: Path,
+    digest: str,
+    count: int,
+    frames: Callable[[], Any],
+    report: Callable[[str], None] = print,
+) -> np.ndarray:
+    """Features `[F, d_v]` float32 of the centre crop of each frame, those that inference sees.
+
+    Args:
+      encoder: stays as it is.
+      policy_config: networks.
+      train_config: gives the crop.
+      root: folder of the demonstrations.
+      digest: hash that names their content.
+      count: F.
+      frames: gives them, uint8 `[F, h, w, 3]` as `windows.Dataset` may hold them; called only if
+        something is missing.
+      report: gets lines for the user.
+
+    Raises:
+      StorageError: the folder cannot be written.
+    """
+    folder = root / "features" / _key(encoder, policy_config, train_config, digest)
+    spans = [(first, min(first + PART, count)) for first in range(0, count, PART)]
+    paths = [folder / f"part_{number:04d}.npz" for number in range(len(spans))]
+    parts: dict[Path, np.ndarray] = {}
+    missing = []
+    for path, (first, last) in zip(paths, spans):
+        found = _read(path, (last - first, policy_config.vision_dim), report)
+        if found is None:
+            missing.append((path, first, last))
+        else:
+            parts[path] = found
+    if missing:
+        see, pictures = _make_see(encoder, policy_config, train_config), frames()
+        done = sum(map(len, parts.values()))
+        with progress.track("Features", count, unit="frames", done=done) as advance:
+            for path, first, last in missing:
+                seen = []
+                for start in range(first, last, BATCH):
+                    rows = np.minimum(np.arange(start, start + BATCH), last - 1)
+                    seen.append(np.asarray(see(pictures[rows]))[: last - start])
+                    advance(len(seen[-1]))
+                parts[path] = np.concatenate(seen)
+                files.write_npz(path, {"features": parts[path]})
+    joined = np.concatenate([parts[path] for path in paths])
+    said = "in" if missing else "done before,"
+    report(f"features of {count} frames, {files.size(joined.nbytes)}: {said} {folder}")
+    return joined
+
+
+def _make_see(
+    encoder: Encoder, policy_config: config.PolicyConfig, train_config: config.TrainConfig
+) -> Callable[[np.ndarray], jax.Array]:
+    """Frames `[BATCH, h, w, 3]` uint8 to features `[BATCH, d_v]`."""
+    vision = diffuser.vision_encoder(policy_config)
+
+    @jax.jit
+    def see(params: Any, frames: jax.Array) -> Any:
+        return vision.apply(params, inputs.centre_crop(policy_config, train_config, frames))
+
+    params = jax.device_put(encoder.params)
+    return lambda frames: see(params, frames)
+
+
+def _key(
+    encoder: Encoder,
+    policy_config: config.PolicyConfig,
+    train_config: config.TrainConfig,
+    digest: str,
+) -> str:
+    """Names the features by what they are made of."""
+    about = {
+        "encoder": encoder.fingerprint,
+        "trunk": policy_config.encoder,
+        "dtype": policy_config.dtype,
+        "crop": inputs.crop_size(policy_config, train_config),
+        "demonstrations": digest,
+    }
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _read(path: Path, shape: tuple[int, int], report: Callable[[str], None]) -> np.ndarray | None:
+    """A finished part, or None if it is missing or damaged."""
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            found = archive["features"]
+    except FileNotFoundError:
+        return None
+    except Exception as error:  # a damaged archive fails in a dozen ways
+        report(f"damaged, computed again: {path}: {error}")
+        return None
+    if found.shape != shape or found.dtype != np.float32:
+        expected = f"expected float32 {shape}, got {found.dtype} {found.shape}"
+        report(f"damaged, computed again: {path}: {expected}")
+        return None
+    return found

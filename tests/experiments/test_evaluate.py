@@ -1,0 +1,110 @@
+"""`starjax evaluate`: a file of weights is enough, mistakes are a line. The simulator is a stub."""
+
+import dataclasses
+import json
+
+import fakes
+import jax.numpy as jnp
+import pytest
+import stubs
+
+from starjax import config
+from starjax.data import normalizer
+from starjax.experiments import evaluate, scoring
+from starjax.experiments.report import video
+from starjax.training import export
+
+POLICY = dataclasses.replace(fakes.TINY, execute=4)
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """A policy's file in an empty folder, for the stub of a simulator and of networks."""
+    network, params = stubs.make_policy()
+
+    def sample(_, stats, keys, observation, trocar):
+        return network.sample(params, 1.0, keys, observation, trocar)
+
+    monkeypatch.setattr(scoring.sim_env, "make", lambda *_: stubs.make_env())
+    monkeypatch.setattr(scoring.policies, "make", lambda *_: stubs.Policy(sample))
+    monkeypatch.setattr(video, "record", lambda runs, sim, path: path)
+    monkeypatch.chdir(tmp_path)
+    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
+    made = export.Trained(
+        method="dp_rcm2",
+        policy=POLICY,
+        train=config.TrainConfig(steps=77),
+        params={"unet": {"kernel": jnp.ones(3)}},
+        normalizer=normalizer.Normalizer(box, None),
+        demos=config.DemosConfig(per_trocar=2, seen_trocars=4),
+        preset="smoke",
+    )
+    export.save(tmp_path / "mine.safetensors", made)
+    return tmp_path / "mine.safetensors"
+
+
+def score(*more):
+    trials = ["--eval.trials", "2", "--eval.time-limit-s", "1"]
+    return evaluate.main(["--policy", "mine.safetensors", *trials, *more])
+
+
+def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
+    assert score() == 0
+    folder = file.parent / "runs" / "evaluate" / "mine-seed0"
+    result = json.loads((folder / "result.json").read_text())
+    assert result["method"] == "dp_rcm2" and len(result["trials"]) == 24
+    assert (result["seen"]["trials"], result["unseen"]["trials"]) == (8, 16)
+    assert result["config"]["train"]["steps"] == 77 and result["preset"] == "smoke"
+    assert result["config"]["policy"] == json.loads(json.dumps(dataclasses.asdict(POLICY)))
+    assert result["timings_s"]["evaluate"] > 0
+    said = capsys.readouterr().out
+    for words in ("DP-RCM-2 of mine.safetensors", "12 trocars x 2 trials", "4 seen trocars"):
+        assert words in said
+    assert "/8 = " in said and "/16 = " in said and "95% interval" in said
+    assert "rollout.mp4" in said and "result.json" in said
+
+
+def test_the_same_command_again_runs_nothing_twice(file):
+    score("--out", "here")
+    chunks = {path: path.stat().st_mtime_ns for path in (file.parent / "here").rglob("chunk*")}
+    score("--out", "here", "--no-video")
+    assert chunks and all(path.stat().st_mtime_ns == then for path, then in chunks.items())
+
+
+def test_a_machine_without_a_video_encoder_still_gets_the_result(file, monkeypatch, capsys):
+    def broken(runs, sim, path):
+        raise RuntimeError("no ffmpeg")
+
+    monkeypatch.setattr(video, "record", broken)
+    assert score() == 0
+    assert "no video: no ffmpeg" in capsys.readouterr().out
+
+
+def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
+    assert evaluate._label(tmp_path / "stardiff" / "policy.safetensors") == "stardiff"
+    assert evaluate._label(tmp_path / "compact.safetensors") == "compact"
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], ["RUN or --policy", "none"]),
+        (["runs/x", "--policy", "y"], ["RUN or --policy", "both"]),
+        (["a", "b"], ["RUN", "a b"]),
+        (["--policy", "nowhere"], ["--policy", "a file", "nowhere"]),
+        (["--policy", "x", "--eval.trials", "0"], ["--eval.trials", "more than 0"]),
+        (["nowhere"], ["nowhere", "method folder"]),
+    ],
+)
+def test_a_mistake_is_one_line(argv, words):
+    with pytest.raises(config.UsageError) as caught:
+        evaluate.main(argv)
+    message = str(caught.value)
+    assert "\n" not in message and all(word in message for word in words), message
+
+
+def test_a_damaged_file_is_one_line(file):
+    content = file.read_bytes()
+    file.write_bytes(content[:-3] + b"abc")
+    with pytest.raises(config.UsageError, match=r"--policy: mine.safetensors: damaged"):
+        score()

@@ -1,0 +1,171 @@
+"""The encoder of another policy: taken as it is, or refused in one line that says why."""
+
+import dataclasses
+import functools
+
+import fakes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from starjax import config
+from starjax.data import normalizer
+from starjax.models import encoders
+from starjax.policies import diffuser
+from starjax.policies import policy as policies
+from starjax.training import encoder, export
+
+TRAIN = config.TrainConfig()
+IMAGE = dataclasses.replace(fakes.TINY, observation="image")
+
+
+@functools.cache
+def initial():
+    """Parameters of the encoder of `IMAGE`."""
+    vision, size = diffuser.vision_encoder(IMAGE), IMAGE.image_size
+    init = jax.jit(vision.init, compiler_options={"xla_backend_optimization_level": 0})
+    return init(jax.random.key(5), jnp.zeros((1, size, size, 3)))
+
+
+def save(path, method="stardiff", policy_config=IMAGE, change=lambda vision: vision):
+    """A file of a policy that is little more than its encoder; returns its parameters."""
+    rest = {"unet": {"kernel": jnp.ones((2, 3))}}
+    params = {"diffuser": rest, "roll": {"bias": jnp.ones(3)}} if method == "stardiff" else rest
+    if policy_config.observation == "image":
+        params = policies.with_vision(params, change(initial()))
+    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
+    stats = normalizer.Normalizer(box, None)
+    export.save(path, export.Trained(method, policy_config, TRAIN, params, stats))
+    return params
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """A policy's file and its parameters."""
+    path = tmp_path_factory.mktemp("source") / "policy.safetensors"
+    return path, save(path)
+
+
+def settings(path, **changed):
+    return dataclasses.replace(IMAGE, encoder_weights=str(path), **changed)
+
+
+@pytest.mark.parametrize("method", ["stardiff", "dp_rcm1"])
+def test_it_is_found_in_both_kinds_of_policy(tmp_path, method):
+    save(tmp_path / "p", method)
+    found = encoder.read(settings(tmp_path / "p"), TRAIN)
+    jax.tree.map(np.testing.assert_array_equal, found.params, initial())
+
+
+def test_fingerprint_tells_weights_apart(source, tmp_path):
+    path, _ = source
+    other = save(tmp_path / "p", change=lambda v: jax.tree.map(lambda x: x + 1e-3, v))
+    one, two = (encoder.read(settings(p), TRAIN).fingerprint for p in (path, tmp_path / "p"))
+    assert one != two and len(one) == len(two)
+    again = encoder.read(settings(path, freeze_encoder=True), TRAIN)
+    assert again.fingerprint == one != export.fingerprint(policies.vision_of(other))
+
+
+def test_a_policy_that_goes_on_learning_starts_with_it(source):
+    path, params = source
+    begun = policies.with_vision(
+        jax.tree.map(jnp.ones_like, params),
+        jax.tree.map(jnp.zeros_like, policies.vision_of(params)),
+    )
+    found = encoder.start(begun, settings(path), TRAIN)
+    jax.tree.map(
+        np.testing.assert_array_equal, policies.vision_of(found), policies.vision_of(params)
+    )
+    assert all((leaf == 1).all() for leaf in jax.tree.leaves(found["roll"]))
+
+
+@pytest.mark.parametrize(
+    ("ours", "train", "words"),
+    [
+        ({"vision_dim": 32}, {}, ["--policy.vision-dim 16 (here 32)"]),
+        (
+            {"encoder": "resnet18", "vision_dim": 32},
+            {},
+            ["--policy.encoder small (here resnet18)", "--policy.vision-dim 16 (here 32)"],
+        ),
+        (
+            {"freeze_encoder": True, "image_size": 48},
+            {"crop_fraction": 0.5},
+            ["--policy.image-size 32 (here 48)", "--train.crop-fraction 0.9 (here 0.5)"],
+        ),
+    ],
+)
+def test_another_architecture_is_one_line_that_names_all_that_differs(source, ours, train, words):
+    path, _ = source
+    with pytest.raises(config.UsageError) as caught:
+        encoder.read(settings(path, **ours), dataclasses.replace(TRAIN, **train))
+    message = str(caught.value)
+    assert "\n" not in message and str(path) in message
+    assert all(word in message for word in words), message
+
+
+def test_another_picture_is_fine_where_it_goes_on_learning(source):
+    path, _ = source
+    assert encoder.read(settings(path, image_size=48), TRAIN) is not None
+
+
+def test_a_policy_without_a_camera_is_refused(tmp_path):
+    save(tmp_path / "p", policy_config=fakes.TINY)
+    with pytest.raises(config.UsageError, match=r"--policy.observation state \(here image\)"):
+        encoder.read(settings(tmp_path / "p"), TRAIN)
+
+
+def test_parameters_of_another_network_are_named(tmp_path):
+    def change(vision):
+        inner = vision["params"]
+        return {"params": {**inner, "keypoints": inner["keypoints"][:-1]}}
+
+    save(tmp_path / "p", change=change)
+    with pytest.raises(config.UsageError, match=r"keypoints.*expected \(64, 8\), got \(63, 8\)"):
+        encoder.read(settings(tmp_path / "p"), TRAIN)
+
+
+def test_a_damaged_file_is_one_line(source, tmp_path):
+    content = bytearray(source[0].read_bytes())
+    content[-5] ^= 1
+    (tmp_path / "p").write_bytes(content)
+    with pytest.raises(config.UsageError, match=r"--policy.encoder-weights: .*damaged"):
+        encoder.read(settings(tmp_path / "p"), TRAIN)
+
+
+def test_a_missing_file_is_one_line():
+    with pytest.raises(config.UsageError, match=r"--policy.encoder-weights: expected .*nowhere"):
+        encoder.read(settings("nowhere"), TRAIN)
+
+
+def test_torchvision_fills_a_trunk_only(tmp_path):
+    path = tmp_path / "resnet18.safetensors"
+    safetensors.numpy.save_file({"conv1.weight": np.zeros((64, 3, 7, 7), np.float32)}, path)
+    assert encoder.read(settings(path, encoder="resnet18"), TRAIN) is None
+    with pytest.raises(config.UsageError, match=r"--policy.encoder: expected resnet18 .*got small"):
+        encoder.read(settings(path), TRAIN)
+    with pytest.raises(config.UsageError, match=r"--policy.freeze-encoder: .*keypoints untrained"):
+        encoder.read(settings(path, encoder="resnet18", freeze_encoder=True), TRAIN)
+
+
+def test_torchvision_still_starts_a_policy(tmp_path):
+    """The trunk's first kernel is the file's, what torchvision does not have stays."""
+    vision = encoders.ImageEncoder(trunk="resnet18", features=16)
+    shapes = jax.eval_shape(vision.init, jax.random.key(0), jnp.zeros((1, 64, 64, 3)))
+    begun = {"vision": jax.tree.map(lambda x: jnp.full(x.shape, 0.25), shapes)}
+    trunk = begun["vision"]["params"]["trunk"]
+    flat = {
+        ".".join(entry.key for entry in path[:-1]).replace("_", ".") + ".weight": np.full(
+            [leaf.shape[i] for i in (3, 2, 0, 1)], 0.5, np.float32
+        )
+        for path, leaf in jax.tree_util.tree_leaves_with_path(trunk)
+        if path[-1].key == "kernel"
+    }
+    path = tmp_path / "resnet18.safetensors"
+    safetensors.numpy.save_file(flat, path)
+    ours = settings(path, encoder="resnet18", image_size=64)
+    found = encoder.start(begun, ours, TRAIN)["vision"]["params"]
+    assert (found["trunk"]["conv1"]["kernel"] == 0.5).all()
+    assert (found["keypoints"] == 0.25).all()
