@@ -51,6 +51,8 @@ def _product(equation: Any, times: int) -> Product | None:
     elif name == "conv_general_dilated":
         kernel = equation.invars[1].aval
         inner = kernel.size // kernel.shape[equation.params["dimension_numbers"].rhs_spec[0]]
+        # The gradient of a strided convolution spreads its input with zeros: no work in them.
+        inner = max(1, round(inner / np.prod(equation.params["lhs_dilation"])))
     else:
         return None
     columns = out.shape[-1] if out.ndim else 1
