@@ -86,6 +86,13 @@ def time_plain(function: Callable[[], Any], repeats: int = 7) -> Timing:
     return Timing(0.0, statistics.median(seconds), min(seconds))
 
 
+def time_once(function: Callable[[], Any]) -> float:
+    """Seconds of one call that waits for its work itself."""
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
 def rounded(value: Any) -> Any:
     """`value` with every float at four significant digits, at any depth."""
     if isinstance(value, dict):

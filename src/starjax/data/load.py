@@ -94,7 +94,7 @@ def _read(record: store.Record) -> dict[str, Any]:
 
 
 def _place(total: int) -> str:
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     host = xla.available_bytes()
     stats = device.memory_stats() or {}
     free = stats.get("bytes_limit", 2 * host) - stats.get("bytes_in_use", 0)

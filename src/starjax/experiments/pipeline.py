@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax.experiments import clock, folders, methods, words
+from starjax.experiments import clock, folders, following, methods, words
 from starjax.runtime import files, xla
 
 STAGES = words.STAGES
@@ -26,11 +26,19 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
       command: what was typed, for the record.
     """
     xla.prepare_xla()
+    from starjax.training import processes
+
+    processes.join()
     out = Path(config.out)
     files.require_writable(out, LEAST_FREE_BYTES)
     names = folders.selected(config)
     trained = list(dict.fromkeys(methods.METHODS[name].weights_of for name in names))
+    if not processes.is_first():
+        env = _environment(config)
+        root, _ = _demonstrations(config, env)
+        return following.follow(config, trained if "train" in stages else [], root, env.p_world_ref)
     with files.lock(out):
+        processes.agree(0)
         print(words.plan(config, stages), flush=True)
         env = _environment(config)
         root, collect = _demonstrations(config, env)
@@ -105,12 +113,13 @@ def _load(root: Path, collect: Callable[[], None]) -> Any:
 
 def _train(config: config_lib.RunConfig, name: str, demos: Callable[[], Any], env: Any) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
-    from starjax.training import export, loop
+    from starjax.training import export, loop, processes
 
     out = Path(config.out)
     folder = out / name
     weights = folders.weights(out, name)
-    if weights.exists():
+    (done,) = processes.agree(weights.exists())
+    if done:
         words.stage("train", f"{name}: done before, {weights}")
         return
     dataset = demos().dataset
@@ -130,7 +139,7 @@ def _train(config: config_lib.RunConfig, name: str, demos: Callable[[], Any], en
             )
         except loop.TrainingFailed as error:
             raise config_lib.UsageError(str(error)) from error
-    state = result.state
+    state = processes.own(result.state)
     port = tuple(float(x) for x in env.p_world_ref)
     made = (name, config.policy, config.train, state.ema_params, state.normalizer, port)
     export.save(weights, export.Trained(*made))
@@ -195,10 +204,10 @@ def _report(out: Path, names: Sequence[str]) -> None:
 
 
 def _devices() -> Any:
-    """All devices if there are several, None (the default one) otherwise."""
+    """This process's devices if there are several, None (the default one) otherwise."""
     import jax
 
-    return jax.devices() if len(jax.devices()) > 1 else None
+    return jax.local_devices() if len(jax.local_devices()) > 1 else None
 
 
 @contextlib.contextmanager
