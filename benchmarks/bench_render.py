@@ -120,7 +120,11 @@ def c_rate(mj_model: mujoco.MjModel, qpos: np.ndarray, size: int) -> float | Non
         command = [sys.executable, str(GL_RENDERER), *files, "camera", str(size), str(size)]
         for backend in ("egl", "osmesa"):
             environment = {**os.environ, "MUJOCO_GL": backend}
-            if subprocess.run(command, env=environment, capture_output=True).returncode == 0:
+            try:
+                run = subprocess.run(command, env=environment, capture_output=True, timeout=60)
+            except subprocess.TimeoutExpired:  # some drivers hang instead of failing
+                continue
+            if run.returncode == 0:
                 with np.load(files[2]) as out:
                     return 1 / float(np.median(out["seconds"][1:]))
     return None

@@ -32,7 +32,8 @@ def join() -> None:
             f"{', '.join(_VARIABLES)}: expected all or none of them, the last two whole numbers, "
             f"got {[address, *numbers]}"
         )
-    jax.distributed.initialize(address, *map(int, numbers))
+    count, index = map(int, numbers)
+    jax.distributed.initialize(address, num_processes=count, process_id=index)
 
 
 def is_first() -> bool:
