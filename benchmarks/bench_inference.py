@@ -104,7 +104,9 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
     )
     observation, trocar = latency.example(case.policy, _setup.P_WORLD_REF, batch)
     traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, trocar)
-    arithmetic_s = _arithmetic.operations(policy.sample, *traced) / rates.flops
+    work = _arithmetic.operations(policy.sample, *traced)
+    work -= batch * case.policy.ddim_steps * _arithmetic.of_padding(case.policy)
+    arithmetic_s = work / rates.flops
     reading_s = weights_read(params, case.policy) / rates.bandwidth
     floor = max(arithmetic_s, reading_s)
     row = {

@@ -80,6 +80,8 @@ def measure(case: _setup.Case, rates: _machine.Rates) -> dict:
     gradient = jax.grad(job.policy.loss, has_aux=True)
     traced = (job.state.params, job.state.normalizer, jax.random.key(0), job.example)
     work = _arithmetic.operations(gradient, *traced)
+    # Forward, and the gradients of inputs and of weights.
+    work -= 3 * case.train.batch_size * _arithmetic.of_padding(case.policy)
     arithmetic_s = work / rates.flops
     floor = arithmetic_s + STATE_PASSES * 4 * parameters / rates.bandwidth
     count = np.int32(job.per_call)
