@@ -103,9 +103,11 @@ def evaluate(count: int, tiny: bool) -> dict:
 
 def between_processes(asked: argparse.Namespace) -> dict[str, dict]:
     """Rows of the train step in one process, and in several."""
-    # Not asked of jax: a device that the children need must not be taken before them.
-    listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True)
-    total = len(listed.stdout.splitlines()) if _peer.platform() == "gpu" else asked.processes
+    total = asked.processes
+    if _peer.platform() == "gpu":
+        # Not asked of jax: a device that the children need must not be taken before them.
+        listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=True)
+        total = len(listed.stdout.splitlines())
     alone = launch(asked, 1, 1)
     together = launch(asked, asked.processes, total)
     names = (
