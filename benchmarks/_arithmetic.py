@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from starjax.config import PolicyConfig
+
 
 class Product(NamedTuple):
     """A matrix product `[rows, contracted] @ [contracted, columns]`, done `times` times."""
@@ -25,6 +27,31 @@ def products(function: Callable, *arguments: Any) -> list[Product]:
     """Every product; a convolution as the one it amounts to."""
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     return [p for equation, times in _equations(jaxpr, 1) if (p := _product(equation, times))]
+
+
+def of_padding(policy_config: PolicyConfig, action_dim: int = 4) -> float:
+    """Operations of one U-Net evaluation of one sample that multiply padding: no work either."""
+    widths, length, inputs = policy_config.unet_channels, policy_config.horizon, action_dim
+    total = 0
+
+    def block(inputs: int, width: int) -> int:
+        taps = range(-(policy_config.kernel_size // 2), policy_config.kernel_size // 2 + 1)
+        outside = [[not 0 <= i + tap < length for i in range(length)] for tap in taps]
+        # A tap that is outside everywhere is not made at all.
+        zeros = sum(sum(tap) for tap in outside if not all(tap))
+        return zeros * (inputs * width + width * width)
+
+    for level, width in enumerate(widths):
+        total += block(inputs, width) + block(width, width)
+        inputs = width
+        if level < len(widths) - 1:
+            total += width * width
+            length //= 2
+    total += 2 * block(inputs, inputs)
+    for width, joined in zip(widths[-2::-1], widths[:0:-1]):
+        total += block(2 * joined, width) + block(width, width) + 2 * width * width
+        length *= 2
+    return 2.0 * (total + block(0, widths[0]))
 
 
 def _equations(jaxpr: Any, times: int) -> Iterator[tuple[Any, int]]:
@@ -51,6 +78,8 @@ def _product(equation: Any, times: int) -> Product | None:
     elif name == "conv_general_dilated":
         kernel = equation.invars[1].aval
         inner = kernel.size // kernel.shape[equation.params["dimension_numbers"].rhs_spec[0]]
+        # The gradient of a strided convolution spreads its input with zeros: no work in them.
+        inner = max(1, round(inner / np.prod(equation.params["lhs_dilation"])))
     else:
         return None
     columns = out.shape[-1] if out.ndim else 1

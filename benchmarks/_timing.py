@@ -4,6 +4,7 @@ A time is the median of repeated calls, each waited for; compilation is timed ap
 is timed in the same process, so that a ratio means something on a busy or a slow machine.
 """
 
+import json
 import pathlib
 import statistics
 import time
@@ -11,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from starjax.runtime import files, xla
 
@@ -18,22 +20,59 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 
 
 class Timing(NamedTuple):
-    """Seconds: ahead-of-time compilation, and one call (median and fastest of the repeats)."""
+    """What is known of a program.
+
+    Attributes:
+      compile_s: ahead-of-time compilation (or reading it from the persistent cache), seconds.
+      median_s: of one call, over the repeats; min_s: the fastest.
+      temporary_bytes: the compiler's scratch memory, beside inputs and results.
+      result_bytes: its results, where they do not reuse an input's memory.
+    """
 
     compile_s: float
     median_s: float
     min_s: float
+    temporary_bytes: int = 0
+    result_bytes: int = 0
 
 
 def time_jitted(function: Callable, *arguments: Any, repeats: int = 7) -> Timing:
     """Compile `function` for `arguments`, then time calls until their results are ready."""
-    start = time.perf_counter()
-    # A new function object: one that was called before would come out of jit's cache.
-    compiled = jax.jit(lambda *inputs: function(*inputs)).lower(*arguments).compile()
-    compile_s = time.perf_counter() - start
+    compiled, known = _compile(function, arguments)
     arguments = jax.device_put(arguments)
     timing = time_plain(lambda: jax.block_until_ready(compiled(*arguments)), repeats=repeats)
-    return timing._replace(compile_s=compile_s)
+    return known._replace(median_s=timing.median_s, min_s=timing.min_s)
+
+
+def time_carried(
+    function: Callable, carry: Any, *arguments: Any, repeats: int = 5, **options: Any
+) -> tuple[Timing, Any]:
+    """The same of `(carry, *arguments) -> carry`, each call on the last one's memory.
+
+    Returns the timing and the last carry; the given one stays as it is. `options` are jit's.
+    """
+    # Copied: a buffer that stands in it twice could not be given away.
+    carry = jax.tree.map(jnp.copy, carry)
+    compiled, known = _compile(function, (carry, *arguments), donate_argnums=0, **options)
+
+    def call():
+        nonlocal carry
+        carry = jax.block_until_ready(compiled(carry, *arguments))
+
+    timing = time_plain(call, repeats=repeats)
+    return known._replace(median_s=timing.median_s, min_s=timing.min_s), carry
+
+
+def _compile(function: Callable, arguments: tuple, **options: Any) -> tuple[Any, Timing]:
+    start = time.perf_counter()
+    # A new function object: one that was called before would come out of jit's cache.
+    program = jax.jit(lambda *inputs: function(*inputs), **options)
+    compiled = program.lower(*arguments).compile()
+    compile_s = time.perf_counter() - start
+    memory = compiled.memory_analysis()
+    temporary = getattr(memory, "temp_size_in_bytes", 0)
+    result = getattr(memory, "output_size_in_bytes", 0) - getattr(memory, "alias_size_in_bytes", 0)
+    return compiled, Timing(compile_s, 0.0, 0.0, temporary, result)
 
 
 def time_plain(function: Callable[[], Any], repeats: int = 7) -> Timing:
@@ -47,6 +86,13 @@ def time_plain(function: Callable[[], Any], repeats: int = 7) -> Timing:
     return Timing(0.0, statistics.median(seconds), min(seconds))
 
 
+def time_once(function: Callable[[], Any]) -> float:
+    """Seconds of one call that waits for its work itself."""
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
 def rounded(value: Any) -> Any:
     """`value` with every float at four significant digits, at any depth."""
     if isinstance(value, dict):
@@ -57,9 +103,26 @@ def rounded(value: Any) -> Any:
 
 
 def write(name: str, results: dict[str, Any]) -> pathlib.Path:
-    """Write `results/<name>_<backend>.json` with the versions and the hardware beside it."""
+    """Write `results/<name>_<backend>.json` with the versions and the hardware beside it.
+
+    Rows (`results["results"]`) measured before with the same versions on the same kind of device
+    stay, so that a benchmark may be run row by row.
+    """
     path = RESULTS / f"{name}_{jax.default_backend()}.json"
     path.parent.mkdir(exist_ok=True)
     machine = {"versions": xla.versions(), "hardware": xla.hardware()}
-    files.write_json(path, {"benchmark": name, **rounded(results), **machine})
+    new = {"benchmark": name, **rounded(results), **machine}
+    before = json.loads(path.read_text()) if path.exists() else {}
+    if "results" in new and _made_with(before) == _made_with(new):
+        new["results"] = {**before.get("results", {}), **new["results"]}
+    files.write_json(path, new)
     return path
+
+
+def report(name: str, results: dict[str, Any], tiny: bool) -> None:
+    """`write`, unless the sizes were only for a test."""
+    print("a test's sizes: nothing is written" if tiny else f"wrote {write(name, results)}")
+
+
+def _made_with(found: dict[str, Any]) -> Any:
+    return found.get("versions"), set(found.get("hardware", {}).get("devices", []))

@@ -1,87 +1,144 @@
-"""Time of one policy call (Table IV): DDIM steps, batch 1 and 24, the roll network's share.
+"""Time of one policy call (Table IV): encoder, DDIM, roll network; and the roll network's share.
 
-    python benchmarks/bench_inference.py [--seconds 2]
+    python benchmarks/bench_inference.py [--only "224 px"] [--peer [PYTHON]] [--tiny]
 
-The peer is numpy doing nothing but the matrix products of the same call on the same cores.
+On a GPU: the paper's model from pictures, at batch 1 and 360, beside PyTorch and the floor: the
+larger of its arithmetic and of its weights in the networks' type read once a DDIM step, FiLM's and
+the encoder's once a call. On a CPU: a small model of the task's state, for every count of DDIM
+steps, beside numpy doing nothing but the matrix products of the same call on the same cores.
 """
 
 import argparse
 import dataclasses
 
 import _arithmetic
+import _machine
+import _peer
+import _setup
 import _timing
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from starjax import runtime
-from starjax.config import PolicyConfig, TrainConfig
-from starjax.data import normalizer
 from starjax.evaluation import latency
-from starjax.experiments.methods import METHODS
+from starjax.models import roll_net
+from starjax.policies import features
 from starjax.policies import policy as policies
-from starjax.training import state
 
-P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)
-METHOD = METHODS["stardiff"]
-SETTINGS = PolicyConfig(
-    observation="state",
-    encoder="small",
-    vision_dim=128,
-    unet_channels=(64, 128, 256),
-    time_dim=64,
-)
-CASES = {1: latency.DDIM_STEPS, 24: (10,)}  # batch: DDIM steps
+CHAIN = 100  # roll networks in one program, each fed by the one before
+
+# name: case, batch, DDIM steps
+CASES = {
+    "gpu": {
+        f"{crop} px batch {batch}": (_setup.paper(crop), batch, 10)
+        for crop in (96, 224)
+        for batch in (1, 360)
+    },
+    "cpu": {
+        f"state batch {batch}, {steps} steps": (_setup.small(batch), batch, steps)
+        for batch, counts in ((1, latency.DDIM_STEPS), (24, (10,)))
+        for steps in counts
+    },
+    "tiny": {"48 px batch 2": (_setup.miniature(), 2, 10)},
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=1.0, help="of timed calls a row")
-    seconds = parser.parse_args().seconds
+    parser.add_argument("--only", default="", help="rows whose name contains this")
+    parser.add_argument("--seconds", type=float, default=2.0, help="of timed calls a row")
+    parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
+    _peer.add_flag(parser)
+    asked = parser.parse_args()
     runtime.prepare_xla()
-    policy = policies.make(METHOD, SETTINGS, P_WORLD_REF, TrainConfig())
-    params = state.init_params(policy, 0)
-    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
-    wide = normalizer.MinMax(-jnp.ones(12), jnp.ones(12))
-    stats = normalizer.Normalizer(box, wide)
-    rows = []
-    for batch, ddim_steps in CASES.items():
-        rows += latency.table(
-            METHOD,
-            SETTINGS,
-            TrainConfig(),
-            params,
-            stats,
-            P_WORLD_REF,
-            ddim_steps=ddim_steps,
-            batches=[batch],
-            seconds=seconds,
+    cases = CASES["tiny" if asked.tiny else _peer.platform()]
+    cases = {name: case for name, case in cases.items() if asked.only in name}
+    # Before jax takes the device's memory.
+    peers = {
+        name: _peer.ask(
+            asked.peer, "policy", "--crop", case.crop, "--batch", batch, tiny=asked.tiny
         )
-    print("batch  DDIM steps      p50      p95      p99 ms  numpy ms  x numpy")
-    for row in rows:
-        row["numpy_ms"] = numpy_ms(params, stats, row["batch"], row["ddim_steps"])
-        row["ratio_to_numpy"] = row["p50"] / row["numpy_ms"]
+        for name, (case, batch, _) in cases.items()
+        if case.crop
+    }
+    rates = {c.policy.dtype: None for c, _, _ in cases.values()}
+    rates = {dtype: _machine.measure(dtype) for dtype in rates}
+    print("row                           p50      p95      p99 ms  floor ms  x floor  x peer")
+    rows = {}
+    for name, (case, batch, steps) in cases.items():
+        case = case._replace(policy=dataclasses.replace(case.policy, ddim_steps=steps))
+        row = measure(case, batch, rates[case.policy.dtype], asked.seconds)
+        row |= _peer.compared(peers.get(name, {}), row["p50"])
+        rows[name] = row
+        speed = row.get("times_peer_speed", row.get("times_numpy_speed", float("nan")))
         print(
-            f"{row['batch']:5} {row['ddim_steps']:11} {row['p50']:8.2f} {row['p95']:8.2f} "
-            f"{row['p99']:8.2f} {row['numpy_ms']:9.2f} {row['ratio_to_numpy']:8.2f}"
+            f"{name:24} {row['p50']:8.2f} {row['p95']:8.2f} {row['p99']:8.2f} "
+            f"{row['floor_ms']:12.2f} {row['ratio_to_floor']:8.2f} {speed:7.2f}",
+            flush=True,
         )
-    roll = {str(batch): latency.roll_ms(SETTINGS, batch=batch) for batch in CASES}
-    for batch, times in roll.items():
-        print(f"roll network, batch {batch}: p50 {times['p50']:.3f} ms, p99 {times['p99']:.3f} ms")
-    results = {"method": "stardiff", "rows": rows, "roll_network_ms": roll}
-    print(f"wrote {_timing.write('inference', results)}")
+    settings = {batch: case.policy for case, batch, _ in cases.values()}
+    for batch, policy_config in settings.items():
+        rows[f"roll network batch {batch}"] = row = roll_network(policy_config, batch)
+        print(
+            f"roll network, batch {batch}: {row['in_a_program_ms']:.4f} ms within a program, "
+            f"called alone p50 {row['p50']:.3f} ms"
+        )
+    facts = next(iter(rates.values())).facts()
+    results = {"method": "stardiff", **facts, "results": rows}
+    _timing.report("inference", results, asked.tiny)
 
 
-def numpy_ms(params, stats, batch: int, ddim_steps: int) -> float:
+def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float) -> dict:
+    """Percentiles of one call, ms, and its floor."""
+    policy, params, stats = _setup.untrained(case)
+    times = latency.policy_ms(
+        policy,
+        case.policy,
+        params,
+        stats,
+        _setup.P_WORLD_REF,
+        batch=batch,
+        calls=200,
+        seconds=seconds,
+    )
+    observation, trocar = latency.example(case.policy, _setup.P_WORLD_REF, batch)
+    traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, trocar)
+    work = _arithmetic.operations(policy.sample, *traced)
+    work -= batch * case.policy.ddim_steps * _arithmetic.of_padding(case.policy)
+    arithmetic_s = work / rates.flops
+    reading_s = weights_read(params, case.policy) / rates.bandwidth
+    floor = max(arithmetic_s, reading_s)
+    row = {
+        "batch": batch,
+        "ddim_steps": case.policy.ddim_steps,
+        **times,
+        "floor_ms": 1e3 * floor,
+        "floor_arithmetic_ms": 1e3 * arithmetic_s,
+        "floor_reading_ms": 1e3 * reading_s,
+        "ratio_to_floor": times["p50"] / (1e3 * floor),
+    }
+    if jax.default_backend() == "cpu" and not case.crop:
+        row["numpy_ms"] = numpy_ms(policy, *traced)
+        row["times_numpy_speed"] = row["numpy_ms"] / row["p50"]
+    return row
+
+
+def weights_read(params: policies.Params, policy_config) -> float:
+    """Bytes: what a DDIM step needs again each time, and what is needed once."""
+    total = 0
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params):
+        name = jax.tree_util.keystr(path)
+        again = "'unet'" in name and "film_" not in name and "'time_" not in name
+        total += leaf.size * (policy_config.ddim_steps if again else 1)
+    return total * jnp.dtype(policy_config.dtype).itemsize
+
+
+def numpy_ms(policy: policies.Policy, *traced) -> float:
     """All matrix products of a policy call, done by numpy."""
-    settings = dataclasses.replace(SETTINGS, ddim_steps=ddim_steps)
-    policy = policies.make(METHOD, settings, P_WORLD_REF, TrainConfig())
-    observation, trocar = latency.example(SETTINGS, P_WORLD_REF, batch)
-    keys = jax.random.split(jax.random.key(0), batch)
-    found = _arithmetic.products(policy.sample, params, stats, keys, observation, trocar)
     pairs = [
         (np.ones((m, k), np.float32), np.ones((k, n), np.float32), times)
-        for m, k, n, times in found
+        for m, k, n, times in _arithmetic.products(policy.sample, *traced)
     ]
 
     def multiply() -> None:
@@ -90,6 +147,28 @@ def numpy_ms(params, stats, batch: int, ddim_steps: int) -> float:
                 left @ right
 
     return 1e3 * _timing.time_plain(multiply, repeats=5).min_s
+
+
+def roll_network(policy_config, batch: int) -> dict:
+    """Its time within a program, ms, and percentiles of calling it alone (mostly the call)."""
+    net = roll_net.RollNet(
+        width=policy_config.roll_width,
+        blocks=policy_config.roll_blocks,
+        dtype=jnp.dtype(policy_config.dtype),
+    )
+    p = jnp.zeros((batch, policy_config.horizon, 3))
+    inputs = (p, jnp.zeros((batch, features.TROCAR_FEATURES)))
+    history = jnp.zeros((batch, policy_config.obs_horizon))
+    params = net.init(jax.random.key(0), *inputs, history)
+
+    def chain(params, history):
+        def one(_, history):
+            return net.apply(params, *inputs, history)[:, : history.shape[1]]
+
+        return jax.lax.fori_loop(0, CHAIN, one, history)
+
+    within = _timing.time_jitted(chain, params, history).median_s / CHAIN
+    return {"in_a_program_ms": 1e3 * within, **latency.roll_ms(policy_config, batch=batch)}
 
 
 if __name__ == "__main__":

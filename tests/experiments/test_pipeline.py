@@ -8,7 +8,7 @@ import signal
 import pytest
 
 from starjax import config
-from starjax.experiments import methods, pipeline, presets, words
+from starjax.experiments import demonstrations, methods, pipeline, presets, words
 from starjax.runtime import files
 
 
@@ -17,7 +17,7 @@ def done(monkeypatch):
     """Stages replaced by stubs that write down their names."""
     calls = []
 
-    def demonstrations(settings, env):
+    def plan(settings, env):
         return pipeline.Path(settings.out) / "demos-a", lambda: calls.append("collect")
 
     def train(settings, name, demos, env, encoder):
@@ -25,8 +25,8 @@ def done(monkeypatch):
         calls.append(f"train {name}")
 
     monkeypatch.setattr(pipeline, "_environment", lambda settings: None)
-    monkeypatch.setattr(pipeline, "_demonstrations", demonstrations)
-    monkeypatch.setattr(pipeline, "_load", lambda _, root, collect, encoder: collect())
+    monkeypatch.setattr(demonstrations, "plan", plan)
+    monkeypatch.setattr(demonstrations, "load", lambda _, root, collect, encoder: collect())
     monkeypatch.setattr(pipeline, "_train", train)
     monkeypatch.setattr(pipeline, "_evaluate", lambda c, name, *_: calls.append(f"score {name}"))
     monkeypatch.setattr(pipeline, "_report", lambda out, names: calls.append("report"))

@@ -109,8 +109,39 @@ def devices_main(count: int, out: str) -> None:
     np.savez(Path(out) / "found.npz", frames=frames, losses=losses, **arrays)
 
 
+def processes_main(out: str, asks: int) -> None:
+    """Trains as one process of several; the first is told to stop at its `asks`th question."""
+    import itertools
+
+    from starjax.training import loop, processes
+
+    processes.join()
+    loop.policies.make = lambda *_: _linear_policy()
+    asked = itertools.count(1)
+    try:
+        result = train(
+            Path(out) / "run", should_stop=lambda: next(asked) == asks and processes.is_first()
+        )
+    except loop.Interrupted as stopped:
+        print(stopped)
+        return
+    save(Path(out) / processes.own_name("found.npz"), processes.own(result.state))
+
+
+def save(path: Path, state) -> None:
+    """The parameters and their averages."""
+    import jax
+    import numpy as np
+
+    leaves = jax.tree.leaves((state.params, state.ema_params))
+    np.savez(path, **{str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)})
+
+
 if __name__ == "__main__":
     from starjax import runtime
 
     runtime.prepare_xla()
-    devices_main(int(sys.argv[1]), sys.argv[2])
+    if sys.argv[1] == "process":
+        processes_main(sys.argv[2], int(sys.argv[3]))
+    else:
+        devices_main(int(sys.argv[1]), sys.argv[2])

@@ -11,7 +11,7 @@ import pytest
 
 from starjax import config
 from starjax.data import load, normalizer, windows
-from starjax.experiments import folders, pipeline, presets
+from starjax.experiments import demonstrations, folders, pipeline, presets
 from starjax.experiments.methods import METHODS
 from starjax.policies import diffuser
 from starjax.policies import policy as policies
@@ -221,7 +221,7 @@ def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, 
     monkeypatch.setattr(load, "load", without_pictures)
     monkeypatch.setattr(load, "frames", lambda root: np.asarray(dataset.observation.image))
     settings, found = source
-    loaded = pipeline._load(run_config(settings, tmp_path), tmp_path, lambda: None, found)
+    loaded = demonstrations.load(run_config(settings, tmp_path), tmp_path, lambda: None, found)
     assert loaded.observation.image is None and windows.on_device(loaded)
     wanted = features(source, dataset, tmp_path / "other")
     np.testing.assert_array_equal(loaded.observation.features, wanted)

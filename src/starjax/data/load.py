@@ -130,7 +130,7 @@ def _paths(root: Path, records: list[store.Record], name: str) -> list[Path]:
 
 
 def _place(total: int) -> str:
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     host = xla.available_bytes()
     stats = device.memory_stats() or {}
     free = stats.get("bytes_limit", 2 * host) - stats.get("bytes_in_use", 0)

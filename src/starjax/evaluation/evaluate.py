@@ -78,7 +78,7 @@ def evaluate(
         execute=execute,
         max_steps=math.ceil(time_limit_s * env.control_hz - 1e-6),
     )
-    lanes = lanes or rollout.lanes_per_device((devices or jax.devices())[0])
+    lanes = lanes or rollout.lanes_per_device((devices or jax.local_devices())[0])
     batch = lanes * len(devices or [0])
     count = len(trocars.radius)
     index, trial = (x.reshape(-1) for x in np.divmod(np.arange(count * trials), trials))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax.experiments import clock, folders, methods, words
+from starjax.experiments import clock, demonstrations, folders, following, methods, words
 from starjax.runtime import files, xla
 
 STAGES = words.STAGES
@@ -26,21 +26,31 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
       command: what was typed, for the record.
     """
     xla.prepare_xla()
+    from starjax.training import processes
+
+    processes.join()
+    if config.policy.freeze_encoder and not processes.is_alone():
+        raise config_lib.UsageError("--policy.freeze-encoder: expected one process, got several")
     out = Path(config.out)
     files.require_writable(out, LEAST_FREE_BYTES)
     names = folders.selected(config)
     trained = list(dict.fromkeys(methods.METHODS[name].weights_of for name in names))
+    if not processes.is_first():
+        env = _environment(config)
+        root, _ = demonstrations.plan(config, env)
+        return following.follow(config, trained if "train" in stages else [], root, env.p_world_ref)
     with files.lock(out):
+        processes.agree(0)
         print(words.plan(config, stages), flush=True)
         untrained = any(not folders.weights(out, name).exists() for name in trained)
-        encoder = _encoder(config) if "train" in stages and untrained else None
+        encoder = demonstrations.frozen_encoder(config) if "train" in stages and untrained else None
         env = _environment(config)
-        root, collect = _demonstrations(config, env)
+        root, collect = demonstrations.plan(config, env)
         if "train" in stages:
             for name in dict.fromkeys([*trained, *names]):
                 folders.claim(out / name, config, root.name, encoder and encoder.fingerprint)
         # Loaded once, and only if something is still to be trained with them.
-        demos = functools.cache(lambda: _load(config, root, collect, encoder))
+        demos = functools.cache(lambda: demonstrations.load(config, root, collect, encoder))
         if "train" not in stages:
             collect()
         else:
@@ -53,93 +63,11 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
             _report(out, names)
 
 
-def _encoder(config: config_lib.RunConfig) -> Any:
-    """The vision encoder that stays frozen, None for other runs; mistakes are found here."""
-    # Here and below, what brings jax is imported where it is used, after XLA has been prepared.
-    if config.policy.observation != "image" or not config.policy.encoder_weights:
-        return None
-    from starjax.training import encoder
-
-    found = encoder.read(config.policy, config.train)
-    return found if config.policy.freeze_encoder else None
-
-
 def _environment(config: config_lib.RunConfig) -> Any:
+    # Here and below, what brings jax is imported where it is used, after XLA has been prepared.
     from starjax.sim import env
 
     return env.make(config.policy.observation, config.policy.image_size)
-
-
-def _demonstrations(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
-    """The folder of a run's demonstrations, and a function that collects what it lacks."""
-    from starjax import rcm
-    from starjax.data import demos, store
-    from starjax.sim.tasks import expert
-
-    trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
-    wanted = {
-        "per_trocar": config.demos.per_trocar,
-        "seed": config.seed,
-        "max_steps": config.demos.max_steps,
-        "keep_failures": config.demos.keep_failures,
-    }
-    out = Path(config.out)
-    root = out / f"demos-{store.digest(demos.describe(env, trocars, **wanted))}"
-
-    def collect() -> None:
-        if store.is_sealed(root):
-            words.stage("collect", f"done before, {root}")
-            return
-        words.stage("collect", f"into {root}")
-        with clock.timed(out, "collect"):
-            found = demos.collect(
-                root, env, expert, trocars, devices=_devices(), report=words.indented, **wanted
-            )
-        words.indented(
-            "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
-        )
-
-    return root, collect
-
-
-def _load(
-    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], encoder: Any
-) -> Any:
-    """The dataset to train on, with what a frozen encoder sees in the place of pictures."""
-    from starjax.data import load, store
-
-    collect()
-    settings = {"pictures": encoder is None, "report": words.indented}
-    try:
-        found = load.load(root, **settings)
-    except store.DamagedEpisode as error:
-        words.indented(f"damaged, collected again: {error}")
-        (root / "SEALED.json").unlink()
-        collect()
-        found = load.load(root, **settings)
-    return found.dataset if encoder is None else _with_features(config, root, found, encoder)
-
-
-def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder: Any) -> Any:
-    import jax
-
-    from starjax.data import load, windows
-    from starjax.training import frozen
-
-    dataset = demos.dataset
-    with clock.timed(Path(config.out), "features"):
-        found = frozen.features(
-            encoder,
-            config.policy,
-            config.train,
-            root,
-            demos.digest,
-            len(dataset.episode),
-            lambda: load.frames(root),
-            words.indented,
-        )
-    features = jax.device_put(found) if windows.on_device(dataset) else found
-    return dataset.replace(observation=dataset.observation.replace(features=features))
 
 
 def _train(
@@ -147,12 +75,13 @@ def _train(
 ) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
     from starjax.policies import policy as policies
-    from starjax.training import export, loop
+    from starjax.training import export, loop, processes
 
     out = Path(config.out)
     folder = out / name
     weights = folders.weights(out, name)
-    if weights.exists():
+    (done,) = processes.agree(weights.exists())
+    if done:
         words.stage("train", f"{name}: done before, {weights}")
         return
     dataset = demos()
@@ -172,13 +101,14 @@ def _train(
             )
         except loop.TrainingFailed as error:
             raise config_lib.UsageError(str(error)) from error
-    params = result.state.ema_params
+    state = processes.own(result.state)
+    params = state.ema_params
     made = export.Trained(
         method=name,
         policy=config.policy,
         train=config.train,
         params=policies.with_vision(params, encoder.params) if encoder else params,
-        normalizer=result.state.normalizer,
+        normalizer=state.normalizer,
         p_world_ref=tuple(float(x) for x in env.p_world_ref),
         demos=config.demos,
         preset=config.preset,
@@ -243,13 +173,6 @@ def _report(out: Path, names: Sequence[str]) -> None:
         page = build.build(scored, out / "report", report=words.indented)
     results = [json.loads((out / name / "result.json").read_text()) for name in names]
     print(f"\n{words.outcome(results)}\n\nreport: {page}", flush=True)
-
-
-def _devices() -> Any:
-    """All devices if there are several, None (the default one) otherwise."""
-    import jax
-
-    return jax.devices() if len(jax.devices()) > 1 else None
 
 
 @contextlib.contextmanager

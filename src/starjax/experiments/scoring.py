@@ -79,7 +79,7 @@ def rollouts(
     directory: Path, who: Subject, trocars: rcm.Trocar, settings: config_lib.EvalConfig, seed: int
 ) -> table.Table:
     """Runs what is missing of an evaluation, on all devices."""
-    devices = jax.devices()
+    devices = jax.local_devices()
     return evaluate.evaluate(
         directory,
         who.env,

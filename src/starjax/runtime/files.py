@@ -134,6 +134,12 @@ def lock(directory: Path) -> Iterator[None]:
             file.truncate(0)
 
 
+def wait_until_free(directory: Path) -> None:
+    """Waits while another process holds `directory` by `lock`."""
+    with open(directory / ".lock", "a+") as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+
+
 def size(count: float) -> str:
     """A number of bytes for people, e.g. `14.2 GB`."""
     for unit in ("B", "kB", "MB"):

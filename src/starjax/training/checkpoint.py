@@ -18,6 +18,7 @@ import jax
 from orbax.checkpoint import v1 as ocp
 
 from starjax.runtime import files
+from starjax.training import processes
 
 _MANIFEST = "manifest.json"
 _STATE = "state"
@@ -41,17 +42,24 @@ def steps(directory: str | os.PathLike) -> list[int]:
 def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> pathlib.Path:
     """Writes a step, and afterwards removes all but the newest `keep`.
 
+    All processes of a run call it together: each writes its part of the arrays, the first the rest.
+
     Raises:
       files.StorageError: the disk is full, in one plain sentence.
     """
     if keep < 1:
         raise ValueError(f"keep: expected at least 1 checkpoint, got {keep}")
     root = pathlib.Path(directory).absolute()
+    writing, final = root / f"{_TEMPORARY}{step}", path_of(root, step)
+    if not processes.is_first():
+        processes.agree(step)
+        ocp.save(str(writing / _STATE), state)
+        return final
     root.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(root)
-    writing = root / f"{_TEMPORARY}{step}"
     try:
         _require_space(root, _bytes(state))
+        processes.agree(step)
         ocp.save(str(writing / _STATE), state)
         _write_manifest(writing, step, state)
     except Exception as error:
@@ -63,7 +71,6 @@ def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> p
                 f"continues from step {max(steps(root), default=0)}"
             ) from error
         raise
-    final = path_of(root, step)
     shutil.rmtree(final, ignore_errors=True)  # a damaged one that was trained past again
     writing.rename(final)
     _sync(root)

@@ -6,13 +6,24 @@ from typing import Any
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from starjax.training import processes
+
 _AXIS = "batch"
 
 
 def make_mesh(batch_size: int, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """A mesh of the given devices (all of them by default), or of as many as divide the batch."""
+    """A mesh of the given devices (all of them by default), or of as many as divide the batch.
+
+    Raises:
+      ValueError: several processes, whose devices do not divide the batch: none may be left out.
+    """
     devices = list(jax.devices() if devices is None else devices)
     count = max(n for n in range(1, len(devices) + 1) if batch_size % n == 0)
+    if jax.process_count() > 1 and count < len(devices):
+        raise ValueError(
+            f"batch_size: expected a multiple of the {len(devices)} devices of all processes, "
+            f"got {batch_size}"
+        )
     # Auto: the compiler propagates the batch's sharding; gradients meet in one all-reduce
     return jax.make_mesh((count,), (_AXIS,), axis_types=(AxisType.Auto,), devices=devices[:count])
 
@@ -27,11 +38,17 @@ def replicated(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec())
 
 
-def replicate(tree: Any, mesh: Mesh) -> Any:
+def replicate(tree: Any, mesh: Mesh, may_alias: bool | None = False) -> Any:
     """Copies every array to all devices of the mesh, in buffers of its own (safe to donate)."""
-    return jax.device_put(tree, replicated(mesh), may_alias=False)
+    return _put(tree, replicated(mesh), may_alias)
 
 
 def shard_batch(tree: Any, mesh: Mesh) -> Any:
     """Splits the leading axis of every array over the devices."""
-    return jax.device_put(tree, batch_sharding(mesh))
+    return _put(tree, batch_sharding(mesh), None)
+
+
+def _put(tree: Any, sharding: NamedSharding, may_alias: bool | None) -> Any:
+    if sharding.is_fully_addressable:
+        return jax.device_put(tree, sharding, may_alias=may_alias)
+    return jax.tree.map(lambda x: processes.spread(x, sharding), tree)

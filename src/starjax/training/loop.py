@@ -14,7 +14,7 @@ from starjax import config
 from starjax.data import normalizer, windows
 from starjax.policies import policy as policies
 from starjax.runtime import progress
-from starjax.training import checkpoint, devices, encoder, feed, holdout, metrics
+from starjax.training import checkpoint, devices, encoder, feed, holdout, metrics, processes
 from starjax.training import state as states
 from starjax.training import step as steps
 
@@ -81,7 +81,7 @@ def run(
       StorageError: the disk is full.
     """
     directory = pathlib.Path(directory)
-    log = directory / "metrics.jsonl"
+    log = directory / processes.own_name("metrics.jsonl")
     mesh = devices.make_mesh(train_config.batch_size, mesh_devices)
     p_world_ref = np.asarray(p_world_ref, np.float32)
     dataset = _observed(dataset, policy_config)
@@ -105,14 +105,16 @@ def run(
     )
     step = first = int(state.step)
     metrics.resume(log, step)
-    judge = holdout.make(policy, policy_config, dataset, held_out)
-    errors = judge(state) if judge and step == train_config.steps else {}
+    judge = holdout.make(policy, policy_config, dataset, held_out) if processes.is_first() else None
+    errors = judge(processes.own(state)) if judge and step == train_config.steps else {}
     advance = _advance(policy, optimizer, policy_config, train_config, mesh, dataset, train, state)
     rate = _Rate(train_config.batch_size)
     with progress.track(description, train_config.steps, unit="steps", done=step) as show:
         note, call = "", 1
         while step < train_config.steps:
-            if should_stop():
+            # Processes of one run stop together, and after the same steps.
+            stop, call = processes.agree(should_stop(), call)
+            if stop:
                 if step > first:
                     _save(directory, state, train_config)
                 raise Interrupted(
@@ -131,7 +133,7 @@ def run(
                 state, note = _log(log, step, state, train_config)
             if step % train_config.checkpoint_every == 0 or last:
                 if judge:
-                    errors = judge(state)
+                    errors = judge(processes.own(state))
                     metrics.append(log, step, "holdout", errors)
                 _save(directory, state, train_config)
             show(count, note=note)
@@ -176,6 +178,9 @@ def _restored_or_new(
         jax.eval_shape(lambda: around(policy.init(jax.random.key(seed)))),
     )
     restored = checkpoint.restore(directory / "checkpoints", like)
+    step = -1 if restored is None else restored[0]
+    if processes.agree(step) != (step,):
+        raise TrainingFailed(f"{directory}: processes see other checkpoints; is the folder shared?")
     if restored is not None:
         return restored[1]
     params = states.init_params(policy, seed)
@@ -190,7 +195,7 @@ def _advance(policy, optimizer, policy_config, train_config, mesh, dataset, fram
     settings = (policy, optimizer, policy_config, train_config, mesh)
     placed = devices.replicated(mesh)
     if windows.on_device(dataset):
-        resident = jax.device_put((dataset, jnp.asarray(frames)), placed)
+        resident = devices.replicate((dataset, jnp.asarray(frames)), mesh, may_alias=None)
         if steps.runs_in_a_loop(policy_config, mesh):
             many = jax.jit(
                 functools.partial(steps.resident_steps, *settings),
@@ -211,7 +216,13 @@ def _advance(policy, optimizer, policy_config, train_config, mesh, dataset, fram
         out_shardings=placed,
     )
     stream = feed.batches(
-        dataset, frames, policy_config, train_config, mesh, jnp.copy(state.key), int(state.step)
+        dataset,
+        frames,
+        policy_config,
+        train_config,
+        mesh,
+        jnp.copy(processes.own(state.key)),
+        int(state.step),
     )
     return _repeated(lambda state: one(state, next(stream)))
 

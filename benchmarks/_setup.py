@@ -1,0 +1,150 @@
+"""What the benchmarks train and call: the paper's model on a GPU, a small one on a CPU."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import rcm
+from starjax.config import PolicyConfig, TrainConfig
+from starjax.data import normalizer, windows
+from starjax.evaluation import latency
+from starjax.experiments.methods import METHODS
+from starjax.policies import features
+from starjax.policies import policy as policies
+from starjax.training import devices, state, step
+from starjax.types import Command
+
+P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)
+METHOD = METHODS["stardiff"]
+
+IMAGE = {96: 108, 224: 256}  # side of the stored picture for each crop
+SMALL = PolicyConfig(
+    observation="state",
+    encoder="small",
+    vision_dim=128,
+    unet_channels=(64, 128, 256),
+    time_dim=64,
+)
+MINIATURE = dataclasses.replace(
+    SMALL, vision_dim=32, state_dim=32, unet_channels=(32, 64), time_dim=32
+)
+
+
+class Case(NamedTuple):
+    """Settings of one row."""
+
+    policy: PolicyConfig
+    train: TrainConfig
+
+    @property
+    def crop(self) -> int:
+        """Side of the crop in pixels, 0 without pictures."""
+        sees = self.policy.observation == "image"
+        return features.crop_size(self.policy, self.train) if sees else 0
+
+
+class Job(NamedTuple):
+    """A training run ready to be timed.
+
+    Attributes:
+      policy: being trained.
+      state: its TrainState, on all devices.
+      dataset: made-up frames on all devices.
+      example: a batch.
+      steps: (state, dataset, count) -> state after `per_call` steps.
+      per_call: steps in one call; `count` must be given as this.
+      mesh: of the devices.
+    """
+
+    policy: policies.Policy
+    state: state.TrainState
+    dataset: windows.Dataset
+    example: windows.Batch
+    steps: Callable[..., state.TrainState]
+    per_call: int
+    mesh: jax.sharding.Mesh
+
+
+def paper(crop: int, batch: int = 256, dtype: str = "bfloat16") -> Case:
+    """The paper's networks (ResNet-18, U-Net 256-512-1024-2048) on crops of this side."""
+    size = IMAGE[crop]
+    policy_config = PolicyConfig(image_size=size, dtype=dtype)
+    return Case(policy_config, TrainConfig(batch_size=batch, crop_fraction=crop / size))
+
+
+def small(batch: int, image_size: int = 0) -> Case:
+    """A model for two cores: of the task's state, or of pictures of this side."""
+    return looking(Case(SMALL, TrainConfig(batch_size=batch)), image_size)
+
+
+def miniature(batch: int = 4, image_size: int = 54) -> Case:
+    """To see in seconds that a benchmark runs."""
+    train_config = TrainConfig(batch_size=batch, crop_fraction=48 / 54)
+    return looking(Case(MINIATURE, train_config), image_size)
+
+
+def looking(case: Case, image_size: int) -> Case:
+    """The case with pictures of this side as its observations, or with the task's state (0)."""
+    seen = {"observation": "image", "image_size": image_size} if image_size else {}
+    changed = dataclasses.replace(case.policy, **(seen or {"observation": "state"}))
+    return case._replace(policy=changed)
+
+
+def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frames: int = 0) -> Job:
+    """The case's training on the given devices (default: the first one)."""
+    on = jax.devices()[:1] if on is None else on
+    policy = policies.make(METHOD, case.policy, P_WORLD_REF, case.train)
+    optimizer = state.make_optimizer(case.train)
+    count = frames or (512 if on[0].platform == "cpu" else 4096)
+    dataset = made_up(case.policy, count)
+    batch = case.train.batch_size
+    drawn = jnp.arange(batch) % count
+    example = windows.gather(dataset, drawn, case.policy.obs_horizon, case.policy.horizon)
+    stats = statistics(case.policy)
+    first = state.create(policy, optimizer, state.init_params(policy, seed), stats, example, seed)
+    mesh = devices.make_mesh(batch, on)
+    settings = (policy, optimizer, case.policy, case.train, mesh)
+    looped = step.runs_in_a_loop(case.policy, mesh)
+
+    def steps(state, dataset, count):
+        drawn = jnp.arange(len(dataset.episode))
+        if looped:
+            return step.resident_steps(*settings, state, dataset, drawn, count)
+        return step.resident_step(*settings, state, dataset, drawn)
+
+    first, dataset = devices.replicate((first, dataset), mesh)
+    return Job(policy, first, dataset, example, steps, 10 if looped else 1, mesh)
+
+
+def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:
+    """A policy, its first parameters and its statistics."""
+    policy = policies.make(METHOD, case.policy, P_WORLD_REF, case.train)
+    return policy, state.init_params(policy, 0), statistics(case.policy)
+
+
+def statistics(policy_config: PolicyConfig) -> normalizer.Normalizer:
+    """Of commands that are in [-1, 1] already."""
+    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
+    wide = normalizer.MinMax(-jnp.ones(features.TASK_STATE), jnp.ones(features.TASK_STATE))
+    return normalizer.Normalizer(box, wide if policy_config.observation == "state" else None)
+
+
+@functools.lru_cache(maxsize=1)
+def made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
+    """One long demonstration; what is in it does not change the time."""
+    seen = dataclasses.replace(policy_config, obs_horizon=1)
+    observation, _ = latency.example(seen, P_WORLD_REF, count)
+    observation = jax.tree.map(lambda leaf: leaf[:, 0], observation)
+    return windows.Dataset(
+        observation=observation,
+        command=Command(observation.pose, observation.gripper),
+        trocar=jax.tree.map(lambda leaf: jnp.asarray(leaf[:1]), rcm.TROCARS),
+        episode=jnp.zeros(count, jnp.int32),
+        start=jnp.zeros(1, jnp.int32),
+        length=jnp.full(1, count, jnp.int32),
+    )

@@ -1,0 +1,149 @@
+"""Closed-loop evaluation: 12 trocars x 30 trials of up to 60 s, with every step of them run.
+
+    python benchmarks/bench_evaluate.py [--image 256] [--policy FILE] [--trials 30] [--tiny]
+
+Without `--policy` an untrained policy is run: nothing ends early, so this is the worst case. The
+programs are those of `starjax evaluate`, on as many trials at once; compiling them is timed apart,
+by a call in which no trial is wanted. Beside it: what C MuJoCo on one thread would need for the
+physics steps alone, and, as the floor, the sum of the parts timed one by one in this process.
+"""
+
+import argparse
+import math
+import time
+
+import _c_mujoco
+import _peer
+import _setup
+import _timing
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import rcm, runtime
+from starjax.evaluation import latency, rollout
+from starjax.experiments import methods
+from starjax.policies import policy as policies
+from starjax.sim import env as envs
+from starjax.training import export
+from starjax.types import Command
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    side = 256 if _peer.platform() == "gpu" else 0
+    parser.add_argument("--image", type=int, default=side, help="pixels a side; 0: task state")
+    parser.add_argument("--policy", help="a policy.safetensors")
+    parser.add_argument("--trials", type=int, default=30, help="a trocar")
+    parser.add_argument("--limit", type=float, default=60.0, help="s, of a trial")
+    parser.add_argument("--lanes", type=int, default=0, help="trials at once; 0: the product's")
+    parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
+    asked = parser.parse_args()
+    runtime.prepare_xla()
+    if asked.tiny:
+        asked.trials, asked.limit, asked.lanes = 1, 0.5, 4
+    policy, params, stats, settings = subject(asked)
+    env = envs.make(settings.observation, settings.image_size)
+    steps = math.ceil(asked.limit * env.control_hz)
+    lanes = asked.lanes or rollout.lanes_per_device(jax.devices()[0])
+    rules = rollout.Settings(settings.obs_horizon, settings.execute, steps)
+    run = rollout.make(env, policy, rules, seed=0)
+    chunks = trials_in_chunks(asked.trials, lanes)
+
+    def call(trials: rollout.Trials) -> rollout.Rollouts:
+        return run(params, stats, trials, lambda fraction: None)
+
+    start = time.perf_counter()
+    call(chunks[0]._replace(wanted=np.zeros(lanes, bool)))
+    compile_s = time.perf_counter() - start
+    start = time.perf_counter()
+    lengths = np.concatenate([call(chunk).length[chunk.wanted] for chunk in chunks])
+    run_s = time.perf_counter() - start
+
+    control_steps = int(lengths.sum())
+    substeps = round(1 / env.control_hz / env.model.mj_model.opt.timestep)
+    c_s = control_steps * substeps / _c_mujoco.steps_per_s(env.model)
+    plans = len(chunks) * math.ceil(steps / rules.execute)
+    found = parts(env, policy, params, stats, settings, lanes)
+    floor = (
+        1e-3
+        * plans
+        * (
+            found["policy_ms"]
+            + rules.execute * found["step_ms"]
+            + rules.obs_horizon * found["observe_ms"]
+        )
+    )
+    row = {
+        "trials": len(lengths),
+        "time_limit_s": asked.limit,
+        "lanes": lanes,
+        "chunks": len(chunks),
+        "control_steps": control_steps,
+        "run_s": run_s,
+        "compile_s": compile_s,
+        "simulated_s_a_second": control_steps / env.control_hz / run_s,
+        "c_physics_alone_s": c_s,
+        "times_c_physics_speed": c_s / run_s,
+        "sum_of_parts_s": floor,
+        "ratio_to_sum_of_parts": run_s / floor,
+        **found,
+    }
+    name = f"image {settings.image_size} px" if settings.observation == "image" else "state"
+    print(
+        f"{name}: {len(lengths)} trials of {asked.limit:g} s in {run_s:.2f} s, compiling "
+        f"{compile_s:.1f} s; C MuJoCo's physics alone {c_s:.1f} s; {lanes} trials at once; "
+        f"parts {floor:.2f} s (policy {found['policy_ms']:.2f}, step {found['step_ms']:.2f}, "
+        f"observe {found['observe_ms']:.2f} ms)"
+    )
+    _timing.report("evaluate", {"results": {name: row}}, asked.tiny)
+
+
+def subject(asked: argparse.Namespace):
+    """Policy, parameters, statistics and settings: trained ones, or new ones of the right size."""
+    if asked.policy:
+        trained = export.load(asked.policy)
+        method = methods.METHODS[trained.method]
+        policy = policies.make(method, trained.policy, trained.p_world_ref, trained.train)
+        return policy, *jax.device_put((trained.params, trained.normalizer)), trained.policy
+    case = _setup.paper(224) if _peer.platform() == "gpu" else _setup.small(1, asked.image)
+    case = _setup.looking(_setup.miniature() if asked.tiny else case, asked.image)
+    return *_setup.untrained(case), case.policy
+
+
+def trials_in_chunks(trials: int, lanes: int) -> list[rollout.Trials]:
+    """All trials of the twelve trocars, `lanes` at once, the last chunk filled up."""
+    index, trial = np.divmod(np.arange(len(rcm.IS_SEEN) * trials, dtype=np.int32), trials)
+    chunks = []
+    for first in range(0, len(index), lanes):
+        rows = first + np.arange(lanes)
+        wanted = rows < len(index)
+        rows = np.where(wanted, rows, first)
+        trocar = rcm.Trocar(*(field[index[rows]] for field in rcm.TROCARS))
+        chunks.append(rollout.Trials(trocar, index[rows], trial[rows], wanted))
+    return chunks
+
+
+def parts(env, policy, params, stats, settings, lanes: int) -> dict[str, float]:
+    """ms: one policy call, one control step and one look, each of all lanes."""
+    observation, trocar = latency.example(settings, env.p_world_ref, lanes)
+    keys = jax.random.split(jax.random.key(0), lanes)
+    state = jax.jit(jax.vmap(env.reset))(keys, envs.EnvParams(trocar))
+    command = Command(state.pose, jnp.ones(lanes))
+
+    def some_steps(state, command):
+        step = jax.vmap(env.step)
+        return jax.lax.fori_loop(0, settings.execute, lambda _, s: step(s, command), state)
+
+    step, state = _timing.time_carried(some_steps, state, command, repeats=3)
+    call = _timing.time_jitted(policy.sample, params, stats, keys, observation, trocar, repeats=3)
+    look = _timing.time_jitted(jax.vmap(env.observe), state, repeats=3)
+    return {
+        "policy_ms": 1e3 * call.median_s,
+        "step_ms": 1e3 * step.median_s / settings.execute,
+        "observe_ms": 1e3 * look.median_s,
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""Demonstrations of a run: where they lie, collecting what is missing, and what training sees.
+
+What brings jax is imported where it is used, after XLA has been prepared.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from starjax import config as config_lib
+from starjax.experiments import clock, words
+
+
+def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
+    """The folder of a run's demonstrations, and a function that collects what it lacks."""
+    from starjax import rcm
+    from starjax.data import demos, store
+    from starjax.sim.tasks import expert
+
+    trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
+    wanted = {
+        "per_trocar": config.demos.per_trocar,
+        "seed": config.seed,
+        "max_steps": config.demos.max_steps,
+        "keep_failures": config.demos.keep_failures,
+    }
+    out = Path(config.out)
+    root = out / f"demos-{store.digest(demos.describe(env, trocars, **wanted))}"
+
+    def collect() -> None:
+        if store.is_sealed(root):
+            words.stage("collect", f"done before, {root}")
+            return
+        words.stage("collect", f"into {root}")
+        with clock.timed(out, "collect"):
+            found = demos.collect(
+                root, env, expert, trocars, devices=_devices(), report=words.indented, **wanted
+            )
+        words.indented(
+            "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
+        )
+
+    return root, collect
+
+
+def load(
+    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], encoder: Any
+) -> Any:
+    """The dataset to train on, with what a frozen encoder sees in the place of pictures."""
+    from starjax.data import load as loading
+    from starjax.data import store
+
+    collect()
+    settings = {"pictures": encoder is None, "report": words.indented}
+    try:
+        found = loading.load(root, **settings)
+    except store.DamagedEpisode as error:
+        words.indented(f"damaged, collected again: {error}")
+        (root / "SEALED.json").unlink()
+        collect()
+        found = loading.load(root, **settings)
+    return found.dataset if encoder is None else _with_features(config, root, found, encoder)
+
+
+def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder: Any) -> Any:
+    import jax
+
+    from starjax.data import load as loading
+    from starjax.data import windows
+    from starjax.training import frozen
+
+    dataset = demos.dataset
+    with clock.timed(Path(config.out), "features"):
+        found = frozen.features(
+            encoder,
+            config.policy,
+            config.train,
+            root,
+            demos.digest,
+            len(dataset.episode),
+            lambda: loading.frames(root),
+            words.indented,
+        )
+    features = jax.device_put(found) if windows.on_device(dataset) else found
+    return dataset.replace(observation=dataset.observation.replace(features=features))
+
+
+def frozen_encoder(config: config_lib.RunConfig) -> Any:
+    """The vision encoder that stays frozen, None for other runs; mistakes are found here."""
+    if config.policy.observation != "image" or not config.policy.encoder_weights:
+        return None
+    from starjax.training import encoder
+
+    found = encoder.read(config.policy, config.train)
+    return found if config.policy.freeze_encoder else None
+
+
+def _devices() -> Any:
+    """This process's devices if there are several, None (the default one) otherwise."""
+    import jax
+
+    return jax.local_devices() if len(jax.local_devices()) > 1 else None

@@ -1,0 +1,52 @@
+"""What the other processes of a run do: their share of each training, and nothing on disk."""
+
+import functools
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from starjax import config as config_lib
+from starjax.experiments import methods
+from starjax.runtime import files
+
+
+def follow(
+    config: config_lib.RunConfig,
+    trained: Sequence[str],
+    root: Path,
+    p_world_ref: Any,
+) -> None:
+    """Trains along with the first process, then waits until that one has done the rest.
+
+    Args:
+      config: settings of the run.
+      trained: names of the methods that are trained, in order; none if the run does not train.
+      root: folder of the demonstrations, which the first process collects.
+      p_world_ref: `[3]` m, the nominal port.
+    """
+    from starjax.data import load, store
+    from starjax.training import loop, processes
+
+    @functools.cache
+    def dataset():
+        while not store.is_sealed(root):
+            time.sleep(1.0)
+        return load.load(root).dataset
+
+    processes.agree(0)  # from here on the first one holds the folder
+    for name in trained:
+        (done,) = processes.agree(0)
+        if not done:
+            loop.run(
+                methods.METHODS[name],
+                config.policy,
+                config.train,
+                dataset(),
+                p_world_ref,
+                Path(config.out) / name,
+                config.seed,
+                description=f"Training {name}",
+            )
+    # A process that leaves early would end the others.
+    files.wait_until_free(Path(config.out))

@@ -1,0 +1,78 @@
+"""Several processes as one training run: joining it, agreeing, and acting alone.
+
+Every process runs the same command on a shared folder, with JAX_COORDINATOR_ADDRESS (host:port of
+the first one), JAX_NUM_PROCESSES and JAX_PROCESS_ID set. All train together; whatever else there is
+to do, files above all, the first does alone. With one process nothing here does anything.
+"""
+
+import os
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import NamedSharding
+
+from starjax import config
+
+_VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+
+
+def join() -> None:
+    """Joins the run that the variables name, if they do; call it before the first jax array.
+
+    Raises:
+      UsageError: some of the variables are missing or are no numbers.
+    """
+    address, *numbers = (os.environ.get(name, "") for name in _VARIABLES)
+    if not address:
+        return
+    if not all(number.isdigit() for number in numbers):
+        raise config.UsageError(
+            f"{', '.join(_VARIABLES)}: expected all or none of them, the last two whole numbers, "
+            f"got {[address, *numbers]}"
+        )
+    count, index = map(int, numbers)
+    jax.distributed.initialize(address, num_processes=count, process_id=index)
+
+
+def is_alone() -> bool:
+    """Whether this process is the whole run."""
+    return jax.process_count() == 1
+
+
+def is_first() -> bool:
+    """Whether this process is the one that writes."""
+    return jax.process_index() == 0
+
+
+def agree(*values: int) -> tuple[int, ...]:
+    """The first process's values, in all of them; each waits here for the others."""
+    if is_alone():
+        return values
+    said = multihost_utils.broadcast_one_to_all(np.array(values, np.int32))
+    return tuple(int(value) for value in said)
+
+
+def spread(x: Any, sharding: NamedSharding) -> jax.Array:
+    """An array over the devices of all processes, of which each holds all of `x`."""
+    x = x if isinstance(x, jax.Array) else np.asarray(x)
+    whole = sharding.is_fully_replicated
+    parts = [
+        jax.device_put(x if whole else x[index], device, may_alias=False)
+        for device, index in sharding.addressable_devices_indices_map(x.shape).items()
+    ]
+    return jax.make_array_from_single_device_arrays(x.shape, sharding, parts)
+
+
+def own(tree: Any) -> Any:
+    """This process's copy of arrays that are replicated over all processes."""
+    if is_alone():
+        return tree
+    return jax.tree.map(lambda x: x.addressable_data(0), tree)
+
+
+def own_name(name: str) -> str:
+    """A file's name, with the process's number in all processes but the first."""
+    stem, _, suffix = name.partition(".")
+    return name if is_first() else f"{stem}-{jax.process_index()}.{suffix}"
