@@ -1,6 +1,6 @@
 """Scripted expert of peg transfer: a phase machine that looks at the block, in pure JAX.
 
-It grasps a wall to the left or right of its middle, on the middle row either of two walls, at
+It grasps a wall to the left or right of its middle and, of two walls that are alike, either, at
 random (never by the trocar), at its own pace, is disturbed on purpose, and starts over when the
 block is not where it should be.
 The roll follows from tip positions and trocar alone: the tool turns only once the coming positions
@@ -38,7 +38,8 @@ RELEASE_SHIFT = 0.0005  # m further out along the grasped wall's normal: room fo
 HELD = 0.006  # m from the tip within which the grasped wall counts as held
 GRASP_SIDE = 0.0015  # m along the wall, to either side of its middle
 CANDIDATES = 2  # walls to choose from
-OUTWARD = 0.003  # m off the middle row at which a preference shows
+OUTWARD = 0.001  # m off the middle row at which a preference shows
+SKEW = 0.1  # sine of the angle between jaws and the world's y at which a preference shows
 
 NOISE_POSITION = 0.0012  # m, standard deviation of the disturbance
 NOISE_ROLL = 0.07  # rad
@@ -162,9 +163,9 @@ def _enter(
     skew = jnp.abs(normals[:, 0])
     is_candidate = skew <= jnp.sort(skew)[CANDIDATES - 1]
     # Of these, the one towards the board's middle, where the shaft leans away from the peg; on the
-    # middle row either will do.
-    outward = normals[:, 1] * block.p[1] / OUTWARD
-    chosen = jax.random.categorical(key_wall, jnp.where(is_candidate, -outward, -jnp.inf))
+    # middle row the one that asks for less of a turn, or either if they are alike.
+    unlike = normals[:, 1] * block.p[1] / OUTWARD + skew / SKEW
+    chosen = jax.random.categorical(key_wall, jnp.where(is_candidate, -unlike, -jnp.inf))
     wall = jnp.where(is_approach, chosen, expert.wall)
     out = normals[wall] * jnp.array([1.0, 1.0, 0.0])
     out = out / jnp.maximum(jnp.linalg.norm(out), 1e-6)
