@@ -19,7 +19,7 @@ from starjax.sim import env as envs
 from starjax.sim.tasks import expert
 
 STEPS = 600  # control steps, 20 s; the limit of a policy's trial is 60 s
-CHUNK = {"cpu": 48}  # episodes at once
+CHUNK = {"cpu": 16}  # episodes at once
 CHUNK_GPU = 600
 
 
@@ -83,15 +83,16 @@ def _episode(environment: envs.Env, key: jax.Array, trocar: rcm.Trocar) -> dict[
     key_reset, key_expert = jax.random.split(key)
     state = environment.reset(key_reset, envs.EnvParams(trocar))
 
-    def step(carry, _):
-        state, script = carry
+    def step(carry):
+        state, script, errors = carry
         command, script = expert.act(script, state)
         after = environment.step(state, command)
-        return (after, script), (after.rcm_error, ~state.done)
+        return after, script, errors.at[state.step].set(after.rcm_error)
 
-    start = (state, expert.init(key_expert, state))
-    (state, _), (errors, live) = jax.lax.scan(step, start, None, length=STEPS)
+    start = (state, expert.init(key_expert, state), jnp.zeros(STEPS))
+    state, _, errors = jax.lax.while_loop(lambda c: ~c[0].done & (c[0].step < STEPS), step, start)
     names = ("success", "step", "collided", "invalid")
+    live = jnp.arange(STEPS) < state.step
     return {"errors": errors, "live": live, **{name: getattr(state, name) for name in names}}
 
 
