@@ -32,6 +32,14 @@ def test_the_last_plain_line_is_shown_once():
     assert len(stream.getvalue().splitlines()) == 1
 
 
+def test_shares_that_add_up_to_a_little_less_reach_the_end():
+    stream = io.StringIO()
+    with progress.track("Evaluation", 1, stream=stream) as advance:
+        for _ in range(10):
+            advance(0.1)
+    assert len(stream.getvalue().splitlines()) == 1
+
+
 def test_a_bar_on_a_terminal(monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):

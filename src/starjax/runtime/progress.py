@@ -77,11 +77,11 @@ def _plain(description: str, total: int, unit: str, done: int, stream: TextIO) -
 
     def advance(count: float = 1, note: str = "") -> None:
         nonlocal shown
-        if not count and meter.done >= total:
+        if meter.is_over():
             return  # the last line is out
         meter.add(count)
         now = time.monotonic()
-        if now - shown < PLAIN_EVERY_S and meter.done < total:
+        if now - shown < PLAIN_EVERY_S and not meter.is_over():
             return
         shown = now
         so_far = f"{description}: {meter.done:.0f}/{total} {unit}"
@@ -100,6 +100,9 @@ class _Meter:
     def add(self, count: float) -> None:
         self.done += count
 
+    def is_over(self) -> bool:
+        return self.done >= self.total - 1e-6  # shares of a unit rarely add up to the last bit
+
     def per_second(self) -> float:
         return (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
 
@@ -110,7 +113,7 @@ class _Meter:
     def eta(self) -> str:
         """Time left in words; empty before the first unit and after the last."""
         rate = self.per_second()
-        if rate <= 0 or self.done >= self.total:
+        if rate <= 0 or self.is_over():
             return ""
         minutes, seconds = divmod(round((self.total - self.done) / rate), 60)
         hours, minutes = divmod(minutes, 60)
