@@ -78,29 +78,7 @@ def test_other_observations_and_seeds_have_folders_of_their_own():
     assert settings(*typed, "--out", "runs/cpu").out == "runs/cpu"
 
 
-@pytest.fixture
-def frozen(monkeypatch):
-    """A preset whose vision encoder is frozen."""
-    cpu = presets.PRESETS["cpu"]
-    seeing = dataclasses.replace(
-        cpu.policy, observation="image", encoder_weights="compact", freeze_encoder=True
-    )
-    changed = dataclasses.replace(cpu, policy=seeing)
-    monkeypatch.setitem(presets.PRESETS, "cpu", changed)
-    return changed
-
-
-def test_a_frozen_encoder_is_left_out_where_the_state_is_observed(frozen):
-    assert settings("--preset", "cpu") == frozen
-    blind = settings("--preset", "cpu", "--policy.observation", "state")
-    assert blind.policy.encoder_weights == "" and not blind.policy.freeze_encoder
-    assert blind.out == "runs/cpu-state"
-    with pytest.raises(config.UsageError, match=r"--policy.freeze-encoder: expected"):
-        settings("--preset", "cpu", "--policy.observation=state", "--policy.freeze_encoder")
-
-
-def test_frozen_and_learning_encoders_have_folders_of_their_own(frozen):
-    assert settings("--preset", "cpu", "--policy.no-freeze-encoder").out == "runs/cpu-unfrozen"
+def test_a_frozen_encoder_has_a_folder_of_its_own():
     typed = ["--policy.observation", "image", "--policy.freeze-encoder"]
     typed += ["--policy.encoder-weights", "x"]
     assert settings("--preset", "smoke", *typed).out == "runs/smoke-image-frozen"

@@ -134,6 +134,24 @@ def test_unusable_settings_are_named(arguments, named):
         envs.make(*arguments)
 
 
+def test_the_expert_takes_the_inner_wall_and_on_the_middle_row_the_one_of_less_turn(reset, begin):
+    clear = {"outer": 0, "middle": 0}
+    for seed in range(8):
+        state = reset(seed)
+        walls = np.asarray(begin(state, seed).wall)
+        normals = np.asarray(jax.vmap(peg_transfer.wall_normals)(state.block_pose))
+        for wall, normal, y in zip(walls, normals, np.asarray(state.block_pose.p[:, 1])):
+            skew = np.abs(normal[:, 0])
+            first, second = np.argsort(skew)[:2]
+            if abs(y) > 0.015:
+                clear["outer"] += 1
+                assert normal[wall, 1] * y < 0
+            elif abs(y) < 0.0005 and skew[second] - skew[first] > 0.6:
+                clear["middle"] += 1
+                assert wall == first
+    assert min(clear.values()) >= 3
+
+
 def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
     """What is multimodal never depends on the trocar, or positions would not be invariant."""
     state = reset(5)

@@ -1,7 +1,6 @@
 """`starjax evaluate`: a trained policy on the twelve trocars; a file of weights is enough."""
 
 import dataclasses
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ import tyro
 
 from starjax import config as config_lib
 from starjax.experiments import checks, clock, folders, methods, options, presets, words
-from starjax.policies import weights
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Scores a trained policy on the twelve trocars, and films it.
@@ -18,15 +16,13 @@ DESCRIPTION = """Scores a trained policy on the twelve trocars, and films it.
 RUN is a method's folder, such as runs/cpu/stardiff; or --policy names a policy.safetensors, from
 anywhere. The same command again goes on from the trials that are done."""
 
-_CONTROL_HZ = 30.0
-
 
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Flags of the command."""
 
     run: tyro.conf.Positional[str] = ""  # a method's folder, such as runs/cpu/stardiff
-    policy: str = ""  # a policy.safetensors, or the name of weights that come with starjax
+    policy: str = ""  # a policy.safetensors
     seed: int = 0  # of the trials
     out: str = ""  # folder of the result; if empty, in RUN or in runs/evaluate
     video: bool = True  # rollout.mp4
@@ -45,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
     checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
     run = Path(chosen.run)
     if chosen.policy:
-        file = weights.find("--policy", chosen.policy)
+        file = files.existing("--policy", chosen.policy)
         default = Path("runs/evaluate") / f"{_label(file)}-seed{chosen.seed}"
         config = None
     else:
@@ -68,7 +64,7 @@ def main(argv: Sequence[str]) -> int:
         table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed)
     command = options.typed("evaluate", argv)
     result = scoring.write_result(folder, who, table, config, command, clock.timings(folder))
-    print(f"\n{words.outcome([result])}\n{_times(result)}\n")
+    print(f"\n{words.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
     if chosen.video:
         print(_film(folder, who))
     print(f"result: {folder / 'result.json'}; starjax report {folder} draws tables and figures")
@@ -99,10 +95,10 @@ def _config(trained: Any) -> config_lib.RunConfig:
     return config_lib.from_dict(config_lib.RunConfig, known)
 
 
-def _times(result: dict[str, Any]) -> str:
+def _times(result: dict[str, Any], control_hz: float) -> str:
     """How long a transfer and a decision take."""
-    taken = [trial["steps"] for trial in result["trials"] if trial["success"]]
-    transfer = f"{statistics.median(taken) / _CONTROL_HZ:.1f} s" if taken else "-"
+    steps = result["steps"]["median"]
+    transfer = "-" if steps is None else f"{steps / control_hz:.1f} s"
     return f"  median transfer {transfer}, decision {result['inference_ms']['p50']:.1f} ms"
 
 

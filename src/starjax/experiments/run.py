@@ -21,7 +21,6 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
     config = options.parse(
         config_lib.RunConfig, argv, prog=prog, description=description, default=default
     )
-    config = _without_unused(config, argv)
     out = config.out
     if options.value_of("--out", argv) is None:
         out = _folder(config, default)
@@ -30,23 +29,12 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
     return config
 
 
-def _without_unused(config: config_lib.RunConfig, argv: Sequence[str]) -> config_lib.RunConfig:
-    """Without the preset's image encoder where the state is observed, unless it was asked for."""
-    flags = ("--policy.freeze-encoder", "--policy.encoder-weights")
-    typed = any(word.replace("_", "-").startswith(flags) for word in argv)
-    if config.policy.observation == "image" or typed:
-        return config
-    policy = dataclasses.replace(config.policy, encoder_weights="", freeze_encoder=False)
-    return dataclasses.replace(config, policy=policy)
-
-
 def _folder(config: config_lib.RunConfig, default: config_lib.RunConfig) -> str:
     """Folder of a run that names none: runs that differ do not meet in one."""
     policy, usual = config.policy, default.policy
     parts = [default.out]
     parts += [policy.observation] if policy.observation != usual.observation else []
-    if policy.observation == "image" and policy.freeze_encoder != usual.freeze_encoder:
-        parts.append("frozen" if policy.freeze_encoder else "unfrozen")
+    parts += ["frozen"] if policy.freeze_encoder else []
     parts += [f"seed{config.seed}"] if config.seed != default.seed else []
     return "-".join(parts)
 

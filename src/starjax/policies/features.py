@@ -156,8 +156,8 @@ def _history(
 def _relative(observation: Observation) -> jax.Array:
     """Tip to block, in the world's frame and in the block's, and tip to target: `[..., 9]`.
 
-    The workspace is 20 times as wide as a grasp is accurate: a small network would have to learn
-    these differences to a hundredth before anything else.
+    They decide a grasp, and a small network does not get such small differences exactly enough from
+    positions in the scale of the workspace.
     """
     state = jnp.asarray(observation.state)
     tip = observation.pose.p

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from starjax import config
-from starjax.policies import diffuser, features, weights
+from starjax.policies import diffuser, features
 from starjax.policies import policy as policies
+from starjax.runtime import files
 from starjax.training import export
 
 
@@ -34,7 +35,7 @@ def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -
         not the one that the settings describe.
     """
     name = policy_config.encoder_weights
-    path = weights.find("--policy.encoder-weights", name)
+    path = files.existing("--policy.encoder-weights", name)
     if not export.is_policy(path):
         _check_torchvision(policy_config)
         return None
@@ -58,7 +59,7 @@ def start(
     """A policy's parameters before the first step, with the encoder that the settings name."""
     found = read(policy_config, train_config)
     if found is None:
-        return policies.with_resnet18(params, weights.resolve(policy_config.encoder_weights))
+        return policies.with_resnet18(params, policy_config.encoder_weights)
     return policies.with_vision(params, found.params)
 
 

@@ -1,5 +1,6 @@
 """The rollout video: recorded joint positions drawn again by the simulator's own camera."""
 
+import contextlib
 import itertools
 import pathlib
 import subprocess
@@ -137,12 +138,11 @@ def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) ->
         [*program, *source, *coded, str(path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     ) as encoder:
         assert encoder.stdin and encoder.stderr
-        try:
+        # A pipe breaks when the encoder has given up; it has said why.
+        with contextlib.suppress(BrokenPipeError):
             for picture in itertools.chain([first], stream):
                 encoder.stdin.write(np.ascontiguousarray(picture).data)
             encoder.stdin.close()
-        except BrokenPipeError:
-            pass  # the encoder has said why
         said = encoder.stderr.read().decode().strip()
     if encoder.returncode:
         raise OSError(f"{path}: the video could not be written: {said or encoder.returncode}")
