@@ -122,9 +122,10 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
 
 
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:
-    """A policy, its first parameters and its statistics."""
+    """A policy, its first parameters as an evaluation holds them, and its statistics."""
     policy = policies.make(METHOD, case.policy, P_WORLD_REF, case.train)
-    return policy, state.init_params(policy, 0), statistics(case.policy)
+    params = policies.for_sampling(state.init_params(policy, 0), case.policy.dtype)
+    return policy, params, statistics(case.policy)
 
 
 def statistics(policy_config: PolicyConfig) -> normalizer.Normalizer:

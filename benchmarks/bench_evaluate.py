@@ -10,6 +10,7 @@ physics steps alone, and, as the floor, the sum of the parts timed one by one in
 
 import argparse
 import math
+import pathlib
 import time
 
 import _c_mujoco
@@ -22,10 +23,8 @@ import numpy as np
 
 from starjax import rcm, runtime
 from starjax.evaluation import latency, rollout
-from starjax.experiments import methods
-from starjax.policies import policy as policies
+from starjax.experiments import scoring
 from starjax.sim import env as envs
-from starjax.training import export
 from starjax.types import Command
 
 
@@ -45,7 +44,7 @@ def main() -> None:
     policy, params, stats, settings = subject(asked)
     env = envs.make(settings.observation, settings.image_size)
     steps = math.ceil(asked.limit * env.control_hz)
-    lanes = asked.lanes or rollout.lanes_per_device(jax.devices()[0])
+    lanes = asked.lanes or rollout.lanes_per_device(jax.devices()[0], len(rcm.IS_SEEN) * asked.trials)
     rules = rollout.Settings(settings.obs_horizon, settings.execute, steps)
     run = rollout.make(env, policy, rules, seed=0)
     chunks = trials_in_chunks(asked.trials, lanes)
@@ -102,10 +101,9 @@ def main() -> None:
 def subject(asked: argparse.Namespace):
     """Policy, parameters, statistics and settings: trained ones, or new ones of the right size."""
     if asked.policy:
-        trained = export.load(asked.policy)
-        method = methods.METHODS[trained.method]
-        policy = policies.make(method, trained.policy, trained.p_world_ref, trained.train)
-        return policy, *jax.device_put((trained.params, trained.normalizer)), trained.policy
+        who = scoring.from_file(pathlib.Path(asked.policy))
+        trained = jax.device_put((who.trained.params, who.trained.normalizer))
+        return who.policy, *trained, who.trained.policy
     case = _setup.paper(224) if _peer.platform() == "gpu" else _setup.small(1, asked.image)
     case = _setup.looking(_setup.miniature() if asked.tiny else case, asked.image)
     return *_setup.untrained(case), case.policy

@@ -102,12 +102,30 @@ def test_resnet18_shrinks_by_32():
     assert shape == (2, 7, 8, 512)
 
 
-def test_max_pool_is_jaxs():
-    x = jax.nn.relu(frames(size=9))
-    expected = jax.lax.reduce_window(
-        x, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), [(0, 0), (1, 1), (1, 1), (0, 0)]
+@pytest.mark.parametrize("size", [9, 12])
+def test_max_pool_is_jaxs_and_its_gradient_too(size):
+    x = jax.random.uniform(KEY, (2, size, size + 1, 3))
+
+    def jaxs(x):
+        pads = [(0, 0), (1, 1), (1, 1), (0, 0)]
+        return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), pads)
+
+    expected, jaxs_gradient = jax.vjp(jaxs, x)
+    actual, gradient = jax.vjp(resnet.max_pool, x)
+    np.testing.assert_array_equal(actual, expected)
+    g = jax.random.normal(jax.random.key(1), actual.shape)
+    np.testing.assert_allclose(gradient(g)[0], jaxs_gradient(g)[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [15, 16, 17])
+def test_the_stem_is_the_convolution_it_stands_for(size):
+    x = jax.random.normal(KEY, (2, size, size + 3, 3))
+    params = resnet.Stem(8).init(KEY, x)
+    plain = resnet.Conv2d(8, 7, 2)
+    assert jax.tree.map(jnp.shape, params) == jax.tree.map(jnp.shape, plain.init(KEY, x))
+    np.testing.assert_allclose(
+        resnet.Stem(8).apply(params, x), plain.apply(params, x), rtol=1e-4, atol=1e-5
     )
-    np.testing.assert_array_equal(resnet.max_pool(x), expected)
 
 
 def test_unknown_trunk_is_named():

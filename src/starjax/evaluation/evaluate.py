@@ -78,9 +78,10 @@ def evaluate(
         execute=execute,
         max_steps=math.ceil(time_limit_s * env.control_hz - 1e-6),
     )
-    lanes = lanes or rollout.lanes_per_device((devices or jax.local_devices())[0])
-    batch = lanes * len(devices or [0])
     count = len(trocars.radius)
+    first_device = (devices or jax.local_devices())[0]
+    lanes = lanes or rollout.lanes_per_device(first_device, count * trials)
+    batch = lanes * len(devices or [0])
     index, trial = (x.reshape(-1) for x in np.divmod(np.arange(count * trials), trials))
     chosen = recorded.choose(count, trials, video_trials)
     with files.lock(directory):

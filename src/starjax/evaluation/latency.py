@@ -50,6 +50,8 @@ def policy_ms(
     observation, trocar = example(policy_config, p_world_ref, batch)
     sample = jax.jit(policy.sample)
     keys = jax.random.split(jax.random.key(0), batch)
+    # Weights on the host would be copied again at each call.
+    params, stats = jax.device_put((params, stats))
     return _percentiles(lambda: sample(params, stats, keys, observation, trocar), calls, seconds)
 
 

@@ -165,12 +165,17 @@ def make(
     return run
 
 
-def lanes_per_device(device: jax.Device) -> int:
-    """Trials that a device of this kind runs at once."""
+def lanes_per_device(device: jax.Device, trials: int) -> int:
+    """Trials that a device of this kind runs at once, where there are `trials` in all.
+
+    A GPU's are as many as make the fewest chunks, and no more than these need.
+    """
     if device.platform == "cpu":
         return CPU_LANES
     limit = (device.memory_stats() or {}).get("bytes_limit", 0)
-    return GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
+    most = GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
+    chunks = -(-trials // most)
+    return min(most, 8 * -(-trials // (8 * chunks)))
 
 
 def _check(settings: Settings) -> None:

@@ -25,7 +25,7 @@ class Subject(NamedTuple):
       method: its name.
       env: with the observation that it was trained on.
       policy: its functions.
-      trained: its weights and what they were trained with.
+      trained: its weights, rounded as `sample` would, and what they were trained with.
     """
 
     method: str
@@ -72,7 +72,8 @@ def _subject(method: str, trained: export.Trained, env: sim_env.Env | None) -> S
     env = env or sim_env.make(trained.policy.observation, trained.policy.image_size)
     row = methods.METHODS[method]
     policy = policies.make(row, trained.policy, env.p_world_ref, trained.train)
-    return Subject(method, env, policy, trained)
+    params = policies.for_sampling(trained.params, trained.policy.dtype)
+    return Subject(method, env, policy, trained._replace(params=params))
 
 
 def rollouts(
@@ -102,9 +103,14 @@ def rollouts(
 
 def decision_ms(who: Subject) -> dict[str, float]:
     """Time of one decision at batch 1: observation in, commands out, compilation apart."""
-    params, stats = jax.device_put((who.trained.params, who.trained.normalizer))
+    trained = who.trained
     return latency.policy_ms(
-        who.policy, who.trained.policy, params, stats, who.env.p_world_ref, seconds=5.0
+        who.policy,
+        trained.policy,
+        trained.params,
+        trained.normalizer,
+        who.env.p_world_ref,
+        seconds=5.0,
     )
 
 

@@ -123,10 +123,10 @@ class Conv1d(nn.Module):
 
 
 class Upsample1d(nn.Module):
-    """Transposed convolution, kernel 4, stride 2, padding 1, as one matrix product.
+    """Transposed convolution, kernel 4, stride 2, padding 1, as two products of one batch.
 
-    Output 2i is x[i] w1 + x[i-1] w3 and output 2i + 1 is x[i+1] w0 + x[i] w2: each pair of outputs
-    reads three inputs.
+    With taps w0..w3, output 2i is x[i] w1 + x[i-1] w3 and output 2i + 1 is x[i] w2 + x[i+1] w0: the
+    parameter holds w1 above w3, and w2 above w0.
     """
 
     @nn.compact
@@ -134,15 +134,14 @@ class Upsample1d(nn.Module):
         """`[B, L, C] -> [B, 2 L, C]`."""
         batch, length, channels = x.shape
         init = uniform_init(4 * channels)
-        kernel = self.param("kernel", init, (4, channels, channels)).astype(x.dtype)
+        kernel = self.param("kernel", init, (2, 2 * channels, channels)).astype(x.dtype)
         bias = self.param("bias", init, (channels,)).astype(x.dtype)
-        padded = jnp.pad(x, ((0, 0), (1, 1), (0, 0)))
-        before, here, after = padded[:, :-2], x, padded[:, 2:]
-        even = jnp.concatenate([before, here], -1).reshape(batch * length, 2 * channels)
-        odd = jnp.concatenate([here, after], -1).reshape(batch * length, 2 * channels)
-        even = even @ jnp.concatenate([kernel[3], kernel[1]])
-        odd = odd @ jnp.concatenate([kernel[2], kernel[0]])
-        return jnp.stack([even, odd], 1).reshape(batch, 2 * length, channels) + bias
+        before = jnp.pad(x, ((0, 0), (1, 0), (0, 0)))[:, :-1]
+        after = jnp.pad(x, ((0, 0), (0, 1), (0, 0)))[:, 1:]
+        pairs = jnp.stack([jnp.concatenate([x, other], -1) for other in (before, after)])
+        y = jnp.matmul(pairs.reshape(2, batch * length, 2 * channels), kernel)
+        y = jnp.moveaxis(y.reshape(2, batch, length, channels), 0, 2)
+        return y.reshape(batch, 2 * length, channels) + bias
 
 
 def _mix(x: jax.Array) -> jax.Array:

@@ -26,7 +26,7 @@ class ResNet18(nn.Module):
     @nn.compact
     def __call__(self, image: jax.Array) -> jax.Array:
         """`[N, h, w, 3]` normalised -> `[N, ceil(h/32), ceil(w/32), 8 width]`."""
-        x = Conv2d(self.width, 7, 2, name="conv1")(image.astype(self.dtype))
+        x = Stem(self.width, name="conv1")(image.astype(self.dtype))
         x = max_pool(nn.relu(group_norm("bn1", x)))
         for stage in range(4):
             for block in range(2):
@@ -34,6 +34,28 @@ class ResNet18(nn.Module):
                 name = f"layer{stage + 1}_{block}"
                 x = BasicBlock(self.width << stage, stride, name=name)(x)
         return x
+
+
+class Stem(nn.Module):
+    """7x7 convolution, stride 2, padding 3, without bias, over `[N, h, w, 3]`.
+
+    Computed as a 4x4 convolution, stride 1, of 2x2 blocks of pixels: a GPU's matrix units need
+    channels in eights, and three would be padded to them at full resolution.
+    """
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[N, h, w, 3] -> [N, ceil(h/2), ceil(w/2), features]`."""
+        init = _kernel_init(7, self.features)
+        kernel = self.param("kernel", init, (7, 7, x.shape[-1], self.features))
+        # One more tap before the seven makes them four pairs: the padding before is then 4.
+        kernel = jnp.pad(kernel.astype(x.dtype), ((1, 0), (1, 0), (0, 0), (0, 0)))
+        pads = [(4, 2 * ((side + 1) // 2) + 2 - side) for side in x.shape[1:3]]
+        blocks = _pairs(jnp.pad(x, ((0, 0), *pads, (0, 0))))
+        kernel = jnp.moveaxis(_pairs(jnp.moveaxis(kernel, -1, 0)), 0, -1)
+        return _convolve(blocks, kernel, 1, 0)
 
 
 class BasicBlock(nn.Module):
@@ -65,16 +87,9 @@ class Conv2d(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[N, h, w, C] -> [N, ceil(h/stride), ceil(w/stride), features]`."""
         size, pad = self.kernel_size, self.kernel_size // 2
-        # Variance 2 / fan-out, as torchvision's.
-        init = layers.uniform_init(size * size * self.features, gain=math.sqrt(6.0))
+        init = _kernel_init(size, self.features)
         kernel = self.param("kernel", init, (size, size, x.shape[-1], self.features))
-        return jax.lax.conv_general_dilated(
-            x,
-            kernel.astype(x.dtype),
-            (self.stride, self.stride),
-            [(pad, pad), (pad, pad)],
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        )
+        return _convolve(x, kernel.astype(x.dtype), self.stride, pad)
 
 
 def group_norm(name: str, x: jax.Array) -> jax.Array:
@@ -82,14 +97,70 @@ def group_norm(name: str, x: jax.Array) -> jax.Array:
     return layers.GroupNorm(x.shape[-1] // 16, name=name)(x)
 
 
+@jax.custom_vjp
 def max_pool(x: jax.Array) -> jax.Array:
     """3x3 maximum, stride 2, of values that are not negative: zero padding then changes nothing.
 
-    Written as maxima of slices, whose gradient is cheaper than select-and-scatter.
+    Its gradient goes to the first of the largest, remembered as its number in the window: one pass
+    over the output, where the gradient of maxima takes several over the input.
     """
+    return _max_pool(x)[0]
+
+
+def _max_pool(x: jax.Array) -> tuple[jax.Array, tuple[jax.Array, tuple[int, ...]]]:
     height, width = (x.shape[1] + 1) // 2, (x.shape[2] + 1) // 2
-    x = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
-    rows = [x[:, i : i + 2 * height - 1 : 2] for i in range(3)]
-    x = jnp.maximum(jnp.maximum(rows[0], rows[1]), rows[2])
-    columns = [x[:, :, j : j + 2 * width - 1 : 2] for j in range(3)]
-    return jnp.maximum(jnp.maximum(columns[0], columns[1]), columns[2])
+    padded = jnp.pad(x, ((0, 0), (1, 2), (1, 2), (0, 0)))
+    largest = padded[:, : 2 * height : 2, : 2 * width : 2]
+    number = jnp.zeros(largest.shape, jnp.uint8)
+    for n in range(1, 9):
+        i, j = divmod(n, 3)
+        other = padded[:, i : i + 2 * height : 2, j : j + 2 * width : 2]
+        number = jnp.where(other > largest, jnp.uint8(n), number)
+        largest = jnp.maximum(largest, other)
+    return largest, (number, x.shape)
+
+
+def _max_pool_gradient(kept, g: jax.Array) -> tuple[jax.Array]:
+    number, shape = kept
+
+    def of(n: int, down: int = 0, right: int = 0) -> jax.Array:
+        """What windows give to their entry n; those one further down or right, if asked."""
+        given = jnp.where(number == n, g, 0)
+        return jnp.pad(given, ((0, 0), (0, down), (0, right), (0, 0)))[:, down:, right:]
+
+    # Even rows and columns are the middle of one window, odd ones lie between two.
+    even = jnp.stack([of(4), of(5) + of(3, right=1)], 3)
+    odd = jnp.stack([of(7) + of(1, 1), of(8) + of(6, 0, 1) + of(2, 1, 0) + of(0, 1, 1)], 3)
+    both = jnp.stack([even, odd], 2)
+    batch, height, _, width, _, channels = both.shape
+    whole = both.reshape(batch, 2 * height, 2 * width, channels)
+    return (whole[:, : shape[1], : shape[2]],)
+
+
+max_pool.defvjp(_max_pool, _max_pool_gradient)
+
+
+def _kernel_init(size: int, features: int):
+    """Variance 2 / fan-out, as torchvision's."""
+    return layers.uniform_init(size * size * features, gain=math.sqrt(6.0))
+
+
+def _convolve(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.Array:
+    return jax.lax.conv_general_dilated(
+        x,
+        kernel,
+        (stride, stride),
+        [(pad, pad), (pad, pad)],
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )
+
+
+def _pairs(x: jax.Array) -> jax.Array:
+    """Blocks of 2x2 pixels as channels, filled up to a multiple of 8 with zeros.
+
+    `[N, 2 h, 2 w, C] -> [N, h, w, 4 C rounded up]`.
+    """
+    batch, height, width, channels = x.shape
+    x = x.reshape(batch, height // 2, 2, width // 2, 2, channels)
+    x = jnp.moveaxis(x, 2, 3).reshape(batch, height // 2, width // 2, 4 * channels)
+    return jnp.pad(x, ((0, 0), (0, 0), (0, 0), (0, -4 * channels % 8)))

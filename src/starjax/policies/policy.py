@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from starjax import config
 from starjax.data import normalizer, windows
@@ -54,6 +55,21 @@ def with_resnet18(params: Params, path: str | pathlib.Path) -> Params:
     vision = vision_of(params)["params"]
     filled = {**vision, "trunk": pretrained.load_resnet18(vision["trunk"], path)}
     return with_vision(params, {"params": filled})
+
+
+def for_sampling(params: Params, dtype: str) -> Params:
+    """Parameters whose large matrices are in the type that the networks calculate in.
+
+    `sample` rounds them so anyway, to the same numbers; done before, the U-Net's are not read in
+    float32 and rounded again at each DDIM step.
+    """
+    large = {"kernel", "film_time", "film_cond"}
+
+    def rounded(path: tuple[Any, ...], leaf: Any) -> Any:
+        names = {getattr(key, "key", None) for key in path}
+        return leaf.astype(jnp.dtype(dtype)) if names & {"unet", "trunk"} and names & large else leaf
+
+    return jax.tree_util.tree_map_with_path(rounded, params)
 
 
 def make(
