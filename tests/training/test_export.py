@@ -57,9 +57,64 @@ def test_non_finite_weights_are_not_saved(tmp_path):
     assert not (tmp_path / "p").exists()
 
 
-def test_every_flipped_bit_is_noticed(tmp_path):
+def random(largest=4.0, size=(100, 300)):
+    """A policy with weights of many magnitudes, some too small for float16."""
+    rng = np.random.default_rng(1)
+    kernel = rng.choice([-1, 1], size) * np.exp(rng.uniform(np.log(1e-9), np.log(largest), size))
+    params = {"unet": {"kernel": jnp.asarray(kernel, jnp.float32), "count": jnp.arange(3)}}
+    return trained()._replace(params=params)
+
+
+def test_half_precision_is_half_the_size_and_rounds(tmp_path):
+    one = random()
+    export.save(tmp_path / "full", one)
+    export.save(tmp_path / "half", one, half=True)
+    full, half = ((tmp_path / name).stat().st_size for name in ("full", "half"))
+    assert 0.5 < half / full < 0.51
+    found, before = export.load(tmp_path / "half"), np.asarray(one.params["unet"]["kernel"])
+    after = np.asarray(found.params["unet"]["kernel"])
+    assert after.dtype == np.float32
+    error = np.abs(after - before)
+    assert (error <= np.maximum(np.abs(before) / 2048, 3e-8)).all() and error.max() > 1e-4
+    np.testing.assert_array_equal(found.params["unet"]["count"], np.arange(3))
+    assert found.params["unet"]["count"].dtype == one.params["unet"]["count"].dtype
+    assert found._replace(params=None, normalizer=None) == one._replace(
+        params=None, normalizer=None
+    )
+
+
+def test_half_precision_leaves_the_statistics_alone(tmp_path):
+    box = normalizer.MinMax(jnp.full(5, -1.0001), jnp.full(5, 70_000.25))
+    export.save(
+        tmp_path / "p", random()._replace(normalizer=normalizer.Normalizer(box, None)), True
+    )
+    found = export.load(tmp_path / "p").normalizer.action
+    jax.tree.map(np.testing.assert_array_equal, found, box)
+
+
+def test_a_rounded_policy_stays_the_same(tmp_path):
+    export.save(tmp_path / "half", random(), half=True)
+    rounded = export.load(tmp_path / "half")
+    export.save(tmp_path / "full", rounded)
+    export.save(tmp_path / "again", rounded, half=True)
+    assert export.is_policy(tmp_path / "half") and export.is_policy(tmp_path / "full")
+    for name in ("full", "again"):
+        found = export.load(tmp_path / name)
+        assert export.fingerprint(found.params) == export.fingerprint(rounded.params)
+    assert (tmp_path / "again").read_bytes() == (tmp_path / "half").read_bytes()
+
+
+def test_weights_too_large_for_half_precision_are_not_saved(tmp_path):
+    export.save(tmp_path / "full", trained(scale=20_000.0))
+    with pytest.raises(ValueError, match=r"at most 65504 for float16, got 100000 in .*kernel"):
+        export.save(tmp_path / "half", trained(scale=20_000.0), half=True)
+    assert not (tmp_path / "half").exists()
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_every_flipped_bit_is_noticed(tmp_path, half):
     path = tmp_path / "policy.safetensors"
-    export.save(path, trained())
+    export.save(path, trained(), half)
     content = path.read_bytes()
     rng = np.random.default_rng(0)
     for at in rng.integers(len(content), size=200):
