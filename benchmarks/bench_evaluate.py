@@ -10,7 +10,6 @@ physics steps alone, and, as the floor, the sum of the parts timed one by one in
 
 import argparse
 import math
-import pathlib
 import time
 
 import _c_mujoco
@@ -24,6 +23,7 @@ import numpy as np
 from starjax import rcm, runtime
 from starjax.evaluation import latency, rollout
 from starjax.experiments import scoring
+from starjax.policies import packaged
 from starjax.sim import env as envs
 from starjax.types import Command
 
@@ -32,7 +32,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     side = 256 if _peer.platform() == "gpu" else 0
     parser.add_argument("--image", type=int, default=side, help="pixels a side; 0: task state")
-    parser.add_argument("--policy", help="a policy.safetensors")
+    parser.add_argument("--policy", help="a policy.safetensors, or the name of a packaged one")
     parser.add_argument("--trials", type=int, default=30, help="a trocar")
     parser.add_argument("--limit", type=float, default=60.0, help="s, of a trial")
     parser.add_argument("--lanes", type=int, default=0, help="trials at once; 0: the product's")
@@ -44,7 +44,9 @@ def main() -> None:
     policy, params, stats, settings = subject(asked)
     env = envs.make(settings.observation, settings.image_size)
     steps = math.ceil(asked.limit * env.control_hz)
-    lanes = asked.lanes or rollout.lanes_per_device(jax.devices()[0], len(rcm.IS_SEEN) * asked.trials)
+    lanes = asked.lanes or rollout.lanes_per_device(
+        jax.devices()[0], len(rcm.IS_SEEN) * asked.trials
+    )
     rules = rollout.Settings(settings.obs_horizon, settings.execute, steps)
     run = rollout.make(env, policy, rules, seed=0)
     chunks = trials_in_chunks(asked.trials, lanes)
@@ -101,7 +103,7 @@ def main() -> None:
 def subject(asked: argparse.Namespace):
     """Policy, parameters, statistics and settings: trained ones, or new ones of the right size."""
     if asked.policy:
-        who = scoring.from_file(pathlib.Path(asked.policy))
+        who = scoring.from_file(packaged.find("--policy", asked.policy))
         trained = jax.device_put((who.trained.params, who.trained.normalizer))
         return who.policy, *trained, who.trained.policy
     case = _setup.paper(224) if _peer.platform() == "gpu" else _setup.small(1, asked.image)

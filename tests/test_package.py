@@ -17,7 +17,7 @@ TEXT = [
     for path in (ROOT / folder).rglob("*")
     if path.suffix in {".py", ".md", ".xml", ".txt", ".toml", ".json"}
 ] + [path for path in ROOT.iterdir() if path.suffix in {".md", ".toml", ".yaml"}]
-COMMANDS = ["run", "collect", "train", "evaluate", "sweep", "bench", "report"]
+COMMANDS = ["run", "collect", "train", "evaluate", "sweep", "bench", "pack", "report"]
 HEAVY = ("jax", "mujoco", "flax", "scipy", "matplotlib")
 
 

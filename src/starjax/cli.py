@@ -18,6 +18,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "evaluate": ("starjax.experiments.evaluate", "score a trained policy on the twelve trocars"),
     "sweep": ("starjax.experiments.sweep", "score a trained policy on a grid or sample of trocars"),
     "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)"),
+    "pack": ("starjax.experiments.pack", "a policy in a file of half the size, to pass on"),
     "report": (
         "starjax.experiments.report_command",
         "tables, figures, video, page from results",

@@ -54,7 +54,8 @@ class PolicyConfig:
     horizon: int = 16  # H, commands predicted: t+1 .. t+H
     execute: int = 8  # commands executed before re-planning
     encoder: Literal["resnet18", "small"] = "resnet18"
-    # A starjax policy.safetensors, torchvision's .pth or .safetensors; empty: from scratch
+    # A policy that ships with starjax, by its name; a policy.safetensors of yours; torchvision's
+    # .pth or .safetensors. Empty: from scratch
     encoder_weights: str = ""
     freeze_encoder: bool = False  # train the rest only, on features computed once a frame
     vision_dim: int = 512  # d_v

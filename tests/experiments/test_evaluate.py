@@ -12,6 +12,7 @@ from starjax import config
 from starjax.data import normalizer
 from starjax.experiments import evaluate, scoring
 from starjax.experiments.report import video
+from starjax.policies import packaged
 from starjax.training import export
 
 POLICY = dataclasses.replace(fakes.TINY, execute=4)
@@ -62,6 +63,26 @@ def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
         assert words in said
     assert "/8 = " in said and "/16 = " in said and "95% interval" in said
     assert "rollout.mp4" in said and "result.json" in said
+
+
+def test_a_packaged_policy_is_scored_by_its_name(file, monkeypatch, capsys):
+    monkeypatch.setattr(packaged, "FOLDER", file.parent / "weights")
+    packaged.FOLDER.mkdir()
+    file.rename(packaged.FOLDER / "compact.safetensors")
+    assert evaluate.main(["--policy", "compact", "--eval.trials=1", "--eval.time-limit-s=1"]) == 0
+    said = capsys.readouterr().out
+    assert "DP-RCM-2 of compact\n" in said and "into runs/evaluate/compact-seed0\n" in said
+    assert (file.parent / "runs" / "evaluate" / "compact-seed0" / "result.json").is_file()
+    assert [path.name for path in packaged.FOLDER.iterdir()] == ["compact.safetensors"]
+
+
+def test_another_temperature_is_another_evaluation(file, capsys):
+    score("--out", "here")
+    made = export.load(file)
+    colder = dataclasses.replace(POLICY, temperature=0.25)
+    export.save(file, made._replace(policy=colder))
+    score("--out", "here")
+    assert "chunks of another evaluation are replaced" in capsys.readouterr().out
 
 
 def test_the_same_command_again_runs_nothing_twice(file):

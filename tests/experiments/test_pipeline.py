@@ -5,11 +5,15 @@ import json
 import os
 import signal
 
+import numpy as np
 import pytest
 
 from starjax import config
+from starjax.data import normalizer
 from starjax.experiments import demonstrations, methods, pipeline, presets, words
+from starjax.policies import packaged
 from starjax.runtime import files
+from starjax.training import export
 
 
 @pytest.fixture
@@ -110,6 +114,16 @@ def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):
     path = str(tmp_path / "resnet18.pth")
     policy = config.PolicyConfig(encoder_weights=path)
     assert words.encoder(policy) == f"trained further, from {path}"
+
+
+def test_a_packaged_encoder_is_of_this_task(tmp_path, monkeypatch):
+    box = normalizer.MinMax(np.zeros(5), np.ones(5))
+    stats, policy = normalizer.Normalizer(box, None), config.PolicyConfig(encoder_weights="compact")
+    made = export.Trained("dp_rcm2", policy, config.TrainConfig(), {"unet": np.ones(3)}, stats)
+    monkeypatch.setattr(packaged, "FOLDER", tmp_path)
+    assert words.encoder(policy) == "trained further, from compact"
+    export.save(tmp_path / "compact.safetensors", made)
+    assert words.encoder(policy) == "trained further, from compact (pretrained on this task)"
 
 
 def test_a_wrong_encoder_is_found_before_anything_is_collected(tmp_path, done):

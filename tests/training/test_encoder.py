@@ -13,7 +13,7 @@ import safetensors.numpy
 from starjax import config
 from starjax.data import normalizer
 from starjax.models import encoders
-from starjax.policies import diffuser
+from starjax.policies import diffuser, packaged
 from starjax.policies import policy as policies
 from starjax.training import encoder, export
 
@@ -57,6 +57,21 @@ def test_it_is_found_in_both_kinds_of_policy(tmp_path, method):
     save(tmp_path / "p", method)
     found = encoder.read(settings(tmp_path / "p"), TRAIN)
     jax.tree.map(np.testing.assert_array_equal, found.params, initial())
+
+
+def test_a_packaged_policy_is_known_by_its_name_or_its_path(source, tmp_path, monkeypatch):
+    path, params = source
+    monkeypatch.setattr(packaged, "FOLDER", tmp_path)
+    export.save(tmp_path / "compact.safetensors", export.load(path), half=True)
+    named = settings("compact", freeze_encoder=True)
+    found = encoder.read(named, TRAIN)
+    # The folder of a frozen encoder's features is named by this.
+    assert found.fingerprint == encoder.read(settings(tmp_path / "compact.safetensors"), TRAIN)[1]
+    assert found.fingerprint != encoder.read(settings(path), TRAIN).fingerprint
+    begun = encoder.start(jax.tree.map(jnp.zeros_like, params), named, TRAIN)
+    for leaf, stored in zip(*map(jax.tree.leaves, (policies.vision_of(begun), initial()))):
+        assert leaf.dtype == jnp.float32
+        np.testing.assert_allclose(leaf, stored, rtol=2**-11, atol=3e-8)
 
 
 def test_fingerprint_tells_weights_apart(source, tmp_path):

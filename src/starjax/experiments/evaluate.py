@@ -9,12 +9,14 @@ import tyro
 
 from starjax import config as config_lib
 from starjax.experiments import checks, clock, folders, methods, options, presets, words
+from starjax.policies import packaged
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Scores a trained policy on the twelve trocars, and films it.
 
 RUN is a method's folder, such as runs/cpu/stardiff; or --policy names a policy.safetensors, from
-anywhere. The same command again goes on from the trials that are done."""
+anywhere, or a policy that ships with starjax. The same command again goes on from the trials that
+are done."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +24,7 @@ class Options:
     """Flags of the command."""
 
     run: tyro.conf.Positional[str] = ""  # a method's folder, such as runs/cpu/stardiff
-    policy: str = ""  # a policy.safetensors
+    policy: str = ""  # a policy.safetensors, or the name of a policy that ships with starjax
     seed: int = 0  # of the trials
     out: str = ""  # folder of the result; if empty, in RUN or in runs/evaluate
     video: bool = True  # rollout.mp4
@@ -41,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
     checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
     run = Path(chosen.run)
     if chosen.policy:
-        file = files.existing("--policy", chosen.policy)
+        file = packaged.find("--policy", chosen.policy)
         default = Path("runs/evaluate") / f"{_label(file)}-seed{chosen.seed}"
         config = None
     else:

@@ -142,10 +142,10 @@ def _check_values(flag: str, hint: Any, values: list[str]) -> None:
 
 def _check_value(flag: str, hint: Any, value: str) -> None:
     """Checks one word against `int`, `float`, a `Literal`; any word is a string or a path."""
+    if isinstance(hint, types.UnionType):  # `float | None`: a value, unless nothing was typed
+        hint = typing.get_args(hint)[0]
     if typing.get_origin(hint) is Literal:
         choice(flag, value, [str(arg) for arg in typing.get_args(hint)])
-    if isinstance(hint, types.UnionType):
-        return
     if hint in (int, float):
         try:
             hint(value)

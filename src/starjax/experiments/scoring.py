@@ -96,7 +96,10 @@ def rollouts(
         chunk=settings.chunk,
         video_trials=settings.video_trials,
         devices=devices if len(devices) > 1 else None,
-        identity=folders.behaviour(who.method)._asdict(),
+        identity={
+            **folders.behaviour(who.method)._asdict(),
+            "temperature": who.trained.policy.temperature,
+        },
         report=words.indented,
     )
 

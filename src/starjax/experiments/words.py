@@ -87,9 +87,10 @@ def encoder(policy: config_lib.PolicyConfig) -> str:
 
 def _is_of_this_task(policy: config_lib.PolicyConfig) -> bool:
     """Whether the encoder began in a policy of ours; where its file is gone, as far as we know."""
+    from starjax.policies import packaged
     from starjax.training import export
 
-    return policy.freeze_encoder or export.is_policy(policy.encoder_weights)
+    return policy.freeze_encoder or export.is_policy(packaged.locate(policy.encoder_weights))
 
 
 def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[str]:

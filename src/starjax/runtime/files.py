@@ -18,8 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from starjax import config
-
 _BLOCK = 1 << 22
 
 
@@ -108,18 +106,6 @@ def require_writable(directory: Path, free_bytes: int = 0) -> None:
         raise StorageError(
             f"{directory}: about {size(free_bytes)} will be written, the disk has {size(free)} free"
         )
-
-
-def existing(argument: str, path: str) -> Path:
-    """The file at `path`.
-
-    Raises:
-      config.UsageError: there is none; the message begins with `argument`.
-    """
-    found = Path(path)
-    if not found.is_file():
-        raise config.UsageError(f"{argument}: expected a file, got {path}")
-    return found
 
 
 @contextlib.contextmanager

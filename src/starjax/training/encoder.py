@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from starjax import config
-from starjax.policies import diffuser, features
+from starjax.policies import diffuser, features, packaged
 from starjax.policies import policy as policies
-from starjax.runtime import files
 from starjax.training import export
 
 
@@ -35,7 +34,7 @@ def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -
         not the one that the settings describe.
     """
     name = policy_config.encoder_weights
-    path = files.existing("--policy.encoder-weights", name)
+    path = packaged.find("--policy.encoder-weights", name)
     if not export.is_policy(path):
         _check_torchvision(policy_config)
         return None

@@ -1,0 +1,55 @@
+"""`starjax pack POLICY OUT`: a trained policy in half the space, to pass on."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from starjax import config as config_lib
+from starjax.experiments import options
+from starjax.policies import packaged
+from starjax.runtime import files, xla
+
+DESCRIPTION = """Writes a policy for inference: weights in float16, arithmetic in float32.
+
+POLICY is a policy.safetensors, OUT the file to write. Weights are rounded to 11 bits, so score OUT
+itself (`starjax evaluate --policy OUT`)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    policy: tyro.conf.Positional[str]  # a policy.safetensors
+    out: tyro.conf.Positional[str]  # the file to write
+    temperature: float | None = None  # of the noise a sample starts from; if left out, POLICY's
+
+
+def main(argv: Sequence[str]) -> int:
+    """Writes the file, says how large it is."""
+    chosen = options.parse(Options, argv, prog="starjax pack", description=DESCRIPTION)
+    if chosen.temperature is not None and not 0 <= chosen.temperature <= 1:
+        raise config_lib.UsageError(f"--temperature: expected in [0, 1], got {chosen.temperature}")
+    source, out = packaged.find("POLICY", chosen.policy), Path(chosen.out)
+    if out.exists() and out.samefile(source):
+        raise config_lib.UsageError(f"OUT: expected another file than POLICY, got {out}")
+    xla.prepare_xla()
+
+    import jax
+
+    from starjax.training import export
+
+    try:
+        trained = export.load(source)
+        policy = dataclasses.replace(trained.policy, dtype="float32")
+        if chosen.temperature is not None:
+            policy = dataclasses.replace(policy, temperature=chosen.temperature)
+        export.save(out, trained._replace(policy=policy), half=True)
+    except ValueError as error:
+        raise config_lib.UsageError(f"POLICY: {error}") from error
+    count = sum(leaf.size for leaf in jax.tree.leaves(trained.params)) / 1e6
+    before, after = (files.size(path.stat().st_size) for path in (source, out))
+    print(f"{out}: {count:.3g} M parameters, {after} ({source}: {before})")
+    print(f"temperature {policy.temperature:g}, arithmetic in {policy.dtype}")
+    return 0

@@ -1,0 +1,36 @@
+"""Trained policies that ship with the package, found by name.
+
+weights/<name>.safetensors    in half precision, by `starjax pack`
+weights/<name>.json           result.json of its evaluation, for people: nothing reads it
+"""
+
+from pathlib import Path
+
+from starjax import config
+
+FOLDER = Path(__file__).with_name("weights")
+_SUFFIX = ".safetensors"
+
+
+def names() -> list[str]:
+    """Names of the policies that are there."""
+    return sorted(path.stem for path in FOLDER.glob(f"*{_SUFFIX}"))
+
+
+def locate(name_or_path: str) -> Path:
+    """The packaged file of this name, else the path as it is; it may not exist."""
+    is_packaged = name_or_path in names()
+    return FOLDER / f"{name_or_path}{_SUFFIX}" if is_packaged else Path(name_or_path)
+
+
+def find(argument: str, name_or_path: str) -> Path:
+    """The file that `locate` gives; `./name` is never a packaged one.
+
+    Raises:
+      config.UsageError: there is none; the message begins with `argument`.
+    """
+    path = locate(name_or_path)
+    if not path.is_file():
+        expected = " or one of ".join(filter(None, ["a file", ", ".join(names())]))
+        raise config.UsageError(f"{argument}: expected {expected}, got {name_or_path}")
+    return path

@@ -1,0 +1,77 @@
+"""`starjax pack`: what its file holds, what it says, and mistakes in one line."""
+
+import dataclasses
+
+import fakes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import config
+from starjax.data import normalizer
+from starjax.experiments import pack
+from starjax.training import export
+
+POLICY = dataclasses.replace(fakes.TINY, dtype="bfloat16", temperature=0.5)
+
+
+def save(path, scale=1.0):
+    kernel = scale * jax.random.normal(jax.random.key(0), (300, 1000))
+    box = normalizer.MinMax(-jnp.ones(5), jnp.full(5, 1 / 3))
+    stats = normalizer.Normalizer(box, None)
+    made = export.Trained("dp_rcm2", POLICY, config.TrainConfig(steps=7), {"unet": kernel}, stats)
+    export.save(path, made)
+    return made
+
+
+@pytest.fixture
+def made(tmp_path, monkeypatch):
+    """A policy, in mine.safetensors of an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    return save(tmp_path / "mine.safetensors")
+
+
+@pytest.mark.parametrize(("argv", "temperature"), [([], 0.5), (["--temperature", "0"], 0.0)])
+def test_a_packed_policy_is_small_and_for_a_cpu(made, tmp_path, capsys, argv, temperature):
+    assert pack.main(["mine.safetensors", "out/compact.safetensors", *argv]) == 0
+    out = tmp_path / "out" / "compact.safetensors"
+    found = export.load(out)
+    assert found.policy == dataclasses.replace(POLICY, dtype="float32", temperature=temperature)
+    assert (found.method, found.train) == (made.method, made.train)
+    np.testing.assert_allclose(found.params["unet"], made.params["unet"], rtol=2**-11, atol=3e-8)
+    jax.tree.map(np.testing.assert_array_equal, found.normalizer, made.normalizer)
+    assert 600_000 < out.stat().st_size < 605_000
+    said = capsys.readouterr().out
+    for words in (
+        "0.3 M parameters, 60",
+        " kB (mine.safetensors: 1.2 MB)",
+        f"temperature {temperature:g}",
+    ):
+        assert words in said
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["mine.safetensors"], ["POLICY OUT", "got mine.safetensors"]),
+        (["nowhere", "out"], ["POLICY: expected a file", "got nowhere"]),
+        (["other", "out"], ["POLICY: other: not a readable starjax policy"]),
+        (["large", "out"], ["POLICY: params: expected at most 65504", "unet"]),
+        (["mine.safetensors", "./mine.safetensors"], ["OUT: expected another file", "got mine."]),
+        (["mine.safetensors", "out", "--temperature", "2"], ["--temperature", "[0, 1]", "got 2"]),
+        (["mine.safetensors", "out", "--temperature", "nan"], ["--temperature", "[0, 1]", "nan"]),
+        (["mine.safetensors", "out", "--temperature", "x"], ["--temperature", "a number", "'x'"]),
+        (["mine.safetensors", "out", "--temprature", "1"], ["did you mean --temperature"]),
+    ],
+)
+def test_a_mistake_is_one_line(made, tmp_path, argv, words):
+    (tmp_path / "other").write_bytes(b"x" * 100)
+    save(tmp_path / "large", scale=1e5)
+    before = (tmp_path / "mine.safetensors").read_bytes()
+    with pytest.raises(config.UsageError) as caught:
+        pack.main(argv)
+    message = str(caught.value)
+    assert "\n" not in message and all(word in message for word in words), message
+    assert not (tmp_path / "out").exists()
+    assert (tmp_path / "mine.safetensors").read_bytes() == before

@@ -1,0 +1,111 @@
+"""Packaged policies are found by name, and are whole, small, of today's networks, and scored."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import fakes
+import jax
+import jax.numpy as jnp
+import pytest
+
+from starjax import config
+from starjax.data import normalizer
+from starjax.experiments import methods
+from starjax.policies import packaged
+from starjax.policies import policy as policies
+from starjax.training import export
+
+MOST = 12e6  # bytes of a file
+
+
+def shapes(params):
+    leaves = jax.tree_util.tree_leaves_with_path(params)
+    return {jax.tree_util.keystr(path): leaf.shape for path, leaf in leaves}
+
+
+def initial(method, policy_config):
+    """Shapes of the parameters that the networks have today."""
+    whole = dataclasses.replace(policy_config, freeze_encoder=False)
+    policy = policies.make(methods.METHODS[method], whole, fakes.P_WORLD_REF)
+    return jax.eval_shape(policy.init, jax.random.key(0))
+
+
+def faults(name):
+    """What is wrong with a packaged policy, in words."""
+    path = packaged.find("name", name)
+    found = [] if path.stat().st_size <= MOST else [f"{name}: too large"]
+    try:
+        trained = export.load(path)
+    except ValueError as error:
+        return [*found, str(error)]
+    if shapes(trained.params) != shapes(initial(trained.method, trained.policy)):
+        found.append(f"{name}: of other networks")
+    result = path.with_suffix(".json")
+    if not result.is_file():
+        return [*found, f"{name}: no result"]
+    method = json.loads(result.read_text())["method"]
+    return [*found, f"{name}: result of {method}"] if method != trained.method else found
+
+
+def test_what_is_packaged_is_whole():
+    assert [fault for name in packaged.names() for fault in faults(name)] == []
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A package with one policy, in which nothing is wrong."""
+    params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), initial("dp_rcm2", fakes.TINY))
+    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
+    made = export.Trained(
+        "dp_rcm2", fakes.TINY, config.TrainConfig(), params, normalizer.Normalizer(box, None)
+    )
+    place = tmp_path / "weights"
+    export.save(place / "compact.safetensors", made, half=True)
+    (place / "compact.json").write_text('{"method": "dp_rcm2"}')
+    monkeypatch.setattr(packaged, "FOLDER", place)
+    monkeypatch.chdir(tmp_path)
+    return place
+
+
+def test_faults_of_a_packaged_policy_are_found(folder):
+    assert faults("compact") == []
+    path = folder / "compact.safetensors"
+    trained = export.load(path)
+    path.with_suffix(".json").write_text('{"method": "stardiff"}')
+    assert faults("compact") == ["compact: result of stardiff"]
+    path.with_suffix(".json").unlink()
+    export.save(path, trained._replace(policy=dataclasses.replace(fakes.TINY, state_dim=32)))
+    assert faults("compact") == ["compact: of other networks", "compact: no result"]
+    large = {**trained.params, "more": jnp.zeros(13_000_000 // 4)}
+    export.save(path, trained._replace(params=large))
+    assert faults("compact")[0] == "compact: too large"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert len(faults("compact")) == 2 and "not a readable" in faults("compact")[1]
+
+
+def test_a_name_is_a_file_of_the_package(folder):
+    assert packaged.names() == ["compact"]
+    Path("compact").touch()
+    assert packaged.find("--policy", "compact") == folder / "compact.safetensors"
+
+
+def test_other_words_are_paths(folder):
+    Path("compact").touch()
+    for word in ("./compact", "weights/compact.safetensors"):
+        assert packaged.find("--policy", word) == Path(word)
+    assert packaged.locate("nowhere") == Path("nowhere")
+    # A file of the package has a name there, a file of the folder that one is in has a path.
+    with pytest.raises(config.UsageError):
+        packaged.find("--policy", "compact.safetensors")
+
+
+def test_a_missing_file_is_one_line_that_lists_the_names(folder, tmp_path, monkeypatch):
+    (folder / "large.safetensors").touch()
+    expected = "--policy: expected a file or one of compact, large, got compcat"
+    with pytest.raises(config.UsageError) as caught:
+        packaged.find("--policy", "compcat")
+    assert str(caught.value) == expected
+    monkeypatch.setattr(packaged, "FOLDER", tmp_path / "none")
+    with pytest.raises(config.UsageError, match=r"^--policy: expected a file, got compact$"):
+        packaged.find("--policy", "compact")
