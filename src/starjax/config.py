@@ -109,7 +109,7 @@ class RunConfig:
     """One run of `python -m starjax.experiments.run`."""
 
     method: str = "stardiff"  # a row of Table II, or all
-    preset: Literal["auto", "smoke", "cpu", "gpu", "paper"] = "auto"  # starting values
+    preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"  # starting values
     seed: int = 0  # of everything random
     out: str = "runs"  # folder of the demonstrations and of one folder a method
     demos: DemosConfig = dataclasses.field(default_factory=DemosConfig)

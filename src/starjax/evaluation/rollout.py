@@ -23,7 +23,7 @@ from starjax.types import Command
 SEGMENT = 25  # re-plans between two looks at the host
 # Trials at once on each device. A CPU is at its best with 16; a GPU takes hundreds in the time of
 # one, as far as its memory goes.
-CPU_LANES, GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 16, 512, 128, 40 << 30
+CPU_LANES, GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 16, 1280, 128, 40 << 30
 
 
 class Settings(NamedTuple):

@@ -77,6 +77,28 @@ PRESETS: dict[str, RunConfig] = {
             checkpoint_every=4_000,
         ),
     ),
+    # One modern GPU: a policy small enough to be carried to a laptop, from more demonstrations.
+    "compact": RunConfig(
+        preset="compact",
+        out="runs/compact",
+        demos=DemosConfig(per_trocar=100),
+        policy=PolicyConfig(
+            image_size=128,
+            encoder="small",
+            vision_dim=128,
+            unet_channels=(64, 128, 224),
+            time_dim=64,
+            temperature=0.5,
+            dtype="bfloat16",
+        ),
+        train=TrainConfig(
+            steps=40_000,
+            learning_rate=5e-4,
+            state_noise=0.005,
+            ema_max=0.9995,
+            checkpoint_every=10_000,
+        ),
+    ),
     # The paper: 100k iterations, batch 256, 256 x 256 pixels.
     "paper": RunConfig(preset="paper", out="runs/paper"),
 }
