@@ -67,7 +67,9 @@ def for_sampling(params: Params, dtype: str) -> Params:
 
     def rounded(path: tuple[Any, ...], leaf: Any) -> Any:
         names = {getattr(key, "key", None) for key in path}
-        return leaf.astype(jnp.dtype(dtype)) if names & {"unet", "trunk"} and names & large else leaf
+        return (
+            leaf.astype(jnp.dtype(dtype)) if names & {"unet", "trunk"} and names & large else leaf
+        )
 
     return jax.tree_util.tree_map_with_path(rounded, params)
 
