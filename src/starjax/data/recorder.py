@@ -267,7 +267,7 @@ def _episode(
         "trial": trial[1],
         "seed": seed,
         "length": length,
-        **{name: bool(status[name][lane]) for name in ("success", "loose", "invalid", "collided")},
+        **{name: bool(status[name][lane]) for name in ("collided", "invalid", "loose", "success")},
     }
     fields = {name: [segment[name][lane] for segment in others] for name in others[0]}
     if pictures:
