@@ -90,6 +90,22 @@ def test_pictures_do_not_depend_on_the_segment(pictures, tmp_path, monkeypatch):
     assert kill.tree(tmp_path / "other") == kill.tree(pictures)
 
 
+def test_pictures_are_those_of_their_own_episode(pictures):
+    observation = load.load(pictures, report=lambda _: None).dataset.observation
+    drawn = np.asarray(observation.image)[:, :3, 0, 0]
+    np.testing.assert_allclose(drawn, np.asarray(observation.pose.p) * 1000 + 128, atol=1.01)
+
+
+def test_an_episode_ends_at_the_last_step(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder, "SEGMENT", 4)
+    root = tmp_path / "d"
+    collect(root, per_trocar=2, max_steps=14, keep_failures=True)
+    records = [store.verify(root, key) for key in store.keys(root)]
+    late = [r for r in records if not (r["success"] or r["invalid"])]
+    assert late and all(r["length"] == 14 for r in late)
+    assert all(r["files"]["p.npy"]["shape"] == [r["length"], 3] for r in records)
+
+
 def test_free_lanes_take_the_place_of_failures(tmp_path, monkeypatch):
     groups = []
     simulator = recorder.simulator

@@ -273,7 +273,5 @@ def _episode(
     if pictures:
         fields["image"] = pictures
     left = [length - first for first in range(0, len(others) * SEGMENT, SEGMENT)]
-    return Episode(
-        outcome,
-        {name: [p[: max(0, n)] for p, n in zip(fields[name], left)] for name in sorted(fields)},
-    )
+    arrays = {name: [p[:n] for p, n in zip(fields[name], left)] for name in sorted(fields)}
+    return Episode(outcome, arrays)
