@@ -1,19 +1,20 @@
-"""Collecting demonstrations: 240 of them, 256 x 256 pixels, 30 Hz; and how much of it is writing.
+"""Collecting demonstrations: 240 of them, 256 x 256 pixels, 30 Hz; and what it waits for.
 
     python benchmarks/bench_collect.py [--image 256] [--per-trocar 30] [--folder DIR] [--tiny]
 
-The same programs and the same files as `starjax collect`: a wave of trials at the eight seen
-trocars, then as many as failed. The first wave is simulated once before the clock starts, which
-compiles; compilation is the difference. Beside it: one thread of C MuJoCo doing the physics steps
-alone, and for the writing a plain sequential write with fsync in the same folder.
+`demos.collect` at the eight seen trocars, as `starjax collect` calls it, with programs that have
+run one segment before the clock starts: compilation is timed apart. Simulating, copying pictures to
+the host and writing overlap; its time is divided by what it waited for. Beside it: one thread of C
+MuJoCo doing the physics steps alone, and a plain sequential write of the same bytes with fsync in
+the same folder.
 """
 
 import argparse
-import concurrent.futures
 import os
 import pathlib
 import tempfile
 import time
+from unittest import mock
 
 import _c_mujoco
 import _peer
@@ -45,20 +46,16 @@ def main() -> None:
         asked.image, asked.per_trocar, asked.chunk = 16, 1, SEEN
     env = envs.make("image", asked.image)
     trocars = rcm.Trocar(*(np.asarray(field[:SEEN], np.float32) for field in rcm.TROCARS))
-    trocar, trial = np.divmod(np.arange(SEEN * asked.per_trocar), asked.per_trocar)
-    wave = list(zip(trocar.tolist(), trial.tolist()))
     simulate = recorder.simulator(env, expert, trocars, 0, MAX_STEPS, asked.chunk, None)
-
-    start = time.perf_counter()
-    simulate(wave[: asked.chunk])
-    first_s = time.perf_counter() - start
+    group = [(lane % SEEN, lane // SEEN) for lane in range(asked.chunk)]
+    first_s, again_s = (_timing.time_once(lambda: next(simulate(group))) for _ in range(2))
     with tempfile.TemporaryDirectory(dir=asked.folder) as folder:
-        spent = {"simulate": [], "write": []}
-        records = collect(simulate, wave, asked, pathlib.Path(folder), spent)
+        root = pathlib.Path(folder) / "demos"
+        spent = collect(root, simulate, env, trocars, asked)
         plain_rate = plain_write(pathlib.Path(folder) / "plain", 1 << 24 if asked.tiny else 0)
+        records = [store.verify(root, key, arrays=False) for key in store.keys(root)]
     frames = sum(record["length"] for record in records)
     stored = sum(file["bytes"] for r in records for file in r["files"].values())
-    simulate_s, write_s = sum(spent["simulate"]), sum(spent["write"])
     substeps = round(1 / env.control_hz / env.model.mj_model.opt.timestep)
     c_s = frames * substeps / _c_mujoco.steps_per_s(env.model)
     row = {
@@ -67,51 +64,63 @@ def main() -> None:
         "frames": frames,
         "bytes": stored,
         "chunk": asked.chunk,
-        "run_s": simulate_s + write_s,
-        "simulate_s": simulate_s,
-        "simulate_chunks_s": spent["simulate"],
-        "write_s": write_s,
-        "compile_s": max(0.0, first_s - spent["simulate"][0]),
+        **spent,
+        "compile_s": max(0.0, first_s - again_s),
         "c_physics_alone_s": c_s,
-        "times_c_physics_speed": c_s / (simulate_s + write_s),
+        "times_c_physics_speed": c_s / spent["run_s"],
         "plain_write_s": stored / plain_rate,
-        "write_ratio_to_plain": write_s / (stored / plain_rate),
+        "ratio_to_plain_write": spent["run_s"] / (stored / plain_rate),
     }
     print(
         f"{row['demonstrations']} demonstrations of {asked.image} px in {row['run_s']:.1f} s: "
-        f"simulating {simulate_s:.1f}, hashing and writing {stored / 1e9:.2f} GB {write_s:.1f} "
-        f"(plainly {row['plain_write_s']:.1f}); compiling {row['compile_s']:.1f} s; "
+        f"waiting {row['simulate_s']:.1f} for the simulation, {row['copy_s']:.1f} for pictures, "
+        f"{row['write_s']:.1f} for the disk ({stored / 1e9:.2f} GB, plainly "
+        f"{row['plain_write_s']:.1f}); compiling {row['compile_s']:.1f} s; "
         f"C MuJoCo's physics alone {c_s:.1f} s"
     )
     _timing.report("collect", {"results": {f"{asked.image} px": row}}, asked.tiny)
 
 
-def collect(simulate, wave, asked, folder: pathlib.Path, spent: dict) -> list[store.Record]:
-    """Simulates and commits chunk by chunk, wave by wave; appends to `spent` seconds."""
-    records, drawn = [], [asked.per_trocar] * SEEN
-    with concurrent.futures.ThreadPoolExecutor(demos.COMMITS) as pool:
-        while wave:
-            failed = []
-            for group in (wave[i : i + asked.chunk] for i in range(0, len(wave), asked.chunk)):
-                start = time.perf_counter()
-                episode = simulate(group)
-                spent["simulate"].append(time.perf_counter() - start)
-                start = time.perf_counter()
+def collect(root: pathlib.Path, simulate, env, trocars, asked) -> dict:
+    """Collects with programs that are compiled; how long it took, and for what it waited."""
+    clock = {"begun": 0.0, "segments": 0.0, "fetch": 0.0}
+    fetch, chunks = recorder.fetch, []
 
-                def commit(lane: int, episode=episode) -> store.Record:
-                    outcome, arrays = episode(lane)
-                    key = store.key(outcome["trocar"], outcome["trial"], 0)
-                    return store.commit(folder, key, outcome, arrays if outcome["success"] else {})
+    def begin(*_):
+        clock["begun"] = time.perf_counter()
+        return timed_simulate
 
-                done = list(pool.map(commit, range(len(group))))
-                spent["write"].append(time.perf_counter() - start)
-                records += done
-                failed += [record["trocar"] for record in done if not record["success"]]
-            wave = []
-            for trocar in failed:
-                wave.append((trocar, drawn[trocar]))
-                drawn[trocar] += 1
-    return records
+    def timed_simulate(group):
+        chunks.append(len(group))
+        segments = simulate(group)
+        while True:
+            start = time.perf_counter()
+            finished = next(segments, None)
+            clock["segments"] += time.perf_counter() - start
+            if finished is None:
+                return
+            yield finished
+
+    def timed_fetch(slices):
+        start = time.perf_counter()
+        fetched = fetch(slices)
+        clock["fetch"] += time.perf_counter() - start
+        return fetched
+
+    wanted = {"per_trocar": asked.per_trocar, "seed": 0, "max_steps": MAX_STEPS}
+    with (
+        mock.patch.object(recorder, "simulator", begin),
+        mock.patch.object(recorder, "fetch", timed_fetch),
+    ):
+        demos.collect(root, env, expert, trocars, chunk=asked.chunk, **wanted)
+    run_s = time.perf_counter() - clock["begun"]
+    return {
+        "chunks": chunks,
+        "run_s": run_s,
+        "simulate_s": clock["segments"] - clock["fetch"],
+        "copy_s": clock["fetch"],
+        "write_s": run_s - clock["segments"],
+    }
 
 
 def plain_write(path: pathlib.Path, count: int) -> float:

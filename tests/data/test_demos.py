@@ -12,7 +12,7 @@ import pytest
 import stubs
 
 from starjax import rcm
-from starjax.data import demos, load, store
+from starjax.data import demos, load, recorder, store
 from starjax.runtime import files
 
 TROCARS = rcm.Trocar(*(field[[0, 8]] for field in rcm.TROCARS))
@@ -33,6 +33,13 @@ def job(root):
 def sealed(tmp_path_factory):
     root = tmp_path_factory.mktemp("demos") / "d"
     return root, collect(root)
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    root = tmp_path_factory.mktemp("pictures") / "d"
+    collect(root, "image", per_trocar=2)
+    return root
 
 
 @pytest.fixture
@@ -70,9 +77,87 @@ def test_kills_leave_no_trace(tmp_path):
     assert len(survived.whole) > 50
 
 
-def test_the_chunk_does_not_matter(sealed, tmp_path):
-    collect(tmp_path / "other", chunk=3)
+@pytest.mark.parametrize(("chunk", "segment"), [(4, 16), (8, 3), (16, 5)])
+def test_chunk_and_segment_do_not_matter(sealed, tmp_path, monkeypatch, chunk, segment):
+    monkeypatch.setattr(recorder, "SEGMENT", segment)
+    collect(tmp_path / "other", chunk=chunk)
     assert kill.tree(tmp_path / "other") == kill.tree(sealed[0])
+
+
+def test_pictures_do_not_depend_on_the_segment(pictures, tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder, "SEGMENT", 3)
+    collect(tmp_path / "other", "image", chunk=8, per_trocar=2)
+    assert kill.tree(tmp_path / "other") == kill.tree(pictures)
+
+
+def test_pictures_are_those_of_their_own_episode(pictures):
+    observation = load.load(pictures, report=lambda _: None).dataset.observation
+    drawn = np.asarray(observation.image)[:, :3, 0, 0]
+    np.testing.assert_allclose(drawn, np.asarray(observation.pose.p) * 1000 + 128, atol=1.01)
+
+
+def test_an_episode_ends_at_the_last_step(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder, "SEGMENT", 4)
+    root = tmp_path / "d"
+    collect(root, per_trocar=2, max_steps=14, keep_failures=True)
+    records = [store.verify(root, key) for key in store.keys(root)]
+    late = [r for r in records if not (r["success"] or r["invalid"])]
+    assert late and all(r["length"] == 14 for r in late)
+    assert all(r["files"]["p.npy"]["shape"] == [r["length"], 3] for r in records)
+
+
+def test_free_lanes_take_the_place_of_failures(tmp_path, monkeypatch):
+    groups = []
+    simulator = recorder.simulator
+
+    def counted(*args):
+        simulate = simulator(*args)
+        return lambda group: groups.append(group) or simulate(group)
+
+    monkeypatch.setattr(recorder, "simulator", counted)
+    summary = collect(tmp_path / "d", chunk=16)
+    assert [len(group) for group in groups] == [16]
+    assert summary["episodes"] == 8 < summary["trials"] < 16
+
+
+def _full_disk(monkeypatch):
+    commit, calls = store.commit, []
+
+    def failing(*args):
+        calls.append(args)
+        if len(calls) > 2:
+            raise files.StorageError("no space left")
+        return commit(*args)
+
+    monkeypatch.setattr(store, "commit", failing)
+
+
+def _interrupt(monkeypatch):
+    fetch, calls = recorder.fetch, []
+
+    def interrupted(slices):
+        calls.append(slices)
+        if len(calls) > 4:
+            raise KeyboardInterrupt
+        return fetch(slices)
+
+    monkeypatch.setattr(recorder, "fetch", interrupted)
+
+
+@pytest.mark.parametrize(
+    ("stop", "error"), [(_full_disk, files.StorageError), (_interrupt, KeyboardInterrupt)]
+)
+def test_stopped_in_the_middle_the_same_command_completes_it(
+    pictures, tmp_path, monkeypatch, stop, error
+):
+    root = tmp_path / "d"
+    monkeypatch.setattr(recorder, "SEGMENT", 4)
+    with monkeypatch.context() as patch, pytest.raises(error):
+        stop(patch)
+        collect(root, "image", per_trocar=2)
+    assert 0 < len(store.keys(root)) < len(store.keys(pictures))
+    collect(root, "image", per_trocar=2)
+    assert kill.tree(root) == kill.tree(pictures)
 
 
 def test_failures_are_kept_on_request(tmp_path, sealed):
@@ -175,13 +260,6 @@ def test_a_read_only_folder_is_said_before_anything_runs(tmp_path, monkeypatch):
     )
     with pytest.raises(files.StorageError, match="cannot write"):
         collect(tmp_path / "d")
-
-
-@pytest.fixture(scope="module")
-def pictures(tmp_path_factory):
-    root = tmp_path_factory.mktemp("pictures") / "d"
-    collect(root, "image", per_trocar=2)
-    return root
 
 
 @pytest.mark.parametrize("residency", ["device", "host", "disk"])

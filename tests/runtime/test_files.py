@@ -1,5 +1,6 @@
 """Files survive kills, say clearly what is wrong, and one run holds a folder."""
 
+import io
 import os
 import subprocess
 import sys
@@ -26,14 +27,14 @@ def test_a_failed_write_leaves_the_old_content(tmp_path, monkeypatch):
 
 def test_a_directory_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     final, staged = tmp_path / "final", tmp_path / "staged"
-    contents = {"one": b"1", "two": b"22"}
+    contents = {"one": [b"1"], "two": [b"2", b"2"]}
     with monkeypatch.context() as patch:
         patch.setattr(os, "rename", lambda *_: (_ for _ in ()).throw(OSError(13, "denied")))
         with pytest.raises(files.StorageError, match="denied"):
             files.commit_directory(final, staged, contents)
     assert not final.exists()
     files.commit_directory(final, staged, contents)
-    assert {p.name: p.read_bytes() for p in final.iterdir()} == contents
+    assert {p.name: p.read_bytes() for p in final.iterdir()} == {"one": b"1", "two": b"22"}
 
 
 def test_npz_bytes_are_a_function_of_the_arrays(tmp_path, monkeypatch):
@@ -46,9 +47,18 @@ def test_npz_bytes_are_a_function_of_the_arrays(tmp_path, monkeypatch):
         np.testing.assert_array_equal(loaded["a"], arrays["a"])
 
 
+@pytest.mark.parametrize("dtype", ["uint8", "float32", "bool"])
+def test_parts_are_saved_as_numpy_saves_the_whole(dtype):
+    whole = np.arange(5 * 2 * 3).reshape(5, 2, 3).astype(dtype)
+    expected = io.BytesIO()
+    np.save(expected, whole, allow_pickle=False)
+    for parts in ([whole], [whole[:3], whole[3:], whole[:0]], [np.asfortranarray(whole)]):
+        assert b"".join(files.npy(parts)) == expected.getvalue()
+
+
 def test_objects_and_nan_are_refused(tmp_path):
     with pytest.raises(ValueError):
-        files.npy_bytes(np.array([object()]))
+        files.npy([np.array([object()])])
     with pytest.raises(ValueError):
         files.write_json(tmp_path / "x.json", float("nan"))
 

@@ -1,28 +1,32 @@
 """Collects demonstrations: the expert in every trocar, as one program over (trocar, trial).
 
-What ends up on disk is a function of the description and the seed alone. Trials are drawn in waves:
-`per_trocar` at each trocar, then as many as failed, until every trocar has its successes; so the
-first successes by trial number are kept, whatever the chunk. A wave's chunks are the same in every
-run, and a chunk with a missing episode is simulated again as a whole: after any interruption the
-same command ends in the same bytes.
+What ends up on disk is a function of the description and the seed alone: of each trocar, all trials
+up to the one that completes its successes. They are drawn in waves, at first `per_trocar` at each
+trocar, then as many as failed; lanes that a wave leaves free run the trials that come next, and
+those of them that were not needed are dropped. A wave's chunks are the same in every run, and a
+chunk with a missing episode is simulated again as a whole: after any interruption the same command
+ends in the same bytes.
+
+Episodes are written as they end, while the rest of their chunk and the next are simulated.
 """
 
+import collections
 import concurrent.futures
+import contextlib
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from starjax.data import recorder, store
+from starjax.data import recorder, store, trials
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files, progress, xla
 
-MIN_SUCCESS_RATE = 0.5  # below it at some trocar, the expert is broken and collecting stops
-COMMITS = 8  # episodes written at once
+COMMITS = 16  # episodes written at once; most of it is waiting for the disk
 FRAME_GUESS = 300  # control steps of a typical demonstration, for the estimate of disk space
 
 
@@ -122,26 +126,22 @@ def collect(
         chunk = chunk or _chunk(frame_bytes, devices)
         chunk = -(-chunk // len(devices or [0])) * len(devices or [0])
         simulate = recorder.simulator(env, expert, trocars, seed, max_steps, chunk, devices)
+        known = {(r["trocar"], r["trial"]): r["success"] for r in records.values()}
+
+        def commit(episode: recorder.Episode) -> store.Record:
+            outcome = episode.outcome
+            key = store.key(outcome["trocar"], outcome["trial"], seed)
+            kept = outcome["success"] or keep_failures
+            return store.commit(root, key, outcome, episode.arrays if kept else {})
+
+        def note(record: store.Record) -> None:
+            records[record["key"]] = record
+            advance(int(record["success"]))
+
         shown = progress.track("Demonstrations", total, unit="episodes", done=done)
-        with shown as advance, concurrent.futures.ThreadPoolExecutor(COMMITS) as pool:
-            drawn = np.zeros(len(trocars.radius), int)
-            while wave := _wave(records, drawn, per_trocar, seed):
-                for group in (wave[i : i + chunk] for i in range(0, len(wave), chunk)):
-                    missing = [i for i, t in enumerate(group) if store.key(*t, seed) not in records]
-                    if not missing:
-                        continue
-                    episode = simulate(group)
-
-                    def commit(lane: int, episode=episode) -> store.Record:
-                        outcome, arrays = episode(lane)
-                        key = store.key(outcome["trocar"], outcome["trial"], seed)
-                        kept = outcome["success"] or keep_failures
-                        return store.commit(root, key, outcome, arrays if kept else {})
-
-                    # In threads: most of a commit is waiting for the disk.
-                    for record in pool.map(commit, missing):
-                        records[record["key"]] = record
-                        advance(int(record["success"]))
+        with shown as advance, _writer(commit, note, chunk) as write:
+            for episode in trials.run(simulate, known, len(trocars.radius), per_trocar, chunk):
+                write(episode)
         digest = store.seal(root, records)
     return {
         "digest": digest,
@@ -164,25 +164,33 @@ def _sound(root: Path, report: Callable[[str], None]) -> dict[str, store.Record]
     return records
 
 
-def _wave(
-    records: dict[str, store.Record], drawn: np.ndarray, per_trocar: int, seed: int
-) -> list[tuple[int, int]]:
-    """Next trials (trocar, trial): as many at each trocar as successes are missing there.
+@contextlib.contextmanager
+def _writer(
+    commit: Callable[[recorder.Episode], store.Record],
+    note: Callable[[store.Record], None],
+    limit: int,
+) -> Iterator[Callable[[recorder.Episode], None]]:
+    """Yields a function that has an episode committed in a thread; `note` hears of it when it is.
 
-    Updates `drawn` `[C]`, the trials drawn so far at each trocar.
+    The function waits while more than `limit` are under way, and the end for all of them; after an
+    error or an interrupt, those not begun are left out.
     """
-    wave = []
-    for trocar, first in enumerate(drawn.tolist()):
-        done = [records[store.key(trocar, trial, seed)]["success"] for trial in range(first)]
-        missing = per_trocar - sum(done)
-        if missing and first >= 8 + per_trocar / MIN_SUCCESS_RATE:
-            raise ValueError(
-                f"expert: expected a success rate above {MIN_SUCCESS_RATE:.0%}, "
-                f"got {sum(done)} of {first} at trocar {trocar}"
-            )
-        wave += [(trocar, first + i) for i in range(missing)]
-        drawn[trocar] += missing
-    return wave
+    pool = concurrent.futures.ThreadPoolExecutor(COMMITS)
+    under_way = collections.deque()
+
+    def settle(most: int) -> None:
+        while under_way and (len(under_way) > most or under_way[0].done()):
+            note(under_way.popleft().result())
+
+    def write(episode: recorder.Episode) -> None:
+        under_way.append(pool.submit(commit, episode))
+        settle(limit)
+
+    try:
+        yield write
+        settle(0)
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _chunk(frame_bytes: int, devices: Sequence[jax.Device] | None) -> int:

@@ -1,10 +1,12 @@
 """The program that demonstrations come from: expert and environment in step, everything recorded.
 
 It runs in segments of a fixed number of control steps: that bounds the memory of recorded pictures
-on the device, and a segment ends early when all of its episodes are over.
+on the device, and a segment ends early when all of its episodes are over. While the device runs a
+segment, the host fetches the pictures of the one before.
 """
 
-from collections.abc import Callable, Sequence
+import concurrent.futures
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +18,8 @@ from starjax.rcm.trocar import Trocar
 from starjax.sim.types import Observation
 from starjax.types import Command
 
-SEGMENT = 64  # control steps between two looks at the host
+SEGMENT = 16  # control steps between two looks at the host
+FETCHES = 8  # pictures of episodes that are copied to the host at once
 # Demonstrations never start from the states that an evaluation with the same seed draws.
 STREAM = 0x64656D6F
 
@@ -47,6 +50,18 @@ class Expert(NamedTuple):
     act: Callable[..., Any]
 
 
+class Episode(NamedTuple):
+    """One that is over.
+
+    Attributes:
+      outcome: JSON values: which trial it is, and how it ended.
+      arrays: for each of FIELDS, parts that make up `[length, ...]` along their first axis.
+    """
+
+    outcome: store.Record
+    arrays: dict[str, list[np.ndarray]]
+
+
 class _Trials(NamedTuple):
     """N trials: `trocar` of fields `[N]`, `index` `[N]` of that trocar, `trial` `[N]`."""
 
@@ -72,35 +87,54 @@ def simulator(
     max_steps: int,
     chunk: int,
     devices: Sequence[jax.Device] | None,
-) -> Callable[..., Any]:
-    """The compiled programs as `group -> (lane -> (outcome, arrays))`."""
+) -> Callable[[list[tuple[int, int]]], Iterator[list[Episode]]]:
+    """The compiled programs: from a group of (trocar, trial) to its episodes, as they end.
+
+    What is returned yields, after every segment, the episodes that it was the last one of, on the
+    host; a caller that needs no more of them may stop.
+    """
     key = jax.random.fold_in(jax.random.key(seed), STREAM)
     start = lanes.split(_starter(env, expert), devices, (lanes.SHARED, lanes.LANE), lanes.LANE)
     advance = lanes.split(
-        _advancer(env, expert),
-        devices,
-        (lanes.LANE, lanes.SHARED),
-        (lanes.LANE, lanes.TIME_LANE),
-        donate=(0,),
+        _advancer(env, expert), devices, (lanes.LANE, lanes.SHARED), lanes.LANE, donate=(0,)
     )
 
-    def simulate(group: list[tuple[int, int]]) -> Callable[[int], Any]:
+    def simulate(group: list[tuple[int, int]]) -> Iterator[list[Episode]]:
         count = len(group)
         index, trial = np.array(group + [group[0]] * (chunk - count), np.int32).T
         trials = _Trials(Trocar(*(field[index] for field in trocars)), index, trial)
         carry = start(key, trials)
         carry = carry._replace(wanted=carry.wanted & (np.arange(chunk) < count))
-        segments = []
-        for first in range(0, max_steps, SEGMENT):
-            steps = min(SEGMENT, max_steps - first)
-            carry, segment = advance(carry, np.int32(steps))
-            segments.append(jax.tree.map(np.asarray, segment))
-            if np.all(np.asarray(carry.env.done) | ~np.asarray(carry.wanted)):
-                break
-        final = jax.device_get((carry.length, _outcome(carry.env)))
-        return lambda lane: _episode(lane, group[lane], trocars, seed, segments, final)
+        running = list(range(count))
+        pictures = {lane: [] for lane in running}
+        others = []
+        ahead = advance(carry, np.int32(min(SEGMENT, max_steps)))
+        for left in range(max_steps - SEGMENT, -SEGMENT, -SEGMENT):
+            carry, records, status = ahead
+            slices = _slices(records.pop("image", None), running)
+            if left > 0:
+                # Before anything is waited for. If all are over, it ends at once and is dropped.
+                ahead = advance(carry, np.int32(min(SEGMENT, left)))
+            status = jax.device_get(status)
+            others.append(jax.device_get(records))
+            for lane, fetched in zip(running, fetch(slices)):
+                pictures[lane].append(fetched)
+            over = [lane for lane in running if status["over"][lane] or left <= 0]
+            running = [lane for lane in running if lane not in over]
+            yield [
+                _episode(lane, group[lane], trocars, seed, status, others, pictures.pop(lane))
+                for lane in over
+            ]
+            if not running:
+                return
 
     return simulate
+
+
+def fetch(slices: Sequence[jax.Array]) -> list[np.ndarray]:
+    """The arrays on the host; in threads, as one copies at a fraction of the rate of several."""
+    with concurrent.futures.ThreadPoolExecutor(FETCHES) as pool:
+        return list(pool.map(np.asarray, slices))
 
 
 def _starter(env: Any, expert: Any) -> Callable[..., _Carry]:
@@ -121,7 +155,7 @@ def _starter(env: Any, expert: Any) -> Callable[..., _Carry]:
     return jax.vmap(start_one, in_axes=(None, 0))
 
 
-def _advancer(env: Any, expert: Any) -> Callable[..., tuple[_Carry, dict[str, jax.Array]]]:
+def _advancer(env: Any, expert: Any) -> Callable[..., Any]:
     def step_one(carry: _Carry) -> tuple[_Carry, dict[str, jax.Array]]:
         command, expert_state = expert.act(carry.expert, carry.env)
         after = env.step(carry.env, command)
@@ -133,10 +167,15 @@ def _advancer(env: Any, expert: Any) -> Callable[..., tuple[_Carry, dict[str, ja
 
     step = jax.vmap(step_one)
 
-    def advance(carry: _Carry, steps: jax.Array) -> tuple[_Carry, dict[str, jax.Array]]:
-        """Up to `steps` control steps, fewer when all episodes are over; records `[SEGMENT, N]`."""
+    def advance(carry: _Carry, steps: jax.Array) -> tuple[_Carry, dict[str, Any], dict[str, Any]]:
+        """Up to `steps` control steps, fewer when all episodes are over.
+
+        Returns the carry, records `[N, SEGMENT]`, and the status `[N]`.
+        """
         shapes = jax.eval_shape(step, carry)[1]
-        blank = jax.tree.map(lambda s: jnp.zeros((SEGMENT, *s.shape), s.dtype), shapes)
+        blank = jax.tree.map(
+            lambda s: jnp.zeros((s.shape[0], SEGMENT, *s.shape[1:]), s.dtype), shapes
+        )
 
         def is_running(loop):
             t, carry, _ = loop
@@ -145,11 +184,11 @@ def _advancer(env: Any, expert: Any) -> Callable[..., tuple[_Carry, dict[str, ja
         def body(loop):
             t, carry, records = loop
             carry, record = step(carry)
-            records = jax.tree.map(lambda all_, one: all_.at[t].set(one), records, record)
+            records = jax.tree.map(lambda all_, one: all_.at[:, t].set(one), records, record)
             return t + 1, carry, records
 
         _, carry, records = jax.lax.while_loop(is_running, body, (jnp.int32(0), carry, blank))
-        return carry, records
+        return carry, records, _status(carry)
 
     return advance
 
@@ -182,13 +221,32 @@ def frame(env: Any) -> dict[str, jax.ShapeDtypeStruct]:
     return jax.eval_shape(one, jax.random.key(0))
 
 
-def _outcome(state: Any) -> dict[str, jax.Array]:
-    return {
+def _status(carry: _Carry) -> dict[str, jax.Array]:
+    state = carry.env
+    status = {
+        "over": state.done,
+        "length": carry.length,
         "success": state.success & ~state.invalid,
         "loose": state.loose,
         "invalid": state.invalid,
         "collided": state.collided,
     }
+    # Copied, as the next segment is given the carry's memory before the host has read this.
+    return jax.tree.map(jnp.copy, status)
+
+
+@jax.jit
+def _lane(records: jax.Array, lane: jax.Array) -> jax.Array:
+    return records[lane]
+
+
+def _slices(images: jax.Array | None, running: Sequence[int]) -> list[jax.Array]:
+    """The pictures of each running lane apart: those of the others are neither copied nor kept."""
+    if images is None:
+        return []
+    share = images.sharding.shard_shape(images.shape)[0]
+    on = {(shard.index[0].start or 0) // share: shard.data for shard in images.addressable_shards}
+    return [_lane(on[lane // share], np.int32(lane % share)) for lane in running]
 
 
 def _episode(
@@ -196,11 +254,11 @@ def _episode(
     trial: tuple[int, int],
     trocars: Trocar,
     seed: int,
-    segments: list[dict[str, np.ndarray]],
-    final: tuple[np.ndarray, dict[str, np.ndarray]],
-) -> tuple[store.Record, dict[str, np.ndarray]]:
-    lengths, outcomes = final
-    length = int(lengths[lane])
+    status: dict[str, np.ndarray],
+    others: list[dict[str, np.ndarray]],
+    pictures: list[np.ndarray],
+) -> Episode:
+    length = int(status["length"][lane])
     outcome = {
         "trocar": trial[0],
         "radius": float(trocars.radius[trial[0]]),
@@ -209,10 +267,11 @@ def _episode(
         "trial": trial[1],
         "seed": seed,
         "length": length,
-        **{name: bool(value[lane]) for name, value in outcomes.items()},
+        **{name: bool(status[name][lane]) for name in ("collided", "invalid", "loose", "success")},
     }
-    arrays = {
-        name: np.concatenate([segment[name][:, lane] for segment in segments])[:length]
-        for name in segments[0]
-    }
-    return outcome, arrays
+    fields = {name: [segment[name][lane] for segment in others] for name in others[0]}
+    if pictures:
+        fields["image"] = pictures
+    left = [length - first for first in range(0, len(others) * SEGMENT, SEGMENT)]
+    arrays = {name: [p[:n] for p, n in zip(fields[name], left)] for name in sorted(fields)}
+    return Episode(outcome, arrays)

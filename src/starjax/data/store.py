@@ -13,7 +13,7 @@ import concurrent.futures
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,27 +82,29 @@ def read_description(root: Path) -> dict[str, Any]:
     return description
 
 
-def commit(root: Path, key: str, outcome: Record, arrays: Mapping[str, np.ndarray]) -> Record:
+def commit(
+    root: Path, key: str, outcome: Record, arrays: Mapping[str, Sequence[np.ndarray]]
+) -> Record:
     """Writes one episode; it is on disk, whole, when this returns.
 
     Args:
       outcome: JSON values, e.g. success, trocar, seed.
-      arrays: fields `[T, ...]`; none for a trial that is not kept.
+      arrays: fields `[T, ...]`, each in parts along its first axis; none for a trial that is not
+        kept.
     """
-    contents = {f"{name}.npy": files.npy_bytes(array) for name, array in arrays.items()}
+    contents = {f"{name}.npy": files.npy(parts) for name, parts in arrays.items()}
     listed = {
         f"{name}.npy": {
-            "shape": list(array.shape),
-            "dtype": array.dtype.str,
-            "bytes": len(contents[f"{name}.npy"]),
-            "sha256": hashlib.sha256(contents[f"{name}.npy"]).hexdigest(),
+            "shape": [sum(map(len, parts)), *parts[0].shape[1:]],
+            "dtype": parts[0].dtype.str,
+            **_hashed(contents[f"{name}.npy"]),
         }
-        for name, array in arrays.items()
+        for name, parts in arrays.items()
     }
     record = json.loads(json.dumps({"key": key, **outcome, "files": listed}))
     record["digest"] = _hash(record)
     # Last, so that a folder with an episode.json is whole even where renames are not atomic.
-    contents["episode.json"] = (json.dumps(record, indent=1) + "\n").encode()
+    contents["episode.json"] = [(json.dumps(record, indent=1) + "\n").encode()]
     (root / "episodes").mkdir(parents=True, exist_ok=True)
     files.commit_directory(root / "episodes" / key, root / "staging" / key, contents)
     return record
@@ -200,6 +202,13 @@ def read_seal(root: Path) -> dict[str, Any]:
         where = root / "dataset.json"
         raise ValueError(f"{where}: expected sha256 {sealed['dataset.json']}, got {got}")
     return {**sealed, "digest": said}
+
+
+def _hashed(parts: Sequence[bytes | memoryview]) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return {"bytes": sum(map(len, parts)), "sha256": digest.hexdigest()}
 
 
 def _hash(value: Any) -> str:

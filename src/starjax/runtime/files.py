@@ -12,7 +12,7 @@ import json
 import os
 import shutil
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ def write_bytes(path: Path, data: bytes) -> None:
     staged = path.with_name(f".{path.name}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _write_synced(staged, data)
+        _write_synced(staged, [data])
         os.replace(staged, path)
         _sync_directory(path.parent)
     except OSError as error:
@@ -51,32 +51,44 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def npy_bytes(array: np.ndarray) -> bytes:
-    """`array` in numpy's .npy format."""
-    buffer = io.BytesIO()
-    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
-    return buffer.getvalue()
+def npy(parts: Sequence[np.ndarray]) -> list[bytes | memoryview]:
+    """Arrays, joined along their first axis, in numpy's .npy format, without copying them."""
+    first = parts[0]
+    if first.dtype.hasobject:
+        raise ValueError("parts: expected numbers, got Python objects")
+    header = io.BytesIO()
+    described = {
+        "descr": np.lib.format.dtype_to_descr(first.dtype),
+        "fortran_order": False,
+        "shape": (sum(map(len, parts)), *first.shape[1:]),
+    }
+    np.lib.format.write_array_header_1_0(header, described)
+    flat = (np.ascontiguousarray(part).reshape(-1).view(np.uint8) for part in parts)
+    return [header.getvalue(), *(part.data for part in flat)]
 
 
-def commit_directory(final: Path, staged: Path, contents: Mapping[str, bytes]) -> None:
+def commit_directory(
+    final: Path, staged: Path, contents: Mapping[str, Sequence[bytes | memoryview]]
+) -> None:
     """Makes folder `final` appear at once with all its files, in the given order.
 
     Args:
       final: must not exist.
       staged: where it is built, on the same file system; whatever is there is removed.
-      contents: bytes of each file by name.
+      contents: bytes of each file by name, in parts.
     """
     try:
         shutil.rmtree(staged, ignore_errors=True)
         staged.mkdir(parents=True)
-        for name, data in contents.items():
-            _write_synced(staged / name, data)
+        for name, parts in contents.items():
+            _write_synced(staged / name, parts)
         _sync_directory(staged)
         os.rename(staged, final)
         _sync_directory(final.parent)
     except OSError as error:
         shutil.rmtree(staged, ignore_errors=True)
-        raise _explained(error, final, sum(map(len, contents.values()))) from error
+        count = sum(len(part) for parts in contents.values() for part in parts)
+        raise _explained(error, final, count) from error
 
 
 def sha256(path: Path) -> str:
@@ -149,9 +161,9 @@ def size(count: float) -> str:
     return f"{count:.1f} GB"
 
 
-def _write_synced(path: Path, data: bytes) -> None:
+def _write_synced(path: Path, parts: Sequence[bytes | memoryview]) -> None:
     with open(path, "wb") as file:
-        file.write(data)
+        file.writelines(parts)
         file.flush()
         os.fsync(file.fileno())
 
