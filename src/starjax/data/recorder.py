@@ -6,6 +6,7 @@ segment, the host fetches the pictures of the one before.
 """
 
 import concurrent.futures
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -184,8 +185,9 @@ def _advancer(env: Any, expert: Any) -> Callable[..., Any]:
         def body(loop):
             t, carry, records = loop
             carry, record = step(carry)
-            records = jax.tree.map(lambda all_, one: all_.at[:, t].set(one), records, record)
-            return t + 1, carry, records
+            # In place: not `.at[:, t].set`, a scatter, which may move the whole of the pictures.
+            put = functools.partial(jax.lax.dynamic_update_index_in_dim, index=t, axis=1)
+            return t + 1, carry, jax.tree.map(put, records, record)
 
         _, carry, records = jax.lax.while_loop(is_running, body, (jnp.int32(0), carry, blank))
         return carry, records, _status(carry)
