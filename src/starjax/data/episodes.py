@@ -18,7 +18,7 @@ class Episode(NamedTuple):
 
     Attributes:
       outcome: JSON values: which trial it is, and how it ended.
-      arrays: for each of `recorder.FIELDS`, parts that make up `[length, ...]` along their first axis.
+      arrays: of each of `recorder.FIELDS`, parts that make `[length, ...]` along the first axis.
     """
 
     outcome: store.Record
