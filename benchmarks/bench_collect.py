@@ -22,7 +22,7 @@ import _timing
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.data import demos, recorder, store
+from starjax.data import demos, episodes, recorder, store
 from starjax.sim import env as envs
 from starjax.sim.tasks import expert
 
@@ -84,7 +84,7 @@ def main() -> None:
 def collect(root: pathlib.Path, simulate, env, trocars, asked) -> dict:
     """Collects with programs that are compiled; how long it took, and for what it waited."""
     clock = {"begun": 0.0, "segments": 0.0, "fetch": 0.0}
-    fetch, chunks = recorder.fetch, []
+    fetch, chunks = episodes.fetch, []
 
     def begin(*_):
         clock["begun"] = time.perf_counter()
@@ -110,7 +110,7 @@ def collect(root: pathlib.Path, simulate, env, trocars, asked) -> dict:
     wanted = {"per_trocar": asked.per_trocar, "seed": 0, "max_steps": MAX_STEPS}
     with (
         mock.patch.object(recorder, "simulator", begin),
-        mock.patch.object(recorder, "fetch", timed_fetch),
+        mock.patch.object(episodes, "fetch", timed_fetch),
     ):
         demos.collect(root, env, expert, trocars, chunk=asked.chunk, **wanted)
     run_s = time.perf_counter() - clock["begun"]

@@ -12,7 +12,7 @@ import pytest
 import stubs
 
 from starjax import rcm
-from starjax.data import demos, load, recorder, store
+from starjax.data import demos, episodes, load, recorder, store
 from starjax.runtime import files
 
 TROCARS = rcm.Trocar(*(field[[0, 8]] for field in rcm.TROCARS))
@@ -133,7 +133,7 @@ def _full_disk(monkeypatch):
 
 
 def _interrupt(monkeypatch):
-    fetch, calls = recorder.fetch, []
+    fetch, calls = episodes.fetch, []
 
     def interrupted(slices):
         calls.append(slices)
@@ -141,7 +141,7 @@ def _interrupt(monkeypatch):
             raise KeyboardInterrupt
         return fetch(slices)
 
-    monkeypatch.setattr(recorder, "fetch", interrupted)
+    monkeypatch.setattr(episodes, "fetch", interrupted)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from starjax.data import recorder, trials
+from starjax.data import episodes, trials
 
 
 class World:
@@ -23,7 +23,7 @@ class World:
         self.groups.append(group)
         for segment in range(1, 6):
             yield [
-                recorder.Episode({"trocar": t[0], "trial": t[1], "success": self.fate(t)[0]}, {})
+                episodes.Episode({"trocar": t[0], "trial": t[1], "success": self.fate(t)[0]}, {})
                 for t in group
                 if self.fate(t)[1] == segment
             ]

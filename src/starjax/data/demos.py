@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from starjax.data import recorder, store, trials
+from starjax.data import episodes, recorder, store, trials
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files, progress, xla
 
@@ -128,7 +128,7 @@ def collect(
         simulate = recorder.simulator(env, expert, trocars, seed, max_steps, chunk, devices)
         known = {(r["trocar"], r["trial"]): r["success"] for r in records.values()}
 
-        def commit(episode: recorder.Episode) -> store.Record:
+        def commit(episode: episodes.Episode) -> store.Record:
             outcome = episode.outcome
             key = store.key(outcome["trocar"], outcome["trial"], seed)
             kept = outcome["success"] or keep_failures
@@ -166,10 +166,10 @@ def _sound(root: Path, report: Callable[[str], None]) -> dict[str, store.Record]
 
 @contextlib.contextmanager
 def _writer(
-    commit: Callable[[recorder.Episode], store.Record],
+    commit: Callable[[episodes.Episode], store.Record],
     note: Callable[[store.Record], None],
     limit: int,
-) -> Iterator[Callable[[recorder.Episode], None]]:
+) -> Iterator[Callable[[episodes.Episode], None]]:
     """Yields a function that has an episode committed in a thread; `note` hears of it when it is.
 
     The function waits while more than `limit` are under way, and the end for all of them; after an
@@ -182,7 +182,7 @@ def _writer(
         while under_way and (len(under_way) > most or under_way[0].done()):
             note(under_way.popleft().result())
 
-    def write(episode: recorder.Episode) -> None:
+    def write(episode: episodes.Episode) -> None:
         under_way.append(pool.submit(commit, episode))
         settle(limit)
 

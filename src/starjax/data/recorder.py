@@ -5,7 +5,7 @@ on the device, and a segment ends early when all of its episodes are over. While
 segment, the host fetches the pictures of the one before.
 """
 
-import concurrent.futures
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -13,13 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.data import lanes, store
+from starjax.data import episodes, lanes
 from starjax.rcm.trocar import Trocar
 from starjax.sim.types import Observation
 from starjax.types import Command
 
 SEGMENT = 16  # control steps between two looks at the host
-FETCHES = 8  # pictures of episodes that are copied to the host at once
 # Demonstrations never start from the states that an evaluation with the same seed draws.
 STREAM = 0x64656D6F
 
@@ -50,18 +49,6 @@ class Expert(NamedTuple):
     act: Callable[..., Any]
 
 
-class Episode(NamedTuple):
-    """One that is over.
-
-    Attributes:
-      outcome: JSON values: which trial it is, and how it ended.
-      arrays: for each of FIELDS, parts that make up `[length, ...]` along their first axis.
-    """
-
-    outcome: store.Record
-    arrays: dict[str, list[np.ndarray]]
-
-
 class _Trials(NamedTuple):
     """N trials: `trocar` of fields `[N]`, `index` `[N]` of that trocar, `trial` `[N]`."""
 
@@ -87,7 +74,7 @@ def simulator(
     max_steps: int,
     chunk: int,
     devices: Sequence[jax.Device] | None,
-) -> Callable[[list[tuple[int, int]]], Iterator[list[Episode]]]:
+) -> Callable[[list[tuple[int, int]]], Iterator[list[episodes.Episode]]]:
     """The compiled programs: from a group of (trocar, trial) to its episodes, as they end.
 
     What is returned yields, after every segment, the episodes that it was the last one of, on the
@@ -99,7 +86,7 @@ def simulator(
         _advancer(env, expert), devices, (lanes.LANE, lanes.SHARED), lanes.LANE, donate=(0,)
     )
 
-    def simulate(group: list[tuple[int, int]]) -> Iterator[list[Episode]]:
+    def simulate(group: list[tuple[int, int]]) -> Iterator[list[episodes.Episode]]:
         count = len(group)
         index, trial = np.array(group + [group[0]] * (chunk - count), np.int32).T
         trials = _Trials(Trocar(*(field[index] for field in trocars)), index, trial)
@@ -111,30 +98,26 @@ def simulator(
         ahead = advance(carry, np.int32(min(SEGMENT, max_steps)))
         for left in range(max_steps - SEGMENT, -SEGMENT, -SEGMENT):
             carry, records, status = ahead
-            slices = _slices(records.pop("image", None), running)
+            slices = episodes.slices(records.pop("image", None), running)
             if left > 0:
                 # Before anything is waited for. If all are over, it ends at once and is dropped.
                 ahead = advance(carry, np.int32(min(SEGMENT, left)))
             status = jax.device_get(status)
             others.append(jax.device_get(records))
-            for lane, fetched in zip(running, fetch(slices)):
+            for lane, fetched in zip(running, episodes.fetch(slices)):
                 pictures[lane].append(fetched)
             over = [lane for lane in running if status["over"][lane] or left <= 0]
             running = [lane for lane in running if lane not in over]
             yield [
-                _episode(lane, group[lane], trocars, seed, status, others, pictures.pop(lane))
+                episodes.assemble(
+                    lane, group[lane], trocars, seed, status, others, pictures.pop(lane)
+                )
                 for lane in over
             ]
             if not running:
                 return
 
     return simulate
-
-
-def fetch(slices: Sequence[jax.Array]) -> list[np.ndarray]:
-    """The arrays on the host; in threads, as one copies at a fraction of the rate of several."""
-    with concurrent.futures.ThreadPoolExecutor(FETCHES) as pool:
-        return list(pool.map(np.asarray, slices))
 
 
 def _starter(env: Any, expert: Any) -> Callable[..., _Carry]:
@@ -184,8 +167,9 @@ def _advancer(env: Any, expert: Any) -> Callable[..., Any]:
         def body(loop):
             t, carry, records = loop
             carry, record = step(carry)
-            records = jax.tree.map(lambda all_, one: all_.at[:, t].set(one), records, record)
-            return t + 1, carry, records
+            # In place: not `.at[:, t].set`, a scatter, which may move the whole of the pictures.
+            put = functools.partial(jax.lax.dynamic_update_index_in_dim, index=t, axis=1)
+            return t + 1, carry, jax.tree.map(put, records, record)
 
         _, carry, records = jax.lax.while_loop(is_running, body, (jnp.int32(0), carry, blank))
         return carry, records, _status(carry)
@@ -233,45 +217,3 @@ def _status(carry: _Carry) -> dict[str, jax.Array]:
     }
     # Copied, as the next segment is given the carry's memory before the host has read this.
     return jax.tree.map(jnp.copy, status)
-
-
-@jax.jit
-def _lane(records: jax.Array, lane: jax.Array) -> jax.Array:
-    return records[lane]
-
-
-def _slices(images: jax.Array | None, running: Sequence[int]) -> list[jax.Array]:
-    """The pictures of each running lane apart: those of the others are neither copied nor kept."""
-    if images is None:
-        return []
-    share = images.sharding.shard_shape(images.shape)[0]
-    on = {(shard.index[0].start or 0) // share: shard.data for shard in images.addressable_shards}
-    return [_lane(on[lane // share], np.int32(lane % share)) for lane in running]
-
-
-def _episode(
-    lane: int,
-    trial: tuple[int, int],
-    trocars: Trocar,
-    seed: int,
-    status: dict[str, np.ndarray],
-    others: list[dict[str, np.ndarray]],
-    pictures: list[np.ndarray],
-) -> Episode:
-    length = int(status["length"][lane])
-    outcome = {
-        "trocar": trial[0],
-        "radius": float(trocars.radius[trial[0]]),
-        "polar": float(trocars.polar[trial[0]]),
-        "azimuth": float(trocars.azimuth[trial[0]]),
-        "trial": trial[1],
-        "seed": seed,
-        "length": length,
-        **{name: bool(status[name][lane]) for name in ("collided", "invalid", "loose", "success")},
-    }
-    fields = {name: [segment[name][lane] for segment in others] for name in others[0]}
-    if pictures:
-        fields["image"] = pictures
-    left = [length - first for first in range(0, len(others) * SEGMENT, SEGMENT)]
-    arrays = {name: [p[:n] for p, n in zip(fields[name], left)] for name in sorted(fields)}
-    return Episode(outcome, arrays)

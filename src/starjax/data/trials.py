@@ -7,7 +7,7 @@ successes, and is not once they do have them.
 import math
 from collections.abc import Callable, Iterator, Mapping
 
-from starjax.data import recorder
+from starjax.data import episodes
 
 MIN_SUCCESS_RATE = 0.5  # below it at some trocar, the expert is broken and collecting stops
 
@@ -16,12 +16,12 @@ Known = Mapping[Trial, bool]  # whether it succeeded
 
 
 def run(
-    simulate: Callable[[list[Trial]], Iterator[list[recorder.Episode]]],
+    simulate: Callable[[list[Trial]], Iterator[list[episodes.Episode]]],
     known: dict[Trial, bool],
     trocars: int,
     per_trocar: int,
     chunk: int,
-) -> Iterator[recorder.Episode]:
+) -> Iterator[episodes.Episode]:
     """Simulates what is needed, `chunk` trials at once; yields each episode when that is certain.
 
     Args:
@@ -93,5 +93,5 @@ def _is_open(trial: Trial, known: Known, per_trocar: int) -> bool:
     return trial not in known and before < per_trocar
 
 
-def _trial(episode: recorder.Episode) -> Trial:
+def _trial(episode: episodes.Episode) -> Trial:
     return episode.outcome["trocar"], episode.outcome["trial"]
