@@ -31,9 +31,12 @@ def settings(*argv: str) -> config.RunConfig:
         (["--demos.seen-trocars=9"], ["--demos.seen-trocars", "1 to 8", "9"]),
         (["--demos.keep-failures", "yes"], ["--demos.keep-failures", "0 value", "yes"]),
         (["--policy.freeze-encoder", "yes"], ["--policy.freeze-encoder", "0 value", "yes"]),
-        (["--policy.freeze-encoder"], ["--policy.freeze-encoder", "--policy.observation image"]),
         (
-            ["--policy.freeze-encoder", "--policy.observation", "image"],
+            ["--preset=smoke", "--policy.freeze-encoder"],
+            ["--policy.freeze-encoder", "--policy.observation image"],
+        ),
+        (
+            ["--preset=smoke", "--policy.freeze-encoder", "--policy.observation", "image"],
             ["--policy.freeze-encoder", "--policy.encoder-weights", "got none"],
         ),
         (["stardiff"], ["stardiff", "flag"]),
@@ -73,8 +76,8 @@ def test_flags_override_the_preset_and_nothing_else():
 def test_other_observations_and_seeds_have_folders_of_their_own():
     assert settings("--preset", "cpu").out == "runs/cpu"
     assert settings("--preset", "cpu", "--seed=3").out == "runs/cpu-seed3"
-    typed = ["--preset", "cpu", "--policy.observation", "image", "--seed", "3"]
-    assert settings(*typed).out == "runs/cpu-image-seed3"
+    typed = ["--preset", "cpu", "--policy.observation", "state", "--seed", "3"]
+    assert settings(*typed).out == "runs/cpu-state-seed3"
     assert settings(*typed, "--out", "runs/cpu").out == "runs/cpu"
 
 
@@ -82,6 +85,15 @@ def test_a_frozen_encoder_has_a_folder_of_its_own():
     typed = ["--policy.observation", "image", "--policy.freeze-encoder"]
     typed += ["--policy.encoder-weights", "x"]
     assert settings("--preset", "smoke", *typed).out == "runs/smoke-image-frozen"
+    assert settings("--preset", "cpu", "--policy.no-freeze-encoder").out == "runs/cpu-unfrozen"
+
+
+def test_a_presets_encoder_is_no_part_of_a_run_that_sees_the_state():
+    policy = settings("--preset", "cpu", "--policy.observation", "state").policy
+    assert presets.PRESETS["cpu"].policy.freeze_encoder
+    assert not policy.freeze_encoder and not policy.encoder_weights
+    with pytest.raises(config.UsageError, match="freeze-encoder: expected"):
+        settings("--preset", "cpu", "--policy.observation", "state", "--policy.freeze-encoder")
 
 
 def test_auto_is_named_by_what_it_picked(monkeypatch):

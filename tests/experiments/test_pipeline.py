@@ -91,23 +91,19 @@ def test_first_signal_asks_and_second_ends():
 
 
 def test_plan_names_the_observation_and_the_flag(tmp_path):
-    preset = presets.PRESETS["cpu"]
+    preset = presets.PRESETS["smoke"]
     said = words.plan(preset, pipeline.STAGES)
-    assert "state" in said and "--policy.observation image" in said and "preset cpu" in said
+    assert "state" in said and "--policy.observation image" in said and "preset smoke" in said
     policy = dataclasses.replace(preset.policy, observation="image")
     said = words.plan(dataclasses.replace(preset, policy=policy), pipeline.STAGES)
-    assert "image, 96 px" in said and "from scratch" in said and "state" not in said
+    assert "image, 64 px" in said and "from scratch" in said and "state" not in said
 
 
 def test_plan_and_warnings_say_that_an_encoder_is_frozen():
     cpu = presets.PRESETS["cpu"]
-    policy = dataclasses.replace(
-        cpu.policy, observation="image", encoder_weights="compact", freeze_encoder=True
-    )
-    seeing = dataclasses.replace(cpu, policy=policy)
     said = "frozen, from compact (pretrained on this task); small"
-    assert f"  encoder         {said}\n" in words.plan(seeing, pipeline.STAGES)
-    assert words.warnings(seeing, {"invalid": 0}) == [f"Image encoder: {said}, 96 px."]
+    assert f"  encoder         {said}\n" in words.plan(cpu, pipeline.STAGES)
+    assert words.warnings(cpu, {"invalid": 0}) == [f"Image encoder: {said}, 128 px."]
 
 
 def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):

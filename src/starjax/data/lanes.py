@@ -12,6 +12,16 @@ LANE = PartitionSpec("lane")
 TIME_LANE = PartitionSpec(None, "lane")
 
 
+def devices() -> list[jax.Device] | None:
+    """Devices that lanes are split over: this process's if there are several, None for one.
+
+    Of several GPUs only the first: over four H200s with jaxlib 0.11.2 the first program that was
+    split died with a segmentation fault, and the reason is not known.
+    """
+    found = jax.local_devices()
+    return found if len(found) > 1 and found[0].platform != "gpu" else None
+
+
 def split(
     fn: Callable[..., Any],
     devices: Sequence[jax.Device] | None,

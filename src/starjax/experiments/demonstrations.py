@@ -14,7 +14,7 @@ from starjax.experiments import clock, words
 def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
     """The folder of a run's demonstrations, and a function that collects what it lacks."""
     from starjax import rcm
-    from starjax.data import demos, store
+    from starjax.data import demos, lanes, store
     from starjax.sim.tasks import expert
 
     trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
@@ -34,7 +34,7 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
         words.stage("collect", f"into {root}")
         with clock.timed(out, "collect"):
             found = demos.collect(
-                root, env, expert, trocars, devices=_devices(), report=words.indented, **wanted
+                root, env, expert, trocars, devices=lanes.devices(), report=words.indented, **wanted
             )
         words.indented(
             "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
@@ -93,10 +93,3 @@ def frozen_encoder(config: config_lib.RunConfig) -> Any:
 
     found = encoder.read(config.policy, config.train)
     return found if config.policy.freeze_encoder else None
-
-
-def _devices() -> Any:
-    """This process's devices if there are several, None (the default one) otherwise."""
-    import jax
-
-    return jax.local_devices() if len(jax.local_devices()) > 1 else None

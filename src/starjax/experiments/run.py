@@ -21,6 +21,10 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
     config = options.parse(
         config_lib.RunConfig, argv, prog=prog, description=description, default=default
     )
+    if config.policy.observation == "state" and "--policy.freeze-encoder" not in argv:
+        # A preset's encoder; one that was asked for is refused below.
+        policy = dataclasses.replace(config.policy, encoder_weights="", freeze_encoder=False)
+        config = dataclasses.replace(config, policy=policy)
     out = config.out
     if options.value_of("--out", argv) is None:
         out = _folder(config, default)
@@ -34,7 +38,9 @@ def _folder(config: config_lib.RunConfig, default: config_lib.RunConfig) -> str:
     policy, usual = config.policy, default.policy
     parts = [default.out]
     parts += [policy.observation] if policy.observation != usual.observation else []
-    parts += ["frozen"] if policy.freeze_encoder else []
+    sees, freezes = policy.observation == "image", policy.freeze_encoder
+    if sees and freezes != usual.freeze_encoder:
+        parts.append("frozen" if freezes else "unfrozen")
     parts += [f"seed{config.seed}"] if config.seed != default.seed else []
     return "-".join(parts)
 

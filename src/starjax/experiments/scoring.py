@@ -5,11 +5,11 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from starjax import config as config_lib
 from starjax import rcm
+from starjax.data import lanes
 from starjax.evaluation import evaluate, latency, metrics, table
 from starjax.experiments import folders, methods, options, words
 from starjax.policies import policy as policies
@@ -79,8 +79,7 @@ def _subject(method: str, trained: export.Trained, env: sim_env.Env | None) -> S
 def rollouts(
     directory: Path, who: Subject, trocars: rcm.Trocar, settings: config_lib.EvalConfig, seed: int
 ) -> table.Table:
-    """Runs what is missing of an evaluation, on all devices."""
-    devices = jax.local_devices()
+    """Runs what is missing of an evaluation."""
     return evaluate.evaluate(
         directory,
         who.env,
@@ -95,7 +94,7 @@ def rollouts(
         time_limit_s=settings.time_limit_s,
         chunk=settings.chunk,
         video_trials=settings.video_trials,
-        devices=devices if len(devices) > 1 else None,
+        devices=lanes.devices(),
         identity={
             **folders.behaviour(who.method)._asdict(),
             "temperature": who.trained.policy.temperature,
