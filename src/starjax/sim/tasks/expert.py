@@ -4,7 +4,8 @@ It grasps a wall to the left or right of its middle and, of two walls that are a
 random (never by the trocar), at its own pace, is disturbed on purpose, and starts over when the
 block is not where it should be.
 The roll follows from tip positions and trocar alone: the tool turns only once the coming positions
-hold the grasp point, and the jaws' axis then stays on the wall's normal.
+hold the grasp point, and the jaws' axis then stays on the wall's normal. It comes in along that
+normal, from outside, so that the path says which way the wall faces, and ways to two walls differ.
 """
 
 import flax.struct
@@ -45,6 +46,7 @@ NOISE_POSITION = 0.0012  # m, standard deviation of the disturbance
 NOISE_ROLL = 0.07  # rad
 NOISE_TIME = 0.4  # s, correlation time
 NOISE_SMOOTHING = 0.15  # s, low-pass: an arm's tool does not jump
+HOVER_OUT = 0.008  # m out from the grasp point along the wall's normal
 HOVER_SPREAD = 0.0015  # m, standard deviation of where it hovers
 NOISE_STREAM = 1 << 20  # folded into the key: apart from every attempt's stream
 
@@ -186,7 +188,7 @@ def _enter(
     goals = jnp.stack(
         [
             tip.at[2].set(jnp.maximum(tip[2], hover)),
-            grasp.at[2].set(hover) + spread,
+            grasp.at[2].set(hover) + HOVER_OUT * out + spread,
             grasp,
             tip,
             tip.at[2].set(hover),
