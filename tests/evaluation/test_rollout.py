@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from typing import Any
 
 import fakes
 import jax
@@ -13,6 +14,7 @@ import pytest
 import stubs
 
 from starjax import rcm
+from starjax.data import lanes as splitting
 from starjax.data import normalizer
 from starjax.evaluation import evaluate, metrics, recorded, rollout, table
 from starjax.experiments.methods import METHODS
@@ -338,3 +340,30 @@ def test_two_devices_give_the_same_bits(tmp_path):
     assert done.returncode == 0 and "same" in done.stdout, done.stderr[-3000:]
     plans = [json.loads((tmp_path / n / "plan.json").read_text()) for n in "12"]
     assert [plan["chunk"] for plan in plans] == [2, 4]
+
+
+class _Device:
+    platform = "gpu"
+
+    def __init__(self, gigabytes):
+        self.gigabytes = gigabytes
+
+    def memory_stats(self):
+        return {"bytes_limit": self.gigabytes << 30}
+
+
+@pytest.mark.parametrize(
+    ("gigabytes", "trials", "lanes"),
+    [(100, 360, 360), (100, 1200, 1200), (100, 1281, 648), (100, 5, 8), (16, 360, 120)],
+)
+def test_a_gpu_runs_as_many_lanes_as_make_the_fewest_chunks(gigabytes, trials, lanes):
+    device: Any = _Device(gigabytes)
+    assert rollout.lanes_per_device(device, trials) == lanes
+
+
+def test_lanes_are_split_over_several_devices_but_not_over_gpus(monkeypatch):
+    two = [_Device(100)] * 2
+    monkeypatch.setattr(jax, "local_devices", lambda: two)
+    assert splitting.devices() is None
+    monkeypatch.setattr(_Device, "platform", "cpu")
+    assert splitting.devices() == jax.local_devices()

@@ -198,3 +198,23 @@ def test_state_features_tell_block_and_target_from_the_tip(made):
     inputs = features.for_sampling(fakes.TINY, TRAIN, it.stats, observation, jnp.zeros((B, 2, 4)))
     expected = np.broadcast_to([1, 0, 0, 0, -1, 0, 0, 0, -2], (B, 2, 9))
     np.testing.assert_allclose(inputs.history[..., -9:], expected, atol=1e-5)
+
+
+def test_large_matrices_are_rounded_once_to_what_sample_rounds_them_to(dataset):
+    settings = dataclasses.replace(fakes.TINY, observation="image", dtype="bfloat16")
+    policy = policies.make(METHODS["stardiff"], settings, fakes.P_WORLD_REF, TRAIN)
+    stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(80))
+    params = jit(policy.init)(jax.random.key(0))
+    rounded = policies.for_sampling(params, "bfloat16")
+    batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
+    given = (stats, jax.random.split(jax.random.key(1), B), batch.observation, batch.trocar)
+    sample = jit(policy.sample)
+    jax.tree.map(np.testing.assert_array_equal, sample(params, *given), sample(rounded, *given))
+    kinds = {
+        jax.tree_util.keystr(path): leaf.dtype
+        for path, leaf in jax.tree_util.tree_leaves_with_path(rounded)
+    }
+    exact = {name for name, kind in kinds.items() if kind == jnp.float32}
+    assert any("film_cond" in name for name in kinds.keys() - exact)
+    assert not any("'unet'" in name and "'kernel'" in name for name in exact)
+    assert all("'kernel'" in n or "film_" in n for n in kinds.keys() - exact)

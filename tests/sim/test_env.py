@@ -152,6 +152,16 @@ def test_the_expert_takes_the_inner_wall_and_on_the_middle_row_the_one_of_less_t
     assert min(clear.values()) >= 3
 
 
+def test_the_expert_comes_in_from_outside_along_the_wall(reset, begin):
+    state = reset(3)
+    script = begin(state, 3)
+    normals = np.asarray(jax.vmap(peg_transfer.wall_normals)(state.block_pose))
+    outward = normals[np.arange(len(normals)), np.asarray(script.wall)]
+    away = np.sum(np.asarray(script.goal - state.block_pose.p) * outward, -1)
+    # HOVER_SPREAD is left out by the mean over the twelve.
+    assert away.mean() == pytest.approx(peg_transfer.RIM_RADIUS + expert.HOVER_OUT, abs=0.0015)
+
+
 def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
     """What is multimodal never depends on the trocar, or positions would not be invariant."""
     state = reset(5)

@@ -4,6 +4,7 @@ Names and shapes follow torchvision's, so that `pretrained` can fill in its Imag
 """
 
 import math
+from collections.abc import Callable
 
 import flax.linen as nn
 import jax
@@ -140,7 +141,7 @@ def _max_pool_gradient(kept, g: jax.Array) -> tuple[jax.Array]:
 max_pool.defvjp(_max_pool, _max_pool_gradient)
 
 
-def _kernel_init(size: int, features: int):
+def _kernel_init(size: int, features: int) -> Callable[..., jax.Array]:
     """Variance 2 / fan-out, as torchvision's."""
     return layers.uniform_init(size * size * features, gain=math.sqrt(6.0))
 

@@ -1,7 +1,7 @@
 """Trained policies that ship with the package, found by name.
 
 weights/<name>.safetensors    in half precision, by `starjax pack`
-weights/<name>.json           result.json of its evaluation, for people: nothing reads it
+weights/<name>.json           result.json of its evaluation without the trials: nothing reads it
 """
 
 from pathlib import Path

@@ -63,13 +63,11 @@ def for_sampling(params: Params, dtype: str) -> Params:
     `sample` rounds them so anyway, to the same numbers; done before, the U-Net's are not read in
     float32 and rounded again at each DDIM step.
     """
-    large = {"kernel", "film_time", "film_cond"}
+    networks, matrices = {"unet", "trunk"}, {"kernel", "film_time", "film_cond"}
 
     def rounded(path: tuple[Any, ...], leaf: Any) -> Any:
         names = {getattr(key, "key", None) for key in path}
-        return (
-            leaf.astype(jnp.dtype(dtype)) if names & {"unet", "trunk"} and names & large else leaf
-        )
+        return leaf.astype(jnp.dtype(dtype)) if names & networks and names & matrices else leaf
 
     return jax.tree_util.tree_map_with_path(rounded, params)
 
