@@ -19,7 +19,7 @@ from starjax import runtime
 from starjax.evaluation import rollout
 from starjax.sim import model, physics
 
-PERIODS = 1  # control periods a call
+PERIODS = 8  # control periods a call
 PERIOD = 1 / 30  # s
 BATCHES = {"cpu": [1, 16, 256], "gpu": [360, 4096, 16384]}
 
