@@ -9,6 +9,8 @@ import _timing
 import jax
 import jax.numpy as jnp
 
+AGAIN = 10  # products, or copies, in one call
+
 
 class Rates(NamedTuple):
     """FLOP/s of a product in `dtype`; bytes/s of a copy, what is read and written both counted."""
@@ -37,7 +39,12 @@ def measure(dtype: str) -> Rates:
     n, count = (8192, 1 << 30) if big else (1024, 1 << 24)
     # Random, as a product of ones or zeros draws less power and runs faster than real ones.
     a = jax.random.normal(jax.random.key(0), (n, n)).astype(dtype)
-    product = _timing.time_jitted(lambda a: a @ a, a, repeats=9)
     x = jnp.ones(count)
-    copy = _timing.time_jitted(lambda x: x + 1.0, x, repeats=9)
-    return Rates(2 * n**3 / product.min_s, 2 * x.nbytes / copy.min_s, dtype)
+    # Many in a call, so that a rate does not hold what the call costs.
+    product = _timing.time_jitted(lambda a: _again(lambda b: a @ b / n, a), a, repeats=5)
+    copy = _timing.time_jitted(lambda x: _again(lambda y: y + 1.0, x), x, repeats=5)
+    return Rates(AGAIN * 2 * n**3 / product.min_s, AGAIN * 2 * x.nbytes / copy.min_s, dtype)
+
+
+def _again(fn, x: jax.Array) -> jax.Array:
+    return jax.lax.fori_loop(0, AGAIN, lambda _, x: fn(x), x)

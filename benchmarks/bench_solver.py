@@ -23,7 +23,7 @@ from starjax.sim.tasks import expert
 
 STEPS = 240  # control steps an episode
 CONVERGED = (60, 40, 1e-9)  # iterations, line-search turns, tolerance
-SETTINGS = [(8, 8, 1e-8), (8, 6, 1e-8), (8, 6, 1e-7), (8, 6, 1e-5), (8, 5, 1e-7), (8, 4, 1e-7)]
+SETTINGS = [(8, 8, 1e-8), (8, 8, 1e-7), (8, 8, 1e-5), (8, 7, 1e-7), (8, 6, 1e-7), (8, 4, 1e-7)]
 QUANTILES = (0.99, 0.999, 1.0)
 
 
@@ -48,7 +48,7 @@ def main() -> None:
 
 
 def visited(env: envs.Env, episodes: int) -> tuple[physics.PhysicsState, jax.Array]:
-    """States `[N]` and the joint servos' targets `[N, 6]` that episodes of the expert went through."""
+    """States `[N]` of episodes of the expert, and the joint servos' targets `[N, 6]` there."""
     index = jnp.arange(episodes)
     trocars = jax.tree.map(lambda field: jnp.asarray(field)[index % 12], rcm.TROCARS)
 

@@ -19,7 +19,7 @@ def run(path: pathlib.Path, method="stardiff", skill=(0.85, 0.7), trials=6, swee
     ports = rcm.Trocar(*(field[index] for field in rcm.TROCARS))
     rows = outcomes(rng, ports, index, np.where(rcm.IS_SEEN[index], *skill))
     (path / "evaluation").mkdir(parents=True)
-    (path / "result.json").write_text(json.dumps(result(method, rows)))
+    (path / "result.json").write_text(json.dumps(result(method, rows, seed)))
     (path / "metrics.jsonl").write_text("\n".join(json.dumps(line) for line in curves(rng)))
     np.savez(path / "evaluation" / "recorded.npz", **recorded(rng, rows, 3))
     if sweep_of:
@@ -57,14 +57,17 @@ def outcomes(rng, ports, index, chance):
     )
 
 
-def result(method, rows):
+def result(method, rows, seed=0):
     """result.json of an evaluation."""
     return {
         **metrics.compose(rows, rcm.IS_SEEN, method=method, observation="state", seed=0),
         "inference_ms": {"p50": 18.4, "p95": 21.0, "p99": 24.9},
         "config": dataclasses.asdict(
             config.RunConfig(
-                method=method, preset="cpu", policy=config.PolicyConfig(observation="state")
+                method=method,
+                preset="cpu",
+                seed=seed,
+                policy=config.PolicyConfig(observation="state"),
             )
         ),
         "versions": {"python": "3.11.9", "jax": "0.10.2", "mujoco": "4.0.0", "starjax": "0.1.0"},

@@ -361,9 +361,7 @@ def test_a_gpu_runs_as_many_lanes_as_make_the_fewest_chunks(gigabytes, trials, l
     assert rollout.lanes_per_device(device, trials) == lanes
 
 
-def test_lanes_are_split_over_several_devices_but_not_over_gpus(monkeypatch):
-    two = [_Device(100)] * 2
-    monkeypatch.setattr(jax, "local_devices", lambda: two)
-    assert splitting.devices() is None
-    monkeypatch.setattr(_Device, "platform", "cpu")
-    assert splitting.devices() == jax.local_devices()
+def test_lanes_are_split_over_all_devices_of_several(monkeypatch):
+    for count, expected in ((1, None), (2, [_Device, _Device])):
+        monkeypatch.setattr(jax, "local_devices", lambda n=count: [_Device] * n)
+        assert splitting.devices() == expected

@@ -299,8 +299,17 @@ def test_a_result_alone_is_enough_to_load(one, tmp_path):
     assert results.load(tmp_path / "stardiff").trials == one.trials
 
 
-def test_runs_of_one_method_are_told_apart(tmp_path):
-    paths = [synthetic.run(tmp_path / name / "stardiff", seed=i) for i, name in enumerate("ab")]
+@pytest.mark.parametrize(
+    ("seeds", "names"), [((0, 0), ("a/stardiff", "b/stardiff")), ((0, 3), ("seed 0", "seed 3"))]
+)
+def test_runs_of_one_method_are_told_apart(tmp_path, seeds, names):
+    paths = [synthetic.run(tmp_path / x / "stardiff", seed=i) for x, i in zip("ab", seeds)]
     build.build(paths, tmp_path / "report", with_video=False)
     text = (tmp_path / "report" / "tables.md").read_text()
-    assert "STAR-Diff (a/stardiff)" in text and "STAR-Diff (b/stardiff)" in text
+    assert all(f"STAR-Diff ({name})" in text for name in names)
+
+
+def test_a_note_of_some_runs_names_them(one):
+    other = one._replace(label="DP-EE", result={"warnings": ["common", "its own"]})
+    both = [one._replace(result={"warnings": ["common"]}), other]
+    assert results.notes(both) == ["common", "DP-EE: its own"]

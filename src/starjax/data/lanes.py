@@ -1,11 +1,12 @@
 """One program over a batch of lanes (episodes), split over devices that never wait for others."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 SHARED = PartitionSpec()
 LANE = PartitionSpec("lane")
@@ -13,19 +14,15 @@ TIME_LANE = PartitionSpec(None, "lane")
 
 
 def devices() -> list[jax.Device] | None:
-    """Devices that lanes are split over: this process's if there are several, None for one.
-
-    Of several GPUs only the first: over four H200s with jaxlib 0.11.2 the first program that was
-    split died with a segmentation fault, and the reason is not known.
-    """
+    """Devices that lanes are split over: this process's if there are several, None for one."""
     found = jax.local_devices()
-    return found if len(found) > 1 and found[0].platform != "gpu" else None
+    return found if len(found) > 1 else None
 
 
 def split(
     fn: Callable[..., Any],
     devices: Sequence[jax.Device] | None,
-    in_specs: Any,
+    in_specs: Sequence[PartitionSpec],
     out_specs: Any,
     donate: tuple[int, ...] = (),
 ) -> Callable[..., Any]:
@@ -35,13 +32,42 @@ def split(
       fn: acts on lanes independently; shapes inside are those of one device's share.
       devices: None for the default one.
       in_specs: SHARED, LANE (leading axis) or TIME_LANE (second axis) for each argument.
-      out_specs: the same for the result.
+      out_specs: the same for the result, or for its parts.
       donate: arguments whose memory may be reused.
     """
+    program = jax.jit(fn, donate_argnums=donate)
     if devices is None or len(devices) == 1:
-        return jax.jit(fn, donate_argnums=donate)
-    # shard_map, not sharded jit: that would put a reduction over all devices into every loop's
-    # condition, the solver's included. MJX's loops carry values that its check cannot follow.
+        return program
+    # A program and a thread for each device. One program over all of them would put a reduction
+    # into every loop's condition, the solver's included; under shard_map it would not, but there
+    # XLA's compiler for GPUs dies with a segmentation fault (jaxlib 0.11.2).
     mesh = Mesh(np.array(devices), ("lane",))
-    mapped = jax.shard_map(fn, mesh=mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False)
-    return jax.jit(mapped, donate_argnums=donate)
+    shardings = [NamedSharding(mesh, spec) for spec in in_specs]
+
+    def call(*arguments: Any) -> Any:
+        placed = [jax.device_put(*pair) for pair in zip(arguments, shardings, strict=True)]
+        shares = [jax.tree.map(lambda x, d=device: _share(x, d), placed) for device in devices]
+        # Traced here, once, and not in every thread.
+        jax.eval_shape(program, *shares[0])
+        with ThreadPoolExecutor(len(devices)) as pool:
+            parts = list(pool.map(lambda share: program(*share), shares))
+        specs = jax.tree.broadcast(out_specs, parts[0], is_leaf=_is_spec)
+        return jax.tree.map(lambda spec, *leaves: _joined(mesh, spec, leaves), specs, *parts)
+
+    return call
+
+
+def _share(leaf: jax.Array, device: jax.Device) -> jax.Array:
+    return next(shard.data for shard in leaf.addressable_shards if shard.device == device)
+
+
+def _joined(mesh: Mesh, spec: PartitionSpec, leaves: Sequence[jax.Array]) -> jax.Array:
+    shape = list(leaves[0].shape)
+    shape[tuple(spec).index("lane")] *= len(leaves)
+    return jax.make_array_from_single_device_arrays(
+        tuple(shape), NamedSharding(mesh, spec), list(leaves)
+    )
+
+
+def _is_spec(x: Any) -> bool:
+    return isinstance(x, PartitionSpec)

@@ -7,6 +7,7 @@ segment, the host fetches the pictures of the one before.
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -95,27 +96,30 @@ def simulator(
         running = list(range(count))
         pictures = {lane: [] for lane in running}
         others = []
-        ahead = advance(carry, np.int32(min(SEGMENT, max_steps)))
-        for left in range(max_steps - SEGMENT, -SEGMENT, -SEGMENT):
-            carry, records, status = ahead
-            slices = episodes.slices(records.pop("image", None), running)
-            if left > 0:
-                # Before anything is waited for. If all are over, it ends at once and is dropped.
-                ahead = advance(carry, np.int32(min(SEGMENT, left)))
-            status = jax.device_get(status)
-            others.append(jax.device_get(records))
-            for lane, fetched in zip(running, episodes.fetch(slices)):
-                pictures[lane].append(fetched)
-            over = [lane for lane in running if status["over"][lane] or left <= 0]
-            running = [lane for lane in running if lane not in over]
-            yield [
-                episodes.assemble(
-                    lane, group[lane], trocars, seed, status, others, pictures.pop(lane)
-                )
-                for lane in over
-            ]
-            if not running:
-                return
+        # In a thread: a call returns only once the last of its loops has asked the host whether
+        # to go on.
+        with ThreadPoolExecutor(1) as device:
+            ahead = device.submit(advance, carry, np.int32(min(SEGMENT, max_steps)))
+            for left in range(max_steps - SEGMENT, -SEGMENT, -SEGMENT):
+                carry, records, status = ahead.result()
+                slices = episodes.slices(records.pop("image", None), running)
+                if left > 0:
+                    # Before anything is waited for. If all are over, it ends at once, unused.
+                    ahead = device.submit(advance, carry, np.int32(min(SEGMENT, left)))
+                status = jax.device_get(status)
+                others.append(jax.device_get(records))
+                for lane, fetched in zip(running, episodes.fetch(slices)):
+                    pictures[lane].append(fetched)
+                over = [lane for lane in running if status["over"][lane] or left <= 0]
+                running = [lane for lane in running if lane not in over]
+                yield [
+                    episodes.assemble(
+                        lane, group[lane], trocars, seed, status, others, pictures.pop(lane)
+                    )
+                    for lane in over
+                ]
+                if not running:
+                    return
 
     return simulate
 

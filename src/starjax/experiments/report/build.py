@@ -43,14 +43,17 @@ def _order(run: results.Run) -> int:
 
 
 def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
-    """Runs of one method, say with other seeds, get their folder's name beside the method's."""
-    labels = [run.label for run in runs]
-    return [
-        run._replace(label=f"{run.label} ({run.path.parent.name}/{run.path.name})")
-        if labels.count(run.label) > 1
-        else run
-        for run in runs
-    ]
+    """Runs of one method get their seeds beside its name, or, if these are alike, their folders."""
+    named = []
+    for run in runs:
+        alike = [other for other in runs if other.label == run.label]
+        seeds = {str(other.result.get("config", {}).get("seed")) for other in alike}
+        if len(seeds) == len(alike):
+            which = f"seed {run.result['config']['seed']}"
+        else:
+            which = f"{run.path.parent.name}/{run.path.name}"
+        named.append(run._replace(label=f"{run.label} ({which})") if len(alike) > 1 else run)
+    return named
 
 
 def _focus(runs: Sequence[results.Run]) -> results.Run:

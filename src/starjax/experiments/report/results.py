@@ -157,3 +157,15 @@ def _sweep(file: Path) -> list[outcomes.Trial]:
 
 def _lines(file: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
+
+
+def notes(runs: Sequence[Run]) -> list[str]:
+    """Warnings of the runs, each once, with the names of those that it is about if not of all."""
+    said: dict[str, list[str]] = {}
+    for run in runs:
+        for text in run.result.get("warnings") or []:
+            said.setdefault(text, []).append(run.label)
+    return [
+        text if len(labels) == len(runs) else f"{', '.join(labels)}: {text}"
+        for text, labels in said.items()
+    ]

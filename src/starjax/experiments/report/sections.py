@@ -37,8 +37,7 @@ def facts(runs: Sequence[results.Run], focus: results.Run) -> str:
 
 def notes(runs: Sequence[results.Run]) -> str:
     """Warnings, each once."""
-    texts = dict.fromkeys(text for run in runs for text in run.result.get("warnings") or [])
-    return "\n".join(f'<p class="note">{markup.escape(text)}</p>' for text in texts)
+    return "\n".join(f'<p class="note">{markup.escape(text)}</p>' for text in results.notes(runs))
 
 
 def cards(run: results.Run) -> str:

@@ -24,8 +24,7 @@ def markdown(runs: Sequence[results.Run]) -> str:
         ("Table IV. Inference time", inference(runs), INFERENCE_NOTE),
     ]
     filled = [f"## {title}\n\n{render(t)}\n\n{note}\n" for title, t, note in parts if len(t) > 1]
-    said = dict.fromkeys(text for run in runs for text in run.result.get("warnings") or [])
-    notes = "".join(f"- {text}\n" for text in said)
+    notes = "".join(f"- {text}\n" for text in results.notes(runs))
     head = f"# Peg transfer from {results.observed(runs)} observations\n"
     return "\n".join(part for part in (head, notes, *filled) if part)
 
