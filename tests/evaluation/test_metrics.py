@@ -101,7 +101,7 @@ def test_executed_error_is_pooled_over_steps():
     series = np.concatenate([[5.0], np.linspace(0.0, 1.0, 999)]).astype(np.float16)
     found = metrics.rcm_error_mm(
         trials(
-            [1, 1],
+            [1, 0],
             steps=steps,
             rcm_error_mm=series,
             rcm_mean=np.array([5e-3, 0.5e-3], np.float32),
@@ -113,6 +113,7 @@ def test_executed_error_is_pooled_over_steps():
     assert found["executed"]["mean"] == pytest.approx(0.5045)  # not 2.75, the mean of trials
     assert found["executed"]["p99"] == pytest.approx(0.99, abs=2e-3)
     assert found["executed"]["max"] == pytest.approx(5.0)
+    assert found["executed"]["p99_of_successes"] == pytest.approx(5.0)
 
 
 def test_selection_keeps_steps_with_their_trials():

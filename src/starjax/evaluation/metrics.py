@@ -8,8 +8,9 @@ Written by `compose`, figures in SI units unless the name says otherwise, interv
     strict, loose, safe   {seen, unseen, all}, each as above; safe: strict, and the executed RCM
                           error never above safe_rcm_mm
     per_trocar            list of {trocar, radius, polar, azimuth, seen} and strict success as above
-    rcm_error_mm          {commanded {max}, executed {mean, p99, max}}: the executed ones are over
-                          all control steps of all trials
+    rcm_error_mm          {commanded {max}, executed {mean, p99, max, p99_of_successes}}: the
+                          executed ones are over all control steps of all trials (a failed one
+                          has many, up to the time limit), or of the strictly successful ones
     steps                 {mean, median} control steps of the strictly successful trials
     invalid, collided     number of trials
     trials                list of {trocar, radius, polar, azimuth, seen, trial, seed, success,
@@ -84,18 +85,23 @@ def mcnemar(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
 
 
 def rcm_error_mm(table: tables.Table) -> dict[str, Any]:
-    """Commanded {max} and executed {mean, p99, max} RCM error in mm."""
-    errors = table.rcm_error_mm.astype(np.float64)
+    """Commanded {max} and executed {mean, p99, max, p99_of_successes} RCM error in mm."""
     # The mean and the maximum come from float32 figures: float16 is for the quantile only.
     mean = np.sum(table.rcm_mean * table.steps.astype(np.float64)) / max(np.sum(table.steps), 1)
     return {
         "commanded": {"max": 1e3 * _max(table.rcm_commanded_max)},
         "executed": {
             "mean": 1e3 * float(mean),
-            "p99": float(np.quantile(errors, 0.99)) if errors.size else 0.0,
+            "p99": _p99(table),
             "max": 1e3 * _max(table.rcm_max),
+            "p99_of_successes": _p99(tables.select(table, table.success)),
         },
     }
+
+
+def _p99(table: tables.Table) -> float:
+    errors = table.rcm_error_mm.astype(np.float64)
+    return float(np.quantile(errors, 0.99)) if errors.size else 0.0
 
 
 def compose(
