@@ -3,7 +3,6 @@
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from starjax.sim.engine import mjx
 from starjax.sim.model import SimModel
@@ -12,9 +11,8 @@ from starjax.types import Pose
 # Jaw targets at gripper -1 and +1 (m a side): past closed, so that the servo squeezes.
 JAW_CLOSED = -0.001
 JAW_OPEN = 0.0032
-# Natural frequency of the critically damped joint servos (rad/s), as in fr5.xml. The wrist's is
-# higher: its give under the tool's load is most of what the shaft moves at the port.
-SERVO_FREQUENCY = np.array([100.0, 100.0, 100.0, 150.0, 150.0, 150.0], np.float32)
+# Natural frequency of the critically damped joint servos (rad/s), as in fr5.xml.
+SERVO_FREQUENCY = 100.0
 # Beyond these the solver has diverged.
 MAX_ARM_SPEED = 20.0  # rad/s
 MAX_BLOCK_SPEED = 5.0  # m/s
