@@ -53,7 +53,7 @@ PRESETS: dict[str, RunConfig] = {
             temperature=0.5,
         ),
         train=TrainConfig(
-            steps=6_500,
+            steps=8_000,
             batch_size=128,
             learning_rate=1e-3,
             state_noise=0.003,
