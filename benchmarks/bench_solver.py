@@ -2,8 +2,8 @@
 
     python benchmarks/bench_solver.py [--episodes 48]
 
-The states are those of the scripted expert's episodes, 8 s each, so most of them hold contacts.
-Iterations of a batch are those of its slowest member: on a GPU they decide the time of a step.
+The states are those of the scripted expert's episodes, 8 s each, so most of them hold contacts; the
+servos hold the arm, and the jaws close.
 """
 
 import argparse

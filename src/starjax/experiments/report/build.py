@@ -44,16 +44,17 @@ def _order(run: results.Run) -> int:
 
 def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
     """Runs of one method get their seeds beside its name, or, if these are alike, their folders."""
-    named = []
-    for run in runs:
-        alike = [other for other in runs if other.label == run.label]
-        seeds = {str(other.result.get("config", {}).get("seed")) for other in alike}
-        if len(seeds) == len(alike):
-            which = f"seed {run.result['config']['seed']}"
-        else:
-            which = f"{run.path.parent.name}/{run.path.name}"
-        named.append(run._replace(label=f"{run.label} ({which})") if len(alike) > 1 else run)
-    return named
+    return [run._replace(label=_name(run, runs)) for run in runs]
+
+
+def _name(run: results.Run, runs: Sequence[results.Run]) -> str:
+    alike = [other for other in runs if other.label == run.label]
+    if len(alike) == 1:
+        return run.label
+    seeds = [other.result.get("config", {}).get("seed") for other in alike]
+    if None not in seeds and len(set(seeds)) == len(seeds):
+        return f"{run.label} (seed {run.result['config']['seed']})"
+    return f"{run.label} ({run.path.parent.name}/{run.path.name})"
 
 
 def _focus(runs: Sequence[results.Run]) -> results.Run:
