@@ -96,8 +96,8 @@ def simulator(
         running = list(range(count))
         pictures = {lane: [] for lane in running}
         others = []
-        # In a thread: a call returns only once the last of its loops has asked the host whether
-        # to go on.
+        # In a thread: on a GPU a call may hold its caller while its loops ask the host whether to
+        # go on.
         with ThreadPoolExecutor(1) as device:
             ahead = device.submit(advance, carry, np.int32(min(SEGMENT, max_steps)))
             for left in range(max_steps - SEGMENT, -SEGMENT, -SEGMENT):
