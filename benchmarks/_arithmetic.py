@@ -62,6 +62,8 @@ def _equations(jaxpr: Any, times: int) -> Iterator[tuple[Any, int]]:
             for value in (parameter if isinstance(parameter, tuple) else (parameter,))
             if hasattr(value, "eqns") or hasattr(value, "jaxpr")
         ]
+        if equation.primitive.name == "cond":  # a choice by platform, the default last
+            nested = nested[-1:]
         if not nested:
             yield equation, times
         inside = times * equation.params["length"] if equation.primitive.name == "scan" else times

@@ -137,7 +137,16 @@ def statistics(policy_config: PolicyConfig) -> normalizer.Normalizer:
 
 @functools.lru_cache(maxsize=1)
 def made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
-    """One long demonstration; what is in it does not change the time."""
+    """One long demonstration; what is in it does not change the time.
+
+    Made on the CPU, as what is read from a disk begins there.
+    """
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        dataset = _made_up(policy_config, count)
+    return jax.device_put(dataset, jax.local_devices()[0])
+
+
+def _made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
     seen = dataclasses.replace(policy_config, obs_horizon=1)
     observation, _ = latency.example(seen, P_WORLD_REF, count)
     observation = jax.tree.map(lambda leaf: leaf[:, 0], observation)

@@ -51,7 +51,7 @@ def main() -> None:
     print(f"C MuJoCo, one thread: {c_rate:,.0f} steps/s")
     rows = {}
     for batch in batches:
-        states = jax.tree.map(lambda leaf, n=batch: jnp.stack([leaf] * n), start)
+        states = jax.tree.map(lambda leaf, n=batch: jnp.repeat(leaf[None], n, axis=0), start)
         timing, _ = _timing.time_carried(step_all, states, repeats=5)
         rate = batch * PERIODS * substeps / timing.median_s
         rows[str(batch)] = {

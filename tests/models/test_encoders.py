@@ -128,6 +128,14 @@ def test_the_stem_is_the_convolution_it_stands_for(size):
     )
 
 
+@pytest.mark.parametrize("size", [(7, 9), (8, 6)])
+@pytest.mark.parametrize(("kernel", "stride", "pad"), [(3, 1, 1), (3, 2, 1), (1, 2, 0), (4, 1, 0)])
+def test_a_convolution_as_a_product_is_the_same(size, kernel, stride, pad):
+    x, w = normal(2, *size, 5), normal(kernel, kernel, 5, 3)
+    actual = resnet._product(x, w, stride, pad)
+    np.testing.assert_allclose(actual, resnet._convolution(x, w, stride, pad), atol=1e-4)
+
+
 def test_unknown_trunk_is_named():
     with pytest.raises(ValueError, match=r"trunk: expected one of .*'small'.*got 'vit'"):
         make("vit").init(KEY, frames())

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import chex
 import fakes
 import jax
 import jax.numpy as jnp
@@ -218,3 +219,16 @@ def test_large_matrices_are_rounded_once_to_what_sample_rounds_them_to(dataset):
     assert any("film_cond" in name for name in kinds.keys() - exact)
     assert not any("'unet'" in name and "'kernel'" in name for name in exact)
     assert all("'kernel'" in n or "film_" in n for n in kinds.keys() - exact)
+
+
+@pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
+def test_kernels_side_by_side_sample_the_same(dataset, name):
+    policy = policies.make(METHODS[name], fakes.TINY, fakes.P_WORLD_REF, TRAIN)
+    stats = normalizer.fit(METHODS[name], dataset, fakes.P_WORLD_REF, np.arange(80))
+    params = jit(policy.init)(jax.random.key(0))
+    changed = policies.with_columns(params)
+    assert "columns" in str(jax.tree.structure(changed))
+    batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
+    given = (stats, jax.random.split(jax.random.key(1), B), batch.observation, batch.trocar)
+    sample = jit(policy.sample)
+    chex.assert_trees_all_close(sample(params, *given), sample(changed, *given), atol=2e-5)

@@ -6,11 +6,12 @@ import sys
 
 from starjax.runtime import xla
 
+SMALLEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 FLAG = "--xla_cpu_use_fusion_emitters=false"
 
 
 def _prepared(monkeypatch, tmp_path, version, **environment):
-    for name in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR"):
+    for name in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", SMALLEST):
         monkeypatch.setenv(name, "")  # so that it is put back as it was, also where it was not set
         monkeypatch.delenv(name)
     monkeypatch.setenv("STARJAX_CACHE", str(tmp_path))
@@ -40,6 +41,13 @@ def test_the_cache_is_on_unless_the_user_chose_one(monkeypatch, tmp_path):
     assert chosen == "/x"
 
 
+def test_small_programs_are_kept_unless_the_user_set_a_time(monkeypatch, tmp_path):
+    _prepared(monkeypatch, tmp_path, (0, 10))
+    assert float(os.environ[SMALLEST]) == 0
+    _prepared(monkeypatch, tmp_path, (0, 10), **{SMALLEST: "2"})
+    assert os.environ[SMALLEST] == "2"
+
+
 def test_no_cache_where_none_can_be_made(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     assert _prepared(monkeypatch, tmp_path / "file", (0, 10))[1] is None
@@ -55,8 +63,10 @@ def test_jax_accepts_what_is_set(tmp_path):
     code = "import starjax.runtime as r; r.prepare_xla(); import jax; jax.numpy.ones(3).sum();"
     code += "h = r.xla.hardware(); assert h['backend'] == 'cpu' and h['memory_gb'] > 0"
     subprocess.run([sys.executable, "-c", code], check=True, env=_env(STARJAX_CACHE=str(tmp_path)))
+    assert any(file.is_file() for file in tmp_path.rglob("*")), "the program was not kept"
 
 
 def _env(**more):
-    env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_PLATFORMS")}
+    own = ("XLA_FLAGS", "JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", SMALLEST)
+    env = {k: v for k, v in os.environ.items() if k not in own}
     return {**env, "PYTHONPATH": os.pathsep.join(sys.path), "JAX_PLATFORMS": "cpu", **more}

@@ -88,6 +88,9 @@ class Conv1d(nn.Module):
 
     Taps that only ever meet the padding at this length are not made at all: at length 2 a kernel
     of 5 is exactly its centred 3, and the others would never get a gradient.
+
+    A convolution that keeps the length may have `columns` (see there) for its kernel: then the
+    products are shifted instead of the inputs, which spares a GPU writing each input once a tap.
     """
 
     features: int
@@ -106,6 +109,9 @@ class Conv1d(nn.Module):
                 f"x: expected a length that kernel {self.kernel_size} fits, got {length}"
             )
         taps = _live_taps(self.kernel_size, self.stride, padding, length, out)
+        if self.has_variable("params", "columns"):
+            given = self.variables["params"]
+            return _shifted_sum(x @ given["columns"].astype(x.dtype), taps, padding, given["bias"])
         # The fan-in counts the dropped taps, so that the start is distributed as with them.
         init = uniform_init(self.kernel_size * channels)
         kernel = self.param("kernel", init, (len(taps), channels, self.features))
@@ -120,6 +126,11 @@ class Conv1d(nn.Module):
         flat = stacked.reshape(batch * out, len(taps) * channels)
         y = flat @ kernel.astype(x.dtype).reshape(len(taps) * channels, self.features)
         return y.reshape(batch, out, self.features) + bias.astype(x.dtype)
+
+
+def columns(kernel: jax.Array) -> jax.Array:
+    """A kernel `[taps, C, features]` with its taps side by side: `[C, taps features]`."""
+    return jnp.moveaxis(kernel, 0, 1).reshape(kernel.shape[1], -1)
 
 
 class Upsample1d(nn.Module):
@@ -142,6 +153,18 @@ class Upsample1d(nn.Module):
         y = jnp.matmul(pairs.reshape(2, batch * length, 2 * channels), kernel)
         y = jnp.moveaxis(y.reshape(2, batch, length, channels), 0, 2)
         return y.reshape(batch, 2 * length, channels) + bias
+
+
+def _shifted_sum(products: jax.Array, taps: range, padding: int, bias: jax.Array) -> jax.Array:
+    """`[B, L, taps features]` of every tap with every input -> `[B, L, features]`."""
+    batch, length, _ = products.shape
+    of_tap = products.reshape(batch, length, len(taps), -1)
+    total = bias.astype(jnp.float32)
+    for number, tap in enumerate(taps):
+        ahead = tap - padding  # output i takes input i + ahead
+        part = of_tap[:, max(0, ahead) : length + min(0, ahead), number].astype(jnp.float32)
+        total = total + jnp.pad(part, ((0, 0), (max(0, -ahead), max(0, ahead)), (0, 0)))
+    return total.astype(products.dtype)
 
 
 def _mix(x: jax.Array) -> jax.Array:

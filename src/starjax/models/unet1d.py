@@ -15,6 +15,7 @@ latter is computed once for all DDIM steps:
 
 import itertools
 import math
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -109,6 +110,19 @@ class ConditionalUnet1D(nn.Module):
 
     def _block(self, features: int) -> "ResidualBlock":
         return ResidualBlock(features, self.kernel_size, self.groups)
+
+
+def with_columns(params: dict[str, Any]) -> dict[str, Any]:
+    """Parameters in which the convolutions of all `ConvBlock`s have `layers.columns`."""
+
+    def changed(name: str, tree: Any) -> Any:
+        if not isinstance(tree, dict):
+            return tree
+        if name == "Conv1d_0" and len(tree["kernel"]) > 1:
+            return {"columns": layers.columns(tree["kernel"]), "bias": tree["bias"]}
+        return {name: changed(name, child) for name, child in tree.items()}
+
+    return changed("", params)
 
 
 class ResidualBlock(nn.Module):

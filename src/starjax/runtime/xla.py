@@ -20,11 +20,14 @@ def prepare_xla() -> None:
     With jaxlib < 0.11 on CPU, XLA's fusion emitters recompute the kinematic chain and make one
     physics step about 300 times slower, so they are turned off; later versions need no flag, and
     abort on it. Flags that the user has in XLA_FLAGS stay, and win. Compiled programs are kept in
-    `cache_directory()`, unless JAX_COMPILATION_CACHE_DIR already names a place.
+    `cache_directory()`, unless JAX_COMPILATION_CACHE_DIR already names a place; the small ones too,
+    which jax alone would not keep: the hundred of them that begin a training take longer to compile
+    than the rest to load.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if _jaxlib_version() < (0, 11) and _FUSION_FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_FUSION_FLAG}=false".strip()
+    _set_default("jax_persistent_cache_min_compile_time_secs", 0.0)
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     cache = cache_directory() / "xla" / _machine()
@@ -32,9 +35,7 @@ def prepare_xla() -> None:
         cache.mkdir(parents=True, exist_ok=True)
     except OSError:
         return  # no cache: every start compiles again, nothing else changes
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache)
-    if "jax" in sys.modules:  # it has read the environment already
-        sys.modules["jax"].config.update("jax_compilation_cache_dir", str(cache))
+    _set_default("jax_compilation_cache_dir", str(cache))
 
 
 def cache_directory() -> Path:
@@ -94,6 +95,15 @@ def available_bytes() -> int:
     except OSError:
         pass
     return memory_bytes() // 2
+
+
+def _set_default(option: str, value: Any) -> None:
+    """Sets an option of jax by its variable, for children too, unless the user has."""
+    if option.upper() in os.environ:
+        return
+    os.environ[option.upper()] = str(value)
+    if "jax" in sys.modules:  # it has read the environment already
+        sys.modules["jax"].config.update(option, value)
 
 
 def _jaxlib_version() -> tuple[int, ...]:

@@ -160,13 +160,12 @@ def _restored_or_new(
     seed,
     mesh,
 ) -> states.TrainState:
-    example = windows.gather(
+    example = jax.eval_shape(
+        lambda data: windows.gather(
+            data, jnp.zeros(1, jnp.int32), policy_config.obs_horizon, policy_config.horizon
+        ),
         dataset,
-        frames[:1] if not windows.on_device(dataset) else jnp.asarray(frames[:1]),
-        policy_config.obs_horizon,
-        policy_config.horizon,
     )
-    example = jax.tree.map(jnp.asarray, example)
     stats = normalizer.fit(method, dataset, p_world_ref, frames)
 
     def around(params):
@@ -187,7 +186,7 @@ def _restored_or_new(
     begins = policy_config.observation == "image" and not policy_config.freeze_encoder
     if begins and policy_config.encoder_weights:
         params = encoder.start(params, policy_config, train_config)
-    return devices.replicate(around(params), mesh)
+    return devices.replicate(states.run_once(around, params), mesh)
 
 
 def _advance(policy, optimizer, policy_config, train_config, mesh, dataset, frames, state):
