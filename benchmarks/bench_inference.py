@@ -65,28 +65,30 @@ def main() -> None:
     rates = {c.policy.dtype: None for c, _, _ in cases.values()}
     rates = {dtype: _machine.measure(dtype) for dtype in rates}
     print("row                           p50      p95      p99 ms  floor ms  x floor  x peer")
-    rows = {}
+    facts = {"method": "stardiff", **next(iter(rates.values())).facts()}
+
+    def keep(name: str, row: dict) -> None:
+        _timing.report("inference", {**facts, "results": {name: row}}, asked.tiny)
+
     for name, (case, batch, steps) in cases.items():
         case = case._replace(policy=dataclasses.replace(case.policy, ddim_steps=steps))
         row = measure(case, batch, rates[case.policy.dtype], asked.seconds)
         row |= _peer.compared(peers.get(name, {}), row["p50"])
-        rows[name] = row
         speed = row.get("times_peer_speed", row.get("times_numpy_speed", float("nan")))
         print(
             f"{name:24} {row['p50']:8.2f} {row['p95']:8.2f} {row['p99']:8.2f} "
             f"{row['floor_ms']:12.2f} {row['ratio_to_floor']:8.2f} {speed:7.2f}",
             flush=True,
         )
+        keep(name, row)
     settings = {batch: case.policy for case, batch, _ in cases.values()}
     for batch, policy_config in settings.items():
-        rows[f"roll network batch {batch}"] = row = roll_network(policy_config, batch)
+        row = roll_network(policy_config, batch)
         print(
             f"roll network, batch {batch}: {row['in_a_program_ms']:.4f} ms within a program, "
             f"called alone p50 {row['p50']:.3f} ms"
         )
-    facts = next(iter(rates.values())).facts()
-    results = {"method": "stardiff", **facts, "results": rows}
-    _timing.report("inference", results, asked.tiny)
+        keep(f"roll network batch {batch}", row)
 
 
 def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float) -> dict:

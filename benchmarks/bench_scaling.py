@@ -14,6 +14,7 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import _peer
 import _setup
@@ -46,13 +47,13 @@ def main() -> None:
     runtime.prepare_xla()
     if asked.child:
         return child(asked)
-    rows = between_processes(asked) if asked.processes else within_one(asked)
-    _timing.report("scaling", {"results": rows}, asked.tiny)
+    for name, row in between_processes(asked) if asked.processes else within_one(asked):
+        _timing.report("scaling", {"results": {name: row}}, asked.tiny)
 
 
-def within_one(asked: argparse.Namespace) -> dict[str, dict]:
+def within_one(asked: argparse.Namespace) -> Iterator[tuple[str, dict]]:
     """Rows of this process on its first n devices."""
-    rows, times = {}, {}
+    times = {}
     counts = [n for n in asked.devices if n <= len(jax.devices())]
     for left in sorted(set(asked.devices) - set(counts)):
         print(f"{left} devices: not here, {len(jax.devices())} are")
@@ -61,8 +62,8 @@ def within_one(asked: argparse.Namespace) -> dict[str, dict]:
         for count in counts:
             row = work[name](count, asked.tiny)
             times.setdefault(name, row["seconds"])
-            rows[f"{name}, {count} devices"] = told(f"{name}, {count} devices", row, times[name])
-    return rows
+            title = f"{name}, {count} devices"
+            yield title, told(title, row, times[name])
 
 
 def told(name: str, row: dict, alone: float) -> dict:
@@ -101,7 +102,7 @@ def evaluate(count: int, tiny: bool) -> dict:
     return {"seconds": timing.min_s, "trials": lanes, "compile_s": compiling}
 
 
-def between_processes(asked: argparse.Namespace) -> dict[str, dict]:
+def between_processes(asked: argparse.Namespace) -> Iterator[tuple[str, dict]]:
     """Rows of the train step in one process, and in several."""
     total = asked.processes
     if _peer.platform() == "gpu":
@@ -114,8 +115,8 @@ def between_processes(asked: argparse.Namespace) -> dict[str, dict]:
         "train, one process, 1 devices",
         f"train, {asked.processes} processes, {total} devices",
     )
-    rows = zip(names, (alone, together))
-    return {name: told(name, row, alone["seconds"]) for name, row in rows}
+    for name, row in zip(names, (alone, together)):
+        yield name, told(name, row, alone["seconds"])
 
 
 def launch(asked: argparse.Namespace, count: int, total: int) -> dict:

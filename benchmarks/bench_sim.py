@@ -49,20 +49,20 @@ def main() -> None:
 
     c_rate = _c_mujoco.steps_per_s(sim)
     print(f"C MuJoCo, one thread: {c_rate:,.0f} steps/s")
-    rows = {}
     for batch in batches:
         states = jax.tree.map(lambda leaf, n=batch: jnp.repeat(leaf[None], n, axis=0), start)
         timing, _ = _timing.time_carried(step_all, states, repeats=5)
         rate = batch * PERIODS * substeps / timing.median_s
-        rows[str(batch)] = {
+        row = {
             "steps_per_s": rate,
             "ms_a_step": 1e3 * timing.median_s / PERIODS / substeps,
+            "c_steps_per_s": c_rate,
             "ratio_to_c": rate / c_rate,
             "compile_s": timing.compile_s,
             "temporary_bytes_an_environment": timing.temporary_bytes / batch,
         }
         print(f"MJX, batch {batch}: {rate:,.0f} steps/s, {rate / c_rate:.2f} of C", flush=True)
-    print("written to", _timing.write("sim", {"c_steps_per_s": c_rate, "results": rows}))
+        _timing.report("sim", {"results": {str(batch): row}}, tiny=False)
 
 
 if __name__ == "__main__":

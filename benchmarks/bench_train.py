@@ -58,19 +58,17 @@ def main() -> None:
     print(
         "case              samples/s  ms a step  floor ms  x floor  x peer  parameters  compile s"
     )
-    rows = {}
+    facts = next(iter(rates.values())).facts()
     for name, case in cases.items():
         row = measure(case, rates[case.policy.dtype])
         row |= _peer.compared(peers.get(name, {}), row["ms"])
-        rows[name] = row
         print(
             f"{name:17} {row['samples_per_s']:9.0f} {row['ms']:10.2f} {row['floor_ms']:9.2f} "
             f"{row['ratio_to_floor']:8.2f} {row.get('times_peer_speed', float('nan')):7.2f} "
             f"{row['parameters'] / 1e6:9.2f} M {row['compile_s']:9.1f}",
             flush=True,
         )
-    facts = next(iter(rates.values())).facts()
-    _timing.report("train", {**facts, "results": rows}, asked.tiny)
+        _timing.report("train", {**facts, "results": {name: row}}, asked.tiny)
 
 
 def measure(case: _setup.Case, rates: _machine.Rates) -> dict:

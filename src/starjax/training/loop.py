@@ -171,12 +171,14 @@ def _restored_or_new(
     def around(params):
         return states.create(policy, optimizer, params, stats, example, seed)
 
-    placed = devices.replicated(mesh)
-    like = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
-        jax.eval_shape(lambda: around(policy.init(jax.random.key(seed)))),
-    )
-    restored = checkpoint.restore(directory / "checkpoints", like)
+    restored, checkpoints = None, directory / "checkpoints"
+    if checkpoint.steps(checkpoints):
+        placed = devices.replicated(mesh)
+        like = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
+            jax.eval_shape(lambda: around(policy.init(jax.random.key(seed)))),
+        )
+        restored = checkpoint.restore(checkpoints, like)
     step = -1 if restored is None else restored[0]
     if processes.agree(step) != (step,):
         raise TrainingFailed(f"{directory}: processes see other checkpoints; is the folder shared?")
