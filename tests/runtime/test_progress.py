@@ -16,7 +16,8 @@ def _shown(stream, monkeypatch, every=0.0, done=0):
 def test_plain_lines_off_a_terminal(monkeypatch):
     shown = _shown(io.StringIO(), monkeypatch).splitlines()
     assert len(shown) == 4
-    assert shown[0].startswith("Collect: 1/4 episodes") and "ETA" in shown[0]
+    assert shown[0].startswith("Collect: 1/4 episodes") and "ETA" not in shown[0]
+    assert "ETA" in shown[1]
     assert "episodes/s" in shown[-1] and "ETA" not in shown[-1] and shown[-1].endswith("succeeded")
 
 
@@ -49,10 +50,14 @@ def test_a_bar_on_a_terminal(monkeypatch):
     assert "Collect" in shown and "4/4 episodes" in shown
 
 
-def test_earlier_work_does_not_count_for_the_rate(monkeypatch):
-    clock = iter(range(100))
-    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock)))
+def test_neither_earlier_work_nor_the_first_piece_counts_for_the_time_left(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
     meter = progress._Meter(1000, 900)
+    now = 50.0
     meter.add(10)
-    assert meter.per_second() == 10.0
-    assert meter.eta() == "ETA 0:18"
+    assert meter.per_second() == 0.2 and meter.eta() == ""
+    now = 51.0
+    meter.add(5)
+    assert meter.per_second() == 5.0
+    assert meter.eta() == "ETA 0:17"

@@ -92,28 +92,39 @@ def _plain(description: str, total: int, unit: str, done: int, stream: TextIO) -
 
 
 class _Meter:
-    """Units done, their rate and the time left, counted from its creation."""
+    """Units done, their rate and the time left.
+
+    Both are counted from the end of the first piece of work, in which programs are compiled.
+    """
 
     def __init__(self, total: int, done: float):
-        self.total, self.done, self._first, self._start = total, done, done, time.monotonic()
+        self.total, self.done = total, done
+        self._begun = (done, time.monotonic())
+        self._first: tuple[float, float] | None = None
 
     def add(self, count: float) -> None:
         self.done += count
+        if count and self._first is None:
+            self._first = (self.done, time.monotonic())
 
     def is_over(self) -> bool:
         return self.done >= self.total - 1e-6  # shares of a unit rarely add up to the last bit
 
     def per_second(self) -> float:
-        return (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
+        done, since = self._first if self._first and self._is_past_first() else self._begun
+        return (self.done - done) / max(time.monotonic() - since, 1e-9)
+
+    def _is_past_first(self) -> bool:
+        return self._first is not None and self.done > self._first[0]
 
     def rate(self, unit: str) -> str:
         rate = self.per_second()
         return f"{rate:.3g} {unit}/s" if rate >= 0.1 else f"{60 * rate:.3g} {unit}/min"
 
     def eta(self) -> str:
-        """Time left in words; empty before the first unit and after the last."""
+        """Time left in words; empty until there is a rate, and after the end."""
         rate = self.per_second()
-        if rate <= 0 or self.is_over():
+        if not self._is_past_first() or rate <= 0 or self.is_over():
             return ""
         minutes, seconds = divmod(round((self.total - self.done) / rate), 60)
         hours, minutes = divmod(minutes, 60)
