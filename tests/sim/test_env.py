@@ -43,8 +43,8 @@ def test_executed_rcm_error_is_small(episodes):
     _, errors, _, running, _ = episodes
     live = errors[running]
     assert live.max() > 0
-    assert np.quantile(live, 0.99) < 0.2e-3
-    assert live.max() < 2e-3
+    assert np.quantile(live, 0.99) < 0.07e-3
+    assert live.max() < 1e-3
 
 
 def test_labels_are_on_the_manifold_and_their_roll_never_wraps(episodes):

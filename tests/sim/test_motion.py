@@ -88,3 +88,33 @@ def test_a_command_off_the_manifold_stays_off_it():
     for _ in range(5):
         pose, velocity = tracking.toward(pose, velocity, bad, port, PERIOD)
     np.testing.assert_allclose(rcm.rcm_error(pose, port), 0.02, atol=1e-5)
+
+
+def test_a_tool_leans_at_the_port_and_stays_at_its_tip():
+    trocar = first_trocar()
+    port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
+    pose = on_manifold(trocar, jnp.array([0.01, 0.02, 0.03]), 0.3)
+    leant = tracking.leaning(pose, port, 2e-3 * pose.R[:, 0])
+    np.testing.assert_array_equal(leant.p, pose.p)
+    np.testing.assert_allclose(rcm.rcm_error(leant, port), 2e-3, rtol=1e-3)
+    back = tracking.leaning(leant, port, -2e-3 * pose.R[:, 0])
+    np.testing.assert_allclose(rcm.rcm_error(back, port), 0.0, atol=1e-5)
+
+
+def test_a_load_that_stays_is_compensated_at_the_port_up_to_a_limit():
+    trocar = first_trocar()
+    port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
+    reference = on_manifold(trocar, jnp.array([0.01, 0.02, 0.03]), 0.3)
+    hold = jax.jit(tracking.hold)
+
+    def left_of(load, periods=30):
+        lean = jnp.zeros(3)
+        for _ in range(periods):
+            measured = tracking.leaning(reference, port, lean + load * reference.R[:, 0])
+            lean = hold(lean, measured, reference, port)
+        return float(rcm.rcm_error(measured, port)), float(jnp.linalg.norm(lean))
+
+    assert left_of(1e-3)[0] < 1e-6
+    np.testing.assert_allclose(
+        left_of(8e-3), (8e-3 - tracking.MAX_LEAN, tracking.MAX_LEAN), rtol=1e-2
+    )

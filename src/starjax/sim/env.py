@@ -40,7 +40,8 @@ class EnvState:
     Attributes:
       sim: joint positions, velocities, warm start.
       q_target: `[6]` rad, joint target of the last command; q_velocity: `[6]` rad/s, the target's;
-        velocity: `[4]` of the reference pose, see `tracking`; gripper_target: [-1, 1].
+        velocity: `[4]` of the reference pose, lean: `[3]` m, see `tracking`; gripper_target:
+        [-1, 1].
       trocar, source, target: the episode's port and its pegs (int32).
       target_peg: `[2]` m, the target's axis. p_world_ref: `[3]` m, the nominal port.
       step: int32, control steps taken. settled: consecutive steps that look like success.
@@ -58,6 +59,7 @@ class EnvState:
     q_target: jax.Array
     q_velocity: jax.Array
     velocity: jax.Array
+    lean: jax.Array
     gripper_target: jax.Array
     trocar: rcm.Trocar
     source: jax.Array
@@ -131,6 +133,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             q_target=q,
             q_velocity=jnp.zeros_like(q),
             velocity=jnp.zeros(4),
+            lean=jnp.zeros(3),
             gripper_target=jnp.ones(()),
             trocar=params.trocar,
             source=layout.source,
@@ -154,12 +157,15 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         return _measure(state)
 
     def step(state: EnvState, command: Command) -> EnvState:
-        present, _, _ = ik.forward(sim.arm, state.q_target)
         port = rcm.trocar_position(state.trocar, sim.p_world_ref)
+        leant, _, _ = ik.forward(sim.arm, state.q_target)
+        present = tracking.leaning(leant, port, -state.lean)
+        lean = tracking.hold(state.lean, state.pose, present, port)
         target, velocity = tracking.toward(
             present, state.velocity, command.pose, port, 1.0 / CONTROL_HZ
         )
-        q, _ = ik.solve(sim.arm, target, state.q_target, STEP_IK_ITERATIONS)
+        leant = tracking.leaning(target, port, lean)
+        q, _ = ik.solve(sim.arm, leant, state.q_target, STEP_IK_ITERATIONS)
         usable = _is_finite(command) & jnp.all(jnp.isfinite(q))
         dq = jnp.where(usable, q - state.q_target, 0.0)
         fastest = jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9)
@@ -173,10 +179,15 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             q_target=state.q_target + dq,
             q_velocity=CONTROL_HZ * dq,
             velocity=jnp.where(usable, velocity, 0.0),
+            lean=jnp.where(usable, lean, state.lean),
             gripper_target=gripper,
             step=state.step + 1,
             ik_error=jnp.where(
-                usable, ik.residual(sim.arm, command.pose, state.q_target + dq), jnp.inf
+                usable,
+                ik.residual(
+                    sim.arm, tracking.leaning(command.pose, port, lean), state.q_target + dq
+                ),
+                jnp.inf,
             ),
             jaw_contact=jaw_contact,
         )
