@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from starjax.sim import linear
 from starjax.types import Pose
 
 # Rotation errors weigh this many metres a radian against position errors.
@@ -100,7 +101,7 @@ def solve(chain: Chain, target: Pose, q: jax.Array, iterations: int) -> tuple[ja
         pose, origins, axes = forward(chain, q)
         J = jnp.concatenate([jnp.cross(axes, pose.p - origins).T, ROTATION_WEIGHT * axes.T])
         H = J @ J.T + DAMPING**2 * jnp.eye(6)
-        dq = J.T @ jax.scipy.linalg.solve(H, _error(pose, target), assume_a="pos")
+        dq = J.T @ linear.solve_positive(H, _error(pose, target))
         dq = dq * jnp.minimum(1.0, MAX_STEP / jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9))
         return jnp.clip(q + dq, low, high)
 

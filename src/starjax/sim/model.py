@@ -10,7 +10,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from starjax.sim import assets, ik
+from starjax.sim import assets, ik, solver
 from starjax.sim.engine import mjx
 
 # Which MJCF parts exist. Adding one: a file and a line.
@@ -83,6 +83,7 @@ def load(robot: str = "fr5", tool: str = "grasper", task: str = "peg_transfer") 
     # XLA's MJX implementation everywhere: the warp one needs CUDA.
     mjx_model = mjx.put_model(m, impl="jax")
     mjx_data = mjx.make_data(m, impl="jax")
+    solver.check(mjx_model, mjx_data)
     numbered = sum(m.geom(g).name.startswith("peg") for g in range(m.ngeom))
     peg_geoms = np.array([m.geom(f"peg{i}").id for i in range(numbered)])
     rgb = np.array(m.geom_rgba[:, :3], np.float32)

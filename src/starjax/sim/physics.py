@@ -4,6 +4,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from starjax.sim import solver
 from starjax.sim.engine import mjx
 from starjax.sim.model import SimModel
 from starjax.types import Pose
@@ -86,7 +87,7 @@ def advance(
             qacc_warmstart=state.qacc_warmstart,
             ctrl=jnp.append(target, jaw),
         )
-        data = mjx.step(sim.mjx_model, data)
+        data = solver.step(sim.mjx_model, data)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
         return state, _jaw_contact(sim, data)
 

@@ -1,0 +1,23 @@
+"""Small linear systems as plain array operations.
+
+`jax.scipy.linalg` calls LAPACK or cuSOLVER. For a batch of matrices of order 14 starting those
+costs an H200 more than the arithmetic (a step of 360 environments in contact takes 0.94 ms with
+them, 0.67 with these), and jaxlib 0.10's batched Cholesky may wait for ever on two CPU cores.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def solve_positive(H: jax.Array, g: jax.Array) -> jax.Array:
+    """x `[N]` with H x = g for a symmetric positive definite H `[N, N]`, single-sample.
+
+    Gauss-Jordan elimination, which needs no pivots for such an H. Not finite where H is singular.
+    """
+    rows = jnp.concatenate([H, g[:, None]], axis=1)
+    index = np.arange(len(g))[:, None]
+    for i in range(len(g)):
+        pivot = rows[i] / rows[i, i]
+        rows = jnp.where(index == i, pivot, rows - rows[:, i : i + 1] * pivot)
+    return rows[:, -1]

@@ -1,0 +1,243 @@
+"""One physics step of MJX with a Newton solver of our own for its contact forces.
+
+The problem is MuJoCo's (Todorov 2014, "Convex and analytically-invertible dynamics with contacts
+and constraints"; MuJoCo's documentation, chapter Computation): the acceleration minimises
+
+    x M x / 2 - f x + sum over constraints of the squared distance of A x - b from a convex set / 2
+
+with A and b the constraint rows times the roots of their stiffnesses. In these units the set of a
+contact is a circular cone, whatever the contact's friction and `impratio`.
+
+MJX's own solver minimises the same. This one has fewer and larger operations: candidates of the
+line search are tried side by side, contacts enter the Hessian as three vectors each, and no cost is
+ever computed, only slopes, which keep their digits in float32 (`benchmarks/bench_solver.py`).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.sim import linear
+from starjax.sim.engine import mjx
+
+MAX_ITERATIONS = 10
+# The error left may move the scene with no more than this kinetic energy (J): the 3 g block at
+# 0.08 mm/s, the first joint at 3 um/s.
+MAX_ERROR_ENERGY = 1e-11
+# Shares of the Newton step that the line search tries first: it is mostly right, or far too long.
+FIRST_SHARES = (
+    *(0.0625, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875),
+    *(1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 8.0, 16.0),
+)
+SECOND_SHARES = 16  # tried between the two that enclose the minimum
+
+
+class Problem(NamedTuple):
+    """What is minimised. V velocities, E rows, the last 3 C of them those of C contacts.
+
+    Attributes:
+      M: `[V, V]` inertia; f: `[V]` force of all but the constraints.
+      A: `[E, V]`, b: `[E]`: rows and their reference accelerations, times the root of stiffness.
+      mu: `[C]` slope of each contact's cone, 0 at its axis.
+      equalities: how many of the first rows hold both ways; limits follow, then contacts.
+    """
+
+    M: jax.Array
+    f: jax.Array
+    A: jax.Array
+    b: jax.Array
+    mu: jax.Array
+    equalities: int
+
+
+class Iterate(NamedTuple):
+    """An acceleration x `[V]`, its products M x and A x - b, and the cost's gradient `[V]`."""
+
+    x: jax.Array
+    Mx: jax.Array
+    r: jax.Array
+    gradient: jax.Array
+
+
+def step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
+    """`mjx.step`: kinematics, contacts, forces, and the implicit integrator."""
+    d = mjx.fwd_position(m, d)
+    d = mjx.fwd_velocity(m, d)
+    d = mjx.fwd_actuation(m, d)
+    d = d.replace(qfrc_smooth=d.qfrc_passive - d.qfrc_bias + d.qfrc_actuator)
+    x, force = solve(problem(m, d), d.qacc_warmstart, m.opt.timestep)
+    # As `mjx.implicit`: servos and dampers at the velocity after the step. `mjx.euler` then only
+    # integrates, since the model lets it do nothing about damping (flag eulerdamp).
+    by_velocity = mjx.deriv_smooth_vel(m, d)
+    assert by_velocity is not None, "a model without actuators and dampers"
+    damped = d._impl.M - m.opt.timestep * by_velocity
+    d = d.replace(qacc=linear.solve_positive(damped, d.qfrc_smooth + force))
+    return mjx.euler(m, d).replace(qacc=x, qacc_warmstart=x, qfrc_constraint=force)
+
+
+def problem(m: mjx.Model, d: mjx.Data) -> Problem:
+    """The problem of a state whose positions, velocities and actuators have been computed."""
+    rows = d._impl
+    root = jnp.sqrt(rows.efc_D)
+    return Problem(
+        M=rows.M,
+        f=d.qfrc_smooth,
+        A=root[:, None] * rows.efc_J,
+        b=root * rows.efc_aref,
+        mu=rows.contact.friction[:, 0] / jnp.sqrt(m.opt.impratio),
+        equalities=int(rows.ne),
+    )
+
+
+def check(m: mjx.Model, d: mjx.Data) -> None:
+    """ValueError for a model with constraints that this solver does not know."""
+    if d._impl.nf or np.any(d._impl.contact.dim != 3):
+        raise ValueError(
+            "model: expected contacts of condim 3 and no friction loss, got condim "
+            f"{sorted(set(d._impl.contact.dim.tolist()))} and {d._impl.nf} rows of friction loss"
+        )
+    found = m.opt.cone, m.opt.integrator, m.opt.disableflags & mjx.DisableBit.EULERDAMP
+    if found != (mjx.ConeType.ELLIPTIC, mjx.IntegratorType.IMPLICITFAST, mjx.DisableBit.EULERDAMP):
+        raise ValueError(
+            "model: expected an elliptic cone, the integrator implicitfast and eulerdamp disabled, "
+            f"got {m.opt.cone.name}, {m.opt.integrator.name} and flags {m.opt.disableflags!r}"
+        )
+
+
+def solve(
+    problem: Problem, x: jax.Array, timestep: float | jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The minimum by Newton's method from `x` `[V]`, single-sample.
+
+    A lane that is not finite stays so and ends at once.
+
+    Returns:
+      acceleration `[V]`; the constraints' force on the velocities `[V]`.
+    """
+    M, f, A, b, _, _ = problem
+    # Of an error e in x: e M e >= gradient (M + ..)^-1 gradient. The diagonal stands for M, in
+    # which the motors' armature prevails.
+    limit = 2.0 * MAX_ERROR_ENERGY / timestep**2
+    weights = 1.0 / jnp.diagonal(M)
+
+    def at(x: jax.Array, Mx: jax.Array, r: jax.Array) -> Iterate:
+        return Iterate(x, Mx, r, Mx - f + pull(problem, r) @ A)
+
+    def is_coarse(loop: tuple[jax.Array, Iterate]) -> jax.Array:
+        count, now = loop
+        return (count < MAX_ITERATIONS) & (jnp.sum(now.gradient**2 * weights) > limit)
+
+    def improve(loop: tuple[jax.Array, Iterate]) -> tuple[jax.Array, Iterate]:
+        count, now = loop
+        B = half_hessian(problem, now.r)
+        p = -linear.solve_positive(M + B.T @ B, now.gradient)
+        Mp, Ap = M @ p, A @ p
+        slope_0, bend = p @ (now.Mx - f), p @ Mp
+
+        def slope(share: jax.Array) -> jax.Array:
+            return slope_0 + share * bend + pull(problem, now.r + share * Ap) @ Ap
+
+        share = line_search(slope, now.gradient @ p)
+        return count + 1, at(now.x + share * p, now.Mx + share * Mp, now.r + share * Ap)
+
+    start = at(x, M @ x, A @ x - b)
+    _, end = jax.lax.while_loop(is_coarse, improve, (jnp.zeros((), jnp.int32), start))
+    return end.x, -pull(problem, end.r) @ A
+
+
+def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> jax.Array:
+    """Where a convex function of one variable has its minimum on the positive axis.
+
+    Args:
+      slope: of a share `[]`; grows with it. first: `[]`, the slope at 0, negative.
+
+    Returns:
+      `[]`, no larger than the last of `FIRST_SHARES`.
+    """
+    low, high = jnp.zeros_like(first), jnp.full_like(first, FIRST_SHARES[-1])
+    slopes = first, jnp.full_like(first, jnp.inf)
+    between = np.linspace(0.0, 1.0, SECOND_SHARES + 2, dtype=np.float32)[1:-1]
+    for second in (False, True):
+        shares = low + (high - low) * between if second else jnp.asarray(FIRST_SHARES)
+        found = jax.vmap(slope)(shares)
+        falls = found < 0
+        low = jnp.max(shares, where=falls, initial=low)
+        high = jnp.min(shares, where=~falls, initial=high)
+        slopes = (
+            jnp.max(found, where=falls, initial=slopes[0]),
+            jnp.min(found, where=~falls, initial=slopes[1]),
+        )
+    rise = slopes[1] - slopes[0]
+    is_enclosed = jnp.isfinite(rise) & (rise > 0)
+    share = jnp.where(is_enclosed, -slopes[0] / jnp.where(is_enclosed, rise, 1.0), 1.0)
+    return low + (high - low) * jnp.clip(share, 0.0, 1.0)
+
+
+def pull(problem: Problem, r: jax.Array) -> jax.Array:
+    """`[E]`: from the nearest point that satisfies the constraints to `r` `[E]`."""
+    others, contacts = _split(problem, r)
+    slip = jnp.concatenate([-jnp.ones_like(contacts.mu), contacts.mu * contacts.along], 1)
+    rows = jnp.where(contacts.sticks, contacts.r, contacts.depth * slip)
+    return jnp.concatenate([jnp.where(_holds(problem, others), others, 0.0), rows.reshape(-1)])
+
+
+def half_hessian(problem: Problem, r: jax.Array) -> jax.Array:
+    """B `[E, V]`, with B' B the second derivative of the constraints' cost at `r` `[E]`.
+
+    A sticking contact adds its three rows; a slipping one the cone's normal, and the cone's bend
+    across the direction in which it slips.
+    """
+    others, contacts = _split(problem, r)
+    A_others, A_contacts = problem.A[: len(others)], problem.A[len(others) :]
+    normal, first, second = jnp.moveaxis(A_contacts.reshape(-1, 3, A_contacts.shape[1]), 1, 0)
+    x, y = contacts.along[:, :1], contacts.along[:, 1:]
+    along, across = x * first + y * second, x * second - y * first
+    mu, sticks = contacts.mu, contacts.sticks
+    slips = ~sticks & (contacts.depth > 0)
+    outward = jnp.where(slips, (normal - mu * along) * jax.lax.rsqrt(1.0 + mu**2), 0.0)
+    rows = (
+        jnp.where(_holds(problem, others)[:, None], A_others, 0.0),
+        jnp.where(sticks, normal, outward),
+        jnp.where(sticks, along, 0.0),
+        jnp.where(sticks, across, jnp.sqrt(contacts.bend) * across),
+    )
+    return jnp.concatenate(rows)
+
+
+class _Contacts(NamedTuple):
+    """Where each contact is beside its cone; all but `along` `[C, 1]`.
+
+    Attributes:
+      r: `[C, 3]`: along the normal and both tangents. along: `[C, 2]` unit vector of the tangents'.
+      mu: the cone's slope. sticks: nearest to the cone is its tip.
+      depth: distance from the cone along its axis, over 1 + mu^2. bend: of the cone there.
+    """
+
+    r: jax.Array
+    along: jax.Array
+    mu: jax.Array
+    sticks: jax.Array
+    depth: jax.Array
+    bend: jax.Array
+
+
+def _split(problem: Problem, r: jax.Array) -> tuple[jax.Array, _Contacts]:
+    count = problem.mu.shape[0]
+    others, r = r[: r.shape[0] - 3 * count], r[r.shape[0] - 3 * count :].reshape(count, 3)
+    mu, normal, tangents = problem.mu[:, None], r[:, :1], r[:, 1:]
+    square = jnp.sum(tangents**2, -1, keepdims=True)
+    is_sideways = square > 0
+    size = jnp.sqrt(jnp.where(is_sideways, square, 1.0))
+    along = jnp.where(is_sideways, tangents / size, np.array([1.0, 0.0], np.float32))
+    sideways = jnp.where(is_sideways, size, 0.0)
+    depth = jnp.maximum(mu * sideways - normal, 0.0) / (1.0 + mu**2)
+    bend = jnp.where(is_sideways, mu * depth / size, 0.0)
+    return others, _Contacts(r, along, mu, mu * normal + sideways <= 0, depth, bend)
+
+
+def _holds(problem: Problem, others: jax.Array) -> jax.Array:
+    """Which rows before the contacts' pull: equalities always, limits where they are passed."""
+    return (others < 0) | jnp.asarray(np.arange(others.shape[0]) < problem.equalities)
