@@ -1,10 +1,10 @@
-"""Physics steps a second: MJX at several batch sizes beside C MuJoCo on one thread.
+"""Physics steps a second at several batch sizes, beside C MuJoCo on one thread and MJX's own step.
 
-    python benchmarks/bench_sim.py [--batches 360 4096 16384]
+    python benchmarks/bench_sim.py [--batches 360 4096 16384] [--peer]
 
-Both step the same composed model from the same state: arm at home, block standing on its peg. A
-CPU steps a batch 16 at a time, as `evaluation.rollout` does: jaxlib 0.10's batched Cholesky waits
-for ever on two cores when a large batch is factored twice at once.
+At rest (arm at home, block on its peg) and at work: states of the scripted expert's episodes, with
+the jaws closing. `--peer` also times `mjx.step`, whose contact solver is MJX's, from the same
+states. A CPU steps a batch 16 at a time, as `evaluation.rollout` does.
 """
 
 import argparse
@@ -12,15 +12,19 @@ import argparse
 import _c_mujoco
 import _peer
 import _timing
+import _visited
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from starjax import runtime
 from starjax.evaluation import rollout
-from starjax.sim import model, physics
+from starjax.sim import env as envs
+from starjax.sim import physics, solver
+from starjax.sim.engine import mjx
 
-PERIODS = 8  # control periods a call
-PERIOD = 1 / 30  # s
+STEPS = 64  # physics steps a call
+EPISODES = 48  # of the expert, from which states are drawn
 BATCHES = {"cpu": [1, 16, 256], "gpu": [360, 4096, 16384]}
 
 
@@ -28,41 +32,54 @@ def main() -> None:
     runtime.prepare_xla()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--batches", type=int, nargs="+", default=BATCHES[_peer.platform()])
-    batches = parser.parse_args().batches
-    sim = model.load()
-    start = _c_mujoco.at_rest(sim)
-    substeps = round(PERIOD / sim.mj_model.opt.timestep)
-
-    def run(state: physics.PhysicsState) -> physics.PhysicsState:
-        still = jnp.zeros(6)
-
-        def period(_, state):
-            home = jnp.asarray(sim.home)
-            return physics.advance(sim, state, home, still, still, jnp.ones(()), PERIOD)[0]
-
-        return jax.lax.fori_loop(0, PERIODS, period, state)
-
-    def step_all(states: physics.PhysicsState) -> physics.PhysicsState:
-        if jax.default_backend() == "cpu":
-            return jax.lax.map(run, states, batch_size=rollout.CPU_LANES)
-        return jax.vmap(run)(states)
-
+    parser.add_argument("--peer", action="store_true", help="time mjx.step too")
+    asked = parser.parse_args()
+    env = envs.make("state")
+    sim = env.model
+    rest = _c_mujoco.at_rest(sim), jnp.asarray([*sim.home, physics.JAW_OPEN], jnp.float32)
+    visited = _visited.states(env, EPISODES)
     c_rate = _c_mujoco.steps_per_s(sim)
-    print(f"C MuJoCo, one thread: {c_rate:,.0f} steps/s")
-    for batch in batches:
-        states = jax.tree.map(lambda leaf, n=batch: jnp.repeat(leaf[None], n, axis=0), start)
-        timing, _ = _timing.time_carried(step_all, states, repeats=5)
-        rate = batch * PERIODS * substeps / timing.median_s
-        row = {
-            "steps_per_s": rate,
-            "ms_a_step": 1e3 * timing.median_s / PERIODS / substeps,
-            "c_steps_per_s": c_rate,
-            "ratio_to_c": rate / c_rate,
-            "compile_s": timing.compile_s,
-            "temporary_bytes_an_environment": timing.temporary_bytes / batch,
+    print(f"C MuJoCo, one thread, at rest: {c_rate:,.0f} steps/s")
+    steps = {"": solver.step, "mjx_": mjx.step} if asked.peer else {"": solver.step}
+    for batch in asked.batches:
+        drawn = np.random.default_rng(0).integers(0, len(visited[1]), batch)
+        starts = {
+            "at_rest": jax.tree.map(lambda leaf, n=batch: jnp.repeat(leaf[None], n, axis=0), rest),
+            "at_work": jax.tree.map(lambda leaf, rows=drawn: jnp.asarray(leaf[rows]), visited),
         }
-        print(f"MJX, batch {batch}: {rate:,.0f} steps/s, {rate / c_rate:.2f} of C", flush=True)
+        row = {"c_steps_per_s_at_rest": c_rate}
+        for name, step in steps.items():
+            run = program(sim, step).lower(*starts["at_rest"]).compile()
+            for kind, start in starts.items():
+                timing = _timing.time_plain(
+                    lambda run=run, start=start: jax.block_until_ready(run(*start)), repeats=5
+                )
+                row[f"{name}steps_per_s_{kind}"] = batch * STEPS / timing.median_s
+                row[f"{name}ms_a_step_{kind}"] = 1e3 * timing.median_s / STEPS
+            memory = run.memory_analysis()
+            row[f"{name}temporary_bytes_an_environment"] = memory.temp_size_in_bytes / batch
+        for kind in starts if asked.peer else ():
+            row[f"times_mjx_speed_{kind}"] = (
+                row[f"steps_per_s_{kind}"] / row[f"mjx_steps_per_s_{kind}"]
+            )
+        row["ratio_to_c_at_rest"] = row["steps_per_s_at_rest"] / c_rate
+        print(f"batch {batch}: " + ", ".join(f"{key} {value:,.4g}" for key, value in row.items()))
         _timing.report("sim", {"results": {str(batch): row}}, tiny=False)
+
+
+def program(sim, step):
+    """Jitted: `(PhysicsState [N], ctrl [N, 7]) -> PhysicsState [N]`, `STEPS` steps later."""
+    one = _visited.stepper(sim, step, sim.mjx_model)
+
+    def run(state, ctrl):
+        return jax.lax.fori_loop(0, STEPS, lambda _, state: one(state, ctrl), state)
+
+    def run_all(*batch):
+        if jax.default_backend() == "cpu":
+            return jax.lax.map(lambda x: run(*x), batch, batch_size=rollout.CPU_LANES)
+        return jax.vmap(run)(*batch)
+
+    return jax.jit(run_all)
 
 
 if __name__ == "__main__":

@@ -63,7 +63,10 @@ class Iterate(NamedTuple):
 
 
 def step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
-    """`mjx.step`: kinematics, contacts, forces, and the implicit integrator."""
+    """`mjx.step`: kinematics, contacts, forces, and the implicit integrator.
+
+    For models that pass `check`, and no forces from outside (`qfrc_applied`, `xfrc_applied`).
+    """
     d = mjx.fwd_position(m, d)
     d = mjx.fwd_velocity(m, d)
     d = mjx.fwd_actuation(m, d)
@@ -118,8 +121,8 @@ def solve(
       acceleration `[V]`; the constraints' force on the velocities `[V]`.
     """
     M, f, A, b, _, _ = problem
-    # Of an error e in x: e M e >= gradient (M + ..)^-1 gradient. The diagonal stands for M, in
-    # which the motors' armature prevails.
+    # An error e in x has e M e <= gradient M^-1 gradient, for the Hessian is at least M. Of M the
+    # diagonal will do: the motors' armature prevails.
     limit = 2.0 * MAX_ERROR_ENERGY / timestep**2
     weights = 1.0 / jnp.diagonal(M)
 
