@@ -53,7 +53,7 @@ def test_the_minimum_is_that_of_a_general_optimiser(seed):
     rng = np.random.default_rng(seed)
     problem = random_problem(rng, active=CONTACTS - seed % 3)
     x, force = solve(problem, jnp.asarray(rng.normal(size=VELOCITIES), jnp.float32), TIMESTEP)
-    best = scipy.optimize.minimize(lambda x: cost(problem, x), np.asarray(x), tol=1e-14)
+    best = scipy.optimize.minimize(lambda x: cost(problem, x), np.asarray(x, float), tol=1e-14)
     np.testing.assert_allclose(x, best.x, atol=3e-4)
     # At the minimum the forces balance.
     np.testing.assert_allclose(problem.M @ x, problem.f + force, atol=1e-3)
