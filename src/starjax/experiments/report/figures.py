@@ -26,7 +26,7 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
                 _whiskers(left, run, (i - (len(runs) - 1) / 2) * 0.35)
         left.set_xlabel("distance to the nearest training trocar (mm)")
         left.set_ylabel("success rate")
-        name = focus.label if len(runs) == 1 else "All methods"
+        name = focus.label if len(runs) == 1 else f"{len(runs)} methods"
         left.set_title(f"{name} from {results.observed(runs)}, 95% Wilson intervals")
         style.percent_axis(left)
         if len(runs) > 1:
