@@ -106,7 +106,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     drawn = jnp.arange(batch) % count
     example = windows.gather(dataset, drawn, case.policy.obs_horizon, case.policy.horizon)
     stats = statistics(case.policy)
-    first = state.create(policy, optimizer, state.init_params(policy, seed), stats, example, seed)
+    first = state.create(policy, optimizer, state.init_params(policy, seed), stats, seed)
     mesh = devices.make_mesh(batch, on)
     settings = (policy, optimizer, case.policy, case.train, mesh)
     looped = step.runs_in_a_loop(case.policy, mesh)

@@ -112,4 +112,4 @@ def make(
     def _measured(stats, observation, trocar):
         return features.measured(stats, method.action_space, observation, trocar, p_world_ref)
 
-    return Policy(init, loss, sample)
+    return Policy(init, loss, sample, ("position_loss", "roll_loss"))

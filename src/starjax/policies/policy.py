@@ -22,9 +22,10 @@ class Policy(NamedTuple):
     Attributes:
       init: `key -> params`, those that training changes: a frozen vision encoder's are missing,
         and `with_vision` adds them for `sample` to see pictures.
-      loss: `(params, stats, key, batch) -> (scalar, metrics)`; metrics are named scalars.
+      loss: `(params, stats, key, batch) -> (scalar, {name: scalar})`, the names being `metrics`.
       sample: `(params, stats, keys [B], Observation [B, O], Trocar [B]) -> Command [B, H]`, finite
         whatever the networks say. What sample i draws depends on `keys[i]` alone.
+      metrics: names of what `loss` tells beside its value.
     """
 
     init: Callable[[jax.Array], Params]
@@ -36,6 +37,7 @@ class Policy(NamedTuple):
         [Params, normalizer.Normalizer, jax.Array, Observation, Any],
         Command,
     ]
+    metrics: tuple[str, ...] = ()
 
 
 def vision_of(params: Params) -> Params:

@@ -160,16 +160,10 @@ def _restored_or_new(
     seed,
     mesh,
 ) -> states.TrainState:
-    example = jax.eval_shape(
-        lambda data: windows.gather(
-            data, jnp.zeros(1, jnp.int32), policy_config.obs_horizon, policy_config.horizon
-        ),
-        dataset,
-    )
     stats = normalizer.fit(method, dataset, p_world_ref, frames)
 
     def around(params):
-        return states.create(policy, optimizer, params, stats, example, seed)
+        return states.create(policy, optimizer, params, stats, seed)
 
     restored, checkpoints = None, directory / "checkpoints"
     if checkpoint.steps(checkpoints):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 
 from starjax import config
-from starjax.data import normalizer, windows
+from starjax.data import normalizer
 from starjax.policies.policy import Params, Policy
 
 
@@ -83,7 +83,6 @@ def create(
     optimizer: optax.GradientTransformation,
     params: Params,
     stats: normalizer.Normalizer,
-    batch: windows.Batch,
     seed: int,
 ) -> TrainState:
     """The state before the first step.
@@ -93,12 +92,10 @@ def create(
       optimizer: from `make_optimizer`.
       params: from `init_params`.
       stats: fitted to the training frames.
-      batch: arrays or their shapes, which tell what metrics there will be.
       seed: of everything random.
     """
     _, key = _keys(seed)
-    _, metrics = jax.eval_shape(policy.loss, params, stats, key, batch)
-    names = ["loss", "gradient_norm", "taken", "skipped", *metrics]
+    names = ["loss", "gradient_norm", "taken", "skipped", *policy.metrics]
     return TrainState(
         step=jnp.int32(0),
         params=params,
