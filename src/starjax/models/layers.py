@@ -4,6 +4,7 @@ Parameters are float32; arithmetic runs in the dtype of the input (float32 or bf
 statistics are always float32. Initial values follow torch's defaults, as Diffusion Policy's do.
 """
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -12,6 +13,8 @@ import jax
 import jax.numpy as jnp
 
 
+# Compiled inside of compiled programs: jax then follows what many layers share once a shape.
+@jax.jit
 def mish(x: jax.Array) -> jax.Array:
     """x tanh(softplus(x)), with one exponential: tanh(log(1 + e)) = e (e + 2) / (e (e + 2) + 2)."""
     wide = x.astype(jnp.float32)
@@ -29,14 +32,16 @@ def uniform_init(fan_in: int, gain: float = 1.0) -> Callable[..., jax.Array]:
     """
     bound = gain / math.sqrt(fan_in)
 
-    def init(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-        bits = jnp.arange(math.prod(shape), dtype=jnp.uint32)
-        for word in jax.random.key_data(key).ravel():
-            bits = _mix(bits ^ word)
-        unit = (bits >> 8).astype(jnp.float32) * 2.0**-23 - 1.0
-        return (bound * unit).reshape(shape)
+    return lambda key, shape: bound * _hashed(key, shape)
 
-    return init
+
+@functools.partial(jax.jit, static_argnames="shape")
+def _hashed(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Uniform in [-1, 1)."""
+    bits = jnp.arange(math.prod(shape), dtype=jnp.uint32)
+    for word in jax.random.key_data(key).ravel():
+        bits = _mix(bits ^ word)
+    return ((bits >> 8).astype(jnp.float32) * 2.0**-23 - 1.0).reshape(shape)
 
 
 class Dense(nn.Module):
@@ -62,25 +67,31 @@ class GroupNorm(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[B, ..., C] -> [B, ..., C]`."""
-        batch, channels = x.shape[0], x.shape[-1]
+        channels = x.shape[-1]
         if channels % self.groups:
             raise ValueError(
                 f"groups: expected a divisor of {channels} channels, got {self.groups}"
             )
         scale = self.param("scale", nn.initializers.ones, (channels,))
         bias = self.param("bias", nn.initializers.zeros, (channels,))
-        wide = x.astype(jnp.float32)
-        positions = tuple(range(1, x.ndim - 1))
-        # Positions first, channels after: both reductions then run along contiguous memory, and
-        # what remains is one multiply-add for each element.
-        per_group = (batch, self.groups, channels // self.groups)
-        mean = wide.mean(positions).reshape(per_group).mean(-1)
-        square = (wide * wide).mean(positions).reshape(per_group).mean(-1)
-        inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + 1e-5)
-        gain = jnp.repeat(inverse, channels // self.groups, axis=1) * scale
-        shift = bias - jnp.repeat(mean, channels // self.groups, axis=1) * gain
-        shape = (batch,) + (1,) * len(positions) + (channels,)
-        return (wide * gain.reshape(shape) + shift.reshape(shape)).astype(x.dtype)
+        return _group_norm(x, scale, bias, self.groups)
+
+
+@functools.partial(jax.jit, static_argnames="groups")
+def _group_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int) -> jax.Array:
+    batch, channels = x.shape[0], x.shape[-1]
+    wide = x.astype(jnp.float32)
+    positions = tuple(range(1, x.ndim - 1))
+    # Positions first, channels after: both reductions then run along contiguous memory, and
+    # what remains is one multiply-add for each element.
+    per_group = (batch, groups, channels // groups)
+    mean = wide.mean(positions).reshape(per_group).mean(-1)
+    square = (wide * wide).mean(positions).reshape(per_group).mean(-1)
+    inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + 1e-5)
+    gain = jnp.repeat(inverse, channels // groups, axis=1) * scale
+    shift = bias - jnp.repeat(mean, channels // groups, axis=1) * gain
+    shape = (batch,) + (1,) * len(positions) + (channels,)
+    return (wide * gain.reshape(shape) + shift.reshape(shape)).astype(x.dtype)
 
 
 class Conv1d(nn.Module):

@@ -180,7 +180,12 @@ def _product(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.Arra
     shifted = [
         x[:, i : i + down : stride, j : j + right : stride] for i, j in np.ndindex(size, size)
     ]
-    return jnp.concatenate(shifted, -1) @ kernel.reshape(-1, kernel.shape[-1])
+    columns = jnp.concatenate(shifted, -1)
+    if size == 1:
+        # XLA would take the strided slice into the product's kernel, and abort the process where
+        # its sides are odd (jaxlib 0.11, 29 pixels to 15).
+        columns = jax.lax.optimization_barrier(columns)
+    return columns @ kernel.reshape(-1, kernel.shape[-1])
 
 
 def _pairs(x: jax.Array) -> jax.Array:

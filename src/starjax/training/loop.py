@@ -1,6 +1,5 @@
 """Training from a dataset to a finished state: resume, log, checkpoint, stop."""
 
-import functools
 import pathlib
 import time
 from collections.abc import Callable, Sequence
@@ -14,9 +13,9 @@ from starjax import config
 from starjax.data import normalizer, windows
 from starjax.policies import policy as policies
 from starjax.runtime import progress
-from starjax.training import checkpoint, devices, encoder, feed, holdout, metrics, processes
+from starjax.training import advance as advancing
+from starjax.training import checkpoint, devices, encoder, holdout, metrics, processes
 from starjax.training import state as states
-from starjax.training import step as steps
 
 _CALL_SECONDS = 1.0  # aim of one compiled call: how long Ctrl-C waits, how often the bar moves
 
@@ -90,24 +89,30 @@ def run(
     train, held_out = windows.split_holdout(
         dataset.start, dataset.length, train_config.holdout_demos
     )
-    state = _restored_or_new(
-        method,
-        policy,
-        optimizer,
-        policy_config,
-        train_config,
-        dataset,
-        p_world_ref,
-        train,
-        directory,
-        seed,
-        mesh,
-    )
+    stats = normalizer.fit(method, dataset, p_world_ref, train)
+
+    def around(params):
+        return states.create(policy, optimizer, params, stats, seed)
+
+    checkpoints = directory / "checkpoints"
+    like = _like(around, policy, seed, mesh)
+    settings = (policy, optimizer, policy_config, train_config, mesh, dataset, train)
+    advance = None
+    if windows.on_device(dataset):
+        new = not checkpoint.steps(checkpoints)  # a restored training may be finished
+        advance = advancing.resident(*settings, like if new else None)
+    restored = _restored(checkpoints, like)
+    if restored is None:
+        params = _begun(policy, policy_config, train_config, seed)
+        state = devices.replicate(states.run_once(around, params), mesh)
+    else:
+        state = restored
     step = first = int(state.step)
     metrics.resume(log, step)
     judge = holdout.make(policy, policy_config, dataset, held_out) if processes.is_first() else None
     errors = judge(processes.own(state)) if judge and step == train_config.steps else {}
-    advance = _advance(policy, optimizer, policy_config, train_config, mesh, dataset, train, state)
+    if advance is None:
+        advance = advancing.streamed(*settings, state)
     rate = _Rate(train_config.batch_size)
     with progress.track(description, train_config.steps, unit="steps", done=step) as show:
         note, call = "", 1
@@ -147,88 +152,32 @@ def _observed(dataset: windows.Dataset, policy_config: config.PolicyConfig) -> w
     return dataset.replace(observation=dataset.observation.replace(**unseen))
 
 
-def _restored_or_new(
-    method,
-    policy,
-    optimizer,
-    policy_config,
-    train_config,
-    dataset,
-    p_world_ref,
-    frames,
-    directory,
-    seed,
-    mesh,
-) -> states.TrainState:
-    stats = normalizer.fit(method, dataset, p_world_ref, frames)
+def _like(around, policy, seed, mesh) -> states.TrainState:
+    """Shapes and places of the state, without the state."""
+    placed = devices.replicated(mesh)
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
+        jax.eval_shape(lambda: around(policy.init(jax.random.key(seed)))),
+    )
 
-    def around(params):
-        return states.create(policy, optimizer, params, stats, seed)
 
-    restored, checkpoints = None, directory / "checkpoints"
-    if checkpoint.steps(checkpoints):
-        placed = devices.replicated(mesh)
-        like = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
-            jax.eval_shape(lambda: around(policy.init(jax.random.key(seed)))),
-        )
-        restored = checkpoint.restore(checkpoints, like)
+def _restored(checkpoints, like) -> states.TrainState | None:
+    restored = checkpoint.restore(checkpoints, like) if checkpoint.steps(checkpoints) else None
     step = -1 if restored is None else restored[0]
     if processes.agree(step) != (step,):
-        raise TrainingFailed(f"{directory}: processes see other checkpoints; is the folder shared?")
-    if restored is not None:
-        return restored[1]
+        raise TrainingFailed(
+            f"{checkpoints.parent}: processes see other checkpoints; is the folder shared?"
+        )
+    return None if restored is None else restored[1]
+
+
+def _begun(policy, policy_config, train_config, seed) -> policies.Params:
+    """Parameters of a new training."""
     params = states.init_params(policy, seed)
     begins = policy_config.observation == "image" and not policy_config.freeze_encoder
     if begins and policy_config.encoder_weights:
         params = encoder.start(params, policy_config, train_config)
-    return devices.replicate(states.run_once(around, params), mesh)
-
-
-def _advance(policy, optimizer, policy_config, train_config, mesh, dataset, frames, state):
-    """`(state, count) -> state`; the given state's memory is reused."""
-    settings = (policy, optimizer, policy_config, train_config, mesh)
-    placed = devices.replicated(mesh)
-    if windows.on_device(dataset):
-        resident = devices.replicate((dataset, jnp.asarray(frames)), mesh, may_alias=None)
-        if steps.runs_in_a_loop(policy_config, mesh):
-            many = jax.jit(
-                functools.partial(steps.resident_steps, *settings),
-                donate_argnums=0,
-                out_shardings=placed,
-            )
-            return lambda state, count: many(state, *resident, jnp.int32(count))
-        one = jax.jit(
-            functools.partial(steps.resident_step, *settings),
-            donate_argnums=0,
-            out_shardings=placed,
-        )
-        return _repeated(lambda state: one(state, *resident))
-
-    one = jax.jit(
-        functools.partial(steps.train_step, policy, optimizer, train_config),
-        donate_argnums=0,
-        out_shardings=placed,
-    )
-    stream = feed.batches(
-        dataset,
-        frames,
-        policy_config,
-        train_config,
-        mesh,
-        jnp.copy(processes.own(state.key)),
-        int(state.step),
-    )
-    return _repeated(lambda state: one(state, next(stream)))
-
-
-def _repeated(one):
-    def advance(state, count):
-        for _ in range(count):
-            state = one(state)
-        return state
-
-    return advance
+    return params
 
 
 def _log(log, step, state, train_config) -> tuple[states.TrainState, str]:

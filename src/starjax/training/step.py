@@ -1,5 +1,7 @@
 """One pure training step, and many of them in one compiled call."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -46,7 +48,7 @@ def train_step(
     sums["skipped"] = state.sums["skipped"] + jnp.where(finite, 0.0, 1.0)
 
     def keep(new, old):
-        return jax.tree.map(lambda n, o: jnp.where(finite, n, o), new, old)
+        return jax.tree.map(functools.partial(jax.lax.select, finite), new, old)
 
     return state.replace(
         step=state.step + 1,

@@ -1,0 +1,98 @@
+"""Training steps as calls `(state, count) -> state` that reuse the given state's memory."""
+
+import functools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh
+
+from starjax import config
+from starjax.data import windows
+from starjax.policies.policy import Policy
+from starjax.training import devices, feed, processes
+from starjax.training import step as steps
+from starjax.training.state import TrainState
+
+Advance = Callable[[TrainState, int], TrainState]
+
+
+def resident(
+    policy: Policy,
+    optimizer: optax.GradientTransformation,
+    policy_config: config.PolicyConfig,
+    train_config: config.TrainConfig,
+    mesh: Mesh,
+    dataset: windows.Dataset,
+    frames: np.ndarray,
+    like: TrainState | None = None,
+) -> Advance:
+    """Steps on a dataset that is on the device.
+
+    Args:
+      policy: to be trained.
+      optimizer: from `state.make_optimizer`.
+      policy_config: the horizons of a window.
+      train_config: batch size and averaging.
+      mesh: the batch is split over it.
+      dataset: is copied to every device of the mesh.
+      frames: `[n]` frame numbers to draw from.
+      like: shapes and places of the state, if steps will be asked for: the program is then compiled
+        from now on, beside what the caller does until then.
+    """
+    looped = steps.runs_in_a_loop(policy_config, mesh)
+    body = steps.resident_steps if looped else steps.resident_step
+    given = (policy, optimizer, policy_config, train_config, mesh)
+    program = _program(functools.partial(body, *given), mesh)
+    data = devices.replicate((dataset, jnp.asarray(frames)), mesh, may_alias=None)
+
+    def counted(count: int) -> jax.Array:
+        return devices.replicate(np.int32(count), mesh)
+
+    if like is not None:
+        program = _compiled_beside(program, like, *data, *([counted(1)] if looped else []))
+    if looped:
+        return lambda state, count: program(state, *data, counted(count))
+    return _repeated(lambda state: program(state, *data))
+
+
+def streamed(
+    policy: Policy,
+    optimizer: optax.GradientTransformation,
+    policy_config: config.PolicyConfig,
+    train_config: config.TrainConfig,
+    mesh: Mesh,
+    dataset: windows.Dataset,
+    frames: np.ndarray,
+    state: TrainState,
+) -> Advance:
+    """Steps on a dataset of the host, whose batches follow this state's; else as `resident`."""
+    program = _program(functools.partial(steps.train_step, policy, optimizer, train_config), mesh)
+    key = jnp.copy(processes.own(state.key))
+    stream = feed.batches(dataset, frames, policy_config, train_config, mesh, key, int(state.step))
+    return _repeated(lambda state: program(state, next(stream)))
+
+
+def _program(body: Callable[..., TrainState], mesh: Mesh) -> Any:
+    return jax.jit(body, donate_argnums=0, out_shardings=devices.replicated(mesh))
+
+
+def _compiled_beside(program: Any, *like: Any) -> Callable[..., TrainState]:
+    """The program, compiled by a thread for arguments like these; its first call waits for it."""
+    pool = ThreadPoolExecutor(1, thread_name_prefix="starjax-compile")
+    compiled = pool.submit(lambda: program.lower(*like).compile())
+    pool.shutdown(wait=False)
+    return lambda *args: compiled.result()(*args)
+
+
+def _repeated(one: Callable[[TrainState], TrainState]) -> Advance:
+    def advance(state: TrainState, count: int) -> TrainState:
+        for _ in range(count):
+            state = one(state)
+        return state
+
+    return advance
