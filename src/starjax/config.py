@@ -66,6 +66,9 @@ class PolicyConfig:
     time_dim: int = 128
     roll_width: int = 256
     roll_blocks: int = 3
+    roll_history: bool = True  # the roll network also reads the measured rolls; ablation: not
+    # Whether the diffusion model is given the trocar: as Table II says, or against it
+    sees_trocar: Literal["method", "always", "never"] = "method"
     diffusion_steps: int = 100  # K
     ddim_steps: int = 10
     temperature: float = 1.0  # of the noise a sample starts from; lower is nearer to the likeliest

@@ -33,15 +33,19 @@ def dataset():
 class Made:
     """A policy with random weights, and compiled functions of it."""
 
-    def __init__(self, name, dataset, observation="state"):
+    def __init__(self, name, dataset, observation="state", **changed):
         self.method = METHODS[name]
-        settings = dataclasses.replace(fakes.TINY, observation=observation)
+        settings = dataclasses.replace(fakes.TINY, observation=observation, **changed)
         self.policy = policies.make(self.method, settings, fakes.P_WORLD_REF, TRAIN)
         self.stats = normalizer.fit(self.method, dataset, fakes.P_WORLD_REF, np.arange(80))
         self.params = jit(self.policy.init)(jax.random.key(0))
         self.batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
         self.sample = jit(self.policy.sample)
         self.gradient = jit(jax.value_and_grad(self.policy.loss, has_aux=True))
+
+    @property
+    def loss_arguments(self):
+        return self.params, self.stats, jax.random.key(0), self.batch
 
     def commands(self, keys=None, trocar=None, params=None):
         return self.sample(
@@ -61,8 +65,7 @@ def made(dataset):
 @pytest.mark.parametrize("name", ["dp_ee", "dp_rcm1", "stardiff"])
 def test_every_parameter_learns(made, name):
     it = made(name)
-    key = jax.random.key(0)
-    (loss, _), gradient = it.gradient(it.params, it.stats, key, it.batch)
+    (loss, _), gradient = it.gradient(*it.loss_arguments)
     assert np.isfinite(loss) and 0.2 < loss < 5.0
     flat = jax.tree_util.tree_flatten_with_path(gradient)[0]
     for path, g in flat:
@@ -137,6 +140,31 @@ def test_a_missing_observation_is_named(made, dataset):
     blind = it.batch.replace(observation=it.batch.observation.replace(state=None))
     with pytest.raises(ValueError, match=r"observation.state: expected"):
         it.policy.loss(it.params, it.stats, jax.random.key(0), blind)
+
+
+@pytest.mark.parametrize(
+    ("name", "sees", "wider"),
+    [("dp_ee", "always", 1), ("dp_rcm4", "never", -1), ("stardiff", "always", 1)],
+)
+def test_a_method_may_be_given_the_trocar_or_not(made, dataset, name, sees, wider):
+    changed = Made(name, dataset, sees_trocar=sees)
+    assert np.isfinite(changed.gradient(*changed.loss_arguments)[0][0])
+    assert np.isfinite(changed.commands().pose.p).all()
+    widths = []
+    for it in (changed, made(name)):
+        unet = it.params.get("diffuser", it.params)["unet"]["params"]
+        widths.append(unet["film_cond"].shape[0])
+    assert widths[0] - widths[1] == wider * features.TROCAR_FEATURES
+
+
+def test_the_roll_may_be_predicted_without_its_history(dataset):
+    it = Made("stardiff", dataset, roll_history=False)
+    params = jax.tree.map(lambda leaf: leaf + 0.01, it.params)
+    predicted = it.commands(params=params)
+    seen = it.batch.observation
+    turned = seen.pose._replace(R=seen.pose.R @ np.diag([-1.0, -1.0, 1.0]).astype(np.float32))
+    it.batch = it.batch.replace(observation=seen.replace(pose=turned))
+    chex.assert_trees_all_equal(it.commands(params=params), predicted)
 
 
 def test_hierarchy_needs_a_roll():

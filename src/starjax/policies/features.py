@@ -48,6 +48,16 @@ def trocar_features(trocar: rcm.Trocar, p_world_ref: jax.Array) -> jax.Array:
     return jnp.concatenate([scalars, shift / _LENGTH], axis=-1)
 
 
+def extra_dim(method: config.Method) -> int:
+    """Width of `extra`."""
+    return TROCAR_FEATURES if method.sees_trocar else 0
+
+
+def extra(method: config.Method, trocar: rcm.Trocar, p_world_ref: jax.Array) -> jax.Array:
+    """What conditions the diffusion model beside the observation: the trocar's features or none."""
+    return trocar_features(trocar, p_world_ref)[..., : extra_dim(method)]
+
+
 def measured(
     stats: normalizer.Normalizer,
     action_space: str,

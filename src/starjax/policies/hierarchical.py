@@ -37,12 +37,15 @@ def make(
     # what is diffused: the position and, after the whole space, the gripper
     diffused = jnp.r_[space.slices["p"], space.dim]
     task_dim = features.TASK_FEATURES if policy_config.observation == "state" else 0
-    model = diffuser.make(policy_config, len(diffused), len(diffused) + task_dim, 0)
+    model = diffuser.make(
+        policy_config, len(diffused), len(diffused) + task_dim, features.extra_dim(method)
+    )
     rolls = roll_net.RollNet(
         width=policy_config.roll_width,
         blocks=policy_config.roll_blocks,
         dtype=jnp.dtype(policy_config.dtype),
     )
+    history_weight = float(policy_config.roll_history)
     # linen's `apply` may return changed variables too; ours never does
     predict: Callable[..., jax.Array] = rolls.apply  # pyright: ignore[reportAssignmentType]
 
@@ -69,15 +72,14 @@ def make(
             measured[..., diffused],
         )
         x0 = action[..., diffused]
-        position_loss = model.loss(
-            params["diffuser"], key_diffusion, inputs, jnp.zeros((len(x0), 0)), x0
-        )
+        extra = features.extra(method, batch.trocar, p_world_ref)
+        position_loss = model.loss(params["diffuser"], key_diffusion, inputs, extra, x0)
         p, history = action[..., space.slices["p"]], measured[..., roll]
         predicted = predict(
             params["roll"],
             p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
             features.trocar_features(batch.trocar, p_world_ref),
-            history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
+            history_weight * (history + ROLL_NOISE * jax.random.normal(key_roll, history.shape)),
         )
         roll_loss = jnp.mean((action[..., roll] - predicted) ** 2)  # Eq. 14
         total = position_loss + policy_config.roll_loss_weight * roll_loss
@@ -94,13 +96,14 @@ def make(
         inputs = features.for_sampling(
             policy_config, train_config, stats, observation, measured[..., diffused]
         )
-        x0 = model.sample(params["diffuser"], keys, inputs, jnp.zeros((keys.shape[0], 0)))
+        extra = features.extra(method, trocar, p_world_ref)
+        x0 = model.sample(params["diffuser"], keys, inputs, extra)
         p, gripper = x0[..., :3], x0[..., 3:]
         gamma = predict(
             params["roll"],
             p,
             features.trocar_features(trocar, p_world_ref),
-            measured[..., roll],
+            history_weight * measured[..., roll],
         )
         # within the demonstrated range, as the diffused part is
         gamma = jnp.clip(gamma, -1.0, 1.0)[..., None]

@@ -101,5 +101,7 @@ def make(
     # imported here because both of them build on this module's Policy
     from starjax.policies import hierarchical, single
 
+    if policy_config.sees_trocar != "method":
+        method = method._replace(sees_trocar=policy_config.sees_trocar == "always")
     build = hierarchical.make if method.hierarchical else single.make
     return build(method, policy_config, p_world_ref, train_config or config.TrainConfig())

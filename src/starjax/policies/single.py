@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from starjax import config, rcm
 from starjax.data import normalizer, windows
@@ -22,8 +21,7 @@ def make(
     """Diffusion over (pose in the method's action space, gripper); see `policy.make`."""
     dim = rcm.ACTION_SPACES[method.action_space].dim + 1
     task_dim = features.TASK_FEATURES if policy_config.observation == "state" else 0
-    extra_dim = features.TROCAR_FEATURES if method.sees_trocar else 0
-    model = diffuser.make(policy_config, dim, dim + task_dim, extra_dim)
+    model = diffuser.make(policy_config, dim, dim + task_dim, features.extra_dim(method))
 
     def loss(
         params: Params, stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
@@ -38,7 +36,7 @@ def make(
             batch.observation,
             _proprioception(stats, batch.observation, batch.trocar),
         )
-        value = model.loss(params, key_diffusion, inputs, _extra(batch.trocar, len(x0)), x0)
+        value = model.loss(params, key_diffusion, inputs, _extra(batch.trocar), x0)
         return value, {}
 
     def sample(
@@ -55,15 +53,13 @@ def make(
             observation,
             _proprioception(stats, observation, trocar),
         )
-        action = model.sample(params, keys, inputs, _extra(trocar, keys.shape[0]))
+        action = model.sample(params, keys, inputs, _extra(trocar))
         return execution.command(method, stats, action, trocar, p_world_ref)
 
     def _proprioception(stats, observation, trocar):
         return features.measured(stats, method.action_space, observation, trocar, p_world_ref)
 
-    def _extra(trocar: rcm.Trocar, batch: int) -> jax.Array:
-        if not method.sees_trocar:
-            return jnp.zeros((batch, 0))
-        return features.trocar_features(trocar, p_world_ref)
+    def _extra(trocar: rcm.Trocar) -> jax.Array:
+        return features.extra(method, trocar, p_world_ref)
 
     return Policy(model.init, loss, sample)

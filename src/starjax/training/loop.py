@@ -157,7 +157,8 @@ def _like(around, policy, seed, mesh) -> states.TrainState:
     placed = devices.replicated(mesh)
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
-        jax.eval_shape(lambda: around(policy.init(jax.random.key(seed)))),
+        # jit: so that jax follows `init` once, for the parameters too
+        jax.eval_shape(lambda: around(jax.jit(policy.init)(jax.random.key(seed)))),
     )
 
 
