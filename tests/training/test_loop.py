@@ -13,7 +13,7 @@ import kill
 import numpy as np
 import pytest
 
-from starjax.training import checkpoint, loop, metrics, state, step
+from starjax.training import advance, checkpoint, loop, metrics, state, step
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
@@ -80,8 +80,9 @@ def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
     assert log == (directory / "metrics.jsonl").read_bytes()
 
 
-def test_a_finished_run_is_only_loaded(whole):
+def test_a_finished_run_is_only_loaded(whole, monkeypatch):
     directory, result = whole
+    monkeypatch.setattr(advance, "_compiled_beside", lambda *_: pytest.fail("compiles a step"))
     before = (directory / "metrics.jsonl").read_bytes()
     again = jobs.train(directory)
     assert_same_bytes(again.state, result.state)
