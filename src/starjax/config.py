@@ -66,8 +66,8 @@ class PolicyConfig:
     time_dim: int = 128
     roll_width: int = 256
     roll_blocks: int = 3
-    roll_history: bool = True  # the roll network also reads the measured rolls; ablation: not
-    # Whether the diffusion model is given the trocar: as Table II says, or against it
+    roll_history: bool = True  # the roll network reads the measured rolls (Eq. 13); off: ablation
+    # Whether the diffusion model is given the trocar: as Table II says, or an ablation
     sees_trocar: Literal["method", "always", "never"] = "method"
     diffusion_steps: int = 100  # K
     ddim_steps: int = 10

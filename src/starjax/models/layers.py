@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 
-# Compiled inside of compiled programs: jax then follows what many layers share once a shape.
+# Jitted inside of jitted programs: what many layers share is then traced once a shape.
 @jax.jit
 def mish(x: jax.Array) -> jax.Array:
     """x tanh(softplus(x)), with one exponential: tanh(log(1 + e)) = e (e + 2) / (e (e + 2) + 2)."""

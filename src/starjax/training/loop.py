@@ -157,7 +157,7 @@ def _like(around, policy, seed, mesh) -> states.TrainState:
     placed = devices.replicated(mesh)
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
-        # jit: so that jax follows `init` once, for the parameters too
+        # jitted, `init` is traced once: here, and not again for the parameters
         jax.eval_shape(lambda: around(jax.jit(policy.init)(jax.random.key(seed)))),
     )
 
