@@ -15,6 +15,7 @@ from starjax.experiments.report import (
     markup,
     outcomes,
     page,
+    ports,
     results,
     stats,
     tables,
@@ -307,6 +308,29 @@ def test_runs_of_one_method_are_told_apart(tmp_path, seeds, names):
     build.build(paths, tmp_path / "report", with_video=False)
     text = (tmp_path / "report" / "tables.md").read_text()
     assert all(f"STAR-Diff ({name})" in text for name in names)
+
+
+def test_runs_trained_at_fewer_trocars_show_what_more_buy(tmp_path):
+    paths = []
+    for count in (1, 2, 8):
+        path = synthetic.run(tmp_path / f"{count}" / "stardiff", skill=(1.0, 0.5))
+        result = json.loads((path / "result.json").read_text())
+        for trial in result["trials"]:
+            trial["seen"] = trial["trocar"] < count
+        (path / "result.json").write_text(json.dumps(result))
+        paths.append(path)
+    index = build.build(paths, tmp_path / "report", with_video=False)
+    assert (tmp_path / "report" / "ports.png").stat().st_size > 1000
+    assert "number of training trocars" in index.read_text()
+    text = (tmp_path / "report" / "tables.md").read_text()
+    assert all(f"STAR-Diff ({n})" in text for n in ("1 trocar", "2 trocars", "8 trocars"))
+    runs = [results.load(path) for path in paths]
+    assert ports.never_seen(runs) == {8, 9, 10, 11}
+    assert [ports.trained_at(run) for run in runs] == [1, 2, 8]
+    line = ports.draw(runs).axes[0].lines[0]
+    expected = outcomes.tally(t for t in runs[0].trials if t["trocar"] >= 8).rate
+    np.testing.assert_allclose(line.get_ydata(), expected)
+    assert ports.draw(runs[1:2]) is None and ports.draw([runs[2], runs[2]]) is None
 
 
 def test_a_note_of_some_runs_names_them(one):

@@ -5,7 +5,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from starjax.experiments import methods
-from starjax.experiments.report import figures, page, results, style, tables, trajectories, video
+from starjax.experiments.report import (
+    figures,
+    page,
+    ports,
+    results,
+    style,
+    tables,
+    trajectories,
+    video,
+)
 from starjax.runtime import files
 
 
@@ -43,7 +52,7 @@ def _order(run: results.Run) -> int:
 
 
 def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
-    """Runs of one method get their seeds beside its name, or, if these are alike, their folders."""
+    """Runs of one method get what sets them apart beside its name: seed, trocars or folder."""
     return [run._replace(label=_name(run, runs)) for run in runs]
 
 
@@ -54,6 +63,10 @@ def _name(run: results.Run, runs: Sequence[results.Run]) -> str:
     seeds = [other.result.get("config", {}).get("seed") for other in alike]
     if None not in seeds and len(set(seeds)) == len(seeds):
         return f"{run.label} (seed {run.result['config']['seed']})"
+    trocars = [ports.trained_at(other) for other in alike]
+    if len(set(trocars)) == len(trocars):
+        count = ports.trained_at(run)
+        return f"{run.label} ({count} trocar{'s' if count > 1 else ''})"
     return f"{run.label} ({run.path.parent.name}/{run.path.name})"
 
 
@@ -78,6 +91,7 @@ def _figures(
     }
     evaluated = [run for run in runs if run.trials]
     if evaluated and focus.trials:
+        drawings["ports"] = lambda dark: ports.draw(evaluated, dark)
         drawings["fig4"] = lambda dark: figures.distance(evaluated, focus, dark)
     if sim is not None:
         shown = results.representatives(runs)

@@ -20,6 +20,10 @@ CAPTIONS = {
         "Left: trials pooled by distance of their trocar to the nearest one in the demonstrations, "
         "with 95% Wilson intervals. Right: every port from above.",
     ),
+    "ports": (
+        "Success and the number of training trocars",
+        "Trials at the trocars that none of these runs was trained at, with 95% Wilson intervals.",
+    ),
     "training": (
         "Training",
         "Loss on the training batches, and the error of predicted commands on demonstrations kept "
@@ -44,6 +48,7 @@ def render(
         sections.comparison(runs) if several else sections.tests(focus),
         _figure("fig3", figures),
         _figure("fig4", figures),
+        _figure("ports", figures),
         sections.matrix(runs) if several else sections.per_trocar(focus),
         sections.failures(runs),
         sections.measurements(runs),
