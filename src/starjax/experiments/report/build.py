@@ -52,21 +52,22 @@ def _order(run: results.Run) -> int:
 
 
 def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
-    """Runs of one method get what sets them apart beside its name: seed, trocars or folder."""
+    """Labels with what sets runs apart: their numbers of trocars, seeds or, at last, folders."""
     return [run._replace(label=_name(run, runs)) for run in runs]
 
 
 def _name(run: results.Run, runs: Sequence[results.Run]) -> str:
     alike = [other for other in runs if other.label == run.label]
+    trocars = [ports.trained_at(other) for other in alike]
+    counts = {ports.trained_at(other) for other in runs if other.trials}
+    if run.trials and len(counts) > 1 and len(set(trocars)) == len(trocars):
+        count = ports.trained_at(run)
+        return f"{run.label} ({count} trocar{'s' if count > 1 else ''})"
     if len(alike) == 1:
         return run.label
     seeds = [other.result.get("config", {}).get("seed") for other in alike]
     if None not in seeds and len(set(seeds)) == len(seeds):
         return f"{run.label} (seed {run.result['config']['seed']})"
-    trocars = [ports.trained_at(other) for other in alike]
-    if len(set(trocars)) == len(trocars):
-        count = ports.trained_at(run)
-        return f"{run.label} ({count} trocar{'s' if count > 1 else ''})"
     return f"{run.label} ({run.path.parent.name}/{run.path.name})"
 
 
