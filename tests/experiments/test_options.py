@@ -145,7 +145,7 @@ def test_every_field_has_its_flag():
         len(dataclasses.fields(part))
         for part in (config.DemosConfig, config.PolicyConfig, config.TrainConfig, config.EvalConfig)
     )
-    assert len(flags) == leaves + 4 + 2  # method, preset, seed, out; two flags have a no- twin
+    assert len(flags) == leaves + 4 + 3  # method, preset, seed, out; three have a no- twin
 
 
 @pytest.mark.parametrize(
