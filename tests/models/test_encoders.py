@@ -136,6 +136,13 @@ def test_a_convolution_as_a_product_is_the_same(size, kernel, stride, pad):
     np.testing.assert_allclose(actual, resnet._convolution(x, w, stride, pad), atol=1e-4)
 
 
+def test_a_strided_slice_is_kept_out_of_a_products_kernel():
+    # XLA's compiler for GPUs aborts on it, which no test without a GPU would see
+    program = jax.jit(lambda x, w: resnet._product(x, w, 2, 0))
+    text = program.lower(normal(2, 29, 29, 8), normal(1, 1, 8, 16)).as_text()
+    assert "optimization_barrier" in text
+
+
 def test_unknown_trunk_is_named():
     with pytest.raises(ValueError, match=r"trunk: expected one of .*'small'.*got 'vit'"):
         make("vit").init(KEY, frames())

@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,37 +21,41 @@ from starjax.training.state import TrainState
 Advance = Callable[[TrainState, int], TrainState]
 
 
-def resident(
-    policy: Policy,
-    optimizer: optax.GradientTransformation,
-    policy_config: config.PolicyConfig,
-    train_config: config.TrainConfig,
-    mesh: Mesh,
-    dataset: windows.Dataset,
-    frames: np.ndarray,
-    like: TrainState | None = None,
-) -> Advance:
-    """Steps on a dataset that is on the device.
+class Training(NamedTuple):
+    """What steps are made of.
 
-    Args:
+    Attributes:
       policy: to be trained.
       optimizer: from `state.make_optimizer`.
-      policy_config: the horizons of a window.
-      train_config: batch size and averaging.
+      policy_config: networks and horizons.
+      train_config: optimisation.
       mesh: the batch is split over it.
-      dataset: is copied to every device of the mesh.
+      dataset: on the device or on the host.
       frames: `[n]` frame numbers to draw from.
-      like: shapes and places of the state, if steps will be asked for: the program is then compiled
-        from now on, beside what the caller does until then.
     """
-    looped = steps.runs_in_a_loop(policy_config, mesh)
+
+    policy: Policy
+    optimizer: optax.GradientTransformation
+    policy_config: config.PolicyConfig
+    train_config: config.TrainConfig
+    mesh: Mesh
+    dataset: windows.Dataset
+    frames: np.ndarray
+
+
+def resident(it: Training, like: TrainState | None = None) -> Advance:
+    """Steps on a dataset that is on the device, and is copied to every device of the mesh.
+
+    With `like`, shapes and places of the state, the program is compiled from now on, beside what
+    the caller does until the first step.
+    """
+    looped = steps.runs_in_a_loop(it.policy_config, it.mesh)
     body = steps.resident_steps if looped else steps.resident_step
-    given = (policy, optimizer, policy_config, train_config, mesh)
-    program = _program(functools.partial(body, *given), mesh)
-    data = devices.replicate((dataset, jnp.asarray(frames)), mesh, may_alias=None)
+    program = _program(functools.partial(body, *it[:5]), it.mesh)
+    data = devices.replicate((it.dataset, jnp.asarray(it.frames)), it.mesh, may_alias=None)
 
     def counted(count: int) -> jax.Array:
-        return devices.replicate(np.int32(count), mesh)
+        return devices.replicate(np.int32(count), it.mesh)
 
     if like is not None:
         program = _compiled_beside(program, like, *data, *([counted(1)] if looped else []))
@@ -60,20 +64,14 @@ def resident(
     return _repeated(lambda state: program(state, *data))
 
 
-def streamed(
-    policy: Policy,
-    optimizer: optax.GradientTransformation,
-    policy_config: config.PolicyConfig,
-    train_config: config.TrainConfig,
-    mesh: Mesh,
-    dataset: windows.Dataset,
-    frames: np.ndarray,
-    state: TrainState,
-) -> Advance:
-    """Steps on a dataset of the host, whose batches follow this state's; else as `resident`."""
-    program = _program(functools.partial(steps.train_step, policy, optimizer, train_config), mesh)
+def streamed(it: Training, state: TrainState) -> Advance:
+    """Steps on a dataset of the host, whose batches follow this state's."""
+    body = functools.partial(steps.train_step, it.policy, it.optimizer, it.train_config)
+    program = _program(body, it.mesh)
     key = jnp.copy(processes.own(state.key))
-    stream = feed.batches(dataset, frames, policy_config, train_config, mesh, key, int(state.step))
+    stream = feed.batches(
+        it.dataset, it.frames, it.policy_config, it.train_config, it.mesh, key, int(state.step)
+    )
     return _repeated(lambda state: program(state, next(stream)))
 
 

@@ -96,11 +96,11 @@ def run(
 
     checkpoints = directory / "checkpoints"
     like = _like(around, policy, seed, mesh)
-    settings = (policy, optimizer, policy_config, train_config, mesh, dataset, train)
+    it = advancing.Training(policy, optimizer, policy_config, train_config, mesh, dataset, train)
     advance = None
     if windows.on_device(dataset):
         new = not checkpoint.steps(checkpoints)  # a restored training may be finished
-        advance = advancing.resident(*settings, like if new else None)
+        advance = advancing.resident(it, like if new else None)
     restored = _restored(checkpoints, like)
     if restored is None:
         params = _begun(policy, policy_config, train_config, seed)
@@ -112,7 +112,7 @@ def run(
     judge = holdout.make(policy, policy_config, dataset, held_out) if processes.is_first() else None
     errors = judge(processes.own(state)) if judge and step == train_config.steps else {}
     if advance is None:
-        advance = advancing.streamed(*settings, state)
+        advance = advancing.streamed(it, state)
     rate = _Rate(train_config.batch_size)
     with progress.track(description, train_config.steps, unit="steps", done=step) as show:
         note, call = "", 1

@@ -106,11 +106,9 @@ def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
 
 def _whiskers(axis: Any, run: results.Run, offset: float) -> None:
     """One of several methods: a line with whiskers, `offset` mm aside to hide no other."""
-    points, (color, marker) = _pooled(run), style.method(run.result["method"])
-    x, rates = [at + offset for at, _ in points], [score.rate for _, score in points]
-    below, above = [s.rate - s.low for _, s in points], [s.high - s.rate for _, s in points]
-    axis.plot(x, rates, color=color, linewidth=1.2, marker=marker, markersize=4, label=run.label)
-    axis.errorbar(x, rates, [below, above], color=color, linewidth=0.8, linestyle="")
+    points = _pooled(run)
+    x, scores = [at + offset for at, _ in points], [score for _, score in points]
+    style.rates(axis, x, scores, run.result["method"], run.label)
 
 
 def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> None:

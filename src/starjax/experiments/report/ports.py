@@ -38,14 +38,7 @@ def draw(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
             ours = sorted((run for run in runs if run.result["method"] == name), key=trained_at)
             scores = [_score(run, scored_at) for run in ours]
             x = [trained_at(run) * 1.025 ** (i - (len(names) - 1) / 2) for run in ours]
-            rates = [score.rate for score in scores]
-            whiskers = [[s.rate - s.low for s in scores], [s.high - s.rate for s in scores]]
-            color, marker = style.method(name)
-            label = methods.METHODS[name].label
-            axis.plot(
-                x, rates, color=color, marker=marker, linewidth=1.2, markersize=4, label=label
-            )
-            axis.errorbar(x, rates, whiskers, color=color, linewidth=0.8, linestyle="")
+            style.rates(axis, x, scores, name, methods.METHODS[name].label)
         axis.set_xscale("log", base=2)
         axis.set_xticks(counts, [str(count) for count in counts])
         axis.xaxis.set_minor_locator(ticker.NullLocator())

@@ -4,11 +4,12 @@ Figures are made as `matplotlib.figure.Figure`, never through pyplot, so no back
 """
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from starjax.experiments import methods
+from starjax.experiments.report import stats
 
 SUCCESS, FAILURE = "#2083C5", "#D55E00"
 # In the order of the methods' table, so that a method keeps its colour in every figure.
@@ -55,6 +56,15 @@ def method(name: str) -> tuple[str, str]:
     """Colour and marker of a method."""
     index = list(methods.METHODS).index(name) % len(_METHODS)
     return _METHODS[index], _MARKERS[index]
+
+
+def rates(axis: Any, x: Sequence[float], scores: Sequence[stats.Rate], name: str, label: str):
+    """A method's rates at `x`: a line in its colour, with whiskers from low to high."""
+    color, marker = method(name)
+    middle = [score.rate for score in scores]
+    ends = [[s.rate - s.low for s in scores], [s.high - s.rate for s in scores]]
+    axis.plot(x, middle, color=color, linewidth=1.2, marker=marker, markersize=4, label=label)
+    axis.errorbar(x, middle, ends, color=color, linewidth=0.8, linestyle="")
 
 
 def save(figure: Any, kind: str) -> bytes:
