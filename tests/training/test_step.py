@@ -1,5 +1,8 @@
 """The training step: one program, nothing lost to a broken loss, the right frames."""
 
+import types
+from typing import Any
+
 import chex
 import fakes
 import jax
@@ -107,3 +110,16 @@ def test_a_broken_loss_is_left_out_and_counted(start, dataset):
 def test_mesh_divides_the_batch():
     assert devices.make_mesh(8).size == 1
     assert devices.make_mesh(7, jax.devices()).size == 1
+
+
+def test_options_of_several_gpus_are_known_to_this_xla():
+    gpu, cpu = (types.SimpleNamespace(platform=name) for name in ("gpu", "cpu"))
+
+    def options(*on):
+        mesh: Any = types.SimpleNamespace(size=len(on), devices=np.array(on))
+        return devices.compiler_options(mesh)
+
+    assert options(gpu) == options(cpu, cpu) == {}
+    assert options(gpu, gpu)
+    # an option that XLA does not know is an error at compilation
+    jax.jit(lambda x: x + 1, compiler_options=options(gpu, gpu))(1)

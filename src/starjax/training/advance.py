@@ -76,7 +76,8 @@ def streamed(it: Training, state: TrainState) -> Advance:
 
 
 def _program(body: Callable[..., TrainState], mesh: Mesh) -> Any:
-    return jax.jit(body, donate_argnums=0, out_shardings=devices.replicated(mesh))
+    placed, options = devices.replicated(mesh), devices.compiler_options(mesh)
+    return jax.jit(body, donate_argnums=0, out_shardings=placed, compiler_options=options)
 
 
 def _compiled_beside(program: Any, *like: Any) -> Callable[..., TrainState]:

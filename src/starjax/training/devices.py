@@ -9,6 +9,12 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from starjax.training import processes
 
 _AXIS = "batch"
+# Of a step on several GPUs: gradients are summed in pieces of 128 MB, some of them beside the
+# backward pass (benchmarks/README.md).
+_OVERLAP: dict[str, Any] = {
+    "xla_gpu_enable_latency_hiding_scheduler": True,
+    "xla_gpu_all_reduce_combine_threshold_bytes": 128 << 20,
+}
 
 
 def make_mesh(batch_size: int, devices: Sequence[jax.Device] | None = None) -> Mesh:
@@ -36,6 +42,12 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
 def replicated(mesh: Mesh) -> NamedSharding:
     """A full copy on every device."""
     return NamedSharding(mesh, PartitionSpec())
+
+
+def compiler_options(mesh: Mesh) -> dict[str, Any]:
+    """Options of `jax.jit` for a training step on the mesh."""
+    several_gpus = mesh.size > 1 and mesh.devices.flat[0].platform == "gpu"
+    return _OVERLAP if several_gpus else {}
 
 
 def replicate(tree: Any, mesh: Mesh, may_alias: bool | None = False) -> Any:
