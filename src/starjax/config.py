@@ -66,7 +66,10 @@ class PolicyConfig:
     time_dim: int = 128
     roll_width: int = 256
     roll_blocks: int = 3
-    roll_history: bool = True  # the roll network reads the measured rolls (Eq. 13); off: ablation
+    # Ablations of the roll network, which reads tip positions, trocar and measured rolls (Eq. 13)
+    roll_history: bool = True  # the measured rolls
+    roll_trocar: bool = True  # the trocar
+    roll_observation: bool = False  # what conditions the diffusion model: picture or task state
     # Whether the diffusion model is given the trocar: as Table II says, or an ablation
     sees_trocar: Literal["method", "always", "never"] = "method"
     diffusion_steps: int = 100  # K

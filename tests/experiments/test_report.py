@@ -17,6 +17,7 @@ from starjax.experiments.report import (
     page,
     ports,
     results,
+    sections,
     stats,
     tables,
     video,
@@ -103,6 +104,13 @@ def test_table_three_counts_and_marks_the_best(several):
         assert re.search(rf"\| {run.label} \| \**{100 * seen / 48:.1f} \({seen}/48\)", text)
     assert text.count("**") == 4 and text.index("**") > text.index("| STAR-Diff |")
     assert "state observations" in text and "Holm" in text
+
+
+def test_stars_are_each_runs_own(several):
+    elsewhere = edited(several[0], trials=[t | {"seen": not t["seen"]} for t in several[0].trials])
+    table = sections.matrix([elsewhere, several[1]])
+    here, there = (row.count("*</td>") for row in re.findall(r"<tr>.*?</tr>", table, re.S)[1:])
+    assert (here, there) == (8, 4)
 
 
 def test_one_method_has_no_empty_comparison(one):

@@ -157,14 +157,47 @@ def test_a_method_may_be_given_the_trocar_or_not(made, dataset, name, sees, wide
     assert widths[0] - widths[1] == wider * features.TROCAR_FEATURES
 
 
-def test_the_roll_may_be_predicted_without_its_history(dataset):
-    it = Made("stardiff", dataset, roll_history=False)
+def turned(observation):
+    pose = observation.pose
+    half_a_turn = np.diag([-1.0, -1.0, 1.0]).astype(np.float32)
+    return observation.replace(pose=pose._replace(R=pose.R @ half_a_turn))
+
+
+def elsewhere(observation):
+    return observation.replace(state=observation.state + 0.01)
+
+
+def moved(trocar):
+    return trocar._replace(radius=trocar.radius + 0.01)
+
+
+@pytest.mark.parametrize(
+    ("changed", "matters"),
+    [
+        ({}, (True, True, False)),
+        ({"roll_history": False}, (False, True, False)),
+        # measured rolls are relative to the trocar's frame
+        ({"roll_history": False, "roll_trocar": False}, (False, False, False)),
+        ({"roll_observation": True}, (True, True, True)),
+    ],
+)
+def test_what_the_roll_network_reads(dataset, changed, matters):
+    it = Made("stardiff", dataset, **changed)
     params = jax.tree.map(lambda leaf: leaf + 0.01, it.params)
-    predicted = it.commands(params=params)
-    seen = it.batch.observation
-    turned = seen.pose._replace(R=seen.pose.R @ np.diag([-1.0, -1.0, 1.0]).astype(np.float32))
-    it.batch = it.batch.replace(observation=seen.replace(pose=turned))
-    chex.assert_trees_all_equal(it.commands(params=params), predicted)
+    # the same positions whatever is observed
+    params["diffuser"]["unet"] = jax.tree.map(jnp.zeros_like, params["diffuser"]["unet"])
+    keys = jax.random.split(jax.random.key(0), B)
+
+    def roll(observation, trocar):
+        command = it.sample(params, it.stats, keys, observation, trocar)
+        per_step = jax.tree.map(lambda leaf: leaf[:, None], trocar)
+        space = rcm.ACTION_SPACES["rcm4"]
+        return space.encode(command.pose, per_step, fakes.P_WORLD_REF)[..., 0]
+
+    seen, trocar = it.batch.observation, it.batch.trocar
+    before = roll(seen, trocar)
+    after = (roll(turned(seen), trocar), roll(seen, moved(trocar)), roll(elsewhere(seen), trocar))
+    assert tuple(float(jnp.abs(x - before).max()) > 1e-4 for x in after) == matters
 
 
 def test_hierarchy_needs_a_roll():

@@ -27,7 +27,13 @@ class RollNet(nn.Module):
     dtype: jnp.dtype = jnp.float32
 
     @nn.compact
-    def __call__(self, p: jax.Array, trocar: jax.Array, roll_history: jax.Array) -> jax.Array:
+    def __call__(
+        self,
+        p: jax.Array,
+        trocar: jax.Array,
+        roll_history: jax.Array,
+        observed: jax.Array | None = None,
+    ) -> jax.Array:
         """Eq. 13: one roll for each future position.
 
         The paper's Embed(lambda) is a linear layer with GELU: the trocar is continuous, and a table
@@ -37,6 +43,7 @@ class RollNet(nn.Module):
           p: `[B, H, 3]` future tip positions, normalised.
           trocar: `[B, F]` features of the trocar.
           roll_history: `[B, O]` measured rolls, in the unit of the output.
+          observed: `[B, C]` whatever else it is to see; the paper's sees nothing else.
 
         Returns:
           Rolls float32 `[B, H]`.
@@ -44,6 +51,8 @@ class RollNet(nn.Module):
         batch, horizon = p.shape[:2]
         embedded = nn.gelu(layers.Dense(self.embed_dim, name="embed")(trocar.astype(self.dtype)))
         inputs = [p.reshape(batch, -1), embedded, roll_history]
+        if observed is not None:
+            inputs.append(observed)
         x = jnp.concatenate([part.astype(self.dtype) for part in inputs], -1)
         x = layers.Dense(self.width, name="project")(x)
         for _ in range(self.blocks):

@@ -18,11 +18,15 @@ class Diffuser(NamedTuple):
 
     Attributes:
       init: `key -> params`, those that training changes: none for a frozen vision encoder.
+      observed_dim: N, numbers that the networks make of an observation.
+      condition: `(params, inputs, extra [B, E]) -> [B, N + E]`, what the U-Net is told.
       loss: `(params, key, inputs, extra [B, E], x0 [B, H, A]) -> scalar` of Eq. 9.
       sample: `(params, keys [B], inputs, extra [B, E]) -> [B, H, A]` in [-1, 1], by DDIM.
     """
 
+    observed_dim: int
     init: Callable[[jax.Array], Params]
+    condition: Callable[[Params, features.Inputs, jax.Array], jax.Array]
     loss: Callable[[Params, jax.Array, features.Inputs, jax.Array, jax.Array], jax.Array]
     sample: Callable[[Params, jax.Array, features.Inputs, jax.Array], jax.Array]
 
@@ -41,11 +45,12 @@ def make(
     dtype = jnp.dtype(policy_config.dtype)
     sees_image = policy_config.observation == "image"
     vision_dim = policy_config.obs_horizon * policy_config.vision_dim if sees_image else 0
+    observed_dim = vision_dim + policy_config.state_dim
     vision = vision_encoder(policy_config)
     state = encoders.StateEncoder(features=policy_config.state_dim, dtype=dtype)
     unet = unet1d.ConditionalUnet1D(
         action_dim=action_dim,
-        cond_dim=vision_dim + policy_config.state_dim + extra_dim,
+        cond_dim=observed_dim + extra_dim,
         channels=tuple(policy_config.unet_channels),
         kernel_size=policy_config.kernel_size,
         groups=policy_config.groups,
@@ -107,7 +112,7 @@ def make(
             prepare=lambda k: unet.apply(params["unet"], k, method="embed_step"),
         )
 
-    return Diffuser(init, loss, sample)
+    return Diffuser(observed_dim, init, condition, loss, sample)
 
 
 def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:

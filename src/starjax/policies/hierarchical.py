@@ -46,6 +46,7 @@ def make(
         dtype=jnp.dtype(policy_config.dtype),
     )
     history_weight = float(policy_config.roll_history)
+    trocar_weight = float(policy_config.roll_trocar)
     # linen's `apply` may return changed variables too; ours never does
     predict: Callable[..., jax.Array] = rolls.apply  # pyright: ignore[reportAssignmentType]
 
@@ -54,7 +55,25 @@ def make(
         p = jnp.zeros((1, policy_config.horizon, 3))
         trocar = jnp.zeros((1, features.TROCAR_FEATURES))
         history = jnp.zeros((1, policy_config.obs_horizon))
-        return {"diffuser": model.init(key_model), "roll": rolls.init(key_roll, p, trocar, history)}
+        seen = jnp.zeros((1, model.observed_dim)) if policy_config.roll_observation else None
+        return {
+            "diffuser": model.init(key_model),
+            "roll": rolls.init(key_roll, p, trocar, history, seen),
+        }
+
+    def rolls_along(
+        params: Params,
+        p: jax.Array,
+        trocar: rcm.Trocar,
+        history: jax.Array,
+        inputs: features.Inputs,
+    ) -> jax.Array:
+        """Eq. 13, but for what an ablation adds or leaves out."""
+        seen = None
+        if policy_config.roll_observation:
+            seen = model.condition(params["diffuser"], inputs, jnp.zeros((len(p), 0)))
+        about = trocar_weight * features.trocar_features(trocar, p_world_ref)
+        return predict(params["roll"], p, about, history_weight * history, seen)
 
     def loss(
         params: Params, stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
@@ -75,11 +94,12 @@ def make(
         extra = features.extra(method, batch.trocar, p_world_ref)
         position_loss = model.loss(params["diffuser"], key_diffusion, inputs, extra, x0)
         p, history = action[..., space.slices["p"]], measured[..., roll]
-        predicted = predict(
-            params["roll"],
+        predicted = rolls_along(
+            params,
             p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
-            features.trocar_features(batch.trocar, p_world_ref),
-            history_weight * (history + ROLL_NOISE * jax.random.normal(key_roll, history.shape)),
+            batch.trocar,
+            history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
+            inputs,
         )
         roll_loss = jnp.mean((action[..., roll] - predicted) ** 2)  # Eq. 14
         total = position_loss + policy_config.roll_loss_weight * roll_loss
@@ -99,12 +119,7 @@ def make(
         extra = features.extra(method, trocar, p_world_ref)
         x0 = model.sample(params["diffuser"], keys, inputs, extra)
         p, gripper = x0[..., :3], x0[..., 3:]
-        gamma = predict(
-            params["roll"],
-            p,
-            features.trocar_features(trocar, p_world_ref),
-            history_weight * measured[..., roll],
-        )
+        gamma = rolls_along(params, p, trocar, measured[..., roll], inputs)
         # within the demonstrated range, as the diffused part is
         gamma = jnp.clip(gamma, -1.0, 1.0)[..., None]
         parts = {"roll": gamma, "p": p}

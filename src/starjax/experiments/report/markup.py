@@ -65,12 +65,10 @@ def interval(rate: stats.Rate, part: str) -> str:
     )
 
 
-def tint(rate: stats.Rate | None) -> Cell:
-    """A cell shaded by its rate."""
-    if rate is None:
-        return Cell("", "tint")
+def tint(rate: stats.Rate, mark: str) -> Cell:
+    """A cell shaded by its rate, which a mark follows."""
     shade = f"background:color-mix(in srgb, var(--seen) {round(70 * rate.rate)}%, transparent)"
-    return Cell(f"{100 * rate.rate:.0f}", "tint", shade)
+    return Cell(f"{100 * rate.rate:.0f}{mark}", "tint", shade)
 
 
 def uri(kind: str, data: bytes) -> str:

@@ -143,13 +143,19 @@ def matrix(runs: Sequence[results.Run]) -> str:
         return ""
     header, rows = [Cell("Method")], []
     for group in columns:
-        header.append(Cell(f"{group[0]['trocar']}{'' if group[0]['seen'] else '*'}", "tint"))
+        header.append(Cell(f"{group[0]['trocar']}", "tint"))
     for run in runs:
-        rates = {g[0]["trocar"]: outcomes.tally(g) for g in outcomes.by_trocar(run.trials)}
-        cells = [markup.tint(rates.get(group[0]["trocar"])) for group in columns]
+        own = {group[0]["trocar"]: group for group in outcomes.by_trocar(run.trials)}
+        cells = [_at_trocar(own.get(group[0]["trocar"])) for group in columns]
         rows.append([Cell(markup.escape(run.label)), *cells])
-    note = "Success in percent of the trials at each trocar; * marks trocars not trained on."
+    note = "Success in percent of the trials at each trocar; * where it was not trained on."
     return "<h2>Trocar by trocar</h2>\n" + markup.table(header, rows) + markup.small(note)
+
+
+def _at_trocar(trials: Sequence[outcomes.Trial] | None) -> Cell:
+    if not trials:
+        return Cell("", "tint")
+    return markup.tint(outcomes.tally(trials), "" if trials[0]["seen"] else "*")
 
 
 def failures(runs: Sequence[results.Run]) -> str:
