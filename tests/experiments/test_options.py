@@ -141,11 +141,10 @@ def test_every_field_has_its_flag():
     assert {"--seed", "--train.steps", "--demos.no-keep-failures", "--eval.time-limit-s"} <= {
         *flags
     }
-    leaves = sum(
-        len(dataclasses.fields(part))
-        for part in (config.DemosConfig, config.PolicyConfig, config.TrainConfig, config.EvalConfig)
-    )
-    assert len(flags) == leaves + 4 + 3  # method, preset, seed, out; three have a no- twin
+    parts = (config.DemosConfig, config.PolicyConfig, config.TrainConfig, config.EvalConfig)
+    leaves = [field for part in parts for field in dataclasses.fields(part)]
+    twins = sum(isinstance(field.default, bool) for field in leaves)  # a switch has a no- twin
+    assert twins and len(flags) == len(leaves) + twins + 4  # method, preset, seed, out
 
 
 @pytest.mark.parametrize(
