@@ -54,19 +54,23 @@ class Job(NamedTuple):
     Attributes:
       policy: being trained.
       state: its TrainState, on all devices.
+      carried: it and its rounded matrices, what goes from call to call.
       dataset: made-up frames on all devices.
       example: a batch.
-      steps: (state, dataset, count) -> state after `per_call` steps.
+      steps: (carried, dataset, count) -> carried after `per_call` steps.
       per_call: steps in one call; `count` must be given as this.
+      calls: made before the last one's result is waited for, as training does.
       mesh: of the devices.
     """
 
     policy: policies.Policy
     state: state.TrainState
+    carried: step.Carried
     dataset: windows.Dataset
     example: windows.Batch
-    steps: Callable[..., state.TrainState]
+    steps: Callable[..., step.Carried]
     per_call: int
+    calls: int
     mesh: jax.sharding.Mesh
 
 
@@ -109,16 +113,18 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     first = state.create(policy, optimizer, state.init_params(policy, seed), stats, seed)
     mesh = devices.make_mesh(batch, on)
     settings = (policy, optimizer, case.policy, case.train, mesh)
-    looped = step.runs_in_a_loop(case.policy, mesh)
+    looped = step.runs_in_a_loop(case.policy)
 
-    def steps(state, dataset, count):
+    def steps(carried, dataset, count):
         drawn = jnp.arange(len(dataset.episode))
         if looped:
-            return step.resident_steps(*settings, state, dataset, drawn, count)
-        return step.resident_step(*settings, state, dataset, drawn)
+            return step.resident_steps(*settings, carried[0], dataset, drawn, count), carried[1]
+        return step.carried_step(*settings, carried, dataset, drawn)
 
-    first, dataset = devices.replicate((first, dataset), mesh)
-    return Job(policy, first, dataset, example, steps, 10 if looped else 1, mesh)
+    narrow = None if looped else step.rounded(first.params, case.policy.dtype)
+    carried, dataset = devices.replicate(((first, narrow), dataset), mesh)
+    per_call, calls = (10, 1) if looped else (1, 10 if on[0].platform == "gpu" else 1)
+    return Job(policy, carried[0], carried, dataset, example, steps, per_call, calls, mesh)
 
 
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:

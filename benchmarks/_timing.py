@@ -45,11 +45,17 @@ def time_jitted(function: Callable, *arguments: Any, repeats: int = 7) -> Timing
 
 
 def time_carried(
-    function: Callable, carry: Any, *arguments: Any, repeats: int = 5, **options: Any
+    function: Callable,
+    carry: Any,
+    *arguments: Any,
+    repeats: int = 5,
+    calls: int = 1,
+    **options: Any,
 ) -> tuple[Timing, Any]:
     """The same of `(carry, *arguments) -> carry`, each call on the last one's memory.
 
-    Returns the timing and the last carry; the given one stays as it is. `options` are jit's.
+    Times are of `calls` calls, of which the last is waited for. Returns the timing and the last
+    carry; the given one stays as it is. `options` are jit's.
     """
     # Copied: a buffer that stands in it twice could not be given away.
     carry = jax.tree.map(jnp.copy, carry)
@@ -57,7 +63,9 @@ def time_carried(
 
     def call():
         nonlocal carry
-        carry = jax.block_until_ready(compiled(carry, *arguments))
+        for _ in range(calls):
+            carry = compiled(carry, *arguments)
+        jax.block_until_ready(carry)
 
     timing = time_plain(call, repeats=repeats)
     return known._replace(median_s=timing.median_s, min_s=timing.min_s), carry

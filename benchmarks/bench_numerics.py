@@ -70,16 +70,17 @@ def losses(case: _setup.Case, seed: int, steps: int) -> np.ndarray:
     """`[steps]` losses, one a step."""
     job = _setup.job(case, seed=seed, frames=256)
 
-    def step(state, dataset):
+    def step(carried, dataset):
+        state, narrow = carried
         cleared = jax.tree.map(jnp.zeros_like, state.sums)
-        return job.steps(state.replace(sums=cleared), dataset, jnp.int32(1))
+        return job.steps((state.replace(sums=cleared), narrow), dataset, jnp.int32(1))
 
     one = jax.jit(step, donate_argnums=0)
-    state, found = job.state, []
+    carried, found = job.carried, []
     for _ in range(steps):
-        state = one(state, job.dataset)
+        carried = one(carried, job.dataset)
         # Copied, as the next step takes the state's memory; not waited for.
-        found.append(jnp.copy(state.sums["loss"]))
+        found.append(jnp.copy(carried[0].sums["loss"]))
     return np.array(jax.device_get(found))
 
 

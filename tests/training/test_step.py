@@ -1,5 +1,6 @@
 """The training step: one program, nothing lost to a broken loss, the right frames."""
 
+import dataclasses
 import types
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 
 from starjax import config
 from starjax.data import normalizer, windows
+from starjax.experiments.methods import METHODS
+from starjax.policies import policy as policies
 from starjax.policies.policy import Policy
 from starjax.training import devices, state, step
 
@@ -87,6 +90,23 @@ def test_it_learns_the_given_frames_only(start, dataset):
     last = run(first, dataset, jnp.arange(20, 40), jnp.int32(300))
     wanted = np.asarray(dataset.command.pose.p[20:40]).mean(0)
     np.testing.assert_allclose(last.params["w"], wanted, atol=0.05)
+
+
+def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset):
+    small = dataclasses.replace(fakes.TINY, dtype="bfloat16")
+    settings = dataclasses.replace(SETTINGS, learning_rate=1e-3)
+    policy = policies.make(METHODS["stardiff"], small, fakes.P_WORLD_REF, settings)
+    optimizer, mesh = state.make_optimizer(settings), devices.make_mesh(8)
+    stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(80))
+    first = state.create(policy, optimizer, state.init_params(policy, 0), stats, seed=0)
+    given = (policy, optimizer, small, settings, mesh)
+    frames = jnp.arange(80)
+    one = jax.jit(lambda s: step.resident_step(*given, s, dataset, frames))
+    many = jax.jit(lambda s, n: step.resident_steps(*given, s, dataset, frames, n))
+    looped, called = many(first, 3), one(one(one(first)))
+    chex.assert_trees_all_close((looped.params, looped.sums), (called.params, called.sums))
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), looped.params, first.params)
+    assert min(jax.tree.leaves(moved)) > 1e-3  # three steps of the learning rate
 
 
 def test_a_broken_loss_is_left_out_and_counted(start, dataset):

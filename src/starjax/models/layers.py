@@ -7,10 +7,13 @@ statistics are always float32. Initial values follow torch's defaults, as Diffus
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+
+_PARTS = 128  # of a sum over many places on a GPU
 
 
 # Jitted inside of jitted programs: what many layers share is then traced once a shape.
@@ -22,6 +25,38 @@ def mish(x: jax.Array) -> jax.Array:
     e = jnp.exp(jnp.minimum(wide, 20.0))
     n = e * (e + 2.0)
     return (wide * (n / (n + 2.0))).astype(x.dtype)
+
+
+def spread(vector: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """`vector` `[C]` at every place of `shape` `[..., C]`.
+
+    On a GPU its gradient, the sum over all places, takes two steps: XLA would sum up each channel
+    from end to end, beside other work, in 0.1 ms where 0.01 do.
+    """
+    return _spread(vector, shape)
+
+
+_spread: Any = jax.custom_vjp(jnp.broadcast_to, nondiff_argnums=(1,))
+_spread.defvjp(
+    lambda vector, shape: (jnp.broadcast_to(vector, shape), None),
+    lambda shape, _, g: (_sum_of_places(g),),
+)
+
+
+@jax.jit
+def _sum_of_places(g: jax.Array) -> jax.Array:
+    at_once = functools.partial(jnp.sum, axis=range(g.ndim - 1))
+    return jax.lax.platform_dependent(g, cuda=sum_in_two, default=at_once)
+
+
+def sum_in_two(g: jax.Array) -> jax.Array:
+    """`[..., C] -> [C]`, by way of at most `_PARTS` sums or, of `[B, C]`, of what is given."""
+    dtype = g.dtype
+    if g.ndim > 2:
+        parts = math.gcd(math.prod(g.shape[:-1]), _PARTS)
+        g = g.reshape(parts, -1, g.shape[-1]).sum(1, dtype=jnp.float32)
+    # without a barrier XLA makes one sum of the two again
+    return jax.lax.optimization_barrier(g).sum(0).astype(dtype)
 
 
 def uniform_init(fan_in: int, gain: float = 1.0) -> Callable[..., jax.Array]:
@@ -88,8 +123,9 @@ def _group_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int) ->
     mean = wide.mean(positions).reshape(per_group).mean(-1)
     square = (wide * wide).mean(positions).reshape(per_group).mean(-1)
     inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + 1e-5)
-    gain = jnp.repeat(inverse, channels // groups, axis=1) * scale
-    shift = bias - jnp.repeat(mean, channels // groups, axis=1) * gain
+    shape = (batch, channels)
+    gain = jnp.repeat(inverse, channels // groups, axis=1) * spread(scale, shape)
+    shift = spread(bias, shape) - jnp.repeat(mean, channels // groups, axis=1) * gain
     shape = (batch,) + (1,) * len(positions) + (channels,)
     return (wide * gain.reshape(shape) + shift.reshape(shape)).astype(x.dtype)
 
@@ -136,7 +172,8 @@ class Conv1d(nn.Module):
         stacked = jnp.concatenate(shifted, -1) if len(taps) > 1 else shifted[0]
         flat = stacked.reshape(batch * out, len(taps) * channels)
         y = flat @ kernel.astype(x.dtype).reshape(len(taps) * channels, self.features)
-        return y.reshape(batch, out, self.features) + bias.astype(x.dtype)
+        shape = (batch, out, self.features)
+        return y.reshape(shape) + spread(bias.astype(x.dtype), shape)
 
 
 def columns(kernel: jax.Array) -> jax.Array:
@@ -163,7 +200,8 @@ class Upsample1d(nn.Module):
         pairs = jnp.stack([jnp.concatenate([x, other], -1) for other in (before, after)])
         y = jnp.matmul(pairs.reshape(2, batch * length, 2 * channels), kernel)
         y = jnp.moveaxis(y.reshape(2, batch, length, channels), 0, 2)
-        return y.reshape(batch, 2 * length, channels) + bias
+        shape = (batch, 2 * length, channels)
+        return y.reshape(shape) + spread(bias, shape)
 
 
 def _shifted_sum(products: jax.Array, taps: range, padding: int, bias: jax.Array) -> jax.Array:

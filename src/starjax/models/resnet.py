@@ -130,19 +130,28 @@ def _max_pool(x: jax.Array) -> tuple[jax.Array, tuple[jax.Array, tuple[int, ...]
 
 def _max_pool_gradient(kept, g: jax.Array) -> tuple[jax.Array]:
     number, shape = kept
+    # An even row is the middle of one window; an odd one the last of that and the first of the
+    # next. Element-wise in the input's entries, so that it can be part of what uses it.
+    row, column = (jnp.arange(side)[:, None] for side in shape[1:3])
+    row, gradient = row[:, None], jnp.zeros(shape, g.dtype)
+    for down, right in np.ndindex(2, 2):
+        place = 3 * _place(row, down) + _place(column, right)
+        chosen = _each_twice(number, down, right, shape) == place.astype(jnp.uint8)
+        gradient += jnp.where(chosen, _each_twice(g, down, right, shape), 0)
+    return (gradient,)
 
-    def of(n: int, down: int = 0, right: int = 0) -> jax.Array:
-        """What windows give to their entry n; those one further down or right, if asked."""
-        given = jnp.where(number == n, g, 0)
-        return jnp.pad(given, ((0, 0), (0, down), (0, right), (0, 0)))[:, down:, right:]
 
-    # Even rows and columns are the middle of one window, odd ones lie between two.
-    even = jnp.stack([of(4), of(5) + of(3, right=1)], 3)
-    odd = jnp.stack([of(7) + of(1, 1), of(8) + of(6, 0, 1) + of(2, 1, 0) + of(0, 1, 1)], 3)
-    both = jnp.stack([even, odd], 2)
-    batch, height, _, width, _, channels = both.shape
-    whole = both.reshape(batch, 2 * height, 2 * width, channels)
-    return (whole[:, : shape[1], : shape[2]],)
+def _place(index: jax.Array, following: int) -> jax.Array:
+    """Place (0 to 2) of an entry in its window, or in the following one; 9 if it is not in it."""
+    return jnp.where(index % 2 == 0, 9 if following else 1, 0 if following else 2)
+
+
+def _each_twice(x: jax.Array, down: int, right: int, shape: tuple[int, ...]) -> jax.Array:
+    """`[N, h, w, C] -> shape`: for each entry its window's value, or that of a following one."""
+    x = jnp.pad(x[:, down:, right:], ((0, 0), (0, down), (0, right), (0, 0)))
+    batch, height, width, channels = x.shape
+    twice = jnp.broadcast_to(x[:, :, None, :, None], (batch, height, 2, width, 2, channels))
+    return twice.reshape(batch, 2 * height, 2 * width, channels)[:, : shape[1], : shape[2]]
 
 
 max_pool.defvjp(_max_pool, _max_pool_gradient)

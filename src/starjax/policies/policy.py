@@ -62,19 +62,26 @@ def with_resnet18(params: Params, path: str | pathlib.Path) -> Params:
 def for_sampling(params: Params, dtype: str) -> Params:
     """Parameters as `sample` uses them fastest: for evaluation, not for training.
 
-    Large matrices are in the type that the networks calculate in. `sample` rounds them so anyway,
-    to the same numbers; done before, the U-Net's are not read in float32 and rounded again at each
-    DDIM step. And on a GPU the kernels of the U-Net's blocks lie as `layers.columns`.
+    `rounded`, and on a GPU the kernels of the U-Net's blocks lie as `layers.columns`.
+    """
+    if jax.default_backend() == "gpu":  # a CPU would be a little slower with them
+        params = with_columns(params)
+    return rounded(params, dtype)
+
+
+def rounded(params: Params, dtype: str) -> Params:
+    """Parameters whose large matrices are in the type that the networks calculate in.
+
+    The networks round them so anyway, to the same numbers, wherever they use them; done before,
+    the U-Net's are not read in float32 and rounded again at each DDIM step.
     """
     networks, matrices = {"unet", "trunk"}, {"kernel", "columns", "film_time", "film_cond"}
 
-    def rounded(path: tuple[Any, ...], leaf: Any) -> Any:
+    def one(path: tuple[Any, ...], leaf: Any) -> Any:
         names = {getattr(key, "key", None) for key in path}
         return leaf.astype(jnp.dtype(dtype)) if names & networks and names & matrices else leaf
 
-    if jax.default_backend() == "gpu":  # a CPU would be a little slower with them
-        params = with_columns(params)
-    return jax.tree_util.tree_map_with_path(rounded, params)
+    return jax.tree_util.tree_map_with_path(one, params)
 
 
 def with_columns(params: Params) -> Params:

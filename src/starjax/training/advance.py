@@ -49,19 +49,37 @@ def resident(it: Training, like: TrainState | None = None) -> Advance:
     With `like`, shapes and places of the state, the program is compiled from now on, beside what
     the caller does until the first step.
     """
-    looped = steps.runs_in_a_loop(it.policy_config, it.mesh)
-    body = steps.resident_steps if looped else steps.resident_step
-    program = _program(functools.partial(body, *it[:5]), it.mesh)
     data = devices.replicate((it.dataset, jnp.asarray(it.frames)), it.mesh, may_alias=None)
+    if steps.runs_in_a_loop(it.policy_config):
+        return _looped(it, like, data)
+    program = _program(functools.partial(steps.carried_step, *it[:5]), it.mesh)
+    rounded = jax.jit(
+        functools.partial(steps.rounded, dtype=it.policy_config.dtype),
+        out_shardings=devices.replicated(it.mesh),
+    )
+    if like is not None:
+        narrow = jax.eval_shape(rounded, like.params)
+        placed = jax.tree.map(lambda x: x.update(sharding=like.step.sharding), narrow)
+        program = _compiled_beside(program, (like, placed), *data)
+
+    def advance(state: TrainState, count: int) -> TrainState:
+        carried: Any = (state, rounded(state.params))
+        for _ in range(count):
+            carried = program(carried, *data)
+        return carried[0]
+
+    return advance
+
+
+def _looped(it: Training, like: TrainState | None, data: Any) -> Advance:
+    program = _program(functools.partial(steps.resident_steps, *it[:5]), it.mesh)
 
     def counted(count: int) -> jax.Array:
         return devices.replicate(np.int32(count), it.mesh)
 
     if like is not None:
-        program = _compiled_beside(program, like, *data, *([counted(1)] if looped else []))
-    if looped:
-        return lambda state, count: program(state, *data, counted(count))
-    return _repeated(lambda state: program(state, *data))
+        program = _compiled_beside(program, like, *data, counted(1))
+    return lambda state, count: program(state, *data, counted(count))
 
 
 def streamed(it: Training, state: TrainState) -> Advance:
@@ -72,10 +90,16 @@ def streamed(it: Training, state: TrainState) -> Advance:
     stream = feed.batches(
         it.dataset, it.frames, it.policy_config, it.train_config, it.mesh, key, int(state.step)
     )
-    return _repeated(lambda state: program(state, next(stream)))
+
+    def advance(state: TrainState, count: int) -> TrainState:
+        for _ in range(count):
+            state = program(state, next(stream))
+        return state
+
+    return advance
 
 
-def _program(body: Callable[..., TrainState], mesh: Mesh) -> Any:
+def _program(body: Callable[..., Any], mesh: Mesh) -> Any:
     placed, options = devices.replicated(mesh), devices.compiler_options(mesh)
     return jax.jit(body, donate_argnums=0, out_shardings=placed, compiler_options=options)
 
@@ -86,12 +110,3 @@ def _compiled_beside(program: Any, *like: Any) -> Callable[..., TrainState]:
     compiled = pool.submit(lambda: program.lower(*like).compile())
     pool.shutdown(wait=False)
     return lambda *args: compiled.result()(*args)
-
-
-def _repeated(one: Callable[[TrainState], TrainState]) -> Advance:
-    def advance(state: TrainState, count: int) -> TrainState:
-        for _ in range(count):
-            state = one(state)
-        return state
-
-    return advance

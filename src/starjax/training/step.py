@@ -1,6 +1,7 @@
 """One pure training step, and many of them in one compiled call."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +10,14 @@ from jax.sharding import Mesh
 
 from starjax import config
 from starjax.data import windows
-from starjax.policies.policy import Policy
+from starjax.policies import policy as policies
 from starjax.training import devices
 from starjax.training import state as states
 from starjax.training.state import TrainState
+
+_SMALL = 1 << 16  # entries
+
+Carried = tuple[TrainState, policies.Params | None]
 
 
 def step_keys(key: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -22,18 +27,26 @@ def step_keys(key: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def train_step(
-    policy: Policy,
+    policy: policies.Policy,
     optimizer: optax.GradientTransformation,
     train_config: config.TrainConfig,
     state: TrainState,
     batch: windows.Batch,
+    narrow: policies.Params | None = None,
 ) -> TrainState:
-    """One step of AdamW and of the average; left out, and counted, if it is not finite."""
+    """One step of AdamW and of the average; left out, and counted, if it is not finite.
+
+    `narrow` are the `rounded` matrices of the state's parameters, if they are at hand.
+    """
     _, key_loss = step_keys(state.key, state.step)
+    params = state.params
+    if narrow is not None:
+        params = jax.tree.map(lambda p, n: p if n is None else n, params, narrow)
     (loss, metrics), gradients = jax.value_and_grad(policy.loss, has_aux=True)(
-        state.params, state.normalizer, key_loss, batch
+        params, state.normalizer, key_loss, batch
     )
-    norm = optax.tree.norm(gradients)
+    gradients = jax.tree.map(lambda g, p: g.astype(p.dtype), gradients, state.params)
+    norm = _norm(gradients)
     finite = jnp.isfinite(loss) & jnp.isfinite(norm)
     # zeros in place of NaN keep the arithmetic below harmless; its results are dropped
     gradients = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradients)
@@ -61,7 +74,7 @@ def train_step(
 
 
 def resident_step(
-    policy: Policy,
+    policy: policies.Policy,
     optimizer: optax.GradientTransformation,
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,
@@ -69,6 +82,7 @@ def resident_step(
     state: TrainState,
     dataset: windows.Dataset,
     frames: jax.Array,
+    narrow: policies.Params | None = None,
 ) -> TrainState:
     """One step on a dataset that is on the device.
 
@@ -81,16 +95,40 @@ def resident_step(
       state: donated by the caller.
       dataset: leaves are jax arrays, on every device of the mesh.
       frames: `[n]` int32 frames to draw from.
+      narrow: see `train_step`.
     """
     key_frames, _ = step_keys(state.key, state.step)
     frame = windows.sample_frames(key_frames, frames, train_config.batch_size)
     frame = jax.lax.with_sharding_constraint(frame, devices.batch_sharding(mesh))
     batch = windows.gather(dataset, frame, policy_config.obs_horizon, policy_config.horizon)
-    return train_step(policy, optimizer, train_config, state, batch)
+    return train_step(policy, optimizer, train_config, state, batch, narrow)
+
+
+def carried_step(
+    policy: policies.Policy,
+    optimizer: optax.GradientTransformation,
+    policy_config: config.PolicyConfig,
+    train_config: config.TrainConfig,
+    mesh: Mesh,
+    carried: Carried,
+    dataset: windows.Dataset,
+    frames: jax.Array,
+) -> Carried:
+    """`resident_step` of a state and its `rounded` matrices: the optimiser writes both, so that
+    the float32 ones are not read again to round them."""
+    settings = (policy, optimizer, policy_config, train_config, mesh)
+    state = resident_step(*settings, carried[0], dataset, frames, carried[1])
+    return state, rounded(state.params, policy_config.dtype)
+
+
+def rounded(params: policies.Params, dtype: str) -> policies.Params:
+    """The matrices that `policy.rounded` changes, as it gives them; None in the others' places."""
+    changed = policies.rounded(params, dtype)
+    return jax.tree.map(lambda old, new: None if new.dtype == old.dtype else new, params, changed)
 
 
 def resident_steps(
-    policy: Policy,
+    policy: policies.Policy,
     optimizer: optax.GradientTransformation,
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,
@@ -105,20 +143,29 @@ def resident_steps(
     `count`, int32 `[]`, is a traced number, so that logging and checkpoints may stop anywhere
     without another compilation.
     """
-
-    def one(_, state):
-        return resident_step(
-            policy, optimizer, policy_config, train_config, mesh, state, dataset, frames
-        )
-
-    return jax.lax.fori_loop(0, count, one, state)
+    settings = (policy, optimizer, policy_config, train_config, mesh)
+    first = state, rounded(state.params, policy_config.dtype)
+    return jax.lax.fori_loop(
+        0, count, lambda _, carried: carried_step(*settings, carried, dataset, frames), first
+    )[0]
 
 
-def runs_in_a_loop(policy_config: config.PolicyConfig, mesh: Mesh) -> bool:
-    """Whether many steps in one call are faster than one: everywhere but for pictures on a CPU.
+def _norm(tree: Any) -> jax.Array:
+    """Euclidean norm of all leaves. The small ones are summed up together: on a GPU a kernel or
+    two for each take longer than all the large ones."""
+    leaves = jax.tree.leaves(tree)
+    small = [leaf.ravel() for leaf in leaves if leaf.size < _SMALL]
+    large = [leaf for leaf in leaves if leaf.size >= _SMALL]
+    together = [jnp.concatenate(small)] if small else []
+    return jnp.sqrt(jnp.stack([jnp.sum(leaf * leaf) for leaf in large + together]).sum())
+
+
+def runs_in_a_loop(policy_config: config.PolicyConfig) -> bool:
+    """Whether many steps in one program are faster than a program for each: not with pictures.
 
     XLA's CPU compiler gives convolutions the layout that its fast kernels need only outside of
-    loops; inside, those of the gradient run 12 times slower.
+    loops; inside, those of the gradient run 12 times slower. On a GPU a loop asks the host after
+    each step whether to go on, and then waits for it, while calls are handed over ahead of time;
+    steps without pictures are shorter than that takes.
     """
-    sees_pictures = policy_config.observation == "image" and not policy_config.freeze_encoder
-    return not sees_pictures or mesh.devices.flat[0].platform != "cpu"
+    return policy_config.observation != "image" or policy_config.freeze_encoder
