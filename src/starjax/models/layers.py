@@ -27,6 +27,7 @@ def mish(x: jax.Array) -> jax.Array:
     return (wide * (n / (n + 2.0))).astype(x.dtype)
 
 
+@functools.partial(jax.jit, static_argnames="shape")
 def spread(vector: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """`vector` `[C]` at every place of `shape` `[..., C]`.
 

@@ -156,7 +156,17 @@ class ConvBlock(nn.Module):
         return layers.mish(layers.GroupNorm(self.groups)(x))
 
 
+@jax.custom_vjp
 def _matmul_f32(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """Product in the dtype of `x`, accumulated and returned in float32: the two FiLM parts are
-    added before they are rounded."""
+    added before they are rounded. So is their gradient, which is therefore exact in that dtype."""
     return jnp.matmul(x, kernel.astype(x.dtype), preferred_element_type=jnp.float32)
+
+
+def _matmul_f32_gradient(kept: Any, g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    x, kernel = kept
+    g = g.astype(x.dtype)
+    return g @ kernel.astype(x.dtype).T, (x.T @ g).astype(kernel.dtype)
+
+
+_matmul_f32.defvjp(lambda x, kernel: (_matmul_f32(x, kernel), (x, kernel)), _matmul_f32_gradient)
