@@ -21,7 +21,7 @@ SETTINGS = config.TrainConfig(
 )
 
 
-def train(directory, settings=SETTINGS, host=False, observation="state", **kwargs):
+def train(directory, settings=SETTINGS, host=False, observation="state", dtype="float32", **kwargs):
     """A whole training run on fake demonstrations."""
     import jax
     import numpy as np
@@ -34,7 +34,7 @@ def train(directory, settings=SETTINGS, host=False, observation="state", **kwarg
         dataset = jax.tree.map(np.asarray, dataset)
     return loop.run(
         METHODS["stardiff"],
-        dataclasses.replace(fakes.TINY, observation=observation),
+        dataclasses.replace(fakes.TINY, observation=observation, dtype=dtype),
         settings,
         dataset,
         fakes.P_WORLD_REF,

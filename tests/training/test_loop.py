@@ -112,15 +112,15 @@ def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
     np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
 
 
-def test_pictures_train_too_and_resume(tmp_path):
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_pictures_train_too_and_resume(tmp_path, dtype):
     settings = dataclasses.replace(jobs.SETTINGS, steps=2, holdout_demos=0)
-    whole = jobs.train(tmp_path / "a", settings, observation="image")
+    seen = {"observation": "image", "dtype": dtype}
+    whole = jobs.train(tmp_path / "a", settings, **seen)
     asked = iter(range(100))
     with pytest.raises(loop.Interrupted):
-        jobs.train(
-            tmp_path / "b", settings, observation="image", should_stop=lambda: next(asked) == 1
-        )
-    again = jobs.train(tmp_path / "b", settings, observation="image")
+        jobs.train(tmp_path / "b", settings, **seen, should_stop=lambda: next(asked) == 1)
+    again = jobs.train(tmp_path / "b", settings, **seen)
     assert_same_bytes(again.state, whole.state)
 
 
