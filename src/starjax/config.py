@@ -41,6 +41,7 @@ class DemosConfig:
     per_trocar: int = 30  # successful demonstrations a seen trocar (V-A3)
     seen_trocars: int = 8  # the first n of the eight seen trocars
     keep_failures: bool = False
+    one_wall: bool = False  # on the middle row the expert always takes the wall of one side
     max_steps: int = 600  # control steps at 30 Hz an expert may take
 
 

@@ -152,6 +152,19 @@ def test_the_expert_takes_the_inner_wall_and_on_the_middle_row_the_one_of_less_t
     assert min(clear.values()) >= 3
 
 
+def test_with_one_wall_the_expert_takes_the_same_on_the_middle_row_and_else_as_before(reset):
+    begin = jax.jit(jax.vmap(expert.init_with_one_wall))
+    middle = 0
+    for seed in range(4):
+        state = reset(seed)
+        walls = np.asarray(begin(jax.random.split(jax.random.key(seed), 12), state).wall)
+        normals = np.asarray(jax.vmap(peg_transfer.wall_normals)(state.block_pose))
+        for wall, normal, y in zip(walls, normals, np.asarray(state.block_pose.p[:, 1])):
+            assert (normal[wall, 1] < 0) == (y > expert.BETWEEN_ROWS)
+            middle += abs(y) < expert.BETWEEN_ROWS
+    assert middle >= 8
+
+
 def test_the_expert_comes_in_from_outside_along_the_wall(reset, begin):
     state = reset(3)
     script = begin(state, 3)

@@ -38,6 +38,7 @@ def describe(
     seed: int,
     max_steps: int,
     keep_failures: bool = False,
+    one_wall: bool = False,
 ) -> dict[str, Any]:
     """What a dataset is: the content of dataset.json, and by `store.digest` its name."""
     frame = recorder.frame(env)
@@ -61,6 +62,7 @@ def describe(
         "scene": _scene_hash(env.model),
         "seed_rule": f"fold_in(fold_in(fold_in(key(seed), {recorder.STREAM}), trocar), trial)",
         "versions": xla.versions(),
+        **({"one_wall": True} if one_wall else {}),  # not in the names of datasets without
     }
 
 
@@ -74,6 +76,7 @@ def collect(
     seed: int,
     max_steps: int,
     keep_failures: bool = False,
+    one_wall: bool = False,
     chunk: int = 0,
     devices: Sequence[jax.Device] | None = None,
     report: Callable[[str], None] = print,
@@ -88,6 +91,7 @@ def collect(
       per_trocar: successful episodes wanted at each.
       max_steps: control steps after which an episode has failed.
       keep_failures: store failed episodes too.
+      one_wall: what the description says of the expert.
       chunk: episodes simulated at once; 0 for what suits the machine.
       devices: to split a chunk over.
       report: gets lines for the user.
@@ -115,6 +119,7 @@ def collect(
             seed=seed,
             max_steps=max_steps,
             keep_failures=keep_failures,
+            one_wall=one_wall,
         )
         store.create(root, description)
         store.clean(root)

@@ -14,7 +14,7 @@ from starjax.experiments import clock, words
 def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
     """The folder of a run's demonstrations, and a function that collects what it lacks."""
     from starjax import rcm
-    from starjax.data import demos, lanes, store
+    from starjax.data import demos, lanes, recorder, store
     from starjax.sim.tasks import expert
 
     trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
@@ -23,7 +23,10 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
         "seed": config.seed,
         "max_steps": config.demos.max_steps,
         "keep_failures": config.demos.keep_failures,
+        "one_wall": config.demos.one_wall,
     }
+    init = expert.init_with_one_wall if config.demos.one_wall else expert.init
+    script = recorder.Expert(init, expert.act)
     out = Path(config.out)
     root = out / f"demos-{store.digest(demos.describe(env, trocars, **wanted))}"
 
@@ -34,7 +37,7 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
         words.stage("collect", f"into {root}")
         with clock.timed(out, "collect"):
             found = demos.collect(
-                root, env, expert, trocars, devices=lanes.devices(), report=words.indented, **wanted
+                root, env, script, trocars, devices=lanes.devices(), report=words.indented, **wanted
             )
         words.indented(
             "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)

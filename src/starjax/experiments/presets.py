@@ -42,6 +42,7 @@ PRESETS: dict[str, RunConfig] = {
     "cpu": RunConfig(
         preset="cpu",
         out="runs/cpu",
+        demos=DemosConfig(one_wall=True),
         policy=PolicyConfig(
             image_size=128,
             encoder="small",

@@ -8,6 +8,8 @@ hold the grasp point, and the jaws' axis then stays on the wall's normal. It com
 normal, from outside, so that the path says which way the wall faces, and ways to two walls differ.
 """
 
+import functools
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -40,6 +42,7 @@ HELD = 0.006  # m from the tip within which the grasped wall counts as held
 GRASP_SIDE = 0.0015  # m along the wall, to either side of its middle
 CANDIDATES = 2  # walls to choose from
 OUTWARD = 0.001  # m off the middle row at which a preference shows
+BETWEEN_ROWS = 0.012  # m off the middle row, half way to the next
 SKEW = 0.1  # sine of the angle between jaws and the world's y at which a preference shows
 
 NOISE_POSITION = 0.0012  # m, standard deviation of the disturbance
@@ -63,6 +66,7 @@ class ExpertState:
       normal: `[3]`, the wall's direction, or the opposite: jaws are symmetric, and this keeps the
         roll on one branch.
       roll_from: rad, the roll that the next turn begins at. jaws_from: jaws at the phase's start.
+      middle: m, y of the row on which either wall may be taken.
       tempo: pace. noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
       label: the undisturbed command, which is what demonstrations record.
     """
@@ -79,13 +83,15 @@ class ExpertState:
     normal: jax.Array
     roll_from: jax.Array
     jaws_from: jax.Array
+    middle: jax.Array
     tempo: jax.Array
     noise: jax.Array
     label: Command
 
 
-def init(key: jax.Array, state: env.EnvState) -> ExpertState:
-    """The script at the start of an episode."""
+def init(key: jax.Array, state: env.EnvState, middle: float = 0.0) -> ExpertState:
+    """The script at the start of an episode. `middle`: see `ExpertState`; the peg rows' by default,
+    and between two rows there is no choice."""
     key_tempo, key = jax.random.split(key)
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
     expert = ExpertState(
@@ -101,11 +107,15 @@ def init(key: jax.Array, state: env.EnvState) -> ExpertState:
         normal=jnp.array([0.0, -1.0, 0.0]),
         roll_from=jnp.zeros(()),
         jaws_from=jnp.ones(()),
+        middle=jnp.asarray(middle, jnp.float32),
         tempo=tempo,
         noise=jnp.zeros((2, 4)),
         label=Command(state.pose, jnp.ones(())),
     )
     return _enter(expert, jnp.asarray(APPROACH, jnp.int32), state, jnp.zeros(()))
+
+
+init_with_one_wall = functools.partial(init, middle=BETWEEN_ROWS)
 
 
 def act(expert: ExpertState, state: env.EnvState) -> tuple[Command, ExpertState]:
@@ -166,7 +176,7 @@ def _enter(
     is_candidate = skew <= jnp.sort(skew)[CANDIDATES - 1]
     # Of these, the one towards the board's middle, where the shaft leans away from the peg; on the
     # middle row the one that asks for less of a turn, or either if they are alike.
-    unlike = normals[:, 1] * block.p[1] / OUTWARD + skew / SKEW
+    unlike = normals[:, 1] * (block.p[1] - expert.middle) / OUTWARD + skew / SKEW
     chosen = jax.random.categorical(key_wall, jnp.where(is_candidate, -unlike, -jnp.inf))
     wall = jnp.where(is_approach, chosen, expert.wall)
     out = normals[wall] * jnp.array([1.0, 1.0, 0.0])
