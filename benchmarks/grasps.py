@@ -1,13 +1,15 @@
-"""How recorded trials first close their jaws: turned off the block's wall, and how far from it.
+"""How recorded trials come down on the block's wall, and how they first close the jaws on it.
 
     python benchmarks/grasps.py RUN...
 
 RUN is a method's folder, of an evaluation that recorded trials (`--eval.video-trials`). Jaws close
-along their y axis, wanted on a wall's normal; the tip is wanted `RIM_RADIUS` from the block's axis.
+along their y axis, wanted on a wall's normal; the tip is wanted on the wall, `RIM_RADIUS` from the
+block's axis. Coming down is measured where nothing touches yet, from the block as it stood first.
 """
 
 import argparse
 import pathlib
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -18,6 +20,10 @@ from starjax.sim.tasks import peg_transfer as task
 
 PERIOD_DEG = 60.0  # walls are 120 degrees apart, and jaws look alike after half a turn
 TURNED_DEG = 10.0
+BESIDE = 0.001  # m
+ABOVE = 0.0065  # m over the block's frame: coming down
+AROUND = 0.014  # m from the block's axis
+MIDDLE = 0.012  # m: blocks nearer than this to y = 0 are on the middle row
 JAW = "robot/tool/jaw_left"
 
 
@@ -25,39 +31,74 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", type=pathlib.Path)
     model = envs.make("state").model.mj_model
-    print("run: trials; of the successful ones angle off the wall, mean and deviation (deg);")
-    print("successful of those within 1 mm of the wall, of the others;")
-    print(f"of those within {TURNED_DEG:g} degrees of it, of the others")
     for path in parser.parse_args().runs:
-        run = results.load(path)
-        found = [first_closing(model, it) for it in run.rollouts]
-        success = np.array([bool(it.trial["success"]) for it in run.rollouts])
-        angle, radius = np.array(found).T
-        near = np.abs(radius - task.RIM_RADIUS) < 0.001
-        turned = np.abs(angle) < TURNED_DEG
-        counts = [f"{success[w].sum()} of {w.sum()}" for w in (near, ~near, turned, ~turned)]
-        won = angle[success]
-        spread = f"{np.nanmean(won):.1f}, {np.nanstd(won):.1f}"
-        print(f"{path}: {len(found)}; {spread}; {'; '.join(counts)}")
+        report(model, results.load(path))
 
 
-def first_closing(model: mujoco.MjModel, it: results.Rollout) -> tuple[float, float]:
-    """Angle (deg, within half a period) and distance of the tip from the block's axis (m) when the
-    jaws first are half closed; NaN if they never are."""
-    assert it.qpos is not None
-    jaw = it.qpos[:, model.joint(JAW).qposadr[0]]
+def report(model: mujoco.MjModel, run: results.Run) -> None:
+    success = np.array([bool(it.trial["success"]) for it in run.rollouts])
+    print(f"{run.path}: {success.sum()} of {len(success)} recorded trials succeed")
+    angle, radius, _ = measure(model, run, closes).T
+    near, turned = np.abs(radius - task.RIM_RADIUS) < BESIDE, np.abs(angle) < TURNED_DEG
+    won = angle[success]
+    print(f"  closing, successful: {np.nanmean(won):.1f} degrees off the wall's normal,", end=" ")
+    print(f"deviation {np.nanstd(won):.1f}")
+    for chosen, what in ((near, f"{1e3 * BESIDE:g} mm"), (turned, f"{TURNED_DEG:g} degrees")):
+        print(f"  closing within {what}: {count(success, chosen)}, else {count(success, ~chosen)}")
+    _, radius, row = measure(model, run, comes_down).T
+    for chosen, what in ((np.abs(row) < MIDDLE, "middle"), (np.abs(row) >= MIDDLE, "outer")):
+        inward = 1e3 * (task.RIM_RADIUS - radius[chosen])
+        print(f"  {what} rows: {count(success, chosen)};", end=" ")
+        print(f"coming down {np.nanmean(inward):.1f} mm inside, deviation {np.nanstd(inward):.1f}")
+
+
+def count(success: np.ndarray, chosen: np.ndarray) -> str:
+    return f"{success[chosen].sum()} of {chosen.sum()}"
+
+
+def measure(model: mujoco.MjModel, run: results.Run, moment: Callable[..., int]) -> np.ndarray:
+    """`[R, 3]` at that moment of each trial: angle off the nearest normal (deg), distance of the
+    tip from the block's axis (m), the block's y at first (m); NaN where the moment never comes."""
+    rows = []
+    for it in run.rollouts:
+        assert it.qpos is not None
+        data = mujoco.MjData(model)
+        tip, block = data.site("robot/tool/tcp"), data.body("block")
+        place(model, data, it.qpos[0])
+        first, step = (block.xpos.copy(), block.xmat.copy()), moment(model, data, it.qpos)
+        if step < 0:
+            rows.append((np.nan, np.nan, first[0][1]))
+            continue
+        place(model, data, it.qpos[step])
+        xpos, xmat = (block.xpos, block.xmat) if moment is closes else first
+        jaws = xmat.reshape(3, 3).T @ tip.xmat.reshape(3, 3)[:, 1]
+        angle = np.degrees(np.arctan2(jaws[1], jaws[0])) + PERIOD_DEG / 2
+        away = xmat.reshape(3, 3).T @ (tip.xpos - xpos)
+        rows.append((angle % PERIOD_DEG - PERIOD_DEG / 2, np.hypot(*away[:2]), first[0][1]))
+    return np.array(rows)
+
+
+def closes(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> int:
+    """The step at which the jaws first are half closed, or -1."""
+    jaw = qpos[:, model.joint(JAW).qposadr[0]]
     closed = np.abs(jaw - jaw[0]) > 0.5 * np.ptp(jaw)
-    if not closed.any():
-        return np.nan, np.nan
-    data = mujoco.MjData(model)
-    data.qpos[:] = it.qpos[closed.argmax()]
+    return int(closed.argmax()) if closed.any() else -1
+
+
+def comes_down(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> int:
+    """The step at which the tip first is `ABOVE` the block, or -1."""
+    block = data.body("block").xpos.copy()
+    for step, now in enumerate(qpos):
+        place(model, data, now)
+        away = data.site("robot/tool/tcp").xpos - block
+        if away[2] < ABOVE and np.hypot(*away[:2]) < AROUND:
+            return step
+    return -1
+
+
+def place(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> None:
+    data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
-    tip, block = data.site("robot/tool/tcp"), data.body("block")
-    in_block = block.xmat.reshape(3, 3).T @ tip.xmat.reshape(3, 3)[:, 1]
-    angle = np.degrees(np.arctan2(in_block[1], in_block[0]))
-    place = block.xmat.reshape(3, 3).T @ (tip.xpos - block.xpos)
-    half = PERIOD_DEG / 2
-    return (angle + half) % PERIOD_DEG - half, float(np.hypot(*place[:2]))
 
 
 if __name__ == "__main__":
