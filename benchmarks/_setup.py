@@ -53,8 +53,7 @@ class Job(NamedTuple):
 
     Attributes:
       policy: being trained.
-      state: its TrainState, on all devices.
-      carried: it and its rounded matrices, what goes from call to call.
+      carried: its TrainState and its rounded matrices, what goes from call to call, on all devices.
       dataset: made-up frames on all devices.
       example: a batch.
       steps: (carried, dataset, count) -> carried after `per_call` steps.
@@ -64,7 +63,6 @@ class Job(NamedTuple):
     """
 
     policy: policies.Policy
-    state: state.TrainState
     carried: step.Carried
     dataset: windows.Dataset
     example: windows.Batch
@@ -124,7 +122,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     narrow = None if looped else step.rounded(first.params, case.policy.dtype)
     carried, dataset = devices.replicate(((first, narrow), dataset), mesh)
     per_call, calls = (10, 1) if looped else (1, 10 if on[0].platform == "gpu" else 1)
-    return Job(policy, carried[0], carried, dataset, example, steps, per_call, calls, mesh)
+    return Job(policy, carried, dataset, example, steps, per_call, calls, mesh)
 
 
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:

@@ -74,9 +74,10 @@ def main() -> None:
 def measure(case: _setup.Case, rates: _machine.Rates) -> dict:
     """One method (stardiff), dataset resident on the device."""
     job = _setup.job(case)
-    parameters = sum(leaf.size for leaf in jax.tree.leaves(job.state.params))
+    state, _ = job.carried
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
     gradient = jax.grad(job.policy.loss, has_aux=True)
-    traced = (job.state.params, job.state.normalizer, jax.random.key(0), job.example)
+    traced = (state.params, state.normalizer, jax.random.key(0), job.example)
     work = _arithmetic.operations(gradient, *traced)
     # Forward, and the gradients of inputs and of weights.
     work -= 3 * case.train.batch_size * _arithmetic.of_padding(case.policy)
