@@ -17,6 +17,7 @@ from starjax.experiments.methods import METHODS
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.training import devices, state, step
+from starjax.training.parts import Carried, Parts
 from starjax.types import Command
 
 P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)
@@ -58,18 +59,18 @@ class Job(NamedTuple):
       example: a batch.
       steps: (carried, dataset, count) -> carried after `per_call` steps.
       per_call: steps in one call; `count` must be given as this.
+      options: of `jax.jit` for `steps`, as training has them.
       calls: made before the last one's result is waited for, as training does.
-      mesh: of the devices.
     """
 
     policy: policies.Policy
-    carried: step.Carried
+    carried: Carried
     dataset: windows.Dataset
     example: windows.Batch
-    steps: Callable[..., step.Carried]
+    steps: Callable[..., Carried]
     per_call: int
+    options: dict[str, Any]
     calls: int
-    mesh: jax.sharding.Mesh
 
 
 def paper(crop: int, batch: int = 256, dtype: str = "bfloat16") -> Case:
@@ -108,27 +109,29 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     drawn = jnp.arange(batch) % count
     example = windows.gather(dataset, drawn, case.policy.obs_horizon, case.policy.horizon)
     stats = statistics(case.policy)
-    first = state.create(policy, optimizer, state.init_params(policy, seed), stats, seed)
+    first = state.create(policy, optimizer, state.init(policy, seed).draw(), stats, seed)
     mesh = devices.make_mesh(batch, on)
-    settings = (policy, optimizer, case.policy, case.train, mesh)
+    parts = Parts(mesh, case.policy.dtype, jax.eval_shape(lambda x: x, first))
+    settings = (policy, optimizer, case.policy, case.train, parts)
     looped = step.runs_in_a_loop(case.policy)
 
     def steps(carried, dataset, count):
         drawn = jnp.arange(len(dataset.episode))
         if looped:
-            return step.resident_steps(*settings, carried[0], dataset, drawn, count), carried[1]
-        return step.carried_step(*settings, carried, dataset, drawn)
+            return step.resident_steps(*settings, carried, dataset, drawn, count)
+        return step.resident_step(*settings, carried, dataset, drawn)
 
-    narrow = None if looped else step.rounded(first.params, case.policy.dtype)
-    carried, dataset = devices.replicate(((first, narrow), dataset), mesh)
+    first, dataset = devices.replicate((first, dataset), mesh)
+    carried = jax.jit(parts.begin, out_shardings=parts.placed())(first)
+    options = {"out_shardings": parts.placed(), "compiler_options": devices.compiler_options(mesh)}
     per_call, calls = (10, 1) if looped else (1, 10 if on[0].platform == "gpu" else 1)
-    return Job(policy, carried, dataset, example, steps, per_call, calls, mesh)
+    return Job(policy, carried, dataset, example, steps, per_call, options, calls)
 
 
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:
     """A policy, its first parameters as an evaluation holds them, and its statistics."""
     policy = policies.make(METHOD, case.policy, P_WORLD_REF, case.train)
-    params = policies.for_sampling(state.init_params(policy, 0), case.policy.dtype)
+    params = policies.for_sampling(state.init(policy, 0).draw(), case.policy.dtype)
     return policy, params, statistics(case.policy)
 
 

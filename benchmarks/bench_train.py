@@ -77,8 +77,8 @@ def measure(case: _setup.Case, rates: _machine.Rates) -> dict:
     state, _ = job.carried
     parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
     gradient = jax.grad(job.policy.loss, has_aux=True)
-    traced = (state.params, state.normalizer, jax.random.key(0), job.example)
-    work = _arithmetic.operations(gradient, *traced)
+    given = job.policy.prepare(state.normalizer, jax.random.key(0), job.example)
+    work = _arithmetic.operations(gradient, state.params, given)
     # Forward, and the gradients of inputs and of weights.
     work -= 3 * case.train.batch_size * _arithmetic.of_padding(case.policy)
     arithmetic_s = work / rates.flops

@@ -127,14 +127,12 @@ def test_noise_of_a_sample_depends_on_its_key_alone():
 
 def test_loss_is_zero_for_the_right_noise_and_one_for_none():
     x0 = clean((512, 4, 2))
-    loss = lambda eps_fn: diffusion.eps_loss(eps_fn, SCHEDULE, jax.random.key(8), x0)  # noqa: E731
+    given = diffusion.noised(SCHEDULE, jax.random.key(8), x0)
+    loss = lambda eps_fn: diffusion.eps_loss(eps_fn, given)  # noqa: E731
     assert float(loss(lambda x, k: jax.vmap(lambda x, x0, k: perfect(x0)(x, k))(x, x0, k))) < 1e-3
     assert float(loss(lambda x, k: jnp.zeros_like(x))) == pytest.approx(1.0, abs=0.07)
 
 
 def test_loss_draws_every_step():
-    seen = []
-    diffusion.eps_loss(
-        lambda x, k: seen.append(np.asarray(k)) or x, SCHEDULE, jax.random.key(9), clean((4096, 1))
-    )
-    assert set(seen[0].tolist()) == set(range(100))
+    given = diffusion.noised(SCHEDULE, jax.random.key(9), clean((4096, 1)))
+    assert set(given.k.tolist()) == set(range(100))

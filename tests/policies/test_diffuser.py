@@ -32,13 +32,8 @@ def learned():
     def step(i, carry):
         params, state = carry
         inputs = features.Inputs(repeated(history), None, None)
-        gradient = jax.grad(model.loss)(
-            params,
-            jax.random.fold_in(jax.random.key(1), i),
-            inputs,
-            jnp.zeros((32, 0)),
-            repeated(wanted),
-        )
+        given = model.noised(jax.random.fold_in(jax.random.key(1), i), repeated(wanted))
+        gradient = jax.grad(model.loss)(params, inputs, jnp.zeros((32, 0)), given)
         updates, state = optimizer.update(gradient, state, params)
         return optax.apply_updates(params, updates), state
 

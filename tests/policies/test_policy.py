@@ -41,7 +41,10 @@ class Made:
         self.params = jit(self.policy.init)(jax.random.key(0))
         self.batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
         self.sample = jit(self.policy.sample)
-        self.gradient = jit(jax.value_and_grad(self.policy.loss, has_aux=True))
+        self.gradient = jit(jax.value_and_grad(self.loss, has_aux=True))
+
+    def loss(self, params, stats, key, batch):
+        return self.policy.loss(params, self.policy.prepare(stats, key, batch))
 
     @property
     def loss_arguments(self):
@@ -139,7 +142,7 @@ def test_a_missing_observation_is_named(made, dataset):
     it = made("stardiff")
     blind = it.batch.replace(observation=it.batch.observation.replace(state=None))
     with pytest.raises(ValueError, match=r"observation.state: expected"):
-        it.policy.loss(it.params, it.stats, jax.random.key(0), blind)
+        it.policy.prepare(it.stats, jax.random.key(0), blind)
 
 
 @pytest.mark.parametrize(

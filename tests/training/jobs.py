@@ -48,7 +48,7 @@ def train_and_export(directory: Path) -> None:
     """What `starjax train` does, with a policy that compiles at once; its last file is weights."""
     from starjax.training import export, loop
 
-    loop.policies.make = lambda *_: _linear_policy()
+    loop.policies.make = lambda *_: _quadratic_policy()
 
     path = directory / "policy.safetensors"
     if path.exists():
@@ -60,8 +60,8 @@ def train_and_export(directory: Path) -> None:
     )
 
 
-def _linear_policy():
-    """The next tip position from the last, linear, with noise from the step's key."""
+def _quadratic_policy():
+    """The next tip position, quadratic in the last, with noise from the step's key."""
     import jax
     import jax.numpy as jnp
 
@@ -69,11 +69,16 @@ def _linear_policy():
     from starjax.types import Command
 
     def say(params, observation):
-        return observation.pose.p[:, -1:] @ params["a"] + params["b"]
+        p = observation.pose.p[:, -1:]
+        return jnp.concatenate([p, p * p], -1) @ params["a"] + params["b"]
 
-    def loss(params, stats, key, batch):
+    def prepare(stats, key, batch):
         noise = 0.001 * jax.random.normal(key, batch.command.pose.p.shape)
-        return jnp.mean((say(params, batch.observation) + noise - batch.command.pose.p) ** 2), {}
+        return batch.observation, batch.command.pose.p - noise
+
+    def loss(params, given):
+        observation, p = given
+        return jnp.mean((say(params, observation) - p) ** 2), {}
 
     def sample(params, stats, keys, observation, trocar):
         p = jnp.broadcast_to(say(params, observation), (len(keys), 16, 3))
@@ -81,42 +86,41 @@ def _linear_policy():
         return Command(pose._replace(p=p), observation.gripper[:, -1:])
 
     def init(key):
-        return {"a": jax.random.normal(key, (3, 3)), "b": jnp.zeros(3)}
+        return {"a": jax.random.normal(key, (6, 3)), "b": jnp.zeros(3)}
 
-    return Policy(init, loss, sample)
+    return Policy(init, prepare, loss, sample)
 
 
-def devices_main(count: int, out: str) -> None:
-    """Trains on `count` devices; saves the parameters, the frames drawn and the log's losses."""
+def devices_main(count: int, out: str, observation: str, dtype: str) -> None:
+    """Trains on `count` devices; saves the parameters and the frames drawn."""
     import jax
     import jax.numpy as jnp
     import numpy as np
 
     from starjax.data import windows
-    from starjax.training import metrics, step
+    from starjax.training import parts, step
 
     assert len(jax.devices()) == count
+    parts.LARGE = 256  # so that this small policy has some
     settings = dataclasses.replace(SETTINGS, holdout_demos=0)
-    state = train(Path(out) / "run", settings).state
+    state = train(Path(out), settings, observation=observation, dtype=dtype).state
     key_frames, _ = step.step_keys(state.key, 5)
     frames = windows.sample_frames(key_frames, jnp.arange(100), settings.batch_size)
     arrays = {str(i): np.asarray(x) for i, x in enumerate(jax.tree.leaves(state.params))}
-    losses = [
-        line["loss"] for line in metrics.read(Path(out) / "run/metrics.jsonl") if "loss" in line
-    ]
     sizes = {len(x.sharding.device_set) for x in jax.tree.leaves(state.params)}
     assert sizes == {count}
-    np.savez(Path(out) / "found.npz", frames=frames, losses=losses, **arrays)
+    np.savez(Path(out) / "found.npz", frames=frames, **arrays)
 
 
 def processes_main(out: str, asks: int) -> None:
     """Trains as one process of several; the first is told to stop at its `asks`th question."""
     import itertools
 
-    from starjax.training import loop, processes
+    from starjax.training import loop, parts, processes
 
     processes.join()
-    loop.policies.make = lambda *_: _linear_policy()
+    parts.LARGE = 18  # the matrix, not the vector
+    loop.policies.make = lambda *_: _quadratic_policy()
     asked = itertools.count(1)
     try:
         result = train(
@@ -144,4 +148,4 @@ if __name__ == "__main__":
     if sys.argv[1] == "process":
         processes_main(sys.argv[2], int(sys.argv[3]))
     else:
-        devices_main(int(sys.argv[1]), sys.argv[2])
+        devices_main(int(sys.argv[1]), *sys.argv[2:])

@@ -180,7 +180,7 @@ def test_the_rest_learns(source, whole):
     lines = loop.metrics.read(whole.parent / "metrics.jsonl")
     assert {"train", "holdout"} == {line["kind"] for line in lines}
     kernel = export.load(whole).params["diffuser"]["unet"]
-    begun = state.init_params(policy, 0)["diffuser"]["unet"]
+    begun = state.init(policy, 0).draw()["diffuser"]["unet"]
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), kernel, begun)
     assert max(jax.tree.leaves(moved)) > 1e-3
 
@@ -205,9 +205,10 @@ def test_a_single_model_trains_on_features_too(source, seen):
     policy = policies.make(METHODS["dp_rcm1"], source[0], fakes.P_WORLD_REF, TRAIN)
     stats = normalizer.fit(METHODS["dp_rcm1"], seen, fakes.P_WORLD_REF, np.arange(80))
     params = jax.jit(policy.init, compiler_options=QUICK)(jax.random.key(0))
-    gradient = jax.jit(jax.grad(policy.loss, has_aux=True), compiler_options=QUICK)
     batch = windows.gather(seen, jnp.array([3, 25, 70]), 2, 16)
-    found, _ = gradient(params, stats, jax.random.key(1), batch)
+    given = policy.prepare(stats, jax.random.key(1), batch)
+    gradient = jax.jit(jax.grad(policy.loss, has_aux=True), compiler_options=QUICK)
+    found, _ = gradient(params, given)
     assert set(found) == {"state", "unet"}
     assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(found))
 

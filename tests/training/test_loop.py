@@ -44,13 +44,6 @@ def whole(tmp_path_factory):
     return directory, result
 
 
-@pytest.fixture(scope="module")
-def alone(tmp_path_factory):
-    """A run of `jobs.devices_main`'s settings on one device."""
-    settings = dataclasses.replace(jobs.SETTINGS, holdout_demos=0)
-    return jobs.train(tmp_path_factory.mktemp("alone"), settings)
-
-
 def test_a_run_leaves_its_log_and_checkpoints(whole):
     directory, result = whole
     lines = metrics.read(directory / "metrics.jsonl")
@@ -143,9 +136,15 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
     assert last == {"step_00000008", "step_00000012"}
 
 
-@pytest.mark.parametrize("count", [2, 8])
-def test_many_devices_give_the_numbers_of_one(alone, tmp_path, count):
-    result = alone
+# Adam turns the rounding of a gradient near zero into a whole step of the learning rate: wide for
+# bfloat16, whose parameters are compared on average.
+@pytest.mark.parametrize(
+    ("count", "observation", "dtype", "tolerance"),
+    [(8, "state", "float32", 1e-4), (2, "image", "bfloat16", 5e-2)],
+)
+def test_many_devices_give_the_numbers_of_one(tmp_path, count, observation, dtype, tolerance):
+    settings = dataclasses.replace(jobs.SETTINGS, holdout_demos=0)
+    last = jobs.train(tmp_path / "1", settings, observation=observation, dtype=dtype).state
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
     environment = {
         **os.environ,
@@ -153,14 +152,20 @@ def test_many_devices_give_the_numbers_of_one(alone, tmp_path, count):
         "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
     }
     subprocess.run(
-        [sys.executable, jobs.__file__, str(count), str(tmp_path)], env=environment, check=True
+        [sys.executable, jobs.__file__, str(count), str(tmp_path / "n"), observation, dtype],
+        env=environment,
+        check=True,
     )
-    with np.load(tmp_path / "found.npz", allow_pickle=False) as found:
-        key_frames, _ = step.step_keys(result.state.key, 5)
+    one, many = (list(metrics.read(tmp_path / name / "metrics.jsonl")) for name in "1n")
+    for a, b in zip(one, many, strict=True):
+        assert a.pop("kind") == b.pop("kind")
+        assert a == pytest.approx(b, rel=tolerance)
+    with np.load(tmp_path / "n/found.npz", allow_pickle=False) as found:
+        key_frames, _ = step.step_keys(last.key, 5)
         drawn = jax.random.randint(key_frames, (16,), 0, 100)
         np.testing.assert_array_equal(found["frames"], drawn)
-        for i, x in enumerate(leaves(result.state.params)):
-            np.testing.assert_allclose(found[str(i)], x, rtol=1e-3, atol=2e-5)
+        for i, x in enumerate(leaves(last.params)):
+            assert np.abs(found[str(i)] - x).mean() < tolerance * settings.learning_rate * 12
 
 
 def test_learning_rate_and_average():

@@ -44,7 +44,7 @@ def test_two_processes_are_one_run(tmp_path, monkeypatch):
     assert 0 < checkpoint.steps(tmp_path / "run/checkpoints")[-1] < jobs.SETTINGS.steps
     run_two(tmp_path, asks=0)
     first, second = (dict(np.load(tmp_path / name)) for name in ("found.npz", "found-1.npz"))
-    monkeypatch.setattr(loop.policies, "make", lambda *_: jobs._linear_policy())
+    monkeypatch.setattr(loop.policies, "make", lambda *_: jobs._quadratic_policy())
     jobs.save(tmp_path / "alone.npz", jobs.train(tmp_path / "alone").state)
     for name, alone in np.load(tmp_path / "alone.npz").items():
         np.testing.assert_array_equal(first[name], second[name])

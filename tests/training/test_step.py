@@ -17,6 +17,7 @@ from starjax.experiments.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies.policy import Policy
 from starjax.training import devices, state, step
+from starjax.training.parts import Parts
 
 SETTINGS = config.TrainConfig(
     steps=300, batch_size=8, learning_rate=0.1, warmup_steps=0, weight_decay=0.0
@@ -29,12 +30,12 @@ def regression():
     def init(key):
         return {"w": jax.random.normal(key, (3,))}
 
-    def loss(params, stats, key, batch):
+    def loss(params, batch):
         error = jnp.mean((params["w"] - batch.command.pose.p) ** 2)
         broken = jnp.mean(batch.observation.gripper) > 1.5
         return jnp.where(broken, jnp.nan, error), {"error": error}
 
-    return Policy(init, loss, lambda *_: None, ("error",))
+    return Policy(init, lambda stats, key, batch: batch, loss, lambda *_: None, ("error",))
 
 
 @pytest.fixture(scope="module")
@@ -47,17 +48,19 @@ def start():
     policy, optimizer = regression(), state.make_optimizer(SETTINGS)
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
     stats = normalizer.Normalizer(box, None)
-    first = state.create(policy, optimizer, state.init_params(policy, 0), stats, seed=0)
+    first = state.create(policy, optimizer, state.init(policy, 0).draw(), stats, seed=0)
     return policy, optimizer, devices.replicate(first, devices.make_mesh(SETTINGS.batch_size))
 
 
-def program(policy, optimizer):
-    mesh = devices.make_mesh(SETTINGS.batch_size)
+def parts(dtype="float32"):
+    return Parts(devices.make_mesh(SETTINGS.batch_size), dtype)
 
+
+def program(policy, optimizer):
     def run(state, dataset, frames, count):
-        return step.resident_steps(
-            policy, optimizer, fakes.TINY, SETTINGS, mesh, state, dataset, frames, count
-        )
+        settings = (policy, optimizer, fakes.TINY, SETTINGS, parts())
+        carried = step.resident_steps(*settings, parts().begin(state), dataset, frames, count)
+        return parts().end(carried)
 
     return run
 
@@ -96,14 +99,14 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
     small = dataclasses.replace(fakes.TINY, dtype="bfloat16")
     settings = dataclasses.replace(SETTINGS, learning_rate=1e-3)
     policy = policies.make(METHODS["stardiff"], small, fakes.P_WORLD_REF, settings)
-    optimizer, mesh = state.make_optimizer(settings), devices.make_mesh(8)
+    optimizer = state.make_optimizer(settings)
     stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(80))
-    first = state.create(policy, optimizer, state.init_params(policy, 0), stats, seed=0)
-    given = (policy, optimizer, small, settings, mesh)
-    frames = jnp.arange(80)
-    one = jax.jit(lambda s: step.resident_step(*given, s, dataset, frames))
-    many = jax.jit(lambda s, n: step.resident_steps(*given, s, dataset, frames, n))
-    looped, called = many(first, 3), one(one(one(first)))
+    first = state.create(policy, optimizer, state.init(policy, 0).draw(), stats, seed=0)
+    given = (policy, optimizer, small, settings, parts("bfloat16"))
+    frames, nothing = jnp.arange(80), jax.tree.map(lambda _: None, first.params)
+    one = jax.jit(lambda s: step.resident_step(*given, (s, nothing), dataset, frames)[0])
+    many = jax.jit(lambda c, n: step.resident_steps(*given, c, dataset, frames, n)[0])
+    looped, called = many(parts("bfloat16").begin(first), 3), one(one(one(first)))
     chex.assert_trees_all_close((looped.params, looped.sums), (called.params, called.sums))
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), looped.params, first.params)
     assert min(jax.tree.leaves(moved)) > 1e-3  # three steps of the learning rate
@@ -111,7 +114,8 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
 
 def test_a_broken_loss_is_left_out_and_counted(start, dataset):
     policy, optimizer, first = start
-    once = jax.jit(lambda s, b: step.train_step(policy, optimizer, SETTINGS, s, b))
+    given = (policy, optimizer, SETTINGS, parts())
+    once = jax.jit(lambda s, b: step.train_step(*given, parts().begin(s), b)[0])
     good = windows.gather(dataset, jnp.arange(8), 2, 16)
     bad = good.replace(observation=good.observation.replace(gripper=jnp.full((8, 2), 2.0)))
     before = once(first, good)

@@ -4,7 +4,7 @@ No network here: `eps_fn` is whatever predicts the noise. All arithmetic is floa
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,23 +21,34 @@ def add_noise(schedule: Schedule, x0: jax.Array, k: jax.Array, noise: jax.Array)
     return signal * x0 + spread * noise
 
 
-def eps_loss(
-    eps_fn: Callable[[jax.Array, jax.Array], jax.Array],
-    schedule: Schedule,
-    key: jax.Array,
-    x0: jax.Array,
-) -> jax.Array:
-    """Eq. 9: mean squared error of the predicted noise, one random step k for each sample.
+class Noised(NamedTuple):
+    """Sequences to learn from.
 
-    Args:
-      eps_fn: `(x [B, ...], k int32 [B]) -> eps [B, ...]`.
-      key: one typed key for the whole batch.
-      x0: clean sequences `[B, ...]`, about [-1, 1].
+    Attributes:
+      x: `[B, ...]`, with noise.
+      k: int32 `[B]`, the step after which they look so.
+      noise: `[B, ...]`, what is to be predicted.
+    """
+
+    x: jax.Array
+    k: jax.Array
+    noise: jax.Array
+
+
+def noised(schedule: Schedule, key: jax.Array, x0: jax.Array) -> Noised:
+    """Clean sequences `[B, ...]`, about [-1, 1], each after a random step.
+
+    `key` is one typed key for the whole batch.
     """
     key_k, key_noise = jax.random.split(key)
     k = jax.random.randint(key_k, x0.shape[:1], 0, schedule.steps)
     noise = jax.random.normal(key_noise, x0.shape, x0.dtype)
-    return jnp.mean((eps_fn(add_noise(schedule, x0, k, noise), k) - noise) ** 2)
+    return Noised(add_noise(schedule, x0, k, noise), k, noise)
+
+
+def eps_loss(eps_fn: Callable[[jax.Array, jax.Array], jax.Array], given: Noised) -> jax.Array:
+    """Eq. 9: mean squared error of the noise that `eps_fn(x, k)` `[B, ...]` predicts."""
+    return jnp.mean((eps_fn(given.x, given.k) - given.noise) ** 2)
 
 
 def predict_x0(schedule: Schedule, x: jax.Array, k: jax.Array, eps: jax.Array) -> jax.Array:

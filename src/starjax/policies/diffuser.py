@@ -20,14 +20,16 @@ class Diffuser(NamedTuple):
       init: `key -> params`, those that training changes: none for a frozen vision encoder.
       observed_dim: N, numbers that the networks make of an observation.
       condition: `(params, inputs, extra [B, E]) -> [B, N + E]`, what the U-Net is told.
-      loss: `(params, key, inputs, extra [B, E], x0 [B, H, A]) -> scalar` of Eq. 9.
+      noised: `(key, x0 [B, H, A]) -> Noised`, what is learned from clean sequences.
+      loss: `(params, inputs, extra [B, E], Noised) -> scalar` of Eq. 9.
       sample: `(params, keys [B], inputs, extra [B, E]) -> [B, H, A]` in [-1, 1], by DDIM.
     """
 
     observed_dim: int
     init: Callable[[jax.Array], Params]
     condition: Callable[[Params, features.Inputs, jax.Array], jax.Array]
-    loss: Callable[[Params, jax.Array, features.Inputs, jax.Array, jax.Array], jax.Array]
+    noised: Callable[[jax.Array, jax.Array], diffusion.Noised]
+    loss: Callable[[Params, features.Inputs, jax.Array, diffusion.Noised], jax.Array]
     sample: Callable[[Params, jax.Array, features.Inputs, jax.Array], jax.Array]
 
 
@@ -77,7 +79,9 @@ def make(
         return params
 
     def condition(params: Params, inputs: features.Inputs, extra: jax.Array) -> jax.Array:
-        parts = [state.apply(params["state"], inputs.history), extra]
+        parts = [state.apply(params["state"], inputs.history)]
+        if extra.shape[-1]:  # XLA of jax 0.11 crashes on an empty array under `shard_map`
+            parts.append(extra)
         if inputs.features is not None:
             parts.insert(0, inputs.features.reshape(len(inputs.features), -1))
         elif inputs.image is not None:
@@ -91,13 +95,14 @@ def make(
             parts.insert(0, seen.reshape(batch, -1))
         return jnp.concatenate(parts, axis=-1)
 
+    def noised(key: jax.Array, x0: jax.Array) -> diffusion.Noised:
+        return diffusion.noised(noise_schedule, key, x0)
+
     def loss(
-        params: Params, key: jax.Array, inputs: features.Inputs, extra: jax.Array, x0: jax.Array
+        params: Params, inputs: features.Inputs, extra: jax.Array, given: diffusion.Noised
     ) -> jax.Array:
         cond = condition(params, inputs, extra)
-        return diffusion.eps_loss(
-            lambda x, k: denoise(params["unet"], x, k, cond), noise_schedule, key, x0
-        )
+        return diffusion.eps_loss(lambda x, k: denoise(params["unet"], x, k, cond), given)
 
     def sample(
         params: Params, keys: jax.Array, inputs: features.Inputs, extra: jax.Array
@@ -112,7 +117,7 @@ def make(
             prepare=lambda k: unet.apply(params["unet"], k, method="embed_step"),
         )
 
-    return Diffuser(observed_dim, init, condition, loss, sample)
+    return Diffuser(observed_dim, init, condition, noised, loss, sample)
 
 
 def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:

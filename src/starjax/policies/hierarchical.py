@@ -1,14 +1,14 @@
 """STAR-Diff: diffusion for (position, gripper), blind to the trocar, and a network for the roll."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from starjax import config, rcm
 from starjax.data import normalizer, windows
-from starjax.models import roll_net
+from starjax.models import diffusion, roll_net
 from starjax.policies import diffuser, execution, features
 from starjax.policies.policy import Params, Policy
 from starjax.sim.types import Observation
@@ -19,6 +19,28 @@ from starjax.types import Command
 # themselves, and a history that cannot be trusted keeps it from copying the last roll.
 POSITION_NOISE = 0.02
 ROLL_NOISE = 0.05
+
+
+class Prepared(NamedTuple):
+    """A batch as the networks learn from it.
+
+    Attributes:
+      inputs: of the diffusion model.
+      extra: `[B, E]`, what conditions it beside them.
+      noised: its sequences.
+      p: `[B, H, 3]` demonstrated positions with noise, for the roll network.
+      trocar: `[B, 7]` features.
+      history: `[B, O]` measured rolls with noise.
+      roll: `[B, H]` demonstrated ones.
+    """
+
+    inputs: features.Inputs
+    extra: jax.Array
+    noised: diffusion.Noised
+    p: jax.Array
+    trocar: jax.Array
+    history: jax.Array
+    roll: jax.Array
 
 
 def make(
@@ -64,7 +86,7 @@ def make(
     def rolls_along(
         params: Params,
         p: jax.Array,
-        trocar: rcm.Trocar,
+        trocar: jax.Array,
         history: jax.Array,
         inputs: features.Inputs,
     ) -> jax.Array:
@@ -72,13 +94,9 @@ def make(
         seen = None
         if policy_config.roll_observation:
             seen = model.condition(params["diffuser"], inputs, jnp.zeros((len(p), 0)))
-        about = trocar_weight * features.trocar_features(trocar, p_world_ref)
-        return predict(params["roll"], p, about, history_weight * history, seen)
+        return predict(params["roll"], p, trocar_weight * trocar, history_weight * history, seen)
 
-    def loss(
-        params: Params, stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Eq. 15."""
+    def prepare(stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch) -> Prepared:
         key_inputs, key_diffusion, key_p, key_roll = jax.random.split(key, 4)
         action = features.demonstrated(stats, method.action_space, batch, p_world_ref)
         measured = _measured(stats, batch.observation, batch.trocar)
@@ -90,18 +108,22 @@ def make(
             batch.observation,
             measured[..., diffused],
         )
-        x0 = action[..., diffused]
-        extra = features.extra(method, batch.trocar, p_world_ref)
-        position_loss = model.loss(params["diffuser"], key_diffusion, inputs, extra, x0)
         p, history = action[..., space.slices["p"]], measured[..., roll]
-        predicted = rolls_along(
-            params,
-            p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
-            batch.trocar,
-            history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
-            inputs,
+        return Prepared(
+            inputs=inputs,
+            extra=features.extra(method, batch.trocar, p_world_ref),
+            noised=model.noised(key_diffusion, action[..., diffused]),
+            p=p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
+            trocar=features.trocar_features(batch.trocar, p_world_ref),
+            history=history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
+            roll=action[..., roll],
         )
-        roll_loss = jnp.mean((action[..., roll] - predicted) ** 2)  # Eq. 14
+
+    def loss(params: Params, given: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Eq. 15."""
+        position_loss = model.loss(params["diffuser"], given.inputs, given.extra, given.noised)
+        predicted = rolls_along(params, given.p, given.trocar, given.history, given.inputs)
+        roll_loss = jnp.mean((given.roll - predicted) ** 2)  # Eq. 14
         total = position_loss + policy_config.roll_loss_weight * roll_loss
         return total, {"position_loss": position_loss, "roll_loss": roll_loss}
 
@@ -119,7 +141,8 @@ def make(
         extra = features.extra(method, trocar, p_world_ref)
         x0 = model.sample(params["diffuser"], keys, inputs, extra)
         p, gripper = x0[..., :3], x0[..., 3:]
-        gamma = rolls_along(params, p, trocar, measured[..., roll], inputs)
+        about = features.trocar_features(trocar, p_world_ref)
+        gamma = rolls_along(params, p, about, measured[..., roll], inputs)
         # within the demonstrated range, as the diffused part is
         gamma = jnp.clip(gamma, -1.0, 1.0)[..., None]
         parts = {"roll": gamma, "p": p}
@@ -130,4 +153,4 @@ def make(
     def _measured(stats, observation, trocar):
         return features.measured(stats, method.action_space, observation, trocar, p_world_ref)
 
-    return Policy(init, loss, sample, ("position_loss", "roll_loss"))
+    return Policy(init, prepare, loss, sample, ("position_loss", "roll_loss"))

@@ -1,15 +1,24 @@
 """One diffusion model for the whole action: every row of Table II but the hierarchical one."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
 from starjax import config, rcm
 from starjax.data import normalizer, windows
+from starjax.models import diffusion
 from starjax.policies import diffuser, execution, features
 from starjax.policies.policy import Params, Policy
 from starjax.sim.types import Observation
 from starjax.types import Command
+
+
+class Prepared(NamedTuple):
+    """What `diffuser.Diffuser.loss` is given."""
+
+    inputs: features.Inputs
+    extra: jax.Array
+    noised: diffusion.Noised
 
 
 def make(
@@ -23,9 +32,7 @@ def make(
     task_dim = features.TASK_FEATURES if policy_config.observation == "state" else 0
     model = diffuser.make(policy_config, dim, dim + task_dim, features.extra_dim(method))
 
-    def loss(
-        params: Params, stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
-    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def prepare(stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch) -> Prepared:
         key_inputs, key_diffusion = jax.random.split(key)
         x0 = features.demonstrated(stats, method.action_space, batch, p_world_ref)
         inputs = features.for_training(
@@ -36,8 +43,10 @@ def make(
             batch.observation,
             _proprioception(stats, batch.observation, batch.trocar),
         )
-        value = model.loss(params, key_diffusion, inputs, _extra(batch.trocar), x0)
-        return value, {}
+        return Prepared(inputs, _extra(batch.trocar), model.noised(key_diffusion, x0))
+
+    def loss(params: Params, given: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return model.loss(params, *given), {}
 
     def sample(
         params: Params,
@@ -62,4 +71,4 @@ def make(
     def _extra(trocar: rcm.Trocar) -> jax.Array:
         return features.extra(method, trocar, p_world_ref)
 
-    return Policy(model.init, loss, sample)
+    return Policy(model.init, prepare, loss, sample)

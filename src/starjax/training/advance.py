@@ -16,6 +16,7 @@ from starjax.data import windows
 from starjax.policies.policy import Policy
 from starjax.training import devices, feed, processes
 from starjax.training import step as steps
+from starjax.training.parts import Carried, Parts
 from starjax.training.state import TrainState
 
 Advance = Callable[[TrainState, int], TrainState]
@@ -43,68 +44,67 @@ class Training(NamedTuple):
     frames: np.ndarray
 
 
-def resident(it: Training, like: TrainState | None = None) -> Advance:
+def resident(it: Training, like: TrainState, ahead: bool) -> Advance:
     """Steps on a dataset that is on the device, and is copied to every device of the mesh.
 
-    With `like`, shapes and places of the state, the program is compiled from now on, beside what
-    the caller does until the first step.
+    `like` has shapes and places of the state. `ahead`: the program is compiled from now on, beside
+    what the caller does until the first step.
     """
     data = devices.replicate((it.dataset, jnp.asarray(it.frames)), it.mesh, may_alias=None)
-    if steps.runs_in_a_loop(it.policy_config):
-        return _looped(it, like, data)
-    program = _program(functools.partial(steps.carried_step, *it[:5]), it.mesh)
-    rounded = jax.jit(
-        functools.partial(steps.rounded, dtype=it.policy_config.dtype),
-        out_shardings=devices.replicated(it.mesh),
-    )
-    if like is not None:
-        narrow = jax.eval_shape(rounded, like.params)
-        placed = jax.tree.map(lambda x: x.update(sharding=like.step.sharding), narrow)
-        program = _compiled_beside(program, (like, placed), *data)
+    parts = Parts(it.mesh, it.policy_config.dtype, like)
+    settings = (it.policy, it.optimizer, it.policy_config, it.train_config, parts)
+    looped = steps.runs_in_a_loop(it.policy_config)
+    body = steps.resident_steps if looped else steps.resident_step
+    program = _program(functools.partial(body, *settings), parts)
 
-    def advance(state: TrainState, count: int) -> TrainState:
-        carried: Any = (state, rounded(state.params))
-        for _ in range(count):
-            carried = program(carried, *data)
-        return carried[0]
+    def counted(count: int) -> tuple[jax.Array, ...]:
+        return (devices.replicate(np.int32(count), it.mesh),) if looped else ()
 
-    return advance
+    if ahead:
+        program = _compiled_beside(program, parts.carried(), *data, *counted(1))
 
+    def several(carried: Carried, count: int) -> Carried:
+        for _ in range(1 if looped else count):
+            carried = program(carried, *data, *counted(count))
+        return carried
 
-def _looped(it: Training, like: TrainState | None, data: Any) -> Advance:
-    program = _program(functools.partial(steps.resident_steps, *it[:5]), it.mesh)
-
-    def counted(count: int) -> jax.Array:
-        return devices.replicate(np.int32(count), it.mesh)
-
-    if like is not None:
-        program = _compiled_beside(program, like, *data, counted(1))
-    return lambda state, count: program(state, *data, counted(count))
+    return _between(parts, several)
 
 
 def streamed(it: Training, state: TrainState) -> Advance:
     """Steps on a dataset of the host, whose batches follow this state's."""
-    body = functools.partial(steps.train_step, it.policy, it.optimizer, it.train_config)
-    program = _program(body, it.mesh)
+    parts = Parts(it.mesh, it.policy_config.dtype, jax.eval_shape(lambda x: x, state))
+    settings = (it.policy, it.optimizer, it.train_config, parts)
+    program = _program(functools.partial(steps.train_step, *settings), parts)
     key = jnp.copy(processes.own(state.key))
     stream = feed.batches(
         it.dataset, it.frames, it.policy_config, it.train_config, it.mesh, key, int(state.step)
     )
 
-    def advance(state: TrainState, count: int) -> TrainState:
+    def several(carried: Carried, count: int) -> Carried:
         for _ in range(count):
-            state = program(state, next(stream))
-        return state
+            carried = program(carried, next(stream))
+        return carried
 
-    return advance
-
-
-def _program(body: Callable[..., Any], mesh: Mesh) -> Any:
-    placed, options = devices.replicated(mesh), devices.compiler_options(mesh)
-    return jax.jit(body, donate_argnums=0, out_shardings=placed, compiler_options=options)
+    return _between(parts, several)
 
 
-def _compiled_beside(program: Any, *like: Any) -> Callable[..., TrainState]:
+def _between(parts: Parts, several: Callable[[Carried, int], Carried]) -> Advance:
+    """`several` steps of what is carried, as steps of the whole state."""
+    # On one device nothing moves; on several no part fits into the memory of what it is a part of.
+    donated = (0,) if parts.mesh.size == 1 else ()
+    whole = devices.replicated(parts.mesh)
+    begin = jax.jit(parts.begin, out_shardings=parts.placed(), donate_argnums=donated)
+    end = jax.jit(parts.end, out_shardings=whole, donate_argnums=donated)
+    return lambda state, count: end(several(begin(state), count))
+
+
+def _program(body: Callable[..., Any], parts: Parts) -> Any:
+    options = devices.compiler_options(parts.mesh)
+    return jax.jit(body, donate_argnums=0, out_shardings=parts.placed(), compiler_options=options)
+
+
+def _compiled_beside(program: Any, *like: Any) -> Callable[..., Carried]:
     """The program, compiled by a thread for arguments like these; its first call waits for it."""
     pool = ThreadPoolExecutor(1, thread_name_prefix="starjax-compile")
     compiled = pool.submit(lambda: program.lower(*like).compile())

@@ -1,4 +1,4 @@
-"""One mesh of devices: the batch is split over it, everything else is on all of them."""
+"""One mesh of devices: the batch is split over it, between calls all else is on all of them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,12 +8,14 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from starjax.training import processes
 
-_AXIS = "batch"
-# Of a step on several GPUs: gradients are summed in pieces of 128 MB, some of them beside the
-# backward pass (benchmarks/README.md).
+AXIS = "batch"
+# Of a step on several GPUs: matrices are gathered and gradients summed in pieces of 128 MB, beside
+# the encoder's work (benchmarks/README.md).
 _OVERLAP: dict[str, Any] = {
     "xla_gpu_enable_latency_hiding_scheduler": True,
     "xla_gpu_all_reduce_combine_threshold_bytes": 128 << 20,
+    "xla_gpu_all_gather_combine_threshold_bytes": 128 << 20,
+    "xla_gpu_reduce_scatter_combine_threshold_bytes": 128 << 20,
 }
 
 
@@ -30,13 +32,13 @@ def make_mesh(batch_size: int, devices: Sequence[jax.Device] | None = None) -> M
             f"batch_size: expected a multiple of the {len(devices)} devices of all processes, "
             f"got {batch_size}"
         )
-    # Auto: the compiler propagates the batch's sharding; gradients meet in one all-reduce
-    return jax.make_mesh((count,), (_AXIS,), axis_types=(AxisType.Auto,), devices=devices[:count])
+    # Auto: the compiler propagates the batch's sharding
+    return jax.make_mesh((count,), (AXIS,), axis_types=(AxisType.Auto,), devices=devices[:count])
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
     """Leading axis split over the devices."""
-    return NamedSharding(mesh, PartitionSpec(_AXIS))
+    return NamedSharding(mesh, PartitionSpec(AXIS))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:

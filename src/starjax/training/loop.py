@@ -95,15 +95,16 @@ def run(
         return states.create(policy, optimizer, params, stats, seed)
 
     checkpoints = directory / "checkpoints"
-    like = _like(around, policy, seed, mesh)
+    begun = states.init(policy, seed)
+    like = _like(around, begun, mesh)
     it = advancing.Training(policy, optimizer, policy_config, train_config, mesh, dataset, train)
     advance = None
     if windows.on_device(dataset):
         new = not checkpoint.steps(checkpoints)  # a restored training may be finished
-        advance = advancing.resident(it, like if new else None)
+        advance = advancing.resident(it, like, ahead=new)
     restored = _restored(checkpoints, like)
     if restored is None:
-        params = _begun(policy, policy_config, train_config, seed)
+        params = _begun(begun, policy_config, train_config)
         state = devices.replicate(states.run_once(around, params), mesh)
     else:
         state = restored
@@ -152,13 +153,12 @@ def _observed(dataset: windows.Dataset, policy_config: config.PolicyConfig) -> w
     return dataset.replace(observation=dataset.observation.replace(**unseen))
 
 
-def _like(around, policy, seed, mesh) -> states.TrainState:
+def _like(around, begun, mesh) -> states.TrainState:
     """Shapes and places of the state, without the state."""
     placed = devices.replicated(mesh)
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
-        # jitted, `init` is traced once: here, and not again for the parameters
-        jax.eval_shape(lambda: around(jax.jit(policy.init)(jax.random.key(seed)))),
+        jax.eval_shape(around, begun.traced.out_info),
     )
 
 
@@ -172,9 +172,9 @@ def _restored(checkpoints, like) -> states.TrainState | None:
     return None if restored is None else restored[1]
 
 
-def _begun(policy, policy_config, train_config, seed) -> policies.Params:
+def _begun(begun, policy_config, train_config) -> policies.Params:
     """Parameters of a new training."""
-    params = states.init_params(policy, seed)
+    params = begun.draw()
     begins = policy_config.observation == "image" and not policy_config.freeze_encoder
     if begins and policy_config.encoder_weights:
         params = encoder.start(params, policy_config, train_config)

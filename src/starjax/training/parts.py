@@ -1,0 +1,151 @@
+"""Several devices: each keeps, and updates, its own part of every large matrix (ZeRO, stage 2).
+
+Rajbhandari et al., arXiv:1910.02054. A step puts the matrices together where the networks use them,
+in the networks' type, and of the gradients' sum each device gets its part alone. On one device all
+of this does nothing.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from starjax.policies import policy as policies
+from starjax.training import devices
+from starjax.training.state import TrainState
+
+Carried = tuple[TrainState, policies.Params]
+
+LARGE = 1 << 18  # entries of a matrix: smaller ones take longer to send than to update everywhere
+_SMALL = 1 << 16  # entries: a leaf below takes a GPU longer to start on than to read
+
+
+class Parts(NamedTuple):
+    """How a state lies on the devices from step to step.
+
+    What is carried is the state and its `rounded` matrices: the optimiser writes both, so that the
+    float32 ones are not read again to round them. Matrices in parts are flat there.
+
+    Attributes:
+      mesh: the batch is split over it.
+      dtype: of the networks' arithmetic.
+      like: the whole state's shapes, as a TrainState; not needed on one device.
+    """
+
+    mesh: Mesh
+    dtype: str
+    like: Any = None
+
+    def begin(self, state: TrainState) -> Carried:
+        """What is carried, of a whole state."""
+        carried = state, rounded(state.params, self.dtype)
+        return jax.tree_util.tree_map_with_path(
+            lambda path, x: x.reshape(-1) if self._is_split(path, x) else x, carried
+        )
+
+    def end(self, carried: Carried) -> TrainState:
+        """The whole state of what is carried."""
+        if self.mesh.size == 1:
+            return carried[0]
+        return jax.tree.map(lambda x, like: x.reshape(like.shape), carried[0], self.like)
+
+    def on_each(self, update: Callable[[Carried, Any], Carried]) -> Callable[..., Carried]:
+        """`update(carried, batch)` on every device, of its parts and its share of the batch."""
+        if self.mesh.size == 1:
+            return update
+        spec = jax.tree.map(lambda placed: placed.spec, self.placed())
+        share = devices.batch_sharding(self.mesh).spec
+        return jax.shard_map(
+            update, mesh=self.mesh, in_specs=(spec, share), out_specs=spec, check_vma=False
+        )
+
+    def placed(self) -> Any:
+        """Shardings of what is carried."""
+        if self.mesh.size == 1:
+            return devices.replicated(self.mesh)
+        return jax.tree.map(lambda x: x.sharding, self.carried())
+
+    def carried(self) -> Any:
+        """Shapes and places of what is carried."""
+        placed = {True: devices.batch_sharding(self.mesh), False: devices.replicated(self.mesh)}
+
+        def one(path: tuple[Any, ...], x: Any) -> jax.ShapeDtypeStruct:
+            split = self._is_split(path, x)
+            shape = (x.size,) if split else x.shape
+            return jax.ShapeDtypeStruct(shape, x.dtype, sharding=placed[split])
+
+        natural = jax.eval_shape(
+            lambda state: (state, rounded(state.params, self.dtype)), self.like
+        )
+        return jax.tree_util.tree_map_with_path(one, natural)
+
+    def whole(self, params: policies.Params) -> policies.Params:
+        """Parameters put together, within `on_each`; differentiated, sums come back as parts."""
+        if self.mesh.size == 1:
+            return params
+        gather = functools.partial(jax.lax.all_gather, axis_name=devices.AXIS, tiled=True)
+        return jax.tree.map(
+            lambda x, like: x if x.shape == like.shape else gather(x).reshape(like.shape),
+            params,
+            self.like.params,
+        )
+
+    def mean(self, tree: Any) -> Any:
+        """Of every device's numbers, within `on_each`."""
+        return tree if self.mesh.size == 1 else jax.lax.pmean(tree, devices.AXIS)
+
+    def mean_gradient(self, gradients: policies.Params, params: policies.Params) -> policies.Params:
+        """Each device's gradients of `whole` parameters as the batch's, in the parameters' type."""
+        count = self.mesh.size
+        if count > 1:
+            parts, rest, join = self._apart(gradients)
+            gradients = join(parts, jax.lax.psum(rest, devices.AXIS))
+        gradients = jax.tree.map(lambda g, p: g.astype(p.dtype), gradients, params)
+        return jax.tree.map(lambda g: g / count, gradients) if count > 1 else gradients
+
+    def norm(self, gradients: policies.Params) -> jax.Array:
+        """Euclidean norm of all of them, within `on_each`."""
+        if self.mesh.size == 1:
+            return jnp.sqrt(_squares(jax.tree.leaves(gradients)))
+        parts, rest, _ = self._apart(gradients)
+        return jnp.sqrt(jax.lax.psum(_squares(parts), devices.AXIS) + _squares(rest))
+
+    def _is_split(self, path: tuple[Any, ...], x: Any) -> bool:
+        """Whether a leaf of what is carried lies in parts: not the vision encoder's, which is the
+        first to be used and the last whose gradient is known, so that nothing could run beside."""
+        count = self.mesh.size
+        names = {getattr(key, "key", None) for key in path}
+        return count > 1 and x.size >= LARGE and x.size % count == 0 and "vision" not in names
+
+    def _apart(self, params: policies.Params) -> tuple[list, list, Callable[[list, list], Any]]:
+        """Leaves that are parts, the others, and what puts the two lists together again."""
+        leaves, structure = jax.tree.flatten(params)
+        whole = [like.shape for like in jax.tree.leaves(self.like.params)]
+        is_part = [x.shape != shape for x, shape in zip(leaves, whole, strict=True)]
+
+        def join(parts: list, rest: list) -> Any:
+            kinds = {True: iter(parts), False: iter(rest)}
+            return jax.tree.unflatten(structure, [next(kinds[kind]) for kind in is_part])
+
+        parts = [x for x, kind in zip(leaves, is_part, strict=True) if kind]
+        rest = [x for x, kind in zip(leaves, is_part, strict=True) if not kind]
+        return parts, rest, join
+
+
+def rounded(params: policies.Params, dtype: str) -> policies.Params:
+    """The matrices that `policy.rounded` changes, as it gives them; None in the others' places."""
+    changed = policies.rounded(params, dtype)
+    return jax.tree.map(lambda old, new: None if new.dtype == old.dtype else new, params, changed)
+
+
+def _squares(leaves: list[jax.Array]) -> jax.Array:
+    """Sum of all squares. Small leaves are summed up together: on a GPU a kernel or two for each
+    take longer than all the large ones."""
+    small = [leaf.ravel() for leaf in leaves if leaf.size < _SMALL]
+    large = [leaf for leaf in leaves if leaf.size >= _SMALL]
+    together = [jnp.concatenate(small)] if small else []
+    sums = [jnp.sum(leaf * leaf) for leaf in large + together]
+    return jnp.stack(sums).sum() if sums else jnp.float32(0.0)
