@@ -79,7 +79,7 @@ def make(
         return params
 
     def condition(params: Params, inputs: features.Inputs, extra: jax.Array) -> jax.Array:
-        parts = [state.apply(params["state"], inputs.history)]
+        parts: list[Any] = [state.apply(params["state"], inputs.history)]
         if extra.shape[-1]:  # XLA of jax 0.11 crashes on an empty array under `shard_map`
             parts.append(extra)
         if inputs.features is not None:

@@ -16,7 +16,7 @@ from starjax.data import windows
 from starjax.policies.policy import Policy
 from starjax.training import devices, feed, processes
 from starjax.training import step as steps
-from starjax.training.parts import Carried, Parts
+from starjax.training.parts import Carried, Parts, rounded
 from starjax.training.state import TrainState
 
 Advance = Callable[[TrainState, int], TrainState]
@@ -91,11 +91,12 @@ def streamed(it: Training, state: TrainState) -> Advance:
 
 def _between(parts: Parts, several: Callable[[Carried, int], Carried]) -> Advance:
     """`several` steps of what is carried, as steps of the whole state."""
-    # On one device nothing moves; on several no part fits into the memory of what it is a part of.
-    donated = (0,) if parts.mesh.size == 1 else ()
     whole = devices.replicated(parts.mesh)
-    begin = jax.jit(parts.begin, out_shardings=parts.placed(), donate_argnums=donated)
-    end = jax.jit(parts.end, out_shardings=whole, donate_argnums=donated)
+    if parts.mesh.size == 1:  # the state stays where it is
+        narrow = jax.jit(functools.partial(rounded, dtype=parts.dtype), out_shardings=whole)
+        return lambda state, count: several((state, narrow(state.params)), count)[0]
+    begin = jax.jit(parts.begin, out_shardings=parts.placed())
+    end = jax.jit(parts.end, out_shardings=whole)
     return lambda state, count: end(several(begin(state), count))
 
 

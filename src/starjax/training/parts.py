@@ -47,9 +47,7 @@ class Parts(NamedTuple):
         )
 
     def end(self, carried: Carried) -> TrainState:
-        """The whole state of what is carried."""
-        if self.mesh.size == 1:
-            return carried[0]
+        """The whole state of what is carried, on several devices."""
         return jax.tree.map(lambda x, like: x.reshape(like.shape), carried[0], self.like)
 
     def on_each(self, update: Callable[[Carried, Any], Carried]) -> Callable[..., Carried]:
