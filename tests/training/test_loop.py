@@ -1,11 +1,13 @@
 """Training as a whole: resume to the last bit, kills, devices, residency, broken losses."""
 
 import dataclasses
+import itertools
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -144,7 +146,11 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
 )
 def test_many_devices_give_the_numbers_of_one(tmp_path, count, observation, dtype, tolerance):
     settings = dataclasses.replace(jobs.SETTINGS, holdout_demos=0)
-    last = jobs.train(tmp_path / "1", settings, observation=observation, dtype=dtype).state
+    seen: dict[str, Any] = {"observation": observation, "dtype": dtype}
+    last = jobs.train(tmp_path / "1", settings, **seen).state
+    asked = itertools.count(1)
+    with pytest.raises(loop.Interrupted):  # begun on one device, and resumed on many
+        jobs.train(tmp_path / "n", settings, should_stop=lambda: next(asked) == 3, **seen)
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
     environment = {
         **os.environ,
