@@ -99,17 +99,23 @@ class Parts(NamedTuple):
         """Each device's gradients of `whole` parameters as the batch's, in the parameters' type."""
         count = self.mesh.size
         if count > 1:
-            parts, rest, join = self._apart(gradients)
-            gradients = join(parts, jax.lax.psum(rest, devices.AXIS))
+            gradients = jax.tree.map(
+                lambda g, like: jax.lax.psum(g, devices.AXIS) if g.shape == like.shape else g,
+                gradients,
+                self.like.params,
+            )
         gradients = jax.tree.map(lambda g, p: g.astype(p.dtype), gradients, params)
         return jax.tree.map(lambda g: g / count, gradients) if count > 1 else gradients
 
     def norm(self, gradients: policies.Params) -> jax.Array:
         """Euclidean norm of all of them, within `on_each`."""
+        leaves = jax.tree.leaves(gradients)
         if self.mesh.size == 1:
-            return jnp.sqrt(_squares(jax.tree.leaves(gradients)))
-        parts, rest, _ = self._apart(gradients)
-        return jnp.sqrt(jax.lax.psum(_squares(parts), devices.AXIS) + _squares(rest))
+            return jnp.sqrt(_squares(leaves))
+        of: dict[bool, list[jax.Array]] = {True: [], False: []}
+        for leaf, like in zip(leaves, jax.tree.leaves(self.like.params), strict=True):
+            of[leaf.shape == like.shape].append(leaf)
+        return jnp.sqrt(_squares(of[True]) + jax.lax.psum(_squares(of[False]), devices.AXIS))
 
     def _is_split(self, path: tuple[Any, ...], x: Any) -> bool:
         """Whether a leaf of what is carried lies in parts: not the vision encoder's, which is the
@@ -117,20 +123,6 @@ class Parts(NamedTuple):
         count = self.mesh.size
         names = {getattr(key, "key", None) for key in path}
         return count > 1 and x.size >= LARGE and x.size % count == 0 and "vision" not in names
-
-    def _apart(self, params: policies.Params) -> tuple[list, list, Callable[[list, list], Any]]:
-        """Leaves that are parts, the others, and what puts the two lists together again."""
-        leaves, structure = jax.tree.flatten(params)
-        whole = [like.shape for like in jax.tree.leaves(self.like.params)]
-        is_part = [x.shape != shape for x, shape in zip(leaves, whole, strict=True)]
-
-        def join(parts: list, rest: list) -> Any:
-            kinds = {True: iter(parts), False: iter(rest)}
-            return jax.tree.unflatten(structure, [next(kinds[kind]) for kind in is_part])
-
-        parts = [x for x, kind in zip(leaves, is_part, strict=True) if kind]
-        rest = [x for x, kind in zip(leaves, is_part, strict=True) if not kind]
-        return parts, rest, join
 
 
 def rounded(params: policies.Params, dtype: str) -> policies.Params:
