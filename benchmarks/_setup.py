@@ -124,7 +124,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     first, dataset = devices.replicate((first, dataset), mesh)
     carried = jax.jit(parts.begin, out_shardings=parts.placed())(first)
     options = {"out_shardings": parts.placed(), "compiler_options": devices.compiler_options(mesh)}
-    per_call, calls = (10, 1) if looped else (1, 10 if on[0].platform == "gpu" else 1)
+    per_call, calls = (10, 1) if looped else (1, 50 if on[0].platform == "gpu" else 1)
     return Job(policy, carried, dataset, example, steps, per_call, options, calls)
 
 

@@ -66,7 +66,7 @@ def main() -> None:
 
 def timed(call, asked, repeats: int) -> dict[str, float]:
     """Median ms: of train steps back to back, of policy calls each waited for."""
-    times, inner = [], 10 if asked.work == "train" and asked.device == "cuda" else 1
+    times, inner = [], 50 if asked.work == "train" and asked.device == "cuda" else 1
     for _ in range(repeats):
         start = time.perf_counter()
         for _ in range(inner):

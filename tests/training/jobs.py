@@ -101,7 +101,7 @@ def devices_main(count: int, out: str, observation: str, dtype: str) -> None:
     from starjax.training import parts, step
 
     assert len(jax.devices()) == count
-    parts.LARGE = 256  # so that this small policy has some
+    parts.LARGE, parts.JOINS = 256, {"cpu"}  # so that this small policy has some, as on GPUs
     settings = dataclasses.replace(SETTINGS, holdout_demos=0)
     state = train(Path(out), settings, observation=observation, dtype=dtype).state
     key_frames, _ = step.step_keys(state.key, 5)
@@ -119,7 +119,7 @@ def processes_main(out: str, asks: int) -> None:
     from starjax.training import loop, parts, processes
 
     processes.join()
-    parts.LARGE = 18  # the matrix, not the vector
+    parts.LARGE, parts.JOINS = 18, {"cpu"}  # the matrix, not the vector
     loop.policies.make = lambda *_: _quadratic_policy()
     asked = itertools.count(1)
     try:

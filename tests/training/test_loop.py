@@ -15,7 +15,7 @@ import kill
 import numpy as np
 import pytest
 
-from starjax.training import advance, checkpoint, loop, metrics, state, step
+from starjax.training import advance, checkpoint, loop, metrics, parts, state, step
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
@@ -105,6 +105,21 @@ def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
     assert [line["step"] for line in ours] == [line["step"] for line in theirs]
     losses = [[line["loss"] for line in log if "loss" in line] for log in (ours, theirs)]
     np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
+
+
+def test_joined_vectors_give_the_same_run_and_resume(whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(parts, "JOINS", {"cpu"})
+    asked = itertools.count(1)
+    with pytest.raises(loop.Interrupted):
+        jobs.train(tmp_path, should_stop=lambda: next(asked) == 3)
+    directory, result = whole
+    again = jobs.train(tmp_path)
+    for x, y in zip(leaves(again.state), leaves(result.state), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
+    ours, theirs = (metrics.read(d / "metrics.jsonl") for d in (tmp_path, directory))
+    for a, b in zip(ours, theirs, strict=True):
+        assert a.pop("kind") == b.pop("kind")
+        assert a == pytest.approx(b, rel=1e-4)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])

@@ -52,15 +52,15 @@ def start():
     return policy, optimizer, devices.replicate(first, devices.make_mesh(SETTINGS.batch_size))
 
 
-def parts(dtype="float32"):
-    return Parts(devices.make_mesh(SETTINGS.batch_size), dtype)
+def parts(like, dtype="float32"):
+    return Parts(devices.make_mesh(SETTINGS.batch_size), dtype, like)
 
 
 def program(policy, optimizer):
     def run(state, dataset, frames, count):
-        settings = (policy, optimizer, fakes.TINY, SETTINGS, parts())
-        carried = step.resident_steps(*settings, parts().begin(state), dataset, frames, count)
-        return carried[0]
+        it = parts(state)
+        settings = (policy, optimizer, fakes.TINY, SETTINGS, it)
+        return it.end(step.resident_steps(*settings, it.begin(state), dataset, frames, count))
 
     return run
 
@@ -102,11 +102,17 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
     optimizer = state.make_optimizer(settings)
     stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(80))
     first = state.create(policy, optimizer, state.init(policy, 0).draw(), stats, seed=0)
-    given = (policy, optimizer, small, settings, parts("bfloat16"))
+    it = parts(first, "bfloat16")
+    given = (policy, optimizer, small, settings, it)
     frames, nothing = jnp.arange(80), jax.tree.map(lambda _: None, first.params)
-    one = jax.jit(lambda s: step.resident_step(*given, (s, nothing), dataset, frames)[0])
-    many = jax.jit(lambda c, n: step.resident_steps(*given, c, dataset, frames, n)[0])
-    looped, called = many(parts("bfloat16").begin(first), 3), one(one(one(first)))
+    unrounded = jax.jit(
+        lambda c: (step.resident_step(*given, (c[0], nothing), dataset, frames)[0], nothing)
+    )
+    many = jax.jit(lambda c, n: step.resident_steps(*given, c, dataset, frames, n))
+    called = it.begin(first)
+    for _ in range(3):
+        called = unrounded(called)
+    looped, called = it.end(many(it.begin(first), 3)), it.end(called)
     chex.assert_trees_all_close((looped.params, looped.sums), (called.params, called.sums))
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), looped.params, first.params)
     assert min(jax.tree.leaves(moved)) > 1e-3  # three steps of the learning rate
@@ -114,8 +120,9 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
 
 def test_a_broken_loss_is_left_out_and_counted(start, dataset):
     policy, optimizer, first = start
-    given = (policy, optimizer, SETTINGS, parts())
-    once = jax.jit(lambda s, b: step.train_step(*given, parts().begin(s), b)[0])
+    it = parts(first)
+    given = (policy, optimizer, SETTINGS, it)
+    once = jax.jit(lambda s, b: it.end(step.train_step(*given, it.begin(s), b)))
     good = windows.gather(dataset, jnp.arange(8), 2, 16)
     bad = good.replace(observation=good.observation.replace(gripper=jnp.full((8, 2), 2.0)))
     before = once(first, good)

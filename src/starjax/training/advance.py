@@ -1,4 +1,4 @@
-"""Training steps as calls `(state, count) -> state` that reuse the given state's memory."""
+"""Many training steps in a row, of a state as `Parts` carries it."""
 
 import functools
 from collections.abc import Callable
@@ -16,10 +16,22 @@ from starjax.data import windows
 from starjax.policies.policy import Policy
 from starjax.training import devices, feed, processes
 from starjax.training import step as steps
-from starjax.training.parts import Carried, Parts, rounded
+from starjax.training.parts import Carried, Parts
 from starjax.training.state import TrainState
 
-Advance = Callable[[TrainState, int], TrainState]
+
+class Advance(NamedTuple):
+    """What training calls.
+
+    Attributes:
+      begin: what is carried, of a state, whose memory the steps may reuse.
+      several: so many steps `(carried, count) -> carried`, in the given memory.
+      end: the state of what is carried, and is carried on: gone with the next steps.
+    """
+
+    begin: Callable[[TrainState], Carried]
+    several: Callable[[Carried, int], Carried]
+    end: Callable[[Carried], TrainState]
 
 
 class Training(NamedTuple):
@@ -68,7 +80,7 @@ def resident(it: Training, like: TrainState, ahead: bool) -> Advance:
             carried = program(carried, *data, *counted(count))
         return carried
 
-    return _between(parts, several)
+    return _advance(parts, several)
 
 
 def streamed(it: Training, state: TrainState) -> Advance:
@@ -86,18 +98,14 @@ def streamed(it: Training, state: TrainState) -> Advance:
             carried = program(carried, next(stream))
         return carried
 
-    return _between(parts, several)
+    return _advance(parts, several)
 
 
-def _between(parts: Parts, several: Callable[[Carried, int], Carried]) -> Advance:
-    """`several` steps of what is carried, as steps of the whole state."""
-    whole = devices.replicated(parts.mesh)
-    if parts.mesh.size == 1:  # the state stays where it is
-        narrow = jax.jit(functools.partial(rounded, dtype=parts.dtype), out_shardings=whole)
-        return lambda state, count: several((state, narrow(state.params)), count)[0]
+def _advance(parts: Parts, several: Callable[[Carried, int], Carried]) -> Advance:
+    if parts.mesh.size == 1:  # matrices stay where they are
+        return Advance(parts.begin, several, parts.end)
     begin = jax.jit(parts.begin, out_shardings=parts.placed())
-    end = jax.jit(parts.end, out_shardings=whole)
-    return lambda state, count: end(several(begin(state), count))
+    return Advance(begin, several, jax.jit(parts.end, out_shardings=devices.replicated(parts.mesh)))
 
 
 def _program(body: Callable[..., Any], parts: Parts) -> Any:

@@ -16,6 +16,7 @@ from starjax.runtime import progress
 from starjax.training import advance as advancing
 from starjax.training import checkpoint, devices, encoder, holdout, metrics, processes
 from starjax.training import state as states
+from starjax.training.parts import Carried
 
 _CALL_SECONDS = 1.0  # aim of one compiled call: how long Ctrl-C waits, how often the bar moves
 
@@ -111,9 +112,14 @@ def run(
     step = first = int(state.step)
     metrics.resume(log, step)
     judge = holdout.make(policy, policy_config, dataset, held_out) if processes.is_first() else None
-    errors = judge(processes.own(state)) if judge and step == train_config.steps else {}
+    if step == train_config.steps:
+        errors = judge(processes.own(state)) if judge else {}
+        return Result(state, 0.0, int(state.skipped), errors)
     if advance is None:
         advance = advancing.streamed(it, state)
+    carried = advance.begin(state)
+    del state  # on several devices, memory that the steps may need
+    errors: dict[str, float] = {}
     rate = _Rate(train_config.batch_size)
     with progress.track(description, train_config.steps, unit="steps", done=step) as show:
         note, call = "", 1
@@ -122,7 +128,7 @@ def run(
             stop, call = processes.agree(should_stop(), call)
             if stop:
                 if step > first:
-                    _save(directory, state, train_config)
+                    _save(directory, advance.end(carried), train_config)
                 raise Interrupted(
                     f"stopped after step {step} of {train_config.steps}; what is done is in "
                     f"{directory}, the same command goes on from there"
@@ -130,19 +136,22 @@ def run(
             count = min(call, *(_until(step, n) for n in _stops(train_config)))
             count = min(count, train_config.steps - step)
             start = time.monotonic()
-            state = advance(state, count)
-            jax.block_until_ready(state.step)
+            carried = advance.several(carried, count)
+            jax.block_until_ready(carried[0].step)
             call = rate.next_call(count, time.monotonic() - start, train_config.steps_per_call)
             step += count
             last = step == train_config.steps
             if step % train_config.log_every == 0 or last:
-                state, note = _log(log, step, state, train_config)
+                carried, note = _log(log, step, carried, train_config)
             if step % train_config.checkpoint_every == 0 or last:
+                state = advance.end(carried)  # by all processes together
                 if judge:
                     errors = judge(processes.own(state))
                     metrics.append(log, step, "holdout", errors)
                 _save(directory, state, train_config)
+                del state
             show(count, note=note)
+    state = advance.end(carried)
     return Result(state, rate.samples_per_second, int(state.skipped), errors)
 
 
@@ -181,8 +190,9 @@ def _begun(begun, policy_config, train_config) -> policies.Params:
     return params
 
 
-def _log(log, step, state, train_config) -> tuple[states.TrainState, str]:
+def _log(log, step, carried, train_config) -> tuple[Carried, str]:
     """Writes the means since the last line and starts the sums afresh."""
+    state, narrow = carried
     sums = {name: float(value) for name, value in state.sums.items()}
     taken, skipped = int(sums.pop("taken")), int(sums.pop("skipped"))
     if taken == 0:
@@ -198,7 +208,7 @@ def _log(log, step, state, train_config) -> tuple[states.TrainState, str]:
     note = f"loss {values['loss']:.4f}" + (f", {skipped} steps skipped" if skipped else "")
     # placed as they were: another placement would be another program
     fresh = jax.tree.map(lambda x: jax.device_put(jnp.zeros_like(x), x.sharding), state.sums)
-    return state.replace(sums=fresh), note
+    return (state.replace(sums=fresh), narrow), note
 
 
 def _save(directory, state, train_config) -> None:

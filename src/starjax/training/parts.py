@@ -14,12 +14,14 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from starjax.policies import policy as policies
-from starjax.training import devices
+from starjax.training import devices, joined
 from starjax.training.state import TrainState
 
 Carried = tuple[TrainState, policies.Params]
 
 LARGE = 1 << 18  # entries of a matrix: smaller ones take longer to send than to update everywhere
+JOINS = {"gpu"}  # on a CPU a vector is updated as fast alone
+_ROW = 1 << 10  # entries: what a block of a GPU's threads adds up at once
 _SMALL = 1 << 16  # entries: a leaf below takes a GPU longer to start on than to read
 
 
@@ -27,28 +29,34 @@ class Parts(NamedTuple):
     """How a state lies on the devices from step to step.
 
     What is carried is the state and its `rounded` matrices: the optimiser writes both, so that the
-    float32 ones are not read again to round them. Matrices in parts are flat there.
+    float32 ones are not read again to round them. Matrices in parts are flat there, and on a GPU
+    vectors are joined.
 
     Attributes:
       mesh: the batch is split over it.
       dtype: of the networks' arithmetic.
-      like: the whole state's shapes, as a TrainState; not needed on one device.
+      like: the whole state's shapes, as a TrainState.
     """
 
     mesh: Mesh
     dtype: str
-    like: Any = None
+    like: Any
 
     def begin(self, state: TrainState) -> Carried:
         """What is carried, of a whole state."""
-        carried = state, rounded(state.params, self.dtype)
+        carried = self._join(state), rounded(state.params, self.dtype)
         return jax.tree_util.tree_map_with_path(
             lambda path, x: x.reshape(-1) if self._is_split(path, x) else x, carried
         )
 
     def end(self, carried: Carried) -> TrainState:
-        """The whole state of what is carried, on several devices."""
-        return jax.tree.map(lambda x, like: x.reshape(like.shape), carried[0], self.like)
+        """The whole state of what is carried."""
+        state = jax.tree.map(
+            lambda x, like: x if x.shape == like.shape else x.reshape(like.shape),
+            carried[0],
+            self._joined(self.like),
+        )
+        return self._separate(state)
 
     def on_each(self, update: Callable[[Carried, Any], Carried]) -> Callable[..., Carried]:
         """`update(carried, batch)` on every device, of its parts and its share of the batch."""
@@ -75,10 +83,18 @@ class Parts(NamedTuple):
             shape = (x.size,) if split else x.shape
             return jax.ShapeDtypeStruct(shape, x.dtype, sharding=placed[split])
 
-        natural = jax.eval_shape(
-            lambda state: (state, rounded(state.params, self.dtype)), self.like
-        )
-        return jax.tree_util.tree_map_with_path(one, natural)
+        narrow = jax.eval_shape(lambda params: rounded(params, self.dtype), self.like.params)
+        return jax.tree_util.tree_map_with_path(one, (self._joined(self.like), narrow))
+
+    def params(self, carried: Carried) -> policies.Params:
+        """The networks' parameters, matrices in their type; those in parts still are."""
+        state, narrow = carried
+        params = self._separate(state.params)
+        return jax.tree.map(lambda p, n: p if n is None else n, params, narrow)
+
+    def rounded(self, params: Any) -> policies.Params:
+        """The matrices of a carried state's parameters, as they are carried beside it."""
+        return rounded(params.matrices if self._joins else params, self.dtype)
 
     def whole(self, params: policies.Params) -> policies.Params:
         """Parameters put together, within `on_each`; differentiated, sums come back as parts."""
@@ -95,36 +111,53 @@ class Parts(NamedTuple):
         """Of every device's numbers, within `on_each`."""
         return tree if self.mesh.size == 1 else jax.lax.pmean(tree, devices.AXIS)
 
-    def mean_gradient(self, gradients: policies.Params, params: policies.Params) -> policies.Params:
-        """Each device's gradients of `whole` parameters as the batch's, in the parameters' type."""
-        count = self.mesh.size
+    def mean_gradient(self, gradients: policies.Params) -> Any:
+        """Each device's gradients of `whole` parameters as the batch's, as the state's are."""
+        count, like = self.mesh.size, self._joined(self.like.params)
+        summed = self._join(gradients)
         if count > 1:
-            gradients = jax.tree.map(
+            summed = jax.tree.map(
                 lambda g, like: jax.lax.psum(g, devices.AXIS) if g.shape == like.shape else g,
-                gradients,
-                self.like.params,
+                summed,
+                like,
             )
-        gradients = jax.tree.map(lambda g, p: g.astype(p.dtype), gradients, params)
-        return jax.tree.map(lambda g: g / count, gradients) if count > 1 else gradients
+        summed = jax.tree.map(lambda g, like: g.astype(like.dtype), summed, like)
+        return jax.tree.map(lambda g: g / count, summed) if count > 1 else summed
 
-    def norm(self, gradients: policies.Params) -> jax.Array:
+    def norm(self, gradients: Any) -> jax.Array:
         """Euclidean norm of all of them, within `on_each`."""
         leaves = jax.tree.leaves(gradients)
         if self.mesh.size == 1:
             return jnp.sqrt(_squares(leaves))
         of: dict[bool, list[jax.Array]] = {True: [], False: []}
-        for leaf, like in zip(leaves, jax.tree.leaves(self.like.params), strict=True):
+        for leaf, like in zip(leaves, jax.tree.leaves(self._joined(self.like.params)), strict=True):
             of[leaf.shape == like.shape].append(leaf)
         return jnp.sqrt(_squares(of[True]) + jax.lax.psum(_squares(of[False]), devices.AXIS))
+
+    def _joined(self, like: Any) -> Any:
+        """Shapes of the state, or of its parameters, as they are carried but for the parts."""
+        return jax.eval_shape(self._join, like)
+
+    def _join(self, tree: Any) -> Any:
+        return joined.join_all(tree, self.like.params) if self._joins else tree
+
+    def _separate(self, tree: Any) -> Any:
+        return joined.separate_all(tree, self.like.params) if self._joins else tree
+
+    @property
+    def _joins(self) -> bool:
+        return self.mesh.devices.flat[0].platform in JOINS
 
     def _is_split(self, path: tuple[Any, ...], x: Any) -> bool:
         """Whether a leaf of what is carried lies in parts: not the vision encoder's, which is the
         first to be used and the last whose gradient is known, so that nothing could run beside."""
         count = self.mesh.size
         names = {getattr(key, "key", None) for key in path}
-        return count > 1 and x.size >= LARGE and x.size % count == 0 and "vision" not in names
+        large = x.ndim > 1 and x.size >= LARGE and x.size % count == 0
+        return count > 1 and large and "vision" not in names
 
 
+@functools.partial(jax.jit, static_argnums=1)  # outside of any, one program for all of them
 def rounded(params: policies.Params, dtype: str) -> policies.Params:
     """The matrices that `policy.rounded` changes, as it gives them; None in the others' places."""
     changed = policies.rounded(params, dtype)
@@ -132,10 +165,15 @@ def rounded(params: policies.Params, dtype: str) -> policies.Params:
 
 
 def _squares(leaves: list[jax.Array]) -> jax.Array:
-    """Sum of all squares. Small leaves are summed up together: on a GPU a kernel or two for each
-    take longer than all the large ones."""
-    small = [leaf.ravel() for leaf in leaves if leaf.size < _SMALL]
-    large = [leaf for leaf in leaves if leaf.size >= _SMALL]
-    together = [jnp.concatenate(small)] if small else []
-    sums = [jnp.sum(leaf * leaf) for leaf in large + together]
-    return jnp.stack(sums).sum() if sums else jnp.float32(0.0)
+    """Sum of all squares. A GPU needs two kernels for the sum of a large array, and starting them
+    takes longer than most of them run: the second is shared, and so are both of small ones."""
+    found = [jnp.square(leaf).ravel() if leaf.size < _SMALL else _by_rows(leaf) for leaf in leaves]
+    # without the barrier XLA takes apart again what is put together
+    return jax.lax.optimization_barrier(jnp.concatenate([*found, jnp.zeros(1)])).sum()
+
+
+def _by_rows(leaf: jax.Array) -> jax.Array:
+    """Its squares summed along the last axis, or `_ROW` at a time: one kernel."""
+    if leaf.ndim == 1:
+        leaf = jnp.pad(leaf, (0, -leaf.size % _ROW)).reshape(-1, _ROW)
+    return jnp.square(leaf).sum(-1).ravel()

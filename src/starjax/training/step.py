@@ -12,7 +12,7 @@ from starjax.data import windows
 from starjax.policies import policy as policies
 from starjax.training import devices
 from starjax.training import state as states
-from starjax.training.parts import Carried, Parts, rounded
+from starjax.training.parts import Carried, Parts
 
 
 def step_keys(key: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -46,13 +46,12 @@ def _update(
     given: Any,
 ) -> Carried:
     """What each device does with its share of a prepared batch."""
-    state, narrow = carried
-    params = jax.tree.map(lambda p, n: p if n is None else n, state.params, narrow)
+    state, _ = carried
     (loss, metrics), gradients = jax.value_and_grad(
         lambda params: policy.loss(parts.whole(params), given), has_aux=True
-    )(params)
+    )(parts.params(carried))
     said = parts.mean({"loss": loss, **metrics})
-    gradients = parts.mean_gradient(gradients, state.params)
+    gradients = parts.mean_gradient(gradients)
     norm = parts.norm(gradients)
     finite = jnp.isfinite(said["loss"]) & jnp.isfinite(norm)
     # zeros in place of NaN keep the arithmetic below harmless; its results are dropped
@@ -78,7 +77,7 @@ def _update(
         skipped=state.skipped + jnp.where(finite, 0, 1),
         sums=sums,
     )
-    return state, rounded(state.params, parts.dtype)
+    return state, parts.rounded(state.params)
 
 
 def resident_step(

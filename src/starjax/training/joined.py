@@ -1,0 +1,83 @@
+"""Parameters whose vectors (biases, scales) are joined into one.
+
+An optimiser's kernel takes a GPU longer to start on a vector than to run, and every array that a
+program is called with costs the host some microseconds; half of the paper's parameters are vectors.
+"""
+
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class Joined(NamedTuple):
+    """What `join` makes of parameters.
+
+    Attributes:
+      matrices: the parameters with None in the vectors' places.
+      vectors: `[n]`, all of them, in the order of jax's leaves.
+    """
+
+    matrices: Any
+    vectors: jax.Array
+
+
+def join(params: Any, like: Any) -> Joined:
+    """The vectors of `params` joined. Which leaves are, the shapes `like` say: a matrix may be
+    held flat."""
+    leaves, tree = jax.tree.flatten(like)
+    given = tree.flatten_up_to(params)
+    matrices = [x if is_matrix(shape) else None for x, shape in zip(given, leaves, strict=True)]
+    vectors = [x for x, shape in zip(given, leaves, strict=True) if not is_matrix(shape)]
+    return Joined(tree.unflatten(matrices), _concatenated(vectors))
+
+
+def separate(joined: Joined, like: Any) -> Any:
+    """The parameters, as they were."""
+    leaves, tree = jax.tree.flatten(like)
+    matrices = tree.flatten_up_to(joined.matrices)
+    vectors = iter(_apart(joined.vectors, tuple(x.shape for x in leaves if not is_matrix(x))))
+    given = zip(matrices, leaves, strict=True)
+    return tree.unflatten([x if is_matrix(shape) else next(vectors) for x, shape in given])
+
+
+def join_all(state: Any, like: Any) -> Any:
+    """Whatever holds parameters (averages, moments) with each of them joined."""
+    structure = jax.tree.structure(like)
+
+    def are_params(x: Any) -> bool:
+        return jax.tree.structure(x) == structure
+
+    return jax.tree.map(lambda x: join(x, like) if are_params(x) else x, state, is_leaf=are_params)
+
+
+def separate_all(state: Any, like: Any) -> Any:
+    """The same with each of them as it was."""
+    return jax.tree.map(
+        lambda x: separate(x, like) if isinstance(x, Joined) else x,
+        state,
+        is_leaf=lambda x: isinstance(x, Joined),
+    )
+
+
+def is_matrix(x: Any) -> bool:
+    """Whether a parameter of this shape stays as it is."""
+    return x.ndim > 1
+
+
+# Programs of their own, so that called outside of any they are one, and not one for each vector.
+@jax.jit
+def _concatenated(vectors: list[jax.Array]) -> jax.Array:
+    return jnp.concatenate([x.ravel() for x in vectors]) if vectors else jnp.zeros(0)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _apart(vectors: jax.Array, shapes: tuple[tuple[int, ...], ...]) -> list[jax.Array]:
+    found, first = [], 0
+    for shape in shapes:
+        size = math.prod(shape)
+        found.append(jax.lax.slice_in_dim(vectors, first, first + size).reshape(shape))
+        first += size
+    return found
