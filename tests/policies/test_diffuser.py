@@ -29,11 +29,14 @@ def learned():
     def repeated(x):
         return jnp.repeat(x, 16, axis=0)
 
+    def loss(params, inputs, given):
+        return model.loss(params, model.observe(params, inputs), jnp.zeros((32, 0)), given)
+
     def step(i, carry):
         params, state = carry
         inputs = features.Inputs(repeated(history), None, None)
         given = model.noised(jax.random.fold_in(jax.random.key(1), i), repeated(wanted))
-        gradient = jax.grad(model.loss)(params, inputs, jnp.zeros((32, 0)), given)
+        gradient = jax.grad(loss)(params, inputs, given)
         updates, state = optimizer.update(gradient, state, params)
         return optax.apply_updates(params, updates), state
 
@@ -48,7 +51,13 @@ def learned():
 def sampled(settings, params, inputs, seed=2):
     model = diffuser.make(settings, ACTION, ACTION, 0)
     keys = jax.random.split(jax.random.key(seed), len(PRESENT))
-    return np.asarray(jax.jit(model.sample)(params, keys, inputs, jnp.zeros((len(PRESENT), 0))))
+
+    @jax.jit
+    def sample(params, keys, inputs):
+        observed = model.observe(params, inputs)
+        return model.sample(params, keys, observed, jnp.zeros((len(PRESENT), 0)))
+
+    return np.asarray(sample(params, keys, inputs))
 
 
 def test_samples_are_what_was_learned(learned):

@@ -13,6 +13,7 @@ import pytest
 from starjax import config, rcm
 from starjax.data import normalizer, windows
 from starjax.experiments.methods import METHODS
+from starjax.models import encoders
 from starjax.policies import execution, features, hierarchical
 from starjax.policies import policy as policies
 
@@ -201,6 +202,16 @@ def test_what_the_roll_network_reads(dataset, changed, matters):
     before = roll(seen, trocar)
     after = (roll(turned(seen), trocar), roll(seen, moved(trocar)), roll(elsewhere(seen), trocar))
     assert tuple(float(jnp.abs(x - before).max()) > 1e-4 for x in after) == matters
+
+
+def test_what_both_networks_read_is_encoded_once(dataset, monkeypatch):
+    it = Made("stardiff", dataset, roll_observation=True)
+    calls, encode = [], encoders.StateEncoder.apply
+    monkeypatch.setattr(
+        encoders.StateEncoder, "apply", lambda *args: calls.append(1) or encode(*args)
+    )
+    jax.eval_shape(it.loss, *it.loss_arguments)
+    assert len(calls) == 1
 
 
 def test_hierarchy_needs_a_roll():

@@ -19,18 +19,18 @@ class Diffuser(NamedTuple):
     Attributes:
       init: `key -> params`, those that training changes: none for a frozen vision encoder.
       observed_dim: N, numbers that the networks make of an observation.
-      condition: `(params, inputs, extra [B, E]) -> [B, N + E]`, what the U-Net is told.
+      observe: `(params, inputs) -> [B, N]`, those numbers.
       noised: `(key, x0 [B, H, A]) -> Noised`, what is learned from clean sequences.
-      loss: `(params, inputs, extra [B, E], Noised) -> scalar` of Eq. 9.
-      sample: `(params, keys [B], inputs, extra [B, E]) -> [B, H, A]` in [-1, 1], by DDIM.
+      loss: `(params, observed [B, N], extra [B, E], Noised) -> scalar` of Eq. 9.
+      sample: `(params, keys [B], observed [B, N], extra [B, E]) -> [B, H, A]` in [-1, 1], by DDIM.
     """
 
     observed_dim: int
     init: Callable[[jax.Array], Params]
-    condition: Callable[[Params, features.Inputs, jax.Array], jax.Array]
+    observe: Callable[[Params, features.Inputs], jax.Array]
     noised: Callable[[jax.Array, jax.Array], diffusion.Noised]
-    loss: Callable[[Params, features.Inputs, jax.Array, diffusion.Noised], jax.Array]
-    sample: Callable[[Params, jax.Array, features.Inputs, jax.Array], jax.Array]
+    loss: Callable[[Params, jax.Array, jax.Array, diffusion.Noised], jax.Array]
+    sample: Callable[[Params, jax.Array, jax.Array, jax.Array], jax.Array]
 
 
 def make(
@@ -78,10 +78,8 @@ def make(
             params["vision"] = vision.init(key_vision, jnp.zeros((1, size, size, 3)))
         return params
 
-    def condition(params: Params, inputs: features.Inputs, extra: jax.Array) -> jax.Array:
+    def observe(params: Params, inputs: features.Inputs) -> jax.Array:
         parts: list[Any] = [state.apply(params["state"], inputs.history)]
-        if extra.shape[-1]:  # XLA of jax 0.11 crashes on an empty array under `shard_map`
-            parts.append(extra)
         if inputs.features is not None:
             parts.insert(0, inputs.features.reshape(len(inputs.features), -1))
         elif inputs.image is not None:
@@ -99,15 +97,13 @@ def make(
         return diffusion.noised(noise_schedule, key, x0)
 
     def loss(
-        params: Params, inputs: features.Inputs, extra: jax.Array, given: diffusion.Noised
+        params: Params, observed: jax.Array, extra: jax.Array, given: diffusion.Noised
     ) -> jax.Array:
-        cond = condition(params, inputs, extra)
+        cond = _beside(observed, extra)
         return diffusion.eps_loss(lambda x, k: denoise(params["unet"], x, k, cond), given)
 
-    def sample(
-        params: Params, keys: jax.Array, inputs: features.Inputs, extra: jax.Array
-    ) -> jax.Array:
-        cond = condition(params, inputs, extra)
+    def sample(params: Params, keys: jax.Array, observed: jax.Array, extra: jax.Array) -> jax.Array:
+        cond = _beside(observed, extra)
         film = unet.apply(params["unet"], cond, method="condition")
         return diffusion.ddim_sample(
             lambda x, film_k: denoise(params["unet"], x, film + film_k, method="denoise"),
@@ -117,7 +113,7 @@ def make(
             prepare=lambda k: unet.apply(params["unet"], k, method="embed_step"),
         )
 
-    return Diffuser(observed_dim, init, condition, noised, loss, sample)
+    return Diffuser(observed_dim, init, observe, noised, loss, sample)
 
 
 def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:
@@ -127,6 +123,12 @@ def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:
         features=policy_config.vision_dim,
         dtype=jnp.dtype(policy_config.dtype),
     )
+
+
+def _beside(observed: jax.Array, extra: jax.Array) -> jax.Array:
+    """What the U-Net is told."""
+    # XLA of jax 0.11 crashes on an empty array that is concatenated under `shard_map`
+    return jnp.concatenate([observed, extra], axis=-1) if extra.shape[-1] else observed
 
 
 def _zeros(width: int) -> jax.Array:

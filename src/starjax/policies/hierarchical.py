@@ -88,12 +88,10 @@ def make(
         p: jax.Array,
         trocar: jax.Array,
         history: jax.Array,
-        inputs: features.Inputs,
+        observed: jax.Array,
     ) -> jax.Array:
         """Eq. 13, but for what an ablation adds or leaves out."""
-        seen = None
-        if policy_config.roll_observation:
-            seen = model.condition(params["diffuser"], inputs, jnp.zeros((len(p), 0)))
+        seen = observed if policy_config.roll_observation else None
         return predict(params["roll"], p, trocar_weight * trocar, history_weight * history, seen)
 
     def prepare(stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch) -> Prepared:
@@ -121,8 +119,9 @@ def make(
 
     def loss(params: Params, given: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Eq. 15."""
-        position_loss = model.loss(params["diffuser"], given.inputs, given.extra, given.noised)
-        predicted = rolls_along(params, given.p, given.trocar, given.history, given.inputs)
+        observed = model.observe(params["diffuser"], given.inputs)
+        position_loss = model.loss(params["diffuser"], observed, given.extra, given.noised)
+        predicted = rolls_along(params, given.p, given.trocar, given.history, observed)
         roll_loss = jnp.mean((given.roll - predicted) ** 2)  # Eq. 14
         total = position_loss + policy_config.roll_loss_weight * roll_loss
         return total, {"position_loss": position_loss, "roll_loss": roll_loss}
@@ -139,10 +138,11 @@ def make(
             policy_config, train_config, stats, observation, measured[..., diffused]
         )
         extra = features.extra(method, trocar, p_world_ref)
-        x0 = model.sample(params["diffuser"], keys, inputs, extra)
+        observed = model.observe(params["diffuser"], inputs)
+        x0 = model.sample(params["diffuser"], keys, observed, extra)
         p, gripper = x0[..., :3], x0[..., 3:]
         about = features.trocar_features(trocar, p_world_ref)
-        gamma = rolls_along(params, p, about, measured[..., roll], inputs)
+        gamma = rolls_along(params, p, about, measured[..., roll], observed)
         # within the demonstrated range, as the diffused part is
         gamma = jnp.clip(gamma, -1.0, 1.0)[..., None]
         parts = {"roll": gamma, "p": p}

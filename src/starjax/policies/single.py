@@ -14,7 +14,7 @@ from starjax.types import Command
 
 
 class Prepared(NamedTuple):
-    """What `diffuser.Diffuser.loss` is given."""
+    """A batch as the loss needs it, with everything random drawn."""
 
     inputs: features.Inputs
     extra: jax.Array
@@ -46,7 +46,8 @@ def make(
         return Prepared(inputs, _extra(batch.trocar), model.noised(key_diffusion, x0))
 
     def loss(params: Params, given: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
-        return model.loss(params, *given), {}
+        observed = model.observe(params, given.inputs)
+        return model.loss(params, observed, given.extra, given.noised), {}
 
     def sample(
         params: Params,
@@ -62,7 +63,8 @@ def make(
             observation,
             _proprioception(stats, observation, trocar),
         )
-        action = model.sample(params, keys, inputs, _extra(trocar))
+        observed = model.observe(params, inputs)
+        action = model.sample(params, keys, observed, _extra(trocar))
         return execution.command(method, stats, action, trocar, p_world_ref)
 
     def _proprioception(stats, observation, trocar):
