@@ -26,7 +26,7 @@ class Advance(NamedTuple):
     Attributes:
       begin: what is carried, of a state, whose memory the steps may reuse.
       several: so many steps `(carried, count) -> carried`, in the given memory.
-      end: the state of what is carried, and is carried on: gone with the next steps.
+      end: the state of what is carried, whose memory further steps may reuse.
     """
 
     begin: Callable[[TrainState], Carried]

@@ -112,7 +112,7 @@ class Parts(NamedTuple):
         return tree if self.mesh.size == 1 else jax.lax.pmean(tree, devices.AXIS)
 
     def mean_gradient(self, gradients: policies.Params) -> Any:
-        """Each device's gradients of `whole` parameters as the batch's, as the state's are."""
+        """Each device's gradients of `whole` parameters as the batch's, joined as those are."""
         count, like = self.mesh.size, self._joined(self.like.params)
         summed = self._join(gradients)
         if count > 1:
