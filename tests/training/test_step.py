@@ -138,6 +138,15 @@ def test_a_broken_loss_is_left_out_and_counted(start, dataset):
     assert not np.array_equal(again.params["w"], after.params["w"])
 
 
+def test_norm_is_of_every_entry():
+    shapes = {"matrix": (300, 400), "flat": (70_001,), "small": (5, 7), "vector": (3,)}
+    random = np.random.default_rng(0)
+    gradients = {name: random.normal(size=shape) for name, shape in shapes.items()}
+    wanted = np.linalg.norm(np.concatenate([g.ravel() for g in gradients.values()]))
+    found = parts(None).norm(jax.tree.map(jnp.asarray, gradients))
+    np.testing.assert_allclose(found, wanted, rtol=1e-5)
+
+
 def test_mesh_divides_the_batch():
     assert devices.make_mesh(8).size == 1
     assert devices.make_mesh(7, jax.devices()).size == 1

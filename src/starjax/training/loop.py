@@ -103,12 +103,10 @@ def run(
     if windows.on_device(dataset):
         new = not checkpoint.steps(checkpoints)  # a restored training may be finished
         advance = advancing.resident(it, like, ahead=new)
-    restored = _restored(checkpoints, like)
-    if restored is None:
-        params = _begun(begun, policy_config, train_config)
-        state = devices.replicate(states.run_once(around, params), mesh)
-    else:
-        state = restored
+    state = _restored(checkpoints, like)
+    if state is None:
+        state = states.run_once(around, _begun(begun, policy_config, train_config))
+        state = devices.replicate(state, mesh)
     step = first = int(state.step)
     metrics.resume(log, step)
     judge = holdout.make(policy, policy_config, dataset, held_out) if processes.is_first() else None
