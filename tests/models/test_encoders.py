@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import encoders, resnet, spatial_softmax
+from starjax.models import encoders, layers, pooled_norm, resnet, spatial_softmax
 
 KEY = jax.random.key(0)
 
@@ -102,30 +102,50 @@ def test_resnet18_shrinks_by_32():
     assert shape == (2, 7, 8, 512)
 
 
-@pytest.mark.parametrize("size", [9, 12])
-def test_max_pool_is_jaxs_and_its_gradient_too(size):
-    x = jax.random.uniform(KEY, (2, size, size + 1, 3))
+@pytest.fixture(scope="module", params=[(16, 20), (15, 18), (13, 9)])
+def stem(request):
+    """Our convolution, GroupNorm, ReLU and max-pooling, and jax's: outputs and gradients."""
+    x, size = normal(3, *request.param, 3), tuple(-(-side // 2) for side in request.param)
+    ours, norm = resnet.Stem(32), pooled_norm.PooledNorm(2, size)
+    plain, plain_norm = resnet.Conv2d(32, 7, 2), layers.GroupNorm(2)
+    params = plain.init(KEY, x), plain_norm.init(KEY, normal(3, *size, 32))
+    # half of the gains negative, where the largest comes from the smallest
+    params = jax.tree.map(lambda leaf: leaf * normal(*leaf.shape), params)
 
-    def jaxs(x):
+    def actual(params, x):
+        return norm.apply(params[1], ours.apply(params[0], x))
+
+    def expected(params, x):
+        y = jax.nn.relu(plain_norm.apply(params[1], plain.apply(params[0], x)))
         pads = [(0, 0), (1, 1), (1, 1), (0, 0)]
-        return jax.lax.reduce_window(x, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), pads)
+        return jax.lax.reduce_window(y, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), pads)
 
-    expected, jaxs_gradient = jax.vjp(jaxs, x)
-    actual, gradient = jax.vjp(resnet.max_pool, x)
-    np.testing.assert_array_equal(actual, expected)
-    g = jax.random.normal(jax.random.key(1), actual.shape)
-    np.testing.assert_allclose(gradient(g)[0], jaxs_gradient(g)[0], rtol=1e-6)
+    def outputs(start):
+        y, pullback = jax.vjp(start, params, x)
+        return y, pullback(normal(*y.shape))
+
+    return [outputs(jax.jit(start)) for start in (actual, expected)]
 
 
-@pytest.mark.parametrize("size", [15, 16, 17])
-def test_the_stem_is_the_convolution_it_stands_for(size):
-    x = jax.random.normal(KEY, (2, size, size + 3, 3))
-    params = resnet.Stem(8).init(KEY, x)
-    plain = resnet.Conv2d(8, 7, 2)
-    assert jax.tree.map(jnp.shape, params) == jax.tree.map(jnp.shape, plain.init(KEY, x))
-    np.testing.assert_allclose(
-        resnet.Stem(8).apply(params, x), plain.apply(params, x), rtol=1e-4, atol=1e-5
-    )
+def test_the_stem_is_what_it_stands_for(stem):
+    (actual, _), (expected, _) = stem
+    assert actual.shape == expected.shape
+    assert (expected == 0).any()
+    np.testing.assert_allclose(actual, expected, atol=1e-5 * float(jnp.abs(expected).max()))
+
+
+def test_the_stems_gradient_is_too(stem):
+    (_, actual), (_, expected) = stem
+    for ours, jaxs in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(ours, jaxs, atol=1e-5 * float(jnp.abs(jaxs).max()))
+
+
+def test_the_gradient_of_a_blocks_end_is_jaxs():
+    x, y, g = normal(4, 5), normal(5, 4).T, normal(20).reshape(4, 5)
+    _, actual = jax.vjp(resnet._relu_of_sum, x, y)
+    _, expected = jax.vjp(lambda x, y: jax.nn.relu(x + y), x, y)
+    for ours, jaxs in zip(actual(g), expected(g), strict=True):
+        np.testing.assert_array_equal(ours, jaxs)
 
 
 @pytest.mark.parametrize("size", [(7, 9), (8, 6)])

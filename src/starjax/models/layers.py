@@ -103,32 +103,53 @@ class GroupNorm(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[B, ..., C] -> [B, ..., C]`."""
-        channels = x.shape[-1]
-        if channels % self.groups:
-            raise ValueError(
-                f"groups: expected a divisor of {channels} channels, got {self.groups}"
-            )
-        scale = self.param("scale", nn.initializers.ones, (channels,))
-        bias = self.param("bias", nn.initializers.zeros, (channels,))
-        return _group_norm(x, scale, bias, self.groups)
+        return _group_norm(x, *scale_and_bias(self, x, self.groups), self.groups)
+
+
+def scale_and_bias(module: nn.Module, x: jax.Array, groups: int) -> tuple[jax.Array, jax.Array]:
+    """Parameters `[C]` of a module that normalises `x` `[B, ..., C]`, in its compact method."""
+    channels = x.shape[-1]
+    if channels % groups:
+        raise ValueError(f"groups: expected a divisor of {channels} channels, got {groups}")
+    scale = module.param("scale", nn.initializers.ones, (channels,))
+    return scale, module.param("bias", nn.initializers.zeros, (channels,))
 
 
 @functools.partial(jax.jit, static_argnames="groups")
 def _group_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int) -> jax.Array:
-    batch, channels = x.shape[0], x.shape[-1]
+    return normalized(x, *affine(*moments(x), scale, bias, groups))
+
+
+def moments(x: jax.Array, entries: int | None = None) -> tuple[jax.Array, jax.Array]:
+    """Means of `[B, ..., C]` and of its squares over all positions, or as if there were `entries`.
+
+    Each is `[B, C]` float32.
+    """
     wide = x.astype(jnp.float32)
     positions = tuple(range(1, x.ndim - 1))
+    entries = math.prod(x.shape[1:-1]) if entries is None else entries
+    return wide.sum(positions) / entries, (wide * wide).sum(positions) / entries
+
+
+def affine(
+    mean: jax.Array, square: jax.Array, scale: jax.Array, bias: jax.Array, groups: int
+) -> tuple[jax.Array, jax.Array]:
+    """Gain and shift `[B, C]` by which a sample of these moments is normalised over groups."""
+    shape = batch, channels = mean.shape
     # Positions first, channels after: both reductions then run along contiguous memory, and
     # what remains is one multiply-add for each element.
     per_group = (batch, groups, channels // groups)
-    mean = wide.mean(positions).reshape(per_group).mean(-1)
-    square = (wide * wide).mean(positions).reshape(per_group).mean(-1)
+    mean, square = (moment.reshape(per_group).mean(-1) for moment in (mean, square))
     inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + 1e-5)
-    shape = (batch, channels)
     gain = jnp.repeat(inverse, channels // groups, axis=1) * spread(scale, shape)
-    shift = spread(bias, shape) - jnp.repeat(mean, channels // groups, axis=1) * gain
-    shape = (batch,) + (1,) * len(positions) + (channels,)
-    return (wide * gain.reshape(shape) + shift.reshape(shape)).astype(x.dtype)
+    return gain, spread(bias, shape) - jnp.repeat(mean, channels // groups, axis=1) * gain
+
+
+def normalized(x: jax.Array, gain: jax.Array, shift: jax.Array) -> jax.Array:
+    """`[B, ..., C]` times gain plus shift, `[B, C]` each."""
+    batch, *positions, channels = x.shape
+    shape = (batch, *(1 for _ in positions), channels)
+    return (x.astype(jnp.float32) * gain.reshape(shape) + shift.reshape(shape)).astype(x.dtype)
 
 
 class Conv1d(nn.Module):

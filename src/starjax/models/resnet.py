@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.models import layers
+from starjax.models.pooled_norm import PooledNorm
 
 # Images up to which a GPU convolves as a matrix product. cuDNN's convolutions, started one by one
 # between CUDA graphs, then take longer to start than to run: 0.35 ms of a call for one robot, which
@@ -35,7 +36,8 @@ class ResNet18(nn.Module):
     def __call__(self, image: jax.Array) -> jax.Array:
         """`[N, h, w, 3]` normalised -> `[N, ceil(h/32), ceil(w/32), 8 width]`."""
         x = Stem(self.width, name="conv1")(image.astype(self.dtype))
-        x = max_pool(nn.relu(group_norm("bn1", x)))
+        size = math.ceil(image.shape[1] / 2), math.ceil(image.shape[2] / 2)
+        x = PooledNorm(_groups(x), size, name="bn1")(x)
         for stage in range(4):
             for block in range(2):
                 stride = 2 if stage > 0 and block == 0 else 1
@@ -47,23 +49,21 @@ class ResNet18(nn.Module):
 class Stem(nn.Module):
     """7x7 convolution, stride 2, padding 3, without bias, over `[N, h, w, 3]`.
 
-    Computed as a 4x4 convolution, stride 1, of 2x2 blocks of pixels: a GPU's matrix units need
-    channels in eights, and three would be padded to them at full resolution.
+    Computed as a 3x3 convolution, stride 1, of 4x4 blocks of pixels, to all of a block's four
+    outputs: a GPU's matrix units need channels in eights, and more than three of them.
     """
 
     features: int
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[N, h, w, 3] -> [N, ceil(h/2), ceil(w/2), features]`."""
+        """`[N, h, w, 3] -> [N, ceil(h/4), ceil(w/4), 2, 2, features]`: rows, columns in pairs."""
         init = _kernel_init(7, self.features)
         kernel = self.param("kernel", init, (7, 7, x.shape[-1], self.features))
-        # One more tap before the seven makes them four pairs: the padding before is then 4.
-        kernel = jnp.pad(kernel.astype(x.dtype), ((1, 0), (1, 0), (0, 0), (0, 0)))
-        pads = [(4, 2 * ((side + 1) // 2) + 2 - side) for side in x.shape[1:3]]
-        blocks = _pairs(jnp.pad(x, ((0, 0), *pads, (0, 0))))
-        kernel = jnp.moveaxis(_pairs(jnp.moveaxis(kernel, -1, 0)), 0, -1)
-        return _convolve(blocks, kernel, 1, 0)
+        pads = [(4, 4 * math.ceil(side / 4) + 4 - side) for side in x.shape[1:3]]
+        blocks = _blocks(jnp.pad(x, ((0, 0), *pads, (0, 0))), 4)
+        y = _convolve(blocks, _to_blocks(kernel.astype(x.dtype)), 1, 0)
+        return y.reshape(*y.shape[:3], 2, 2, self.features)
 
 
 class BasicBlock(nn.Module):
@@ -81,7 +81,7 @@ class BasicBlock(nn.Module):
         if x.shape != y.shape:
             x = Conv2d(self.features, 1, self.stride, name="downsample_0")(x)
             x = group_norm("downsample_1", x)
-        return nn.relu(x + y)
+        return _relu_of_sum(x, y)
 
 
 class Conv2d(nn.Module):
@@ -102,59 +102,31 @@ class Conv2d(nn.Module):
 
 def group_norm(name: str, x: jax.Array) -> jax.Array:
     """GroupNorm with 16 channels a group, inside a compact module."""
-    return layers.GroupNorm(x.shape[-1] // 16, name=name)(x)
+    return layers.GroupNorm(_groups(x), name=name)(x)
+
+
+def _groups(x: jax.Array) -> int:
+    return x.shape[-1] // 16
 
 
 @jax.custom_vjp
-def max_pool(x: jax.Array) -> jax.Array:
-    """3x3 maximum, stride 2, of values that are not negative: zero padding then changes nothing.
-
-    Its gradient goes to the first of the largest, remembered as its number in the window: one pass
-    over the output, where the gradient of maxima takes several over the input.
-    """
-    return _max_pool(x)[0]
+def _relu_of_sum(x: jax.Array, y: jax.Array) -> jax.Array:
+    """ReLU of x + y; its gradient asks what came out, which is kept anyway, not both summands."""
+    return nn.relu(x + y)
 
 
-def _max_pool(x: jax.Array) -> tuple[jax.Array, tuple[jax.Array, tuple[int, ...]]]:
-    height, width = (x.shape[1] + 1) // 2, (x.shape[2] + 1) // 2
-    padded = jnp.pad(x, ((0, 0), (1, 2), (1, 2), (0, 0)))
-    largest = padded[:, : 2 * height : 2, : 2 * width : 2]
-    number = jnp.zeros(largest.shape, jnp.uint8)
-    for n in range(1, 9):
-        i, j = divmod(n, 3)
-        other = padded[:, i : i + 2 * height : 2, j : j + 2 * width : 2]
-        number = jnp.where(other > largest, jnp.uint8(n), number)
-        largest = jnp.maximum(largest, other)
-    return largest, (number, x.shape)
+def _relu_of_sum_forward(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    out = _relu_of_sum(x, y)
+    return out, out
 
 
-def _max_pool_gradient(kept, g: jax.Array) -> tuple[jax.Array]:
-    number, shape = kept
-    # An even row is the middle of one window; an odd one the last of that and the first of the
-    # next. Element-wise in the input's entries, so that it can be part of what uses it.
-    row, column = (jnp.arange(side)[:, None] for side in shape[1:3])
-    row, gradient = row[:, None], jnp.zeros(shape, g.dtype)
-    for down, right in np.ndindex(2, 2):
-        place = 3 * _place(row, down) + _place(column, right)
-        chosen = _each_twice(number, down, right, shape) == place.astype(jnp.uint8)
-        gradient += jnp.where(chosen, _each_twice(g, down, right, shape), 0)
-    return (gradient,)
+def _relu_of_sum_gradient(out: jax.Array, g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    # without a barrier XLA asks the sum again
+    g = jnp.where(jax.lax.optimization_barrier(out) > 0, g, 0)
+    return g, g
 
 
-def _place(index: jax.Array, following: int) -> jax.Array:
-    """Place (0 to 2) of an entry in its window, or in the following one; 9 if it is not in it."""
-    return jnp.where(index % 2 == 0, 9 if following else 1, 0 if following else 2)
-
-
-def _each_twice(x: jax.Array, down: int, right: int, shape: tuple[int, ...]) -> jax.Array:
-    """`[N, h, w, C] -> shape`: for each entry its window's value, or that of a following one."""
-    x = jnp.pad(x[:, down:, right:], ((0, 0), (0, down), (0, right), (0, 0)))
-    batch, height, width, channels = x.shape
-    twice = jnp.broadcast_to(x[:, :, None, :, None], (batch, height, 2, width, 2, channels))
-    return twice.reshape(batch, 2 * height, 2 * width, channels)[:, : shape[1], : shape[2]]
-
-
-max_pool.defvjp(_max_pool, _max_pool_gradient)
+_relu_of_sum.defvjp(_relu_of_sum_forward, _relu_of_sum_gradient)
 
 
 def _kernel_init(size: int, features: int) -> Callable[..., jax.Array]:
@@ -197,12 +169,18 @@ def _product(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.Arra
     return columns @ kernel.reshape(-1, kernel.shape[-1])
 
 
-def _pairs(x: jax.Array) -> jax.Array:
-    """Blocks of 2x2 pixels as channels, filled up to a multiple of 8 with zeros.
+def _to_blocks(kernel: jax.Array) -> jax.Array:
+    """`[7, 7, C, F] -> [3, 3, 16 C, 4 F]`: of blocks of 4x4 pixels to their 2x2 outputs."""
+    shifts = [(1 + 2 * output, 4 - 2 * output) for output in range(2)]
+    wide = jnp.stack([jnp.pad(kernel, (i, j, (0, 0), (0, 0))) for i in shifts for j in shifts], -2)
+    _, _, channels, outputs, features = wide.shape
+    wide = _blocks(wide.reshape(1, 12, 12, -1), 4)
+    return wide.reshape(3, 3, 16 * channels, outputs * features)
 
-    `[N, 2 h, 2 w, C] -> [N, h, w, 4 C rounded up]`.
-    """
+
+def _blocks(x: jax.Array, size: int) -> jax.Array:
+    """Blocks of pixels as channels: `[N, size h, size w, C] -> [N, h, w, size size C]`."""
     batch, height, width, channels = x.shape
-    x = x.reshape(batch, height // 2, 2, width // 2, 2, channels)
-    x = jnp.moveaxis(x, 2, 3).reshape(batch, height // 2, width // 2, 4 * channels)
-    return jnp.pad(x, ((0, 0), (0, 0), (0, 0), (0, -4 * channels % 8)))
+    height, width = height // size, width // size
+    x = x.reshape(batch, height, size, width, size, channels)
+    return jnp.moveaxis(x, 2, 3).reshape(batch, height, width, -1)

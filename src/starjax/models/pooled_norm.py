@@ -1,0 +1,112 @@
+"""GroupNorm, ReLU and max-pooling of a ResNet's stem, with one gradient for all three.
+
+The gradient reaches one entry of each window only. Sums over all entries are then sums over the
+windows, a quarter as many, and what the three hand to each other is never written.
+"""
+
+import functools
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.models import layers
+
+_NOWHERE = 255  # place of the largest in a window whose largest ReLU has cut
+
+Size = tuple[int, int]
+
+
+class PooledNorm(nn.Module):
+    """GroupNorm, ReLU, then the 3x3 maximum at stride 2, padding 1, of pairs of rows and columns.
+
+    Attributes:
+      groups: of channels.
+      size: rows and columns; where these are odd, what is beside the last is left out.
+    """
+
+    groups: int
+    size: Size
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[N, h, w, 2, 2, C] -> [N, h, w, C]`: of h pairs of rows, w pairs of columns."""
+        return _pooled(x, *layers.scale_and_bias(self, x, self.groups), self.groups, self.size)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _pooled(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int, size: Size) -> jax.Array:
+    return _forward(x, scale, bias, groups, size)[0]
+
+
+def _forward(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int, size: Size):
+    moments = layers.moments(_inside(x, size, 0), entries=size[0] * size[1])
+    gain, shift = layers.affine(*moments, scale, bias, groups)
+    # The largest comes from the largest x, where the gain is negative from the smallest.
+    sign = jnp.where(gain < 0, -1, 1).astype(x.dtype)
+    largest, place = _largest(_inside(_each(sign, x) * x, size, -jnp.inf))
+    chosen = _each(sign, largest) * largest
+    y = nn.relu(layers.normalized(chosen, gain, shift))
+    place = jnp.where(y > 0, place, jnp.uint8(_NOWHERE))
+    return y, (x, scale, bias, moments, place, chosen)
+
+
+def _gradient(
+    groups: int, size: Size, kept, g: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    x, scale, bias, moments, place, chosen = kept
+    affine = functools.partial(layers.affine, groups=groups)
+    (gain, _), back = jax.vjp(affine, *moments, scale, bias)
+    wide = jnp.where(place == _NOWHERE, 0, g).astype(jnp.float32)
+    by_gain = (wide * chosen.astype(jnp.float32)).sum((1, 2))
+    by_mean, by_square, by_scale, by_bias = back((by_gain, wide.sum((1, 2))))
+    everywhere = _each(by_mean, x) + 2 * x.astype(jnp.float32) * _each(by_square, x)
+    by_x = _each(gain, x) * _to_chosen(place, g) + everywhere / (size[0] * size[1])
+    return _inside(by_x.astype(x.dtype), size, 0), by_scale, by_bias
+
+
+_pooled.defvjp(_forward, _gradient)
+
+
+def _each(vector: jax.Array, x: jax.Array) -> jax.Array:
+    """`[N, C]` beside `[N, ..., C]`."""
+    return jnp.expand_dims(vector, tuple(range(1, x.ndim - 1)))
+
+
+def _inside(x: jax.Array, size: Size, other: float) -> jax.Array:
+    """`[N, h, w, 2, 2, C]` with `other` in what is beside the last row or column."""
+    rows, columns = (np.arange(2 * pairs).reshape(-1, 2) for pairs in x.shape[1:3])
+    inside = (rows < size[0])[:, None, :, None] & (columns < size[1])[None, :, None]
+    return x if inside.all() else jnp.where(inside[..., None], x, other)
+
+
+def _largest(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The largest of each window, and its place there, 0 to 8 (of several the first)."""
+    pads = ((0, 0), (1, 0), (1, 0), (0, 0), (0, 0), (0, 0))
+    x = jnp.pad(x, pads, constant_values=-jnp.inf)
+    # Rows of window i: the second of pair i - 1 and both of pair i.
+    rows = ((slice(-1), 1), (slice(1, None), 0), (slice(1, None), 1))
+    largest, *others = (x[:, i, j, a, b] for i, a in rows for j, b in rows)
+    place = jnp.zeros(largest.shape, jnp.uint8)
+    for number, other in enumerate(others, 1):
+        place = jnp.where(other > largest, jnp.uint8(number), place)
+        largest = jnp.where(other > largest, other, largest)
+    return largest, place
+
+
+def _to_chosen(place: jax.Array, g: jax.Array) -> jax.Array:
+    """The gradient `g` of each window at its chosen entry: `[N, h, w, 2, 2, C]` float32."""
+    # The first of a pair is the middle of its window; the second the last there and the first of
+    # the next. Element-wise in the entries, so that it can be part of what uses it.
+    places = ((1, 2), (9, 0))  # of both in their window and in the next one; 9 if not in it
+    gradient = jnp.float32(0)
+    for down, right in np.ndindex(2, 2):
+        here = 3 * np.array(places[down])[:, None] + np.array(places[right])
+        pads = ((0, 0), (0, down), (0, right), (0, 0))
+        of_window, of_g = (
+            jnp.pad(z[:, down:, right:], pads)[:, :, :, None, None] for z in (place, g)
+        )
+        chosen = of_window == here[..., None].astype(np.uint8)
+        gradient += jnp.where(chosen, of_g, 0).astype(jnp.float32)
+    return gradient
