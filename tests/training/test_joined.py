@@ -32,6 +32,14 @@ def test_a_matrix_that_is_held_flat_is_no_vector():
     chex.assert_trees_all_equal(joined.separate(found, given), flat)
 
 
+def test_kernels_of_convolutions_are_turned():
+    kernel = np.random.default_rng(0).random((3, 2, 4, 5), np.float32)
+    given = {"bias": np.zeros(5, np.float32), "kernel": kernel}
+    found = joined.join(given, given)
+    np.testing.assert_array_equal(found.matrices["kernel"][1], kernel[..., 1])
+    chex.assert_trees_all_equal(joined.separate(found, given), given)
+
+
 def test_all_that_holds_parameters_is_joined():
     given = params()
     held = {"params": given, "opt_state": make_optimizer(TrainConfig()).init(given), "step": 3}

@@ -9,12 +9,12 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from starjax.training import processes
 
 AXIS = "batch"
-# Of a step on several GPUs: matrices are gathered and gradients summed in pieces of 128 MB, beside
-# the encoder's work (benchmarks/README.md).
+# Of a step on several GPUs: matrices are gathered at once beside the encoder's work, gradients are
+# summed in pieces of 128 MB beside the backward pass (benchmarks/README.md).
 _OVERLAP: dict[str, Any] = {
     "xla_gpu_enable_latency_hiding_scheduler": True,
     "xla_gpu_all_reduce_combine_threshold_bytes": 128 << 20,
-    "xla_gpu_all_gather_combine_threshold_bytes": 128 << 20,
+    "xla_gpu_all_gather_combine_threshold_bytes": 1 << 30,
     "xla_gpu_reduce_scatter_combine_threshold_bytes": 128 << 20,
 }
 

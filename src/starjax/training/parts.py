@@ -44,9 +44,10 @@ class Parts(NamedTuple):
 
     def begin(self, state: TrainState) -> Carried:
         """What is carried, of a whole state."""
-        carried = self._join(state), rounded(state.params, self.dtype)
+        state = self._join(state)
         return jax.tree_util.tree_map_with_path(
-            lambda path, x: x.reshape(-1) if self._is_split(path, x) else x, carried
+            lambda path, x: x.reshape(-1) if self._is_split(path, x) else x,
+            (state, self.rounded(state.params)),
         )
 
     def end(self, carried: Carried) -> TrainState:
@@ -83,14 +84,17 @@ class Parts(NamedTuple):
             shape = (x.size,) if split else x.shape
             return jax.ShapeDtypeStruct(shape, x.dtype, sharding=placed[split])
 
-        narrow = jax.eval_shape(lambda params: rounded(params, self.dtype), self.like.params)
-        return jax.tree_util.tree_map_with_path(one, (self._joined(self.like), narrow))
+        state = self._joined(self.like)
+        narrow = jax.eval_shape(self.rounded, state.params)
+        return jax.tree_util.tree_map_with_path(one, (state, narrow))
 
     def params(self, carried: Carried) -> policies.Params:
         """The networks' parameters, matrices in their type; those in parts still are."""
         state, narrow = carried
-        params = self._separate(state.params)
-        return jax.tree.map(lambda p, n: p if n is None else n, params, narrow)
+        if self._joins:
+            params = state.params._replace(matrices=_taken(narrow, state.params.matrices))
+            return self._separate(params)
+        return _taken(narrow, state.params)
 
     def rounded(self, params: Any) -> policies.Params:
         """The matrices of a carried state's parameters, as they are carried beside it."""
@@ -162,6 +166,17 @@ def rounded(params: policies.Params, dtype: str) -> policies.Params:
     """The matrices that `policy.rounded` changes, as it gives them; None in the others' places."""
     changed = policies.rounded(params, dtype)
     return jax.tree.map(lambda old, new: None if new.dtype == old.dtype else new, params, changed)
+
+
+def _taken(some: Any, tree: Any) -> Any:
+    """`tree` with those of its leaves replaced that are not None in `some`."""
+    return jax.tree.map(
+        lambda one, leaf: leaf if one is None else one, some, tree, is_leaf=_is_none
+    )
+
+
+def _is_none(x: Any) -> bool:
+    return x is None
 
 
 def _squares(leaves: list[jax.Array]) -> jax.Array:
