@@ -54,6 +54,7 @@ class Job(NamedTuple):
 
     Attributes:
       policy: being trained.
+      params: shapes of its parameters, as the networks take them.
       carried: its TrainState and its rounded matrices, what goes from call to call, on all devices.
       dataset: made-up frames on all devices.
       example: a batch.
@@ -64,6 +65,7 @@ class Job(NamedTuple):
     """
 
     policy: policies.Policy
+    params: policies.Params
     carried: Carried
     dataset: windows.Dataset
     example: windows.Batch
@@ -111,7 +113,8 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     stats = statistics(case.policy)
     first = state.create(policy, optimizer, state.init(policy, seed).draw(), stats, seed)
     mesh = devices.make_mesh(batch, on)
-    parts = Parts(mesh, case.policy.dtype, jax.eval_shape(lambda x: x, first))
+    like = jax.eval_shape(lambda x: x, first)
+    parts = Parts(mesh, case.policy.dtype, like)
     settings = (policy, optimizer, case.policy, case.train, parts)
     looped = step.runs_in_a_loop(case.policy)
 
@@ -125,7 +128,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     carried = jax.jit(parts.begin, out_shardings=parts.placed())(first)
     options = {"out_shardings": parts.placed(), "compiler_options": devices.compiler_options(mesh)}
     per_call, calls = (10, 1) if looped else (1, 50 if on[0].platform == "gpu" else 1)
-    return Job(policy, carried, dataset, example, steps, per_call, options, calls)
+    return Job(policy, like.params, carried, dataset, example, steps, per_call, options, calls)
 
 
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:

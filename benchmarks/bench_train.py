@@ -75,10 +75,10 @@ def measure(case: _setup.Case, rates: _machine.Rates) -> dict:
     """One method (stardiff), dataset resident on the device."""
     job = _setup.job(case)
     state, _ = job.carried
-    parameters = sum(leaf.size for leaf in jax.tree.leaves(state.params))
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(job.params))
     gradient = jax.grad(job.policy.loss, has_aux=True)
     given = job.policy.prepare(state.normalizer, jax.random.key(0), job.example)
-    work = _arithmetic.operations(gradient, state.params, given)
+    work = _arithmetic.operations(gradient, job.params, given)
     # Forward, and the gradients of inputs and of weights.
     work -= 3 * case.train.batch_size * _arithmetic.of_padding(case.policy)
     arithmetic_s = work / rates.flops

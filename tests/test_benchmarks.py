@@ -1,0 +1,18 @@
+"""A benchmark runs with what a state carries on a GPU, which a run on a CPU would not see."""
+
+import sys
+
+from starjax.training import parts
+
+
+def test_the_training_step_is_timed(monkeypatch, capsys, pytestconfig):
+    monkeypatch.setattr(parts, "JOINS", {"cpu"})
+    monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
+    monkeypatch.setattr(sys, "argv", ["bench_train.py", "--tiny"])
+    import bench_train  # from the folder of benchmarks, which is no package
+
+    bench_train.main()
+    row = capsys.readouterr().out.split("48 px")[1].split()
+    samples, milliseconds, floor = map(float, row[:3])
+    assert 0 < floor < milliseconds
+    assert abs(samples * milliseconds / 4e3 - 1) < 0.05  # batches of four
