@@ -123,7 +123,7 @@ def test_joined_vectors_give_the_same_run_and_resume(whole, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_pictures_train_too_and_resume(tmp_path, dtype):
+def test_pictures_train_too_and_resume(tmp_path, dtype, monkeypatch):
     settings = dataclasses.replace(jobs.SETTINGS, steps=2, holdout_demos=0)
     seen = {"observation": "image", "dtype": dtype}
     whole = jobs.train(tmp_path / "a", settings, **seen)
@@ -132,6 +132,11 @@ def test_pictures_train_too_and_resume(tmp_path, dtype):
         jobs.train(tmp_path / "b", settings, **seen, should_stop=lambda: next(asked) == 1)
     again = jobs.train(tmp_path / "b", settings, **seen)
     assert_same_bytes(again.state, whole.state)
+
+    monkeypatch.setattr(parts, "JOINS", {"cpu"})  # and kernels turned
+    joined = jobs.train(tmp_path / "c", settings, **seen)
+    for x, y in zip(leaves(joined.state), leaves(whole.state), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)
 
 
 def test_training_learns(tmp_path):
