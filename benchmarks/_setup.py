@@ -156,6 +156,7 @@ def made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
     return jax.device_put(dataset, jax.local_devices()[0])
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1))  # one program, not one for each of its arrays
 def _made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
     seen = dataclasses.replace(policy_config, obs_horizon=1)
     observation, _ = latency.example(seen, P_WORLD_REF, count)
