@@ -117,13 +117,15 @@ def scale_and_bias(module: nn.Module, x: jax.Array, groups: int) -> tuple[jax.Ar
 
 @functools.partial(jax.jit, static_argnames="groups")
 def _group_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int) -> jax.Array:
+    # Positions first, channels after: both reductions then run along contiguous memory, and
+    # what remains is one multiply-add for each element.
     return normalized(x, *affine(*moments(x), scale, bias, groups))
 
 
 def moments(x: jax.Array, entries: int | None = None) -> tuple[jax.Array, jax.Array]:
-    """Means of `[B, ..., C]` and of its squares over all positions, or as if there were `entries`.
+    """Means of `[B, ..., C]` and of its squares over positions, each `[B, C]` float32.
 
-    Each is `[B, C]` float32.
+    `entries`: how many positions count, if the others are zeros.
     """
     wide = x.astype(jnp.float32)
     positions = tuple(range(1, x.ndim - 1))
@@ -136,8 +138,6 @@ def affine(
 ) -> tuple[jax.Array, jax.Array]:
     """Gain and shift `[B, C]` by which a sample of these moments is normalised over groups."""
     shape = batch, channels = mean.shape
-    # Positions first, channels after: both reductions then run along contiguous memory, and
-    # what remains is one multiply-add for each element.
     per_group = (batch, groups, channels // groups)
     mean, square = (moment.reshape(per_group).mean(-1) for moment in (mean, square))
     inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + 1e-5)

@@ -85,7 +85,7 @@ def _largest(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The largest of each window, and its place there, 0 to 8 (of several the first)."""
     pads = ((0, 0), (1, 0), (1, 0), (0, 0), (0, 0), (0, 0))
     x = jnp.pad(x, pads, constant_values=-jnp.inf)
-    # Rows of window i: the second of pair i - 1 and both of pair i.
+    # Rows of window i, and columns: the second of pair i - 1 and both of pair i.
     rows = ((slice(-1), 1), (slice(1, None), 0), (slice(1, None), 1))
     largest, *others = (x[:, i, j, a, b] for i, a in rows for j, b in rows)
     place = jnp.zeros(largest.shape, jnp.uint8)
