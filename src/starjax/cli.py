@@ -1,10 +1,13 @@
 """The console script `starjax`: one subcommand, one module, imported only when it is called."""
 
+import _thread
 import errno
 import importlib
 import os
 import sys
+import threading
 from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
 
 from starjax import __version__
 from starjax import config as config_lib
@@ -27,23 +30,42 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
-def main() -> int:
+_STORAGE = (
+    errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT, errno.EPERM, errno.EISDIR, errno.ENOTDIR,
+)  # fmt: skip
+_STOPPED = 130  # exit code after Ctrl-C
+
+
+def main() -> NoReturn:
     """Entry of the console script."""
-    return guard(dispatch, sys.argv[1:])
+    run(dispatch)
+
+
+def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
+    """The whole of a process: `command` with the words of its command line."""
+    sys.unraisablehook = _again
+    code = guard(command, sys.argv[1:])
+    if code == _STOPPED:  # jax's threads may still run, and would meet an interpreter that is gone
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """Runs a command; what its user can mend becomes one line and an exit code, no traceback.
 
-    Returns 2 for a mistake on the command line, 74 for a disk that is full or cannot be written,
-    130 after Ctrl-C (whatever was running has saved by then, and says how to go on).
+    Returns 2 for a mistake on the command line, 71 for too little memory, 74 for a disk that is
+    full or cannot be written, 130 after Ctrl-C (whatever was running has saved by then, and says
+    how to go on).
     """
     try:
         return command(argv)
     except config_lib.UsageError as error:
         return _fail(error, 2)
     except KeyboardInterrupt as stop:
-        return _fail(str(stop) or "stopped; the same command goes on from what is saved", 130)
+        text = str(stop) or "stopped; the same command goes on from what is saved"
+        return _fail(text, _STOPPED)
     except BrokenPipeError:
         # Whoever read our output has seen enough (`| head`); nothing more may be written there.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -54,10 +76,16 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
 
         if isinstance(error, files.StorageError):
             return _fail(error, 74)
-        if error.errno not in (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT, errno.EPERM):
+        if error.errno not in _STORAGE:
             raise
         place = f": {error.filename}" if error.filename else ""
         return _fail(f"cannot write{place}: {error.strerror}; choose another folder by --out", 74)
+    except RuntimeError as error:
+        if not str(error).startswith("RESOURCE_EXHAUSTED"):
+            raise
+        said = str(error).splitlines()[0].removeprefix("RESOURCE_EXHAUSTED: ")
+        less = "--train.batch-size for training, --eval.chunk for trials"
+        return _fail(f"{said} Too much for this device's memory: lower {less}", 71)
 
 
 def dispatch(argv: Sequence[str]) -> int:
@@ -73,6 +101,17 @@ def dispatch(argv: Sequence[str]) -> int:
         return 0
     options.choice("COMMAND", name, COMMANDS)
     return importlib.import_module(COMMANDS[name][0]).main(argv[1:])
+
+
+def _again(ignored: Any) -> None:
+    """Ctrl-C that came where Python drops exceptions, in a callback of its collector, comes again.
+
+    Only later: raised from in here it would be dropped as well.
+    """
+    if ignored.exc_type is KeyboardInterrupt:
+        threading.Timer(0.05, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(ignored)
 
 
 def _fail(message: object, code: int) -> int:

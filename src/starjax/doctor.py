@@ -4,7 +4,6 @@ import importlib.metadata
 import os
 import pathlib
 import shutil
-import sys
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -116,9 +115,10 @@ def devices() -> list[Finding]:
     try:
         kinds = [device.device_kind for device in jax.devices()]
         total = float(jax.jit(jnp.sum)(jnp.arange(5.0)))
-    except RuntimeError as error:
+    except (AssertionError, RuntimeError) as error:  # the first for a platform without its plugin
         remedy = "start with JAX_PLATFORMS=cpu, then see to the GPU's driver (nvidia-smi)"
-        return [*gpu, Finding("jax", str(error).splitlines()[0], remedy)]
+        reason = str(error) or f"no plugin for JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')}"
+        return [*gpu, Finding("jax", reason.splitlines()[0], remedy)]
     if total != 10.0:
         return [*gpu, Finding("jax", f"0+1+2+3+4 = {total}", "reinstall jax and jaxlib")]
     value = f"{jax.default_backend()}, {len(kinds)} x {kinds[0]}, {xla.cores()} cores"
@@ -161,4 +161,4 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 if __name__ == "__main__":
-    sys.exit(cli.guard(main, sys.argv[1:]))
+    cli.run(main)

@@ -204,6 +204,16 @@ def test_damaged_lists_are_noticed(copy, name):
         load.load(copy, report=lambda _: None)
 
 
+@pytest.mark.parametrize("damage", ["truncated", "removed"])
+def test_a_damaged_description_is_written_again(copy, sealed, damage):
+    DAMAGE[damage](copy / "dataset.json")
+    with pytest.raises(ValueError, match=r"dataset\.json"):
+        store.read_seal(copy)
+    (copy / "SEALED.json").unlink()
+    collect(copy)
+    assert kill.tree(copy) == kill.tree(sealed[0])
+
+
 def test_an_episode_of_another_dataset_is_noticed(copy, tmp_path):
     collect(tmp_path / "other", max_steps=99)
     key = store.keys(copy)[0]

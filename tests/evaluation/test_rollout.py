@@ -146,6 +146,16 @@ def test_a_damaged_chunk_is_named_and_run_again(tmp_path, whole):
         assert path.read_bytes() == good
 
 
+def test_a_damaged_plan_is_named_and_written_again(tmp_path, whole):
+    first = run(tmp_path, chunk=6)
+    plan = tmp_path / "plan.json"
+    good = plan.read_bytes()
+    plan.write_bytes(good[:-9])
+    said = []
+    assert_same(run(tmp_path, chunk=6, report=said.append), first)
+    assert "plan.json is damaged" in said[0] and plan.read_bytes() == good
+
+
 def test_no_flipped_bit_of_a_chunk_gets_into_the_table(tmp_path, whole):
     run(tmp_path, chunk=6)
     path = tmp_path / "chunk_0000.npz"

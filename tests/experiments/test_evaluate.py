@@ -102,7 +102,14 @@ def test_a_machine_without_a_video_encoder_still_gets_the_result(file, monkeypat
 
 
 def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
-    assert evaluate._label(tmp_path / "stardiff" / "policy.safetensors") == "stardiff"
+    """And by what is in it: most runs' folders have the names of their methods."""
+    names = []
+    for content in (b"a", b"b", b"a"):
+        path = tmp_path / "stardiff" / "policy.safetensors"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(content)
+        names.append(evaluate._label(path))
+    assert names[0] == names[2] != names[1] and all(n.startswith("stardiff-") for n in names)
     assert evaluate._label(tmp_path / "compact.safetensors") == "compact"
 
 
@@ -113,8 +120,9 @@ def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
         (["runs/x", "--policy", "y"], ["RUN or --policy", "both"]),
         (["a", "b"], ["RUN", "a b"]),
         (["--policy", "nowhere"], ["--policy", "a file", "nowhere"]),
-        (["--policy", "x", "--eval.trials", "0"], ["--eval.trials", "more than 0"]),
-        (["nowhere"], ["nowhere", "method folder"]),
+        (["--policy", "x", "--eval.trials", "0"], ["--eval.trials", "got 0"]),
+        (["nowhere"], ["nowhere", "a method's folder"]),
+        (["stardiff"], ["stardiff", "no config.json"]),
     ],
 )
 def test_a_mistake_is_one_line(argv, words):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import time
 
 import numpy as np
@@ -11,6 +12,12 @@ from starjax import config
 from starjax.experiments import clock, folders, methods, presets
 
 SMOKE = presets.PRESETS["smoke"]
+
+
+def claimed(folder, *rest):
+    """A folder in which training has begun."""
+    folders.claim(folder, SMOKE, "demos-a", *rest)
+    (folder / "policy.safetensors").touch()
 
 
 def changed(**parts):
@@ -31,20 +38,20 @@ def changed(**parts):
     ],
 )
 def test_weights_of_other_settings_are_refused_by_name(tmp_path, parts, word):
-    folders.claim(tmp_path, SMOKE, "demos-a")
+    claimed(tmp_path)
     with pytest.raises(config.UsageError, match="--out") as caught:
         folders.claim(tmp_path, changed(**parts), "demos-a")
     assert str(caught.value).startswith(f"{word}: ")
 
 
 def test_weights_of_another_scene_are_refused(tmp_path):
-    folders.claim(tmp_path, SMOKE, "demos-a")
+    claimed(tmp_path)
     with pytest.raises(config.UsageError, match="demos-a, got demos-b"):
         folders.claim(tmp_path, SMOKE, "demos-b")
 
 
 def test_weights_of_another_frozen_encoder_are_refused(tmp_path):
-    folders.claim(tmp_path, SMOKE, "demos-a", "aaaa")
+    claimed(tmp_path, "aaaa")
     folders.claim(tmp_path, SMOKE, "demos-a")  # trained by now: the encoder may be gone
     with pytest.raises(config.UsageError, match=r"--policy.encoder-weights: .*aaaa, got bbbb"):
         folders.claim(tmp_path, SMOKE, "demos-a", "bbbb")
@@ -52,7 +59,7 @@ def test_weights_of_another_frozen_encoder_are_refused(tmp_path):
 
 
 def test_a_folder_from_before_a_setting_existed_goes_on(tmp_path):
-    folders.claim(tmp_path, SMOKE, "demos-a")
+    claimed(tmp_path)
     path = tmp_path / "config.json"
     old = json.loads(path.read_text())
     del old["policy"]["freeze_encoder"]
@@ -63,9 +70,56 @@ def test_a_folder_from_before_a_setting_existed_goes_on(tmp_path):
 
 @pytest.mark.parametrize("parts", [{"eval": {"trials": 9}}, {"train": {"keep_checkpoints": 9}}])
 def test_what_leaves_the_weights_alone_may_change(tmp_path, parts):
-    folders.claim(tmp_path, SMOKE, "demos-a")
+    claimed(tmp_path)
     folders.claim(tmp_path, changed(**parts), "demos-a")
     assert folders.read_config(tmp_path) == changed(**parts)
+
+
+def test_a_folder_where_nothing_was_trained_takes_other_settings(tmp_path):
+    folders.claim(tmp_path, SMOKE, "demos-a")
+    (tmp_path / "checkpoints").mkdir()
+    other = changed(train={"learning_rate": 1e-3})
+    folders.claim(tmp_path, other, "demos-b", "bbbb")
+    assert folders.read_config(tmp_path) == other
+    (tmp_path / "checkpoints" / "20").mkdir()
+    with pytest.raises(config.UsageError, match="learning-rate"):
+        folders.claim(tmp_path, SMOKE, "demos-b", "bbbb")
+
+
+@pytest.mark.parametrize("text", [None, "", '{"seed": 0', "[]", "{}", '{"newthing": 1}'])
+def test_weights_whose_settings_are_gone_are_refused(tmp_path, text):
+    """As any settings would do, and the result would tell of those."""
+    claimed(tmp_path)
+    path = tmp_path / "config.json"
+    path.unlink() if text is None else path.write_text(text)
+    with pytest.raises(config.UsageError, match=re.escape(str(tmp_path))):
+        folders.claim(tmp_path, SMOKE, "demos-a")
+    with pytest.raises(config.UsageError, match=re.escape(str(tmp_path))):
+        folders.read_config(tmp_path)
+
+
+def test_a_methods_folder_is_found_from_within_and_told_from_others(tmp_path, monkeypatch):
+    (tmp_path / "stardiff").mkdir()
+    monkeypatch.chdir(tmp_path / "stardiff")
+    assert folders.existing(".") == tmp_path / "stardiff"
+    with pytest.raises(config.UsageError, match=r"RUN: .*got \.\..*--policy"):
+        folders.existing("..")
+
+
+def test_a_damaged_record_of_times_starts_afresh_and_a_full_disk_hides_nothing(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "timings.json").write_text('{"train": 1')
+    with clock.timed(tmp_path, "train"):
+        pass
+    assert clock.timings(tmp_path)["train"] < 1
+
+    def full(path, value):
+        raise OSError("no room for timings.json")
+
+    monkeypatch.setattr(clock.files, "write_json", full)
+    with pytest.raises(OSError, match="checkpoint"), clock.timed(tmp_path, "train"):
+        raise OSError("no room for the checkpoint")
 
 
 def test_a_folder_without_a_run_is_one_line(tmp_path):

@@ -1,13 +1,27 @@
 """The command line: presets, overrides, and mistakes that become one line."""
 
 import dataclasses
+import json
 import subprocess
 import sys
 
 import pytest
+import stubs
 
 from starjax import cli, config
-from starjax.experiments import checks, methods, options, presets, run
+from starjax.experiments import (
+    bench,
+    checks,
+    demonstrations,
+    folders,
+    methods,
+    options,
+    presets,
+    run,
+    sweep,
+)
+
+SMOKE = presets.PRESETS["smoke"]
 
 
 def settings(*argv: str) -> config.RunConfig:
@@ -40,6 +54,37 @@ def settings(*argv: str) -> config.RunConfig:
             ["--policy.freeze-encoder", "--policy.encoder-weights", "got none"],
         ),
         (["stardiff"], ["stardiff", "flag"]),
+        (["--seed", "-1"], ["--seed", "0 to 4294967295", "-1"]),
+        (["--seed", "4294967296"], ["--seed", "0 to 4294967295", "4294967296"]),
+        (["--train.learning-rate", "nan"], ["--train.learning-rate", "a finite number", "nan"]),
+        (["--train.weight-decay", "inf"], ["--train.weight-decay", "a finite number", "inf"]),
+        (["--eval.time-limit-s", "inf"], ["--eval.time-limit-s", "a finite number", "inf"]),
+        (["--eval.time-limit-s", "0"], ["--eval.time-limit-s", "0.1 to 86400 s", "got 0"]),
+        (["--eval.time-limit-s", "86401"], ["--eval.time-limit-s", "0.1 to 86400 s", "86401"]),
+        (["--eval.trials", "0"], ["--eval.trials", "1 to 1000000", "got 0"]),
+        (["--eval.trials", "1000001"], ["--eval.trials", "1 to 1000000", "1000001"]),
+        (["--policy.time-dim", "2"], ["--policy.time-dim", "even", "4 or more", "got 2"]),
+        (["--policy.time-dim", "65"], ["--policy.time-dim", "even", "4 or more", "got 65"]),
+        (["--policy.kernel-size", "4"], ["--policy.kernel-size", "an odd number", "got 4"]),
+        (["--policy.kernel-size", "-1"], ["--policy.kernel-size", "above 0", "got -1"]),
+        (["--policy.vision-dim", "1"], ["--policy.vision-dim", "2 or more", "got 1"]),
+        (["--policy.state-dim", "3"], ["--policy.state-dim", "4 or more", "got 3"]),
+        (["--policy.roll-blocks", "-1"], ["--policy.roll-blocks", "0 or more", "-1"]),
+        (["--policy.roll-loss-weight", "-1"], ["--policy.roll-loss-weight", "0 or more", "-1"]),
+        (["--train.warmup-steps", "-1"], ["--train.warmup-steps", "0 or more", "-1"]),
+        (["--train.weight-decay", "-1"], ["--train.weight-decay", "0 or more", "-1"]),
+        (["--train.state-noise", "-1"], ["--train.state-noise", "0 or more", "-1"]),
+        (["--train.image-noise", "-1"], ["--train.image-noise", "0 or more", "-1"]),
+        (["--train.jitter", "-1"], ["--train.jitter", "0 or more", "-1"]),
+        (
+            ["--preset=paper", "--policy.image-size", "34"],
+            ["--policy.image-size", "more than 32 pixels", "train.crop-fraction = 0.9", "got 31"],
+        ),
+        (
+            ["--preset=smoke", "--policy.freeze_encoder"],
+            ["--policy.freeze-encoder", "--policy.observation image"],
+        ),
+        (["--preset", "smoke", "--preset", "cpi"], ["--preset", "did you mean cpu"]),
     ],
 )
 def test_a_mistake_is_one_line(argv, words):
@@ -50,17 +95,122 @@ def test_a_mistake_is_one_line(argv, words):
     assert all(word in message for word in words), message
 
 
-def test_mistakes_come_before_jax():
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--eval.trials", "0"], ["--eval.trials", "1 to 1000000", "got 0"]),
+        (["--eval.time-limit-s", "0"], ["--eval.time-limit-s", "0.1 to 86400 s", "got 0"]),
+        (["--seed", "-1"], ["--seed", "0 to 4294967295", "-1"]),
+        (["--trocars", "0"], ["--trocars", "1 to 1000000", "got 0"]),
+        (["--radii-cm", "2", "--azimuths", "0"], ["--azimuths", "1 to 1000000", "got 0"]),
+        (["--radii-cm", "2", "--azimuths", "-3"], ["--azimuths", "1 to 1000000", "-3"]),
+        (["--radii-cm", "2", "nan"], ["--radii-cm", "a finite number", "nan"]),
+        (["--radii-cm", "2", "-1"], ["--radii-cm", "0 to 100 cm", "-1"]),
+        (["--polars-deg", "181"], ["--polars-deg", "0 to 180 degrees", "181"]),
+        ([], ["no/stardiff", "no config.json"]),
+    ],
+)
+def test_sweep_names_the_flag(flags, words):
+    with pytest.raises(config.UsageError) as caught:
+        sweep.main(["no/stardiff", *flags])
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+@pytest.mark.parametrize("calls", ["0", "-1"])
+def test_bench_times_one_call_at_least(calls):
+    with pytest.raises(config.UsageError, match=f"^--calls: expected 1 or more, got {calls}$"):
+        bench.main(["no/stardiff", "--calls", calls])
+
+
+@pytest.mark.parametrize("command", [sweep, bench])
+def test_a_renamed_folder_is_explained(command, tmp_path):
+    with pytest.raises(config.UsageError, match="RUN: expected a method's folder"):
+        command.main([str(tmp_path / "policy2")])
+
+
+@pytest.fixture
+def scored(tmp_path):
+    """A method's folder as far as bench asks for it."""
+    folder = tmp_path / "stardiff"
+    folder.mkdir()
+    folders.claim(folder, SMOKE, "demos-a")
+    (folder / "result.json").write_text('{"method": "stardiff"}')
+    return folder
+
+
+def test_bench_adds_to_the_result_of_the_folder_it_is_in(scored, monkeypatch):
+    monkeypatch.setattr(bench, "_time", lambda folder, chosen: {"timed": folder.name})
+    monkeypatch.chdir(scored)
+    assert bench.main(["."]) == 0
+    found = json.loads((scored / "result.json").read_text())
+    assert found == {"method": "stardiff", "timed": "stardiff"}
+
+
+def test_bench_promises_nothing_after_ctrl_c(scored, monkeypatch, capsys):
+    def stop(folder, chosen):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench, "_time", stop)
+    assert cli.guard(bench.main, [str(scored)]) == 130
+    said = capsys.readouterr().err
+    assert "bench saves its figures only at its end" in said and "same command" not in said
+    assert json.loads((scored / "result.json").read_text()) == {"method": "stardiff"}
+
+
+def test_too_few_steps_for_the_expert_name_the_flag(tmp_path, monkeypatch):
+    from starjax.data import demos, trials
+
+    def collect(*_, **settings):
+        raise trials.ExpertFailed("got 0 of 10 at trocar 0")
+
+    monkeypatch.setattr(demos, "collect", collect)
+    few = dataclasses.replace(SMOKE.demos, max_steps=1)
+    tried = dataclasses.replace(SMOKE, demos=few, out=str(tmp_path))
+    _, missing = demonstrations.plan(tried, stubs.make_env())
+    with pytest.raises(config.UsageError, match=r"^--demos.max-steps: .*, got 1; .*0 of 10"):
+        missing()
+
+
+@pytest.mark.parametrize(
+    ("argv", "heavy"),
+    [
+        (["run", "--train.stepps", "3"], {"jax", "mujoco", "numpy"}),
+        (["run", "--seed", "-1"], {"jax", "mujoco", "numpy"}),
+        (["sweep", "x", "--trocars", "0"], {"jax", "mujoco"}),
+    ],
+)
+def test_mistakes_come_before_jax(argv, heavy):
     program = (
         "import sys\n"
         "from starjax import cli\n"
-        "sys.argv = ['starjax', 'run', '--train.stepps', '3']\n"
-        "code = cli.main()\n"
-        "print(code, {'jax', 'mujoco', 'numpy'} & set(sys.modules))\n"
+        "code = cli.guard(cli.dispatch, sys.argv[1:])\n"
+        f"print(code, {heavy} & set(sys.modules))\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout.strip() == "2 set()"
+    done = subprocess.run([sys.executable, "-c", program, *argv], capture_output=True, text=True)
+    assert done.stdout.strip() == "2 set()", done.stdout
     assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("argv", "value"),
+    [
+        ([], None),
+        (["--preset", "smoke", "--preset", "paper"], "paper"),
+        (["--preset=smoke", "--preset", "paper", "--seed", "1"], "paper"),
+        (["--preset", "smoke", "--preset=paper"], "paper"),
+        (["--preset", "smoke", "--preset"], "smoke"),
+    ],
+)
+def test_the_last_of_a_flag_wins(argv, value):
+    assert options.value_of("--preset", argv) == value
+
+
+def test_a_flag_is_found_however_it_is_spelled():
+    assert options.value_of("--eval.time-limit-s", ["--eval.time_limit-s=3"]) == "3"
+    assert options.value_of("--out", ["--out", "a_b"]) == "a_b"
+    assert options.is_given("--policy.freeze-encoder", ["--policy.freeze_encoder"])
+    assert not options.is_given("--policy.freeze-encoder", ["--policy.no-freeze-encoder"])
+    assert settings("--preset", "smoke", "--preset", "paper").preset == "paper"
 
 
 def test_flags_override_the_preset_and_nothing_else():
@@ -128,8 +278,6 @@ def test_paper_preset_is_the_default_configuration():
 
 @pytest.mark.parametrize("name", presets.PRESETS)
 def test_configuration_survives_json(name):
-    import json
-
     values = json.loads(json.dumps(dataclasses.asdict(presets.PRESETS[name])))
     assert config.from_dict(config.RunConfig, values) == presets.PRESETS[name]
     with pytest.raises(ValueError, match="stepps"):

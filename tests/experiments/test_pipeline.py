@@ -10,7 +10,7 @@ import pytest
 
 from starjax import config
 from starjax.data import normalizer
-from starjax.experiments import demonstrations, methods, pipeline, presets, words
+from starjax.experiments import demonstrations, folders, methods, pipeline, presets, words
 from starjax.policies import packaged
 from starjax.runtime import files
 from starjax.training import export
@@ -137,9 +137,10 @@ def test_a_finished_run_needs_its_encoder_no_more(tmp_path, done):
     policy = dataclasses.replace(
         preset.policy, observation="image", encoder_weights="nowhere", freeze_encoder=True
     )
-    (tmp_path / "stardiff").mkdir()
+    settings = dataclasses.replace(preset, policy=policy)
+    folders.claim(tmp_path / "stardiff", settings, "demos-a", "abcd")
     (tmp_path / "stardiff" / "policy.safetensors").touch()
-    pipeline.run(dataclasses.replace(preset, policy=policy), pipeline.STAGES, "")
+    pipeline.run(settings, pipeline.STAGES, "")
     assert done[-2:] == ["score stardiff", "report"]
 
 
@@ -153,6 +154,9 @@ def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
     assert pipeline._is_scored(tmp_path, _json(presets.PRESETS["smoke"]))
     more = {**settings, "eval": {**settings["eval"], "trials": 9}}
     assert not pipeline._is_scored(tmp_path, more)
+    for damaged in ("{", "{}", '{"config": 1}', '{"config": {"of": "another version"}}'):
+        (tmp_path / "result.json").write_text(damaged)
+        assert not pipeline._is_scored(tmp_path, settings)
 
 
 def _json(settings):

@@ -309,6 +309,30 @@ def test_a_result_alone_is_enough_to_load(one, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("result.json", b'{"method": "stardiff"'),
+        ("result.json", b"{}"),
+        ("result.json", b'{"method": "mine", "observation": "image", "config": {}}'),
+        ("sweep.json", b'{"trials": ['),
+        ("evaluation/recorded.npz", b"PK"),
+    ],
+)
+def test_a_damaged_file_of_a_run_is_named(one, tmp_path, name, content):
+    (tmp_path / "evaluation").mkdir()
+    (tmp_path / "result.json").write_text(json.dumps(one.result))
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=re.escape(str(tmp_path / name))):
+        results.load(tmp_path)
+
+
+def test_a_log_that_ends_within_a_line_ends_before_it(one, tmp_path):
+    (tmp_path / "result.json").write_text(json.dumps(one.result))
+    (tmp_path / "metrics.jsonl").write_text('{"step": 1}\n{"step": 2')
+    assert results.load(tmp_path).curves == [{"step": 1}]
+
+
+@pytest.mark.parametrize(
     ("seeds", "names"), [((0, 0), ("a/stardiff", "b/stardiff")), ((0, 3), ("seed 0", "seed 3"))]
 )
 def test_runs_of_one_method_are_told_apart(tmp_path, seeds, names):

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import textwrap
 
 from starjax.runtime import xla
 
@@ -51,6 +52,32 @@ def test_small_programs_are_kept_unless_the_user_set_a_time(monkeypatch, tmp_pat
 def test_no_cache_where_none_can_be_made(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     assert _prepared(monkeypatch, tmp_path / "file", (0, 10))[1] is None
+
+
+def test_who_has_no_home_has_a_cache_too(monkeypatch):
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("STARJAX_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(xla.Path, "home", homeless)
+    assert xla.cache_directory().name.startswith("starjax-")
+
+
+def test_a_platform_that_jax_cannot_use_is_a_mistake():
+    code = """
+        import sys
+        from starjax import cli
+        from starjax.runtime import xla
+        xla.prepare_xla()
+        sys.exit(cli.guard(lambda argv: xla.require_devices(), []))
+    """
+    for name in ("nonsense", "cuda"):
+        environment = {**_env(), "JAX_PLATFORMS": name}
+        command = [sys.executable, "-c", textwrap.dedent(code)]
+        found = subprocess.run(command, capture_output=True, text=True, env=environment)
+        assert found.returncode == 2 and "JAX_PLATFORMS: expected" in found.stderr, found.stderr
+        assert name in found.stderr and "Traceback" not in found.stderr
 
 
 def test_jax_is_not_imported():

@@ -60,6 +60,21 @@ def test_half_of_the_variables_is_a_mistake(monkeypatch):
         processes.join()
 
 
+@pytest.mark.parametrize(
+    ("address", "count", "index", "word"),
+    [
+        ("", "2", "", "all or none"),
+        ("", "", "1", "all or none"),
+        ("localhost:1", "2", "2", "0 to 1"),
+    ],
+)
+def test_variables_that_cannot_be_are_a_mistake(monkeypatch, address, count, index, word):
+    for name, value in zip(processes._VARIABLES, (address, count, index), strict=True):
+        monkeypatch.setenv(name, value)
+    with pytest.raises(config.UsageError, match=word):
+        processes.join()
+
+
 def test_one_process_agrees_with_itself():
     assert processes.agree(False, 7) == (False, 7)
     assert processes.is_first() and processes.own_name("metrics.jsonl") == "metrics.jsonl"

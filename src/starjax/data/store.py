@@ -48,7 +48,9 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
     """
     description = json.loads(json.dumps({"schema": SCHEMA, **description}))
     path = root / "dataset.json"
-    if not path.exists():
+    try:
+        files.read_json(path)
+    except (FileNotFoundError, ValueError):  # never written, or damaged
         files.write_json(path, description)
         return
     found = read_description(root)
@@ -197,9 +199,9 @@ def read_seal(root: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: {_reason(error)}") from error
     if _hash(sealed) != said:
         raise ValueError(f"{path}: expected content with hash {said}, got {_hash(sealed)}")
-    got = files.sha256(root / "dataset.json")
+    where = root / "dataset.json"
+    got = files.sha256(where) if where.exists() else "no file"
     if got != sealed["dataset.json"]:
-        where = root / "dataset.json"
         raise ValueError(f"{where}: expected sha256 {sealed['dataset.json']}, got {got}")
     return {**sealed, "digest": said}
 

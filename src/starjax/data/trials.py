@@ -15,6 +15,10 @@ Trial = tuple[int, int]  # trocar, number
 Known = Mapping[Trial, bool]  # whether it succeeded
 
 
+class ExpertFailed(ValueError):
+    """The expert succeeds too rarely to go on collecting."""
+
+
 def run(
     simulate: Callable[[list[Trial]], Iterator[list[episodes.Episode]]],
     known: dict[Trial, bool],
@@ -32,7 +36,7 @@ def run(
       chunk: number of lanes.
 
     Raises:
-      ValueError: the expert fails too often.
+      ExpertFailed: the expert fails too often.
     """
     there = set(known)
     drawn = [0] * trocars
@@ -68,7 +72,7 @@ def _wave(known: Known, drawn: list[int], per_trocar: int, chunk: int) -> list[T
         if done >= per_trocar:
             continue
         if first >= limit:
-            raise ValueError(
+            raise ExpertFailed(
                 f"expert: expected a success rate above {MIN_SUCCESS_RATE:.0%}, "
                 f"got {done} of {first} at trocar {trocar}"
             )

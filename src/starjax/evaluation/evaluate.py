@@ -152,7 +152,11 @@ def _resume(
 ) -> int:
     """Keeps the chunks of an earlier run of the same plan, removes others; returns their size."""
     path = directory / "plan.json"
-    found = json.loads(path.read_text()) if path.exists() else {}
+    try:
+        found = files.read_json(path) if path.exists() else {}
+    except ValueError as error:
+        report(str(error))
+        found = {}
     same = {k: v for k, v in found.items() if k != "chunk"} == json.loads(json.dumps(plan))
     if same and found["chunk"] <= batch:
         return found["chunk"]

@@ -1,14 +1,14 @@
 """`starjax bench RUN`: inference latency of a trained policy (Table IV)."""
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from starjax import config as config_lib
-from starjax.experiments import folders, options
+from starjax.experiments import checks, folders, options
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Times one decision at batch 1: observation in, commands out, compilation apart.
@@ -29,15 +29,30 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Times, prints and records."""
     chosen = options.parse(Options, argv, prog="starjax bench", description=DESCRIPTION)
-    run = Path(chosen.run)
+    checks.expect(chosen.calls >= 1, "calls", "1 or more", chosen.calls)
+    run = folders.existing(chosen.run)
     config = folders.read_config(run)
     result_file = run / "result.json"
     if not result_file.is_file():
         raise config_lib.UsageError(f"{run}: expected a scored method, no result.json there")
+    try:
+        files.read_json(result_file)
+    except ValueError as error:
+        raise config_lib.UsageError(f"{error}; the same starjax run makes it again") from error
     for count in chosen.ddim_steps:
         if not 1 <= count <= config.policy.diffusion_steps:
             most = config.policy.diffusion_steps
             raise config_lib.UsageError(f"--ddim-steps: expected 1 to {most}, got {count}")
+    try:
+        figures = _time(run, chosen)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("stopped; bench saves its figures only at its end") from None
+    files.write_json(result_file, files.read_json(result_file) | figures)
+    return 0
+
+
+def _time(run: Path, chosen: Options) -> dict[str, Any]:
+    """Times and prints; returns what joins result.json."""
     xla.prepare_xla()
 
     from starjax.evaluation import latency
@@ -65,10 +80,7 @@ def main(argv: Sequence[str]) -> int:
     if methods.METHODS[run.name].hierarchical:
         roll = latency.roll_ms(trained.policy, calls=chosen.calls)
         print(_row("roll net", roll))
-    result = json.loads(result_file.read_text())
-    result |= {"inference_ms_by_ddim_steps": found, "roll_network_ms": roll}
-    files.write_json(result_file, result)
-    return 0
+    return {"inference_ms_by_ddim_steps": found, "roll_network_ms": roll}
 
 
 def _row(name: str, ms: dict[str, float]) -> str:

@@ -1,7 +1,6 @@
 """How long each stage took, compilation apart, summed over every start of the same run."""
 
 import contextlib
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,21 +21,30 @@ def timed(out: Path, stage: str) -> Iterator[None]:
     `stage` is all of them, `stage: compile` those in which jax compiled.
     """
     start, compiling = time.monotonic(), _CompileSeconds()
-    try:
-        with compiling:
-            yield
-    finally:
+
+    def note() -> None:
         spent = timings(out)
         total = time.monotonic() - start
         for name, seconds in ((stage, total), (f"{stage}: compile", compiling.seconds)):
             spent[name] = round(spent.get(name, 0.0) + seconds, 2)
         files.write_json(out / "timings.json", spent)
 
+    try:
+        with compiling:
+            yield
+    except BaseException:
+        with contextlib.suppress(OSError):  # a full disk is told by what it stopped
+            note()
+        raise
+    note()
+
 
 def timings(out: Path) -> dict[str, float]:
-    """Seconds a stage so far."""
-    path = out / "timings.json"
-    return json.loads(path.read_text()) if path.exists() else {}
+    """Seconds a stage so far; of a damaged file none."""
+    try:
+        return files.read_json(out / "timings.json")
+    except (FileNotFoundError, ValueError):
+        return {}
 
 
 class _CompileSeconds:

@@ -14,7 +14,7 @@ from starjax.experiments import clock, words
 def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
     """The folder of a run's demonstrations, and a function that collects what it lacks."""
     from starjax import rcm
-    from starjax.data import demos, lanes, recorder, store
+    from starjax.data import demos, lanes, recorder, store, trials
     from starjax.sim.tasks import expert
 
     trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
@@ -32,13 +32,24 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
 
     def collect() -> None:
         if store.is_sealed(root):
-            words.stage("collect", f"done before, {root}")
-            return
+            try:
+                store.read_seal(root)
+            except ValueError as error:
+                words.indented(f"damaged, collected again: {error}")
+                (root / "SEALED.json").unlink()
+            else:
+                words.stage("collect", f"done before, {root}")
+                return
         words.stage("collect", f"into {root}")
-        with clock.timed(out, "collect"):
-            found = demos.collect(
-                root, env, script, trocars, devices=lanes.devices(), report=words.indented, **wanted
-            )
+        settings = {"devices": lanes.devices(), "report": words.indented, **wanted}
+        try:
+            with clock.timed(out, "collect"):
+                found = demos.collect(root, env, script, trocars, **settings)
+        except trials.ExpertFailed as error:
+            raise config_lib.UsageError(
+                "--demos.max-steps: expected enough control steps for a transfer, "
+                f"got {config.demos.max_steps}; {error}"
+            ) from error
         words.indented(
             "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
         )

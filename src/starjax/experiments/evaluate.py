@@ -1,6 +1,7 @@
 """`starjax evaluate`: a trained policy on the twelve trocars; a file of weights is enough."""
 
 import dataclasses
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -41,23 +42,24 @@ def main(argv: Sequence[str]) -> int:
         raise config_lib.UsageError(f"RUN or --policy: expected one of the two, got {got}")
     # A mistake should not wait for jax.
     checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
-    run = Path(chosen.run)
     if chosen.policy:
         file = packaged.find("--policy", chosen.policy)
         default = Path("runs/evaluate") / f"{_label(file)}-seed{chosen.seed}"
-        config = None
+        method = config = None
     else:
-        config = folders.read_config(run)
-        file = folders.weights(run.parent, run.name)
-        default = run / f"evaluate-seed{chosen.seed}"
+        run = folders.existing(chosen.run)
+        method, config = run.name, folders.read_config(run)
+        file = folders.weights(run.parent, method)
+        default = Path(chosen.run) / f"evaluate-seed{chosen.seed}"
     folder = Path(chosen.out or default)
     xla.prepare_xla()
+    xla.require_devices()
     files.require_writable(folder)
 
     from starjax import rcm
     from starjax.experiments import scoring
 
-    who = scoring.subject(run.name, file) if config else scoring.from_file(file)
+    who = scoring.subject(method, file) if method else scoring.from_file(file)
     config = dataclasses.replace(
         config or _config(who.trained), seed=chosen.seed, out=str(folder), eval=chosen.eval
     )
@@ -69,7 +71,8 @@ def main(argv: Sequence[str]) -> int:
     print(f"\n{words.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
     if chosen.video:
         print(_film(folder, who))
-    print(f"result: {folder / 'result.json'}; starjax report {folder} draws tables and figures")
+    hint = f"starjax report {shlex.quote(str(folder))} draws tables and figures"
+    print(f"result: {folder / 'result.json'}; {hint}")
     return 0
 
 
@@ -81,8 +84,11 @@ def _default() -> Options:
 
 
 def _label(file: Path) -> str:
-    """A name for a file of weights: that of its folder where its own says nothing."""
-    return file.resolve().parent.name if file.stem == "policy" else file.stem
+    """A name for a file of weights: where its own says nothing, that of its folder and what is in
+    it, as the folders of other runs are called so too."""
+    if file.stem != "policy":
+        return file.stem
+    return f"{file.resolve().parent.name}-{files.sha256(file)[:8]}"
 
 
 def _config(trained: Any) -> config_lib.RunConfig:

@@ -9,6 +9,7 @@
 
 import dataclasses
 import json
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,23 @@ from starjax.runtime import files
 TRAINED_WITH = ("seed", "demos", "policy", "train")
 # Of those, what leaves the weights alone.
 _FREE = {"--train.keep-checkpoints", "--train.checkpoint-every", "--train.steps-per-call"}
+_BESIDE = ("dataset", "encoder")  # what a config.json records beside the settings
+_ELSEWHERE = "choose another folder by --out, or remove that one"
+
+
+def existing(run: str) -> Path:
+    """The absolute path of a method's folder that a command line names.
+
+    Raises:
+      config.UsageError: it is not called as a method is.
+    """
+    folder = Path(run).resolve()
+    if folder.name not in methods.METHODS:
+        raise config_lib.UsageError(
+            f"RUN: expected a method's folder such as runs/cpu/stardiff, got {run}; any policy is "
+            f"scored by starjax evaluate --policy {shlex.quote(f'{run}/policy.safetensors')}"
+        )
+    return folder
 
 
 def weights(out: Path, method: str) -> Path:
@@ -55,7 +73,7 @@ def selected(config: config_lib.RunConfig) -> list[str]:
 def claim(
     folder: Path, config: config_lib.RunConfig, dataset: str, encoder: str | None = None
 ) -> None:
-    """Writes the config.json of a folder of weights, or makes sure that they are trained likewise.
+    """Writes the config.json of a method's folder; weights there must have been trained likewise.
 
     Args:
       folder: of one method.
@@ -64,29 +82,31 @@ def claim(
       encoder: fingerprint of its frozen vision encoder; None if it has none, or is trained.
 
     Raises:
-      config.UsageError: naming the first setting that differs.
+      config.UsageError: naming the first setting that differs, or what weights are there without.
     """
-    path = folder / "config.json"
     wanted = _as_json(config)
-    found = json.loads(path.read_text()) if path.exists() else {}
-    before = _as_json(_settings(found)) if found else wanted
-    for name in (name for part in TRAINED_WITH for name in _flat(wanted[part], part)):
-        _refuse(folder, f"--{name}", _value(before, name), _value(wanted, name))
-    _refuse(folder, "demonstrations", found.get("dataset", dataset), dataset)
-    encoder_before = found.get("encoder") or encoder
-    _refuse(folder, "--policy.encoder-weights", encoder_before, encoder or encoder_before)
-    extra = {"dataset": dataset} | ({"encoder": encoder_before} if encoder_before else {})
-    files.write_json(path, {**wanted, **extra})
+    started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/*"))
+    found = _recorded(folder) if (folder / "config.json").exists() else {}
+    if started and not found:
+        raise config_lib.UsageError(
+            f"{folder}: expected the config.json that its weights were trained with, got none; "
+            f"{_ELSEWHERE}"
+        )
+    if started:
+        before = _as_json(_settings(folder, found))
+        for name in (name for part in TRAINED_WITH for name in _flat(wanted[part], part)):
+            _refuse(folder, f"--{name}", _value(before, name), _value(wanted, name))
+        _refuse(folder, "demonstrations", found.get("dataset", dataset), dataset)
+        encoder_before = found.get("encoder") or encoder
+        _refuse(folder, "--policy.encoder-weights", encoder_before, encoder or encoder_before)
+    frozen = encoder or found.get("encoder")
+    extra = {"dataset": dataset} | ({"encoder": frozen} if frozen else {})
+    files.write_json(folder / "config.json", {**wanted, **extra})
 
 
 def read_config(folder: Path) -> config_lib.RunConfig:
     """Settings of a finished or running method folder."""
-    path = folder / "config.json"
-    if not path.is_file():
-        raise config_lib.UsageError(
-            f"{folder}: expected a run's method folder such as runs/cpu/stardiff, no config.json"
-        )
-    return _settings(json.loads(path.read_text()))
+    return _settings(folder, _recorded(folder))
 
 
 def trained_alike(one: dict[str, Any], other: dict[str, Any], *parts: str) -> bool:
@@ -94,13 +114,36 @@ def trained_alike(one: dict[str, Any], other: dict[str, Any], *parts: str) -> bo
 
     Settings that did not exist yet when one of them was written have their default.
     """
-    one, other = (_as_json(_settings(values)) for values in (one, other))
+    one, other = (_as_json(_from_json(values)) for values in (one, other))
     return all(one[part] == other[part] for part in (*TRAINED_WITH, *parts))
 
 
-def _settings(values: dict[str, Any]) -> config_lib.RunConfig:
+def _recorded(folder: Path) -> dict[str, Any]:
+    """The content of a method folder's config.json."""
+    path = folder / "config.json"
+    if not path.is_file():
+        raise config_lib.UsageError(
+            f"{folder}: expected a run's method folder such as runs/cpu/stardiff, no config.json"
+        )
+    try:
+        found = files.read_json(path)
+    except ValueError as error:
+        raise config_lib.UsageError(f"{error}; {_ELSEWHERE}") from error
+    if not found:
+        raise config_lib.UsageError(f"{path} is damaged: expected settings, got none; {_ELSEWHERE}")
+    return found
+
+
+def _settings(folder: Path, values: dict[str, Any]) -> config_lib.RunConfig:
+    try:
+        return _from_json(values)
+    except (TypeError, ValueError) as error:
+        raise config_lib.UsageError(f"{folder / 'config.json'}: {error}; {_ELSEWHERE}") from error
+
+
+def _from_json(values: dict[str, Any]) -> config_lib.RunConfig:
     """Settings from a config.json, without what else it records."""
-    kept = {name: value for name, value in values.items() if name not in ("dataset", "encoder")}
+    kept = {name: value for name, value in dict(values).items() if name not in _BESIDE}
     return config_lib.from_dict(config_lib.RunConfig, kept)
 
 
@@ -111,8 +154,7 @@ def _as_json(config: config_lib.RunConfig) -> dict[str, Any]:
 def _refuse(folder: Path, name: str, before: Any, now: Any) -> None:
     if before != now and name not in _FREE:
         raise config_lib.UsageError(
-            f"{name}: {folder} was made with {before}, got {now}; choose another folder by --out, "
-            "or remove that one"
+            f"{name}: {folder} was made with {before}, got {now}; {_ELSEWHERE}"
         )
 
 

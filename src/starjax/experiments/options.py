@@ -6,6 +6,7 @@ argument, what was expected, what came. Imports neither jax nor numpy.
 
 import dataclasses
 import difflib
+import itertools
 import shlex
 import types
 import typing
@@ -56,13 +57,18 @@ def flags(settings: type, prefix: str = "") -> dict[str, Any]:
 
 
 def value_of(flag: str, argv: Sequence[str]) -> str | None:
-    """The word after `flag` (or its `flag=word`), None if the flag is not there."""
-    for index, token in enumerate(argv):
-        if token.startswith(f"{flag}="):
-            return token.partition("=")[2]
-        if token == flag and index + 1 < len(argv):
-            return argv[index + 1]
-    return None
+    """The word after the last `flag` (or its `flag=word`), None if the flag is not there."""
+    found = None
+    for token, following in itertools.zip_longest(argv, argv[1:]):
+        name, equals, word = token.partition("=")
+        if _spelled(name) == flag:
+            found = word if equals else following or found
+    return found
+
+
+def is_given(flag: str, argv: Sequence[str]) -> bool:
+    """Whether `flag` was typed, with hyphens or with underscores."""
+    return flag in (_spelled(token.partition("=")[0]) for token in argv)
 
 
 def typed(name: str, argv: Sequence[str]) -> str:
@@ -83,6 +89,11 @@ def choice(argument: str, value: str, known: Iterable[str]) -> None:
         raise config_lib.UsageError(
             f"{argument}: expected one of {', '.join(names)}, got {value!r}{suggest(value, names)}"
         )
+
+
+def _spelled(token: str) -> str:
+    """A flag as `flags` spells it: tyro takes underscores for hyphens."""
+    return token.replace("_", "-") if token.startswith("--") else token
 
 
 def _is_positional(settings: type, name: str) -> bool:
@@ -114,7 +125,7 @@ def _check(known: Mapping[str, Any], argv: Sequence[str]) -> None:
         index += 1
         if not token.startswith("--"):
             raise config_lib.UsageError(f"{token}: expected a flag such as {next(iter(known))}")
-        flag = "--" + token[2:].replace("_", "-")
+        flag = _spelled(token)
         if flag not in known:
             raise config_lib.UsageError(f"{token}: unknown argument{suggest(flag, known)}")
         values = [value] if equals else []

@@ -29,6 +29,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     from starjax.training import processes
 
     processes.join()
+    xla.require_devices()
     if config.policy.freeze_encoder and not processes.is_alone():
         raise config_lib.UsageError("--policy.freeze-encoder: expected one process, got several")
     out = Path(config.out)
@@ -138,12 +139,12 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, command: str) -
 
 
 def _is_scored(folder: Path, settings: dict[str, Any]) -> bool:
-    """Whether result.json is there and of these settings."""
-    path = folder / "result.json"
-    if not path.exists():
+    """Whether result.json is there, whole and of these settings."""
+    try:
+        found = files.read_json(folder / "result.json")
+        return folders.trained_alike(found["config"], settings, "eval")
+    except (FileNotFoundError, KeyError, TypeError, ValueError):  # damaged: made again
         return False
-    found = json.loads(path.read_text())["config"]
-    return folders.trained_alike(found, settings, "eval")
 
 
 def _timings(out: Path, name: str) -> dict[str, float]:
@@ -171,7 +172,7 @@ def _report(out: Path, names: Sequence[str]) -> None:
     words.stage("report", f"of {', '.join(path.name for path in scored)}, into {out / 'report'}")
     with clock.timed(out, "report"):
         page = build.build(scored, out / "report", report=words.indented)
-    results = [json.loads((out / name / "result.json").read_text()) for name in names]
+    results = [files.read_json(out / name / "result.json") for name in names]
     print(f"\n{words.outcome(results)}\n\nreport: {page}", flush=True)
 
 

@@ -34,7 +34,11 @@ def main(argv: Sequence[str]) -> int:
 
     from starjax.experiments.report import build
 
-    print(f"report: {build.build(runs, out, with_video=chosen.video)}")
+    try:
+        page = build.build(runs, out, with_video=chosen.video)
+    except ValueError as error:  # of a damaged file, which it names
+        raise config_lib.UsageError(str(error)) from error
+    print(f"report: {page}")
     return 0
 
 

@@ -1,7 +1,6 @@
 """The main command, `python -m starjax.experiments.run`: from trocar to table."""
 
 import dataclasses
-import sys
 from collections.abc import Sequence
 
 from starjax import cli
@@ -21,7 +20,9 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
     config = options.parse(
         config_lib.RunConfig, argv, prog=prog, description=description, default=default
     )
-    if config.policy.observation == "state" and "--policy.freeze-encoder" not in argv:
+    if config.policy.observation == "state" and not options.is_given(
+        "--policy.freeze-encoder", argv
+    ):
         # A preset's encoder; one that was asked for is refused below.
         policy = dataclasses.replace(config.policy, encoder_weights="", freeze_encoder=False)
         config = dataclasses.replace(config, policy=policy)
@@ -56,4 +57,4 @@ def main(argv: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(cli.guard(main, sys.argv[1:]))
+    cli.run(main)

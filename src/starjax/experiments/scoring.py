@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,12 +46,13 @@ def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subje
     Raises:
       config.UsageError: the file is missing or damaged.
     """
+    again = f"starjax run with its flags and --out {shlex.quote(str(weights.parent.parent))}"
+    if not weights.exists():
+        raise config_lib.UsageError(f"{weights}: no weights there; {again} trains them")
     try:
         trained = export.load(weights)
     except ValueError as error:
-        raise config_lib.UsageError(
-            f"{error}; remove it, and run the same command again"
-        ) from error
+        raise config_lib.UsageError(f"{error}; remove it, and {again} trains it again") from error
     return _subject(method, trained, env)
 
 

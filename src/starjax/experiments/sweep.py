@@ -1,20 +1,24 @@
 """`starjax sweep RUN`: a trained policy over any sample or grid of trocars."""
 
 import dataclasses
+import shlex
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import tyro
 
 from starjax import config as config_lib
-from starjax.experiments import folders, options
+from starjax.experiments import checks, folders, options
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Scores a trained policy on a random sample (Eq. 19) or a grid of trocars.
 
 RUN is a method's folder, such as runs/cpu/stardiff; RUN/sweep.json is what the report draws
 as the success map and as Fig. 4."""
+
+# More is a slip of the hand.
+MOST_TROCARS = 1_000_000
+MOST_RADIUS_CM = 100.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +39,9 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Runs the trials that are missing and writes sweep.json."""
     chosen = options.parse(Options, argv, prog="starjax sweep", description=DESCRIPTION)
-    run = Path(chosen.run)
+    # A mistake should not wait for jax.
+    _check(chosen)
+    run = folders.existing(chosen.run)
     config = folders.read_config(run)
     xla.prepare_xla()
     files.require_writable(run)
@@ -58,8 +64,21 @@ def main(argv: Sequence[str]) -> int:
     }
     files.write_json(run / "sweep.json", {**about, **figures})
     print(_outcome(figures))
-    print(f"\nresult: {run / 'sweep.json'}; starjax report {run} draws it")
+    print(f"\nresult: {run / 'sweep.json'}; starjax report {shlex.quote(str(run))} draws it")
     return 0
+
+
+def _check(chosen: Options) -> None:
+    """Raises UsageError for the first value that is out of its range."""
+    checks.expect_finite(chosen)
+    checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
+    for name, count in (("trocars", chosen.trocars), ("azimuths", chosen.azimuths)):
+        checks.expect(1 <= count <= MOST_TROCARS, name, f"1 to {MOST_TROCARS}", count)
+    for radius in chosen.radii_cm:
+        inside = 0 <= radius <= MOST_RADIUS_CM
+        checks.expect(inside, "radii-cm", f"each 0 to {MOST_RADIUS_CM:g} cm", radius)
+    for polar in chosen.polars_deg:
+        checks.expect(0 <= polar <= 180, "polars-deg", "each 0 to 180 degrees", polar)
 
 
 def _trocars(chosen: Options) -> Any:
@@ -68,14 +87,11 @@ def _trocars(chosen: Options) -> Any:
 
     from starjax.evaluation import sweep
 
-    try:
-        if not chosen.radii_cm:
-            return sweep.sample(chosen.seed, chosen.trocars)
-        azimuths = 2 * np.pi * np.arange(chosen.azimuths) / max(chosen.azimuths, 1)
-        radii = np.array(chosen.radii_cm) / 100
-        return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths)
-    except ValueError as error:
-        raise config_lib.UsageError(f"trocars: {error}") from error
+    if not chosen.radii_cm:
+        return sweep.sample(chosen.seed, chosen.trocars)
+    azimuths = 2 * np.pi * np.arange(chosen.azimuths) / chosen.azimuths
+    radii = np.array(chosen.radii_cm) / 100
+    return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths)
 
 
 def _outcome(figures: dict[str, Any]) -> str:

@@ -44,6 +44,21 @@ def write_json(path: Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+      ValueError: the file is damaged; the message names it.
+    """
+    try:
+        found = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} is damaged: expected an object, got {type(found).__name__}")
+    return found
+
+
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Writes a compressed .npz atomically; the same arrays always give the same bytes."""
     buffer = io.BytesIO()

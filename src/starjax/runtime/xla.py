@@ -5,8 +5,11 @@ import importlib.metadata
 import os
 import platform
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
+
+from starjax import config
 
 _FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
 _PACKAGES = (
@@ -39,11 +42,35 @@ def prepare_xla() -> None:
 
 
 def cache_directory() -> Path:
-    """Folder for what can be made again: STARJAX_CACHE, else the user's cache directory."""
+    """Folder for what can be made again: STARJAX_CACHE, else the user's cache directory, or the
+    system's temporary one where the user has no home."""
     if chosen := os.environ.get("STARJAX_CACHE"):
         return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "starjax"
+    if base := os.environ.get("XDG_CACHE_HOME"):
+        return Path(base) / "starjax"
+    try:
+        return Path.home() / ".cache" / "starjax"
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"starjax-{os.getuid()}"
+
+
+def require_devices() -> None:
+    """Starts jax.
+
+    Raises:
+      config.UsageError: it cannot use what JAX_PLATFORMS asks for.
+    """
+    import jax
+
+    try:
+        jax.devices()
+    except (AssertionError, RuntimeError) as error:  # the first for a platform without its plugin
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        reason = str(error).splitlines()[0] if str(error) else "its plugin is not installed"
+        raise config.UsageError(
+            f"JAX_PLATFORMS: expected what jax can use here, got {asked!r}: {reason}; "
+            "starjax doctor says more"
+        ) from error
 
 
 def versions() -> dict[str, str]:

@@ -25,14 +25,16 @@ def join() -> None:
       UsageError: some of the variables are missing or are no numbers.
     """
     address, *numbers = (os.environ.get(name, "") for name in _VARIABLES)
-    if not address:
+    if not address and not any(numbers):
         return
-    if not all(number.isdigit() for number in numbers):
+    if not address or not all(number.isdigit() for number in numbers):
         raise config.UsageError(
             f"{', '.join(_VARIABLES)}: expected all or none of them, the last two whole numbers, "
             f"got {[address, *numbers]}"
         )
     count, index = map(int, numbers)
+    if index >= count:
+        raise config.UsageError(f"JAX_PROCESS_ID: expected 0 to {count - 1}, got {index}")
     jax.distributed.initialize(address, num_processes=count, process_id=index)
 
 

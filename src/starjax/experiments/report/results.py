@@ -9,6 +9,7 @@ import numpy as np
 
 from starjax.experiments import methods
 from starjax.experiments.report import outcomes, stats
+from starjax.runtime import files
 
 OURS = "stardiff"  # the method that the others are compared with
 
@@ -96,7 +97,11 @@ def load(path: Path) -> Run:
     file = path / "result.json"
     if not file.is_file():
         raise ValueError(f"path: expected a run directory with a result.json, got {path}")
-    result = json.loads(file.read_text())
+    result = files.read_json(file)
+    if missing := [key for key in ("method", "observation", "config") if key not in result]:
+        raise ValueError(f"{file}: expected a result of starjax, got one without {missing[0]}")
+    if result["method"] not in methods.METHODS:
+        raise ValueError(f"{file}: expected a method of Table II, got {result['method']!r}")
     method = methods.METHODS[result["method"]]
     return Run(
         path=path,
@@ -130,8 +135,14 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
     file = path / "evaluation" / "recorded.npz"
     if not file.is_file():
         return []
-    with np.load(file, allow_pickle=False) as arrays:
-        kept = dict(arrays)
+    try:
+        with open(file, "rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+            kept = dict(arrays)
+    except Exception as error:  # a damaged archive fails in a dozen ways
+        raise ValueError(
+            f"{file} is damaged: {error}; remove {path / 'result.json'}, and the same run makes "
+            "both again"
+        ) from error
     rollouts = []
     for row, length in enumerate(kept["length"]):
         if length < 2 or not np.isfinite(kept["p_world_tip"][row, :length]).all():
@@ -152,11 +163,13 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
 
 
 def _sweep(file: Path) -> list[outcomes.Trial]:
-    return json.loads(file.read_text())["trials"] if file.is_file() else []
+    return files.read_json(file).get("trials") or [] if file.is_file() else []
 
 
 def _lines(file: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in file.read_text().splitlines()] if file.is_file() else []
+    """What is whole of a log: a kill may have cut its last line short."""
+    lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
+    return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
 def notes(runs: Sequence[Run]) -> list[str]:

@@ -1,0 +1,42 @@
+"""How a process of ours ends."""
+
+import subprocess
+import sys
+import textwrap
+
+from starjax import cli
+
+
+def test_too_little_memory_is_one_line_that_names_what_to_lower(capsys):
+    def command(argv):
+        raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nmore of it")
+
+    assert cli.guard(command, []) == 71
+    said = capsys.readouterr().err
+    assert "9 bytes. Too much" in said and "--train.batch-size" in said and said.count("\n") == 1
+
+
+def test_ctrl_c_in_a_callback_of_the_collector_is_not_lost():
+    """Python drops what is raised there, and jax has such a callback."""
+    code = """
+        import gc, os, signal, time
+        from starjax import cli
+
+        def callback(phase, info):
+            gc.callbacks.clear()
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0)
+
+        def command(argv):
+            gc.callbacks.append(callback)
+            gc.collect()
+            for _ in range(1000):
+                time.sleep(0.01)
+            return 0
+
+        cli.run(command)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert found.returncode == 130, found.stderr
+    assert found.stderr == "starjax: stopped; the same command goes on from what is saved\n"
