@@ -16,6 +16,28 @@ def test_too_little_memory_is_one_line_that_names_what_to_lower(capsys):
     assert "9 bytes. Too much" in said and "--train.batch-size" in said and said.count("\n") == 1
 
 
+def test_a_process_that_is_terminated_says_so():
+    code = """
+        import time
+        from starjax import cli
+
+        def command(argv):
+            print("begun", flush=True)
+            time.sleep(60)
+
+        cli.run(command)
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout and process.stdout.readline()
+    process.terminate()
+    assert "stopped" in process.communicate(timeout=60)[1] and process.returncode == 130
+
+
 def test_ctrl_c_in_a_callback_of_the_collector_is_not_lost():
     """Python drops what is raised there, and jax has such a callback."""
     code = """

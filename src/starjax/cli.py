@@ -4,6 +4,7 @@ import _thread
 import errno
 import importlib
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -33,7 +34,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
 _STORAGE = (
     errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT, errno.EPERM, errno.EISDIR, errno.ENOTDIR,
 )  # fmt: skip
-_STOPPED = 130  # exit code after Ctrl-C
+_STOPPED = 130  # exit code after Ctrl-C or SIGTERM
 
 
 def main() -> NoReturn:
@@ -44,6 +45,7 @@ def main() -> NoReturn:
 def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
     """The whole of a process: `command` with the words of its command line."""
     sys.unraisablehook = _again
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     code = guard(command, sys.argv[1:])
     if code == _STOPPED:  # jax's threads may still run, and would meet an interpreter that is gone
         sys.stdout.flush()
@@ -56,8 +58,8 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """Runs a command; what its user can mend becomes one line and an exit code, no traceback.
 
     Returns 2 for a mistake on the command line, 71 for too little memory, 74 for a disk that is
-    full or cannot be written, 130 after Ctrl-C (whatever was running has saved by then, and says
-    how to go on).
+    full or cannot be written, 130 after Ctrl-C or SIGTERM (whatever was running has saved by then,
+    and says how to go on).
     """
     try:
         return command(argv)

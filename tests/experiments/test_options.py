@@ -81,6 +81,10 @@ def settings(*argv: str) -> config.RunConfig:
             ["--policy.image-size", "more than 32 pixels", "train.crop-fraction = 0.9", "got 31"],
         ),
         (
+            ["--preset=smoke", "--policy.encoder-weights", "compact"],
+            ["--policy.encoder-weights", "--policy.observation image", "got state"],
+        ),
+        (
             ["--preset=smoke", "--policy.freeze_encoder"],
             ["--policy.freeze-encoder", "--policy.observation image"],
         ),

@@ -20,6 +20,10 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
     config = options.parse(
         config_lib.RunConfig, argv, prog=prog, description=description, default=default
     )
+    if config.policy.observation == "state" and options.value_of("--policy.encoder-weights", argv):
+        raise config_lib.UsageError(
+            "--policy.encoder-weights: expected --policy.observation image, got state"
+        )
     if config.policy.observation == "state" and not options.is_given(
         "--policy.freeze-encoder", argv
     ):
