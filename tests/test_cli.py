@@ -44,6 +44,9 @@ def test_ctrl_c_in_a_callback_of_the_collector_is_not_lost():
         import gc, os, signal, time
         from starjax import cli
 
+        # a shell's background job, as tests may be, is born deaf to it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
         def callback(phase, info):
             gc.callbacks.clear()
             os.kill(os.getpid(), signal.SIGINT)
