@@ -191,14 +191,13 @@ def _write(path: Path, rows: table.Table, kept: dict[str, np.ndarray]) -> None:
 def _read(
     path: Path, report: Callable[[str], None]
 ) -> tuple[table.Table, dict[str, np.ndarray]] | None:
-    """A finished chunk, or None if it is missing or damaged (the archive has checksums)."""
+    """A finished chunk, or None if it is missing or damaged."""
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            arrays = dict(archive)
-        rows = table.Table(**{name: arrays.pop(name) for name in table.Table._fields})
+        arrays = files.read_npz(path, table.Table._fields)
     except FileNotFoundError:
         return None
-    except Exception as error:  # a damaged archive fails in a dozen ways
-        report(f"damaged, evaluated again: {path}: {error}")
+    except ValueError as error:
+        report(f"{error}; evaluated again")
         return None
+    rows = table.Table(**{name: arrays.pop(name) for name in table.Table._fields})
     return rows, {name.removeprefix("recorded."): value for name, value in arrays.items()}

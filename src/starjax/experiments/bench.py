@@ -54,6 +54,7 @@ def main(argv: Sequence[str]) -> int:
 def _time(run: Path, chosen: Options) -> dict[str, Any]:
     """Times and prints; returns what joins result.json."""
     xla.prepare_xla()
+    xla.require_devices()
 
     from starjax.evaluation import latency
     from starjax.experiments import methods, scoring

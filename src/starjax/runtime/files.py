@@ -66,6 +66,24 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
+def read_npz(path: Path, names: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """All arrays of an .npz, whose checksums are checked.
+
+    Raises:
+      ValueError: the file is damaged, or one of `names` is not in it; the message names it.
+    """
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
+            found = dict(archive)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # a damaged archive fails in a dozen ways
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if missing := [name for name in names if name not in found]:
+        raise ValueError(f"{path} is damaged: no {missing[0]} in it")
+    return found
+
+
 def npy(parts: Sequence[np.ndarray]) -> list[bytes | memoryview]:
     """Arrays, joined along their first axis, in numpy's .npy format, without copying them."""
     first = parts[0]

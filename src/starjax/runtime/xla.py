@@ -1,4 +1,6 @@
-"""XLA settings for this machine, set before jax starts, and what the machine is. Imports no jax."""
+"""XLA settings for this machine, set before jax starts, and what the machine is.
+
+Importing it imports no jax."""
 
 import hashlib
 import importlib.metadata

@@ -114,15 +114,14 @@ def _key(
 def _read(path: Path, shape: tuple[int, int], report: Callable[[str], None]) -> np.ndarray | None:
     """A finished part, or None if it is missing or damaged."""
     try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            found = archive["features"]
+        found = files.read_npz(path, ["features"])["features"]
     except FileNotFoundError:
         return None
-    except Exception as error:  # a damaged archive fails in a dozen ways
-        report(f"damaged, computed again: {path}: {error}")
+    except ValueError as error:
+        report(f"{error}; computed again")
         return None
     if found.shape != shape or found.dtype != np.float32:
         expected = f"expected float32 {shape}, got {found.dtype} {found.shape}"
-        report(f"damaged, computed again: {path}: {expected}")
+        report(f"{path} is damaged: {expected}; computed again")
         return None
     return found

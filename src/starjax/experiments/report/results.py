@@ -136,12 +136,10 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
     if not file.is_file():
         return []
     try:
-        with open(file, "rb") as opened, np.load(opened, allow_pickle=False) as arrays:
-            kept = dict(arrays)
-    except Exception as error:  # a damaged archive fails in a dozen ways
+        kept = files.read_npz(file)
+    except ValueError as error:
         raise ValueError(
-            f"{file} is damaged: {error}; remove {path / 'result.json'}, and the same run makes "
-            "both again"
+            f"{error}; remove {path / 'result.json'}, and the same run makes both again"
         ) from error
     rollouts = []
     for row, length in enumerate(kept["length"]):
