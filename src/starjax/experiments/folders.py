@@ -99,7 +99,8 @@ def claim(
         _refuse(folder, "demonstrations", found.get("dataset", dataset), dataset)
         encoder_before = found.get("encoder") or encoder
         _refuse(folder, "--policy.encoder-weights", encoder_before, encoder or encoder_before)
-    frozen = encoder or found.get("encoder")
+    known = found.get("encoder") if started or config.policy.freeze_encoder else None
+    frozen = encoder or known
     extra = {"dataset": dataset} | ({"encoder": frozen} if frozen else {})
     files.write_json(folder / "config.json", {**wanted, **extra})
 
