@@ -56,15 +56,6 @@ def test_dropped_taps_change_nothing(kernel, stride, length, live):
     np.testing.assert_allclose(y, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("kernel", "length"), [(5, 16), (5, 3), (5, 2), (5, 1), (3, 2)])
-def test_a_kernel_with_its_taps_side_by_side_is_the_same_convolution(kernel, length):
-    x = inputs(2, length, 6)
-    conv = layers.Conv1d(4, kernel)
-    params, expected = run(conv, x)
-    beside = {"columns": layers.columns(params["kernel"]), "bias": params["bias"] + 1.0}
-    np.testing.assert_allclose(conv.apply({"params": beside}, x), expected + 1.0, atol=1e-5)
-
-
 def test_upsample_is_the_transpose_of_a_strided_convolution():
     """<up(x), y> = <x, down(y)> for the convolution of kernel 4, stride 2, padding 1."""
     x, y = inputs(2, 4, 3), inputs(2, 8, 3, seed=2)

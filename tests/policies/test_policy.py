@@ -297,12 +297,12 @@ def test_large_matrices_are_rounded_once_to_what_sample_rounds_them_to(dataset):
 
 
 @pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
-def test_kernels_side_by_side_sample_the_same(dataset, name):
+def test_the_blocks_of_a_gpu_sample_the_same(dataset, name):
     policy = policies.make(METHODS[name], fakes.TINY, fakes.P_WORLD_REF, TRAIN)
     stats = normalizer.fit(METHODS[name], dataset, fakes.P_WORLD_REF, np.arange(80))
     params = jit(policy.init)(jax.random.key(0))
-    changed = policies.with_columns(params)
-    assert "columns" in str(jax.tree.structure(changed))
+    changed = policies.with_sampling_blocks(params)
+    assert "second" in str(jax.tree.structure(changed))
     batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
     given = (stats, jax.random.split(jax.random.key(1), B), batch.observation, batch.trocar)
     sample = jit(policy.sample)

@@ -13,6 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+EPSILON = 1e-5  # of GroupNorm, torch's default
 _PARTS = 128  # of a sum over many places on a GPU
 
 
@@ -96,7 +97,7 @@ class Dense(nn.Module):
 
 
 class GroupNorm(nn.Module):
-    """Normalise each sample over groups of channels and all positions (epsilon 1e-5)."""
+    """Normalise each sample over groups of channels and all positions."""
 
     groups: int
 
@@ -140,7 +141,7 @@ def affine(
     shape = batch, channels = mean.shape
     per_group = (batch, groups, channels // groups)
     mean, square = (moment.reshape(per_group).mean(-1) for moment in (mean, square))
-    inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + 1e-5)
+    inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + EPSILON)
     gain = jnp.repeat(inverse, channels // groups, axis=1) * spread(scale, shape)
     return gain, spread(bias, shape) - jnp.repeat(mean, channels // groups, axis=1) * gain
 
@@ -157,9 +158,6 @@ class Conv1d(nn.Module):
 
     Taps that only ever meet the padding at this length are not made at all: at length 2 a kernel
     of 5 is exactly its centred 3, and the others would never get a gradient.
-
-    A convolution that keeps the length may have `columns` (see there) for its kernel: then the
-    products are shifted instead of the inputs, which spares a GPU writing each input once a tap.
     """
 
     features: int
@@ -178,9 +176,6 @@ class Conv1d(nn.Module):
                 f"x: expected a length that kernel {self.kernel_size} fits, got {length}"
             )
         taps = _live_taps(self.kernel_size, self.stride, padding, length, out)
-        if self.has_variable("params", "columns"):
-            given = self.variables["params"]
-            return _shifted_sum(x @ given["columns"].astype(x.dtype), taps, padding, given["bias"])
         # The fan-in counts the dropped taps, so that the start is distributed as with them.
         init = uniform_init(self.kernel_size * channels)
         kernel = self.param("kernel", init, (len(taps), channels, self.features))
@@ -196,11 +191,6 @@ class Conv1d(nn.Module):
         y = flat @ kernel.astype(x.dtype).reshape(len(taps) * channels, self.features)
         shape = (batch, out, self.features)
         return y.reshape(shape) + spread(bias.astype(x.dtype), shape)
-
-
-def columns(kernel: jax.Array) -> jax.Array:
-    """A kernel `[taps, C, features]` with its taps side by side: `[C, taps features]`."""
-    return jnp.moveaxis(kernel, 0, 1).reshape(kernel.shape[1], -1)
 
 
 class Upsample1d(nn.Module):
@@ -224,18 +214,6 @@ class Upsample1d(nn.Module):
         y = jnp.moveaxis(y.reshape(2, batch, length, channels), 0, 2)
         shape = (batch, 2 * length, channels)
         return y.reshape(shape) + spread(bias, shape)
-
-
-def _shifted_sum(products: jax.Array, taps: range, padding: int, bias: jax.Array) -> jax.Array:
-    """`[B, L, taps features]` of every tap with every input -> `[B, L, features]`."""
-    batch, length, _ = products.shape
-    of_tap = products.reshape(batch, length, len(taps), -1)
-    total = bias.astype(jnp.float32)
-    for number, tap in enumerate(taps):
-        ahead = tap - padding  # output i takes input i + ahead
-        part = of_tap[:, max(0, ahead) : length + min(0, ahead), number].astype(jnp.float32)
-        total = total + jnp.pad(part, ((0, 0), (max(0, -ahead), max(0, ahead)), (0, 0)))
-    return total.astype(products.dtype)
 
 
 def _mix(x: jax.Array) -> jax.Array:

@@ -21,7 +21,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from starjax.models import layers
+from starjax.models import layers, sampling_blocks
 
 
 class ConditionalUnet1D(nn.Module):
@@ -112,19 +112,6 @@ class ConditionalUnet1D(nn.Module):
         return ResidualBlock(features, self.kernel_size, self.groups)
 
 
-def with_columns(params: dict[str, Any]) -> dict[str, Any]:
-    """Parameters in which the convolutions of all `ConvBlock`s have `layers.columns`."""
-
-    def changed(name: str, tree: Any) -> Any:
-        if not isinstance(tree, dict):
-            return tree
-        if name == "Conv1d_0" and len(tree["kernel"]) > 1:
-            return {"columns": layers.columns(tree["kernel"]), "bias": tree["bias"]}
-        return {name: changed(name, child) for name, child in tree.items()}
-
-    return changed("", params)
-
-
 class ResidualBlock(nn.Module):
     """Two convolution blocks with FiLM between them, and a skip (1x1 where the width changes)."""
 
@@ -135,6 +122,8 @@ class ResidualBlock(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array, film: jax.Array) -> jax.Array:
         """`x` `[B, L, C]`, `film` `[B, 2 features]` (scale, then bias) -> `[B, L, features]`."""
+        if self.has_variable("params", "first"):  # of `sampling_blocks.prepared`
+            return sampling_blocks.residual_block(self.variables["params"], x, film, self.groups)
         scale, bias = jnp.split(film[:, None, :], 2, axis=-1)
         h = ConvBlock(self.features, self.kernel_size, self.groups)(x)
         h = ConvBlock(self.features, self.kernel_size, self.groups)(scale * h + bias)
@@ -152,6 +141,8 @@ class ConvBlock(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[B, L, C] -> [B, L, features]`."""
+        if self.has_variable("params", "kernel"):  # of `sampling_blocks.prepared`
+            return sampling_blocks.conv_block(self.variables["params"], x, self.groups)
         x = layers.Conv1d(self.features, self.kernel_size)(x)
         return layers.mish(layers.GroupNorm(self.groups)(x))
 

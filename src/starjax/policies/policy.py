@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from starjax import config
 from starjax.data import normalizer, windows
-from starjax.models import pretrained, unet1d
+from starjax.models import pretrained, sampling_blocks
 from starjax.sim.types import Observation
 from starjax.types import Command
 
@@ -65,10 +65,10 @@ def with_resnet18(params: Params, path: str | pathlib.Path) -> Params:
 def for_sampling(params: Params, dtype: str) -> Params:
     """Parameters as `sample` uses them fastest: for evaluation, not for training.
 
-    `rounded`, and on a GPU the kernels of the U-Net's blocks lie as `layers.columns`.
+    `rounded`, and on a GPU those of the U-Net's blocks are as `sampling_blocks` takes them.
     """
     if jax.default_backend() == "gpu":  # a CPU would be a little slower with them
-        params = with_columns(params)
+        params = with_sampling_blocks(params)
     return rounded(params, dtype)
 
 
@@ -78,7 +78,7 @@ def rounded(params: Params, dtype: str) -> Params:
     The networks round them so anyway, to the same numbers, wherever they use them; done before,
     the U-Net's are not read in float32 and rounded again at each DDIM step.
     """
-    networks, matrices = {"unet", "trunk"}, {"kernel", "columns", "film_time", "film_cond"}
+    networks, matrices = {"unet", "trunk"}, {"kernel", "film_time", "film_cond"}
 
     def one(path: tuple[Any, ...], leaf: Any) -> Any:
         names = {getattr(key, "key", None) for key in path}
@@ -87,11 +87,11 @@ def rounded(params: Params, dtype: str) -> Params:
     return jax.tree_util.tree_map_with_path(one, params)
 
 
-def with_columns(params: Params) -> Params:
-    """Parameters of `sample` with its U-Net's kernels as `layers.columns`."""
+def with_sampling_blocks(params: Params) -> Params:
+    """Parameters of `sample` with its U-Net's blocks as `sampling_blocks` takes them."""
     if "diffuser" in params:
-        return {**params, "diffuser": with_columns(params["diffuser"])}
-    return {**params, "unet": unet1d.with_columns(params["unet"])}
+        return {**params, "diffuser": with_sampling_blocks(params["diffuser"])}
+    return {**params, "unet": sampling_blocks.prepared(params["unet"])}
 
 
 def make(
