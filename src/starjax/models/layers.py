@@ -41,12 +41,13 @@ def spread(vector: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 _spread: Any = jax.custom_vjp(jnp.broadcast_to, nondiff_argnums=(1,))
 _spread.defvjp(
     lambda vector, shape: (jnp.broadcast_to(vector, shape), None),
-    lambda shape, _, g: (_sum_of_places(g),),
+    lambda shape, _, g: (sum_of_places(g),),
 )
 
 
 @jax.jit
-def _sum_of_places(g: jax.Array) -> jax.Array:
+def sum_of_places(g: jax.Array) -> jax.Array:
+    """`[..., C] -> [C]`."""
     at_once = functools.partial(jnp.sum, axis=range(g.ndim - 1))
     return jax.lax.platform_dependent(g, cuda=sum_in_two, default=at_once)
 
@@ -104,7 +105,7 @@ class GroupNorm(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[B, ..., C] -> [B, ..., C]`."""
-        return _group_norm(x, *scale_and_bias(self, x, self.groups), self.groups)
+        return group_norm(x, *scale_and_bias(self, x, self.groups), self.groups)
 
 
 def scale_and_bias(module: nn.Module, x: jax.Array, groups: int) -> tuple[jax.Array, jax.Array]:
@@ -117,7 +118,8 @@ def scale_and_bias(module: nn.Module, x: jax.Array, groups: int) -> tuple[jax.Ar
 
 
 @functools.partial(jax.jit, static_argnames="groups")
-def _group_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int) -> jax.Array:
+def group_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int) -> jax.Array:
+    """What `GroupNorm` does with its parameters `[C]`."""
     # Positions first, channels after: both reductions then run along contiguous memory, and
     # what remains is one multiply-add for each element.
     return normalized(x, *affine(*moments(x), scale, bias, groups))
@@ -138,12 +140,21 @@ def affine(
     mean: jax.Array, square: jax.Array, scale: jax.Array, bias: jax.Array, groups: int
 ) -> tuple[jax.Array, jax.Array]:
     """Gain and shift `[B, C]` by which a sample of these moments is normalised over groups."""
-    shape = batch, channels = mean.shape
-    per_group = (batch, groups, channels // groups)
-    mean, square = (moment.reshape(per_group).mean(-1) for moment in (mean, square))
-    inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + EPSILON)
-    gain = jnp.repeat(inverse, channels // groups, axis=1) * spread(scale, shape)
-    return gain, spread(bias, shape) - jnp.repeat(mean, channels // groups, axis=1) * gain
+    shape = mean.shape
+    mean, inverse = of_groups(mean, square, groups)
+    gain = each(inverse, shape[1]) * spread(scale, shape)
+    return gain, spread(bias, shape) - each(mean, shape[1]) * gain
+
+
+def of_groups(mean: jax.Array, square: jax.Array, groups: int) -> tuple[jax.Array, jax.Array]:
+    """Mean and one over the standard deviation of groups, `[B, G]`, from moments `[B, C]`."""
+    mean, square = (m.reshape(len(m), groups, -1).mean(-1) for m in (mean, square))
+    return mean, jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + EPSILON)
+
+
+def each(group: jax.Array, channels: int) -> jax.Array:
+    """`[B, G] -> [B, C]`: of each channel's group."""
+    return jnp.repeat(group, channels // group.shape[1], axis=1)
 
 
 def normalized(x: jax.Array, gain: jax.Array, shift: jax.Array) -> jax.Array:
@@ -165,9 +176,14 @@ class Conv1d(nn.Module):
     stride: int = 1
     padding: int | None = None  # on either side; None: kernel_size // 2
 
-    @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[B, L, C] -> [B, (L + 2 padding - kernel_size) // stride + 1, features]`."""
+        product, bias = self.apart(x)
+        return product + spread(bias.astype(x.dtype), product.shape)
+
+    @nn.compact
+    def apart(self, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The same without its bias, and that, float32 `[features]`."""
         batch, length, channels = x.shape
         padding = self.kernel_size // 2 if self.padding is None else self.padding
         out = (length + 2 * padding - self.kernel_size) // self.stride + 1
@@ -189,8 +205,7 @@ class Conv1d(nn.Module):
         stacked = jnp.concatenate(shifted, -1) if len(taps) > 1 else shifted[0]
         flat = stacked.reshape(batch * out, len(taps) * channels)
         y = flat @ kernel.astype(x.dtype).reshape(len(taps) * channels, self.features)
-        shape = (batch, out, self.features)
-        return y.reshape(shape) + spread(bias.astype(x.dtype), shape)
+        return y.reshape(batch, out, self.features), bias
 
 
 class Upsample1d(nn.Module):

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax.models import layers, sampling_blocks
+from starjax.models.activated_norm import ActivatedNorm
 
 
 class ConditionalUnet1D(nn.Module):
@@ -143,8 +144,8 @@ class ConvBlock(nn.Module):
         """`[B, L, C] -> [B, L, features]`."""
         if self.has_variable("params", "kernel"):  # of `sampling_blocks.prepared`
             return sampling_blocks.conv_block(self.variables["params"], x, self.groups)
-        x = layers.Conv1d(self.features, self.kernel_size)(x)
-        return layers.mish(layers.GroupNorm(self.groups)(x))
+        product, bias = layers.Conv1d(self.features, self.kernel_size).apart(x)
+        return ActivatedNorm(self.groups, name="GroupNorm_0")(product, bias)
 
 
 @jax.custom_vjp

@@ -119,6 +119,8 @@ class Parts(NamedTuple):
         """Each device's gradients of `whole` parameters as the batch's, joined as those are."""
         count, like = self.mesh.size, self._joined(self.like.params)
         summed = self._join(gradients)
+        if self._joins:
+            summed = jax.tree.map(_as_it_lies, summed)
         if count > 1:
             summed = jax.tree.map(
                 lambda g, like: jax.lax.psum(g, devices.AXIS) if g.shape == like.shape else g,
@@ -177,6 +179,17 @@ def _taken(some: Any, tree: Any) -> Any:
 
 def _is_none(x: Any) -> bool:
     return x is None
+
+
+def _as_it_lies(gradient: jax.Array) -> jax.Array:
+    """A gradient; of a convolution's kernel one that is written in the order of its axes.
+
+    Over 3x3 pixels XLA has it from a forward convolution, whose result lies otherwise, and would
+    turn each of the optimiser's arrays instead, in five kernels. What is flat has one order only.
+    """
+    if gradient.ndim < 4:
+        return gradient
+    return jax.lax.optimization_barrier(gradient.ravel()).reshape(gradient.shape)
 
 
 def _squares(leaves: list[jax.Array]) -> jax.Array:
