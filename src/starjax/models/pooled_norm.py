@@ -31,7 +31,7 @@ class PooledNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[N, h, w, 2, 2, C] -> [N, h, w, C]`: of h pairs of rows, w pairs of columns."""
+        """`[N, h, 2, w, 2, C] -> [N, h, w, C]`: of h pairs of rows, w pairs of columns."""
         return _pooled(x, *layers.scale_and_bias(self, x, self.groups), self.groups, self.size)
 
 
@@ -75,19 +75,19 @@ def _each(vector: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def _inside(x: jax.Array, size: Size, other: float) -> jax.Array:
-    """`[N, h, w, 2, 2, C]` with `other` in what is beside the last row or column."""
-    rows, columns = (np.arange(2 * pairs).reshape(-1, 2) for pairs in x.shape[1:3])
-    inside = (rows < size[0])[:, None, :, None] & (columns < size[1])[None, :, None]
+    """`[N, h, 2, w, 2, C]` with `other` in what is beside the last row or column."""
+    rows, columns = (np.arange(2 * pairs).reshape(-1, 2) for pairs in (x.shape[1], x.shape[3]))
+    inside = (rows < size[0])[:, :, None, None] & (columns < size[1])
     return x if inside.all() else jnp.where(inside[..., None], x, other)
 
 
 def _largest(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The largest of each window, and its place there, 0 to 8 (of several the first)."""
-    pads = ((0, 0), (1, 0), (1, 0), (0, 0), (0, 0), (0, 0))
+    pads = ((0, 0), (1, 0), (0, 0), (1, 0), (0, 0), (0, 0))
     x = jnp.pad(x, pads, constant_values=-jnp.inf)
     # Rows of window i, and columns: the second of pair i - 1 and both of pair i.
     rows = ((slice(-1), 1), (slice(1, None), 0), (slice(1, None), 1))
-    largest, *others = (x[:, i, j, a, b] for i, a in rows for j, b in rows)
+    largest, *others = (x[:, i, a, j, b] for i, a in rows for j, b in rows)
     place = jnp.zeros(largest.shape, jnp.uint8)
     for number, other in enumerate(others, 1):
         place = jnp.where(other > largest, jnp.uint8(number), place)
@@ -96,17 +96,28 @@ def _largest(x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _to_chosen(place: jax.Array, g: jax.Array) -> jax.Array:
-    """The gradient `g` of each window at its chosen entry: `[N, h, w, 2, 2, C]` float32."""
+    """The gradient `g` of each window at its chosen entry: `[N, h, 2, w, 2, C]` float32."""
     # The first of a pair is the middle of its window; the second the last there and the first of
     # the next. Element-wise in the entries, so that it can be part of what uses it.
-    places = ((1, 2), (9, 0))  # of both in their window and in the next one; 9 if not in it
+    places = np.array([[1, 2], [9, 0]])  # of both in their window and in the next one; 9: nowhere
     gradient = jnp.float32(0)
     for down, right in np.ndindex(2, 2):
-        here = 3 * np.array(places[down])[:, None] + np.array(places[right])
-        pads = ((0, 0), (0, down), (0, right), (0, 0))
-        of_window, of_g = (
-            jnp.pad(z[:, down:, right:], pads)[:, :, :, None, None] for z in (place, g)
-        )
-        chosen = of_window == here[..., None].astype(np.uint8)
-        gradient += jnp.where(chosen, of_g, 0).astype(jnp.float32)
+        here = (3 * places[down][:, None, None] + places[right]).astype(np.uint8)
+        of_window, of_g = (_of_window(z, down, right)[:, :, None, :, None] for z in (place, g))
+        gradient += jnp.where(of_window == here[..., None], of_g, 0).astype(jnp.float32)
     return gradient
+
+
+def _of_window(z: jax.Array, down: int, right: int) -> jax.Array:
+    """`[N, h, w, C]` of the window so far on, at the end of a row the next row's first and after
+    the last one the first image's.
+
+    These never choose what lies before their row or above their image, where such are looked for.
+    A gather, because of a padded array XLA asks for each number by itself whether it is there.
+    """
+    if not (down or right):
+        return z
+    rows = z.reshape(-1, z.shape[-1])
+    at = jnp.arange(len(rows)) + (down * z.shape[2] + right)
+    at = jnp.where(at < len(rows), at, at - len(rows))
+    return rows.at[at].get(mode="promise_in_bounds").reshape(z.shape)

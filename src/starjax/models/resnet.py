@@ -49,7 +49,7 @@ class ResNet18(nn.Module):
 class Stem(nn.Module):
     """7x7 convolution, stride 2, padding 3, without bias, over `[N, h, w, 3]`.
 
-    Computed as a 3x3 convolution, stride 1, of 4x4 blocks of pixels, to all of a block's four
+    Computed as a 4x2 convolution, stride 1, of blocks of 2x8 pixels, to all of a block's four
     outputs: a GPU's matrix units need channels in eights, and more than three of them.
     """
 
@@ -57,13 +57,15 @@ class Stem(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[N, h, w, 3] -> [N, ceil(h/4), ceil(w/4), 2, 2, features]`: rows, columns in pairs."""
+        """`[N, h, w, 3] -> [N, ceil(h/4), 2, ceil(w/4), 2, features]`: rows, columns in pairs."""
         init = _kernel_init(7, self.features)
         kernel = self.param("kernel", init, (7, 7, x.shape[-1], self.features))
-        pads = [(4, 4 * math.ceil(side / 4) + 4 - side) for side in x.shape[1:3]]
-        blocks = _blocks(jnp.pad(x, ((0, 0), *pads, (0, 0))), 4)
-        y = _convolve(blocks, _to_blocks(kernel.astype(x.dtype)), 1, 0)
-        return y.reshape(*y.shape[:3], 2, 2, self.features)
+        height, width = x.shape[1:3]
+        down, right = math.ceil(height / 4), math.ceil(width / 8)
+        pads = ((0, 0), (4, 4 * down + 2 - height), (4, 8 * right + 4 - width), (0, 0))
+        y = _convolve(_blocks(jnp.pad(x, pads)), _to_blocks(kernel.astype(x.dtype)), 1, 0)
+        y = y.reshape(len(x), down, 2, 2 * right, 2, self.features)
+        return y[:, :, :, : math.ceil(width / 4)]
 
 
 class BasicBlock(nn.Module):
@@ -135,7 +137,7 @@ def _kernel_init(size: int, features: int) -> Callable[..., jax.Array]:
 
 
 def _convolve(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.Array:
-    """Convolution of `[N, h, w, C]` with `[size, size, C, features]`."""
+    """Convolution of `[N, h, w, C]` with `[rows, columns, C, features]`."""
     if len(x) > _FEW:
         return _convolution(x, kernel, stride, pad)
     product = functools.partial(_product, stride=stride, pad=pad)
@@ -155,14 +157,14 @@ def _convolution(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.
 
 def _product(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.Array:
     """The same as one matrix product of the shifted inputs."""
-    size = len(kernel)
+    sides = kernel.shape[:2]
     x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
-    down, right = ((side - size) // stride * stride + 1 for side in x.shape[1:3])
-    shifted = [
-        x[:, i : i + down : stride, j : j + right : stride] for i, j in np.ndindex(size, size)
-    ]
+    down, right = (
+        (side - size) // stride * stride + 1 for side, size in zip(x.shape[1:3], sides, strict=True)
+    )
+    shifted = [x[:, i : i + down : stride, j : j + right : stride] for i, j in np.ndindex(*sides)]
     columns = jnp.concatenate(shifted, -1)
-    if size == 1:
+    if sides == (1, 1):
         # XLA would take the strided slice into the product's kernel, and abort the process where
         # its sides are odd (jaxlib 0.11, 29 pixels to 15).
         columns = jax.lax.optimization_barrier(columns)
@@ -170,17 +172,17 @@ def _product(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.Arra
 
 
 def _to_blocks(kernel: jax.Array) -> jax.Array:
-    """`[7, 7, C, F] -> [3, 3, 16 C, 4 F]`: of blocks of 4x4 pixels to their 2x2 outputs."""
-    shifts = [(1 + 2 * output, 4 - 2 * output) for output in range(2)]
-    wide = jnp.stack([jnp.pad(kernel, (i, j, (0, 0), (0, 0))) for i in shifts for j in shifts], -2)
+    """`[7, 7, C, F] -> [4, 2, 16 C, 4 F]`: of blocks of 2x8 pixels to their four outputs."""
+    rows, none = (1, 0), (0, 0)
+    shifts = [(1 + 2 * output, 8 - 2 * output) for output in range(4)]
+    wide = jnp.stack([jnp.pad(kernel, (rows, columns, none, none)) for columns in shifts], -2)
     _, _, channels, outputs, features = wide.shape
-    wide = _blocks(wide.reshape(1, 12, 12, -1), 4)
-    return wide.reshape(3, 3, 16 * channels, outputs * features)
+    wide = _blocks(wide.reshape(1, 8, 16, -1))
+    return wide.reshape(4, 2, 16 * channels, outputs * features)
 
 
-def _blocks(x: jax.Array, size: int) -> jax.Array:
-    """Blocks of pixels as channels: `[N, size h, size w, C] -> [N, h, w, size size C]`."""
+def _blocks(x: jax.Array) -> jax.Array:
+    """Blocks of 2x8 pixels as channels: `[N, 2 h, 8 w, C] -> [N, h, w, 16 C]`."""
     batch, height, width, channels = x.shape
-    height, width = height // size, width // size
-    x = x.reshape(batch, height, size, width, size, channels)
-    return jnp.moveaxis(x, 2, 3).reshape(batch, height, width, -1)
+    x = x.reshape(batch, height // 2, 2, width // 8, 8, channels)
+    return jnp.moveaxis(x, 2, 3).reshape(batch, height // 2, width // 8, -1)
