@@ -1,4 +1,4 @@
-"""The U-Net's blocks as a GPU samples with them: the same functions, in half as many kernels.
+"""The U-Net's blocks as a GPU samples with them: the same functions in fewer kernels.
 
 Of one robot's action, and of hundreds, what takes a GPU longest after the products themselves is
 the way from one product to the next: adding up the taps, GroupNorm, Mish, FiLM and the skip. Here
