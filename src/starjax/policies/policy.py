@@ -67,7 +67,7 @@ def for_sampling(params: Params, dtype: str) -> Params:
 
     `rounded`, and on a GPU those of the U-Net's blocks are as `sampling_blocks` takes them.
     """
-    if jax.default_backend() == "gpu":  # a CPU would be a little slower with them
+    if jax.default_backend() == "gpu":  # a CPU would be slower with them
         params = with_sampling_blocks(params)
     return rounded(params, dtype)
 
