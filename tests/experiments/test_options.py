@@ -323,3 +323,21 @@ def test_guard_lets_a_fault_of_the_program_through():
 
     with pytest.raises(ValueError, match="a bug"):
         cli.guard(command, [])
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("bench", "RUN"),
+        ("evaluate", "[RUN]"),
+        ("pack", "POLICY OUT"),
+        ("report", "RUN [RUN ...]"),
+        ("sweep", "RUN"),
+    ],
+)
+def test_help_names_the_words_before_the_flags(command, words, capsys):
+    with pytest.raises(SystemExit):
+        cli.dispatch([command, "--help"])
+    usage, box = capsys.readouterr().out.split("positional arguments")
+    assert words in usage.splitlines()[0]
+    assert "STR" not in box.split("options")[0]

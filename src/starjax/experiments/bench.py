@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from starjax import config as config_lib
 from starjax.experiments import checks, folders, options
 from starjax.runtime import files, xla
@@ -21,8 +19,8 @@ the report's Table IV."""
 class Options:
     """Flags of the command."""
 
-    run: tyro.conf.Positional[str]
-    ddim_steps: tuple[int, ...] = (1, 2, 5, 10, 20, 50, 100)
+    run: options.Run  # a method's folder, such as runs/cpu/stardiff
+    ddim_steps: tuple[int, ...] = (1, 2, 5, 10, 20, 50, 100)  # a row for each
     calls: int = 100  # decisions timed for each
 
 

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from starjax import config as config_lib
 from starjax.experiments import checks, clock, folders, methods, options, presets, words
 from starjax.policies import packaged
@@ -24,7 +22,7 @@ are done."""
 class Options:
     """Flags of the command."""
 
-    run: tyro.conf.Positional[str] = ""  # a method's folder, such as runs/cpu/stardiff
+    run: options.RunOrNone = ""  # a method's folder, such as runs/cpu/stardiff
     policy: str = ""  # a policy.safetensors, or the name of a policy that ships with starjax
     seed: int = 0  # of the trials
     out: str = ""  # folder of the result; if empty, in RUN or in runs/evaluate

@@ -11,13 +11,18 @@ import shlex
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
 from starjax import config as config_lib
 
 SettingsT = TypeVar("SettingsT")
+
+# The words before the flags, as help and mistakes name them.
+Run = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+RunOrNone = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]")]
+Runs = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
 
 
 def parse(

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -21,8 +22,10 @@ itself (`starjax evaluate --policy OUT`)."""
 class Options:
     """Flags of the command."""
 
-    policy: tyro.conf.Positional[str]  # a policy.safetensors
-    out: tyro.conf.Positional[str]  # the file to write
+    # a policy.safetensors
+    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    # the file to write
+    out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     temperature: float | None = None  # of the noise a sample starts from; if left out, POLICY's
 
 

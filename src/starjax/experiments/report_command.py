@@ -4,8 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-import tyro
-
 from starjax import config as config_lib
 from starjax.experiments import options
 from starjax.runtime import files, xla
@@ -19,9 +17,9 @@ RUN is a method's folder, such as runs/cpu/stardiff, or a folder of them, such a
 class Options:
     """Flags of the command."""
 
-    runs: tyro.conf.Positional[tuple[str, ...]]
+    runs: options.Runs  # methods' folders, or folders of them
     out: str = ""  # folder of the report; `report` beside the first method's folder if empty
-    video: bool = True
+    video: bool = True  # rollout.mp4
 
 
 def main(argv: Sequence[str]) -> int:

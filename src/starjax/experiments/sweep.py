@@ -5,8 +5,6 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
-import tyro
-
 from starjax import config as config_lib
 from starjax.experiments import checks, folders, options
 from starjax.runtime import files, xla
@@ -25,7 +23,7 @@ MOST_RADIUS_CM = 100.0
 class Options:
     """Flags of the command."""
 
-    run: tyro.conf.Positional[str]
+    run: options.Run  # a method's folder, such as runs/cpu/stardiff
     trocars: int = 200  # how many to draw; not used with a grid
     radii_cm: tuple[float, ...] = ()  # of a grid; 0 is one point
     polars_deg: tuple[float, ...] = (90.0,)  # of a grid
