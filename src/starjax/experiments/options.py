@@ -19,7 +19,7 @@ from starjax import config as config_lib
 
 SettingsT = TypeVar("SettingsT")
 
-# The words before the flags, as help and mistakes name them.
+# The words before the flags, as help names them.
 Run = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 RunOrNone = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]")]
 Runs = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
