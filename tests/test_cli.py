@@ -65,3 +65,25 @@ def test_ctrl_c_in_a_callback_of_the_collector_is_not_lost():
     found = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert found.returncode == 130, found.stderr
     assert found.stderr == "starjax: stopped; the same command goes on from what is saved\n"
+
+
+def test_a_job_whose_reader_went_away_does_not_claim_to_be_done():
+    """As in `starjax run | head`."""
+    code = """
+        from starjax import cli
+
+        def command(argv):
+            for line in range(100000):
+                print(line)
+            return 0
+
+        cli.run(command)
+    """
+    process = subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout and process.stdout.readline()
+    process.stdout.close()
+    assert process.stderr and process.stderr.read() == b"" and process.wait(60) == 141

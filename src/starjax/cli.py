@@ -35,6 +35,7 @@ _STORAGE = (
     errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT, errno.EPERM, errno.EISDIR, errno.ENOTDIR,
 )  # fmt: skip
 _STOPPED = 130  # exit code after Ctrl-C or SIGTERM
+_UNREAD = 141  # exit code of a program whose reader went away (128 + SIGPIPE), as in `| head`
 
 
 def main() -> NoReturn:
@@ -59,7 +60,7 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
 
     Returns 2 for a mistake on the command line, 71 for too little memory, 74 for a disk that is
     full or cannot be written, 130 after Ctrl-C or SIGTERM (whatever was running has saved by then,
-    and says how to go on).
+    and says how to go on), 141 once nobody reads the output.
     """
     try:
         return command(argv)
@@ -69,9 +70,9 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         text = str(stop) or "stopped; the same command goes on from what is saved"
         return _fail(text, _STOPPED)
     except BrokenPipeError:
-        # Whoever read our output has seen enough (`| head`); nothing more may be written there.
+        # What Python still holds for the reader would fail again when the process ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return _UNREAD
     except OSError as error:
         # Imported late: it brings numpy, and `--help` need not wait for it.
         from starjax.runtime import files

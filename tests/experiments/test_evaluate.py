@@ -1,4 +1,4 @@
-"""`starjax evaluate`: a file of weights is enough, mistakes are a line. The simulator is a stub."""
+"""`starjax evaluate` and `starjax sweep` of trained weights. The simulator is a stub."""
 
 import dataclasses
 import json
@@ -10,7 +10,7 @@ import stubs
 
 from starjax import config
 from starjax.data import normalizer
-from starjax.experiments import evaluate, scoring
+from starjax.experiments import evaluate, folders, presets, scoring, sweep
 from starjax.experiments.report import video
 from starjax.policies import packaged
 from starjax.training import export
@@ -111,6 +111,31 @@ def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
         names.append(evaluate._label(path))
     assert names[0] == names[2] != names[1] and all(n.startswith("stardiff-") for n in names)
     assert evaluate._label(tmp_path / "compact.safetensors") == "compact"
+
+
+def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):
+    run = file.parent / "dp_rcm2"
+    run.mkdir()
+    folders.claim(run, presets.PRESETS["smoke"], "demos-a")
+    file.rename(run / "policy.safetensors")
+
+    def swept(*flags):
+        assert sweep.main([str(run), "--eval.time-limit-s", "1", *flags]) == 0
+        return json.loads((run / "sweep.json").read_text())
+
+    drawn, grid = ["--trocars", "5"], ["--radii-cm", "0", "2", "--azimuths", "3"]
+    first = swept(*drawn)
+    chunks = {path: path.stat().st_mtime_ns for path in (run / "sweep").rglob("chunk*")}
+    assert first["strict"]["trials"] == len(first["trials"]) == 5 and chunks
+    assert {trial["trial"] for trial in first["trials"]} == {0}
+    assert swept(*drawn, "--seed", "1")["trials"] != first["trials"]
+    assert [trial["radius"] for trial in swept(*grid)["trials"]] == pytest.approx(
+        [0, 0.02, 0.02, 0.02]
+    )
+    assert swept(*drawn, "--eval.chunk", "2")["trials"] == first["trials"]
+    assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
+    said = capsys.readouterr().out
+    assert "replaced" not in said and "/5 = " in said.replace("  ", " ")
 
 
 @pytest.mark.parametrize(

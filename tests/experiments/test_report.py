@@ -23,6 +23,7 @@ from starjax.experiments.report import (
     video,
     words,
 )
+from starjax.runtime import files
 from starjax.sim import env
 
 
@@ -185,15 +186,21 @@ def test_the_interval_bar_is_where_the_rate_is():
 def test_build_writes_every_file(tmp_path):
     run = synthetic.run(tmp_path / "stardiff", sweep_of=40)
     index = build.build([run], tmp_path / "report", with_video=False)
-    files = {path.name: path.read_bytes() for path in (tmp_path / "report").iterdir()}
-    assert sorted(files) == sorted(
+    written = {path.name: path.read_bytes() for path in (tmp_path / "report").glob("[!.]*")}
+    assert sorted(written) == sorted(
         ["tables.md", "fig3.png", "fig3.pdf", "fig4.png", "fig4.pdf", "training.png", "index.html"]
     )
-    for name, data in files.items():
+    for name, data in written.items():
         magic = {"png": b"\x89PNG", "pdf": b"%PDF"}.get(name.split(".")[1], b"")
         assert data.startswith(magic) and len(data) > 500
     build.build([run], tmp_path / "report", with_video=False)
-    assert index.read_bytes() == files["index.html"]
+    assert index.read_bytes() == written["index.html"]
+
+
+def test_two_reports_do_not_write_into_one_folder(tmp_path):
+    run = synthetic.run(tmp_path / "stardiff")
+    with files.lock(tmp_path / "report"), pytest.raises(files.StorageError, match="in use by"):
+        build.build([run], tmp_path / "report")
 
 
 def test_build_without_rollouts_or_results(tmp_path):

@@ -17,7 +17,7 @@ RUN is a method's folder, such as runs/cpu/stardiff, or a folder of them, such a
 class Options:
     """Flags of the command."""
 
-    runs: options.Runs  # methods' folders, or folders of them
+    run: options.Runs  # methods' folders, or folders of them
     out: str = ""  # folder of the report; `report` beside the first method's folder if empty
     video: bool = True  # rollout.mp4
 
@@ -25,7 +25,7 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Builds the report."""
     chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
-    runs = [found for name in chosen.runs for found in _with_results(Path(name))]
+    runs = [found for name in chosen.run for found in _with_results(Path(name))]
     out = Path(chosen.out or runs[0].parent / "report")
     xla.prepare_xla()
     files.require_writable(out)

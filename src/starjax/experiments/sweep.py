@@ -1,8 +1,11 @@
 """`starjax sweep RUN`: a trained policy over any sample or grid of trocars."""
 
 import dataclasses
+import hashlib
+import json
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
@@ -11,8 +14,9 @@ from starjax.runtime import files, xla
 
 DESCRIPTION = """Scores a trained policy on a random sample (Eq. 19) or a grid of trocars.
 
-RUN is a method's folder, such as runs/cpu/stardiff; RUN/sweep.json is what the report draws
-as the success map and as Fig. 4."""
+RUN is a method's folder, such as runs/cpu/stardiff; RUN/sweep.json, of the last sweep, is what the
+report draws as the success map and as Fig. 4. Trials of every sweep stay in RUN/sweep: the same
+command again only puts its figures together."""
 
 # More is a slip of the hand.
 MOST_TROCARS = 1_000_000
@@ -51,7 +55,7 @@ def main(argv: Sequence[str]) -> int:
 
     trocars = _trocars(chosen)
     who = scoring.subject(run.name, folders.weights(run.parent, run.name))
-    table = scoring.rollouts(run / "sweep", who, trocars, chosen.eval, chosen.seed)
+    table = scoring.rollouts(_folder(run, chosen), who, trocars, chosen.eval, chosen.seed)
     seen = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
     figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)
     about = {
@@ -78,6 +82,14 @@ def _check(chosen: Options) -> None:
         checks.expect(inside, "radii-cm", f"each 0 to {MOST_RADIUS_CM:g} cm", radius)
     for polar in chosen.polars_deg:
         checks.expect(0 <= polar <= 180, "polars-deg", "each 0 to 180 degrees", polar)
+
+
+def _folder(run: Path, chosen: Options) -> Path:
+    """Where a sweep's trials are kept, one folder for each so that none replaces another's."""
+    what = dataclasses.asdict(chosen)
+    del what["run"], what["eval"]["chunk"]
+    digest = hashlib.sha256(json.dumps(what).encode()).hexdigest()
+    return run / "sweep" / f"seed{chosen.seed}-{digest[:8]}"
 
 
 def _trocars(chosen: Options) -> Any:

@@ -31,19 +31,22 @@ def build(
 
     Raises:
       ValueError: no runs, or a directory without a result.
+      files.StorageError: another process is writing a report into `out`.
     """
     if not runs:
         raise ValueError("runs: expected at least one run directory, got none")
     loaded = _named_apart(sorted((results.load(path) for path in runs), key=_order))
     focus = _focus(loaded)
-    out.mkdir(parents=True, exist_ok=True)
-    files.write_bytes(out / "tables.md", tables.markdown(loaded).encode())
     sim = _model() if any(run.rollouts for run in loaded) else None
-    pictures = _figures(loaded, focus, sim, out)
-    film = video.record(loaded, sim, out / "rollout.mp4", report) if with_video and sim else None
-    clip = film.read_bytes() if film else None
-    index = out / "index.html"
-    files.write_bytes(index, page.render(loaded, focus, pictures, clip).encode())
+    with files.lock(out):
+        files.write_bytes(out / "tables.md", tables.markdown(loaded).encode())
+        pictures = _figures(loaded, focus, sim, out)
+        film = (
+            video.record(loaded, sim, out / "rollout.mp4", report) if with_video and sim else None
+        )
+        clip = film.read_bytes() if film else None
+        index = out / "index.html"
+        files.write_bytes(index, page.render(loaded, focus, pictures, clip).encode())
     return index
 
 
