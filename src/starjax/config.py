@@ -25,7 +25,7 @@ class Method(NamedTuple):
       group: group in Tables II and III.
     """
 
-    action_space: Literal["se3", "rcm1", "rcm2", "rcm3", "rcm4"]
+    action_space: str
     sees_trocar: bool
     projects: bool
     hierarchical: bool
@@ -73,6 +73,9 @@ class PolicyConfig:
     roll_observation: bool = False  # what conditions the diffusion model: picture or task state
     # Whether the diffusion model is given the trocar: as Table II says, or an ablation
     sees_trocar: Literal["method", "always", "never"] = "method"
+    # Which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
+    # trocar's azimuth, or an ablation
+    trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
     diffusion_steps: int = 100  # K
     ddim_steps: int = 10
     temperature: float = 1.0  # of the noise a sample starts from; lower is nearer to the likeliest

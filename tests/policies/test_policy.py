@@ -161,6 +161,13 @@ def test_a_method_may_be_given_the_trocar_or_not(made, dataset, name, sees, wide
     assert widths[0] - widths[1] == wider * features.TROCAR_FEATURES
 
 
+def test_only_relative_actions_have_a_trocar_frame_to_turn():
+    fixed = dataclasses.replace(fakes.TINY, trocar_yaw="fixed")
+    spaces = {name: policies.ablated(row, fixed).action_space for name, row in METHODS.items()}
+    changed = {name: space for name, space in spaces.items() if space != METHODS[name].action_space}
+    assert changed == {"dp_rcm1": "rcm1_fixed_yaw", "dp_rcm2": "rcm2_fixed_yaw"}
+
+
 def turned(observation):
     pose = observation.pose
     half_a_turn = np.diag([-1.0, -1.0, 1.0]).astype(np.float32)

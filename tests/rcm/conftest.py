@@ -95,6 +95,8 @@ def decode(name, action, trocar, p_world_ref):
     """Eq. 5 and Alg. 1 for well-behaved actions, without any clamp: (R, p) in float64."""
     action = np.asarray(action, np.float64)
     p_trocar, R_trocar = trocar_position(trocar, p_world_ref), trocar_rotation(trocar)
+    if name.endswith("_fixed_yaw"):
+        name, R_trocar = name.removesuffix("_fixed_yaw"), np.broadcast_to(DOWN, R_trocar.shape)
     if name == "se3":
         return gram_schmidt(action[..., 3:]), action[..., :3]
     if name in ("rcm1", "rcm3"):

@@ -9,12 +9,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import fakes
 import jax
 import jax.numpy as jnp
 import kill
 import numpy as np
 import pytest
 
+from starjax.experiments.methods import METHODS
 from starjax.training import advance, checkpoint, loop, metrics, parts, state, step
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -59,6 +61,17 @@ def test_a_run_leaves_its_log_and_checkpoints(whole):
     assert {"loss", "gradient_norm", "learning_rate", "skipped", "roll_loss"} <= first.keys()
     assert checkpoint.steps(directory / "checkpoints") == [8, 12]
     assert int(result.state.step) == 12 and result.skipped == 0
+
+
+def test_statistics_are_of_the_action_space_that_is_trained(monkeypatch, tmp_path):
+    def fit(row, *_):
+        raise InterruptedError(row.action_space)  # nothing else is asked of it
+
+    monkeypatch.setattr(loop.normalizer, "fit", fit)
+    fixed = dataclasses.replace(fakes.TINY, trocar_yaw="fixed")
+    given = METHODS["dp_rcm2"], fixed, jobs.SETTINGS, fakes.dataset(seed=0), fakes.P_WORLD_REF
+    with pytest.raises(InterruptedError, match="rcm2_fixed_yaw"):
+        loop.run(*given, tmp_path, 0)
 
 
 def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config
+from starjax import config, rcm
 from starjax.data import normalizer, windows
 from starjax.models import pretrained, sampling_blocks
 from starjax.sim.types import Observation
@@ -94,6 +94,16 @@ def with_sampling_blocks(params: Params) -> Params:
     return {**params, "unet": sampling_blocks.prepared(params["unet"])}
 
 
+def ablated(method: config.Method, policy_config: config.PolicyConfig) -> config.Method:
+    """The row of Table II as settings change it: what it sees and how its poses are written."""
+    if policy_config.sees_trocar != "method":
+        method = method._replace(sees_trocar=policy_config.sees_trocar == "always")
+    fixed = f"{method.action_space}_fixed_yaw"
+    if policy_config.trocar_yaw == "fixed" and fixed in rcm.ACTION_SPACES:
+        method = method._replace(action_space=fixed)
+    return method
+
+
 def make(
     method: config.Method,
     policy_config: config.PolicyConfig,
@@ -111,7 +121,6 @@ def make(
     # imported here because both of them build on this module's Policy
     from starjax.policies import hierarchical, single
 
-    if policy_config.sees_trocar != "method":
-        method = method._replace(sees_trocar=policy_config.sees_trocar == "always")
+    method = ablated(method, policy_config)
     build = hierarchical.make if method.hierarchical else single.make
     return build(method, policy_config, p_world_ref, train_config or config.TrainConfig())

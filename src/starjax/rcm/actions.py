@@ -1,7 +1,11 @@
 """The action spaces: SE(3) and the four parameterisations of the RCM manifold (Eq. 5), both ways.
 
-`decode` is total. Whatever the numbers, its pose is finite, its rotation a rotation, and in the
-four RCM spaces the shaft passes through the trocar. If an input (action, trocar or reference)
+Two more are an ablation of {T}, whose x axis turns with the trocar's azimuth: `rcm1_fixed_yaw` and
+`rcm2_fixed_yaw` write the same relative poses in a {T} of one yaw for every trocar. Both then hold
+what `rcm3` holds, the world's rotation and the depth, in other coordinates.
+
+`decode` is total. Whatever the numbers, its pose is finite, its rotation a rotation, and in all
+but SE(3) the shaft passes through the trocar. If an input (action, trocar or reference)
 is not finite, the flag `valid` is False and the pose is the **hold pose**: tool straight down,
 roll 0, tip `HOLD_DEPTH` below the trocar (whose own non-finite numbers count as zero: below the
 reference if the radius is not finite). Finite inputs are always valid: depths are clipped to
@@ -13,7 +17,7 @@ signed one of Eq. 3, its roll and rotation those of the pose. It propagates NaN.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -105,6 +109,20 @@ class _Frame(NamedTuple):
     p: jax.Array
 
 
+def _fixed_yaw(encode_or_decode: Callable) -> Callable:
+    """A map between poses and actions with a {T} whose x axis is the world's at every trocar."""
+
+    def mapped(pose_or_parts: Any, frame: _Frame) -> Any:
+        return encode_or_decode(pose_or_parts, frame._replace(R=_down(frame.R.dtype)))
+
+    return mapped
+
+
+def _down(dtype: jnp.dtype) -> jax.Array:
+    """Rotation of a frame with z down and x along the world's, G of `rotation_from_axis_roll`."""
+    return jnp.diag(jnp.array([1.0, -1.0, -1.0], dtype))
+
+
 def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> ActionSpace:
     """Wrap a pair of maps: inputs checked, broadcast and bounded, the hold pose put in."""
     slices, dim = {}, 0
@@ -165,8 +183,8 @@ def _batch_shapes(*trocar_and_ref: jax.Array) -> list[tuple[int, ...]]:
 
 
 def _hold_pose(p_world_trocar: jax.Array) -> types.Pose:
-    """Tool straight down, roll 0 (`rotation_from_axis_roll` gives diag(1, -1, -1) there)."""
-    R = jnp.diag(jnp.array([1.0, -1.0, -1.0], p_world_trocar.dtype))
+    """Tool straight down, roll 0."""
+    R = _down(p_world_trocar.dtype)
     return manifold.pose_at_depth(R, jnp.asarray(manifold.HOLD_DEPTH), p_world_trocar)
 
 
@@ -176,4 +194,10 @@ ACTION_SPACES: dict[str, ActionSpace] = {
     "rcm2": _space("rcm2", _encode_rcm2, _decode_rcm2, roll=1, p=3),
     "rcm3": _space("rcm3", _encode_rcm3, _decode_rcm3, depth=1, R=6),
     "rcm4": _space("rcm4", _encode_rcm4, _decode_rcm4, roll=1, p=3),
+    "rcm1_fixed_yaw": _space(
+        "rcm1_fixed_yaw", _fixed_yaw(_encode_rcm1), _fixed_yaw(_decode_rcm1), depth=1, R=6
+    ),
+    "rcm2_fixed_yaw": _space(
+        "rcm2_fixed_yaw", _fixed_yaw(_encode_rcm2), _fixed_yaw(_decode_rcm2), roll=1, p=3
+    ),
 }

@@ -90,7 +90,8 @@ def run(
     train, held_out = windows.split_holdout(
         dataset.start, dataset.length, train_config.holdout_demos
     )
-    stats = normalizer.fit(method, dataset, p_world_ref, train)
+    row = policies.ablated(method, policy_config)
+    stats = normalizer.fit(row, dataset, p_world_ref, train)
 
     def around(params):
         return states.create(policy, optimizer, params, stats, seed)
