@@ -116,6 +116,12 @@ def test_executed_error_is_pooled_over_steps():
     assert found["executed"]["p99_of_successes"] == pytest.approx(5.0)
 
 
+def test_without_a_success_there_is_no_error_of_successes():
+    steps, series = np.array([2], np.int32), np.array([50.0, 50.0], np.float16)
+    found = metrics.rcm_error_mm(trials([0], steps=steps, rcm_error_mm=series))
+    assert found["executed"]["p99"] == 50.0 and found["executed"]["p99_of_successes"] is None
+
+
 def test_selection_keeps_steps_with_their_trials():
     found = trials(
         [1, 0, 1],

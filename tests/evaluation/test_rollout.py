@@ -134,6 +134,16 @@ def test_other_weights_start_afresh(tmp_path, whole):
     assert not np.array_equal(other.rcm_error_mm, whole[1].rcm_error_mm)
 
 
+@pytest.mark.parametrize("what", ["scene", "versions"])
+def test_another_simulator_starts_afresh(tmp_path, whole, monkeypatch, what):
+    run(tmp_path, chunk=3)
+    change = {"scene": (evaluate.demos, "scene_hash"), "versions": (evaluate.xla, "versions")}
+    monkeypatch.setattr(*change[what], lambda *_: "another")
+    said = []
+    assert_same(run(tmp_path, chunk=3, report=said.append), whole[1])
+    assert "2 chunks of another evaluation" in said[0]
+
+
 def test_a_damaged_chunk_is_named_and_run_again(tmp_path, whole):
     first = run(tmp_path, chunk=3)
     path = tmp_path / "chunk_0001.npz"
@@ -292,11 +302,15 @@ def test_commanded_error_counts_executed_commands_only(whole):
         ({"chunk": -1}, "chunk"),
         ({"execute": 0}, "settings"),
         ({"obs_horizon": 6}, "obs_horizon"),
+        ({"trocars": rcm.Trocar(0.02, 80.0, 0.0)}, "trocar.polar"),
+        ({"trocars": rcm.Trocar(0.02, np.nan, 0.0)}, "trocar.polar"),
     ],
 )
-def test_bad_arguments_are_named(tmp_path, bad, name):
+def test_bad_arguments_are_named_and_cost_nothing(tmp_path, bad, name):
+    (tmp_path / "chunk_0000.npz").write_bytes(b"of an earlier evaluation")
     with pytest.raises(ValueError, match=name):
         run(tmp_path, **bad)
+    assert (tmp_path / "chunk_0000.npz").exists()
 
 
 def test_each_program_is_traced_once(tmp_path):
@@ -320,7 +334,9 @@ assert len(jax.devices()) == 2
 one = test_rollout.run(out / "1", lanes=2, devices=jax.devices()[:1])
 two = test_rollout.run(out / "2", lanes=2, devices=jax.devices())
 test_rollout.assert_same(one, two)
-from starjax.data import demos
+from starjax.data import demos, lanes
+last = lanes.split(lambda x: x + 1, jax.devices()[1:], [lanes.LANE], lanes.LANE)(np.ones(2))
+assert last.devices() == {jax.devices()[1]}
 import stubs, kill
 for count in (1, 2):
     demos.collect(out / f"demos{count}", stubs.make_env(), stubs.Expert(), test_rollout.TROCARS,

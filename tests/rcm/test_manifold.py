@@ -118,7 +118,10 @@ def test_derivatives_are_finite_everywhere():
 def test_a_non_finite_pose_shows_as_one():
     pose = rcm.Pose(R=np.eye(3), p=np.array([0.0, np.nan, 0.0]))
     assert np.isnan(rcm.rcm_error(pose, np.zeros(3)))
-    assert np.isnan(rcm.project(pose, np.zeros(3)).p).any()
+    sound, here = rcm.Pose(R=np.eye(3), p=np.zeros(3)), np.zeros(3)
+    far = sound._replace(p=np.array([np.inf, 0.0, 0.0]))
+    for bad, port in ((pose, here), (far, here), (sound, here * np.nan)):
+        assert all(np.isnan(part).all() for part in rcm.project(bad, port))
 
 
 def test_bad_shapes_are_named():

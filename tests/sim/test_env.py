@@ -134,6 +134,11 @@ def test_unusable_settings_are_named(arguments, named):
         envs.make(*arguments)
 
 
+def test_double_precision_is_refused_in_a_line():
+    with jax.enable_x64(True), pytest.raises(ValueError, match="JAX_ENABLE_X64"):
+        envs.make("state")
+
+
 def test_the_expert_takes_the_inner_wall_and_on_the_middle_row_the_one_of_less_turn(reset, begin):
     clear = {"outer": 0, "middle": 0}
     for seed in range(8):

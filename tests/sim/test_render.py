@@ -246,6 +246,19 @@ def test_colours_are_an_argument():
     assert changed.any() and (np.asarray(before.segmentation)[changed] == geom).all()
 
 
+def test_a_scene_needs_not_have_every_shape():
+    mj_model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><light directional="true"/>
+          <camera name="camera" pos="0 0 1"/><geom type="plane" size="1 1 .1" rgba="0 0 1 1"/>
+          <body pos="0 0 .2"><freejoint/><geom type="sphere" size=".1" rgba="1 0 0 1"/></body>
+        </worldbody></mujoco>"""
+    )
+    xpos, xmat = geoms(mj_model, mj_model.qpos0[None])
+    take = render.make(mj_model, "camera", 16, 16)
+    rgb = np.asarray(take(xpos[0], xmat[0], render.geom_rgb(mj_model)).rgb).astype(int)
+    assert rgb[8, 8, 0] > rgb[8, 8, 2] and rgb[0, 0, 2] > rgb[0, 0, 0]
+
+
 def test_what_is_hidden_is_not_drawn():
     frame = draw(pile(), poses(pile(), 3))
     assert not np.isin(frame.segmentation, (2, 3)).any()

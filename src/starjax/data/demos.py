@@ -22,6 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from starjax import rcm
 from starjax.data import episodes, recorder, store, trials
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files, progress, xla
@@ -59,7 +60,7 @@ def describe(
         "p_world_ref": np.asarray(env.p_world_ref, np.float64).tolist(),
         "control_hz": env.control_hz,
         "features": features,
-        "scene": _scene_hash(env.model),
+        "scene": scene_hash(env.model),
         "seed_rule": f"fold_in(fold_in(fold_in(key(seed), {recorder.STREAM}), trocar), trial)",
         "versions": xla.versions(),
         **({"one_wall": True} if one_wall else {}),  # not in the names of datasets without
@@ -102,12 +103,13 @@ def collect(
 
     Raises:
       StorageError: the folder cannot be written, is in use, holds another dataset, or is too small.
-      ValueError: an argument out of range, or an expert that fails too often.
+      ValueError: an argument out of range, a trocar that is none, an expert that fails too often.
     """
     if per_trocar < 1 or max_steps < 1 or chunk < 0:
         got = {"per_trocar": per_trocar, "max_steps": max_steps, "chunk": chunk}
         raise ValueError(f"per_trocar, max_steps: expected 1 or more, chunk: 0 or more, got {got}")
     trocars = Trocar(*(np.asarray(field, np.float32) for field in trocars))
+    rcm.check_trocar(trocars)
     total = per_trocar * len(trocars.radius)
     with files.lock(root):
         frame = recorder.frame(env)
@@ -208,7 +210,7 @@ def _chunk(frame_bytes: int, devices: Sequence[jax.Device] | None) -> int:
     return max(1, min(fast, fits))
 
 
-def _scene_hash(model: Any) -> str:
+def scene_hash(model: Any) -> str:
     """Identifies the simulated scene; empty where the environment has no MuJoCo model."""
     mj_model = getattr(model, "mj_model", None)
     if mj_model is None:

@@ -36,7 +36,7 @@ def split(
       donate: arguments whose memory may be reused.
     """
     program = jax.jit(fn, donate_argnums=donate)
-    if devices is None or len(devices) == 1:
+    if devices is None:
         return program
     # A program and a thread for each device. One program over all of them would put a reduction
     # into every loop's condition, the solver's included; under shard_map it would not, but there

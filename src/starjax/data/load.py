@@ -1,5 +1,6 @@
 """Reads collected demonstrations: checked, and placed where they fit (device, host, or disk)."""
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,6 +18,7 @@ Residency = Literal["auto", "device", "host", "disk"]
 
 DEVICE_SHARE = 0.5  # of the device's free memory that demonstrations may take
 HOST_SHARE = 0.6  # of the host's
+_MOST_OPEN = 256  # files of a field at once; systems allow a process about 1,000
 
 
 class Demos(NamedTuple):
@@ -134,8 +136,8 @@ def _place(total: int) -> str:
     host = xla.available_bytes()
     stats = device.memory_stats() or {}
     free = stats.get("bytes_limit", 2 * host) - stats.get("bytes_in_use", 0)
-    if device.platform == "cpu":
-        free = host
+    if device.platform == "cpu":  # jax copies them within the same memory
+        free = HOST_SHARE * host
     # Frames pass through host memory on their way to the device.
     if total <= DEVICE_SHARE * free and total <= HOST_SHARE * host:
         return "device"
@@ -175,10 +177,11 @@ class Frames:
     """One field of all episodes as if it were one array `[F, ...]`, read from disk when indexed."""
 
     def __init__(self, paths: list[Path], start: np.ndarray, length: np.ndarray):
-        self._arrays = [np.load(path, mmap_mode="r", allow_pickle=False) for path in paths]
-        self._start = start
-        self.shape = (int(length.sum()), *self._arrays[0].shape[1:])
-        self.dtype = self._arrays[0].dtype
+        self._paths, self._start = paths, start
+        self._mapped = functools.lru_cache(_MOST_OPEN)(_map)
+        first = self._mapped(paths[0])
+        self.shape = (int(length.sum()), *first.shape[1:])
+        self.dtype = first.dtype
 
     def __getitem__(self, index: Any) -> np.ndarray:
         """Frames at `index`, `[N]` integers, as `[N, ...]` in memory."""
@@ -186,12 +189,18 @@ class Frames:
         out = np.zeros((*index.shape, *self.shape[1:]), self.dtype)
         episode = np.searchsorted(self._start, index, side="right") - 1
         for i in np.ndindex(index.shape):
-            out[i] = self._arrays[episode[i]][index[i] - self._start[episode[i]]]
+            array = self._mapped(self._paths[episode[i]])
+            out[i] = array[index[i] - self._start[episode[i]]]
         return out
 
     def read(self) -> np.ndarray:
         """All frames in memory."""
         out = np.zeros(self.shape, self.dtype)
-        for array, first in zip(self._arrays, self._start, strict=True):
+        for path, first in zip(self._paths, self._start, strict=True):
+            array = _map(path)
             out[first : first + len(array)] = array
         return out
+
+
+def _map(path: Path) -> np.ndarray:
+    return np.load(path, mmap_mode="r", allow_pickle=False)

@@ -156,7 +156,8 @@ def verify_all(
 def keys(root: Path) -> list[str]:
     """Committed episodes, in order of trocar, trial and seed."""
     folder = root / "episodes"
-    return sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
+    # a file among them is not ours: file systems and desktops leave some
+    return sorted(path.name for path in folder.glob("*/"))
 
 
 def clean(root: Path) -> None:

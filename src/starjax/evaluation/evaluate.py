@@ -1,6 +1,7 @@
 """Evaluates a policy over all trocars x trials, chunk by chunk, going on where a run was killed.
 
-<directory>/plan.json          what is being evaluated; other weights or settings start afresh
+<directory>/plan.json          what is being evaluated; other weights, settings, scenes or versions
+                               start afresh
 <directory>/chunk_<n>.npz      a `table.Table` of the chunk's trials; its recorded trials
 <directory>/recorded.npz       trajectories of a few trials, for figures and the video
 """
@@ -15,9 +16,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from starjax import rcm
+from starjax.data import demos
 from starjax.evaluation import recorded, rollout, table
 from starjax.rcm.trocar import Trocar
-from starjax.runtime import files, progress
+from starjax.runtime import files, progress, xla
 
 
 def evaluate(
@@ -65,7 +68,7 @@ def evaluate(
 
     Raises:
       StorageError: the folder cannot be written or is in use.
-      ValueError: an argument out of range.
+      ValueError: an argument out of range, a trocar that is none.
     """
     if trials < 1 or time_limit_s <= 0 or chunk < 0 or video_trials < 0:
         raise ValueError(
@@ -73,11 +76,13 @@ def evaluate(
             f"got {trials}, {time_limit_s}, {chunk}, {video_trials}"
         )
     trocars = Trocar(*(np.asarray(field, np.float32).reshape(-1) for field in trocars))
+    rcm.check_trocar(trocars)
     settings = rollout.Settings(
         obs_horizon=obs_horizon,
         execute=execute,
         max_steps=math.ceil(time_limit_s * env.control_hz - 1e-6),
     )
+    run = rollout.make(env, policy, settings, seed, devices)
     count = len(trocars.radius)
     first_device = (devices or jax.local_devices())[0]
     lanes = lanes or rollout.lanes_per_device(first_device, count * trials)
@@ -94,9 +99,10 @@ def evaluate(
             "recorded": int(chosen.sum()),
             "weights": fingerprint((params, normalizer)),
             "identity": dict(identity or {}),
+            "scene": demos.scene_hash(env.model),
+            "versions": xla.versions(),
         }
         chunk = _resume(directory, plan, min(chunk or batch, batch), batch, report)
-        run = rollout.make(env, policy, settings, seed, devices)
         tables, kept = [], []
         with progress.track("Evaluation", len(index), unit="trials") as advance:
             for number, first in enumerate(range(0, len(index), chunk)):

@@ -11,7 +11,7 @@ import numpy as np
 
 from starjax import config, rcm
 from starjax.models import roll_net
-from starjax.policies import features
+from starjax.policies import diffuser, features
 from starjax.policies import policy as policies
 from starjax.sim.types import Observation
 
@@ -97,11 +97,13 @@ def roll_ms(
         blocks=policy_config.roll_blocks,
         dtype=jnp.dtype(policy_config.dtype),
     )
-    inputs = (
+    inputs = [
         jnp.zeros((batch, policy_config.horizon, 3)),
         jnp.zeros((batch, features.TROCAR_FEATURES)),
         jnp.zeros((batch, policy_config.obs_horizon)),
-    )
+    ]
+    if policy_config.roll_observation:
+        inputs.append(jnp.zeros((batch, diffuser.observed_dim(policy_config))))
     params = net.init(jax.random.key(0), *inputs)
     apply = jax.jit(net.apply)
     return _percentiles(lambda: apply(params, *inputs), calls, seconds)

@@ -17,7 +17,7 @@ Written by `compose`, figures in SI units unless the name says otherwise, interv
                           loose, safe, invalid, collided, steps, source, target, rcm_max_mm,
                           rcm_commanded_max_mm}
 
-Rates and intervals without trials are null.
+Rates, intervals and the quantile of successes are null where there are none.
 """
 
 import math
@@ -99,9 +99,9 @@ def rcm_error_mm(table: tables.Table) -> dict[str, Any]:
     }
 
 
-def _p99(table: tables.Table) -> float:
+def _p99(table: tables.Table) -> float | None:
     errors = table.rcm_error_mm.astype(np.float64)
-    return float(np.quantile(errors, 0.99)) if errors.size else 0.0
+    return float(np.quantile(errors, 0.99)) if errors.size else None
 
 
 def compose(

@@ -18,19 +18,24 @@ class Diffuser(NamedTuple):
 
     Attributes:
       init: `key -> params`, those that training changes: none for a frozen vision encoder.
-      observed_dim: N, numbers that the networks make of an observation.
       observe: `(params, inputs) -> [B, N]`, those numbers.
       noised: `(key, x0 [B, H, A]) -> Noised`, what is learned from clean sequences.
       loss: `(params, observed [B, N], extra [B, E], Noised) -> scalar` of Eq. 9.
       sample: `(params, keys [B], observed [B, N], extra [B, E]) -> [B, H, A]` in [-1, 1], by DDIM.
     """
 
-    observed_dim: int
     init: Callable[[jax.Array], Params]
     observe: Callable[[Params, features.Inputs], jax.Array]
     noised: Callable[[jax.Array, jax.Array], diffusion.Noised]
     loss: Callable[[Params, jax.Array, jax.Array, diffusion.Noised], jax.Array]
     sample: Callable[[Params, jax.Array, jax.Array, jax.Array], jax.Array]
+
+
+def observed_dim(policy_config: config.PolicyConfig) -> int:
+    """N, numbers that the networks make of an observation."""
+    sees_image = policy_config.observation == "image"
+    vision_dim = policy_config.obs_horizon * policy_config.vision_dim if sees_image else 0
+    return vision_dim + policy_config.state_dim
 
 
 def make(
@@ -46,13 +51,11 @@ def make(
     """
     dtype = jnp.dtype(policy_config.dtype)
     sees_image = policy_config.observation == "image"
-    vision_dim = policy_config.obs_horizon * policy_config.vision_dim if sees_image else 0
-    observed_dim = vision_dim + policy_config.state_dim
     vision = vision_encoder(policy_config)
     state = encoders.StateEncoder(features=policy_config.state_dim, dtype=dtype)
     unet = unet1d.ConditionalUnet1D(
         action_dim=action_dim,
-        cond_dim=observed_dim + extra_dim,
+        cond_dim=observed_dim(policy_config) + extra_dim,
         channels=tuple(policy_config.unet_channels),
         kernel_size=policy_config.kernel_size,
         groups=policy_config.groups,
@@ -113,7 +116,7 @@ def make(
             prepare=lambda k: unet.apply(params["unet"], k, method="embed_step"),
         )
 
-    return Diffuser(observed_dim, init, observe, noised, loss, sample)
+    return Diffuser(init, observe, noised, loss, sample)
 
 
 def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:

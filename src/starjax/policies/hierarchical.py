@@ -77,7 +77,8 @@ def make(
         p = jnp.zeros((1, policy_config.horizon, 3))
         trocar = jnp.zeros((1, features.TROCAR_FEATURES))
         history = jnp.zeros((1, policy_config.obs_horizon))
-        seen = jnp.zeros((1, model.observed_dim)) if policy_config.roll_observation else None
+        width = diffuser.observed_dim(policy_config)
+        seen = jnp.zeros((1, width)) if policy_config.roll_observation else None
         return {
             "diffuser": model.init(key_model),
             "roll": rolls.init(key_roll, p, trocar, history, seen),

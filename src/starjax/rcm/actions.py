@@ -13,7 +13,7 @@ reference if the radius is not finite). Finite inputs are always valid: depths a
 are completed, and SE(3) positions are clipped to +-MAX_REACH.
 
 `encode` describes measured poses too, which are a little off the manifold: its depth is the
-signed one of Eq. 3, its roll and rotation those of the pose. It propagates NaN.
+signed one of Eq. 3, its roll and rotation those of the pose. What is computed from a NaN is NaN.
 """
 
 from collections.abc import Callable

@@ -93,7 +93,8 @@ def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
 
     The tip is kept and the tool turned by the smallest rotation that puts its axis through the
     trocar with the tip on the far side (depth positive, Eq. 18). A tip at the trocar is on the
-    manifold whichever way the tool points: that pose is returned as it is.
+    manifold whichever way the tool points: that pose is returned as it is. Where an input is not
+    finite, all of the pose is NaN.
 
     Args:
       pose: pose_world_tip `[...]`.
@@ -102,10 +103,20 @@ def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
     Returns:
       pose_world_tip `[...]`.
     """
-    R, p, p_world_trocar = _checked(pose, p_world_trocar)
+    given = _checked(pose, p_world_trocar)
+    R, p, p_world_trocar = given
+    is_known = (
+        jnp.isfinite(R).all((-2, -1))
+        & jnp.isfinite(p).all(-1)
+        & jnp.isfinite(p_world_trocar).all(-1)
+    )
+    R, p, p_world_trocar = (arrays.bounded(x) for x in given)
     target, _ = arrays.direction(p - p_world_trocar, R[..., :, 2])
     R = arrays.matmul(rotations.rotation_align(R[..., :, 2], target), R)
-    return types.Pose(R=R, p=jnp.broadcast_to(p, R.shape[:-1]))
+    return types.Pose(
+        R=jnp.where(is_known[..., None, None], R, jnp.nan),
+        p=jnp.where(is_known[..., None], jnp.broadcast_to(p, R.shape[:-1]), jnp.nan),
+    )
 
 
 def _checked(pose: types.Pose, p_world_trocar: ArrayLike) -> list[jax.Array]:

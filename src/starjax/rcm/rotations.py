@@ -13,6 +13,8 @@ from starjax.rcm import arrays
 
 # World to the fixed-yaw frame whose z points down, G = diag(1, -1, -1); it is its own inverse.
 _DOWN = np.array([1.0, -1.0, -1.0], np.float32)
+# Entries of what should be a rotation are clipped to +-this: their squares stay finite.
+_MOST_ENTRY = 1e9
 _E_X = np.array([1.0, 0.0, 0.0], np.float32)
 _E_Y = np.array([0.0, 1.0, 0.0], np.float32)
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
@@ -103,7 +105,7 @@ def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     """
     (R_world_tip,) = arrays.checked(R_world_tip=(R_world_tip, (3, 3)))
     base = _base_rotation(R_world_tip[..., :, 2])
-    x = R_world_tip[..., :, 0]
+    x = jnp.clip(R_world_tip[..., :, 0], -_MOST_ENTRY, _MOST_ENTRY)
     cos = arrays.dot(base[..., :, 0], x)[..., 0]
     sin = arrays.dot(base[..., :, 1], x)[..., 0]
     # Only a matrix that is no rotation gives (0, 0), where arctan2 has no derivative.

@@ -1,7 +1,10 @@
 """Notices where arm, shaft and jaws touch things they have no modelled contact with.
 
 The physics models pads against walls and pegs, walls against pegs, feet against the board. The rest
-is watched here, so that nothing passes through the board, a peg or the block unnoticed.
+is watched here. It is a flag beside the outcome of a trial, which it does not decide, and a rough
+one: walls count as the sides of a full triangle, 3.5 mm longer at either end than they are, and of
+the jaws only the end of their axis is looked at, so that a tool that leans by 30 degrees gets a
+pad's corner up to 3 mm into the board unnoticed.
 """
 
 import jax

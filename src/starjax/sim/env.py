@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import rcm
+from starjax import config, rcm
 from starjax.sim import collision, ik, model, physics, render, tracking
 from starjax.sim.tasks import peg_transfer
 from starjax.sim.types import Observation
@@ -110,8 +110,10 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
       image_size: pixels a side of the camera's square picture.
 
     Raises:
-      ValueError: an unknown observation or an unusable size.
+      ValueError: an unknown observation, an unusable size, or jax in double precision.
     """
+    if jnp.result_type(float) == jnp.float64:
+        raise config.UsageError("JAX_ENABLE_X64: expected it off, the simulation is in float32")
     if policy_observation not in ("image", "state"):
         raise ValueError(
             f"policy_observation: expected 'image' or 'state', got {policy_observation!r}"

@@ -1,8 +1,8 @@
 """Composes robot, tool and task into one MuJoCo model and resolves every id once.
 
-A second robot or tool is one more MJCF file with the same sites: the task offers `robot_base`, a
-robot ends in `flange`, a tool brings `tcp`. In the composed model the robot's names begin with
-`robot/`, the tool's with `robot/tool/`.
+A second robot or tool is one more MJCF file with the sites and names of the others: a task offers
+`robot_base`, a robot ends in `flange`, a tool brings `tcp` (`mjcf/README.md` has the rest). In the
+composed model the robot's names begin with `robot/`, the tool's with `robot/tool/`.
 """
 
 from typing import NamedTuple
@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from starjax.sim import assets, ik, solver
+from starjax.sim.camera import scene
 from starjax.sim.engine import mjx
 
 # Which MJCF parts exist. Adding one: a file and a line.
@@ -30,6 +31,7 @@ class SimModel(NamedTuple):
     Attributes:
       mj_model: the C model; `mjx_model`: its MJX copy; `mjx_data`: a template of the state.
       arm: kinematic chain from the world to the tcp, see `ik.Chain`.
+      home: `[6]` rad, where inverse kinematics starts.
       p_world_ref: `[3]` m, the nominal port o_ref.
       arm_q, jaw, block: where the arm's, the jaws' and the block's coordinates start in qpos;
         `arm_dof`, `block_dof`: in qvel.
@@ -86,10 +88,6 @@ def load(robot: str = "fr5", tool: str = "grasper", task: str = "peg_transfer") 
     solver.check(mjx_model, mjx_data)
     numbered = sum(m.geom(g).name.startswith("peg") for g in range(m.ngeom))
     peg_geoms = np.array([m.geom(f"peg{i}").id for i in range(numbered)])
-    rgb = np.array(m.geom_rgba[:, :3], np.float32)
-    for g in range(m.ngeom):
-        if m.geom_matid[g] >= 0:
-            rgb[g] = m.mat_rgba[m.geom_matid[g], :3]
     return SimModel(
         mj_model=m,
         mjx_model=mjx_model,
@@ -102,7 +100,7 @@ def load(robot: str = "fr5", tool: str = "grasper", task: str = "peg_transfer") 
         arm_dof=int(m.joint("robot/j1").dofadr[0]),
         block=int(m.joint("block").qposadr[0]),
         block_dof=int(m.joint("block").dofadr[0]),
-        geom_rgb=rgb,
+        geom_rgb=scene.geom_rgb(m),
         peg_geoms=peg_geoms,
         seat_geoms=np.array([m.geom(f"seat{i}").id for i in range(numbered)]),
         pad_geoms=np.array([m.geom(f"robot/tool/pad_{side}").id for side in ("left", "right")]),

@@ -12,7 +12,7 @@ from starjax.types import Pose
 # Jaw targets at gripper -1 and +1 (m a side): past closed, so that the servo squeezes.
 JAW_CLOSED = -0.001
 JAW_OPEN = 0.0032
-# Natural frequency of the critically damped joint servos (rad/s), as in fr5.xml.
+# Natural frequency of the joint servos (rad/s), as in fr5.xml.
 SERVO_FREQUENCY = 100.0
 # Beyond these the solver has diverged.
 MAX_ARM_SPEED = 20.0  # rad/s

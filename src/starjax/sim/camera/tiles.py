@@ -143,6 +143,8 @@ def each(overlap: Array, table: Array, visit: Visit, carry: Array, *pixels: Arra
       visit: sees row `[T, 1]` (-1 where a tile has none left) and F features `[T, 1]`.
       carry, pixels: `[T, Q]`; in `visit` perhaps those of fewer tiles.
     """
+    if not overlap.shape[1]:  # a scene without any of this kind
+        return carry
     count = -(-overlap.shape[1] // 32)
     parts = jnp.pad(overlap, ((0, 0), (0, 32 * count - overlap.shape[1]))).reshape(-1, count, 32)
     words = jnp.sum(jnp.where(parts, _bit(jnp.arange(32)), 0), -1, dtype=jnp.uint32)
