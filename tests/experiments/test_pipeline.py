@@ -16,6 +16,13 @@ from starjax.runtime import files
 from starjax.training import export
 
 
+def test_a_damaged_result_of_another_method_is_one_line(tmp_path):
+    (tmp_path / "dp_ee").mkdir()
+    (tmp_path / "dp_ee" / "result.json").write_text("{")
+    with pytest.raises(config.UsageError, match=r"dp_ee/result\.json is damaged"):
+        pipeline._report(tmp_path, ["stardiff"])
+
+
 @pytest.fixture
 def done(monkeypatch):
     """Stages replaced by stubs that write down their names."""

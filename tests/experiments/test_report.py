@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 
 import imageio_ffmpeg
@@ -290,9 +291,13 @@ def test_pictures_that_cannot_be_coded_are_refused(tmp_path, bad):
         video.write([bad], tmp_path / "bad.mp4")
 
 
-def test_an_encoder_that_fails_says_so(tmp_path):
-    with pytest.raises(OSError, match=r"none/clip\.mp4"):
-        video.write([np.zeros((8, 8, 3), np.uint8)] * 3, tmp_path / "none" / "clip.mp4")
+def test_an_encoder_that_fails_says_so_and_leaves_what_was_there(tmp_path, monkeypatch):
+    clip = tmp_path / "clip.mp4"
+    clip.write_bytes(b"of before")
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: shutil.which("false"))
+    with pytest.raises(OSError, match=r"clip\.mp4: the video could not be written"):
+        video.write([np.zeros((8, 8, 3), np.uint8)] * 3, clip)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"of before"]
 
 
 def test_the_renderer_draws_the_recorded_configuration(one):
@@ -322,6 +327,7 @@ def test_a_result_alone_is_enough_to_load(one, tmp_path):
         ("result.json", b"{}"),
         ("result.json", b'{"method": "mine", "observation": "image", "config": {}}'),
         ("sweep.json", b'{"trials": ['),
+        ("metrics.jsonl", b'{"step": 1\n{"step": 2}\n'),
         ("evaluation/recorded.npz", b"PK"),
     ],
 )
@@ -347,6 +353,67 @@ def test_runs_of_one_method_are_told_apart(tmp_path, seeds, names):
     build.build(paths, tmp_path / "report", with_video=False)
     text = (tmp_path / "report" / "tables.md").read_text()
     assert all(f"STAR-Diff ({name})" in text for name in names)
+
+
+def test_folders_of_one_name_are_told_apart_further_up(tmp_path):
+    skills = {"a": (1.0, 1.0), "b": (0.0, 0.0)}
+    paths = [synthetic.run(tmp_path / x / "cpu" / "stardiff", skill=s) for x, s in skills.items()]
+    build.build(paths, tmp_path / "report", with_video=False)
+    text = (tmp_path / "report" / "tables.md").read_text()
+    assert all(f"STAR-Diff ({x}/cpu/stardiff)" in text for x in skills)
+    (failed,) = re.findall(r"\| STAR-Diff \(b/cpu/stardiff\) \|([ \d|]+)\|\n", text)
+    assert sum(map(int, failed.split("|"))) == 72
+
+
+@pytest.fixture
+def seeds(several, tmp_path):
+    """Two methods, two seeds each, whose trials are of their seed too."""
+    runs = []
+    for seed in (0, 1):
+        for run in several[1:]:
+            trials = [{**trial, "seed": seed} for trial in run.trials]
+            settings = {**run.result["config"], "seed": seed}
+            labelled = run._replace(
+                label=f"{run.label} (seed {seed})", path=tmp_path / str(seed) / run.path.name
+            )
+            runs.append(edited(labelled, trials=trials, config=settings))
+    return runs
+
+
+def test_each_seed_is_compared_with_its_own(seeds):
+    rows = tables.paired(seeds)[1:]
+    said = [f"DP-RCM-4 (seed {i}), of STAR-Diff (seed {i})" for i in (0, 1)]
+    assert [row[0] for row in rows] == said and {row[1] for row in rows} == {"72"}
+
+
+def test_a_report_of_several_seeds_shows_all_of_them(seeds):
+    assert words.title(seeds) == "4 runs of 2 methods on peg transfer"
+    assert "<dt>Seed</dt><dd>0; 1</dd>" in sections.facts(seeds)
+    lines = figures.training(seeds).axes[0].lines
+    assert len(lines) == 4 == len({(line.get_color(), line.get_linestyle()) for line in lines})
+    shown = figures.distance(seeds, seeds[-1]).axes[0].lines
+    drawn = [line for line in shown if not line.get_label().startswith("_")]
+    assert len(drawn) == 4 == len({(x.get_color(), x.get_linestyle()) for x in drawn})
+
+
+def test_curves_are_of_the_runs_own_training(one, tmp_path):
+    """Not of what was trained beside a folder with another evaluation's result."""
+    for name in ("stardiff", "packaged"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "result.json").write_text(json.dumps(one.result))
+    (tmp_path / "stardiff" / "metrics.jsonl").write_text('{"step": 1}\n')
+    assert results.load(tmp_path / "packaged").curves == []
+    assert results.load(tmp_path / "stardiff").curves == [{"step": 1}]
+
+
+def test_a_machine_without_a_video_encoder_still_gets_the_page(tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no ffmpeg")
+
+    monkeypatch.setattr(video, "record", fail)
+    said = []
+    index = build.build([synthetic.run(tmp_path / "x")], tmp_path / "report", report=said.append)
+    assert index.exists() and said == ["no video: no ffmpeg"]
 
 
 def test_runs_trained_at_fewer_trocars_show_what_more_buy(tmp_path):

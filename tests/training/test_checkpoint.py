@@ -98,9 +98,16 @@ def test_all_damaged_is_a_fresh_start(three):
         files_of(three, step)[-1].write_bytes(b"x")
     with pytest.warns(UserWarning, match="damaged"):
         assert checkpoint.restore(three, state(0)) is None
-    checkpoint.save(three, 20, state(20), keep=2)
-    with pytest.warns(UserWarning, match="step 30 is damaged"):
-        assert checkpoint.restore(three, state(0))[0] == 20
+
+
+@pytest.mark.parametrize("keep", [1, 2])
+def test_damaged_steps_never_push_out_a_sound_one(three, keep):
+    for step in (20, 30):
+        files_of(three, step)[-1].write_bytes(b"x")
+    for step in (5, 20):
+        checkpoint.save(three, step, state(step), keep=keep)
+        assert checkpoint.restore(three, state(0))[0] == step
+    assert checkpoint.steps(three) == [5, 20][-keep:]
 
 
 def test_leftovers_of_a_kill_are_cleared(three):

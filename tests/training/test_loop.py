@@ -88,6 +88,14 @@ def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
     assert log == (directory / "metrics.jsonl").read_bytes()
 
 
+def test_a_stop_right_after_a_checkpoint_does_not_write_it_again(monkeypatch, tmp_path):
+    written, save = [], checkpoint.save
+    monkeypatch.setattr(checkpoint, "save", lambda *a, **k: written.append(a[1]) or save(*a, **k))
+    with pytest.raises(loop.Interrupted, match="stopped after step 4 of 12"):
+        jobs.train(tmp_path, should_stop=lambda: bool(written))
+    assert written == [4]
+
+
 def test_a_finished_run_is_only_loaded(whole, monkeypatch):
     directory, result = whole
     monkeypatch.setattr(advance, "_compiled_beside", lambda *_: pytest.fail("compiles a step"))

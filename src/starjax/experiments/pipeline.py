@@ -171,7 +171,10 @@ def _report(out: Path, names: Sequence[str]) -> None:
     scored = [out / name for name in methods.METHODS if (out / name / "result.json").exists()]
     words.stage("report", f"of {', '.join(path.name for path in scored)}, into {out / 'report'}")
     with clock.timed(out, "report"):
-        page = build.build(scored, out / "report", report=words.indented)
+        try:
+            page = build.build(scored, out / "report", report=words.indented)
+        except ValueError as error:  # of a damaged file, which it names
+            raise config_lib.UsageError(str(error)) from error
     results = [files.read_json(out / name / "result.json") for name in names]
     print(f"\n{words.outcome(results)}\n\nreport: {page}", flush=True)
 

@@ -42,6 +42,9 @@ def steps(directory: str | os.PathLike) -> list[int]:
 def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> pathlib.Path:
     """Writes a step, and afterwards removes all but the newest `keep`.
 
+    Steps from this one on are removed first: `restore` found them damaged, and the training went
+    back before them.
+
     All processes of a run call it together: each writes its part of the arrays, the first the rest.
 
     Raises:
@@ -71,7 +74,9 @@ def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> p
                 f"continues from step {max(steps(root), default=0)}"
             ) from error
         raise
-    shutil.rmtree(final, ignore_errors=True)  # a damaged one that was trained past again
+    for refused in steps(root):
+        if refused >= step:
+            _remove(path_of(root, refused))
     writing.rename(final)
     _sync(root)
     for old in steps(root)[:-keep]:

@@ -108,7 +108,7 @@ def run(
     if state is None:
         state = states.run_once(around, _begun(begun, policy_config, train_config))
         state = devices.replicate(state, mesh)
-    step = first = int(state.step)
+    step = saved = int(state.step)
     metrics.resume(log, step)
     judge = holdout.make(policy, policy_config, dataset, held_out) if processes.is_first() else None
     if step == train_config.steps:
@@ -126,7 +126,7 @@ def run(
             # Processes of one run stop together, and after the same steps.
             stop, call = processes.agree(should_stop(), call)
             if stop:
-                if step > first:
+                if step > saved:
                     _save(directory, advance.end(carried), train_config)
                 raise Interrupted(
                     f"stopped after step {step} of {train_config.steps}; what is done is in "
@@ -148,6 +148,7 @@ def run(
                     errors = judge(processes.own(state))
                     metrics.append(log, step, "holdout", errors)
                 _save(directory, state, train_config)
+                saved = step
                 del state
             show(count, note=note)
     state = advance.end(carried)

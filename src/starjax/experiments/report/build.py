@@ -41,9 +41,7 @@ def build(
     with files.lock(out):
         files.write_bytes(out / "tables.md", tables.markdown(loaded).encode())
         pictures = _figures(loaded, focus, sim, out)
-        film = (
-            video.record(loaded, sim, out / "rollout.mp4", report) if with_video and sim else None
-        )
+        film = _film(loaded, sim, out / "rollout.mp4", report) if with_video and sim else None
         clip = film.read_bytes() if film else None
         index = out / "index.html"
         files.write_bytes(index, page.render(loaded, focus, pictures, clip).encode())
@@ -71,7 +69,27 @@ def _name(run: results.Run, runs: Sequence[results.Run]) -> str:
     seeds = [other.result.get("config", {}).get("seed") for other in alike]
     if None not in seeds and len(set(seeds)) == len(seeds):
         return f"{run.label} (seed {run.result['config']['seed']})"
-    return f"{run.label} ({run.path.parent.name}/{run.path.name})"
+    return f"{run.label} ({_place(run, alike)})"
+
+
+def _place(run: results.Run, others: Sequence[results.Run]) -> str:
+    """As much of a run's path, from its end, as sets it apart."""
+    parts = [other.path.absolute().parts for other in others]
+    for count in range(2, max(map(len, parts))):
+        if len({path[-count:] for path in parts}) == len(parts):
+            return "/".join(run.path.absolute().parts[-count:])
+    return str(run.path)
+
+
+def _film(
+    runs: Sequence[results.Run], sim: Any, path: pathlib.Path, report: Callable[[str], None]
+) -> pathlib.Path | None:
+    """The video, or None after a line that says why there is none: the page is worth more."""
+    try:
+        return video.record(runs, sim, path, report)
+    except (OSError, RuntimeError) as error:  # the encoder is a program of its own
+        report(f"no video: {error}")
+        return None
 
 
 def _focus(runs: Sequence[results.Run]) -> results.Run:

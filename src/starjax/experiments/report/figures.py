@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from starjax.experiments.report import outcomes, results, stats, style
+from starjax.experiments.report import outcomes, results, stats, style, words
 
 _BIN = 0.005  # m of distance pooled in one point
 _SMOOTH = 0.008  # m, width of the kernel behind the heat map
@@ -19,14 +19,15 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
     with style.use(dark) as shades:
         figure = Figure((7.4, 3.4), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
+        strokes = style.strokes([run.result["method"] for run in runs])
         for i, run in enumerate(runs):
             if len(runs) == 1:
                 _band(left, run, shades)
             else:
-                _whiskers(left, run, (i - (len(runs) - 1) / 2) * 0.35)
+                _whiskers(left, run, (i - (len(runs) - 1) / 2) * 0.35, strokes[i])
         left.set_xlabel("distance to the nearest training trocar (mm)")
         left.set_ylabel("success rate")
-        name = focus.label if len(runs) == 1 else f"{len(runs)} methods"
+        name = focus.label if len(runs) == 1 else words.several(runs)
         left.set_title(f"{name} from {results.observed(runs)}, 95% Wilson intervals")
         style.percent_axis(left)
         if len(runs) > 1:
@@ -43,7 +44,7 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
     from matplotlib import ticker
     from matplotlib.figure import Figure
 
-    runs = list({run.weights_of: run for run in reversed(runs)}.values())[::-1]
+    runs = list({(run.path.parent, run.weights_of): run for run in reversed(runs)}.values())[::-1]
     panels = [
         (name, title)
         for name, title in CURVES.items()
@@ -53,12 +54,14 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
         return None
     with style.use(dark):
         figure = Figure((2.6 * len(panels), 2.4), layout="constrained")
+        strokes = style.strokes([run.result["method"] for run in runs])
         for axis, (name, title) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
-            for run in runs:
+            for run, stroke in zip(runs, strokes):
                 points = [(line["step"], line[name]) for line in run.curves if name in line]
                 color, _ = style.method(run.result["method"])
                 if points:
-                    axis.plot(*np.array(points).T, color=color, linewidth=1.3, label=run.label)
+                    line = {"color": color, "linewidth": 1.3, "linestyle": stroke}
+                    axis.plot(*np.array(points).T, label=run.label, **line)
             axis.set_title(title)
             axis.set_xlabel(f"training step (from {results.observed(runs)})")
             axis.set_yscale("log")
@@ -104,11 +107,11 @@ def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
         axis.text(at, -0.01, text, ha="center", va="bottom", fontsize=6.5, color=shades["muted"])
 
 
-def _whiskers(axis: Any, run: results.Run, offset: float) -> None:
+def _whiskers(axis: Any, run: results.Run, offset: float, stroke: str) -> None:
     """One of several methods: a line with whiskers, `offset` mm aside to hide no other."""
     points = _pooled(run)
     x, scores = [at + offset for at, _ in points], [score for _, score in points]
-    style.rates(axis, x, scores, run.result["method"], run.label)
+    style.rates(axis, x, scores, run.result["method"], run.label, stroke)
 
 
 def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> None:

@@ -9,11 +9,12 @@ from starjax.experiments.report import stats, tables
 
 
 class Cell(NamedTuple):
-    """One table cell: finished HTML, and the class that sets it."""
+    """One table cell: finished HTML, the class that sets it, and how many columns it heads."""
 
     html: str
     kind: str = ""
     style: str = ""
+    span: int = 1
 
 
 def escape(text: object) -> str:
@@ -28,7 +29,7 @@ def number(text: str) -> Cell:
 
 def table(header: Sequence[Cell], rows: Sequence[Sequence[Cell]]) -> str:
     """A table that scrolls sideways where the screen is too narrow."""
-    head = "".join(f'<th class="{cell.kind}">{cell.html}</th>' for cell in header)
+    head = "".join(_th(cell) for cell in header)
     body = "".join(f"<tr>{''.join(_td(cell) for cell in row)}</tr>\n" for row in rows)
     top = f"<thead><tr>{head}</tr></thead>"
     return f'<div class="scroll"><table>{top}<tbody>\n{body}</tbody></table></div>'
@@ -67,13 +68,20 @@ def interval(rate: stats.Rate, part: str) -> str:
 
 def tint(rate: stats.Rate, mark: str) -> Cell:
     """A cell shaded by its rate, which a mark follows."""
-    shade = f"background:color-mix(in srgb, var(--seen) {round(70 * rate.rate)}%, transparent)"
+    most = 45  # percent of the colour: on light and dark paper the text stays readable (WCAG AA)
+    shade = f"background:color-mix(in srgb, var(--seen) {round(most * rate.rate)}%, transparent)"
     return Cell(f"{100 * rate.rate:.0f}{mark}", "tint", shade)
 
 
 def uri(kind: str, data: bytes) -> str:
     """A file inside the page."""
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def _th(cell: Cell) -> str:
+    kind = f' class="{cell.kind}"' if cell.kind else ""
+    span = f' colspan="{cell.span}" scope="colgroup"' if cell.span > 1 else ' scope="col"'
+    return f"<th{kind}{span}>{cell.html}</th>"
 
 
 def _td(cell: Cell) -> str:

@@ -41,7 +41,7 @@ def render(
     body = [
         f'<p class="eyebrow">starjax report</p><h1>{markup.escape(title)}</h1>',
         f'<p class="verdict">{markup.escape(words.verdict(runs, focus))}</p>',
-        sections.facts(runs, focus),
+        sections.facts(runs),
         sections.notes(runs),
         sections.cards(focus),
         _video(video, results.observed(runs)),

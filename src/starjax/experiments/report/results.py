@@ -110,8 +110,7 @@ def load(path: Path) -> Run:
         group=method.group,
         weights_of=method.weights_of,
         rollouts=_rollouts(path, result.get("trials") or []),
-        curves=_lines(path.parent / method.weights_of / "metrics.jsonl")
-        or _lines(path / "metrics.jsonl"),
+        curves=_curves(path, result["method"]),
         sweep=_sweep(path / "sweep.json"),
     )
 
@@ -164,10 +163,21 @@ def _sweep(file: Path) -> list[outcomes.Trial]:
     return files.read_json(file).get("trials") or [] if file.is_file() else []
 
 
+def _curves(path: Path, method: str) -> list[dict[str, Any]]:
+    """The log of a run's training, which another method's folder has where they share weights."""
+    shared = path.parent / methods.METHODS[method].weights_of
+    return (_lines(shared / "metrics.jsonl") if path.name == method else []) or _lines(
+        path / "metrics.jsonl"
+    )
+
+
 def _lines(file: Path) -> list[dict[str, Any]]:
     """What is whole of a log: a kill may have cut its last line short."""
     lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
-    return [json.loads(line) for line in lines if line.endswith("\n")]
+    try:
+        return [json.loads(line) for line in lines if line.endswith("\n")]
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged: {error}") from error
 
 
 def notes(runs: Sequence[Run]) -> list[str]:

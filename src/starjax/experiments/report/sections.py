@@ -11,28 +11,30 @@ _BARS_NOTE = (
     "Bars are 95% Wilson intervals, ticks the rates. The gap is seen minus unseen with Newcombe's "
     "95% interval; it means little where both are low."
 )
-_SCORES = (Cell("Seen"), Cell(""), Cell("Unseen"), Cell(""))
+_SCORES = (Cell("Seen", span=2), Cell("Unseen", span=2))
 
 
-def facts(runs: Sequence[results.Run], focus: results.Run) -> str:
-    """What was run, on what."""
-    result, config = focus.result, focus.result.get("config") or {}
-    trials, trocars = len(focus.trials), len(outcomes.by_trocar(focus.trials))
+def facts(runs: Sequence[results.Run]) -> str:
+    """What was run, on what: of several runs all that there is, each once."""
+    configs = [run.result.get("config") or {} for run in runs]
     items = {
-        "Observation": results.observed(runs),
-        "Trials" if len(runs) == 1 else "Trials a method": (
-            f"{trials} over {trocars} trocars" if trials else None
-        ),
-        "Preset": config.get("preset"),
-        "Seed": config.get("seed"),
-        "Hardware": words.hardware(result.get("hardware") or {}),
+        "Observation": [results.observed(runs)],
+        "Trials" if len(runs) == 1 else "Trials a run": [_trials(run) for run in runs],
+        "Preset": [config.get("preset") for config in configs],
+        "Seed": [config.get("seed") for config in configs],
+        "Hardware": [words.hardware(run.result.get("hardware") or {}) for run in runs],
     }
-    shown = [(name, value) for name, value in items.items() if value not in (None, "", {})]
-    inner = "".join(
-        f"<div><dt>{name}</dt><dd>{markup.escape(words.listing(value))}</dd></div>"
-        for name, value in shown
-    )
+    inner = ""
+    for name, values in items.items():
+        found = dict.fromkeys(str(value) for value in values if value not in (None, ""))
+        if found:
+            inner += f"<div><dt>{name}</dt><dd>{markup.escape('; '.join(found))}</dd></div>"
     return f'<dl class="facts">{inner}</dl>'
+
+
+def _trials(run: results.Run) -> str:
+    trocars = len(outcomes.by_trocar(run.trials))
+    return f"{len(run.trials)} over {trocars} trocars" if trocars else ""
 
 
 def notes(runs: Sequence[results.Run]) -> str:
@@ -131,7 +133,7 @@ def per_trocar(run: results.Run) -> str:
     if not rows:
         return ""
     right = [markup.number(text) for text in ("r", "θ", "φ")]
-    header = [Cell("Trocar"), Cell(""), *right, Cell("Success"), Cell("")]
+    header = [Cell("Trocar", span=2), *right, Cell("Success", span=2)]
     header += [markup.number("Median time"), markup.number("Worst RCM error")]
     return "<h2>Trocar by trocar</h2>\n" + markup.table(header, rows)
 

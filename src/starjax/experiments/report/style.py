@@ -15,6 +15,7 @@ SUCCESS, FAILURE = "#2083C5", "#D55E00"
 # In the order of the methods' table, so that a method keeps its colour in every figure.
 _METHODS = ("#D55E00", "#E69F00", "#CC79A7", "#8C6D4F", "#7F7F7F", "#56B4E9", "#009E73", "#2083C5")
 _MARKERS = "sD^v<>Po"
+_STROKES = ("-", "--", ":", "-.")
 MAP = "cividis"  # perceptually even, the same to every kind of colour vision
 
 _LIGHT = {"ink": "#1d2329", "muted": "#6b7480", "line": "#d9dee3", "paper": "#ffffff"}
@@ -58,12 +59,25 @@ def method(name: str) -> tuple[str, str]:
     return _METHODS[index], _MARKERS[index]
 
 
-def rates(axis: Any, x: Sequence[float], scores: Sequence[stats.Rate], name: str, label: str):
+def strokes(names: Sequence[str]) -> list[str]:
+    """A line style for each of several runs of these methods, which share a method's colour."""
+    return [_STROKES[names[:i].count(name) % len(_STROKES)] for i, name in enumerate(names)]
+
+
+def rates(
+    axis: Any,
+    x: Sequence[float],
+    scores: Sequence[stats.Rate],
+    name: str,
+    label: str,
+    stroke: str = "-",
+):
     """A method's rates at `x`: a line in its colour, with whiskers from low to high."""
     color, marker = method(name)
     middle = [score.rate for score in scores]
     ends = [[s.rate - s.low for s in scores], [s.high - s.rate for s in scores]]
-    axis.plot(x, middle, color=color, linewidth=1.2, marker=marker, markersize=4, label=label)
+    line = {"color": color, "linewidth": 1.2, "linestyle": stroke}
+    axis.plot(x, middle, marker=marker, markersize=4, label=label, **line)
     axis.errorbar(x, middle, ends, color=color, linewidth=0.8, linestyle="")
 
 

@@ -1,5 +1,6 @@
 """The paper's tables as markdown: success (III), paired tests, RCM error, inference time (IV)."""
 
+import itertools
 from collections.abc import Callable, Sequence
 
 from starjax.experiments.report import outcomes, results, stats, words
@@ -89,26 +90,26 @@ def by_test(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = rat
 
 def failures(runs: Sequence[results.Run]) -> Table:
     """Failed trials by class, classes that never occurred left out."""
-    counts = {run.label: outcomes.failures(run.trials) for run in runs if run.trials}
-    classes = [key for key in outcomes.FAILURES if any(key in found for found in counts.values())]
+    counts = [(run.label, outcomes.failures(run.trials)) for run in runs if run.trials]
+    classes = [key for key in outcomes.FAILURES if any(key in found for _, found in counts)]
     table = [["Method", *(outcomes.SHORT[key].capitalize() for key in classes)]]
     if classes:
-        table += [
-            [label, *(str(found.get(k, 0)) for k in classes)] for label, found in counts.items()
-        ]
+        table += [[label, *(str(found.get(k, 0)) for k in classes)] for label, found in counts]
     return table
 
 
 def paired(runs: Sequence[results.Run]) -> Table:
-    """McNemar's test of STAR-Diff against every other method."""
+    """McNemar's test of every run of STAR-Diff against each run that met the same trials."""
     table = [["Against", "Pairs", "Only STAR-Diff", "Only the other", "p", "p (Holm)"]]
-    first = next((run for run in runs if run.result["method"] == results.OURS), None)
-    tests = [(run, results.pair(first, run)) for run in runs if first and run is not first]
-    found = [(run, test) for run, test in tests if test]
-    corrected = stats.holm([test.p for _, test in found])
-    for (run, test), p in zip(found, corrected):
+    ours = [run for run in runs if run.result["method"] == results.OURS]
+    others = [run for run in runs if run.result["method"] != results.OURS]
+    pairs = [*itertools.product(ours, others), *itertools.combinations(ours, 2)]
+    found = [(a, b, test) for a, b in pairs if (test := results.pair(a, b))]
+    corrected = stats.holm([test.p for *_, test in found])
+    for (a, b, test), p in zip(found, corrected):
         counts = [str(n) for n in (test.pairs, test.only_a, test.only_b)]
-        table.append([run.label, *counts, p_value(test.p), p_value(p)])
+        against = b.label if len(ours) == 1 else f"{b.label}, of {a.label}"
+        table.append([against, *counts, p_value(test.p), p_value(p)])
     return table
 
 
@@ -142,11 +143,11 @@ def inference(runs: Sequence[results.Run]) -> Table:
 
 def phases(runs: Sequence[results.Run]) -> Table:
     """Wall-clock time of the phases that each result rests on."""
-    times = {run.label: run.result.get("timings_s") or {} for run in runs}
-    every = dict.fromkeys(name for found in times.values() for name in found)
+    times = [(run.label, run.result.get("timings_s") or {}) for run in runs]
+    every = dict.fromkeys(name for _, found in times for name in found)
     names = [name for name in every if not name.endswith(_COMPILE)]
     table = [["Method", *(name.capitalize() for name in names), "Total", "Of it compiling"]]
-    for label, found in times.items():
+    for label, found in times:
         if any(name in found for name in names):
             sums = [sum(found.get(n + end, 0.0) for n in names) for end in ("", _COMPILE)]
             cells = [words.duration(found[n]) if n in found else "–" for n in names]

@@ -95,7 +95,7 @@ def _panel(
         dashed = len(runs) > 1 and not won
         if len(runs) == 1:
             color = style.SUCCESS if won else style.FAILURE
-        _path(axis, rollout, color, dashed, fan=rollout is drawn[-1][1])
+        _path(axis, rollout, color, dashed, rollout is drawn[-1][1], shades)
     axis.plot(*_flat(trocar), "x", color=shades["ink"], markersize=9, markeredgewidth=2, zorder=9)
 
 
@@ -113,14 +113,21 @@ def _boards(axis: Any, pegs: np.ndarray, shades: dict[str, str]) -> None:
         axis.plot(*stick.T, color=shades["muted"], linewidth=2.0, solid_capstyle="round", zorder=2)
 
 
-def _path(axis: Any, rollout: results.Rollout, color: str, dashed: bool, fan: bool) -> None:
+def _path(
+    axis: Any,
+    rollout: results.Rollout,
+    color: str,
+    dashed: bool,
+    fan: bool,
+    shades: dict[str, str],
+) -> None:
     tip, trocar = rollout.p_world_tip, rollout.p_world_trocar
     if fan:
         for point in tip[np.linspace(0, len(tip) - 1, _FAN).round().astype(int)]:
             beyond = trocar + 0.02 * (trocar - point) / max(np.linalg.norm(trocar - point), 1e-9)
             axis.plot(*_flat(np.stack([beyond, point])).T, color=color, linewidth=0.6, alpha=0.34)
     shadow = _flat(tip * np.array([1.0, 1.0, 0.0]))
-    axis.plot(*shadow.T, color="black", linewidth=1.0, alpha=0.12, zorder=1)
+    axis.plot(*shadow.T, color=shades["muted"], linewidth=1.0, alpha=0.4, zorder=1)
     flat = _flat(tip)
     axis.plot(*flat.T, color=color, linewidth=1.4, linestyle="--" if dashed else "-", zorder=5)
     axis.plot(*flat[0], "o", color=color, markersize=4, markerfacecolor="none", zorder=6)

@@ -121,7 +121,13 @@ def renderer(sim: Any, size: int = SIZE) -> Draw:
 
 
 def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) -> None:
-    """Writes `[h, w, 3]` uint8 pictures as H.264 in yuv420p, which every browser plays."""
+    """Writes `[h, w, 3]` uint8 pictures as H.264 in yuv420p, which every browser plays.
+
+    The file appears whole or not at all.
+
+    Raises:
+      OSError, RuntimeError: the encoder failed, or there is none for this machine.
+    """
     import imageio_ffmpeg
 
     stream = iter(pictures)
@@ -134,8 +140,9 @@ def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) ->
     coded = ["-c:v", "libx264", "-crf", "23", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     # Not imageio's own writer: it forks, and jax's threads do not survive a fork.
     program = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+    staged = path.with_name(f".{path.name}")  # its ending tells the encoder what to write
     with subprocess.Popen(
-        [*program, *source, *coded, str(path)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        [*program, *source, *coded, str(staged)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
     ) as encoder:
         assert encoder.stdin and encoder.stderr
         # A pipe breaks when the encoder has given up; it has said why.
@@ -145,7 +152,9 @@ def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) ->
             encoder.stdin.close()
         said = encoder.stderr.read().decode().strip()
     if encoder.returncode:
+        staged.unlink(missing_ok=True)
         raise OSError(f"{path}: the video could not be written: {said or encoder.returncode}")
+    staged.replace(path)
 
 
 def caption(rows: Sequence[Sequence[tuple[str, str]]], width: int) -> np.ndarray:

@@ -10,7 +10,14 @@ def title(runs: Sequence[results.Run]) -> str:
     """Heading of the page."""
     if len(runs) == 1:
         return f"{runs[0].label} on peg transfer"
-    return f"{len(runs)} methods on peg transfer"
+    return f"{several(runs)} on peg transfer"
+
+
+def several(runs: Sequence[results.Run]) -> str:
+    """E.g. `3 methods`, `4 runs of 2 methods`."""
+    count = len({run.result["method"] for run in runs})
+    methods = f"{count} method{'s' if count > 1 else ''}"
+    return methods if count == len(runs) else f"{len(runs)} runs of {methods}"
 
 
 def verdict(runs: Sequence[results.Run], focus: results.Run) -> str:
