@@ -1,6 +1,9 @@
 """The doctor finds what is planted, and gives each fault one remedy."""
 
 import importlib.metadata
+import sys
+
+import pytest
 
 from starjax import doctor
 
@@ -35,6 +38,23 @@ def test_versions_that_do_not_fit_are_found(monkeypatch):
     assert "untested" in faults(doctor.packages())[0].remedy
     del found["mujoco"]
     assert "mujoco not installed" in faults(doctor.packages())[0].remedy
+
+
+def test_what_is_not_installed_ends_the_search_before_it_is_needed(monkeypatch, capsys):
+    def absent(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", absent)
+    monkeypatch.setattr(doctor, "devices", lambda: pytest.fail("jax was asked"))
+    assert doctor.main([]) == 1
+    said = capsys.readouterr().out
+    assert "jax, jaxlib, mujoco, mujoco-mjx not installed" in said and "left out" in said
+
+
+def test_a_missing_encoder_is_found(monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    (fault,) = faults(doctor.video())
+    assert fault.remedy == "pip install imageio-ffmpeg"
 
 
 def test_unwritable_cache_and_little_memory_are_found(monkeypatch, tmp_path):

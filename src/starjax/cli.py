@@ -87,8 +87,8 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         if not str(error).startswith("RESOURCE_EXHAUSTED"):
             raise
         said = str(error).splitlines()[0].removeprefix("RESOURCE_EXHAUSTED: ")
-        less = "--train.batch-size for training, --eval.chunk for trials"
-        return _fail(f"{said} Too much for this device's memory: lower {less}", 71)
+        less = "in training lower --train.batch-size, for the rest start with JAX_PLATFORMS=cpu"
+        return _fail(f"{said} Too much for this device's memory: {less}", 71)
 
 
 def dispatch(argv: Sequence[str]) -> int:

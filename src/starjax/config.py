@@ -97,7 +97,7 @@ class TrainConfig:
     jitter: float = 0.1  # brightness, contrast, saturation: +- this
     image_noise: float = 0.02  # standard deviation, of [0, 1]
     state_noise: float = 0.02  # standard deviation, of normalised low-dimensional inputs
-    steps_per_call: int = 100  # train steps in one compiled scan
+    steps_per_call: int = 100  # train steps handed to the device between two looks, at most
     checkpoint_every: int = 5_000
     keep_checkpoints: int = 2
     log_every: int = 100
@@ -110,7 +110,7 @@ class EvalConfig:
 
     trials: int = 30  # a trocar
     time_limit_s: float = 60.0
-    chunk: int = 0  # environments simulated at once; 0: as many as memory allows
+    chunk: int = 0  # trials between two savings, at most; 0: as many as run at once
     video_trials: int = 4  # trials recorded for the video and the figures
 
 

@@ -40,8 +40,8 @@ def main(argv: Sequence[str]) -> int:
     # The order matters: a wrong XLA flag ends the process as soon as jax starts.
     checks: list[Callable[[], list[Finding]]] = [packages, xla_flags, storage, memory]
     findings = [finding for check in checks for finding in _shown(check)]
-    if any(finding.name == "XLA_FLAGS" and finding.remedy for finding in findings):
-        print("       the checks that start jax were left out: it would abort")
+    if any(finding.name in ("packages", "XLA_FLAGS") and finding.remedy for finding in findings):
+        print("       the checks that start jax were left out: it would fail")
     else:
         findings += [finding for check in (devices, scene, video) for finding in _shown(check)]
     faults = sum(bool(finding.remedy) for finding in findings)
@@ -57,7 +57,8 @@ def packages() -> list[Finding]:
     missing = [name for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx") if name not in found]
     if missing:
         remedy = f"{', '.join(missing)} not installed: pip install -e . in starjax's folder"
-    elif found["jax"] != found["jaxlib"]:
+        return [Finding("packages", text, remedy)]
+    if found["jax"] != found["jaxlib"]:
         remedy = f"jax and jaxlib differ: pip install jax=={found['jax']} jaxlib=={found['jax']}"
     elif not (0, 10) <= _numbers(found["jax"])[:2] < (0, 12):
         remedy = f"jax {found['jax']} is untested: pip install 'jax>=0.10.2,<0.12'"
@@ -68,7 +69,10 @@ def xla_flags() -> list[Finding]:
     """Whether XLA_FLAGS suits this jaxlib: the flag that speeds up 0.10 makes 0.11 abort."""
     flag = "--xla_cpu_use_fusion_emitters"
     typed = os.environ.get("XLA_FLAGS", "")
-    recent = _numbers(importlib.metadata.version("jaxlib"))[:2] >= (0, 11)
+    try:
+        recent = _numbers(importlib.metadata.version("jaxlib"))[:2] >= (0, 11)
+    except importlib.metadata.PackageNotFoundError:  # said before
+        return []
     if recent and flag in typed:
         return [Finding("XLA_FLAGS", typed, f"jaxlib >= 0.11 aborts on {flag}: take it out")]
     if not recent and f"{flag}=true" in typed:
@@ -98,7 +102,7 @@ def memory() -> list[Finding]:
     """Free memory of the host."""
     free = xla.available_bytes()
     value = f"{files.size(free)} free of {files.size(xla.memory_bytes())}"
-    remedy = f"close programs, or lower --eval.chunk: {files.size(NEEDED_MEMORY)} are wanted"
+    remedy = f"close programs: {files.size(NEEDED_MEMORY)} are wanted"
     return [Finding("memory", value, remedy if free < NEEDED_MEMORY else "")]
 
 
@@ -139,11 +143,11 @@ def scene() -> list[Finding]:
 
 def video() -> list[Finding]:
     """Whether the report can write videos."""
-    import imageio_ffmpeg
-
     try:
+        import imageio_ffmpeg
+
         return [Finding("ffmpeg", imageio_ffmpeg.get_ffmpeg_version())]
-    except RuntimeError as error:
+    except (ImportError, RuntimeError) as error:
         return [Finding("ffmpeg", str(error).splitlines()[0], "pip install imageio-ffmpeg")]
 
 

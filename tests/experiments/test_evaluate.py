@@ -144,6 +144,7 @@ def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):
         ([], ["RUN or --policy", "none"]),
         (["runs/x", "--policy", "y"], ["RUN or --policy", "both"]),
         (["a", "b"], ["RUN", "a b"]),
+        (["-x"], ["-x", "a flag such as --policy"]),
         (["--policy", "nowhere"], ["--policy", "a file", "nowhere"]),
         (["--policy", "x", "--eval.trials", "0"], ["--eval.trials", "got 0"]),
         (["nowhere"], ["nowhere", "a method's folder"]),

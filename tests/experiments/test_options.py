@@ -40,6 +40,7 @@ def settings(*argv: str) -> config.RunConfig:
         (["--method", "stardif"], ["--method", "dp_rcm4", "did you mean stardiff"]),
         (["--preset", "cpi"], ["--preset", "smoke", "did you mean cpu"]),
         (["--policy.execute", "17"], ["--policy.execute", "16", "17"]),
+        (["--policy.obs-horizon", "10"], ["--policy.obs-horizon", "policy.execute + 1 = 9", "10"]),
         (["--policy.unet-channels", "64", "100"], ["--policy.unet-channels", "8", "100"]),
         (["--train.steps", "0"], ["--train.steps", "more than 0", "0"]),
         (["--demos.seen-trocars=9"], ["--demos.seen-trocars", "1 to 8", "9"]),
@@ -262,8 +263,19 @@ def test_jax_platforms_forbids_the_gpu(monkeypatch):
     monkeypatch.setattr(presets, "has_gpu_plugin", lambda: True)
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     assert not presets.has_gpu()
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu,cuda")  # jax takes the first
+    assert not presets.has_gpu()
     monkeypatch.setenv("JAX_PLATFORMS", "cuda,cpu")
     assert presets.has_gpu()
+
+
+@pytest.mark.parametrize(("visible", "seen"), [("", False), ("-1", False), ("1", True)])
+def test_a_gpu_may_be_hidden(monkeypatch, visible, seen):
+    monkeypatch.setattr(presets, "has_gpu_device", lambda: True)
+    monkeypatch.setattr(presets, "has_gpu_plugin", lambda: True)
+    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert presets.has_gpu() == seen
 
 
 @pytest.mark.parametrize("name", presets.PRESETS)

@@ -158,7 +158,8 @@ def test_a_missing_file_is_one_line():
 def test_torchvision_fills_a_trunk_only(tmp_path):
     path = tmp_path / "resnet18.safetensors"
     safetensors.numpy.save_file({"conv1.weight": np.zeros((64, 3, 7, 7), np.float32)}, path)
-    assert encoder.read(settings(path, encoder="resnet18"), TRAIN) is None
+    with pytest.raises(config.UsageError, match=r"--policy.encoder-weights: .*weight is missing"):
+        encoder.read(settings(path, encoder="resnet18", image_size=64), TRAIN)
     with pytest.raises(config.UsageError, match=r"--policy.encoder: expected resnet18 .*got small"):
         encoder.read(settings(path), TRAIN)
     with pytest.raises(config.UsageError, match=r"--policy.freeze-encoder: .*keypoints untrained"):
@@ -181,6 +182,7 @@ def test_torchvision_still_starts_a_policy(tmp_path):
     path = tmp_path / "resnet18.safetensors"
     safetensors.numpy.save_file(flat, path)
     ours = settings(path, encoder="resnet18", image_size=64)
+    assert encoder.read(ours, TRAIN) is None
     found = encoder.start(begun, ours, TRAIN)["vision"]["params"]
     assert (found["trunk"]["conv1"]["kernel"] == 0.5).all()
     assert (found["keypoints"] == 0.25).all()

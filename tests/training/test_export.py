@@ -65,6 +65,14 @@ def random(largest=4.0, size=(100, 300)):
     return trained()._replace(params=params)
 
 
+def test_a_setting_of_a_newer_version_is_named_with_its_file(tmp_path, monkeypatch):
+    asdict = export.dataclasses.asdict
+    monkeypatch.setattr(export.dataclasses, "asdict", lambda x: {**asdict(x), "future": 1})
+    export.save(tmp_path / "p", trained())
+    with pytest.raises(ValueError, match=r"p: made by another version of starjax: .*'future'"):
+        export.load(tmp_path / "p")
+
+
 def test_half_precision_is_half_the_size_and_rounds(tmp_path):
     one = random()
     export.save(tmp_path / "full", one)

@@ -37,10 +37,6 @@ class MinMax:
     def denormalize(self, x: jax.Array) -> jax.Array:
         return (x + 1.0) * (0.5 * (self.high - self.low)) + self.low
 
-    def part(self, index: slice) -> "MinMax":
-        """The same map for some of the entries."""
-        return MinMax(self.low[index], self.high[index])
-
 
 @flax.struct.dataclass
 class Normalizer:

@@ -57,8 +57,8 @@ def evaluate(
       obs_horizon: observations the policy sees.
       execute: commands executed before re-planning.
       time_limit_s: of a trial, simulated.
-      chunk: trials simulated at once, at most; 0 for what suits the machine. Does not change the
-        result.
+      chunk: trials that are simulated and saved together, at most; 0 for as many as run at once.
+        Changes neither the result nor the memory taken.
       lanes: size of the compiled batch on each device, 0 for `rollout.lanes_per_device`: it is what
         decides memory, and may change last bits.
       video_trials: how many trials get their joint positions recorded, at least.

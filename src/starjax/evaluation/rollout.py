@@ -4,7 +4,7 @@ A trial is named by (trocar, trial). Its key is `fold_in(fold_in(key(seed), troc
 half resets the environment, the other is folded with the number of the re-plan for the policy's
 noise. So a trial does not know in which batch, on which device or beside whom it runs. Only the
 size of the compiled batch may change last bits (of matrix products, and of the simulator when it is
-small), so each device always runs `LANES` trials, some of them idle if there are fewer.
+small), so each device always runs equally many trials, some of them idle if there are fewer.
 """
 
 from collections.abc import Callable, Sequence

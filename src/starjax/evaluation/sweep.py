@@ -11,16 +11,11 @@ from starjax.evaluation import table as tables
 from starjax.rcm.trocar import Trocar
 
 
-def sample(seed: int, count: int, polar_range: tuple[float, float] | None = None) -> Trocar:
-    """`count` trocars drawn as in Eq. 19.
-
-    Args:
-      polar_range: rad; section V-A2's unless given.
-    """
+def sample(seed: int, count: int) -> Trocar:
+    """`count` trocars drawn as in Eq. 19, in section V-A2's ranges."""
     if count < 1:
         raise ValueError(f"count: expected 1 or more, got {count}")
-    ranges = {"polar_range": polar_range} if polar_range else {}
-    drawn = rcm.sample_trocar(jax.random.key(seed), (count,), **ranges)
+    drawn = rcm.sample_trocar(jax.random.key(seed), (count,))
     return Trocar(*(np.asarray(field) for field in drawn))
 
 

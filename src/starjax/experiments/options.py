@@ -108,7 +108,7 @@ def _is_positional(settings: type, name: str) -> bool:
 
 def _count_positional(settings: type, argv: Sequence[str]) -> int:
     """Words before the first flag; UsageError unless they are as many as `settings` asks for."""
-    given = next((i for i, token in enumerate(argv) if token.startswith("--")), len(argv))
+    given = next((i for i, token in enumerate(argv) if token.startswith("-")), len(argv))
     hints = typing.get_type_hints(settings)
     fields = [f for f in dataclasses.fields(settings) if _is_positional(settings, f.name)]
     names = [field.name for field in fields]

@@ -117,8 +117,9 @@ def has_gpu() -> bool:
 
     Asked without importing jax, which takes seconds.
     """
-    platforms = os.environ.get("JAX_PLATFORMS", "")
-    allowed = not platforms or any(name in platforms for name in ("cuda", "gpu"))
+    first = os.environ.get("JAX_PLATFORMS", "").split(",")[0]
+    hidden = os.environ.get("CUDA_VISIBLE_DEVICES", "0").strip() in ("", "-1")
+    allowed = first in ("", "cuda", "gpu") and not hidden
     return allowed and has_gpu_device() and has_gpu_plugin()
 
 

@@ -139,7 +139,7 @@ def require_writable(directory: Path, free_bytes: int = 0) -> None:
     Raises:
       StorageError: it cannot be created or written, or the disk has less than `free_bytes` free.
     """
-    probe = directory / ".writable"
+    probe = directory / f".writable-{socket.gethostname()}-{os.getpid()}"
     try:
         directory.mkdir(parents=True, exist_ok=True)
         probe.write_bytes(b"x")

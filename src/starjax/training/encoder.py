@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import config
+from starjax.models import pretrained
 from starjax.policies import diffuser, features, packaged
 from starjax.policies import policy as policies
 from starjax.training import export
@@ -36,7 +37,7 @@ def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -
     name = policy_config.encoder_weights
     path = packaged.find("--policy.encoder-weights", name)
     if not export.is_policy(path):
-        _check_torchvision(policy_config)
+        _check_torchvision(policy_config, path)
         return None
     try:
         trained = export.load(path)
@@ -83,7 +84,7 @@ def _differing(
     return found
 
 
-def _check_torchvision(policy_config: config.PolicyConfig) -> None:
+def _check_torchvision(policy_config: config.PolicyConfig, path: Path) -> None:
     name = policy_config.encoder_weights
     if policy_config.freeze_encoder:
         raise config.UsageError(
@@ -95,17 +96,19 @@ def _check_torchvision(policy_config: config.PolicyConfig) -> None:
             f"--policy.encoder: expected resnet18 with weights of torchvision ({name}), "
             f"got {policy_config.encoder}"
         )
+    try:
+        pretrained.load_resnet18(_shapes(policy_config)["params"]["trunk"], path)
+    except ValueError as error:
+        raise config.UsageError(f"--policy.encoder-weights: {error}") from error
 
 
 def _check_shapes(
     policy_config: config.PolicyConfig, params: policies.Params, name: str | Path
 ) -> None:
     """UsageError unless the network of today has these parameters."""
-    vision, size = diffuser.vision_encoder(policy_config), policy_config.image_size
-    wanted = jax.eval_shape(vision.init, jax.random.key(0), jnp.zeros((1, size, size, 3)))
     shapes = [
         {jax.tree_util.keystr(path): leaf.shape for path, leaf in leaves}
-        for leaves in map(jax.tree_util.tree_leaves_with_path, (wanted, params))
+        for leaves in map(jax.tree_util.tree_leaves_with_path, (_shapes(policy_config), params))
     ]
     for key in sorted({*shapes[0], *shapes[1]}):
         want, got = (shape.get(key, "no such parameter") for shape in shapes)
@@ -113,3 +116,9 @@ def _check_shapes(
             raise config.UsageError(
                 f"--policy.encoder-weights: {name}: {key}: expected {want}, got {got}"
             )
+
+
+def _shapes(policy_config: config.PolicyConfig) -> policies.Params:
+    """The vision encoder's parameters without their numbers."""
+    vision, size = diffuser.vision_encoder(policy_config), policy_config.image_size
+    return jax.eval_shape(vision.init, jax.random.key(0), jnp.zeros((1, size, size, 3)))

@@ -112,14 +112,20 @@ def load(path: pathlib.Path | str) -> Trained:
     tree = _unflatten(arrays)
     stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
     port, demos = about["p_world_ref"], about.get("demos")
+    try:
+        policy = config.from_dict(config.PolicyConfig, about["policy"])
+        train = config.from_dict(config.TrainConfig, about["train"])
+        demos = None if demos is None else config.from_dict(config.DemosConfig, demos)
+    except ValueError as error:
+        raise ValueError(f"{path}: made by another version of starjax: {error}") from error
     return Trained(
         method=about["method"],
-        policy=config.from_dict(config.PolicyConfig, about["policy"]),
-        train=config.from_dict(config.TrainConfig, about["train"]),
+        policy=policy,
+        train=train,
         params=tree["params"],
         normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
         p_world_ref=None if port is None else tuple(port),
-        demos=None if demos is None else config.from_dict(config.DemosConfig, demos),
+        demos=demos,
         preset=about.get("preset"),
     )
 

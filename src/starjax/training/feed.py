@@ -1,4 +1,4 @@
-"""Batches of a dataset that is not on the device: gathered by a thread, one ahead of the step."""
+"""Batches of a dataset that is not on the device: gathered by a thread, ahead of the steps."""
 
 import queue
 import threading
