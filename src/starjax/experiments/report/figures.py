@@ -26,9 +26,9 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
             else:
                 _whiskers(left, run, (i - (len(runs) - 1) / 2) * 0.35, strokes[i])
         left.set_xlabel("distance to the nearest training trocar (mm)")
-        left.set_ylabel("success rate")
+        left.set_ylabel("success rate, 95% Wilson interval")
         name = focus.label if len(runs) == 1 else words.several(runs)
-        left.set_title(f"{name} from {results.observed(runs)}, 95% Wilson intervals")
+        left.set_title(f"{name} from {results.observed(runs)}")
         style.percent_axis(left)
         if len(runs) > 1:
             figure.legend(loc="outside lower left", fontsize=7, ncols=4)
