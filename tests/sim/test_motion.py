@@ -51,6 +51,13 @@ def test_inverse_kinematics_reach_every_trocar_and_peg(sim):
     assert margin.min() > 0.1  # rad
 
 
+def test_joints_stay_within_their_limits(sim):
+    out_of_reach = Pose(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))
+    q, residual = ik.solve(sim.arm, out_of_reach, jnp.asarray(sim.home), 40)
+    low, high = sim.arm.limits.T
+    assert residual > 0.1 and (q > low).all() and (q < high).all()
+
+
 def test_a_near_command_is_reached_at_once():
     trocar = first_trocar()
     here = on_manifold(trocar, jnp.array([0.01, 0.0, 0.03]), 0.1)
@@ -88,6 +95,36 @@ def test_a_command_off_the_manifold_stays_off_it():
     for _ in range(5):
         pose, velocity = tracking.toward(pose, velocity, bad, port, PERIOD)
     np.testing.assert_allclose(rcm.rcm_error(pose, port), 0.02, atol=1e-5)
+
+
+def test_a_far_command_off_the_manifold_is_missed_by_a_share_on_the_way():
+    trocar = first_trocar()
+    port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
+    pose = on_manifold(trocar, jnp.array([-0.04, 0.0, 0.03]), 0.0)
+    good = on_manifold(trocar, jnp.array([0.04, 0.0, 0.03]), 0.0)
+    bad = Pose(good.R, good.p + 0.02 * good.R[:, 1])
+    velocity, toward = jnp.zeros(4), jax.jit(tracking.toward, static_argnums=4)
+    errors = []
+    for _ in range(60):
+        pose, velocity = toward(pose, velocity, bad, port, PERIOD)
+        errors.append(float(rcm.rcm_error(pose, port)))
+    assert 0.005 < errors[15] < 0.02
+    np.testing.assert_allclose(errors[-1], 0.02, atol=1e-4)
+
+
+def test_the_roll_is_turned_no_faster_than_allowed():
+    trocar = first_trocar()
+    port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
+    pose, goal = (on_manifold(trocar, jnp.array([0.0, 0.0, 0.03]), roll) for roll in (-1.5, 1.5))
+    velocity, toward = jnp.zeros(4), jax.jit(tracking.toward, static_argnums=4)
+    spins = [0.0]
+    for _ in range(40):
+        pose, velocity = toward(pose, velocity, goal, port, PERIOD)
+        spins.append(float(velocity[3]))
+    assert np.abs(spins).max() <= tracking.MAX_SPIN * 1.001
+    fastest = tracking.MAX_SPIN_ACCELERATION * PERIOD
+    assert np.abs(np.diff(spins)).max() <= fastest * 1.001
+    np.testing.assert_allclose(pose.R, goal.R, atol=1e-3)
 
 
 def test_a_tool_leans_at_the_port_and_stays_at_its_tip():
