@@ -16,6 +16,7 @@ import kill
 import numpy as np
 import pytest
 
+from starjax.data import windows
 from starjax.experiments.methods import METHODS
 from starjax.training import advance, checkpoint, loop, metrics, parts, state, step
 
@@ -72,6 +73,48 @@ def test_statistics_are_of_the_action_space_that_is_trained(monkeypatch, tmp_pat
     given = METHODS["dp_rcm2"], fixed, jobs.SETTINGS, fakes.dataset(seed=0), fakes.P_WORLD_REF
     with pytest.raises(InterruptedError, match="rcm2_fixed_yaw"):
         loop.run(*given, tmp_path, 0)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """A policy that compiles at once."""
+    policy = jobs._quadratic_policy()
+    monkeypatch.setattr(loop.policies, "make", lambda *_: policy)
+    return policy
+
+
+def test_demonstrations_kept_out_are_neither_trained_on_nor_fitted(quick, monkeypatch, tmp_path):
+    fitted, drawn, fit, resident = [], [], loop.normalizer.fit, advance.resident
+    monkeypatch.setattr(loop.normalizer, "fit", lambda *a: fitted.append(a[3]) or fit(*a))
+    monkeypatch.setattr(
+        advance, "resident", lambda it, *a, **k: drawn.append(it.frames) or resident(it, *a, **k)
+    )
+    jobs.train(tmp_path, dataclasses.replace(jobs.SETTINGS, steps=1))
+    dataset = fakes.dataset(seed=0)
+    train, held = windows.split_holdout(dataset.start, dataset.length, jobs.SETTINGS.holdout_demos)
+    assert len(held) and not np.isin(held, train).any()
+    np.testing.assert_array_equal(fitted, [train])
+    np.testing.assert_array_equal(drawn, [train])
+
+
+def test_losses_that_are_all_broken_end_the_training(quick, monkeypatch, tmp_path):
+    broken = quick._replace(loss=lambda *a: (jnp.nan * quick.loss(*a)[0], {}))
+    monkeypatch.setattr(loop.policies, "make", lambda *_: broken)
+    said = r"in any of the 3 steps before step 3: lower --train.learning-rate"
+    with pytest.raises(loop.TrainingFailed, match=said):
+        jobs.train(tmp_path)
+
+
+def test_data_on_the_host_goes_on_where_it_was_stopped(quick, tmp_path):
+    once = jobs.train(tmp_path / "once", host=True)
+    asked = iter(range(100))
+    with pytest.raises(loop.Interrupted):
+        jobs.train(tmp_path / "twice", host=True, should_stop=lambda: next(asked) == 2)
+    assert 0 < checkpoint.steps(tmp_path / "twice/checkpoints")[-1] < 12
+    again = jobs.train(tmp_path / "twice", host=True)
+    assert_same_bytes(again.state, once.state)
+    logs = [(tmp_path / name / "metrics.jsonl").read_bytes() for name in ("once", "twice")]
+    assert logs[0] == logs[1]
 
 
 def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):

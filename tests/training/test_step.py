@@ -138,6 +138,17 @@ def test_a_broken_loss_is_left_out_and_counted(start, dataset):
     assert not np.array_equal(again.params["w"], after.params["w"])
 
 
+def test_the_average_forgets_its_beginning_as_the_paper_says(start, dataset):
+    policy, optimizer, before = start
+    run = jax.jit(program(policy, optimizer))
+    for step_before in range(5):
+        after = run(before, dataset, jnp.arange(80), jnp.int32(1))
+        kept = 1 - (1 + step_before) ** -0.75
+        wanted = kept * before.ema_params["w"] + (1 - kept) * after.params["w"]
+        np.testing.assert_allclose(after.ema_params["w"], wanted, rtol=1e-4, atol=1e-6)
+        before = after
+
+
 def test_norm_is_of_every_entry():
     shapes = {"matrix": (300, 400), "flat": (70_001,), "small": (5, 7), "vector": (3,)}
     random = np.random.default_rng(0)

@@ -1,0 +1,25 @@
+"""Batches that a thread gathers on the host."""
+
+import fakes
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import config
+from starjax.data import windows
+from starjax.training import devices, feed, step
+
+
+def test_frames_follow_the_step_from_wherever_it_begins(monkeypatch):
+    monkeypatch.setattr(feed, "_CHUNK", 4)  # several of them in ten steps
+    dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
+    frames, key, first = np.arange(40), jax.random.key(3), 3
+    settings, mesh = config.TrainConfig(batch_size=16), devices.make_mesh(16)
+    stream = feed.batches(dataset, frames, fakes.TINY, settings, mesh, key, first)
+    for number in range(first, first + 10):
+        drawn = windows.sample_frames(step.step_keys(key, number)[0], jnp.asarray(frames), 16)
+        wanted = windows.gather(
+            dataset, np.asarray(drawn), fakes.TINY.obs_horizon, fakes.TINY.horizon
+        )
+        jax.tree.map(np.testing.assert_array_equal, next(stream), wanted)
+    stream.close()

@@ -1,0 +1,25 @@
+"""The optimiser, as the paper sets it."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from starjax import config
+from starjax.training import state
+
+
+def test_the_optimiser_is_adamw_with_the_momenta_of_the_paper():
+    settings = config.TrainConfig(warmup_steps=0, weight_decay=0.5, learning_rate=0.1)
+    optimizer = state.make_optimizer(settings)
+    weight, gradient = {"w": jnp.array([2.0])}, {"w": jnp.array([3.0])}
+    updates, after = optimizer.update(gradient, optimizer.init(weight), weight)
+    np.testing.assert_allclose(updates["w"], -0.1 * (1.0 + 0.5 * 2.0), rtol=1e-5)
+
+    def is_adam(node):
+        return isinstance(node, optax.ScaleByAdamState)
+
+    (adam,) = filter(is_adam, jax.tree.leaves(after, is_leaf=is_adam))
+    wanted = {"w": jnp.array([0.05 * 3])}, {"w": jnp.array([0.001 * 9])}
+    chex.assert_trees_all_close((adam.mu, adam.nu), wanted, rtol=1e-4)
