@@ -3,8 +3,10 @@
 import dataclasses
 
 import fakes
+import pytest
 
 from starjax.evaluation import latency
+from starjax.experiments.methods import METHODS
 from starjax.models import roll_net
 
 
@@ -20,3 +22,24 @@ def test_the_roll_network_is_timed_with_what_it_is_told(monkeypatch):
         settings = dataclasses.replace(fakes.TINY, observation="state", roll_observation=told)
         assert latency.roll_ms(settings, calls=1)["n"] >= 1
     assert given[1] == [*given[0], fakes.TINY.state_dim]
+
+
+def test_percentiles_are_named_by_what_they_are(monkeypatch):
+    now, taken = [0.0], iter([9.0] * latency._WARM_UP + [1e-3 * ms for ms in range(1, 101)])
+
+    def call():
+        now[0] += next(taken)
+
+    monkeypatch.setattr(latency.time, "perf_counter", lambda: now[0])
+    found = latency._percentiles(call, calls=100, seconds=1e9)
+    times = [found[name] for name in ("p50", "p95", "p99")]
+    assert times == pytest.approx([50.5, 95.05, 99.01], abs=0.01) and found["n"] == 100
+
+
+def test_every_row_of_the_table_has_its_own_sampler(monkeypatch):
+    made = []
+    monkeypatch.setattr(latency.policies, "make", lambda _, chosen, *__: made.append(chosen))
+    monkeypatch.setattr(latency, "policy_ms", lambda *_, **__: {})
+    given = METHODS["stardiff"], fakes.TINY, None, None, None, None
+    rows = latency.table(*given, ddim_steps=(1, 5), batches=(1,))
+    assert [chosen.ddim_steps for chosen in made] == [row["ddim_steps"] for row in rows] == [1, 5]

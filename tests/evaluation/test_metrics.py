@@ -88,6 +88,32 @@ def test_result_splits_seen_and_unseen():
     json.dumps(found, allow_nan=False)
 
 
+def test_every_outcome_is_split_and_times_are_of_successes():
+    steps = np.array([2, 4, 60, 60], np.int32)
+    found = metrics.compose(
+        trials(
+            [1, 1, 0, 0],
+            trocar=[0, 0, 1, 1],
+            loose=np.array([1, 1, 1, 0], bool),
+            safe=np.array([1, 0, 0, 0], bool),
+            steps=steps,
+            rcm_error_mm=np.zeros(steps.sum(), np.float16),
+            rcm_max=np.full(4, 2e-3, np.float32),
+            rcm_commanded_max=np.full(4, 1e-3, np.float32),
+        ),
+        np.array([True, False]),
+        method="m",
+        observation="state",
+        seed=0,
+    )
+    for outcome, counts in {"strict": [2, 0, 2], "loose": [2, 1, 3], "safe": [1, 0, 1]}.items():
+        parts = found[outcome]
+        assert [parts[part]["successes"] for part in ("seen", "unseen", "all")] == counts
+    assert found["steps"] == {"mean": 3.0, "median": 3.0}
+    errors = [found["trials"][0][name] for name in ("rcm_max_mm", "rcm_commanded_max_mm")]
+    assert errors == pytest.approx([2.0, 1.0])
+
+
 def test_a_result_without_unseen_trocars_has_no_gap():
     found = metrics.compose(
         trials([1, 0]), np.array([True]), method="m", observation="state", seed=0

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stubs
+import synthetic
 
 from starjax import rcm
 from starjax.evaluation import evaluate, sweep
@@ -35,6 +36,14 @@ def test_distance_is_to_the_nearest_training_trocar():
     np.testing.assert_allclose(far[:8], 0, atol=1e-7)
     assert far[11] == pytest.approx(0.02, abs=1e-6)  # the centre, 2 cm from the inner four
     assert (far[8:] > 0.01).all()
+
+
+def test_seen_are_the_training_trocars_and_none_beside_them():
+    radius, polar, azimuth = (field[[0, 1, 0]] for field in rcm.TROCARS)
+    near = rcm.Trocar(radius + np.float32([0, 0, 0.004]), polar, azimuth)
+    found = synthetic.outcomes(np.random.default_rng(0), near, np.arange(3), np.ones(3))
+    result = sweep.compose(found, TRAINING, stubs.P_WORLD_REF, seed=0)
+    assert [trial["seen"] for trial in result["trials"]] == [True, True, False]
 
 
 def test_a_sweep_of_a_policy(tmp_path):
