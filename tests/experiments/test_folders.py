@@ -44,6 +44,27 @@ def test_weights_of_other_settings_are_refused_by_name(tmp_path, parts, word):
     assert str(caught.value).startswith(f"{word}: ")
 
 
+def another(value):
+    match value:
+        case bool():
+            return not value
+        case str():
+            return value + "x"
+        case tuple():
+            return value + value[:1]
+    return value + 1
+
+
+@pytest.mark.parametrize("part", ["demos", "policy", "train"])
+def test_every_setting_but_three_decides_the_weights(tmp_path, part):
+    claimed(tmp_path)
+    names = [field.name for field in dataclasses.fields(getattr(SMOKE, part))]
+    for name in {*names} - {"keep_checkpoints", "checkpoint_every", "steps_per_call"}:
+        other = changed(**{part: {name: another(getattr(getattr(SMOKE, part), name))}})
+        with pytest.raises(config.UsageError, match=f"^--{part}.{name.replace('_', '-')}: "):
+            folders.claim(tmp_path, other, "demos-a")
+
+
 def test_weights_of_another_scene_are_refused(tmp_path):
     claimed(tmp_path)
     with pytest.raises(config.UsageError, match="demos-a, got demos-b"):

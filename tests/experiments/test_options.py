@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import stubs
 
@@ -20,6 +21,7 @@ from starjax.experiments import (
     run,
     sweep,
 )
+from starjax.runtime import files
 
 SMOKE = presets.PRESETS["smoke"]
 
@@ -278,6 +280,23 @@ def test_a_gpu_may_be_hidden(monkeypatch, visible, seen):
     assert presets.has_gpu() == seen
 
 
+@pytest.mark.parametrize(("device", "plugin"), [(True, False), (False, True)])
+def test_a_gpu_is_a_device_with_its_plugin(monkeypatch, device, plugin):
+    monkeypatch.setattr(presets, "has_gpu_device", lambda: device)
+    monkeypatch.setattr(presets, "has_gpu_plugin", lambda: plugin)
+    for name in ("JAX_PLATFORMS", "CUDA_VISIBLE_DEVICES"):
+        monkeypatch.delenv(name, raising=False)
+    assert not presets.has_gpu()
+
+
+def test_a_grid_is_in_centimetres_and_degrees():
+    grid = {"radii_cm": (2.0, 5.0), "polars_deg": (70.0,), "azimuths": 4}
+    found = sweep._trocars(sweep.Options(run="x", **grid))
+    np.testing.assert_allclose(np.unique(found.radius), [0.02, 0.05], rtol=1e-6)
+    np.testing.assert_allclose(np.rad2deg(found.polar), 70, rtol=1e-6)
+    np.testing.assert_allclose(np.rad2deg(found.azimuth[:4]), [0, 90, 180, 270], atol=1e-4)
+
+
 @pytest.mark.parametrize("name", presets.PRESETS)
 @pytest.mark.parametrize("method", [*methods.METHODS, "all"])
 def test_presets_pass_their_own_checks(name, method):
@@ -318,6 +337,7 @@ def test_every_field_has_its_flag():
         (KeyboardInterrupt(), 130, "same command"),
         (OSError(28, "No space left on device", "runs/x"), 74, "runs/x"),
         (PermissionError(13, "Permission denied", "runs/y"), 74, "runs/y"),
+        (files.StorageError("runs/z: the disk is full"), 74, "runs/z"),
     ],
 )
 def test_guard_turns_what_a_user_can_mend_into_one_line(error, code, word, capsys):

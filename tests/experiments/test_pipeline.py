@@ -4,7 +4,9 @@ import dataclasses
 import json
 import os
 import signal
+import types
 
+import fakes
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from starjax.data import normalizer
 from starjax.experiments import demonstrations, folders, methods, pipeline, presets, words
 from starjax.policies import packaged
 from starjax.runtime import files
-from starjax.training import export
+from starjax.training import export, loop
 
 
 def test_a_damaged_result_of_another_method_is_one_line(tmp_path):
@@ -83,6 +85,17 @@ def test_a_folder_that_cannot_be_made_is_refused_early(tmp_path, done):
     with pytest.raises(files.StorageError, match="file"):
         pipeline.run(smoke(tmp_path / "file" / "below", "stardiff"), pipeline.STAGES, "")
     assert not done
+
+
+def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
+    stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
+    raw, average = {"w": np.zeros(3)}, {"w": np.ones(3)}
+    state = types.SimpleNamespace(params=raw, ema_params=average, normalizer=stats)
+    monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
+    env = types.SimpleNamespace(p_world_ref=fakes.P_WORLD_REF)
+    pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None)
+    kept = export.load(folders.weights(tmp_path, "stardiff"))
+    np.testing.assert_array_equal(kept.params["w"], np.ones(3))
 
 
 def test_first_signal_asks_and_second_ends():
@@ -175,3 +188,21 @@ def test_warnings_name_what_a_reader_must_know():
     assert "not pixels" in smoke_words and "too short" in smoke_words and "2 trial" in smoke_words
     (paper,) = words.warnings(config.RunConfig(), {"invalid": 0})
     assert "Image encoder: trained from scratch; resnet18, 256 px" in paper
+
+
+def test_seen_comes_before_unseen_in_the_outcome():
+    def rate(successes, trials):
+        found = {"successes": successes, "trials": trials, "rate": successes / trials}
+        return {**found, "ci95": [0.0, 1.0]}
+
+    result = {
+        "method": "stardiff",
+        "seen": rate(1, 8),
+        "unseen": rate(2, 4),
+        "safe": {"all": rate(3, 12)},
+        "rcm_error_mm": {"executed": {"mean": 0.1, "max": 0.2}},
+    }
+    head, row = words.outcome([result]).splitlines()
+    assert row.index("1/8") == head.index(" seen") + 1
+    assert row.index("2/4") == head.index("unseen")
+    assert row.index("3/12") == head.index("safe")
