@@ -112,6 +112,30 @@ def test_observations_hold_what_they_say(environment, reset):
     np.testing.assert_allclose(seen.state[:3], state.block_pose.p)
     np.testing.assert_allclose(rcm.rot6d_decode(seen.state[3:9]), state.block_pose.R, atol=1e-6)
     np.testing.assert_allclose(seen.state[9:11], environment.model.pegs[int(state.target)])
+    half_open = state.replace(gripper=jnp.float32(0.3), gripper_target=-jnp.ones(()))
+    assert float(environment.observe(half_open).gripper) == jnp.float32(0.3), "measured"
+
+
+def test_a_collision_and_a_near_miss_are_remembered(reset, begin, drive):
+    state = reset(13)
+    yes = jnp.ones_like(state.collided)
+    after, _ = drive(state.replace(collided=yes, loose=yes), begin(state, 14))
+    assert after.collided.all() and after.loose.all()
+
+
+def test_the_picture_shows_the_port_and_the_target_of_its_episode(reset):
+    state = jax.tree.map(lambda leaf: leaf[0], reset(2))
+    observe = jax.jit(envs.make("image", 32).observe)
+
+    def picture(**other):
+        return np.asarray(observe(state.replace(**other)).image)
+
+    here = picture()
+    assert here.shape == (32, 32, 3) and here.dtype == np.uint8
+    elsewhere = jax.tree.map(lambda field: jnp.asarray(field[9]), rcm.Trocar(*rcm.TROCARS))
+    assert (picture(trocar=elsewhere) != here).any()
+    assert (picture(target=6 + (state.target - 5) % 6) != here).any()
+    assert (picture(source=(state.source + 1) % 6) == here).all()
 
 
 def test_the_target_peg_is_marked_in_the_picture(sim):
