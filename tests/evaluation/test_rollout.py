@@ -1,8 +1,10 @@
 """Closed-loop rollouts: what a trial is, and that neither its neighbours nor kills change it."""
 
 import json
+import shutil
 import subprocess
 import sys
+import types
 from typing import Any
 
 import fakes
@@ -26,14 +28,14 @@ TROCARS = rcm.Trocar(*(field[[0, 4, 8]] for field in rcm.TROCARS))
 KWARGS = {"trials": 2, "seed": 0, "obs_horizon": 2, "execute": 4, "time_limit_s": 1.0, "lanes": 6}
 
 
-def run(directory, policy=None, params=None, env=None, report=lambda _: None, **kwargs):
+def run(directory, policy=None, params=None, env=None, stats=1.0, report=lambda _: None, **kwargs):
     stub, weights = stubs.make_policy(width=32)
     return evaluate.evaluate(
         directory,
         env or stubs.make_env(),
         policy or stub,
         weights if params is None else params,
-        jnp.float32(1.0),
+        jnp.float32(stats),
         kwargs.pop("trocars", TROCARS),
         report=report,
         **{**KWARGS, **kwargs},
@@ -134,6 +136,30 @@ def test_other_weights_start_afresh(tmp_path, whole):
     assert not np.array_equal(other.rcm_error_mm, whole[1].rcm_error_mm)
 
 
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"seed": 1},
+        {"trocars": rcm.Trocar(*(field[[0, 4, 9]] for field in rcm.TROCARS))},
+        {"time_limit_s": 0.5},
+        {"execute": 3},
+        {"stats": 2.0},
+    ],
+    ids=lambda other: next(iter(other)),
+)
+def test_trials_of_other_settings_are_not_taken_for_these(whole, tmp_path, monkeypatch, other):
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
+
+    def trials(*_):
+        pytest.fail("begins afresh")
+
+    monkeypatch.setattr(rollout, "make", lambda *_: trials)
+    said = []
+    with pytest.raises(pytest.fail.Exception, match="begins afresh"):
+        run(tmp_path, chunk=6, video_trials=4, report=said.append, **other)
+    assert "another evaluation" in said[0]
+
+
 @pytest.mark.parametrize("what", ["scene", "versions"])
 def test_another_simulator_starts_afresh(tmp_path, whole, monkeypatch, what):
     run(tmp_path, chunk=3)
@@ -205,6 +231,12 @@ def test_recorded_trajectories_are_those_of_the_trials(whole):
             rtol=1e-3,
         )
         np.testing.assert_allclose(1e3 * found.rcm_max[at], recorded_max(kept, row), rtol=1e-6)
+
+
+def test_recorded_ports_are_those_of_the_trials(whole):
+    with np.load(whole[0] / "recorded.npz", allow_pickle=False) as kept:
+        ports = np.asarray(rcm.trocar_position(TROCARS, stubs.P_WORLD_REF))
+        np.testing.assert_allclose(kept["p_world_trocar"], ports[kept["trocar"]], atol=1e-7)
 
 
 def recorded_max(kept, row):
@@ -292,6 +324,23 @@ def test_commanded_error_counts_executed_commands_only(whole):
     path = done.steps.p_world_tip[: done.length[0], 0]
     far = np.linalg.norm(path[:, :2] - port[:2], axis=-1).max()
     np.testing.assert_allclose(done.commanded_max[0], far, atol=2e-3)
+
+
+def test_safe_is_a_success_whose_executed_error_stayed_small():
+    no, pegs = np.zeros(3, bool), np.zeros(3, int)
+    env = types.SimpleNamespace(
+        trocar=rcm.Trocar(*(np.zeros(3, np.float32),) * 3),
+        success=np.array([True, True, False]),
+        **dict.fromkeys(("invalid", "loose", "collided"), no),
+        **dict.fromkeys(("source", "target"), pegs),
+    )
+    executed = np.array([[1e-3, 1e-3, 0], [1.9e-3, 2.1e-3, 0], [9, 9, 9]], np.float32)
+    commanded = np.array([5e-3, 0, 0])
+    steps = rollout.Steps(executed, None, None)
+    done = rollout.Rollouts(env, np.array([2, 2, 2]), commanded, steps)
+    found = table.from_rollouts(done, np.arange(3), np.zeros(3, int))
+    np.testing.assert_array_equal(found.safe, [True, False, False])
+    np.testing.assert_allclose(found.rcm_max, [1.9e-3, 2.1e-3, 0])
 
 
 @pytest.mark.parametrize(
