@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 
 import fakes
 import jax.numpy as jnp
@@ -90,6 +91,25 @@ def test_the_same_command_again_runs_nothing_twice(file):
     chunks = {path: path.stat().st_mtime_ns for path in (file.parent / "here").rglob("chunk*")}
     score("--out", "here", "--no-video")
     assert chunks and all(path.stat().st_mtime_ns == then for path, then in chunks.items())
+
+
+def test_the_seed_is_that_of_the_flag(file):
+    score("--seed", "5", "--out", "here")
+    plan = json.loads((file.parent / "here" / "evaluation" / "plan.json").read_text())
+    assert plan["seed"] == 5 and plan["max_steps"] == 30
+    trials = json.loads((file.parent / "here" / "result.json").read_text())["trials"]
+    assert {trial["seed"] for trial in trials} == {5}
+
+
+def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
+    said = {}
+    monkeypatch.setattr(scoring.evaluate, "evaluate", lambda *_, **given: said.update(given))
+    policy = dataclasses.replace(POLICY, obs_horizon=3)
+    trained = types.SimpleNamespace(policy=policy, params=None, normalizer=None)
+    who = types.SimpleNamespace(method="stardiff", env=None, policy=None, trained=trained)
+    flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
+    scoring.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
+    assert said.items() >= {**flags, "seed": 9, "obs_horizon": 3, "execute": 4}.items()
 
 
 def test_a_machine_without_a_video_encoder_still_gets_the_result(file, monkeypatch, capsys):

@@ -20,7 +20,9 @@ from starjax.experiments.report import (
     results,
     sections,
     stats,
+    style,
     tables,
+    trajectories,
     video,
     words,
 )
@@ -57,6 +59,66 @@ def test_tallies_are_those_of_result_json(one):
     assert stats.gap(seen, unseen)[0] == pytest.approx(one.result["generalization_gap"])
 
 
+def test_headlines_are_those_of_the_result(one):
+    found = {name: (value, more) for name, value, _, more in sections._headlines(one)}
+    for part in ("seen", "unseen"):
+        said = one.result[part]
+        value, more = found[f"Success, {part} trocars"]
+        assert value == f"{100 * said['rate']:.0f}"
+        assert f"{said['successes']} of {said['trials']}" in more
+    gap = one.result["generalization_gap"]
+    assert found["Generalization gap"][0] == f"{100 * gap:+.0f}"
+    won = [trial["steps"] / env.CONTROL_HZ for trial in one.trials if trial["success"]]
+    value, more = found["Time a transfer"]
+    assert value == f"{np.median(won):.1f}" and f" {len(won)} succ" in more
+
+
+def test_the_gap_on_the_page_is_that_of_the_table(several):
+    text = sections.comparison(several)
+    for row in tables.success(several)[1:]:
+        assert re.search(rf"<td>{row[1]}</td>.*{re.escape(row[4])}</td></tr>", text)
+
+
+def test_paired_counts_stand_under_their_own_names(several):
+    ours = several[2]
+    for run, row in zip(several[:2], tables.paired(several)[1:]):
+        both = list(zip(ours.trials, run.trials))
+        only_ours = sum(a["success"] > b["success"] for a, b in both)
+        only_theirs = sum(a["success"] < b["success"] for a, b in both)
+        assert row[:4] == [run.label, str(len(both)), str(only_ours), str(only_theirs)]
+        assert only_ours > only_theirs
+
+
+def test_rcm_errors_stand_under_their_own_names(one):
+    executed = {"mean": 2.0, "p99_of_successes": 3.0, "p99": 4.0, "max": 5.0}
+    errors = {"commanded": {"max": 1.0}, "executed": executed}
+    header, row = tables.rcm([edited(one, rcm_error_mm=errors)])
+    assert dict(zip(header[1:], row[1:])) == {
+        "Commanded max": "1.000",
+        "Executed mean": "2.000",
+        "Executed p99 of successes": "3.000",
+        "Executed p99": "4.000",
+        "Executed max": "5.000",
+    }
+
+
+def test_the_worst_error_at_a_trocar_is_its_largest(one):
+    rows = re.findall(r"<tr>(.*?)</tr>", sections.per_trocar(one), re.S)[1:]
+    for group, row in zip(outcomes.by_trocar(one.trials), rows, strict=True):
+        worst = max(trial["rcm_max_mm"] for trial in group)
+        assert f"{tables.millimetres(worst)} mm" in row
+
+
+def test_the_page_is_about_stardiff_wherever_it_stands(several):
+    for runs in (several, several[::-1]):
+        assert build._focus(runs).result["method"] == "stardiff"
+
+
+def test_a_benchmark_counts_more_than_the_timing_of_the_evaluation(one):
+    bench = {"p50": 1.0, "p95": 1.0, "p99": 1.0}
+    assert results.latencies(edited(one, inference_ms_by_ddim_steps={"10": bench})) == [(10, bench)]
+
+
 def test_holm_steps_down():
     # Sorted 0.01, 0.02, 0.04 are multiplied by 3, 2, 1 and never decrease.
     assert stats.holm([0.02, 0.01, 0.04]) == pytest.approx([0.04, 0.03, 0.04])
@@ -87,6 +149,13 @@ def test_distances_to_the_training_trocars(one):
     apart = 1e3 * outcomes.distances(groups, results.training_trocars(one))
     np.testing.assert_allclose(apart[:8], 0, atol=1e-4)
     np.testing.assert_allclose(apart[8:], [30.29, 21.04, 21.46, 20.0], atol=0.01)
+
+
+def test_success_over_distance_begins_with_the_training_trocars(one):
+    (at, score), *further = figures._pooled(one)
+    seen, unseen = outcomes.split(one.trials)
+    assert at == pytest.approx(0, abs=1e-3) and score == outcomes.tally(seen)
+    assert sum(score.trials for _, score in further) == len(unseen) == 24
 
 
 def test_pairs_are_trials_both_ran(several):
@@ -151,6 +220,13 @@ def test_the_verdict_says_what_is_sure(one):
     assert "may be chance" in said(25, 24)
     assert "better on the new ones" in said(15, 45)
     assert "not evaluated" in words.verdict([one], edited(one, trials=[]))
+
+
+def test_the_verdict_begins_with_the_trocars_that_were_seen(one):
+    seen, unseen = (outcomes.tally(trials) for trials in outcomes.split(one.trials))
+    said = words.verdict([one], one)
+    first, second = (f"{rate.successes} of {rate.trials}" for rate in (seen, unseen))
+    assert said.index(first) < said.index(second)
 
 
 def test_the_page_stands_alone(several):
@@ -247,6 +323,32 @@ def test_the_video_shows_seen_and_unseen_whatever_their_outcome(one):
     ]
     assert chosen(run._replace(rollouts=turned)) == chosen(run)
     assert chosen(one) == []
+
+
+def test_a_clip_says_what_it_shows_and_how_it_ended(one, monkeypatch):
+    said = []
+
+    def caption(rows, width):
+        said.append(rows)
+        return np.zeros((44, width, 3), np.uint8)
+
+    monkeypatch.setattr(video, "caption", caption)
+    for seen in (True, False):
+        rollout = next(r for r in one.rollouts if r.trial["seen"] == seen)
+        rollout = rollout._replace(p_world_tip=rollout.p_world_tip[:3])
+        list(video._clip(lambda *_: np.zeros((16, 8, 8, 3), np.uint8), "m", rollout, ""))
+        (_, (ended, _)), ((about, _), _) = said[-1]
+        assert about == f"{'seen' if seen else 'unseen'} trocar {rollout.trial['trocar']}"
+        assert ended.startswith("success") == rollout.trial["success"]
+
+
+@pytest.mark.parametrize(("won", "colour"), [(True, style.SUCCESS), (False, style.FAILURE)])
+def test_paths_have_the_colour_of_their_outcome(one, won, colour):
+    rollout = one.rollouts[0]
+    rollout = rollout._replace(trial={**rollout.trial, "success": won})
+    axis = trajectories.draw([one._replace(rollouts=[rollout])], np.zeros((12, 2))).axes[0]
+    used = {line.get_color() for line in axis.lines}
+    assert used & {style.SUCCESS, style.FAILURE} == {colour}
 
 
 def test_several_methods_are_shown_at_the_same_trial(several):
