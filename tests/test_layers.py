@@ -20,7 +20,7 @@ ALLOWED: dict[str, set[str]] = {
     "training": FOUNDATION | {"rcm", "sim", "data", "models", "policies"},
     "evaluation": FOUNDATION | {"rcm", "sim", "data", "models", "policies"},
 }
-TOP = {"experiments", "cli", "doctor", "__main__"}
+TOP = {"experiments", "deploy", "cli", "doctor", "__main__"}
 
 
 def layer(path: pathlib.Path) -> str:

@@ -76,6 +76,14 @@ def test_import_of_the_package_is_light():
     assert python("-X", "importtime", "-c", "import starjax").stderr.count("jax.") <= 1
 
 
+def test_the_readmes_programs_run():
+    programs = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert len(programs) == 2
+    for program in programs:
+        done = python("-c", program, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
+        assert done.returncode == 0, done.stderr
+
+
 def test_module_entry_prints_help():
     done = python("-m", "starjax.experiments.run", "--help")
     assert done.returncode == 0 and "--policy.observation" in done.stdout

@@ -1,0 +1,121 @@
+"""A trained policy in a program of one's own: what a robot measures in, its commands out.
+
+>>> policy = deploy.load("compact")
+>>> command = policy(jax.random.key(0), observation, trocar)
+"""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import config, rcm
+from starjax.experiments import methods
+from starjax.policies import features, packaged
+from starjax.policies import policy as policies
+from starjax.sim.types import Observation
+from starjax.training import export
+from starjax.types import Command, Pose
+
+__all__ = ["Command", "Deployed", "Observation", "Pose", "load"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Deployed:
+    """A policy that is ready to decide; calling it runs one compiled program.
+
+    Attributes:
+      method: its row of Table II, by name.
+      settings: what it was trained with. It asks for the last `obs_horizon` moments, in pictures of
+        `image_size` pixels a side if `observation` is "image", and plans `horizon` control steps
+        of 1/30 s, of which `execute` are carried out before it is asked again.
+      p_world_ref: `[3]` m, the nominal port, which a trocar is described from.
+    """
+
+    method: str
+    settings: config.PolicyConfig
+    p_world_ref: np.ndarray
+    _sample: Callable[..., Command]
+    _weights: tuple[Any, Any]
+
+    def __call__(self, key: jax.Array, observation: Observation, trocar: rcm.Trocar) -> Command:
+        """Plans the next commands of one robot, or of B at once.
+
+        The first call for a number of robots compiles the program.
+
+        Args:
+          key: random key; a new one for each decision.
+          observation: of the last O moments, oldest first, fields `[O, ...]` or `[B, O, ...]`.
+          trocar: where the port is, fields `[]` or `[B]`.
+
+        Returns:
+          Command `[H]` or `[B, H]`: tip poses in the world frame, all of them on the RCM manifold
+          (but for `dp_ee`), and the gripper's openings.
+
+        Raises:
+          ValueError: an array has another shape or type than expected, or the trocar is none.
+        """
+        rcm.check_trocar(trocar)
+        robots = np.shape(trocar.radius)
+        self._check(observation, robots)
+        keys = jax.random.split(key, robots[0]) if robots else key[None]
+        if not robots:
+            observation, trocar = jax.tree.map(
+                lambda x: jnp.asarray(x)[None], (observation, trocar)
+            )
+        command = self._sample(*self._weights, keys, observation, trocar)
+        return command if robots else jax.tree.map(lambda x: x[0], command)
+
+    def _check(self, observation: Observation, robots: tuple[int, ...]) -> None:
+        if len(robots) > 1:
+            raise ValueError(f"trocar.radius: expected shape [] or [B], got {list(robots)}")
+        size, moments = self.settings.image_size, (*robots, self.settings.obs_horizon)
+        expected: dict[str, tuple[int, ...]] = {"pose.R": (3, 3), "pose.p": (3,), "gripper": ()}
+        given: dict[str, Any] = dict(
+            zip(expected, (*observation.pose, observation.gripper), strict=True)
+        )
+        if self.settings.observation == "image":
+            expected["image"], given["image"] = (size, size, 3), observation.image
+        else:
+            expected["state"], given["state"] = (features.TASK_STATE,), observation.state
+        for name, rest in expected.items():
+            shape = [*moments, *rest]
+            got = "none" if given[name] is None else list(np.shape(given[name]))
+            if got != shape:
+                raise ValueError(f"observation.{name}: expected shape {shape}, got {got}")
+        if "image" in given and (dtype := jnp.result_type(given["image"])) != jnp.uint8:
+            raise ValueError(f"observation.image: expected uint8, got {dtype}")
+
+
+def load(policy: str | Path, ddim_steps: int | None = None) -> Deployed:
+    """A policy from its file.
+
+    Args:
+      policy: a policy.safetensors, or the name of one that ships with starjax, such as "compact".
+      ddim_steps: denoising steps of a decision, those of its training's settings unless given:
+        fewer are faster.
+
+    Raises:
+      ValueError: there is no such file, it is damaged or of another version, or `ddim_steps` is
+        out of range.
+    """
+    path = packaged.find("policy", str(policy))
+    trained = export.load(path)
+    if trained.p_world_ref is None:
+        raise ValueError(f"policy: expected one that says its nominal port, got {path}")
+    settings = trained.policy
+    if ddim_steps is not None:
+        if not 1 <= ddim_steps <= settings.diffusion_steps:
+            most = settings.diffusion_steps
+            raise ValueError(f"ddim_steps: expected 1 to {most}, got {ddim_steps}")
+        settings = dataclasses.replace(settings, ddim_steps=ddim_steps)
+    row = methods.METHODS[trained.method]
+    port = np.asarray(trained.p_world_ref, np.float32)
+    made = policies.make(row, settings, port, trained.train)
+    params = policies.for_sampling(trained.params, settings.dtype)
+    weights = jax.device_put((params, trained.normalizer))
+    return Deployed(trained.method, settings, port, jax.jit(made.sample), weights)
