@@ -62,7 +62,6 @@ def place(trial: Trial) -> tuple[str, str, str]:
 
 FAILURES = {
     "invalid": "simulation diverged",
-    "dropped": "block dropped",
     "collided": "touched board, peg or block with shaft or arm",
     "loose": "block at its peg, but not threaded, released and at rest",
     "timeout": "out of time",
@@ -71,7 +70,6 @@ FAILURES = {
 
 SHORT = {
     "invalid": "diverged",
-    "dropped": "dropped",
     "collided": "collided",
     "loose": "not settled",
     "timeout": "out of time",
