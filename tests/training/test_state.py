@@ -3,7 +3,6 @@
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from starjax import config
@@ -15,7 +14,8 @@ def test_the_optimiser_is_adamw_with_the_momenta_of_the_paper():
     optimizer = state.make_optimizer(settings)
     weight, gradient = {"w": jnp.array([2.0])}, {"w": jnp.array([3.0])}
     updates, after = optimizer.update(gradient, optimizer.init(weight), weight)
-    np.testing.assert_allclose(updates["w"], -0.1 * (1.0 + 0.5 * 2.0), rtol=1e-5)
+    step = {"w": jnp.array([-0.1 * (1.0 + 0.5 * 2.0)])}
+    chex.assert_trees_all_close(updates, step, rtol=1e-5)
 
     def is_adam(node):
         return isinstance(node, optax.ScaleByAdamState)
