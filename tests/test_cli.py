@@ -4,6 +4,8 @@ import subprocess
 import sys
 import textwrap
 
+import pytest
+
 from starjax import cli
 
 
@@ -36,6 +38,30 @@ def test_a_process_that_is_terminated_says_so():
     assert process.stdout and process.stdout.readline()
     process.terminate()
     assert "stopped" in process.communicate(timeout=60)[1] and process.returncode == 130
+
+
+@pytest.mark.parametrize(
+    ("job", "said"),
+    [
+        # as jax's C++ does
+        ("try: time.sleep(60)\nexcept KeyboardInterrupt: pass\ntime.sleep(60)", "begun\n"),
+        ("try: time.sleep(60)\nfinally: time.sleep(2); print('saved')", "begun\nsaved\n"),
+    ],
+    ids=["lost", "cleaning up"],
+)
+def test_a_stop_is_insisted_on_but_disturbs_no_cleaning_up(job, said):
+    lines = ["import time", "from starjax import cli", "def command(argv):"]
+    lines += [f"    {line}" for line in ["print('begun', flush=True)", *job.splitlines()]]
+    process = subprocess.Popen(
+        [sys.executable, "-c", "\n".join([*lines, "    return 0", "cli.run(command)"])],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout and process.stdout.readline() == "begun\n"
+    process.terminate()
+    rest, error = process.communicate(timeout=30)
+    assert process.returncode == 130 and "begun\n" + rest == said and error.count("\n") == 1
 
 
 def test_ctrl_c_in_a_callback_of_the_collector_is_not_lost():

@@ -35,6 +35,7 @@ _STORAGE = (
     errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT, errno.EPERM, errno.EISDIR, errno.ENOTDIR,
 )  # fmt: skip
 _STOPPED = 130  # exit code after Ctrl-C or SIGTERM
+_AGAIN_S = 0.5  # s until a stop that was lost is asked for again
 _UNREAD = 141  # exit code of a program whose reader went away (128 + SIGPIPE), as in `| head`
 
 
@@ -45,8 +46,11 @@ def main() -> NoReturn:
 
 def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
     """The whole of a process: `command` with the words of its command line."""
-    sys.unraisablehook = _again
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
+    stop = _Stop()
+    sys.unraisablehook = _without_interrupts
+    signal.signal(signal.SIGTERM, stop)
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as of a shell's background job
+        signal.signal(signal.SIGINT, stop)
     code = guard(command, sys.argv[1:])
     if code == _STOPPED:  # jax's threads may still run, and would meet an interpreter that is gone
         sys.stdout.flush()
@@ -106,14 +110,33 @@ def dispatch(argv: Sequence[str]) -> int:
     return importlib.import_module(COMMANDS[name][0]).main(argv[1:])
 
 
-def _again(ignored: Any) -> None:
-    """Ctrl-C that came where Python drops exceptions, in a callback of its collector, comes again.
+class _Stop:
+    """Handler of Ctrl-C and SIGTERM that lasts: KeyboardInterrupt, again where it was lost.
 
-    Only later: raised from in here it would be dropped as well.
+    Python drops what is raised in a callback of its collector, and jax's C++ some of what is raised
+    while it calls Python, at every start for some milliseconds.
     """
-    if ignored.exc_type is KeyboardInterrupt:
-        threading.Timer(0.05, _thread.interrupt_main).start()
-    else:
+
+    def __init__(self) -> None:
+        self._insists = False
+
+    def __call__(self, number: int, frame: Any) -> None:
+        insists, self._insists = self._insists, False
+        timer = threading.Timer(_AGAIN_S, self._insist, [number])
+        timer.daemon = True
+        timer.start()
+        # Whatever is cleaning up because of the first one is left in peace.
+        if not (insists and isinstance(sys.exc_info()[1], KeyboardInterrupt)):
+            raise KeyboardInterrupt
+
+    def _insist(self, number: int) -> None:
+        self._insists = True
+        _thread.interrupt_main(signal.Signals(number))
+
+
+def _without_interrupts(ignored: Any) -> None:
+    """Says what Python dropped, but for Ctrl-C, which comes again."""
+    if ignored.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(ignored)
 
 
