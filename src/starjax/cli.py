@@ -1,6 +1,5 @@
 """The console script `starjax`: one subcommand, one module, imported only when it is called."""
 
-import _thread
 import errno
 import importlib
 import os
@@ -118,6 +117,7 @@ class _Stop:
     """
 
     def __init__(self) -> None:
+        self._main = threading.get_ident()
         self._insists = False
 
     def __call__(self, number: int, frame: Any) -> None:
@@ -131,7 +131,7 @@ class _Stop:
 
     def _insist(self, number: int) -> None:
         self._insists = True
-        _thread.interrupt_main(signal.Signals(number))
+        signal.pthread_kill(self._main, number)  # a real one, which wakes what waits
 
 
 def _without_interrupts(ignored: Any) -> None:

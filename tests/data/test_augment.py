@@ -141,3 +141,24 @@ def test_wrong_inputs_are_named(images, crop, message):
         augment.augment(KEY, images, crop=crop)
     with pytest.raises(ValueError, match=message):
         augment.center(images, crop=crop)
+
+
+def test_pixel_noise_has_its_deviation_and_is_another_in_every_frame():
+    crops, _ = run(KEY, jnp.full((2, 64, 64, 3), 128, jnp.uint8), crop=64, jitter=0.0, noise=0.05)
+    x = np.asarray(denormalize(crops)) / 255.0 - 128 / 255
+    np.testing.assert_allclose(x.std((1, 2, 3)), 0.05, rtol=0.03)
+    assert abs((x[0] * x[1]).mean()) < 0.1 * 0.05**2
+
+
+def test_contrast_moves_values_about_mid_grey():
+    halves = jnp.where(jnp.arange(8)[:, None, None] < 4, 64, 192) * jnp.ones((200, 8, 8, 3))
+    crops, _ = run(KEY, halves.astype(jnp.uint8), crop=8, jitter=0.1, noise=0.0)
+    low, high = np.asarray(denormalize(crops))[:, [0, -1], 0, 0].T
+    assert ((high - low) / (high + low)).std() > 0.02  # brightness alone leaves this ratio
+
+
+def test_normalisation_is_imagenets():
+    white = jnp.full((2, 2, 3), 255, jnp.uint8)
+    np.testing.assert_allclose(
+        augment.center(white, crop=1)[0, 0], [2.2489, 2.4286, 2.64], atol=1e-4
+    )

@@ -5,9 +5,13 @@ import json
 import os
 import resource
 import shutil
+import types
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import kill
+import mujoco
 import numpy as np
 import pytest
 import stubs
@@ -15,6 +19,8 @@ import stubs
 from starjax import rcm
 from starjax.data import demos, episodes, load, recorder, store
 from starjax.runtime import files
+from starjax.sim import env as sim_env
+from starjax.types import Command
 
 TROCARS = rcm.Trocar(*(field[[0, 8]] for field in rcm.TROCARS))
 KWARGS = {"per_trocar": 4, "seed": 0, "max_steps": 100}
@@ -351,3 +357,123 @@ def test_nothing_is_unpickled(pictures, tmp_path):
     np.save(root / "episodes" / key / "p.npy", np.array([{}]), allow_pickle=True)
     with pytest.raises(ValueError, match=r"pickle|Python objects"):
         load.load(root, verify=False, report=lambda _: None)
+
+
+def test_an_episode_starts_and_steps_as_its_seed_says(sealed):
+    """Of the seed rule in dataset.json: never the states of an evaluation with this seed."""
+    root, _ = sealed
+    env = stubs.make_env("state", unlucky=0.4)
+    stream = jax.random.fold_in(jax.random.key(0), recorder.STREAM)
+    for record in load._successful(root, store.read_seal(root), True):
+        key = jax.random.fold_in(jax.random.fold_in(stream, record["trocar"]), record["trial"])
+        key_env, key_expert = jax.random.split(key)
+        trocar = rcm.Trocar(*(field[record["trocar"]] for field in TROCARS))
+        state = env.reset(key_env, sim_env.EnvParams(trocar))
+        command, _ = stubs.Expert().act(stubs.Expert().init(key_expert, state), state)
+        wanted = {
+            "qpos": state.sim.qpos,
+            "state": env.observe(state).state,
+            "command_p": command.pose.p,
+            "rcm_error": env.step(state, command).rcm_error,
+        }
+        for name, value in wanted.items():
+            found = np.load(root / "episodes" / record["key"] / f"{name}.npy")[0]
+            np.testing.assert_allclose(found, value, atol=1e-6, err_msg=name)
+        for name in rcm.Trocar._fields:
+            assert record[name] == float(getattr(trocar, name))
+
+
+class _Labelled(NamedTuple):
+    key: jax.Array
+    label: Command
+
+
+def test_the_label_of_a_disturbed_command_is_what_is_recorded(tmp_path):
+    def act(state, env_state):
+        label, key = stubs.Expert().act(state.key, env_state)
+        moved = label._replace(pose=label.pose._replace(p=label.pose.p + 0.001))
+        return moved, _Labelled(key, label._replace(gripper=-label.gripper))
+
+    def init(key, env_state):
+        return _Labelled(key, stubs.Expert().act(key, env_state)[0])
+
+    env = stubs.make_env(unlucky=0.0)
+    demos.collect(
+        tmp_path, env, recorder.Expert(init, act), TROCARS, chunk=2, **KWARGS | {"per_trocar": 1}
+    )
+    dataset = load.load(tmp_path, report=lambda _: None).dataset
+    np.testing.assert_array_equal(dataset.command.gripper, -1.0)
+    np.testing.assert_array_equal(dataset.observation.gripper, 1.0)
+
+
+def test_every_field_is_loaded_as_itself(tmp_path):
+    shapes = {"p": (3,), "R": (3, 3), "gripper": (), "state": (12,)}
+    shapes |= {"command_p": (3,), "command_R": (3, 3), "command_gripper": ()}
+    rng = np.random.default_rng(0)
+    arrays = {n: [rng.random((3, *s), np.float32)] for n, s in shapes.items()}
+    outcome = {"success": True, "length": 3, "radius": 0.01, "polar": 1.0, "azimuth": 2.0}
+    store.create(tmp_path, {})
+    store.seal(tmp_path, {"k": store.commit(tmp_path, "k", outcome, arrays)})
+    it = load.load(tmp_path, report=lambda _: None).dataset
+    seen, said = it.observation, it.command
+    found = (
+        seen.pose.p,
+        seen.pose.R,
+        seen.gripper,
+        seen.state,
+        said.pose.p,
+        said.pose.R,
+        said.gripper,
+    )
+    for leaf, parts in zip(found, arrays.values(), strict=True):
+        np.testing.assert_array_equal(leaf, parts[0])
+    np.testing.assert_array_equal(jnp.stack(it.trocar)[:, 0], np.float32([0.01, 1.0, 2.0]))
+
+
+def test_software_versions_bind_an_unfinished_dataset_only(tmp_path):
+    one, two = ({"seed": 0, "versions": {"jax": v}} for v in "12")
+    assert store.digest(one) == store.digest(two) != store.digest({**one, "seed": 1})
+    store.create(tmp_path, one)
+    with pytest.raises(files.StorageError, match="its versions is"):
+        store.create(tmp_path, two)
+    store.seal(tmp_path, {})
+    store.create(tmp_path, two)
+
+
+def test_the_description_tells_scenes_ports_and_experts_apart():
+    def scene(x):
+        xml = f'<mujoco><worldbody><geom size="{x}"/></worldbody></mujoco>'
+        return types.SimpleNamespace(mj_model=mujoco.MjModel.from_xml_string(xml))
+
+    def name(env, **kwargs):
+        return store.digest(demos.describe(env, TROCARS, **KWARGS, **kwargs))
+
+    env = stubs.make_env()._replace(model=scene(0.1))
+    assert name(env) == name(env._replace(model=scene(0.1)))
+    others = [
+        name(env, one_wall=True),
+        name(env, keep_failures=True),
+        name(env._replace(model=scene(0.2))),
+        name(env._replace(p_world_ref=np.float32([0, 0, 0.1]))),
+    ]
+    assert len({name(env), *others}) == 5
+
+
+def test_a_folder_under_another_name_is_damage(copy):
+    first, second = store.keys(copy)[:2]
+    store.remove(copy, second)
+    shutil.copytree(copy / "episodes" / first, copy / "episodes" / second)
+    with pytest.raises(store.DamagedEpisode, match=second):
+        store.verify(copy, second)
+
+
+def test_a_sound_episode_that_was_not_sealed_is_noticed(copy):
+    key = store.keys(copy)[0]
+    record = store.verify(copy, key)
+    files_ = {name[:-4]: [np.load(copy / "episodes" / key / name)] for name in record["files"]}
+    outcome = {k: v for k, v in record.items() if k not in ("key", "files", "digest")}
+    store.remove(copy, key)
+    store.commit(copy, key, {**outcome, "loose": not outcome["loose"]}, files_)
+    store.verify(copy, key)
+    with pytest.raises(store.DamagedEpisode, match=rf"{key}/episode.json: is not the episode"):
+        load.load(copy, report=lambda _: None)

@@ -123,3 +123,25 @@ def test_methods_are_table_two():
     assert {name for name, method in METHODS.items() if method.hierarchical} == {"stardiff"}
     borrowed = {n: m.weights_of for n, m in METHODS.items() if m.weights_of != n}
     assert borrowed == {"dp_ee_proj": "dp_ee", "stardiff_single": "dp_rcm4"}
+
+
+def test_only_the_given_frames_states_are_fitted(dataset):
+    few = normalizer.fit(METHODS["dp_ee"], dataset, fakes.P_WORLD_REF, np.arange(40))
+    state = np.asarray(dataset.observation.state)
+    np.testing.assert_allclose(few.state.low[:2], state[:40, :2].min(0), atol=1e-7)
+    np.testing.assert_allclose(few.state.high[:2], state[:40, :2].max(0), atol=1e-7)
+
+
+def test_over_frames_is_of_every_chunk(dataset, monkeypatch):
+    frames = np.arange(60)[::-1]
+    monkeypatch.setattr(windows, "_CHUNK", 7)
+    found = windows.over_frames(
+        dataset, frames, lambda _, command, trocar: np.c_[command.pose.p, trocar.radius]
+    )
+    radius = np.repeat(np.asarray(dataset.trocar.radius), 20)
+    np.testing.assert_array_equal(found, np.c_[dataset.command.pose.p, radius][frames])
+
+
+def test_a_millimetre_is_a_range_and_less_than_a_tenth_is_not():
+    box = normalizer._min_max(np.array([[0, 1], [1e-3, 1 + 9e-5]]), np.arange(2))
+    np.testing.assert_allclose(box.high - box.low, [1e-3, 2.0], rtol=1e-4)

@@ -181,3 +181,51 @@ def test_state_encoder_sees_all_of_the_history(horizon):
     assert out.shape == (3, 16)
     gradient = jax.jit(jax.grad(lambda h: module.apply(params, h).sum()))(history)
     assert (jnp.abs(gradient).max(-1) > 0).all()
+
+
+@pytest.mark.parametrize(("stride", "into"), [(1, 32), (2, 16)])
+def test_a_block_is_torchvisions_with_groups_of_16_channels(stride, into):
+    x = normal(3, 8, 8, into)
+    block = resnet.BasicBlock(32, stride)
+    params = block.init(KEY, x)["params"]
+    norm = layers.GroupNorm(2).init(KEY, normal(3, 8, 8, 32))["params"]
+
+    def conv(name, x, size, stride=1):
+        return resnet.Conv2d(32, size, stride).apply({"params": params[name]}, x)
+
+    def group_norm(x):
+        return layers.GroupNorm(2).apply({"params": norm}, x)
+
+    y = jax.nn.relu(group_norm(conv("conv1", x, 3, stride)))
+    y = group_norm(conv("conv2", y, 3))
+    skip = group_norm(conv("downsample_0", x, 1, stride)) if into != 32 else x
+    expected = jax.nn.relu(y + skip)
+    np.testing.assert_allclose(block.apply({"params": params}, x), expected, atol=1e-5)
+
+
+def test_variance_at_the_start_is_two_over_fan_out():
+    params = resnet.Conv2d(64, 3).init(KEY, normal(1, 4, 4, 32))["params"]
+    assert float(params["kernel"].var()) == pytest.approx(2 / (9 * 64), rel=0.03)
+
+
+def test_the_small_trunks_layers_are_cut_by_relu():
+    x, module = frames(), encoders.SmallTrunk()
+    variables = jax.jit(module.init)(KEY, x)
+    for size, (stride, doubling) in enumerate(
+        ((2, 0), (1, 0), (2, 1), (1, 1), (2, 2), (1, 2), (1, 2))
+    ):
+        params = variables["params"]
+        x = resnet.Conv2d(16 << doubling, 3, stride).apply({"params": params[f"Conv2d_{size}"]}, x)
+        norm = layers.GroupNorm((16 << doubling) // 8)
+        x = jax.nn.relu(norm.apply({"params": params[f"GroupNorm_{size}"]}, x))
+    np.testing.assert_allclose(module.apply(variables, frames()), x, atol=1e-4)
+
+
+def test_a_state_encoder_is_two_convolutions_with_mish_and_one_without():
+    history, module = normal(3, 2, 5), encoders.StateEncoder(16)
+    params = jax.jit(module.init)(KEY, history)["params"]
+    x = history
+    for i, (features, size, pad) in enumerate(((4, 3, None), (8, 3, None), (16, 2, 0))):
+        x = layers.Conv1d(features, size, padding=pad).apply({"params": params[f"Conv1d_{i}"]}, x)
+        x = layers.mish(x) if i < 2 else x
+    np.testing.assert_allclose(module.apply({"params": params}, history), x[:, 0], atol=1e-5)

@@ -122,3 +122,15 @@ def test_a_spread_vectors_gradient_is_the_sum_over_all_places(shape):
     assert layers.sum_in_two(half).dtype == jnp.bfloat16
     exact = np.asarray(half, np.float64).reshape(-1, shape[-1]).sum(0)
     np.testing.assert_allclose(layers.sum_in_two(half).astype(float), exact, rtol=0.01, atol=0.01)
+
+
+def test_a_convolution_starts_within_torchs_bound():
+    """1 / sqrt(taps times channels), also of the bias and where taps are dropped; Diffusion
+    Policy's GroupNorm has torch's epsilon."""
+    for length in (16, 2):
+        params, _ = run(layers.Conv1d(64, 5), inputs(2, length, 16))
+        for leaf in jax.tree.leaves(params):
+            assert 0.9 < float(jnp.abs(leaf).max()) * np.sqrt(5 * 16) <= 1.0
+    x = jnp.array([[[-3e-3, 3e-3]]])  # variance 9e-6
+    _, y = run(layers.GroupNorm(1), x)
+    np.testing.assert_allclose(y[0, 0, 1], 3e-3 / np.sqrt(9e-6 + 1e-5), rtol=1e-4)

@@ -293,3 +293,31 @@ def test_files_of_no_known_kind_are_named(tmp_path):
     (tmp_path / "w.safetensors").write_bytes(b"\xff" * 64)
     with pytest.raises(ValueError, match="not a readable safetensors file"):
         pretrained.read_weights(tmp_path / "w.safetensors")
+
+
+def test_files_too_large_unpacked_are_refused(tmp_path, monkeypatch):
+    arrays = {"w": np.zeros(4096, np.float32)}
+    program, buffers = state_program(programs(arrays)), [arrays["w"].tobytes()]
+    path = tmp_path / "bomb.pth"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("model/data.pkl", program)
+        archive.writestr("model/data/0", buffers[0])
+    assert path.stat().st_size < 2000
+    assert torch_file.read(path).keys() == {"w"}
+    monkeypatch.setattr(torch_file, "_MAX_BYTES", 2000)
+    with pytest.raises(ValueError, match="at most 2000 bytes"):
+        torch_file.read(path)
+    program = state_program({n: tensor_program("0", "f4", 256, (256,), (1,)) for n in "abc"})
+    small = write_zip(tmp_path / "shared.pth", program, [bytes(1024)])
+    with pytest.raises(ValueError, match="at most 2000 bytes, got"):
+        torch_file.read(small)
+
+
+def test_parameters_are_tensors_too(tmp_path):
+    """As `torch.save(dict(module.named_parameters()))` writes them."""
+    tensor = tensor_program("0", "f4", 2, (2,), (1,))
+    program = b"ctorch._utils\n_rebuild_parameter\n(" + tensor + b"\x89}tR"
+    path = write_zip(
+        tmp_path / "p.pth", state_program({"w": program}), [np.float32([1, 2]).tobytes()]
+    )
+    np.testing.assert_array_equal(torch_file.read(path)["w"], [1, 2])

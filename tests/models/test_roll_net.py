@@ -72,3 +72,23 @@ def test_size_of_the_papers_network():
     linear = lambda a, b: a * b + b  # noqa: E731
     block = 2 * 256 + 2 * linear(256, 256)
     assert size == linear(7, 64) + linear(48 + 64 + 2, 256) + 3 * block + linear(256, 16)
+
+
+def test_it_is_a_residual_mlp_with_gelu(trained):
+    """In numpy, as its docstring says; the trained one, as an untrained one says 0."""
+    params, (x, trocar, history) = trained[0]["params"], inputs()
+
+    def gelu(x):
+        return 0.5 * x * (1 + np.tanh(np.sqrt(2 / np.pi) * (x + 0.044715 * x**3)))
+
+    def dense(name, x):
+        return x @ np.asarray(params[name]["kernel"], float) + np.asarray(params[name]["bias"])
+
+    x = np.concatenate([x.reshape(len(x), -1), gelu(dense("embed", trocar)), history], -1)
+    x = dense("project", x)
+    for i in range(3):
+        norm = params[f"LayerNorm_{i}"]
+        h = (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-6)
+        h = dense(f"Dense_{2 * i}", h * np.asarray(norm["scale"]) + np.asarray(norm["bias"]))
+        x = x + dense(f"Dense_{2 * i + 1}", gelu(h))
+    np.testing.assert_allclose(MODULE.apply(trained[0], *inputs()), dense("out", x), atol=1e-4)

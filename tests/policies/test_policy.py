@@ -14,7 +14,7 @@ from starjax import config, rcm
 from starjax.data import normalizer, windows
 from starjax.experiments.methods import METHODS
 from starjax.models import encoders
-from starjax.policies import execution, features, hierarchical
+from starjax.policies import diffuser, execution, features, hierarchical
 from starjax.policies import policy as policies
 
 TRAIN = config.TrainConfig(state_noise=0.0)
@@ -35,8 +35,9 @@ class Made:
     """A policy with random weights, and compiled functions of it."""
 
     def __init__(self, name, dataset, observation="state", **changed):
-        self.method = METHODS[name]
+        self.method, self.observation, self.dataset = METHODS[name], observation, dataset
         settings = dataclasses.replace(fakes.TINY, observation=observation, **changed)
+        self.settings = settings
         self.policy = policies.make(self.method, settings, fakes.P_WORLD_REF, TRAIN)
         self.stats = normalizer.fit(self.method, dataset, fakes.P_WORLD_REF, np.arange(80))
         self.params = jit(self.policy.init)(jax.random.key(0))
@@ -314,3 +315,113 @@ def test_the_blocks_of_a_gpu_sample_the_same(dataset, name):
     given = (stats, jax.random.split(jax.random.key(1), B), batch.observation, batch.trocar)
     sample = jit(policy.sample)
     chex.assert_trees_all_close(sample(params, *given), sample(changed, *given), atol=2e-5)
+
+
+def prepared(it, **changed):
+    """What 64 windows are learned as, with other settings of training; the windows."""
+    train = dataclasses.replace(TRAIN, **changed)
+    settings = dataclasses.replace(fakes.TINY, observation=it.observation)
+    policy = policies.make(it.method, settings, fakes.P_WORLD_REF, train)
+    batch = windows.gather(it.dataset, jnp.arange(64), 2, 16)
+    return policy.prepare(it.stats, jax.random.key(0), batch), batch
+
+
+def test_the_losses_are_weighed(made):
+    it = made("stardiff")
+    (loss, parts), _ = it.gradient(*it.loss_arguments)
+    weight = fakes.TINY.roll_loss_weight
+    expected = parts["position_loss"] + weight * parts["roll_loss"]
+    assert float(loss) == pytest.approx(float(expected), rel=1e-5)
+    assert parts["roll_loss"] > 0.01
+
+
+def test_the_roll_network_learns_from_inexact_inputs_what_is_exact(made):
+    it = made("stardiff")
+    given, batch = prepared(it)
+    exact = features.demonstrated(it.stats, "rcm4", batch, fakes.P_WORLD_REF)
+    seen = features.measured(it.stats, "rcm4", batch.observation, batch.trocar, fakes.P_WORLD_REF)
+    p, roll = np.ravel(given.p - exact[..., 1:4]), np.ravel(given.history - seen[..., 0])
+    assert p.std() == pytest.approx(hierarchical.POSITION_NOISE, rel=0.1)
+    assert roll.std() == pytest.approx(hierarchical.ROLL_NOISE, rel=0.2)
+    assert abs(np.corrcoef(p[: roll.size], roll)[0, 1]) < 0.4
+    np.testing.assert_allclose(given.roll, exact[..., 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
+def test_training_adds_noise_to_what_is_measured(made, name):
+    noisy, exact = (prepared(made(name), state_noise=x)[0].inputs.history for x in (0.5, 0.0))
+    assert float(jnp.std(noisy - exact)) == pytest.approx(0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
+def test_training_sees_random_crops_and_is_told_where_they_are(made, name):
+    it = made(name, "image")
+    inputs = prepared(it, jitter=0.0, image_noise=0.0)[0].inputs
+    assert inputs.image.shape == (64, 2, 29, 29, 3)
+    assert len(np.unique(np.asarray(inputs.offset).reshape(-1, 2), axis=0)) == 16
+    jittered = prepared(it, jitter=0.5, image_noise=0.0)[0].inputs
+    assert np.abs(jittered.image - inputs.image).max() > 0.5
+    model = diffuser.make(it.settings, 4, 4, 0)
+    params = it.params.get("diffuser", it.params)
+    here = inputs._replace(history=inputs.history[..., :4])
+    there = here._replace(offset=here.offset + 4.0)
+    params = {**params, "state": model.init(jax.random.key(0))["state"]}
+    assert np.abs(model.observe(params, here) - model.observe(params, there)).max() > 1e-3
+
+
+def test_rolls_stay_in_the_demonstrated_range(made):
+    it = made("stardiff")
+    out = it.params["roll"]["params"]["out"]
+    far = {**out, "bias": jnp.full_like(out["bias"], 9.0)}
+    params = {**it.params, "roll": {"params": {**it.params["roll"]["params"], "out": far}}}
+    roll = rcm.roll_of(it.commands(params=params).pose.R)
+    np.testing.assert_allclose(roll, it.stats.action.high[0], atol=1e-5)
+
+
+def test_what_is_held_is_not_dropped(made):
+    it = made("stardiff")
+    action = jnp.ones((B, 16, 5)).at[:, 3, -1].set(jnp.nan)
+    command = execution.command(it.method, it.stats, action, it.batch.trocar, fakes.P_WORLD_REF)
+    np.testing.assert_array_equal(command.gripper[:, 3], -1.0)
+    np.testing.assert_array_equal(command.gripper[:, 4], 1.0)
+
+
+def test_features_of_any_trocar():
+    found = features.trocar_features(rcm.Trocar(0.02, 1.2, -0.7), fakes.P_WORLD_REF)
+    cos, sin = np.cos([1.2, -0.7]), np.sin([1.2, -0.7])
+    shift = 0.4 * np.array([sin[0] * cos[1], sin[0] * sin[1], cos[0]])
+    np.testing.assert_allclose(found, [0.4, *cos, sin[1], *shift], atol=1e-6)
+
+
+def test_what_is_measured_is_of_the_scale_of_what_is_learned(made):
+    """A pose measured where one was commanded is the same number; states are in [-1, 1]."""
+    it = made("stardiff")
+    batch, command = it.batch, it.batch.command
+    reached = batch.observation.replace(pose=command.pose, gripper=command.gripper)
+    where = (it.stats, "rcm4")
+    np.testing.assert_allclose(
+        features.measured(*where, reached, batch.trocar, fakes.P_WORLD_REF),
+        features.demonstrated(*where, batch, fakes.P_WORLD_REF),
+        atol=1e-6,
+    )
+    zeros = jnp.zeros((B, 2, 4))
+    inputs = features.for_sampling(fakes.TINY, TRAIN, it.stats, batch.observation, zeros)
+    state = it.stats.state.normalize(batch.observation.state)
+    np.testing.assert_array_equal(inputs.history[..., 4:16], state)
+
+
+def test_inference_crops_as_training_did(made, dataset):
+    """The crop of `train_config`, whatever the default is."""
+    it = made("dp_rcm1", "image")
+    half = dataclasses.replace(TRAIN, crop_fraction=0.5)
+    settings = dataclasses.replace(fakes.TINY, observation="image")
+    policy = policies.make(it.method, settings, fakes.P_WORLD_REF, half)
+    given = (it.stats, jax.random.split(jax.random.key(1), B))
+    edge = it.batch.observation.image.at[..., :8, :, :].set(0)
+    seen = it.batch.observation.replace(image=edge)
+    one, other = (
+        jit(policy.sample)(it.params, *given, o, it.batch.trocar).pose.p
+        for o in (it.batch.observation, seen)
+    )
+    np.testing.assert_array_equal(one, other)
+    assert features.crop_size(settings, half) == 16
