@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import pytest
 
 from starjax import rcm
 from starjax.sim import ik, tracking
@@ -49,6 +50,11 @@ def test_inverse_kinematics_reach_every_trocar_and_peg(sim):
     residual, margin = jax.jit(grid)(trocars, tips, jnp.array([-1.2, 0.0, 1.2]))
     assert residual.max() < 1e-5
     assert margin.min() > 0.1  # rad
+
+
+def test_a_chain_that_does_not_begin_where_it_should_is_named(sim):
+    with pytest.raises(ValueError, match="above the site robot/tool/tcp, got 'robot/first'"):
+        ik.chain_of(sim.mj_model, first="robot/first", site="robot/tool/tcp")
 
 
 def test_joints_stay_within_their_limits(sim):

@@ -139,11 +139,11 @@ def require_writable(directory: Path, free_bytes: int = 0) -> None:
     Raises:
       StorageError: it cannot be created or written, or the disk has less than `free_bytes` free.
     """
-    probe = directory / f".writable-{socket.gethostname()}-{os.getpid()}"
+    probe = directory / ".writable"
     try:
         directory.mkdir(parents=True, exist_ok=True)
         probe.write_bytes(b"x")
-        probe.unlink()
+        probe.unlink(missing_ok=True)  # another process that starts here may have been quicker
     except OSError as error:
         raise _explained(error, directory, 1) from error
     free = shutil.disk_usage(directory).free

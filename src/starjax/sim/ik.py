@@ -40,17 +40,23 @@ class Chain(NamedTuple):
 
 
 def chain_of(m: mujoco.MjModel, first: str, site: str) -> Chain:
-    """The chain from body `first` down to `site`, read off a compiled model."""
+    """The chain from body `first` down to `site`, read off a compiled model.
+
+    Raises:
+      ValueError: `first` is not above the site.
+    """
     data = mujoco.MjData(m)
     mujoco.mj_kinematics(m, data)
     body = int(m.site(site).bodyid[0])
     p_tip, R_tip = np.array(m.site(site).pos), _matrix(m.site(site).quat)
-    while m.body_jntnum[body] == 0:  # tool bodies fixed to the last link
+    while body and m.body_jntnum[body] == 0:  # tool bodies fixed to the last link
         R = _matrix(m.body_quat[body])
         p_tip, R_tip = m.body_pos[body] + R @ p_tip, R @ R_tip
         body = int(m.body_parentid[body])
     bodies = [body]
     while m.body(bodies[-1]).name != first:
+        if not bodies[-1]:  # the world, which is its own parent
+            raise ValueError(f"first: expected a body above the site {site}, got {first!r}")
         bodies.append(int(m.body_parentid[bodies[-1]]))
     bodies = bodies[::-1]
     root = int(m.body_parentid[bodies[0]])
