@@ -9,6 +9,16 @@ import pytest
 from starjax import cli
 
 
+def started(code):
+    """A process that runs this, with its output in pipes."""
+    return subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
 def test_too_little_memory_is_one_line_that_names_what_to_lower(capsys):
     def command(argv):
         raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nmore of it")
@@ -29,12 +39,7 @@ def test_a_process_that_is_terminated_says_so():
 
         cli.run(command)
     """
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = started(code)
     assert process.stdout and process.stdout.readline()
     process.terminate()
     assert "stopped" in process.communicate(timeout=60)[1] and process.returncode == 130
@@ -61,12 +66,7 @@ def test_a_stop_is_insisted_on_but_disturbs_no_cleaning_up(job, said):
 
         cli.run(command)
     """
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = started(code)
     assert process.stdout and process.stdout.readline() == "begun\n"
     process.terminate()
     rest, error = process.communicate(timeout=30)
@@ -114,11 +114,7 @@ def test_a_job_whose_reader_went_away_does_not_claim_to_be_done():
 
         cli.run(command)
     """
-    process = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    process = started(code)
     assert process.stdout and process.stdout.readline()
     process.stdout.close()
-    assert process.stderr and process.stderr.read() == b"" and process.wait(60) == 141
+    assert process.stderr and process.stderr.read() == "" and process.wait(60) == 141
