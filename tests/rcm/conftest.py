@@ -103,6 +103,7 @@ def decode(name, action, trocar, p_world_ref):
         R = gram_schmidt(action[..., 1:])
         R = R_trocar @ R if name == "rcm1" else R
         return R, p_trocar + action[..., :1] * R[..., :, 2]
+    assert name in ("rcm2", "rcm4"), f"no formula for {name}"
     p = action[..., 1:]
     p = p_trocar + np.einsum("...ij,...j->...i", R_trocar, p) if name == "rcm2" else p
     axis = (p - p_trocar) / np.linalg.norm(p - p_trocar, axis=-1, keepdims=True)
