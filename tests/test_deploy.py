@@ -96,3 +96,12 @@ def test_a_file_that_will_not_do_is_named(made, tmp_path):
     export.save(tmp_path / "p", trained._replace(p_world_ref=None, params=small))
     with pytest.raises(ValueError, match="nominal port"):
         deploy.load(tmp_path / "p")
+    export.save(tmp_path / "p", trained._replace(method="stardif", params=small))
+    with pytest.raises(ValueError, match=r"/p: method: expected one of .*, got 'stardif'"):
+        deploy.load(tmp_path / "p")
+
+
+def test_a_policy_prints_as_its_settings_without_its_weights(made):
+    path, trained, _ = made
+    said = repr(deploy.load(path))
+    assert repr(trained.policy) in said and "Array" not in said

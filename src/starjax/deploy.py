@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import config, rcm
-from starjax.experiments import methods
+from starjax.experiments import methods, options
 from starjax.policies import features, packaged
 from starjax.policies import policy as policies
 from starjax.sim.types import Observation
@@ -24,7 +24,7 @@ from starjax.types import Command, Pose
 __all__ = ["Command", "Deployed", "Observation", "Pose", "load"]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Deployed:
     """A policy that is ready to decide; calling it runs one compiled program.
 
@@ -39,8 +39,8 @@ class Deployed:
     method: str
     settings: config.PolicyConfig
     p_world_ref: np.ndarray
-    _sample: Callable[..., Command]
-    _weights: tuple[Any, Any]
+    _sample: Callable[..., Command] = dataclasses.field(repr=False)
+    _weights: tuple[Any, Any] = dataclasses.field(repr=False)
 
     def __call__(self, key: jax.Array, observation: Observation, trocar: rcm.Trocar) -> Command:
         """Plans the next commands of one robot, or of B at once.
@@ -113,6 +113,7 @@ def load(policy: str | Path, ddim_steps: int | None = None) -> Deployed:
             most = settings.diffusion_steps
             raise ValueError(f"ddim_steps: expected 1 to {most}, got {ddim_steps}")
         settings = dataclasses.replace(settings, ddim_steps=ddim_steps)
+    options.choice(f"{path}: method", trained.method, methods.METHODS)
     row = methods.METHODS[trained.method]
     port = np.asarray(trained.p_world_ref, np.float32)
     made = policies.make(row, settings, port, trained.train)

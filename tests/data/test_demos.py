@@ -1,7 +1,6 @@
 """Demonstrations: what is collected, that it survives kills and shows damage, and loading."""
 
 import errno
-import json
 import os
 import resource
 import shutil
@@ -219,16 +218,6 @@ def test_a_damaged_description_is_written_again(copy, sealed, damage):
     (copy / "SEALED.json").unlink()
     collect(copy)
     assert kill.tree(copy) == kill.tree(sealed[0])
-
-
-def test_an_episode_of_another_dataset_is_noticed(copy, tmp_path):
-    collect(tmp_path / "other", max_steps=99)
-    key = store.keys(copy)[0]
-    record = json.loads((copy / "episodes" / key / "episode.json").read_text())
-    store.remove(copy, key)
-    store.commit(copy, key, {**record, "loose": not record["loose"]}, {})
-    with pytest.raises(store.DamagedEpisode, match=key):
-        load.load(copy, report=lambda _: None)
 
 
 def test_an_incomplete_dataset_is_not_loaded(copy):
