@@ -317,6 +317,29 @@ def test_the_blocks_of_a_gpu_sample_the_same(dataset, name):
     chex.assert_trees_all_close(sample(params, *given), sample(changed, *given), atol=2e-5)
 
 
+@pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
+def test_packed_parameters_are_fewer_arrays_and_say_the_same(dataset, name):
+    settings = dataclasses.replace(fakes.TINY, observation="image")
+    policy = policies.make(METHODS[name], settings, fakes.P_WORLD_REF, TRAIN)
+    stats = normalizer.fit(METHODS[name], dataset, fakes.P_WORLD_REF, np.arange(80))
+    params = jit(policy.init)(jax.random.key(0))
+    packed = policies.packed(params)
+    assert len(jax.tree.leaves(packed)) < 0.6 * len(jax.tree.leaves(params))
+    batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
+    given = (stats, jax.random.split(jax.random.key(1), B), batch.observation, batch.trocar)
+    sample = jit(policy.sample)
+    chex.assert_trees_all_close(sample(params, *given), sample(packed, *given), atol=1e-6)
+
+
+def test_a_gpu_is_handed_packed_blocks_and_a_cpu_the_parameters(monkeypatch):
+    policy = policies.make(METHODS["stardiff"], fakes.TINY, fakes.P_WORLD_REF, TRAIN)
+    params = jit(policy.init)(jax.random.key(0))
+    chex.assert_trees_all_equal(policies.for_sampling(params, "float32"), params)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    wanted = policies.packed(policies.with_sampling_blocks(params))
+    chex.assert_trees_all_equal(policies.for_sampling(params, "float32"), wanted)
+
+
 def prepared(it, **changed):
     """What 64 windows are learned as, with other settings of training; the windows."""
     train = dataclasses.replace(TRAIN, **changed)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import config
-from starjax.models import diffusion, encoders, schedule, unet1d
+from starjax.models import diffusion, encoders, joined, schedule, unet1d
 from starjax.policies import features
 
 Params = dict[str, Any]
@@ -62,8 +62,7 @@ def make(
         time_dim=policy_config.time_dim,
         dtype=dtype,
     )
-    # linen's `apply` may return changed variables too; ours never does
-    denoise: Callable[..., jax.Array] = unet.apply  # pyright: ignore[reportAssignmentType]
+    of_unet, of_state, of_vision = (joined.applied(network) for network in (unet, state, vision))
     noise_schedule = schedule.cosine(policy_config.diffusion_steps)
     shape = (policy_config.horizon, action_dim)
 
@@ -82,13 +81,13 @@ def make(
         return params
 
     def observe(params: Params, inputs: features.Inputs) -> jax.Array:
-        parts: list[Any] = [state.apply(params["state"], inputs.history)]
+        parts: list[Any] = [of_state(params["state"], inputs.history)]
         if inputs.features is not None:
             parts.insert(0, inputs.features.reshape(len(inputs.features), -1))
         elif inputs.image is not None:
             batch, horizon = inputs.image.shape[:2]
             offset = inputs.offset
-            seen = vision.apply(
+            seen = of_vision(
                 params["vision"],
                 inputs.image.reshape(batch * horizon, *inputs.image.shape[2:]),
                 None if offset is None else offset.reshape(batch * horizon, 2),
@@ -103,17 +102,17 @@ def make(
         params: Params, observed: jax.Array, extra: jax.Array, given: diffusion.Noised
     ) -> jax.Array:
         cond = _beside(observed, extra)
-        return diffusion.eps_loss(lambda x, k: denoise(params["unet"], x, k, cond), given)
+        return diffusion.eps_loss(lambda x, k: of_unet(params["unet"], x, k, cond), given)
 
     def sample(params: Params, keys: jax.Array, observed: jax.Array, extra: jax.Array) -> jax.Array:
         cond = _beside(observed, extra)
-        film = unet.apply(params["unet"], cond, method="condition")
+        film = of_unet(params["unet"], cond, method="condition")
         return diffusion.ddim_sample(
-            lambda x, film_k: denoise(params["unet"], x, film + film_k, method="denoise"),
+            lambda x, film_k: of_unet(params["unet"], x, film + film_k, method="denoise"),
             policy_config.temperature * diffusion.sample_noise(keys, shape),
             diffusion_steps=policy_config.diffusion_steps,
             steps=policy_config.ddim_steps,
-            prepare=lambda k: unet.apply(params["unet"], k, method="embed_step"),
+            prepare=lambda k: of_unet(params["unet"], k, method="embed_step"),
         )
 
     return Diffuser(init, observe, noised, loss, sample)

@@ -1,6 +1,5 @@
 """STAR-Diff: diffusion for (position, gripper), blind to the trocar, and a network for the roll."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 
 from starjax import config, rcm
 from starjax.data import normalizer, windows
-from starjax.models import diffusion, roll_net
+from starjax.models import diffusion, joined, roll_net
 from starjax.policies import diffuser, execution, features
 from starjax.policies.policy import Params, Policy
 from starjax.sim.types import Observation
@@ -69,8 +68,7 @@ def make(
     )
     history_weight = float(policy_config.roll_history)
     trocar_weight = float(policy_config.roll_trocar)
-    # linen's `apply` may return changed variables too; ours never does
-    predict: Callable[..., jax.Array] = rolls.apply  # pyright: ignore[reportAssignmentType]
+    predict = joined.applied(rolls)
 
     def init(key: jax.Array) -> Params:
         key_model, key_roll = jax.random.split(key)

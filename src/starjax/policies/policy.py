@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from starjax import config, rcm
 from starjax.data import normalizer, windows
-from starjax.models import pretrained, sampling_blocks
+from starjax.models import joined, pretrained, sampling_blocks
 from starjax.sim.types import Observation
 from starjax.types import Command
 
@@ -65,10 +65,11 @@ def with_resnet18(params: Params, path: str | pathlib.Path) -> Params:
 def for_sampling(params: Params, dtype: str) -> Params:
     """Parameters as `sample` uses them fastest: for evaluation, not for training.
 
-    `rounded`, and on a GPU those of the U-Net's blocks are as `sampling_blocks` takes them.
+    `rounded`, and on a GPU those of the U-Net's blocks are as `sampling_blocks` takes them and all
+    of them `packed`.
     """
     if jax.default_backend() == "gpu":  # a CPU would be slower with them
-        params = with_sampling_blocks(params)
+        return packed(rounded(with_sampling_blocks(params), dtype))
     return rounded(params, dtype)
 
 
@@ -92,6 +93,15 @@ def with_sampling_blocks(params: Params) -> Params:
     if "diffuser" in params:
         return {**params, "diffuser": with_sampling_blocks(params["diffuser"])}
     return {**params, "unet": sampling_blocks.prepared(params["unet"])}
+
+
+def packed(params: Params) -> Params:
+    """Parameters with each network's vectors in one array: a decision for one robot begins the
+    later, the more arrays it is handed."""
+    if "diffuser" in params:
+        rest = {name: joined.packed(net) for name, net in params.items() if name != "diffuser"}
+        return {**rest, "diffuser": packed(params["diffuser"])}
+    return {name: joined.packed(net) for name, net in params.items()}
 
 
 def ablated(method: config.Method, policy_config: config.PolicyConfig) -> config.Method:

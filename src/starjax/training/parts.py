@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
+from starjax.models import joined
 from starjax.policies import policy as policies
-from starjax.training import devices, joined
+from starjax.training import devices
 from starjax.training.state import TrainState
 
 Carried = tuple[TrainState, policies.Params]

@@ -8,10 +8,13 @@ that way, neither these nor what the optimiser knows of them are turned at every
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 
 class Joined(NamedTuple):
@@ -44,6 +47,39 @@ def separate(joined: Joined, like: Any) -> Any:
     vectors = iter(_apart(joined.vectors, tuple(x.shape for x in leaves if not is_matrix(x))))
     given = zip(matrices, leaves, strict=True)
     return tree.unflatten([x if is_matrix(shape) else next(vectors) for x, shape in given])
+
+
+class Packed(struct.PyTreeNode):
+    """Parameters that are joined and know how they were.
+
+    Attributes:
+      joined: their arrays.
+      like: their structure and the shapes of its leaves.
+    """
+
+    joined: Joined
+    like: tuple[Any, tuple[jax.ShapeDtypeStruct, ...]] = struct.field(pytree_node=False)
+
+
+def packed(params: Any) -> Packed:
+    """Parameters as `applied` takes them, too."""
+    leaves, tree = jax.tree.flatten(jax.eval_shape(lambda x: x, params))
+    return Packed(join(params, tree.unflatten(leaves)), (tree, tuple(leaves)))
+
+
+def applied(network: nn.Module) -> Callable[..., Any]:
+    """`network.apply` of parameters that may be packed.
+
+    Called within a loop it separates them there: before the loop that would be a kernel for each.
+    """
+
+    def apply(params: Any, *given: Any, **options: Any) -> Any:
+        if isinstance(params, Packed):
+            tree, leaves = params.like
+            params = separate(params.joined, tree.unflatten(leaves))
+        return network.apply(params, *given, **options)
+
+    return apply
 
 
 def join_all(state: Any, like: Any) -> Any:

@@ -5,7 +5,7 @@ import jax
 import numpy as np
 
 from starjax.config import TrainConfig
-from starjax.training import joined
+from starjax.models import encoders, joined
 from starjax.training.state import make_optimizer
 
 
@@ -53,3 +53,13 @@ def test_all_that_holds_parameters_is_joined():
 def test_without_vectors_nothing_is_joined():
     given = {"kernel": np.ones((2, 2), np.float32)}
     chex.assert_trees_all_equal(joined.separate(joined.join(given, given), given), given)
+
+
+def test_a_network_takes_packed_parameters_as_it_takes_others():
+    network = encoders.SmallTrunk(width=16)
+    image = jax.random.normal(jax.random.key(0), (2, 16, 16, 3))
+    params = network.init(jax.random.key(1), image)
+    packed = joined.packed(params)
+    assert len(jax.tree.leaves(packed)) == len(jax.tree.leaves(params)) - 2 * 7 + 1
+    apply = jax.jit(joined.applied(network))
+    chex.assert_trees_all_equal(apply(packed, image), apply(params, image))
