@@ -50,7 +50,7 @@ def separate(joined: Joined, like: Any) -> Any:
 
 
 class Packed(struct.PyTreeNode):
-    """Parameters that are joined and know how they were.
+    """A network's parameters, joined, that know how they were.
 
     Attributes:
       joined: their arrays.
@@ -62,7 +62,7 @@ class Packed(struct.PyTreeNode):
 
 
 def packed(params: Any) -> Packed:
-    """Parameters as `applied` takes them, too."""
+    """A network's parameters as fewer arrays, which `applied` takes as it takes others."""
     leaves, tree = jax.tree.flatten(jax.eval_shape(lambda x: x, params))
     return Packed(join(params, tree.unflatten(leaves)), (tree, tuple(leaves)))
 
@@ -70,7 +70,8 @@ def packed(params: Any) -> Packed:
 def applied(network: nn.Module) -> Callable[..., Any]:
     """`network.apply` of parameters that may be packed.
 
-    Called within a loop it separates them there: before the loop that would be a kernel for each.
+    Called within a loop it separates them there, in the kernels that use them; before the loop a
+    GPU would need one for each.
     """
 
     def apply(params: Any, *given: Any, **options: Any) -> Any:
