@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.evaluation import rollout
 from starjax.sim import env as envs
 from starjax.sim import physics
 from starjax.sim.engine import mjx
@@ -15,6 +14,7 @@ from starjax.sim.model import SimModel
 from starjax.sim.tasks import expert
 
 STEPS = 240  # control steps an episode, 8 s, so most states hold contacts
+CPU_LANES = 16  # of a program that has a CPU to itself: enough to share its operations out
 
 
 def states(env: envs.Env, episodes: int) -> tuple[physics.PhysicsState, np.ndarray]:
@@ -35,7 +35,7 @@ def states(env: envs.Env, episodes: int) -> tuple[physics.PhysicsState, np.ndarr
         return jax.lax.scan(act, (state, expert.init(key, state)), None, length=STEPS)[1]
 
     keys = jax.random.split(jax.random.key(11), episodes)
-    batch = rollout.CPU_LANES if jax.default_backend() == "cpu" else episodes
+    batch = CPU_LANES if jax.default_backend() == "cpu" else episodes
     found = jax.jit(lambda x: jax.lax.map(episode, x, batch_size=batch))((keys, trocars))
     return jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), found)
 

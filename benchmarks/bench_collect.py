@@ -4,9 +4,9 @@
 
 `demos.collect` at the eight seen trocars, as `starjax collect` calls it, with programs that have
 run one segment before the clock starts: compilation is timed apart. Simulating, copying pictures to
-the host and writing overlap; its time is divided by what it waited for. Beside it: one thread of C
-MuJoCo doing the physics steps alone, and a plain sequential write of the same bytes with fsync in
-the same folder.
+the host and writing overlap; its time is divided by what it, or each of a CPU's cores, waited for.
+Beside it: one thread of C MuJoCo doing the physics steps alone, and a plain sequential write of the
+same bytes with fsync in the same folder.
 """
 
 import argparse
@@ -22,14 +22,13 @@ import _timing
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.data import demos, episodes, recorder, store
+from starjax.data import demos, episodes, recorder, store, workers
 from starjax.sim import env as envs
 from starjax.sim.tasks import expert
 
 SEEN = 8
 MAX_STEPS = 600
 PLAIN_BYTES = 1 << 30
-GPU_CHUNK = 256  # as `demos.collect`
 
 
 def main() -> None:
@@ -37,7 +36,9 @@ def main() -> None:
     small = _peer.platform() == "cpu"
     parser.add_argument("--image", type=int, default=64 if small else 256)
     parser.add_argument("--per-trocar", type=int, default=2 if small else 30)
-    parser.add_argument("--chunk", type=int, default=16 if small else GPU_CHUNK)
+    parser.add_argument(
+        "--chunk", type=int, default=workers.CPU_LANES if small else demos.GPU_LANES
+    )
     parser.add_argument("--folder", help="where a temporary folder is made; default: the system's")
     parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
     asked = parser.parse_args()
@@ -83,20 +84,20 @@ def main() -> None:
 
 def collect(root: pathlib.Path, simulate, env, trocars, asked) -> dict:
     """Collects with programs that are compiled; how long it took, and for what it waited."""
-    clock = {"begun": 0.0, "segments": 0.0, "fetch": 0.0}
+    begun, segments, fetches = [], [], []  # s; appended to by all threads
     fetch, chunks = episodes.fetch, []
 
     def begin(*_):
-        clock["begun"] = time.perf_counter()
+        begun.append(time.perf_counter())
         return timed_simulate
 
     def timed_simulate(group):
         chunks.append(len(group))
-        segments = simulate(group)
+        simulation = simulate(group)
         while True:
             start = time.perf_counter()
-            finished = next(segments, None)
-            clock["segments"] += time.perf_counter() - start
+            finished = next(simulation, None)
+            segments.append(time.perf_counter() - start)
             if finished is None:
                 return
             yield finished
@@ -104,7 +105,7 @@ def collect(root: pathlib.Path, simulate, env, trocars, asked) -> dict:
     def timed_fetch(slices):
         start = time.perf_counter()
         fetched = fetch(slices)
-        clock["fetch"] += time.perf_counter() - start
+        fetches.append(time.perf_counter() - start)
         return fetched
 
     wanted = {"per_trocar": asked.per_trocar, "seed": 0, "max_steps": MAX_STEPS}
@@ -113,13 +114,14 @@ def collect(root: pathlib.Path, simulate, env, trocars, asked) -> dict:
         mock.patch.object(episodes, "fetch", timed_fetch),
     ):
         demos.collect(root, env, expert, trocars, chunk=asked.chunk, **wanted)
-    run_s = time.perf_counter() - clock["begun"]
+    run_s = time.perf_counter() - begun[0]
+    simulated, copied = (sum(spent) / workers.count() for spent in (segments, fetches))
     return {
         "chunks": chunks,
         "run_s": run_s,
-        "simulate_s": clock["segments"] - clock["fetch"],
-        "copy_s": clock["fetch"],
-        "write_s": run_s - clock["segments"],
+        "simulate_s": simulated - copied,
+        "copy_s": copied,
+        "write_s": run_s - simulated,
     }
 
 

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import runtime
-from starjax.evaluation import rollout
 from starjax.sim import env as envs
 from starjax.sim import physics, solver
 from starjax.sim.engine import mjx
@@ -76,7 +75,7 @@ def program(sim, step):
 
     def run_all(*batch):
         if jax.default_backend() == "cpu":
-            return jax.lax.map(lambda x: run(*x), batch, batch_size=rollout.CPU_LANES)
+            return jax.lax.map(lambda x: run(*x), batch, batch_size=_visited.CPU_LANES)
         return jax.vmap(run)(*batch)
 
     return jax.jit(run_all)

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import runtime
-from starjax.evaluation import rollout
 from starjax.sim import env as envs
 from starjax.sim import solver
 from starjax.sim.engine import mjx
@@ -78,7 +77,7 @@ def with_settings(sim: SimModel, settings: tuple[int, int, float]) -> mjx.Model:
 def program(sim: SimModel, step, model: mjx.Model):
     """Compiled: velocities `[N, V]` after one step of N states."""
     one = _visited.stepper(sim, step, model)
-    batch = rollout.CPU_LANES
+    batch = _visited.CPU_LANES
     return jax.jit(lambda x: jax.lax.map(lambda y: one(*y).qvel, x, batch_size=batch))
 
 

@@ -28,10 +28,10 @@ class World:
                 if self.fate(t)[1] == segment
             ]
 
-    def collected(self, known, per_trocar, chunk):
+    def collected(self, known, per_trocar, chunk, at_once=1):
         """The trials that are yielded, once each."""
         self.groups = []
-        given = trials.run(self.simulate, dict(known), self.trocars, per_trocar, chunk)
+        given = trials.run(self.simulate, dict(known), self.trocars, per_trocar, chunk, at_once)
         found = [(e.outcome["trocar"], e.outcome["trial"]) for e in given]
         assert len(set(found)) == len(found)
         return set(found)
@@ -55,6 +55,7 @@ def test_what_is_collected_is_what_is_needed(seed):
     wanted = needed(world, 5)
     for chunk in (1, 2, 4, 7, 16, 64):
         assert world.collected({}, 5, chunk) == wanted
+        assert world.collected({}, 5, chunk, at_once=3) == wanted
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -318,7 +318,7 @@ def test_commanded_error_counts_executed_commands_only(whole):
         trial=np.zeros(1, np.int32),
         wanted=np.ones(1, bool),
     )
-    done = rollout.make(env, policy, settings, 0)(params, jnp.float32(1.0), trials, lambda _: None)
+    *_, (_, done) = rollout.make(env, policy, settings, 0)(params, jnp.float32(1.0), trials)
     port = np.asarray(rcm.trocar_position(trials.trocar, stubs.P_WORLD_REF))[0]
     # Where the plan is followed exactly, the tip has been at every command that was executed.
     path = done.steps.p_world_tip[: done.length[0], 0]

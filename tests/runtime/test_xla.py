@@ -30,6 +30,13 @@ def test_the_flag_is_only_for_old_jaxlib(monkeypatch, tmp_path):
     assert _prepared(monkeypatch, tmp_path, (0, 11))[0] == ""
 
 
+def test_programs_that_simulate_nothing_get_back_what_it_turns_off(monkeypatch):
+    monkeypatch.setattr(xla, "_jaxlib_version", lambda: (0, 10))
+    assert xla.options_without_kinematics() == {FLAG.split("=")[0].lstrip("-"): True}
+    monkeypatch.setattr(xla, "_jaxlib_version", lambda: (0, 11))
+    assert xla.options_without_kinematics() == {}
+
+
 def test_the_users_flags_stay_and_win(monkeypatch, tmp_path):
     flags, _ = _prepared(monkeypatch, tmp_path, (0, 10), XLA_FLAGS="--a=1")
     assert flags == f"--a=1 {FLAG}"

@@ -16,6 +16,7 @@ from starjax.data import normalizer, windows
 from starjax.experiments.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies.policy import Policy
+from starjax.runtime import xla
 from starjax.training import devices, state, step
 from starjax.training.parts import Parts
 
@@ -163,14 +164,16 @@ def test_mesh_divides_the_batch():
     assert devices.make_mesh(7, jax.devices()).size == 1
 
 
-def test_options_of_several_gpus_are_known_to_this_xla():
+def test_options_of_devices_are_known_to_this_xla():
     gpu, cpu = (types.SimpleNamespace(platform=name) for name in ("gpu", "cpu"))
 
     def options(*on):
         mesh: Any = types.SimpleNamespace(size=len(on), devices=np.array(on))
         return devices.compiler_options(mesh)
 
-    assert options(gpu) == options(cpu, cpu) == {}
+    assert options(gpu) == {}
     assert options(gpu, gpu)
+    assert options(cpu) == options(cpu, cpu) == xla.options_without_kinematics()
     # an option that XLA does not know is an error at compilation
     jax.jit(lambda x: x + 1, compiler_options=options(gpu, gpu))(1)
+    jax.jit(lambda x: x + 1, compiler_options=options(cpu))(1)

@@ -23,12 +23,14 @@ import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.data import episodes, recorder, store, trials
+from starjax.data import episodes, recorder, store, trials, workers
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files, progress, xla
 
 COMMITS = 16  # episodes written at once; most of it is waiting for the disk
-FRAME_GUESS = 300  # control steps of a typical demonstration, for the estimate of disk space
+FRAME_GUESS = 300  # control steps of a typical demonstration, for estimates of disk and memory
+MEMORY_SHARE = 0.25  # of the host's, for pictures of the episodes that are simulated together
+GPU_LANES = 256  # episodes a GPU simulates together
 
 
 def describe(
@@ -93,7 +95,8 @@ def collect(
       max_steps: control steps after which an episode has failed.
       keep_failures: store failed episodes too.
       one_wall: what the description says of the expert.
-      chunk: episodes simulated at once; 0 for what suits the machine.
+      chunk: episodes simulated together; 0 for what suits the machine. On a CPU each of its cores
+        has so many of its own.
       devices: to split a chunk over.
       report: gets lines for the user.
 
@@ -130,7 +133,9 @@ def collect(
         files.require_writable(
             root, max(total - done, 0) * min(max_steps, FRAME_GUESS) * frame_bytes
         )
-        chunk = chunk or _chunk(frame_bytes, devices)
+        fits = int(MEMORY_SHARE * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
+        chunk = chunk or max(1, min(_fast(devices), fits))
+        at_once = max(1, min(workers.count(), fits // chunk))
         chunk = -(-chunk // len(devices or [0])) * len(devices or [0])
         simulate = recorder.simulator(env, expert, trocars, seed, max_steps, chunk, devices)
         known = {(r["trocar"], r["trial"]): r["success"] for r in records.values()}
@@ -147,7 +152,8 @@ def collect(
 
         shown = progress.track("Demonstrations", total, unit="episodes", done=done)
         with shown as advance, _writer(commit, note, chunk) as write:
-            for episode in trials.run(simulate, known, len(trocars.radius), per_trocar, chunk):
+            wanted = (len(trocars.radius), per_trocar, chunk, at_once)
+            for episode in trials.run(simulate, known, *wanted):
                 write(episode)
         digest = store.seal(root, records)
     return {
@@ -200,14 +206,11 @@ def _writer(
         pool.shutdown(cancel_futures=True)
 
 
-def _chunk(frame_bytes: int, devices: Sequence[jax.Device] | None) -> int:
-    """Episodes at once: 16 fill a CPU, a GPU takes hundreds; pictures of all must fit the host.
-
-    A function of the machine alone, as the size of a batch may change last bits.
-    """
-    fast = 16 if jax.default_backend() == "cpu" else 256 * len(devices or [0])
-    fits = int(0.25 * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
-    return max(1, min(fast, fits))
+def _fast(devices: Sequence[jax.Device] | None) -> int:
+    """Episodes that make the most of a program. A function of the machine alone, as the size of a
+    batch may change last bits."""
+    on_cpu = jax.default_backend() == "cpu"
+    return workers.CPU_LANES if on_cpu else GPU_LANES * len(devices or [0])
 
 
 def scene_hash(model: Any) -> str:

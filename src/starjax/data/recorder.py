@@ -6,7 +6,7 @@ segment, the host fetches the pictures of the one before.
 """
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -75,7 +75,7 @@ def simulator(
     max_steps: int,
     chunk: int,
     devices: Sequence[jax.Device] | None,
-) -> Callable[[list[tuple[int, int]]], Iterator[list[episodes.Episode]]]:
+) -> Callable[[list[tuple[int, int]]], Generator[list[episodes.Episode]]]:
     """The compiled programs: from a group of (trocar, trial) to its episodes, as they end.
 
     What is returned yields, after every segment, the episodes that it was the last one of, on the
@@ -87,7 +87,7 @@ def simulator(
         _advancer(env, expert), devices, (lanes.LANE, lanes.SHARED), lanes.LANE, donate=(0,)
     )
 
-    def simulate(group: list[tuple[int, int]]) -> Iterator[list[episodes.Episode]]:
+    def simulate(group: list[tuple[int, int]]) -> Generator[list[episodes.Episode]]:
         count = len(group)
         index, trial = np.array(group + [group[0]] * (chunk - count), np.int32).T
         trials = _Trials(Trocar(*(field[index] for field in trocars)), index, trial)

@@ -5,9 +5,9 @@ successes, and is not once they do have them.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 
-from starjax.data import episodes
+from starjax.data import episodes, workers
 
 MIN_SUCCESS_RATE = 0.5  # below it at some trocar, the expert is broken and collecting stops
 
@@ -20,13 +20,14 @@ class ExpertFailed(ValueError):
 
 
 def run(
-    simulate: Callable[[list[Trial]], Iterator[list[episodes.Episode]]],
+    simulate: Callable[[list[Trial]], Generator[list[episodes.Episode]]],
     known: dict[Trial, bool],
     trocars: int,
     per_trocar: int,
     chunk: int,
+    at_once: int = 1,
 ) -> Iterator[episodes.Episode]:
-    """Simulates what is needed, `chunk` trials at once; yields each episode when that is certain.
+    """Simulates what is needed, `chunk` trials together; yields each episode when that is certain.
 
     Args:
       simulate: as `recorder.simulator` makes it.
@@ -34,6 +35,7 @@ def run(
       trocars: how many there are.
       per_trocar: successes wanted at each.
       chunk: number of lanes.
+      at_once: chunks that are simulated side by side.
 
     Raises:
       ExpertFailed: the expert fails too often.
@@ -41,18 +43,22 @@ def run(
     there = set(known)
     drawn = [0] * trocars
     while wave := _wave(known, drawn, per_trocar, chunk):
-        for first in range(0, len(wave), chunk):
-            group = wave[first : first + chunk]
-            segments, waiting = simulate(group), []
-            while any(_is_open(trial, known, per_trocar) for trial in group):
-                waiting += next(segments)
-                known.update({_trial(episode): episode.outcome["success"] for episode in waiting})
-                ready = [e for e in waiting if _is_needed(_trial(e), known, per_trocar)]
-                waiting = [e for e in waiting if not _is_needed(_trial(e), known, per_trocar)]
-                while ready:
-                    episode = ready.pop()  # so that its memory is free once it is written
-                    if _trial(episode) not in there:
-                        yield episode
+        groups = [wave[first : first + chunk] for first in range(0, len(wave), chunk)]
+        waiting: list[episodes.Episode] = []
+
+        def is_wanted(group: list[Trial]) -> bool:
+            return any(_is_open(trial, known, per_trocar) for trial in group)
+
+        for ended in workers.run(groups, simulate, at_once, is_wanted):
+            waiting += ended
+            known.update({_trial(episode): episode.outcome["success"] for episode in ended})
+            ended.clear()  # so that an episode's memory is free once it is written
+            ready = [e for e in waiting if _is_needed(_trial(e), known, per_trocar)]
+            waiting = [e for e in waiting if not _is_needed(_trial(e), known, per_trocar)]
+            while ready:
+                episode = ready.pop()
+                if _trial(episode) not in there:
+                    yield episode
 
 
 def _wave(known: Known, drawn: list[int], per_trocar: int, chunk: int) -> list[Trial]:

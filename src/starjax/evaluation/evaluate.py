@@ -9,7 +9,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.data import demos
+from starjax.data import demos, workers
 from starjax.evaluation import recorded, rollout, table
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files, progress, xla
@@ -59,8 +59,8 @@ def evaluate(
       time_limit_s: of a trial, simulated.
       chunk: trials that are simulated and saved together, at most; 0 for as many as run at once.
         Changes neither the result nor the memory taken.
-      lanes: size of the compiled batch on each device, 0 for `rollout.lanes_per_device`: it is what
-        decides memory, and may change last bits.
+      lanes: size of the compiled batch on each device, or of each core's on a CPU; 0 for
+        `rollout.lanes_per_device`: it is what decides memory, and may change last bits.
       video_trials: how many trials get their joint positions recorded, at least.
       devices: to split a chunk over. Does not change the result.
       identity: JSON values that tell this policy from others with the same weights.
@@ -103,26 +103,31 @@ def evaluate(
             "versions": xla.versions(),
         }
         chunk = _resume(directory, plan, min(chunk or batch, batch), batch, report)
-        tables, kept = [], []
-        with progress.track("Evaluation", len(index), unit="trials") as advance:
-            for number, first in enumerate(range(0, len(index), chunk)):
-                rows = slice(first, min(first + chunk, len(index)))
-                path = directory / f"chunk_{number:04d}.npz"
-                found = _read(path, report)
-                if found is None:
-                    here = _fill(trocars, index[rows], trial[rows], batch)
-                    told = _Told(advance, rows.stop - rows.start)
-                    done = run(params, normalizer, here, told)
-                    found = (
-                        table.from_rollouts(done, index[rows], trial[rows]),
-                        recorded.take(done, here, chosen[rows], env.p_world_ref),
-                    )
-                    _write(path, *found)
-                    told(1.0)
-                else:
-                    advance(rows.stop - rows.start)
-                tables.append(found[0])
-                kept.append(found[1])
+        spans = [
+            slice(first, min(first + chunk, len(index))) for first in range(0, len(index), chunk)
+        ]
+        paths = [directory / f"chunk_{number:04d}.npz" for number in range(len(spans))]
+        chunks = [_read(path, report) for path in paths]
+        missing = [number for number, found in enumerate(chunks) if found is None]
+        done = len(index) - sum(spans[number].stop - spans[number].start for number in missing)
+
+        def simulate(number: int) -> Generator[float]:
+            """Makes a chunk; yields how many trials, or parts of them, have passed in between."""
+            rows, shown = spans[number], 0.0
+            here = _fill(trocars, index[rows], trial[rows], batch)
+            for passed, rollouts in run(params, normalizer, here):
+                if rollouts is not None:
+                    rows_of = table.from_rollouts(rollouts, index[rows], trial[rows])
+                    kept = recorded.take(rollouts, here, chosen[rows], env.p_world_ref)
+                    _write(paths[number], rows_of, kept)
+                    chunks[number] = (rows_of, kept)
+                yield (passed - shown) * (rows.stop - rows.start)
+                shown = passed
+
+        with progress.track("Evaluation", len(index), unit="trials", done=done) as advance:
+            for passed in workers.run(missing, simulate, workers.count()):
+                advance(passed)
+        tables, kept = zip(*chunks, strict=True)
         if chosen.any():
             files.write_npz(directory / "recorded.npz", recorded.join(kept))
     return table.join(tables)
@@ -136,17 +141,6 @@ def fingerprint(tree: Any) -> str:
         digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-class _Told:
-    """Turns a chunk's share of time into trials of the progress bar."""
-
-    def __init__(self, advance: Callable[..., None], count: int):
-        self._advance, self._count, self._shown = advance, count, 0.0
-
-    def __call__(self, fraction: float) -> None:
-        self._advance((fraction - self._shown) * self._count)
-        self._shown = fraction
 
 
 def _resume(

@@ -7,7 +7,7 @@ size of the compiled batch may change last bits (of matrix products, and of the 
 small), so each device always runs equally many trials, some of them idle if there are fewer.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,15 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.data import lanes
+from starjax.data import lanes, workers
 from starjax.rcm.trocar import Trocar
 from starjax.sim import env as sim_env
 from starjax.types import Command
 
 SEGMENT = 25  # re-plans between two looks at the host
-# Trials at once on each device. A CPU is at its best with 16; a GPU takes hundreds in the time of
-# one, as far as its memory goes.
-CPU_LANES, GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 16, 1280, 128, 40 << 30
+# Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
+GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
 
 
 class Settings(NamedTuple):
@@ -106,13 +105,25 @@ class Rollouts(NamedTuple):
     steps: Steps
 
 
+class Progress(NamedTuple):
+    """Of trials under way.
+
+    Attributes:
+      passed: share of the time limit.
+      rollouts: None until all are over.
+    """
+
+    passed: float
+    rollouts: Rollouts | None
+
+
 def make(
     env: Any,
     policy: Any,
     settings: Settings,
     seed: int,
     devices: Sequence[jax.Device] | None = None,
-) -> Callable[..., Rollouts]:
+) -> Callable[..., Generator[Progress]]:
     """Builds the programs.
 
     Args:
@@ -122,8 +133,7 @@ def make(
       devices: to split trials over; their number must divide that of the trials.
 
     Returns:
-      run(params, normalizer, trials, tick) -> Rollouts. `tick(fraction)` is called now and then
-      with the share of the time limit that has passed.
+      run(params, normalizer, trials), which yields Progress now and then, the rollouts at last.
     """
     _check(settings)
     key = jax.random.key(seed)
@@ -142,36 +152,34 @@ def make(
     )
     plans = -(-settings.max_steps // settings.execute) + 1  # one more: the first executes nothing
 
-    def run(
-        params: Any, normalizer: Any, trials: Trials, tick: Callable[[float], None]
-    ) -> Rollouts:
+    def run(params: Any, normalizer: Any, trials: Trials) -> Generator[Progress]:
         carry = start(key, params, normalizer, trials)
         kept = []
         for first in range(0, plans, SEGMENT):
             carry, steps = advance(params, normalizer, carry, np.int32(first))
             over = np.asarray(carry.env.done | ~carry.wanted)
             kept.append(jax.device_get(steps))
-            tick(min(1.0, (first + SEGMENT) / plans))
             if over.all():
                 break
+            yield Progress(min(1.0, (first + SEGMENT) / plans), None)
         length = np.asarray(carry.length)
         # The first row of blocks belongs to plan 0, which has nothing to execute yet.
         joined = jax.tree.map(lambda *parts: np.concatenate(parts)[settings.execute :], *kept)
         steps = jax.tree.map(lambda leaf: leaf[: max(length.max(), 1)], joined)
-        return Rollouts(
-            jax.device_get(carry.env), length, np.asarray(carry.commanded_max), Steps(*steps)
-        )
+        commanded_max = np.asarray(carry.commanded_max)
+        rollouts = Rollouts(jax.device_get(carry.env), length, commanded_max, Steps(*steps))
+        yield Progress(1.0, rollouts)
 
     return run
 
 
 def lanes_per_device(device: jax.Device, trials: int) -> int:
-    """Trials that a device of this kind runs at once, where there are `trials` in all.
+    """Trials that a device of this kind runs together, where there are `trials` in all.
 
     A GPU's are as many as make the fewest chunks, and no more than these need.
     """
     if device.platform == "cpu":
-        return CPU_LANES
+        return workers.CPU_LANES
     limit = (device.memory_stats() or {}).get("bytes_limit", 0)
     most = GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
     chunks = -(-trials // most)

@@ -43,6 +43,15 @@ def prepare_xla() -> None:
     _set_default("jax_compilation_cache_dir", str(cache))
 
 
+def options_without_kinematics() -> dict[str, Any]:
+    """Options of `jax.jit` for programs on a CPU that simulate nothing.
+
+    They get back the fusion emitters that `prepare_xla` turns off: a training step without pictures
+    takes 0.8 to 0.9 times as long with them.
+    """
+    return {_FUSION_FLAG.lstrip("-"): True} if _jaxlib_version() < (0, 11) else {}
+
+
 def cache_directory() -> Path:
     """Folder for what can be made again: STARJAX_CACHE, else the user's cache directory, or the
     system's temporary one where the user has no home."""

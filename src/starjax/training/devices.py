@@ -6,6 +6,7 @@ from typing import Any
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from starjax.runtime import xla
 from starjax.training import processes
 
 AXIS = "batch"
@@ -48,8 +49,10 @@ def replicated(mesh: Mesh) -> NamedSharding:
 
 def compiler_options(mesh: Mesh) -> dict[str, Any]:
     """Options of `jax.jit` for a training step on the mesh."""
-    several_gpus = mesh.size > 1 and mesh.devices.flat[0].platform == "gpu"
-    return _OVERLAP if several_gpus else {}
+    platform = mesh.devices.flat[0].platform
+    if platform == "cpu":
+        return xla.options_without_kinematics()
+    return _OVERLAP if mesh.size > 1 and platform == "gpu" else {}
 
 
 def replicate(tree: Any, mesh: Mesh, may_alias: bool | None = False) -> Any:

@@ -8,7 +8,7 @@ the same encoder, finds them. Archives have checksums: a damaged part is noticed
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,16 @@ import jax
 import numpy as np
 
 from starjax import config
+from starjax.data import workers
 from starjax.policies import diffuser
 from starjax.policies import features as inputs
 from starjax.runtime import files, progress
 from starjax.training.encoder import Encoder
 
 PART = 1024  # frames a file: what a kill may cost
-BATCH = 64  # frames a call: always as many, since the size of a batch may change last bits
+# Frames a call: always as many, since the size of a batch may change last bits. With more, what a
+# CPU's core works on leaves its cache.
+BATCH = 16
 
 
 def features(
@@ -64,16 +67,22 @@ def features(
             parts[path] = found
     if missing:
         see, pictures = _make_see(encoder, policy_config, train_config), frames()
+
+        def make(part: tuple[Path, int, int]) -> Generator[int]:
+            """Yields how many frames it has seen in between."""
+            path, first, last = part
+            seen = []
+            for start in range(first, last, BATCH):
+                rows = np.minimum(np.arange(start, start + BATCH), last - 1)
+                seen.append(np.asarray(see(pictures[rows]))[: last - start])
+                yield len(seen[-1])
+            parts[path] = np.concatenate(seen)
+            files.write_npz(path, {"features": parts[path]})
+
         done = sum(map(len, parts.values()))
         with progress.track("Features", count, unit="frames", done=done) as advance:
-            for path, first, last in missing:
-                seen = []
-                for start in range(first, last, BATCH):
-                    rows = np.minimum(np.arange(start, start + BATCH), last - 1)
-                    seen.append(np.asarray(see(pictures[rows]))[: last - start])
-                    advance(len(seen[-1]))
-                parts[path] = np.concatenate(seen)
-                files.write_npz(path, {"features": parts[path]})
+            for seen in workers.run(missing, make, workers.count()):
+                advance(seen)
     joined = np.concatenate([parts[path] for path in paths])
     said = "in" if missing else "done before,"
     report(f"features of {count} frames, {files.size(joined.nbytes)}: {said} {folder}")

@@ -1,0 +1,74 @@
+"""Control steps a second on a CPU: a program for each core, against one for all of them.
+
+    python benchmarks/bench_workers.py [--image 128] [--tiny]
+
+The scripted expert in the programs that collect demonstrations, compiled beforehand.
+"""
+
+import argparse
+from collections.abc import Generator
+
+import _timing
+import numpy as np
+
+from starjax import rcm, runtime
+from starjax.data import recorder, workers
+from starjax.sim import env as envs
+from starjax.sim.tasks import expert
+
+ALONE = 16  # lanes of one program for all cores: with more it is no faster
+SEGMENTS = 8  # of a measurement: 4 s simulated, in which no episode ends
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--image", type=int, default=128, help="pixels a side")
+    parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
+    asked = parser.parse_args()
+    runtime.prepare_xla()
+    side, segments = (16, 1) if asked.tiny else (asked.image, SEGMENTS)
+    env = envs.make("image", side)
+    rows = {}
+    for name, lanes, at_once in (
+        ("one program", ALONE, 1),
+        ("one program, fewer lanes", workers.CPU_LANES, 1),
+        ("one for each core", workers.CPU_LANES, workers.count()),
+    ):
+        rows[name] = measure(env, lanes, at_once, segments)
+        rows[name]["times_one_program"] = (
+            rows[name]["control_steps_per_s"] / rows["one program"]["control_steps_per_s"]
+        )
+        print(
+            f"{name:24} {at_once} x {lanes:2} lanes: "
+            f"{rows[name]['control_steps_per_s']:.0f} control steps/s, "
+            f"{rows[name]['times_one_program']:.2f} times one program's",
+            flush=True,
+        )
+    _timing.report("workers", {"results": {f"{side} px": rows}}, asked.tiny)
+
+
+def measure(env: envs.Env, lanes: int, at_once: int, segments: int) -> dict:
+    """Rate of `at_once` simulations of `lanes` episodes each."""
+    trocars = rcm.Trocar(*(np.asarray(field, np.float32) for field in rcm.TROCARS))
+    steps = segments * recorder.SEGMENT
+    script = recorder.Expert(expert.init, expert.act)
+    simulator = recorder.simulator(env, script, trocars, 0, steps, lanes, None)
+
+    def simulate(number: int) -> Generator[int]:
+        group = [(lane % 12, number * lanes + lane) for lane in range(lanes)]
+        for ended in simulator(group):
+            yield len(ended)
+
+    def run() -> None:
+        sum(workers.run(range(at_once), simulate, at_once))
+
+    timing = _timing.time_plain(run, repeats=3)
+    return {
+        "lanes": lanes,
+        "at_once": at_once,
+        "control_steps_per_s": at_once * lanes * steps / timing.median_s,
+    }
+
+
+if __name__ == "__main__":
+    main()
