@@ -84,7 +84,8 @@ def measure(case: _setup.Case, rates: _machine.Rates) -> dict:
     arithmetic_s = work / rates.flops
     floor = arithmetic_s + STATE_PASSES * 4 * parameters / rates.bandwidth
     count = np.int32(job.per_call)
-    timing, _ = _timing.time_carried(job.steps, job.carried, job.dataset, count, calls=job.calls)
+    inputs = (job.carried, job.dataset, count)
+    timing, _ = _timing.time_carried(job.steps, *inputs, calls=job.calls, **job.options)
     timed = job.calls * job.per_call
     seconds = timing.median_s / timed
     batch = case.train.batch_size

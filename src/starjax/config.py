@@ -110,7 +110,7 @@ class EvalConfig:
 
     trials: int = 30  # a trocar
     time_limit_s: float = 60.0
-    chunk: int = 0  # trials between two savings, at most; 0: as many as run at once
+    chunk: int = 0  # trials between two savings, at most; 0: as many as a program runs
     video_trials: int = 4  # trials recorded for the video and the figures
 
 

@@ -150,10 +150,10 @@ def collect(
             records[record["key"]] = record
             advance(int(record["success"]))
 
+        needed = trials.run(simulate, known, len(trocars.radius), per_trocar, chunk, at_once)
         shown = progress.track("Demonstrations", total, unit="episodes", done=done)
         with shown as advance, _writer(commit, note, chunk) as write:
-            wanted = (len(trocars.radius), per_trocar, chunk, at_once)
-            for episode in trials.run(simulate, known, *wanted):
+            for episode in needed:
                 write(episode)
         digest = store.seal(root, records)
     return {

@@ -1,7 +1,8 @@
 """Simulations side by side, each in a thread of its own.
 
 One program's operations are small: a CPU's cores that share each of them wait for each other most
-of the time. Two cores make 930 control steps a second of two programs of 8 lanes, 580 of one of 16.
+of the time. Two make 1.5 times as many control steps with a program each, of 8 lanes, as with one
+of 16 (benchmarks/bench_workers.py).
 """
 
 import collections

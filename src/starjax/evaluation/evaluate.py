@@ -57,7 +57,7 @@ def evaluate(
       obs_horizon: observations the policy sees.
       execute: commands executed before re-planning.
       time_limit_s: of a trial, simulated.
-      chunk: trials that are simulated and saved together, at most; 0 for as many as run at once.
+      chunk: trials that are simulated and saved together, at most; 0 for as many as the lanes.
         Changes neither the result nor the memory taken.
       lanes: size of the compiled batch on each device, or of each core's on a CPU; 0 for
         `rollout.lanes_per_device`: it is what decides memory, and may change last bits.
@@ -117,10 +117,11 @@ def evaluate(
             here = _fill(trocars, index[rows], trial[rows], batch)
             for passed, rollouts in run(params, normalizer, here):
                 if rollouts is not None:
-                    rows_of = table.from_rollouts(rollouts, index[rows], trial[rows])
-                    kept = recorded.take(rollouts, here, chosen[rows], env.p_world_ref)
-                    _write(paths[number], rows_of, kept)
-                    chunks[number] = (rows_of, kept)
+                    chunks[number] = (
+                        table.from_rollouts(rollouts, index[rows], trial[rows]),
+                        recorded.take(rollouts, here, chosen[rows], env.p_world_ref),
+                    )
+                    _write(paths[number], *chunks[number])
                 yield (passed - shown) * (rows.stop - rows.start)
                 shown = passed
 
