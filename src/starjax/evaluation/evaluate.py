@@ -117,11 +117,12 @@ def evaluate(
             here = _fill(trocars, index[rows], trial[rows], batch)
             for passed, rollouts in run(params, normalizer, here):
                 if rollouts is not None:
-                    chunks[number] = (
+                    made = (
                         table.from_rollouts(rollouts, index[rows], trial[rows]),
                         recorded.take(rollouts, here, chosen[rows], env.p_world_ref),
                     )
-                    _write(paths[number], *chunks[number])
+                    _write(paths[number], *made)
+                    chunks[number] = made
                 yield (passed - shown) * (rows.stop - rows.start)
                 shown = passed
 
