@@ -9,6 +9,7 @@ import argparse
 from collections.abc import Generator
 
 import _timing
+import _visited
 import numpy as np
 
 from starjax import rcm, runtime
@@ -16,7 +17,6 @@ from starjax.data import recorder, workers
 from starjax.sim import env as envs
 from starjax.sim.tasks import expert
 
-ALONE = 16  # lanes of one program for all cores: with more it is no faster
 SEGMENTS = 8  # of a measurement: 4 s simulated, in which no episode ends
 
 
@@ -30,7 +30,7 @@ def main() -> None:
     env = envs.make("image", side)
     rows = {}
     for name, lanes, at_once in (
-        ("one program", ALONE, 1),
+        ("one program", _visited.CPU_LANES, 1),
         ("one program, fewer lanes", workers.CPU_LANES, 1),
         ("one for each core", workers.CPU_LANES, workers.count()),
     ):

@@ -16,8 +16,8 @@ import pytest
 import stubs
 
 from starjax import rcm
-from starjax.data import demos, episodes, load, recorder, store
-from starjax.runtime import files
+from starjax.data import demos, episodes, load, recorder, store, trials, workers
+from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
 from starjax.types import Command
 
@@ -124,6 +124,21 @@ def test_free_lanes_take_the_place_of_failures(tmp_path, monkeypatch):
     summary = collect(tmp_path / "d", chunk=16)
     assert [len(group) for group in groups] == [16]
     assert summary["episodes"] == 8 < summary["trials"] < 16
+
+
+@pytest.mark.parametrize(("chunks", "lanes", "at_once"), [(9.5, 8, 4), (2.5, 8, 2), (0.5, 4, 1)])
+def test_pictures_of_all_that_is_simulated_fit_the_memory(
+    tmp_path, monkeypatch, chunks, lanes, at_once
+):
+    frame = recorder.frame(stubs.make_env("image", unlucky=0.4))
+    lane = 2 * demos.FRAME_GUESS * sum(np.dtype(x.dtype).itemsize * x.size for x in frame.values())
+    memory = int(chunks * workers.CPU_LANES * lane / demos.MEMORY_SHARE)
+    monkeypatch.setattr(xla, "memory_bytes", lambda: memory)
+    monkeypatch.setattr(workers, "count", lambda: 4)
+    asked = []
+    monkeypatch.setattr(trials, "run", lambda *args: asked.append(args[-2:]) or [])
+    collect(tmp_path / "d", "image", chunk=0)
+    assert asked == [(lanes, at_once)]
 
 
 def _full_disk(monkeypatch):
