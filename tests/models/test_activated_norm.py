@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import activated_norm, layers
+from starjax.models import activated_norm, layers, norms
 
 GROUPS = 4
 
@@ -26,7 +26,7 @@ def test_both_gradients_are_of_the_three_layers(length):
     args, g = given(length)
 
     def plain(product, bias, scale, shift):
-        return layers.mish(layers.group_norm(product + bias, scale, shift, GROUPS))
+        return layers.mish(norms.group_norm(product + bias, scale, shift, GROUPS))
 
     expected, back = jax.vjp(plain, *args)
     y, kept = activated_norm.forward(*args, GROUPS)

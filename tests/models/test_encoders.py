@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import encoders, layers, pooled_norm, resnet, spatial_softmax
+from starjax.models import encoders, layers, norms, pooled_norm, resnet, spatial_softmax
 
 KEY = jax.random.key(0)
 
@@ -107,7 +107,7 @@ def stem(request):
     """Our convolution, GroupNorm, ReLU and max-pooling, and jax's: outputs and gradients."""
     x, size = normal(3, *request.param, 3), tuple(-(-side // 2) for side in request.param)
     ours, norm = resnet.Stem(32), pooled_norm.PooledNorm(2, size)
-    plain, plain_norm = resnet.Conv2d(32, 7, 2), layers.GroupNorm(2)
+    plain, plain_norm = resnet.Conv2d(32, 7, 2), norms.GroupNorm(2)
     params = plain.init(KEY, x), plain_norm.init(KEY, normal(3, *size, 32))
     # half of the gains negative, where the largest comes from the smallest
     params = jax.tree.map(lambda leaf: leaf * normal(*leaf.shape), params)
@@ -188,13 +188,13 @@ def test_a_block_is_torchvisions_with_groups_of_16_channels(stride, into):
     x = normal(3, 8, 8, into)
     block = resnet.BasicBlock(32, stride)
     params = block.init(KEY, x)["params"]
-    norm = layers.GroupNorm(2).init(KEY, normal(3, 8, 8, 32))["params"]
+    norm = norms.GroupNorm(2).init(KEY, normal(3, 8, 8, 32))["params"]
 
     def conv(name, x, size, stride=1):
         return resnet.Conv2d(32, size, stride).apply({"params": params[name]}, x)
 
     def group_norm(x):
-        return layers.GroupNorm(2).apply({"params": norm}, x)
+        return norms.GroupNorm(2).apply({"params": norm}, x)
 
     y = jax.nn.relu(group_norm(conv("conv1", x, 3, stride)))
     y = group_norm(conv("conv2", y, 3))
@@ -216,7 +216,7 @@ def test_the_small_trunks_layers_are_cut_by_relu():
     ):
         params = variables["params"]
         x = resnet.Conv2d(16 << doubling, 3, stride).apply({"params": params[f"Conv2d_{size}"]}, x)
-        norm = layers.GroupNorm((16 << doubling) // 8)
+        norm = norms.GroupNorm((16 << doubling) // 8)
         x = jax.nn.relu(norm.apply({"params": params[f"GroupNorm_{size}"]}, x))
     np.testing.assert_allclose(module.apply(variables, frames()), x, atol=1e-4)
 

@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from starjax.models import layers, resnet, spatial_softmax
+from starjax.models import layers, norms, resnet, spatial_softmax
 
 
 class ImageEncoder(nn.Module):
@@ -66,7 +66,7 @@ class SmallTrunk(nn.Module):
         x = image.astype(self.dtype)
         for doubling, stride in ((0, 2), (0, 1), (1, 2), (1, 1), (2, 2), (2, 1), (2, 1)):
             x = resnet.Conv2d(self.width << doubling, 3, stride)(x)
-            x = nn.relu(layers.GroupNorm(x.shape[-1] // 8)(x))
+            x = nn.relu(norms.GroupNorm(x.shape[-1] // 8)(x))
         return x
 
 

@@ -1,7 +1,7 @@
-"""Layers shared by the networks: Conv1d as one matrix product, GroupNorm, Mish, Dense.
+"""Layers shared by the networks: Conv1d as one matrix product, Mish, Dense.
 
-Parameters are float32; arithmetic runs in the dtype of the input (float32 or bfloat16), while
-statistics are always float32. Initial values follow torch's defaults, as Diffusion Policy's do.
+Parameters are float32; arithmetic runs in the dtype of the input (float32 or bfloat16). Initial
+values follow torch's defaults, as Diffusion Policy's do.
 """
 
 import functools
@@ -13,8 +13,15 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-EPSILON = 1e-5  # of GroupNorm, torch's default
 _PARTS = 128  # of a sum over many places on a GPU
+
+
+def on_gpu() -> bool:
+    """Whether programs are for a GPU, which needs sums and gradients in another order to be fast.
+
+    Asked where a program is traced: of `jax.lax.platform_dependent` both branches would be.
+    """
+    return jax.default_backend() == "gpu"
 
 
 # Jitted inside of jitted programs: what many layers share is then traced once a shape.
@@ -48,8 +55,7 @@ _spread.defvjp(
 @jax.jit
 def sum_of_places(g: jax.Array) -> jax.Array:
     """`[..., C] -> [C]`."""
-    at_once = functools.partial(jnp.sum, axis=range(g.ndim - 1))
-    return jax.lax.platform_dependent(g, cuda=sum_in_two, default=at_once)
+    return sum_in_two(g) if on_gpu() else jnp.sum(g, range(g.ndim - 1))
 
 
 def sum_in_two(g: jax.Array) -> jax.Array:
@@ -95,73 +101,6 @@ class Dense(nn.Module):
         kernel = self.param("kernel", init, (x.shape[-1], self.features))
         bias = self.param("bias", init, (self.features,))
         return x @ kernel.astype(x.dtype) + bias.astype(x.dtype)
-
-
-class GroupNorm(nn.Module):
-    """Normalise each sample over groups of channels and all positions."""
-
-    groups: int
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """`[B, ..., C] -> [B, ..., C]`."""
-        return group_norm(x, *scale_and_bias(self, x, self.groups), self.groups)
-
-
-def scale_and_bias(module: nn.Module, x: jax.Array, groups: int) -> tuple[jax.Array, jax.Array]:
-    """Parameters `[C]` of a module that normalises `x` `[B, ..., C]`, in its compact method."""
-    channels = x.shape[-1]
-    if channels % groups:
-        raise ValueError(f"groups: expected a divisor of {channels} channels, got {groups}")
-    scale = module.param("scale", nn.initializers.ones, (channels,))
-    return scale, module.param("bias", nn.initializers.zeros, (channels,))
-
-
-@functools.partial(jax.jit, static_argnames="groups")
-def group_norm(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int) -> jax.Array:
-    """What `GroupNorm` does with its parameters `[C]`."""
-    # Positions first, channels after: both reductions then run along contiguous memory, and
-    # what remains is one multiply-add for each element.
-    return normalized(x, *affine(*moments(x), scale, bias, groups))
-
-
-def moments(x: jax.Array, entries: int | None = None) -> tuple[jax.Array, jax.Array]:
-    """Means of `[B, ..., C]` and of its squares over positions, each `[B, C]` float32.
-
-    `entries`: how many positions count, if the others are zeros.
-    """
-    wide = x.astype(jnp.float32)
-    positions = tuple(range(1, x.ndim - 1))
-    entries = math.prod(x.shape[1:-1]) if entries is None else entries
-    return wide.sum(positions) / entries, (wide * wide).sum(positions) / entries
-
-
-def affine(
-    mean: jax.Array, square: jax.Array, scale: jax.Array, bias: jax.Array, groups: int
-) -> tuple[jax.Array, jax.Array]:
-    """Gain and shift `[B, C]` by which a sample of these moments is normalised over groups."""
-    shape = mean.shape
-    mean, inverse = of_groups(mean, square, groups)
-    gain = each(inverse, shape[1]) * spread(scale, shape)
-    return gain, spread(bias, shape) - each(mean, shape[1]) * gain
-
-
-def of_groups(mean: jax.Array, square: jax.Array, groups: int) -> tuple[jax.Array, jax.Array]:
-    """Mean and one over the standard deviation of groups, `[B, G]`, from moments `[B, C]`."""
-    mean, square = (m.reshape(len(m), groups, -1).mean(-1) for m in (mean, square))
-    return mean, jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + EPSILON)
-
-
-def each(group: jax.Array, channels: int) -> jax.Array:
-    """`[B, G] -> [B, C]`: of each channel's group."""
-    return jnp.repeat(group, channels // group.shape[1], axis=1)
-
-
-def normalized(x: jax.Array, gain: jax.Array, shift: jax.Array) -> jax.Array:
-    """`[B, ..., C]` times gain plus shift, `[B, C]` each."""
-    batch, *positions, channels = x.shape
-    shape = (batch, *(1 for _ in positions), channels)
-    return (x.astype(jnp.float32) * gain.reshape(shape) + shift.reshape(shape)).astype(x.dtype)
 
 
 class Conv1d(nn.Module):

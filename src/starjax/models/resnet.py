@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.models import layers
+from starjax.models import layers, norms
 from starjax.models.pooled_norm import PooledNorm
 
 # Images up to which a GPU convolves as a matrix product. cuDNN's convolutions, started one by one
@@ -104,7 +104,7 @@ class Conv2d(nn.Module):
 
 def group_norm(name: str, x: jax.Array) -> jax.Array:
     """GroupNorm with 16 channels a group, inside a compact module."""
-    return layers.GroupNorm(_groups(x), name=name)(x)
+    return norms.GroupNorm(_groups(x), name=name)(x)
 
 
 def _groups(x: jax.Array) -> int:

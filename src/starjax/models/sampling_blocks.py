@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax.models import layers
+from starjax.models import layers, norms
 
 Params = Mapping[str, Any]
 
@@ -76,7 +76,7 @@ def _normalized(params: Params, x: jax.Array, groups: int) -> tuple[jax.Array, j
     flat = jax.lax.optimization_barrier(rows.reshape(len(x) * groups, -1)).astype(jnp.float32)
     centred = flat - flat.mean(-1, keepdims=True)
     variance = (centred * centred).mean(-1, keepdims=True)
-    y = (centred * jax.lax.rsqrt(variance + layers.EPSILON)).reshape(rows.shape)
+    y = (centred * jax.lax.rsqrt(variance + norms.EPSILON)).reshape(rows.shape)
     y = y * _per_group(params["gain"], groups) + _per_group(params["shift"], groups)
     y = layers.mish(y).astype(x.dtype).swapaxes(1, 2)
     return y, beside + bias[features:].astype(x.dtype) if more else None
