@@ -64,8 +64,9 @@ def at_once(groups: int, kept: norms.Kept, g: jax.Array) -> Gradients:
     """The same by way of two sums over positions."""
     z = norms.normalized(kept.x, *norms.kept_affine(kept, groups)).astype(jnp.float32)
     found = norms.gradient(kept, g.astype(jnp.float32) * _mish_slope(z), groups)
-    of_samples = norms.sums_of_samples(found.by_sum, found.by_scale, found.by_shift)
-    return found.by_x.astype(g.dtype), *of_samples
+    of_samples = found.by_sum, found.by_scale, found.by_shift
+    by_bias, by_scale, by_shift = norms.sums_of_samples(*of_samples)
+    return found.by_x.astype(g.dtype), by_bias, by_scale, by_shift
 
 
 def _mish_slope(z: jax.Array) -> jax.Array:

@@ -122,7 +122,8 @@ def gradient(kept: Kept, by_z: jax.Array, groups: int) -> Gradient:
 
 def _gradient(groups: int, kept: Kept, g: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     found = gradient(kept, g.astype(jnp.float32), groups)
-    return found.by_x.astype(g.dtype), *sums_of_samples(found.by_scale, found.by_shift)
+    by_scale, by_shift = sums_of_samples(found.by_scale, found.by_shift)
+    return found.by_x.astype(g.dtype), by_scale, by_shift
 
 
 _at_once = jax.custom_vjp(_plain, nondiff_argnums=(3,))
