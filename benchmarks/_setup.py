@@ -12,13 +12,13 @@ import numpy as np
 from starjax import rcm
 from starjax.config import PolicyConfig, TrainConfig
 from starjax.data import normalizer, windows
-from starjax.evaluation import latency
 from starjax.experiments.methods import METHODS
 from starjax.policies import features
 from starjax.policies import policy as policies
+from starjax.sim.types import Observation
 from starjax.training import devices, state, step
 from starjax.training.parts import Carried, Parts
-from starjax.types import Command
+from starjax.types import Command, Pose
 
 P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)
 METHOD = METHODS["stardiff"]
@@ -108,10 +108,10 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     count = frames or (512 if on[0].platform == "cpu" else 4096)
     dataset = made_up(case.policy, count)
     batch = case.train.batch_size
-    drawn = jnp.arange(batch) % count
-    example = windows.gather(dataset, drawn, case.policy.obs_horizon, case.policy.horizon)
+    frame = jnp.arange(batch) % count
+    example = windows.gather(dataset, frame, case.policy.obs_horizon, case.policy.horizon)
     stats = statistics(case.policy)
-    first = state.create(policy, optimizer, state.init(policy, seed).draw(), stats, seed)
+    first = state.create(policy, optimizer, drawn(policy, seed), stats, seed)
     mesh = devices.make_mesh(batch, on)
     like = jax.eval_shape(lambda x: x, first)
     parts = Parts(mesh, case.policy.dtype, like)
@@ -134,8 +134,13 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:
     """A policy, its first parameters as an evaluation holds them, and its statistics."""
     policy = policies.make(METHOD, case.policy, P_WORLD_REF, case.train)
-    params = policies.for_sampling(state.init(policy, 0).draw(), case.policy.dtype)
+    params = policies.for_sampling(drawn(policy), case.policy.dtype)
     return policy, params, statistics(case.policy)
+
+
+def drawn(policy: policies.Policy, seed: int = 0) -> policies.Params:
+    """A policy's first parameters, on the device."""
+    return state.on_device(state.init(policy, seed).drawn())
 
 
 def statistics(policy_config: PolicyConfig) -> normalizer.Normalizer:
@@ -147,25 +152,25 @@ def statistics(policy_config: PolicyConfig) -> normalizer.Normalizer:
 
 @functools.lru_cache(maxsize=1)
 def made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
-    """One long demonstration; what is in it does not change the time.
+    """One long demonstration on the device; what is in it does not change the time.
 
-    Made on the CPU, as what is read from a disk begins there.
+    Made by numpy: no program is compiled for what a training reads from a disk.
     """
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        dataset = _made_up(policy_config, count)
-    return jax.device_put(dataset, jax.local_devices()[0])
-
-
-@functools.partial(jax.jit, static_argnums=(0, 1))  # one program, not one for each of its arrays
-def _made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
-    seen = dataclasses.replace(policy_config, obs_horizon=1)
-    observation, _ = latency.example(seen, P_WORLD_REF, count)
-    observation = jax.tree.map(lambda leaf: leaf[:, 0], observation)
-    return windows.Dataset(
-        observation=observation,
-        command=Command(observation.pose, observation.gripper),
-        trocar=jax.tree.map(lambda leaf: jnp.asarray(leaf[:1]), rcm.TROCARS),
-        episode=jnp.zeros(count, jnp.int32),
-        start=jnp.zeros(1, jnp.int32),
-        length=jnp.full(1, count, jnp.int32),
+    image = state = None
+    if policy_config.observation == "image":
+        size = (count, policy_config.image_size, policy_config.image_size, 3)
+        image = np.random.default_rng(0).integers(0, 256, size, np.uint8)
+    else:
+        state = np.full((count, features.TASK_STATE), 0.5, np.float32)
+    down = np.tile(np.diag([1.0, -1.0, -1.0]).astype(np.float32), (count, 1, 1))
+    pose = Pose(down, np.full((count, 3), 0.02, np.float32))
+    gripper = np.ones(count, np.float32)
+    dataset = windows.Dataset(
+        observation=Observation(pose, gripper, image, state),
+        command=Command(pose, gripper),
+        trocar=jax.tree.map(lambda leaf: np.asarray(leaf)[:1], rcm.TROCARS),
+        episode=np.zeros(count, np.int32),
+        start=np.zeros(1, np.int32),
+        length=np.full(1, count, np.int32),
     )
+    return jax.device_put(dataset, jax.local_devices()[0])

@@ -180,7 +180,7 @@ def test_the_rest_learns(source, whole):
     lines = loop.metrics.read(whole.parent / "metrics.jsonl")
     assert {"train", "holdout"} == {line["kind"] for line in lines}
     kernel = export.load(whole).params["diffuser"]["unet"]
-    begun = state.init(policy, 0).draw()["diffuser"]["unet"]
+    begun = state.init(policy, 0).drawn()["diffuser"]["unet"]
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), kernel, begun)
     assert max(jax.tree.leaves(moved)) > 1e-3
 

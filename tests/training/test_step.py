@@ -49,7 +49,7 @@ def start():
     policy, optimizer = regression(), state.make_optimizer(SETTINGS)
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
     stats = normalizer.Normalizer(box, None)
-    first = state.create(policy, optimizer, state.init(policy, 0).draw(), stats, seed=0)
+    first = state.create(policy, optimizer, state.init(policy, 0).drawn(), stats, seed=0)
     return policy, optimizer, devices.replicate(first, devices.make_mesh(SETTINGS.batch_size))
 
 
@@ -102,7 +102,7 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
     policy = policies.make(METHODS["stardiff"], small, fakes.P_WORLD_REF, settings)
     optimizer = state.make_optimizer(settings)
     stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(80))
-    first = state.create(policy, optimizer, state.init(policy, 0).draw(), stats, seed=0)
+    first = state.create(policy, optimizer, state.init(policy, 0).drawn(), stats, seed=0)
     it = parts(first, "bfloat16")
     given = (policy, optimizer, small, settings, it)
     frames, nothing = jnp.arange(80), jax.tree.map(lambda _: None, first.params)

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +13,7 @@ from jax.sharding import Mesh
 from starjax import config
 from starjax.data import windows
 from starjax.policies.policy import Policy
+from starjax.runtime import threads
 from starjax.training import devices, feed, processes
 from starjax.training import step as steps
 from starjax.training.parts import Carried, Parts
@@ -59,8 +59,8 @@ class Training(NamedTuple):
 def resident(it: Training, like: TrainState, ahead: bool) -> Advance:
     """Steps on a dataset that is on the device, and is copied to every device of the mesh.
 
-    `like` has shapes and places of the state. `ahead`: the program is compiled from now on, beside
-    what the caller does until the first step.
+    `like` has shapes and places of the state. `ahead`: the program is traced now, and compiled
+    beside what the caller does until the first step.
     """
     data = devices.replicate((it.dataset, jnp.asarray(it.frames)), it.mesh, may_alias=None)
     parts = Parts(it.mesh, it.policy_config.dtype, like)
@@ -115,7 +115,6 @@ def _program(body: Callable[..., Any], parts: Parts) -> Any:
 
 def _compiled_beside(program: Any, *like: Any) -> Callable[..., Carried]:
     """The program, compiled by a thread for arguments like these; its first call waits for it."""
-    pool = ThreadPoolExecutor(1, thread_name_prefix="starjax-compile")
-    compiled = pool.submit(lambda: program.lower(*like).compile())
-    pool.shutdown(wait=False)
-    return lambda *args: compiled.result()(*args)
+    # Traced here: by a thread it would take turns with what the caller does, both in Python.
+    compiled = threads.beside(program.lower(*like).compile)
+    return lambda *args: compiled()(*args)

@@ -12,7 +12,7 @@ import numpy as np
 from starjax import config
 from starjax.data import normalizer, windows
 from starjax.policies import policy as policies
-from starjax.runtime import progress
+from starjax.runtime import progress, threads
 from starjax.training import advance as advancing
 from starjax.training import checkpoint, devices, encoder, holdout, metrics, processes
 from starjax.training import state as states
@@ -98,16 +98,15 @@ def run(
 
     checkpoints = directory / "checkpoints"
     begun = states.init(policy, seed)
+    new = not checkpoint.steps(checkpoints)  # a restored training may be finished
+    drawn = threads.beside(begun.drawn) if new else begun.drawn
     like = _like(around, begun, mesh)
     it = advancing.Training(policy, optimizer, policy_config, train_config, mesh, dataset, train)
-    advance = None
-    if windows.on_device(dataset):
-        new = not checkpoint.steps(checkpoints)  # a restored training may be finished
-        advance = advancing.resident(it, like, ahead=new)
+    advance = advancing.resident(it, like, ahead=new) if windows.on_device(dataset) else None
     state = _restored(checkpoints, like)
     if state is None:
-        state = states.run_once(around, _begun(begun, policy_config, train_config))
-        state = devices.replicate(state, mesh)
+        params = _begun(states.on_device(drawn()), policy_config, train_config)
+        state = devices.replicate(states.run_once(around, params), mesh)
     step = saved = int(state.step)
     metrics.resume(log, step)
     judge = holdout.make(policy, policy_config, dataset, held_out) if processes.is_first() else None
@@ -181,9 +180,8 @@ def _restored(checkpoints, like) -> states.TrainState | None:
     return None if restored is None else restored[1]
 
 
-def _begun(begun, policy_config, train_config) -> policies.Params:
-    """Parameters of a new training."""
-    params = begun.draw()
+def _begun(params, policy_config, train_config) -> policies.Params:
+    """Parameters of a new training, of drawn ones."""
     begins = policy_config.observation == "image" and not policy_config.freeze_encoder
     if begins and policy_config.encoder_weights:
         params = encoder.start(params, policy_config, train_config)

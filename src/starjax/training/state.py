@@ -67,10 +67,14 @@ class Init(NamedTuple):
     traced: jax.stages.Traced
     key: jax.Array
 
-    def draw(self) -> Params:
-        """The parameters, on jax's first device."""
-        params = self.traced.lower().compile()(self.key)
-        return jax.device_put(jax.device_get(params))
+    def drawn(self) -> Params:
+        """The parameters, where they were drawn."""
+        return jax.block_until_ready(self.traced.lower().compile()(self.key))
+
+
+def on_device(params: Params) -> Params:
+    """`Init.drawn`, on jax's first device."""
+    return jax.device_put(jax.device_get(params))
 
 
 def init(policy: Policy, seed: int) -> Init:
