@@ -74,7 +74,7 @@ def scale_and_shift(module: nn.Module, x: jax.Array, groups: int) -> tuple[jax.A
 @functools.partial(jax.jit, static_argnames="groups")  # traced once a shape
 def group_norm(x: jax.Array, scale: jax.Array, shift: jax.Array, groups: int) -> jax.Array:
     """What `GroupNorm` does with its parameters `[C]`."""
-    # jax's own gradient: sums one by one, which a CPU does not mind
+    # as jax differentiates it on a CPU, where trainings keep their bits
     return _at_once(x, scale, shift, groups) if layers.on_gpu() else _plain(x, scale, shift, groups)
 
 
@@ -130,9 +130,9 @@ _at_once = jax.custom_vjp(_plain, nondiff_argnums=(3,))
 _at_once.defvjp(forward, _gradient)
 
 
-def sums_of_samples(*each: jax.Array) -> list[jax.Array]:
+def sums_of_samples(*vectors: jax.Array) -> list[jax.Array]:
     """`[B, C]` each -> `[C]` each."""
-    return jnp.split(layers.sum_in_two(jnp.concatenate(each, axis=1)), len(each))
+    return jnp.split(layers.sum_in_two(jnp.concatenate(vectors, axis=1)), len(vectors))
 
 
 def moments(x: jax.Array, entries: int | None = None) -> tuple[jax.Array, jax.Array]:
