@@ -142,26 +142,24 @@ def moments(x: jax.Array, entries: int | None = None) -> tuple[jax.Array, jax.Ar
     """
     wide = x.astype(jnp.float32)
     entries = math.prod(x.shape[1:-1]) if entries is None else entries
-    total, squares = sums(wide, wide * wide)
-    return total / entries, squares / entries
+    if layers.on_gpu():
+        total, squares = sums(wide, wide * wide)
+        return total / entries, squares / entries
+    # One after the other: another order of operations, and a CPU's trainings have other bits.
+    positions = tuple(range(1, x.ndim - 1))
+    return wide.sum(positions) / entries, (wide * wide).sum(positions) / entries
 
 
 def sums(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-    """`[B, ..., C]` each -> `[B, C]` each, over positions."""
-    if layers.on_gpu() and arrays[0].ndim == 4:
-        return sums_over_images(*arrays)
-    return tuple(x.sum(tuple(range(1, x.ndim - 1))) for x in arrays)
-
-
-def sums_over_images(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-    """`[B, h, w, C]` each -> `[B, C]` each, small images' one by one."""
-    batch, height, width, channels = arrays[0].shape
-    if height * width <= _IMAGE:
-        shape = (batch, height * width, channels)
-        found = tuple(_one_by_one(x.reshape(shape), 1) for x in arrays)
-        return jax.lax.optimization_barrier(found)  # or each of its uses would add up again
-    if width <= _ROW:
-        arrays = jax.lax.optimization_barrier(tuple(_one_by_one(x, 2) for x in arrays))
+    """`[B, ..., C]` each -> `[B, C]` each, over positions, on a GPU."""
+    if arrays[0].ndim == 4:
+        batch, height, width, channels = arrays[0].shape
+        if height * width <= _IMAGE:
+            shape = (batch, height * width, channels)
+            found = tuple(_one_by_one(x.reshape(shape), 1) for x in arrays)
+            return jax.lax.optimization_barrier(found)  # or each of its uses would add up again
+        if width <= _ROW:
+            arrays = jax.lax.optimization_barrier(tuple(_one_by_one(x, 2) for x in arrays))
     return tuple(x.sum(tuple(range(1, x.ndim - 1))) for x in arrays)
 
 
