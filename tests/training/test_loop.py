@@ -1,6 +1,7 @@
 """Training as a whole: resume to the last bit, kills, devices, residency, broken losses."""
 
 import dataclasses
+import gc
 import itertools
 import os
 import shutil
@@ -129,6 +130,21 @@ def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
     assert again.holdout == result.holdout
     log = (tmp_path / "metrics.jsonl").read_bytes()
     assert log == (directory / "metrics.jsonl").read_bytes()
+
+
+def test_only_the_state_is_held_while_steps_are_taken(whole, tmp_path):
+    """A matrix, its two moments and its average; not what they began with, too."""
+    largest = max(leaves(whole[1].state.params), key=np.size).shape
+
+    def held():
+        gc.collect()
+        return sum(x.shape == largest for x in jax.live_arrays())
+
+    before, found = held(), []
+    with pytest.raises(loop.Interrupted):
+        jobs.train(tmp_path, should_stop=lambda: bool(found.append(held()) or len(found) == 2))
+    of_one = sum(np.shape(x) == largest for x in leaves(whole[1].state.params))
+    assert [count - before for count in found] == [4 * of_one, 4 * of_one]
 
 
 def test_a_stop_right_after_a_checkpoint_does_not_write_it_again(monkeypatch, tmp_path):

@@ -105,8 +105,9 @@ def run(
     advance = advancing.resident(it, like, ahead=new) if windows.on_device(dataset) else None
     state = _restored(checkpoints, like)
     if state is None:
-        params = _begun(states.on_device(drawn()), policy_config, train_config)
-        state = devices.replicate(states.run_once(around, params), mesh)
+        state = states.run_once(around, _begun(drawn(), policy_config, train_config))
+        state = devices.replicate(state, mesh)
+    del drawn  # it holds what was drawn
     step = saved = int(state.step)
     metrics.resume(log, step)
     judge = holdout.make(policy, policy_config, dataset, held_out) if processes.is_first() else None
@@ -180,8 +181,9 @@ def _restored(checkpoints, like) -> states.TrainState | None:
     return None if restored is None else restored[1]
 
 
-def _begun(params, policy_config, train_config) -> policies.Params:
+def _begun(drawn, policy_config, train_config) -> policies.Params:
     """Parameters of a new training, of drawn ones."""
+    params = states.on_device(drawn)
     begins = policy_config.observation == "image" and not policy_config.freeze_encoder
     if begins and policy_config.encoder_weights:
         params = encoder.start(params, policy_config, train_config)
