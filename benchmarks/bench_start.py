@@ -72,9 +72,10 @@ def child(asked: argparse.Namespace) -> None:
     def mark(name: str) -> None:
         marks[f"{name}_s"] = time.time() - asked.child
 
-    from starjax import runtime
+    from starjax.runtime import xla
 
-    runtime.prepare_xla()
+    xla.prepare_xla()
+    xla.require_devices("_setup", "starjax.training.loop")
     import _setup
     import jax
 

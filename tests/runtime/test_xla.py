@@ -1,9 +1,11 @@
 """XLA is prepared once, for the jaxlib at hand, without taking anything from the user."""
 
+import importlib
 import os
 import subprocess
 import sys
 import textwrap
+import threading
 
 from starjax.experiments import presets
 from starjax.runtime import xla
@@ -78,7 +80,7 @@ def test_a_platform_that_jax_cannot_use_is_a_mistake():
         from starjax import cli
         from starjax.runtime import xla
         xla.prepare_xla()
-        sys.exit(cli.guard(lambda argv: xla.require_devices(), []))
+        sys.exit(cli.guard(lambda argv: xla.require_devices("starjax.sim.env"), []))
     """
     for name in ("nonsense",) if presets.has_gpu_plugin() else ("nonsense", "cuda"):
         environment = {**_env(), "JAX_PLATFORMS": name}
@@ -105,3 +107,20 @@ def _env(**more):
     own = ("XLA_FLAGS", "JAX_PLATFORMS", "JAX_COMPILATION_CACHE_DIR", SMALLEST)
     env = {k: v for k, v in os.environ.items() if k not in own}
     return {**env, "PYTHONPATH": os.pathsep.join(sys.path), "JAX_PLATFORMS": "cpu", **more}
+
+
+def test_modules_are_imported_while_jax_starts(monkeypatch):
+    seen = []
+
+    def slow():
+        seen.append("begun")
+        assert imported.wait(10)
+        return []
+
+    imported = threading.Event()
+    monkeypatch.setattr("jax.devices", slow)
+    monkeypatch.setattr(
+        importlib, "import_module", lambda name: (seen.append(name), imported.set())
+    )
+    xla.require_devices("somewhere.there")
+    assert sorted(seen) == ["begun", "somewhere.there"]

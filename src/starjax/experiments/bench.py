@@ -52,7 +52,7 @@ def main(argv: Sequence[str]) -> int:
 def _time(run: Path, chosen: Options) -> dict[str, Any]:
     """Times and prints; returns what joins result.json."""
     xla.prepare_xla()
-    xla.require_devices()
+    xla.require_devices("starjax.experiments.scoring")
 
     from starjax.evaluation import latency
     from starjax.experiments import methods, scoring

@@ -51,7 +51,7 @@ def main(argv: Sequence[str]) -> int:
         default = Path(chosen.run) / f"evaluate-seed{chosen.seed}"
     folder = Path(chosen.out or default)
     xla.prepare_xla()
-    xla.require_devices()
+    xla.require_devices("starjax.experiments.scoring")
     files.require_writable(folder)
 
     from starjax import rcm

@@ -29,7 +29,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     from starjax.training import processes
 
     processes.join()
-    xla.require_devices()
+    xla.require_devices("starjax.sim.env", "starjax.training.loop")
     if config.policy.freeze_encoder and not processes.is_alone():
         raise config_lib.UsageError("--policy.freeze-encoder: expected one process, got several")
     out = Path(config.out)

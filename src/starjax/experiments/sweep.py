@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
     run = folders.existing(chosen.run)
     config = folders.read_config(run)
     xla.prepare_xla()
-    xla.require_devices()
+    xla.require_devices("starjax.experiments.scoring")
     files.require_writable(run)
 
     from starjax import rcm

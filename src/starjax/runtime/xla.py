@@ -3,6 +3,7 @@
 Importing it imports no jax."""
 
 import hashlib
+import importlib
 import importlib.metadata
 import os
 import platform
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config
+from starjax.runtime import threads
 
 _FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
 _PACKAGES = (
@@ -65,16 +67,19 @@ def cache_directory() -> Path:
         return Path(tempfile.gettempdir()) / f"starjax-{os.getuid()}"
 
 
-def require_devices() -> None:
-    """Starts jax.
+def require_devices(*modules: str) -> None:
+    """Starts jax, and beside it, because a GPU takes a second, imports these modules.
 
     Raises:
       config.UsageError: it cannot use what JAX_PLATFORMS asks for.
     """
     import jax
 
+    started = threads.beside(jax.devices)
+    for module in modules:
+        importlib.import_module(module)
     try:
-        jax.devices()
+        started()
     except (AssertionError, RuntimeError) as error:  # the first for a platform without its plugin
         asked = os.environ.get("JAX_PLATFORMS", "")
         reason = str(error).splitlines()[0] if str(error) else "its plugin is not installed"

@@ -13,7 +13,7 @@ from jax.sharding import Mesh
 from starjax import config
 from starjax.data import windows
 from starjax.policies.policy import Policy
-from starjax.runtime import threads
+from starjax.runtime import garbage, threads
 from starjax.training import devices, feed, processes
 from starjax.training import step as steps
 from starjax.training.parts import Carried, Parts
@@ -116,5 +116,7 @@ def _program(body: Callable[..., Any], parts: Parts) -> Any:
 def _compiled_beside(program: Any, *like: Any) -> Callable[..., Carried]:
     """The program, compiled by a thread for arguments like these; its first call waits for it."""
     # Traced here: by a thread it would take turns with what the caller does, both in Python.
-    compiled = threads.beside(program.lower(*like).compile)
+    with garbage.kept():
+        lowered = program.lower(*like)
+    compiled = threads.beside(lowered.compile)
     return lambda *args: compiled()(*args)

@@ -11,6 +11,7 @@ import optax
 from starjax import config
 from starjax.data import normalizer
 from starjax.policies.policy import Params, Policy
+from starjax.runtime import garbage
 
 
 @flax.struct.dataclass
@@ -85,7 +86,8 @@ def init(policy: Policy, seed: int) -> Init:
     except RuntimeError:  # JAX_PLATFORMS leaves it out
         place = jax.local_devices()[0]
     key = jax.device_put(_keys(seed)[0], place)
-    return Init(_quick(policy.init).trace(key), key)
+    with garbage.kept():
+        return Init(_quick(policy.init).trace(key), key)
 
 
 def run_once(fn: Callable[..., Any], *args: Any) -> Any:
