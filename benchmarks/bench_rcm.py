@@ -1,6 +1,6 @@
 """RCM maps per second: each action space both ways, against numpy (float64) and scipy.
 
-    python benchmarks/bench_rcm.py [--batch 100000]
+    python benchmarks/bench_rcm.py [--batch 100000] [--tiny]
 
 numpy is the same mathematics vectorised without the guards that make `starjax.rcm` total; scipy
 is the usual loop over single poses with `Rotation` objects.
@@ -18,13 +18,16 @@ from starjax import rcm, runtime
 
 P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)
 DOWN = np.array([1.0, -1.0, -1.0])
+FIXED = "_fixed_yaw"
 LOOP = 200  # poses in the scipy loop; its rate does not depend on the number
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--batch", type=int, default=100_000, help="poses a call")
-    batch = parser.parse_args().batch
+    parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
+    asked = parser.parse_args()
+    batch = LOOP if asked.tiny else asked.batch
     runtime.prepare_xla()
     trocar = jax.tree.map(np.asarray, rcm.sample_trocar(jax.random.key(0), (batch,)))
     wide_trocar = rcm.Trocar(*(field.astype(np.float64) for field in trocar))
@@ -61,8 +64,7 @@ def main() -> None:
                 f"{scipy_rate / 1e3:7.1f} {rate / numpy_rate:8.1f} {rate / scipy_rate:8.0f} "
                 f"{time_ours.compile_s:10.2f} {gap:8.1e}"
             )
-    path = _timing.write("rcm", {"batch": batch, "dtype": "float32", "results": rows})
-    print(f"wrote {path}")
+    _timing.report("rcm", {"batch": batch, "dtype": "float32", "results": rows}, asked.tiny)
 
 
 def sample_poses(trocar: rcm.Trocar, batch: int) -> rcm.Pose:
@@ -84,13 +86,18 @@ def largest_gap(ours, vectorised, one_by_one) -> float:
     return float(max(np.abs(ours - vectorised).max(), np.abs(ours[:LOOP] - one_by_one).max()))
 
 
-def numpy_frame(trocar: rcm.Trocar, p_world_ref: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """R_world_trocar `[..., 3, 3]` and p_world_trocar `[..., 3]`."""
+def numpy_frame(
+    name: str, trocar: rcm.Trocar, p_world_ref: np.ndarray
+) -> tuple[str, np.ndarray, np.ndarray]:
+    """Name of the action space but for its frame's yaw, R_world_trocar `[..., 3, 3]`, and
+    p_world_trocar `[..., 3]`."""
     r, theta, phi = trocar
     c, s, o = np.cos(phi), np.sin(phi), np.zeros_like(phi)
     R = np.stack([c, s, o, s, -c, o, o, o, o - 1.0], axis=-1).reshape(*np.shape(phi), 3, 3)
     direction = np.stack([np.sin(theta) * c, np.sin(theta) * s, np.cos(theta)], axis=-1)
-    return R, p_world_ref + r[..., None] * direction
+    if name.endswith(FIXED):
+        R = np.broadcast_to(np.diag(DOWN), R.shape)
+    return name.removesuffix(FIXED), R, p_world_ref + r[..., None] * direction
 
 
 def numpy_align(b: np.ndarray) -> np.ndarray:
@@ -109,7 +116,7 @@ def numpy_gram_schmidt(rot6d: np.ndarray) -> np.ndarray:
 
 
 def numpy_encode(name, pose, trocar, p_world_ref) -> np.ndarray:
-    R_trocar, p_trocar = numpy_frame(trocar, p_world_ref)
+    name, R_trocar, p_trocar = numpy_frame(name, trocar, p_world_ref)
     R, p = pose
     if name in ("se3", "rcm1", "rcm3"):
         first = p
@@ -123,7 +130,7 @@ def numpy_encode(name, pose, trocar, p_world_ref) -> np.ndarray:
 
 
 def numpy_decode(name, action, trocar, p_world_ref) -> np.ndarray:
-    R_trocar, p_trocar = numpy_frame(trocar, p_world_ref)
+    name, R_trocar, p_trocar = numpy_frame(name, trocar, p_world_ref)
     if name in ("se3", "rcm1", "rcm3"):
         R = numpy_gram_schmidt(action[..., -6:])
         R = R_trocar @ R if name == "rcm1" else R
@@ -142,17 +149,17 @@ def numpy_decode(name, action, trocar, p_world_ref) -> np.ndarray:
 def scipy_encode(name, pose, trocar, p_world_ref) -> np.ndarray:
     rows = []
     for i in range(LOOP):
-        R_trocar, p_trocar = scipy_frame(trocar, i, p_world_ref)
+        kind, R_trocar, p_trocar = scipy_frame(name, trocar, i, p_world_ref)
         R, p = transform.Rotation.from_matrix(pose.R[i]), pose.p[i]
         depth = np.dot(p - p_trocar, R.apply([0, 0, 1]))
-        if name in ("se3", "rcm1", "rcm3"):
-            M = (R_trocar.inv() * R if name == "rcm1" else R).as_matrix()
-            rows.append(np.hstack([p if name == "se3" else depth, M[:, 0], M[:, 1]]))
+        if kind in ("se3", "rcm1", "rcm3"):
+            M = (R_trocar.inv() * R if kind == "rcm1" else R).as_matrix()
+            rows.append(np.hstack([p if kind == "se3" else depth, M[:, 0], M[:, 1]]))
         else:
             _, _, z, w = (transform.Rotation.from_matrix(np.diag(DOWN)) * R).as_quat()
             roll = 2 * np.arctan2(z, w)
             roll = (roll + np.pi) % (2 * np.pi) - np.pi
-            p = R_trocar.inv().apply(p - p_trocar) if name == "rcm2" else p
+            p = R_trocar.inv().apply(p - p_trocar) if kind == "rcm2" else p
             rows.append(np.hstack([roll, p]))
     return np.array(rows)
 
@@ -160,14 +167,14 @@ def scipy_encode(name, pose, trocar, p_world_ref) -> np.ndarray:
 def scipy_decode(name, action, trocar, p_world_ref) -> np.ndarray:
     rows = []
     for i in range(LOOP):
-        R_trocar, p_trocar = scipy_frame(trocar, i, p_world_ref)
-        if name in ("se3", "rcm1", "rcm3"):
+        kind, R_trocar, p_trocar = scipy_frame(name, trocar, i, p_world_ref)
+        if kind in ("se3", "rcm1", "rcm3"):
             R = transform.Rotation.from_matrix(numpy_gram_schmidt(action[i, -6:]))
-            R = R_trocar * R if name == "rcm1" else R
-            p = action[i, :3] if name == "se3" else p_trocar + action[i, 0] * R.apply([0, 0, 1])
+            R = R_trocar * R if kind == "rcm1" else R
+            p = action[i, :3] if kind == "se3" else p_trocar + action[i, 0] * R.apply([0, 0, 1])
         else:
             p = action[i, 1:]
-            p = p_trocar + R_trocar.apply(p) if name == "rcm2" else p
+            p = p_trocar + R_trocar.apply(p) if kind == "rcm2" else p
             axis = DOWN * (p - p_trocar) / np.linalg.norm(p - p_trocar)
             k = np.cross([0, 0, 1], axis)
             sin = np.linalg.norm(k)
@@ -178,9 +185,9 @@ def scipy_decode(name, action, trocar, p_world_ref) -> np.ndarray:
     return np.array(rows)
 
 
-def scipy_frame(trocar, i, p_world_ref):
-    R, p = numpy_frame(rcm.Trocar(*(field[i] for field in trocar)), p_world_ref)
-    return transform.Rotation.from_matrix(R), p
+def scipy_frame(name, trocar, i, p_world_ref):
+    name, R, p = numpy_frame(name, rcm.Trocar(*(field[i] for field in trocar)), p_world_ref)
+    return name, transform.Rotation.from_matrix(R), p
 
 
 if __name__ == "__main__":

@@ -403,9 +403,9 @@ def test_rolls_stay_in_the_demonstrated_range(made):
 
 def test_what_is_held_is_not_dropped(made):
     it = made("stardiff")
-    action = jnp.ones((B, 16, 5)).at[:, 3, -1].set(jnp.nan)
+    action = jnp.ones((B, 16, 5)).at[:, 3, -1].set(jnp.nan).at[:, 5, 0].set(jnp.nan)
     command = execution.command(it.method, it.stats, action, it.batch.trocar, fakes.P_WORLD_REF)
-    np.testing.assert_array_equal(command.gripper[:, 3], -1.0)
+    np.testing.assert_array_equal(command.gripper[:, [3, 5]], -1.0)
     np.testing.assert_array_equal(command.gripper[:, 4], 1.0)
 
 

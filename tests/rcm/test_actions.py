@@ -251,3 +251,13 @@ def test_encode_propagates_nan(p_world_ref):
     pose = rcm.Pose(R=np.full((3, 3), np.nan), p=np.full(3, np.nan))
     for space in rcm.ACTION_SPACES.values():
         assert np.isnan(space.encode(pose, rcm.Trocar(0.02, 1.5, 0.3), p_world_ref)).all()
+
+
+@pytest.mark.parametrize("column", [0, 2])
+def test_a_roll_needs_a_jaw_and_an_axis(p_world_ref, column):
+    R = np.diag([1.0, -1.0, -1.0])
+    R[1, column] = np.nan
+    for name in ("rcm2", "rcm4"):
+        space = rcm.ACTION_SPACES[name]
+        action = space.encode(rcm.Pose(R, p_world_ref), rcm.Trocar(0.02, 1.5, 0.3), p_world_ref)
+        assert np.isnan(action[space.slices["roll"]]).all() and np.isfinite(action[1:]).all()

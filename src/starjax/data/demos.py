@@ -134,7 +134,7 @@ def collect(
             root, max(total - done, 0) * min(max_steps, FRAME_GUESS) * frame_bytes
         )
         fits = int(MEMORY_SHARE * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
-        chunk = chunk or max(1, min(_fast(devices), fits))
+        chunk = chunk or max(1, min(_fast(devices, total), fits))
         at_once = max(1, min(workers.count(), fits // chunk))
         chunk = -(-chunk // len(devices or [0])) * len(devices or [0])
         simulate = recorder.simulator(env, expert, trocars, seed, max_steps, chunk, devices)
@@ -206,11 +206,13 @@ def _writer(
         pool.shutdown(cancel_futures=True)
 
 
-def _fast(devices: Sequence[jax.Device] | None) -> int:
-    """Episodes that make the most of a program. A function of the machine alone, as the size of a
-    batch may change last bits."""
-    on_cpu = jax.default_backend() == "cpu"
-    return workers.CPU_LANES if on_cpu else GPU_LANES * len(devices or [0])
+def _fast(devices: Sequence[jax.Device] | None, total: int) -> int:
+    """Episodes that make the most of a program, where `total` are wanted: several GPUs share what
+    one would do alone. Not of what is there already, as the size of a batch may change last bits.
+    """
+    if jax.default_backend() == "cpu":
+        return workers.CPU_LANES
+    return GPU_LANES * min(len(devices or [0]), -(-total // GPU_LANES))
 
 
 def scene_hash(model: Any) -> str:

@@ -62,7 +62,7 @@ def evaluate(
       lanes: size of the compiled batch on each device, or of each core's on a CPU; 0 for
         `rollout.lanes_per_device`: it is what decides memory, and may change last bits.
       video_trials: how many trials get their joint positions recorded, at least.
-      devices: to split a chunk over. Does not change the result.
+      devices: to split a chunk over; with `lanes` 0 their number decides that one's.
       identity: JSON values that tell this policy from others with the same weights.
       report: gets lines for the user.
 
@@ -85,8 +85,9 @@ def evaluate(
     run = rollout.make(env, policy, settings, seed, devices)
     count = len(trocars.radius)
     first_device = (devices or jax.local_devices())[0]
-    lanes = lanes or rollout.lanes_per_device(first_device, count * trials)
-    batch = lanes * len(devices or [0])
+    several = len(devices or [0])
+    lanes = lanes or rollout.lanes_per_device(first_device, -(-count * trials // several))
+    batch = lanes * several
     index, trial = (x.reshape(-1) for x in np.divmod(np.arange(count * trials), trials))
     chosen = recorded.choose(count, trials, video_trials)
     with files.lock(directory):

@@ -174,7 +174,7 @@ def make(
 
 
 def lanes_per_device(device: jax.Device, trials: int) -> int:
-    """Trials that a device of this kind runs together, where there are `trials` in all.
+    """Trials that a device of this kind runs together, where its share of them are `trials`.
 
     A GPU's are as many as make the fewest chunks, and no more than these need.
     """

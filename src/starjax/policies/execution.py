@@ -32,9 +32,10 @@ def command(
     per_step = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], trocar)
     vector = stats.action.denormalize(action)
     space = rcm.ACTION_SPACES[method.action_space]
-    pose, _ = space.decode(vector[..., :-1], per_step, p_world_ref)
+    pose, is_valid = space.decode(vector[..., :-1], per_step, p_world_ref)
     if method.projects:
         pose = rcm.project(pose, rcm.trocar_position(per_step, p_world_ref))
     gripper = vector[..., -1]
-    gripper = jnp.where(jnp.isfinite(gripper), jnp.clip(gripper, -1.0, 1.0), -1.0)
+    is_valid &= jnp.isfinite(gripper)
+    gripper = jnp.where(is_valid, jnp.clip(gripper, -1.0, 1.0), -1.0)
     return Command(pose=pose, gripper=gripper)

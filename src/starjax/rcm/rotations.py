@@ -98,7 +98,8 @@ def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array
 def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     """Roll `[...]` in (-pi, pi] rad such that `rotation_from_axis_roll(axis, roll)` is R.
 
-    Continuous in R except for a tool that points straight up, and at half a turn.
+    Continuous in R except for a tool that points straight up, and at half a turn; NaN if the first
+    or the last column has one.
 
     Args:
       R_world_tip: `[..., 3, 3]`.
@@ -110,7 +111,9 @@ def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     sin = arrays.dot(base[..., :, 1], x)[..., 0]
     # Only a matrix that is no rotation gives (0, 0), where arctan2 has no derivative.
     is_degenerate = cos**2 + sin**2 <= arrays.epsilon(x.dtype) ** 2
-    return jnp.arctan2(sin, jnp.where(is_degenerate, 1.0, cos))
+    roll = jnp.arctan2(sin, jnp.where(is_degenerate, 1.0, cos))
+    # `_base_rotation` takes any axis, a NaN as a tool that points straight down.
+    return jnp.where(jnp.isnan(R_world_tip[..., :, 2]).any(-1), jnp.nan, roll)
 
 
 def rot6d_encode(R: ArrayLike) -> jax.Array:
