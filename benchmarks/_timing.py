@@ -113,8 +113,8 @@ def rounded(value: Any) -> Any:
 def write(name: str, results: dict[str, Any]) -> pathlib.Path:
     """Write `results/<name>_<backend>.json` with the versions and the hardware beside it.
 
-    Rows (`results["results"]`) measured before with the same versions on the same kind of device
-    stay, so that a benchmark may be run row by row.
+    Rows (`results["results"]`) measured before with the same versions on the same kind of device,
+    of a CPU the same number of the same cores, stay, so that a benchmark may be run row by row.
     """
     path = RESULTS / f"{name}_{jax.default_backend()}.json"
     path.parent.mkdir(exist_ok=True)
@@ -133,4 +133,7 @@ def report(name: str, results: dict[str, Any], tiny: bool) -> None:
 
 
 def _made_with(found: dict[str, Any]) -> Any:
-    return found.get("versions"), set(found.get("hardware", {}).get("devices", []))
+    hardware = found.get("hardware", {})
+    device = ("cpu", "cores") if hardware.get("backend") == "cpu" else ()
+    host = [hardware.get(name) for name in device]
+    return found.get("versions"), set(hardware.get("devices", [])), host

@@ -1,8 +1,9 @@
-"""Closed-loop evaluation: 12 trocars x 30 trials of up to 60 s, with every step of them run.
+"""Closed-loop evaluation: 12 trocars x 30 trials of up to 60 s.
 
     python benchmarks/bench_evaluate.py [--image 256] [--policy FILE] [--trials 30] [--tiny]
 
-Without `--policy` an untrained policy is run: nothing ends early, so this is the worst case. The
+Without `--policy` an untrained policy is run: nothing ends early, so this is the worst case. With
+one, a trial ends when the block stands on its peg, and what is compared ends there too. The
 programs are those of `starjax evaluate`, on as many trials at once, a CPU's cores side by side;
 compiling them is timed apart, by a call in which no trial is wanted. Beside it: what C MuJoCo on
 one thread would need for the physics steps alone, and, as the floor, the sum of the parts timed one
@@ -11,6 +12,7 @@ by one in this process (on a CPU each has all cores, so less is possible).
 
 import argparse
 import math
+import pathlib
 import time
 from collections.abc import Generator
 
@@ -45,6 +47,7 @@ def main() -> None:
     if asked.tiny:
         asked.trials, asked.limit, asked.lanes = 1, 0.5, 4
     policy, params, stats, settings = subject(asked)
+    subject_name = pathlib.Path(asked.policy).stem if asked.policy else "untrained"
     env = envs.make(settings.observation, settings.image_size)
     steps = math.ceil(asked.limit * env.control_hz)
     lanes = asked.lanes or rollout.lanes_per_device(
@@ -62,13 +65,13 @@ def main() -> None:
     list(simulate(chunks[0]._replace(wanted=np.zeros(lanes, bool))))
     compile_s = time.perf_counter() - start
     start = time.perf_counter()
-    lengths = np.concatenate(list(workers.run(chunks, simulate, workers.count())))
+    lengths = [found for found in workers.run(chunks, simulate, workers.count()) if len(found)]
     run_s = time.perf_counter() - start
 
-    control_steps = int(lengths.sum())
+    control_steps = int(sum(found.sum() for found in lengths))
     substeps = round(1 / env.control_hz / env.model.mj_model.opt.timestep)
     c_s = control_steps * substeps / _c_mujoco.steps_per_s(env.model)
-    plans = len(chunks) * math.ceil(steps / rules.execute)
+    plans = sum(math.ceil(found.max() / rules.execute) for found in lengths)
     found = parts(env, policy, params, stats, settings, lanes)
     floor = (
         1e-3
@@ -80,7 +83,8 @@ def main() -> None:
         )
     )
     row = {
-        "trials": len(lengths),
+        "policy": subject_name,
+        "trials": sum(map(len, lengths)),
         "time_limit_s": asked.limit,
         "lanes": lanes,
         "chunks": len(chunks),
@@ -95,8 +99,9 @@ def main() -> None:
         **found,
     }
     name = f"image {settings.image_size} px" if settings.observation == "image" else "state"
+    name += f", {subject_name}"
     print(
-        f"{name}: {len(lengths)} trials of {asked.limit:g} s in {run_s:.2f} s, compiling "
+        f"{name}: {row['trials']} trials of {asked.limit:g} s at most in {run_s:.2f} s, compiling "
         f"{compile_s:.1f} s; C MuJoCo's physics alone {c_s:.1f} s; {lanes} trials at once; "
         f"parts {floor:.2f} s (policy {found['policy_ms']:.2f}, step {found['step_ms']:.2f}, "
         f"observe {found['observe_ms']:.2f} ms)"

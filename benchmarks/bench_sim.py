@@ -4,7 +4,7 @@
 
 At rest (arm at home, block on its peg) and at work: states of the scripted expert's episodes, with
 the jaws closing. `--peer` also times `mjx.step`, whose contact solver is MJX's, from the same
-states. A CPU steps a batch 16 at a time, as `evaluation.rollout` does.
+states. A CPU steps a batch 16 at a time.
 """
 
 import argparse

@@ -16,6 +16,7 @@ import numpy as np
 
 from starjax.experiments.report import results
 from starjax.sim import env as envs
+from starjax.sim import physics
 from starjax.sim.tasks import peg_transfer as task
 
 PERIOD_DEG = 60.0  # walls are 120 degrees apart, and jaws look alike after half a turn
@@ -79,10 +80,11 @@ def measure(model: mujoco.MjModel, run: results.Run, moment: Callable[..., int])
 
 
 def closes(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> int:
-    """The step at which the jaws first are half closed, or -1."""
+    """The step at which the jaws first are half closed, or -1: they never were more than a quarter
+    of their opening closed."""
     jaw = qpos[:, model.joint(JAW).qposadr[0]]
     closed = np.abs(jaw - jaw[0]) > 0.5 * np.ptp(jaw)
-    return int(closed.argmax()) if closed.any() else -1
+    return int(closed.argmax()) if np.ptp(jaw) > 0.25 * physics.JAW_OPEN else -1
 
 
 def comes_down(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> int:

@@ -1,7 +1,8 @@
-"""A benchmark runs with what a state carries on a GPU, which a run on a CPU would not see."""
+"""Benchmarks run, one with what a state carries on a GPU, which a run on a CPU would not see."""
 
 import sys
 
+from starjax import rcm
 from starjax.training import parts
 
 
@@ -16,3 +17,14 @@ def test_the_training_step_is_timed(monkeypatch, capsys, pytestconfig):
     samples, milliseconds, floor = map(float, row[:3])
     assert floor > 0
     assert abs(samples * milliseconds / 4e3 - 1) < 0.05  # batches of four
+
+
+def test_the_peers_of_all_action_spaces_compute_the_same(monkeypatch, capsys, pytestconfig):
+    monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
+    monkeypatch.setattr(sys, "argv", ["bench_rcm.py", "--tiny"])
+    import bench_rcm
+
+    bench_rcm.main()
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if "code " in line]
+    assert {row[0] for row in rows} == set(rcm.ACTION_SPACES) and len(rows) == 14
+    assert max(float(row[-1]) for row in rows) < 1e-6

@@ -5,7 +5,7 @@ import os
 import resource
 import shutil
 import types
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -481,3 +481,11 @@ def test_a_sound_episode_that_was_not_sealed_is_noticed(copy):
     store.verify(copy, key)
     with pytest.raises(store.DamagedEpisode, match=rf"{key}/episode.json: is not the episode"):
         load.load(copy, report=lambda _: None)
+
+
+def test_several_gpus_share_what_one_would_do(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    devices: Any = [None] * 4
+    lanes = [demos._fast(devices, total) for total in (240, 257, 4000)]
+    assert lanes == [demos.GPU_LANES, 2 * demos.GPU_LANES, 4 * demos.GPU_LANES]
+    assert demos._fast(None, 4000) == demos.GPU_LANES

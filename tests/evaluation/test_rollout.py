@@ -383,6 +383,9 @@ assert len(jax.devices()) == 2
 one = test_rollout.run(out / "1", lanes=2, devices=jax.devices()[:1])
 two = test_rollout.run(out / "2", lanes=2, devices=jax.devices())
 test_rollout.assert_same(one, two)
+from starjax.evaluation import rollout
+rollout.lanes_per_device = lambda _, trials: trials
+test_rollout.run(out / "3", lanes=0, devices=jax.devices())
 from starjax.data import demos, lanes
 last = lanes.split(lambda x: x + 1, jax.devices()[1:], [lanes.LANE], lanes.LANE)(np.ones(2))
 assert last.devices() == {jax.devices()[1]}
@@ -413,8 +416,9 @@ def test_two_devices_give_the_same_bits(tmp_path):
         text=True,
     )
     assert done.returncode == 0 and "same" in done.stdout, done.stderr[-3000:]
-    plans = [json.loads((tmp_path / n / "plan.json").read_text()) for n in "12"]
-    assert [plan["chunk"] for plan in plans] == [2, 4]
+    plans = [json.loads((tmp_path / n / "plan.json").read_text()) for n in "123"]
+    assert [plan["chunk"] for plan in plans] == [2, 4, 6]
+    assert plans[2]["lanes"] == 3  # each device has its share
 
 
 class _Device:
