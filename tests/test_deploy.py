@@ -65,6 +65,17 @@ def test_it_decides_as_the_policy_of_an_evaluation_does(made):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[1], atol=1e-5), alone, wanted)
 
 
+def test_fields_of_a_trocar_broadcast(made):
+    path, trained, _ = made
+    deployed, observation = deploy.load(path), observed(trained.policy)
+    radius = np.full(ROBOTS, 0.02, np.float32)
+    wanted = deployed(
+        jax.random.key(0), observation, rcm.Trocar(radius, 0 * radius + 1.4, 0 * radius + 0.8)
+    )
+    got = deployed(jax.random.key(0), observation, rcm.Trocar(0.02, 1.4 + 0 * radius, 0.8))
+    jax.tree.map(np.testing.assert_array_equal, got, wanted)
+
+
 def test_a_mistake_names_the_array(made):
     path, trained, _ = made
     deployed, kind = deploy.load(path), trained.policy.observation
@@ -75,7 +86,7 @@ def test_a_mistake_names_the_array(made):
         rf"observation.{kind}: expected shape .*, got none": (good.replace(**{kind: None}), trocar),
         r"trocar.polar: .*got 80": (good, trocar._replace(polar=80.0)),
         r"observation.pose.R: expected shape \[4, 2, 3, 3\]": (good, rcm.Trocar(*np.ones((3, 4)))),
-        r"trocar.radius: expected shape \[\] or \[B\]": (good, rcm.Trocar(*np.ones((3, 1, 1)))),
+        r"trocar: expected fields of shape \[\] or \[B\]": (good, rcm.Trocar(*np.ones((3, 1, 1)))),
     }
     if kind == "image":
         bright = good.replace(image=good.image / np.float32(255))

@@ -1,6 +1,8 @@
 """The doctor finds what is planted, and gives each fault one remedy."""
 
 import importlib.metadata
+import os
+import subprocess
 import sys
 
 import pytest
@@ -33,7 +35,7 @@ def test_versions_that_do_not_fit_are_found(monkeypatch):
     found = {"jax": "0.10.2", "jaxlib": "0.10.1", "mujoco": "4.0.0", "mujoco-mjx": "3.17.0"}
     monkeypatch.setattr(doctor.xla, "versions", lambda: found)
     (fault,) = faults(doctor.packages())
-    assert "jaxlib==0.10.2" in fault.remedy
+    assert "jaxlib==0.10.2" in fault.remedy and fault.name == "packages"  # ends the search
     found["jax"] = found["jaxlib"] = "0.12.0"
     assert "untested" in faults(doctor.packages())[0].remedy
     del found["mujoco"]
@@ -51,6 +53,21 @@ def test_what_is_not_installed_ends_the_search_before_it_is_needed(monkeypatch, 
     assert "jax, jaxlib, mujoco, mujoco-mjx not installed" in said and "left out" in said
 
 
+@pytest.mark.parametrize("error", ["RuntimeError", "ImportError"])
+def test_a_jax_that_refuses_its_jaxlib_is_a_fault(tmp_path, error):
+    (tmp_path / "jax.py").write_text(f"raise {error}('jaxlib is too old\\nfor this jax')")
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        [sys.executable, "-m", "starjax", "doctor"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert done.returncode == 1 and not done.stderr
+    assert "jaxlib is too old\n       -> reinstall jax and jaxlib\n" in done.stdout
+    assert "scene     jaxlib is too old\n" in done.stdout
+
+
 def test_a_missing_encoder_is_found(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     (fault,) = faults(doctor.video())
@@ -61,6 +78,10 @@ def test_unwritable_cache_and_little_memory_are_found(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("STARJAX_CACHE", str(tmp_path / "file" / "below"))
     assert any("STARJAX_CACHE" in fault.remedy for fault in faults(doctor.storage()))
+    monkeypatch.setenv("STARJAX_CACHE", str(tmp_path))
+    monkeypatch.setattr(doctor, "NEEDED_DISK", 1e18)
+    folder, cache = (fault.remedy for fault in faults(doctor.storage()))
+    assert folder.endswith("by --out") and cache.endswith("by STARJAX_CACHE")
     monkeypatch.setattr(doctor, "NEEDED_MEMORY", 1e15)
     assert faults(doctor.memory())
 

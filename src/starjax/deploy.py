@@ -50,7 +50,7 @@ class Deployed:
         Args:
           key: random key; a new one for each decision.
           observation: of the last O moments, oldest first, fields `[O, ...]` or `[B, O, ...]`.
-          trocar: where the port is, fields `[]` or `[B]`.
+          trocar: where the port is, fields `[]` or `[B]`, which broadcast.
 
         Returns:
           Command `[H]` or `[B, H]`: tip poses in the world frame, all of them on the RCM manifold
@@ -59,7 +59,7 @@ class Deployed:
         Raises:
           ValueError: an array has another shape or type than expected, or the trocar is none.
         """
-        rcm.check_trocar(trocar)
+        trocar = rcm.Trocar(*jnp.broadcast_arrays(*rcm.check_trocar(trocar)))
         robots = np.shape(trocar.radius)
         self._check(observation, robots)
         keys = jax.random.split(key, robots[0]) if robots else key[None]
@@ -72,7 +72,7 @@ class Deployed:
 
     def _check(self, observation: Observation, robots: tuple[int, ...]) -> None:
         if len(robots) > 1:
-            raise ValueError(f"trocar.radius: expected shape [] or [B], got {list(robots)}")
+            raise ValueError(f"trocar: expected fields of shape [] or [B], got {list(robots)}")
         size, moments = self.settings.image_size, (*robots, self.settings.obs_horizon)
         expected: dict[str, tuple[int, ...]] = {"pose.R": (3, 3), "pose.p": (3,), "gripper": ()}
         given: dict[str, Any] = dict(

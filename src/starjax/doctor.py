@@ -60,7 +60,8 @@ def packages() -> list[Finding]:
         return [Finding("packages", text, remedy)]
     if found["jax"] != found["jaxlib"]:
         remedy = f"jax and jaxlib differ: pip install jax=={found['jax']} jaxlib=={found['jax']}"
-    elif not (0, 10) <= _numbers(found["jax"])[:2] < (0, 12):
+        return [Finding("packages", text, remedy)]
+    if not (0, 10) <= _numbers(found["jax"])[:2] < (0, 12):
         remedy = f"jax {found['jax']} is untested: pip install 'jax>=0.10.2,<0.12'"
     return [Finding("versions", text, remedy)]
 
@@ -84,7 +85,10 @@ def xla_flags() -> list[Finding]:
 def storage() -> list[Finding]:
     """Room and rights in the working folder and in the cache."""
     findings = []
-    for name, place in (("folder", pathlib.Path.cwd()), ("cache", xla.cache_directory())):
+    for name, place, option in (
+        ("folder", pathlib.Path.cwd(), "--out"),
+        ("cache", xla.cache_directory(), "STARJAX_CACHE"),
+    ):
         try:
             files.require_writable(place)
         except OSError as error:
@@ -93,7 +97,7 @@ def storage() -> list[Finding]:
             continue
         free = shutil.disk_usage(place).free
         short = free < NEEDED_DISK
-        remedy = f"make {files.size(NEEDED_DISK)} free, or use another disk by --out"
+        remedy = f"make {files.size(NEEDED_DISK)} free, or use another disk by {option}"
         findings.append(Finding(name, f"{place}, {files.size(free)} free", remedy if short else ""))
     return findings
 
@@ -113,9 +117,11 @@ def devices() -> list[Finding]:
         gpu = [Finding("GPU", "an NVIDIA device, no CUDA plugin of jax", remedy)]
     else:
         gpu = []
-    import jax
-    import jax.numpy as jnp
-
+    try:
+        import jax
+        import jax.numpy as jnp
+    except (ImportError, RuntimeError) as error:  # the second from jax's check of jaxlib
+        return [*gpu, Finding("jax", _first_line(error), "reinstall jax and jaxlib")]
     try:
         kinds = [device.device_kind for device in jax.devices()]
         total = float(jax.jit(jnp.sum)(jnp.arange(5.0)))
@@ -132,8 +138,10 @@ def devices() -> list[Finding]:
 
 def scene() -> list[Finding]:
     """Whether the MJCF parts are found and compile."""
-    from starjax.sim import model
-
+    try:
+        from starjax.sim import model
+    except (ImportError, RuntimeError) as error:
+        return [Finding("scene", _first_line(error), "pip install -e . in starjax's folder")]
     try:
         made = model.compose()
     except (OSError, ValueError) as error:
@@ -148,7 +156,7 @@ def video() -> list[Finding]:
 
         return [Finding("ffmpeg", imageio_ffmpeg.get_ffmpeg_version())]
     except (ImportError, RuntimeError) as error:
-        return [Finding("ffmpeg", str(error).splitlines()[0], "pip install imageio-ffmpeg")]
+        return [Finding("ffmpeg", _first_line(error), "pip install imageio-ffmpeg")]
 
 
 def _shown(check: Callable[[], list[Finding]]) -> list[Finding]:
@@ -158,6 +166,10 @@ def _shown(check: Callable[[], list[Finding]]) -> list[Finding]:
         if finding.remedy:
             print(f"       -> {finding.remedy}")
     return findings
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 def _numbers(version: str) -> tuple[int, ...]:

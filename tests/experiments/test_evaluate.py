@@ -97,8 +97,28 @@ def test_the_seed_is_that_of_the_flag(file):
     score("--seed", "5", "--out", "here")
     plan = json.loads((file.parent / "here" / "evaluation" / "plan.json").read_text())
     assert plan["seed"] == 5 and plan["max_steps"] == 30
-    trials = json.loads((file.parent / "here" / "result.json").read_text())["trials"]
-    assert {trial["seed"] for trial in trials} == {5}
+    result = json.loads((file.parent / "here" / "result.json").read_text())
+    assert {trial["seed"] for trial in result["trials"]} == {5} == {result["seed"]}
+    assert result["config"]["seed"] is None  # of the training, which no file of weights says
+
+
+@pytest.mark.parametrize(("name", "label"), [("dp_ee", "DP-EE"), ("dp_ee_proj", "DP-EE-Proj")])
+@pytest.mark.parametrize("typed", ["all", "dp_ee_proj"])
+def test_a_method_of_a_run_of_several_is_scored_under_its_own_name(
+    file, capsys, name, label, typed
+):
+    run = file.parent / "run"
+    settings = dataclasses.replace(presets.PRESETS["smoke"], method=typed, seed=3)
+    for folder in ("dp_ee", "dp_ee_proj"):
+        folders.claim(run / folder, settings, "demos-a")
+    file.rename(run / "dp_ee" / "policy.safetensors")
+    flags = ["--seed", "7", "--eval.trials", "1", "--eval.time-limit-s", "1"]
+    assert evaluate.main([f"run/{name}", *flags]) == 0
+    said = capsys.readouterr().out
+    assert f": {label} of run/{name}\n" in said and "1 s each, seed 7" in said
+    result = json.loads((run / name / "evaluate-seed7" / "result.json").read_text())
+    assert (result["method"], result["config"]["method"]) == (name, name)
+    assert (result["seed"], result["config"]["seed"]) == (7, 3)
 
 
 def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):

@@ -121,6 +121,21 @@ def test_weights_whose_settings_are_gone_are_refused(tmp_path, text):
         folders.read_config(tmp_path)
 
 
+def test_settings_that_runs_differ_in_are_named_by_their_flags():
+    def values(**parts):
+        return json.loads(json.dumps(dataclasses.asdict(changed(**parts))))
+
+    old = values()
+    del old["policy"]["trocar_yaw"]
+    same = values(seed=5, train={"keep_checkpoints": 9}, eval={"trials": 9})
+    assert folders.differing([]) == folders.differing([values(), old, same]) == []
+    newer = values(policy={"trocar_yaw": "fixed"}, demos={"per_trocar": 9})
+    newer["policy"]["unheard_of"] = 1
+    found = folders.differing([old, newer])
+    flags = ["--demos.per-trocar", "--policy.trocar-yaw", "--policy.unheard-of"]
+    assert found == folders.differing([newer, old, newer]) == flags
+
+
 def test_a_methods_folder_is_found_from_within_and_told_from_others(tmp_path, monkeypatch):
     (tmp_path / "stardiff").mkdir()
     monkeypatch.chdir(tmp_path / "stardiff")

@@ -14,6 +14,7 @@ from starjax import config
 from starjax.data import normalizer
 from starjax.experiments import demonstrations, folders, methods, pipeline, presets, words
 from starjax.policies import packaged
+from starjax.policies import policy as policies
 from starjax.runtime import files
 from starjax.training import export, loop
 
@@ -98,6 +99,21 @@ def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
     np.testing.assert_array_equal(kept.params["w"], np.ones(3))
 
 
+def test_a_stop_during_the_last_steps_ends_the_run_after_the_weights(tmp_path, monkeypatch):
+    stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
+    state = types.SimpleNamespace(ema_params={"w": np.ones(3)}, normalizer=stats)
+
+    def last_steps(*_, **__):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return loop.Result(state, 1.0, 0, {})
+
+    monkeypatch.setattr(loop, "run", last_steps)
+    env = types.SimpleNamespace(p_world_ref=fakes.P_WORLD_REF)
+    with pytest.raises(KeyboardInterrupt, match=r"stopped after training stardiff;.*same command"):
+        pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None)
+    assert folders.weights(tmp_path, "stardiff").exists()
+
+
 def test_first_signal_asks_and_second_ends():
     # A process started in the background ignores SIGINT: what was there is what must come back.
     before = signal.getsignal(signal.SIGINT)
@@ -123,7 +139,8 @@ def test_plan_and_warnings_say_that_an_encoder_is_frozen():
     cpu = presets.PRESETS["cpu"]
     said = "frozen, from compact (pretrained on this task); small"
     assert f"  encoder         {said}\n" in words.plan(cpu, pipeline.STAGES)
-    assert words.warnings(cpu, {"invalid": 0}) == [f"Image encoder: {said}, 128 px."]
+    found = words.warnings(cpu, {"method": "stardiff", "invalid": 0})
+    assert found == [f"Image encoder: {said}, 128 px."]
 
 
 def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):
@@ -172,7 +189,10 @@ def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
     del settings["policy"]["freeze_encoder"]  # a result that is older than this setting
     files.write_json(tmp_path / "result.json", {"config": settings})
     assert pipeline._is_scored(tmp_path, _json(presets.PRESETS["smoke"]))
+    files.write_json(tmp_path / "result.json", {"config": settings, "seed": settings["seed"] + 1})
+    assert not pipeline._is_scored(tmp_path, settings)  # of `starjax evaluate --out`
     more = {**settings, "eval": {**settings["eval"], "trials": 9}}
+    files.write_json(tmp_path / "result.json", {"config": settings})
     assert not pipeline._is_scored(tmp_path, more)
     for damaged in ("{", "{}", '{"config": 1}', '{"config": {"of": "another version"}}'):
         (tmp_path / "result.json").write_text(damaged)
@@ -184,10 +204,45 @@ def _json(settings):
 
 
 def test_warnings_name_what_a_reader_must_know():
-    smoke_words = " ".join(words.warnings(presets.PRESETS["smoke"], {"invalid": 2}))
+    figures = {"method": "stardiff", "invalid": 2}
+    smoke_words = " ".join(words.warnings(presets.PRESETS["smoke"], figures))
     assert "not pixels" in smoke_words and "too short" in smoke_words and "2 trial" in smoke_words
-    (paper,) = words.warnings(config.RunConfig(), {"invalid": 0})
+    (paper,) = words.warnings(config.RunConfig(), {**figures, "invalid": 0})
     assert "Image encoder: trained from scratch; resnet18, 256 px" in paper
+
+
+@pytest.mark.parametrize(
+    ("switch", "flag", "changes", "leaves"),
+    [
+        ({"sees_trocar": "always"}, "sees-trocar always", "stardiff", "dp_rcm4"),
+        ({"sees_trocar": "never"}, "sees-trocar never", "dp_rcm4", "stardiff"),
+        ({"trocar_yaw": "fixed"}, "trocar-yaw fixed", "dp_rcm2", "dp_rcm4"),
+        ({"roll_history": False}, "no-roll-history", "stardiff", "dp_rcm4"),
+        ({"roll_trocar": False}, "no-roll-trocar", "stardiff", "dp_ee"),
+        ({"roll_observation": True}, "roll-observation", "stardiff", "stardiff_single"),
+    ],
+)
+def test_an_ablation_is_named_where_it_changes_the_method(switch, flag, changes, leaves):
+    policy = config.PolicyConfig(**switch)
+
+    def said(method):
+        settings = config.RunConfig(method=method, policy=policy)
+        (_, *found) = words.warnings(settings, {"method": method, "invalid": 0})
+        return found, words.plan(settings, ()).count(f"(--policy.{flag})")
+
+    assert said(leaves) == ([], 0)
+    (warning,), planned = said(changes)
+    assert warning.startswith("Ablation: ") and f"(--policy.{flag})" in warning and planned == 1
+    everything = config.RunConfig(method="all", policy=policy)
+    assert f"(--policy.{flag})" in words.plan(everything, ())
+
+
+def test_the_ablation_of_the_frame_is_named_for_those_that_have_one():
+    policy = config.PolicyConfig(trocar_yaw="fixed")
+    named = {name for name in methods.METHODS if words._ablations(name, policy)}
+    assert named == {
+        name for name, row in methods.METHODS.items() if policies.ablated(row, policy) != row
+    }
 
 
 def test_seen_comes_before_unseen_in_the_outcome():

@@ -199,6 +199,19 @@ def test_table_four_joins_what_was_benchmarked(one):
     assert rows[3][0].endswith("roll network alone") and rows[3][2] == "0.250"
 
 
+def test_table_four_says_where_it_was_timed(one):
+    ms = {"p50": 2.0, "p95": 4.0, "p99": 5.0}
+    old = edited(one, inference_ms_by_ddim_steps={"1": ms, "2": ms}, roll_network_ms=ms)
+    gpu = {"backend": "gpu", "devices": ["NVIDIA H200"]}
+    timed = {"inference_ms_by_ddim_steps": {"5": ms}, "roll_network_ms": None, "hardware": gpu}
+    run = old._replace(bench=timed)
+    assert [row[1] for row in tables.inference([run])[1:]] == ["5", "10"]
+    assert "STAR-Diff was timed on 1 x NVIDIA H200." in tables.markdown([run])
+    assert "STAR-Diff was timed on 1 x NVIDIA H200." in sections.measurements([run])
+    here = run._replace(bench={**timed, "hardware": one.result["hardware"]})
+    assert tables.inference_note([here, old, one]) == tables.INFERENCE_NOTE
+
+
 @pytest.mark.parametrize("value", [0.0, 3e-5, 0.0041, 0.23, 12.0])
 def test_small_errors_are_never_shown_as_zero(value):
     text = tables.millimetres(value)
@@ -358,6 +371,29 @@ def test_several_methods_are_shown_at_the_same_trial(several):
     assert len(trials) == 1 and not trials.pop()[2]
 
 
+def of_seed(run, seed):
+    """The run as if its trials were of another seed."""
+    rollouts = [r._replace(trial={**r.trial, "seed": seed}) for r in run.rollouts]
+    trials = [{**trial, "seed": seed} for trial in run.trials]
+    return edited(run._replace(rollouts=rollouts), trials=trials, seed=seed)
+
+
+def test_trials_of_different_seeds_are_not_shown_as_one(several):
+    runs = [with_qpos(of_seed(run, seed)) for run, seed in zip(several, (1, 0, 1))]
+    shown = [several[0].label, several[2].label]
+    assert [label for label, _ in video.choose(runs)] == shown
+    drawn = trajectories.draw(runs, np.zeros((12, 2))).axes[0].lines
+    colours = {style.method(run.result["method"])[0]: run.label for run in runs}
+    assert {colours[x.get_color()] for x in drawn if x.get_color() in colours} == set(shown)
+
+
+def test_figures_prefer_the_trials_that_stardiff_met(several):
+    single = several[2]._replace(group="one")
+    others = [of_seed(run._replace(group="two"), seed) for run, seed in zip(several, (4, 5))]
+    assert results.representatives([*others, of_seed(single, 4)])[0] is others[0]
+    assert results.representatives([*others, of_seed(single, 5)])[0] is others[1]
+
+
 def test_a_clip_that_ends_early_stays_as_it_ended(one):
     short, long = (
         r._replace(p_world_tip=r.p_world_tip[:n], qpos=np.zeros((n, 2)))
@@ -429,6 +465,7 @@ def test_a_result_alone_is_enough_to_load(one, tmp_path):
         ("result.json", b"{}"),
         ("result.json", b'{"method": "mine", "observation": "image", "config": {}}'),
         ("sweep.json", b'{"trials": ['),
+        ("bench.json", b"{"),
         ("metrics.jsonl", b'{"step": 1\n{"step": 2}\n'),
         ("evaluation/recorded.npz", b"PK"),
     ],
@@ -455,6 +492,32 @@ def test_runs_of_one_method_are_told_apart(tmp_path, seeds, names):
     build.build(paths, tmp_path / "report", with_video=False)
     text = (tmp_path / "report" / "tables.md").read_text()
     assert all(f"STAR-Diff ({name})" in text for name in names)
+
+
+def test_two_evaluations_of_one_policy_are_told_from_two_trainings(one):
+    def named(*changes):
+        runs = [edited(one, **change)._replace(path=one.path / f"{i}/x") for i, change in changes]
+        return [run.label.removeprefix("STAR-Diff ") for run in build._named_apart(runs)]
+
+    settings = one.result["config"]
+    trained = [{"config": {**settings, "seed": seed}, "seed": 7} for seed in (0, 3)]
+    assert named(*enumerate(trained)) == ["(seed 0)", "(seed 3)"]
+    scored = [{"config": settings, "seed": seed} for seed in (0, 7)]
+    assert named(*enumerate(scored)) == ["(trials of seed 0)", "(trials of seed 7)"]
+    other = {**settings, "train": {**settings["train"], "steps": 9}}
+    assert named(*enumerate([scored[0], {"config": other, "seed": 7}])) == ["(0/x)", "(1/x)"]
+    unknown = {"config": {**settings, "seed": None}, "seed": 7}
+    assert named(*enumerate([unknown, trained[0]])) == ["(0/x)", "(1/x)"]
+    old = [{"config": {**settings, "seed": seed}} for seed in (0, 7)]
+    assert named(*enumerate(old)) == ["(seed 0)", "(seed 7)"]
+
+
+def test_another_seed_of_the_trials_is_a_fact(one):
+    assert "Seed of the trials" not in sections.facts([edited(one, seed=0)])
+    assert "<dt>Seed of the trials</dt><dd>7</dd>" in sections.facts([edited(one, seed=7)])
+    unknown = edited(one, seed=7, config={**one.result["config"], "seed": None})
+    assert "<dt>Seed</dt>" not in sections.facts([unknown])
+    assert "seed = unknown" in sections.reproduce([unknown])
 
 
 def test_folders_of_one_name_are_told_apart_further_up(tmp_path):
@@ -512,8 +575,10 @@ def test_a_machine_without_a_video_encoder_still_gets_the_page(tmp_path, monkeyp
     def fail(*_):
         raise RuntimeError("no ffmpeg")
 
-    monkeypatch.setattr(video, "record", fail)
     said = []
+    build.build([synthetic.run(tmp_path / "y")], tmp_path / "report", report=said.append)
+    assert said.pop().startswith("no video: no trial was recorded") and not said
+    monkeypatch.setattr(video, "record", fail)
     index = build.build([synthetic.run(tmp_path / "x")], tmp_path / "report", report=said.append)
     assert index.exists() and said == ["no video: no ffmpeg"]
 
@@ -545,3 +610,13 @@ def test_a_note_of_some_runs_names_them(one):
     other = one._replace(label="DP-EE", result={"warnings": ["common", "its own"]})
     both = [one._replace(result={"warnings": ["common"]}), other]
     assert results.notes(both) == ["common", "DP-EE: its own"]
+
+
+def test_a_report_of_runs_that_were_trained_otherwise_says_in_what(one):
+    policy = {**one.result["config"]["policy"], "sees_trocar": "never"}
+    other = edited(one, config={**one.result["config"], "policy": policy})
+    (*_, note) = results.notes([one, other])
+    assert note.startswith("These runs were not trained alike") and note.endswith(
+        "in --policy.sees-trocar."
+    )
+    assert results.notes([one, one]) == one.result["warnings"]

@@ -70,6 +70,7 @@ def test_result_holds_what_is_documented(said, out):
     assert result["rcm_error_mm"]["commanded"]["max"] < 1e-2
     assert {"mean", "p99", "max"} <= result["rcm_error_mm"]["executed"].keys()
     assert 0 < result["inference_ms"]["p50"] <= result["inference_ms"]["p99"]
+    assert result["seed"] == result["config"]["seed"] == 0
     assert len(result["trials"]) == 12 and len(result["per_trocar"]) == 12
     assert result["config"]["train"]["steps"] == 20 and result["config"]["preset"] == "smoke"
     assert {"collect", "train", "evaluate", "train: compile"} <= result["timings_s"].keys()
@@ -99,7 +100,7 @@ def test_commands_on_a_finished_run(said, out):
     run = str(out / "stardiff")
     bench = starjax("bench", run, "--ddim-steps", "1", "2", "--calls", "5")
     assert bench.returncode == 0, bench.stderr
-    timed = json.loads((out / "stardiff" / "result.json").read_text())
+    timed = json.loads((out / "stardiff" / "bench.json").read_text())
     assert timed["inference_ms_by_ddim_steps"].keys() == {"1", "2"}
     assert timed["roll_network_ms"]["p50"] > 0
     drawn = starjax("report", run, "--no-video", "--out", str(out / "again"))

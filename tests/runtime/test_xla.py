@@ -7,6 +7,8 @@ import sys
 import textwrap
 import threading
 
+import pytest
+
 from starjax.experiments import presets
 from starjax.runtime import xla
 
@@ -88,6 +90,49 @@ def test_a_platform_that_jax_cannot_use_is_a_mistake():
         found = subprocess.run(command, capture_output=True, text=True, env=environment)
         assert found.returncode == 2 and "JAX_PLATFORMS: expected" in found.stderr, found.stderr
         assert name in found.stderr and "Traceback" not in found.stderr
+
+
+def _container(monkeypatch, tmp_path, line, group, names, values):
+    """A process whose control group has this limit, use, and cache in use, in GB."""
+    folder = tmp_path / "groups" / group
+    folder.mkdir(parents=True)
+    limit, used, cached = (str(value) if value == "max" else str(value << 30) for value in values)
+    (folder / names[0]).write_text(f"{limit}\n")
+    (folder / names[1]).write_text(f"{used}\n")
+    (folder / "memory.stat").write_text(f"anon 5\n{names[2]} {cached}\n")
+    (tmp_path / "self").write_text(f"2:cpu:/\n{line}\n")
+    monkeypatch.setattr(xla, "_GROUPS", tmp_path / "groups")
+    monkeypatch.setattr(xla, "_GROUPS_OF_THIS", tmp_path / "self")
+    monkeypatch.setattr(xla, "_physical_bytes", lambda: 64 << 30)
+    monkeypatch.setattr(xla, "_free_bytes", lambda: 32 << 30)
+    return xla.memory_bytes() >> 30, xla.available_bytes() >> 30
+
+
+_V1 = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+_V2 = ("memory.max", "memory.current", "inactive_file")
+
+
+@pytest.mark.parametrize(
+    ("line", "group", "names", "values", "wanted"),
+    [
+        ("0::/job/step", "job/step", _V2, (8, 5, 1), (8, 4)),
+        ("0::/job/step", "job", _V2, (8, 5, 1), (8, 4)),  # the limit of a parent counts
+        ("0::/", "", _V2, (8, 9, 0), (8, 0)),
+        ("0::/job", "job", _V2, ("max", 5, 1), (64, 32)),
+        ("0::/job", "job", _V2, (60, 5, 1), (60, 32)),  # the machine has less
+        ("0::/job", "elsewhere", _V2, (8, 5, 1), (64, 32)),
+        ("3:hugetlb,memory:/job", "memory/job", _V1, (8, 5, 1), (8, 4)),
+        ("3:memory:/outside/job", "memory", _V1, (8, 5, 1), (8, 4)),  # seen from in the container
+        ("3:memory:/job", "memory/job", _V1, (1 << 33, 5, 1), (64, 32)),
+    ],
+)
+def test_the_limit_of_a_container_counts(monkeypatch, tmp_path, line, group, names, values, wanted):
+    assert _container(monkeypatch, tmp_path, line, group, names, values) == wanted
+
+
+def test_no_control_groups_no_limit(monkeypatch, tmp_path):
+    monkeypatch.setattr(xla, "_GROUPS_OF_THIS", tmp_path / "none")
+    assert xla.memory_bytes() == xla._physical_bytes()
 
 
 def test_jax_is_not_imported():

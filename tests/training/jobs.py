@@ -2,6 +2,8 @@
 
 import dataclasses
 import sys
+import time
+import types
 from pathlib import Path
 
 import fakes
@@ -116,9 +118,14 @@ def processes_main(out: str, asks: int) -> None:
     """Trains as one process of several; the first is told to stop at its `asks`th question."""
     import itertools
 
-    from starjax.training import loop, parts, processes
+    import jax
+
+    from starjax.training import devices, loop, parts, processes
 
     processes.join()
+    given = jax.numpy.ones(3)
+    spread = devices.replicate(given, devices.make_mesh(2), may_alias=None).addressable_data(0)
+    assert spread.unsafe_buffer_pointer() == given.unsafe_buffer_pointer(), "held twice"
     parts.LARGE, parts.JOINS = 18, {"cpu"}  # the matrix, not the vector
     loop.policies.make = lambda *_: _quadratic_policy()
     asked = itertools.count(1)
@@ -129,7 +136,39 @@ def processes_main(out: str, asks: int) -> None:
     except loop.Interrupted as stopped:
         print(stopped)
         return
-    save(Path(out) / processes.own_name("found.npz"), processes.own(result.state))
+    save(Path(out) / f"found-{jax.process_index()}.npz", processes.own(result.state))
+
+
+def stopped_main(out: str, trains: bool) -> None:
+    """Is one process of several, as of `starjax train`, until it is told to stop."""
+    import jax
+
+    from starjax import cli
+    from starjax.data import load, store
+    from starjax.experiments import following
+    from starjax.runtime.signals import stop_signals
+    from starjax.training import loop, processes
+
+    settings = dataclasses.replace(SETTINGS, steps=10**6, checkpoint_every=10**6)
+    loop.policies.make = lambda *_: _quadratic_policy()
+    store.is_sealed = lambda root: True
+    load.load = lambda root: types.SimpleNamespace(dataset=fakes.dataset(seed=0))
+
+    def command(argv) -> int:
+        processes.join()
+        if not trains:
+            (Path(out) / f"waits-{jax.process_index()}").touch()
+            time.sleep(60)
+        if not processes.is_first():
+            run = config.RunConfig(out=out, policy=fakes.TINY, train=settings)
+            following.follow(run, ["stardiff"], Path(out), fakes.P_WORLD_REF)
+        processes.agree(0)  # as `pipeline.run`: the folder is held, and nothing is done
+        processes.agree(0)
+        with stop_signals() as should_stop:
+            train(Path(out) / "stardiff", settings, should_stop=should_stop)
+        return 0
+
+    cli.run(command)
 
 
 def save(path: Path, state) -> None:
@@ -147,5 +186,7 @@ if __name__ == "__main__":
     runtime.prepare_xla()
     if sys.argv[1] == "process":
         processes_main(sys.argv[2], int(sys.argv[3]))
+    elif sys.argv[1] in ("trains", "waits"):
+        stopped_main(sys.argv[2], sys.argv[1] == "trains")
     else:
         devices_main(int(sys.argv[1]), *sys.argv[2:])

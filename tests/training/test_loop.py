@@ -106,6 +106,24 @@ def test_losses_that_are_all_broken_end_the_training(quick, monkeypatch, tmp_pat
         jobs.train(tmp_path)
 
 
+def test_a_skipped_step_does_not_move_the_learning_rate(quick, monkeypatch, tmp_path):
+    def prepare(stats, key, batch):
+        observation, p = quick.prepare(stats, key, batch)
+        return observation, jnp.where(jax.random.bernoulli(key), jnp.nan, p)
+
+    broken = quick._replace(prepare=prepare)
+    monkeypatch.setattr(loop.policies, "make", lambda *_: broken)
+    result = jobs.train(tmp_path)
+    used = int(result.state.opt_state[0].count)
+    lines = [x for x in metrics.read(tmp_path / "metrics.jsonl") if x["kind"] == "train"]
+    skipped = np.cumsum([line["skipped"] for line in lines])
+    assert 0 < skipped[-2] < skipped[-1] == result.skipped == 12 - used
+    rate = state.learning_rate(jobs.SETTINGS)
+    wanted = [float(rate(line["step"] - s - 1)) for line, s in zip(lines, skipped, strict=True)]
+    assert [line["learning_rate"] for line in lines] == pytest.approx(wanted)
+    assert wanted[-1] == float(rate(used - 1)) > float(rate(11))
+
+
 def test_data_on_the_host_goes_on_where_it_was_stopped(quick, tmp_path):
     once = jobs.train(tmp_path / "once", host=True)
     asked = iter(range(100))

@@ -1,27 +1,34 @@
 """Two processes that train together are one run, interrupted and resumed or not."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
+import time
+import types
+from collections.abc import Callable
 from pathlib import Path
 
+import fakes
+import jax
 import numpy as np
 import pytest
 
 from starjax import config
-from starjax.training import checkpoint, loop, processes
+from starjax.data import load, store
+from starjax.experiments import following, pipeline
+from starjax.training import checkpoint, loop, metrics, processes
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
 
 
-def run_two(folder: Path, asks: int) -> list[str]:
-    """What two processes print that train in `folder`."""
+def start_two(*words: str) -> list[subprocess.Popen]:
+    """Two processes of one run, of what these words ask of `jobs`."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
-    command = [sys.executable, str(Path(jobs.__file__)), "process", str(folder), str(asks)]
     started = []
     for index in range(2):
         environment = {
@@ -32,7 +39,14 @@ def run_two(folder: Path, asks: int) -> list[str]:
             "JAX_PROCESS_ID": str(index),
         }
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        command = [sys.executable, str(Path(jobs.__file__)), *words]
         started.append(subprocess.Popen(command, env=environment, **pipes))
+    return started
+
+
+def run_two(folder: Path, asks: int) -> list[str]:
+    """What two processes print that train in `folder`."""
+    started = start_two("process", str(folder), str(asks))
     said = [process.communicate(timeout=300) for process in started]
     assert [process.returncode for process in started] == [0, 0], said
     return [out for out, _ in said]
@@ -43,13 +57,74 @@ def test_two_processes_are_one_run(tmp_path, monkeypatch):
     assert all("same command goes on" in line for line in stopped)
     assert 0 < checkpoint.steps(tmp_path / "run/checkpoints")[-1] < jobs.SETTINGS.steps
     run_two(tmp_path, asks=0)
-    first, second = (dict(np.load(tmp_path / name)) for name in ("found.npz", "found-1.npz"))
+    first, second = (dict(np.load(tmp_path / name)) for name in ("found-0.npz", "found-1.npz"))
     monkeypatch.setattr(loop.policies, "make", lambda *_: jobs._quadratic_policy())
     jobs.save(tmp_path / "alone.npz", jobs.train(tmp_path / "alone").state)
     for name, alone in np.load(tmp_path / "alone.npz").items():
         np.testing.assert_array_equal(first[name], second[name])
         np.testing.assert_allclose(first[name], alone, rtol=1e-5, atol=1e-6)
-    assert (tmp_path / "run/metrics.jsonl").exists()
+    written = {path.name for path in (tmp_path / "run").iterdir()}
+    assert written == {"checkpoints", "metrics.jsonl"}
+    logs = [metrics.read(tmp_path / name / "metrics.jsonl") for name in ("run", "alone")]
+    ours, theirs = ([(line["step"], line["kind"]) for line in log] for log in logs)
+    assert ours == theirs  # the log of the first process alone
+
+
+def stop_two(started: list[subprocess.Popen], begun: Callable[[], bool], number: int) -> list[str]:
+    """What two processes say that get this signal, one soon after the other, once they have begun.
+
+    The first process, which decides, gets it last.
+    """
+    try:
+        end = time.monotonic() + 60
+        while not begun():
+            assert time.monotonic() < end and all(process.poll() is None for process in started)
+            time.sleep(0.05)
+        for process in reversed(started):
+            process.send_signal(number)
+            time.sleep(0.1)
+        said = [process.communicate(timeout=30) for process in started]
+    finally:
+        for process in started:
+            process.kill()
+    assert [process.returncode for process in started] == [130, 130], said
+    return [error for _, error in said]
+
+
+def test_ctrl_c_while_all_train_saves(tmp_path):
+    log = tmp_path / "stardiff/metrics.jsonl"
+    started = start_two("trains", str(tmp_path))
+    said = stop_two(started, lambda: log.exists() and log.read_text() != "", signal.SIGINT)
+    assert all("same command goes on from there" in error for error in said)
+    assert len(checkpoint.steps(tmp_path / "stardiff/checkpoints")) == 1
+
+
+def test_sigterm_ends_several_processes_that_do_not_train(tmp_path):
+    started = start_two("waits", str(tmp_path))
+    stop_two(started, lambda: len(list(tmp_path.iterdir())) == 2, signal.SIGTERM)
+
+
+def test_a_batch_that_the_devices_cannot_share_is_a_mistake_at_once(tmp_path, monkeypatch):
+    here = jax.devices() * 2
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "devices", lambda *_: here)
+    train_config = config.TrainConfig(batch_size=33)
+    settings = config.RunConfig(out=str(tmp_path / "run"), train=train_config)
+    with pytest.raises(config.UsageError, match=r"--train.batch-size: .*of the 2 devices.*got 33"):
+        pipeline.run(settings, ["collect", "train"], "")
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_ends_a_training_is_no_traceback_in_any_process(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise loop.TrainingFailed("the loss was not finite")
+
+    monkeypatch.setattr(loop, "run", fail)
+    monkeypatch.setattr(store, "is_sealed", lambda root: True)
+    monkeypatch.setattr(load, "load", lambda root: types.SimpleNamespace(dataset=None))
+    settings = config.RunConfig(out=str(tmp_path))
+    with pytest.raises(config.UsageError, match="the loss was not finite"):
+        following.follow(settings, ["stardiff"], tmp_path, fakes.P_WORLD_REF)
 
 
 def test_half_of_the_variables_is_a_mistake(monkeypatch):
@@ -77,4 +152,4 @@ def test_variables_that_cannot_be_are_a_mistake(monkeypatch, address, count, ind
 
 def test_one_process_agrees_with_itself():
     assert processes.agree(False, 7) == (False, 7)
-    assert processes.is_first() and processes.own_name("metrics.jsonl") == "metrics.jsonl"
+    assert processes.is_first() and processes.is_alone()

@@ -10,6 +10,8 @@ import math
 import jax
 import jax.numpy as jnp
 
+from starjax.runtime import hashing
+
 # Of ImageNet, which the pretrained encoder expects; good enough from scratch.
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
@@ -78,8 +80,8 @@ def hash_normal(seed: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     Returns:
       float32 `[N, *shape]`.
     """
-    counter = _mix(jnp.arange(math.prod(shape), dtype=jnp.uint32))
-    bits = _mix(seed[:, None] ^ counter)
+    counter = hashing.lowbias32(jnp.arange(math.prod(shape), dtype=jnp.uint32))
+    bits = hashing.lowbias32(seed[:, None] ^ counter)
     low, high = bits & 0x00FF00FF, (bits >> 8) & 0x00FF00FF
     pairs = low + high
     total = (pairs & 0xFFFF) + (pairs >> 16)
@@ -99,13 +101,6 @@ def _jitter(x: jax.Array, brightness: jax.Array, contrast: jax.Array, saturation
 
 def _normalize(x: jax.Array, dtype: jnp.dtype) -> jax.Array:
     return ((x - jnp.array(MEAN)) / jnp.array(STD)).astype(dtype)
-
-
-def _mix(x: jax.Array) -> jax.Array:
-    """A 32-bit integer hash (lowbias32 of C. Wellons): every input bit flips half the outputs."""
-    x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
-    x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
-    return x ^ (x >> 16)
 
 
 def _centre(height: int, width: int, crop: int) -> tuple[int, int]:

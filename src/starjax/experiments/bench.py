@@ -1,6 +1,7 @@
 """`starjax bench RUN`: inference latency of a trained policy (Table IV)."""
 
 import dataclasses
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,8 @@ from starjax.runtime import files, xla
 
 DESCRIPTION = """Times one decision at batch 1: observation in, commands out, compilation apart.
 
-RUN is a method's folder, such as runs/cpu/stardiff; the figures join its result.json, and so
-the report's Table IV."""
+RUN is a method's folder, such as runs/cpu/stardiff; RUN/bench.json is what the report's Table IV
+is made of."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Options:
 
     run: options.Run  # a method's folder, such as runs/cpu/stardiff
     ddim_steps: tuple[int, ...] = (1, 2, 5, 10, 20, 50, 100)  # a row for each
-    calls: int = 100  # decisions timed for each
+    calls: int = 100  # decisions timed for each, fewer if they take longer than 10 s
 
 
 def main(argv: Sequence[str]) -> int:
@@ -30,13 +31,6 @@ def main(argv: Sequence[str]) -> int:
     checks.expect(chosen.calls >= 1, "calls", "1 or more", chosen.calls)
     run = folders.existing(chosen.run)
     config = folders.read_config(run)
-    result_file = run / "result.json"
-    if not result_file.is_file():
-        raise config_lib.UsageError(f"{run}: expected a scored method, no result.json there")
-    try:
-        files.read_json(result_file)
-    except ValueError as error:
-        raise config_lib.UsageError(f"{error}; the same starjax run makes it again") from error
     for count in chosen.ddim_steps:
         if not 1 <= count <= config.policy.diffusion_steps:
             most = config.policy.diffusion_steps
@@ -45,12 +39,19 @@ def main(argv: Sequence[str]) -> int:
         figures = _time(run, chosen)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("stopped; bench saves its figures only at its end") from None
-    files.write_json(result_file, files.read_json(result_file) | figures)
+    about = {
+        "method": run.name,
+        "command": options.typed("bench", argv),
+        "versions": xla.versions(),
+        "hardware": xla.hardware(),
+    }
+    files.write_json(run / "bench.json", {**about, **figures})
+    print(f"\nresult: {run / 'bench.json'}; starjax report {shlex.quote(str(run))} shows it")
     return 0
 
 
 def _time(run: Path, chosen: Options) -> dict[str, Any]:
-    """Times and prints; returns what joins result.json."""
+    """Times and prints; returns the rows of Table IV."""
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
 

@@ -59,13 +59,16 @@ def main(argv: Sequence[str]) -> int:
 
     who = scoring.subject(method, file) if method else scoring.from_file(file)
     config = dataclasses.replace(
-        config or _config(who.trained), seed=chosen.seed, out=str(folder), eval=chosen.eval
+        config or _config(who.trained), method=who.method, out=str(folder), eval=chosen.eval
     )
-    print(f"{words.about(config, chosen.policy or chosen.run)}, into {folder}\n", flush=True)
+    about = words.about(config, chosen.policy or chosen.run, chosen.seed)
+    print(f"{about}, into {folder}\n", flush=True)
     with clock.timed(folder, "evaluate"):
         table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed)
     command = options.typed("evaluate", argv)
-    result = scoring.write_result(folder, who, table, config, command, clock.timings(folder))
+    result = scoring.write_result(
+        folder, who, table, config, chosen.seed, command, clock.timings(folder)
+    )
     print(f"\n{words.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
     if chosen.video:
         print(_film(folder, who))
@@ -94,6 +97,7 @@ def _config(trained: Any) -> config_lib.RunConfig:
     known = {
         "method": trained.method,
         "preset": trained.preset or "auto",
+        "seed": None,  # no file of weights says it
         "policy": dataclasses.asdict(trained.policy),
         "train": dataclasses.asdict(trained.train),
         "demos": dataclasses.asdict(trained.demos or config_lib.DemosConfig()),

@@ -11,6 +11,7 @@ import dataclasses
 import json
 import shlex
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -117,6 +118,27 @@ def trained_alike(one: dict[str, Any], other: dict[str, Any], *parts: str) -> bo
     """
     one, other = (_as_json(_from_json(values)) for values in (one, other))
     return all(one[part] == other[part] for part in (*TRAINED_WITH, *parts))
+
+
+def differing(configs: Sequence[dict[str, Any]]) -> list[str]:
+    """Flags of demonstrations, policy and training that configurations from JSON disagree on.
+
+    Settings that one of them lacks have their default there; what leaves the weights alone is left
+    out.
+    """
+    usual = _as_json(config_lib.RunConfig())
+
+    def flags(values: dict[str, Any]) -> dict[str, Any]:
+        full = {part: usual[part] | values.get(part, {}) for part in ("demos", "policy", "train")}
+        names = (name for part in full for name in _flat(full[part], part))
+        return {f"--{name}": _value(full, name) for name in names}
+
+    rows = [flags(values) for values in configs]
+    return [
+        flag
+        for flag in dict.fromkeys(flag for row in rows for flag in row)
+        if flag not in _FREE and any(row.get(flag) != rows[0].get(flag) for row in rows)
+    ]
 
 
 def _recorded(folder: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What the other processes of a run do: their share of each training, and nothing on disk."""
+"""What the other processes of a run do: their share of each training and of its checkpoints."""
 
 import functools
 import time
@@ -9,6 +9,7 @@ from typing import Any
 from starjax import config as config_lib
 from starjax.experiments import methods
 from starjax.runtime import files
+from starjax.runtime.signals import stop_signals
 
 
 def follow(
@@ -37,16 +38,22 @@ def follow(
     processes.agree(0)  # from here on the first one holds the folder
     for name in trained:
         (done,) = processes.agree(0)
-        if not done:
-            loop.run(
-                methods.METHODS[name],
-                config.policy,
-                config.train,
-                dataset(),
-                p_world_ref,
-                Path(config.out) / name,
-                config.seed,
-                description=f"Training {name}",
-            )
+        if done:
+            continue
+        demos = dataset()
+        with stop_signals():  # whether to stop, the first one decides
+            try:
+                loop.run(
+                    methods.METHODS[name],
+                    config.policy,
+                    config.train,
+                    demos,
+                    p_world_ref,
+                    Path(config.out) / name,
+                    config.seed,
+                    description=f"Training {name}",
+                )
+            except loop.TrainingFailed as error:
+                raise config_lib.UsageError(str(error)) from error
     # A process that leaves early would end the others.
     files.wait_until_free(Path(config.out))

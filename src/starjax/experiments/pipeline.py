@@ -1,17 +1,16 @@
 """The stages of a run, one after another, each skipped when its result is there."""
 
-import contextlib
 import dataclasses
 import functools
 import json
-import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
 from starjax.experiments import clock, demonstrations, folders, following, methods, words
 from starjax.runtime import files, xla
+from starjax.runtime.signals import stop_signals
 
 STAGES = words.STAGES
 LEAST_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints ask for their own
@@ -26,12 +25,14 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
       command: what was typed, for the record.
     """
     xla.prepare_xla()
-    from starjax.training import processes
+    from starjax.training import devices, processes
 
     processes.join()
     xla.require_devices("starjax.sim.env", "starjax.training.loop")
     if config.policy.freeze_encoder and not processes.is_alone():
         raise config_lib.UsageError("--policy.freeze-encoder: expected one process, got several")
+    if "train" in stages:
+        devices.make_mesh(config.train.batch_size)  # a mistake is found before demonstrations are
     out = Path(config.out)
     files.require_writable(out, LEAST_FREE_BYTES)
     names = folders.selected(config)
@@ -117,6 +118,13 @@ def _train(
     export.save(weights, made)
     errors = ", ".join(f"{key} {value:.3g}" for key, value in result.holdout.items())
     words.indented(f"{result.samples_per_second:.0f} samples/s; held-out {errors or 'none'}")
+    # Asked during the last steps, whose loop looks no more. Several processes go on: the others
+    # would wait for this one.
+    if should_stop() and processes.is_alone():
+        raise KeyboardInterrupt(
+            f"stopped after training {name}; its weights are {weights}, the same command goes on "
+            "from there"
+        )
 
 
 def _evaluate(config: config_lib.RunConfig, name: str, env: Any, command: str) -> None:
@@ -135,14 +143,16 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, command: str) -
     with clock.timed(out, f"evaluate {name}"):
         who = scoring.subject(name, weights, env)
         table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, config.eval, config.seed)
-    scoring.write_result(folder, who, table, config, command, _timings(out, name))
+    timings = _timings(out, name)
+    scoring.write_result(folder, who, table, config, config.seed, command, timings)
 
 
 def _is_scored(folder: Path, settings: dict[str, Any]) -> bool:
     """Whether result.json is there, whole and of these settings."""
     try:
         found = files.read_json(folder / "result.json")
-        return folders.trained_alike(found["config"], settings, "eval")
+        alike = folders.trained_alike(found["config"], settings, "eval")
+        return alike and found.get("seed", settings["seed"]) == settings["seed"]
     except (FileNotFoundError, KeyError, TypeError, ValueError):  # damaged: made again
         return False
 
@@ -177,22 +187,3 @@ def _report(out: Path, names: Sequence[str]) -> None:
             raise config_lib.UsageError(str(error)) from error
     results = [files.read_json(out / name / "result.json") for name in names]
     print(f"\n{words.outcome(results)}\n\nreport: {page}", flush=True)
-
-
-@contextlib.contextmanager
-def stop_signals() -> Iterator[Callable[[], bool]]:
-    """Yields `should_stop`: true after Ctrl-C or SIGTERM; the second one ends at once."""
-    asked = False
-
-    def ask(number: int, frame: Any) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

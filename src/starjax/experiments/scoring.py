@@ -123,6 +123,7 @@ def write_result(
     who: Subject,
     trials: table.Table,
     config: config_lib.RunConfig,
+    seed: int,
     command: str,
     timings_s: dict[str, float] | None = None,
 ) -> dict[str, Any]:
@@ -133,18 +134,20 @@ def write_result(
       who: was evaluated.
       trials: of the twelve trocars.
       config: settings of the run and of this evaluation.
+      seed: of the trials; the run's own is in `config`.
       command: what was typed.
       timings_s: seconds by stage.
     """
     is_seen = np.arange(len(rcm.IS_SEEN)) < config.demos.seen_trocars
     observation = who.trained.policy.observation
     figures = metrics.compose(
-        trials, is_seen, method=who.method, observation=observation, seed=config.seed
+        trials, is_seen, method=who.method, observation=observation, seed=seed
     )
     result = {
         **figures,
         "inference_ms": decision_ms(who),
         "preset": config.preset,
+        "seed": seed,
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "command": command,
         "timings_s": timings_s or {},

@@ -18,6 +18,7 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
         f"seed {config.seed}, folder {config.out}",
         _device(),
         *_seeing(config.policy),
+        *(f"  ablation        {what}" for what in _ablations(config.method, config.policy)),
         _learning_from(config.demos),
     ]
     lines += [_training(config)] if "train" in stages else []
@@ -25,15 +26,16 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def about(config: config_lib.RunConfig, name: str) -> str:
-    """What is going to be scored: the policy `name`, and how it was made."""
+def about(config: config_lib.RunConfig, name: str, seed: int) -> str:
+    """What is going to be scored: the policy `name`, how it was made, the trials and their seed."""
     lines = [
         f"starjax {starjax.__version__}: {methods.METHODS[config.method].label} of {name}",
         _device(),
         *_seeing(config.policy),
+        *(f"  ablation        {what}" for what in _ablations(config.method, config.policy)),
         _learning_from(config.demos),
         _training(config),
-        f"{_evaluation(config.eval)}, seed {config.seed}",
+        f"{_evaluation(config.eval)}, seed {seed}",
     ]
     return "\n".join(lines)
 
@@ -93,8 +95,32 @@ def _is_of_this_task(policy: config_lib.PolicyConfig) -> bool:
     return policy.freeze_encoder or export.is_policy(packaged.locate(policy.encoder_weights))
 
 
+def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
+    """What settings make otherwise than the row of Table II says, or than one of `all` says."""
+    rows = methods.METHODS.values() if method == "all" else [methods.METHODS[method]]
+    sees, yaw = policy.sees_trocar, policy.trocar_yaw
+    given = "given" if sees == "always" else "not given"
+    told = sees != "method" and any(row.sees_trocar != (sees == "always") for row in rows)
+    turned = yaw == "fixed" and any(row.action_space in ("rcm1", "rcm2") for row in rows)
+    rolls = any(row.hierarchical for row in rows)
+    found = {
+        f"the diffusion model is {given} the trocar (--policy.sees-trocar {sees})": told,
+        "the frame {T} does not turn with the trocar's azimuth (--policy.trocar-yaw fixed)": turned,
+        "the roll network does not read the measured rolls (--policy.no-roll-history)": (
+            rolls and not policy.roll_history
+        ),
+        "the roll network does not read the trocar (--policy.no-roll-trocar)": (
+            rolls and not policy.roll_trocar
+        ),
+        "the roll network reads the observation too (--policy.roll-observation)": (
+            rolls and policy.roll_observation
+        ),
+    }
+    return [what for what, holds in found.items() if holds]
+
+
 def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[str]:
-    """What a reader of the result must know, one sentence each."""
+    """What a reader of the result, whose method `figures` names, must know, one sentence each."""
     found = []
     if config.policy.observation == "state":
         found.append(
@@ -104,6 +130,7 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
     else:
         policy = config.policy
         found.append(f"Image encoder: {encoder(policy)}; {policy.encoder}, {policy.image_size} px.")
+    found += [f"Ablation: {what}." for what in _ablations(figures["method"], config.policy)]
     if config.preset == "smoke":
         found.append("Preset smoke is too short to learn anything: its rates mean nothing.")
     if figures["invalid"]:

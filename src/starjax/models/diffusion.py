@@ -89,7 +89,6 @@ def ddim_sample(
     diffusion_steps: int = 100,
     steps: int = 10,
     prepare: Callable[[jax.Array], Any] = lambda k: k,
-    unroll: int | bool = 1,
 ) -> jax.Array:
     """Deterministic DDIM (eta = 0, 'leading' steps, clean sequence clipped to [-1, 1]).
 
@@ -100,7 +99,6 @@ def ddim_sample(
       steps: how many network evaluations.
       prepare: maps the int32 steps `[n]` to a pytree with leading axis n, once, before the loop;
         `eps_fn` gets its slice. By default the step k itself, int32 `[]`.
-      unroll: loop unrolling of the scan: faster at batch 1 on a GPU, slower to compile.
 
     Returns:
       Clean sequences, the shape of `noise`, within [-1, 1].
@@ -117,7 +115,7 @@ def ddim_sample(
         return x, None
 
     rows = jax.tree.map(jnp.asarray, table)
-    x, _ = jax.lax.scan(step, noise, (rows, prepared), unroll=unroll)
+    x, _ = jax.lax.scan(step, noise, (rows, prepared))
     return x
 
 

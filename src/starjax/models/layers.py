@@ -13,6 +13,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from starjax.runtime import hashing
+
 _PARTS = 128  # of a sum over many places on a GPU
 
 
@@ -84,7 +86,7 @@ def _hashed(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """Uniform in [-1, 1)."""
     bits = jnp.arange(math.prod(shape), dtype=jnp.uint32)
     for word in jax.random.key_data(key).ravel():
-        bits = _mix(bits ^ word)
+        bits = hashing.lowbias32(bits ^ word)
     return ((bits >> 8).astype(jnp.float32) * 2.0**-23 - 1.0).reshape(shape)
 
 
@@ -168,13 +170,6 @@ class Upsample1d(nn.Module):
         y = jnp.moveaxis(y.reshape(2, batch, length, channels), 0, 2)
         shape = (batch, 2 * length, channels)
         return y.reshape(shape) + spread(bias, shape)
-
-
-def _mix(x: jax.Array) -> jax.Array:
-    """A 32-bit integer hash (lowbias32 of C. Wellons), one to one."""
-    x = (x ^ (x >> 16)) * jnp.uint32(0x7FEB352D)
-    x = (x ^ (x >> 15)) * jnp.uint32(0x846CA68B)
-    return x ^ (x >> 16)
 
 
 def _live_taps(kernel_size: int, stride: int, padding: int, length: int, out: int) -> range:

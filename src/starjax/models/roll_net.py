@@ -1,4 +1,4 @@
-"""The relative roll network: future tip positions and the trocar give the roll (Eq. 13, 14)."""
+"""The relative roll network: future tip positions and the trocar give the roll (Eq. 13)."""
 
 import flax.linen as nn
 import jax

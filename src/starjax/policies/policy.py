@@ -1,4 +1,4 @@
-"""A policy of Table II: three pure functions, made from a method's row."""
+"""A policy of Table II: four pure functions, made from a method's row."""
 
 import pathlib
 from collections.abc import Callable

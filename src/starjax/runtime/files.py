@@ -32,7 +32,7 @@ def write_bytes(path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         _write_synced(staged, [data])
         os.replace(staged, path)
-        _sync_directory(path.parent)
+        sync_directory(path.parent)
     except OSError as error:
         with contextlib.suppress(OSError):
             staged.unlink()
@@ -115,9 +115,9 @@ def commit_directory(
         staged.mkdir(parents=True)
         for name, parts in contents.items():
             _write_synced(staged / name, parts)
-        _sync_directory(staged)
+        sync_directory(staged)
         os.rename(staged, final)
-        _sync_directory(final.parent)
+        sync_directory(final.parent)
     except OSError as error:
         shutil.rmtree(staged, ignore_errors=True)
         count = sum(len(part) for parts in contents.values() for part in parts)
@@ -185,6 +185,15 @@ def wait_until_free(directory: Path) -> None:
         fcntl.flock(file, fcntl.LOCK_SH)
 
 
+def sync_directory(path: Path) -> None:
+    """Makes what was created, renamed or removed in a folder survive a crash."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def size(count: float) -> str:
     """A number of bytes for people, e.g. `14.2 GB`."""
     for unit in ("B", "kB", "MB"):
@@ -199,14 +208,6 @@ def _write_synced(path: Path, parts: Sequence[bytes | memoryview]) -> None:
         file.writelines(parts)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _sync_directory(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _explained(error: OSError, path: Path, count: int) -> StorageError:

@@ -2,6 +2,7 @@
 
 Importing it imports no jax."""
 
+import contextlib
 import hashlib
 import importlib
 import importlib.metadata
@@ -9,12 +10,14 @@ import os
 import platform
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from starjax import config
 from starjax.runtime import threads
 
+_GROUPS, _GROUPS_OF_THIS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
 _PACKAGES = (
     "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "numpy", "scipy",
@@ -124,12 +127,20 @@ def cores() -> int:
 
 
 def memory_bytes() -> int:
-    """Physical memory of the machine."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    """Memory that this process may use: the machine's, or its container's if that is less."""
+    return min([_physical_bytes(), *(limit for limit, _ in _limits())])
 
 
 def available_bytes() -> int:
-    """Memory that can be taken now without swapping."""
+    """Memory that can be taken now without swapping, or being killed by a container's limit."""
+    return min([_free_bytes(), *(max(limit - used, 0) for limit, used in _limits())])
+
+
+def _physical_bytes() -> int:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _free_bytes() -> int:
     try:
         with open("/proc/meminfo") as file:
             for line in file:
@@ -137,7 +148,34 @@ def available_bytes() -> int:
                     return 1024 * int(line.split()[1])
     except OSError:
         pass
-    return memory_bytes() // 2
+    return _physical_bytes() // 2
+
+
+def _limits() -> Iterator[tuple[int, int]]:
+    """Limits of the control groups that this process is in, and how much of each is in use."""
+    try:
+        lines = _GROUPS_OF_THIS.read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if not controllers:  # version 2
+            root, names = _GROUPS, ("memory.max", "memory.current", "inactive_file")
+        elif "memory" in controllers.split(","):
+            root = _GROUPS / "memory"
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+        else:
+            continue
+        place = Path(path.lstrip("/"))
+        for group in (place, *place.parents):
+            with contextlib.suppress(OSError, ValueError):  # not there, or "max": no limit
+                yield _limit(root / group, *names)
+
+
+def _limit(group: Path, limit: str, usage: str, reclaimed: str) -> tuple[int, int]:
+    most, used = (int((group / name).read_text()) for name in (limit, usage))
+    stat = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+    return most, used - int(stat.get(reclaimed, 0))  # the kernel drops cached files in need
 
 
 def _set_default(option: str, value: Any) -> None:

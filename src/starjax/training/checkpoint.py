@@ -78,7 +78,7 @@ def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> p
         if refused >= step:
             _remove(path_of(root, refused))
     writing.rename(final)
-    _sync(root)
+    files.sync_directory(root)
     for old in steps(root)[:-keep]:
         _remove(path_of(root, old))
     return final
@@ -153,7 +153,7 @@ def _write_manifest(root: pathlib.Path, step: int, state: Any) -> None:
         stream.write(text)
         stream.flush()
         os.fsync(stream.fileno())
-    _sync(root)
+    files.sync_directory(root)
 
 
 def _hash_of_manifest(manifest: dict[str, Any]) -> str:
@@ -208,11 +208,3 @@ def _remove(path: pathlib.Path) -> None:
     hidden = path.with_name(f"{_TEMPORARY}old-{path.name}")
     path.rename(hidden)
     shutil.rmtree(hidden, ignore_errors=True)
-
-
-def _sync(directory: pathlib.Path) -> None:
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

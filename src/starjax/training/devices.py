@@ -6,6 +6,7 @@ from typing import Any
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from starjax import config
 from starjax.runtime import xla
 from starjax.training import processes
 
@@ -24,14 +25,14 @@ def make_mesh(batch_size: int, devices: Sequence[jax.Device] | None = None) -> M
     """A mesh of the given devices (all of them by default), or of as many as divide the batch.
 
     Raises:
-      ValueError: several processes, whose devices do not divide the batch: none may be left out.
+      UsageError: several processes, whose devices do not divide the batch: none may be left out.
     """
     devices = list(jax.devices() if devices is None else devices)
     count = max(n for n in range(1, len(devices) + 1) if batch_size % n == 0)
     if jax.process_count() > 1 and count < len(devices):
-        raise ValueError(
-            f"batch_size: expected a multiple of the {len(devices)} devices of all processes, "
-            f"got {batch_size}"
+        raise config.UsageError(
+            f"--train.batch-size: expected a multiple of the {len(devices)} devices of all "
+            f"processes, got {batch_size}"
         )
     # Auto: the compiler propagates the batch's sharding
     return jax.make_mesh((count,), (AXIS,), axis_types=(AxisType.Auto,), devices=devices[:count])
@@ -68,4 +69,4 @@ def shard_batch(tree: Any, mesh: Mesh) -> Any:
 def _put(tree: Any, sharding: NamedSharding, may_alias: bool | None) -> Any:
     if sharding.is_fully_addressable:
         return jax.device_put(tree, sharding, may_alias=may_alias)
-    return jax.tree.map(lambda x: processes.spread(x, sharding), tree)
+    return jax.tree.map(lambda x: processes.spread(x, sharding, may_alias), tree)

@@ -69,7 +69,7 @@ def run(
       dataset: on the device (jax arrays) or on the host, see `windows.Dataset`; with features in
         the place of pictures for a frozen vision encoder, whose parameters stay out of the state.
       p_world_ref: `[3]` m, the nominal port.
-      directory: gets `checkpoints/` and `metrics.jsonl`.
+      directory: gets `checkpoints/` and, from the first process, `metrics.jsonl`.
       seed: of everything random.
       mesh_devices: all of jax's by default.
       should_stop: asked about once a second; True saves and raises Interrupted.
@@ -81,7 +81,7 @@ def run(
       StorageError: the disk is full.
     """
     directory = pathlib.Path(directory)
-    log = directory / processes.own_name("metrics.jsonl")
+    log = directory / "metrics.jsonl"
     mesh = devices.make_mesh(train_config.batch_size, mesh_devices)
     p_world_ref = np.asarray(p_world_ref, np.float32)
     dataset = _observed(dataset, policy_config)
@@ -109,8 +109,10 @@ def run(
         state = devices.replicate(state, mesh)
     del drawn  # it holds what was drawn
     step = saved = int(state.step)
-    metrics.resume(log, step)
-    judge = holdout.make(policy, policy_config, dataset, held_out) if processes.is_first() else None
+    judge = None
+    if processes.is_first():
+        metrics.resume(log, step)
+        judge = holdout.make(policy, policy_config, dataset, held_out)
     if step == train_config.steps:
         errors = judge(processes.own(state)) if judge else {}
         return Result(state, 0.0, int(state.skipped), errors)
@@ -202,9 +204,11 @@ def _log(log, step, carried, train_config) -> tuple[Carried, str]:
             "--policy.dtype float32"
         )
     values = {name: value / taken for name, value in sums.items()}
-    values["learning_rate"] = float(jnp.asarray(states.learning_rate(train_config)(step - 1)))
+    last = step - 1 - int(state.skipped)  # as the optimiser counts, which sees no skipped step
+    values["learning_rate"] = float(jnp.asarray(states.learning_rate(train_config)(last)))
     values["skipped"] = skipped
-    metrics.append(log, step, "train", values)
+    if processes.is_first():
+        metrics.append(log, step, "train", values)
     note = f"loss {values['loss']:.4f}" + (f", {skipped} steps skipped" if skipped else "")
     # placed as they were: another placement would be another program
     fresh = jax.tree.map(lambda x: jax.device_put(jnp.zeros_like(x), x.sharding), state.sums)

@@ -1,8 +1,9 @@
 """Several processes as one training run: joining it, agreeing, and acting alone.
 
 Every process runs the same command on a shared folder, with JAX_COORDINATOR_ADDRESS (host:port of
-the first one), JAX_NUM_PROCESSES and JAX_PROCESS_ID set. All train together; whatever else there is
-to do, files above all, the first does alone. With one process nothing here does anything.
+the first one), JAX_NUM_PROCESSES and JAX_PROCESS_ID set. All train together and write the arrays of
+checkpoints; whatever else there is to do, other files above all, the first does alone. With one
+process nothing here does anything.
 """
 
 import os
@@ -16,6 +17,7 @@ from jax.sharding import NamedSharding
 from starjax import config
 
 _VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+_PREEMPTION = "jax_enable_preemption_service"
 
 
 def join() -> None:
@@ -35,6 +37,9 @@ def join() -> None:
     count, index = map(int, numbers)
     if index >= count:
         raise config.UsageError(f"JAX_PROCESS_ID: expected 0 to {count - 1}, got {index}")
+    # Its handler of SIGTERM, in C++, would take the signal from Python's.
+    if hasattr(jax.config, _PREEMPTION):
+        jax.config.update(_PREEMPTION, False)
     jax.distributed.initialize(address, num_processes=count, process_id=index)
 
 
@@ -56,12 +61,15 @@ def agree(*values: int) -> tuple[int, ...]:
     return tuple(int(value) for value in said)
 
 
-def spread(x: Any, sharding: NamedSharding) -> jax.Array:
-    """An array over the devices of all processes, of which each holds all of `x`."""
+def spread(x: Any, sharding: NamedSharding, may_alias: bool | None) -> jax.Array:
+    """An array over the devices of all processes, of which each holds all of `x`.
+
+    `may_alias`, of `jax.device_put`: whether it may share the memory of `x`.
+    """
     x = x if isinstance(x, jax.Array) else np.asarray(x)
     whole = sharding.is_fully_replicated
     parts = [
-        jax.device_put(x if whole else x[index], device, may_alias=False)
+        jax.device_put(x if whole else x[index], device, may_alias=may_alias)
         for device, index in sharding.addressable_devices_indices_map(x.shape).items()
     ]
     return jax.make_array_from_single_device_arrays(x.shape, sharding, parts)
@@ -72,9 +80,3 @@ def own(tree: Any) -> Any:
     if is_alone():
         return tree
     return jax.tree.map(lambda x: x.addressable_data(0), tree)
-
-
-def own_name(name: str) -> str:
-    """A file's name, with the process's number in all processes but the first."""
-    stem, _, suffix = name.partition(".")
-    return name if is_first() else f"{stem}-{jax.process_index()}.{suffix}"

@@ -114,7 +114,7 @@ def create(
     Args:
       policy: to be trained.
       optimizer: from `make_optimizer`.
-      params: from `Init.draw`.
+      params: from `Init.drawn`.
       stats: fitted to the training frames.
       seed: of everything random.
     """

@@ -67,9 +67,16 @@ def _name(run: results.Run, runs: Sequence[results.Run]) -> str:
     if len(alike) == 1:
         return run.label
     seeds = [other.result.get("config", {}).get("seed") for other in alike]
-    if None not in seeds and len(set(seeds)) == len(seeds):
+    if _all_apart(seeds):
         return f"{run.label} (seed {run.result['config']['seed']})"
+    seeds = [results.trials_seed(other) for other in alike]
+    if _all_apart(seeds) and not results.differing(alike):
+        return f"{run.label} (trials of seed {results.trials_seed(run)})"
     return f"{run.label} ({_place(run, alike)})"
+
+
+def _all_apart(seeds: Sequence[int | None]) -> bool:
+    return None not in seeds and len(set(seeds)) == len(seeds)
 
 
 def _place(run: results.Run, others: Sequence[results.Run]) -> str:
@@ -86,10 +93,13 @@ def _film(
 ) -> pathlib.Path | None:
     """The video, or None after a line that says why there is none: the page is worth more."""
     try:
-        return video.record(runs, sim, path, report)
+        film = video.record(runs, sim, path, report)
     except (OSError, RuntimeError) as error:  # the encoder is a program of its own
         report(f"no video: {error}")
         return None
+    if film is None:
+        report("no video: no trial was recorded with its joint positions")
+    return film
 
 
 def _focus(runs: Sequence[results.Run]) -> results.Run:

@@ -1,13 +1,14 @@
 """What a finished run left on disk, read for the report: results, rollouts, loss curves, sweep."""
 
+import collections
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax.experiments import methods
+from starjax.experiments import folders, methods
 from starjax.experiments.report import outcomes, stats
 from starjax.runtime import files
 
@@ -44,6 +45,7 @@ class Run(NamedTuple):
       rollouts: recorded trials, empty if none were.
       curves: lines of metrics.jsonl, of the training of its weights.
       sweep: trials of a sweep over other trocars, empty if none was made.
+      bench: bench.json, empty if there is none: `starjax bench` once wrote into result.json.
     """
 
     path: Path
@@ -54,6 +56,7 @@ class Run(NamedTuple):
     rollouts: list[Rollout]
     curves: list[dict[str, Any]]
     sweep: list[outcomes.Trial]
+    bench: dict[str, Any]
 
     @property
     def trials(self) -> list[outcomes.Trial]:
@@ -66,13 +69,33 @@ def observed(runs: Sequence[Run]) -> str:
     return " and ".join(sorted({run.result["observation"] for run in runs}))
 
 
+def identity(trial: outcomes.Trial) -> tuple[int, int, int]:
+    """What two runs have in common where they met the same trial: trocar, number, seed."""
+    return int(trial["trocar"]), int(trial["trial"]), int(trial["seed"])
+
+
+def most_shared(trials: Iterable[outcomes.Trial]) -> tuple[int, int, int]:
+    """The trial that most runs met, of these an unseen one, of these the first."""
+    trials = list(trials)
+    counts = collections.Counter(map(identity, trials))
+    return identity(min(trials, key=lambda t: (-counts[identity(t)], t["seen"], identity(t))))
+
+
+def trials_seed(run: Run) -> int | None:
+    """Seed of a run's trials; a result from before it was recorded has one for everything."""
+    return run.result.get("seed", (run.result.get("config") or {}).get("seed"))
+
+
+def differing(runs: Sequence[Run]) -> list[str]:
+    """Flags of what decides the weights, but for the seed, that the runs do not agree on."""
+    configs = [run.result["config"] for run in runs if run.result.get("config")]
+    return folders.differing(configs)
+
+
 def pair(a: Run, b: Run) -> stats.Paired | None:
     """McNemar's test over the trials that both methods ran with the same trocar and seed."""
 
-    def key(trial: outcomes.Trial) -> tuple[int, int, int]:
-        return int(trial["trocar"]), int(trial["trial"]), int(trial["seed"])
-
-    ours, theirs = ({key(t): outcomes.strict(t) for t in run.trials} for run in (a, b))
+    ours, theirs = ({identity(t): outcomes.strict(t) for t in run.trials} for run in (a, b))
     common = sorted(ours.keys() & theirs.keys())
     if not common:
         return None
@@ -80,10 +103,13 @@ def pair(a: Run, b: Run) -> stats.Paired | None:
 
 
 def representatives(runs: Sequence[Run]) -> list[Run]:
-    """One run of each group, in the runs' order: STAR-Diff itself, else the most successful."""
+    """One run of each group, in the runs' order: STAR-Diff itself, else the most successful of
+    those that met the trials of the first STAR-Diff, if any did."""
+    seed = next((trials_seed(run) for run in runs if run.result["method"] == OURS), None)
 
-    def standing(run: Run) -> tuple[bool, float]:
-        return run.result["method"] == OURS, outcomes.tally(run.trials).rate
+    def standing(run: Run) -> tuple[bool, bool, float]:
+        is_ours, same_trials = run.result["method"] == OURS, trials_seed(run) == seed
+        return is_ours, same_trials, outcomes.tally(run.trials).rate
 
     groups = [
         [run for run in runs if run.trials and run.group == g] for g in {r.group for r in runs}
@@ -111,7 +137,8 @@ def load(path: Path) -> Run:
         weights_of=method.weights_of,
         rollouts=_rollouts(path, result.get("trials") or []),
         curves=_curves(path, result["method"]),
-        sweep=_sweep(path / "sweep.json"),
+        sweep=_beside(path / "sweep.json").get("trials") or [],
+        bench=_beside(path / "bench.json"),
     )
 
 
@@ -122,7 +149,8 @@ def training_trocars(run: Run) -> list[outcomes.Trial]:
 
 def latencies(run: Run) -> list[tuple[int, dict[str, float]]]:
     """(DDIM steps, {p50, p95, p99} in ms) of one policy call, fewest steps first."""
-    found = {int(n): ms for n, ms in (run.result.get("inference_ms_by_ddim_steps") or {}).items()}
+    rows = (run.bench or run.result).get("inference_ms_by_ddim_steps") or {}
+    found = {int(n): ms for n, ms in rows.items()}
     if run.result.get("inference_ms"):
         steps = run.result["config"]["policy"]["ddim_steps"]
         found.setdefault(int(steps), run.result["inference_ms"])
@@ -159,8 +187,9 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
     return rollouts
 
 
-def _sweep(file: Path) -> list[outcomes.Trial]:
-    return files.read_json(file).get("trials") or [] if file.is_file() else []
+def _beside(file: Path) -> dict[str, Any]:
+    """What another command left beside result.json."""
+    return files.read_json(file) if file.is_file() else {}
 
 
 def _curves(path: Path, method: str) -> list[dict[str, Any]]:
@@ -181,12 +210,16 @@ def _lines(file: Path) -> list[dict[str, Any]]:
 
 
 def notes(runs: Sequence[Run]) -> list[str]:
-    """Warnings of the runs, each once, with the names of those that it is about if not of all."""
+    """Warnings of the runs, each once, with the names of those that it is about if not of all, and
+    what sets their trainings apart."""
     said: dict[str, list[str]] = {}
     for run in runs:
         for text in run.result.get("warnings") or []:
             said.setdefault(text, []).append(run.label)
-    return [
+    found = [
         text if len(labels) == len(runs) else f"{', '.join(labels)}: {text}"
         for text, labels in said.items()
     ]
+    if flags := differing(runs):
+        found.append(f"These runs were not trained alike: they differ in {', '.join(flags)}.")
+    return found

@@ -22,6 +22,7 @@ def facts(runs: Sequence[results.Run]) -> str:
         "Trials" if len(runs) == 1 else "Trials a run": [_trials(run) for run in runs],
         "Preset": [config.get("preset") for config in configs],
         "Seed": [config.get("seed") for config in configs],
+        "Seed of the trials": [_other_seed(run) for run in runs],
         "Hardware": [words.hardware(run.result.get("hardware") or {}) for run in runs],
     }
     inner = ""
@@ -30,6 +31,12 @@ def facts(runs: Sequence[results.Run]) -> str:
         if found:
             inner += f"<div><dt>{name}</dt><dd>{markup.escape('; '.join(found))}</dd></div>"
     return f'<dl class="facts">{inner}</dl>'
+
+
+def _other_seed(run: results.Run) -> int | None:
+    """Seed of the trials where it is not that of the training."""
+    seed = results.trials_seed(run)
+    return None if seed == (run.result.get("config") or {}).get("seed") else seed
 
 
 def _trials(run: results.Run) -> str:
@@ -183,7 +190,7 @@ def measurements(runs: Sequence[results.Run]) -> str:
     """RCM error, inference time (Table IV), wall-clock time a phase."""
     parts = (
         ("RCM error (mm)", tables.rcm(runs), tables.RCM_NOTE),
-        ("Inference time", tables.inference(runs), tables.INFERENCE_NOTE),
+        ("Inference time", tables.inference(runs), tables.inference_note(runs)),
         ("Where the time went", tables.phases(runs), tables.PHASES_NOTE),
     )
     return "\n".join(f"<h2>{h}</h2>\n{markup.plain(t, n)}" for h, t, n in parts if len(t) > 1)

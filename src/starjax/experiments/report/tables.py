@@ -22,7 +22,7 @@ def markdown(runs: Sequence[results.Run]) -> str:
         ("Paired comparison with STAR-Diff", paired(runs), PAIRED_NOTE),
         ("Failed trials", failures(runs), FAILURES_NOTE),
         ("RCM error (mm)", rcm(runs), RCM_NOTE),
-        ("Table IV. Inference time", inference(runs), INFERENCE_NOTE),
+        ("Table IV. Inference time", inference(runs), inference_note(runs)),
     ]
     filled = [f"## {title}\n\n{render(t)}\n\n{note}\n" for title, t, note in parts if len(t) > 1]
     notes = "".join(f"- {text}\n" for text in results.notes(runs))
@@ -132,13 +132,23 @@ def inference(runs: Sequence[results.Run]) -> Table:
     table = [["Method", "DDIM steps", "p50 (ms)", "p95 (ms)", "p99 (ms)", "p50 (Hz)", "p99 (Hz)"]]
     for run in runs:
         rows = [(run.label, str(steps), ms) for steps, ms in results.latencies(run)]
-        if run.result.get("roll_network_ms"):
-            rows.append((f"{run.label}, roll network alone", "–", run.result["roll_network_ms"]))
+        if roll := (run.bench or run.result).get("roll_network_ms"):
+            rows.append((f"{run.label}, roll network alone", "–", roll))
         for name, steps, ms in rows:
             times = [f"{ms[q]:.3f}" if ms["p50"] < 1 else f"{ms[q]:.1f}" for q in _QUANTILES]
             hertz = [f"{1e3 / ms[q]:.0f}" for q in ("p50", "p99")]
             table.append([name, steps, *times, *hertz])
     return table
+
+
+def inference_note(runs: Sequence[results.Run]) -> str:
+    """How to read Table IV, and where `starjax bench` ran if not on the machine of the run."""
+    note = INFERENCE_NOTE
+    for run in runs:
+        timed, scored = (words.hardware(x.get("hardware") or {}) for x in (run.bench, run.result))
+        if timed and timed != scored:
+            note += f" {run.label} was timed on {timed}."
+    return note
 
 
 def phases(runs: Sequence[results.Run]) -> Table:

@@ -81,8 +81,8 @@ def _panel(
         (i, r) for i, run in enumerate(runs) for r in run.rollouts if r.trial["trocar"] == index
     ]
     if len(runs) > 1:  # the same trial for every method, so that the paths can be compared
-        first = min(r.trial["trial"] for _, r in drawn)
-        drawn = [(i, r) for i, r in drawn if r.trial["trial"] == first]
+        shared = results.most_shared(r.trial for _, r in drawn)
+        drawn = [(i, r) for i, r in drawn if results.identity(r.trial) == shared]
     trial, trocar = drawn[0][1].trial, drawn[0][1].p_world_trocar
     axis.set_axis_off()
     axis.set_aspect("equal")

@@ -52,8 +52,8 @@ def choose(runs: Sequence[results.Run], most: int = 4) -> list[tuple[str, result
     """(method, rollout) to show side by side, an even number if there are two or more.
 
     One run: half of them at seen and half at unseen trocars, spread over these. Several runs:
-    one trial that all of them recorded, at an unseen trocar if there is one. The choice does not
-    look at how a rollout ended.
+    one trial that as many of them as possible recorded, at an unseen trocar if there is one. The
+    choice does not look at how a rollout ended.
     """
     if len(runs) > 1:
         return _same_trial(runs, most)
@@ -213,14 +213,10 @@ def _spread(rollouts: list[results.Rollout], most: int) -> list[results.Rollout]
 def _same_trial(runs: Sequence[results.Run], most: int) -> list[tuple[str, results.Rollout]]:
     """The same trial of up to `most` runs; the last ones where there are more."""
     kept = [
-        {(r.trial["trocar"], r.trial["trial"]): r for r in run.rollouts if r.qpos is not None}
-        for run in runs
+        {results.identity(r.trial): r for r in run.rollouts if r.qpos is not None} for run in runs
     ]
     found = [(run.label, rollouts) for run, rollouts in zip(runs, kept) if rollouts][-most:]
     if not found:
         return []
-    common = set.intersection(*(set(rollouts) for _, rollouts in found))
-    if not common:
-        return []
-    pick = min(common, key=lambda key: (found[0][1][key].trial["seen"], *key))
-    return [(label, rollouts[pick]) for label, rollouts in found]
+    pick = results.most_shared(r.trial for _, rollouts in found for r in rollouts.values())
+    return [(label, rollouts[pick]) for label, rollouts in found if pick in rollouts]

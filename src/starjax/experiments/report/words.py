@@ -75,6 +75,8 @@ def listing(value: Any) -> str:
     """A small JSON value as a phrase."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {listing(part)}" for key, part in value.items())
+    if value is None:
+        return "unknown"
     if isinstance(value, list):
         return ", ".join(listing(part) for part in value)
     return f"{value:g}" if isinstance(value, float) else str(value)
