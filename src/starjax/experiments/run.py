@@ -40,7 +40,7 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
 
 def _folder(config: config_lib.RunConfig, default: config_lib.RunConfig) -> str:
     """Folder of a run that names none: other observations, encoders frozen or not, and seeds have
-    one each; runs that differ in what else decides the weights meet in it, and are refused."""
+    one each; trainings of one method that differ in anything else meet in it, and are refused."""
     policy, usual = config.policy, default.policy
     parts = [default.out]
     parts += [policy.observation] if policy.observation != usual.observation else []
