@@ -155,17 +155,18 @@ def _env(**more):
 
 
 def test_modules_are_imported_while_jax_starts(monkeypatch):
-    seen = []
+    begun, imported, seen = threading.Event(), threading.Event(), []
 
-    def slow():
-        seen.append("begun")
+    def start():
+        begun.set()
         assert imported.wait(10)
-        return []
 
-    imported = threading.Event()
-    monkeypatch.setattr("jax.devices", slow)
-    monkeypatch.setattr(
-        importlib, "import_module", lambda name: (seen.append(name), imported.set())
-    )
+    def import_module(name):
+        assert begun.wait(10)
+        seen.append(name)
+        imported.set()
+
+    monkeypatch.setattr("jax.devices", start)
+    monkeypatch.setattr(importlib, "import_module", import_module)
     xla.require_devices("somewhere.there")
-    assert sorted(seen) == ["begun", "somewhere.there"]
+    assert seen == ["somewhere.there"]

@@ -62,7 +62,7 @@ def evaluate(
       lanes: size of the compiled batch on each device, or of each core's on a CPU; 0 for
         `rollout.lanes_per_device`: it is what decides memory, and may change last bits.
       video_trials: how many trials get their joint positions recorded, at least.
-      devices: to split a chunk over; with `lanes` 0 their number decides that one's.
+      devices: to split a chunk over; where `lanes` is 0, these are so few that all have a share.
       identity: JSON values that tell this policy from others with the same weights.
       report: gets lines for the user.
 

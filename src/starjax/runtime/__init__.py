@@ -1,4 +1,4 @@
-"""What every command needs from the machine: safe files, progress, XLA settings. No jax inside."""
+"""What all the rest stands on: safe files, progress, signals, XLA settings, a hash. No jax."""
 
 from starjax.runtime.xla import prepare_xla
 
