@@ -160,13 +160,27 @@ def test_modules_are_imported_while_jax_starts(monkeypatch):
     def start():
         begun.set()
         assert imported.wait(10)
+        return []
 
     def import_module(name):
         assert begun.wait(10)
         seen.append(name)
         imported.set()
 
-    monkeypatch.setattr("jax.devices", start)
+    monkeypatch.setattr("jax.local_devices", start)
     monkeypatch.setattr(importlib, "import_module", import_module)
     xla.require_devices("somewhere.there")
     assert seen == ["somewhere.there"]
+
+
+def test_a_start_takes_the_memory_of_each_device_unless_it_is_full(monkeypatch):
+    asked = []
+
+    def put(value, device):
+        asked.append(device)
+        raise RuntimeError("RESOURCE_EXHAUSTED")
+
+    monkeypatch.setattr("jax.device_put", put)
+    monkeypatch.setattr("jax.local_devices", lambda: ["first", "second"])
+    xla.require_devices()
+    assert asked == ["first", "second"]

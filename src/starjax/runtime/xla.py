@@ -71,14 +71,20 @@ def cache_directory() -> Path:
 
 
 def require_devices(*modules: str) -> None:
-    """Starts jax, and beside it, because a GPU takes a second, imports these modules.
+    """Starts jax, and beside it, because a GPU takes two seconds, imports these modules.
 
     Raises:
       config.UsageError: it cannot use what JAX_PLATFORMS asks for.
     """
     import jax
 
-    started = threads.beside(jax.devices)
+    def start() -> None:
+        for device in jax.local_devices():
+            # A GPU's memory is taken with the first array, the longer part of its start.
+            with contextlib.suppress(RuntimeError):  # a full one will say so where it is used
+                jax.device_put(0, device)
+
+    started = threads.beside(start)
     for module in modules:
         importlib.import_module(module)
     try:
