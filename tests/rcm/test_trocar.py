@@ -20,6 +20,33 @@ def test_position_and_frame_equal_numpy(oracle, p_world_ref):
     oracle.check_rotations(R, atol=1e-6)
 
 
+def test_a_measured_position_has_the_parameters_it_was_made_of(p_world_ref):
+    drawn = rcm.sample_trocar(jax.random.key(2), (4096,), radius_range=(1e-3, 0.05))
+    for trocar in (drawn, rcm.TROCARS):
+        p = np.float64(p_world_ref) + rcm.trocar_position(trocar, np.zeros(3))
+        # In double precision, as float32 metres about 0.15 are a ten-thousandth of 1e-3 m apart.
+        with jax.enable_x64(True):
+            found = jax.jit(rcm.trocar_from_position)(p, np.float64(p_world_ref))
+            for got, field in zip(found, trocar, strict=True):
+                np.testing.assert_allclose(got, field, atol=2e-5 * np.abs(field).max())
+    found = rcm.check_trocar(rcm.trocar_from_position(p.astype(np.float32), p_world_ref))
+    np.testing.assert_allclose(rcm.trocar_position(found, p_world_ref), p, atol=3e-8)
+
+
+def test_a_position_that_says_nothing_of_an_angle(p_world_ref):
+    offset = np.array([[0, 0, 0], [1e-7, 0, -1e-7], [0, 0, 0.03], [-1e-7, 0, -0.03]], np.float32)
+    found = rcm.trocar_from_position(offset, np.zeros(3))
+    np.testing.assert_allclose(found.radius, [0, 0, 0.03, 0.03], atol=2e-7)
+    np.testing.assert_allclose(found.polar, [np.pi / 2, np.pi / 2, 0, np.pi], atol=1e-5)
+    np.testing.assert_array_equal(found.azimuth, 0)
+    jacobian = jax.vmap(jax.jacfwd(lambda p: rcm.trocar_from_position(p, np.zeros(3))))(offset)
+    assert all(np.isfinite(field).all() for field in jacobian)
+    for bad in (np.nan, np.inf, -np.inf):
+        assert np.isnan(rcm.trocar_from_position([0.0, bad, 0.1], p_world_ref)).all()
+    with pytest.raises(ValueError, match=r"p_world_trocar: expected .*3\], got \[2\]"):
+        rcm.trocar_from_position(np.zeros(2), p_world_ref)
+
+
 def test_frame_points_down_and_along_the_azimuth():
     R = rcm.trocar_rotation(rcm.Trocar(0.04, 1.4, np.pi / 2))
     np.testing.assert_allclose(R[:, 0], [0, 1, 0], atol=1e-7)

@@ -33,6 +33,7 @@ from starjax.rcm.trocar import (
     Trocar,
     check_trocar,
     sample_trocar,
+    trocar_from_position,
     trocar_position,
     trocar_rotation,
 )
@@ -66,6 +67,7 @@ __all__ = [
     "rotation_from_axis_roll",
     "rotation_z",
     "sample_trocar",
+    "trocar_from_position",
     "trocar_position",
     "trocar_rotation",
 ]

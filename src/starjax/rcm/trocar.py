@@ -90,6 +90,33 @@ def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
     return p_world_ref + offset
 
 
+def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> Trocar:
+    """Parameters of a trocar that was measured in the world frame: Eq. 2 solved for lambda.
+
+    Where a position says nothing of an angle it is as in `TROCARS`: at the nominal port the polar
+    angle is pi/2, and there, above and below it the azimuth is 0. That azimuth turns {T}.
+
+    Args:
+      p_world_trocar: `[..., 3]` m.
+      p_world_ref: `[..., 3]` m, the nominal port o_ref.
+
+    Returns:
+      Fields `[...]`, the azimuth in [0, 2 pi]; NaN where a position is not finite.
+    """
+    p_world_trocar, p_world_ref = arrays.checked(
+        p_world_trocar=(p_world_trocar, (3,)), p_world_ref=(p_world_ref, (3,))
+    )
+    offset = p_world_trocar - p_world_ref
+    offset = jnp.where(jnp.isfinite(offset).all(-1, keepdims=True), offset, jnp.nan)
+    radius, across = arrays.norm(offset), arrays.norm(offset[..., :2])
+    x, y, z = (offset[..., i] for i in range(3))
+    # Where arctan2 has no derivative, or one that grows without bound.
+    is_ref, is_above = (length <= arrays.epsilon(offset.dtype) for length in (radius, across))
+    polar = jnp.arctan2(jnp.where(is_ref, 1.0, across), z)
+    azimuth = jnp.arctan2(jnp.where(is_above, 0.0, y), jnp.where(is_above, 1.0, x))
+    return Trocar(radius, polar, jnp.where(azimuth < 0.0, azimuth + 2.0 * np.pi, azimuth))
+
+
 def trocar_rotation(trocar: Trocar) -> jax.Array:
     """Orientation of {T}, R_world_trocar `[..., 3, 3]`: z down, x horizontal along the azimuth."""
     _, _, azimuth = arrays.checked(**named_fields(trocar))
