@@ -28,10 +28,12 @@ TINY = config.PolicyConfig(
 
 
 def dataset(seed: int, demos: int = 8, length: int = 30, image_size: int = 0) -> windows.Dataset:
-    """Each demonstration goes from A to B at constant height; its roll depends on where it is."""
+    """Each demonstration goes from A to B at constant height; its roll depends on where it is. Two
+    share a trocar."""
     keys = jax.random.split(jax.random.key(seed), 4)
     shape = (demos, length)
-    trocar = rcm.sample_trocar(keys[0], (demos,))
+    drawn = rcm.sample_trocar(keys[0], (-(-demos // 2),))
+    trocar = jax.tree.map(lambda field: jnp.repeat(field, 2)[:demos], drawn)
     start = jax.random.uniform(keys[1], (demos, 1, 3), minval=-0.03, maxval=0.03)
     end = jax.random.uniform(keys[2], (demos, 1, 3), minval=-0.03, maxval=0.03)
     height = jnp.array([0.0, 0.0, 1.0])

@@ -96,6 +96,28 @@ def test_a_mistake_names_the_array(made):
             deployed(jax.random.key(0), *given)
 
 
+def test_numbers_that_no_robot_measures_are_refused(made):
+    path, trained, _ = made
+    deployed, key = deploy.load(path), jax.random.key(0)
+    good, port = observed(trained.policy, ()), rcm.Trocar(0.02, 1.4, 0.8)
+
+    def refused(message, observation=good, trocar=port):
+        with pytest.raises(ValueError, match=message):
+            deployed(key, observation, trocar)
+
+    bad = np.full_like(good.gripper, np.nan)
+    refused("observation.gripper: expected finite", good.replace(gripper=bad))
+    for name, turn in (("pose.p", lambda x: x + np.inf), ("pose.R", lambda x: x * np.nan)):
+        part = name.removeprefix("pose.")
+        pose = good.pose._replace(**{part: turn(getattr(good.pose, part))})
+        refused(f"observation.{name}: expected finite", good.replace(pose=pose))
+    for R in (np.zeros_like(good.pose.R), -good.pose.R, 1.1 * good.pose.R):
+        refused("pose.R: expected rotations", good.replace(pose=good.pose._replace(R=R)))
+    refused(r"trocar.radius: expected at most 0.5 m, got 14", trocar=rcm.Trocar(14.0, 1.4, 0.8))
+    refused("trocar: expected an rcm.Trocar, got list", trocar=[0.02, 1.4, 0.8])
+    deployed(key, good, port)
+
+
 def test_a_file_that_will_not_do_is_named(made, tmp_path):
     path, trained, _ = made
     with pytest.raises(ValueError, match=r"^policy: expected a file or one of .*compact, got no"):

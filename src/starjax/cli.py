@@ -52,6 +52,8 @@ def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
         signal.signal(signal.SIGINT, stop)
     code = guard(command, sys.argv[1:])
     if code == _STOPPED:  # jax's threads may still run, and would meet an interpreter that is gone
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)  # it has been heard
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

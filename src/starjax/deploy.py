@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import core
 
 from starjax import config, rcm
 from starjax.experiments import methods, options
@@ -21,7 +22,10 @@ from starjax.sim.types import Observation
 from starjax.training import export
 from starjax.types import Command, Pose
 
-__all__ = ["Command", "Deployed", "Observation", "Pose", "load"]
+__all__ = ["FARTHEST", "Command", "Deployed", "Observation", "Pose", "load"]
+
+FARTHEST = 0.5  # m, of a trocar from the nominal port: farther away are millimetres for metres
+_SKEW = 0.05  # of R'R from the identity: what rounding and calibration leave is far below
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,11 +61,16 @@ class Deployed:
           (but for `dp_ee`), and the gripper's openings.
 
         Raises:
-          ValueError: an array has another shape or type than expected, or the trocar is none.
+          ValueError: an array has another shape or type than expected, a number is not finite, a
+            rotation is none, or the trocar is none, or farther than `FARTHEST` from the nominal
+            port.
         """
+        if not isinstance(trocar, rcm.Trocar):
+            raise ValueError(f"trocar: expected an rcm.Trocar, got {type(trocar).__name__}")
         trocar = rcm.Trocar(*jnp.broadcast_arrays(*rcm.check_trocar(trocar)))
         robots = np.shape(trocar.radius)
         self._check(observation, robots)
+        _check_values(observation, trocar)
         keys = jax.random.split(key, robots[0]) if robots else key[None]
         if not robots:
             observation, trocar = jax.tree.map(
@@ -89,6 +98,30 @@ class Deployed:
                 raise ValueError(f"observation.{name}: expected shape {shape}, got {got}")
         if "image" in given and (dtype := jnp.result_type(given["image"])) != jnp.uint8:
             raise ValueError(f"observation.image: expected uint8, got {dtype}")
+
+
+def _check_values(observation: Observation, trocar: rcm.Trocar) -> None:
+    """Raises ValueError for what no robot measures: a policy would make a plausible plan of it."""
+    given = {
+        "pose.R": observation.pose.R,
+        "pose.p": observation.pose.p,
+        "gripper": observation.gripper,
+        "state": observation.state,
+    }
+    known = {k: np.asarray(v) for k, v in given.items() if v is not None and not _is_traced(v)}
+    for name, value in known.items():
+        if not np.isfinite(value).all():
+            raise ValueError(f"observation.{name}: expected finite numbers, got some that are not")
+    if (R := known.get("pose.R")) is not None:
+        off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max()
+        if off > _SKEW or (np.linalg.det(R) < 0).any():
+            raise ValueError(f"observation.pose.R: expected rotations, got one off by {off:.2g}")
+    if not _is_traced(trocar.radius) and (radius := np.max(trocar.radius)) > FARTHEST:
+        raise ValueError(f"trocar.radius: expected at most {FARTHEST} m, got {radius:g}")
+
+
+def _is_traced(value: Any) -> bool:
+    return isinstance(value, core.Tracer)
 
 
 def load(policy: str | Path, ddim_steps: int | None = None) -> Deployed:

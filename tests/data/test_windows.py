@@ -42,22 +42,35 @@ def test_host_and_device_gather_the_same(dataset):
     jax.tree.map(np.testing.assert_array_equal, on_device, on_host)
 
 
+def ports(numbers):
+    """A trocar for each number, at one distance from the nominal port."""
+    return rcm.Trocar(np.full(len(numbers), 0.02), np.full(len(numbers), 1.5), 0.1 * numbers)
+
+
 def test_holdout_is_whole_demonstrations_spread_over_the_dataset():
     start, length = np.arange(16) * 10, np.full(16, 10)
-    train, held = windows.split_holdout(start, length, 4)
+    train, held = windows.split_holdout(start, length, ports(np.arange(16) // 2), 4)
     assert sorted(np.concatenate([train, held])) == list(range(160))
     np.testing.assert_array_equal(np.unique(held // 10), [2, 6, 10, 14])
     assert len(held) == 40
 
 
 def test_holdout_never_takes_more_than_a_quarter():
-    train, held = windows.split_holdout(np.arange(3) * 10, np.full(3, 10), 8)
+    train, held = windows.split_holdout(np.arange(3) * 10, np.full(3, 10), ports(np.zeros(3)), 8)
     assert len(train) == 30 and len(held) == 0
+
+
+def test_holdout_leaves_every_trocar_a_demonstration():
+    start, length, port = np.arange(16) * 10, np.full(16, 10), np.arange(16) // 2
+    port[2], port[6] = 20, 21  # alone at theirs
+    train, held = windows.split_holdout(start, length, ports(port), 4)
+    np.testing.assert_array_equal(np.unique(held // 10), [10, 14])
+    assert set(port[train // 10]) == set(port)
 
 
 def test_no_demonstrations_is_an_error():
     with pytest.raises(ValueError, match="dataset: expected at least one demonstration"):
-        windows.split_holdout(np.zeros(0, int), np.zeros(0, int), 8)
+        windows.split_holdout(np.zeros(0, int), np.zeros(0, int), ports(np.zeros(0)), 8)
 
 
 def test_sampled_frames_are_training_frames():

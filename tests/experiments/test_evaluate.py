@@ -52,7 +52,7 @@ def score(*more):
 
 def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
     assert score() == 0
-    folder = file.parent / "runs" / "evaluate" / "mine-seed0"
+    folder = file.parent / "runs" / "evaluate" / "mine-seed0-2x1s"
     result = json.loads((folder / "result.json").read_text())
     assert result["method"] == "dp_rcm2" and len(result["trials"]) == 24
     assert (result["seen"]["trials"], result["unseen"]["trials"]) == (8, 16)
@@ -72,16 +72,16 @@ def test_a_packaged_policy_is_scored_by_its_name(file, monkeypatch, capsys):
     file.rename(packaged.FOLDER / "compact.safetensors")
     assert evaluate.main(["--policy", "compact", "--eval.trials=1", "--eval.time-limit-s=1"]) == 0
     said = capsys.readouterr().out
-    assert "DP-RCM-2 of compact\n" in said and "into runs/evaluate/compact-seed0\n" in said
-    assert (file.parent / "runs" / "evaluate" / "compact-seed0" / "result.json").is_file()
+    assert "DP-RCM-2 of compact\n" in said and "into runs/evaluate/compact-seed0-1x1s\n" in said
+    assert (file.parent / "runs" / "evaluate" / "compact-seed0-1x1s" / "result.json").is_file()
     assert [path.name for path in packaged.FOLDER.iterdir()] == ["compact.safetensors"]
 
 
-def test_another_temperature_is_another_evaluation(file, capsys):
+@pytest.mark.parametrize("change", [{"temperature": 0.25}, {"ddim_steps": 1}])
+def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
     score("--out", "here")
     made = export.load(file)
-    colder = dataclasses.replace(POLICY, temperature=0.25)
-    export.save(file, made._replace(policy=colder))
+    export.save(file, made._replace(policy=dataclasses.replace(POLICY, **change)))
     score("--out", "here")
     assert "chunks of another evaluation are replaced" in capsys.readouterr().out
 
@@ -116,9 +116,11 @@ def test_a_method_of_a_run_of_several_is_scored_under_its_own_name(
     assert evaluate.main([f"run/{name}", *flags]) == 0
     said = capsys.readouterr().out
     assert f": {label} of run/{name}\n" in said and "1 s each, seed 7" in said
-    result = json.loads((run / name / "evaluate-seed7" / "result.json").read_text())
+    result = json.loads((run / name / "evaluate-seed7-1x1s" / "result.json").read_text())
     assert (result["method"], result["config"]["method"]) == (name, name)
     assert (result["seed"], result["config"]["seed"]) == (7, 3)
+    # what its weights were trained with, whatever the settings beside them say
+    assert (result["config"]["train"]["steps"], result["seen"]["trials"]) == (77, 4)
 
 
 def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
@@ -166,6 +168,7 @@ def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):
 
     drawn, grid = ["--trocars", "5"], ["--radii-cm", "0", "2", "--azimuths", "3"]
     first = swept(*drawn)
+    assert first["time_limit_s"] == 1.0 and len(first["weights"]) == 64
     chunks = {path: path.stat().st_mtime_ns for path in (run / "sweep").rglob("chunk*")}
     assert first["strict"]["trials"] == len(first["trials"]) == 5 and chunks
     assert {trial["trial"] for trial in first["trials"]} == {0}
@@ -176,7 +179,19 @@ def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):
     assert swept(*drawn, "--eval.chunk", "2")["trials"] == first["trials"]
     assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
     said = capsys.readouterr().out
-    assert "replaced" not in said and "/5 = " in said.replace("  ", " ")
+    assert "replaced" not in said and "/1 = " in said.replace("  ", " ")
+
+
+def test_a_sweep_has_the_time_limit_of_its_run(file):
+    run = file.parent / "dp_rcm2"
+    run.mkdir()
+    settings = presets.PRESETS["smoke"]
+    short = dataclasses.replace(settings.eval, time_limit_s=2.0)
+    folders.claim(run, dataclasses.replace(settings, eval=short), "demos-a")
+    file.rename(run / "policy.safetensors")
+    assert sweep.main([str(run), "--trocars", "1"]) == 0
+    found = json.loads((run / "sweep.json").read_text())
+    assert found["time_limit_s"] == 2.0 and found["strict"]["trials"] == 1
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import synthetic
+from matplotlib.figure import Figure
 
 from starjax.experiments.report import (
     build,
@@ -75,18 +76,70 @@ def test_headlines_are_those_of_the_result(one):
 
 def test_the_gap_on_the_page_is_that_of_the_table(several):
     text = sections.comparison(several)
-    for row in tables.success(several)[1:]:
+    rows = tables.success(several)[1:]
+    assert len(rows) == len(several)
+    for row in rows:
         assert re.search(rf"<td>{row[1]}</td>.*{re.escape(row[4])}</td></tr>", text)
 
 
 def test_paired_counts_stand_under_their_own_names(several):
     ours = several[2]
-    for run, row in zip(several[:2], tables.paired(several)[1:]):
+    for run, row in zip(several[:2], tables.paired(several)[1:], strict=True):
         both = list(zip(ours.trials, run.trials))
         only_ours = sum(a["success"] > b["success"] for a, b in both)
         only_theirs = sum(a["success"] < b["success"] for a, b in both)
         assert row[:4] == [run.label, str(len(both)), str(only_ours), str(only_theirs)]
         assert only_ours > only_theirs
+
+
+def test_methods_that_are_one_policy_are_one_comparison(several):
+    twin = edited(several[1], method="stardiff_single")
+    (_, *alone), (_, *together) = tables.paired(several), tables.paired([*several, twin])
+    assert together[:2] == alone and together[2] == alone[1]
+
+
+def test_trials_of_other_limits_are_neither_paired_nor_pooled(several):
+    short = several[1]._replace(limit_s=4.0)
+    assert results.pair(several[2], several[1]) and results.pair(several[2], short) is None
+    assert "Trials were given 4, 60 s; runs with" in "".join(results.notes([several[2], short]))
+    swept = several[2]._replace(sweep=several[2].trials)
+    both, alone = (
+        sum(rate.trials for _, rate in figures._pooled(run))
+        for run in (swept, swept._replace(sweep_limit_s=30.0))
+    )
+    assert both == 2 * alone
+    assert (
+        "sweep's trials were given 30 s" in results.notes([swept._replace(sweep_limit_s=30.0)])[-1]
+    )
+
+
+def test_what_other_weights_left_beside_a_result_is_not_shown(tmp_path):
+    run = synthetic.run(tmp_path / "stardiff")
+    for name, figure in (("sweep", "trials"), ("bench", "roll_network_ms")):
+        files.write_json(run / f"{name}.json", {"weights": "a", figure: [{"p50": 1.0}]})
+    for weights, count in ((None, 1), ("a", 1), ("b", 0)):
+        result = files.read_json(run / "result.json")
+        files.write_json(run / "result.json", result | ({"weights": weights} if weights else {}))
+        found = results.load(run)
+        assert (len(found.sweep), bool(found.bench)) == (count, bool(count))
+
+
+def test_a_trajectory_of_another_evaluation_is_not_shown(tmp_path):
+    run = synthetic.run(tmp_path / "stardiff")
+    result = files.read_json(run / "result.json")
+    shown = results.load(run).rollouts
+    told = results.identity(shown[0].trial)
+    for trial in result["trials"]:
+        trial["steps"] += results.identity(trial) == told
+    files.write_json(run / "result.json", result)
+    assert len(results.load(run).rollouts) == len(shown) - 1
+
+
+def test_the_map_shows_nothing_far_from_all_ports():
+    axis = Figure().subplots()
+    shown = figures._heat(axis, np.array([[20.0, 0.0]]), np.array([1.0]), np.array([1]))
+    filled = np.isfinite(np.ma.filled(shown.get_array(), np.nan))
+    assert filled[80, 112] and not filled[80, 48] and 0.02 < filled.mean() < 0.2
 
 
 def test_rcm_errors_stand_under_their_own_names(one):
@@ -229,9 +282,10 @@ def test_the_verdict_says_what_is_sure(one):
     def said(seen, unseen):
         return words.verdict([one], edited(one, trials=trials(seen, unseen)))
 
-    assert "costs it 60 points" in said(45, 15)
+    assert "costs it 60.0 points" in said(45, 15)
     assert "may be chance" in said(25, 24)
-    assert "better on the new ones" in said(15, 45)
+    assert "better on the new ones, by 60.0 points (95% interval 4" in said(15, 45)
+    assert "costs it 16.0 points (95% interval 0.2 to" in said(44, 36)
     assert "not evaluated" in words.verdict([one], edited(one, trials=[]))
 
 

@@ -162,8 +162,8 @@ def stopped_main(out: str, trains: bool) -> None:
         if not processes.is_first():
             run = config.RunConfig(out=out, policy=fakes.TINY, train=settings)
             following.follow(run, ["stardiff"], Path(out), fakes.P_WORLD_REF)
-        processes.agree(0)  # as `pipeline.run`: the folder is held, and nothing is done
-        processes.agree(0)
+        for _ in range(3):  # as `pipeline`: the folder is held, nothing done, demonstrations there
+            processes.agree(0)
         with stop_signals() as should_stop:
             train(Path(out) / "stardiff", settings, should_stop=should_stop)
         return 0

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,9 @@ def test_demonstrations_kept_out_are_neither_trained_on_nor_fitted(quick, monkey
     )
     jobs.train(tmp_path, dataclasses.replace(jobs.SETTINGS, steps=1))
     dataset = fakes.dataset(seed=0)
-    train, held = windows.split_holdout(dataset.start, dataset.length, jobs.SETTINGS.holdout_demos)
+    train, held = windows.split_holdout(
+        dataset.start, dataset.length, dataset.trocar, jobs.SETTINGS.holdout_demos
+    )
     assert len(held) and not np.isin(held, train).any()
     np.testing.assert_array_equal(fitted, [train])
     np.testing.assert_array_equal(drawn, [train])
@@ -104,6 +107,23 @@ def test_losses_that_are_all_broken_end_the_training(quick, monkeypatch, tmp_pat
     said = r"in any of the 3 steps before step 3: lower --train.learning-rate"
     with pytest.raises(loop.TrainingFailed, match=said):
         jobs.train(tmp_path)
+
+
+def test_a_single_step_that_is_broken_does_not_end_the_training(tmp_path):
+    def log(step, skipped, of_all):
+        sums = {"loss": 0.0, "taken": 0, "skipped": skipped}
+        state = types.SimpleNamespace(
+            sums=jax.tree.map(jnp.float32, sums), skipped=of_all, replace=lambda **made: made
+        )
+        settings = dataclasses.replace(jobs.SETTINGS, log_every=3)
+        return loop._log(tmp_path / "log", step, (state, None), settings)[1]
+
+    assert log(13, 1, 1) == "no finite loss, 1 steps skipped"  # the end cut the stretch short
+    (line,) = metrics.read(tmp_path / "log")
+    assert line["skipped"] == 1 and "loss" not in line
+    for hopeless in ((12, 3, 3), (2, 1, 2)):
+        with pytest.raises(loop.TrainingFailed):
+            log(*hopeless)
 
 
 def test_a_skipped_step_does_not_move_the_learning_rate(quick, monkeypatch, tmp_path):

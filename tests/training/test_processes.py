@@ -70,18 +70,21 @@ def test_two_processes_are_one_run(tmp_path, monkeypatch):
     assert ours == theirs  # the log of the first process alone
 
 
-def stop_two(started: list[subprocess.Popen], begun: Callable[[], bool], number: int) -> list[str]:
-    """What two processes say that get this signal, one soon after the other, once they have begun.
-
-    The first process, which decides, gets it last.
-    """
+def stop_two(
+    started: list[subprocess.Popen],
+    begun: Callable[[], bool],
+    number: int,
+    told: tuple[int, ...] = (1, 0),
+) -> list[str]:
+    """What two processes say of which those `told` get this signal, one soon after the other, once
+    they have begun."""
     try:
         end = time.monotonic() + 60
         while not begun():
             assert time.monotonic() < end and all(process.poll() is None for process in started)
             time.sleep(0.05)
-        for process in reversed(started):
-            process.send_signal(number)
+        for index in told:
+            started[index].send_signal(number)
             time.sleep(0.1)
         said = [process.communicate(timeout=30) for process in started]
     finally:
@@ -91,10 +94,13 @@ def stop_two(started: list[subprocess.Popen], begun: Callable[[], bool], number:
     return [error for _, error in said]
 
 
-def test_ctrl_c_while_all_train_saves(tmp_path):
+@pytest.mark.parametrize(
+    ("number", "told"), [(signal.SIGINT, (1, 0)), (signal.SIGTERM, (1,)), (signal.SIGTERM, (0,))]
+)
+def test_a_stop_while_all_train_saves(tmp_path, number, told):
     log = tmp_path / "stardiff/metrics.jsonl"
     started = start_two("trains", str(tmp_path))
-    said = stop_two(started, lambda: log.exists() and log.read_text() != "", signal.SIGINT)
+    said = stop_two(started, lambda: log.exists() and log.read_text() != "", number, told)
     assert all("same command goes on from there" in error for error in said)
     assert len(checkpoint.steps(tmp_path / "stardiff/checkpoints")) == 1
 

@@ -116,7 +116,7 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
     looped, called = it.end(many(it.begin(first), 3)), it.end(called)
     chex.assert_trees_all_close((looped.params, looped.sums), (called.params, called.sums))
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), looped.params, first.params)
-    assert min(jax.tree.leaves(moved)) > 1e-3  # three steps of the learning rate
+    assert min(jax.tree.leaves(moved)) > 5e-4  # of three steps of the learning rate
 
 
 def test_a_broken_loss_is_left_out_and_counted(start, dataset):

@@ -58,23 +58,33 @@ class Batch:
     trocar: rcm.Trocar
 
 
-def split_holdout(start: Any, length: Any, holdout: int) -> tuple[np.ndarray, np.ndarray]:
+def split_holdout(
+    start: Any, length: Any, trocar: rcm.Trocar, holdout: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Frames to train on and frames kept out, by whole demonstrations.
 
     Args:
       start: `[D]` first frame of each demonstration.
       length: `[D]` frames in each.
-      holdout: demonstrations to keep out, spread evenly over the dataset so that every trocar
-        gets its share; at most a quarter of them all.
+      trocar: fields `[D]`.
+      holdout: demonstrations to keep out, spread evenly over the dataset; at most a quarter of
+        them all, and none that is the last one at its trocar.
 
     Returns:
       `[F_train]` and `[F_holdout]` int32 frame numbers.
     """
     start, length = np.asarray(start), np.asarray(length)
     count = min(holdout, len(start) // 4)
-    kept_out = ((np.arange(count) + 0.5) * len(start) / max(count, 1)).astype(int)
+    places = np.stack([np.asarray(field) for field in trocar], -1)
+    place = np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
+    left = np.bincount(place)
+    kept_out = []
+    for demo in ((np.arange(count) + 0.5) * len(start) / max(count, 1)).astype(int).tolist():
+        if left[place[demo]] > 1:
+            left[place[demo]] -= 1
+            kept_out.append(demo)
     frames = [np.arange(s, s + n, dtype=np.int32) for s, n in zip(start, length, strict=True)]
-    train = [frames[d] for d in range(len(frames)) if d not in set(kept_out.tolist())]
+    train = [frames[d] for d in range(len(frames)) if d not in kept_out]
     if not train:
         raise ValueError("dataset: expected at least one demonstration, got none")
     held = [frames[d] for d in kept_out]

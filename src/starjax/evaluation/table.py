@@ -65,7 +65,7 @@ def from_rollouts(rollouts: Any, index: np.ndarray, trial: np.ndarray) -> Table:
         azimuth=np.asarray(env.trocar.azimuth[:count], np.float32),
         trial=np.asarray(trial, np.int32),
         success=success,
-        loose=env.loose[:count],
+        loose=env.loose[:count] & ~invalid,
         safe=success & (largest <= SAFE_RCM_M),
         invalid=invalid,
         collided=env.collided[:count],

@@ -80,7 +80,11 @@ def _time(run: Path, chosen: Options) -> dict[str, Any]:
     if methods.METHODS[run.name].hierarchical:
         roll = latency.roll_ms(trained.policy, calls=chosen.calls)
         print(_row("roll net", roll))
-    return {"inference_ms_by_ddim_steps": found, "roll_network_ms": roll}
+    return {
+        "weights": scoring.fingerprint(who),
+        "inference_ms_by_ddim_steps": found,
+        "roll_network_ms": roll,
+    }
 
 
 def _row(name: str, ms: dict[str, float]) -> str:

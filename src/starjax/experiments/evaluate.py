@@ -42,13 +42,13 @@ def main(argv: Sequence[str]) -> int:
     checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
     if chosen.policy:
         file = packaged.find("--policy", chosen.policy)
-        default = Path("runs/evaluate") / f"{_label(file)}-seed{chosen.seed}"
+        default = Path("runs/evaluate") / f"{_label(file)}-{_trials(chosen)}"
         method = config = None
     else:
         run = folders.existing(chosen.run)
         method, config = run.name, folders.read_config(run)
         file = folders.weights(run.parent, method)
-        default = Path(chosen.run) / f"evaluate-seed{chosen.seed}"
+        default = Path(chosen.run) / f"evaluate-{_trials(chosen)}"
     folder = Path(chosen.out or default)
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
@@ -58,9 +58,8 @@ def main(argv: Sequence[str]) -> int:
     from starjax.experiments import scoring
 
     who = scoring.subject(method, file) if method else scoring.from_file(file)
-    config = dataclasses.replace(
-        config or _config(who.trained), method=who.method, out=str(folder), eval=chosen.eval
-    )
+    config = scoring.settings(who, config) if config else _config(who.trained)
+    config = dataclasses.replace(config, method=who.method, out=str(folder), eval=chosen.eval)
     about = words.about(config, chosen.policy or chosen.run, chosen.seed)
     print(f"{about}, into {folder}\n", flush=True)
     with clock.timed(folder, "evaluate"):
@@ -82,6 +81,11 @@ def _default() -> Options:
     if presets.has_gpu():
         return Options()
     return Options(eval=config_lib.EvalConfig(trials=4, time_limit_s=30.0))
+
+
+def _trials(chosen: Options) -> str:
+    """A name for an evaluation's trials, so that others do not replace them."""
+    return f"seed{chosen.seed}-{chosen.eval.trials}x{chosen.eval.time_limit_s:g}s"
 
 
 def _label(file: Path) -> str:

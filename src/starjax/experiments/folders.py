@@ -35,9 +35,15 @@ def existing(run: str) -> Path:
     """
     folder = Path(run).resolve()
     if folder.name not in methods.METHODS:
+        files = [file for file in (folder, folder / "policy.safetensors") if file.is_file()]
+        hint = (
+            f"starjax evaluate --policy {shlex.quote(str(files[0]))} scores that" if files else ""
+        )
+        within = [f"{run}/{name}" for name in methods.METHODS if (folder / name).is_dir()]
+        hint = hint or (f"there is {', '.join(within)}" if within else "")
         raise config_lib.UsageError(
-            f"RUN: expected a method's folder such as runs/cpu/stardiff, got {run}; any policy is "
-            f"scored by starjax evaluate --policy {shlex.quote(f'{run}/policy.safetensors')}"
+            f"RUN: expected a method's folder such as runs/cpu/stardiff, got {run}"
+            + (f"; {hint}" if hint else "")
         )
     return folder
 

@@ -26,22 +26,20 @@ def follow(
       root: folder of the demonstrations, which the first process collects.
       p_world_ref: `[3]` m, the nominal port.
     """
-    from starjax.data import load, store
+    from starjax.data import load
     from starjax.training import loop, processes
 
-    @functools.cache
-    def dataset():
-        while not store.is_sealed(root):
-            time.sleep(1.0)
-        return load.load(root).dataset
+    dataset = functools.cache(lambda: load.load(root).dataset)
 
     processes.agree(0)  # from here on the first one holds the folder
     for name in trained:
         (done,) = processes.agree(0)
         if done:
             continue
+        _await(root)
+        processes.agree(0)  # the first one has checked them, and collected again what was damaged
         demos = dataset()
-        with stop_signals():  # whether to stop, the first one decides
+        with stop_signals() as should_stop:
             try:
                 loop.run(
                     methods.METHODS[name],
@@ -51,9 +49,18 @@ def follow(
                     p_world_ref,
                     Path(config.out) / name,
                     config.seed,
+                    should_stop=should_stop,
                     description=f"Training {name}",
                 )
             except loop.TrainingFailed as error:
                 raise config_lib.UsageError(str(error)) from error
     # A process that leaves early would end the others.
     files.wait_until_free(Path(config.out))
+
+
+def _await(root: Path) -> None:
+    """Waits for the demonstrations, which may take longer than devices wait for each other."""
+    from starjax.data import store
+
+    while not store.is_sealed(root):
+        time.sleep(1.0)

@@ -87,6 +87,7 @@ def _train(
         words.stage("train", f"{name}: done before, {weights}")
         return
     dataset = demos()
+    processes.agree(0)  # the others may read them
     words.stage("train", f"{name}, into {folder}")
     with clock.timed(out, f"train {name}"), stop_signals() as should_stop:
         try:

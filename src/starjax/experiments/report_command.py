@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from starjax import config as config_lib
-from starjax.experiments import options
+from starjax.experiments import methods, options
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
@@ -18,15 +18,17 @@ class Options:
     """Flags of the command."""
 
     run: options.Runs  # methods' folders, or folders of them
-    out: str = ""  # folder of the report; `report` beside the first method's folder if empty
+    out: str = ""  # of the report; if empty `report` beside the first method, in an evaluation
     video: bool = True  # rollout.mp4
 
 
 def main(argv: Sequence[str]) -> int:
     """Builds the report."""
     chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
-    runs = [found for name in chosen.run for found in _with_results(Path(name))]
-    out = Path(chosen.out or runs[0].parent / "report")
+    named = [found for name in chosen.run for found in _with_results(Path(name))]
+    runs = list({run.resolve(): run for run in named}.values())  # each once
+    first = runs[0]
+    out = Path(chosen.out or (first.parent if first.name in methods.METHODS else first) / "report")
     xla.prepare_xla()
     files.require_writable(out)
 

@@ -99,10 +99,24 @@ def rollouts(
         devices=lanes.devices(),
         identity={
             **folders.behaviour(who.method)._asdict(),
-            "temperature": who.trained.policy.temperature,
+            "policy": dataclasses.asdict(who.trained.policy),
         },
         report=words.indented,
     )
+
+
+def settings(who: Subject, config: config_lib.RunConfig) -> config_lib.RunConfig:
+    """A run's settings, with those that its weights were trained with: another method may have
+    trained them."""
+    trained = who.trained
+    return dataclasses.replace(
+        config, policy=trained.policy, train=trained.train, demos=trained.demos or config.demos
+    )
+
+
+def fingerprint(who: Subject) -> str:
+    """What tells its weights from others."""
+    return evaluate.fingerprint((who.trained.params, who.trained.normalizer))
 
 
 def decision_ms(who: Subject) -> dict[str, float]:
@@ -148,6 +162,7 @@ def write_result(
         "inference_ms": decision_ms(who),
         "preset": config.preset,
         "seed": seed,
+        "weights": fingerprint(who),
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "command": command,
         "timings_s": timings_s or {},

@@ -20,7 +20,9 @@ command again only puts its figures together."""
 
 # More is a slip of the hand.
 MOST_TROCARS = 1_000_000
-MOST_RADIUS_CM = 100.0
+MOST_RADIUS_CM = 10.0
+
+_EVAL = config_lib.EvalConfig(trials=1, video_trials=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,18 +35,18 @@ class Options:
     polars_deg: tuple[float, ...] = (90.0,)  # of a grid
     azimuths: int = 12  # of a grid, evenly around
     seed: int = 0  # of the sample and of the trials
-    eval: config_lib.EvalConfig = dataclasses.field(
-        default_factory=lambda: config_lib.EvalConfig(trials=1, video_trials=0)
-    )
+    eval: config_lib.EvalConfig = _EVAL  # with the run's time limit
 
 
 def main(argv: Sequence[str]) -> int:
     """Runs the trials that are missing and writes sweep.json."""
-    chosen = options.parse(Options, argv, prog="starjax sweep", description=DESCRIPTION)
+    chosen = _parse(argv)
     # A mistake should not wait for jax.
     _check(chosen)
     run = folders.existing(chosen.run)
     config = folders.read_config(run)
+    like_run = dataclasses.replace(_EVAL, time_limit_s=config.eval.time_limit_s)
+    chosen = _parse(argv, dataclasses.replace(chosen, eval=like_run))
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
     files.require_writable(run)
@@ -56,12 +58,15 @@ def main(argv: Sequence[str]) -> int:
     trocars = _trocars(chosen)
     who = scoring.subject(run.name, folders.weights(run.parent, run.name))
     table = scoring.rollouts(_folder(run, chosen), who, trocars, chosen.eval, chosen.seed)
-    seen = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
+    demos = scoring.settings(who, config).demos
+    seen = rcm.Trocar(*(field[: demos.seen_trocars] for field in rcm.TROCARS))
     figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)
     about = {
         "method": who.method,
         "observation": who.trained.policy.observation,
         "command": options.typed("sweep", argv),
+        "weights": scoring.fingerprint(who),
+        "time_limit_s": chosen.eval.time_limit_s,
         "versions": xla.versions(),
         "hardware": xla.hardware(),
     }
@@ -71,8 +76,14 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
+def _parse(argv: Sequence[str], default: Options | None = None) -> Options:
+    return options.parse(
+        Options, argv, prog="starjax sweep", description=DESCRIPTION, default=default
+    )
+
+
 def _check(chosen: Options) -> None:
-    """Raises UsageError for the first value that is out of its range."""
+    """Raises UsageError for the first value that is out of its range, or that would do nothing."""
     checks.expect_finite(chosen)
     checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
     for name, count in (("trocars", chosen.trocars), ("azimuths", chosen.azimuths)):
@@ -82,6 +93,11 @@ def _check(chosen: Options) -> None:
         checks.expect(inside, "radii-cm", f"each 0 to {MOST_RADIUS_CM:g} cm", radius)
     for polar in chosen.polars_deg:
         checks.expect(0 <= polar <= 180, "polars-deg", "each 0 to 180 degrees", polar)
+    is_grid, default = bool(chosen.radii_cm), Options(chosen.run)
+    for field in ("trocars",) if is_grid else ("polars_deg", "azimuths"):
+        value, name = getattr(chosen, field), field.replace("_", "-")
+        what = "nothing with --radii-cm" if is_grid else "--radii-cm beside it"
+        checks.expect(value == getattr(default, field), name, what, value)
 
 
 def _folder(run: Path, chosen: Options) -> Path:

@@ -88,7 +88,7 @@ def run(
     policy = policies.make(method, policy_config, p_world_ref, train_config)
     optimizer = states.make_optimizer(train_config)
     train, held_out = windows.split_holdout(
-        dataset.start, dataset.length, train_config.holdout_demos
+        dataset.start, dataset.length, dataset.trocar, train_config.holdout_demos
     )
     row = policies.ablated(method, policy_config)
     stats = normalizer.fit(row, dataset, p_world_ref, train)
@@ -126,8 +126,9 @@ def run(
         note, call = "", 1
         while step < train_config.steps:
             # Processes of one run stop together, and after the same steps.
-            stop, call = processes.agree(should_stop(), call)
-            if stop:
+            stop, calls = processes.gathered(should_stop(), call)
+            call = calls[0]
+            if any(stop):
                 if step > saved:
                     _save(directory, advance.end(carried), train_config)
                 raise Interrupted(
@@ -197,19 +198,21 @@ def _log(log, step, carried, train_config) -> tuple[Carried, str]:
     state, narrow = carried
     sums = {name: float(value) for name, value in state.sums.items()}
     taken, skipped = int(sums.pop("taken")), int(sums.pop("skipped"))
-    if taken == 0:
+    # A single step says nothing, as where the training's end cuts a stretch short.
+    if taken == 0 and (skipped >= max(train_config.log_every, 2) or 1 < step == int(state.skipped)):
         raise TrainingFailed(
             f"the loss was not finite in any of the {skipped} steps before step {step}: "
             f"lower --train.learning-rate (now {train_config.learning_rate:g}) or use "
             "--policy.dtype float32"
         )
-    values = {name: value / taken for name, value in sums.items()}
+    values = {name: value / taken for name, value in sums.items()} if taken else {}
     last = step - 1 - int(state.skipped)  # as the optimiser counts, which sees no skipped step
     values["learning_rate"] = float(jnp.asarray(states.learning_rate(train_config)(last)))
     values["skipped"] = skipped
     if processes.is_first():
         metrics.append(log, step, "train", values)
-    note = f"loss {values['loss']:.4f}" + (f", {skipped} steps skipped" if skipped else "")
+    note = f"loss {values['loss']:.4f}" if taken else "no finite loss"
+    note += f", {skipped} steps skipped" if skipped else ""
     # placed as they were: another placement would be another program
     fresh = jax.tree.map(lambda x: jax.device_put(jnp.zeros_like(x), x.sharding), state.sums)
     return (state.replace(sums=fresh), narrow), note

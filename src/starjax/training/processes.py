@@ -55,10 +55,15 @@ def is_first() -> bool:
 
 def agree(*values: int) -> tuple[int, ...]:
     """The first process's values, in all of them; each waits here for the others."""
+    return tuple(said[0] for said in gathered(*values))
+
+
+def gathered(*values: int) -> list[list[int]]:
+    """Of each value what all processes have, in their order; each waits here for the others."""
     if is_alone():
-        return values
-    said = multihost_utils.broadcast_one_to_all(np.array(values, np.int32))
-    return tuple(int(value) for value in said)
+        return [[value] for value in values]
+    said = multihost_utils.process_allgather(np.array(values, np.int32))
+    return np.asarray(said).T.tolist()
 
 
 def spread(x: Any, sharding: NamedSharding, may_alias: bool | None) -> jax.Array:

@@ -9,6 +9,7 @@ from starjax.experiments.report import outcomes, results, stats, style, words
 
 _BIN = 0.005  # m of distance pooled in one point
 _SMOOTH = 0.008  # m, width of the kernel behind the heat map
+_FAR = 2.0  # kernel widths from the nearest port: farther off the map shows nothing
 _DISC = 0.05  # m, radius of Eq. 19's disc
 
 
@@ -83,7 +84,8 @@ CURVES = {
 
 def _pooled(run: results.Run) -> list[tuple[float, stats.Rate]]:
     """(mean distance in mm, score) of the trials whose distance falls in one bin."""
-    trials = [*run.trials, *run.sweep]
+    twelve = [] if run.sweep and run.sweep_limit_s != run.limit_s else run.trials
+    trials = [*twelve, *run.sweep]
     apart = outcomes.distances(trials, results.training_trocars(run))
     bins = np.round(apart / _BIN).astype(int)
     inside = [np.flatnonzero(bins == b) for b in np.unique(bins)]
@@ -148,12 +150,13 @@ def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> N
 
 
 def _heat(axis: Any, at: np.ndarray, rates: np.ndarray, weights: np.ndarray) -> Any:
-    """Kernel mean of `rates [N]` at `at [N, 2]` mm over the disc, weighed by trials."""
+    """Kernel mean of `rates [N]` at `at [N, 2]` mm, weighed by trials, where the disc has any."""
     line = 1e3 * np.linspace(-_DISC, _DISC, 161)
     x, y = np.meshgrid(line, line)
     near = ((x[..., None] - at[:, 0]) ** 2 + (y[..., None] - at[:, 1]) ** 2) / (1e3 * _SMOOTH) ** 2
     kernel = np.exp(-near / 2) * weights
     mean = (kernel @ rates) / np.maximum(kernel.sum(-1), 1e-12)
-    mean[np.hypot(x, y) > 1e3 * _DISC] = np.nan
+    far = near.min(-1) > _FAR**2
+    mean[far | (np.hypot(x, y) > 1e3 * _DISC)] = np.nan
     edges = (line[0], line[-1], line[0], line[-1])
     return axis.imshow(mean, extent=edges, origin="lower", cmap=style.MAP, vmin=0, vmax=1)

@@ -44,8 +44,11 @@ class Run(NamedTuple):
       weights_of: the method whose weights it runs on.
       rollouts: recorded trials, empty if none were.
       curves: lines of metrics.jsonl, of the training of its weights.
-      sweep: trials of a sweep over other trocars, empty if none was made.
-      bench: bench.json, empty if there is none: `starjax bench` once wrote into result.json.
+      limit_s: how long a trial may take, simulated.
+      sweep: trials of a sweep over other trocars, empty if none was made of these weights.
+      sweep_limit_s: the same of these.
+      bench: bench.json, empty if there is none of these weights: `starjax bench` once wrote into
+        result.json.
     """
 
     path: Path
@@ -55,7 +58,9 @@ class Run(NamedTuple):
     weights_of: str
     rollouts: list[Rollout]
     curves: list[dict[str, Any]]
+    limit_s: float
     sweep: list[outcomes.Trial]
+    sweep_limit_s: float
     bench: dict[str, Any]
 
     @property
@@ -93,8 +98,9 @@ def differing(runs: Sequence[Run]) -> list[str]:
 
 
 def pair(a: Run, b: Run) -> stats.Paired | None:
-    """McNemar's test over the trials that both methods ran with the same trocar and seed."""
-
+    """McNemar's test over the trials that both methods ran with the same trocar, seed and limit."""
+    if a.limit_s != b.limit_s:
+        return None
     ours, theirs = ({identity(t): outcomes.strict(t) for t in run.trials} for run in (a, b))
     common = sorted(ours.keys() & theirs.keys())
     if not common:
@@ -129,6 +135,8 @@ def load(path: Path) -> Run:
     if result["method"] not in methods.METHODS:
         raise ValueError(f"{file}: expected a method of Table II, got {result['method']!r}")
     method = methods.METHODS[result["method"]]
+    sweep, bench = (_beside(path / f"{name}.json", result) for name in ("sweep", "bench"))
+    limit_s = result["config"].get("eval", {}).get("time_limit_s", 0.0)
     return Run(
         path=path,
         result=result,
@@ -137,8 +145,10 @@ def load(path: Path) -> Run:
         weights_of=method.weights_of,
         rollouts=_rollouts(path, result.get("trials") or []),
         curves=_curves(path, result["method"]),
-        sweep=_beside(path / "sweep.json").get("trials") or [],
-        bench=_beside(path / "bench.json"),
+        limit_s=limit_s,
+        sweep=sweep.get("trials") or [],
+        sweep_limit_s=sweep.get("time_limit_s", limit_s),
+        bench=bench,
     )
 
 
@@ -174,7 +184,8 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
             continue
         same = (t for t in trials if t["trocar"] == kept["trocar"][row])
         trial = next((t for t in same if t["trial"] == kept["trial"][row]), None)
-        if trial is not None:
+        # After a kill it may be of the evaluation before.
+        if trial is not None and trial["steps"] == length:
             rollouts.append(
                 Rollout(
                     trial=trial,
@@ -187,9 +198,11 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
     return rollouts
 
 
-def _beside(file: Path) -> dict[str, Any]:
-    """What another command left beside result.json."""
-    return files.read_json(file) if file.is_file() else {}
+def _beside(file: Path, result: dict[str, Any]) -> dict[str, Any]:
+    """What another command left beside result.json, if it is of the same weights."""
+    found = files.read_json(file) if file.is_file() else {}
+    weights = {x["weights"] for x in (found, result) if "weights" in x}  # once neither said it
+    return found if len(weights) < 2 else {}
 
 
 def _curves(path: Path, method: str) -> list[dict[str, Any]]:
@@ -222,4 +235,14 @@ def notes(runs: Sequence[Run]) -> list[str]:
     ]
     if flags := differing(runs):
         found.append(f"These runs were not trained alike: they differ in {', '.join(flags)}.")
+    limits = sorted({run.limit_s for run in runs if run.trials})
+    if len(limits) > 1:
+        allowed = ", ".join(f"{limit:g}" for limit in limits)
+        found.append(f"Trials were given {allowed} s; runs with different limits are not paired.")
+    found += [
+        f"{run.label}: the sweep's trials were given {run.sweep_limit_s:g} s, those through the "
+        f"twelve trocars {run.limit_s:g} s; Fig. 4 shows the sweep's alone."
+        for run in runs
+        if run.sweep and run.sweep_limit_s != run.limit_s
+    ]
     return found

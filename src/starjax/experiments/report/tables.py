@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Sequence
 
+from starjax.experiments import folders
 from starjax.experiments.report import outcomes, results, stats, words
 
 Table = list[list[str]]  # header first
@@ -105,8 +106,11 @@ def paired(runs: Sequence[results.Run]) -> Table:
     others = [run for run in runs if run.result["method"] != results.OURS]
     pairs = [*itertools.product(ours, others), *itertools.combinations(ours, 2)]
     found = [(a, b, test) for a, b in pairs if (test := results.pair(a, b))]
-    corrected = stats.holm([test.p for *_, test in found])
-    for (a, b, test), p in zip(found, corrected):
+    # Methods that are one policy, as DP-RCM-4 and STAR-Diff-Single, are one comparison.
+    single = {_comparison(a, b): test.p for a, b, test in found}
+    corrected = dict(zip(single, stats.holm(list(single.values())), strict=True))
+    for a, b, test in found:
+        p = corrected[_comparison(a, b)]
         counts = [str(n) for n in (test.pairs, test.only_a, test.only_b)]
         against = b.label if len(ours) == 1 else f"{b.label}, of {a.label}"
         table.append([against, *counts, p_value(test.p), p_value(p)])
@@ -191,6 +195,10 @@ def millimetres(value: float) -> str:
 def p_value(p: float) -> str:
     """Two digits, and no claim of more than 1e-4."""
     return "<0.0001" if p < 1e-4 else f"{p:.4f}" if p < 0.01 else f"{p:.2f}"
+
+
+def _comparison(a: results.Run, b: results.Run) -> tuple[object, ...]:
+    return a.path, b.path.parent, folders.behaviour(b.result["method"])
 
 
 def _seen_unseen(

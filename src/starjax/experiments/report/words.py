@@ -84,12 +84,13 @@ def listing(value: Any) -> str:
 
 def _gap(seen: stats.Rate, unseen: stats.Rate) -> str:
     middle, low, high = (100 * x for x in stats.gap(seen, unseen))
-    if low >= 0.5:
-        lost = f"{middle:.0f} points (95% interval {low:.0f} to {high:.0f})"
+    if low > 0:
+        lost = f"{middle:.1f} points (95% interval {low:.1f} to {high:.1f})"
         return f"A new trocar costs it {lost}."
-    if high <= -0.5:
-        return f"It does better on the new ones, by {-middle:.0f} points."
-    bounds = f"{low:+.0f} to {high:+.0f} points"
+    if high < 0:
+        gained = f"{-middle:.1f} points (95% interval {-high:.1f} to {-low:.1f})"
+        return f"It does better on the new ones, by {gained}."
+    bounds = f"{low:+.1f} to {high:+.1f} points"
     return f"The difference between the two may be chance (95% interval {bounds})."
 
 
