@@ -140,8 +140,14 @@ def test_a_methods_folder_is_found_from_within_and_told_from_others(tmp_path, mo
     (tmp_path / "stardiff").mkdir()
     monkeypatch.chdir(tmp_path / "stardiff")
     assert folders.existing(".") == tmp_path / "stardiff"
-    with pytest.raises(config.UsageError, match=r"RUN: .*got \.\..*--policy"):
+    with pytest.raises(config.UsageError, match=r"RUN: .*got \.\.; there is \.\./stardiff$"):
         folders.existing("..")
+    (tmp_path / "policy.safetensors").touch()
+    for name in ("..", "../policy.safetensors"):
+        with pytest.raises(config.UsageError, match=r"--policy \S*[^s]/policy.safetensors scores"):
+            folders.existing(name)
+    with pytest.raises(config.UsageError, match=r"got nowhere$"):
+        folders.existing("nowhere")
 
 
 def test_a_damaged_record_of_times_starts_afresh_and_a_full_disk_hides_nothing(

@@ -11,6 +11,7 @@ import pytest
 import synthetic
 from matplotlib.figure import Figure
 
+from starjax.experiments import report_command
 from starjax.experiments.report import (
     build,
     figures,
@@ -140,6 +141,19 @@ def test_the_map_shows_nothing_far_from_all_ports():
     shown = figures._heat(axis, np.array([[20.0, 0.0]]), np.array([1.0]), np.array([1]))
     filled = np.isfinite(np.ma.filled(shown.get_array(), np.nan))
     assert filled[80, 112] and not filled[80, 48] and 0.02 < filled.mean() < 0.2
+
+
+def test_a_run_named_twice_is_reported_once_and_an_evaluation_in_its_folder(tmp_path, monkeypatch):
+    built = []
+    monkeypatch.setattr(build, "build", lambda runs, out, **_: built.append((runs, out)))
+    run = synthetic.run(tmp_path / "all" / "stardiff")
+    other = shutil.copytree(run, tmp_path / "compact-seed0-4x30s")
+    for typed in ([str(run.parent), f"{run}/../stardiff"], [str(other)], [str(other), str(run)]):
+        assert report_command.main(typed) == 0
+    first, second, third = built
+    assert first == ([run], run.parent / "report")
+    assert second == ([other], other / "report")
+    assert third[0] == [other, run]
 
 
 def test_rcm_errors_stand_under_their_own_names(one):

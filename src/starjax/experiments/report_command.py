@@ -25,8 +25,11 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Builds the report."""
     chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
-    named = [found for name in chosen.run for found in _with_results(Path(name))]
-    runs = list({run.resolve(): run for run in named}.values())  # each once
+    once: dict[Path, Path] = {}
+    for name in chosen.run:
+        for found in _with_results(Path(name)):
+            once.setdefault(found.resolve(), found)
+    runs = list(once.values())
     first = runs[0]
     out = Path(chosen.out or (first.parent if first.name in methods.METHODS else first) / "report")
     xla.prepare_xla()

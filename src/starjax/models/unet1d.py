@@ -67,7 +67,8 @@ class ConditionalUnet1D(nn.Module):
         self.film_bias = self.param("film_bias", init, (size,))
 
     def __call__(self, x: jax.Array, k: jax.Array, cond: jax.Array) -> jax.Array:
-        """Noise in `x` `[B, H, A]` at step `k` (int `[B]` or `[]`), given `cond` `[B, C]`."""
+        """Noise in `x` `[B, H, A]` at step `k` (int `[B]`, or `[]` where nobody differentiates),
+        given `cond` `[B, C]`."""
         return self.denoise(x, self.condition(cond) + self.embed_step(k))
 
     def condition(self, cond: jax.Array) -> jax.Array:

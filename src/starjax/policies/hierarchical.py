@@ -1,4 +1,4 @@
-"""STAR-Diff: diffusion for (position, gripper), blind to the trocar, and a network for the roll."""
+"""STAR-Diff: diffusion for (position, gripper), not told the trocar, and a network for the roll."""
 
 from typing import Any, NamedTuple
 

@@ -5,7 +5,8 @@ Two more are an ablation of {T}, whose x axis turns with the trocar's azimuth: `
 what `rcm3` holds, the world's rotation and the depth, in other coordinates.
 
 `decode` is total. Whatever the numbers, its pose is finite, its rotation a rotation, and in all
-but SE(3) the shaft passes through the trocar. If an input (action, trocar or reference)
+but SE(3) the shaft passes through the trocar, as nearly as float32 tells where that is: to
+1e-4 mm within a metre of the origin. If an input (action, trocar or reference)
 is not finite, the flag `valid` is False and the pose is the **hold pose**: tool straight down,
 roll 0, tip `HOLD_DEPTH` below the trocar (whose own non-finite numbers count as zero: below the
 reference if the radius is not finite). Finite inputs are always valid: depths are clipped to
