@@ -2,11 +2,11 @@
 
 What ends up on disk is a function of the description, the seed and, in the last bits, the size of
 the batch, which a machine's memory and devices decide: of each trocar, all trials up to the one
-that completes its successes. They are drawn in waves, at first `per_trocar` at each
-trocar, then as many as failed; lanes that a wave leaves free run the trials that come next, and
-those of them that were not needed are dropped. A wave's chunks are the same in every run, and a
-chunk with a missing episode is simulated again as a whole: after any interruption the same command
-on the same machine ends in the same bytes.
+that completes its successes. They are drawn in waves, at first `per_trocar` at each trocar, then as
+many as failed; lanes that a wave leaves free run the trials that come next, and those of them that
+were not needed are dropped. A wave's chunks are the same in every run, and a chunk with a missing
+episode is simulated again as a whole: after any interruption the same command on the same machine
+ends in the same bytes.
 
 Episodes are written as they end, while the rest of their chunk and the next are simulated.
 """

@@ -81,7 +81,7 @@ def _time(run: Path, chosen: Options) -> dict[str, Any]:
         roll = latency.roll_ms(trained.policy, calls=chosen.calls)
         print(_row("roll net", roll))
     return {
-        "weights": scoring.fingerprint(who),
+        "weights": who.weights,
         "inference_ms_by_ddim_steps": found,
         "roll_network_ms": roll,
     }

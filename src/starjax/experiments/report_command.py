@@ -18,7 +18,7 @@ class Options:
     """Flags of the command."""
 
     run: options.Runs  # methods' folders, or folders of them
-    out: str = ""  # of the report; if empty `report` beside the first method, in an evaluation
+    out: str = ""  # folder; default: `report` beside a method's folder, or in an evaluation's
     video: bool = True  # rollout.mp4
 
 

@@ -27,12 +27,14 @@ class Subject(NamedTuple):
       env: with the observation that it was trained on.
       policy: its functions.
       trained: its weights, rounded as `sample` would, and what they were trained with.
+      weights: SHA-256 of their file.
     """
 
     method: str
     env: sim_env.Env
     policy: policies.Policy
     trained: export.Trained
+    weights: str
 
 
 def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subject:
@@ -53,7 +55,7 @@ def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subje
         trained = export.load(weights)
     except ValueError as error:
         raise config_lib.UsageError(f"{error}; remove it, and {again} trains it again") from error
-    return _subject(method, trained, env)
+    return _subject(method, trained, weights, env)
 
 
 def from_file(path: Path) -> Subject:
@@ -67,15 +69,15 @@ def from_file(path: Path) -> Subject:
     except ValueError as error:
         raise config_lib.UsageError(f"--policy: {error}") from error
     options.choice(f"{path}: method", trained.method, methods.METHODS)
-    return _subject(trained.method, trained, None)
+    return _subject(trained.method, trained, path, None)
 
 
-def _subject(method: str, trained: export.Trained, env: sim_env.Env | None) -> Subject:
+def _subject(method: str, trained: export.Trained, file: Path, env: sim_env.Env | None) -> Subject:
     env = env or sim_env.make(trained.policy.observation, trained.policy.image_size)
     row = methods.METHODS[method]
     policy = policies.make(row, trained.policy, env.p_world_ref, trained.train)
     params = policies.for_sampling(trained.params, trained.policy.dtype)
-    return Subject(method, env, policy, trained._replace(params=params))
+    return Subject(method, env, policy, trained._replace(params=params), files.sha256(file))
 
 
 def rollouts(
@@ -112,11 +114,6 @@ def settings(who: Subject, config: config_lib.RunConfig) -> config_lib.RunConfig
     return dataclasses.replace(
         config, policy=trained.policy, train=trained.train, demos=trained.demos or config.demos
     )
-
-
-def fingerprint(who: Subject) -> str:
-    """What tells its weights from others."""
-    return evaluate.fingerprint((who.trained.params, who.trained.normalizer))
 
 
 def decision_ms(who: Subject) -> dict[str, float]:
@@ -162,7 +159,7 @@ def write_result(
         "inference_ms": decision_ms(who),
         "preset": config.preset,
         "seed": seed,
-        "weights": fingerprint(who),
+        "weights": who.weights,
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "command": command,
         "timings_s": timings_s or {},

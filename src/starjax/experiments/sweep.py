@@ -65,7 +65,7 @@ def main(argv: Sequence[str]) -> int:
         "method": who.method,
         "observation": who.trained.policy.observation,
         "command": options.typed("sweep", argv),
-        "weights": scoring.fingerprint(who),
+        "weights": who.weights,
         "time_limit_s": chosen.eval.time_limit_s,
         "versions": xla.versions(),
         "hardware": xla.hardware(),
