@@ -3,6 +3,10 @@
 Lengths and angles are scaled; 6-D rotations and the gripper are in [-1, 1] by nature and pass
 unchanged. Proprioception is the measured pose in the method's own action space and so shares the
 actions' statistics: what was commanded and what was measured stay comparable.
+
+Samples are clipped to [-1, 1], so these bounds are also as far as a tool can be sent. Where
+positions or depths count from the port, they hold the demonstrated tips as seen from any port that
+may be drawn (Eq. 19), not from the training ports alone: from a higher port a tip is farther away.
 """
 
 from typing import Any
@@ -16,6 +20,8 @@ from starjax import config, rcm
 from starjax.data import windows
 
 _SMALLEST_RANGE = 1e-4  # m or rad: below it an entry counts as constant, and is only centred
+_ABSOLUTE = ("se3", "rcm4")  # action spaces whose positions are the world's, whatever the port
+_EDGE_AZIMUTHS = 16  # of ports on the edge of Eq. 19: between two of them up to 1 mm is missing
 _STATE_SCALED = np.r_[0:3, 9:12]  # block position and target peg position; 3:9 is a rotation
 
 
@@ -79,28 +85,59 @@ def fit(
     actions = windows.over_frames(
         dataset, frames, lambda _, command, trocar: encode_commands(command, trocar)
     )
+    low, high = actions.min(axis=0), actions.max(axis=0)
     space = rcm.ACTION_SPACES[method.action_space]
-    scaled = [i for name, part in space.slices.items() if name != "R" for i in _entries(part)]
+    if method.action_space not in _ABSOLUTE:
+        edge = _through_edge(space, dataset, frames, p_world_ref)
+        counted = _entries(space, "p", "depth")
+        low[counted] = np.minimum(low[counted], edge[:, counted].min(axis=0))
+        high[counted] = np.maximum(high[counted], edge[:, counted].max(axis=0))
     state = None
     if dataset.observation.state is not None:
         states = windows.over_frames(dataset, frames, lambda observation, *_: observation.state)
-        state = _min_max(states, _STATE_SCALED)
-    return Normalizer(action=_min_max(actions, np.asarray(scaled)), state=state)
+        state = _min_max(states.min(axis=0), states.max(axis=0), _STATE_SCALED)
+    action = _min_max(low, high, _entries(space, "p", "depth", "roll"))
+    return Normalizer(action=action, state=state)
 
 
-def _entries(part: slice) -> range:
-    return range(part.start, part.stop)
+def _through_edge(
+    space: rcm.ActionSpace, dataset: windows.Dataset, frames: np.ndarray, p_world_ref: Any
+) -> np.ndarray:
+    """Lowest and highest entries, in `[m, A]`: the commanded tips through the ports of the edge.
+
+    Those are the highest, lowest and outermost ones of Eq. 19, and the centre: {T} turns there too.
+    """
+    around = np.linspace(*rcm.AZIMUTH_RANGE, _EDGE_AZIMUTHS, endpoint=False)
+    heights = [*rcm.POLAR_RANGE, np.mean(rcm.POLAR_RANGE)]
+    ports = rcm.Trocar(*(x.ravel() for x in np.meshgrid(rcm.RADIUS_RANGE, heights, around)))
+
+    @jax.jit
+    def ends(pose):
+        def through(port):
+            turned = rcm.project(pose, rcm.trocar_position(port, p_world_ref))
+            encoded = space.encode(turned, port, p_world_ref)
+            return encoded.min(axis=0), encoded.max(axis=0)
+
+        low, high = jax.vmap(through)(ports)
+        return jnp.concatenate([low, high])
+
+    return windows.over_frames(dataset, frames, lambda _, command, __: ends(command.pose))
 
 
-def _min_max(values: np.ndarray, scaled: np.ndarray) -> MinMax:
-    if not np.isfinite(values).all():
+def _entries(space: rcm.ActionSpace, *names: str) -> np.ndarray:
+    """Where the parts of these names lie in the space's vector, for those that it has."""
+    parts = [space.slices[name] for name in names if name in space.slices]
+    return np.concatenate([np.arange(part.start, part.stop) for part in parts])
+
+
+def _min_max(low: np.ndarray, high: np.ndarray, scaled: np.ndarray) -> MinMax:
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError("dataset: expected finite poses and states, got NaN or infinity")
-    low, high = values.min(axis=0), values.max(axis=0)
     # a constant entry is centred and keeps its unit's scale, so that noise on it is not blown up
     constant = high - low < _SMALLEST_RANGE
     middle = 0.5 * (low + high)
     low, high = np.where(constant, middle - 1.0, low), np.where(constant, middle + 1.0, high)
-    unchanged = np.ones(values.shape[-1], bool)
+    unchanged = np.ones(low.shape, bool)
     unchanged[scaled] = False
     low, high = np.where(unchanged, -1.0, low), np.where(unchanged, 1.0, high)
     return MinMax(jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32))

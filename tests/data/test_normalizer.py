@@ -1,0 +1,59 @@
+"""What samples may say: bounds of each action space, fitted to demonstrations."""
+
+import fakes
+import jax
+import numpy as np
+import pytest
+
+from starjax import rcm
+from starjax.data import normalizer
+from starjax.experiments.methods import METHODS
+
+FRAMES = np.arange(240)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return fakes.dataset(seed=0)
+
+
+def fitted(space, dataset):
+    row = METHODS["dp_rcm1"]._replace(action_space=space)
+    return normalizer.fit(row, dataset, fakes.P_WORLD_REF, FRAMES).action
+
+
+@pytest.mark.parametrize("name", ["rcm1", "rcm2", "rcm3", "rcm1_fixed_yaw", "rcm2_fixed_yaw"])
+def test_a_demonstrated_tip_is_within_bounds_through_every_port(dataset, name):
+    space, box = rcm.ACTION_SPACES[name], fitted(name, dataset)
+    drawn = rcm.sample_trocar(jax.random.key(3), (200,))
+    ports = jax.tree.map(lambda *fields: np.concatenate(fields), rcm.TROCARS, drawn)
+
+    def through(port):
+        p_world_trocar = rcm.trocar_position(port, fakes.P_WORLD_REF)
+        pose = rcm.project(dataset.command.pose, p_world_trocar)
+        return space.encode(pose, port, fakes.P_WORLD_REF)
+
+    actions = np.asarray(jax.jit(jax.vmap(through))(ports)).reshape(-1, space.dim)
+    for part in (space.slices[kind] for kind in ("p", "depth") if kind in space.slices):
+        low, high = np.asarray(box.low)[part], np.asarray(box.high)[part]
+        beyond = np.maximum(low - actions[:, part], actions[:, part] - high).max(axis=0)
+        assert (beyond <= 1e-3).all(), beyond
+        # and no looser than the farthest port asks for
+        assert (high - low < 1.2 * np.ptp(actions[:, part], axis=0)).all()
+
+
+@pytest.mark.parametrize("name", ["se3", "rcm4"])
+def test_a_position_in_the_world_is_bounded_by_the_demonstrations(dataset, name):
+    box, position = fitted(name, dataset), rcm.ACTION_SPACES[name].slices["p"]
+    p = np.asarray(dataset.command.pose.p)
+    np.testing.assert_array_equal(np.asarray(box.low)[position], p.min(axis=0))
+    np.testing.assert_array_equal(np.asarray(box.high)[position], p.max(axis=0))
+
+
+def test_damaged_poses_are_told(dataset):
+    pose = dataset.command.pose
+    pose = pose._replace(p=pose.p.at[7].set(np.nan))
+    command = dataset.command._replace(pose=pose)
+    for name in ("rcm2", "rcm4"):
+        with pytest.raises(ValueError, match="expected finite poses"):
+            fitted(name, dataset.replace(command=command))
