@@ -73,6 +73,29 @@ def test_a_stop_is_insisted_on_but_disturbs_no_cleaning_up(job, said):
     assert process.returncode == 130 and rest == said and error.count("\n") == 1
 
 
+def test_a_second_stop_while_the_first_is_told_is_no_traceback():
+    process = started("""
+        import signal
+        from starjax import cli
+
+        def command(argv):
+            raise KeyboardInterrupt
+
+        def again(number, handler):
+            signal.signal = set_handler
+            raise KeyboardInterrupt
+
+        def guard(*given, first=cli.guard):
+            code, signal.signal = first(*given), again
+            return code
+
+        set_handler, cli.guard = signal.signal, guard
+        cli.run(command)
+    """)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130 and error.count("\n") == 1
+
+
 def test_ctrl_c_in_a_callback_of_the_collector_is_not_lost():
     """Python drops what is raised there, and jax has such a callback."""
     code = """

@@ -50,10 +50,14 @@ def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
     signal.signal(signal.SIGTERM, stop)
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as of a shell's background job
         signal.signal(signal.SIGINT, stop)
-    code = guard(command, sys.argv[1:])
+    code = _STOPPED
+    try:
+        code = guard(command, sys.argv[1:])
+        if code == _STOPPED:
+            _ignore_stops()
+    except KeyboardInterrupt:  # once more, between two lines of ours
+        _ignore_stops()
     if code == _STOPPED:  # jax's threads may still run, and would meet an interpreter that is gone
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)  # it has been heard
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -134,6 +138,11 @@ class _Stop:
     def _insist(self, number: int) -> None:
         self._insists = True
         signal.pthread_kill(self._main, number)  # a real one, which wakes what waits
+
+
+def _ignore_stops() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _without_interrupts(ignored: Any) -> None:
