@@ -89,14 +89,14 @@ def fit(
     space = rcm.ACTION_SPACES[method.action_space]
     if method.action_space not in _ABSOLUTE:
         edge = _through_edge(space, dataset, frames, p_world_ref)
-        counted = _entries(space, "p", "depth")
+        counted = _entries_but(space, "R", "roll")
         low[counted] = np.minimum(low[counted], edge[:, counted].min(axis=0))
         high[counted] = np.maximum(high[counted], edge[:, counted].max(axis=0))
     state = None
     if dataset.observation.state is not None:
         states = windows.over_frames(dataset, frames, lambda observation, *_: observation.state)
         state = _min_max(states.min(axis=0), states.max(axis=0), _STATE_SCALED)
-    action = _min_max(low, high, _entries(space, "p", "depth", "roll"))
+    action = _min_max(low, high, _entries_but(space, "R"))
     return Normalizer(action=action, state=state)
 
 
@@ -124,9 +124,9 @@ def _through_edge(
     return windows.over_frames(dataset, frames, lambda _, command, __: ends(command.pose))
 
 
-def _entries(space: rcm.ActionSpace, *names: str) -> np.ndarray:
-    """Where the parts of these names lie in the space's vector, for those that it has."""
-    parts = [space.slices[name] for name in names if name in space.slices]
+def _entries_but(space: rcm.ActionSpace, *names: str) -> np.ndarray:
+    """Where the parts lie in the space's vector, without those of these names."""
+    parts = [part for name, part in space.slices.items() if name not in names]
     return np.concatenate([np.arange(part.start, part.stop) for part in parts])
 
 
