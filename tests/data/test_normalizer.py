@@ -1,4 +1,4 @@
-"""What samples may say: bounds of each action space, fitted to demonstrations."""
+"""What samples may say: how far each action space reaches, fitted to demonstrations."""
 
 import fakes
 import jax
@@ -10,6 +10,7 @@ from starjax.data import normalizer
 from starjax.experiments.methods import METHODS
 
 FRAMES = np.arange(240)
+RELATIVE = ["rcm1", "rcm2", "rcm3", "rcm1_fixed_yaw", "rcm2_fixed_yaw"]
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +23,8 @@ def fitted(space, dataset):
     return normalizer.fit(row, dataset, fakes.P_WORLD_REF, FRAMES).action
 
 
-@pytest.mark.parametrize("name", ["rcm1", "rcm2", "rcm3", "rcm1_fixed_yaw", "rcm2_fixed_yaw"])
-def test_a_demonstrated_tip_is_within_bounds_through_every_port(dataset, name):
+@pytest.mark.parametrize("name", RELATIVE)
+def test_a_demonstrated_tip_is_within_reach_through_every_port(dataset, name):
     space, box = rcm.ACTION_SPACES[name], fitted(name, dataset)
     drawn = rcm.sample_trocar(jax.random.key(3), (200,))
     ports = jax.tree.map(lambda *fields: np.concatenate(fields), rcm.TROCARS, drawn)
@@ -34,18 +35,28 @@ def test_a_demonstrated_tip_is_within_bounds_through_every_port(dataset, name):
         return space.encode(pose, port, fakes.P_WORLD_REF)
 
     actions = np.asarray(jax.jit(jax.vmap(through))(ports)).reshape(-1, space.dim)
+    low, high = np.asarray(jax.vmap(box.denormalize)(box.reach))
     for part in (space.slices[kind] for kind in ("p", "depth") if kind in space.slices):
-        low, high = np.asarray(box.low)[part], np.asarray(box.high)[part]
-        beyond = np.maximum(low - actions[:, part], actions[:, part] - high).max(axis=0)
-        assert (beyond <= 1e-3).all(), beyond
-        # and no looser than the farthest port asks for
-        assert (high - low < 1.2 * np.ptp(actions[:, part], axis=0)).all()
+        beyond = np.maximum(low[part] - actions[:, part], actions[:, part] - high[part])
+        assert (beyond.max(axis=0) <= 1e-3).all(), beyond.max(axis=0)
+        # and no farther than the farthest port asks for
+        assert (high[part] - low[part] < 1.2 * np.ptp(actions[:, part], axis=0)).all()
+
+
+@pytest.mark.parametrize("name", RELATIVE)
+def test_rotations_roll_and_gripper_reach_as_far_as_they_were_shown(dataset, name):
+    space, box = rcm.ACTION_SPACES[name], fitted(name, dataset)
+    others = [space.slices[kind] for kind in ("R", "roll") if kind in space.slices]
+    for part in [*others, slice(space.dim, None)]:
+        np.testing.assert_array_equal(box.reach[0, part], -1.0)
+        np.testing.assert_array_equal(box.reach[1, part], 1.0)
 
 
 @pytest.mark.parametrize("name", ["se3", "rcm4"])
-def test_a_position_in_the_world_is_bounded_by_the_demonstrations(dataset, name):
+def test_a_position_in_the_world_reaches_as_far_as_it_was_shown(dataset, name):
     box, position = fitted(name, dataset), rcm.ACTION_SPACES[name].slices["p"]
     p = np.asarray(dataset.command.pose.p)
+    assert box.reach is None
     np.testing.assert_array_equal(np.asarray(box.low)[position], p.min(axis=0))
     np.testing.assert_array_equal(np.asarray(box.high)[position], p.max(axis=0))
 

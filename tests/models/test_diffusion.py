@@ -81,6 +81,15 @@ def test_ddim_step_is_the_papers_formula():
     np.testing.assert_allclose(diffusion.ddim_sample(eps_fn, noise, steps=2), x, atol=3e-6)
 
 
+def test_ddim_reaches_as_far_as_it_may():
+    x0 = jnp.broadcast_to(jnp.array([-3.0, -1.2, 1.2, 3.0]), (2, 16, 4))
+    found = diffusion.ddim_sample(perfect(x0), normal(2, 16, 4), steps=10)
+    np.testing.assert_allclose(found[0, 0], [-1, -1, 1, 1], atol=1e-6)
+    reach = jnp.array([[-1.5] * 4, [1.0, 1.0, 1.5, 2.0]])
+    found = diffusion.ddim_sample(perfect(x0), normal(2, 16, 4), steps=10, reach=reach)
+    np.testing.assert_allclose(found[0, 0], [-1.5, -1.2, 1.2, 2.0], atol=1e-5)
+
+
 def test_ddim_prepares_every_step_once():
     calls = []
 

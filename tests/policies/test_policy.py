@@ -99,6 +99,24 @@ def test_samples_are_finite_with_broken_weights(made, name):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(command))
 
 
+def test_samples_reach_as_far_as_the_normaliser_says(made):
+    """A position that counts from the port may be farther than any demonstration's was."""
+    it = made("dp_rcm2")
+    part = rcm.ACTION_SPACES["rcm2"].slices["p"]
+    lifted = it.stats.replace(action=it.stats.action.replace(reach=it.stats.action.reach + 3.0))
+    arguments = jax.random.split(jax.random.key(1), B), it.batch.observation, it.batch.trocar
+
+    def scaled(stats):
+        pose = it.sample(it.params, stats, *arguments).pose
+        per_step = jax.tree.map(lambda leaf: leaf[:, None], it.batch.trocar)
+        vector = rcm.ACTION_SPACES["rcm2"].encode(pose, per_step, fakes.P_WORLD_REF)
+        return stats.action.normalize(jnp.append(vector, jnp.zeros((B, 16, 1)), -1))[..., part]
+
+    low, high = np.asarray(it.stats.action.reach)[:, part]
+    assert (scaled(it.stats) > low - 1e-3).all() and (scaled(it.stats) < high + 1e-3).all()
+    assert (scaled(lifted) > low + 3.0 - 1e-3).all()
+
+
 @pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
 def test_a_sample_depends_on_its_own_key_alone(made, name):
     it = made(name)

@@ -51,6 +51,13 @@ def test_state_statistics_travel(tmp_path):
     assert export.load(tmp_path / "p").normalizer.state.high.shape == (12,)
 
 
+def test_how_far_samples_reach_travels(tmp_path):
+    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5), jnp.array([[-1.0] * 5, [1.5] * 5]))
+    export.save(tmp_path / "p", trained()._replace(normalizer=normalizer.Normalizer(box, None)))
+    found = export.load(tmp_path / "p").normalizer.action
+    np.testing.assert_array_equal(found.reach, box.reach)
+
+
 def test_non_finite_weights_are_not_saved(tmp_path):
     with pytest.raises(ValueError, match=r"expected finite values, got others in .*kernel"):
         export.save(tmp_path / "p", trained(scale=np.nan))

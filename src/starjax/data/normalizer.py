@@ -4,9 +4,9 @@ Lengths and angles are scaled; 6-D rotations and the gripper are in [-1, 1] by n
 unchanged. Proprioception is the measured pose in the method's own action space and so shares the
 actions' statistics: what was commanded and what was measured stay comparable.
 
-Samples are clipped to [-1, 1], so these bounds are also as far as a tool can be sent. Where
-positions or depths count from the port, they hold the demonstrated tips as seen from any port that
-may be drawn (Eq. 19), not from the training ports alone: from a higher port a tip is farther away.
+A policy's samples are clipped to [-1, 1], so what was demonstrated is as far as a tool can be sent.
+Where positions or depths count from the port, samples reach farther: to the demonstrated tips as
+seen from any port that may be drawn (Eq. 19), since from a higher port a tip is farther away.
 """
 
 from typing import Any
@@ -32,10 +32,12 @@ class MinMax:
     Attributes:
       low: `[n]` smallest value seen.
       high: `[n]` largest value seen.
+      reach: `[2, n]` lowest and highest sample, scaled, or None: -1 and 1.
     """
 
     low: Any
     high: Any
+    reach: Any = None
 
     def normalize(self, x: jax.Array) -> jax.Array:
         return (x - self.low) * (2.0 / (self.high - self.low)) - 1.0
@@ -85,25 +87,25 @@ def fit(
     actions = windows.over_frames(
         dataset, frames, lambda _, command, trocar: encode_commands(command, trocar)
     )
-    low, high = actions.min(axis=0), actions.max(axis=0)
     space = rcm.ACTION_SPACES[method.action_space]
+    action = _min_max(actions, _entries_but(space, "R"))
     if method.action_space not in _ABSOLUTE:
-        edge = _through_edge(space, dataset, frames, p_world_ref)
-        counted = _entries_but(space, "R", "roll")
-        low[counted] = np.minimum(low[counted], edge[:, counted].min(axis=0))
-        high[counted] = np.maximum(high[counted], edge[:, counted].max(axis=0))
+        action = action.replace(reach=_reach(action, space, dataset, frames, p_world_ref))
     state = None
     if dataset.observation.state is not None:
         states = windows.over_frames(dataset, frames, lambda observation, *_: observation.state)
-        state = _min_max(states.min(axis=0), states.max(axis=0), _STATE_SCALED)
-    action = _min_max(low, high, _entries_but(space, "R"))
+        state = _min_max(states, _STATE_SCALED)
     return Normalizer(action=action, state=state)
 
 
-def _through_edge(
-    space: rcm.ActionSpace, dataset: windows.Dataset, frames: np.ndarray, p_world_ref: Any
-) -> np.ndarray:
-    """Lowest and highest entries, in `[m, A]`: the commanded tips through the ports of the edge.
+def _reach(
+    box: MinMax,
+    space: rcm.ActionSpace,
+    dataset: windows.Dataset,
+    frames: np.ndarray,
+    p_world_ref: Any,
+) -> jax.Array:
+    """`[2, A + 1]`, scaled: what the commanded tips ask for through the ports of the edge.
 
     Those are the highest, lowest and outermost ones of Eq. 19, and the centre: {T} turns there too.
     """
@@ -112,16 +114,21 @@ def _through_edge(
     ports = rcm.Trocar(*(x.ravel() for x in np.meshgrid(rcm.RADIUS_RANGE, heights, around)))
 
     @jax.jit
-    def ends(pose):
+    def ends(command):
         def through(port):
-            turned = rcm.project(pose, rcm.trocar_position(port, p_world_ref))
-            encoded = space.encode(turned, port, p_world_ref)
-            return encoded.min(axis=0), encoded.max(axis=0)
+            pose = rcm.project(command.pose, rcm.trocar_position(port, p_world_ref))
+            scaled = box.normalize(encode(space.name, pose, command.gripper, port, p_world_ref))
+            return scaled.min(axis=0), scaled.max(axis=0)
 
         low, high = jax.vmap(through)(ports)
         return jnp.concatenate([low, high])
 
-    return windows.over_frames(dataset, frames, lambda _, command, __: ends(command.pose))
+    edge = windows.over_frames(dataset, frames, lambda _, command, __: ends(command))
+    reach = np.stack([np.full(edge.shape[-1], -1.0), np.full(edge.shape[-1], 1.0)])
+    counted = _entries_but(space, "R", "roll")
+    reach[0, counted] = np.minimum(edge[:, counted].min(axis=0), -1.0)
+    reach[1, counted] = np.maximum(edge[:, counted].max(axis=0), 1.0)
+    return jnp.asarray(reach, jnp.float32)
 
 
 def _entries_but(space: rcm.ActionSpace, *names: str) -> np.ndarray:
@@ -130,14 +137,15 @@ def _entries_but(space: rcm.ActionSpace, *names: str) -> np.ndarray:
     return np.concatenate([np.arange(part.start, part.stop) for part in parts])
 
 
-def _min_max(low: np.ndarray, high: np.ndarray, scaled: np.ndarray) -> MinMax:
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+def _min_max(values: np.ndarray, scaled: np.ndarray) -> MinMax:
+    if not np.isfinite(values).all():
         raise ValueError("dataset: expected finite poses and states, got NaN or infinity")
+    low, high = values.min(axis=0), values.max(axis=0)
     # a constant entry is centred and keeps its unit's scale, so that noise on it is not blown up
     constant = high - low < _SMALLEST_RANGE
     middle = 0.5 * (low + high)
     low, high = np.where(constant, middle - 1.0, low), np.where(constant, middle + 1.0, high)
-    unchanged = np.ones(low.shape, bool)
+    unchanged = np.ones(values.shape[-1], bool)
     unchanged[scaled] = False
     low, high = np.where(unchanged, -1.0, low), np.where(unchanged, 1.0, high)
     return MinMax(jnp.asarray(low, jnp.float32), jnp.asarray(high, jnp.float32))

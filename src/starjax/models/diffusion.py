@@ -89,8 +89,9 @@ def ddim_sample(
     diffusion_steps: int = 100,
     steps: int = 10,
     prepare: Callable[[jax.Array], Any] = lambda k: k,
+    reach: Any = None,
 ) -> jax.Array:
-    """Deterministic DDIM (eta = 0, 'leading' steps, clean sequence clipped to [-1, 1]).
+    """Deterministic DDIM (eta = 0, 'leading' steps, clean sequence clipped to `reach`).
 
     Args:
       eps_fn: `(x [B, ...], prepared) -> eps [B, ...]`.
@@ -99,18 +100,20 @@ def ddim_sample(
       steps: how many network evaluations.
       prepare: maps the int32 steps `[n]` to a pytree with leading axis n, once, before the loop;
         `eps_fn` gets its slice. By default the step k itself, int32 `[]`.
+      reach: lowest and highest value, what broadcasts against `[B, ...]` each; None: -1 and 1.
 
     Returns:
-      Clean sequences, the shape of `noise`, within [-1, 1].
+      Clean sequences, the shape of `noise`, within `reach`.
     """
     table = schedules.ddim_table(diffusion_steps, steps)
     prepared = prepare(jnp.asarray(table.k))
+    low, high = (-1.0, 1.0) if reach is None else reach
 
     def step(x, inputs):
         row, at_k = inputs
         eps = eps_fn(x, at_k)
         x0 = (x - row.sqrt_one_minus_alpha_bar * eps) / row.sqrt_alpha_bar
-        x0 = jnp.clip(x0, -1.0, 1.0)
+        x0 = jnp.clip(x0, low, high)
         x = row.sqrt_alpha_bar_next * x0 + row.sqrt_one_minus_alpha_bar_next * eps
         return x, None
 

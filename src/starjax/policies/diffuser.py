@@ -21,14 +21,15 @@ class Diffuser(NamedTuple):
       observe: `(params, inputs) -> [B, N]`, those numbers.
       noised: `(key, x0 [B, H, A]) -> Noised`, what is learned from clean sequences.
       loss: `(params, observed [B, N], extra [B, E], Noised) -> scalar` of Eq. 9.
-      sample: `(params, keys [B], observed [B, N], extra [B, E]) -> [B, H, A]` in [-1, 1], by DDIM.
+      sample: `(params, keys [B], observed [B, N], extra [B, E], reach=None) -> [B, H, A]` by DDIM,
+        within `reach` `[2, A]`, lowest and highest, or if it is None within [-1, 1].
     """
 
     init: Callable[[jax.Array], Params]
     observe: Callable[[Params, features.Inputs], jax.Array]
     noised: Callable[[jax.Array, jax.Array], diffusion.Noised]
     loss: Callable[[Params, jax.Array, jax.Array, diffusion.Noised], jax.Array]
-    sample: Callable[[Params, jax.Array, jax.Array, jax.Array], jax.Array]
+    sample: Callable[..., jax.Array]
 
 
 def observed_dim(policy_config: config.PolicyConfig) -> int:
@@ -104,7 +105,13 @@ def make(
         cond = _beside(observed, extra)
         return diffusion.eps_loss(lambda x, k: of_unet(params["unet"], x, k, cond), given)
 
-    def sample(params: Params, keys: jax.Array, observed: jax.Array, extra: jax.Array) -> jax.Array:
+    def sample(
+        params: Params,
+        keys: jax.Array,
+        observed: jax.Array,
+        extra: jax.Array,
+        reach: jax.Array | None = None,
+    ) -> jax.Array:
         cond = _beside(observed, extra)
         film = of_unet(params["unet"], cond, method="condition")
         return diffusion.ddim_sample(
@@ -113,6 +120,7 @@ def make(
             diffusion_steps=policy_config.diffusion_steps,
             steps=policy_config.ddim_steps,
             prepare=lambda k: of_unet(params["unet"], k, method="embed_step"),
+            reach=reach,
         )
 
     return Diffuser(init, observe, noised, loss, sample)

@@ -64,7 +64,7 @@ def make(
             _proprioception(stats, observation, trocar),
         )
         observed = model.observe(params, inputs)
-        action = model.sample(params, keys, observed, _extra(trocar))
+        action = model.sample(params, keys, observed, _extra(trocar), stats.action.reach)
         return execution.command(method, stats, action, trocar, p_world_ref)
 
     def _proprioception(stats, observation, trocar):

@@ -63,7 +63,7 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
       StorageError: the file cannot be written.
     """
     stats = {
-        name: {"low": part.low, "high": part.high}
+        name: {key: value for key, value in vars(part).items() if value is not None}
         for name in ("action", "state")
         if (part := getattr(trained.normalizer, name)) is not None
     }
