@@ -38,6 +38,7 @@ class State:
     invalid: jax.Array
     collided: jax.Array
     rcm_error: jax.Array
+    rcm_error_within: jax.Array
     pose: Pose
     gripper: jax.Array
 
@@ -75,6 +76,7 @@ def make_env(observation: str = "state", unlucky: float = 0.25) -> Env:
             invalid=no,
             collided=no,
             rcm_error=jnp.zeros(()),
+            rcm_error_within=jnp.zeros(()),
             pose=Pose(jnp.eye(3), p),
             gripper=jnp.ones(()),
         )
@@ -95,6 +97,7 @@ def make_env(observation: str = "state", unlucky: float = 0.25) -> Env:
             done=success | invalid,
             collided=state.collided | (p[2] < -0.03),
             rcm_error=0.1 * jnp.linalg.norm(delta),
+            rcm_error_within=0.2 * jnp.linalg.norm(delta),
             pose=Pose(command.pose.R, p),
             gripper=command.gripper,
         )

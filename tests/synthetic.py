@@ -53,7 +53,9 @@ def outcomes(rng, ports, index, chance):
         rcm_commanded_max=np.full(len(index), 3.1e-8, np.float32),
         rcm_mean=largest / 8,
         rcm_max=largest,
+        rcm_within_max=1.5 * largest,
         rcm_error_mm=np.repeat(125 * largest, steps).astype(np.float16),
+        rcm_within_mm=np.repeat(190 * largest, steps).astype(np.float16),
     )
 
 

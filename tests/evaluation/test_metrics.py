@@ -16,7 +16,8 @@ def trials(success, trocar=None, **columns):
     base |= {name: np.zeros(count, bool) for name in ("loose", "safe", "invalid", "collided")}
     base |= {"trocar": np.zeros(count, np.int32) if trocar is None else np.array(trocar, np.int32)}
     base |= {name: np.zeros(count, np.int32) for name in ("trial", "source", "target")}
-    base |= {"rcm_error_mm": np.zeros(2 * count, np.float16)}
+    by_step = np.zeros(base["steps"].sum(), np.float16)
+    base |= dict.fromkeys(table.BY_STEP, by_step)
     return table.Table(**(base | columns))
 
 
@@ -97,8 +98,9 @@ def test_every_outcome_is_split_and_times_are_of_successes():
             loose=np.array([1, 1, 1, 0], bool),
             safe=np.array([1, 0, 0, 0], bool),
             steps=steps,
-            rcm_error_mm=np.zeros(steps.sum(), np.float16),
+            **dict.fromkeys(table.BY_STEP, np.zeros(steps.sum(), np.float16)),
             rcm_max=np.full(4, 2e-3, np.float32),
+            rcm_within_max=np.full(4, 3e-3, np.float32),
             rcm_commanded_max=np.full(4, 1e-3, np.float32),
         ),
         np.array([True, False]),
@@ -110,8 +112,8 @@ def test_every_outcome_is_split_and_times_are_of_successes():
         parts = found[outcome]
         assert [parts[part]["successes"] for part in ("seen", "unseen", "all")] == counts
     assert found["steps"] == {"mean": 3.0, "median": 3.0}
-    errors = [found["trials"][0][name] for name in ("rcm_max_mm", "rcm_commanded_max_mm")]
-    assert errors == pytest.approx([2.0, 1.0])
+    names = ("rcm_max_mm", "rcm_within_max_mm", "rcm_commanded_max_mm")
+    assert [found["trials"][0][name] for name in names] == pytest.approx([2.0, 3.0, 1.0])
 
 
 def test_a_result_without_unseen_trocars_has_no_gap():
@@ -130,6 +132,8 @@ def test_executed_error_is_pooled_over_steps():
             [1, 0],
             steps=steps,
             rcm_error_mm=series,
+            rcm_within_mm=2 * series,
+            rcm_within_max=np.array([11e-3, 2e-3], np.float32),
             rcm_mean=np.array([5e-3, 0.5e-3], np.float32),
             rcm_max=np.array([5e-3, 1e-3], np.float32),
             rcm_commanded_max=np.array([1e-6, 3e-6], np.float32),
@@ -140,12 +144,17 @@ def test_executed_error_is_pooled_over_steps():
     assert found["executed"]["p99"] == pytest.approx(0.99, abs=2e-3)
     assert found["executed"]["max"] == pytest.approx(5.0)
     assert found["executed"]["p99_of_successes"] == pytest.approx(5.0)
+    within = {"p99": 1.98, "max": 11.0, "p99_of_successes": 10.0}
+    assert found["within_steps"] == pytest.approx(within, abs=4e-3)
 
 
 def test_without_a_success_there_is_no_error_of_successes():
     steps, series = np.array([2], np.int32), np.array([50.0, 50.0], np.float16)
-    found = metrics.rcm_error_mm(trials([0], steps=steps, rcm_error_mm=series))
-    assert found["executed"]["p99"] == 50.0 and found["executed"]["p99_of_successes"] is None
+    found = metrics.rcm_error_mm(
+        trials([0], steps=steps, rcm_error_mm=series, rcm_within_mm=series)
+    )
+    for kind in ("executed", "within_steps"):
+        assert found[kind]["p99"] == 50.0 and found[kind]["p99_of_successes"] is None
 
 
 def test_selection_keeps_steps_with_their_trials():
@@ -153,8 +162,10 @@ def test_selection_keeps_steps_with_their_trials():
         [1, 0, 1],
         steps=np.array([2, 1, 3], np.int32),
         rcm_error_mm=np.arange(6, dtype=np.float16),
+        rcm_within_mm=np.arange(6, 12, dtype=np.float16),
     )
     kept = table.select(found, np.array([True, False, True]))
     np.testing.assert_array_equal(kept.rcm_error_mm, [0, 1, 3, 4, 5])
+    np.testing.assert_array_equal(kept.rcm_within_mm, [6, 7, 9, 10, 11])
     joined = table.join([kept, table.select(found, np.array([False, True, False]))])
     np.testing.assert_array_equal(joined.success, [1, 1, 0])

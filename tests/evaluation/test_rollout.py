@@ -336,14 +336,17 @@ def test_a_trial_is_safe_if_its_executed_error_stayed_small_and_nothing_if_it_di
         collided=no,
         **dict.fromkeys(("source", "target"), pegs),
     )
-    executed = np.array([[1e-3, 1e-3, 0], [1.9e-3, 2.1e-3, 0], [9, 9, 9]], np.float32)
+    executed = np.array([[1e-3, 1e-3, 0], [1.8e-3, 1.9e-3, 0], [9, 9, 9]], np.float32)
+    within = np.array([[1.9e-3, 1e-3, 0], [1.8e-3, 2.1e-3, 0], [9, 9, 9]], np.float32)
     commanded = np.array([5e-3, 0, 0])
-    steps = rollout.Steps(executed, None, None)
+    steps = rollout.Steps(executed, within, None, None)
     done = rollout.Rollouts(env, np.array([2, 2, 2]), commanded, steps)
     found = table.from_rollouts(done, np.arange(3), np.zeros(3, int))
     np.testing.assert_array_equal(found.safe, [True, False, False])
     np.testing.assert_array_equal(found.loose, [True, False, False])
-    np.testing.assert_allclose(found.rcm_max, [1.9e-3, 2.1e-3, 0])
+    np.testing.assert_allclose(found.rcm_max, [1.8e-3, 1.9e-3, 0])
+    np.testing.assert_allclose(found.rcm_within_max, [1.9e-3, 2.1e-3, 0])
+    np.testing.assert_allclose(found.rcm_within_mm, [1.9, 1.8, 1, 2.1, 0, 0], rtol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -158,7 +158,8 @@ def test_a_run_named_twice_is_reported_once_and_an_evaluation_in_its_folder(tmp_
 
 def test_rcm_errors_stand_under_their_own_names(one):
     executed = {"mean": 2.0, "p99_of_successes": 3.0, "p99": 4.0, "max": 5.0}
-    errors = {"commanded": {"max": 1.0}, "executed": executed}
+    within = {"p99": 6.0, "max": 7.0}
+    errors = {"commanded": {"max": 1.0}, "executed": executed, "within_steps": within}
     header, row = tables.rcm([edited(one, rcm_error_mm=errors)])
     assert dict(zip(header[1:], row[1:])) == {
         "Commanded max": "1.000",
@@ -166,6 +167,8 @@ def test_rcm_errors_stand_under_their_own_names(one):
         "Executed p99 of successes": "3.000",
         "Executed p99": "4.000",
         "Executed max": "5.000",
+        "Within steps p99": "6.000",
+        "Within steps max": "7.000",
     }
 
 

@@ -23,7 +23,7 @@ def episodes(reset, begin, drive):
     for _ in range(STEPS):
         running.append(np.asarray(~state.done))
         state, script = drive(state, script)
-        errors.append(np.asarray(state.rcm_error))
+        errors.append(np.stack([state.rcm_error, state.rcm_error_within]))
         labels.append(jax.tree.map(np.asarray, script.label))
         if bool(state.done.all()):
             break
@@ -41,10 +41,19 @@ def test_the_expert_succeeds_on_every_trocar(episodes):
 
 def test_executed_rcm_error_is_small(episodes):
     _, errors, _, running, _ = episodes
-    live = errors[running]
+    live, within = errors[:, 0][running], errors[:, 1][running]
     assert live.max() > 0
     assert np.quantile(live, 0.99) < 0.07e-3
-    assert live.max() < 1e-3
+    assert within.max() < 1e-3
+
+
+def test_the_error_within_a_control_step_is_the_largest_of_its_physics_steps(episodes):
+    _, errors, _, running, _ = episodes
+    at_end, within = errors[:, 0], errors[:, 1]
+    both = running[1:] & running[:-1]  # a step begins where the one before it ended
+    assert (within[running] >= at_end[running]).all()
+    assert (within[1:][both] >= at_end[:-1][both]).all()
+    assert np.median(within[running] / np.maximum(at_end[running], 1e-9)) > 1.2
 
 
 def test_labels_are_on_the_manifold_and_their_roll_never_wraps(episodes):

@@ -79,12 +79,13 @@ class Steps(NamedTuple):
     """What is kept of every control step, `[T, N]`; after a trial's end it is meaningless.
 
     Attributes:
-      rcm_error: m, executed.
+      rcm_error: m, executed. rcm_error_within: m, the largest within the step.
       p_world_tip: `[T, N, 3]` m, measured after the step.
       qpos: `[T, N, Q]` after the step.
     """
 
     rcm_error: Any
+    rcm_error_within: Any
     p_world_tip: Any
     qpos: Any
 
@@ -296,4 +297,5 @@ def _advancer(env: Any, policy: Any, settings: Settings) -> Callable[..., tuple[
 
 
 def _steps(carry: Carry) -> Steps:
-    return Steps(carry.env.rcm_error, carry.env.pose.p, carry.env.sim.qpos)
+    env = carry.env
+    return Steps(env.rcm_error, env.rcm_error_within, env.pose.p, env.sim.qpos)

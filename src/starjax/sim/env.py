@@ -50,6 +50,7 @@ class EnvState:
       invalid: the simulation diverged; the last sound state is kept.
       collided: arm, shaft or jaws were where they have no modelled contact.
       rcm_error: m, executed: distance of the port from the measured tool axis.
+      rcm_error_within: m, the largest such distance at any physics step of the last control step.
       ik_error: m, residual of the IK, rotations weighed; inf after a command that is not finite.
       jaw_contact: the jaws touch the block.
       pose, block_pose: measured tip and block in the world. gripper: measured opening, [-1, 1].
@@ -74,6 +75,7 @@ class EnvState:
     invalid: jax.Array
     collided: jax.Array
     rcm_error: jax.Array
+    rcm_error_within: jax.Array
     ik_error: jax.Array
     jaw_contact: jax.Array
     pose: Pose
@@ -150,6 +152,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             invalid=no,
             collided=no,
             rcm_error=jnp.zeros(()),
+            rcm_error_within=jnp.zeros(()),
             ik_error=ik_error,
             jaw_contact=no,
             pose=pose,
@@ -173,9 +176,10 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         fastest = jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9)
         dq = dq * jnp.minimum(1.0, MAX_JOINT_SPEED / CONTROL_HZ / fastest)
         gripper = jnp.where(usable, jnp.clip(command.gripper, -1.0, 1.0), state.gripper_target)
-        after, jaw_contact = physics.advance(
+        after, jaw_contact, passed = physics.advance(
             sim, state.sim, state.q_target, dq, state.q_velocity, gripper, 1.0 / CONTROL_HZ
         )
+        between, _, _ = jax.vmap(ik.forward, in_axes=(None, 0))(sim.arm, passed)
         moved = state.replace(
             sim=after,
             q_target=state.q_target + dq,
@@ -192,6 +196,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
                 jnp.inf,
             ),
             jaw_contact=jaw_contact,
+            rcm_error_within=jnp.max(rcm.rcm_error(between, port)),
         )
         moved = _judge(_measure(moved))
         stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
@@ -204,11 +209,13 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         block = physics.block_pose(sim, state.sim)
         hit = collision.detect(pose, origins, block, pegs)
         port = rcm.trocar_position(state.trocar, sim.p_world_ref)
+        rcm_error = rcm.rcm_error(pose, port)
         return state.replace(
             pose=pose,
             block_pose=block,
             gripper=physics.opening(sim, state.sim),
-            rcm_error=rcm.rcm_error(pose, port),
+            rcm_error=rcm_error,
+            rcm_error_within=jnp.maximum(state.rcm_error_within, rcm_error),
             collided=state.collided | hit,
         )
 

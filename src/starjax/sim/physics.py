@@ -56,7 +56,7 @@ def advance(
     velocity: jax.Array,
     gripper: jax.Array,
     period: float,
-) -> tuple[PhysicsState, jax.Array]:
+) -> tuple[PhysicsState, jax.Array, jax.Array]:
     """One control period: the joint target moves smoothly from `q` to `q + dq`.
 
     The target follows the cubic that begins at `velocity` and ends at `dq / period`; velocity and
@@ -67,14 +67,16 @@ def advance(
       period: s.
 
     Returns:
-      the state after; whether a pad touches a wall of the block in the last substep.
+      the state after; whether a pad touches a wall of the block in the last substep; the arm's
+      joints where each substep began, `[substeps, 6]` rad.
     """
     substeps = round(period / sim.mj_model.opt.timestep)
     jaw = JAW_CLOSED + 0.5 * (gripper + 1.0) * (JAW_OPEN - JAW_CLOSED)
     turn = period * velocity - dq
 
     def substep(i, carry):
-        state, _ = carry
+        state, _, passed = carry
+        passed = passed.at[i].set(state.qpos[sim.arm_q : sim.arm_q + 6])
         s = (i + 1) / substeps
         # Cubic Hermite: the straight line, and the bend that its first slope asks for.
         x = q + s * dq + s * (1 - s) ** 2 * turn
@@ -89,9 +91,10 @@ def advance(
         )
         data = solver.step(sim.mjx_model, data)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-        return state, _jaw_contact(sim, data)
+        return state, _jaw_contact(sim, data), passed
 
-    return jax.lax.fori_loop(0, substeps, substep, (state, jnp.zeros((), bool)))
+    first = state, jnp.zeros((), bool), jnp.zeros((substeps, 6))
+    return jax.lax.fori_loop(0, substeps, substep, first)
 
 
 def is_sound(sim: SimModel, state: PhysicsState) -> jax.Array:

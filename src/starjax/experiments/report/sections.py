@@ -72,9 +72,11 @@ def _headlines(run: results.Run) -> Iterator[tuple[str, str, str, str]]:
         middle, low, high = (100 * x for x in stats.gap(seen, unseen))
         more = f"seen minus unseen, 95% interval {low:+.0f} to {high:+.0f}"
         yield "Generalization gap", f"{middle:+.0f}", " points", more
-    executed = (run.result.get("rcm_error_mm") or {}).get("executed") or {}
+    errors = run.result.get("rcm_error_mm") or {}
+    executed = errors.get("executed") or {}
     if executed.get("p99") is not None:
-        more = f"99th percentile; worst {tables.millimetres(executed['max'])} mm"
+        worst = max(executed["max"], (errors.get("within_steps") or {}).get("max", 0.0))
+        more = f"99th percentile; worst {tables.millimetres(worst)} mm"
         yield "Shaft off the trocar", tables.millimetres(executed["p99"]), " mm", more
     seconds = outcomes.transfer_times(run.trials)
     if seconds:

@@ -118,9 +118,10 @@ def paired(runs: Sequence[results.Run]) -> Table:
 
 
 def rcm(runs: Sequence[results.Run]) -> Table:
-    """Commanded and executed RCM error."""
+    """Commanded and executed RCM error, at the ends of control steps and within them."""
     keys = [("commanded", "max")]
     keys += [("executed", what) for what in ("mean", "p99_of_successes", "p99", "max")]
+    keys += [("within_steps", what) for what in ("p99", "max")]
     names = (f"{kind.capitalize()} {what}".replace("_", " ") for kind, what in keys)
     table = [["Method", *names]]
     for run in runs:
