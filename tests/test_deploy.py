@@ -16,6 +16,7 @@ from starjax.training import export
 
 TRAIN = config.TrainConfig()
 ROBOTS = 3
+PORT = jax.tree.map(lambda field: field[0], rcm.TROCARS)
 
 
 @pytest.fixture(scope="module", params=["state", "image"])
@@ -36,14 +37,17 @@ def made(request, tmp_path_factory):
 
 
 def observed(settings, robots=(ROBOTS,)):
+    """Tools through the first trocars, near the board."""
     moments, rng = (*robots, settings.obs_horizon), np.random.default_rng(0)
+    count = robots[0] if robots else 1
+    port = jax.tree.map(lambda field: field[:count, None], rcm.TROCARS)
+    parts = np.zeros((count, settings.obs_horizon, 4), np.float32)
+    parts[..., 1:] = np.array([0.0, 0.0, 0.02]) + rng.normal(scale=0.01, size=parts[..., 1:].shape)
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(parts, port, fakes.P_WORLD_REF)
     is_image = settings.observation == "image"
     size = (*moments, settings.image_size, settings.image_size, 3)
     return deploy.Observation(
-        pose=deploy.Pose(
-            R=np.tile(np.diag([1.0, -1.0, -1.0]).astype(np.float32), (*moments, 1, 1)),
-            p=rng.normal(scale=0.02, size=(*moments, 3)).astype(np.float32),
-        ),
+        pose=jax.tree.map(lambda x: np.asarray(x).reshape(*moments, *x.shape[2:]), pose),
         gripper=np.ones(moments, np.float32),
         image=rng.integers(0, 256, size, np.uint8) if is_image else None,
         state=None if is_image else rng.normal(size=(*moments, 12)).astype(np.float32),
@@ -68,25 +72,30 @@ def test_it_decides_as_the_policy_of_an_evaluation_does(made):
 def test_fields_of_a_trocar_broadcast(made):
     path, trained, _ = made
     deployed, observation = deploy.load(path), observed(trained.policy)
-    radius = np.full(ROBOTS, 0.02, np.float32)
-    wanted = deployed(
-        jax.random.key(0), observation, rcm.Trocar(radius, 0 * radius + 1.4, 0 * radius + 0.8)
-    )
-    got = deployed(jax.random.key(0), observation, rcm.Trocar(0.02, 1.4 + 0 * radius, 0.8))
+    one = jax.tree.map(lambda x: np.repeat(x[:1], ROBOTS, 0), observation)
+    port = jax.tree.map(lambda field: field[:1].repeat(ROBOTS), rcm.TROCARS)
+    wanted = deployed(jax.random.key(0), one, port)
+    got = deployed(jax.random.key(0), one, port._replace(radius=PORT.radius, azimuth=PORT.azimuth))
     jax.tree.map(np.testing.assert_array_equal, got, wanted)
 
 
 def test_a_mistake_names_the_array(made):
     path, trained, _ = made
     deployed, kind = deploy.load(path), trained.policy.observation
-    trocar, good = rcm.Trocar(0.02, 1.4, 0.3), observed(trained.policy, ())
+    trocar, good = PORT, observed(trained.policy, ())
     turned = good.replace(pose=good.pose._replace(p=np.zeros(3)))
     mistakes = {
         r"observation.pose.p: expected shape \[2, 3\], got \[3\]": (turned, trocar),
         rf"observation.{kind}: expected shape .*, got none": (good.replace(**{kind: None}), trocar),
         r"trocar.polar: .*got 80": (good, trocar._replace(polar=80.0)),
-        r"observation.pose.R: expected shape \[4, 2, 3, 3\]": (good, rcm.Trocar(*np.ones((3, 4)))),
-        r"trocar: expected fields of shape \[\] or \[B\]": (good, rcm.Trocar(*np.ones((3, 1, 1)))),
+        r"observation.pose.R: expected shape \[4, 2, 3, 3\]": (
+            good,
+            rcm.Trocar(*np.full((3, 4), 0.1)),
+        ),
+        r"trocar: expected fields of shape \[\] or \[B\]": (
+            good,
+            rcm.Trocar(*np.full((3, 1, 1), 0.1)),
+        ),
     }
     if kind == "image":
         bright = good.replace(image=good.image / np.float32(255))
@@ -99,9 +108,9 @@ def test_a_mistake_names_the_array(made):
 def test_numbers_that_no_robot_measures_are_refused(made):
     path, trained, _ = made
     deployed, key = deploy.load(path), jax.random.key(0)
-    good, port = observed(trained.policy, ()), rcm.Trocar(0.02, 1.4, 0.8)
+    good = observed(trained.policy, ())
 
-    def refused(message, observation=good, trocar=port):
+    def refused(message, observation=good, trocar=PORT):
         with pytest.raises(ValueError, match=message):
             deployed(key, observation, trocar)
 
@@ -115,16 +124,62 @@ def test_numbers_that_no_robot_measures_are_refused(made):
         refused("pose.R: expected rotations", good.replace(pose=good.pose._replace(R=R)))
     refused(r"trocar.radius: expected at most 0.5 m, got 14", trocar=rcm.Trocar(14.0, 1.4, 0.8))
     refused("trocar: expected an rcm.Trocar, got list", trocar=[0.02, 1.4, 0.8])
-    deployed(key, good, port)
+    refused("observation.gripper: .*, got 3.6", good.replace(gripper=3.6 * good.gripper))
+    in_mm = good.replace(pose=good.pose._replace(p=1e3 * good.pose.p))
+    refused("observation.pose.p: expected tips within 0.5 m", in_mm)
+    other = jax.tree.map(lambda field: field[4], rcm.TROCARS)
+    refused("an axis that misses it by .* mm", trocar=other)
+    with pytest.raises(ValueError, match=r"trocar.radius: expected at most 0.5 m, got 14"):
+        jax.jit(lambda key: deployed(key, good, PORT._replace(radius=14.0)))(key)
+    deployed(key, good, PORT)
+
+
+def test_what_the_policy_does_not_look_at_is_not_looked_at(made):
+    path, trained, _ = made
+    deployed, key, good = deploy.load(path), jax.random.key(0), observed(trained.policy, ())
+    wanted = deployed(key, good, PORT)
+    unused = "state" if trained.policy.observation == "image" else "image"
+    more = good.replace(**{unused: np.full((2, 12), np.nan)}, features=np.zeros((2, 5)))
+    jax.tree.map(np.testing.assert_array_equal, deployed(key, more, PORT), wanted)
+    lists = jax.tree.map(lambda x: x.tolist() if x.dtype != np.uint8 else list(x), good)
+    jax.tree.map(np.testing.assert_array_equal, deployed(key, lists, PORT), wanted)
+
+
+def test_a_tool_half_a_turn_away_is_the_same_tool(made):
+    path, trained, _ = made
+    deployed, key, good = deploy.load(path), jax.random.key(0), observed(trained.policy, ())
+    half = np.diag([-1.0, -1.0, 1.0]).astype(np.float32)
+    turned = good.replace(pose=good.pose._replace(R=good.pose.R @ half))
+    wanted, got = deployed(key, good, PORT), deployed(key, turned, PORT)
+    np.testing.assert_array_equal(got.pose.p, wanted.pose.p)
+    np.testing.assert_array_equal(got.pose.R, wanted.pose.R @ half)
+
+
+def test_methods_that_share_weights_are_each_deployed(made, tmp_path):
+    _, trained, _ = made
+    stats = normalizer.fit(METHODS["dp_ee"], fakes.dataset(0), fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.P_WORLD_REF, TRAIN)
+    params = jax.jit(policy.init)(jax.random.key(0))
+    file = tmp_path / "policy.safetensors"
+    export.save(file, trained._replace(method="dp_ee", params=params, normalizer=stats))
+    off = {}
+    for name in ("dp_ee", "dp_ee_proj"):
+        deployed = deploy.load(file, method=name)
+        pose = deployed(jax.random.key(0), observed(trained.policy, ()), PORT).pose
+        off[name] = rcm.rcm_error(pose, rcm.trocar_position(PORT, fakes.P_WORLD_REF)).max()
+    assert deployed.method == "dp_ee_proj" and off["dp_ee_proj"] < 1e-6 < 1e-3 < off["dp_ee"]
+    assert deploy.load(file).method == "dp_ee"
+    with pytest.raises(ValueError, match=r"method: expected one of dp_ee, dp_ee_proj, got 'star"):
+        deploy.load(file, method="stardiff")
 
 
 def test_a_file_that_will_not_do_is_named(made, tmp_path):
     path, trained, _ = made
     with pytest.raises(ValueError, match=r"^policy: expected a file or one of .*compact, got no"):
         deploy.load("no")
-    with pytest.raises(ValueError, match=r"ddim_steps: expected 1 to .*, got 0"):
-        deploy.load(path, ddim_steps=0)
-    assert deploy.load(path, ddim_steps=1).settings.ddim_steps == 1
+    with pytest.raises(ValueError, match=r"ddim_steps: expected 2 to .*, got 1"):
+        deploy.load(path, ddim_steps=1)
+    assert deploy.load(path, ddim_steps=2).settings.ddim_steps == 2
     small = {"unet": {"kernel": jnp.ones(3)}}
     export.save(tmp_path / "p", trained._replace(p_world_ref=None, params=small))
     with pytest.raises(ValueError, match="nominal port"):

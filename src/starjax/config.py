@@ -45,6 +45,10 @@ class DemosConfig:
     max_steps: int = 600  # control steps at 30 Hz an expert may take
 
 
+# One DDIM step alone returns the noise that it began with (`models.schedule.ddim_table`).
+FEWEST_DDIM_STEPS = 2
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PolicyConfig:
     """Networks and diffusion (IV-G)."""

@@ -24,7 +24,9 @@ from starjax.types import Command, Pose
 
 __all__ = ["FARTHEST", "Command", "Deployed", "Observation", "Pose", "load"]
 
-FARTHEST = 0.5  # m, of a trocar from the nominal port: farther away are millimetres for metres
+FARTHEST = 0.5  # m, of trocar or tip from the nominal port: farther are millimetres for metres
+FARTHEST_OFF = 0.02  # m, of the trocar from the measured axis: farther is another port or frame
+_WIDEST = 1.1  # of the gripper's [-1, 1], with what a sensor is off
 _SKEW = 0.05  # of R'R from the identity: what rounding and calibration leave is far below
 
 
@@ -56,21 +58,30 @@ class Deployed:
           observation: of the last O moments, oldest first, fields `[O, ...]` or `[B, O, ...]`.
           trocar: where the port is, fields `[]` or `[B]`, which broadcast.
 
+        Jaws are the same after half a turn, so a tool that is turned by more than a quarter (of
+        `rcm.roll_of`), which no demonstration shows, is read and commanded as half a turn back.
+
         Returns:
           Command `[H]` or `[B, H]`: tip poses in the world frame, all of them on the RCM manifold
           (but for `dp_ee`), and the gripper's openings.
 
         Raises:
-          ValueError: an array has another shape or type than expected, a number is not finite, a
-            rotation is none, or the trocar is none, or farther than `FARTHEST` from the nominal
-            port.
+          ValueError: an array has another shape or type than expected, a number is not finite or
+            none that is measured so, a rotation is none, the trocar is none, tip or trocar are
+            farther than `FARTHEST` from the nominal port, or, of a policy that keeps to the RCM
+            manifold, the tool's axis is farther than `FARTHEST_OFF` from the trocar. Values that
+            jax traces are not looked at.
         """
         if not isinstance(trocar, rcm.Trocar):
             raise ValueError(f"trocar: expected an rcm.Trocar, got {type(trocar).__name__}")
-        trocar = rcm.Trocar(*jnp.broadcast_arrays(*rcm.check_trocar(trocar)))
+        trocar = rcm.check_trocar(trocar)
+        if not _is_traced(trocar.radius) and (radius := np.max(trocar.radius)) > FARTHEST:
+            raise ValueError(f"trocar.radius: expected at most {FARTHEST} m, got {radius:g}")
+        trocar = rcm.Trocar(*jnp.broadcast_arrays(*trocar))
         robots = np.shape(trocar.radius)
+        observation = self._given(observation)
         self._check(observation, robots)
-        _check_values(observation, trocar)
+        self._check_values(observation, trocar)
         keys = jax.random.split(key, robots[0]) if robots else key[None]
         if not robots:
             observation, trocar = jax.tree.map(
@@ -78,6 +89,13 @@ class Deployed:
             )
         command = self._sample(*self._weights, keys, observation, trocar)
         return command if robots else jax.tree.map(lambda x: x[0], command)
+
+    def _given(self, observation: Observation) -> Observation:
+        """What the policy looks at, as arrays."""
+        pose, kind = Pose(*map(_array, observation.pose)), self.settings.observation
+        seen = getattr(observation, kind)
+        seen = {kind: None if seen is None else _array(seen)}
+        return Observation(pose=pose, gripper=_array(observation.gripper), **seen)
 
     def _check(self, observation: Observation, robots: tuple[int, ...]) -> None:
         if len(robots) > 1:
@@ -99,42 +117,81 @@ class Deployed:
         if "image" in given and (dtype := jnp.result_type(given["image"])) != jnp.uint8:
             raise ValueError(f"observation.image: expected uint8, got {dtype}")
 
+    def _check_values(self, observation: Observation, trocar: rcm.Trocar) -> None:
+        """Raises ValueError for what no robot measures: a policy would plan on from there."""
+        given = {
+            "pose.R": observation.pose.R,
+            "pose.p": observation.pose.p,
+            "gripper": observation.gripper,
+            "state": observation.state,
+        }
+        known = {k: np.asarray(v) for k, v in given.items() if v is not None and not _is_traced(v)}
+        for name, value in known.items():
+            if not np.isfinite(value).all():
+                raise ValueError(
+                    f"observation.{name}: expected finite numbers, got some that are not"
+                )
+        if (R := known.get("pose.R")) is not None:
+            off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max()
+            if off > _SKEW or (np.linalg.det(R) < 0).any():
+                raise ValueError(
+                    f"observation.pose.R: expected rotations, got one off by {off:.2g}"
+                )
+        if (p := known.get("pose.p")) is not None:
+            far = np.linalg.norm(p - self.p_world_ref, axis=-1).max()
+            if far > FARTHEST:
+                raise ValueError(
+                    f"observation.pose.p: expected tips within {FARTHEST} m of the nominal port "
+                    f"{self.p_world_ref.tolist()}, got one {far:.3g} m away"
+                )
+        if (gripper := known.get("gripper")) is not None and np.abs(gripper).max() > _WIDEST:
+            raise ValueError(
+                "observation.gripper: expected numbers from -1 (closed) to 1 (open), "
+                f"got {gripper.flat[np.abs(gripper).argmax()]:.3g}"
+            )
+        traced = map(_is_traced, (*observation.pose, *trocar))
+        if self._keeps_to_manifold and not any(traced):
+            off = float(_largest_miss(observation.pose, trocar, self.p_world_ref))
+            if off > FARTHEST_OFF:
+                raise ValueError(
+                    "observation.pose: expected tools through the trocar, "
+                    f"got an axis that misses it by {1e3 * off:.0f} mm"
+                )
 
-def _check_values(observation: Observation, trocar: rcm.Trocar) -> None:
-    """Raises ValueError for what no robot measures: a policy would make a plausible plan of it."""
-    given = {
-        "pose.R": observation.pose.R,
-        "pose.p": observation.pose.p,
-        "gripper": observation.gripper,
-        "state": observation.state,
-    }
-    known = {k: np.asarray(v) for k, v in given.items() if v is not None and not _is_traced(v)}
-    for name, value in known.items():
-        if not np.isfinite(value).all():
-            raise ValueError(f"observation.{name}: expected finite numbers, got some that are not")
-    if (R := known.get("pose.R")) is not None:
-        off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max()
-        if off > _SKEW or (np.linalg.det(R) < 0).any():
-            raise ValueError(f"observation.pose.R: expected rotations, got one off by {off:.2g}")
-    if not _is_traced(trocar.radius) and (radius := np.max(trocar.radius)) > FARTHEST:
-        raise ValueError(f"trocar.radius: expected at most {FARTHEST} m, got {radius:g}")
+    @property
+    def _keeps_to_manifold(self) -> bool:
+        row = methods.METHODS[self.method]
+        return row.projects or row.action_space != "se3"
+
+
+@jax.jit
+def _largest_miss(pose: Pose, trocar: rcm.Trocar, p_world_ref: Any) -> jax.Array:
+    """m, of trocars `[...]` from the axes of tools `[..., O]`."""
+    through = rcm.trocar_position(trocar, p_world_ref)
+    return jnp.max(rcm.rcm_error(pose, through[..., None, :]))
+
+
+def _array(value: Any) -> Any:
+    return value if isinstance(value, jax.Array) else np.asarray(value)
 
 
 def _is_traced(value: Any) -> bool:
     return isinstance(value, core.Tracer)
 
 
-def load(policy: str | Path, ddim_steps: int | None = None) -> Deployed:
+def load(policy: str | Path, ddim_steps: int | None = None, method: str | None = None) -> Deployed:
     """A policy from its file.
 
     Args:
       policy: a policy.safetensors, or the name of one that ships with starjax, such as "compact".
       ddim_steps: denoising steps of a decision, those of its training's settings unless given:
         fewer are faster.
+      method: of several with the same weights the one to run: `dp_ee_proj` runs those of `dp_ee`.
+        By default the one that trained them.
 
     Raises:
-      ValueError: there is no such file, it is damaged or of another version, or `ddim_steps` is
-        out of range.
+      ValueError: there is no such file, it is damaged or of another version, `ddim_steps` is out
+        of range, or `method` has other weights.
     """
     path = packaged.find("policy", str(policy))
     trained = export.load(path)
@@ -142,14 +199,32 @@ def load(policy: str | Path, ddim_steps: int | None = None) -> Deployed:
         raise ValueError(f"policy: expected one that says its nominal port, got {path}")
     settings = trained.policy
     if ddim_steps is not None:
-        if not 1 <= ddim_steps <= settings.diffusion_steps:
-            most = settings.diffusion_steps
-            raise ValueError(f"ddim_steps: expected 1 to {most}, got {ddim_steps}")
+        most = settings.diffusion_steps
+        fewest = min(config.FEWEST_DDIM_STEPS, most)
+        if not fewest <= ddim_steps <= most:
+            raise ValueError(f"ddim_steps: expected {fewest} to {most}, got {ddim_steps}")
         settings = dataclasses.replace(settings, ddim_steps=ddim_steps)
     options.choice(f"{path}: method", trained.method, methods.METHODS)
-    row = methods.METHODS[trained.method]
+    method = method or trained.method
+    sharing = [name for name, row in methods.METHODS.items() if row.weights_of == trained.method]
+    options.choice("method", method, sharing)
+    row = methods.METHODS[method]
     port = np.asarray(trained.p_world_ref, np.float32)
     made = policies.make(row, settings, port, trained.train)
     params = policies.for_sampling(trained.params, settings.dtype)
     weights = jax.device_put((params, trained.normalizer))
-    return Deployed(trained.method, settings, port, jax.jit(made.sample), weights)
+    return Deployed(method, settings, port, jax.jit(_half_turned(made.sample)), weights)
+
+
+def _half_turned(sample: Callable[..., Command]) -> Callable[..., Command]:
+    """`sample`, with tools that are turned by more than a quarter half a turn back."""
+
+    def decide(params, stats, keys, observation: Observation, trocar: rcm.Trocar) -> Command:
+        now = rcm.roll_of(observation.pose.R[:, -1])
+        sign = jnp.where(jnp.abs(now) > jnp.pi / 2, -1.0, 1.0)[:, None, None, None]
+        half = jnp.concatenate([sign, sign, jnp.ones_like(sign)], axis=-1)  # of x, y and z
+        pose = observation.pose._replace(R=observation.pose.R * half)
+        command = sample(params, stats, keys, observation.replace(pose=pose), trocar)
+        return command._replace(pose=command.pose._replace(R=command.pose.R * half))
+
+    return decide

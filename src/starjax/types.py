@@ -9,7 +9,8 @@ class Pose(NamedTuple):
     """A rigid pose; the frames are in the variable's name, e.g. `pose_world_tip`.
 
     Attributes:
-      R: `[..., 3, 3]` rotation matrix; its third column is the tool's axis, distal.
+      R: `[..., 3, 3]` rotation matrix; its third column is the tool's axis, distal, its second the
+        direction in which the jaws open.
       p: `[..., 3]` position of the tip (jaw centre) in m.
     """
 

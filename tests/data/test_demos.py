@@ -353,6 +353,9 @@ def test_place_depends_on_what_is_free(monkeypatch):
     monkeypatch.setattr(load.xla, "available_bytes", lambda: 1000)
     # on a CPU there are two copies for a moment, in the same memory
     assert [load._place(n) for n in (299, 599, 700)] == ["device", "host", "disk"]
+    # and each of several devices has one
+    monkeypatch.setattr(load.jax, "local_device_count", lambda: 2)
+    assert [load._place(n) for n in (149, 151)] == ["device", "host"]
 
 
 def test_nothing_is_unpickled(pictures, tmp_path):

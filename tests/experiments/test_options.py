@@ -66,6 +66,7 @@ def settings(*argv: str) -> config.RunConfig:
         (["--eval.time-limit-s", "86401"], ["--eval.time-limit-s", "0.1 to 86400 s", "86401"]),
         (["--eval.trials", "0"], ["--eval.trials", "1 to 1000000", "got 0"]),
         (["--eval.trials", "1000001"], ["--eval.trials", "1 to 1000000", "1000001"]),
+        (["--policy.ddim-steps", "1"], ["--policy.ddim-steps", "2 to", "= 100", "got 1"]),
         (["--policy.time-dim", "2"], ["--policy.time-dim", "even", "4 or more", "got 2"]),
         (["--policy.time-dim", "65"], ["--policy.time-dim", "even", "4 or more", "got 65"]),
         (["--policy.kernel-size", "4"], ["--policy.kernel-size", "an odd number", "got 4"]),

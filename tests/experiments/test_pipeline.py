@@ -135,6 +135,17 @@ def test_plan_names_the_observation_and_the_flag(tmp_path):
     assert "image, 64 px" in said and "from scratch" in said and "state" not in said
 
 
+def test_plan_says_where_devices_cannot_share_a_batch(monkeypatch):
+    smoke = presets.PRESETS["smoke"]
+    assert "devices" not in words.plan(smoke, pipeline.STAGES)
+    monkeypatch.setattr("jax.device_count", lambda: 8)
+    monkeypatch.setattr(
+        "starjax.training.devices.make_mesh", lambda _: types.SimpleNamespace(size=5)
+    )
+    assert "on 5 of 8 devices" in words.plan(smoke, pipeline.STAGES)
+    assert "on 5 of 8 devices" not in words.plan(smoke, ("collect",))
+
+
 def test_plan_and_warnings_say_that_an_encoder_is_frozen():
     cpu = presets.PRESETS["cpu"]
     said = "frozen, from compact (pretrained on this task); small"

@@ -99,9 +99,12 @@ def test_samples_are_finite_with_broken_weights(made, name):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(command))
 
 
-def test_samples_reach_as_far_as_the_normaliser_says(made):
+@pytest.mark.parametrize("hierarchical", [False, True])
+def test_samples_reach_as_far_as_the_normaliser_says(dataset, hierarchical, monkeypatch):
     """A position that counts from the port may be farther than any demonstration's was."""
-    it = made("dp_rcm2")
+    row = METHODS["stardiff" if hierarchical else "dp_rcm2"]._replace(action_space="rcm2")
+    monkeypatch.setitem(METHODS, "row", row)
+    it = Made("row", dataset)
     part = rcm.ACTION_SPACES["rcm2"].slices["p"]
     lifted = it.stats.replace(action=it.stats.action.replace(reach=it.stats.action.reach + 3.0))
     arguments = jax.random.split(jax.random.key(1), B), it.batch.observation, it.batch.trocar

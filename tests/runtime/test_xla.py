@@ -92,6 +92,14 @@ def test_a_platform_that_jax_cannot_use_is_a_mistake():
         assert name in found.stderr and "Traceback" not in found.stderr
 
 
+def test_random_numbers_that_depend_on_their_neighbours_are_refused():
+    code = "from starjax.runtime import xla; xla.require_devices()"
+    environment = _env(JAX_DEFAULT_PRNG_IMPL="rbg")
+    command = [sys.executable, "-c", code]
+    found = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert "UsageError: JAX_DEFAULT_PRNG_IMPL: expected threefry2x32, got rbg" in found.stderr
+
+
 def _container(monkeypatch, tmp_path, line, group, names, values):
     """A process whose control group has this limit, use, and cache in use, in GB."""
     folder = tmp_path / "groups" / group

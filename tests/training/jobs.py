@@ -23,15 +23,24 @@ SETTINGS = config.TrainConfig(
 )
 
 
-def train(directory, settings=SETTINGS, host=False, observation="state", dtype="float32", **kwargs):
-    """A whole training run on fake demonstrations."""
+def train(
+    directory,
+    settings=SETTINGS,
+    host=False,
+    observation="state",
+    dtype="float32",
+    seed=0,
+    demos=0,
+    **kwargs,
+):
+    """A whole training run on fake demonstrations of the seed `demos`."""
     import jax
     import numpy as np
 
     from starjax.training import loop
 
     size = fakes.TINY.image_size if observation == "image" else 0
-    dataset = fakes.dataset(seed=0, image_size=size)
+    dataset = fakes.dataset(seed=demos, image_size=size)
     if host:
         dataset = jax.tree.map(np.asarray, dataset)
     return loop.run(
@@ -41,7 +50,7 @@ def train(directory, settings=SETTINGS, host=False, observation="state", dtype="
         dataset,
         fakes.P_WORLD_REF,
         directory,
-        0,
+        seed,
         **kwargs,
     )
 

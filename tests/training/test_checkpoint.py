@@ -93,6 +93,19 @@ def test_truncated_or_missing_file_is_named(three):
     damage_of_every_file(three, 30, lambda f, c: f.unlink(), seen)
 
 
+def test_a_file_that_the_disk_does_not_give_back_costs_its_step(three, monkeypatch):
+    lost, sha256 = files_of(three, 30)[-1], checkpoint.files.sha256
+
+    def read(file):
+        if file == lost:
+            raise OSError(errno.EIO, "Input/output error")
+        return sha256(file)
+
+    monkeypatch.setattr(checkpoint.files, "sha256", read)
+    with pytest.warns(UserWarning, match=f"step 30 is damaged: .*{lost.name} cannot be read"):
+        assert checkpoint.restore(three, state(0))[0] == 20
+
+
 def test_all_damaged_is_a_fresh_start(three):
     for step in (20, 30):
         files_of(three, step)[-1].write_bytes(b"x")

@@ -203,6 +203,19 @@ def test_a_finished_run_is_only_loaded(whole, monkeypatch):
     assert (directory / "metrics.jsonl").read_bytes() == before
 
 
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"seed": 5}, "a training of another seed"),
+        ({"demos": 7}, "a training of other demonstrations"),
+        ({"settings": dataclasses.replace(jobs.SETTINGS, steps=6)}, "12 steps, expected at most 6"),
+    ],
+)
+def test_another_training_is_not_taken_for_this_one(whole, changed, message):
+    with pytest.raises(ValueError, match=f"{whole[0]}: holds {message}"):
+        jobs.train(whole[0], **changed)
+
+
 def test_damaged_checkpoint_costs_only_its_steps(whole, tmp_path):
     directory, result = whole
     shutil.copytree(directory, tmp_path, dirs_exist_ok=True)

@@ -136,8 +136,8 @@ def _place(total: int) -> str:
     host = xla.available_bytes()
     stats = device.memory_stats() or {}
     free = stats.get("bytes_limit", 2 * host) - stats.get("bytes_in_use", 0)
-    if device.platform == "cpu":  # jax copies them within the same memory
-        free = HOST_SHARE * host
+    if device.platform == "cpu":  # jax copies them within the same memory, for each device
+        free = HOST_SHARE * host / jax.local_device_count()
     # Frames pass through host memory on their way to the device.
     if total <= DEVICE_SHARE * free and total <= HOST_SHARE * host:
         return "device"

@@ -87,14 +87,15 @@ def _check_networks(policy: config_lib.PolicyConfig) -> None:
 
 def _check_sampling(policy: config_lib.PolicyConfig) -> None:
     executed = f"at most policy.horizon = {policy.horizon}"
-    steps = f"1 to policy.diffusion-steps = {policy.diffusion_steps}"
+    fewest = min(config_lib.FEWEST_DDIM_STEPS, policy.diffusion_steps)
+    steps = f"{fewest} to policy.diffusion-steps = {policy.diffusion_steps}"
     expect(policy.execute <= policy.horizon, "policy.execute", executed, policy.execute)
     observed = f"at most policy.execute + 1 = {policy.execute + 1}"
     expect(
         policy.obs_horizon <= policy.execute + 1, "policy.obs-horizon", observed, policy.obs_horizon
     )
     expect(
-        1 <= policy.ddim_steps <= policy.diffusion_steps,
+        fewest <= policy.ddim_steps <= policy.diffusion_steps,
         "policy.ddim-steps",
         steps,
         policy.ddim_steps,

@@ -21,7 +21,7 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
         *(f"  ablation        {what}" for what in _ablations(config.method, config.policy)),
         _learning_from(config.demos),
     ]
-    lines += [_training(config)] if "train" in stages else []
+    lines += [_training(config), *_idle(config.train.batch_size)] if "train" in stages else []
     lines += [_evaluation(config.eval)] if "evaluate" in stages else []
     return "\n".join(lines)
 
@@ -58,6 +58,18 @@ def _training(config: config_lib.RunConfig) -> str:
     dtype = "" if policy.dtype == "float32" else f", {policy.dtype}"
     steps = f"{train.steps} steps of {train.batch_size}"
     return f"  training        {steps}, U-Net {channels}{dtype}"
+
+
+def _idle(batch_size: int) -> list[str]:
+    """A line if some devices cannot share a batch."""
+    import jax
+
+    from starjax.training import devices
+
+    used, there = devices.make_mesh(batch_size).size, jax.device_count()
+    if used == there:
+        return []
+    return [f"                  on {used} of {there} devices, as the batch must divide by them"]
 
 
 def _evaluation(evaluation: config_lib.EvalConfig) -> str:
@@ -142,14 +154,16 @@ def outcome(results: Sequence[Mapping[str, Any]]) -> str:
     """Seen against unseen trocars, one line a method, for the end of a run."""
     rows = [("success [95% interval]", "seen", "unseen", "safe", "RCM executed")]
     for result in results:
-        error = result["rcm_error_mm"]
+        error = result["rcm_error_mm"]["executed"]
+        # results of earlier versions do not have it
+        within = result["rcm_error_mm"].get("within_steps", error)
         rows.append(
             (
                 methods.METHODS[result["method"]].label,
                 _rate(result["seen"]),
                 _rate(result["unseen"]),
                 _rate(result["safe"]["all"]),
-                f"{error['executed']['mean']:.3f} mm, at most {error['within_steps']['max']:.2f}",
+                f"{error['mean']:.3f} mm, at most {within['max']:.2f}",
             )
         )
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]

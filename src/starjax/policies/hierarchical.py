@@ -138,7 +138,9 @@ def make(
         )
         extra = features.extra(method, trocar, p_world_ref)
         observed = model.observe(params["diffuser"], inputs)
-        x0 = model.sample(params["diffuser"], keys, observed, extra)
+        reach = stats.action.reach
+        reach = None if reach is None else reach[:, diffused]
+        x0 = model.sample(params["diffuser"], keys, observed, extra, reach)
         p, gripper = x0[..., :3], x0[..., 3:]
         about = features.trocar_features(trocar, p_world_ref)
         gamma = rolls_along(params, p, about, measured[..., roll], observed)

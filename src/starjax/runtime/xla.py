@@ -19,6 +19,7 @@ from starjax.runtime import threads
 
 _GROUPS, _GROUPS_OF_THIS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
+_GENERATOR = "threefry2x32"  # under `vmap` a number depends on its own key alone
 _PACKAGES = (
     "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "numpy", "scipy",
 )  # fmt: skip
@@ -74,9 +75,16 @@ def require_devices(*modules: str) -> None:
     """Starts jax, and beside it, because a GPU takes two seconds, imports these modules.
 
     Raises:
-      config.UsageError: it cannot use what JAX_PLATFORMS asks for.
+      config.UsageError: it cannot use what JAX_PLATFORMS asks for, or its random numbers would
+        depend on what is computed beside them.
     """
     import jax
+
+    if (generator := jax.config.jax_default_prng_impl) != _GENERATOR:
+        raise config.UsageError(
+            f"JAX_DEFAULT_PRNG_IMPL: expected {_GENERATOR}, got {generator}: with it a trial would "
+            "depend on those beside it"
+        )
 
     def start() -> None:
         for device in jax.local_devices():

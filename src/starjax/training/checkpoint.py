@@ -125,11 +125,13 @@ def verify(path: str | os.PathLike) -> dict[str, Any]:
         file = root / name
         if not file.is_file():
             raise DamagedCheckpoint(f"{file} is missing")
-        if file.stat().st_size != expected["bytes"]:
-            raise DamagedCheckpoint(
-                f"{file} has {file.stat().st_size} bytes, expected {expected['bytes']}"
-            )
-        if files.sha256(file) != expected["sha256"]:
+        try:
+            size, digest = file.stat().st_size, files.sha256(file)
+        except OSError as error:
+            raise DamagedCheckpoint(f"{file} cannot be read ({error})") from error
+        if size != expected["bytes"]:
+            raise DamagedCheckpoint(f"{file} has {size} bytes, expected {expected['bytes']}")
+        if digest != expected["sha256"]:
             raise DamagedCheckpoint(f"{file} has another content than was written (sha256)")
     return manifest
 

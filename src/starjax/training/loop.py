@@ -79,6 +79,8 @@ def run(
       Interrupted: after `should_stop`.
       TrainingFailed: no step of a whole stretch of the log was finite.
       StorageError: the disk is full.
+      ValueError: the directory holds a training of another seed, of other demonstrations, or of
+        more steps.
     """
     directory = pathlib.Path(directory)
     log = directory / "metrics.jsonl"
@@ -107,6 +109,8 @@ def run(
     if state is None:
         state = states.run_once(around, _begun(drawn(), policy_config, train_config))
         state = devices.replicate(state, mesh)
+    else:
+        _check_same(directory, state, states.keys(seed)[1], stats, train_config.steps)
     del drawn  # it holds what was drawn
     step = saved = int(state.step)
     judge = None
@@ -182,6 +186,16 @@ def _restored(checkpoints, like) -> states.TrainState | None:
             f"{checkpoints.parent}: processes see other checkpoints; is the folder shared?"
         )
     return None if restored is None else restored[1]
+
+
+def _check_same(directory, state, key, stats, steps) -> None:
+    """Raises ValueError for a state of another training."""
+    if not np.array_equal(jax.random.key_data(state.key), jax.random.key_data(key)):
+        raise ValueError(f"{directory}: holds a training of another seed")
+    if not all(map(np.array_equal, jax.tree.leaves(state.normalizer), jax.tree.leaves(stats))):
+        raise ValueError(f"{directory}: holds a training of other demonstrations")
+    if int(state.step) > steps:
+        raise ValueError(f"{directory}: holds {state.step} steps, expected at most {steps}")
 
 
 def _begun(drawn, policy_config, train_config) -> policies.Params:

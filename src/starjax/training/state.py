@@ -85,7 +85,7 @@ def init(policy: Policy, seed: int) -> Init:
         place = jax.local_devices(backend="cpu")[0]
     except RuntimeError:  # JAX_PLATFORMS leaves it out
         place = jax.local_devices()[0]
-    key = jax.device_put(_keys(seed)[0], place)
+    key = jax.device_put(keys(seed)[0], place)
     with garbage.kept():
         return Init(_quick(policy.init).trace(key), key)
 
@@ -118,7 +118,7 @@ def create(
       stats: fitted to the training frames.
       seed: of everything random.
     """
-    _, key = _keys(seed)
+    _, key = keys(seed)
     names = ["loss", "gradient_norm", "taken", "skipped", *policy.metrics]
     return TrainState(
         step=jnp.int32(0),
@@ -137,6 +137,6 @@ def ema_decay(step: jax.Array, ema_max: float) -> jax.Array:
     return jnp.minimum(1.0 - (1.0 + step) ** -0.75, ema_max)
 
 
-def _keys(seed: int) -> jax.Array:
+def keys(seed: int) -> jax.Array:
     """Keys of the parameters and of the steps."""
     return jax.random.split(jax.random.key(seed))

@@ -52,7 +52,8 @@ PHASES_NOTE = (
 _QUANTILES = ("p50", "p95", "p99")
 _COMPILE = ": compile"  # ends the name of a phase's share spent compiling
 INFERENCE_NOTE = (
-    "One decision for one environment: observation in, commands out; compiling is not counted."
+    "One decision for one environment: observation in, commands out; compiling is not counted. "
+    "One DDIM step is a time only: its plan is the noise that it began with."
 )
 
 
