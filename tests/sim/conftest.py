@@ -24,10 +24,20 @@ def environment() -> envs.Env:
 
 @pytest.fixture(scope="session")
 def reset(environment):
-    """`seed -> EnvState` of the twelve trocars."""
-    params = envs.EnvParams(rcm.Trocar(*(jnp.asarray(field) for field in rcm.TROCARS)))
+    """`seed -> EnvState` of the twelve trocars, or of others."""
     compiled = jax.jit(jax.vmap(environment.reset))
-    return lambda seed: compiled(jax.random.split(jax.random.key(seed), LANES), params)
+
+    def reset(seed, trocars=rcm.TROCARS):
+        params = envs.EnvParams(rcm.Trocar(*(jnp.asarray(field) for field in trocars)))
+        return compiled(jax.random.split(jax.random.key(seed), LANES), params)
+
+    return reset
+
+
+@pytest.fixture(scope="session")
+def step(environment):
+    """`(state, command) -> the state after one control step`."""
+    return jax.jit(jax.vmap(environment.step))
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,6 @@ from starjax import rcm
 from starjax.sim import env as envs
 from starjax.sim import physics
 from starjax.sim.tasks import expert, peg_transfer
-from starjax.types import Command
 
 STEPS = 330  # control steps: 11 s, longer than the expert takes
 
@@ -96,16 +95,6 @@ def test_a_diverged_lane_is_frozen_and_leaves_its_neighbours_alone(reset, begin,
         ours, theirs = (np.asarray(getattr(s.sim, name))[~sick] for s in (state, broken))
         np.testing.assert_array_equal(ours, theirs)
     assert int(broken.step[2]) == 0, "the last sound state is kept"
-
-
-def test_a_command_that_is_not_finite_holds_the_arm(environment, reset):
-    state = jax.tree.map(lambda leaf: leaf[0], reset(1))
-    held = Command(jax.tree.map(lambda x: x * jnp.nan, state.pose), jnp.ones(()))
-    after = jax.jit(environment.step)(state, held)
-    assert not after.invalid
-    np.testing.assert_array_equal(after.q_target, state.q_target)
-    assert np.isinf(after.ik_error)
-    assert float(jnp.linalg.norm(after.pose.p - state.pose.p)) < 1e-4
 
 
 def test_the_same_key_gives_the_same_episode_and_another_another(reset):

@@ -57,6 +57,18 @@ def test_a_chain_that_does_not_begin_where_it_should_is_named(sim):
         ik.chain_of(sim.mj_model, first="robot/first", site="robot/tool/tcp")
 
 
+@pytest.mark.parametrize("turn", [[-1, -1, 1], [1, -1, -1], [-1, 1, -1]])
+def test_half_a_turn_is_as_far_as_it_is(sim, turn):
+    q = jnp.asarray(sim.home)
+    pose, _, _ = ik.forward(sim.arm, q)
+    target = Pose(pose.R @ np.diag(np.float32(turn)), pose.p)
+    far = np.pi * ik.ROTATION_WEIGHT
+    np.testing.assert_allclose(ik.residual(sim.arm, target, q), far, rtol=1e-4)
+    if turn[2] == 1:  # the jaws exchanged, which the last joint can do but for its limit
+        _, residual = ik.solve(sim.arm, target, q, 40)
+        assert residual < 0.05 * far
+
+
 def test_joints_stay_within_their_limits(sim):
     out_of_reach = Pose(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))
     q, residual = ik.solve(sim.arm, out_of_reach, jnp.asarray(sim.home), 40)
@@ -69,7 +81,7 @@ def test_a_near_command_is_reached_at_once():
     here = on_manifold(trocar, jnp.array([0.01, 0.0, 0.03]), 0.1)
     there = on_manifold(trocar, jnp.array([0.0105, 0.0003, 0.0298]), 0.12)
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
-    pose, _ = tracking.toward(here, jnp.zeros(4), there, port, PERIOD)
+    pose, _ = tracking.toward(here, jnp.zeros(7), there, port, PERIOD)
     np.testing.assert_array_equal(pose.R, there.R)
     np.testing.assert_array_equal(pose.p, there.p)
 
@@ -79,7 +91,7 @@ def test_a_far_command_is_approached_along_the_manifold():
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     pose = on_manifold(trocar, jnp.array([-0.04, 0.02, 0.05]), -1.0)
     goal = on_manifold(trocar, jnp.array([0.04, -0.03, 0.01]), 1.0)
-    velocity, toward = jnp.zeros(4), jax.jit(tracking.toward, static_argnums=4)
+    velocity, toward = jnp.zeros(7), jax.jit(tracking.toward, static_argnums=4)
     for _ in range(60):
         before, last = pose, velocity
         pose, velocity = toward(pose, velocity, goal, port, PERIOD)
@@ -97,7 +109,7 @@ def test_a_command_off_the_manifold_stays_off_it():
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     good = on_manifold(trocar, jnp.array([0.0, 0.0, 0.03]), 0.0)
     bad = Pose(good.R, good.p + 0.02 * good.R[:, 0])
-    pose, velocity = bad, jnp.zeros(4)
+    pose, velocity = bad, jnp.zeros(7)
     for _ in range(5):
         pose, velocity = tracking.toward(pose, velocity, bad, port, PERIOD)
     np.testing.assert_allclose(rcm.rcm_error(pose, port), 0.02, atol=1e-5)
@@ -109,7 +121,7 @@ def test_a_far_command_off_the_manifold_is_missed_by_a_share_on_the_way():
     pose = on_manifold(trocar, jnp.array([-0.04, 0.0, 0.03]), 0.0)
     good = on_manifold(trocar, jnp.array([0.04, 0.0, 0.03]), 0.0)
     bad = Pose(good.R, good.p + 0.02 * good.R[:, 1])
-    velocity, toward = jnp.zeros(4), jax.jit(tracking.toward, static_argnums=4)
+    velocity, toward = jnp.zeros(7), jax.jit(tracking.toward, static_argnums=4)
     errors = []
     for _ in range(60):
         pose, velocity = toward(pose, velocity, bad, port, PERIOD)
@@ -122,7 +134,7 @@ def test_the_roll_is_turned_no_faster_than_allowed():
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     pose, goal = (on_manifold(trocar, jnp.array([0.0, 0.0, 0.03]), roll) for roll in (-1.5, 1.5))
-    velocity, toward = jnp.zeros(4), jax.jit(tracking.toward, static_argnums=4)
+    velocity, toward = jnp.zeros(7), jax.jit(tracking.toward, static_argnums=4)
     spins = [0.0]
     for _ in range(40):
         pose, velocity = toward(pose, velocity, goal, port, PERIOD)

@@ -29,7 +29,8 @@ def rotation_align(a: ArrayLike, b: ArrayLike) -> jax.Array:
     one is taken: half a turn, about x for `a = e_z`.
 
     Args:
-      a: `[..., 3]`, of any length. Zero counts as e_z, non-finite entries count as zero.
+      a: `[..., 3]`, of any length: below 5e-7 (1e-12 in float64) it counts as zero, and zero as
+        e_z. Non-finite entries count as zero.
       b: `[..., 3]`, likewise.
 
     Returns:
@@ -81,7 +82,8 @@ def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array
     singular direction is here a tool that points straight up.
 
     Args:
-      axis_world: `[..., 3]` tool axis, distal; any length.
+      axis_world: `[..., 3]` tool axis, distal, of any length: below 5e-7 (1e-12 in float64) it
+        counts as straight down.
       roll: `[...]` rad.
 
     Returns:
@@ -96,7 +98,7 @@ def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array
 
 
 def roll_of(R_world_tip: ArrayLike) -> jax.Array:
-    """Roll `[...]` in (-pi, pi] rad such that `rotation_from_axis_roll(axis, roll)` is R.
+    """Roll `[...]` in [-pi, pi] rad such that `rotation_from_axis_roll(axis, roll)` is R.
 
     Continuous in R except for a tool that points straight up, and at half a turn; NaN if the first
     or the last column has one.
@@ -126,9 +128,10 @@ def rot6d_decode(rot6d: ArrayLike) -> jax.Array:
     """Rotation from two columns by Gram-Schmidt, for any input.
 
     Args:
-      rot6d: `[..., 6]`, columns of any length and angle. A first column that is zero counts as
-        e_x; a second one that is zero or parallel to the first is replaced by a fixed one
-        orthogonal to it. Non-finite entries count as zero.
+      rot6d: `[..., 6]`, columns of any length and angle; below 5e-7 (1e-12 in float64) they
+        count as zero. A first column that is zero counts as e_x; a second one that is zero or
+        parallel to the first is replaced by a fixed one orthogonal to it. Non-finite entries
+        count as zero.
 
     Returns:
       `[..., 3, 3]`.

@@ -22,6 +22,8 @@ from starjax.types import Command, Pose
 CONTROL_HZ = 30.0
 RESET_IK_ITERATIONS = 40
 STEP_IK_ITERATIONS = 4
+# Of a command's R'R from the identity: float32 and somebody's rounding are far below.
+MAX_SKEW = 0.01
 # FR5 data sheet, the slower joints (rad/s).
 MAX_JOINT_SPEED = 3.15
 
@@ -40,18 +42,19 @@ class EnvState:
     Attributes:
       sim: joint positions, velocities, warm start.
       q_target: `[6]` rad, joint target of the last command; q_velocity: `[6]` rad/s, the target's;
-        velocity: `[4]` of the reference pose, lean: `[3]` m, see `tracking`; gripper_target:
+        velocity: `[7]` of the reference pose, lean: `[3]` m, see `tracking`; gripper_target:
         [-1, 1].
       trocar, source, target: the episode's port and its pegs (int32).
       target_peg: `[2]` m, the target's axis. p_world_ref: `[3]` m, the nominal port.
       step: int32, control steps taken. settled: consecutive steps that look like success.
       done: nothing moves any more: success, or invalid.
       success: strict, see `peg_transfer`. loose: SurRoL's test was met at some step.
-      invalid: the simulation diverged; the last sound state is kept.
+      invalid: the simulation diverged, and the last sound state is kept; or the port is not finite.
       collided: arm, shaft or jaws were where they have no modelled contact.
       rcm_error: m, executed: distance of the port from the measured tool axis.
       rcm_error_within: m, the largest such distance at any physics step of the last control step.
-      ik_error: m, residual of the IK, rotations weighed; inf after a command that is not finite.
+      ik_error: m, residual of the IK, rotations weighed; inf after a command that is not finite, or
+        whose R is no rotation: the arm holds.
       jaw_contact: the jaws touch the block.
       pose, block_pose: measured tip and block in the world. gripper: measured opening, [-1, 1].
     """
@@ -132,11 +135,13 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, params.trocar, sim.p_world_ref)
         q, ik_error = ik.solve(sim.arm, pose, jnp.asarray(sim.home), RESET_IK_ITERATIONS)
         no = jnp.zeros((), bool)
+        port = rcm.trocar_position(params.trocar, sim.p_world_ref)
+        is_lost = ~jnp.all(jnp.isfinite(port))
         state = EnvState(
             sim=physics.initial(sim, q, layout.block),
             q_target=q,
             q_velocity=jnp.zeros_like(q),
-            velocity=jnp.zeros(4),
+            velocity=jnp.zeros(7),
             lean=jnp.zeros(3),
             gripper_target=jnp.ones(()),
             trocar=params.trocar,
@@ -146,10 +151,10 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             p_world_ref=jnp.asarray(sim.p_world_ref),
             step=jnp.zeros((), jnp.int32),
             settled=jnp.zeros((), jnp.int32),
-            done=no,
+            done=is_lost,
             success=no,
             loose=no,
-            invalid=no,
+            invalid=is_lost,
             collided=no,
             rcm_error=jnp.zeros(()),
             rcm_error_within=jnp.zeros(()),
@@ -171,7 +176,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         )
         leant = tracking.leaning(target, port, lean)
         q, _ = ik.solve(sim.arm, leant, state.q_target, STEP_IK_ITERATIONS)
-        usable = _is_finite(command) & jnp.all(jnp.isfinite(q))
+        usable = _is_usable(command) & jnp.all(jnp.isfinite(q))
         dq = jnp.where(usable, q - state.q_target, 0.0)
         fastest = jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9)
         dq = dq * jnp.minimum(1.0, MAX_JOINT_SPEED / CONTROL_HZ / fastest)
@@ -267,8 +272,13 @@ def _precisely(f: Callable) -> Callable:
     return wrapped
 
 
-def _is_finite(command: Command) -> jax.Array:
-    return jax.tree.reduce(lambda ok, x: ok & jnp.all(jnp.isfinite(x)), command, jnp.ones((), bool))
+def _is_usable(command: Command) -> jax.Array:
+    """Finite, and its R a rotation."""
+    finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), command)
+    R = command.pose.R
+    skew = jnp.max(jnp.abs(R.T @ R - jnp.eye(3)))
+    is_rotation = (skew < MAX_SKEW) & (jnp.cross(R[:, 0], R[:, 1]) @ R[:, 2] > 0)
+    return jax.tree.reduce(jnp.logical_and, finite) & is_rotation
 
 
 def _select(which: jax.Array, a: EnvState, b: EnvState) -> EnvState:

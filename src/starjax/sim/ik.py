@@ -116,14 +116,18 @@ def solve(chain: Chain, target: Pose, q: jax.Array, iterations: int) -> tuple[ja
 
 
 def _rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
-    """Rotation vector `[3]` rad, in the world, that takes `R` to `R_target`; exact below pi."""
+    """Rotation vector `[3]` rad, in the world, that takes `R` to `R_target`."""
     E = R_target @ R.T
     v = 0.5 * jnp.stack([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
     sine_sq = jnp.sum(v * v)
     is_small = sine_sq < 1e-12
     sine = jnp.sqrt(jnp.where(is_small, 1.0, sine_sq))
     angle = jnp.arctan2(sine, 0.5 * (jnp.trace(E) - 1.0))
-    return v * jnp.where(is_small, 1.0, angle / sine)
+    turn = v * jnp.where(is_small, 1.0, angle / sine)
+    # Half a turn about a is 2 a a' - 1.
+    column = (E + jnp.eye(3))[:, jnp.argmax(jnp.diagonal(E))]
+    half = jnp.pi * column / jnp.maximum(jnp.linalg.norm(column), 1.0)
+    return jnp.where(is_small & (jnp.trace(E) < 1.0), half, turn)
 
 
 def residual(chain: Chain, target: Pose, q: jax.Array) -> jax.Array:

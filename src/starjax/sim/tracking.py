@@ -3,7 +3,7 @@
 A command far from where the tool is (a policy's next plan rarely begins where the last one ended)
 is approached, not leapt at. On the way the tool's axis keeps to the port as well as both ends do: a
 command on the RCM manifold is reached along the manifold, one that misses the port by d misses it
-by a share of d.
+by a share of d, and its axis passes the port no faster than the tip may move.
 
 Servos give way under load, at the tip as they must, but at the port 0.1 mm is much. There the
 measured axis is brought back to where the reference has it, by turning the tool about its tip.
@@ -16,7 +16,8 @@ from starjax import rcm
 from starjax.types import Pose
 
 # Of the tip (m/s, m/s^2) and of the roll about the axis (rad/s, rad/s^2): what the FR5's joints
-# follow with the torque they have, and the tip no faster than half of that. A policy that is lost
+# follow with the torque they have, and the tip no faster than half of that (the joint that turns
+# the roll then still has its own limit, 3.15 rad/s). A policy that is lost
 # jumps from plan to plan, and the joints' servos do not answer a jerk alike: with 1.8 m/s^2 the
 # axis missed the port by 0.14 mm then (99th percentile of five such trials), with 0.9 by 0.08.
 MAX_SPEED = 0.2
@@ -28,6 +29,10 @@ MAX_SPIN_ACCELERATION = 40.0
 # foresee, grow by a twentieth; with twice the gain by an eighth.
 HOLD_GAIN = 0.2
 MAX_LEAN = 5e-3  # m at the port: servos that give way by more are not just elastic
+MAX_TURN = 0.05  # rad, of the tool for it: near the port turning moves nothing there
+# m, of a deviation that one period answers: a larger one is of servos that have reached their
+# limits, where more would be asked of them for ever
+MAX_DEVIATION = 1e-3
 
 
 def toward(
@@ -37,12 +42,12 @@ def toward(
 
     Args:
       present: reference pose of the tip now.
-      velocity: `[4]`, of the reference: tip (3) m/s, roll rad/s.
+      velocity: `[7]`, of the reference: tip (3) m/s, roll rad/s, its axis at the port (3) m/s.
       wanted: the commanded pose.
       port: `[3]` m.
 
     Returns:
-      the next reference pose, equal to `wanted` if that is near enough; its velocity `[4]`.
+      the next reference pose, equal to `wanted` if that is near enough; its velocity `[7]`.
     """
     speed = MAX_SPEED * period
     step = _step(wanted.p - present.p, velocity[:3] * period, speed, MAX_ACCELERATION * period**2)
@@ -52,33 +57,45 @@ def toward(
     share = jnp.where(length > 0, jnp.clip(share, 0.0, 1.0), 1.0)
 
     z_present, z_wanted = present.R[:, 2], wanted.R[:, 2]
-    through = (1.0 - share) * _nearest(present, port) + share * _nearest(wanted, port)
+    here, there = _nearest(present, port), _nearest(wanted, port)
+    shift, most = share * (there - here), MAX_ACCELERATION * period**2
+    slower = _step(there - here, velocity[4:] * period, speed, most)
+    is_slowed = jnp.sum(slower**2) < jnp.sum(shift**2)  # never on the manifold, where both are 0
+    shift = jnp.where(is_slowed, slower, shift)
+    through = jnp.where(is_slowed, here + slower, (1.0 - share) * here + share * there)
     axis = p - through
+    axis = axis * jnp.where(axis @ z_present < 0, -1.0, 1.0)  # the tip is above the port
+    axis = jnp.where(jnp.linalg.norm(axis) < rcm.MIN_DEPTH, z_present, axis)
     z = axis / jnp.maximum(jnp.linalg.norm(axis), 1e-6)
     carried = rcm.rotation_align(z_present, z_wanted) @ present.R
     twist = jnp.arctan2(carried[:, 1] @ wanted.R[:, 0], carried[:, 0] @ wanted.R[:, 0])
     spin = _step(
-        twist[None], velocity[3:] * period, MAX_SPIN * period, MAX_SPIN_ACCELERATION * period**2
+        twist[None], velocity[3:4] * period, MAX_SPIN * period, MAX_SPIN_ACCELERATION * period**2
     )
     R = rcm.rotation_align(z_present, z) @ present.R @ rcm.rotation_z(spin[0])
 
-    is_there = jnp.all(step == wanted.p - present.p) & (spin[0] == twist)
+    is_there = jnp.all(step == wanted.p - present.p) & (spin[0] == twist) & ~is_slowed
     pose = jax.tree.map(lambda a, b: jnp.where(is_there, a, b), wanted, Pose(R, p))
-    return pose, jnp.concatenate([step, spin]) / period
+    return pose, jnp.concatenate([step, spin, shift]) / period
 
 
 def hold(lean: jax.Array, measured: Pose, reference: Pose, port: jax.Array) -> jax.Array:
     """The `lean` `[3]` m to go on with, given the last one, the measured pose and its reference."""
     deviation = _nearest(measured, port) - _nearest(reference, port)
-    lean = lean - HOLD_GAIN * deviation
-    return lean * jnp.minimum(1.0, MAX_LEAN / jnp.maximum(jnp.linalg.norm(lean), MAX_LEAN))
+    far = jnp.maximum(jnp.linalg.norm(deviation), MAX_DEVIATION)
+    lean = lean - HOLD_GAIN * deviation * (MAX_DEVIATION / far)
+    lever = jnp.abs((reference.p - port) @ reference.R[:, 2])
+    most = jnp.minimum(MAX_LEAN, MAX_TURN * lever)
+    return lean * jnp.minimum(1.0, most / jnp.maximum(jnp.linalg.norm(lean), 1e-9))
 
 
 def leaning(pose: Pose, port: jax.Array, lean: jax.Array) -> Pose:
     """The pose turned about its tip until its axis passes the port by `lean` `[3]` m more."""
     z = pose.R[:, 2]
-    depth = jnp.maximum((pose.p - port) @ z, rcm.MIN_DEPTH)
-    return Pose(rcm.rotation_align(z, depth * z - lean) @ pose.R, pose.p)
+    depth = (pose.p - port) @ z
+    lean = jnp.where(depth < 0, -lean, lean)  # of a tip above the port
+    lever = jnp.maximum(jnp.abs(depth), rcm.MIN_DEPTH)
+    return Pose(rcm.rotation_align(z, lever * z - lean) @ pose.R, pose.p)
 
 
 def _step(way: jax.Array, last: jax.Array, most: float, change: jax.Array | float) -> jax.Array:
