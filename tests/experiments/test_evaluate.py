@@ -52,7 +52,7 @@ def score(*more):
 
 def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
     assert score() == 0
-    folder = file.parent / "runs" / "evaluate" / "mine-seed0-2x1s"
+    (folder,) = (file.parent / "runs" / "evaluate").glob("mine-*-seed0-2x1s")
     result = json.loads((folder / "result.json").read_text())
     assert result["method"] == "dp_rcm2" and len(result["trials"]) == 24
     assert (result["seen"]["trials"], result["unseen"]["trials"]) == (8, 16)
@@ -82,8 +82,32 @@ def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
     score("--out", "here")
     made = export.load(file)
     export.save(file, made._replace(policy=dataclasses.replace(POLICY, **change)))
+    with pytest.raises(config.UsageError, match=r"--out: expected .* result of other weights"):
+        score("--out", "here")
+    (file.parent / "here" / "result.json").unlink()
     score("--out", "here")
     assert "chunks of another evaluation are replaced" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("held", ["config.json", "demos-abc", "stardiff/config.json"])
+def test_the_folder_of_a_run_is_no_place_for_a_result(file, held):
+    place = file.parent / "here" / held
+    place.parent.mkdir(parents=True)
+    place.write_text("{}")
+    with pytest.raises(
+        config.UsageError, match=r"--out: expected a folder of its own, got a run's"
+    ):
+        score("--out", "here")
+
+
+def test_a_video_of_other_trials_does_not_stay(file):
+    score("--out", "here", "--no-video")
+    film = file.parent / "here" / "rollout.mp4"
+    film.write_bytes(b"film")
+    score("--out", "here", "--no-video")
+    assert film.exists()
+    score("--out", "here", "--no-video", "--seed", "3")
+    assert not film.exists()
 
 
 def test_the_same_command_again_runs_nothing_twice(file):
@@ -153,7 +177,10 @@ def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
         path.write_bytes(content)
         names.append(evaluate._label(path))
     assert names[0] == names[2] != names[1] and all(n.startswith("stardiff-") for n in names)
-    assert evaluate._label(tmp_path / "compact.safetensors") == "compact"
+    other = tmp_path / "compact.safetensors"
+    other.write_bytes(b"c")
+    assert evaluate._label(other).startswith("compact-")
+    assert evaluate._label(packaged.FOLDER / "compact.safetensors") == "compact"
 
 
 def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):

@@ -206,3 +206,6 @@ def test_time_adds_up_over_starts_also_after_an_interruption(tmp_path):
     assert 100.0 < spent["train x"] < 160.0
     # Both are rounded to hundredths of a second.
     assert 0.0 < spent["train x: compile"] <= round(spent["train x"] - 100.0, 2)
+    with clock.timed(tmp_path, "train x", goes_on=False):  # nothing of the others is left
+        pass
+    assert clock.timings(tmp_path)["train x"] < 60.0

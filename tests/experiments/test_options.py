@@ -66,6 +66,8 @@ def settings(*argv: str) -> config.RunConfig:
         (["--eval.time-limit-s", "86401"], ["--eval.time-limit-s", "0.1 to 86400 s", "86401"]),
         (["--eval.trials", "0"], ["--eval.trials", "1 to 1000000", "got 0"]),
         (["--eval.trials", "1000001"], ["--eval.trials", "1 to 1000000", "1000001"]),
+        (["--out="], ["--out", "a folder"]),
+        (["--out", ""], ["--out", "a folder"]),
         (["--policy.ddim-steps", "1"], ["--policy.ddim-steps", "2 to", "= 100", "got 1"]),
         (["--policy.time-dim", "2"], ["--policy.time-dim", "even", "4 or more", "got 2"]),
         (["--policy.time-dim", "65"], ["--policy.time-dim", "even", "4 or more", "got 65"]),
@@ -149,14 +151,19 @@ def scored(tmp_path):
     return folder
 
 
-def test_bench_writes_beside_the_result_of_the_folder_it_is_in(scored, monkeypatch):
-    monkeypatch.setattr(bench, "_time", lambda folder, chosen: {"timed": folder.name})
+def test_bench_writes_beside_the_result_of_the_folder_it_is_in(scored, monkeypatch, capsys):
+    timed = {"weights": "a"}
+    monkeypatch.setattr(bench, "_time", lambda folder, chosen: {**timed, "timed": folder.name})
     monkeypatch.chdir(scored)
     assert bench.main(["."]) == 0
+    assert capsys.readouterr().out.endswith(f"starjax report {scored} shows it\n")
     found = json.loads((scored / "bench.json").read_text())
     assert (found["method"], found["timed"]) == ("stardiff", "stardiff")
     assert found["hardware"]["cores"] >= 1 and found["versions"]["starjax"]
     assert json.loads((scored / "result.json").read_text()) == {"method": "stardiff"}
+    (scored / "result.json").write_text('{"method": "stardiff", "weights": "b"}')
+    assert bench.main(["."]) == 0
+    assert "shows it once starjax run has scored these weights" in capsys.readouterr().out
 
 
 def test_bench_promises_nothing_after_ctrl_c(scored, monkeypatch, capsys):

@@ -194,20 +194,45 @@ def test_a_finished_run_needs_its_encoder_no_more(tmp_path, done):
 
 def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
     settings = _json(presets.PRESETS["smoke"])
-    assert not pipeline._is_scored(tmp_path, settings)
-    files.write_json(tmp_path / "result.json", {"config": settings})
-    assert pipeline._is_scored(tmp_path, settings)
-    del settings["policy"]["freeze_encoder"]  # a result that is older than this setting
-    files.write_json(tmp_path / "result.json", {"config": settings})
-    assert pipeline._is_scored(tmp_path, _json(presets.PRESETS["smoke"]))
-    files.write_json(tmp_path / "result.json", {"config": settings, "seed": settings["seed"] + 1})
-    assert not pipeline._is_scored(tmp_path, settings)  # of `starjax evaluate --out`
-    more = {**settings, "eval": {**settings["eval"], "trials": 9}}
-    files.write_json(tmp_path / "result.json", {"config": settings})
-    assert not pipeline._is_scored(tmp_path, more)
-    for damaged in ("{", "{}", '{"config": 1}', '{"config": {"of": "another version"}}'):
-        (tmp_path / "result.json").write_text(damaged)
-        assert not pipeline._is_scored(tmp_path, settings)
+    result = {"config": settings, "trials": []}
+
+    def is_done(found, wanted=settings, weights="a"):
+        (tmp_path / "result.json").write_text(
+            found if isinstance(found, str) else json.dumps(found)
+        )
+        found = pipeline._scored(tmp_path, weights)
+        return bool(found) and pipeline._is_of(found, wanted)
+
+    assert not pipeline._scored(tmp_path, "a")
+    assert is_done(result) and is_done({**result, "weights": "a"})
+    assert not is_done({**result, "weights": "b"})
+    older = json.loads(json.dumps(result))
+    del older["config"]["policy"]["freeze_encoder"]
+    assert is_done(older)
+    assert not is_done({**result, "seed": settings["seed"] + 1})  # of `starjax evaluate --out`
+    assert not is_done(result, {**settings, "eval": {**settings["eval"], "trials": 9}})
+    for damaged in ("{", "{}", '{"config": 1}', '{"config": {"of": "another"}, "trials": []}'):
+        assert not is_done(damaged)
+
+
+def test_more_trials_than_asked_for_are_not_thrown_away(tmp_path):
+    preset = smoke(tmp_path, "stardiff")
+    folder, settings = tmp_path / "stardiff", _json(preset)
+    folder.mkdir()
+    (folder / "policy.safetensors").write_bytes(b"weights")
+    settings["eval"]["trials"] = 2
+    many = {
+        "config": settings,
+        "trials": [{}] * 24,
+        "weights": files.sha256(folder / "policy.safetensors"),
+    }
+    files.write_json(folder / "result.json", many)
+    with pytest.raises(
+        config.UsageError, match=r"--eval.trials: .* has 24 trials of these"
+    ) as told:
+        pipeline._evaluate(preset, "stardiff", None, "demos-a", "")
+    assert f"starjax evaluate {folder}" in str(told.value)
+    assert files.read_json(folder / "result.json") == many
 
 
 def _json(settings):

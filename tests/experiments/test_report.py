@@ -1,9 +1,12 @@
 """The report: numbers against hand counts, nothing invented, nothing left empty."""
 
+import dataclasses
+import html
 import json
 import re
 import shutil
 import subprocess
+import types
 
 import imageio_ffmpeg
 import numpy as np
@@ -11,7 +14,8 @@ import pytest
 import synthetic
 from matplotlib.figure import Figure
 
-from starjax.experiments import report_command
+from starjax import config
+from starjax.experiments import folders, report_command
 from starjax.experiments.report import (
     build,
     figures,
@@ -29,7 +33,9 @@ from starjax.experiments.report import (
     words,
 )
 from starjax.runtime import files
-from starjax.sim import env
+from starjax.sim import env, model
+
+SIM = types.SimpleNamespace(pegs=np.zeros((12, 2)))  # where no joints were recorded
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +181,7 @@ def test_rcm_errors_stand_under_their_own_names(one):
 def test_the_worst_error_at_a_trocar_is_its_largest(one):
     rows = re.findall(r"<tr>(.*?)</tr>", sections.per_trocar(one), re.S)[1:]
     for group, row in zip(outcomes.by_trocar(one.trials), rows, strict=True):
-        worst = max(trial["rcm_max_mm"] for trial in group)
+        worst = max(trial["rcm_within_max_mm"] for trial in group)
         assert f"{tables.millimetres(worst)} mm" in row
 
 
@@ -276,8 +282,8 @@ def test_table_four_says_where_it_was_timed(one):
     timed = {"inference_ms_by_ddim_steps": {"5": ms}, "roll_network_ms": None, "hardware": gpu}
     run = old._replace(bench=timed)
     assert [row[1] for row in tables.inference([run])[1:]] == ["5", "10"]
-    assert "STAR-Diff was timed on 1 x NVIDIA H200." in tables.markdown([run])
-    assert "STAR-Diff was timed on 1 x NVIDIA H200." in sections.measurements([run])
+    for text in (tables.markdown([run]), html.unescape(sections.measurements([run]))):
+        assert "STAR-Diff's rows of 5 steps are of 1 x NVIDIA H200." in text
     here = run._replace(bench={**timed, "hardware": one.result["hardware"]})
     assert tables.inference_note([here, old, one]) == tables.INFERENCE_NOTE
 
@@ -301,6 +307,7 @@ def test_the_verdict_says_what_is_sure(one):
 
     assert "costs it 60.0 points" in said(45, 15)
     assert "may be chance" in said(25, 24)
+    assert "as well on the new ones (95% interval" in said(25, 25)
     assert "better on the new ones, by 60.0 points (95% interval 4" in said(15, 45)
     assert "costs it 16.0 points (95% interval 0.2 to" in said(44, 36)
     assert "not evaluated" in words.verdict([one], edited(one, trials=[]))
@@ -430,9 +437,40 @@ def test_a_clip_says_what_it_shows_and_how_it_ended(one, monkeypatch):
 def test_paths_have_the_colour_of_their_outcome(one, won, colour):
     rollout = one.rollouts[0]
     rollout = rollout._replace(trial={**rollout.trial, "success": won})
-    axis = trajectories.draw([one._replace(rollouts=[rollout])], np.zeros((12, 2))).axes[0]
+    axis = trajectories.draw([one._replace(rollouts=[rollout])], SIM).axes[0]
     used = {line.get_color() for line in axis.lines}
     assert used & {style.SUCCESS, style.FAILURE} == {colour}
+
+
+def test_shafts_are_drawn_where_the_joints_had_them(one):
+    sim = model.load()
+    length, home = 20, sim.mj_model.qpos0.copy()
+    home[sim.arm_q : sim.arm_q + 6] = sim.home
+    rollout = one.rollouts[0]._replace(
+        p_world_tip=one.rollouts[0].p_world_tip[:length], qpos=np.tile(home, (length, 1))
+    )
+    axis = trajectories.draw([one._replace(rollouts=[rollout])], sim).axes[0]
+    fan = [line.get_xydata() for line in axis.lines if line.get_alpha() == 0.34]
+    assert len(fan) == trajectories._FAN
+    (tip,) = trajectories._poses(sim, home[None])
+    for beyond, end in fan:
+        np.testing.assert_allclose(end, trajectories._flat(tip.p), atol=1e-6)
+        along = trajectories._flat(tip.R[:, 2])
+        turned = np.cross(np.append(end - beyond, 0), np.append(along, 0))
+        assert np.abs(turned).max() < 1e-6 and (end - beyond) @ along > 0
+
+
+def test_a_tool_that_flew_off_does_not_shrink_the_boards(one):
+    near = trajectories._frame(np.zeros((12, 2)), [one])
+    far = one.rollouts[0]._replace(p_world_tip=one.rollouts[0].p_world_tip + 2.0)
+    frame = trajectories._frame(np.zeros((12, 2)), [one._replace(rollouts=[far, *one.rollouts])])
+    for (low, high), (lowest, highest) in zip(near, frame):
+        assert lowest >= low - trajectories._ROOM and highest <= high + trajectories._ROOM
+
+
+def trocar_only(runs):
+    """Without joints, of which there is no shaft to draw."""
+    return [run._replace(rollouts=[r._replace(qpos=None) for r in run.rollouts]) for run in runs]
 
 
 def test_several_methods_are_shown_at_the_same_trial(several):
@@ -453,7 +491,7 @@ def test_trials_of_different_seeds_are_not_shown_as_one(several):
     runs = [with_qpos(of_seed(run, seed)) for run, seed in zip(several, (1, 0, 1))]
     shown = [several[0].label, several[2].label]
     assert [label for label, _ in video.choose(runs)] == shown
-    drawn = trajectories.draw(runs, np.zeros((12, 2))).axes[0].lines
+    drawn = trajectories.draw(trocar_only(runs), SIM).axes[0].lines
     colours = {style.method(run.result["method"])[0]: run.label for run in runs}
     assert {colours[x.get_color()] for x in drawn if x.get_color() in colours} == set(shown)
 
@@ -640,6 +678,46 @@ def test_curves_are_of_the_runs_own_training(one, tmp_path):
     (tmp_path / "stardiff" / "metrics.jsonl").write_text('{"step": 1}\n')
     assert results.load(tmp_path / "packaged").curves == []
     assert results.load(tmp_path / "stardiff").curves == [{"step": 1}]
+
+
+def test_what_is_of_other_weights_is_left_out_and_said(tmp_path):
+    path = synthetic.run(tmp_path / "stardiff", sweep_of=5)
+    result = {**json.loads((path / "result.json").read_text()), "weights": "a"}
+    files.write_json(path / "result.json", result)
+    ms = {"p50": 1.0, "p95": 1.0, "p99": 1.0}
+    files.write_json(path / "bench.json", {"weights": "b", "inference_ms_by_ddim_steps": {"2": ms}})
+    run = results.load(path)
+    assert run.sweep and run.curves and not run.bench and run.others == ("bench.json",)
+    sweep = json.loads((path / "sweep.json").read_text())
+    files.write_json(path / "sweep.json", {**sweep, "weights": "b"})
+    trained = config.from_dict(config.RunConfig, result["config"])
+    folders.claim(path, trained, "demos-a")
+    assert results.load(path).curves
+    longer = dataclasses.replace(trained, train=dataclasses.replace(trained.train, steps=7))
+    folders.claim(path, longer, "demos-a")
+    run = results.load(path)
+    assert not run.sweep and not run.curves
+    (note,) = [text for text in results.notes([run]) if "other weights" in text]
+    assert note.startswith("STAR-Diff: sweep.json and bench.json and metrics.jsonl beside")
+
+
+def test_results_that_read_safety_otherwise_are_told_apart(one):
+    errors = {k: v for k, v in one.result["rcm_error_mm"].items() if k != "within_steps"}
+    old = edited(one, rcm_error_mm=errors)._replace(label="old")
+    (note,) = [text for text in results.notes([one, old]) if "safe" in text]
+    assert note == "old: safe successes were read at the ends of control steps only."
+    assert not [text for text in results.notes([old]) if "safe" in text]
+
+
+def test_a_report_leaves_nothing_of_the_one_before(tmp_path):
+    out = tmp_path / "report"
+    out.mkdir()
+    for name in ("ports.png", "ports.pdf", "rollout.mp4", "mine.png"):
+        (out / name).write_text("of before")
+    build.build([synthetic.run(tmp_path / "stardiff")], out, with_video=False)
+    kept = {path.name for path in out.iterdir() if path.is_file()}
+    assert {"fig4.png", "index.html", "mine.png"} <= kept
+    assert not kept & {"ports.png", "ports.pdf", "rollout.mp4"}
 
 
 def test_a_machine_without_a_video_encoder_still_gets_the_page(tmp_path, monkeypatch):

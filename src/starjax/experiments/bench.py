@@ -1,13 +1,12 @@
 """`starjax bench RUN`: inference latency of a trained policy (Table IV)."""
 
 import dataclasses
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax.experiments import checks, folders, options
+from starjax.experiments import checks, folders, options, words
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Times one decision at batch 1: observation in, commands out, compilation apart.
@@ -35,6 +34,7 @@ def main(argv: Sequence[str]) -> int:
         if not 1 <= count <= config.policy.diffusion_steps:
             most = config.policy.diffusion_steps
             raise config_lib.UsageError(f"--ddim-steps: expected 1 to {most}, got {count}")
+    files.require_writable(run)
     try:
         figures = _time(run, chosen)
     except KeyboardInterrupt:
@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
         "hardware": xla.hardware(),
     }
     files.write_json(run / "bench.json", {**about, **figures})
-    print(f"\nresult: {run / 'bench.json'}; starjax report {shlex.quote(str(run))} shows it")
+    print(f"\nresult: {run / 'bench.json'}; {words.hint(run, figures['weights'], 'shows')}")
     return 0
 
 

@@ -15,10 +15,11 @@ _COMPILE_EVENTS = (
 
 
 @contextlib.contextmanager
-def timed(out: Path, stage: str) -> Iterator[None]:
+def timed(out: Path, stage: str, goes_on: bool = True) -> Iterator[None]:
     """Adds the seconds spent inside to `<out>/timings.json`, also after Ctrl-C.
 
-    `stage` is all of them, `stage: compile` those in which jax compiled.
+    `stage` is all of them, `stage: compile` those in which jax compiled. Unless the work `goes_on`
+    from an earlier start, what that took does not count.
     """
     start, compiling = time.monotonic(), _CompileSeconds()
 
@@ -26,7 +27,8 @@ def timed(out: Path, stage: str) -> Iterator[None]:
         spent = timings(out)
         total = time.monotonic() - start
         for name, seconds in ((stage, total), (f"{stage}: compile", compiling.seconds)):
-            spent[name] = round(spent.get(name, 0.0) + seconds, 2)
+            before = spent.get(name, 0.0) if goes_on else 0.0
+            spent[name] = round(before + seconds, 2)
         files.write_json(out / "timings.json", spent)
 
     try:

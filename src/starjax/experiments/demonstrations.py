@@ -43,7 +43,7 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
         words.stage("collect", f"into {root}")
         settings = {"devices": lanes.devices(), "report": words.indented, **wanted}
         try:
-            with clock.timed(out, "collect"):
+            with clock.timed(out, f"collect {root.name}"):
                 found = demos.collect(root, env, script, trocars, **settings)
         except trials.ExpertFailed as error:
             raise config_lib.UsageError(

@@ -61,8 +61,13 @@ def main(argv: Sequence[str]) -> int:
     config = scoring.settings(who, config) if config else _config(who.trained)
     config = dataclasses.replace(config, method=who.method, out=str(folder), eval=chosen.eval)
     about = words.about(config, chosen.policy or chosen.run, chosen.seed)
+    before = _before(folder)
+    same = _identity(before) == (who.weights, chosen.seed, dataclasses.asdict(chosen.eval))
+    if chosen.out:
+        _refuse_foreign(folder, before.get("weights", who.weights) == who.weights)
     print(f"{about}, into {folder}\n", flush=True)
-    with clock.timed(folder, "evaluate"):
+    begun = same or (not before and any((folder / "evaluation").glob("chunk_*")))
+    with clock.timed(folder, "evaluate", begun):
         table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed)
     command = options.typed("evaluate", argv)
     result = scoring.write_result(
@@ -71,6 +76,8 @@ def main(argv: Sequence[str]) -> int:
     print(f"\n{words.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
     if chosen.video:
         print(_film(folder, who))
+    elif not same:
+        (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
     hint = f"starjax report {shlex.quote(str(folder))} draws tables and figures"
     print(f"result: {folder / 'result.json'}; {hint}")
     return 0
@@ -89,11 +96,38 @@ def _trials(chosen: Options) -> str:
 
 
 def _label(file: Path) -> str:
-    """A name for a file of weights: where its own says nothing, that of its folder and what is in
-    it, as the folders of other runs are called so too."""
-    if file.stem != "policy":
+    """A name for a file of weights: its own, or its folder's where that says nothing, and what is
+    in it, as files of other weights are called so too."""
+    if file.parent == packaged.FOLDER:
         return file.stem
-    return f"{file.resolve().parent.name}-{files.sha256(file)[:8]}"
+    name = file.stem if file.stem != "policy" else file.resolve().parent.name
+    return f"{name}-{files.sha256(file)[:8]}"
+
+
+def _before(folder: Path) -> dict[str, Any]:
+    """The result that is there; of a damaged one nothing."""
+    try:
+        return files.read_json(folder / "result.json")
+    except (FileNotFoundError, ValueError):
+        return {}
+
+
+def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any]:
+    """Whose trials a result has, and which."""
+    config = result.get("config") or {}
+    return result.get("weights"), result.get("seed"), config.get("eval")
+
+
+def _refuse_foreign(folder: Path, is_ours: bool) -> None:
+    """Raises UsageError for a folder in which something else would be lost or hidden."""
+    held = [what for what in ("config.json", "demos-*", "*/config.json") if any(folder.glob(what))]
+    if held:
+        raise config_lib.UsageError(f"--out: expected a folder of its own, got a run's, {folder}")
+    if not is_ours:
+        raise config_lib.UsageError(
+            f"--out: expected a folder without a result of other weights, got {folder}; "
+            "choose another, or remove that one"
+        )
 
 
 def _config(trained: Any) -> config_lib.RunConfig:

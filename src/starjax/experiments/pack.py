@@ -35,8 +35,8 @@ def main(argv: Sequence[str]) -> int:
     if chosen.temperature is not None and not 0 <= chosen.temperature <= 1:
         raise config_lib.UsageError(f"--temperature: expected in [0, 1], got {chosen.temperature}")
     source, out = packaged.find("POLICY", chosen.policy), Path(chosen.out)
-    if out.exists() and out.samefile(source):
-        raise config_lib.UsageError(f"OUT: expected another file than POLICY, got {out}")
+    if out.exists():
+        raise config_lib.UsageError(f"OUT: expected a file that is not there yet, got {chosen.out}")
     xla.prepare_xla()
 
     import jax
@@ -45,9 +45,12 @@ def main(argv: Sequence[str]) -> int:
 
     try:
         trained = export.load(source)
-        policy = dataclasses.replace(trained.policy, dtype="float32")
-        if chosen.temperature is not None:
-            policy = dataclasses.replace(policy, temperature=chosen.temperature)
+    except ValueError as error:
+        raise config_lib.UsageError(f"POLICY: {error}") from error
+    policy = dataclasses.replace(trained.policy, dtype="float32")
+    if chosen.temperature is not None:
+        policy = dataclasses.replace(policy, temperature=chosen.temperature)
+    try:
         export.save(out, trained._replace(policy=policy), half=True)
     except ValueError as error:
         raise config_lib.UsageError(f"POLICY: {error}") from error

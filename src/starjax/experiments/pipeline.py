@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
                 _train(config, name, demos, env, encoder)
         if "evaluate" in stages:
             for name in names:
-                _evaluate(config, name, env, command)
+                _evaluate(config, name, env, root.name, command)
         if "report" in stages:
             _report(out, names)
 
@@ -89,7 +90,8 @@ def _train(
     dataset = demos()
     processes.agree(0)  # the others may read them
     words.stage("train", f"{name}, into {folder}")
-    with clock.timed(out, f"train {name}"), stop_signals() as should_stop:
+    begun = any((folder / "checkpoints").glob("step_*"))
+    with clock.timed(out, f"train {name}", begun), stop_signals() as should_stop:
         try:
             result = loop.run(
                 methods.METHODS[name],
@@ -128,7 +130,7 @@ def _train(
         )
 
 
-def _evaluate(config: config_lib.RunConfig, name: str, env: Any, command: str) -> None:
+def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, command: str) -> None:
     """Closed-loop trials of one method; `result.json` is its last file."""
     from starjax import rcm
     from starjax.experiments import scoring
@@ -136,32 +138,55 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, command: str) -
     out = Path(config.out)
     folder, weights = out / name, folders.weights(out, name)
     settings = json.loads(json.dumps(dataclasses.asdict(config)))
-    if _is_scored(folder, settings):
+    found = _scored(folder, files.sha256(weights))
+    if found and _is_of(found, settings):
         words.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
         return
+    if found and (more := len(found["trials"])) > len(rcm.IS_SEEN) * config.eval.trials:
+        raise config_lib.UsageError(
+            f"--eval.trials: {folder / 'result.json'} has {more} trials of these weights, which "
+            f"{config.eval.trials} at each trocar would replace; "
+            f"starjax evaluate {shlex.quote(str(folder))} keeps them apart"
+        )
     words.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
     folders.adopt_twin(out, name)
-    with clock.timed(out, f"evaluate {name}"):
+    begun = any((folder / "evaluation").glob("chunk_*"))
+    goes_on = begun and not (folder / "result.json").exists()
+    with clock.timed(out, f"evaluate {name}", goes_on):
         who = scoring.subject(name, weights, env)
         table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, config.eval, config.seed)
-    timings = _timings(out, name)
+    timings = _timings(out, name, demos)
     scoring.write_result(folder, who, table, config, config.seed, command, timings)
 
 
-def _is_scored(folder: Path, settings: dict[str, Any]) -> bool:
-    """Whether result.json is there, whole and of these settings."""
+def _scored(folder: Path, weights: str) -> dict[str, Any]:
+    """What is in result.json, if it is there, whole and of these weights (SHA-256)."""
     try:
         found = files.read_json(folder / "result.json")
-        alike = folders.trained_alike(found["config"], settings, "eval")
-        return alike and found.get("seed", settings["seed"]) == settings["seed"]
+        config, trials = found["config"], found["trials"]
     except (FileNotFoundError, KeyError, TypeError, ValueError):  # damaged: made again
+        return {}
+    is_whole = isinstance(config, dict) and isinstance(trials, list)
+    # older results do not say whose they are
+    return found if is_whole and found.get("weights", weights) == weights else {}
+
+
+def _is_of(found: dict[str, Any], settings: dict[str, Any]) -> bool:
+    """Whether a result is of these settings."""
+    try:
+        alike = folders.trained_alike(found["config"], settings, "eval")
+    except (KeyError, TypeError, ValueError):
         return False
+    return alike and found.get("seed", settings["seed"]) == settings["seed"]
 
 
-def _timings(out: Path, name: str) -> dict[str, float]:
-    """Seconds of the stages that a method's result rests on, compilation apart."""
+def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
+    """Seconds of the stages that a method's result rests on, compilation apart.
+
+    `demos` is the folder of its demonstrations.
+    """
     stages = {
-        "collect": "collect",
+        "collect": f"collect {demos}",
         "features": "features",
         "train": f"train {methods.METHODS[name].weights_of}",
         "evaluate": f"evaluate {name}",

@@ -30,7 +30,7 @@ def main(argv: Sequence[str]) -> int:
         for found in _with_results(Path(name)):
             once.setdefault(found.resolve(), found)
     runs = list(once.values())
-    first = runs[0]
+    first = runs[0].resolve()
     out = Path(chosen.out or (first.parent if first.name in methods.METHODS else first) / "report")
     xla.prepare_xla()
     files.require_writable(out)

@@ -31,7 +31,9 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
         policy = dataclasses.replace(config.policy, encoder_weights="", freeze_encoder=False)
         config = dataclasses.replace(config, policy=policy)
     out = config.out
-    if options.value_of("--out", argv) is None:
+    if options.is_given("--out", argv):
+        checks.expect(bool(out), "out", "a folder", "nothing")
+    else:
         out = _folder(config, default)
     config = dataclasses.replace(config, preset=default.preset, out=out)
     checks.check(config)

@@ -3,13 +3,12 @@
 import dataclasses
 import hashlib
 import json
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax.experiments import checks, folders, options
+from starjax.experiments import checks, folders, options, words
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Scores a trained policy on a random sample (Eq. 19) or a grid of trocars.
@@ -72,7 +71,7 @@ def main(argv: Sequence[str]) -> int:
     }
     files.write_json(run / "sweep.json", {**about, **figures})
     print(_outcome(figures))
-    print(f"\nresult: {run / 'sweep.json'}; starjax report {shlex.quote(str(run))} draws it")
+    print(f"\nresult: {run / 'sweep.json'}; {words.hint(run, who.weights, 'draws')}")
     return 0
 
 

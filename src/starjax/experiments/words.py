@@ -1,12 +1,14 @@
 """What a run tells its user: the plan, the stages, the outcome."""
 
+import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import starjax
 from starjax import config as config_lib
 from starjax.experiments import methods
-from starjax.runtime import xla
+from starjax.runtime import files, xla
 
 STAGES = ("collect", "train", "evaluate", "report")
 
@@ -171,6 +173,16 @@ def outcome(results: Sequence[Mapping[str, Any]]) -> str:
         "  " + "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths)).rstrip()
         for row in rows
     )
+
+
+def hint(run: Path, weights: str, does: str) -> str:
+    """Which command `does` something with figures of these weights that lie in a run's folder."""
+    try:
+        scored = files.read_json(run / "result.json").get("weights", weights)
+    except (FileNotFoundError, ValueError):
+        scored = None
+    typed = f"starjax report {shlex.quote(str(run))} {does} it"
+    return typed if scored == weights else f"{typed} once starjax run has scored these weights"
 
 
 def stage(name: str, text: str) -> None:

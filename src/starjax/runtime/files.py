@@ -140,6 +140,8 @@ def require_writable(directory: Path, free_bytes: int = 0) -> None:
       StorageError: it cannot be created or written, or the disk has less than `free_bytes` free.
     """
     probe = directory / ".writable"
+    if directory.is_file():
+        raise StorageError(f"{directory}: expected a folder, got a file")
     try:
         directory.mkdir(parents=True, exist_ok=True)
         probe.write_bytes(b"x")

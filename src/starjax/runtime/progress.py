@@ -94,7 +94,8 @@ def _plain(description: str, total: int, unit: str, done: int, stream: TextIO) -
 class _Meter:
     """Units done, their rate and the time left.
 
-    Both are counted from the end of the first piece of work, in which programs are compiled.
+    On the way both are counted from the end of the first piece of work, in which programs are
+    compiled; the last rate is of all.
     """
 
     def __init__(self, total: int, done: float):
@@ -111,7 +112,8 @@ class _Meter:
         return self.done >= self.total - 1e-6  # shares of a unit rarely add up to the last bit
 
     def per_second(self) -> float:
-        done, since = self._first if self._first and self._is_past_first() else self._begun
+        is_past = self._is_past_first() and not self.is_over()  # in the end all of it counts
+        done, since = self._first if self._first and is_past else self._begun
         return (self.done - done) / max(time.monotonic() - since, 1e-9)
 
     def _is_past_first(self) -> bool:

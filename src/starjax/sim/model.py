@@ -25,6 +25,9 @@ TOOL_MOUNT = -1.75
 HOME = (-0.18, -1.10, 1.90, -2.36, -1.571, 0.0)
 
 
+TCP = "robot/tool/tcp"  # site of the tip, {E}
+
+
 class SimModel(NamedTuple):
     """What never varies in an environment.
 
@@ -92,7 +95,7 @@ def load(robot: str = "fr5", tool: str = "grasper", task: str = "peg_transfer") 
         mj_model=m,
         mjx_model=mjx_model,
         mjx_data=mjx_data,
-        arm=ik.chain_of(m, first="robot/shoulder", site="robot/tool/tcp"),
+        arm=ik.chain_of(m, first="robot/shoulder", site=TCP),
         home=np.array(HOME, np.float32),
         p_world_ref=np.array(m.site("port_reference").pos, np.float32),
         arm_q=int(m.joint("robot/j1").qposadr[0]),

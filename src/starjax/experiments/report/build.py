@@ -39,6 +39,8 @@ def build(
     focus = _focus(loaded)
     sim = _model() if any(run.rollouts for run in loaded) else None
     with files.lock(out):
+        for name in _MADE:  # by an earlier report, of other runs
+            (out / name).unlink(missing_ok=True)
         files.write_bytes(out / "tables.md", tables.markdown(loaded).encode())
         pictures = _figures(loaded, focus, sim, out)
         film = _film(loaded, sim, out / "rollout.mp4", report) if with_video and sim else None
@@ -46,6 +48,10 @@ def build(
         index = out / "index.html"
         files.write_bytes(index, page.render(loaded, focus, pictures, clip).encode())
     return index
+
+
+_FIGURES = ("training", "ports", "fig3", "fig4")
+_MADE = ("rollout.mp4", *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf")))
 
 
 def _order(run: results.Run) -> int:
@@ -127,7 +133,7 @@ def _figures(
         drawings["fig4"] = lambda dark: figures.distance(evaluated, focus, dark)
     if sim is not None:
         shown = results.representatives(runs)
-        drawings["fig3"] = lambda dark: trajectories.draw(shown, sim.pegs, dark)
+        drawings["fig3"] = lambda dark: trajectories.draw(shown, sim, dark)
     pictures = {}
     for name, draw in drawings.items():
         light, dark = draw(False), draw(True)

@@ -11,6 +11,7 @@ _BIN = 0.005  # m of distance pooled in one point
 _SMOOTH = 0.008  # m, width of the kernel behind the heat map
 _FAR = 2.0  # kernel widths from the nearest port: farther off the map shows nothing
 _DISC = 0.05  # m, radius of Eq. 19's disc
+_FEWEST = 2  # panels of a page's width, or a single one would be as large as the page
 
 
 def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False) -> Any:
@@ -54,9 +55,12 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
     if not panels:
         return None
     with style.use(dark):
-        figure = Figure((2.6 * len(panels), 2.4), layout="constrained")
+        figure = Figure((2.6 * max(len(panels), _FEWEST), 2.4), layout="constrained")
         strokes = style.strokes([run.result["method"] for run in runs])
-        for axis, (name, title) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels):
+        grid = figure.subplots(1, max(len(panels), _FEWEST), squeeze=False)[0]
+        for unused in grid[len(panels) :]:
+            unused.set_visible(False)
+        for axis, (name, title) in zip(grid, panels):
             for run, stroke in zip(runs, strokes):
                 points = [(line["step"], line[name]) for line in run.curves if name in line]
                 color, _ = style.method(run.result["method"])
@@ -105,8 +109,8 @@ def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
     axis.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
     axis.plot(x, [s.rate for s in scores], "o-", color=color, markersize=5)
     for at, score in points:
-        text = f"n {score.trials}"
-        axis.text(at, -0.01, text, ha="center", va="bottom", fontsize=6.5, color=shades["muted"])
+        text, place = f"n {score.trials}", -0.01 if score.rate > 0.1 else score.high + 0.02
+        axis.text(at, place, text, ha="center", va="bottom", fontsize=6.5, color=shades["muted"])
 
 
 def _whiskers(axis: Any, run: results.Run, offset: float, stroke: str) -> None:
@@ -124,7 +128,7 @@ def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> N
     rates = np.array([outcomes.tally(group).rate for group in groups])
     if run.sweep:
         shown = _heat(axis, at, rates, np.array([len(group) for group in groups]))
-        axis.plot(*at.T, ".", color=shades["paper"], markersize=1.2, alpha=0.3)
+        axis.plot(*at.T, ".", color=shades["ink"], markersize=1.6, alpha=0.4)
         ports = 1e3 * outcomes.positions(results.training_trocars(run))[:, :2]
         axis.plot(*ports.T, "x", color=style.FAILURE, markersize=6, label="training trocar")
         axis.legend(loc="upper left", bbox_to_anchor=(0, -0.12), fontsize=7)
@@ -143,7 +147,7 @@ def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> N
     axis.plot(1e3 * _DISC * np.cos(turn), 1e3 * _DISC * np.sin(turn), color=shades["muted"], lw=0.8)
     axis.set_aspect("equal")
     axis.grid(False)
-    axis.set_title(f"{run.label} by port, from above (mm)")
+    axis.set_title(f"by port, from above (mm)\n{run.label}", fontsize=8)
     bar = figure.colorbar(shown, ax=axis, shrink=0.8, ticks=[0, 0.5, 1])
     bar.ax.set_yticklabels(["0", "50", "100%"])
     bar.outline.set_visible(False)

@@ -54,6 +54,11 @@ def transfer_times(trials: Iterable[Trial]) -> list[float]:
     return [trial["steps"] / CONTROL_HZ for trial in trials if strict(trial)]
 
 
+def worst_rcm_mm(trial: Trial) -> float | None:
+    """Largest executed RCM error, within control steps too if the result says so."""
+    return trial.get("rcm_within_max_mm", trial.get("rcm_max_mm"))
+
+
 def place(trial: Trial) -> tuple[str, str, str]:
     """The trocar's radius, polar angle and azimuth as text."""
     polar, azimuth = np.degrees(trial["polar"]), np.degrees(trial["azimuth"])

@@ -12,13 +12,14 @@ CAPTIONS = {
     "fig3": (
         "Rollouts",
         "Path of the instrument's tip over the boards (top row: seen trocars, bottom row: unseen). "
-        "Thin lines are the shaft at moments of one rollout: all pass through the trocar (cross). "
+        "Thin lines are the shaft at moments of one rollout, the cross is the trocar. "
         "Open circle: start. Grey line on the board: the path seen from straight above.",
     ),
     "fig4": (
         "Success and distance from the training trocars",
         "Left: trials pooled by distance of their trocar to the nearest one in the demonstrations, "
-        "with 95% Wilson intervals. Right: every port from above.",
+        "with 95% Wilson intervals. Right: ports from above; where a sweep filled the disc, its "
+        "mean over 8 mm, its ports as dots.",
     ),
     "ports": (
         "Success and the number of training trocars",

@@ -49,6 +49,7 @@ class Run(NamedTuple):
       sweep_limit_s: the same of these.
       bench: bench.json, empty if there is none of these weights: `starjax bench` once wrote into
         result.json.
+      others: names of what lies beside result.json and is of other weights.
     """
 
     path: Path
@@ -62,6 +63,7 @@ class Run(NamedTuple):
     sweep: list[outcomes.Trial]
     sweep_limit_s: float
     bench: dict[str, Any]
+    others: tuple[str, ...]
 
     @property
     def trials(self) -> list[outcomes.Trial]:
@@ -135,7 +137,11 @@ def load(path: Path) -> Run:
     if result["method"] not in methods.METHODS:
         raise ValueError(f"{file}: expected a method of Table II, got {result['method']!r}")
     method = methods.METHODS[result["method"]]
-    sweep, bench = (_beside(path / f"{name}.json", result) for name in ("sweep", "bench"))
+    beside = {name: _beside(path / name, result) for name in ("sweep.json", "bench.json")}
+    sweep, bench = (found or {} for found in beside.values())
+    curves = _curves(path, result)
+    others = [name for name, found in beside.items() if found is None]
+    others += ["metrics.jsonl"] if curves is None else []
     limit_s = result["config"].get("eval", {}).get("time_limit_s", 0.0)
     return Run(
         path=path,
@@ -144,11 +150,12 @@ def load(path: Path) -> Run:
         group=method.group,
         weights_of=method.weights_of,
         rollouts=_rollouts(path, result.get("trials") or []),
-        curves=_curves(path, result["method"]),
+        curves=curves or [],
         limit_s=limit_s,
         sweep=sweep.get("trials") or [],
         sweep_limit_s=sweep.get("time_limit_s", limit_s),
         bench=bench,
+        others=tuple(others),
     )
 
 
@@ -198,19 +205,35 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
     return rollouts
 
 
-def _beside(file: Path, result: dict[str, Any]) -> dict[str, Any]:
-    """What another command left beside result.json, if it is of the same weights."""
+def _beside(file: Path, result: dict[str, Any]) -> dict[str, Any] | None:
+    """What another command left beside result.json; None if it is of other weights."""
     found = files.read_json(file) if file.is_file() else {}
     weights = {x["weights"] for x in (found, result) if "weights" in x}  # once neither said it
-    return found if len(weights) < 2 else {}
+    return found if len(weights) < 2 else None
 
 
-def _curves(path: Path, method: str) -> list[dict[str, Any]]:
-    """The log of a run's training, which another method's folder has where they share weights."""
-    shared = path.parent / methods.METHODS[method].weights_of
-    return (_lines(shared / "metrics.jsonl") if path.name == method else []) or _lines(
-        path / "metrics.jsonl"
-    )
+def _curves(path: Path, result: dict[str, Any]) -> list[dict[str, Any]] | None:
+    """The log of a run's training, which another method's folder has where they share weights;
+    None if it is of a training with other settings."""
+    method, places = result["method"], [path]
+    if path.name == method:
+        places.insert(0, path.parent / methods.METHODS[method].weights_of)
+    for place in places:
+        if lines := _lines(place / "metrics.jsonl"):
+            return lines if _is_of(place, result) else None
+    return []
+
+
+def _is_of(folder: Path, result: dict[str, Any]) -> bool:
+    """Whether a folder's training had the settings of a result, if it says so."""
+    if not (folder / "config.json").is_file():
+        return True
+    try:
+        trained, config = files.read_json(folder / "config.json"), result["config"]
+        same_seed = trained["seed"] == config.get("seed", trained["seed"])
+        return same_seed and not folders.differing([trained, config])
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return True  # damaged, or of another version: not known
 
 
 def _lines(file: Path) -> list[dict[str, Any]]:
@@ -233,6 +256,17 @@ def notes(runs: Sequence[Run]) -> list[str]:
         text if len(labels) == len(runs) else f"{', '.join(labels)}: {text}"
         for text, labels in said.items()
     ]
+    found += [
+        f"{run.label}: {' and '.join(run.others)} beside its result.json "
+        f"{'is' if len(run.others) == 1 else 'are'} of other weights, and left out; "
+        "starjax run scores the present ones."
+        for run in runs
+        if run.others
+    ]
+    within = [run for run in runs if (run.result.get("rcm_error_mm") or {}).get("within_steps")]
+    if within and len(within) < len(runs):
+        names = ", ".join(run.label for run in runs if run not in within)
+        found.append(f"{names}: safe successes were read at the ends of control steps only.")
     if flags := differing(runs):
         found.append(f"These runs were not trained alike: they differ in {', '.join(flags)}.")
     limits = sorted({run.limit_s for run in runs if run.trials})

@@ -76,7 +76,7 @@ def _headlines(run: results.Run) -> Iterator[tuple[str, str, str, str]]:
     executed = errors.get("executed") or {}
     if executed.get("p99") is not None:
         worst = max(executed["max"], (errors.get("within_steps") or {}).get("max", 0.0))
-        more = f"99th percentile; worst {tables.millimetres(worst)} mm"
+        more = f"99th percentile of steps' ends; {tables.millimetres(worst)} mm at worst"
         yield "Shaft off the trocar", tables.millimetres(executed["p99"]), " mm", more
     seconds = outcomes.transfer_times(run.trials)
     if seconds:
@@ -130,9 +130,7 @@ def per_trocar(run: results.Run) -> str:
     for group in outcomes.by_trocar(run.trials):
         part = "seen" if group[0]["seen"] else "unseen"
         times = outcomes.transfer_times(group)
-        worst = max(
-            (t["rcm_max_mm"] for t in group if t.get("rcm_max_mm") is not None), default=None
-        )
+        worst = max((e for t in group if (e := outcomes.worst_rcm_mm(t)) is not None), default=None)
         row = [Cell(f"{group[0]['trocar']}"), Cell(part)]
         row += [markup.number(text) for text in outcomes.place(group[0])]
         row += markup.score(outcomes.tally(group), part)

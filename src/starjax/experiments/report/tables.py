@@ -43,11 +43,13 @@ PAIRED_NOTE = (
 FAILURES_NOTE = "Each failed trial is counted under the first class that applies."
 RCM_NOTE = (
     "Distance of the shaft's axis from the trocar. Commanded: as the policy asked for it. "
-    "Executed: as the simulated arm did it, over all control steps of all trials or of the "
-    "successful ones; a trial that fails has up to ten times as many steps."
+    "Executed: as the simulated arm did it, at the ends of all control steps of all trials or of "
+    "the successful ones; a trial that fails has up to ten times as many steps. Within steps: the "
+    "largest at any physics step of each control step, where the servos have not answered yet."
 )
 PHASES_NOTE = (
-    "Wall-clock time, summed over every start. Methods share the demonstrations, and some weights."
+    "Wall-clock time, summed over every start. Methods share the demonstrations, and some weights "
+    "and trials."
 )
 _QUANTILES = ("p50", "p95", "p99")
 _COMPILE = ": compile"  # ends the name of a phase's share spent compiling
@@ -153,7 +155,8 @@ def inference_note(runs: Sequence[results.Run]) -> str:
     for run in runs:
         timed, scored = (words.hardware(x.get("hardware") or {}) for x in (run.bench, run.result))
         if timed and timed != scored:
-            note += f" {run.label} was timed on {timed}."
+            rows = ", ".join(sorted(run.bench["inference_ms_by_ddim_steps"], key=int))
+            note += f" {run.label}'s rows of {rows} steps are of {timed}."
     return note
 
 

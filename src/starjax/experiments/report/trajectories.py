@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from starjax.experiments.report import outcomes, results, style
+from starjax.sim.model import TCP, SimModel
 from starjax.sim.tasks import peg_transfer
+from starjax.types import Pose
 
 _AZIMUTH, _ELEVATION = np.deg2rad(-52.0), np.deg2rad(20.0)
 _RIGHT = np.array([-np.sin(_AZIMUTH), np.cos(_AZIMUTH), 0.0])
@@ -25,17 +27,20 @@ _VIEW = np.stack([_RIGHT, np.cross(_BACK, _RIGHT)], -1)  # [3, 2]
 _COLUMNS = 3
 _FAN = 14  # shafts drawn along a path
 _MARGIN = 0.014  # m of board beyond the outer pegs
+_BEYOND = 0.02  # m of shaft drawn above the trocar
+_ROOM = 0.03  # m around boards and trocars that panels show: tools that fly off leave them
 
 
-def draw(runs: Sequence[results.Run], pegs: np.ndarray, dark: bool = False) -> Any | None:
+def draw(runs: Sequence[results.Run], sim: SimModel, dark: bool = False) -> Any | None:
     """Fig. 3, or None if no run recorded a rollout.
 
-    `pegs [P, 2]` m, the first half on the source board. Top row seen, bottom row unseen, a trocar
-    a panel, its place marked with a cross. One run: blue paths succeeded, orange ones failed.
-    Several: a colour a method, failures dashed.
+    Top row seen, bottom row unseen, a trocar a panel, its place marked with a cross. One run: blue
+    paths succeeded, orange ones failed. Several: a colour a method, failures dashed. Shafts are
+    those of the recorded joints.
     """
     from matplotlib.figure import Figure
 
+    pegs = sim.pegs
     rows = [row for row in (_panels(runs, True), _panels(runs, False)) if row]
     if not rows:
         return None
@@ -48,7 +53,7 @@ def draw(runs: Sequence[results.Run], pegs: np.ndarray, dark: bool = False) -> A
             for axis in axes[len(row) :]:
                 axis.set_visible(False)
             for axis, index in zip(axes, row):
-                _panel(axis, runs, index, pegs, shades)
+                _panel(axis, runs, index, sim, shades)
                 axis.set_xlim(frame[0])
                 axis.set_ylim(frame[1])
         _scale_bar(grid[0, 0], frame, shades)
@@ -56,7 +61,7 @@ def draw(runs: Sequence[results.Run], pegs: np.ndarray, dark: bool = False) -> A
             handles=_legend(runs, shades),
             loc="outside lower center",
             ncols=3 + (len(runs) > 1) * len(runs),
-            title=f"policies that see the {results.observed(runs)}",
+            title=_title(runs),
             title_fontsize=8,
         )
     return figure
@@ -74,7 +79,7 @@ def _panels(runs: Sequence[results.Run], seen: bool) -> list[int]:
 
 
 def _panel(
-    axis: Any, runs: Sequence[results.Run], index: int, pegs: np.ndarray, shades: dict[str, str]
+    axis: Any, runs: Sequence[results.Run], index: int, sim: SimModel, shades: dict[str, str]
 ) -> None:
     """One trocar: boards, pegs, paths with their shafts, the trocar."""
     drawn = [
@@ -88,14 +93,16 @@ def _panel(
     axis.set_aspect("equal")
     kind, (r, polar, azimuth) = "Seen" if trial["seen"] else "Unseen", outcomes.place(trial)
     axis.set_title(f"{kind} trocar {index}\nr {r}, θ {polar}, φ {azimuth}", fontsize=8)
-    _boards(axis, pegs, shades)
+    _boards(axis, sim.pegs, shades)
     for i, rollout in drawn:
         won = outcomes.strict(rollout.trial)
         color, _ = style.method(runs[i].result["method"])
         dashed = len(runs) > 1 and not won
         if len(runs) == 1:
             color = style.SUCCESS if won else style.FAILURE
-        _path(axis, rollout, color, dashed, rollout is drawn[-1][1], shades)
+        if rollout is drawn[-1][1] and rollout.qpos is not None:
+            _shafts(axis, rollout, rollout.qpos, color, sim)
+        _path(axis, rollout, color, dashed, shades)
     axis.plot(*_flat(trocar), "x", color=shades["ink"], markersize=9, markeredgewidth=2, zorder=9)
 
 
@@ -118,14 +125,9 @@ def _path(
     rollout: results.Rollout,
     color: str,
     dashed: bool,
-    fan: bool,
     shades: dict[str, str],
 ) -> None:
-    tip, trocar = rollout.p_world_tip, rollout.p_world_trocar
-    if fan:
-        for point in tip[np.linspace(0, len(tip) - 1, _FAN).round().astype(int)]:
-            beyond = trocar + 0.02 * (trocar - point) / max(np.linalg.norm(trocar - point), 1e-9)
-            axis.plot(*_flat(np.stack([beyond, point])).T, color=color, linewidth=0.6, alpha=0.34)
+    tip = rollout.p_world_tip
     shadow = _flat(tip * np.array([1.0, 1.0, 0.0]))
     axis.plot(*shadow.T, color=shades["muted"], linewidth=1.0, alpha=0.4, zorder=1)
     flat = _flat(tip)
@@ -135,16 +137,45 @@ def _path(
     axis.plot(*flat[-1], end, color=color, markersize=5, zorder=7)
 
 
+def _shafts(
+    axis: Any, rollout: results.Rollout, qpos: np.ndarray, color: str, sim: SimModel
+) -> None:
+    """The shaft at moments of a rollout, from the tip to beyond the trocar."""
+    for pose in _poses(sim, qpos[np.linspace(0, len(qpos) - 1, _FAN).round().astype(int)]):
+        length = np.linalg.norm(rollout.p_world_trocar - pose.p) + _BEYOND
+        ends = np.stack([pose.p - length * pose.R[:, 2], pose.p])
+        axis.plot(*_flat(ends).T, color=color, linewidth=0.6, alpha=0.34)
+
+
+def _poses(sim: SimModel, qpos: np.ndarray) -> list[Pose]:
+    """pose_world_tip at each of `[T, Q]` coordinates."""
+    import mujoco
+
+    data, found = mujoco.MjData(sim.mj_model), []
+    for data.qpos[:] in qpos:
+        mujoco.mj_kinematics(sim.mj_model, data)
+        tcp = data.site(TCP)
+        found.append(Pose(tcp.xmat.reshape(3, 3).copy(), tcp.xpos.copy()))
+    return found
+
+
+def _title(runs: Sequence[results.Run]) -> str:
+    if len(runs) == 1:
+        return f"{runs[0].label}, from {results.observed(runs)}"
+    return f"policies that see the {results.observed(runs)}"
+
+
 def _frame(pegs: np.ndarray, runs: Sequence[results.Run]) -> tuple[tuple[float, float], ...]:
-    """Limits that hold the boards and every path, the same in all panels."""
+    """Limits that hold the boards, trocars and what paths do near them, the same in all panels."""
     low, high = pegs.min(0) - 1.3 * _MARGIN, pegs.max(0) + 1.3 * _MARGIN
     corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-    clouds = [corners]
-    for run in runs:
-        for rollout in run.rollouts:
-            clouds += [rollout.p_world_tip, rollout.p_world_trocar[None] + [0.0, 0.0, 0.022]]
-    flat = _flat(np.concatenate(clouds))
-    return tuple((float(a), float(b)) for a, b in zip(flat.min(0), flat.max(0)))
+    rollouts = [rollout for run in runs for rollout in run.rollouts]
+    above = [rollout.p_world_trocar[None] + [0.0, 0.0, _BEYOND + 2e-3] for rollout in rollouts]
+    fixed = _flat(np.concatenate([corners, *above]))
+    paths = _flat(np.concatenate([rollout.p_world_tip for rollout in rollouts]))
+    low = np.minimum(fixed.min(0), np.maximum(paths.min(0), fixed.min(0) - _ROOM))
+    high = np.maximum(fixed.max(0), np.minimum(paths.max(0), fixed.max(0) + _ROOM))
+    return tuple((float(a), float(b)) for a, b in zip(low, high))
 
 
 def _scale_bar(axis: Any, frame: tuple[tuple[float, float], ...], shades: dict[str, str]) -> None:

@@ -91,6 +91,8 @@ def _gap(seen: stats.Rate, unseen: stats.Rate) -> str:
         gained = f"{-middle:.1f} points (95% interval {-high:.1f} to {-low:.1f})"
         return f"It does better on the new ones, by {gained}."
     bounds = f"{low:+.1f} to {high:+.1f} points"
+    if middle == 0:
+        return f"It does as well on the new ones (95% interval of the difference {bounds})."
     return f"The difference between the two may be chance (95% interval {bounds})."
 
 
