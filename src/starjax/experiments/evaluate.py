@@ -107,9 +107,10 @@ def _label(file: Path) -> str:
 def _before(folder: Path) -> dict[str, Any]:
     """The result that is there; of a damaged one nothing."""
     try:
-        return files.read_json(folder / "result.json")
+        found = files.read_json(folder / "result.json")
     except (FileNotFoundError, ValueError):
         return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any]:
