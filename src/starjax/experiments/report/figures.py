@@ -70,13 +70,19 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
             axis.set_title(title)
             axis.set_xlabel(f"training step (from {results.observed(runs)})")
             axis.set_yscale("log")
-            axis.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+            low, high = axis.get_ylim()
+            subs = _TICKS if high > _TICKS[-1] * low else _CLOSE_TICKS
+            axis.yaxis.set_major_locator(ticker.LogLocator(subs=subs))
             axis.yaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
             axis.yaxis.set_minor_locator(ticker.NullLocator())
         if len(runs) > 1:
             figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
 
+
+# Of each decade of a logarithmic axis, and of one that spans less than the first of them.
+_TICKS = (1, 2, 5)
+_CLOSE_TICKS = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
 
 # Keys of metrics.jsonl that are drawn.
 CURVES = {
