@@ -120,6 +120,50 @@ def test_trials_of_other_limits_are_neither_paired_nor_pooled(several):
     )
 
 
+@pytest.fixture(scope="module")
+def sweeps(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sweeps")
+    skills = {"dp_ee": (0.5, 0.1), "stardiff": (0.95, 0.9)}
+    return [
+        results.load(synthetic.run(out / name, name, skill, sweep_of=300))
+        for name, skill in skills.items()
+    ]
+
+
+def test_trials_of_a_sweep_are_told_by_distance(sweeps):
+    table = tables.swept(sweeps)
+    assert table[0][:4] == ["Method", "Strict", "Safe", "0 to 10 mm"]
+    for run, row in zip(sweeps, table[1:], strict=True):
+        trials = {
+            title: [t for t in run.sweep if low <= 1e3 * t["distance_m"] < low + 10]
+            for title, low in zip(table[0][3:], range(0, 100, 10))
+        }
+        expected = [tables.rate(outcomes.tally(part)) if part else "–" for part in trials.values()]
+        assert row[3:] == expected and sum(map(len, trials.values())) == 300
+        assert row[1] == tables.rate(outcomes.tally(run.sweep))
+        assert row[2] == tables.rate(outcomes.tally(run.sweep, outcomes.safe))
+    assert len(tables.swept([sweeps[0]._replace(sweep=[])])) == 1
+    for text in (tables.markdown(sweeps), page.render(sweeps, sweeps[1], {}, None)):
+        assert tables.SWEPT in text and tables.SWEPT_PAIRED in text
+
+
+def test_sweeps_are_paired_where_they_met_the_same_trocars(sweeps):
+    theirs, ours = sweeps
+    (_, row) = tables.paired(results.swept(sweeps))
+    both = list(zip(ours.sweep, theirs.sweep))
+    assert row[1:4] == [
+        "300",
+        str(sum(a["success"] > b["success"] for a, b in both)),
+        str(sum(a["success"] < b["success"] for a, b in both)),
+    ]
+    # of a grid, say: the same numbers and seed, other places
+    moved = [{**trial, "azimuth": trial["azimuth"] + 0.1} for trial in theirs.sweep]
+    assert len(tables.paired(results.swept([theirs._replace(sweep=moved), ours]))) == 1
+    near = [{**trial, "azimuth": trial["azimuth"] + 1e-8} for trial in theirs.sweep]
+    assert len(tables.paired(results.swept([theirs._replace(sweep=near), ours]))) == 2
+    assert len(tables.paired(results.swept([theirs._replace(sweep_limit_s=4.0), ours]))) == 1
+
+
 def test_what_other_weights_left_beside_a_result_is_not_shown(tmp_path):
     run = synthetic.run(tmp_path / "stardiff")
     for name, figure in (("sweep", "trials"), ("bench", "roll_network_ms")):

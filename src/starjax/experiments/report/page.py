@@ -49,6 +49,7 @@ def render(
         sections.comparison(runs) if several else sections.tests(focus),
         _figure("fig3", figures),
         _figure("fig4", figures),
+        sections.swept(runs),
         _figure("ports", figures),
         sections.matrix(runs) if several else sections.per_trocar(focus),
         sections.failures(runs),

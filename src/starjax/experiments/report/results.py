@@ -13,6 +13,7 @@ from starjax.experiments.report import outcomes, stats
 from starjax.runtime import files
 
 OURS = "stardiff"  # the method that the others are compared with
+_DIGITS = 5  # of m and rad: machines draw the same trocar with other last bits
 
 
 class Rollout(NamedTuple):
@@ -81,11 +82,26 @@ def identity(trial: outcomes.Trial) -> tuple[int, int, int]:
     return int(trial["trocar"]), int(trial["trial"]), int(trial["seed"])
 
 
+def _met(trial: outcomes.Trial) -> tuple[float, ...]:
+    """The same and, as sweeps number their own trocars, the place of this one."""
+    place = (round(trial[field], _DIGITS) for field in ("radius", "polar", "azimuth"))
+    return *identity(trial), *place
+
+
 def most_shared(trials: Iterable[outcomes.Trial]) -> tuple[int, int, int]:
     """The trial that most runs met, of these an unseen one, of these the first."""
     trials = list(trials)
     counts = collections.Counter(map(identity, trials))
     return identity(min(trials, key=lambda t: (-counts[identity(t)], t["seen"], identity(t))))
+
+
+def swept(runs: Iterable[Run]) -> list[Run]:
+    """The runs that have a sweep, its trials in the place of those through the twelve trocars."""
+    return [
+        run._replace(result={**run.result, "trials": run.sweep}, limit_s=run.sweep_limit_s)
+        for run in runs
+        if run.sweep
+    ]
 
 
 def trials_seed(run: Run) -> int | None:
@@ -103,7 +119,7 @@ def pair(a: Run, b: Run) -> stats.Paired | None:
     """McNemar's test over the trials that both methods ran with the same trocar, seed and limit."""
     if a.limit_s != b.limit_s:
         return None
-    ours, theirs = ({identity(t): outcomes.strict(t) for t in run.trials} for run in (a, b))
+    ours, theirs = ({_met(t): outcomes.strict(t) for t in run.trials} for run in (a, b))
     common = sorted(ours.keys() & theirs.keys())
     if not common:
         return None

@@ -1,7 +1,7 @@
 """The parts of the HTML page, each empty where a run left nothing to say."""
 
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from starjax.experiments.report import markup, outcomes, results, stats, tables, words
@@ -124,6 +124,15 @@ def comparison(runs: Sequence[results.Run]) -> str:
     return text + "<h2>Success by three tests (%)</h2>\n" + others
 
 
+def swept(runs: Sequence[results.Run]) -> str:
+    """Success through the trocars of sweeps; of several methods, paired tests too."""
+    parts = (
+        (tables.SWEPT, tables.swept(runs, _brief), tables.SWEPT_NOTE),
+        (tables.SWEPT_PAIRED, tables.paired(results.swept(runs)), tables.PAIRED_NOTE),
+    )
+    return _titled(parts)
+
+
 def per_trocar(run: results.Run) -> str:
     """One method: a row a trocar."""
     rows = []
@@ -193,7 +202,7 @@ def measurements(runs: Sequence[results.Run]) -> str:
         ("Inference time", tables.inference(runs), tables.inference_note(runs)),
         ("Where the time went", tables.phases(runs), tables.PHASES_NOTE),
     )
-    return "\n".join(f"<h2>{h}</h2>\n{markup.plain(t, n)}" for h, t, n in parts if len(t) > 1)
+    return _titled(parts)
 
 
 def reproduce(runs: Sequence[results.Run]) -> str:
@@ -208,6 +217,11 @@ def reproduce(runs: Sequence[results.Run]) -> str:
             text += f"<details>{summary}<pre>{markup.escape(lines)}</pre></details>\n"
     versions = runs[0].result.get("versions")
     return text + (f"<footer>{markup.escape(words.listing(versions))}</footer>" if versions else "")
+
+
+def _titled(parts: Iterable[tuple[str, tables.Table, str]]) -> str:
+    """Tables under their headings, each with its note, those of no rows left out."""
+    return "\n".join(f"<h2>{h}</h2>\n{markup.plain(t, n)}" for h, t, n in parts if len(t) > 1)
 
 
 def _brief(rate: stats.Rate) -> str:

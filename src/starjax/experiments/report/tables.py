@@ -21,6 +21,8 @@ def markdown(runs: Sequence[results.Run]) -> str:
         ("Table III. Task success on peg transfer (%)", success(runs), SUCCESS_NOTE),
         ("Success by three tests (%)", by_test(runs), TESTS_NOTE),
         ("Paired comparison with STAR-Diff", paired(runs), PAIRED_NOTE),
+        (SWEPT, swept(runs), SWEPT_NOTE),
+        (SWEPT_PAIRED, paired(results.swept(runs)), PAIRED_NOTE),
         ("Failed trials", failures(runs), FAILURES_NOTE),
         ("RCM error (mm)", rcm(runs), RCM_NOTE),
         ("Table IV. Inference time", inference(runs), inference_note(runs)),
@@ -40,6 +42,12 @@ PAIRED_NOTE = (
     "McNemar's exact test on trials with the same trocar and seed; Holm corrects for the number "
     "of comparisons."
 )
+SWEPT = "Success through other trocars (%)"
+SWEPT_NOTE = (
+    "Trials of the sweep, all of them and by the distance of their trocar to the nearest one in "
+    "the demonstrations. Successes/trials and the 95% Wilson interval in brackets."
+)
+SWEPT_PAIRED = "Paired comparison with STAR-Diff through these trocars"
 FAILURES_NOTE = "Each failed trial is counted under the first class that applies."
 RCM_NOTE = (
     "Distance of the shaft's axis from the trocar. Commanded: as the policy asked for it. "
@@ -52,6 +60,7 @@ PHASES_NOTE = (
     "and trials."
 )
 _QUANTILES = ("p50", "p95", "p99")
+_BIN_MM = 10  # of a trocar's distance to the nearest one in the demonstrations
 _COMPILE = ": compile"  # ends the name of a phase's share spent compiling
 INFERENCE_NOTE = (
     "One decision for one environment: observation in, commands out; compiling is not counted. "
@@ -89,6 +98,21 @@ def by_test(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = rat
         if run.trials:
             scores = [s for test, _ in TESTS.values() for s in _seen_unseen(run, test)]
             table.append([run.label, *(cell(s) if s else "–" for s in scores)])
+    return table
+
+
+def swept(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = rate) -> Table:
+    """Success of the sweeps' trials: all, safe, and strict by distance to training's trocars."""
+    runs = results.swept(runs)
+    bins = sorted({_bin(trial) for run in runs for trial in run.trials})
+    spans = (f"{_BIN_MM * b} to {_BIN_MM * (b + 1)} mm" for b in bins)
+    table = [["Method", "Strict", "Safe", *spans]]
+    for run in runs:
+        scores = [outcomes.tally(run.trials, test) for test in (outcomes.strict, outcomes.safe)]
+        parts = ([t for t in run.trials if _bin(t) == b] for b in bins)
+        cells = [cell(score) for score in scores]
+        cells += [cell(outcomes.tally(part)) if part else "–" for part in parts]
+        table.append([run.label, *cells])
     return table
 
 
@@ -200,6 +224,10 @@ def millimetres(value: float) -> str:
 def p_value(p: float) -> str:
     """Two digits, and no claim of more than 1e-4."""
     return "<0.0001" if p < 1e-4 else f"{p:.4f}" if p < 0.01 else f"{p:.2f}"
+
+
+def _bin(trial: outcomes.Trial) -> int:
+    return int(1e3 * trial["distance_m"] // _BIN_MM)
 
 
 def _comparison(a: results.Run, b: results.Run) -> tuple[object, ...]:
