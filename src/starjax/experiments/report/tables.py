@@ -21,7 +21,7 @@ def markdown(runs: Sequence[results.Run]) -> str:
         ("Table III. Task success on peg transfer (%)", success(runs), SUCCESS_NOTE),
         ("Success by three tests (%)", by_test(runs), TESTS_NOTE),
         ("Paired comparison with STAR-Diff", paired(runs), PAIRED_NOTE),
-        (SWEPT, swept(runs), SWEPT_NOTE),
+        (SWEPT, swept(runs), f"{SWEPT_NOTE} {_CELL_NOTE}"),
         (SWEPT_PAIRED, paired(results.swept(runs)), PAIRED_NOTE),
         ("Failed trials", failures(runs), FAILURES_NOTE),
         ("RCM error (mm)", rcm(runs), RCM_NOTE),
@@ -33,9 +33,10 @@ def markdown(runs: Sequence[results.Run]) -> str:
     return "\n".join(part for part in (head, notes, *filled) if part)
 
 
+_CELL_NOTE = "Successes/trials and the 95% Wilson interval in brackets."
 SUCCESS_NOTE = (
-    "Successes/trials and the 95% Wilson interval in brackets; the gap is seen minus unseen in "
-    "percentage points with Newcombe's 95% interval, and means little where both are low."
+    f"{_CELL_NOTE[:-1]}; the gap is seen minus unseen in percentage points with Newcombe's 95% "
+    "interval, and means little where both are low."
 )
 TESTS_NOTE = ". ".join(f"{name.capitalize()}: {what}" for name, (_, what) in TESTS.items()) + "."
 PAIRED_NOTE = (
@@ -45,7 +46,7 @@ PAIRED_NOTE = (
 SWEPT = "Success through other trocars (%)"
 SWEPT_NOTE = (
     "Trials of the sweep, all of them and by the distance of their trocar to the nearest one in "
-    "the demonstrations. Successes/trials and the 95% Wilson interval in brackets."
+    "the demonstrations."
 )
 SWEPT_PAIRED = "Paired comparison with STAR-Diff through these trocars"
 FAILURES_NOTE = "Each failed trial is counted under the first class that applies."
