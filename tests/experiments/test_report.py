@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 import types
 
 import imageio_ffmpeg
@@ -774,6 +775,9 @@ def test_a_machine_without_a_video_encoder_still_gets_the_page(tmp_path, monkeyp
     monkeypatch.setattr(video, "record", fail)
     index = build.build([synthetic.run(tmp_path / "x")], tmp_path / "report", report=said.append)
     assert index.exists() and said == ["no video: no ffmpeg"]
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(RuntimeError, match="encoder is missing"):
+        video.write([np.zeros((2, 2, 3), np.uint8)], tmp_path / "film.mp4")
 
 
 def test_runs_trained_at_fewer_trocars_show_what_more_buy(tmp_path):

@@ -128,8 +128,10 @@ def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) ->
     Raises:
       OSError, RuntimeError: the encoder failed, or there is none for this machine.
     """
-    import imageio_ffmpeg
-
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise RuntimeError(f"the video's encoder is missing ({error})") from error
     stream = iter(pictures)
     first = next(stream)
     if first.dtype != np.uint8 or first.ndim != 3 or any(n % 2 for n in first.shape[:2]):
