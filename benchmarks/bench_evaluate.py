@@ -26,7 +26,7 @@ import numpy as np
 
 from starjax import rcm, runtime
 from starjax.data import workers
-from starjax.evaluation import latency, rollout
+from starjax.evaluation import evaluate, latency, rollout
 from starjax.experiments import scoring
 from starjax.policies import packaged
 from starjax.sim import env as envs
@@ -50,7 +50,7 @@ def main() -> None:
     subject_name = pathlib.Path(asked.policy).stem if asked.policy else "untrained"
     env = envs.make(settings.observation, settings.image_size)
     steps = math.ceil(asked.limit * env.control_hz)
-    lanes = asked.lanes or rollout.lanes_per_device(
+    lanes = asked.lanes or evaluate.lanes_per_device(
         jax.devices()[0], len(rcm.IS_SEEN) * asked.trials
     )
     rules = rollout.Settings(settings.obs_horizon, settings.execute, steps)

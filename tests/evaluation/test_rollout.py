@@ -389,8 +389,8 @@ assert len(jax.devices()) == 2
 one = test_rollout.run(out / "1", lanes=2, devices=jax.devices()[:1])
 two = test_rollout.run(out / "2", lanes=2, devices=jax.devices())
 test_rollout.assert_same(one, two)
-from starjax.evaluation import rollout
-rollout.lanes_per_device = lambda _, trials: trials
+from starjax.evaluation import evaluate
+evaluate.lanes_per_device = lambda _, trials: trials
 test_rollout.run(out / "3", lanes=0, devices=jax.devices())
 from starjax.data import demos, lanes
 last = lanes.split(lambda x: x + 1, jax.devices()[1:], [lanes.LANE], lanes.LANE)(np.ones(2))
@@ -443,7 +443,7 @@ class _Device:
 )
 def test_a_gpu_runs_as_many_lanes_as_make_the_fewest_chunks(gigabytes, trials, lanes):
     device: Any = _Device(gigabytes)
-    assert rollout.lanes_per_device(device, trials) == lanes
+    assert evaluate.lanes_per_device(device, trials) == lanes
 
 
 def test_lanes_are_split_over_all_devices_of_several(monkeypatch):

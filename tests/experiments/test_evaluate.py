@@ -89,6 +89,16 @@ def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
     assert "chunks of another evaluation are replaced" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("damaged", ["{", "[]"])
+def test_a_damaged_result_is_put_together_again(file, damaged):
+    score("--out", "here")
+    result = file.parent / "here" / "result.json"
+    made = json.loads(result.read_text())
+    result.write_text(damaged)
+    score("--out", "here")
+    assert json.loads(result.read_text())["trials"] == made["trials"]
+
+
 @pytest.mark.parametrize("held", ["config.json", "demos-abc", "stardiff/config.json"])
 def test_the_folder_of_a_run_is_no_place_for_a_result(file, held):
     place = file.parent / "here" / held

@@ -22,6 +22,9 @@ from starjax.evaluation import recorded, rollout, table
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files, progress, xla
 
+# Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
+GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
+
 
 def evaluate(
     directory: Path,
@@ -60,7 +63,7 @@ def evaluate(
       chunk: trials that are simulated and saved together, at most; 0 for as many as the lanes.
         Changes neither the result nor the memory taken.
       lanes: size of the compiled batch on each device, or of each core's on a CPU; 0 for
-        `rollout.lanes_per_device`: it is what decides memory, and may change last bits.
+        `lanes_per_device`: it is what decides memory, and may change last bits.
       video_trials: how many trials get their joint positions recorded, at least.
       devices: to split a chunk over; where `lanes` is 0, these are so few that all have a share.
       identity: JSON values that tell this policy from others with the same weights.
@@ -86,7 +89,7 @@ def evaluate(
     count = len(trocars.radius)
     first_device = (devices or jax.local_devices())[0]
     several = len(devices or [0])
-    lanes = lanes or rollout.lanes_per_device(first_device, -(-count * trials // several))
+    lanes = lanes or lanes_per_device(first_device, -(-count * trials // several))
     batch = lanes * several
     index, trial = (x.reshape(-1) for x in np.divmod(np.arange(count * trials), trials))
     chosen = recorded.choose(count, trials, video_trials)
@@ -134,6 +137,19 @@ def evaluate(
         if chosen.any():
             files.write_npz(directory / "recorded.npz", recorded.join(kept))
     return table.join(tables)
+
+
+def lanes_per_device(device: jax.Device, trials: int) -> int:
+    """Trials that a device of this kind runs together, where its share of them are `trials`.
+
+    A GPU's are as many as make the fewest chunks, and no more than these need.
+    """
+    if device.platform == "cpu":
+        return workers.CPU_LANES
+    limit = (device.memory_stats() or {}).get("bytes_limit", 0)
+    most = GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
+    chunks = -(-trials // most)
+    return min(most, 8 * -(-trials // (8 * chunks)))
 
 
 def fingerprint(tree: Any) -> str:

@@ -15,14 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.data import lanes, workers
+from starjax.data import lanes
 from starjax.rcm.trocar import Trocar
 from starjax.sim import env as sim_env
 from starjax.types import Command
 
 SEGMENT = 25  # re-plans between two looks at the host
-# Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
-GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
 
 
 class Settings(NamedTuple):
@@ -172,19 +170,6 @@ def make(
         yield Progress(1.0, rollouts)
 
     return run
-
-
-def lanes_per_device(device: jax.Device, trials: int) -> int:
-    """Trials that a device of this kind runs together, where its share of them are `trials`.
-
-    A GPU's are as many as make the fewest chunks, and no more than these need.
-    """
-    if device.platform == "cpu":
-        return workers.CPU_LANES
-    limit = (device.memory_stats() or {}).get("bytes_limit", 0)
-    most = GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
-    chunks = -(-trials // most)
-    return min(most, 8 * -(-trials // (8 * chunks)))
 
 
 def _check(settings: Settings) -> None:

@@ -10,6 +10,8 @@ from starjax.evaluation import metrics
 from starjax.evaluation import table as tables
 from starjax.rcm.trocar import Trocar
 
+BIN_WIDTH = 0.01  # m, of the distance to the nearest training trocar
+
 
 def sample(seed: int, count: int) -> Trocar:
     """`count` trocars drawn as in Eq. 19, in section V-A2's ranges."""
@@ -43,7 +45,7 @@ def compose(
     p_world_ref: np.ndarray,
     *,
     seed: int,
-    bin_width: float = 0.01,
+    bin_width: float = BIN_WIDTH,
 ) -> dict[str, Any]:
     """A sweep's result as JSON values: figures over all, over distance, and every trial.
 

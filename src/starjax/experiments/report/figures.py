@@ -80,7 +80,7 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
     return figure
 
 
-# Of each decade of a logarithmic axis, and of one that spans less than the first of them.
+# Ticks of each decade of a logarithmic axis, and of an axis too short for them.
 _TICKS = (1, 2, 5)
 _CLOSE_TICKS = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
 

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Sequence
 
+from starjax.evaluation import sweep
 from starjax.experiments import folders
 from starjax.experiments.report import outcomes, results, stats, words
 
@@ -61,7 +62,6 @@ PHASES_NOTE = (
     "and trials."
 )
 _QUANTILES = ("p50", "p95", "p99")
-_BIN_MM = 10  # of a trocar's distance to the nearest one in the demonstrations
 _COMPILE = ": compile"  # ends the name of a phase's share spent compiling
 INFERENCE_NOTE = (
     "One decision for one environment: observation in, commands out; compiling is not counted. "
@@ -106,7 +106,8 @@ def swept(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = rate)
     """Success of the sweeps' trials: all, safe, and strict by distance to training's trocars."""
     runs = results.swept(runs)
     bins = sorted({_bin(trial) for run in runs for trial in run.trials})
-    spans = (f"{_BIN_MM * b} to {_BIN_MM * (b + 1)} mm" for b in bins)
+    width = 1e3 * sweep.BIN_WIDTH
+    spans = (f"{width * b:g} to {width * (b + 1):g} mm" for b in bins)
     table = [["Method", "Strict", "Safe", *spans]]
     for run in runs:
         scores = [outcomes.tally(run.trials, test) for test in (outcomes.strict, outcomes.safe)]
@@ -228,7 +229,7 @@ def p_value(p: float) -> str:
 
 
 def _bin(trial: outcomes.Trial) -> int:
-    return int(1e3 * trial["distance_m"] // _BIN_MM)
+    return int(trial["distance_m"] / sweep.BIN_WIDTH)
 
 
 def _comparison(a: results.Run, b: results.Run) -> tuple[object, ...]:
