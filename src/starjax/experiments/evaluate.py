@@ -107,10 +107,9 @@ def _label(file: Path) -> str:
 def _before(folder: Path) -> dict[str, Any]:
     """The result that is there; of a damaged one nothing."""
     try:
-        found = files.read_json(folder / "result.json")
+        return files.read_json(folder / "result.json")
     except (FileNotFoundError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any]:
