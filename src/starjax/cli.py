@@ -30,9 +30,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 
 
-_STORAGE = (
-    errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EDQUOT, errno.EPERM, errno.EISDIR, errno.ENOTDIR,
-)  # fmt: skip
+_WRITING = (errno.ENOSPC, errno.EROFS, errno.EDQUOT)
+_STORAGE = (*_WRITING, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTDIR)
 _STOPPED = 130  # exit code after Ctrl-C or SIGTERM
 _AGAIN_S = 0.5  # s until a stop that was lost is asked for again
 _UNREAD = 141  # exit code of a program whose reader went away (128 + SIGPIPE), as in `| head`
@@ -68,7 +67,7 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """Runs a command; what its user can mend becomes one line and an exit code, no traceback.
 
     Returns 2 for a mistake on the command line, 71 for too little memory, 74 for a disk that is
-    full or cannot be written, 130 after Ctrl-C or SIGTERM (whatever was running has saved by then,
+    full or cannot be used, 130 after Ctrl-C or SIGTERM (whatever was running has saved by then,
     and says how to go on), 141 once nobody reads the output.
     """
     try:
@@ -91,7 +90,8 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         if error.errno not in _STORAGE:
             raise
         place = f": {error.filename}" if error.filename else ""
-        return _fail(f"cannot write{place}: {error.strerror}; choose another folder by --out", 74)
+        does = "write" if error.errno in _WRITING else "read or write"
+        return _fail(f"cannot {does}{place}: {error.strerror}", 74)
     except RuntimeError as error:
         if not str(error).startswith("RESOURCE_EXHAUSTED"):
             raise

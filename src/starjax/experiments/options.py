@@ -39,7 +39,7 @@ def parse(
       config.UsageError: one line that names the argument, what was expected and what came.
     """
     if not {"-h", "--help"} & set(argv):
-        _check(flags(settings), argv[_count_positional(settings, argv) :])
+        argv = _sorted(settings, argv)
     start = tyro.MISSING_NONPROP if default is None else default
     return tyro.cli(settings, args=list(argv), prog=prog, description=description, default=start)
 
@@ -106,52 +106,58 @@ def _is_positional(settings: type, name: str) -> bool:
     return tyro.conf.Positional in getattr(hint, "__metadata__", ())
 
 
-def _count_positional(settings: type, argv: Sequence[str]) -> int:
-    """Words before the first flag; UsageError unless they are as many as `settings` asks for."""
-    given = next((i for i, token in enumerate(argv) if token.startswith("-")), len(argv))
-    hints = typing.get_type_hints(settings)
+def _sorted(settings: type, argv: Sequence[str]) -> list[str]:
+    """`argv` without a mistake: the words of no flag first, then the flags with theirs."""
+    hints, known = typing.get_type_hints(settings), flags(settings)
     fields = [f for f in dataclasses.fields(settings) if _is_positional(settings, f.name)]
-    names = [field.name for field in fields]
-    needed = sum(field.default is dataclasses.MISSING for field in fields)
-    several = any(typing.get_origin(hints[name]) is tuple for name in names)
-    if names and (given < needed or (given > len(names) and not several)):
-        got = " ".join(argv[:given]) or "none"
-        raise config_lib.UsageError(
-            f"{' '.join(names).upper()}: expected before any flag, got {got}"
-        )
-    return given if names else 0
-
-
-def _check(known: Mapping[str, Any], argv: Sequence[str]) -> None:
-    """Finds the first mistake in `argv`."""
-    index = 0
+    first = next((i for i, token in enumerate(argv) if token.startswith("-")), len(argv))
+    words, rest = list(argv[:first]), []
+    if words and not fields:
+        raise config_lib.UsageError(f"{words[0]}: expected a flag such as {next(iter(known))}")
+    index = first
     while index < len(argv):
         token, equals, value = argv[index].partition("=")
-        index += 1
+        flag, start = _spelled(token), index
         if not token.startswith("--"):
             raise config_lib.UsageError(f"{token}: expected a flag such as {next(iter(known))}")
-        flag = _spelled(token)
         if flag not in known:
             raise config_lib.UsageError(f"{token}: unknown argument{suggest(flag, known)}")
+        index += 1
         values = [value] if equals else []
         while not equals and index < len(argv) and not argv[index].startswith("--"):
             values.append(argv[index])
             index += 1
-        _check_values(flag, known[flag], values)
+        count = _count(known[flag], values)
+        # What is more than a flag takes may be a word of no flag, after it.
+        beyond = values[count:] if fields and not equals else []
+        words += beyond
+        rest += argv[start : index - len(beyond)]
+        _check_values(flag, known[flag], values[: len(values) - len(beyond)], count)
+    needed = sum(field.default is dataclasses.MISSING for field in fields)
+    several = any(typing.get_origin(hints[field.name]) is tuple for field in fields)
+    if len(words) < needed or (len(words) > len(fields) and not several):
+        names, got = " ".join(field.name for field in fields).upper(), " ".join(words) or "none"
+        count = "one or more" if several else len(fields)
+        raise config_lib.UsageError(f"{names}: expected {count}, got {got}")
+    return [*words, *rest]
 
 
-def _check_values(flag: str, hint: Any, values: list[str]) -> None:
-    """Checks the words after one flag against its type."""
-    several = typing.get_origin(hint) is tuple
+def _count(hint: Any, values: Sequence[str]) -> int:
+    """How many words a flag of this type takes."""
     if hint is None:
-        expected = 0
-    elif several and Ellipsis not in typing.get_args(hint):
-        expected = len(typing.get_args(hint))
-    else:
-        expected = max(1, len(values)) if several else 1
-    if len(values) != expected:
+        return 0
+    if typing.get_origin(hint) is not tuple:
+        return 1
+    kinds = typing.get_args(hint)
+    return max(1, len(values)) if Ellipsis in kinds else len(kinds)
+
+
+def _check_values(flag: str, hint: Any, values: Sequence[str], count: int) -> None:
+    """Checks the words after one flag, of which it takes `count`, against its type."""
+    if len(values) != count:
         got = " ".join(values) or "none"
-        raise config_lib.UsageError(f"{flag}: expected {expected} value(s), got {got}")
+        raise config_lib.UsageError(f"{flag}: expected {count} value(s), got {got}")
+    several = typing.get_origin(hint) is tuple
     for value in values:
         _check_value(flag, typing.get_args(hint)[0] if several else hint, value)
 
