@@ -22,6 +22,7 @@ import numpy as np
 
 from starjax import runtime
 from starjax.evaluation import latency
+from starjax.experiments import bench
 from starjax.models import roll_net
 from starjax.policies import features
 from starjax.policies import policy as policies
@@ -37,7 +38,7 @@ CASES = {
     },
     "cpu": {
         f"state batch {batch}, {steps} steps": (_setup.small(batch), batch, steps)
-        for batch, counts in ((1, latency.DDIM_STEPS), (24, (10,)))
+        for batch, counts in ((1, bench.DDIM_STEPS), (24, (10,)))
         for steps in counts
     },
     "tiny": {"48 px batch 2": (_setup.miniature(), 2, 10)},

@@ -75,8 +75,9 @@ def test_fields_of_a_trocar_broadcast(made):
     one = jax.tree.map(lambda x: np.repeat(x[:1], ROBOTS, 0), observation)
     port = jax.tree.map(lambda field: field[:1].repeat(ROBOTS), rcm.TROCARS)
     wanted = deployed(jax.random.key(0), one, port)
-    got = deployed(jax.random.key(0), one, port._replace(radius=PORT.radius, azimuth=PORT.azimuth))
-    jax.tree.map(np.testing.assert_array_equal, got, wanted)
+    for given in (port._replace(radius=PORT.radius, azimuth=PORT.azimuth), PORT):
+        got = deployed(jax.random.key(0), one, given)
+        jax.tree.map(np.testing.assert_array_equal, got, wanted)
 
 
 def test_a_mistake_names_the_array(made):
@@ -96,6 +97,12 @@ def test_a_mistake_names_the_array(made):
             good,
             rcm.Trocar(*np.full((3, 1, 1), 0.1)),
         ),
+        r"trocar: expected fields of shape \[\] or \[B\], got \[0\]": (
+            observed(trained.policy, (0,)),
+            rcm.Trocar(*np.zeros((3, 0))),
+        ),
+        r"observation.pose.R: expected shape .*, got none": (good.replace(pose=None), trocar),
+        r"observation.gripper: expected shape .*, got none": (good.replace(gripper=None), trocar),
     }
     if kind == "image":
         bright = good.replace(image=good.image / np.float32(255))
@@ -103,6 +110,8 @@ def test_a_mistake_names_the_array(made):
     for message, given in mistakes.items():
         with pytest.raises(ValueError, match=message):
             deployed(jax.random.key(0), *given)
+    with pytest.raises(ValueError, match=r"key: expected a jax\.random\.key, got int"):
+        deployed(0, good, trocar)
 
 
 def test_numbers_that_no_robot_measures_are_refused(made):

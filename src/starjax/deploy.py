@@ -56,7 +56,8 @@ class Deployed:
         Args:
           key: random key; a new one for each decision.
           observation: of the last O moments, oldest first, fields `[O, ...]` or `[B, O, ...]`.
-          trocar: where the port is, fields `[]` or `[B]`, which broadcast.
+          trocar: where the port is, fields `[]` or `[B]`, which broadcast; one for all robots if
+            all are `[]`.
 
         Jaws are the same after half a turn, so a tool that is turned by more than a quarter (of
         `rcm.roll_of`), which no demonstration shows, is read and commanded as half a turn back.
@@ -66,21 +67,26 @@ class Deployed:
           (but for `dp_ee`), and the gripper's openings.
 
         Raises:
-          ValueError: an array has another shape or type than expected, a number is not finite or
-            none that is measured so, a rotation is none, the trocar is none, tip or trocar are
-            farther than `FARTHEST` from the nominal port, or, of a policy that keeps to the RCM
-            manifold, the tool's axis is farther than `FARTHEST_OFF` from the trocar. Values that
-            jax traces are not looked at.
+          ValueError: an array is missing or has another shape or type than expected, a number is
+            not finite or none that is measured so, a rotation is none, the trocar is none, tip or
+            trocar are farther than `FARTHEST` from the nominal port, or, of a policy that keeps to
+            the RCM manifold, the tool's axis is farther than `FARTHEST_OFF` from the trocar.
+            Values that jax traces are not looked at.
         """
         if not isinstance(trocar, rcm.Trocar):
             raise ValueError(f"trocar: expected an rcm.Trocar, got {type(trocar).__name__}")
         trocar = rcm.check_trocar(trocar)
-        if not _is_traced(trocar.radius) and (radius := np.max(trocar.radius)) > FARTHEST:
-            raise ValueError(f"trocar.radius: expected at most {FARTHEST} m, got {radius:g}")
-        trocar = rcm.Trocar(*jnp.broadcast_arrays(*trocar))
-        robots = np.shape(trocar.radius)
+        farthest = 0.0 if _is_traced(trocar.radius) else np.max(trocar.radius, initial=0.0)
+        if farthest > FARTHEST:
+            raise ValueError(f"trocar.radius: expected at most {FARTHEST} m, got {farthest:g}")
+        if not isinstance(key, jax.Array | np.ndarray):
+            raise ValueError(f"key: expected a jax.random.key, got {type(key).__name__}")
         observation = self._given(observation)
+        trocar = rcm.Trocar(*jnp.broadcast_arrays(*trocar))
+        several = np.shape(observation.pose.p)[:-2]
+        robots = np.shape(trocar.radius) or (several if len(several) == 1 else ())
         self._check(observation, robots)
+        trocar = rcm.Trocar(*(jnp.broadcast_to(field, robots) for field in trocar))
         self._check_values(observation, trocar)
         keys = jax.random.split(key, robots[0]) if robots else key[None]
         if not robots:
@@ -92,13 +98,12 @@ class Deployed:
 
     def _given(self, observation: Observation) -> Observation:
         """What the policy looks at, as arrays."""
-        pose, kind = Pose(*map(_array, observation.pose)), self.settings.observation
-        seen = getattr(observation, kind)
-        seen = {kind: None if seen is None else _array(seen)}
+        pose, kind = Pose(*map(_array, observation.pose or (None, None))), self.settings.observation
+        seen = {kind: _array(getattr(observation, kind))}
         return Observation(pose=pose, gripper=_array(observation.gripper), **seen)
 
     def _check(self, observation: Observation, robots: tuple[int, ...]) -> None:
-        if len(robots) > 1:
+        if len(robots) > 1 or robots == (0,):
             raise ValueError(f"trocar: expected fields of shape [] or [B], got {list(robots)}")
         size, moments = self.settings.image_size, (*robots, self.settings.obs_horizon)
         expected: dict[str, tuple[int, ...]] = {"pose.R": (3, 3), "pose.p": (3,), "gripper": ()}
@@ -172,7 +177,7 @@ def _largest_miss(pose: Pose, trocar: rcm.Trocar, p_world_ref: Any) -> jax.Array
 
 
 def _array(value: Any) -> Any:
-    return value if isinstance(value, jax.Array) else np.asarray(value)
+    return value if value is None or isinstance(value, jax.Array) else np.asarray(value)
 
 
 def _is_traced(value: Any) -> bool:

@@ -106,14 +106,14 @@ def collect(
       for them, frames stored.
 
     Raises:
-      StorageError: the folder cannot be written, is in use, holds another dataset, or is too small.
+      StorageError: the folder cannot be read or written, is in use, holds another dataset, or is
+        too small.
       ValueError: an argument out of range, a trocar that is none, an expert that fails too often.
     """
     if per_trocar < 1 or max_steps < 1 or chunk < 0:
         got = {"per_trocar": per_trocar, "max_steps": max_steps, "chunk": chunk}
         raise ValueError(f"per_trocar, max_steps: expected 1 or more, chunk: 0 or more, got {got}")
-    trocars = Trocar(*(np.asarray(field, np.float32) for field in trocars))
-    rcm.check_trocar(trocars)
+    trocars = listed(trocars)
     total = per_trocar * len(trocars.radius)
     with files.lock(root):
         frame = recorder.frame(env)
@@ -129,7 +129,7 @@ def collect(
         )
         store.create(root, description)
         store.clean(root)
-        records = _sound(root, report)
+        records = _sound(root, seed, report)
         done = sum(r["success"] for r in records.values())
         files.require_writable(
             root, max(total - done, 0) * min(max_steps, FRAME_GUESS) * frame_bytes
@@ -165,14 +165,38 @@ def collect(
     }
 
 
-def _sound(root: Path, report: Callable[[str], None]) -> dict[str, store.Record]:
-    """Records of the episodes on disk; damaged ones are removed, to be collected again."""
+def listed(trocars: Trocar) -> Trocar:
+    """Concrete trocars as float32 fields `[C]`.
+
+    Raises:
+      ValueError: one is none, there are none, or they have more axes than one.
+    """
+    rcm.check_trocar(trocars)
+    fields = (np.atleast_1d(np.asarray(field, np.float32)) for field in trocars)
+    trocars = Trocar(*np.broadcast_arrays(*fields))
+    if trocars.radius.ndim != 1 or not trocars.radius.size:
+        got = list(trocars.radius.shape)
+        raise ValueError(f"trocars: expected fields [C] of one trocar or more, got shape {got}")
+    return trocars
+
+
+def _sound(root: Path, seed: int, report: Callable[[str], None]) -> dict[str, store.Record]:
+    """Records of the episodes on disk; damaged ones are removed, to be collected again.
+
+    Raises:
+      StorageError: one is of another seed, so that a lost dataset.json was of another dataset.
+    """
     records = {}
     for key, found in store.verify_all(root, store.keys(root)).items():
         if isinstance(found, store.DamagedEpisode):
             report(f"damaged, collected again: {found}")
             (root / "SEALED.json").unlink(missing_ok=True)
             store.remove(root, key)
+        elif found["seed"] != seed:
+            raise files.StorageError(
+                f"{root} holds another dataset: {key} is of seed {found['seed']}, not {seed}; "
+                "choose another folder, or remove this one"
+            )
         else:
             records[key] = found
     return records

@@ -112,6 +112,8 @@ def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.
             raise store.DamagedEpisode(f"{where}: is not the episode that SEALED.json lists")
         if found["success"]:
             records.append(found)
+    if not records:
+        raise ValueError(f"root: expected successful demonstrations, got none in {root}")
     return records
 
 

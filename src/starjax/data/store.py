@@ -13,7 +13,7 @@ import concurrent.futures
 import hashlib
 import json
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,14 +54,14 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
         files.write_json(path, description)
         return
     found = read_description(root)
-    differing = [k for k in description if description[k] != found.get(k)]
+    differing = [k for k in {**description, **found} if description.get(k) != found.get(k)]
     if is_sealed(root):
         differing = [k for k in differing if k != "versions"]
     if differing:
         name = differing[0]
         raise files.StorageError(
             f"{root} holds another dataset: its {name} is {found.get(name)}, not "
-            f"{description[name]}; choose another folder, or remove this one"
+            f"{description.get(name)}; choose another folder, or remove this one"
         )
 
 
@@ -116,22 +116,21 @@ def verify(root: Path, key: str, arrays: bool = True) -> Record:
     """Reads an episode's record after checking it and, with `arrays`, every byte of its files.
 
     Raises:
-      DamagedEpisode: naming the first file that is not as it was written.
+      DamagedEpisode: naming the first file that is not as it was written, or is missing.
+      StorageError: a file is there and cannot be read.
     """
     folder = root / "episodes" / key
     path = folder / "episode.json"
+    content = _read(path, Path.read_bytes)
     try:
-        record = json.loads(path.read_bytes())
+        record = json.loads(content)
         said = record.pop("digest")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DamagedEpisode(f"{path}: {_reason(error)}") from error
     if _hash(record) != said or record["key"] != key:
         raise DamagedEpisode(f"{path}: expected content with hash {said}, got {_hash(record)}")
     for name, file in record["files"].items() if arrays else ():
-        try:
-            got = files.sha256(folder / name)
-        except OSError as error:
-            raise DamagedEpisode(f"{folder / name}: {_reason(error)}") from error
+        got = _read(folder / name, files.sha256)
         if got != file["sha256"]:
             raise DamagedEpisode(f"{folder / name}: expected sha256 {file['sha256']}, got {got}")
     return {**record, "digest": said}
@@ -216,6 +215,16 @@ def _hashed(parts: Sequence[bytes | memoryview]) -> dict[str, Any]:
 
 def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def _read(path: Path, read: Callable[[Path], Any]) -> Any:
+    """What `read` makes of an episode's file; a disk that fails is no damage to it."""
+    try:
+        return read(path)
+    except FileNotFoundError as error:
+        raise DamagedEpisode(f"{path}: {error.strerror}") from error
+    except OSError as error:
+        raise files.StorageError(f"cannot read {path}: {error.strerror or error}") from error
 
 
 def _reason(error: Exception) -> str:

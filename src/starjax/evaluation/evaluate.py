@@ -16,7 +16,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from starjax import rcm
 from starjax.data import demos, workers
 from starjax.evaluation import recorded, rollout, table
 from starjax.rcm.trocar import Trocar
@@ -73,13 +72,12 @@ def evaluate(
       StorageError: the folder cannot be written or is in use.
       ValueError: an argument out of range, a trocar that is none.
     """
-    if trials < 1 or time_limit_s <= 0 or chunk < 0 or video_trials < 0:
+    if trials < 1 or time_limit_s <= 0 or min(chunk, lanes, video_trials) < 0:
         raise ValueError(
-            "trials, time_limit_s: expected more than 0, chunk, video_trials: 0 or more, "
-            f"got {trials}, {time_limit_s}, {chunk}, {video_trials}"
+            "trials, time_limit_s: expected more than 0, chunk, lanes, video_trials: 0 or more, "
+            f"got {trials}, {time_limit_s}, {chunk}, {lanes}, {video_trials}"
         )
-    trocars = Trocar(*(np.asarray(field, np.float32).reshape(-1) for field in trocars))
-    rcm.check_trocar(trocars)
+    trocars = demos.listed(trocars)
     settings = rollout.Settings(
         obs_horizon=obs_horizon,
         execute=execute,
@@ -111,7 +109,10 @@ def evaluate(
             slice(first, min(first + chunk, len(index))) for first in range(0, len(index), chunk)
         ]
         paths = [directory / f"chunk_{number:04d}.npz" for number in range(len(spans))]
-        chunks = [_read(path, report) for path in paths]
+        chunks = [
+            _read(path, index[rows], trial[rows], report)
+            for path, rows in zip(paths, spans, strict=True)
+        ]
         missing = [number for number, found in enumerate(chunks) if found is None]
         done = len(index) - sum(spans[number].stop - spans[number].start for number in missing)
 
@@ -177,7 +178,7 @@ def _resume(
         report(str(error))
         found = {}
     same = {k: v for k, v in found.items() if k != "chunk"} == json.loads(json.dumps(plan))
-    if same and found["chunk"] <= batch:
+    if same and 1 <= found.get("chunk", 0) <= batch:
         return found["chunk"]
     old = len(list(directory.glob("chunk_*.npz")))
     if old:
@@ -208,9 +209,9 @@ def _write(path: Path, rows: table.Table, kept: dict[str, np.ndarray]) -> None:
 
 
 def _read(
-    path: Path, report: Callable[[str], None]
+    path: Path, index: np.ndarray, trial: np.ndarray, report: Callable[[str], None]
 ) -> tuple[table.Table, dict[str, np.ndarray]] | None:
-    """A finished chunk, or None if it is missing or damaged."""
+    """A finished chunk, or None if it is missing, damaged or of other trials than these."""
     try:
         arrays = files.read_npz(path, table.Table._fields)
     except FileNotFoundError:
@@ -219,4 +220,7 @@ def _read(
         report(f"{error}; evaluated again")
         return None
     rows = table.Table(**{name: arrays.pop(name) for name in table.Table._fields})
+    if not (np.array_equal(rows.trocar, index) and np.array_equal(rows.trial, trial)):
+        report(f"{path} holds other trials; evaluated again")
+        return None
     return rows, {name.removeprefix("recorded."): value for name, value in arrays.items()}

@@ -15,9 +15,6 @@ from starjax.policies import diffuser, features
 from starjax.policies import policy as policies
 from starjax.sim.types import Observation
 
-DDIM_STEPS = (1, 2, 5, 10, 20, 50, 100)
-BATCHES = (1, 24)
-
 _WARM_UP = 3  # calls before the clock starts
 
 
@@ -63,28 +60,17 @@ def table(
     stats: Any,
     p_world_ref: Any,
     *,
-    ddim_steps: Sequence[int] = DDIM_STEPS,
-    batches: Sequence[int] = BATCHES,
+    ddim_steps: Sequence[int],
     calls: int = 100,
     seconds: float = 10.0,
 ) -> list[dict[str, float]]:
-    """Rows {batch, ddim_steps, p50, p95, p99, n} of one method, times in ms."""
+    """Rows {ddim_steps, p50, p95, p99, n} of one method at batch 1, times in ms."""
     rows = []
-    for batch in batches:
-        for steps in ddim_steps:
-            changed = dataclasses.replace(policy_config, ddim_steps=steps)
-            policy = policies.make(method, changed, p_world_ref, train_config)
-            times = policy_ms(
-                policy,
-                changed,
-                params,
-                stats,
-                p_world_ref,
-                batch=batch,
-                calls=calls,
-                seconds=seconds,
-            )
-            rows.append({"batch": batch, "ddim_steps": steps, **times})
+    for steps in ddim_steps:
+        changed = dataclasses.replace(policy_config, ddim_steps=steps)
+        policy = policies.make(method, changed, p_world_ref, train_config)
+        given = (policy, changed, params, stats, p_world_ref)
+        rows.append({"ddim_steps": steps, **policy_ms(*given, calls=calls, seconds=seconds)})
     return rows
 
 

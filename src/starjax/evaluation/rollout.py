@@ -199,6 +199,9 @@ def _starter(env: Any, policy: Any, settings: Settings) -> Callable[..., Carry]:
 
         # Only the shape of a plan: the first one is made before anything is executed.
         shape = jax.eval_shape(plan, state)
+        if (planned := shape.gripper.shape[1]) < settings.execute:
+            got = settings.execute
+            raise ValueError(f"execute: expected at most the {planned} that are planned, got {got}")
         return Carry(
             env=state,
             key=key_policy,

@@ -43,18 +43,18 @@ def load_resnet18(trunk: dict[str, Any], path: str | pathlib.Path) -> dict[str, 
 
 
 def read_weights(path: str | pathlib.Path) -> dict[str, np.ndarray]:
-    """All tensors of a weight file, by name, once its hash agrees with its name."""
+    """All tensors of a weight file, by name, once the hash of torch's agrees with its name."""
     path = pathlib.Path(path)
     if not path.is_file():
         raise ValueError(f"encoder weights: expected a file, got {path}")
-    _check_hash(path)
     if path.suffix in (".pth", ".pt"):
+        _check_hash(path)
         return torch_file.read(path)
     if path.suffix != ".safetensors":
         raise ValueError(f"encoder weights: expected .pth, .pt or .safetensors, got {path}")
     try:
         return safetensors.numpy.load_file(path)
-    except safetensors.SafetensorError as error:
+    except (safetensors.SafetensorError, AttributeError) as error:  # as of types numpy lacks
         raise ValueError(f"{path}: not a readable safetensors file: {error}") from error
 
 

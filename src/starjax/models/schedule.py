@@ -74,15 +74,17 @@ def cosine(steps: int = 100) -> Schedule:
 
 
 def ddim_table(diffusion_steps: int, steps: int) -> DdimTable:
-    """The 'leading' spacing of `steps` DDIM steps over a `cosine(diffusion_steps)` schedule.
+    """`steps` DDIM steps, spread evenly over a `cosine(diffusion_steps)` schedule.
 
-    With 100 and 10 they are k = 90, 80, .., 0. One step alone is k = 0, where the input counts as
-    nearly clean: what comes out is the noise that went in, good for measuring time only.
+    With 100 and 10 they are k = 90, 80, .., 0, the 'leading' spacing, which starts in the middle
+    of the schedule where `steps` is no divisor: k = 50, .. for 51 of 100 in the place of 98, .. .
+    One step alone is k = 0, where the input counts as nearly clean: what comes out is the noise
+    that went in, good for measuring time only.
     """
     if not 1 <= steps <= diffusion_steps:
         raise ValueError(f"steps: expected 1..{diffusion_steps} (the diffusion steps), got {steps}")
     _, alpha_bar = _beta_and_alpha_bar(diffusion_steps)
-    k = np.arange(steps)[::-1] * (diffusion_steps // steps)
+    k = np.arange(steps)[::-1] * diffusion_steps // steps
     following = np.append(alpha_bar[k[1:]], 1.0)
     tables = (alpha_bar[k], 1.0 - alpha_bar[k], following, 1.0 - following)
     return DdimTable(k.astype(np.int32), *(np.sqrt(table).astype(np.float32) for table in tables))

@@ -166,11 +166,12 @@ def check_trocar(trocar: Trocar) -> Trocar:
         polar angle lies outside [0, pi].
     """
     arrays.checked(**named_fields(trocar))
-    if any(isinstance(field, core.Tracer) for field in trocar):
-        return trocar
     limits = {"radius": (0.0, np.inf), "polar": (0.0, np.pi), "azimuth": (-np.inf, np.inf)}
     for name, (low, high) in limits.items():
-        value = np.asarray(getattr(trocar, name), np.float64)
+        field = getattr(trocar, name)
+        if isinstance(field, core.Tracer):
+            continue
+        value = np.asarray(field, np.float64)
         # One float32 rounding of pi is allowed.
         is_bad = ~np.isfinite(value) | (value < low) | (value > high * (1.0 + 1e-6))
         if is_bad.any():

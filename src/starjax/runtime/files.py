@@ -89,6 +89,9 @@ def npy(parts: Sequence[np.ndarray]) -> list[bytes | memoryview]:
     first = parts[0]
     if first.dtype.hasobject:
         raise ValueError("parts: expected numbers, got Python objects")
+    kinds = {f"{part.dtype}{list(part.shape[1:])}" for part in parts}
+    if len(kinds) > 1:
+        raise ValueError(f"parts: expected one type and shape, got {', '.join(sorted(kinds))}")
     header = io.BytesIO()
     described = {
         "descr": np.lib.format.dtype_to_descr(first.dtype),
@@ -140,14 +143,16 @@ def require_writable(directory: Path, free_bytes: int = 0) -> None:
       StorageError: it cannot be created or written, or the disk has less than `free_bytes` free.
     """
     probe = directory / ".writable"
-    if directory.is_file():
-        raise StorageError(f"{directory}: expected a folder, got a file")
     try:
+        if directory.is_file():
+            raise StorageError(f"{directory}: expected a folder, got a file")
         directory.mkdir(parents=True, exist_ok=True)
         probe.write_bytes(b"x")
         probe.unlink(missing_ok=True)  # another process that starts here may have been quicker
+    except StorageError:
+        raise
     except OSError as error:
-        raise _explained(error, directory, 1) from error
+        raise _explained(error, directory) from error
     free = shutil.disk_usage(directory).free
     if free < free_bytes:
         raise StorageError(
@@ -212,5 +217,6 @@ def _write_synced(path: Path, parts: Sequence[bytes | memoryview]) -> None:
         os.fsync(file.fileno())
 
 
-def _explained(error: OSError, path: Path, count: int) -> StorageError:
-    return StorageError(f"cannot write {path} ({size(count)}): {error.strerror or error}")
+def _explained(error: OSError, path: Path, count: int = 0) -> StorageError:
+    much = f" ({size(count)})" if count else ""
+    return StorageError(f"cannot write {path}{much}: {error.strerror or error}")

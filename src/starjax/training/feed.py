@@ -48,6 +48,8 @@ def batches(
             step = first
             while not closed.is_set():
                 for frame in np.asarray(chosen(step)):
+                    if closed.is_set():
+                        return
                     batch = windows.gather(
                         dataset, frame, policy_config.obs_horizon, policy_config.horizon
                     )

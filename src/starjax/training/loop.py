@@ -79,8 +79,9 @@ def run(
       Interrupted: after `should_stop`.
       TrainingFailed: no step of a whole stretch of the log was finite.
       StorageError: the disk is full.
-      ValueError: the directory holds a training of another seed, of other demonstrations, or of
-        more steps.
+      UsageError: the directory holds a training of another seed, of other demonstrations, or of
+        more steps. That its method and settings are these is for the caller to see to, as
+        `experiments.folders.claim` does.
     """
     directory = pathlib.Path(directory)
     log = directory / "metrics.jsonl"
@@ -189,13 +190,18 @@ def _restored(checkpoints, like) -> states.TrainState | None:
 
 
 def _check_same(directory, state, key, stats, steps) -> None:
-    """Raises ValueError for a state of another training."""
+    """Raises UsageError for a state of another training."""
     if not np.array_equal(jax.random.key_data(state.key), jax.random.key_data(key)):
-        raise ValueError(f"{directory}: holds a training of another seed")
-    if not all(map(np.array_equal, jax.tree.leaves(state.normalizer), jax.tree.leaves(stats))):
-        raise ValueError(f"{directory}: holds a training of other demonstrations")
+        raise config.UsageError(f"{directory}: holds a training of another seed")
+    if not all(map(_alike, jax.tree.leaves(state.normalizer), jax.tree.leaves(stats))):
+        raise config.UsageError(f"{directory}: holds a training of other demonstrations")
     if int(state.step) > steps:
-        raise ValueError(f"{directory}: holds {state.step} steps, expected at most {steps}")
+        raise config.UsageError(f"{directory}: holds {state.step} steps, expected at most {steps}")
+
+
+def _alike(one, other) -> bool:
+    """Whether two statistics are of the same data: another processor has other last bits."""
+    return np.shape(one) == np.shape(other) and np.allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
 def _begun(drawn, policy_config, train_config) -> policies.Params:

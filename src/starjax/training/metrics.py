@@ -6,6 +6,8 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
+from starjax.runtime import files
+
 
 def resume(path: str | os.PathLike, step: int) -> None:
     """Drops what a run wrote after the step that it now goes on from, half lines included."""
@@ -13,16 +15,23 @@ def resume(path: str | os.PathLike, step: int) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     lines = file.read_bytes().splitlines(keepends=True) if file.exists() else []
     kept = b"".join(line for line in lines if _is_until(line, step))
-    staged = file.with_name(f".{file.name}.tmp")
-    staged.write_bytes(kept)
-    os.replace(staged, file)
+    files.write_bytes(file, kept)
 
 
 def append(path: str | os.PathLike, step: int, kind: str, values: Mapping[str, Any]) -> None:
-    """Adds a line `{"step", "kind", **values}`; no clock times, so that equal runs log equally."""
+    """Adds a line `{"step", "kind", **values}`; no clock times, so that equal runs log equally.
+
+    Raises:
+      StorageError: it cannot be written.
+    """
     line = json.dumps({"step": step, "kind": kind, **values})
-    with open(path, "a") as stream:
-        stream.write(line + "\n")
+    try:
+        with open(path, "a") as stream:
+            stream.write(line + "\n")
+    except OSError as error:
+        raise files.StorageError(
+            f"cannot write {path}: {error.strerror}; training goes on from its last checkpoint"
+        ) from error
 
 
 def read(path: str | os.PathLike) -> list[dict[str, Any]]:

@@ -23,7 +23,7 @@ class TrainState:
       params: of the policy.
       ema_params: their exponential moving average, what is evaluated.
       opt_state: of the optimiser.
-      normalizer: fitted once, never recomputed on resume.
+      normalizer: fitted once; on resume it is what the checkpoint holds.
       key: typed key; step s uses `fold_in(key, s)` and nothing else.
       skipped: int32 `[]`, steps whose loss or gradient was not finite.
       sums: named float32 scalars, added up since the last line of the log.
