@@ -25,10 +25,13 @@ def test_flag_that_aborts_jaxlib_is_found(monkeypatch):
     assert "take it out" in fault.remedy
 
 
-def test_flag_that_slows_physics_is_found(monkeypatch):
+@pytest.mark.parametrize(
+    ("value", "slow"), [("=true", 1), ("=1", 1), ("", 1), ("=false", 0), ("=False", 0), ("=0", 0)]
+)
+def test_flag_that_slows_physics_is_found(monkeypatch, value, slow):
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.10.2")
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=true")
-    assert faults(doctor.xla_flags())
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_cpu_use_fusion_emitters{value}")
+    assert len(faults(doctor.xla_flags())) == slow
 
 
 def test_versions_that_do_not_fit_are_found(monkeypatch):
@@ -72,6 +75,9 @@ def test_a_missing_encoder_is_found(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     (fault,) = faults(doctor.video())
     assert fault.remedy == "pip install imageio-ffmpeg"
+    monkeypatch.undo()
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/nonexistent")
+    assert faults(doctor.video())
 
 
 def test_unwritable_cache_and_little_memory_are_found(monkeypatch, tmp_path):

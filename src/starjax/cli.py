@@ -31,7 +31,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 
 _WRITING = (errno.ENOSPC, errno.EROFS, errno.EDQUOT)
-_STORAGE = (*_WRITING, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTDIR)
+_STORAGE = (
+    *_WRITING, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG
+)  # fmt: skip
 _STOPPED = 130  # exit code after Ctrl-C or SIGTERM
 _AGAIN_S = 0.5  # s until a stop that was lost is asked for again
 _UNREAD = 141  # exit code of a program whose reader went away (128 + SIGPIPE), as in `| head`

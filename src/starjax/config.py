@@ -1,6 +1,7 @@
 """Settings of a run as frozen dataclasses. Standard library only: `--help` must not import jax."""
 
 import dataclasses
+import types
 import typing
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple, TypeVar
@@ -135,8 +136,11 @@ class RunConfig:
 def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT:
     """Inverse of `dataclasses.asdict`, also after a trip through JSON (which knows no tuples).
 
-    Fields that `values` lacks keep their default; names that `settings` lacks raise ValueError.
+    Fields that `values` lacks keep their default; names that `settings` lacks, and values of other
+    types, raise ValueError.
     """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{settings.__name__}: expected an object, got {values!r}")
     hints = typing.get_type_hints(settings)
     unknown = sorted(set(values) - set(hints))
     if unknown:
@@ -145,6 +149,23 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
     for name, value in values.items():
         if dataclasses.is_dataclass(hints[name]):
             fields[name] = from_dict(hints[name], value)
-        else:
+        elif _fits(value, hints[name]):
             fields[name] = tuple(value) if isinstance(value, list) else value
+        else:
+            kind = getattr(hints[name], "__name__", hints[name])
+            raise ValueError(f"{settings.__name__}.{name}: expected {kind}, got {value!r}")
     return settings(**fields)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value from JSON is of a field's type."""
+    origin, kinds = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        return value in kinds
+    if origin is tuple:
+        return isinstance(value, list | tuple) and all(_fits(part, kinds[0]) for part in value)
+    if isinstance(hint, types.UnionType):
+        return any(_fits(value, kind) for kind in kinds)
+    if isinstance(value, bool):
+        return hint is bool
+    return isinstance(value, int | float if hint is float else hint)

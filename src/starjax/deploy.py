@@ -204,8 +204,7 @@ def load(policy: str | Path, ddim_steps: int | None = None, method: str | None =
         raise ValueError(f"policy: expected one that says its nominal port, got {path}")
     settings = trained.policy
     if ddim_steps is not None:
-        most = settings.diffusion_steps
-        fewest = min(config.FEWEST_DDIM_STEPS, most)
+        fewest, most = config.FEWEST_DDIM_STEPS, settings.diffusion_steps
         if not fewest <= ddim_steps <= most:
             raise ValueError(f"ddim_steps: expected {fewest} to {most}, got {ddim_steps}")
         settings = dataclasses.replace(settings, ddim_steps=ddim_steps)

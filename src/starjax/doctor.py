@@ -76,7 +76,8 @@ def xla_flags() -> list[Finding]:
         return []
     if recent and flag in typed:
         return [Finding("XLA_FLAGS", typed, f"jaxlib >= 0.11 aborts on {flag}: take it out")]
-    if not recent and f"{flag}=true" in typed:
+    on = [word for word in typed.split() if word.partition("=")[0] == flag]
+    if not recent and on and on[-1].partition("=")[2].lower() not in ("false", "0"):
         return [Finding("XLA_FLAGS", typed, f"physics is 300 times slower so: set {flag}=false")]
     xla.prepare_xla()
     return [Finding("XLA_FLAGS", os.environ.get("XLA_FLAGS", "") or "(none needed)")]
@@ -155,7 +156,7 @@ def video() -> list[Finding]:
         import imageio_ffmpeg
 
         return [Finding("ffmpeg", imageio_ffmpeg.get_ffmpeg_version())]
-    except (ImportError, RuntimeError) as error:
+    except (ImportError, OSError, RuntimeError) as error:
         return [Finding("ffmpeg", _first_line(error), "pip install imageio-ffmpeg")]
 
 

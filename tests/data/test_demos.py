@@ -235,6 +235,43 @@ def test_a_damaged_description_is_written_again(copy, sealed, damage):
     assert kill.tree(copy) == kill.tree(sealed[0])
 
 
+def test_a_disk_that_fails_deletes_no_episode(copy, monkeypatch):
+    def fail(path):
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+
+    before = kill.tree(copy)
+    with monkeypatch.context() as patch:
+        patch.setattr(store.files, "sha256", fail)
+        with pytest.raises(files.StorageError, match=r"cannot read .*\.npy: Input/output error"):
+            collect(copy)
+    assert kill.tree(copy) == before
+
+
+def test_episodes_of_another_seed_are_not_taken_for_these(copy):
+    (copy / "dataset.json").unlink()
+    (copy / "SEALED.json").unlink()
+    with pytest.raises(files.StorageError, match=rf"is of seed {KWARGS['seed']}, not 77"):
+        collect(copy, seed=77)
+
+
+def test_what_only_the_dataset_that_is_there_has_counts(tmp_path):
+    collect(tmp_path, one_wall=True)
+    with pytest.raises(files.StorageError, match="its one_wall is True, not None"):
+        collect(tmp_path)
+
+
+@pytest.mark.parametrize("shape", [0, (1, 2)])
+def test_trocars_are_a_row_of_one_or_more(tmp_path, shape):
+    few = rcm.Trocar(np.full(shape, 0.02), np.full(shape, 1.4), np.zeros(shape))
+    with pytest.raises(ValueError, match=r"trocars: expected fields \[C\]"):
+        demos.collect(tmp_path, stubs.make_env(), stubs.Expert(), few, **KWARGS)
+
+
+def test_trocars_broadcast():
+    port = demos.listed(rcm.Trocar(0.02, [1.4, 1.5], 0.0))
+    assert [len(field) for field in port] == [2, 2, 2]
+
+
 def test_an_incomplete_dataset_is_not_loaded(copy):
     (copy / "SEALED.json").unlink()
     with pytest.raises(ValueError, match="not complete"):

@@ -182,6 +182,23 @@ def test_a_damaged_chunk_is_named_and_run_again(tmp_path, whole):
         assert path.read_bytes() == good
 
 
+def test_a_chunk_of_other_trials_is_named_and_run_again(tmp_path):
+    found = run(tmp_path, chunk=3)
+    first, second = sorted(tmp_path.glob("chunk_*.npz"))
+    shutil.copy(second, first)
+    said = []
+    assert_same(run(tmp_path, chunk=3, report=said.append), found)
+    assert said == [f"{first} holds other trials; evaluated again"]
+
+
+def test_a_plan_that_does_not_say_its_chunk_is_another(tmp_path, whole):
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    del plan["chunk"]
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    assert_same(run(tmp_path, video_trials=4), whole[1])
+
+
 def test_a_damaged_plan_is_named_and_written_again(tmp_path, whole):
     first = run(tmp_path, chunk=6)
     plan = tmp_path / "plan.json"
@@ -202,7 +219,7 @@ def test_no_flipped_bit_of_a_chunk_gets_into_the_table(tmp_path, whole):
         bad = bytearray(good)
         bad[bit // 8] ^= 1 << (bit % 8)
         path.write_bytes(bad)
-        found = evaluate._read(path, lambda _: None)
+        found = evaluate._read(path, whole[1].trocar, whole[1].trial, lambda _: None)
         noticed += found is None
         if found is not None:  # a byte that means nothing, such as a date
             assert_same(found[0], whole[1])
@@ -355,10 +372,12 @@ def test_a_trial_is_safe_if_its_executed_error_stayed_small_and_nothing_if_it_di
         ({"trials": 0}, "trials"),
         ({"time_limit_s": 0.0}, "time_limit_s"),
         ({"chunk": -1}, "chunk"),
+        ({"lanes": -1}, "lanes"),
         ({"execute": 0}, "settings"),
         ({"obs_horizon": 6}, "obs_horizon"),
         ({"trocars": rcm.Trocar(0.02, 80.0, 0.0)}, "trocar.polar"),
         ({"trocars": rcm.Trocar(0.02, np.nan, 0.0)}, "trocar.polar"),
+        ({"trocars": rcm.Trocar(*np.zeros((3, 0)))}, "trocars: expected .* one trocar or more"),
     ],
 )
 def test_bad_arguments_are_named_and_cost_nothing(tmp_path, bad, name):
@@ -366,6 +385,11 @@ def test_bad_arguments_are_named_and_cost_nothing(tmp_path, bad, name):
     with pytest.raises(ValueError, match=name):
         run(tmp_path, **bad)
     assert (tmp_path / "chunk_0000.npz").exists()
+
+
+def test_no_more_commands_are_executed_than_planned(tmp_path):
+    with pytest.raises(ValueError, match=r"execute: expected at most the \d+ that are planned"):
+        run(tmp_path, execute=20)
 
 
 def test_each_program_is_traced_once(tmp_path):

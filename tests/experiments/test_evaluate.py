@@ -161,12 +161,14 @@ def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
     said = {}
     monkeypatch.setattr(scoring.evaluate, "evaluate", lambda *_, **given: said.update(given))
     policy = dataclasses.replace(POLICY, obs_horizon=3)
-    trained = types.SimpleNamespace(policy=policy, params=None, normalizer=None)
+    train = config.TrainConfig(crop_fraction=0.5)
+    trained = types.SimpleNamespace(policy=policy, train=train, params=None, normalizer=None)
     who = types.SimpleNamespace(method="stardiff", env=None, policy=None, trained=trained)
     flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
     scoring.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
     wanted = {**flags, "seed": 9, "obs_horizon": 3, "execute": 4}
     assert {name: said.get(name) for name in wanted} == wanted
+    assert said["identity"]["crop_fraction"] == 0.5  # of what the encoder sees
 
 
 def test_a_machine_without_a_video_encoder_still_gets_the_result(file, monkeypatch, capsys):
@@ -241,7 +243,7 @@ def test_a_sweep_has_the_time_limit_of_its_run(file):
         (["--policy", "nowhere"], ["--policy", "a file", "nowhere"]),
         (["--policy", "x", "--eval.trials", "0"], ["--eval.trials", "got 0"]),
         (["nowhere"], ["nowhere", "a method's folder"]),
-        (["stardiff"], ["stardiff", "no config.json"]),
+        (["stardiff"], ["stardiff", "got no config.json"]),
     ],
 )
 def test_a_mistake_is_one_line(argv, words):

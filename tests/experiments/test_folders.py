@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import re
 import time
 
@@ -117,8 +118,40 @@ def test_weights_whose_settings_are_gone_are_refused(tmp_path, text):
     path.unlink() if text is None else path.write_text(text)
     with pytest.raises(config.UsageError, match=re.escape(str(tmp_path))):
         folders.claim(tmp_path, SMOKE, "demos-a")
-    with pytest.raises(config.UsageError, match=re.escape(str(tmp_path))):
+    with pytest.raises(config.UsageError, match=re.escape(str(tmp_path))) as caught:
         folders.read_config(tmp_path)
+    weights = tmp_path / "policy.safetensors"
+    assert f"starjax evaluate --policy {weights} scores its weights" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"eval": {"time_limit_s": "4"}}, "EvalConfig.time_limit_s: expected float, got '4'"),
+        ({"seed": True}, "RunConfig.seed: expected int, got True"),
+        ({"eval": 3}, "EvalConfig: expected an object, got 3"),
+        ({"policy": {"unet_channels": [1, "2"]}}, "unet_channels: expected tuple"),
+        ({"policy": {"observation": "sound"}}, "PolicyConfig.observation: expected"),
+    ],
+)
+def test_settings_of_other_types_are_named(values, said):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        config.from_dict(config.RunConfig, values)
+
+
+def test_an_evaluation_is_under_way_until_its_result_is_there(tmp_path):
+    trials = tmp_path / "evaluation"
+    trials.mkdir()
+    for name in ("plan.json", "chunk_0000.npz"):
+        assert not folders.is_under_way(tmp_path)
+        (trials / name).touch()
+    assert folders.is_under_way(tmp_path)
+    (tmp_path / "result.json").touch()
+    os.utime(trials / "plan.json", ns=(1, 1))
+    assert not folders.is_under_way(tmp_path)
+    (trials / "plan.json").touch()  # of a larger one
+    os.utime(tmp_path / "result.json", ns=(1, 1))
+    assert folders.is_under_way(tmp_path)
 
 
 def test_settings_that_runs_differ_in_are_named_by_their_flags():

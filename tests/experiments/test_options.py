@@ -91,6 +91,10 @@ def settings(*argv: str) -> config.RunConfig:
             ["--policy.encoder-weights", "--policy.observation image", "got state"],
         ),
         (
+            ["--policy.diffusion-steps", "1"],
+            ["--policy.diffusion-steps", "2 or more", "got 1"],
+        ),
+        (
             ["--preset=smoke", "--policy.freeze_encoder"],
             ["--policy.freeze-encoder", "--policy.observation image"],
         ),
@@ -153,7 +157,7 @@ def scored(tmp_path):
 
 def test_bench_writes_beside_the_result_of_the_folder_it_is_in(scored, monkeypatch, capsys):
     timed = {"weights": "a"}
-    monkeypatch.setattr(bench, "_time", lambda folder, chosen: {**timed, "timed": folder.name})
+    monkeypatch.setattr(bench, "_time", lambda folder, *_: {**timed, "timed": folder.name})
     monkeypatch.chdir(scored)
     assert bench.main(["."]) == 0
     assert capsys.readouterr().out.endswith(f"starjax report {scored} shows it\n")
@@ -166,8 +170,22 @@ def test_bench_writes_beside_the_result_of_the_folder_it_is_in(scored, monkeypat
     assert "shows it once starjax run has scored these weights" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("flags", "counts"), [([], (1, 2, 5, 10, 20, 50)), (["--ddim-steps", "3", "60"], (3, 60))]
+)
+def test_bench_times_what_table_iv_has_and_the_policy_can(scored, monkeypatch, flags, counts):
+    few = dataclasses.replace(SMOKE.policy, diffusion_steps=60)
+    folders.claim(scored, dataclasses.replace(SMOKE, policy=few), "demos-a")
+    timed = []
+    monkeypatch.setattr(bench, "_time", lambda *given: timed.append(given) or {"weights": "a"})
+    assert bench.main([str(scored), *flags]) == 0
+    assert timed == [(scored, counts, 100)]
+    with pytest.raises(config.UsageError, match=r"^--ddim-steps: expected 1 to 60, got 61$"):
+        bench.main([str(scored), "--ddim-steps", "61"])
+
+
 def test_bench_promises_nothing_after_ctrl_c(scored, monkeypatch, capsys):
-    def stop(folder, chosen):
+    def stop(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(bench, "_time", stop)
@@ -349,7 +367,9 @@ def test_every_field_has_its_flag():
         (config.UsageError("--seed: expected 0 or more, got -1"), 2, "--seed"),
         (KeyboardInterrupt(), 130, "same command"),
         (OSError(28, "No space left on device", "runs/x"), 74, "runs/x"),
-        (PermissionError(13, "Permission denied", "runs/y"), 74, "runs/y"),
+        (OSError(28, "No space left on device", "runs/x"), 74, "cannot write:"),
+        (PermissionError(13, "Permission denied", "runs/y"), 74, "cannot read or write: runs/y"),
+        (OSError(36, "File name too long", "runs/y"), 74, "File name too long"),
         (files.StorageError("runs/z: the disk is full"), 74, "runs/z"),
     ],
 )
@@ -360,6 +380,36 @@ def test_guard_turns_what_a_user_can_mend_into_one_line(error, code, word, capsy
     assert cli.guard(command, []) == code
     said = capsys.readouterr().err
     assert word in said and len(said.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("argv", "run", "trocars"),
+    [
+        (["x/stardiff", "--trocars", "3"], "x/stardiff", 3),
+        (["--trocars", "3", "x/stardiff"], "x/stardiff", 3),
+        (["--trocars=3", "--seed", "1", "x/stardiff"], "x/stardiff", 3),
+    ],
+)
+def test_words_may_stand_anywhere(argv, run, trocars):
+    found = sweep._parse(argv)
+    assert (found.run, found.trocars) == (run, trocars)
+
+
+@pytest.mark.parametrize(
+    ("command", "argv", "said"),
+    [
+        ("evaluate", "x y", "RUN: expected 1, got x y"),
+        ("evaluate", "--no-video x --seed 3 y", "RUN: expected 1, got x y"),
+        ("sweep", "--radii-cm 1 2", "RUN: expected 1, got none"),
+        ("report", "--out x", "RUN: expected one or more, got none"),
+        ("pack", "a b c", "POLICY OUT: expected 2, got a b c"),
+        ("run", "--seed 1 2", "--seed: expected 1 value(s), got 1 2"),
+        ("run", "x", "x: expected a flag such as --method"),
+    ],
+)
+def test_too_few_and_too_many_words_are_one_line(command, argv, said, capsys):
+    assert cli.guard(cli.dispatch, [command, *argv.split()]) == 2
+    assert capsys.readouterr().err == f"starjax: {said}\n"
 
 
 def test_guard_lets_a_fault_of_the_program_through():

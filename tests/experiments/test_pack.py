@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from starjax import config
 from starjax.data import normalizer
@@ -57,6 +58,7 @@ def test_a_packed_policy_is_small_and_for_a_cpu(made, tmp_path, capsys, argv, te
         (["mine.safetensors"], ["POLICY OUT", "got mine.safetensors"]),
         (["nowhere", "out"], ["POLICY: expected a file", "got nowhere"]),
         (["other", "out"], ["POLICY: other: not a readable starjax policy"]),
+        (["nameless", "out"], ["POLICY: nameless: not a readable", "does not say which policy"]),
         (["large", "out"], ["POLICY: params: expected at most 65504", "unet"]),
         (["mine.safetensors", "./mine.safetensors"], ["OUT: expected", "not there yet", "mine."]),
         (["mine.safetensors", "."], ["OUT: expected a file that is not there yet, got ."]),
@@ -69,6 +71,7 @@ def test_a_packed_policy_is_small_and_for_a_cpu(made, tmp_path, capsys, argv, te
 def test_a_mistake_is_one_line(made, tmp_path, argv, words):
     (tmp_path / "other").write_bytes(b"x" * 100)
     save(tmp_path / "large", scale=1e5)
+    safetensors.numpy.save_file({"w": np.zeros(1)}, tmp_path / "nameless")
     before = (tmp_path / "mine.safetensors").read_bytes()
     with pytest.raises(config.UsageError) as caught:
         pack.main(argv)

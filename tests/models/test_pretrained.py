@@ -282,6 +282,9 @@ def test_the_hash_in_the_name_is_checked(weights, tmp_path):
     bad = good.rename(tmp_path / "resnet18-f37072fd.pth")
     with pytest.raises(ValueError, match=r"expected sha256 f37072fd\.\., got"):
         pretrained.read_weights(bad)
+    dated = tmp_path / "resnet18-20240115.safetensors"
+    safetensors.numpy.save_file({"conv1.weight": np.zeros(1, np.float32)}, dated)
+    assert "conv1.weight" in pretrained.read_weights(dated)
 
 
 def test_files_of_no_known_kind_are_named(tmp_path):

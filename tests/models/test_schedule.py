@@ -60,6 +60,14 @@ def test_ddim_steps_are_leading(steps, first, stride):
     )
 
 
+@pytest.mark.parametrize("steps", [7, 34, 51, 99])
+def test_ddim_steps_that_do_not_divide_the_schedule_cover_it(steps):
+    k = schedule.ddim_table(100, steps).k
+    apart = -np.diff(np.append(k, 0))
+    assert k[0] >= 100 - 100 / steps - 1 and k[-1] == 0
+    assert set(apart[:-1]) <= {100 // steps, 100 // steps + 1}
+
+
 @pytest.mark.parametrize("steps", [0, 101])
 def test_ddim_steps_out_of_range(steps):
     with pytest.raises(ValueError, match=rf"steps: expected 1\.\.100.*got {steps}"):

@@ -109,3 +109,10 @@ def test_a_missing_file_is_one_line_that_lists_the_names(folder, tmp_path, monke
     monkeypatch.setattr(packaged, "FOLDER", tmp_path / "none")
     with pytest.raises(config.UsageError, match=r"^--policy: expected a file, got compact$"):
         packaged.find("--policy", "compact")
+
+
+def test_a_file_that_may_not_be_read_is_no_missing_one(monkeypatch):
+    # Not by the file's mode, which does not bind the superuser.
+    monkeypatch.setattr(packaged.os, "access", lambda path, mode: False)
+    with pytest.raises(config.UsageError, match=r"^name: expected a file that may be read, got "):
+        packaged.find("name", packaged.names()[0])

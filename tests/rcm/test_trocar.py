@@ -129,6 +129,8 @@ def test_check_trocar_names_what_is_wrong(trocar, message):
 def test_check_trocar_passes_traced_values():
     trocar = jax.jit(rcm.check_trocar)(rcm.Trocar(-0.01, 1.5, 0.0))
     assert float(trocar.radius) == pytest.approx(-0.01)
+    with pytest.raises(ValueError, match=r"trocar\.polar: .*got nan"):
+        jax.jit(lambda radius: rcm.check_trocar(rcm.Trocar(radius, np.nan, 0.0)))(0.02)
 
 
 def test_shape_errors_name_the_argument():

@@ -59,6 +59,8 @@ def test_parts_are_saved_as_numpy_saves_the_whole(dtype):
 def test_objects_and_nan_are_refused(tmp_path):
     with pytest.raises(ValueError):
         files.npy([np.array([object()])])
+    with pytest.raises(ValueError, match=r"one type and shape, got float32\[\], float64\[\]"):
+        files.npy([np.zeros(2), np.zeros(2, np.float32)])
     with pytest.raises(ValueError):
         files.write_json(tmp_path / "x.json", float("nan"))
 

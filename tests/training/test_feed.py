@@ -1,5 +1,7 @@
 """Batches that a thread gathers on the host."""
 
+import time
+
 import fakes
 import jax
 import jax.numpy as jnp
@@ -23,3 +25,16 @@ def test_frames_follow_the_step_from_wherever_it_begins(monkeypatch):
         )
         jax.tree.map(np.testing.assert_array_equal, next(stream), wanted)
     stream.close()
+
+
+def test_a_closed_feed_gathers_nothing_more(monkeypatch):
+    dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
+    gathered, gather = [], windows.gather
+    monkeypatch.setattr(
+        windows, "gather", lambda *given: gathered.append(time.sleep(0.02)) or gather(*given)
+    )
+    settings, mesh = config.TrainConfig(batch_size=16), devices.make_mesh(16)
+    stream = feed.batches(dataset, np.arange(40), fakes.TINY, settings, mesh, jax.random.key(3), 0)
+    next(stream)
+    stream.close()
+    assert len(gathered) < feed._CHUNK // 2

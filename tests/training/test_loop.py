@@ -18,8 +18,10 @@ import kill
 import numpy as np
 import pytest
 
+from starjax import config
 from starjax.data import windows
 from starjax.experiments.methods import METHODS
+from starjax.runtime import files
 from starjax.training import advance, checkpoint, loop, metrics, parts, state, step
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -126,6 +128,11 @@ def test_a_single_step_that_is_broken_does_not_end_the_training(tmp_path):
             log(*hopeless)
 
 
+def test_a_full_disk_at_a_line_of_the_log_is_told(tmp_path):
+    with pytest.raises(files.StorageError, match=r"cannot write .*log: .*last checkpoint"):
+        metrics.append(tmp_path / "missing" / "log", 3, "train", {})
+
+
 def test_a_skipped_step_does_not_move_the_learning_rate(quick, monkeypatch, tmp_path):
     def prepare(stats, key, batch):
         observation, p = quick.prepare(stats, key, batch)
@@ -212,8 +219,18 @@ def test_a_finished_run_is_only_loaded(whole, monkeypatch):
     ],
 )
 def test_another_training_is_not_taken_for_this_one(whole, changed, message):
-    with pytest.raises(ValueError, match=f"{whole[0]}: holds {message}"):
+    with pytest.raises(config.UsageError, match=f"{whole[0]}: holds {message}"):
         jobs.train(whole[0], **changed)
+
+
+def test_another_processors_last_bits_are_no_other_demonstrations(whole, monkeypatch):
+    fit = loop.normalizer.fit
+
+    def rounded(*given):
+        return jax.tree.map(lambda x: np.nextafter(x, np.inf, dtype=x.dtype), fit(*given))
+
+    monkeypatch.setattr(loop.normalizer, "fit", rounded)
+    assert_same_bytes(jobs.train(whole[0]).state, whole[1].state)
 
 
 def test_damaged_checkpoint_costs_only_its_steps(whole, tmp_path):

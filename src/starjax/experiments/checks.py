@@ -25,7 +25,6 @@ def check(config: config_lib.RunConfig) -> None:
         "policy.execute": policy.execute,
         "policy.groups": policy.groups,
         "policy.roll-width": policy.roll_width,
-        "policy.diffusion-steps": policy.diffusion_steps,
         "train.steps": train.steps,
         "train.batch-size": train.batch_size,
         "train.learning-rate": train.learning_rate,
@@ -87,7 +86,8 @@ def _check_networks(policy: config_lib.PolicyConfig) -> None:
 
 def _check_sampling(policy: config_lib.PolicyConfig) -> None:
     executed = f"at most policy.horizon = {policy.horizon}"
-    fewest = min(config_lib.FEWEST_DDIM_STEPS, policy.diffusion_steps)
+    fewest, diffusion = config_lib.FEWEST_DDIM_STEPS, policy.diffusion_steps
+    expect(diffusion >= fewest, "policy.diffusion-steps", f"{fewest} or more", diffusion)
     steps = f"{fewest} to policy.diffusion-steps = {policy.diffusion_steps}"
     expect(policy.execute <= policy.horizon, "policy.execute", executed, policy.execute)
     observed = f"at most policy.execute + 1 = {policy.execute + 1}"

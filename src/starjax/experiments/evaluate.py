@@ -66,8 +66,7 @@ def main(argv: Sequence[str]) -> int:
     if chosen.out:
         _refuse_foreign(folder, before.get("weights", who.weights) == who.weights)
     print(f"{about}, into {folder}\n", flush=True)
-    begun = same or (not before and any((folder / "evaluation").glob("chunk_*")))
-    with clock.timed(folder, "evaluate", begun):
+    with clock.timed(folder, "evaluate", same or folders.is_under_way(folder)):
         table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed)
     command = options.typed("evaluate", argv)
     result = scoring.write_result(
@@ -135,12 +134,12 @@ def _config(trained: Any) -> config_lib.RunConfig:
     known = {
         "method": trained.method,
         "preset": trained.preset or "auto",
-        "seed": None,  # no file of weights says it
         "policy": dataclasses.asdict(trained.policy),
         "train": dataclasses.asdict(trained.train),
         "demos": dataclasses.asdict(trained.demos or config_lib.DemosConfig()),
     }
-    return config_lib.from_dict(config_lib.RunConfig, known)
+    unknown = {"seed": None}  # no file of weights says it
+    return dataclasses.replace(config_lib.from_dict(config_lib.RunConfig, known), **unknown)
 
 
 def _times(result: dict[str, Any], control_hz: float) -> str:

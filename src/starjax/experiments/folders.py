@@ -24,7 +24,6 @@ TRAINED_WITH = ("seed", "demos", "policy", "train")
 # Of those, what leaves the weights alone.
 _FREE = {"--train.keep-checkpoints", "--train.checkpoint-every", "--train.steps-per-call"}
 _BESIDE = ("dataset", "encoder")  # what a config.json records beside the settings
-_ELSEWHERE = "choose another folder by --out, or remove that one"
 
 
 def existing(run: str) -> Path:
@@ -42,7 +41,7 @@ def existing(run: str) -> Path:
         within = [f"{run}/{name}" for name in methods.METHODS if (folder / name).is_dir()]
         hint = hint or (f"there is {', '.join(within)}" if within else "")
         raise config_lib.UsageError(
-            f"RUN: expected a method's folder such as runs/cpu/stardiff, got {run}"
+            f"RUN: expected a method's folder such as runs/cpu/stardiff, got {run or 'none'}"
             + (f"; {hint}" if hint else "")
         )
     return folder
@@ -77,6 +76,14 @@ def selected(config: config_lib.RunConfig) -> list[str]:
     return list(methods.METHODS) if config.method == "all" else [config.method]
 
 
+def is_under_way(folder: Path) -> bool:
+    """Whether `folder` has trials of an evaluation that has no result.json yet."""
+    plan, result = folder / "evaluation" / "plan.json", folder / "result.json"
+    if not plan.exists() or not any(plan.parent.glob("chunk_*")):
+        return False
+    return not result.exists() or result.stat().st_mtime_ns < plan.stat().st_mtime_ns
+
+
 def claim(
     folder: Path, config: config_lib.RunConfig, dataset: str, encoder: str | None = None
 ) -> None:
@@ -97,7 +104,7 @@ def claim(
     if started and not found:
         raise config_lib.UsageError(
             f"{folder}: expected the config.json that its weights were trained with, got none; "
-            f"{_ELSEWHERE}"
+            f"{_remedy(folder)}"
         )
     if started:
         before = _as_json(_settings(folder, found))
@@ -151,23 +158,36 @@ def _recorded(folder: Path) -> dict[str, Any]:
     """The content of a method folder's config.json."""
     path = folder / "config.json"
     if not path.is_file():
+        remedy = f"; {_remedy(folder)}" if (folder / "policy.safetensors").is_file() else ""
         raise config_lib.UsageError(
-            f"{folder}: expected a run's method folder such as runs/cpu/stardiff, no config.json"
+            f"{folder}: expected a run's method folder such as runs/cpu/stardiff, got no "
+            f"config.json{remedy}"
         )
     try:
         found = files.read_json(path)
     except ValueError as error:
-        raise config_lib.UsageError(f"{error}; {_ELSEWHERE}") from error
+        raise config_lib.UsageError(f"{error}; {_remedy(folder)}") from error
     if not found:
-        raise config_lib.UsageError(f"{path} is damaged: expected settings, got none; {_ELSEWHERE}")
+        raise config_lib.UsageError(
+            f"{path} is damaged: expected settings, got none; {_remedy(folder)}"
+        )
     return found
+
+
+def _remedy(folder: Path) -> str:
+    """What to do about a method's folder whose settings are lost, or others."""
+    weights = folder / "policy.safetensors"
+    scores = f"; starjax evaluate --policy {shlex.quote(str(weights))} scores its weights"
+    return "train in another folder by --out, or remove this one" + scores * weights.is_file()
 
 
 def _settings(folder: Path, values: dict[str, Any]) -> config_lib.RunConfig:
     try:
         return _from_json(values)
     except (TypeError, ValueError) as error:
-        raise config_lib.UsageError(f"{folder / 'config.json'}: {error}; {_ELSEWHERE}") from error
+        raise config_lib.UsageError(
+            f"{folder / 'config.json'}: {error}; {_remedy(folder)}"
+        ) from error
 
 
 def _from_json(values: dict[str, Any]) -> config_lib.RunConfig:
@@ -183,7 +203,8 @@ def _as_json(config: config_lib.RunConfig) -> dict[str, Any]:
 def _refuse(folder: Path, name: str, before: Any, now: Any) -> None:
     if before != now and name not in _FREE:
         raise config_lib.UsageError(
-            f"{name}: {folder} was made with {before}, got {now}; {_ELSEWHERE}"
+            f"{name}: {folder} was made with {before}, got {now}; choose another folder by --out, "
+            "or remove that one"
         )
 
 

@@ -26,7 +26,8 @@ class Options:
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     # the file to write
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    temperature: float | None = None  # of the noise a sample starts from; if left out, POLICY's
+    # of the noise a sample starts from; if left out, POLICY's
+    temperature: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
 
 
 def main(argv: Sequence[str]) -> int:

@@ -150,9 +150,7 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
         )
     words.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
     folders.adopt_twin(out, name)
-    begun = any((folder / "evaluation").glob("chunk_*"))
-    goes_on = begun and not (folder / "result.json").exists()
-    with clock.timed(out, f"evaluate {name}", goes_on):
+    with clock.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
         who = scoring.subject(name, weights, env)
         table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, config.eval, config.seed)
     timings = _timings(out, name, demos)

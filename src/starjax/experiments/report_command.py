@@ -49,5 +49,7 @@ def _with_results(path: Path) -> list[Path]:
     """A method's folder, or those inside a folder."""
     found = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
     if not found:
-        raise config_lib.UsageError(f"{path}: expected a folder with a result.json, or of such")
+        raise config_lib.UsageError(
+            f"RUN: expected a folder with a result.json, or of such, got {path}"
+        )
     return [file if file.is_dir() else file.parent for file in found]

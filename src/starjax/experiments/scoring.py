@@ -102,6 +102,7 @@ def rollouts(
         identity={
             **folders.behaviour(who.method)._asdict(),
             "policy": dataclasses.asdict(who.trained.policy),
+            "crop_fraction": who.trained.train.crop_fraction,
         },
         report=words.indented,
     )

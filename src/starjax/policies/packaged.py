@@ -4,6 +4,7 @@ weights/<name>.safetensors    in half precision, by `starjax pack`
 weights/<name>.json           result.json of its evaluation without the trials: nothing reads it
 """
 
+import os
 from pathlib import Path
 
 from starjax import config
@@ -32,5 +33,7 @@ def find(argument: str, name_or_path: str) -> Path:
     path = locate(name_or_path)
     if not path.is_file():
         expected = " or one of ".join(filter(None, ["a file", ", ".join(names())]))
-        raise config.UsageError(f"{argument}: expected {expected}, got {name_or_path}")
+        raise config.UsageError(f"{argument}: expected {expected}, got {name_or_path or 'none'}")
+    if not os.access(path, os.R_OK):
+        raise config.UsageError(f"{argument}: expected a file that may be read, got {path}")
     return path

@@ -99,7 +99,10 @@ def load(path: pathlib.Path | str) -> Trained:
         raise ValueError(f"policy: expected a file, got {path}")
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
-            envelope = json.loads((file.metadata() or {})[_KEY])
+            metadata = file.metadata() or {}
+            if _KEY not in metadata:
+                raise ValueError("it does not say which policy it is of")
+            envelope = json.loads(metadata[_KEY])
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         about, expected = envelope["about"], envelope["sha256"]
         schema = about["schema"]
