@@ -33,5 +33,12 @@ def test_a_shaft_may_touch_no_peg_and_no_block():
     assert is_hit(LYING, beside, block=0.0)
 
 
+@pytest.mark.parametrize(("clearance", "hit"), [(3e-4, False), (-4e-4, False), (-6e-4, True)])
+def test_a_shaft_may_lie_closely_above_a_peg(clearance, hit):
+    height = peg_transfer.PEG_HEIGHT + clearance + collision.SHAFT_RADIUS
+    above = [0.02 + collision.SHAFT_END, 0.0, height]
+    assert is_hit(LYING, above, peg=0.0) == hit and not is_hit(LYING, above)
+
+
 def test_an_arm_keeps_its_distance_from_the_board():
     assert is_hit(DOWN, [0.0, 0.0, 0.03], origins=UP.at[3, 2].set(0.04))

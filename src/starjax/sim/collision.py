@@ -40,7 +40,8 @@ def detect(pose: Pose, origins: jax.Array, block: Pose, pegs: jax.Array) -> jax.
     arm_on_board = jnp.min(origins[2:, 2]) < LINK_RADIUS
     jaws_in_board = pose.p[2] + PAD_END * axis[2] < -DEPTH
     shaft_in_board = jnp.min(shaft[:, 2]) < SHAFT_RADIUS - DEPTH
-    above = jnp.maximum(shaft[:, None, 2] - peg_transfer.PEG_HEIGHT, 0.0)
+    peg_end = peg_transfer.PEG_HEIGHT - PEG_RADIUS  # of the capsule's axis
+    above = jnp.maximum(shaft[:, None, 2] - peg_end, 0.0)
     aside = jnp.sum((shaft[:, None, :2] - pegs) ** 2, axis=-1)
     shaft_in_peg = jnp.min(aside + above**2) < (SHAFT_RADIUS + PEG_RADIUS - DEPTH) ** 2
     gap = SHAFT_RADIUS + peg_transfer.WALL_RADIUS - DEPTH
