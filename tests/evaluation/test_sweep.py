@@ -22,11 +22,13 @@ def test_samples_stay_in_their_ranges_and_repeat():
         sweep.sample(0, 0)
 
 
-def test_a_grid_has_its_centre_once():
-    polars, azimuths = np.deg2rad([70, 90, 110]), np.deg2rad(np.arange(0, 360, 30))
+@pytest.mark.parametrize(("polars", "places"), [([70, 90, 110], 73), ([0, 90, 180], 29)])
+def test_a_grid_has_every_place_once(polars, places):
+    """The centre, and those straight above and below it, which every azimuth gives."""
+    polars, azimuths = np.deg2rad(polars), np.deg2rad(np.arange(0, 360, 30))
     found = sweep.grid([0.0, 0.02, 0.05], polars, azimuths)
     ports = np.asarray(rcm.trocar_position(found, stubs.P_WORLD_REF))
-    assert len(found.radius) == 1 + 2 * 3 * 12 == len(np.unique(ports.round(6), axis=0))
+    assert len(found.radius) == places == len(np.unique(ports.round(6), axis=0))
     with pytest.raises(ValueError, match="radius"):
         sweep.grid([-0.01], polars, azimuths)
 

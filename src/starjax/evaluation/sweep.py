@@ -24,12 +24,14 @@ def sample(seed: int, count: int) -> Trocar:
 def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray) -> Trocar:
     """Every combination of the given radii (m), polar angles and azimuths (rad), `[C]`.
 
-    Points that coincide (radius 0) are there once.
+    Places that coincide (at radius 0, and at polar angles 0 and pi) are there once.
     """
     fields = (np.asarray(x, np.float32).reshape(-1) for x in (radii, polars, azimuths))
     combined = np.stack(np.meshgrid(*fields, indexing="ij"), -1).reshape(-1, 3)
-    centre = np.flatnonzero(combined[:, 0] == 0.0)
-    return rcm.check_trocar(Trocar(*np.delete(combined, centre[1:], axis=0).T))
+    trocars = rcm.check_trocar(Trocar(*combined.T))
+    places = np.asarray(rcm.trocar_position(trocars, np.zeros(3, np.float32)))
+    _, first = np.unique(places.round(6), axis=0, return_index=True)
+    return Trocar(*combined[np.sort(first)].T)
 
 
 def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: np.ndarray) -> np.ndarray:
