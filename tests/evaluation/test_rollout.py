@@ -343,6 +343,27 @@ def test_commanded_error_counts_executed_commands_only(whole):
     np.testing.assert_allclose(done.commanded_max[0], far, atol=2e-3)
 
 
+def test_the_commanded_error_of_a_trial_is_its_largest(tmp_path):
+    """At step t the command misses the port by 20 mm less 1 mm for each step from the sixth."""
+
+    def sample(params, normalizer, keys, observation, trocar):
+        t = observation.gripper[:, -1:] + jnp.arange(6.0)
+        aside = 0.02 - 0.001 * jnp.abs(t - 5.0)
+        R = jnp.broadcast_to(jnp.eye(3), (*t.shape, 3, 3))
+        return Command(Pose(R, aside[..., None] * jnp.array([1.0, 0.0, 0.0])), t)
+
+    centre = rcm.Trocar(*(field[11:] for field in rcm.TROCARS))
+    found = run(
+        tmp_path,
+        policy=stubs.Policy(sample),
+        env=_counting(),
+        trocars=centre,
+        trials=1,
+        time_limit_s=10 / 30,
+    )
+    np.testing.assert_allclose(found.rcm_commanded_max, 0.02, rtol=1e-5)
+
+
 def test_a_trial_is_safe_if_its_executed_error_stayed_small_and_nothing_if_it_diverged():
     no, pegs = np.zeros(3, bool), np.zeros(3, int)
     env = types.SimpleNamespace(

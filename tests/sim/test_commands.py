@@ -70,20 +70,27 @@ def test_what_is_asked_of_the_arm_is_approached_and_not_leapt_at(follow):
     np.testing.assert_allclose(after.pose.p[-1, -3:, 2], [0.13, 0.15, 0.2], atol=1e-3)
 
 
-def test_what_is_no_command_holds_the_arm(reset, step):
+def test_what_is_no_command_holds_the_arm_and_a_good_one_is_followed_again(reset, step):
     state = reset(1)
     not_finite = np.full((3, 3), np.nan, np.float32)
     mirrored = np.diag([1.0, 1.0, -1.0]).astype(np.float32)
     bad = [not_finite, np.zeros((3, 3), np.float32), 1.1 * DOWN, mirrored]
+    held = np.arange(LANES) <= len(bad)
     R = np.array(state.pose.R)
     R[: len(bad)] = bad
-    after = step(state, Command(Pose(jnp.asarray(R), state.pose.p), jnp.ones(LANES)))
-    held = np.arange(LANES) < len(bad)
+    close = np.where(np.arange(LANES) == len(bad), np.nan, -1.0).astype(np.float32)
+    after = step(state, Command(Pose(jnp.asarray(R), state.pose.p), jnp.asarray(close)))
     assert not after.invalid.any()
     np.testing.assert_array_equal(np.isinf(after.ik_error), held)
     np.testing.assert_array_equal(after.q_target[held], state.q_target[held])
+    np.testing.assert_array_equal(after.gripper_target, np.where(held, 1.0, -1.0))
+    np.testing.assert_array_equal(after.velocity[held], 0.0)
     off = np.linalg.norm(after.pose.p - state.pose.p, axis=-1)
     assert off.max() < 1e-4
+    back = state.pose.p - 3e-3 * state.pose.R[:, :, 2]
+    for _ in range(12):
+        after = step(after, Command(Pose(state.pose.R, back), jnp.ones(LANES)))
+    np.testing.assert_allclose(after.pose.p, back, atol=3e-4)
 
 
 def test_a_port_that_is_not_finite_ends_the_episode_at_once(reset):

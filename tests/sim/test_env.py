@@ -9,6 +9,7 @@ from starjax import rcm
 from starjax.sim import env as envs
 from starjax.sim import physics
 from starjax.sim.tasks import expert, peg_transfer
+from starjax.types import Pose
 
 STEPS = 330  # control steps: 11 s, longer than the expert takes
 
@@ -73,6 +74,21 @@ def test_a_released_block_is_threaded_and_at_rest(episodes, sim):
     assert not state.jaw_contact[state.success].any()
 
 
+def test_success_wants_a_block_let_go_and_at_rest_on_its_peg_five_steps_in_a_row(reset, sim):
+    state = jax.tree.map(lambda leaf: leaf[0], reset(0))
+    on_target = Pose(jnp.eye(3), jnp.append(state.target_peg, peg_transfer.RIM_HEIGHT))
+    good = state.replace(block_pose=on_target)
+    fast = good.sim.replace(qvel=good.sim.qvel.at[sim.block_dof].set(0.02))
+    after, successes = good, []
+    for _ in range(5):
+        last, after = after, envs._judge(sim, after)
+        successes.append(bool(after.success) and bool(after.done))
+    assert successes == [False] * 4 + [True]
+    for bad in (state, good.replace(sim=fast), good.replace(jaw_contact=jnp.ones((), bool))):
+        again = envs._judge(sim, bad.replace(settled=last.settled))
+        assert int(again.settled) == 0 and not again.success and not again.done
+
+
 def test_a_diverged_lane_is_frozen_and_leaves_its_neighbours_alone(reset, begin, drive):
     """Bit-identical neighbours, beside NaN, infinity and a body at 1e20 m/s."""
     state = reset(3)
@@ -112,6 +128,15 @@ def test_observations_hold_what_they_say(environment, reset):
     np.testing.assert_allclose(seen.state[9:11], environment.model.pegs[int(state.target)])
     half_open = state.replace(gripper=jnp.float32(0.3), gripper_target=-jnp.ones(()))
     assert float(environment.observe(half_open).gripper) == jnp.float32(0.3), "measured"
+
+
+def test_a_collision_is_noticed(reset, begin, drive, sim):
+    state = reset(13)
+    shaft = state.pose.p[4] - 0.03 * state.pose.R[4, :, 2]
+    around = shaft - jnp.array([peg_transfer.RIM_RADIUS, 0.0, 0.0])  # the block has a wall there
+    qpos = state.sim.qpos.at[4, sim.block : sim.block + 7].set(jnp.array([*around, 1, 0, 0, 0]))
+    after, _ = drive(state.replace(sim=state.sim.replace(qpos=qpos)), begin(state, 14))
+    np.testing.assert_array_equal(after.collided, np.arange(12) == 4)
 
 
 def test_a_collision_and_a_near_miss_are_remembered(reset, begin, drive):
@@ -211,3 +236,35 @@ def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
     script = begin(jax.random.key(0), moved)
     assert len(np.unique(script.wall)) == 1 and len(np.unique(script.side)) == 1
     assert float(jnp.ptp(script.goal, axis=0).max()) == 0.0
+
+
+def test_the_expert_starts_over_when_the_block_is_lost_on_the_way(reset, begin):
+    state = reset(6)
+    state, script = (jax.tree.map(lambda leaf: leaf[0], x) for x in (state, begin(state, 6)))
+    normal = peg_transfer.wall_normals(state.block_pose)[script.wall]
+    wall = state.block_pose.p + peg_transfer.RIM_RADIUS * normal
+
+    def after(phase, off):
+        there = state.replace(pose=state.pose._replace(p=wall + jnp.array([0.0, 0.0, off])))
+        return int(expert._following(script.replace(phase=jnp.asarray(phase)), there))
+
+    for phase in range(expert.RAISE, expert.WAIT):
+        is_carried = phase in (expert.LIFT, expert.CARRY)
+        assert after(phase, 0.004) == phase + 1
+        assert after(phase, 0.008) == (expert.RAISE if is_carried else phase + 1)
+
+
+def test_the_expert_is_disturbed_by_a_millimetre_and_a_few_degrees(reset, begin):
+    script = begin(reset(0), 0)
+
+    def one(noise, step):
+        noise = jax.vmap(lambda s, n: expert._disturb(s.replace(noise=n), step, 1 / 30))(
+            script, noise
+        )
+        return noise, noise
+
+    _, noises = jax.lax.scan(one, script.noise, jnp.arange(300))
+    rough, smooth = np.moveaxis(noises, 2, 0)
+    spread = np.std(rough[60:], axis=(0, 1))  # once it has forgotten its start
+    np.testing.assert_allclose(spread, [1.2e-3, 1.2e-3, 1.2e-3, 0.07], rtol=0.3)
+    assert (np.std(smooth[60:], axis=(0, 1)) / spread > 0.5).all()

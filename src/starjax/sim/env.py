@@ -203,7 +203,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             jaw_contact=jaw_contact,
             rcm_error_within=jnp.max(rcm.rcm_error(between, port)),
         )
-        moved = _judge(_measure(moved))
+        moved = _judge(sim, _measure(moved))
         stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
         moved = _select(physics.is_sound(sim, after), moved, stopped)
         return _select(state.done, state, moved)
@@ -223,16 +223,6 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             rcm_error_within=jnp.maximum(state.rcm_error_within, rcm_error),
             collided=state.collided | hit,
         )
-
-    def _judge(state: EnvState) -> EnvState:
-        velocity = state.sim.qvel[sim.block_dof : sim.block_dof + 6]
-        good = peg_transfer.is_threaded(
-            state.block_pose, state.target_peg
-        ) & peg_transfer.is_at_rest(velocity)
-        settled = jnp.where(good & ~state.jaw_contact, state.settled + 1, 0)
-        success = settled >= peg_transfer.SETTLE_STEPS
-        loose = state.loose | peg_transfer.is_near(state.block_pose, state.target_peg)
-        return state.replace(settled=settled, success=success, loose=loose, done=success)
 
     def camera(state: EnvState) -> render.Frame:
         xpos, xmat = physics.geom_poses(
@@ -259,6 +249,17 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         model=sim,
         control_hz=CONTROL_HZ,
     )
+
+
+def _judge(sim: model.SimModel, state: EnvState) -> EnvState:
+    """The measured state with its outcome."""
+    velocity = state.sim.qvel[sim.block_dof : sim.block_dof + 6]
+    threaded = peg_transfer.is_threaded(state.block_pose, state.target_peg)
+    good = threaded & peg_transfer.is_at_rest(velocity) & ~state.jaw_contact
+    settled = jnp.where(good, state.settled + 1, 0)
+    success = settled >= peg_transfer.SETTLE_STEPS
+    loose = state.loose | peg_transfer.is_near(state.block_pose, state.target_peg)
+    return state.replace(settled=settled, success=success, loose=loose, done=success)
 
 
 def _precisely(f: Callable) -> Callable:
