@@ -101,9 +101,27 @@ def test_paired_counts_stand_under_their_own_names(several):
 
 
 def test_methods_that_are_one_policy_are_one_comparison(several):
-    twin = edited(several[1], method="stardiff_single")
+    theirs = several[1]
+    single = theirs._replace(path=theirs.path.parent / "stardiff_single")
+    twin = edited(single, method="stardiff_single")
     (_, *alone), (_, *together) = tables.paired(several), tables.paired([*several, twin])
     assert together[:2] == alone and together[2] == alone[1]
+    of_weights = [edited(x, weights="a")._replace(path=x.path / "x") for x in (theirs, twin)]
+    assert tables.paired([several[0], *of_weights, several[2]])[1:] == together
+
+
+def test_results_of_one_method_side_by_side_are_compared_each_by_itself(several, tmp_path):
+    ours = several[2]
+    lost = [{**trial, "success": False} for trial in ours.trials]
+    near = [{**trial, "success": trial["success"] and i > 1} for i, trial in enumerate(ours.trials)]
+    others = [
+        edited(several[1], trials=trials)._replace(path=tmp_path / f"dp_rcm4-{i}")
+        for i, trials in enumerate((near, lost))
+    ]
+    assert [row[4:] for row in tables.paired([*others, ours])[1:]] == [
+        ["0.50", "0.50"],
+        ["<0.0001", "<0.0001"],
+    ]
 
 
 def test_trials_of_other_limits_are_neither_paired_nor_pooled(several):

@@ -136,10 +136,10 @@ def paired(runs: Sequence[results.Run]) -> Table:
     pairs = [*itertools.product(ours, others), *itertools.combinations(ours, 2)]
     found = [(a, b, test) for a, b in pairs if (test := results.pair(a, b))]
     # Methods that are one policy, as DP-RCM-4 and STAR-Diff-Single, are one comparison.
-    single = {_comparison(a, b): test.p for a, b, test in found}
+    single = {_comparison(a, b, test): test.p for a, b, test in found}
     corrected = dict(zip(single, stats.holm(list(single.values())), strict=True))
     for a, b, test in found:
-        p = corrected[_comparison(a, b)]
+        p = corrected[_comparison(a, b, test)]
         counts = [str(n) for n in (test.pairs, test.only_a, test.only_b)]
         against = b.label if len(ours) == 1 else f"{b.label}, of {a.label}"
         table.append([against, *counts, p_value(test.p), p_value(p)])
@@ -232,8 +232,12 @@ def _bin(trial: outcomes.Trial) -> int:
     return int(trial["distance_m"] / sweep.BIN_WIDTH)
 
 
-def _comparison(a: results.Run, b: results.Run) -> tuple[object, ...]:
-    return a.path, b.path.parent, folders.behaviour(b.result["method"])
+def _comparison(a: results.Run, b: results.Run, test: stats.Paired) -> tuple[object, ...]:
+    """What two comparisons have in common that are one: the policies, by their weights or, where a
+    result does not say whose it is, by their folders, and the trials' outcomes."""
+    method = b.result["method"]
+    place = b.path.parent if b.path.name == method else b.path
+    return a.path, b.result.get("weights", place), folders.behaviour(method), test
 
 
 def _seen_unseen(
