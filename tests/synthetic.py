@@ -104,6 +104,7 @@ def recorded(rng, rows, per_trocar):
         "trial": rows.trial[kept],
         "length": length,
         "p_world_tip": tip,
+        "rcm_error": np.where(np.isnan(tip[..., 0]), np.nan, rows.rcm_max[kept, None]),
         "p_world_trocar": np.asarray(rcm.trocar_position(ports, P_REF)),
         "target_peg": rows.target[kept],
     }

@@ -207,8 +207,7 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
             continue
         same = (t for t in trials if t["trocar"] == kept["trocar"][row])
         trial = next((t for t in same if t["trial"] == kept["trial"][row]), None)
-        # After a kill it may be of the evaluation before.
-        if trial is not None and trial["steps"] == length:
+        if trial is not None and _is_recorded(trial, kept, row):
             rollouts.append(
                 Rollout(
                     trial=trial,
@@ -219,6 +218,17 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
                 )
             )
     return rollouts
+
+
+def _is_recorded(trial: outcomes.Trial, kept: dict[str, np.ndarray], row: int) -> bool:
+    """Whether a recorded trial is this one: after a kill it may be of another evaluation, whose
+    seed or weights gave it another length or, if it ran out of time too, other errors."""
+    if trial["steps"] != kept["length"][row]:
+        return False
+    if "rcm_error" not in kept or "rcm_max_mm" not in trial:
+        return True  # written before they were: not known
+    largest = 1e3 * kept["rcm_error"][row, : trial["steps"]].max()
+    return bool(np.isclose(largest, trial["rcm_max_mm"], rtol=1e-5, atol=0))
 
 
 def _beside(file: Path, result: dict[str, Any]) -> dict[str, Any] | None:
