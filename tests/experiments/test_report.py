@@ -788,6 +788,21 @@ def test_a_report_leaves_nothing_of_the_one_before(tmp_path):
     assert not kept & {"ports.png", "ports.pdf", "rollout.mp4"}
 
 
+@pytest.mark.parametrize("fails", [(page, "render"), (style, "save"), (files, "write_bytes")])
+def test_a_report_that_fails_leaves_the_one_before(tmp_path, monkeypatch, fails):
+    def fail(*_):
+        raise OSError("disk full")
+
+    run, out = synthetic.run(tmp_path / "stardiff"), tmp_path / "report"
+    build.build([run], out, with_video=False)
+    (out / "rollout.mp4").write_text("of before")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    monkeypatch.setattr(*fails, fail)
+    with pytest.raises(OSError, match="disk full"):
+        build.build([run], out, with_video=False)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
 def test_a_machine_without_a_video_encoder_still_gets_the_page(tmp_path, monkeypatch):
     def fail(*_):
         raise RuntimeError("no ffmpeg")

@@ -27,7 +27,9 @@ def build(
     """Writes the report of the run directories `runs` into `out`; returns its index.html.
 
     Each directory holds what `results.load` reads; whatever a run did not produce is left out of
-    the report. Without a recorded rollout, or with `with_video` off, there is no video.
+    the report. Without a recorded rollout, or with `with_video` off, there is no video. An earlier
+    report in `out` stays as it is until all of this one has been drawn; then what the page does
+    not show goes, its video too.
 
     Raises:
       ValueError: no runs, or a directory without a result.
@@ -39,19 +41,23 @@ def build(
     focus = _focus(loaded)
     sim = _model() if any(run.rollouts for run in loaded) else None
     with files.lock(out):
-        for name in _MADE:  # by an earlier report, of other runs
-            (out / name).unlink(missing_ok=True)
-        files.write_bytes(out / "tables.md", tables.markdown(loaded).encode())
-        pictures = _figures(loaded, focus, sim, out)
-        film = _film(loaded, sim, out / "rollout.mp4", report) if with_video and sim else None
+        text = tables.markdown(loaded)
+        pictures, drawn = _figures(loaded, focus, sim)
+        film = _film(loaded, sim, out / _FILM, report) if with_video and sim else None
         clip = film.read_bytes() if film else None
-        index = out / "index.html"
-        files.write_bytes(index, page.render(loaded, focus, pictures, clip).encode())
-    return index
+        html = page.render(loaded, focus, pictures, clip)
+        made = {"tables.md": text.encode(), **drawn, "index.html": html.encode()}
+        for name, data in made.items():
+            files.write_bytes(out / name, data)
+        for name in _NAMES.difference(made, [film.name] if film else []):
+            (out / name).unlink(missing_ok=True)  # of an earlier report
+    return out / "index.html"
 
 
 _FIGURES = ("training", "ports", "fig3", "fig4")
-_MADE = ("rollout.mp4", *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf")))
+_FILM = "rollout.mp4"
+# Of files that a report may have or not.
+_NAMES = {_FILM, *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf"))}
 
 
 def _order(run: results.Run) -> int:
@@ -121,9 +127,9 @@ def _model() -> Any:
 
 
 def _figures(
-    runs: Sequence[results.Run], focus: results.Run, sim: Any, out: pathlib.Path
-) -> dict[str, tuple[bytes, bytes]]:
-    """Draws each figure on light and on dark paper; the light one also goes to files."""
+    runs: Sequence[results.Run], focus: results.Run, sim: Any
+) -> tuple[dict[str, tuple[bytes, bytes]], dict[str, bytes]]:
+    """Each figure on light and on dark paper, and the light one's files by name."""
     drawings: dict[str, Callable[[bool], Any]] = {
         "training": lambda dark: figures.training(runs, dark),
     }
@@ -134,12 +140,12 @@ def _figures(
     if sim is not None:
         shown = results.representatives(runs)
         drawings["fig3"] = lambda dark: trajectories.draw(shown, sim, dark)
-    pictures = {}
+    pictures, drawn = {}, {}
     for name, draw in drawings.items():
         light, dark = draw(False), draw(True)
         if light is not None:
             pictures[name] = style.save(light, "png"), style.save(dark, "png")
-            files.write_bytes(out / f"{name}.png", pictures[name][0])
+            drawn[f"{name}.png"] = pictures[name][0]
             if name != "training":
-                files.write_bytes(out / f"{name}.pdf", style.save(light, "pdf"))
-    return pictures
+                drawn[f"{name}.pdf"] = style.save(light, "pdf")
+    return pictures, drawn
