@@ -455,7 +455,14 @@ def test_weights_that_are_shared_bring_their_curves(tmp_path):
     owner = synthetic.run(tmp_path / "dp_ee", "dp_ee")
     borrower = synthetic.run(tmp_path / "dp_ee_proj", "dp_ee_proj")
     (borrower / "metrics.jsonl").unlink()
-    assert results.load(borrower).curves == results.load(owner).curves != []
+    runs = [results.load(path) for path in (owner, borrower)]
+    assert runs[1].curves == runs[0].curves != []
+    assert len(figures.training(runs).axes[0].lines) == 1
+
+
+def test_runs_side_by_side_have_each_their_curve(tmp_path):
+    runs = [results.load(synthetic.run(tmp_path / name, seed=i)) for i, name in enumerate("ab")]
+    assert len(figures.training(runs).axes[0].lines) == 2
 
 
 def test_recorded_rollouts_end_where_the_trial_did(one):
@@ -715,8 +722,9 @@ def seeds(several, tmp_path):
         for run in several[1:]:
             trials = [{**trial, "seed": seed} for trial in run.trials]
             settings = {**run.result["config"], "seed": seed}
+            path = tmp_path / str(seed) / run.path.name
             labelled = run._replace(
-                label=f"{run.label} (seed {seed})", path=tmp_path / str(seed) / run.path.name
+                label=f"{run.label} (seed {seed})", path=path, log=path / "metrics.jsonl"
             )
             runs.append(edited(labelled, trials=trials, config=settings))
     return runs

@@ -46,7 +46,7 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
     from matplotlib import ticker
     from matplotlib.figure import Figure
 
-    runs = list({(run.path.parent, run.weights_of): run for run in reversed(runs)}.values())[::-1]
+    runs = list({run.log: run for run in reversed(runs) if run.curves}.values())[::-1]
     panels = [
         (name, title)
         for name, title in CURVES.items()

@@ -42,9 +42,9 @@ class Run(NamedTuple):
       result: result.json.
       label: name of the method in tables.
       group: its group in Table III.
-      weights_of: the method whose weights it runs on.
       rollouts: recorded trials, empty if none were.
-      curves: lines of metrics.jsonl, of the training of its weights.
+      log: the metrics.jsonl of the training of its weights, None if there is none.
+      curves: its lines.
       limit_s: how long a trial may take, simulated.
       sweep: trials of a sweep over other trocars, empty if none was made of these weights.
       sweep_limit_s: the same of these.
@@ -57,8 +57,8 @@ class Run(NamedTuple):
     result: dict[str, Any]
     label: str
     group: str
-    weights_of: str
     rollouts: list[Rollout]
+    log: Path | None
     curves: list[dict[str, Any]]
     limit_s: float
     sweep: list[outcomes.Trial]
@@ -155,18 +155,18 @@ def load(path: Path) -> Run:
     method = methods.METHODS[result["method"]]
     beside = {name: _beside(path / name, result) for name in ("sweep.json", "bench.json")}
     sweep, bench = (found or {} for found in beside.values())
-    curves = _curves(path, result)
+    log, curves = _curves(path, result)
     others = [name for name, found in beside.items() if found is None]
-    others += ["metrics.jsonl"] if curves is None else []
+    others += [log.name] if log and not curves else []
     limit_s = result["config"].get("eval", {}).get("time_limit_s", 0.0)
     return Run(
         path=path,
         result=result,
         label=method.label,
         group=method.group,
-        weights_of=method.weights_of,
         rollouts=_rollouts(path, result.get("trials") or []),
-        curves=curves or [],
+        log=log,
+        curves=curves,
         limit_s=limit_s,
         sweep=sweep.get("trials") or [],
         sweep_limit_s=sweep.get("time_limit_s", limit_s),
@@ -238,16 +238,17 @@ def _beside(file: Path, result: dict[str, Any]) -> dict[str, Any] | None:
     return found if len(weights) < 2 else None
 
 
-def _curves(path: Path, result: dict[str, Any]) -> list[dict[str, Any]] | None:
-    """The log of a run's training, which another method's folder has where they share weights;
-    None if it is of a training with other settings."""
+def _curves(path: Path, result: dict[str, Any]) -> tuple[Path | None, list[dict[str, Any]]]:
+    """The log of a run's training, which another method's folder has where they share weights, and
+    its lines; none of them if it is of a training with other settings."""
     method, places = result["method"], [path]
     if path.name == method:
         places.insert(0, path.parent / methods.METHODS[method].weights_of)
     for place in places:
-        if lines := _lines(place / "metrics.jsonl"):
-            return lines if _is_of(place, result) else None
-    return []
+        file = place / "metrics.jsonl"
+        if lines := _lines(file):
+            return file.resolve(), lines if _is_of(place, result) else []
+    return None, []
 
 
 def _is_of(folder: Path, result: dict[str, Any]) -> bool:
