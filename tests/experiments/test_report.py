@@ -10,6 +10,7 @@ import sys
 import types
 
 import imageio_ffmpeg
+import jax
 import numpy as np
 import pytest
 import synthetic
@@ -34,7 +35,7 @@ from starjax.experiments.report import (
     words,
 )
 from starjax.runtime import files
-from starjax.sim import env, model
+from starjax.sim import env, model, physics
 
 SIM = types.SimpleNamespace(pegs=np.zeros((12, 2)))  # where no joints were recorded
 
@@ -622,13 +623,21 @@ def test_an_encoder_that_fails_says_so_and_leaves_what_was_there(tmp_path, monke
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"of before"]
 
 
-def test_the_renderer_draws_the_recorded_configuration(one):
+def test_the_renderer_draws_the_recorded_configuration(one, monkeypatch):
     made = env.model.load()
     qpos = np.tile(made.mj_model.qpos0, (3, 1))
     near = one.rollouts[0]._replace(qpos=qpos, p_world_trocar=made.p_world_ref, target_peg=7)
     far = near._replace(p_world_trocar=made.p_world_ref + np.array([0, 0.04, 0], np.float32))
+    poses, precisions = physics.geom_poses, set()
+
+    def geom_poses(*args):
+        precisions.add(jax.config.jax_default_matmul_precision)
+        return poses(*args)
+
+    monkeypatch.setattr(physics, "geom_poses", geom_poses)
     draw = video.renderer(made, size=64)
     here, there = draw(near, 0), draw(far, 0)
+    assert precisions == {"highest"}
     assert here.shape[1:] == (64, 64, 3) and here.dtype == np.uint8
     assert (here[0] == here[2]).all() and (here[0] != there[0]).any()
     assert (draw(near._replace(target_peg=8), 0)[0] != here[0]).any()

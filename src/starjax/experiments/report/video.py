@@ -49,11 +49,11 @@ def record(
 
 
 def choose(runs: Sequence[results.Run], most: int = 4) -> list[tuple[str, results.Rollout]]:
-    """(method, rollout) to show side by side, an even number if there are two or more.
+    """(method, rollout) to show side by side, `most` at most.
 
-    One run: half of them at seen and half at unseen trocars, spread over these. Several runs:
-    one trial that as many of them as possible recorded, at an unseen trocar if there is one. The
-    choice does not look at how a rollout ended.
+    One run: half of them at seen and half at unseen trocars, spread over these, an even number if
+    there are two or more. Several runs: one trial that as many of them as possible recorded, at an
+    unseen trocar if there is one. The choice does not look at how a rollout ended.
     """
     if len(runs) > 1:
         return _same_trial(runs, most)
@@ -115,7 +115,8 @@ def renderer(sim: Any, size: int = SIZE) -> Draw:
             raise ValueError("rollout: expected one with joint positions, got none")
         rows = np.minimum(np.arange(first, first + _BATCH), len(rollout.qpos) - 1)
         port, target = rollout.p_world_trocar.astype(np.float32), np.int32(rollout.target_peg)
-        return np.asarray(batch(rollout.qpos[rows].astype(np.float32), port, target))
+        with jax.default_matmul_precision("highest"):  # poses to float32, as the environment's
+            return np.asarray(batch(rollout.qpos[rows].astype(np.float32), port, target))
 
     return draw
 
