@@ -186,8 +186,10 @@ def test_sweeps_are_paired_where_they_met_the_same_trocars(sweeps):
 
 def test_what_other_weights_left_beside_a_result_is_not_shown(tmp_path):
     run = synthetic.run(tmp_path / "stardiff")
-    for name, figure in (("sweep", "trials"), ("bench", "roll_network_ms")):
-        files.write_json(run / f"{name}.json", {"weights": "a", figure: [{"p50": 1.0}]})
+    (trial, *_) = files.read_json(run / "result.json")["trials"]
+    swept = {"weights": "a", "trials": [{**trial, "distance_m": 0.0}]}
+    files.write_json(run / "sweep.json", swept)
+    files.write_json(run / "bench.json", {"weights": "a", "inference_ms_by_ddim_steps": {}})
     for weights, count in ((None, 1), ("a", 1), ("b", 0)):
         result = files.read_json(run / "result.json")
         files.write_json(run / "result.json", result | ({"weights": weights} if weights else {}))
@@ -660,6 +662,8 @@ def test_a_result_alone_is_enough_to_load(one, tmp_path):
         ("sweep.json", b'{"trials": ['),
         ("bench.json", b"{"),
         ("metrics.jsonl", b'{"step": 1\n{"step": 2}\n'),
+        ("metrics.jsonl", b'{"step": 1, "note": "\xff"}\n'),
+        ("metrics.jsonl", b"5\n"),
         ("evaluation/recorded.npz", b"PK"),
     ],
 )
@@ -669,6 +673,44 @@ def test_a_damaged_file_of_a_run_is_named(one, tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=re.escape(str(tmp_path / name))):
         results.load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value", "said"),
+    [
+        ("result.json", "method", ["stardiff"], 'method: expected text, got ["stardiff"]'),
+        ("result.json", "config", 3, "config: expected an object, got 3"),
+        ("result.json", "config", None, "config: expected an object, got nothing"),
+        ("result.json", "config.policy", None, "config.policy: expected an object, got nothing"),
+        ("result.json", "trials", 5, "trials: expected a list, got 5"),
+        ("result.json", "trials", [{"trocar": 0}], "trials[0].trial: expected a whole number"),
+        ("result.json", "trials.0.seen", None, "trials[0].seen: expected true or false, got not"),
+        ("result.json", "inference_ms", {"p50": 1.0}, "inference_ms.p95: expected a number"),
+        ("result.json", "rcm_error_mm.executed", {"p99": 1.0}, "rcm_error_mm.executed.max: exp"),
+        ("result.json", "timings_s.train", "1 s", 'timings_s.train: expected a number, got "1 s"'),
+        ("sweep.json", "trials.0.distance_m", "far", "trials[0].distance_m: expected a number"),
+    ],
+)
+def test_what_is_wrong_in_a_file_of_a_run_is_said(tmp_path, name, place, value, said):
+    run = synthetic.run(tmp_path / "stardiff", sweep_of=1)
+    found = part = files.read_json(run / name)
+    *path, last = place.split(".")
+    for key in path:
+        part = part[int(key)] if isinstance(part, list) else part[key]
+    part[last] = value
+    files.write_json(run / name, found)
+    with pytest.raises(ValueError, match=re.escape(f"{run / name}: {said}")):
+        results.load(run)
+
+
+def test_trajectories_without_their_lengths_are_damaged(tmp_path):
+    run = synthetic.run(tmp_path / "stardiff")
+    file = run / "evaluation" / "recorded.npz"
+    kept = files.read_npz(file)
+    del kept["length"]
+    files.write_npz(file, kept)
+    with pytest.raises(ValueError, match=re.escape(f"{file} is damaged: no length in it")):
+        results.load(run)
 
 
 def test_a_log_that_ends_within_a_line_ends_before_it(one, tmp_path):

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from starjax.experiments import folders, methods
-from starjax.experiments.report import outcomes, stats
+from starjax.experiments.report import outcomes, stats, structure
 from starjax.runtime import files
 
 OURS = "stardiff"  # the method that the others are compared with
+_RECORDED = ("trocar", "trial", "length", "p_world_tip", "p_world_trocar")  # of recorded.npz
 _DIGITS = 5  # of m and rad: machines draw the same trocar with other last bits
 
 
@@ -148,17 +149,16 @@ def load(path: Path) -> Run:
     if not file.is_file():
         raise ValueError(f"path: expected a run directory with a result.json, got {path}")
     result = files.read_json(file)
-    if missing := [key for key in ("method", "observation", "config") if key not in result]:
-        raise ValueError(f"{file}: expected a result of starjax, got one without {missing[0]}")
+    structure.check(file, result, structure.RESULT)
     if result["method"] not in methods.METHODS:
         raise ValueError(f"{file}: expected a method of Table II, got {result['method']!r}")
     method = methods.METHODS[result["method"]]
-    beside = {name: _beside(path / name, result) for name in ("sweep.json", "bench.json")}
+    beside = {name: _beside(path / name, result) for name in structure.BESIDE}
     sweep, bench = (found or {} for found in beside.values())
     log, curves = _curves(path, result)
     others = [name for name, found in beside.items() if found is None]
     others += [log.name] if log and not curves else []
-    limit_s = result["config"].get("eval", {}).get("time_limit_s", 0.0)
+    limit_s = (result["config"].get("eval") or {}).get("time_limit_s") or 0.0
     return Run(
         path=path,
         result=result,
@@ -169,7 +169,7 @@ def load(path: Path) -> Run:
         curves=curves,
         limit_s=limit_s,
         sweep=sweep.get("trials") or [],
-        sweep_limit_s=sweep.get("time_limit_s", limit_s),
+        sweep_limit_s=sweep.get("time_limit_s") or limit_s,
         bench=bench,
         others=tuple(others),
     )
@@ -196,7 +196,7 @@ def _rollouts(path: Path, trials: Sequence[outcomes.Trial]) -> list[Rollout]:
     if not file.is_file():
         return []
     try:
-        kept = files.read_npz(file)
+        kept = files.read_npz(file, _RECORDED)
     except ValueError as error:
         raise ValueError(
             f"{error}; remove {path / 'result.json'}, and the same run makes both again"
@@ -225,7 +225,7 @@ def _is_recorded(trial: outcomes.Trial, kept: dict[str, np.ndarray], row: int) -
     seed or weights gave it another length or, if it ran out of time too, other errors."""
     if trial["steps"] != kept["length"][row]:
         return False
-    if "rcm_error" not in kept or "rcm_max_mm" not in trial:
+    if "rcm_error" not in kept or trial.get("rcm_max_mm") is None:
         return True  # written before they were: not known
     largest = 1e3 * kept["rcm_error"][row, : trial["steps"]].max()
     return bool(np.isclose(largest, trial["rcm_max_mm"], rtol=1e-5, atol=0))
@@ -233,7 +233,10 @@ def _is_recorded(trial: outcomes.Trial, kept: dict[str, np.ndarray], row: int) -
 
 def _beside(file: Path, result: dict[str, Any]) -> dict[str, Any] | None:
     """What another command left beside result.json; None if it is of other weights."""
-    found = files.read_json(file) if file.is_file() else {}
+    if not file.is_file():
+        return {}
+    found = files.read_json(file)
+    structure.check(file, found, structure.BESIDE[file.name])
     weights = {x["weights"] for x in (found, result) if "weights" in x}  # once neither said it
     return found if len(weights) < 2 else None
 
@@ -265,11 +268,14 @@ def _is_of(folder: Path, result: dict[str, Any]) -> bool:
 
 def _lines(file: Path) -> list[dict[str, Any]]:
     """What is whole of a log: a kill may have cut its last line short."""
-    lines = file.read_text().splitlines(keepends=True) if file.is_file() else []
+    lines = file.read_bytes().splitlines(keepends=True) if file.is_file() else []
     try:
-        return [json.loads(line) for line in lines if line.endswith("\n")]
+        found = [json.loads(line) for line in lines if line.endswith(b"\n")]
     except ValueError as error:
         raise ValueError(f"{file} is damaged: {error}") from error
+    for number, line in enumerate(found, 1):
+        structure.check(file, line, structure.LINE, f"line {number}")
+    return found
 
 
 def notes(runs: Sequence[Run]) -> list[str]:
