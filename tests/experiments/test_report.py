@@ -83,6 +83,17 @@ def test_headlines_are_those_of_the_result(one):
     assert value == f"{np.median(won):.1f}" and f" {len(won)} succ" in more
 
 
+def test_the_headline_of_the_rcm_error_is_its_quantile_and_the_worst_within_steps(one):
+    errors = {"executed": {"p99": 4.0, "max": 5.0}, "within_steps": {"max": 7.0}}
+    headlines = sections._headlines(edited(one, rcm_error_mm=errors))
+    (said,) = [x[1:] for x in headlines if x[0] == "Shaft off the trocar"]
+    assert said == ("4.000", " mm", "99th percentile of steps' ends; 7.000 mm at worst")
+
+
+def test_the_time_of_all_phases_and_what_of_it_was_compiling(one):
+    assert tables.phases([one])[1][-2:] == ["11 min 36 s", "31 s"]
+
+
 def test_the_gap_on_the_page_is_that_of_the_table(several):
     text = sections.comparison(several)
     rows = tables.success(several)[1:]
@@ -305,6 +316,18 @@ def test_success_over_distance_begins_with_the_training_trocars(one):
     assert sum(score.trials for _, score in further) == len(unseen) == 24
 
 
+def test_intervals_are_drawn_from_their_low_to_their_high_end(one):
+    scores = [score for _, score in figures._pooled(one)]
+    ends = [[score.low, score.high] for score in scores]
+    axis = Figure().subplots()
+    style.rates(axis, range(len(scores)), scores, "stardiff", "")
+    whiskers = [segment[:, 1] for segment in axis.collections[0].get_segments()]
+    np.testing.assert_allclose(whiskers, ends)
+    (band,) = figures.distance([one], one).axes[0].collections
+    edges = np.unique(band.get_paths()[0].vertices[:, 1])
+    np.testing.assert_allclose(edges, np.unique(ends))
+
+
 def test_pairs_are_trials_both_ran(several):
     first, second = several[0], several[2]
     cut = edited(second, trials=[*second.trials[5:], {**second.trials[0], "seed": 9}])
@@ -327,8 +350,10 @@ def test_table_three_counts_and_marks_the_best(several):
 def test_stars_are_each_runs_own(several):
     elsewhere = edited(several[0], trials=[t | {"seen": not t["seen"]} for t in several[0].trials])
     table = sections.matrix([elsewhere, several[1]])
-    here, there = (row.count("*</td>") for row in re.findall(r"<tr>.*?</tr>", table, re.S)[1:])
-    assert (here, there) == (8, 4)
+    rows = re.findall(r"<tr>.*?</tr>", table, re.S)[1:]
+    assert [row.count("*</td>") for row in rows] == [8, 4]
+    rates = [outcomes.tally(group).rate for group in outcomes.by_trocar(several[1].trials)]
+    assert re.findall(r">(\d+)\*?</td>", rows[1]) == [f"{100 * rate:.0f}" for rate in rates]
 
 
 def test_one_method_has_no_empty_comparison(one):
@@ -389,6 +414,12 @@ def test_the_verdict_begins_with_the_trocars_that_were_seen(one):
     said = words.verdict([one], one)
     first, second = (f"{rate.successes} of {rate.trials}" for rate in (seen, unseen))
     assert said.index(first) < said.index(second)
+
+
+def test_the_verdict_ends_with_the_best_of_the_others(several):
+    best = outcomes.tally(outcomes.split(several[1].trials)[1])
+    said = words.verdict(several, several[2])
+    assert said.endswith(f" trocars, DP-RCM-4, reached {100 * best.rate:.0f}%.")
 
 
 def test_the_page_stands_alone(several):

@@ -1,7 +1,7 @@
 """What the report counts on in the JSON that it reads, checked before it does.
 
 A kind is a type, a list of one kind, or an object: a kind by name, `?` after the names of what may
-be missing or null, or one kind by `str` for every name.
+be missing or null, or one kind by `*` for every name.
 """
 
 import json
@@ -42,10 +42,10 @@ RESULT = {
     "weights?": str,
     "trials?": [_TRIAL],
     "inference_ms?": _MS,
-    "inference_ms_by_ddim_steps?": {str: _MS},
+    "inference_ms_by_ddim_steps?": {"*": _MS},
     "roll_network_ms?": _MS,
-    "rcm_error_mm?": {str: _ERRORS},
-    "timings_s?": {str: _NUMBER},
+    "rcm_error_mm?": {"*": _ERRORS},
+    "timings_s?": {"*": _NUMBER},
     "warnings?": [str],
     "hardware?": _HARDWARE,
     "command?": str,
@@ -58,7 +58,7 @@ BESIDE = {
     },
     "bench.json": {
         "weights?": str,
-        "inference_ms_by_ddim_steps": {str: _MS},
+        "inference_ms_by_ddim_steps": {"*": _MS},
         "roll_network_ms?": _MS,
         "hardware?": _HARDWARE,
     },
@@ -78,7 +78,7 @@ def check(file: Path, value: Any, kind: Any, place: str = "") -> None:
             check(file, item, kind[0], f"{place}[{i}]")
     if isinstance(kind, dict):
         for name, part in kind.items():
-            for key in value if name is str else [name.removesuffix("?")]:
+            for key in value if name == "*" else [name.removesuffix("?")]:
                 found = value.get(key)
-                if found is not None or name is str or not name.endswith("?"):
+                if found is not None or not name.endswith("?"):
                     check(file, found, part, f"{place}.{key}" if place else key)
