@@ -235,6 +235,23 @@ def test_more_trials_than_asked_for_are_not_thrown_away(tmp_path):
     assert files.read_json(folder / "result.json") == many
 
 
+def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
+    from starjax.experiments import scoring
+
+    preset = smoke(tmp_path, "stardiff_single")
+    for name in ("dp_rcm4", "stardiff_single"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "dp_rcm4" / "policy.safetensors").write_bytes(b"weights")
+    (tmp_path / "dp_rcm4" / "evaluation").mkdir()
+    (tmp_path / "dp_rcm4" / "evaluation" / "chunk_0000.npz").write_bytes(b"trials")
+    found = []
+    monkeypatch.setattr(scoring, "subject", lambda *_: None)
+    monkeypatch.setattr(scoring, "rollouts", lambda at, *_: found.extend(at.glob("*.npz")))
+    monkeypatch.setattr(scoring, "write_result", lambda *_: None)
+    pipeline._evaluate(preset, "stardiff_single", None, "demos-a", "")
+    assert found == [tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz"]
+
+
 def _json(settings):
     return json.loads(json.dumps(dataclasses.asdict(settings)))
 
