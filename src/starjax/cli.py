@@ -94,6 +94,8 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         place = f": {error.filename}" if error.filename else ""
         does = "write" if error.errno in _WRITING else "read or write"
         return _fail(f"cannot {does}{place}: {error.strerror}", 74)
+    except MemoryError as error:
+        return _fail(f"too little memory ({error or 'none left'}): close other programs", 71)
     except RuntimeError as error:
         if not str(error).startswith("RESOURCE_EXHAUSTED"):
             raise

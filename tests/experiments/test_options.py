@@ -370,6 +370,7 @@ def test_every_field_has_its_flag():
         (OSError(28, "No space left on device", "runs/x"), 74, "cannot write:"),
         (PermissionError(13, "Permission denied", "runs/y"), 74, "cannot read or write: runs/y"),
         (OSError(36, "File name too long", "runs/y"), 74, "File name too long"),
+        (MemoryError("Unable to allocate 9 GiB"), 71, "too little memory (Unable to allocate 9"),
         (files.StorageError("runs/z: the disk is full"), 74, "runs/z"),
     ],
 )
