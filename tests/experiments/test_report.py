@@ -139,7 +139,7 @@ def test_results_of_one_method_side_by_side_are_compared_each_by_itself(several,
 def test_trials_of_other_limits_are_neither_paired_nor_pooled(several):
     short = several[1]._replace(limit_s=4.0)
     assert results.pair(several[2], several[1]) and results.pair(several[2], short) is None
-    assert "Trials were given 4, 60 s; runs with" in "".join(results.notes([several[2], short]))
+    assert "Trials were given 4, 60 s; runs with" in "".join(words.notes([several[2], short]))
     swept = several[2]._replace(sweep=several[2].trials)
     both, alone = (
         sum(rate.trials for _, rate in figures._pooled(run))
@@ -147,7 +147,7 @@ def test_trials_of_other_limits_are_neither_paired_nor_pooled(several):
     )
     assert both == 2 * alone
     assert (
-        "sweep's trials were given 30 s" in results.notes([swept._replace(sweep_limit_s=30.0)])[-1]
+        "sweep's trials were given 30 s" in words.notes([swept._replace(sweep_limit_s=30.0)])[-1]
     )
 
 
@@ -855,16 +855,16 @@ def test_what_is_of_other_weights_is_left_out_and_said(tmp_path):
     folders.claim(path, longer, "demos-a")
     run = results.load(path)
     assert not run.sweep and not run.curves
-    (note,) = [text for text in results.notes([run]) if "other weights" in text]
+    (note,) = [text for text in words.notes([run]) if "other weights" in text]
     assert note.startswith("STAR-Diff: sweep.json and bench.json and metrics.jsonl beside")
 
 
 def test_results_that_read_safety_otherwise_are_told_apart(one):
     errors = {k: v for k, v in one.result["rcm_error_mm"].items() if k != "within_steps"}
     old = edited(one, rcm_error_mm=errors)._replace(label="old")
-    (note,) = [text for text in results.notes([one, old]) if "safe" in text]
+    (note,) = [text for text in words.notes([one, old]) if "safe" in text]
     assert note == "old: safe successes were read at the ends of control steps only."
-    assert not [text for text in results.notes([old]) if "safe" in text]
+    assert not [text for text in words.notes([old]) if "safe" in text]
 
 
 def test_a_report_leaves_nothing_of_the_one_before(tmp_path):
@@ -934,14 +934,14 @@ def test_runs_trained_at_fewer_trocars_show_what_more_buy(tmp_path):
 def test_a_note_of_some_runs_names_them(one):
     other = one._replace(label="DP-EE", result={"warnings": ["common", "its own"]})
     both = [one._replace(result={"warnings": ["common"]}), other]
-    assert results.notes(both) == ["common", "DP-EE: its own"]
+    assert words.notes(both) == ["common", "DP-EE: its own"]
 
 
 def test_a_report_of_runs_that_were_trained_otherwise_says_in_what(one):
     policy = {**one.result["config"]["policy"], "sees_trocar": "never"}
     other = edited(one, config={**one.result["config"], "policy": policy})
-    (*_, note) = results.notes([one, other])
+    (*_, note) = words.notes([one, other])
     assert note.startswith("These runs were not trained alike") and note.endswith(
         "in --policy.sees-trocar."
     )
-    assert results.notes([one, one]) == one.result["warnings"]
+    assert words.notes([one, one]) == one.result["warnings"]

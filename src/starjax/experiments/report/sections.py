@@ -46,7 +46,7 @@ def _trials(run: results.Run) -> str:
 
 def notes(runs: Sequence[results.Run]) -> str:
     """Warnings, each once."""
-    return "\n".join(f'<p class="note">{markup.escape(text)}</p>' for text in results.notes(runs))
+    return "\n".join(f'<p class="note">{markup.escape(text)}</p>' for text in words.notes(runs))
 
 
 def cards(run: results.Run) -> str:

@@ -29,7 +29,7 @@ def markdown(runs: Sequence[results.Run]) -> str:
         ("Table IV. Inference time", inference(runs), inference_note(runs)),
     ]
     filled = [f"## {title}\n\n{render(t)}\n\n{note}\n" for title, t, note in parts if len(t) > 1]
-    notes = "".join(f"- {text}\n" for text in results.notes(runs))
+    notes = "".join(f"- {text}\n" for text in words.notes(runs))
     head = f"# Peg transfer from {results.observed(runs)} observations\n"
     return "\n".join(part for part in (head, notes, *filled) if part)
 

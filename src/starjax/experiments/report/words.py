@@ -107,3 +107,40 @@ def _rank(runs: Sequence[results.Run], focus: results.Run) -> str:
         return ""
     best, label = max(scores)
     return f"The best of the others on new trocars, {label}, reached {100 * best:.0f}%."
+
+
+def notes(runs: Sequence[results.Run]) -> list[str]:
+    """Warnings of the runs, each once, with the names of those that it is about if not of all, and
+    what sets their trainings apart."""
+    said: dict[str, list[str]] = {}
+    for run in runs:
+        for text in run.result.get("warnings") or []:
+            said.setdefault(text, []).append(run.label)
+    found = [
+        text if len(labels) == len(runs) else f"{', '.join(labels)}: {text}"
+        for text, labels in said.items()
+    ]
+    found += [
+        f"{run.label}: {' and '.join(run.others)} beside its result.json "
+        f"{'is' if len(run.others) == 1 else 'are'} of other weights, and left out; "
+        "starjax run scores the present ones."
+        for run in runs
+        if run.others
+    ]
+    within = [run for run in runs if (run.result.get("rcm_error_mm") or {}).get("within_steps")]
+    if within and len(within) < len(runs):
+        names = ", ".join(run.label for run in runs if run not in within)
+        found.append(f"{names}: safe successes were read at the ends of control steps only.")
+    if flags := results.differing(runs):
+        found.append(f"These runs were not trained alike: they differ in {', '.join(flags)}.")
+    limits = sorted({run.limit_s for run in runs if run.trials})
+    if len(limits) > 1:
+        allowed = ", ".join(f"{limit:g}" for limit in limits)
+        found.append(f"Trials were given {allowed} s; runs with different limits are not paired.")
+    found += [
+        f"{run.label}: the sweep's trials were given {run.sweep_limit_s:g} s, those through the "
+        f"twelve trocars {run.limit_s:g} s; Fig. 4 shows the sweep's alone."
+        for run in runs
+        if run.sweep and run.sweep_limit_s != run.limit_s
+    ]
+    return found
