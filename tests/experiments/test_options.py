@@ -388,7 +388,7 @@ def test_guard_turns_what_a_user_can_mend_into_one_line(error, code, word, capsy
     [
         (["x/stardiff", "--trocars", "3"], "x/stardiff", 3),
         (["--trocars", "3", "x/stardiff"], "x/stardiff", 3),
-        (["--trocars=3", "--seed", "1", "x/stardiff"], "x/stardiff", 3),
+        (["--trocars=3", "x=y/stardiff", "--seed", "1"], "x=y/stardiff", 3),
     ],
 )
 def test_words_may_stand_anywhere(argv, run, trocars):

@@ -146,9 +146,7 @@ def test_trials_of_other_limits_are_neither_paired_nor_pooled(several):
         for run in (swept, swept._replace(sweep_limit_s=30.0))
     )
     assert both == 2 * alone
-    assert (
-        "sweep's trials were given 30 s" in words.notes([swept._replace(sweep_limit_s=30.0)])[-1]
-    )
+    assert "sweep's trials were given 30 s" in words.notes([swept._replace(sweep_limit_s=30.0)])[-1]
 
 
 @pytest.fixture(scope="module")

@@ -108,38 +108,42 @@ def _is_positional(settings: type, name: str) -> bool:
 
 def _sorted(settings: type, argv: Sequence[str]) -> list[str]:
     """`argv` without a mistake: the words of no flag first, then the flags with theirs."""
-    hints, known = typing.get_type_hints(settings), flags(settings)
+    known = flags(settings)
     fields = [f for f in dataclasses.fields(settings) if _is_positional(settings, f.name)]
-    first = next((i for i, token in enumerate(argv) if token.startswith("-")), len(argv))
-    words, rest = list(argv[:first]), []
-    if words and not fields:
-        raise config_lib.UsageError(f"{words[0]}: expected a flag such as {next(iter(known))}")
-    index = first
+    words, rest, index = [], [], 0
     while index < len(argv):
         token, equals, value = argv[index].partition("=")
-        flag, start = _spelled(token), index
+        if fields and not token.startswith("-"):
+            words.append(argv[index])
+            index += 1
+            continue
         if not token.startswith("--"):
             raise config_lib.UsageError(f"{token}: expected a flag such as {next(iter(known))}")
+        flag, end = _spelled(token), index + 1
         if flag not in known:
             raise config_lib.UsageError(f"{token}: unknown argument{suggest(flag, known)}")
-        index += 1
-        values = [value] if equals else []
-        while not equals and index < len(argv) and not argv[index].startswith("--"):
-            values.append(argv[index])
-            index += 1
+        while not equals and end < len(argv) and not argv[end].startswith("--"):
+            end += 1
+        values = [value] if equals else list(argv[index + 1 : end])
         count = _count(known[flag], values)
-        # What is more than a flag takes may be a word of no flag, after it.
-        beyond = values[count:] if fields and not equals else []
-        words += beyond
-        rest += argv[start : index - len(beyond)]
-        _check_values(flag, known[flag], values[: len(values) - len(beyond)], count)
+        if fields and len(values) > count:  # what follows is of no flag
+            values, end = values[:count], index + 1 + count
+        _check_values(flag, known[flag], values, count)
+        rest += argv[index:end]
+        index = end
+    _check_words(settings, fields, words)
+    return [*words, *rest]
+
+
+def _check_words(settings: type, fields: Sequence[dataclasses.Field], words: list[str]) -> None:
+    """UsageError unless there are as many words of no flag as positional fields ask for."""
     needed = sum(field.default is dataclasses.MISSING for field in fields)
+    hints = typing.get_type_hints(settings)
     several = any(typing.get_origin(hints[field.name]) is tuple for field in fields)
     if len(words) < needed or (len(words) > len(fields) and not several):
         names, got = " ".join(field.name for field in fields).upper(), " ".join(words) or "none"
         count = "one or more" if several else len(fields)
         raise config_lib.UsageError(f"{names}: expected {count}, got {got}")
-    return [*words, *rest]
 
 
 def _count(hint: Any, values: Sequence[str]) -> int:
