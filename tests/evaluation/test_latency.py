@@ -41,5 +41,5 @@ def test_every_row_of_the_table_has_its_own_sampler(monkeypatch):
     monkeypatch.setattr(latency.policies, "make", lambda _, chosen, *__: made.append(chosen))
     monkeypatch.setattr(latency, "policy_ms", lambda *_, **__: {})
     given = METHODS["stardiff"], fakes.TINY, None, None, None, None
-    rows = latency.table(*given, ddim_steps=(1, 5))
+    rows = list(latency.table(*given, ddim_steps=(1, 5)))
     assert [chosen.ddim_steps for chosen in made] == [row["ddim_steps"] for row in rows] == [1, 5]

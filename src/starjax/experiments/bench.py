@@ -64,19 +64,20 @@ def _time(run: Path, counts: Sequence[int], calls: int) -> dict[str, Any]:
     trained = who.trained
     print("  DDIM steps      p50      p95      p99 ms       Hz")
     found = {}
-    for count in counts:
-        (ms,) = latency.table(
-            methods.METHODS[run.name],
-            trained.policy,
-            trained.train,
-            trained.params,
-            trained.normalizer,
-            who.env.p_world_ref,
-            ddim_steps=[count],
-            calls=calls,
-        )
-        found[str(count)] = ms  # JSON's names are words
-        print(_row(str(count), ms), flush=True)
+    rows = latency.table(
+        methods.METHODS[run.name],
+        trained.policy,
+        trained.train,
+        trained.params,
+        trained.normalizer,
+        who.env.p_world_ref,
+        ddim_steps=counts,
+        calls=calls,
+    )
+    for row in rows:
+        count = str(row["ddim_steps"])  # JSON's names are words
+        found[count] = row
+        print(_row(count, row), flush=True)
     roll = None
     if methods.METHODS[run.name].hierarchical:
         roll = latency.roll_ms(trained.policy, calls=calls)

@@ -9,10 +9,9 @@ but SE(3) the shaft passes through the trocar, as nearly as float32 tells where 
 2e-4 mm within a metre of the origin. If an input (action, trocar or reference) is not finite, the
 flag `valid` is False and the pose is the **hold pose**: tool straight down, roll 0, tip
 `HOLD_DEPTH` below the trocar (whose own non-finite numbers count as zero: below the reference if
-the radius is not finite). Inputs that are finite, in float32 if that is what jax
-calculates in, are always valid: depths are clipped to
-[MIN_DEPTH, MAX_DEPTH], a tip at the trocar takes the axis straight down, degenerate 6-D columns
-are completed, and SE(3) positions are clipped to +-MAX_REACH.
+the radius is not finite). Inputs that are finite, in float32 if that is what jax calculates in, are
+always valid: depths are clipped to [MIN_DEPTH, MAX_DEPTH], a tip at the trocar takes the axis
+straight down, degenerate 6-D columns are completed, and SE(3) positions are clipped to +-MAX_REACH.
 
 `encode` describes measured poses too, which are a little off the manifold: its depth is the
 signed one of Eq. 3, its roll and rotation those of the pose. What is computed from a NaN is NaN.

@@ -144,13 +144,11 @@ def require_writable(directory: Path, free_bytes: int = 0) -> None:
     """
     probe = directory / ".writable"
     try:
-        if directory.is_file():
-            raise StorageError(f"{directory}: expected a folder, got a file")
         directory.mkdir(parents=True, exist_ok=True)
         probe.write_bytes(b"x")
         probe.unlink(missing_ok=True)  # another process that starts here may have been quicker
-    except StorageError:
-        raise
+    except FileExistsError as error:
+        raise StorageError(f"{directory}: expected a folder, got a file") from error
     except OSError as error:
         raise _explained(error, directory) from error
     free = shutil.disk_usage(directory).free
