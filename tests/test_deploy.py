@@ -75,7 +75,8 @@ def test_fields_of_a_trocar_broadcast(made):
     one = jax.tree.map(lambda x: np.repeat(x[:1], ROBOTS, 0), observation)
     port = jax.tree.map(lambda field: field[:1].repeat(ROBOTS), rcm.TROCARS)
     wanted = deployed(jax.random.key(0), one, port)
-    for given in (port._replace(radius=PORT.radius, azimuth=PORT.azimuth), PORT):
+    lists = rcm.Trocar(*(field.tolist() for field in port))
+    for given in (port._replace(radius=PORT.radius, azimuth=PORT.azimuth), PORT, lists):
         got = deployed(jax.random.key(0), one, given)
         jax.tree.map(np.testing.assert_array_equal, got, wanted)
 
@@ -103,6 +104,15 @@ def test_a_mistake_names_the_array(made):
         ),
         r"observation.pose.R: expected shape .*, got none": (good.replace(pose=None), trocar),
         r"observation.gripper: expected shape .*, got none": (good.replace(gripper=None), trocar),
+        r"observation.gripper: expected real numbers, got complex": (
+            good.replace(gripper=good.gripper * 1j),
+            trocar,
+        ),
+        r"observation.gripper: expected real numbers, got <U": (
+            good.replace(gripper=["open", "shut"]),
+            trocar,
+        ),
+        r"observation: expected a deploy.Observation, got NoneType": (None, trocar),
     }
     if kind == "image":
         bright = good.replace(image=good.image / np.float32(255))
@@ -110,8 +120,12 @@ def test_a_mistake_names_the_array(made):
     for message, given in mistakes.items():
         with pytest.raises(ValueError, match=message):
             deployed(jax.random.key(0), *given)
-    with pytest.raises(ValueError, match=r"key: expected a jax\.random\.key, got int"):
+    with pytest.raises(ValueError, match=r"key: expected a jax\.random\.key, .*got int"):
         deployed(0, good, trocar)
+    with pytest.raises(ValueError, match=r"key: expected .*one for all robots, got key<fry>\[3\]"):
+        deployed(jax.random.split(jax.random.key(0), 3), good, trocar)
+    with pytest.raises(ValueError, match=r"key: expected .*got uint32\[1, 2\]"):
+        deployed(np.zeros((1, 2), np.uint32), good, trocar)
 
 
 def test_numbers_that_no_robot_measures_are_refused(made):
@@ -186,8 +200,11 @@ def test_a_file_that_will_not_do_is_named(made, tmp_path):
     path, trained, _ = made
     with pytest.raises(ValueError, match=r"^policy: expected a file or one of .*compact, got no"):
         deploy.load("no")
-    with pytest.raises(ValueError, match=r"ddim_steps: expected 2 to .*, got 1"):
-        deploy.load(path, ddim_steps=1)
+    for steps in (1, 101, 2.5):
+        with pytest.raises(
+            ValueError, match=rf"ddim_steps: expected .* from 2 to 100, got {steps}"
+        ):
+            deploy.load(path, ddim_steps=steps)
     assert deploy.load(path, ddim_steps=2).settings.ddim_steps == 2
     small = {"unet": {"kernel": jnp.ones(3)}}
     export.save(tmp_path / "p", trained._replace(p_world_ref=None, params=small))
@@ -202,3 +219,88 @@ def test_a_policy_prints_as_its_settings_without_its_weights(made):
     path, trained, _ = made
     said = repr(deploy.load(path))
     assert repr(trained.policy) in said and "Array" not in said
+
+
+def test_what_sensors_are_off_is_not_refused(made):
+    path, trained, _ = made
+    deployed, key = deploy.load(path), jax.random.key(0)
+    good = observed(trained.policy, ())
+    deployed(key, good.replace(gripper=1.05 * good.gripper), PORT)
+    pose = good.pose._replace(R=1.01 * good.pose.R, p=good.pose.p + 0.01 * good.pose.R[..., 0])
+    deployed(key, good.replace(pose=pose), PORT)
+
+
+def test_a_tool_through_another_port_is_refused_where_the_policy_keeps_to_it(made, tmp_path):
+    _, trained, _ = made
+    stats = normalizer.fit(METHODS["dp_ee"], fakes.dataset(0), fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.P_WORLD_REF, TRAIN)
+    params = jax.jit(policy.init)(jax.random.key(0))
+    file, other = tmp_path / "policy.safetensors", jax.tree.map(lambda x: x[4], rcm.TROCARS)
+    export.save(file, trained._replace(method="dp_ee", params=params, normalizer=stats))
+    given = jax.random.key(0), observed(trained.policy, ()), other
+    deploy.load(file)(*given)
+    with pytest.raises(ValueError, match="an axis that misses it by"):
+        deploy.load(file, method="dp_ee_proj")(*given)
+
+
+@pytest.mark.parametrize("rolls", [(1.4, 1.7), (1.7, 1.4)])
+def test_the_newest_moment_says_which_way_a_tool_is_turned(made, rolls):
+    """An untrained policy commands a roll of about zero, as it reads the tool."""
+    path, trained, _ = made
+    good = observed(trained.policy, ())
+    R = rcm.rotation_from_axis_roll(good.pose.R[..., 2], np.float32(rolls))
+    turned = good.replace(pose=good.pose._replace(R=R))
+    roll = np.abs(rcm.roll_of(deploy.load(path)(jax.random.key(0), turned, PORT).pose.R))
+    assert ((roll > np.pi / 2) == (rolls[1] > np.pi / 2)).all()
+
+
+def test_it_may_be_part_of_a_program(made):
+    path, trained, _ = made
+    deployed, given = deploy.load(path), (observed(trained.policy, ()), PORT)
+    wanted = deployed(jax.random.key(0), *given)
+    got = jax.jit(deployed)(jax.random.key(0), *jax.tree.map(jnp.asarray, given))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
+
+
+def test_pictures_are_cropped_as_in_its_training(made, tmp_path):
+    _, trained, _ = made
+    if trained.policy.observation == "state":
+        pytest.skip("no pictures")
+    half = dataclasses.replace(TRAIN, crop_fraction=0.5)
+    export.save(tmp_path / "p", trained._replace(train=half))
+    deployed, good = deploy.load(tmp_path / "p"), observed(trained.policy, ())
+    edge = good.image.copy()
+    edge[:, :8] = 0
+    one, other = (deployed(jax.random.key(0), x, PORT) for x in (good, good.replace(image=edge)))
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_one_number_of_one_robot_is_enough_to_refuse(made):
+    path, trained, _ = made
+    deployed, good = deploy.load(path), observed(trained.policy)
+    ports = jax.tree.map(lambda field: field[:ROBOTS].copy(), rcm.TROCARS)
+
+    def changed(x, value):
+        x = np.array(x)
+        x[1, 0] = value(x[1, 0])
+        return x
+
+    pose, mirror = good.pose, np.diag([-1.0, 1.0, 1.0]).astype(np.float32)
+    bad = {
+        "gripper: expected finite": {"gripper": changed(good.gripper, lambda x: np.nan)},
+        "gripper: expected numbers": {"gripper": changed(good.gripper, lambda x: -2.0)},
+        "R: expected rot": {"pose": pose._replace(R=changed(pose.R, lambda x: x @ mirror))},
+        "R: expected rotations": {"pose": pose._replace(R=changed(pose.R, lambda x: 1.1 * x))},
+        "p: expected tips": {"pose": pose._replace(p=changed(pose.p, lambda x: x + 1.0))},
+        "an axis that misses": {
+            "pose": pose._replace(p=changed(pose.p, lambda x: x + np.eye(3)[0] * 0.05))
+        },
+    }
+    if good.state is not None:
+        bad["state: expected finite"] = {"state": changed(good.state, lambda x: x * np.nan)}
+    for message, fields in bad.items():
+        with pytest.raises(ValueError, match=message):
+            deployed(jax.random.key(0), good.replace(**fields), ports)
+    ports.radius[1] = 0.6
+    with pytest.raises(ValueError, match=r"trocar.radius: expected at most 0.5 m, got 0.6"):
+        deployed(jax.random.key(0), good, ports)

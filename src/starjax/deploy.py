@@ -79,10 +79,13 @@ class Deployed:
         farthest = 0.0 if _is_traced(trocar.radius) else np.max(trocar.radius, initial=0.0)
         if farthest > FARTHEST:
             raise ValueError(f"trocar.radius: expected at most {FARTHEST} m, got {farthest:g}")
-        if not isinstance(key, jax.Array | np.ndarray):
-            raise ValueError(f"key: expected a jax.random.key, got {type(key).__name__}")
+        _check_key(key)
+        if not isinstance(observation, Observation):
+            raise ValueError(
+                f"observation: expected a deploy.Observation, got {type(observation).__name__}"
+            )
         observation = self._given(observation)
-        trocar = rcm.Trocar(*jnp.broadcast_arrays(*trocar))
+        trocar = rcm.Trocar(*jnp.broadcast_arrays(*map(jnp.asarray, trocar)))
         several = np.shape(observation.pose.p)[:-2]
         robots = np.shape(trocar.radius) or (several if len(several) == 1 else ())
         self._check(observation, robots)
@@ -119,8 +122,9 @@ class Deployed:
             got = "none" if given[name] is None else list(np.shape(given[name]))
             if got != shape:
                 raise ValueError(f"observation.{name}: expected shape {shape}, got {got}")
-        if "image" in given and (dtype := jnp.result_type(given["image"])) != jnp.uint8:
-            raise ValueError(f"observation.image: expected uint8, got {dtype}")
+            wanted, dtype = "uint8" if name == "image" else "real numbers", given[name].dtype
+            if not (dtype == jnp.uint8 if name == "image" else _is_real(dtype)):
+                raise ValueError(f"observation.{name}: expected {wanted}, got {dtype}")
 
     def _check_values(self, observation: Observation, trocar: rcm.Trocar) -> None:
         """Raises ValueError for what no robot measures: a policy would plan on from there."""
@@ -180,6 +184,18 @@ def _array(value: Any) -> Any:
     return value if value is None or isinstance(value, jax.Array) else np.asarray(value)
 
 
+def _is_real(dtype: Any) -> bool:
+    return any(jnp.issubdtype(dtype, kind) for kind in (jnp.floating, jnp.integer, jnp.bool_))
+
+
+def _check_key(key: Any) -> None:
+    is_array = isinstance(key, jax.Array | np.ndarray)
+    got = f"{key.dtype}{list(key.shape)}" if is_array else type(key).__name__
+    of_old_kind = is_array and not jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    if not is_array or key.ndim != of_old_kind:
+        raise ValueError(f"key: expected a jax.random.key, one for all robots, got {got}")
+
+
 def _is_traced(value: Any) -> bool:
     return isinstance(value, core.Tracer)
 
@@ -205,8 +221,10 @@ def load(policy: str | Path, ddim_steps: int | None = None, method: str | None =
     settings = trained.policy
     if ddim_steps is not None:
         fewest, most = config.FEWEST_DDIM_STEPS, settings.diffusion_steps
-        if not fewest <= ddim_steps <= most:
-            raise ValueError(f"ddim_steps: expected {fewest} to {most}, got {ddim_steps}")
+        if not (isinstance(ddim_steps, int | np.integer) and fewest <= ddim_steps <= most):
+            raise ValueError(
+                f"ddim_steps: expected an integer from {fewest} to {most}, got {ddim_steps}"
+            )
         settings = dataclasses.replace(settings, ddim_steps=ddim_steps)
     options.choice(f"{path}: method", trained.method, methods.METHODS)
     method = method or trained.method

@@ -395,6 +395,14 @@ def test_place_depends_on_what_is_free(monkeypatch):
     assert [load._place(n) for n in (149, 151)] == ["device", "host"]
 
 
+def test_what_does_not_fit_the_host_does_not_pass_through_it(monkeypatch):
+    stats = {"bytes_limit": 10_000, "bytes_in_use": 0}
+    gpu = types.SimpleNamespace(platform="gpu", memory_stats=lambda: stats)
+    monkeypatch.setattr(load.jax, "local_devices", lambda: [gpu])
+    monkeypatch.setattr(load.xla, "available_bytes", lambda: 1000)
+    assert [load._place(n) for n in (599, 601)] == ["device", "disk"]
+
+
 def test_nothing_is_unpickled(pictures, tmp_path):
     root = shutil.copytree(pictures, tmp_path / "d")
     key = next(k for k in store.keys(root) if store.verify(root, k)["success"])

@@ -43,3 +43,15 @@ def test_every_row_of_the_table_has_its_own_sampler(monkeypatch):
     given = METHODS["stardiff"], fakes.TINY, None, None, None, None
     rows = list(latency.table(*given, ddim_steps=(1, 5)))
     assert [chosen.ddim_steps for chosen in made] == [row["ddim_steps"] for row in rows] == [1, 5]
+
+
+def test_a_slow_policy_is_timed_five_times_until_its_answer_is_there(monkeypatch):
+    now = [0.0]
+
+    class Late:
+        def block_until_ready(self):
+            now[0] += 2.0
+
+    monkeypatch.setattr(latency.time, "perf_counter", lambda: now[0])
+    found = latency._percentiles(Late, calls=100, seconds=1.0)
+    assert found == {"p50": 2000.0, "p95": 2000.0, "p99": 2000.0, "n": 5}

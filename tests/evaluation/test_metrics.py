@@ -169,3 +169,29 @@ def test_selection_keeps_steps_with_their_trials():
     np.testing.assert_array_equal(kept.rcm_within_mm, [6, 7, 9, 10, 11])
     joined = table.join([kept, table.select(found, np.array([False, True, False]))])
     np.testing.assert_array_equal(joined.success, [1, 1, 0])
+
+
+def test_each_count_and_place_is_its_own():
+    port = {"radius": [0.01, 0.02], "polar": [1.5, 1.6], "azimuth": [3.0, 4.0]}
+    steps = np.array([1, 2, 6, 9], np.int32)
+    found = metrics.compose(
+        trials(
+            [1, 1, 1, 0],
+            trocar=[0, 0, 1, 1],
+            steps=steps,
+            invalid=np.array([0, 0, 0, 1], bool),
+            collided=np.array([0, 1, 0, 1], bool),
+            **{name: np.repeat(np.float32(x), 2) for name, x in port.items()},
+            **dict.fromkeys(table.BY_STEP, np.zeros(steps.sum(), np.float16)),
+        ),
+        np.array([True, False]),
+        method="m",
+        observation="state",
+        seed=0,
+    )
+    assert (found["invalid"], found["collided"], found["safe_rcm_mm"]) == (1, 2, 2.0)
+    assert found["steps"] == {"mean": 3.0, "median": 2.0}
+    for rows, places in ((found["per_trocar"], [0, 1]), (found["trials"], [0, 0, 1, 1])):
+        for name, values in port.items():
+            assert [row[name] for row in rows] == pytest.approx([values[i] for i in places])
+    assert {"source", "target"} <= found["trials"][0].keys()

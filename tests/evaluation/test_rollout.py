@@ -241,6 +241,7 @@ def test_recorded_trajectories_are_those_of_the_trials(whole):
         assert (speed <= stubs.SPEED + 1e-6).all()
         np.testing.assert_allclose(kept["qpos"][row, :length, :3], path[:length])
         assert kept["target_peg"][row] == found.target[at]
+        assert kept["source_peg"][row] == found.source[at]
         start = found.steps[:at].sum()
         np.testing.assert_allclose(
             1e3 * kept["rcm_error"][row, :length],
@@ -365,13 +366,13 @@ def test_the_commanded_error_of_a_trial_is_its_largest(tmp_path):
 
 
 def test_a_trial_is_safe_if_its_executed_error_stayed_small_and_nothing_if_it_diverged():
-    no, pegs = np.zeros(3, bool), np.zeros(3, int)
+    pegs = np.zeros(3, int)
     env = types.SimpleNamespace(
         trocar=rcm.Trocar(*(np.zeros(3, np.float32),) * 3),
         success=np.array([True, True, False]),
         loose=np.array([True, False, True]),
         invalid=np.array([False, False, True]),
-        collided=no,
+        collided=np.array([False, True, False]),
         **dict.fromkeys(("source", "target"), pegs),
     )
     executed = np.array([[1e-3, 1e-3, 0], [1.8e-3, 1.9e-3, 0], [9, 9, 9]], np.float32)
@@ -383,6 +384,8 @@ def test_a_trial_is_safe_if_its_executed_error_stayed_small_and_nothing_if_it_di
     np.testing.assert_array_equal(found.safe, [True, False, False])
     np.testing.assert_array_equal(found.loose, [True, False, False])
     np.testing.assert_allclose(found.rcm_max, [1.8e-3, 1.9e-3, 0])
+    np.testing.assert_allclose(found.rcm_mean, [1.4e-3, 1.45e-3, 0])
+    np.testing.assert_array_equal(found.collided, [False, True, False])
     np.testing.assert_allclose(found.rcm_within_max, [1.9e-3, 2.1e-3, 0])
     np.testing.assert_allclose(found.rcm_within_mm, [1.9, 1.8, 1, 2.1, 0, 0], rtol=1e-3)
 
@@ -495,3 +498,8 @@ def test_lanes_are_split_over_all_devices_of_several(monkeypatch):
     for count, expected in ((1, None), (2, [_Device, _Device])):
         monkeypatch.setattr(jax, "local_devices", lambda n=count: [_Device] * n)
         assert splitting.devices() == expected
+
+
+def test_a_folder_in_use_is_refused(tmp_path):
+    with files.lock(tmp_path), pytest.raises(files.StorageError, match="in use by"):
+        run(tmp_path)

@@ -1,5 +1,6 @@
 """Trocars beyond the twelve, and success over the distance to training's."""
 
+import collections
 import json
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import synthetic
 
 from starjax import rcm
 from starjax.evaluation import evaluate, sweep
+from starjax.experiments.report import tables
 
 TRAINING = rcm.Trocar(*(field[:8] for field in rcm.TROCARS))
 
@@ -75,3 +77,19 @@ def test_a_sweep_of_a_policy(tmp_path):
     json.dumps(result, allow_nan=False)
     with pytest.raises(ValueError, match="bin_width"):
         sweep.compose(found, TRAINING, stubs.P_WORLD_REF, seed=0, bin_width=0.0)
+
+
+def test_outcomes_of_a_sweep_are_their_own_and_its_bins_those_of_the_report():
+    azimuths = 2 * np.pi * np.arange(12) / 12
+    ports = sweep.grid(np.arange(6) / 100, np.deg2rad([70, 90, 110]), azimuths)
+    count = len(ports.radius)
+    rows = synthetic.outcomes(
+        np.random.default_rng(0), ports, np.arange(count), np.full(count, 0.5)
+    )
+    rows = rows._replace(safe=rows.success & (np.arange(count) % 2 == 0))
+    found = sweep.compose(rows, TRAINING, stubs.P_WORLD_REF, seed=0)
+    for name, column in (("strict", rows.success), ("loose", rows.loose), ("safe", rows.safe)):
+        assert found[name]["successes"] == column.sum()
+    assert sum(b["successes"] for b in found["by_distance"]) == rows.success.sum()
+    there = collections.Counter(tables._bin(trial) for trial in found["trials"])
+    assert [b["trials"] for b in found["by_distance"]] == [there[b] for b in sorted(there)]

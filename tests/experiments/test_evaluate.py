@@ -6,11 +6,13 @@ import types
 
 import fakes
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import stubs
 
-from starjax import config
+from starjax import config, rcm
 from starjax.data import normalizer
+from starjax.evaluation import sweep as sweeping
 from starjax.experiments import evaluate, folders, presets, scoring, sweep
 from starjax.experiments.report import video
 from starjax.policies import packaged
@@ -59,8 +61,13 @@ def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
     assert result["config"]["train"]["steps"] == 77 and result["preset"] == "smoke"
     assert result["config"]["policy"] == json.loads(json.dumps(dataclasses.asdict(POLICY)))
     assert result["timings_s"]["evaluate"] > 0
+    assert any("Preset smoke" in text for text in result["warnings"])
     said = capsys.readouterr().out
-    for words in ("DP-RCM-2 of mine.safetensors", "12 trocars x 2 trials", "4 seen trocars"):
+    for words in (
+        "DP-RCM-2 of mine.safetensors",
+        "12 trocars x 2 trials",
+        "8 (2 x 4 seen trocars)",
+    ):
         assert words in said
     assert "/8 = " in said and "/16 = " in said and "95% interval" in said
     assert "rollout.mp4" in said and "result.json" in said
@@ -258,3 +265,22 @@ def test_a_damaged_file_is_one_line(file):
     file.write_bytes(content[:-3] + b"abc")
     with pytest.raises(config.UsageError, match=r"--policy: mine.safetensors: damaged"):
         score()
+
+
+def test_the_times_of_an_evaluation_are_medians_in_seconds():
+    ms = {"p50": 1.0, "p95": 2.0, "p99": 3.0}
+    said = evaluate._times({"steps": {"median": 60.0}, "inference_ms": ms}, 30.0)
+    assert said == "  median transfer 2.0 s, decision 1.0 ms"
+
+
+def test_distances_of_a_sweep_are_to_the_trocars_of_the_weights(file):
+    run = file.parent / "dp_rcm2"
+    run.mkdir()
+    folders.claim(run, presets.PRESETS["smoke"], "demos-a")  # of 8 trocars; the weights saw 4
+    file.rename(run / "policy.safetensors")
+    assert sweep.main([str(run), "--trocars", "9", "--eval.time-limit-s", "1"]) == 0
+    trials = json.loads((run / "sweep.json").read_text())["trials"]
+    ports = rcm.Trocar(*(np.float32([t[name] for t in trials]) for name in rcm.Trocar._fields))
+    training = rcm.Trocar(*(field[:4] for field in rcm.TROCARS))
+    far = sweeping.distance_to_nearest(ports, training, np.zeros(3))
+    assert [t["distance_m"] for t in trials] == pytest.approx(far, abs=1e-6)

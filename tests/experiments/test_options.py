@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -437,3 +438,86 @@ def test_help_names_the_words_before_the_flags(command, words, capsys):
     usage, box = capsys.readouterr().out.split("positional arguments")
     assert words in usage.splitlines()[0]
     assert "STR" not in box.split("options")[0]
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["--train.ema-max", "1"], "--train.ema-max: expected in [0, 1), got 1.0"),
+        (["--train.crop-fraction", "1.1"], "--train.crop-fraction: expected in (0, 1], got 1.1"),
+        (["--train.holdout-demos", "-1"], "--train.holdout-demos: expected 0 or more, got -1"),
+        (["--eval.chunk", "-1"], "--eval.chunk: expected 0 or more, got -1"),
+        (["--eval.video-trials", "-1"], "--eval.video-trials: expected 0 or more, got -1"),
+        (["--policy.temperature", "1.1"], "--policy.temperature: expected in [0, 1], got 1.1"),
+        (["--policy.ddim-steps", "101"], "--policy.ddim-steps: expected 2 to policy.diff"),
+        (["--policy.horizon", "10"], "--policy.horizon: expected a multiple of 4 for 3 U-Net"),
+        (["--policy.image-size", "31"], "--policy.image-size: expected 32 pixels or more, got 31"),
+        (["--preset=paper", "--policy.image-size", "36"], "--policy.image-size: expected more tha"),
+        *(
+            ([f"--{name}", "0"], f"--{name}: expected more than 0, got 0")
+            for name in (
+                "demos.per-trocar", "demos.max-steps", "policy.obs-horizon", "policy.execute",
+                "policy.groups", "policy.roll-width", "train.batch-size", "train.learning-rate",
+                "train.steps-per-call", "train.checkpoint-every", "train.keep-checkpoints",
+                "train.log-every",
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_what_would_fail_later_is_a_mistake(argv, said):
+    with pytest.raises(config.UsageError) as caught:
+        settings("--preset=cpu", *argv)
+    assert str(caught.value).startswith(said)
+
+
+@pytest.mark.parametrize(("method", "timed"), [("stardiff", True), ("dp_rcm4", False)])
+def test_only_the_hierarchy_has_a_roll_network_to_time(
+    monkeypatch, capsys, tmp_path, method, timed
+):
+    from starjax.evaluation import latency
+    from starjax.experiments import scoring
+
+    ms = {"p50": 4.0, "p95": 5.0, "p99": 8.0}
+    trained = types.SimpleNamespace(policy=None, train=None, params=None, normalizer=None)
+    env = types.SimpleNamespace(p_world_ref=None)
+    who = types.SimpleNamespace(trained=trained, env=env, weights="a")
+    monkeypatch.setattr(scoring, "subject", lambda *_: who)
+    monkeypatch.setattr(latency, "table", lambda *_, **__: iter([{"ddim_steps": 2, **ms}]))
+    monkeypatch.setattr(latency, "roll_ms", lambda *_, **__: ms)
+    assert bool(bench._time(tmp_path / method, (2,), 1)["roll_network_ms"]) == timed
+    assert capsys.readouterr().out.splitlines()[1].split() == [
+        "2",
+        "4.000",
+        "5.000",
+        "8.000",
+        "250.0",
+    ]
+
+
+def test_sweeps_of_other_trials_lie_apart(tmp_path):
+    one = sweep.Options("run")
+    other = dataclasses.replace(one, eval=dataclasses.replace(one.eval, trials=2))
+    same = dataclasses.replace(one, eval=dataclasses.replace(one.eval, chunk=2))
+    assert sweep._folder(tmp_path, one) == sweep._folder(tmp_path, same)
+    assert sweep._folder(tmp_path, one) != sweep._folder(tmp_path, other)
+
+
+@pytest.mark.parametrize(("seen", "one_wall"), [(1, True), (8, False)])
+def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, seen, one_wall):
+    from starjax import rcm
+    from starjax.data import demos
+    from starjax.sim.tasks import expert
+
+    given = []
+    found = {"episodes": 0, "trials": 0, "frames": 0}
+    monkeypatch.setattr(
+        demos, "collect", lambda *a, **settings: given.append((a, settings)) or found
+    )
+    asked = config.DemosConfig(per_trocar=3, seen_trocars=seen, max_steps=7, one_wall=one_wall)
+    chosen = dataclasses.replace(SMOKE, demos=asked, seed=5, out=str(tmp_path))
+    demonstrations.plan(chosen, stubs.make_env())[1]()
+    (((_, _, script, trocars), settings),) = given
+    np.testing.assert_array_equal(trocars, [field[:seen] for field in rcm.TROCARS])
+    assert script.init is (expert.init_with_one_wall if one_wall else expert.init)
+    wanted = {"per_trocar": 3, "seed": 5, "max_steps": 7, "one_wall": one_wall}
+    assert {name: settings[name] for name in wanted} == wanted

@@ -63,6 +63,7 @@ def test_a_packed_policy_is_small_and_for_a_cpu(made, tmp_path, capsys, argv, te
         (["mine.safetensors", "./mine.safetensors"], ["OUT: expected", "not there yet", "mine."]),
         (["mine.safetensors", "."], ["OUT: expected a file that is not there yet, got ."]),
         (["mine.safetensors", "out", "--temperature", "2"], ["--temperature", "[0, 1]", "got 2"]),
+        (["mine.safetensors", "out", "--temperature", "-1"], ["--temperature", "[0, 1]", "got -1"]),
         (["mine.safetensors", "out", "--temperature", "nan"], ["--temperature", "[0, 1]", "nan"]),
         (["mine.safetensors", "out", "--temperature", "x"], ["--temperature", "a number", "'x'"]),
         (["mine.safetensors", "out", "--temprature", "1"], ["did you mean --temperature"]),

@@ -314,3 +314,32 @@ def test_seen_comes_before_unseen_in_the_outcome():
     assert row.index("1/8") == head.index(" seen") + 1
     assert row.index("2/4") == head.index("unseen")
     assert row.index("3/12") == head.index("safe")
+
+
+def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):
+    stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
+    state = types.SimpleNamespace(ema_params={"w": np.ones(3)}, normalizer=stats)
+    monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
+    settings, env = smoke(tmp_path, "stardiff"), types.SimpleNamespace(p_world_ref=[1.0, 2.0, 3.0])
+    pipeline._train(settings, "stardiff", lambda: None, env, None)
+    kept = export.load(folders.weights(tmp_path, "stardiff"))
+    assert (kept.method, kept.preset, kept.demos) == ("stardiff", "smoke", settings.demos)
+    assert (kept.policy, kept.train) == (settings.policy, settings.train)
+    assert kept.p_world_ref == (1.0, 2.0, 3.0)
+
+
+def test_times_of_a_result_are_of_the_weights_that_it_has(tmp_path):
+    spent = {"collect demos-a": 1.0, "collect demos-b": 2.0, "train dp_ee": 3.0}
+    spent |= {"train dp_ee: compile": 4.0, "train stardiff": 5.0, "evaluate dp_ee_proj": 6.0}
+    files.write_json(tmp_path / "timings.json", spent)
+    assert pipeline._timings(tmp_path, "dp_ee_proj", "demos-a") == {
+        "collect": 1.0, "train": 3.0, "train: compile": 4.0, "evaluate": 6.0
+    }  # fmt: skip
+
+
+def test_the_outcome_has_intervals_and_the_worst_within_steps():
+    rate = {"successes": 1, "trials": 4, "rate": 0.25, "ci95": [0.1, 0.6]}
+    errors = {"executed": {"mean": 0.1, "max": 0.2}, "within_steps": {"max": 0.3}}
+    result = {"method": "stardiff", "seen": rate, "unseen": rate, "safe": {"all": rate}}
+    (_, row) = words.outcome([{**result, "rcm_error_mm": errors}]).splitlines()
+    assert row.count("1/4 = 25% [10, 60]") == 3 and row.endswith("0.100 mm, at most 0.30")

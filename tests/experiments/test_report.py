@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import pytest
 import synthetic
+from matplotlib import colors
 from matplotlib.figure import Figure
 
 from starjax import config
@@ -188,8 +189,9 @@ def test_sweeps_are_paired_where_they_met_the_same_trocars(sweeps):
     # of a grid, say: the same numbers and seed, other places
     moved = [{**trial, "azimuth": trial["azimuth"] + 0.1} for trial in theirs.sweep]
     assert len(tables.paired(results.swept([theirs._replace(sweep=moved), ours]))) == 1
-    near = [{**trial, "azimuth": trial["azimuth"] + 1e-8} for trial in theirs.sweep]
-    assert len(tables.paired(results.swept([theirs._replace(sweep=near), ours]))) == 2
+    near = [{**trial, "azimuth": trial["azimuth"] + 4e-6} for trial in theirs.sweep]
+    (_, again) = tables.paired(results.swept([theirs._replace(sweep=near), ours]))
+    assert again == row
     assert len(tables.paired(results.swept([theirs._replace(sweep_limit_s=4.0), ours]))) == 1
 
 
@@ -943,3 +945,120 @@ def test_a_report_of_runs_that_were_trained_otherwise_says_in_what(one):
         "in --policy.sees-trocar."
     )
     assert words.notes([one, one]) == one.result["warnings"]
+
+
+def test_every_test_of_success_stands_under_its_own_name(one):
+    header, row = tables.by_test([one])
+    tests = {"Strict": outcomes.strict, "Loose": outcomes.loose, "Safe": outcomes.safe}
+    for name, test in tests.items():
+        for part, trials in zip(("seen", "unseen"), outcomes.split(one.trials)):
+            said = row[header.index(f"{name}, {part}")]
+            assert said == tables.rate(outcomes.tally(trials, test))
+
+
+def test_intervals_are_written_from_low_to_high(one):
+    score = stats.Rate(71, 96, 0.74, 0.644, 0.817)
+    assert tables.rate(score) == "74.0 (71/96) [64.4, 81.7]"
+    assert words.interval(score) == "95% interval 64–82%"
+    assert tables.points((0.135, -0.027, 0.299)) == "+13.5 [-2.7, +29.9]"
+    low, high = (f"{100 * x:+.0f}" for x in one.result["generalization_gap_ci95"])
+    assert f"95% interval {low} to {high}" in sections.cards(one)
+
+
+def test_counts_on_the_page_stand_under_seen_and_unseen(one, several):
+    def shown(text):
+        rows = re.findall(r"<tr>(.*?)</tr>", text, re.S)
+        return [found for row in rows if (found := re.findall(r"</b> (\d+/\d+)", row))]
+
+    def counted(run, test):
+        scores = (outcomes.tally(trials, test) for trials in outcomes.split(run.trials))
+        return [f"{score.successes}/{score.trials}" for score in scores]
+
+    tests = (outcomes.strict, outcomes.loose, outcomes.safe)
+    assert shown(sections.tests(one)) == [counted(one, test) for test in tests]
+    found = shown(sections.comparison(several))
+    assert found == [counted(run, outcomes.strict) for run in several]
+
+
+def test_failures_are_counted_under_their_own_names(one):
+    found = outcomes.failures(one.trials)
+    assert len(set(found.values())) > 1
+    header, row = tables.failures([one])
+    wanted = {outcomes.SHORT[key].capitalize(): str(n) for key, n in found.items()}
+    assert dict(zip(header[1:], row[1:], strict=True)) == wanted
+    bars = re.findall(r"<div>([^<]+)</div><span[^>]*><i[^>]*></i>(\d+)<", sections.failures([one]))
+    assert bars == [(outcomes.FAILURES[key], str(n)) for key, n in found.items()]
+
+
+def test_each_phase_is_told_with_its_compiling(one):
+    header, row = tables.phases([one])
+    assert header[1:4] == ["Collect", "Train", "Evaluate"]
+    assert row[1:4] == ["2 min 22 s", "7 min 2 s", "2 min 13 s"]
+
+
+def test_rows_of_trocars_are_their_own(one):
+    rows = re.findall(r"<tr>(.*?)</tr>", sections.per_trocar(one), re.S)[1:]
+    for group, row in zip(outcomes.by_trocar(one.trials), rows, strict=True):
+        part = "seen" if group[0]["trocar"] < 8 else "unseen"
+        middle = np.median([trial["steps"] for trial in group if trial["success"]])
+        assert f"<td>{part}</td>" in row and f">{middle / env.CONTROL_HZ:.1f} s<" in row
+    trial = {"radius": 0.02, "polar": np.pi / 2, "azimuth": np.pi / 6}
+    assert outcomes.place(trial) == ("2 cm", "90°", "30°")
+
+
+def test_ports_from_above_are_at_their_places_and_unseen_ones_orange(one):
+    shown = figures.distance([one], one).axes[1].collections[0]
+    groups = [group[0] for group in outcomes.by_trocar(one.trials)]
+    wanted = [
+        [1e3 * t["radius"] * np.sin(t["polar"]) * f(t["azimuth"]) for f in (np.cos, np.sin)]
+        for t in groups
+    ]
+    np.testing.assert_allclose(shown.get_offsets(), wanted, atol=1e-3)
+    orange = [colors.to_hex(edge) == style.FAILURE.lower() for edge in shown.get_edgecolors()]
+    assert orange == [not trial["seen"] for trial in groups]
+
+
+def test_the_map_weighs_ports_by_their_trials():
+    axis, at = Figure().subplots(), np.array([[-5.0, 0.0], [5.0, 0.0]])
+    shown = figures._heat(axis, at, np.array([1.0, 0.0]), np.array([3, 1]))
+    assert shown.get_array()[80, 80] == pytest.approx(0.75)
+
+
+def test_paths_of_seen_trocars_are_above_those_of_unseen_ones(one):
+    figure = trajectories.draw([one], SIM)
+    titles = [axis.get_title("left").split() for axis in figure.axes]
+    assert [title[0] for title in titles] == ["Seen"] * 3 + ["Unseen"] * 3
+    assert [int(title[2]) < 8 for title in titles] == [True] * 3 + [False] * 3
+    keys = {key.get_label(): key.get_color() for key in figure.legends[0].legend_handles}
+    assert (keys["success"], keys["failure"]) == (style.SUCCESS, style.FAILURE)
+
+
+def test_recorded_rollouts_are_their_own(tmp_path):
+    run = synthetic.run(tmp_path / "stardiff")
+    file = run / "evaluation" / "recorded.npz"
+    kept = files.read_npz(file)
+    count, longest = kept["p_world_tip"].shape[:2]
+    kept["qpos"] = np.broadcast_to(np.arange(count)[:, None, None], (count, longest, 2))
+    files.write_npz(file, kept)
+    for row, rollout in enumerate(results.load(run).rollouts):
+        assert (rollout.qpos == row).all() and len(rollout.qpos) == kept["length"][row]
+        assert rollout.target_peg == kept["target_peg"][row]
+        np.testing.assert_array_equal(rollout.p_world_trocar, kept["p_world_trocar"][row])
+
+
+def test_a_clip_that_is_cut_says_when_the_trial_ended(one, monkeypatch):
+    said = []
+    monkeypatch.setattr(video, "caption", lambda rows, w: said.append(rows) or np.zeros((2, w, 3)))
+    rollout = one.rollouts[0]._replace(p_world_tip=np.zeros((450, 3)))
+    list(video._clip(lambda *_: np.zeros((16, 2, 2, 3)), "m", rollout, ""))
+    (_, (ended, _)), (_, (cut, _)) = said[-1]
+    assert ended.endswith(", 15.0 s") and cut == "first 12 s shown"
+
+
+def test_an_evaluation_within_a_methods_folder_is_no_run_of_it(tmp_path, monkeypatch):
+    built = []
+    monkeypatch.setattr(build, "build", lambda runs, out, **_: built.append(runs))
+    run = synthetic.run(tmp_path / "all" / "stardiff")
+    shutil.copytree(run, run / "evaluate-seed1-6x60s")
+    assert report_command.main([str(run.parent)]) == 0
+    assert built == [[run]]

@@ -229,3 +229,17 @@ def test_a_state_encoder_is_two_convolutions_with_mish_and_one_without():
         x = layers.Conv1d(features, size, padding=pad).apply({"params": params[f"Conv1d_{i}"]}, x)
         x = layers.mish(x) if i < 2 else x
     np.testing.assert_allclose(module.apply({"params": params}, history), x[:, 0], atol=1e-5)
+
+
+def test_keypoints_and_states_are_float32_where_arithmetic_is_not(monkeypatch):
+    seen = []
+
+    def spy(logits, *rest):
+        seen.append(logits.dtype)
+        return jnp.zeros((len(logits), logits.shape[-1], 2))
+
+    monkeypatch.setattr(spatial_softmax, "spatial_softmax", spy)
+    jax.eval_shape(make("small", dtype=jnp.bfloat16).init, KEY, frames())
+    assert seen == [jnp.float32]
+    state = encoders.StateEncoder(16, dtype=jnp.bfloat16)
+    assert jax.eval_shape(state.init_with_output, KEY, normal(3, 2, 5))[0].dtype == jnp.float32

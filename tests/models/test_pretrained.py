@@ -324,3 +324,20 @@ def test_parameters_are_tensors_too(tmp_path):
         tmp_path / "p.pth", state_program({"w": program}), [np.float32([1, 2]).tobytes()]
     )
     np.testing.assert_array_equal(torch_file.read(path)["w"], [1, 2])
+
+
+def test_another_version_and_a_view_of_a_storage_are_refused(tmp_path):
+    file = write_legacy(tmp_path / "old.pth", some_arrays())
+    content = file.read_bytes()
+    assert content.count(struct.pack("<H", 1001)) == 1
+    file.write_bytes(content.replace(struct.pack("<H", 1001), struct.pack("<H", 1002)))
+    with pytest.raises(ValueError, match="older container"):
+        torch_file.read(file)
+    # torch's older storages may begin within others: (key, offset, size)
+    plain = tensor_program("0", "f4", 4, (4,), (1,))
+    viewed = plain.replace(number(4) + b"tQ", number(4) + numbers((1, 2, 4)) + b"tQ")
+    path = write_zip(
+        tmp_path / "v.pth", state_program({"a": viewed}), [np.zeros(4, "f4").tobytes()]
+    )
+    with pytest.raises(ValueError, match="not a plain storage"):
+        torch_file.read(path)

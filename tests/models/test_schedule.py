@@ -72,3 +72,8 @@ def test_ddim_steps_that_do_not_divide_the_schedule_cover_it(steps):
 def test_ddim_steps_out_of_range(steps):
     with pytest.raises(ValueError, match=rf"steps: expected 1\.\.100.*got {steps}"):
         schedule.ddim_table(100, steps)
+
+
+def test_a_schedule_has_steps():
+    with pytest.raises(ValueError, match="at least 1 diffusion step, got 0"):
+        schedule.cosine(0)

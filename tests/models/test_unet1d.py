@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import diffusion, unet1d
+from starjax.models import diffusion, layers, unet1d
 
 KEY = jax.random.key(0)
 
@@ -164,3 +164,31 @@ def test_wrong_shapes_are_named(params):
         make().apply(params, x[:, :3], k, cond)
     with pytest.raises(ValueError, match=r"cond: expected \[B, 10\], got \(3, 9\)"):
         make().apply(params, x, k, cond[:, :9])
+
+
+def test_blocks_halvings_and_skips_follow_each_other_as_published(params, apply):
+    x, k, cond = data()
+    inner = params["params"]
+    film = make().apply(params, cond, method="condition")
+    film = iter(
+        jnp.split(
+            film + make().apply(params, k, method="embed_step"), [16, 32, 64, 96, 128, 160, 176], -1
+        )
+    )
+
+    def part(module, name, *given):
+        return jax.jit(module.apply)({"params": inner[name]}, *given)
+
+    def blocks(x, features, *names):
+        for name in names:
+            x = part(unet1d.ResidualBlock(features, 5, 4), name, x, next(film))
+        return x
+
+    high = blocks(x, 8, "down_0_0", "down_0_1")
+    low = part(layers.Conv1d(8, 3, stride=2), "halve_0", high)
+    low = blocks(low, 16, "down_1_0", "down_1_1")
+    deep = blocks(low, 16, "middle_0", "middle_1")
+    y = blocks(jnp.concatenate([deep, low], -1), 8, "up_0_0", "up_0_1")
+    y = part(unet1d.ConvBlock(8, 5, 4), "last", part(layers.Upsample1d(), "double_0", y))
+    expected = part(layers.Conv1d(4, 1), "out", y)
+    np.testing.assert_allclose(apply(params, x, k, cond), expected, atol=1e-5)

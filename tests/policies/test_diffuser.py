@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import pytest
 
+from starjax.models import diffusion, schedule
 from starjax.policies import diffuser, features
 
 ACTION = 2
@@ -74,3 +75,35 @@ def test_at_temperature_zero_no_sample_depends_on_its_key(learned):
     )
     warm = dataclasses.replace(cold, temperature=1.0)
     assert np.abs(sampled(warm, params, inputs, 2) - sampled(warm, params, inputs, 3)).max() > 1e-4
+
+
+def test_a_sample_starts_as_the_settings_say():
+    """A network that predicts no noise leaves what a sample starts from, scaled."""
+    settings = dataclasses.replace(fakes.TINY, diffusion_steps=50, ddim_steps=5, temperature=0.25)
+    model = diffuser.make(settings, ACTION, ACTION, 0)
+    shapes = jax.eval_shape(model.init, jax.random.key(0))
+    params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
+    keys = jax.random.split(jax.random.key(2), 2)
+    given = (jnp.zeros((2, diffuser.observed_dim(settings))), jnp.zeros((2, 0)))
+    found = jax.jit(model.sample)(params, keys, *given, 1e9 * jnp.array([[-1.0], [1.0]]))
+    start = 0.25 * diffusion.sample_noise(keys, (settings.horizon, ACTION))
+    first = schedule.ddim_table(50, 5).sqrt_alpha_bar[0]
+    np.testing.assert_allclose(found, start / first, rtol=1e-4)
+    k = model.noised(jax.random.key(3), jnp.zeros((1024, 1))).k
+    assert set(k.tolist()) == set(range(50))
+
+
+def test_networks_are_as_the_settings_say():
+    def shapes(**changed):
+        model = diffuser.make(dataclasses.replace(fakes.TINY, **changed), ACTION, ACTION, 0)
+        return jax.eval_shape(model.init, jax.random.key(0))
+
+    block = shapes(kernel_size=3)["unet"]["params"]["down_0_0"]["ConvBlock_0"]["Conv1d_0"]
+    assert block["kernel"].shape[0] == 3
+    with pytest.raises(ValueError, match=r"groups: expected a divisor of 16 channels, got 3"):
+        shapes(groups=3)
+    inputs = features.Inputs(jnp.ones((1, 2, ACTION)))
+    half = diffuser.make(dataclasses.replace(fakes.TINY, dtype="bfloat16"), ACTION, ACTION, 0)
+    exact = diffuser.make(fakes.TINY, ACTION, ACTION, 0)
+    params = {"state": exact.init(jax.random.key(0))["state"]}
+    assert (half.observe(params, inputs) != exact.observe(params, inputs)).any()

@@ -13,7 +13,7 @@ import pytest
 from starjax import config, rcm
 from starjax.data import normalizer, windows
 from starjax.experiments.methods import METHODS
-from starjax.models import encoders
+from starjax.models import encoders, roll_net
 from starjax.policies import diffuser, execution, features, hierarchical
 from starjax.policies import policy as policies
 
@@ -469,3 +469,72 @@ def test_inference_crops_as_training_did(made, dataset):
     )
     np.testing.assert_array_equal(one, other)
     assert features.crop_size(settings, half) == 16
+
+
+def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
+    """Positions and the newest measured roll reach it, and what it says is compared as it is."""
+    it = made("stardiff")
+
+    def newest(self, params, p, trocar, history, seen):
+        return history[:, -1:] + p[..., 0]
+
+    monkeypatch.setattr(roll_net.RollNet, "apply", newest)
+    given, _ = prepared(it)
+    _, parts = it.policy.loss(it.params, given)
+    expected = jnp.mean((given.roll - given.history[:, -1:] - given.p[..., 0]) ** 2)
+    assert float(parts["roll_loss"]) == pytest.approx(float(expected), rel=1e-5)
+    policy = policies.make(it.method, it.settings, fakes.P_WORLD_REF, TRAIN)
+    seen, trocar = it.batch.observation, it.batch.trocar
+    keys = jax.random.split(jax.random.key(1), B)
+    pose = jit(policy.sample)(it.params, it.stats, keys, seen, trocar).pose
+    measured = features.measured(it.stats, "rcm4", seen, trocar, fakes.P_WORLD_REF)[..., 0]
+    assert np.abs(measured[:, 1] - measured[:, 0]).max() > 1e-2
+    low, high = it.stats.action.low, it.stats.action.high
+    p = (pose.p[..., 0] - low[1]) * 2.0 / (high - low)[1] - 1.0
+    scaled = jnp.clip(measured[:, -1:] + p, -1.0, 1.0)
+    roll = (scaled + 1.0) * 0.5 * (high - low)[0] + low[0]
+    np.testing.assert_allclose(rcm.roll_of(pose.R), roll, atol=1e-4)
+
+
+def test_inference_reads_what_training_read(made):
+    it = made("stardiff")
+    where = (it.stats, "rcm4", it.batch.observation, it.batch.trocar, fakes.P_WORLD_REF)
+    given = it.batch.observation, features.measured(*where)
+    exact = features.for_training(fakes.TINY, TRAIN, it.stats, jax.random.key(0), *given)
+    again = features.for_sampling(fakes.TINY, TRAIN, it.stats, *given)
+    assert (exact.history[:, 0] != exact.history[:, 1]).any()
+    np.testing.assert_array_equal(exact.history, again.history)
+
+
+def test_training_adds_noise_to_pictures(made):
+    it = made("dp_rcm1", "image")
+    noisy, exact = (prepared(it, jitter=0.0, image_noise=x)[0].inputs.image for x in (0.05, 0.0))
+    assert np.abs(noisy - exact).max() > 0.1
+
+
+@pytest.mark.parametrize("missing", ["image", "features", "state"])
+def test_what_is_not_observed_is_named(made, missing):
+    it = made("stardiff")
+    kind = "state" if missing == "state" else "image"
+    frozen = {"freeze_encoder": missing == "features"}
+    settings = dataclasses.replace(fakes.TINY, observation=kind, **frozen)
+    blind = it.batch.observation.replace(image=None)
+    stats = it.stats.replace(state=None)
+    with pytest.raises(ValueError, match=rf"observation\.{missing}: expected .*got None"):
+        features.for_training(
+            settings, TRAIN, stats, jax.random.key(0), blind, jnp.zeros((B, 2, 4))
+        )
+
+
+def test_the_roll_network_is_as_the_settings_say(made):
+    it = made("stardiff")
+    half = dataclasses.replace(fakes.TINY, roll_blocks=2, dtype="bfloat16")
+    policy = policies.make(it.method, half, fakes.P_WORLD_REF, TRAIN)
+    shapes = jax.eval_shape(policy.init, jax.random.key(0))["roll"]["params"]
+    assert sum(name.startswith("LayerNorm") for name in shapes) == 2
+    given, _ = prepared(it)
+    params = jax.tree.map(lambda leaf: leaf + 0.01, it.params)
+    kinds = [dataclasses.replace(fakes.TINY, dtype=dtype) for dtype in ("float32", "bfloat16")]
+    makers = (policies.make(it.method, kind, fakes.P_WORLD_REF, TRAIN) for kind in kinds)
+    exact, rough = (jit(one.loss)(params, given)[1]["roll_loss"] for one in makers)
+    assert exact != rough and float(rough) == pytest.approx(float(exact), rel=0.1)

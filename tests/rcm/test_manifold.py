@@ -129,3 +129,19 @@ def test_bad_shapes_are_named():
         rcm.rcm_error(rcm.Pose(R=np.zeros(3), p=np.zeros(3)), np.zeros(3))
     with pytest.raises(ValueError, match=r"p_world_trocar: expected .*3\], got \[4\]"):
         jax.jit(rcm.project)(rcm.Pose(R=np.eye(3), p=np.zeros(3)), np.zeros(4))
+
+
+def test_an_error_of_a_ten_thousandth_of_a_millimetre_is_one():
+    pose = rcm.Pose(R=np.diag([1.0, -1.0, -1.0]), p=np.array([1e-7, 0.0, -0.1]))
+    assert float(rcm.rcm_error(pose, np.zeros(3))) == pytest.approx(1e-7, rel=1e-3)
+
+
+def test_a_tilted_tool_whose_tip_is_at_the_trocar_stays_as_it_is():
+    tilted = rcm.rotation_from_axis_roll(np.array([0.3, -0.2, -0.9], np.float32), 0.4)
+    projected = rcm.project(rcm.Pose(R=tilted, p=np.ones(3)), np.ones(3))
+    np.testing.assert_allclose(projected.R, tilted, atol=1e-6)
+
+
+def test_a_rotation_that_is_not_finite_is_not_projected():
+    pose = rcm.Pose(R=np.full((3, 3), np.nan), p=np.ones(3))
+    assert all(np.isnan(part).all() for part in rcm.project(pose, np.zeros(3)))

@@ -183,3 +183,17 @@ def test_the_rolls_derivative_is_finite_everywhere(mode):
 def test_bad_shapes_are_named(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_what_is_too_short_to_have_a_direction():
+    e_x, e_y, e_z = np.eye(3, dtype=np.float32)
+    zero = np.zeros(3, np.float32)
+    for short in (zero, 1e-7 * e_x):
+        np.testing.assert_array_equal(rcm.rotation_align(short, e_y), rcm.rotation_align(e_z, e_y))
+        np.testing.assert_array_equal(rcm.rotation_align(e_y, short), rcm.rotation_align(e_y, e_z))
+        R = rcm.rotation_from_axis_roll(short, 0.0)
+        np.testing.assert_array_equal(R, np.diag([1.0, -1.0, -1.0]))
+    np.testing.assert_allclose(rcm.rot6d_decode([*zero, *e_y]), np.eye(3), atol=1e-7)
+    with jax.enable_x64(True):  # where 1e-7 is long
+        R = rcm.rotation_align(np.float64(e_z), 1e-7 * np.float64(e_x))
+        np.testing.assert_allclose(R[:, 2], e_x, atol=1e-12)

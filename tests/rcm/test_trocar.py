@@ -138,3 +138,18 @@ def test_shape_errors_name_the_argument():
         rcm.trocar_position(rcm.Trocar(0.01, 1.5, 0.0), np.zeros(2))
     with pytest.raises(ValueError, match=r"expected leading axes that broadcast"):
         rcm.trocar_position(rcm.Trocar(np.zeros(5), 1.5, 0.0), np.zeros((4, 3)))
+
+
+def test_float32s_pi_is_a_polar_angle(p_world_ref):
+    """A trocar straight below the nominal port, whose angle is rounded up."""
+    below = rcm.trocar_from_position(np.array([0.0, 0.0, -0.03], np.float32), np.zeros(3))
+    assert float(below.polar) > np.pi
+    rcm.check_trocar(below)
+    rcm.sample_trocar(jax.random.key(0), polar_range=(0.0, np.float32(np.pi)))
+
+
+def test_trocars_are_drawn_from_eq_19_by_default():
+    ranges = (rcm.RADIUS_RANGE, rcm.POLAR_RANGE, rcm.AZIMUTH_RANGE)
+    for field, (low, high) in zip(sample(), ranges, strict=True):
+        counts, _ = np.histogram(field, bins=4, range=(low, high))
+        assert counts.sum() == field.size and counts.min() > 900

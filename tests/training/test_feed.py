@@ -6,6 +6,7 @@ import fakes
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from starjax import config
 from starjax.data import windows
@@ -38,3 +39,15 @@ def test_a_closed_feed_gathers_nothing_more(monkeypatch):
     next(stream)
     stream.close()
     assert len(gathered) < feed._CHUNK // 2
+
+
+def test_a_fault_of_the_thread_is_raised_where_the_batch_is_asked_for(monkeypatch):
+    def fail(*_):
+        raise OSError("disk")
+
+    monkeypatch.setattr(windows, "gather", fail)
+    dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
+    settings, mesh = config.TrainConfig(batch_size=16), devices.make_mesh(16)
+    stream = feed.batches(dataset, np.arange(40), fakes.TINY, settings, mesh, jax.random.key(3), 0)
+    with pytest.raises(OSError, match="disk"):
+        next(stream)

@@ -133,9 +133,10 @@ def test_another_encoder_crop_or_dataset_has_features_of_its_own(source, dataset
         {"source": (settings, other)},
         {"train": dataclasses.replace(TRAIN, crop_fraction=0.8)},
         {"digest": "other"},
+        {"source": (dataclasses.replace(settings, dtype="bfloat16"), found)},
     ):
         features(**{"source": source, "dataset": dataset, "root": tmp_path, **kwargs})
-    assert len(list((tmp_path / "features").iterdir())) == 4
+    assert len(list((tmp_path / "features").iterdir())) == 5
     features(source, dataset, tmp_path, frames=never)
 
 
@@ -232,3 +233,11 @@ def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, 
 def test_pictures_in_the_place_of_features_are_an_error(source, dataset, tmp_path):
     with pytest.raises(ValueError, match=r"observation.features: expected .*frozen"):
         loop.run(METHODS["stardiff"], source[0], TRAIN, dataset, fakes.P_WORLD_REF, tmp_path, 0)
+
+
+def test_every_frame_has_its_own_features(source, dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(frozen, "PART", 30)  # of batches that its end cuts
+    settings, found = source
+    see, pictures = frozen._make_see(found, settings, TRAIN), np.asarray(dataset.observation.image)
+    wanted = np.concatenate([see(pictures[first : first + 16]) for first in range(0, 80, 16)])
+    np.testing.assert_allclose(features(source, dataset, tmp_path), wanted, atol=1e-5)

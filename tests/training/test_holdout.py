@@ -43,3 +43,16 @@ def test_errors_are_in_their_units_and_rolls_go_round_the_circle():
     found = holdout.action_errors(command(0.003, 179.0, 1.0), command(0.0, -179.0, -1.0))
     wanted = {"position_error_mm": 3.0, "roll_error_deg": 2.0, "gripper_error": 2.0}
     assert {name: float(value) for name, value in found.items()} == pytest.approx(wanted, rel=1e-3)
+    turned = holdout.action_errors(command(0.0, -179.0, -1.0), command(0.003, 179.0, 1.0))
+    assert {name: float(value) for name, value in turned.items()} == pytest.approx(wanted, rel=1e-3)
+
+
+def test_windows_are_spread_over_all_that_is_kept_out(monkeypatch):
+    asked, gather = [], holdout.windows.gather
+    monkeypatch.setattr(
+        holdout.windows, "gather", lambda d, f, *a: asked.append(np.asarray(f)) or gather(d, f, *a)
+    )
+    nothing: Any = None
+    dataset = fakes.dataset(seed=0, demos=8, length=20)
+    holdout.make(Policy(*[nothing] * 4), fakes.TINY, dataset, np.arange(32, 160))
+    np.testing.assert_array_equal(asked, [np.arange(32, 160, 2)])

@@ -352,3 +352,32 @@ def test_learning_rate_and_average():
     assert float(state.ema_decay(jnp.int32(0), 0.999)) == 0.0
     np.testing.assert_allclose(float(state.ema_decay(jnp.int32(15), 0.999)), 1 - 16**-0.75)
     assert float(state.ema_decay(jnp.int32(10**6), 0.999)) == np.float32(0.999)
+
+
+def test_a_half_written_line_is_dropped_and_the_rest_goes_on(tmp_path):
+    log = tmp_path / "log"
+    log.write_bytes(b'{"step": 3, "kind": "train"}\n{"step": 4, "kind": "holdout"}')
+    metrics.resume(log, 4)
+    metrics.append(log, 4, "holdout", {})
+    assert [line["step"] for line in metrics.read(log)] == [3, 4]
+
+
+def test_throughput_is_without_the_call_that_compiles():
+    rate = loop._Rate(batch_size=16)
+    assert rate.next_call(1, 100.0, 50) == 1
+    assert rate.next_call(1, 0.5, 50) == 2 and rate.next_call(10, 0.5, 50) == 20
+    assert rate.next_call(20, 0.1, 50) == 50
+    assert rate.samples_per_second == pytest.approx(16 * 31 / 1.1)
+
+
+def test_the_logged_loss_is_of_the_steps_that_were_taken(tmp_path):
+    sums = jax.tree.map(jnp.float32, {"loss": 6.0, "taken": 2, "skipped": 1})
+    it: Any = types.SimpleNamespace(sums=sums, skipped=1, replace=lambda **made: made)
+    assert loop._log(tmp_path / "log", 3, (it, None), jobs.SETTINGS)[1].startswith("loss 3.0000")
+    (line,) = metrics.read(tmp_path / "log")
+    assert (line["loss"], line["skipped"]) == (3.0, 1)
+
+
+def test_a_millimetre_is_another_dataset_and_a_last_bit_is_not():
+    assert loop._alike(np.float32([0.05, 3.0]), np.float32([0.05 + 1e-8, 3.0 + 5e-7]))
+    assert not loop._alike(np.float32([0.05, 3.0]), np.float32([0.051, 3.0]))

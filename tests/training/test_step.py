@@ -177,3 +177,21 @@ def test_options_of_devices_are_known_to_this_xla():
     # an option that XLA does not know is an error at compilation
     jax.jit(lambda x: x + 1, compiler_options=options(gpu, gpu))(1)
     jax.jit(lambda x: x + 1, compiler_options=options(cpu))(1)
+
+
+def test_a_gradient_that_is_not_finite_is_left_out_too(start, dataset):
+    policy, _, first = start
+
+    def loss(params, batch):
+        return jnp.sqrt(jnp.sum(jnp.square(params["w"] - params["w"]))), {"error": jnp.float32(0)}
+
+    optimizer = state.make_optimizer(SETTINGS)
+    run = jax.jit(program(policy._replace(loss=loss), optimizer))
+    after = run(first, dataset, jnp.arange(80), jnp.int32(1))
+    assert int(after.skipped) == 1 and float(after.sums["gradient_norm"]) == 0.0
+    chex.assert_trees_all_equal(after.params, first.params)
+
+
+def test_every_step_has_keys_of_its_own():
+    keys = jax.vmap(lambda s: jnp.stack(step.step_keys(jax.random.key(0), s)))(jnp.arange(50))
+    assert len({bytes(x) for x in np.asarray(jax.random.key_data(keys)).reshape(100, -1)}) == 100

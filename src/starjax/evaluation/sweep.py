@@ -66,7 +66,7 @@ def compose(
         raise ValueError(f"bin_width: expected more than 0 m, got {bin_width}")
     ports = Trocar(table.radius, table.polar, table.azimuth)
     distance = distance_to_nearest(ports, training, p_world_ref)
-    bins = np.floor(distance / bin_width).astype(int)
+    bins = np.floor(distance.astype(np.float64) / bin_width).astype(int)
     seen = distance < 1e-6
     trials = metrics.trials(table, seen, seed)
     return {

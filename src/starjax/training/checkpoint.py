@@ -68,10 +68,11 @@ def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> p
     except Exception as error:
         shutil.rmtree(writing, ignore_errors=True)
         if _is_disk_full(error):
+            left = max((s for s in steps(root) if s < step), default=0)
             raise files.StorageError(
                 f"no space left in {root} for the checkpoint of step {step} "
                 f"({files.size(_bytes(state))}); free some and run the same command again, it "
-                f"continues from step {max(steps(root), default=0)}"
+                f"continues from step {left}"
             ) from error
         raise
     for refused in steps(root):

@@ -14,7 +14,7 @@ from starjax.runtime import files
 
 OURS = "stardiff"  # the method that the others are compared with
 _RECORDED = ("trocar", "trial", "length", "p_world_tip", "p_world_trocar")  # of recorded.npz
-_DIGITS = 5  # of m and rad: machines draw the same trocar with other last bits
+_NEAR = 1e-5  # of m and rad: machines draw the same trocar with other last bits
 
 
 class Rollout(NamedTuple):
@@ -83,10 +83,10 @@ def identity(trial: outcomes.Trial) -> tuple[int, int, int]:
     return int(trial["trocar"]), int(trial["trial"]), int(trial["seed"])
 
 
-def _met(trial: outcomes.Trial) -> tuple[float, ...]:
-    """The same and, as sweeps number their own trocars, the place of this one."""
-    place = (round(trial[field], _DIGITS) for field in ("radius", "polar", "azimuth"))
-    return *identity(trial), *place
+def _same_place(one: outcomes.Trial, other: outcomes.Trial) -> bool:
+    """Whether two trials of one identity met the same trocar: sweeps number their own."""
+    fields = ("radius", "polar", "azimuth")
+    return all(abs(one[field] - other[field]) <= _NEAR for field in fields)
 
 
 def most_shared(trials: Iterable[outcomes.Trial]) -> tuple[int, int, int]:
@@ -120,11 +120,12 @@ def pair(a: Run, b: Run) -> stats.Paired | None:
     """McNemar's test over the trials that both methods ran with the same trocar, seed and limit."""
     if a.limit_s != b.limit_s:
         return None
-    ours, theirs = ({_met(t): outcomes.strict(t) for t in run.trials} for run in (a, b))
-    common = sorted(ours.keys() & theirs.keys())
-    if not common:
+    ours, theirs = ({identity(t): t for t in run.trials} for run in (a, b))
+    both = [(ours[k], theirs[k]) for k in sorted(ours.keys() & theirs.keys())]
+    met = [(one, other) for one, other in both if _same_place(one, other)]
+    if not met:
         return None
-    return stats.mcnemar([ours[k] for k in common], [theirs[k] for k in common])
+    return stats.mcnemar(*([outcomes.strict(t) for t in side] for side in zip(*met, strict=True)))
 
 
 def representatives(runs: Sequence[Run]) -> list[Run]:

@@ -213,7 +213,7 @@ def names_in(header: Sequence[str]) -> int:
 
 
 def points(difference: tuple[float, float, float]) -> str:
-    """E.g. `+13.5 [-2.7, 29.9]`, percentage points."""
+    """E.g. `+13.5 [-2.7, +29.9]`, percentage points."""
     middle, low, high = (100 * x for x in difference)
     return f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]"
 
