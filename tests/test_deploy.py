@@ -262,10 +262,9 @@ def test_it_may_be_part_of_a_program(made):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
 
 
+@pytest.mark.parametrize("made", ["image"], indirect=True)
 def test_pictures_are_cropped_as_in_its_training(made, tmp_path):
     _, trained, _ = made
-    if trained.policy.observation == "state":
-        pytest.skip("no pictures")
     half = dataclasses.replace(TRAIN, crop_fraction=0.5)
     export.save(tmp_path / "p", trained._replace(train=half))
     deployed, good = deploy.load(tmp_path / "p"), observed(trained.policy, ())

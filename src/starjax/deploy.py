@@ -27,6 +27,7 @@ __all__ = ["FARTHEST", "Command", "Deployed", "Observation", "Pose", "load"]
 FARTHEST = 0.5  # m, of trocar or tip from the nominal port: farther are millimetres for metres
 FARTHEST_OFF = 0.02  # m, of the trocar from the measured axis: farther is another port or frame
 _WIDEST = 1.1  # of the gripper's [-1, 1], with what a sensor is off
+_REAL = (jnp.floating, jnp.integer, jnp.bool_)
 _SKEW = 0.05  # of R'R from the identity: what rounding and calibration leave is far below
 
 
@@ -122,9 +123,9 @@ class Deployed:
             got = "none" if given[name] is None else list(np.shape(given[name]))
             if got != shape:
                 raise ValueError(f"observation.{name}: expected shape {shape}, got {got}")
-            wanted, dtype = "uint8" if name == "image" else "real numbers", given[name].dtype
-            if not (dtype == jnp.uint8 if name == "image" else _is_real(dtype)):
-                raise ValueError(f"observation.{name}: expected {wanted}, got {dtype}")
+            wanted, kinds = ("uint8", [jnp.uint8]) if name == "image" else ("real numbers", _REAL)
+            if not any(jnp.issubdtype(given[name].dtype, kind) for kind in kinds):
+                raise ValueError(f"observation.{name}: expected {wanted}, got {given[name].dtype}")
 
     def _check_values(self, observation: Observation, trocar: rcm.Trocar) -> None:
         """Raises ValueError for what no robot measures: a policy would plan on from there."""
@@ -184,16 +185,14 @@ def _array(value: Any) -> Any:
     return value if value is None or isinstance(value, jax.Array) else np.asarray(value)
 
 
-def _is_real(dtype: Any) -> bool:
-    return any(jnp.issubdtype(dtype, kind) for kind in (jnp.floating, jnp.integer, jnp.bool_))
-
-
 def _check_key(key: Any) -> None:
-    is_array = isinstance(key, jax.Array | np.ndarray)
-    got = f"{key.dtype}{list(key.shape)}" if is_array else type(key).__name__
-    of_old_kind = is_array and not jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    if not is_array or key.ndim != of_old_kind:
-        raise ValueError(f"key: expected a jax.random.key, one for all robots, got {got}")
+    if not isinstance(key, jax.Array | np.ndarray):
+        got = type(key).__name__
+    elif key.ndim != (0 if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else 1):
+        got = f"{key.dtype}{list(key.shape)}"
+    else:
+        return
+    raise ValueError(f"key: expected a jax.random.key, one for all robots, got {got}")
 
 
 def _is_traced(value: Any) -> bool:

@@ -75,8 +75,6 @@ def test_a_sweep_of_a_policy(tmp_path):
         inside = (far >= each["low_m"]) & (far < each["high_m"])
         assert inside.sum() == each["trials"]
     json.dumps(result, allow_nan=False)
-    with pytest.raises(ValueError, match="bin_width"):
-        sweep.compose(found, TRAINING, stubs.P_WORLD_REF, seed=0, bin_width=0.0)
 
 
 def test_outcomes_of_a_sweep_are_their_own_and_its_bins_those_of_the_report():

@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from starjax import rcm
 from starjax.evaluation import metrics
@@ -41,13 +42,13 @@ def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: np.ndarr
     return np.linalg.norm(here[:, None] - there[None], axis=-1).min(axis=1)
 
 
+def bin_of(distance: ArrayLike) -> np.ndarray:
+    """Which bin of `BIN_WIDTH` distances (m) lie in: in float64, in which results are read back."""
+    return np.floor(np.asarray(distance, np.float64) / BIN_WIDTH).astype(int)
+
+
 def compose(
-    table: tables.Table,
-    training: Trocar,
-    p_world_ref: np.ndarray,
-    *,
-    seed: int,
-    bin_width: float = BIN_WIDTH,
+    table: tables.Table, training: Trocar, p_world_ref: np.ndarray, *, seed: int
 ) -> dict[str, Any]:
     """A sweep's result as JSON values: figures over all, over distance, and every trial.
 
@@ -56,17 +57,14 @@ def compose(
       training: fields `[K]`, the trocars trained on.
       p_world_ref: `[3]` m.
       seed: of the trials.
-      bin_width: m, of the distance to the nearest training trocar.
 
     Returns:
       {strict, loose, safe: as in result.json, by_distance: list of {low_m, high_m, successes,
       trials, rate, ci95}, rcm_error_mm, trials: as in result.json, with distance_m}.
     """
-    if bin_width <= 0:
-        raise ValueError(f"bin_width: expected more than 0 m, got {bin_width}")
     ports = Trocar(table.radius, table.polar, table.azimuth)
     distance = distance_to_nearest(ports, training, p_world_ref)
-    bins = np.floor(distance.astype(np.float64) / bin_width).astype(int)
+    bins = bin_of(distance)
     seen = distance < 1e-6
     trials = metrics.trials(table, seen, seed)
     return {
@@ -75,8 +73,8 @@ def compose(
         "safe": metrics.rate(table.safe),
         "by_distance": [
             {
-                "low_m": float(b * bin_width),
-                "high_m": float((b + 1) * bin_width),
+                "low_m": float(b * BIN_WIDTH),
+                "high_m": float((b + 1) * BIN_WIDTH),
                 **metrics.rate(table.success[bins == b]),
             }
             for b in np.unique(bins)

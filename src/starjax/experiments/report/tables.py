@@ -229,7 +229,7 @@ def p_value(p: float) -> str:
 
 
 def _bin(trial: outcomes.Trial) -> int:
-    return int(trial["distance_m"] / sweep.BIN_WIDTH)
+    return int(sweep.bin_of(trial["distance_m"]))
 
 
 def _comparison(a: results.Run, b: results.Run, test: stats.Paired) -> tuple[object, ...]:
