@@ -63,6 +63,8 @@ def test_it_decides_as_the_policy_of_an_evaluation_does(made):
     wanted = jax.jit(policy.sample)(trained.params, trained.normalizer, keys, observation, trocar)
     got = deployed(jax.random.key(7), observation, trocar)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
+    old = deployed(jax.random.key_data(jax.random.key(7)), observation, trocar)
+    jax.tree.map(np.testing.assert_array_equal, old, got)
     one = jax.tree.map(lambda x: x[1], (observation, trocar))
     alone = deployed(keys[1], *one)
     assert alone.pose.p.shape == (trained.policy.horizon, 3)
