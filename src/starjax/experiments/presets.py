@@ -71,11 +71,13 @@ PRESETS: dict[str, RunConfig] = {
         policy=PolicyConfig(
             image_size=128,
             unet_channels=(256, 512, 1024),
+            temperature=0.5,
             dtype="bfloat16",
         ),
         train=TrainConfig(
             steps=16_000,
             learning_rate=3e-4,
+            state_noise=0.005,
             ema_max=0.9995,
             checkpoint_every=4_000,
         ),
