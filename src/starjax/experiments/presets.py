@@ -64,8 +64,8 @@ PRESETS: dict[str, RunConfig] = {
         ),
         eval=EvalConfig(trials=6, time_limit_s=30.0, video_trials=4),
     ),
-    # One modern GPU, seven minutes, from pixels. With the paper's 240 demonstrations the roll network
-    # learns them by heart in that time.
+    # One modern GPU, seven minutes, from pixels. Of the paper's 240 demonstrations the roll network
+    # would learn the rolls by heart.
     "gpu": RunConfig(
         preset="gpu",
         out="runs/gpu",
