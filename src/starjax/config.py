@@ -96,6 +96,8 @@ class TrainConfig:
     batch_size: int = 256
     learning_rate: float = 1e-4
     weight_decay: float = 1e-6
+    # More of it, of the kernels of the roll network, which learns few demonstrations by heart
+    roll_weight_decay: float = 0.0
     warmup_steps: int = 500
     ema_max: float = 0.9999
     crop_fraction: float = 0.9  # side of the random crop over the image's side

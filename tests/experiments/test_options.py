@@ -78,6 +78,7 @@ def settings(*argv: str) -> config.RunConfig:
         (["--policy.state-dim", "3"], ["--policy.state-dim", "4 or more", "got 3"]),
         (["--policy.roll-blocks", "-1"], ["--policy.roll-blocks", "0 or more", "-1"]),
         (["--policy.roll-loss-weight", "-1"], ["--policy.roll-loss-weight", "0 or more", "-1"]),
+        (["--train.roll-weight-decay", "-1"], ["--train.roll-weight-decay", "0 or more", "-1"]),
         (["--train.warmup-steps", "-1"], ["--train.warmup-steps", "0 or more", "-1"]),
         (["--train.weight-decay", "-1"], ["--train.weight-decay", "0 or more", "-1"]),
         (["--train.state-noise", "-1"], ["--train.state-noise", "0 or more", "-1"]),

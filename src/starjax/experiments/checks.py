@@ -39,6 +39,7 @@ def check(config: config_lib.RunConfig) -> None:
         "policy.roll-blocks": policy.roll_blocks,
         "policy.roll-loss-weight": policy.roll_loss_weight,
         "train.weight-decay": train.weight_decay,
+        "train.roll-weight-decay": train.roll_weight_decay,
         "train.warmup-steps": train.warmup_steps,
         "train.jitter": train.jitter,
         "train.image-noise": train.image_noise,

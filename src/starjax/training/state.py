@@ -51,10 +51,24 @@ def learning_rate(train_config: config.TrainConfig) -> optax.Schedule:
 
 
 def make_optimizer(train_config: config.TrainConfig) -> optax.GradientTransformation:
-    """AdamW with Diffusion Policy's betas."""
-    return optax.adamw(
-        learning_rate(train_config), b1=0.95, b2=0.999, weight_decay=train_config.weight_decay
-    )
+    """AdamW with Diffusion Policy's betas; kernels of the roll network may decay faster."""
+    parts = [
+        optax.scale_by_adam(b1=0.95, b2=0.999),
+        optax.add_decayed_weights(train_config.weight_decay),
+    ]
+    if train_config.roll_weight_decay:
+        parts.append(optax.add_decayed_weights(train_config.roll_weight_decay, _are_of_roll))
+    return optax.chain(*parts, optax.scale_by_learning_rate(learning_rate(train_config)))
+
+
+def _are_of_roll(params: Any) -> Any:
+    """Which leaves are kernels of the roll network, joined (`models.joined`) or not."""
+
+    def is_one(path: tuple[Any, ...], _: Any) -> bool:
+        names = [getattr(entry, "key", None) for entry in path]
+        return "roll" in names and names[-1] == "kernel"
+
+    return jax.tree_util.tree_map_with_path(is_one, params)
 
 
 class Init(NamedTuple):
