@@ -542,6 +542,14 @@ def test_a_clip_says_what_it_shows_and_how_it_ended(one, monkeypatch):
         assert ended.startswith("success") == rollout.trial["success"]
 
 
+def test_methods_without_a_recorded_path_are_not_in_its_legend(several):
+    silent, *recorded = several
+    runs = [silent._replace(rollouts=[]), *recorded]
+    (legend,) = trajectories.draw(runs, SIM).legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert labels == [*(run.label for run in recorded), "failure", "trocar"]
+
+
 @pytest.mark.parametrize(("won", "colour"), [(True, style.SUCCESS), (False, style.FAILURE)])
 def test_paths_have_the_colour_of_their_outcome(one, won, colour):
     rollout = one.rollouts[0]

@@ -41,6 +41,7 @@ def draw(runs: Sequence[results.Run], sim: SimModel, dark: bool = False) -> Any 
     from matplotlib.figure import Figure
 
     pegs = sim.pegs
+    runs = [run for run in runs if run.rollouts]
     rows = [row for row in (_panels(runs, True), _panels(runs, False)) if row]
     if not rows:
         return None
