@@ -262,6 +262,9 @@ def test_it_may_be_part_of_a_program(made):
     wanted = deployed(jax.random.key(0), *given)
     got = jax.jit(deployed)(jax.random.key(0), *jax.tree.map(jnp.asarray, given))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
+    port = jax.tree.map(jnp.asarray, PORT)
+    got = jax.jit(lambda key, seen: deployed(key, seen, port))(jax.random.key(0), given[0])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
 
 
 @pytest.mark.parametrize("made", ["image"], indirect=True)

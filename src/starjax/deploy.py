@@ -77,7 +77,7 @@ class Deployed:
         if not isinstance(trocar, rcm.Trocar):
             raise ValueError(f"trocar: expected an rcm.Trocar, got {type(trocar).__name__}")
         trocar = rcm.check_trocar(trocar)
-        farthest = 0.0 if _is_traced(trocar.radius) else np.max(trocar.radius, initial=0.0)
+        farthest = 0.0 if _is_traced(trocar.radius) else np.asarray(trocar.radius).max(initial=0.0)
         if farthest > FARTHEST:
             raise ValueError(f"trocar.radius: expected at most {FARTHEST} m, got {farthest:g}")
         _check_key(key)

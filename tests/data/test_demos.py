@@ -486,7 +486,9 @@ def test_software_versions_bind_an_unfinished_dataset_only(tmp_path):
     one, two = ({"seed": 0, "versions": {"jax": v}} for v in "12")
     assert store.digest(one) == store.digest(two) != store.digest({**one, "seed": 1})
     store.create(tmp_path, one)
-    with pytest.raises(files.StorageError, match="its versions is"):
+    with pytest.raises(
+        files.StorageError, match="an incomplete dataset of other software: its versions is"
+    ):
         store.create(tmp_path, two)
     store.seal(tmp_path, {})
     store.create(tmp_path, two)

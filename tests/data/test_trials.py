@@ -74,6 +74,18 @@ def test_what_is_there_is_not_collected_again(seed):
         assert not world.groups
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_what_is_there_stays_as_it_is(seed):
+    """Simulated again on another machine, a trial may end otherwise."""
+    here, elsewhere = World(seed), World(seed)
+    fates = {(trocar, 1): elsewhere.fate((trocar, 1)) for trocar in range(3)}
+    known = {trial: not success for trial, (success, _) in fates.items()}
+    here.fates = {trial: (success, 1) for trial, success in known.items()}
+    wanted = needed(here, 5)
+    elsewhere.fates = here.fates | fates
+    assert elsewhere.collected(known, 5, 4) == wanted - set(known)
+
+
 def test_a_failure_costs_no_second_wave_where_lanes_are_free():
     world = World(0)
     world.fates = {(i, j): (j != 2, 1) for i in range(3) for j in range(20)}

@@ -125,6 +125,9 @@ def test_a_video_of_other_trials_does_not_stay(file):
     assert film.exists()
     score("--out", "here", "--no-video", "--seed", "3")
     assert not film.exists()
+    film.write_bytes(b"film")
+    score("--out", "here", "--seed", "4", "--eval.video-trials", "0")  # nothing to film
+    assert not film.exists()
 
 
 def test_the_same_command_again_runs_nothing_twice(file):

@@ -408,6 +408,7 @@ def test_words_may_stand_anywhere(argv, run, trocars):
         ("pack", "a b c", "POLICY OUT: expected 2, got a b c"),
         ("run", "--seed 1 2", "--seed: expected 1 value(s), got 1 2"),
         ("run", "x", "x: expected a flag such as --method"),
+        ("evaluate", "x --video=False", "--video: expected 0 value(s), got False"),
     ],
 )
 def test_too_few_and_too_many_words_are_one_line(command, argv, said, capsys):

@@ -59,8 +59,10 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
         differing = [k for k in differing if k != "versions"]
     if differing:
         name = differing[0]
+        incomplete = "an incomplete dataset of other software"
+        kind = incomplete if name == "versions" else "another dataset"
         raise files.StorageError(
-            f"{root} holds another dataset: its {name} is {found.get(name)}, not "
+            f"{root} holds {kind}: its {name} is {found.get(name)}, not "
             f"{description.get(name)}; choose another folder, or remove this one"
         )
 

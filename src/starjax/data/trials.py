@@ -51,7 +51,9 @@ def run(
 
         for ended in workers.run(groups, simulate, at_once, is_wanted):
             waiting += ended
-            known.update({_trial(episode): episode.outcome["success"] for episode in ended})
+            for episode in ended:
+                # What is on disk stays, also where another machine's last bits end otherwise.
+                known.setdefault(_trial(episode), episode.outcome["success"])
             ended.clear()  # so that an episode's memory is free once it is written
             ready = [e for e in waiting if _is_needed(_trial(e), known, per_trocar)]
             waiting = [e for e in waiting if not _is_needed(_trial(e), known, per_trocar)]

@@ -73,10 +73,10 @@ def main(argv: Sequence[str]) -> int:
         folder, who, table, config, chosen.seed, command, clock.timings(folder)
     )
     print(f"\n{words.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
+    if not same:
+        (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
     if chosen.video:
         print(_film(folder, who))
-    elif not same:
-        (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
     hint = f"starjax report {shlex.quote(str(folder))} draws tables and figures"
     print(f"result: {folder / 'result.json'}; {hint}")
     return 0

@@ -126,7 +126,7 @@ def _sorted(settings: type, argv: Sequence[str]) -> list[str]:
             end += 1
         values = [value] if equals else list(argv[index + 1 : end])
         count = _count(known[flag], values)
-        if fields and len(values) > count:  # what follows is of no flag
+        if fields and not equals and len(values) > count:  # what follows is of no flag
             values, end = values[:count], index + 1 + count
         _check_values(flag, known[flag], values, count)
         rest += argv[index:end]
