@@ -28,6 +28,26 @@ def test_too_little_memory_is_one_line_that_names_what_to_lower(capsys):
     assert "9 bytes. Too much" in said and "--train.batch-size" in said and said.count("\n") == 1
 
 
+@pytest.mark.parametrize("closed", ["stdout", "stderr"])
+def test_closed_outputs_are_no_fault(closed):
+    code = f"""
+        import os, signal, sys
+        sys.{closed} = None  # as Python has it of `>&-`
+        from starjax import cli
+        from starjax.runtime import progress
+
+        def command(argv):
+            with progress.track("Some", 1, unit="things") as advance:
+                advance(1)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        cli.run(command)
+    """
+    process = started(code)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in said
+
+
 def test_a_process_that_is_terminated_says_so():
     code = """
         import time

@@ -56,6 +56,14 @@ def test_what_is_not_installed_ends_the_search_before_it_is_needed(monkeypatch, 
     assert "jax, jaxlib, mujoco, mujoco-mjx not installed" in said and "left out" in said
 
 
+def test_a_folder_that_is_gone_is_a_fault(tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    (fault,) = faults(doctor.storage())
+    assert fault.name == "folder"
+
+
 @pytest.mark.parametrize("error", ["RuntimeError", "ImportError"])
 def test_a_jax_that_refuses_its_jaxlib_is_a_fault(tmp_path, error):
     (tmp_path / "jax.py").write_text(f"raise {error}('jaxlib is too old\\nfor this jax')")

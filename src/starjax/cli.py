@@ -46,6 +46,9 @@ def main() -> NoReturn:
 
 def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
     """The whole of a process: `command` with the words of its command line."""
+    # Those that were closed by whoever started this.
+    sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     stop = _Stop()
     sys.unraisablehook = _without_interrupts
     signal.signal(signal.SIGTERM, stop)

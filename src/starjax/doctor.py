@@ -86,11 +86,12 @@ def xla_flags() -> list[Finding]:
 def storage() -> list[Finding]:
     """Room and rights in the working folder and in the cache."""
     findings = []
-    for name, place, option in (
-        ("folder", pathlib.Path.cwd(), "--out"),
-        ("cache", xla.cache_directory(), "STARJAX_CACHE"),
+    for name, find, option in (
+        ("folder", pathlib.Path.cwd, "--out"),  # which may have been removed
+        ("cache", xla.cache_directory, "STARJAX_CACHE"),
     ):
         try:
+            place = find()
             files.require_writable(place)
         except OSError as error:
             variable = "another working folder" if name == "folder" else "STARJAX_CACHE"

@@ -16,6 +16,7 @@ from starjax.evaluation import sweep as sweeping
 from starjax.experiments import evaluate, folders, presets, scoring, sweep
 from starjax.experiments.report import video
 from starjax.policies import packaged
+from starjax.runtime import files
 from starjax.training import export
 
 POLICY = dataclasses.replace(fakes.TINY, execute=4)
@@ -114,6 +115,12 @@ def test_the_folder_of_a_run_is_no_place_for_a_result(file, held):
     with pytest.raises(
         config.UsageError, match=r"--out: expected a folder of its own, got a run's"
     ):
+        score("--out", "here")
+
+
+def test_results_of_two_at_once_are_not_mixed(file):
+    (file.parent / "here").mkdir()
+    with files.lock(file.parent / "here"), pytest.raises(files.StorageError, match="is in use by"):
         score("--out", "here")
 
 
@@ -241,6 +248,9 @@ def test_a_sweep_has_the_time_limit_of_its_run(file):
     assert sweep.main([str(run), "--trocars", "1"]) == 0
     found = json.loads((run / "sweep.json").read_text())
     assert found["time_limit_s"] == 2.0 and found["strict"]["trials"] == 1
+    (run / "result.json").write_text('{"config": {"eval": {"time_limit_s": 1.0}}}')
+    assert sweep.main([str(run), "--trocars", "1"]) == 0
+    assert json.loads((run / "sweep.json").read_text())["time_limit_s"] == 1.0
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,11 @@
 """A run's folder: settings that may and may not change, twins, time by stage."""
 
 import dataclasses
+import errno
 import json
 import os
 import re
+import shutil
 import time
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 
 from starjax import config
 from starjax.experiments import clock, folders, methods, presets
+from starjax.runtime import files
 
 SMOKE = presets.PRESETS["smoke"]
 
@@ -225,6 +228,33 @@ def test_a_twin_takes_over_the_evaluation_once(tmp_path):
     chunk.write_bytes(b"second")
     folders.adopt_twin(tmp_path, "stardiff_single")
     assert taken.read_bytes() == b"first"
+
+
+def test_a_twin_whose_trials_cannot_be_copied_is_left_out(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    (tmp_path / "dp_rcm4" / "evaluation").mkdir(parents=True)
+    (tmp_path / "dp_rcm4" / "evaluation" / "chunk_0000.npz").write_bytes(b"first")
+    with monkeypatch.context() as patch, pytest.raises(files.StorageError, match="No space left"):
+        patch.setattr(shutil, "copyfile", full)
+        folders.adopt_twin(tmp_path, "stardiff_single")
+    assert not any((tmp_path / "stardiff_single").iterdir())
+    folders.adopt_twin(tmp_path, "stardiff_single")
+    assert (tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz").exists()
+
+
+def test_a_linked_method_is_called_as_its_link(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "stardiff"
+    link.symlink_to(tmp_path / "elsewhere")
+    assert folders.existing(str(link)) == link
+
+
+def test_time_of_another_work_does_not_outlive_a_kill(tmp_path):
+    (tmp_path / "timings.json").write_text(json.dumps({"x": 1.0, "x: compile": 1.0, "y": 2.0}))
+    with clock.timed(tmp_path, "x", goes_on=False):
+        assert clock.timings(tmp_path) == {"y": 2.0}  # a kill -9 here would leave this
 
 
 def test_time_adds_up_over_starts_also_after_an_interruption(tmp_path):

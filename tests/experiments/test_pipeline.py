@@ -126,6 +126,16 @@ def test_first_signal_asks_and_second_ends():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_a_signal_that_is_ignored_asks_nothing():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pipeline.stop_signals() as should_stop:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert not should_stop()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_plan_names_the_observation_and_the_flag(tmp_path):
     preset = presets.PRESETS["smoke"]
     said = words.plan(preset, pipeline.STAGES)

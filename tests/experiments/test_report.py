@@ -3,6 +3,7 @@
 import dataclasses
 import html
 import json
+import pathlib
 import re
 import shutil
 import subprocess
@@ -635,6 +636,36 @@ def test_a_clip_that_ends_early_stays_as_it_ended(one):
     pixels = np.array([[p[-1, 0, 0], p[-1, -1, 0]] for p in pictures])
     np.testing.assert_array_equal(pixels[:, 0], np.minimum(np.arange(65), 4))
     np.testing.assert_array_equal(pixels[:, 1], np.minimum(np.arange(65), 19))
+
+
+@pytest.mark.parametrize("folder", ["a:1", "-x"])
+def test_a_video_may_lie_in_any_folder(tmp_path, monkeypatch, folder):
+    monkeypatch.chdir(tmp_path)
+    path = pathlib.Path(folder) / "film.mp4"
+    path.parent.mkdir()
+    video.write([np.zeros((8, 8, 3), np.uint8)] * 3, path)
+    assert path.stat().st_size
+
+
+def test_labels_are_drawn_as_they_are_written_and_fit(several):
+    long = "b$x^^$ " + 60 * "x"
+    figure = figures.distance([run._replace(label=long) for run in several], several[0])
+    (legend,) = figure.legends
+    style.save(figure, "png")
+    assert legend.get_texts()[0].get_text() == long
+    assert legend.get_window_extent().x1 <= figure.bbox.x1
+
+
+def test_a_cell_holds_any_name():
+    assert tables.render([["Method"], ["a|b"]]).splitlines()[-1] == "| a\\|b |"
+
+
+def test_seeds_of_trials_are_all_told_where_one_is_not_the_trainings(one):
+    config = one.result["config"]
+    own, other = (edited(one, seed=config["seed"] + i) for i in range(2))
+    assert "Seed of the trials" not in sections.facts([own])
+    told = f"<dt>Seed of the trials</dt><dd>{config['seed']}; {config['seed'] + 1}</dd>"
+    assert told in sections.facts([own, other])
 
 
 def test_the_video_plays_everywhere(tmp_path):

@@ -154,6 +154,16 @@ def test_other_files_are_refused(tmp_path, content):
         export.load(path)
 
 
+def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path, monkeypatch):
+    def refused(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    (tmp_path / "p").write_bytes(b"whatever")
+    monkeypatch.setattr("builtins.open", refused)
+    with pytest.raises(PermissionError):
+        export.load(tmp_path / "p")
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"policy: expected a file, got .*nowhere"):
         export.load(tmp_path / "nowhere")

@@ -22,13 +22,16 @@ def timed(out: Path, stage: str, goes_on: bool = True) -> Iterator[None]:
     from an earlier start, what that took does not count.
     """
     start, compiling = time.monotonic(), _CompileSeconds()
+    names = (stage, f"{stage}: compile")
+    before = timings(out)
+    if not goes_on and any(name in before for name in names):  # at once: a kill leaves no chance
+        kept = {name: seconds for name, seconds in before.items() if name not in names}
+        files.write_json(out / "timings.json", kept)
 
     def note() -> None:
         spent = timings(out)
-        total = time.monotonic() - start
-        for name, seconds in ((stage, total), (f"{stage}: compile", compiling.seconds)):
-            before = spent.get(name, 0.0) if goes_on else 0.0
-            spent[name] = round(before + seconds, 2)
+        for name, seconds in zip(names, (time.monotonic() - start, compiling.seconds)):
+            spent[name] = round(spent.get(name, 0.0) + seconds, 2)
         files.write_json(out / "timings.json", spent)
 
     try:

@@ -61,22 +61,25 @@ def main(argv: Sequence[str]) -> int:
     config = scoring.settings(who, config) if config else _config(who.trained)
     config = dataclasses.replace(config, method=who.method, out=str(folder), eval=chosen.eval)
     about = words.about(config, chosen.policy or chosen.run, chosen.seed)
-    before = _before(folder)
-    same = _identity(before) == (who.weights, chosen.seed, dataclasses.asdict(chosen.eval))
-    if chosen.out:
-        _refuse_foreign(folder, before.get("weights", who.weights) == who.weights)
-    print(f"{about}, into {folder}\n", flush=True)
-    with clock.timed(folder, "evaluate", same or folders.is_under_way(folder)):
-        table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed)
-    command = options.typed("evaluate", argv)
-    result = scoring.write_result(
-        folder, who, table, config, chosen.seed, command, clock.timings(folder)
-    )
-    print(f"\n{words.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
-    if not same:
-        (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
-    if chosen.video:
-        print(_film(folder, who))
+    with files.lock(folder):
+        before = _before(folder)
+        same = _identity(before) == (who.weights, chosen.seed, dataclasses.asdict(chosen.eval))
+        if chosen.out:
+            _refuse_foreign(folder, before.get("weights", who.weights) == who.weights)
+        print(f"{about}, into {folder}\n", flush=True)
+        with clock.timed(folder, "evaluate", same or folders.is_under_way(folder)):
+            table = scoring.rollouts(
+                folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed
+            )
+        command = options.typed("evaluate", argv)
+        result = scoring.write_result(
+            folder, who, table, config, chosen.seed, command, clock.timings(folder)
+        )
+        print(f"\n{words.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
+        if not same:
+            (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
+        if chosen.video:
+            print(_film(folder, who))
     hint = f"starjax report {shlex.quote(str(folder))} draws tables and figures"
     print(f"result: {folder / 'result.json'}; {hint}")
     return 0

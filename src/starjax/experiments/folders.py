@@ -32,7 +32,9 @@ def existing(run: str) -> Path:
     Raises:
       config.UsageError: it is not called as a method is.
     """
-    folder = Path(run).resolve()
+    folder = Path(run).absolute()  # a link is called what its user calls it
+    if folder.name not in methods.METHODS:
+        folder = folder.resolve()
     if folder.name not in methods.METHODS:
         files = [file for file in (folder, folder / "policy.safetensors") if file.is_file()]
         hint = (
@@ -63,7 +65,15 @@ def adopt_twin(out: Path, method: str) -> None:
     """Takes over the evaluation of a twin that was scored before, chunk by chunk."""
     for name in twins(method):
         if (out / name / "evaluation").is_dir() and not (out / method / "evaluation").exists():
-            shutil.copytree(out / name / "evaluation", out / method / "evaluation")
+            staged = out / method / ".evaluation"
+            shutil.rmtree(staged, ignore_errors=True)
+            try:
+                shutil.copytree(out / name / "evaluation", staged)
+            except shutil.Error as error:
+                shutil.rmtree(staged, ignore_errors=True)
+                source, _, why = error.args[0][0]
+                raise files.StorageError(f"cannot copy {source} to {staged}: {why}") from error
+            staged.rename(staged.with_name("evaluation"))
 
 
 def behaviour(method: str) -> config_lib.Method:

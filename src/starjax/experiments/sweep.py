@@ -44,7 +44,7 @@ def main(argv: Sequence[str]) -> int:
     _check(chosen)
     run = folders.existing(chosen.run)
     config = folders.read_config(run)
-    like_run = dataclasses.replace(_EVAL, time_limit_s=config.eval.time_limit_s)
+    like_run = dataclasses.replace(_EVAL, time_limit_s=_time_limit_s(run, config))
     chosen = _parse(argv, dataclasses.replace(chosen, eval=like_run))
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
@@ -73,6 +73,15 @@ def main(argv: Sequence[str]) -> int:
     print(_outcome(figures))
     print(f"\nresult: {run / 'sweep.json'}; {words.hint(run, who.weights, 'draws')}")
     return 0
+
+
+def _time_limit_s(run: Path, config: config_lib.RunConfig) -> float:
+    """That of the run's result, which later commands do not change; until there is one, what was
+    typed last."""
+    try:
+        return float(files.read_json(run / "result.json")["config"]["eval"]["time_limit_s"])
+    except (FileNotFoundError, KeyError, TypeError, ValueError):
+        return config.eval.time_limit_s
 
 
 def _parse(argv: Sequence[str], default: Options | None = None) -> Options:

@@ -8,7 +8,10 @@ from typing import Any
 
 @contextlib.contextmanager
 def stop_signals() -> Iterator[Callable[[], bool]]:
-    """Yields `should_stop`: true after Ctrl-C or SIGTERM; the second one ends at once."""
+    """Yields `should_stop`: true after Ctrl-C or SIGTERM; the second one ends at once.
+
+    What is ignored, as Ctrl-C by a shell's background job, stays so.
+    """
     asked = False
 
     def ask(number: int, frame: Any) -> None:
@@ -17,7 +20,9 @@ def stop_signals() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         asked = True
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    heard = [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, ask) for number in heard}
     try:
         yield lambda: asked
     finally:

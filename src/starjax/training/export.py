@@ -93,10 +93,12 @@ def load(path: pathlib.Path | str) -> Trained:
 
     Raises:
       ValueError: it is missing, damaged, or not one of this schema; the message names it.
+      OSError: it may not be read.
     """
     path = pathlib.Path(path)
     if not path.is_file():
         raise ValueError(f"policy: expected a file, got {path}")
+    open(path, "rb").close()  # safetensors would say of one that may not be read that it is missing
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}

@@ -33,7 +33,7 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
         left.set_title(f"{name} from {results.observed(runs)}")
         style.percent_axis(left)
         if len(runs) > 1:
-            figure.legend(loc="outside lower left", fontsize=7, ncols=4)
+            style.legend(figure, *left.get_legend_handles_labels(), side="left")
         _disc(figure, right, focus, shades)
     return figure
 
@@ -76,7 +76,7 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
             axis.yaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
             axis.yaxis.set_minor_locator(ticker.NullLocator())
         if len(runs) > 1:
-            figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+            style.legend(figure, *axis.get_legend_handles_labels())
     return figure
 
 

@@ -49,7 +49,7 @@ def draw(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
             f"(from {results.observed(runs)})"
         )
         style.percent_axis(axis)
-        figure.legend(loc="outside lower left", fontsize=7, ncols=4)
+        style.legend(figure, *axis.get_legend_handles_labels(), side="left")
     return figure
 
 

@@ -22,7 +22,7 @@ def facts(runs: Sequence[results.Run]) -> str:
         "Trials" if len(runs) == 1 else "Trials a run": [_trials(run) for run in runs],
         "Preset": [config.get("preset") for config in configs],
         "Seed": [config.get("seed") for config in configs],
-        "Seed of the trials": [_other_seed(run) for run in runs],
+        "Seed of the trials": _trials_seeds(runs),
         "Hardware": [words.hardware(run.result.get("hardware") or {}) for run in runs],
     }
     inner = ""
@@ -33,10 +33,11 @@ def facts(runs: Sequence[results.Run]) -> str:
     return f'<dl class="facts">{inner}</dl>'
 
 
-def _other_seed(run: results.Run) -> int | None:
-    """Seed of the trials where it is not that of the training."""
-    seed = results.trials_seed(run)
-    return None if seed == (run.result.get("config") or {}).get("seed") else seed
+def _trials_seeds(runs: Sequence[results.Run]) -> list[int | None]:
+    """Seeds of the trials, unless each is that of its training."""
+    trained = [(run.result.get("config") or {}).get("seed") for run in runs]
+    scored = [results.trials_seed(run) for run in runs]
+    return [] if scored == trained else scored
 
 
 def _trials(run: results.Run) -> str:

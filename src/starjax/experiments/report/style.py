@@ -16,6 +16,7 @@ SUCCESS, FAILURE = "#2083C5", "#D55E00"
 _METHODS = ("#D55E00", "#E69F00", "#CC79A7", "#8C6D4F", "#7F7F7F", "#56B4E9", "#009E73", "#2083C5")
 _MARKERS = "sD^v<>Po"
 _STROKES = ("-", "--", ":", "-.")
+_LINE, _HANDLE = 110, 8  # characters in a line of a legend, and what a handle takes of them
 MAP = "cividis"  # perceptually even, the same to every kind of colour vision
 
 _LIGHT = {"ink": "#1d2329", "muted": "#6b7480", "line": "#d9dee3", "paper": "#ffffff"}
@@ -48,6 +49,7 @@ def use(dark: bool = False) -> Iterator[dict[str, str]]:
         "axes.titlesize": 9.5,
         "axes.titlelocation": "left",
         "legend.frameon": False,
+        "text.parse_math": False,  # a folder's name may hold dollars
     }
     with matplotlib.rc_context(settings):
         yield shades
@@ -79,6 +81,20 @@ def rates(
     line = {"color": color, "linewidth": 1.2, "linestyle": stroke}
     axis.plot(x, middle, marker=marker, markersize=4, label=label, **line)
     axis.errorbar(x, middle, ends, color=color, linewidth=0.8, linestyle="")
+
+
+def legend(
+    figure: Any,
+    handles: Sequence[Any],
+    labels: Sequence[str],
+    side: str = "center",
+    most: int = 4,
+    **settings: Any,
+) -> None:
+    """A legend below the figure, of as many columns as its longest label leaves room for."""
+    columns = max(1, min(most, _LINE // (_HANDLE + max(map(len, labels), default=0))))
+    place = {"loc": f"outside lower {side}", "fontsize": 7, "ncols": columns}
+    figure.legend(handles, labels, **place, **settings)
 
 
 def save(figure: Any, kind: str) -> bytes:

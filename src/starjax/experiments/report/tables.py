@@ -204,7 +204,8 @@ def render(table: Table) -> str:
     """A table as markdown; columns after the names are set to the right."""
     names = names_in(table[0])
     rule = ["---"] * names + ["---:"] * (len(table[0]) - names)
-    return "\n".join("| " + " | ".join(row) + " |" for row in [table[0], rule, *table[1:]])
+    rows = [[cell.replace("|", "\\|") for cell in row] for row in [table[0], rule, *table[1:]]]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
 def names_in(header: Sequence[str]) -> int:

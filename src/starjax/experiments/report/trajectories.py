@@ -58,13 +58,10 @@ def draw(runs: Sequence[results.Run], sim: SimModel, dark: bool = False) -> Any 
                 axis.set_xlim(frame[0])
                 axis.set_ylim(frame[1])
         _scale_bar(grid[0, 0], frame, shades)
-        figure.legend(
-            handles=_legend(runs, shades),
-            loc="outside lower center",
-            ncols=3 + (len(runs) > 1) * len(runs),
-            title=_title(runs),
-            title_fontsize=8,
-        )
+        handles = _legend(runs, shades)
+        labels = [handle.get_label() for handle in handles]
+        title = {"title": _title(runs), "title_fontsize": 8}
+        style.legend(figure, handles, labels, most=len(handles), **title)
     return figure
 
 

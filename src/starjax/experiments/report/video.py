@@ -145,7 +145,10 @@ def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) ->
     program = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
     staged = path.with_name(f".{path.name}")  # its ending tells the encoder what to write
     with subprocess.Popen(
-        [*program, *source, *coded, str(staged)], stdin=subprocess.PIPE, stderr=subprocess.PIPE
+        # Not to be taken for an option, or for a protocol.
+        [*program, *source, *coded, f"file:{staged}"],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
     ) as encoder:
         assert encoder.stdin and encoder.stderr
         # A pipe breaks when the encoder has given up; it has said why.
