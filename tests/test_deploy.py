@@ -128,6 +128,9 @@ def test_a_mistake_names_the_array(made):
         deployed(jax.random.split(jax.random.key(0), 3), good, trocar)
     with pytest.raises(ValueError, match=r"key: expected .*got uint32\[1, 2\]"):
         deployed(np.zeros((1, 2), np.uint32), good, trocar)
+    for no_key in (np.zeros(2), np.zeros(3, np.uint32), np.array([0, 1])):
+        with pytest.raises(ValueError, match=r"key: expected .*one for all robots"):
+            deployed(no_key, good, trocar)
 
 
 def test_numbers_that_no_robot_measures_are_refused(made):
@@ -149,6 +152,8 @@ def test_numbers_that_no_robot_measures_are_refused(made):
         refused("pose.R: expected rotations", good.replace(pose=good.pose._replace(R=R)))
     refused(r"trocar.radius: expected at most 0.5 m, got 14", trocar=rcm.Trocar(14.0, 1.4, 0.8))
     refused("trocar: expected an rcm.Trocar, got list", trocar=[0.02, 1.4, 0.8])
+    wrapped = np.full_like(good.gripper, -128, np.int8)  # its own absolute value
+    refused("observation.gripper: .*, got -128", good.replace(gripper=wrapped))
     refused("observation.gripper: .*, got 3.6", good.replace(gripper=3.6 * good.gripper))
     in_mm = good.replace(pose=good.pose._replace(p=1e3 * good.pose.p))
     refused("observation.pose.p: expected tips within 0.5 m", in_mm)
@@ -157,6 +162,8 @@ def test_numbers_that_no_robot_measures_are_refused(made):
     with pytest.raises(ValueError, match=r"trocar.radius: expected at most 0.5 m, got 14"):
         jax.jit(lambda key: deployed(key, good, PORT._replace(radius=14.0)))(key)
     deployed(key, good, PORT)
+    half = jax.tree.map(lambda x: x.astype(np.float16), good.pose)
+    deployed(key, good.replace(pose=half), PORT)
 
 
 def test_what_the_policy_does_not_look_at_is_not_looked_at(made):

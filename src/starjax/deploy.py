@@ -72,7 +72,8 @@ class Deployed:
             not finite or none that is measured so, a rotation is none, the trocar is none, tip or
             trocar are farther than `FARTHEST` from the nominal port, or, of a policy that keeps to
             the RCM manifold, the tool's axis is farther than `FARTHEST_OFF` from the trocar.
-            Values that jax traces are not looked at.
+            Values that jax traces are not looked at, nor, within a program, whether the tool
+            passes through the trocar.
         """
         if not isinstance(trocar, rcm.Trocar):
             raise ValueError(f"trocar: expected an rcm.Trocar, got {type(trocar).__name__}")
@@ -135,7 +136,11 @@ class Deployed:
             "gripper": observation.gripper,
             "state": observation.state,
         }
-        known = {k: np.asarray(v) for k, v in given.items() if v is not None and not _is_traced(v)}
+        known = {
+            name: np.asarray(value, np.float64)  # numpy's functions refuse or wrap some types
+            for name, value in given.items()
+            if value is not None and not _is_traced(value)
+        }
         for name, value in known.items():
             if not np.isfinite(value).all():
                 raise ValueError(
@@ -188,11 +193,19 @@ def _array(value: Any) -> Any:
 def _check_key(key: Any) -> None:
     if not isinstance(key, jax.Array | np.ndarray):
         got = type(key).__name__
-    elif key.ndim != (0 if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else 1):
+    elif not _is_key(key):
         got = f"{key.dtype}{list(key.shape)}"
     else:
         return
     raise ValueError(f"key: expected a jax.random.key, one for all robots, got {got}")
+
+
+def _is_key(array: jax.Array | np.ndarray) -> bool:
+    """Whether it is one key, typed or in jax's older form."""
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        return array.ndim == 0
+    old = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
+    return (array.dtype, array.shape) == (old.dtype, old.shape)
 
 
 def _is_traced(value: Any) -> bool:

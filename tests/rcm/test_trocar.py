@@ -47,6 +47,12 @@ def test_a_position_that_says_nothing_of_an_angle(p_world_ref):
         rcm.trocar_from_position(np.zeros(2), p_world_ref)
 
 
+def test_position_and_frame_have_one_batch(p_world_ref):
+    trocar = rcm.Trocar(np.full((4, 1), 0.02), np.pi / 2, np.zeros(3))
+    assert rcm.trocar_position(trocar, p_world_ref).shape == (4, 3, 3)
+    assert rcm.trocar_rotation(trocar).shape == (4, 3, 3, 3)
+
+
 def test_frame_points_down_and_along_the_azimuth():
     R = rcm.trocar_rotation(rcm.Trocar(0.04, 1.4, np.pi / 2))
     np.testing.assert_allclose(R[:, 0], [0, 1, 0], atol=1e-7)

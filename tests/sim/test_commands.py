@@ -70,6 +70,15 @@ def test_what_is_asked_of_the_arm_is_approached_and_not_leapt_at(follow):
     np.testing.assert_allclose(after.pose.p[-1, -3:, 2], [0.13, 0.15, 0.2], atol=1e-3)
 
 
+def test_a_tool_near_the_port_comes_to_rest(follow):
+    depths = [rcm.MIN_DEPTH, 0.0055, 0.008, 0.012, 0.02, 0.03]
+    port = np.array([0.0, 0.0, 0.15], np.float32)
+    axes = np.array([[0.06, 0.03, -1.0], [-0.03, 0.08, -1.0]], np.float32)
+    after = follow([rcm.pose_on_manifold(a, 0.0, d, port) for d in depths for a in axes])
+    assert not after.invalid.any()
+    assert after.rcm_error[-15:].max() < 5e-5
+
+
 def test_what_is_no_command_holds_the_arm_and_a_good_one_is_followed_again(reset, step):
     state = reset(1)
     not_finite = np.full((3, 3), np.nan, np.float32)

@@ -103,6 +103,24 @@ def test_a_far_command_is_approached_along_the_manifold():
     np.testing.assert_allclose(pose.R, goal.R, atol=2e-2)
 
 
+def test_a_tool_at_the_least_depth_moves_along_the_manifold():
+    """Such tips are what `rcm` makes of all that are nearer to the port."""
+    trocar = first_trocar()
+    port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
+    axes = jax.random.normal(jax.random.key(0), (2, 64, 3)) * jnp.array([0.4, 0.4, 0.0])
+    rolls = jax.random.uniform(jax.random.key(1), (2, 64), minval=-1.5, maxval=1.5)
+    pose, goal = (
+        rcm.pose_on_manifold(axis - jnp.array([0.0, 0.0, 1.0]), roll, depth, port)
+        for axis, roll, depth in zip(axes, rolls, (0.03, rcm.MIN_DEPTH))
+    )
+    velocity = jnp.zeros((64, 7))
+    toward = jax.jit(jax.vmap(lambda *at: tracking.toward(*at, port, PERIOD)))
+    for _ in range(90):
+        pose, velocity = toward(pose, velocity, goal)
+        assert float(rcm.rcm_error(pose, port).max()) < 1e-6
+    np.testing.assert_allclose(pose.R, goal.R, atol=1e-3)
+
+
 def test_a_command_off_the_manifold_stays_off_it():
     """The controller is no projection: what a naive method violates, it keeps violating."""
     trocar = first_trocar()

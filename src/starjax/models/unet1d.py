@@ -81,7 +81,7 @@ class ConditionalUnet1D(nn.Module):
     def embed_step(self, k: jax.Array) -> jax.Array:
         """The diffusion step's part of every FiLM: int `[...] -> float32 [..., F]`."""
         half = self.time_dim // 2
-        frequency = jnp.exp(jnp.arange(half) * (-math.log(10_000.0) / (half - 1)))
+        frequency = jnp.exp(jnp.arange(half) * (-math.log(10_000.0) / max(half - 1, 1)))
         angle = jnp.asarray(k, jnp.float32)[..., None] * frequency
         wave = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1).astype(self.dtype)
         embedding = self.time_out(layers.mish(self.time_in(wave)))

@@ -119,7 +119,8 @@ def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> T
 
 def trocar_rotation(trocar: Trocar) -> jax.Array:
     """Orientation of {T}, R_world_trocar `[..., 3, 3]`: z down, x horizontal along the azimuth."""
-    _, _, azimuth = arrays.checked(**named_fields(trocar))
+    fields = arrays.checked(**named_fields(trocar))
+    azimuth = jnp.broadcast_arrays(*fields)[2]
     cos, sin = rotations.cos_sin(azimuth)
     zero = jnp.zeros_like(cos)
     rows = ([cos, sin, zero], [sin, -cos, zero], [zero, zero, zero - 1.0])

@@ -28,11 +28,17 @@ MAX_SPIN_ACCELERATION = 40.0
 # load that stays shrinks to a third in 0.17 s. Deviations of single periods, which no feedback can
 # foresee, grow by a twentieth; with twice the gain by an eighth.
 HOLD_GAIN = 0.2
+# m of depth up to which that share grows, with the square: a small turn about a tip near the port
+# is a large one of the joints, and with the whole share the arm swings there for ever.
+FIRM_DEPTH = 0.03
 MAX_LEAN = 5e-3  # m at the port: servos that give way by more are not just elastic
 MAX_TURN = 0.05  # rad, of the tool for it: near the port turning moves nothing there
 # m, of a deviation that one period answers: a larger one is of servos that have reached their
 # limits, where more would be asked of them for ever
 MAX_DEVIATION = 1e-3
+# m between tip and port within which the axis stays as it is, having no certain direction: well
+# below the least depth that actions may ask for (`rcm.MIN_DEPTH`)
+NO_DIRECTION = 1e-3
 
 
 def toward(
@@ -65,7 +71,7 @@ def toward(
     through = jnp.where(is_slowed, here + slower, (1.0 - share) * here + share * there)
     axis = p - through
     axis = axis * jnp.where(axis @ z_present < 0, -1.0, 1.0)  # the tip is above the port
-    axis = jnp.where(jnp.linalg.norm(axis) < rcm.MIN_DEPTH, z_present, axis)
+    axis = jnp.where(jnp.linalg.norm(axis) < NO_DIRECTION, z_present, axis)
     z = axis / jnp.maximum(jnp.linalg.norm(axis), 1e-6)
     carried = rcm.rotation_align(z_present, z_wanted) @ present.R
     twist = jnp.arctan2(carried[:, 1] @ wanted.R[:, 0], carried[:, 0] @ wanted.R[:, 0])
@@ -83,8 +89,9 @@ def hold(lean: jax.Array, measured: Pose, reference: Pose, port: jax.Array) -> j
     """The `lean` `[3]` m to go on with, given the last one, the measured pose and its reference."""
     deviation = _nearest(measured, port) - _nearest(reference, port)
     far = jnp.maximum(jnp.linalg.norm(deviation), MAX_DEVIATION)
-    lean = lean - HOLD_GAIN * deviation * (MAX_DEVIATION / far)
     lever = jnp.abs((reference.p - port) @ reference.R[:, 2])
+    gain = HOLD_GAIN * jnp.minimum(1.0, lever / FIRM_DEPTH) ** 2
+    lean = lean - gain * deviation * (MAX_DEVIATION / far)
     most = jnp.minimum(MAX_LEAN, MAX_TURN * lever)
     return lean * jnp.minimum(1.0, most / jnp.maximum(jnp.linalg.norm(lean), 1e-9))
 
