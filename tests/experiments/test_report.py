@@ -500,6 +500,12 @@ def test_runs_side_by_side_have_each_their_curve(tmp_path):
     assert len(figures.training(runs).axes[0].lines) == 2
 
 
+def test_a_curve_of_one_point_shows(one):
+    (axis, *_) = figures.training([one._replace(curves=[{"step": 1, "loss": 0.5}])]).axes
+    assert axis.lines[0].get_marker() == "o"
+    assert {line.get_marker() for line in figures.training([one]).axes[0].lines} == {"None"}
+
+
 def test_recorded_rollouts_end_where_the_trial_did(one):
     assert len(one.rollouts) == 36
     for rollout in one.rollouts:

@@ -66,6 +66,7 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
                 color, _ = style.method(run.result["method"])
                 if points:
                     line = {"color": color, "linewidth": 1.3, "linestyle": stroke}
+                    line |= {"marker": "o"} if len(points) == 1 else {}  # else it would not show
                     axis.plot(*np.array(points).T, label=run.label, **line)
             axis.set_title(title)
             axis.set_xlabel(f"training step (from {results.observed(runs)})")
