@@ -1,6 +1,7 @@
 """Training jobs for tests that run them in processes of their own. Runs nothing on import."""
 
 import dataclasses
+import signal
 import sys
 import time
 import types
@@ -177,6 +178,8 @@ def stopped_main(out: str, trains: bool) -> None:
             train(Path(out) / "stardiff", settings, should_stop=should_stop)
         return 0
 
+    # Ignored where the tests were started in the background.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     cli.run(command)
 
 
