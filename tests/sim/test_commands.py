@@ -76,7 +76,7 @@ def test_a_tool_near_the_port_comes_to_rest(follow):
     axes = np.array([[0.06, 0.03, -1.0], [-0.03, 0.08, -1.0]], np.float32)
     after = follow([rcm.pose_on_manifold(a, 0.0, d, port) for d in depths for a in axes])
     assert not after.invalid.any()
-    assert after.rcm_error[-15:].max() < 5e-5
+    assert after.rcm_error.max() < 0.01 and after.rcm_error[-15:].max() < 5e-5
 
 
 def test_what_is_no_command_holds_the_arm_and_a_good_one_is_followed_again(reset, step):
