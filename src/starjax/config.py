@@ -39,11 +39,11 @@ class Method(NamedTuple):
 class DemosConfig:
     """Demonstrations: how many, and what is recorded."""
 
-    per_trocar: int = 30  # successful demonstrations a seen trocar (V-A3)
-    seen_trocars: int = 8  # the first n of the eight seen trocars
-    keep_failures: bool = False
+    per_trocar: int = 30  # successful demonstrations at each seen trocar (V-A3)
+    seen_trocars: int = 8  # how many of the eight seen trocars to train with, the first ones
+    keep_failures: bool = False  # store failed episodes too; training leaves them out
     one_wall: bool = False  # on the middle row the expert always takes the wall of one side
-    max_steps: int = 600  # control steps at 30 Hz an expert may take
+    max_steps: int = 600  # control steps, at 30 Hz, that the expert may take
 
 
 # One DDIM step alone returns the noise that it began with (`models.schedule.ddim_table`).
@@ -54,36 +54,37 @@ FEWEST_DDIM_STEPS = 2
 class PolicyConfig:
     """Networks and diffusion (IV-G)."""
 
+    # Pixels as in the paper, or block pose and target position
     observation: Literal["image", "state"] = "image"
-    image_size: int = 256  # pixels a side
-    obs_horizon: int = 2  # T_o
+    image_size: int = 256  # side of a picture in pixels, before the crop
+    obs_horizon: int = 2  # T_o, control steps whose observations a decision sees
     horizon: int = 16  # H, commands predicted: t+1 .. t+H
     execute: int = 8  # commands executed before re-planning
-    encoder: Literal["resnet18", "small"] = "resnet18"
-    # A policy that ships with starjax, by its name; a policy.safetensors of yours; torchvision's
-    # .pth or .safetensors. Empty: from scratch
+    encoder: Literal["resnet18", "small"] = "resnet18"  # network that reads the pictures
+    # Where the encoder's weights begin: a policy that ships with starjax, by its name; a
+    # policy.safetensors of yours; a file of torchvision's (pth or safetensors). Empty: from scratch
     encoder_weights: str = ""
     freeze_encoder: bool = False  # train the rest only, on features computed once a frame
-    vision_dim: int = 512  # d_v
-    state_dim: int = 256  # d_s
-    unet_channels: tuple[int, ...] = (256, 512, 1024, 2048)
-    kernel_size: int = 5
-    groups: int = 8
-    time_dim: int = 128
-    roll_width: int = 256
-    roll_blocks: int = 3
+    vision_dim: int = 512  # d_v, numbers that the encoder makes of a picture
+    state_dim: int = 256  # d_s, numbers made of the low-dimensional history (Eq. 11)
+    unet_channels: tuple[int, ...] = (256, 512, 1024, 2048)  # of each level of the U-Net
+    kernel_size: int = 5  # of the U-Net's convolutions, in commands; odd
+    groups: int = 8  # of the U-Net's GroupNorms; divides all of its channels
+    time_dim: int = 128  # width of the embedding of the diffusion step
+    roll_width: int = 256  # width of the roll network
+    roll_blocks: int = 3  # residual blocks of the roll network
     # Ablations of the roll network, which reads tip positions, trocar and measured rolls (Eq. 13)
-    roll_history: bool = True  # the measured rolls
-    roll_trocar: bool = True  # the trocar
-    roll_observation: bool = False  # what conditions the diffusion model: picture or task state
+    roll_history: bool = True  # the roll network reads the measured rolls
+    roll_trocar: bool = True  # the roll network reads the trocar
+    roll_observation: bool = False  # the roll network reads the picture or the task state too
     # Whether the diffusion model is given the trocar: as Table II says, or an ablation
     sees_trocar: Literal["method", "always", "never"] = "method"
     # Which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
     # trocar's azimuth, or an ablation
     trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
-    diffusion_steps: int = 100  # K
-    ddim_steps: int = 10
-    temperature: float = 1.0  # of the noise a sample starts from; lower is nearer to the likeliest
+    diffusion_steps: int = 100  # K, diffusion steps in training
+    ddim_steps: int = 10  # denoising steps of a decision, 2 to K
+    temperature: float = 1.0  # 0 to 1, of a sample's first noise; lower: nearer to the likeliest
     roll_loss_weight: float = 0.1  # lambda of Eq. 15
     dtype: Literal["float32", "bfloat16"] = "float32"  # of the networks' arithmetic
 
@@ -92,22 +93,21 @@ class PolicyConfig:
 class TrainConfig:
     """Optimisation (IV-G; warm-up, betas and EMA are Diffusion Policy's)."""
 
-    steps: int = 100_000
-    batch_size: int = 256
-    learning_rate: float = 1e-4
-    weight_decay: float = 1e-6
-    # More of it, of the kernels of the roll network, which learns few demonstrations by heart
-    roll_weight_decay: float = 0.0
-    warmup_steps: int = 500
-    ema_max: float = 0.9999
-    crop_fraction: float = 0.9  # side of the random crop over the image's side
-    jitter: float = 0.1  # brightness, contrast, saturation: +- this
-    image_noise: float = 0.02  # standard deviation, of [0, 1]
-    state_noise: float = 0.02  # standard deviation, of normalised low-dimensional inputs
-    steps_per_call: int = 100  # train steps handed to the device between two looks, at most
-    checkpoint_every: int = 5_000
-    keep_checkpoints: int = 2
-    log_every: int = 100
+    steps: int = 100_000  # training steps
+    batch_size: int = 256  # samples a training step
+    learning_rate: float = 1e-4  # AdamW's after the warm-up; half a cosine takes it to 0
+    weight_decay: float = 1e-6  # AdamW's, of all weights
+    roll_weight_decay: float = 0.0  # more of it, of the roll network's kernels alone
+    warmup_steps: int = 500  # training steps until the learning rate is there, at most half of them
+    ema_max: float = 0.9999  # share of the averaged weights that a training step keeps, at most
+    crop_fraction: float = 0.9  # side of the crop, random in training, over the image's
+    jitter: float = 0.1  # of pictures: brightness, contrast, saturation times 1 +- this
+    image_noise: float = 0.02  # standard deviation of the noise on pictures in [0, 1]
+    state_noise: float = 0.02  # standard deviation of the noise on normalised poses and task state
+    steps_per_call: int = 100  # training steps handed to the device between two looks, at most
+    checkpoint_every: int = 5_000  # training steps between two checkpoints
+    keep_checkpoints: int = 2  # how many of the newest checkpoints stay on disk
+    log_every: int = 100  # training steps between two lines of metrics.jsonl
     holdout_demos: int = 8  # demonstrations kept out of training, for the action error
 
 
@@ -115,8 +115,8 @@ class TrainConfig:
 class EvalConfig:
     """Closed-loop evaluation (V-A4)."""
 
-    trials: int = 30  # a trocar
-    time_limit_s: float = 60.0
+    trials: int = 30  # trials at each trocar
+    time_limit_s: float = 60.0  # s of simulated time that a trial may take
     chunk: int = 0  # trials between two savings, at most; 0: as many as a program runs
     video_trials: int = 4  # trials recorded for the video and the figures
 
@@ -126,7 +126,8 @@ class RunConfig:
     """One run of `python -m starjax.experiments.run`."""
 
     method: str = "stardiff"  # a row of Table II, or all
-    preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"  # starting values
+    # Starting values of the rest; auto: gpu where jax can use one, else cpu
+    preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"
     seed: int = 0  # of everything random
     out: str = "runs"  # folder of the demonstrations and of one folder a method
     demos: DemosConfig = dataclasses.field(default_factory=DemosConfig)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 import types
@@ -15,10 +16,13 @@ from starjax.experiments import (
     bench,
     checks,
     demonstrations,
+    evaluate,
     folders,
     methods,
     options,
+    pack,
     presets,
+    report_command,
     run,
     sweep,
 )
@@ -440,6 +444,47 @@ def test_help_names_the_words_before_the_flags(command, words, capsys):
     usage, box = capsys.readouterr().out.split("positional arguments")
     assert words in usage.splitlines()[0]
     assert "STR" not in box.split("options")[0]
+
+
+def helped(command, capsys):
+    """What help says of each flag, without its default."""
+    with pytest.raises(SystemExit):
+        cli.dispatch([command, "--help"])
+    found, entry = {}, []
+    for line in capsys.readouterr().out.replace("│", " ").splitlines():
+        if flag := re.match(r"  (--?\w[^ ,]*)", line):
+            entry = found[flag[1]] = re.split(r"\s{2,}", line.strip(), maxsplit=1)[1:]
+        elif line.startswith(" " * 6):
+            entry.append(line.strip())
+    said = {flag: " ".join(" ".join(entry).split()) for flag, entry in found.items()}
+    return {flag: re.sub(r" ?\(default: .*\)$", "", text) for flag, text in said.items()}
+
+
+@pytest.mark.parametrize(
+    ("command", "settings"),
+    [
+        *((name, config.RunConfig) for name in ("run", "collect", "train")),
+        ("evaluate", evaluate.Options),
+        ("sweep", sweep.Options),
+        ("bench", bench.Options),
+        ("pack", pack.Options),
+        ("report", report_command.Options),
+    ],
+)
+def test_help_says_of_every_flag_something_of_its_own(command, settings, capsys):
+    said = helped(command, capsys)
+    flags = {flag for flag in options.flags(settings) if not re.search(r"--(\w+\.)?no-", flag)}
+    assert {*said} == {*flags, "-h"}
+    unsaid = {flag for flag, text in said.items() if not text}
+    shared = {flag for flag, text in said.items() if [*said.values()].count(text) > 1}
+    assert not unsaid and not shared
+
+
+@pytest.mark.parametrize("command", ["evaluate", "sweep", "bench", "pack", "report"])
+def test_help_shows_no_empty_default(command, capsys):
+    with pytest.raises(SystemExit):
+        cli.dispatch([command, "--help"])
+    assert not re.search(r"\(default:\s*(''|None)?\)", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(

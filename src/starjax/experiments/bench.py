@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from starjax.experiments import checks, folders, options, words
 from starjax.runtime import files, xla
@@ -22,7 +22,8 @@ class Options:
     """Flags of the command."""
 
     run: options.Run  # a method's folder, such as runs/cpu/stardiff
-    ddim_steps: tuple[int, ...] = ()  # a row for each; if empty, Table IV's 1 2 5 10 20 50 100
+    # numbers of denoising steps, a row for each; left out: Table IV's 1 2 5 10 20 50 100
+    ddim_steps: Annotated[tuple[int, ...], options.in_words] = ()
     calls: int = 100  # decisions timed for each, fewer if they take longer than 10 s
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from starjax import config as config_lib
 from starjax.experiments import checks, clock, folders, methods, options, presets, words
@@ -23,10 +23,12 @@ class Options:
     """Flags of the command."""
 
     run: options.RunOrNone = ""  # a method's folder, such as runs/cpu/stardiff
-    policy: str = ""  # a policy.safetensors, or the name of a policy that ships with starjax
+    # a policy.safetensors, or the name of a policy that ships with starjax, in the place of RUN
+    policy: Annotated[str, options.in_words] = ""
     seed: int = 0  # of the trials
-    out: str = ""  # folder of the result; if empty, in RUN or in runs/evaluate
-    video: bool = True  # rollout.mp4
+    # folder of the result; left out: one in RUN or in runs/evaluate
+    out: Annotated[str, options.in_words] = ""
+    video: bool = True  # write rollout.mp4
     eval: config_lib.EvalConfig = dataclasses.field(default_factory=config_lib.EvalConfig)
 
 

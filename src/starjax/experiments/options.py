@@ -21,8 +21,16 @@ SettingsT = TypeVar("SettingsT")
 
 # The words before the flags, as help names them.
 Run = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-RunOrNone = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]")]
-Runs = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
+RunOrNone = Annotated[
+    str, tyro.conf.Positional, tyro.conf.arg(metavar="[RUN]", help_behavior_hint="")
+]
+Runs = Annotated[
+    tuple[str, ...],
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="(required)"),
+]
+# Of a flag whose default is said in words.
+in_words = tyro.conf.arg(help_behavior_hint="")
 
 
 def parse(

@@ -22,12 +22,14 @@ itself (`starjax evaluate --policy OUT`)."""
 class Options:
     """Flags of the command."""
 
-    # a policy.safetensors
+    # a policy.safetensors, or the name of a policy that ships with starjax
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     # the file to write
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    # of the noise a sample starts from; if left out, POLICY's
-    temperature: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    # 0 to 1, of a sample's first noise; left out: POLICY's
+    temperature: Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")] = (
+        None
+    )
 
 
 def main(argv: Sequence[str]) -> int:

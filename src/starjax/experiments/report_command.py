@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 from starjax import config as config_lib
 from starjax.experiments import methods, options
@@ -18,8 +19,9 @@ class Options:
     """Flags of the command."""
 
     run: options.Runs  # methods' folders, or folders of them
-    out: str = ""  # folder; default: `report` beside a method's folder, or in an evaluation's
-    video: bool = True  # rollout.mp4
+    # folder of the report; left out: `report` beside a method's folder, or in an evaluation's
+    out: Annotated[str, options.in_words] = ""
+    video: bool = True  # write rollout.mp4
 
 
 def main(argv: Sequence[str]) -> int:

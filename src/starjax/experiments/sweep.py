@@ -5,7 +5,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from starjax import config as config_lib
 from starjax.experiments import checks, folders, options, words
@@ -30,11 +30,12 @@ class Options:
 
     run: options.Run  # a method's folder, such as runs/cpu/stardiff
     trocars: int = 200  # how many to draw; not used with a grid
-    radii_cm: tuple[float, ...] = ()  # of a grid; 0 is one point
-    polars_deg: tuple[float, ...] = (90.0,)  # of a grid
-    azimuths: int = 12  # of a grid, evenly around
+    # distances of a grid from the nominal port in cm, 0 is one point; left out: no grid
+    radii_cm: Annotated[tuple[float, ...], options.in_words] = ()
+    polars_deg: tuple[float, ...] = (90.0,)  # angles of a grid from straight up, in degrees
+    azimuths: int = 12  # how many directions of a grid, evenly around
     seed: int = 0  # of the sample and of the trials
-    eval: config_lib.EvalConfig = _EVAL  # with the run's time limit
+    eval: config_lib.EvalConfig = _EVAL  # --eval.time-limit-s, left out, is that of RUN
 
 
 def main(argv: Sequence[str]) -> int:
