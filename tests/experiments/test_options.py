@@ -517,6 +517,17 @@ def test_what_would_fail_later_is_a_mistake(argv, said):
     assert str(caught.value).startswith(said)
 
 
+COUNTS = [flag for flag, kind in options.flags(config.RunConfig).items() if kind is int]
+
+
+@pytest.mark.parametrize("flag", [*COUNTS, "--policy.unet-channels"])
+def test_a_slip_of_the_hand_is_a_mistake_of_its_flag(flag):
+    huge = str(2**70 + 1 if flag == "--policy.kernel-size" else 2**70)
+    with pytest.raises(config.UsageError) as caught:
+        settings("--preset=smoke", flag, huge)
+    assert str(caught.value).startswith(f"{flag}: expected ") and huge in str(caught.value)
+
+
 @pytest.mark.parametrize(("method", "timed"), [("stardiff", True), ("dp_rcm4", False)])
 def test_only_the_hierarchy_has_a_roll_network_to_time(
     monkeypatch, capsys, tmp_path, method, timed

@@ -10,6 +10,20 @@ from starjax.experiments import methods, options
 SEEDS = 2**32  # a key of jax takes 32 bits: larger seeds would be those of others again
 LEAST_TIME_S, MOST_TIME_S = 0.1, 86_400.0  # of a trial; one control step takes 1/30 s
 MOST_TRIALS = 1_000_000
+MOST_COUNT = 2**31 - 1  # whole numbers of compiled programs have 32 bits
+# More is a slip of the hand, and would be traced for hours or fill the memory.
+_MOST = {
+    "policy.image-size": 4_096,  # pixels
+    "policy.horizon": 4_096,
+    "policy.vision-dim": 65_536,
+    "policy.state-dim": 65_536,
+    "policy.unet-channels": 65_536,
+    "policy.kernel-size": 4_095,
+    "policy.time-dim": 65_536,
+    "policy.roll-width": 65_536,
+    "policy.roll-blocks": 1_000,
+    "policy.diffusion-steps": 1_000_000,
+}
 _CELL = {"resnet18": 32, "small": 8}  # pixels that a vision encoder makes one of its maps' cells
 
 
@@ -55,6 +69,7 @@ def check(config: config_lib.RunConfig) -> None:
     expect(1 <= seen <= 8, "demos.seen-trocars", "1 to 8", seen)
     expect(0 < fraction <= 1, "train.crop-fraction", "in (0, 1]", fraction)
     expect(0 <= train.ema_max < 1, "train.ema-max", "in [0, 1)", train.ema_max)
+    _check_sizes(config)
     _check_networks(policy)
     _check_sampling(policy)
     _check_encoder(policy, fraction)
@@ -62,6 +77,16 @@ def check(config: config_lib.RunConfig) -> None:
     limits = f"{LEAST_TIME_S:g} to {MOST_TIME_S:g} s"
     expect(1 <= trials <= MOST_TRIALS, "eval.trials", f"1 to {MOST_TRIALS}", trials)
     expect(LEAST_TIME_S <= seconds <= MOST_TIME_S, "eval.time-limit-s", limits, seconds)
+
+
+def _check_sizes(config: config_lib.RunConfig) -> None:
+    for part in ("demos", "policy", "train", "eval"):
+        for field, value in vars(getattr(config, part)).items():
+            name = f"{part}.{field.replace('_', '-')}"
+            most = _MOST.get(name, MOST_COUNT)
+            for number in value if isinstance(value, tuple) else (value,):
+                fits = not isinstance(number, int) or number <= most
+                expect(fits, name, f"at most {most}", number)
 
 
 def _check_networks(policy: config_lib.PolicyConfig) -> None:
