@@ -309,6 +309,21 @@ def test_wrong_settings_are_named(settings, words):
         render.make(pile(), **settings)
 
 
+@pytest.mark.parametrize(
+    ("geoms", "count"),
+    [
+        ("", 0),
+        ('<geom size=".1" rgba="1 0 0 0"/><geom size=".1" group="3"/>', 2),
+    ],
+)
+def test_a_scene_with_nothing_to_draw_is_named(geoms, count):
+    mj_model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><camera name="camera" pos="0 0 1"/>{geoms}</worldbody></mujoco>'
+    )
+    with pytest.raises(ValueError, match=f"geoms: expected one .* got none of {count}$"):
+        render.make(mj_model, height=8, width=8)
+
+
 def test_wrong_shapes_are_named():
     caster = render.make(pile(), height=8, width=8)
     with pytest.raises(ValueError, match="geom_xpos, geom_xmat, geom_rgb: expected"):

@@ -119,6 +119,11 @@ def read(mj_model: mujoco.MjModel, camera: str, aspect: float) -> Scene:
         if int(mj_model.geom_type[g]) not in _KIND_OF:
             shape = mujoco.mjtGeom(mj_model.geom_type[g]).name
             raise ValueError(f"geom {mj_model.geom(g).name!r}: cannot draw a {shape}")
+    if not drawn:
+        raise ValueError(
+            "geoms: expected one that is drawn, of groups 0 to 2 and not fully transparent, "
+            f"got none of {mj_model.ngeom}"
+        )
     kind_of = {g: _KIND_OF[int(mj_model.geom_type[g])] for g in drawn}
     ids = np.array(sorted(drawn, key=lambda g: (kind_of[g], g)), int)
     kind = np.array([kind_of[g] for g in ids])
