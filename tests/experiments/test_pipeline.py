@@ -207,7 +207,15 @@ def test_a_finished_run_needs_its_encoder_no_more(tmp_path, done):
 
 def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
     settings = _json(presets.PRESETS["smoke"])
-    result = {"config": settings, "trials": []}
+    none = {"successes": 0, "trials": 0}
+    figures = {
+        "method": "stardiff",
+        "seen": none,
+        "unseen": none,
+        "safe": {"all": none},
+        "rcm_error_mm": {"executed": {"mean": 0.1, "max": 0.2}},
+    }
+    result = {"config": settings, "trials": [], **figures}
 
     def is_done(found, wanted=settings, weights="a"):
         (tmp_path / "result.json").write_text(
@@ -226,6 +234,9 @@ def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
     assert not is_done(result, {**settings, "eval": {**settings["eval"], "trials": 9}})
     for damaged in ("{", "{}", '{"config": 1}', '{"config": {"of": "another"}, "trials": []}'):
         assert not is_done(damaged)
+    for missing in figures:  # of another version
+        assert not is_done({key: value for key, value in result.items() if key != missing})
+    assert not is_done({**result, "rcm_error_mm": 3})
 
 
 def test_more_trials_than_asked_for_are_not_thrown_away(tmp_path):

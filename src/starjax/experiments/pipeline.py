@@ -170,10 +170,11 @@ def _scored(folder: Path, weights: str) -> dict[str, Any]:
 
 
 def _is_of(found: dict[str, Any], settings: dict[str, Any]) -> bool:
-    """Whether a result is of these settings."""
+    """Whether a result is of these settings, and has what a run says of it at its end."""
     try:
         alike = folders.trained_alike(found["config"], settings, "eval")
-    except (KeyError, TypeError, ValueError):
+        words.outcome([found])
+    except (AttributeError, KeyError, TypeError, ValueError):
         return False
     return alike and found.get("seed", settings["seed"]) == settings["seed"]
 
