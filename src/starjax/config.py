@@ -155,9 +155,17 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
         elif _fits(value, hints[name]):
             fields[name] = tuple(value) if isinstance(value, list) else value
         else:
-            kind = getattr(hints[name], "__name__", hints[name])
-            raise ValueError(f"{settings.__name__}.{name}: expected {kind}, got {value!r}")
+            raise ValueError(
+                f"{settings.__name__}.{name}: expected {_kind(hints[name])}, got {value!r}"
+            )
     return settings(**fields)
+
+
+def _kind(hint: Any) -> str:
+    """A field's type, for people."""
+    if typing.get_origin(hint) is Literal:
+        return f"one of {', '.join(map(str, typing.get_args(hint)))}"
+    return getattr(hint, "__name__", str(hint))
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -134,7 +134,10 @@ def test_weights_whose_settings_are_gone_are_refused(tmp_path, text):
         ({"seed": True}, "RunConfig.seed: expected int, got True"),
         ({"eval": 3}, "EvalConfig: expected an object, got 3"),
         ({"policy": {"unet_channels": [1, "2"]}}, "unet_channels: expected tuple"),
-        ({"policy": {"observation": "sound"}}, "PolicyConfig.observation: expected"),
+        (
+            {"policy": {"observation": "sound"}},
+            "observation: expected one of image, state",
+        ),
     ],
 )
 def test_settings_of_other_types_are_named(values, said):
