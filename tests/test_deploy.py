@@ -274,6 +274,17 @@ def test_it_may_be_part_of_a_program(made):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
 
 
+def test_it_plans_the_same_in_a_program_of_double_precision(made):
+    path, trained, _ = made
+    deployed, good, key = deploy.load(path), observed(trained.policy), jax.random.key(0)
+    ports = jax.tree.map(lambda field: field[:ROBOTS], rcm.TROCARS)
+    wanted = deployed(key, good, ports)
+    with jax.enable_x64(True):
+        pose = jax.tree.map(np.float64, good.pose)
+        got = deployed(key, good.replace(pose=pose), ports)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
+
+
 @pytest.mark.parametrize("made", ["image"], indirect=True)
 def test_pictures_are_cropped_as_in_its_training(made, tmp_path):
     _, trained, _ = made

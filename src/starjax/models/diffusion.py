@@ -79,7 +79,7 @@ def ddpm_step(
 
 def sample_noise(keys: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """Standard normal `[B, *shape]`; row i depends on `keys[i]` alone, whatever the batch."""
-    return jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
+    return jax.vmap(lambda key: jax.random.normal(key, shape, jnp.float32))(keys)
 
 
 def ddim_sample(
