@@ -105,6 +105,14 @@ def test_a_mistake_names_the_array(made):
             rcm.Trocar(*np.zeros((3, 0))),
         ),
         r"observation.pose.R: expected shape .*, got none": (good.replace(pose=None), trocar),
+        r"observation.pose: expected a deploy.Pose, got ndarray": (
+            good.replace(pose=np.zeros((2, 4, 4))),
+            trocar,
+        ),
+        r"observation.pose: expected a deploy.Pose, got dict": (
+            good.replace(pose=good.pose._asdict()),
+            trocar,
+        ),
         r"observation.gripper: expected shape .*, got none": (good.replace(gripper=None), trocar),
         r"observation.gripper: expected real numbers, got complex": (
             good.replace(gripper=good.gripper * 1j),

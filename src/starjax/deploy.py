@@ -103,8 +103,13 @@ class Deployed:
 
     def _given(self, observation: Observation) -> Observation:
         """What the policy looks at, as arrays."""
-        pose, kind = Pose(*map(_array, observation.pose or (None, None))), self.settings.observation
+        pose = (None, None) if observation.pose is None else observation.pose
+        if not (isinstance(pose, tuple | list) and len(pose) == 2):
+            got = type(pose).__name__
+            raise ValueError(f"observation.pose: expected a deploy.Pose, got {got}")
+        kind = self.settings.observation
         seen = {kind: _array(getattr(observation, kind))}
+        pose = Pose(*map(_array, pose))
         return Observation(pose=pose, gripper=_array(observation.gripper), **seen)
 
     def _check(self, observation: Observation, robots: tuple[int, ...]) -> None:
