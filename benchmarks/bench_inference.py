@@ -3,9 +3,10 @@
     python benchmarks/bench_inference.py [--only "224 px"] [--peer [PYTHON]] [--tiny]
 
 On a GPU: the paper's model from pictures, at batch 1 and 360, beside PyTorch and the floor: the
-larger of its arithmetic and of its weights in the networks' type read once a DDIM step, FiLM's and
-the encoder's once a call. On a CPU: a small model of the task's state, for every count of DDIM
-steps, beside numpy doing nothing but the matrix products of the same call on the same cores.
+larger of its arithmetic and of its weights in the networks' type, the U-Net's read once for each of
+its evaluations, FiLM's and the encoder's once a call. On a CPU: a small model of the task's state,
+for every count of DDIM steps, beside numpy doing nothing but the matrix products of the same call
+on the same cores.
 """
 
 import argparse
@@ -23,7 +24,7 @@ import numpy as np
 from starjax import runtime
 from starjax.evaluation import latency
 from starjax.experiments import bench
-from starjax.models import roll_net
+from starjax.models import parallel_ddim, roll_net
 from starjax.policies import features
 from starjax.policies import policy as policies
 
@@ -108,13 +109,17 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
     observation, trocar = latency.example(case.policy, _setup.P_WORLD_REF, batch)
     traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, trocar)
     work = _arithmetic.operations(policy.sample, *traced)
-    work -= batch * case.policy.ddim_steps * _arithmetic.of_padding(case.policy)
+    sequences, evaluations = batch, case.policy.ddim_steps
+    if parallel_ddim.pays(batch, evaluations):
+        sequences, evaluations = batch * evaluations, parallel_ddim.EVALUATIONS
+    work -= sequences * evaluations * _arithmetic.of_padding(case.policy)
     arithmetic_s = work / rates.flops
-    reading_s = weights_read(params, case.policy) / rates.bandwidth
+    reading_s = weights_read(params, case.policy, evaluations) / rates.bandwidth
     floor = max(arithmetic_s, reading_s)
     row = {
         "batch": batch,
         "ddim_steps": case.policy.ddim_steps,
+        "evaluations": evaluations,
         **times,
         "floor_ms": 1e3 * floor,
         "floor_arithmetic_ms": 1e3 * arithmetic_s,
@@ -127,13 +132,13 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
     return row
 
 
-def weights_read(params: policies.Params, policy_config) -> float:
-    """Bytes: what a DDIM step needs again each time, and what is needed once."""
+def weights_read(params: policies.Params, policy_config, evaluations: int) -> float:
+    """Bytes: what each evaluation of the U-Net needs again, and what is needed once."""
     total = 0
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         name = jax.tree_util.keystr(path)
         again = "'unet'" in name and "film_" not in name and "'time_" not in name
-        total += leaf.size * (policy_config.ddim_steps if again else 1)
+        total += leaf.size * (evaluations if again else 1)
     return total * jnp.dtype(policy_config.dtype).itemsize
 
 

@@ -98,7 +98,7 @@ class TrainConfig:
     learning_rate: float = 1e-4  # AdamW's after the warm-up; half a cosine takes it to 0
     weight_decay: float = 1e-6  # AdamW's, of all weights
     roll_weight_decay: float = 0.0  # more of it, of the roll network's kernels alone
-    warmup_steps: int = 500  # training steps until the learning rate is there, at most half of them
+    warmup_steps: int = 500  # training steps in which the learning rate rises, at most half of all
     ema_max: float = 0.9999  # share of the averaged weights that a training step keeps, at most
     crop_fraction: float = 0.9  # side of the crop, random in training, over the image's
     jitter: float = 0.1  # of pictures: brightness, contrast, saturation times 1 +- this

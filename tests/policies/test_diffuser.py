@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from starjax.models import diffusion, schedule
+from starjax.models import diffusion, parallel_ddim, schedule
 from starjax.policies import diffuser, features
 
 ACTION = 2
@@ -65,6 +65,23 @@ def test_samples_are_what_was_learned(learned):
     settings, params, wanted, inputs = learned
     found = sampled(dataclasses.replace(settings, ddim_steps=10), params, inputs)
     assert np.abs(found - wanted).mean() < 0.05
+
+
+def test_samples_are_the_same_where_steps_are_side_by_side(learned, monkeypatch):
+    settings, params, _, inputs = learned
+    ten = dataclasses.replace(settings, ddim_steps=10)
+    wanted, calls = sampled(ten, params, inputs), []
+    one_by_one = diffusion.ddim_sample
+    monkeypatch.setattr(diffusion, "ddim_sample", lambda *a, **k: calls.append(a))
+    monkeypatch.setattr(parallel_ddim, "pays", lambda batch, steps: (batch, steps) == (2, 10))
+    found = sampled(ten, params, inputs)
+    np.testing.assert_allclose(found, wanted, atol=0.01)
+    assert np.abs(found - wanted).max() > 0 and calls == []
+    monkeypatch.setattr(diffusion, "ddim_sample", one_by_one)
+    five = dataclasses.replace(settings, ddim_steps=5)
+    monkeypatch.setattr(parallel_ddim, "ddim_sample", lambda *a, **k: calls.append(a))
+    sampled(five, params, inputs)
+    assert calls == []
 
 
 def test_at_temperature_zero_no_sample_depends_on_its_key(learned):

@@ -7,11 +7,14 @@ from pathlib import Path
 import fakes
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from starjax import config
 from starjax.data import normalizer
+from starjax.evaluation import latency
 from starjax.experiments import methods
+from starjax.models import parallel_ddim
 from starjax.policies import packaged
 from starjax.policies import policy as policies
 from starjax.training import export
@@ -50,6 +53,27 @@ def faults(name):
 
 def test_what_is_packaged_is_whole():
     assert [fault for name in packaged.names() for fault in faults(name)] == []
+
+
+def test_five_evaluations_side_by_side_are_enough_for_what_is_packaged(monkeypatch):
+    """Pictures of noise; `benchmarks/bench_ddim.py` takes demonstrations."""
+    trained = export.load(packaged.find("name", "compact"))
+    policy = policies.make(
+        methods.METHODS[trained.method], trained.policy, fakes.P_WORLD_REF, trained.train
+    )
+    observation, trocar = latency.example(trained.policy, fakes.P_WORLD_REF, 4)
+    keys = jax.random.split(jax.random.key(1), 4)
+
+    def planned():
+        given = (trained.params, trained.normalizer, keys, observation, trocar)
+        return jax.jit(lambda *given: policy.sample(*given))(*given)
+
+    wanted = planned()
+    monkeypatch.setattr(parallel_ddim, "pays", lambda batch, steps: True)
+    found = planned()
+    distance = np.linalg.norm(found.pose.p - wanted.pose.p, axis=-1)
+    assert 0 < distance.max() < 5e-5  # m
+    np.testing.assert_allclose(found.gripper, wanted.gripper, atol=0.002)
 
 
 @pytest.fixture

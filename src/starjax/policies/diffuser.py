@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import config
-from starjax.models import diffusion, encoders, joined, schedule, unet1d
+from starjax.models import diffusion, encoders, joined, parallel_ddim, schedule, unet1d
 from starjax.policies import features
 
 Params = dict[str, Any]
@@ -114,11 +114,20 @@ def make(
     ) -> jax.Array:
         cond = _beside(observed, extra)
         film = of_unet(params["unet"], cond, method="condition")
-        return diffusion.ddim_sample(
-            lambda x, film_k: of_unet(params["unet"], x, film + film_k, method="denoise"),
+
+        def eps_fn(x: jax.Array, film_k: jax.Array) -> jax.Array:
+            """Of `[B, H, A]` at one step, or of `[steps, B, H, A]`."""
+            rows = (film + film_k[..., None, :]).reshape(-1, film.shape[-1])
+            eps = of_unet(params["unet"], x.reshape(-1, *shape), rows, method="denoise")
+            return eps.reshape(x.shape)
+
+        steps = policy_config.ddim_steps
+        ddim = parallel_ddim if parallel_ddim.pays(len(keys), steps) else diffusion
+        return ddim.ddim_sample(
+            eps_fn,
             policy_config.temperature * diffusion.sample_noise(keys, shape),
             diffusion_steps=policy_config.diffusion_steps,
-            steps=policy_config.ddim_steps,
+            steps=steps,
             prepare=lambda k: of_unet(params["unet"], k, method="embed_step"),
             reach=reach,
         )
