@@ -55,7 +55,8 @@ class Deployed:
         The first call for a number of robots compiles the program.
 
         Args:
-          key: random key; a new one for each decision.
+          key: random key; a new one for each decision. One robot uses it as it is, each of B its
+            own part.
           observation: of the last O moments, oldest first, fields `[O, ...]` or `[B, O, ...]`.
           trocar: where the port is, fields `[]` or `[B]`, which broadcast; one for all robots if
             all are `[]`.

@@ -124,6 +124,10 @@ def test_a_mistake_is_one_line(argv, words):
         (["--trocars", "0"], ["--trocars", "1 to 1000000", "got 0"]),
         (["--radii-cm", "2", "--azimuths", "0"], ["--azimuths", "1 to 1000000", "got 0"]),
         (["--radii-cm", "2", "--azimuths", "-3"], ["--azimuths", "1 to 1000000", "-3"]),
+        (
+            ["--radii-cm", "2", "3", "--azimuths", "600000"],
+            ["--azimuths", "at most 1000000 ports of its grid", "1200000"],
+        ),
         (["--radii-cm", "2", "nan"], ["--radii-cm", "a finite number", "nan"]),
         (["--azimuths", "6"], ["--azimuths", "--radii-cm beside it", "6"]),
         (["--polars-deg", "80"], ["--polars-deg", "--radii-cm beside it", "80"]),

@@ -174,7 +174,12 @@ def test_the_target_peg_is_marked_in_the_picture(sim):
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
-    [(("pixels",), "policy_observation"), (("image", 8), "image_size")],
+    [
+        (("pixels",), "policy_observation"),
+        (("image", 8), "image_size"),
+        (("image", 16.5), "image_size"),
+        (("image", "32"), "image_size"),
+    ],
 )
 def test_unusable_settings_are_named(arguments, named):
     with pytest.raises(ValueError, match=named):

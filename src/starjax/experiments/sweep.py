@@ -102,6 +102,9 @@ def _check(chosen: Options) -> None:
         checks.expect(inside, "radii-cm", f"each 0 to {MOST_RADIUS_CM:g} cm", radius)
     for polar in chosen.polars_deg:
         checks.expect(0 <= polar <= 180, "polars-deg", "each 0 to 180 degrees", polar)
+    ports = len(chosen.radii_cm) * len(chosen.polars_deg) * chosen.azimuths
+    most = f"at most {MOST_TROCARS} ports of its grid"
+    checks.expect(ports <= MOST_TROCARS, "azimuths", most, ports)
     is_grid, default = bool(chosen.radii_cm), Options(chosen.run)
     for field in ("trocars",) if is_grid else ("polars_deg", "azimuths"):
         value, name = getattr(chosen, field), field.replace("_", "-")

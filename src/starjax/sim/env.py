@@ -5,6 +5,7 @@ batch of trocars is one vmapped axis.
 """
 
 import functools
+import numbers
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -123,8 +124,10 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         raise ValueError(
             f"policy_observation: expected 'image' or 'state', got {policy_observation!r}"
         )
-    if image_size < 16:
-        raise ValueError(f"image_size: expected at least 16 pixels, got {image_size}")
+    if not isinstance(image_size, numbers.Integral) or image_size < 16:
+        raise ValueError(
+            f"image_size: expected 16 pixels or more, a whole number, got {image_size!r}"
+        )
     sim = model.load()
     draw = render.make(sim.mj_model, "camera", image_size, image_size, shadow=shadow)
     pegs = jnp.asarray(sim.pegs)
