@@ -1,11 +1,12 @@
 """How near DDIM whose steps are side by side comes to DDIM, after so many evaluations.
 
     starjax collect --preset compact --demos.per-trocar 2 --seed 77 --out runs/ddim
-    python benchmarks/bench_ddim.py runs/ddim/demos-* [--policy compact] [--temperature 1]
+    python benchmarks/bench_ddim.py runs/ddim/demos-* [--policy compact] [--temperature 1] \\
+        [--ddim-steps 100]
 
 A policy plans at frames of demonstrations that it did not learn from, each way with the same noise;
-beside it, what calculating in bfloat16 in the place of float32 moves. No time is measured here:
-bench_inference.py does that.
+beside it, what calculating in bfloat16 in the place of float32 moves, step after step and side by
+side. No time is measured here: bench_inference.py does that.
 """
 
 import argparse
@@ -31,7 +32,7 @@ from starjax.training import export
 from starjax.types import Command
 
 FRAMES = 128
-EVALUATIONS = range(3, 9)
+AROUND = range(-2, 4)  # evaluations, from as many as are used
 
 
 def main() -> None:
@@ -39,29 +40,34 @@ def main() -> None:
     parser.add_argument("demos", type=pathlib.Path)
     parser.add_argument("--policy", default="compact")
     parser.add_argument("--temperature", type=float, help="by default the policy's")
+    parser.add_argument("--ddim-steps", type=int, help="by default the policy's")
     asked = parser.parse_args()
     runtime.prepare_xla()
+    # a GPU would calculate with ten bits where float32 is said
+    jax.config.update("jax_default_matmul_precision", "highest")
     trained = export.load(packaged.locate(asked.policy))
-    if asked.temperature is not None:
-        settings = dataclasses.replace(trained.policy, temperature=asked.temperature)
-        trained = trained._replace(policy=settings)
+    given = {"temperature": asked.temperature, "ddim_steps": asked.ddim_steps}
+    changed = {name: value for name, value in given.items() if value is not None}
+    trained = trained._replace(policy=dataclasses.replace(trained.policy, **changed))
     found = load.load(asked.demos)
     frames = np.linspace(0, len(found.dataset.episode) - 1, FRAMES).astype(int)
     batch = windows.gather(
         found.dataset, jnp.asarray(frames), trained.policy.obs_horizon, trained.policy.horizon
     )
+    steps, temperature = trained.policy.ddim_steps, trained.policy.temperature
+    used = parallel_ddim.evaluations_for(steps)
     wanted = planned(trained, batch, "float32", diffusion.ddim_sample)
-    rounded = planned(trained, batch, "bfloat16", diffusion.ddim_sample)
-    rows = {"rounded to bfloat16": apart(rounded, wanted)}
-    for count in EVALUATIONS:
-        ddim = functools.partial(parallel_ddim.ddim_sample, evaluations=count)
-        rows[f"{count} evaluations"] = apart(planned(trained, batch, "float32", ddim), wanted)
-    for name, row in rows.items():
-        print(f"{name:20}", *(f"{key} {value:.4f}" for key, value in row.items()), sep="  ")
-    temperature = trained.policy.temperature
-    facts = {"policy": asked.policy, "frames": FRAMES, "ddim_steps": trained.policy.ddim_steps}
-    named = {f"temperature {temperature}, {name}": row for name, row in rows.items()}
-    _timing.report("ddim", {**facts, "results": named}, tiny=False)
+    ways = {"rounded to bfloat16": ("bfloat16", diffusion.ddim_sample)}
+    for count in (used + more for more in AROUND):
+        beside = functools.partial(parallel_ddim.ddim_sample, evaluations=count)
+        ways[f"{count} evaluations"] = ("float32", beside)
+    ways[f"{used} evaluations, rounded to bfloat16"] = ("bfloat16", parallel_ddim.ddim_sample)
+    named = {}
+    for name, way in ways.items():
+        row = apart(planned(trained, batch, *way), wanted)
+        print(f"{name:36}", *(f"{key} {value:.4f}" for key, value in row.items()), sep="  ")
+        named[f"{steps} steps, temperature {temperature}, {name}"] = row
+    _timing.report("ddim", {"policy": asked.policy, "frames": FRAMES, "results": named}, tiny=False)
 
 
 def planned(

@@ -109,9 +109,10 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
     observation, trocar = latency.example(case.policy, _setup.P_WORLD_REF, batch)
     traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, trocar)
     work = _arithmetic.operations(policy.sample, *traced)
-    sequences, evaluations = batch, case.policy.ddim_steps
-    if parallel_ddim.pays(batch, evaluations):
-        sequences, evaluations = batch * evaluations, parallel_ddim.EVALUATIONS
+    sequences = batch
+    steps = evaluations = case.policy.ddim_steps
+    if parallel_ddim.pays(batch, steps):
+        sequences, evaluations = batch * steps, parallel_ddim.evaluations_for(steps)
     work -= sequences * evaluations * _arithmetic.of_padding(case.policy)
     arithmetic_s = work / rates.flops
     reading_s = weights_read(params, case.policy, evaluations) / rates.bandwidth

@@ -39,6 +39,22 @@ def of_spread_data(spread, mean=0.3):
     return eps_fn
 
 
+def of_two_ways(way=0.5, spread=0.1):
+    """The noise that a perfect network sees, when a clean entry is near +way or near -way."""
+
+    def eps_fn(x, k):
+        signal, noise = (
+            at(SCHEDULE.sqrt_alpha_bar, k, x),
+            at(SCHEDULE.sqrt_one_minus_alpha_bar, k, x),
+        )
+        variance = (spread * signal) ** 2 + noise**2
+        mean = way * jnp.tanh(way * signal * x / variance)
+        clean = mean + spread**2 * signal / variance * (x - signal * mean)
+        return (x - signal * clean) / noise
+
+    return eps_fn
+
+
 def apart(eps_fn, evaluations, reach=None, steps=10):
     wanted = diffusion.ddim_sample(eps_fn, NOISE, steps=steps, reach=reach)
     got = parallel_ddim.ddim_sample(
@@ -47,7 +63,7 @@ def apart(eps_fn, evaluations, reach=None, steps=10):
     return float(jnp.abs(got - wanted).max())
 
 
-@pytest.mark.parametrize("steps", [6, 10])
+@pytest.mark.parametrize("steps", [6, 10, 20])
 def test_after_as_many_evaluations_as_steps_nothing_is_approximate(steps):
     assert apart(curved, steps, steps=steps) < 2e-5
     assert apart(curved, 2, steps=steps) > 1e-3
@@ -83,15 +99,21 @@ def test_a_sequence_does_not_depend_on_those_beside_it():
     np.testing.assert_allclose(parallel_ddim.ddim_sample(curved, NOISE)[1:], alone, atol=1e-6)
 
 
-def test_it_pays_for_one_robot_on_a_gpu(monkeypatch):
+@pytest.mark.parametrize(("steps", "evaluations"), [(6, 5), (10, 5), (11, 6), (50, 8), (100, 9)])
+def test_more_steps_need_few_more_evaluations(steps, evaluations):
+    assert parallel_ddim.evaluations_for(steps) == evaluations
+    assert apart(of_two_ways(), None, steps=steps) < 1e-3
+    assert apart(of_two_ways(), 2, steps=steps) > 1e-3
+
+
+def test_it_pays_for_few_robots_on_a_gpu(monkeypatch):
     assert not parallel_ddim.pays(1, 10)
     monkeypatch.setattr(layers, "on_gpu", lambda: True)
-    found = {
-        (batch, steps): parallel_ddim.pays(batch, steps)
-        for batch in (1, 2)
-        for steps in (5, 6, 10, 11)
+    most = {
+        steps: max([0, *(batch for batch in range(1, 400) if parallel_ddim.pays(batch, steps))])
+        for steps in (1, 5, 6, 10, 100)
     }
-    assert [case for case, pays in found.items() if pays] == [(1, 6), (1, 10)]
+    assert most == {1: 0, 5: 0, 6: 5, 10: 15, 100: 14}
 
 
 def test_noise_in_double_precision_changes_no_type():

@@ -1,15 +1,16 @@
-"""DDIM whose steps are computed side by side, in half as many evaluations of the network.
+"""DDIM whose steps are computed side by side, in few evaluations of the network.
 
-To predict one robot's action a GPU reads every weight at every step, and that takes as long as
-ten sequences' arithmetic. So the network sees the sequences of all steps at once, as far as they
-are known (Picard iteration; Shih et al., "Parallel Sampling of Diffusion Models", 2023), and after
-each evaluation they are put together anew, each step's clean sequence being taken for a linear
-function of its noisy one whose slope is that between the last two evaluations (a secant).
+To predict the actions of a few robots a GPU reads every weight at every step, and that takes longer
+than their arithmetic. So the network sees the sequences of all steps at once, as far as they are
+known (Picard iteration; Shih et al., "Parallel Sampling of Diffusion Models", 2023), and after each
+evaluation they are put together anew, each step's clean sequence being taken for a linear function
+of its noisy one whose slope is that between the last two evaluations (a secant).
 
 Where the iteration ends is `diffusion.ddim_sample`'s own sequence; after as many evaluations as
 steps it is there whatever the network.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -19,15 +20,25 @@ import jax.numpy as jnp
 from starjax.models import layers
 from starjax.models import schedule as schedules
 
-EVALUATIONS = 5
-# Sequences that a GPU evaluates in little more time than one: it waits for the weights.
-_SEQUENCES = 10
+# So many evaluations for so many steps, and one more for twice as many, come equally near
+# (benchmarks/bench_ddim.py).
+_EVALUATIONS, _STEPS = 5, 10
+# Sequences whose arithmetic takes a GPU as long as what does not depend on their number, reading
+# the weights above all: half of what an H100 needed with preset `paper`'s networks, where 32 robots
+# took equally long either way and 16 took 15% less, so that there is something to gain.
+_WEIGHTS_IN_SEQUENCES = 128
 _TINY = 1e-12  # squared distance of sequences that count as the same
 
 
+def evaluations_for(steps: int) -> int:
+    """How many times the network sees the sequences of so many steps."""
+    return _EVALUATIONS + max(0, math.ceil(math.log2(steps / _STEPS)))
+
+
 def pays(batch: int, steps: int) -> bool:
-    """Whether so many sequences take less time here than step by step."""
-    return layers.on_gpu() and steps > EVALUATIONS and batch * steps <= _SEQUENCES
+    """Whether so many robots' sequences take less time here than step by step."""
+    beside = evaluations_for(steps) * (_WEIGHTS_IN_SEQUENCES + batch * steps)
+    return layers.on_gpu() and beside < steps * (_WEIGHTS_IN_SEQUENCES + batch)
 
 
 def ddim_sample(
@@ -36,7 +47,7 @@ def ddim_sample(
     *,
     diffusion_steps: int = 100,
     steps: int = 10,
-    evaluations: int = EVALUATIONS,
+    evaluations: int | None = None,
     prepare: Callable[[jax.Array], Any] = lambda k: k,
     reach: Any = None,
 ) -> jax.Array:
@@ -47,31 +58,31 @@ def ddim_sample(
       noise: the start, standard normal `[B, H, A]`.
       diffusion_steps: K of the cosine schedule that the network was trained with.
       steps: n of DDIM.
-      evaluations: of the network, with n sequences for each of B.
+      evaluations: of the network, with n sequences for each of B; None: `evaluations_for(n)`.
       prepare: maps the int32 steps `[n]` to a pytree with leading axis n, once; `eps_fn` gets it.
       reach: lowest and highest value, what broadcasts against `[B, H, A]` each; None: -1 and 1.
 
     Returns:
       Clean sequences `[B, H, A]` within `reach`.
     """
-    table = jax.tree.map(jnp.asarray, schedules.ddim_table(diffusion_steps, steps))
-    prepared = prepare(table.k)
+    table = schedules.ddim_table(diffusion_steps, steps)
+    prepared = prepare(jnp.asarray(table.k))
     low, high = (-1.0, 1.0) if reach is None else reach
-    signal, spread = (
-        _beside(row) for row in (table.sqrt_alpha_bar, table.sqrt_one_minus_alpha_bar)
+    signal, spread, signal_next, spread_next = (
+        jnp.asarray(row)[:, None, None, None] for row in table[1:]
     )
 
     def through(x0: jax.Array, at: jax.Array, slope: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The end, and every step's noisy sequence, were x0 + slope (x - at) the clean ones."""
-
-        def step(x, inputs):
-            row, x0, at, slope = inputs
-            clean = x0 + slope * (x - at)
-            eps = (x - row.sqrt_alpha_bar * clean) / row.sqrt_one_minus_alpha_bar
-            following = row.sqrt_alpha_bar_next * jnp.clip(clean, low, high)
-            return following + row.sqrt_one_minus_alpha_bar_next * eps, x
-
-        return jax.lax.scan(step, noise, (table, x0, at, slope), unroll=True)
+        clipped = jnp.clip(x0, low, high)
+        # what one more of the clean sequence adds to the next noisy one
+        gain = jnp.where(clipped == x0, signal_next, 0.0) - spread_next * signal / spread
+        factor = spread_next / spread + gain * slope
+        rest = signal_next * clipped - spread_next * signal / spread * x0 - gain * slope * at
+        end, before = jax.lax.scan(
+            lambda x, row: (row[0] * x + row[1], x), noise, (factor, rest), unroll=True
+        )
+        return jnp.clip(end, low, high), before
 
     def evaluate(carry, _):
         _, x, x_before, x0_before = carry
@@ -81,7 +92,9 @@ def ddim_sample(
 
     x0 = jnp.zeros((steps, *noise.shape), noise.dtype)
     end, x = through(x0, x0, x0)
-    (end, *_), _ = jax.lax.scan(evaluate, (end, x, x, x0), length=evaluations)
+    (end, *_), _ = jax.lax.scan(
+        evaluate, (end, x, x, x0), length=evaluations or evaluations_for(steps)
+    )
     return end
 
 
@@ -90,7 +103,3 @@ def _secant(dx: jax.Array, dx0: jax.Array, most: jax.Array) -> jax.Array:
     square = jnp.sum(dx * dx, axis=-2, keepdims=True)
     slope = jnp.sum(dx * dx0, axis=-2, keepdims=True) / jnp.maximum(square, _TINY)
     return jnp.clip(slope, 0.0, most)
-
-
-def _beside(row: jax.Array) -> jax.Array:
-    return row[:, None, None, None]
