@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import re
 import subprocess
 import sys
@@ -519,6 +520,64 @@ def test_what_would_fail_later_is_a_mistake(argv, said):
     with pytest.raises(config.UsageError) as caught:
         settings("--preset=cpu", *argv)
     assert str(caught.value).startswith(said)
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """A folder with a file, one that may not be written, and what report and evaluate read."""
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to("nowhere")
+    (tmp_path / "closed").mkdir()
+    (tmp_path / "result.json").write_text("{}")
+    (tmp_path / "policy.safetensors").touch()
+    is_open = os.access
+    # Not by its mode, which does not bind the superuser.
+    monkeypatch.setattr(
+        os, "access", lambda place, mode: "closed" not in str(place) and is_open(place, mode)
+    )
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "run --preset smoke --out",
+        "collect --preset smoke --out",
+        "train --preset smoke --out",
+        "evaluate --policy policy.safetensors --out",
+        "report . --out",
+    ],
+)
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        ("file", "a folder, got file"),
+        ("file/below/it", "a folder, got file/below/it; file is not one"),
+        ("link", "a folder, got link"),
+        ("closed", "a folder that may be written, got closed"),
+        ("closed/below", "a folder that may be written, got closed/below; closed may not"),
+        ("x" * 300, f"a folder, got {'x' * 300}: File name too long"),
+    ],
+)
+def test_a_folder_that_cannot_be_used_is_a_mistake_of_its_flag(command, out, said, places, capsys):
+    before = sorted(places.rglob("*"))
+    assert cli.guard(cli.dispatch, [*command.split(), out]) == 2
+    assert capsys.readouterr().err == f"starjax: --out: expected {said}\n"
+    assert sorted(places.rglob("*")) == before
+
+
+@pytest.mark.parametrize("out", ["file/mine.safetensors", "closed/mine.safetensors"])
+def test_a_file_is_packed_into_a_folder(out, places, capsys):
+    assert cli.guard(cli.dispatch, ["pack", "policy.safetensors", out]) == 2
+    assert "starjax: folder of OUT: expected a folder" in capsys.readouterr().err
+
+
+def test_a_report_that_cannot_be_made_leaves_nothing(places):
+    before = sorted(places.rglob("*"))
+    with pytest.raises(config.UsageError, match="method: expected text"):
+        report_command.main([".", "--out", "new"])
+    assert sorted(places.rglob("*")) == before
 
 
 COUNTS = [flag for flag, kind in options.flags(config.RunConfig).items() if kind is int]

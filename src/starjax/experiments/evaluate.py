@@ -52,9 +52,9 @@ def main(argv: Sequence[str]) -> int:
         file = folders.weights(run.parent, method)
         default = Path(chosen.run) / f"evaluate-{_trials(chosen)}"
     folder = Path(chosen.out or default)
+    checks.expect_folder("--out", folder)
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
-    files.require_writable(folder)
 
     from starjax import rcm
     from starjax.experiments import scoring

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from starjax import config as config_lib
-from starjax.experiments import options
+from starjax.experiments import checks, options
 from starjax.policies import packaged
 from starjax.runtime import files, xla
 
@@ -40,6 +40,7 @@ def main(argv: Sequence[str]) -> int:
     source, out = packaged.find("POLICY", chosen.policy), Path(chosen.out)
     if out.exists():
         raise config_lib.UsageError(f"OUT: expected a file that is not there yet, got {chosen.out}")
+    checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
 
     import jax

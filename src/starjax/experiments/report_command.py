@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 from starjax import config as config_lib
-from starjax.experiments import methods, options
-from starjax.runtime import files, xla
+from starjax.experiments import checks, methods, options
+from starjax.runtime import xla
 
 DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
 
@@ -34,8 +34,8 @@ def main(argv: Sequence[str]) -> int:
     runs = list(once.values())
     first = runs[0].resolve()
     out = Path(chosen.out or (first.parent if first.name in methods.METHODS else first) / "report")
+    checks.expect_folder("--out", out)
     xla.prepare_xla()
-    files.require_writable(out)
 
     from starjax.experiments.report import build
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 from starjax import cli
 from starjax import config as config_lib
@@ -37,6 +38,7 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
         out = _folder(config, default)
     config = dataclasses.replace(config, preset=default.preset, out=out)
     checks.check(config)
+    checks.expect_folder("--out", Path(out))
     return config
 
 
