@@ -485,6 +485,29 @@ def test_help_says_of_every_flag_something_of_its_own(command, settings, capsys)
     assert not unsaid and not shared
 
 
+def shown(command, flag, capsys):
+    """What help says of a flag, with its default, in one line."""
+    with pytest.raises(SystemExit):
+        cli.dispatch([command, "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    return said.split(f"{flag} ")[1].split(" --")[0]
+
+
+def test_help_of_a_sweep_says_whose_time_limit_it_has(capsys):
+    said = shown("sweep", "--eval.time-limit-s", capsys)
+    assert said.endswith("; left out: RUN's") and "default" not in said
+
+
+@pytest.mark.parametrize(("gpu", "trials", "limit"), [(False, 4, 30.0), (True, 30, 60.0)])
+def test_help_of_an_evaluation_shows_what_it_does(gpu, trials, limit, monkeypatch, capsys):
+    monkeypatch.setattr(presets, "has_gpu", lambda: gpu)
+    assert f"(default: {trials})" in shown("evaluate", "--eval.trials", capsys)
+    assert f"(default: {limit})" in shown("evaluate", "--eval.time-limit-s", capsys)
+    with pytest.raises(SystemExit):
+        cli.dispatch(["evaluate", "--help"])
+    assert "not those of RUN" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("command", ["evaluate", "sweep", "bench", "pack", "report"])
 def test_help_shows_no_empty_default(command, capsys):
     with pytest.raises(SystemExit):

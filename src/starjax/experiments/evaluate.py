@@ -14,8 +14,9 @@ from starjax.runtime import files, xla
 DESCRIPTION = """Scores a trained policy on the twelve trocars, and films it.
 
 RUN is a method's folder, such as runs/cpu/stardiff; or --policy names a policy.safetensors, from
-anywhere, or a policy that ships with starjax. The same command again goes on from the trials that
-are done."""
+anywhere, or a policy that ships with starjax. Trials and their time limit are those that the flags
+say, and else the defaults below, which are for this machine, not those of RUN. The same command
+again goes on from the trials that are done."""
 
 
 @dataclasses.dataclass(frozen=True)

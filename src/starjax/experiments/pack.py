@@ -27,9 +27,7 @@ class Options:
     # the file to write
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     # 0 to 1, of a sample's first noise; left out: POLICY's
-    temperature: Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")] = (
-        None
-    )
+    temperature: options.FloatOrNone = None
 
 
 def main(argv: Sequence[str]) -> int:
