@@ -27,7 +27,7 @@ from starjax.experiments import (
     run,
     sweep,
 )
-from starjax.runtime import files
+from starjax.runtime import files, xla
 
 SMOKE = presets.PRESETS["smoke"]
 
@@ -601,6 +601,21 @@ def test_a_report_that_cannot_be_made_leaves_nothing(places):
     with pytest.raises(config.UsageError, match="method: expected text"):
         report_command.main([".", "--out", "new"])
     assert sorted(places.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["evaluate", "--policy", "compact", "--out="], "--out: expected a folder, got nothing"),
+        (["report", ".", "--out", ""], "--out: expected a folder, got nothing"),
+        (["report", ""], "RUN: expected a folder with a result.json, or of such, got none"),
+        (["pack", "compact", ""], "OUT: expected a file that is not there yet, got none"),
+    ],
+)
+def test_a_word_that_is_empty_is_a_mistake(command, said, places, monkeypatch, capsys):
+    monkeypatch.setattr(xla, "prepare_xla", lambda: pytest.fail("it was about to begin"))
+    assert cli.guard(cli.dispatch, command) == 2
+    assert capsys.readouterr().err == f"starjax: {said}\n"
 
 
 COUNTS = [flag for flag, kind in options.flags(config.RunConfig).items() if kind is int]

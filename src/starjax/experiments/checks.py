@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -154,6 +155,12 @@ def _check_encoder(policy: config_lib.PolicyConfig, crop_fraction: float) -> Non
             "--policy.encoder-weights with a trained policy",
             "none",
         )
+
+
+def expect_named(flag: str, folder: str, argv: Sequence[str]) -> None:
+    """Raises UsageError for a `flag` that was typed with an empty `folder`, as by `$UNSET`."""
+    if options.is_given(flag, argv) and not folder:
+        raise config_lib.UsageError(f"{flag}: expected a folder, got nothing")
 
 
 def expect_folder(argument: str, path: Path) -> None:

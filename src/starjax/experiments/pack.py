@@ -37,7 +37,8 @@ def main(argv: Sequence[str]) -> int:
         raise config_lib.UsageError(f"--temperature: expected in [0, 1], got {chosen.temperature}")
     source, out = packaged.find("POLICY", chosen.policy), Path(chosen.out)
     if out.exists():
-        raise config_lib.UsageError(f"OUT: expected a file that is not there yet, got {chosen.out}")
+        got = chosen.out or "none"
+        raise config_lib.UsageError(f"OUT: expected a file that is not there yet, got {got}")
     checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
 

@@ -27,9 +27,10 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Builds the report."""
     chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
+    checks.expect_named("--out", chosen.out, argv)
     once: dict[Path, Path] = {}
     for name in chosen.run:
-        for found in _with_results(Path(name)):
+        for found in _with_results(name):
             once.setdefault(found.resolve(), found)
     runs = list(once.values())
     first = runs[0].resolve()
@@ -47,11 +48,12 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _with_results(path: Path) -> list[Path]:
+def _with_results(name: str) -> list[Path]:
     """A method's folder, or those inside a folder."""
+    path = Path(name)
     found = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
-    if not found:
+    if not (name and found):
         raise config_lib.UsageError(
-            f"RUN: expected a folder with a result.json, or of such, got {path}"
+            f"RUN: expected a folder with a result.json, or of such, got {name or 'none'}"
         )
     return [file if file.is_dir() else file.parent for file in found]
