@@ -618,6 +618,20 @@ def test_a_word_that_is_empty_is_a_mistake(command, said, places, monkeypatch, c
     assert capsys.readouterr().err == f"starjax: {said}\n"
 
 
+@pytest.mark.parametrize("command", ["pack policy.safetensors new", "report . --out new"])
+def test_a_platform_that_jax_cannot_use_is_one_line(command, places, monkeypatch, capsys):
+    import jax
+
+    def refuse():
+        raise RuntimeError("no such platform")
+
+    monkeypatch.setattr(jax, "local_devices", refuse)
+    assert cli.guard(cli.dispatch, command.split()) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("starjax: JAX_PLATFORMS: ") and said.count("\n") == 1
+    assert not (places / "new").exists()
+
+
 COUNTS = [flag for flag, kind in options.flags(config.RunConfig).items() if kind is int]
 
 

@@ -41,6 +41,7 @@ def main(argv: Sequence[str]) -> int:
         raise config_lib.UsageError(f"OUT: expected a file that is not there yet, got {got}")
     checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
+    xla.require_devices("starjax.training.export")
 
     import jax
 

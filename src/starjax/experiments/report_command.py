@@ -37,6 +37,7 @@ def main(argv: Sequence[str]) -> int:
     out = Path(chosen.out or (first.parent if first.name in methods.METHODS else first) / "report")
     checks.expect_folder("--out", out)
     xla.prepare_xla()
+    xla.require_devices("starjax.experiments.report.build")
 
     from starjax.experiments.report import build
 
