@@ -71,6 +71,17 @@ def test_it_decides_as_the_policy_of_an_evaluation_does(made):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[1], atol=1e-5), alone, wanted)
 
 
+def test_it_decides_alike_where_jax_forbids_other_ranks(made):
+    path, trained, _ = made
+    arguments = jax.random.key(7), observed(trained.policy, ()), PORT
+    wanted = deploy.load(path)(*arguments)
+    with jax.numpy_rank_promotion("raise"):
+        deployed = deploy.load(path)
+        got, compiled = deployed(*arguments), jax.jit(deployed)(*arguments)
+    jax.tree.map(np.testing.assert_array_equal, got, wanted)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), compiled, wanted)
+
+
 def test_fields_of_a_trocar_broadcast(made):
     path, trained, _ = made
     deployed, observation = deploy.load(path), observed(trained.policy)

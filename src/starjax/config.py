@@ -129,7 +129,7 @@ class RunConfig:
     # Starting values of the rest; auto: gpu where jax can use one, else cpu
     preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"
     seed: int = 0  # of everything random
-    out: str = "runs"  # folder of the demonstrations and of one folder a method
+    out: str = "runs"  # folder of results; left out, other seeds and observations have their own
     demos: DemosConfig = dataclasses.field(default_factory=DemosConfig)
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)

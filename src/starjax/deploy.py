@@ -18,6 +18,7 @@ from starjax import config, rcm
 from starjax.experiments import methods, options
 from starjax.policies import features, packaged
 from starjax.policies import policy as policies
+from starjax.rcm import arrays
 from starjax.sim.types import Observation
 from starjax.training import export
 from starjax.types import Command, Pose
@@ -49,6 +50,7 @@ class Deployed:
     _sample: Callable[..., Command] = dataclasses.field(repr=False)
     _weights: tuple[Any, Any] = dataclasses.field(repr=False)
 
+    @arrays.broadcasting
     def __call__(self, key: jax.Array, observation: Observation, trocar: rcm.Trocar) -> Command:
         """Plans the next commands of one robot, or of B at once.
 

@@ -303,6 +303,26 @@ def test_files_that_a_desktop_leaves_among_the_episodes_are_left_alone(copy, sea
     assert collect(copy) == sealed[1]
 
 
+@pytest.mark.parametrize("name", ["@eaDir", ".snapshot", "lost+found", "0000-0000-0 (copy)"])
+def test_folders_that_are_no_episodes_are_left_alone(copy, sealed, name):
+    damaged = store.keys(copy)[0]
+    (copy / "episodes" / damaged / "episode.json").unlink()
+    kept = copy / "episodes" / name / "kept"
+    kept.parent.mkdir()
+    kept.write_bytes(b"x")
+    said = []
+    assert collect(copy, report=said.append) == sealed[1]
+    assert len(said) == 1 and f"{damaged}/episode.json" in said[0] and "damaged" in said[0]
+    assert kept.read_bytes() == b"x"
+
+
+def test_every_key_is_found_again(tmp_path):
+    names = [store.key(*numbers) for numbers in ((0, 0, 0), (11, 12345, 2**32 - 1), (10000, 7, 3))]
+    for name in names:
+        store.commit(tmp_path, name, {}, {})
+    assert store.keys(tmp_path) == sorted(names)
+
+
 def test_a_hopeless_expert_is_an_error(tmp_path):
     env = stubs.make_env(unlucky=1.0)
     with pytest.raises(ValueError, match="expert: expected a success rate above 50%"):

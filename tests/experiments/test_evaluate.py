@@ -8,6 +8,7 @@ import fakes
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 import stubs
 
 from starjax import config, rcm
@@ -278,6 +279,25 @@ def test_a_damaged_file_is_one_line(file):
     file.write_bytes(content[:-3] + b"abc")
     with pytest.raises(config.UsageError, match=r"--policy: mine.safetensors: damaged"):
         score()
+
+
+def test_a_file_that_is_no_policy_leaves_nothing(file):
+    run = file.parent / "dp_rcm2"
+    run.mkdir()
+    folders.claim(run, presets.PRESETS["smoke"], "demos-a")
+    safetensors.numpy.save_file({"w": np.ones(2, np.float32)}, "other.safetensors")
+    (file.parent / "words.safetensors").write_text("words")
+    before = sorted(file.parent.rglob("*"))
+    for given, said in (
+        (["--policy", "nowhere.safetensors"], "--policy: expected a file"),
+        (["--policy", "words.safetensors"], "--policy: words.safetensors: not a readable"),
+        (["--policy", "other.safetensors"], "it does not say which policy it is of"),
+        (["--policy", "other.safetensors", "--out", "here"], "it does not say which policy"),
+        (["dp_rcm2"], "no weights there"),
+    ):
+        with pytest.raises(config.UsageError, match=said):
+            evaluate.main(given)
+    assert sorted(file.parent.rglob("*")) == before
 
 
 def test_the_times_of_an_evaluation_are_medians_in_seconds():

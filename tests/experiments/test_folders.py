@@ -102,13 +102,13 @@ def test_what_leaves_the_weights_alone_may_change(tmp_path, parts):
 
 def test_a_folder_where_nothing_was_trained_takes_other_settings(tmp_path):
     folders.claim(tmp_path, SMOKE, "demos-a")
-    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "@eaDir").mkdir(parents=True)  # a file system's own
     other = changed(train={"learning_rate": 1e-3})
     folders.claim(tmp_path, other, "demos-b", "bbbb")
     assert folders.read_config(tmp_path) == other
     folders.claim(tmp_path, other, "demos-b")
     assert "encoder" not in json.loads((tmp_path / "config.json").read_text())
-    (tmp_path / "checkpoints" / "20").mkdir()
+    (tmp_path / "checkpoints" / "step_00000020").mkdir()
     with pytest.raises(config.UsageError, match="learning-rate"):
         folders.claim(tmp_path, SMOKE, "demos-b", "bbbb")
 

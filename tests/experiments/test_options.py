@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import re
 import subprocess
 import sys
@@ -26,7 +27,7 @@ from starjax.experiments import (
     run,
     sweep,
 )
-from starjax.runtime import files
+from starjax.runtime import files, xla
 
 SMOKE = presets.PRESETS["smoke"]
 
@@ -484,6 +485,29 @@ def test_help_says_of_every_flag_something_of_its_own(command, settings, capsys)
     assert not unsaid and not shared
 
 
+def shown(command, flag, capsys):
+    """What help says of a flag, with its default, in one line."""
+    with pytest.raises(SystemExit):
+        cli.dispatch([command, "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    return said.split(f"{flag} ")[1].split(" --")[0]
+
+
+def test_help_of_a_sweep_says_whose_time_limit_it_has(capsys):
+    said = shown("sweep", "--eval.time-limit-s", capsys)
+    assert said.endswith("; left out: RUN's") and "default" not in said
+
+
+@pytest.mark.parametrize(("gpu", "trials", "limit"), [(False, 4, 30.0), (True, 30, 60.0)])
+def test_help_of_an_evaluation_shows_what_it_does(gpu, trials, limit, monkeypatch, capsys):
+    monkeypatch.setattr(presets, "has_gpu", lambda: gpu)
+    assert f"(default: {trials})" in shown("evaluate", "--eval.trials", capsys)
+    assert f"(default: {limit})" in shown("evaluate", "--eval.time-limit-s", capsys)
+    with pytest.raises(SystemExit):
+        cli.dispatch(["evaluate", "--help"])
+    assert "not those of RUN" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("command", ["evaluate", "sweep", "bench", "pack", "report"])
 def test_help_shows_no_empty_default(command, capsys):
     with pytest.raises(SystemExit):
@@ -519,6 +543,93 @@ def test_what_would_fail_later_is_a_mistake(argv, said):
     with pytest.raises(config.UsageError) as caught:
         settings("--preset=cpu", *argv)
     assert str(caught.value).startswith(said)
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """A folder with a file, one that may not be written, and what report and evaluate read."""
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to("nowhere")
+    (tmp_path / "closed").mkdir()
+    (tmp_path / "result.json").write_text("{}")
+    (tmp_path / "policy.safetensors").touch()
+    is_open = os.access
+    # Not by its mode, which does not bind the superuser.
+    monkeypatch.setattr(
+        os, "access", lambda place, mode: "closed" not in str(place) and is_open(place, mode)
+    )
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "run --preset smoke --out",
+        "collect --preset smoke --out",
+        "train --preset smoke --out",
+        "evaluate --policy policy.safetensors --out",
+        "report . --out",
+    ],
+)
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        ("file", "a folder, got file"),
+        ("file/below/it", "a folder, got file/below/it; file is not one"),
+        ("link", "a folder, got link"),
+        ("closed", "a folder that may be written, got closed"),
+        ("closed/below", "a folder that may be written, got closed/below; closed may not"),
+        ("x" * 300, f"a folder, got {'x' * 300}: File name too long"),
+    ],
+)
+def test_a_folder_that_cannot_be_used_is_a_mistake_of_its_flag(command, out, said, places, capsys):
+    before = sorted(places.rglob("*"))
+    assert cli.guard(cli.dispatch, [*command.split(), out]) == 2
+    assert capsys.readouterr().err == f"starjax: --out: expected {said}\n"
+    assert sorted(places.rglob("*")) == before
+
+
+@pytest.mark.parametrize("out", ["file/mine.safetensors", "closed/mine.safetensors"])
+def test_a_file_is_packed_into_a_folder(out, places, capsys):
+    assert cli.guard(cli.dispatch, ["pack", "policy.safetensors", out]) == 2
+    assert "starjax: folder of OUT: expected a folder" in capsys.readouterr().err
+
+
+def test_a_report_that_cannot_be_made_leaves_nothing(places):
+    before = sorted(places.rglob("*"))
+    with pytest.raises(config.UsageError, match="method: expected text"):
+        report_command.main([".", "--out", "new"])
+    assert sorted(places.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["evaluate", "--policy", "compact", "--out="], "--out: expected a folder, got nothing"),
+        (["report", ".", "--out", ""], "--out: expected a folder, got nothing"),
+        (["report", ""], "RUN: expected a folder with a result.json, or of such, got none"),
+        (["pack", "compact", ""], "OUT: expected a file that is not there yet, got none"),
+    ],
+)
+def test_a_word_that_is_empty_is_a_mistake(command, said, places, monkeypatch, capsys):
+    monkeypatch.setattr(xla, "prepare_xla", lambda: pytest.fail("it was about to begin"))
+    assert cli.guard(cli.dispatch, command) == 2
+    assert capsys.readouterr().err == f"starjax: {said}\n"
+
+
+@pytest.mark.parametrize("command", ["pack policy.safetensors new", "report . --out new"])
+def test_a_platform_that_jax_cannot_use_is_one_line(command, places, monkeypatch, capsys):
+    import jax
+
+    def refuse():
+        raise RuntimeError("no such platform")
+
+    monkeypatch.setattr(jax, "local_devices", refuse)
+    assert cli.guard(cli.dispatch, command.split()) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("starjax: JAX_PLATFORMS: ") and said.count("\n") == 1
+    assert not (places / "new").exists()
 
 
 COUNTS = [flag for flag, kind in options.flags(config.RunConfig).items() if kind is int]

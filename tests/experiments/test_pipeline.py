@@ -88,6 +88,16 @@ def test_a_folder_that_cannot_be_made_is_refused_early(tmp_path, done):
     assert not done
 
 
+def test_a_mistaken_encoder_leaves_no_folder(tmp_path, done):
+    image = dataclasses.replace(
+        presets.PRESETS["smoke"].policy, observation="image", encoder_weights="nowhere"
+    )
+    wanted = dataclasses.replace(smoke(tmp_path / "new", "stardiff"), policy=image)
+    with pytest.raises(config.UsageError, match=r"--policy.encoder-weights: expected a file"):
+        pipeline.run(wanted, pipeline.STAGES, "")
+    assert not done and not (tmp_path / "new").exists()
+
+
 def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
     stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
     raw, average = {"w": np.zeros(3)}, {"w": np.ones(3)}

@@ -77,6 +77,17 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
     assert "\n" not in str(caught.value) and "sub" in str(caught.value)
 
 
+def test_a_full_disk_keeps_no_probe(tmp_path, monkeypatch):
+    def full(path, data):
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files.Path, "write_bytes", full)
+    with pytest.raises(files.StorageError, match="No space left"):
+        files.require_writable(tmp_path)
+    assert not os.listdir(tmp_path)
+
+
 _HOLD = """
 import sys, pathlib
 from starjax.runtime import files

@@ -192,3 +192,17 @@ def test_a_start_takes_the_memory_of_each_device_unless_it_is_full(monkeypatch):
     monkeypatch.setattr("jax.local_devices", lambda: ["first", "second"])
     xla.require_devices()
     assert asked == ["first", "second"]
+
+
+def test_a_command_broadcasts_whatever_the_shell_says_of_ranks():
+    code = """
+        import jax
+        from starjax.runtime import xla
+
+        xla.require_devices()
+        print((jax.numpy.ones((2, 3)) + jax.numpy.ones(3)).shape)
+    """
+    environment = {**os.environ, "JAX_NUMPY_RANK_PROMOTION": "raise"}
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "(2, 3)\n", done.stderr

@@ -1,10 +1,14 @@
 """policy.safetensors: a round trip, the same bytes every time, and damage noticed."""
 
+import json
+
 import fakes
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors
+import safetensors.numpy
 
 from starjax import config
 from starjax.data import normalizer
@@ -151,6 +155,21 @@ def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "policy.safetensors"
     path.write_bytes(content)
     with pytest.raises(ValueError, match="not a readable starjax policy"):
+        export.load(path)
+
+
+@pytest.mark.parametrize("lost", ["p_world_ref", "method", "normalizer", "normalizer/action/low"])
+def test_a_policy_of_another_version_is_named(tmp_path, lost):
+    path = tmp_path / "policy.safetensors"
+    export.save(path, trained())
+    with safetensors.safe_open(path, "numpy") as file:
+        about = json.loads(file.metadata()["starjax"])["about"]
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    about.pop(lost, None)
+    arrays = {name: array for name, array in arrays.items() if not name.startswith(lost)}
+    envelope = {"about": about, "sha256": export._hash(about, arrays)}
+    safetensors.numpy.save_file(arrays, path, {"starjax": json.dumps(envelope)})
+    with pytest.raises(ValueError, match=r"policy\.safetensors: made by another version"):
         export.load(path)
 
 

@@ -12,6 +12,7 @@ a trial that failed and is not kept has a folder with an episode.json alone.
 import concurrent.futures
 import hashlib
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,6 +23,7 @@ import numpy as np
 from starjax.runtime import files, xla
 
 SCHEMA = 1
+_KEY = re.compile(r"\d{4,}-\d{4,}-\d+")  # what `key` gives
 
 Record = dict[str, Any]  # the content of an episode.json
 
@@ -157,8 +159,8 @@ def verify_all(
 def keys(root: Path) -> list[str]:
     """Committed episodes, in order of trocar, trial and seed."""
     folder = root / "episodes"
-    # a file among them is not ours: file systems and desktops leave some
-    return sorted(path.name for path in folder.glob("*/"))
+    # others are not ours: file systems and desktops leave files there, and folders (`@eaDir`)
+    return sorted(path.name for path in folder.glob("*/") if _KEY.fullmatch(path.name))
 
 
 def clean(root: Path) -> None:

@@ -1,7 +1,10 @@
-"""Ranges of a run's settings, checked before anything heavy is imported."""
+"""Ranges of a run's settings, and its folder, checked before anything heavy is imported."""
 
 import dataclasses
 import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
@@ -152,6 +155,36 @@ def _check_encoder(policy: config_lib.PolicyConfig, crop_fraction: float) -> Non
             "--policy.encoder-weights with a trained policy",
             "none",
         )
+
+
+def expect_named(flag: str, folder: str, argv: Sequence[str]) -> None:
+    """Raises UsageError for a `flag` that was typed with an empty `folder`, as by `$UNSET`."""
+    if options.is_given(flag, argv) and not folder:
+        raise config_lib.UsageError(f"{flag}: expected a folder, got nothing")
+
+
+def expect_folder(argument: str, path: Path) -> None:
+    """Raises UsageError for `argument` unless files can be written in the folder `path`.
+
+    It may be missing, where it can be made. Nothing is made here: a command that ends with another
+    mistake leaves none behind.
+    """
+    expected = f"{argument}: expected a folder"
+    for place in (path, *path.parents):
+        try:
+            place.lstat()
+        except (FileNotFoundError, NotADirectoryError, PermissionError):
+            continue  # the folder above it tells
+        except OSError as error:
+            raise config_lib.UsageError(f"{expected}, got {path}: {error.strerror}") from error
+        above = place != path
+        if not place.is_dir():
+            why = f"; {place} is not one" if above else ""
+            raise config_lib.UsageError(f"{expected}, got {path}{why}")
+        if not os.access(place, os.W_OK | os.X_OK):
+            why = f"; {place} may not" if above else ""
+            raise config_lib.UsageError(f"{expected} that may be written, got {path}{why}")
+        return
 
 
 def expect_finite(settings: Any, prefix: str = "") -> None:

@@ -14,8 +14,9 @@ from starjax.runtime import files, xla
 DESCRIPTION = """Scores a trained policy on the twelve trocars, and films it.
 
 RUN is a method's folder, such as runs/cpu/stardiff; or --policy names a policy.safetensors, from
-anywhere, or a policy that ships with starjax. The same command again goes on from the trials that
-are done."""
+anywhere, or a policy that ships with starjax. Trials and their time limit are those that the flags
+say, and else the defaults below, which are for this machine, not those of RUN. The same command
+again goes on from the trials that are done."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +42,7 @@ def main(argv: Sequence[str]) -> int:
         got = "both" if chosen.run else "none"
         raise config_lib.UsageError(f"RUN or --policy: expected one of the two, got {got}")
     # A mistake should not wait for jax.
+    checks.expect_named("--out", chosen.out, argv)
     checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
     if chosen.policy:
         file = packaged.find("--policy", chosen.policy)
@@ -52,9 +54,9 @@ def main(argv: Sequence[str]) -> int:
         file = folders.weights(run.parent, method)
         default = Path(chosen.run) / f"evaluate-{_trials(chosen)}"
     folder = Path(chosen.out or default)
+    checks.expect_folder("--out", folder)
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
-    files.require_writable(folder)
 
     from starjax import rcm
     from starjax.experiments import scoring

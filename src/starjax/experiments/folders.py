@@ -109,7 +109,7 @@ def claim(
       config.UsageError: naming the first setting that differs, or what weights are there without.
     """
     wanted = _as_json(config)
-    started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/*"))
+    started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
     found = _recorded(folder) if (folder / "config.json").exists() else {}
     if started and not found:
         raise config_lib.UsageError(

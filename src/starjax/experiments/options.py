@@ -31,6 +31,7 @@ Runs = Annotated[
 ]
 # Of a flag whose default is said in words.
 in_words = tyro.conf.arg(help_behavior_hint="")
+FloatOrNone = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
 
 
 def parse(

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from starjax import config as config_lib
-from starjax.experiments import options
+from starjax.experiments import checks, options
 from starjax.policies import packaged
 from starjax.runtime import files, xla
 
@@ -27,9 +27,7 @@ class Options:
     # the file to write
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     # 0 to 1, of a sample's first noise; left out: POLICY's
-    temperature: Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")] = (
-        None
-    )
+    temperature: options.FloatOrNone = None
 
 
 def main(argv: Sequence[str]) -> int:
@@ -39,8 +37,11 @@ def main(argv: Sequence[str]) -> int:
         raise config_lib.UsageError(f"--temperature: expected in [0, 1], got {chosen.temperature}")
     source, out = packaged.find("POLICY", chosen.policy), Path(chosen.out)
     if out.exists():
-        raise config_lib.UsageError(f"OUT: expected a file that is not there yet, got {chosen.out}")
+        got = chosen.out or "none"
+        raise config_lib.UsageError(f"OUT: expected a file that is not there yet, got {got}")
+    checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
+    xla.require_devices("starjax.training.export")
 
     import jax
 

@@ -34,10 +34,11 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
         raise config_lib.UsageError("--policy.freeze-encoder: expected one process, got several")
     if "train" in stages:
         devices.make_mesh(config.train.batch_size)  # a mistake is found before demonstrations are
-    out = Path(config.out)
-    files.require_writable(out, LEAST_FREE_BYTES)
-    names = folders.selected(config)
+    out, names = Path(config.out), folders.selected(config)
     trained = list(dict.fromkeys(methods.METHODS[name].weights_of for name in names))
+    untrained = any(not folders.weights(out, name).exists() for name in trained)
+    encoder = demonstrations.frozen_encoder(config) if "train" in stages and untrained else None
+    files.require_writable(out, LEAST_FREE_BYTES)
     if not processes.is_first():
         env = _environment(config)
         root, _ = demonstrations.plan(config, env)
@@ -45,8 +46,6 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     with files.lock(out):
         processes.agree(0)
         print(words.plan(config, stages), flush=True)
-        untrained = any(not folders.weights(out, name).exists() for name in trained)
-        encoder = demonstrations.frozen_encoder(config) if "train" in stages and untrained else None
         env = _environment(config)
         root, collect = demonstrations.plan(config, env)
         if "train" in stages:

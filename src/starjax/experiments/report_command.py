@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 from starjax import config as config_lib
-from starjax.experiments import methods, options
-from starjax.runtime import files, xla
+from starjax.experiments import checks, methods, options
+from starjax.runtime import xla
 
 DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
 
@@ -27,15 +27,17 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Builds the report."""
     chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
+    checks.expect_named("--out", chosen.out, argv)
     once: dict[Path, Path] = {}
     for name in chosen.run:
-        for found in _with_results(Path(name)):
+        for found in _with_results(name):
             once.setdefault(found.resolve(), found)
     runs = list(once.values())
     first = runs[0].resolve()
     out = Path(chosen.out or (first.parent if first.name in methods.METHODS else first) / "report")
+    checks.expect_folder("--out", out)
     xla.prepare_xla()
-    files.require_writable(out)
+    xla.require_devices("starjax.experiments.report.build")
 
     from starjax.experiments.report import build
 
@@ -47,11 +49,12 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _with_results(path: Path) -> list[Path]:
+def _with_results(name: str) -> list[Path]:
     """A method's folder, or those inside a folder."""
+    path = Path(name)
     found = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
-    if not found:
+    if not (name and found):
         raise config_lib.UsageError(
-            f"RUN: expected a folder with a result.json, or of such, got {path}"
+            f"RUN: expected a folder with a result.json, or of such, got {name or 'none'}"
         )
     return [file if file.is_dir() else file.parent for file in found]

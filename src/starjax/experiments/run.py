@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 from starjax import cli
 from starjax import config as config_lib
@@ -30,13 +31,11 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
         # A preset's encoder; one that was asked for is refused below.
         policy = dataclasses.replace(config.policy, encoder_weights="", freeze_encoder=False)
         config = dataclasses.replace(config, policy=policy)
-    out = config.out
-    if options.is_given("--out", argv):
-        checks.expect(bool(out), "out", "a folder", "nothing")
-    else:
-        out = _folder(config, default)
+    checks.expect_named("--out", config.out, argv)
+    out = config.out if options.is_given("--out", argv) else _folder(config, default)
     config = dataclasses.replace(config, preset=default.preset, out=out)
     checks.check(config)
+    checks.expect_folder("--out", Path(out))
     return config
 
 

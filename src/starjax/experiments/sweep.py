@@ -21,7 +21,17 @@ command again only puts its figures together."""
 MOST_TROCARS = 1_000_000
 MOST_RADIUS_CM = 10.0
 
-_EVAL = config_lib.EvalConfig(trials=1, video_trials=0)
+
+# The fields of `config.EvalConfig`, with other defaults.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trials:
+    """Closed-loop trials."""
+
+    trials: int = 1  # trials at each trocar
+    # s of simulated time that a trial may take; left out: RUN's
+    time_limit_s: options.FloatOrNone = None
+    chunk: int = 0  # trials between two savings, at most; 0: as many as a program runs
+    video_trials: int = 0  # trials whose joint positions are recorded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +45,7 @@ class Options:
     polars_deg: tuple[float, ...] = (90.0,)  # angles of a grid from straight up, in degrees
     azimuths: int = 12  # how many directions of a grid, evenly around
     seed: int = 0  # of the sample and of the trials
-    eval: config_lib.EvalConfig = _EVAL  # --eval.time-limit-s, left out, is that of RUN
+    eval: Trials = dataclasses.field(default_factory=Trials)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -45,8 +55,9 @@ def main(argv: Sequence[str]) -> int:
     _check(chosen)
     run = folders.existing(chosen.run)
     config = folders.read_config(run)
-    like_run = dataclasses.replace(_EVAL, time_limit_s=_time_limit_s(run, config))
-    chosen = _parse(argv, dataclasses.replace(chosen, eval=like_run))
+    if chosen.eval.time_limit_s is None:
+        like_run = dataclasses.replace(chosen.eval, time_limit_s=_time_limit_s(run, config))
+        chosen = dataclasses.replace(chosen, eval=like_run)
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
     files.require_writable(run)
@@ -57,7 +68,8 @@ def main(argv: Sequence[str]) -> int:
 
     trocars = _trocars(chosen)
     who = scoring.subject(run.name, folders.weights(run.parent, run.name))
-    table = scoring.rollouts(_folder(run, chosen), who, trocars, chosen.eval, chosen.seed)
+    trials = config_lib.EvalConfig(**vars(chosen.eval))
+    table = scoring.rollouts(_folder(run, chosen), who, trocars, trials, chosen.seed)
     demos = scoring.settings(who, config).demos
     seen = rcm.Trocar(*(field[: demos.seen_trocars] for field in rcm.TROCARS))
     figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)
@@ -85,16 +97,15 @@ def _time_limit_s(run: Path, config: config_lib.RunConfig) -> float:
         return config.eval.time_limit_s
 
 
-def _parse(argv: Sequence[str], default: Options | None = None) -> Options:
-    return options.parse(
-        Options, argv, prog="starjax sweep", description=DESCRIPTION, default=default
-    )
+def _parse(argv: Sequence[str]) -> Options:
+    return options.parse(Options, argv, prog="starjax sweep", description=DESCRIPTION)
 
 
 def _check(chosen: Options) -> None:
     """Raises UsageError for the first value that is out of its range, or that would do nothing."""
     checks.expect_finite(chosen)
-    checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
+    typed = {name: value for name, value in vars(chosen.eval).items() if value is not None}
+    checks.check(config_lib.RunConfig(seed=chosen.seed, eval=config_lib.EvalConfig(**typed)))
     for name, count in (("trocars", chosen.trocars), ("azimuths", chosen.azimuths)):
         checks.expect(1 <= count <= MOST_TROCARS, name, f"1 to {MOST_TROCARS}", count)
     for radius in chosen.radii_cm:

@@ -131,6 +131,7 @@ def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> Actio
         slices[part] = slice(dim, dim + size)
         dim += size
 
+    @arrays.broadcasting
     def encode_pose(pose: types.Pose, trocar: trocars.Trocar, p_world_ref: ArrayLike) -> jax.Array:
         R, p, *rest = arrays.checked(
             **{"pose.R": (pose.R, (3, 3)), "pose.p": (pose.p, (3,))},
@@ -142,6 +143,7 @@ def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> Actio
             [jnp.broadcast_to(part, (*batch, part.shape[-1])) for part in parts], axis=-1
         )
 
+    @arrays.broadcasting
     def decode_action(
         action: ArrayLike, trocar: trocars.Trocar, p_world_ref: ArrayLike
     ) -> tuple[types.Pose, jax.Array]:

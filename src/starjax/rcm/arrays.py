@@ -1,14 +1,31 @@
 """What every RCM map needs of its inputs: one float type, checked shapes, safe directions."""
 
 import functools
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 _BOUND = 1e30  # finite inputs are clipped to +-this, so that sums and squares cannot overflow
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def broadcasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """`function`, whose arrays may differ in their number of axes.
+
+    Also in a program that has told jax to refuse that (`jax_numpy_rank_promotion`).
+    """
+
+    @functools.wraps(function)
+    def mapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
+
+    return mapped
 
 
 def checked(**named: tuple[Any, tuple[int, ...]]) -> list[jax.Array]:

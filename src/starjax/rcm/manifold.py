@@ -15,6 +15,7 @@ HOLD_DEPTH = 0.05  # m; of the hold pose
 _STRAIGHT_DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 
 
+@arrays.broadcasting
 def rcm_error(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
     """Distance of the trocar from the line of the shaft (Eq. 3).
 
@@ -29,12 +30,14 @@ def rcm_error(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
     return arrays.norm(jnp.cross(p - p_world_trocar, R[..., :, 2]))
 
 
+@arrays.broadcasting
 def insertion_depth(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
     """Signed depth d of the tip beyond the trocar, along the tool's axis (Eq. 3): `[...]` m."""
     R, p, p_world_trocar = _checked(pose, p_world_trocar)
     return arrays.dot(p - p_world_trocar, R[..., :, 2])[..., 0]
 
 
+@arrays.broadcasting
 def pose_on_manifold(
     axis_world: ArrayLike, roll: ArrayLike, depth: ArrayLike, p_world_trocar: ArrayLike
 ) -> types.Pose:
@@ -53,6 +56,7 @@ def pose_on_manifold(
     return pose_at_depth(R, depth, p_world_trocar)
 
 
+@arrays.broadcasting
 def pose_at_depth(
     R_world_tip: ArrayLike, depth: ArrayLike, p_world_trocar: ArrayLike
 ) -> types.Pose:
@@ -88,6 +92,7 @@ def axis_and_depth(
     return arrays.direction(p - p_world_trocar, _STRAIGHT_DOWN)
 
 
+@arrays.broadcasting
 def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
     """Post-hoc projection onto the manifold, for DP-EE-Proj.
 

@@ -20,6 +20,7 @@ _E_Y = np.array([0.0, 1.0, 0.0], np.float32)
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
 
 
+@arrays.broadcasting
 def rotation_align(a: ArrayLike, b: ArrayLike) -> jax.Array:
     """Smallest rotation that turns the direction of `a` into that of `b` (Eq. 16, total).
 
@@ -58,6 +59,7 @@ def _align_unit(a: jax.Array, b: jax.Array) -> jax.Array:
     return eye + turn - _outer((1.0 - cos) * a, a) - _outer(factor * spanning, spanning)
 
 
+@arrays.broadcasting
 def rotation_z(angle: ArrayLike) -> jax.Array:
     """Rotation by `angle` `[...]` rad about the z axis: `[..., 3, 3]`."""
     (angle,) = arrays.checked(angle=(angle, ()))
@@ -73,6 +75,7 @@ def cos_sin(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.cos(angle), jnp.sin(angle)
 
 
+@arrays.broadcasting
 def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array:
     """Tool rotation with a given axis and roll (Alg. 1, lines 3-6).
 
@@ -97,6 +100,7 @@ def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array
     return jnp.stack([x, y, z], axis=-1)
 
 
+@arrays.broadcasting
 def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     """Roll `[...]` in [-pi, pi] rad such that `rotation_from_axis_roll(axis, roll)` is R.
 
@@ -118,12 +122,14 @@ def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     return jnp.where(jnp.isnan(R_world_tip[..., :, 2]).any(-1), jnp.nan, roll)
 
 
+@arrays.broadcasting
 def rot6d_encode(R: ArrayLike) -> jax.Array:
     """First two columns of `R` `[..., 3, 3]`, one after the other: `[..., 6]`."""
     (R,) = arrays.checked(R=(R, (3, 3)))
     return jnp.concatenate([R[..., :, 0], R[..., :, 1]], axis=-1)
 
 
+@arrays.broadcasting
 def rot6d_decode(rot6d: ArrayLike) -> jax.Array:
     """Rotation from two columns by Gram-Schmidt, for any input.
 

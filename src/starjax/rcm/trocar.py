@@ -64,6 +64,7 @@ TROCARS: Trocar = _degrees(
 IS_SEEN: np.ndarray = _constant(np.arange(12) < 8)
 
 
+@arrays.broadcasting
 def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
     """Position of the trocar in the world frame (Eq. 2).
 
@@ -90,6 +91,7 @@ def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
     return p_world_ref + offset
 
 
+@arrays.broadcasting
 def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> Trocar:
     """Parameters of a trocar that was measured in the world frame: Eq. 2 solved for lambda.
 
@@ -117,6 +119,7 @@ def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> T
     return Trocar(radius, polar, jnp.where(azimuth < 0.0, azimuth + 2.0 * np.pi, azimuth))
 
 
+@arrays.broadcasting
 def trocar_rotation(trocar: Trocar) -> jax.Array:
     """Orientation of {T}, R_world_trocar `[..., 3, 3]`: z down, x horizontal along the azimuth."""
     fields = arrays.checked(**named_fields(trocar))

@@ -150,6 +150,8 @@ def require_writable(directory: Path, free_bytes: int = 0) -> None:
     except FileExistsError as error:
         raise StorageError(f"{directory}: expected a folder, got a file") from error
     except OSError as error:
+        with contextlib.suppress(OSError):  # a full disk leaves an empty one
+            probe.unlink()
         raise _explained(error, directory) from error
     free = shutil.disk_usage(directory).free
     if free < free_bytes:

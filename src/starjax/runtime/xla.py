@@ -85,6 +85,8 @@ def require_devices(*modules: str) -> None:
             f"JAX_DEFAULT_PRNG_IMPL: expected {_GENERATOR}, got {generator}: with it a trial would "
             "depend on those beside it"
         )
+    # A shell's JAX_NUMPY_RANK_PROMOTION is meant for programs of its user's own.
+    jax.config.update("jax_numpy_rank_promotion", "allow")
 
     def start() -> None:
         for device in jax.local_devices():

@@ -93,7 +93,7 @@ def _check_torchvision(policy_config: config.PolicyConfig, path: Path) -> None:
         )
     if policy_config.encoder != "resnet18":
         raise config.UsageError(
-            f"--policy.encoder: expected resnet18 with weights of torchvision ({name}), "
+            f"--policy.encoder: expected resnet18 with weights of no starjax policy ({name}), "
             f"got {policy_config.encoder}"
         )
     try:

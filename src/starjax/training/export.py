@@ -114,25 +114,11 @@ def load(path: pathlib.Path | str) -> Trained:
         raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}")
     if _hash(about, arrays) != expected:
         raise ValueError(f"{path}: damaged, its content is not what was written (sha256)")
-    tree = _unflatten(arrays)
-    stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
-    port, demos = about["p_world_ref"], about.get("demos")
     try:
-        policy = config.from_dict(config.PolicyConfig, about["policy"])
-        train = config.from_dict(config.TrainConfig, about["train"])
-        demos = None if demos is None else config.from_dict(config.DemosConfig, demos)
-    except ValueError as error:
-        raise ValueError(f"{path}: made by another version of starjax: {error}") from error
-    return Trained(
-        method=about["method"],
-        policy=policy,
-        train=train,
-        params=tree["params"],
-        normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
-        p_world_ref=None if port is None else tuple(port),
-        demos=demos,
-        preset=about.get("preset"),
-    )
+        return _trained(about, _unflatten(arrays))
+    except (KeyError, TypeError, ValueError) as error:
+        why = f"no {error} in it" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path}: made by another version of starjax: {why}") from error
 
 
 def is_policy(path: pathlib.Path | str) -> bool:
@@ -147,6 +133,22 @@ def is_policy(path: pathlib.Path | str) -> bool:
 def fingerprint(params: Params) -> str:
     """SHA-256 of parameters and of their names."""
     return _hash({}, dict(_flatten(params)))
+
+
+def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
+    """What `save` was given; raises KeyError, TypeError or ValueError for what it never wrote."""
+    stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
+    port, demos = about["p_world_ref"], about.get("demos")
+    return Trained(
+        method=about["method"],
+        policy=config.from_dict(config.PolicyConfig, about["policy"]),
+        train=config.from_dict(config.TrainConfig, about["train"]),
+        params=tree["params"],
+        normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
+        p_world_ref=None if port is None else tuple(port),
+        demos=None if demos is None else config.from_dict(config.DemosConfig, demos),
+        preset=about.get("preset"),
+    )
 
 
 def _flatten(tree: Any, prefix: str = ""):

@@ -1,0 +1,77 @@
+"""Every public map broadcasts as its docstring says, whatever jax is told about ranks."""
+
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import rcm
+
+N = 5
+DRAWN = np.random.default_rng(0)
+
+
+def drawn(*shape):
+    return DRAWN.normal(size=shape).astype(np.float32)
+
+
+ROTATION = np.asarray(rcm.rot6d_decode(drawn(N, 6)))
+POSE = rcm.Pose(R=ROTATION, p=drawn(3))
+TROCAR = rcm.Trocar(np.full((2, N), 0.02, np.float32), np.full(N, 1.5, np.float32), 0.3)
+POINT = drawn(3)
+# Arguments whose numbers of axes differ wherever a function takes several.
+MIXED = {
+    "check_trocar": (TROCAR,),
+    "insertion_depth": (POSE, POINT),
+    "pose_at_depth": (ROTATION, drawn(2, N), POINT),
+    "pose_on_manifold": (drawn(N, 3), drawn(2, N), 0.1, POINT),
+    "project": (POSE, drawn(2, N, 3)),
+    "rcm_error": (POSE, drawn(2, N, 3)),
+    "roll_of": (ROTATION,),
+    "rot6d_decode": (drawn(N, 6),),
+    "rot6d_encode": (ROTATION,),
+    "rotation_align": (drawn(2, N, 3), POINT),
+    "rotation_from_axis_roll": (drawn(N, 3), drawn(2, N)),
+    "rotation_z": (drawn(N),),
+    "sample_trocar": (jax.random.key(0), (N,)),
+    "trocar_from_position": (drawn(N, 3), POINT),
+    "trocar_position": (TROCAR, POINT),
+    "trocar_rotation": (TROCAR,),
+}
+
+
+def test_no_public_function_is_left_out():
+    public = {name for name in rcm.__all__ if inspect.isfunction(getattr(rcm, name))}
+    assert public == set(MIXED)
+
+
+@pytest.mark.parametrize("setting", ["raise", "warn"])
+@pytest.mark.parametrize("name", MIXED)
+@pytest.mark.filterwarnings("error")
+def test_ranks_may_differ_where_jax_forbids_it(name, setting):
+    alike(getattr(rcm, name), MIXED[name], setting)
+
+
+@pytest.mark.parametrize("space", rcm.ACTION_SPACES.values(), ids=rcm.ACTION_SPACES.keys())
+def test_ranks_of_an_action_may_differ_where_jax_forbids_it(space):
+    alike(space.decode, (drawn(N, space.dim), TROCAR, POINT))
+    alike(space.encode, (POSE, TROCAR, POINT))
+
+
+def alike(function, arguments, setting="raise"):
+    """Asserts that values, compiled too, and derivatives are those of jax's own setting."""
+
+    def slope(*arrays):
+        floats = (x for x in jax.tree.leaves(function(*arrays)) if x.dtype == jnp.float32)
+        return sum(jnp.sum(x) for x in floats)
+
+    kinds = [function]
+    if function not in (rcm.check_trocar, rcm.sample_trocar):
+        kinds += [jax.jit(function), jax.grad(slope, tuple(range(len(arguments))))]
+    for kind in kinds:
+        wanted = kind(*arguments)
+        with jax.numpy_rank_promotion(setting):
+            got = kind(*arguments)
+        jax.tree.map(np.testing.assert_array_equal, got, wanted)
