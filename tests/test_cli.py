@@ -161,3 +161,22 @@ def test_a_job_whose_reader_went_away_does_not_claim_to_be_done():
     assert process.stdout and process.stdout.readline()
     process.stdout.close()
     assert process.stderr and process.stderr.read() == "" and process.wait(60) == 141
+
+
+def test_a_warning_of_ours_is_a_line_and_of_others_says_where():
+    process = started(
+        """
+        import warnings
+
+        from starjax import cli
+
+        def work(argv):
+            warnings.warn_explicit("step 3 is damaged", UserWarning, cli.__file__, 7)
+            warnings.warn_explicit("old", UserWarning, "elsewhere/starjax.py", 9)
+            return 0
+
+        cli.run(work)
+        """
+    )
+    said = process.communicate(timeout=60)[1].splitlines()
+    assert said == ["starjax: step 3 is damaged", "elsewhere/starjax.py:9: UserWarning: old"]

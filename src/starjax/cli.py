@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
@@ -37,6 +38,8 @@ _STORAGE = (
 _STOPPED = 130  # exit code after Ctrl-C or SIGTERM
 _AGAIN_S = 0.5  # s until a stop that was lost is asked for again
 _UNREAD = 141  # exit code of a program whose reader went away (128 + SIGPIPE), as in `| head`
+_OURS = os.path.join(os.path.dirname(os.path.abspath(__file__)), "")
+_with_its_place = warnings.formatwarning
 
 
 def main() -> NoReturn:
@@ -51,6 +54,7 @@ def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     stop = _Stop()
     sys.unraisablehook = _without_interrupts
+    warnings.formatwarning = _warning
     signal.signal(signal.SIGTERM, stop)
     if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as of a shell's background job
         signal.signal(signal.SIGINT, stop)
@@ -156,6 +160,13 @@ def _without_interrupts(ignored: Any) -> None:
     """Says what Python dropped, but for Ctrl-C, which comes again."""
     if ignored.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(ignored)
+
+
+def _warning(message: Warning | str, kind: type[Warning], place: str, *rest: Any) -> str:
+    """What is printed: of our own warnings a line, of others also where they come from."""
+    if os.path.abspath(place).startswith(_OURS):
+        return f"starjax: {message}\n"
+    return _with_its_place(message, kind, place, *rest)
 
 
 def _fail(message: object, code: int) -> int:

@@ -104,7 +104,10 @@ def restore(directory: str | os.PathLike, like: Any) -> tuple[int, Any] | None:
         try:
             manifest = verify(path)
         except DamagedCheckpoint as damage:
-            warnings.warn(f"checkpoint of step {step} is damaged: {damage}", stacklevel=2)
+            warnings.warn(
+                f"checkpoint of step {step} is damaged: {damage}; training goes on from before it",
+                stacklevel=2,
+            )
             continue
         _check_leaves(path, manifest["leaves"], _leaves(like))
         return step, ocp.load(str(path / _STATE), jax.tree.map(_abstract, like))
