@@ -54,9 +54,11 @@ def main() -> None:
     batch = windows.gather(
         found.dataset, jnp.asarray(frames), trained.policy.obs_horizon, trained.policy.horizon
     )
+    port = envs.make(trained.policy.observation, trained.policy.image_size).p_world_ref
+    plan = functools.partial(planned, trained, port, batch)
     steps, temperature = trained.policy.ddim_steps, trained.policy.temperature
     used = parallel_ddim.evaluations_for(steps)
-    wanted = planned(trained, batch, "float32", diffusion.ddim_sample)
+    wanted = plan("float32", diffusion.ddim_sample)
     ways = {"rounded to bfloat16": ("bfloat16", diffusion.ddim_sample)}
     for count in (used + more for more in AROUND):
         beside = functools.partial(parallel_ddim.ddim_sample, evaluations=count)
@@ -64,18 +66,21 @@ def main() -> None:
     ways[f"{used} evaluations, rounded to bfloat16"] = ("bfloat16", parallel_ddim.ddim_sample)
     named = {}
     for name, way in ways.items():
-        row = apart(planned(trained, batch, *way), wanted)
+        row = apart(plan(*way), wanted)
         print(f"{name:36}", *(f"{key} {value:.4f}" for key, value in row.items()), sep="  ")
         named[f"{steps} steps, temperature {temperature}, {name}"] = row
     _timing.report("ddim", {"policy": asked.policy, "frames": FRAMES, "results": named}, tiny=False)
 
 
 def planned(
-    trained: export.Trained, batch: windows.Batch, dtype: str, ddim_sample: Callable
+    trained: export.Trained,
+    port: np.ndarray,
+    batch: windows.Batch,
+    dtype: str,
+    ddim_sample: Callable,
 ) -> Command:
     """Commands `[FRAMES, H]` with this way to sample."""
     settings = dataclasses.replace(trained.policy, dtype=dtype)
-    port = envs.make(settings.observation, settings.image_size).p_world_ref
     policy = policies.make(methods.METHODS[trained.method], settings, port, trained.train)
     keys = jax.random.split(jax.random.key(1), FRAMES)
     given = (trained.params, trained.normalizer, keys, batch.observation, batch.trocar)

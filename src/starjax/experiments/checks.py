@@ -157,10 +157,9 @@ def _check_encoder(policy: config_lib.PolicyConfig, crop_fraction: float) -> Non
         )
 
 
-def expect_named(flag: str, folder: str, argv: Sequence[str]) -> None:
-    """Raises UsageError for a `flag` that was typed with an empty `folder`, as by `$UNSET`."""
-    if options.is_given(flag, argv) and not folder:
-        raise config_lib.UsageError(f"{flag}: expected a folder, got nothing")
+def expect_named(out: str, argv: Sequence[str]) -> None:
+    """Raises UsageError where `--out` was typed without a folder, as by `$UNSET`."""
+    expect(bool(out) or not options.is_given("--out", argv), "out", "a folder", "nothing")
 
 
 def expect_folder(argument: str, path: Path) -> None:

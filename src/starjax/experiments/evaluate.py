@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
         got = "both" if chosen.run else "none"
         raise config_lib.UsageError(f"RUN or --policy: expected one of the two, got {got}")
     # A mistake should not wait for jax.
-    checks.expect_named("--out", chosen.out, argv)
+    checks.expect_named(chosen.out, argv)
     checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
     if chosen.policy:
         file = packaged.find("--policy", chosen.policy)

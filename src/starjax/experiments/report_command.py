@@ -27,7 +27,7 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Builds the report."""
     chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
-    checks.expect_named("--out", chosen.out, argv)
+    checks.expect_named(chosen.out, argv)
     once: dict[Path, Path] = {}
     for name in chosen.run:
         for found in _with_results(name):

@@ -31,7 +31,7 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
         # A preset's encoder; one that was asked for is refused below.
         policy = dataclasses.replace(config.policy, encoder_weights="", freeze_encoder=False)
         config = dataclasses.replace(config, policy=policy)
-    checks.expect_named("--out", config.out, argv)
+    checks.expect_named(config.out, argv)
     out = config.out if options.is_given("--out", argv) else _folder(config, default)
     config = dataclasses.replace(config, preset=default.preset, out=out)
     checks.check(config)
