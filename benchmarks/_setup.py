@@ -12,12 +12,12 @@ import numpy as np
 from starjax import rcm
 from starjax.config import PolicyConfig, TrainConfig
 from starjax.data import normalizer, windows
-from starjax.experiments.methods import METHODS
+from starjax.methods import METHODS
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.sim.types import Observation
 from starjax.training import devices, state, step
-from starjax.training.parts import Carried, Parts
+from starjax.training.sharding import Carried, Parts
 from starjax.types import Command, Pose
 
 P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)

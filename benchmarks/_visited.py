@@ -10,8 +10,8 @@ from starjax import rcm
 from starjax.sim import env as envs
 from starjax.sim import physics
 from starjax.sim.engine import mjx
-from starjax.sim.model import SimModel
-from starjax.sim.tasks import expert
+from starjax.sim.scene import SimModel
+from starjax.sim.tasks.peg_transfer.task import expert
 
 STEPS = 240  # control steps an episode, 8 s, so most states hold contacts
 CPU_LANES = 16  # of a program that has a CPU to itself: enough to share its operations out

@@ -22,9 +22,10 @@ import _timing
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.data import demos, episodes, recorder, store, workers
+from starjax.data import demos, store
+from starjax.rollouts import cores, episodes, recording
 from starjax.sim import env as envs
-from starjax.sim.tasks import expert
+from starjax.sim.tasks.peg_transfer.task import expert
 
 SEEN = 8
 MAX_STEPS = 600
@@ -36,9 +37,7 @@ def main() -> None:
     small = _peer.platform() == "cpu"
     parser.add_argument("--image", type=int, default=64 if small else 256)
     parser.add_argument("--per-trocar", type=int, default=2 if small else 30)
-    parser.add_argument(
-        "--chunk", type=int, default=workers.CPU_LANES if small else demos.GPU_LANES
-    )
+    parser.add_argument("--chunk", type=int, default=cores.CPU_LANES if small else demos.GPU_LANES)
     parser.add_argument("--folder", help="where a temporary folder is made; default: the system's")
     parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
     asked = parser.parse_args()
@@ -47,7 +46,7 @@ def main() -> None:
         asked.image, asked.per_trocar, asked.chunk = 16, 1, SEEN
     env = envs.make("image", asked.image)
     trocars = rcm.Trocar(*(np.asarray(field[:SEEN], np.float32) for field in rcm.TROCARS))
-    simulate = recorder.simulator(env, expert, trocars, 0, MAX_STEPS, asked.chunk, None)
+    simulate = recording.simulator(env, expert, trocars, 0, MAX_STEPS, asked.chunk, None)
     group = [(lane % SEEN, lane // SEEN) for lane in range(asked.chunk)]
     first_s, again_s = (_timing.time_once(lambda: next(simulate(group))) for _ in range(2))
     with tempfile.TemporaryDirectory(dir=asked.folder) as folder:
@@ -110,12 +109,12 @@ def collect(root: pathlib.Path, simulate, env, trocars, asked) -> dict:
 
     wanted = {"per_trocar": asked.per_trocar, "seed": 0, "max_steps": MAX_STEPS}
     with (
-        mock.patch.object(recorder, "simulator", begin),
+        mock.patch.object(recording, "simulator", begin),
         mock.patch.object(episodes, "fetch", timed_fetch),
     ):
         demos.collect(root, env, expert, trocars, chunk=asked.chunk, **wanted)
     run_s = time.perf_counter() - begun[0]
-    simulated, copied = (sum(spent) / workers.count() for spent in (segments, fetches))
+    simulated, copied = (sum(spent) / cores.count() for spent in (segments, fetches))
     return {
         "chunks": chunks,
         "run_s": run_s,

@@ -21,14 +21,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import runtime
+from starjax import methods, runtime
 from starjax.data import load, windows
-from starjax.experiments import methods
-from starjax.models import diffusion, parallel_ddim
-from starjax.policies import packaged
+from starjax.models import diffusion
+from starjax.models.kernels import parallel_ddim
+from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.sim import env as envs
-from starjax.training import export
 from starjax.types import Command
 
 FRAMES = 128
@@ -45,7 +44,7 @@ def main() -> None:
     runtime.prepare_xla()
     # a GPU would calculate with ten bits where float32 is said
     jax.config.update("jax_default_matmul_precision", "highest")
-    trained = export.load(packaged.locate(asked.policy))
+    trained = policy_file.load(packaged.locate(asked.policy))
     given = {"temperature": asked.temperature, "ddim_steps": asked.ddim_steps}
     changed = {name: value for name, value in given.items() if value is not None}
     trained = trained._replace(policy=dataclasses.replace(trained.policy, **changed))
@@ -73,7 +72,7 @@ def main() -> None:
 
 
 def planned(
-    trained: export.Trained,
+    trained: policy_file.Trained,
     port: np.ndarray,
     batch: windows.Batch,
     dtype: str,

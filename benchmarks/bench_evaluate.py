@@ -25,10 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.data import workers
-from starjax.evaluation import evaluate, latency, rollout
+from starjax.evaluation import evaluate, latency
 from starjax.experiments import scoring
 from starjax.policies import packaged
+from starjax.rollouts import cores, engine
 from starjax.sim import env as envs
 from starjax.types import Command
 
@@ -53,11 +53,11 @@ def main() -> None:
     lanes = asked.lanes or evaluate.lanes_per_device(
         jax.devices()[0], len(rcm.IS_SEEN) * asked.trials
     )
-    rules = rollout.Settings(settings.obs_horizon, settings.execute, steps)
-    run = rollout.make(env, policy, rules, seed=0)
+    rules = engine.Settings(settings.obs_horizon, settings.execute, steps)
+    run = engine.make(env, policy, rules, seed=0)
     chunks = trials_in_chunks(asked.trials, lanes)
 
-    def simulate(trials: rollout.Trials) -> Generator[np.ndarray]:
+    def simulate(trials: engine.Trials) -> Generator[np.ndarray]:
         for _, done in run(params, stats, trials):
             yield np.zeros(0, int) if done is None else done.length[trials.wanted]
 
@@ -65,7 +65,7 @@ def main() -> None:
     list(simulate(chunks[0]._replace(wanted=np.zeros(lanes, bool))))
     compile_s = time.perf_counter() - start
     start = time.perf_counter()
-    lengths = [found for found in workers.run(chunks, simulate, workers.count()) if len(found)]
+    lengths = [found for found in cores.run(chunks, simulate, cores.count()) if len(found)]
     run_s = time.perf_counter() - start
 
     control_steps = int(sum(found.sum() for found in lengths))
@@ -120,7 +120,7 @@ def subject(asked: argparse.Namespace):
     return *_setup.untrained(case), case.policy
 
 
-def trials_in_chunks(trials: int, lanes: int) -> list[rollout.Trials]:
+def trials_in_chunks(trials: int, lanes: int) -> list[engine.Trials]:
     """All trials of the twelve trocars, `lanes` at once, the last chunk filled up."""
     index, trial = np.divmod(np.arange(len(rcm.IS_SEEN) * trials, dtype=np.int32), trials)
     chunks = []
@@ -129,7 +129,7 @@ def trials_in_chunks(trials: int, lanes: int) -> list[rollout.Trials]:
         wanted = rows < len(index)
         rows = np.where(wanted, rows, first)
         trocar = rcm.Trocar(*(field[index[rows]] for field in rcm.TROCARS))
-        chunks.append(rollout.Trials(trocar, index[rows], trial[rows], wanted))
+        chunks.append(engine.Trials(trocar, index[rows], trial[rows], wanted))
     return chunks
 
 

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.evaluation import metrics
+from starjax.evaluation import statistics
 from starjax.sim import env as envs
-from starjax.sim.tasks import expert
+from starjax.sim.tasks.peg_transfer.task import expert
 
 STEPS = 600  # control steps, 20 s; the limit of a policy's trial is 60 s
 CHUNK = {"cpu": 16}  # episodes at once
@@ -58,7 +58,7 @@ def _score(environment: envs.Env, trocars: rcm.Trocar, key: jax.Array, name: str
         parts.append(jax.tree.map(lambda leaf, f=first: np.asarray(leaf)[: count - f], part))
     outcome = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     success, steps, errors, live = (outcome[k] for k in ("success", "step", "errors", "live"))
-    low, high = metrics.wilson(int(success.sum()), count)
+    low, high = statistics.wilson(int(success.sum()), count)
     executed = errors[live] * 1e3
     summary = {
         "episodes": count,

@@ -24,7 +24,8 @@ import numpy as np
 from starjax import runtime
 from starjax.evaluation import latency
 from starjax.experiments import bench
-from starjax.models import parallel_ddim, roll_net
+from starjax.models import roll_net
+from starjax.models.kernels import parallel_ddim
 from starjax.policies import features
 from starjax.policies import policy as policies
 

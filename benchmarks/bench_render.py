@@ -24,7 +24,7 @@ import mujoco
 import numpy as np
 
 from starjax import runtime
-from starjax.sim import model, render
+from starjax.sim import render, scene
 
 GL_RENDERER = pathlib.Path(__file__).parents[1] / "tests/sim/gl_renderer.py"
 SIZES = (96, 128, 256)
@@ -40,7 +40,7 @@ def main() -> None:
     batch = asked.batch
     runtime.prepare_xla()
     rates = _machine.measure("float32")
-    mj_model = model.compose()
+    mj_model = scene.compose()
     qpos = states(mj_model, STEPS * batch)
     geoms = poses(mj_model, qpos, batch)
     print(f"{mj_model.ngeom} geoms, batch {batch}, pictures/s")
@@ -77,7 +77,7 @@ def states(mj_model: mujoco.MjModel, n: int) -> np.ndarray:
     """`[n, nq]` configurations: the tool somewhere over the boards, the block on them."""
     rng = np.random.default_rng(0)
     qpos = np.tile(mj_model.qpos0, (n, 1))
-    for k, home in enumerate(model.HOME):
+    for k, home in enumerate(scene.HOME):
         joint = mj_model.joint(f"robot/j{k + 1}").qposadr[0]
         qpos[:, joint] = home + rng.normal(scale=0.05, size=n)
     block = mj_model.joint("block").qposadr[0]

@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from starjax import runtime
-from starjax.evaluation import rollout
+from starjax.rollouts import engine
 from starjax.sim import env as envs
 from starjax.training import processes
 
@@ -94,8 +94,8 @@ def evaluate(count: int, tiny: bool) -> dict:
     policy, params, stats = _setup.untrained(case)
     env = envs.make("image", case.policy.image_size)
     limit = round((0.3 if tiny else LIMIT_S) * env.control_hz)
-    rules = rollout.Settings(case.policy.obs_horizon, case.policy.execute, limit)
-    run = rollout.make(env, policy, rules, 0, jax.devices()[:count])
+    rules = engine.Settings(case.policy.obs_horizon, case.policy.execute, limit)
+    run = engine.make(env, policy, rules, 0, jax.devices()[:count])
     lanes = LANES[platform] * count
     (trials,) = bench_evaluate.trials_in_chunks(-(-lanes // 12), lanes)[:1]
     idle = trials._replace(wanted=np.zeros(lanes, bool))

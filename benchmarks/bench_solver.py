@@ -18,7 +18,7 @@ from starjax import runtime
 from starjax.sim import env as envs
 from starjax.sim import solver
 from starjax.sim.engine import mjx
-from starjax.sim.model import SimModel
+from starjax.sim.scene import SimModel
 
 # Of MJX's solver: iterations, line-search turns, tolerance.
 EXACT = (100, 50, 1e-14)

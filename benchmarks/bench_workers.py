@@ -13,9 +13,9 @@ import _visited
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.data import recorder, workers
+from starjax.rollouts import cores, recording
 from starjax.sim import env as envs
-from starjax.sim.tasks import expert
+from starjax.sim.tasks.peg_transfer.task import expert
 
 SEGMENTS = 8  # of a measurement: 4 s simulated, in which no episode ends
 
@@ -31,8 +31,8 @@ def main() -> None:
     rows = {}
     for name, lanes, at_once in (
         ("one program", _visited.CPU_LANES, 1),
-        ("one program, fewer lanes", workers.CPU_LANES, 1),
-        ("one for each core", workers.CPU_LANES, workers.count()),
+        ("one program, fewer lanes", cores.CPU_LANES, 1),
+        ("one for each core", cores.CPU_LANES, cores.count()),
     ):
         rows[name] = measure(env, lanes, at_once, segments)
         rows[name]["times_one_program"] = (
@@ -50,9 +50,9 @@ def main() -> None:
 def measure(env: envs.Env, lanes: int, at_once: int, segments: int) -> dict:
     """Rate of `at_once` simulations of `lanes` episodes each."""
     trocars = rcm.Trocar(*(np.asarray(field, np.float32) for field in rcm.TROCARS))
-    steps = segments * recorder.SEGMENT
-    script = recorder.Expert(expert.init, expert.act)
-    simulator = recorder.simulator(env, script, trocars, 0, steps, lanes, None)
+    steps = segments * recording.SEGMENT
+    script = recording.Expert(expert.init, expert.act)
+    simulator = recording.simulator(env, script, trocars, 0, steps, lanes, None)
 
     def simulate(number: int) -> Generator[int]:
         group = [(lane % 12, number * lanes + lane) for lane in range(lanes)]
@@ -60,7 +60,7 @@ def measure(env: envs.Env, lanes: int, at_once: int, segments: int) -> dict:
             yield len(ended)
 
     def run() -> None:
-        sum(workers.run(range(at_once), simulate, at_once))
+        sum(cores.run(range(at_once), simulate, at_once))
 
     timing = _timing.time_plain(run, repeats=3)
     return {

@@ -14,10 +14,10 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from starjax.experiments.report import results
+from starjax.report import results
 from starjax.sim import env as envs
 from starjax.sim import physics
-from starjax.sim.tasks import peg_transfer as task
+from starjax.sim.tasks.peg_transfer.task import task
 
 PERIOD_DEG = 60.0  # walls are 120 degrees apart, and jaws look alike after half a turn
 TURNED_DEG = 10.0

@@ -7,7 +7,8 @@ import pathlib
 import numpy as np
 
 from starjax import config, rcm
-from starjax.evaluation import metrics, sweep, table
+from starjax.evaluation import statistics, sweep
+from starjax.evaluation import trials as table
 
 P_REF = np.array([0.0, 0.0, 0.15], np.float32)
 
@@ -62,7 +63,7 @@ def outcomes(rng, ports, index, chance):
 def result(method, rows, seed=0):
     """result.json of an evaluation."""
     return {
-        **metrics.compose(rows, rcm.IS_SEEN, method=method, observation="state", seed=0),
+        **statistics.compose(rows, rcm.IS_SEEN, method=method, observation="state", seed=0),
         "inference_ms": {"p50": 18.4, "p95": 21.0, "p99": 24.9},
         "config": dataclasses.asdict(
             config.RunConfig(

@@ -4,35 +4,13 @@ import dataclasses
 import types
 import typing
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, TypeVar
 
 SettingsT = TypeVar("SettingsT")
 
 
 class UsageError(ValueError):
     """A mistake of whoever typed the command: shown as one line, without a traceback."""
-
-
-class Method(NamedTuple):
-    """One row of Table II.
-
-    Attributes:
-      action_space: key of `starjax.rcm.ACTION_SPACES`.
-      sees_trocar: whether the diffusion model is conditioned on the trocar.
-      projects: whether poses are projected onto the RCM manifold at execution.
-      hierarchical: diffusion for (position, gripper) and a network for the roll, else one model.
-      weights_of: the method whose weights it shares (its own name if it trains its own).
-      label: name in tables.
-      group: group in Tables II and III.
-    """
-
-    action_space: str
-    sees_trocar: bool
-    projects: bool
-    hierarchical: bool
-    weights_of: str
-    label: str
-    group: str
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -141,7 +141,7 @@ def devices() -> list[Finding]:
 def scene() -> list[Finding]:
     """Whether the MJCF parts are found and compile."""
     try:
-        from starjax.sim import model
+        from starjax.sim import scene as model
     except (ImportError, RuntimeError) as error:
         return [Finding("scene", _first_line(error), "pip install -e . in starjax's folder")]
     try:

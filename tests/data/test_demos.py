@@ -16,7 +16,9 @@ import pytest
 import stubs
 
 from starjax import rcm
-from starjax.data import demos, episodes, load, recorder, store, trials, workers
+from starjax.data import demos, load, store
+from starjax.rollouts import chunks as trials
+from starjax.rollouts import cores, episodes, recording
 from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
 from starjax.types import Command
@@ -85,13 +87,13 @@ def test_kills_leave_no_trace(tmp_path):
 
 @pytest.mark.parametrize(("chunk", "segment"), [(4, 16), (8, 3), (16, 5)])
 def test_chunk_and_segment_do_not_matter(sealed, tmp_path, monkeypatch, chunk, segment):
-    monkeypatch.setattr(recorder, "SEGMENT", segment)
+    monkeypatch.setattr(recording, "SEGMENT", segment)
     collect(tmp_path / "other", chunk=chunk)
     assert kill.tree(tmp_path / "other") == kill.tree(sealed[0])
 
 
 def test_pictures_do_not_depend_on_the_segment(pictures, tmp_path, monkeypatch):
-    monkeypatch.setattr(recorder, "SEGMENT", 3)
+    monkeypatch.setattr(recording, "SEGMENT", 3)
     collect(tmp_path / "other", "image", chunk=8, per_trocar=2)
     assert kill.tree(tmp_path / "other") == kill.tree(pictures)
 
@@ -103,7 +105,7 @@ def test_pictures_are_those_of_their_own_episode(pictures):
 
 
 def test_an_episode_ends_at_the_last_step(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorder, "SEGMENT", 4)
+    monkeypatch.setattr(recording, "SEGMENT", 4)
     root = tmp_path / "d"
     collect(root, per_trocar=2, max_steps=14, keep_failures=True)
     records = [store.verify(root, key) for key in store.keys(root)]
@@ -114,13 +116,13 @@ def test_an_episode_ends_at_the_last_step(tmp_path, monkeypatch):
 
 def test_free_lanes_take_the_place_of_failures(tmp_path, monkeypatch):
     groups = []
-    simulator = recorder.simulator
+    simulator = recording.simulator
 
     def counted(*args):
         simulate = simulator(*args)
         return lambda group: groups.append(group) or simulate(group)
 
-    monkeypatch.setattr(recorder, "simulator", counted)
+    monkeypatch.setattr(recording, "simulator", counted)
     summary = collect(tmp_path / "d", chunk=16)
     assert [len(group) for group in groups] == [16]
     assert summary["episodes"] == 8 < summary["trials"] < 16
@@ -130,11 +132,11 @@ def test_free_lanes_take_the_place_of_failures(tmp_path, monkeypatch):
 def test_pictures_of_all_that_is_simulated_fit_the_memory(
     tmp_path, monkeypatch, chunks, lanes, at_once
 ):
-    frame = recorder.frame(stubs.make_env("image", unlucky=0.4))
+    frame = recording.frame(stubs.make_env("image", unlucky=0.4))
     lane = 2 * demos.FRAME_GUESS * sum(np.dtype(x.dtype).itemsize * x.size for x in frame.values())
-    memory = int(chunks * workers.CPU_LANES * lane / demos.MEMORY_SHARE)
+    memory = int(chunks * cores.CPU_LANES * lane / demos.MEMORY_SHARE)
     monkeypatch.setattr(xla, "memory_bytes", lambda: memory)
-    monkeypatch.setattr(workers, "count", lambda: 4)
+    monkeypatch.setattr(cores, "count", lambda: 4)
     asked = []
     monkeypatch.setattr(trials, "run", lambda *args: asked.append(args[-2:]) or [])
     collect(tmp_path / "d", "image", chunk=0)
@@ -172,7 +174,7 @@ def test_stopped_in_the_middle_the_same_command_completes_it(
     pictures, tmp_path, monkeypatch, stop, error
 ):
     root = tmp_path / "d"
-    monkeypatch.setattr(recorder, "SEGMENT", 4)
+    monkeypatch.setattr(recording, "SEGMENT", 4)
     with monkeypatch.context() as patch, pytest.raises(error):
         stop(patch)
         collect(root, "image", per_trocar=2)
@@ -435,7 +437,7 @@ def test_an_episode_starts_and_steps_as_its_seed_says(sealed):
     """Of the seed rule in dataset.json: never the states of an evaluation with this seed."""
     root, _ = sealed
     env = stubs.make_env("state", unlucky=0.4)
-    stream = jax.random.fold_in(jax.random.key(0), recorder.STREAM)
+    stream = jax.random.fold_in(jax.random.key(0), recording.STREAM)
     for record in load._successful(root, store.read_seal(root), True):
         key = jax.random.fold_in(jax.random.fold_in(stream, record["trocar"]), record["trial"])
         key_env, key_expert = jax.random.split(key)
@@ -471,7 +473,7 @@ def test_the_label_of_a_disturbed_command_is_what_is_recorded(tmp_path):
 
     env = stubs.make_env(unlucky=0.0)
     demos.collect(
-        tmp_path, env, recorder.Expert(init, act), TROCARS, chunk=2, **KWARGS | {"per_trocar": 1}
+        tmp_path, env, recording.Expert(init, act), TROCARS, chunk=2, **KWARGS | {"per_trocar": 1}
     )
     dataset = load.load(tmp_path, report=lambda _: None).dataset
     np.testing.assert_array_equal(dataset.command.gripper, -1.0)

@@ -7,7 +7,7 @@ import pytest
 
 from starjax import rcm
 from starjax.data import normalizer
-from starjax.experiments.methods import METHODS
+from starjax.methods import METHODS
 
 FRAMES = np.arange(240)
 RELATIVE = ["rcm1", "rcm2", "rcm3", "rcm1_fixed_yaw", "rcm2_fixed_yaw"]

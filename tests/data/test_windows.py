@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config, rcm
+from starjax import methods, rcm
 from starjax.data import normalizer, windows
-from starjax.experiments.methods import METHODS
+from starjax.methods import METHODS
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_non_finite_demonstrations_are_refused(dataset):
 
 def test_methods_are_table_two():
     assert len(METHODS) == 8
-    assert all(isinstance(method, config.Method) for method in METHODS.values())
+    assert all(isinstance(method, methods.Method) for method in METHODS.values())
     assert {name for name, method in METHODS.items() if method.projects} == {"dp_ee_proj"}
     assert {name for name, method in METHODS.items() if method.hierarchical} == {"stardiff"}
     borrowed = {n: m.weights_of for n, m in METHODS.items() if m.weights_of != n}

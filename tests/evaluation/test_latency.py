@@ -6,7 +6,7 @@ import fakes
 import pytest
 
 from starjax.evaluation import latency
-from starjax.experiments.methods import METHODS
+from starjax.methods import METHODS
 from starjax.models import roll_net
 
 

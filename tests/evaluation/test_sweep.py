@@ -11,7 +11,7 @@ import synthetic
 
 from starjax import rcm
 from starjax.evaluation import evaluate, sweep
-from starjax.experiments.report import tables
+from starjax.report import tables
 
 TRAINING = rcm.Trocar(*(field[:8] for field in rcm.TROCARS))
 

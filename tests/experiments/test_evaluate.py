@@ -15,10 +15,9 @@ from starjax import config, rcm
 from starjax.data import normalizer
 from starjax.evaluation import sweep as sweeping
 from starjax.experiments import evaluate, folders, presets, scoring, sweep
-from starjax.experiments.report import video
-from starjax.policies import packaged
+from starjax.policies import packaged, policy_file
+from starjax.report import video
 from starjax.runtime import files
-from starjax.training import export
 
 POLICY = dataclasses.replace(fakes.TINY, execute=4)
 
@@ -36,7 +35,7 @@ def file(tmp_path, monkeypatch):
     monkeypatch.setattr(video, "record", lambda runs, sim, path: path)
     monkeypatch.chdir(tmp_path)
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
-    made = export.Trained(
+    made = policy_file.Trained(
         method="dp_rcm2",
         policy=POLICY,
         train=config.TrainConfig(steps=77),
@@ -45,7 +44,7 @@ def file(tmp_path, monkeypatch):
         demos=config.DemosConfig(per_trocar=2, seen_trocars=4),
         preset="smoke",
     )
-    export.save(tmp_path / "mine.safetensors", made)
+    policy_file.save(tmp_path / "mine.safetensors", made)
     return tmp_path / "mine.safetensors"
 
 
@@ -89,8 +88,8 @@ def test_a_packaged_policy_is_scored_by_its_name(file, monkeypatch, capsys):
 @pytest.mark.parametrize("change", [{"temperature": 0.25}, {"ddim_steps": 1}])
 def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
     score("--out", "here")
-    made = export.load(file)
-    export.save(file, made._replace(policy=dataclasses.replace(POLICY, **change)))
+    made = policy_file.load(file)
+    policy_file.save(file, made._replace(policy=dataclasses.replace(POLICY, **change)))
     with pytest.raises(config.UsageError, match=r"--out: expected .* result of other weights"):
         score("--out", "here")
     (file.parent / "here" / "result.json").unlink()

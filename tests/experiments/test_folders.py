@@ -11,8 +11,8 @@ import time
 import numpy as np
 import pytest
 
-from starjax import config
-from starjax.experiments import clock, folders, methods, presets
+from starjax import config, methods
+from starjax.experiments import clock, folders, presets
 from starjax.runtime import files
 
 SMOKE = presets.PRESETS["smoke"]

@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import cli, config
+from starjax import cli, config, methods
 from starjax.experiments import (
     bench,
     checks,
     demonstrations,
     evaluate,
     folders,
-    methods,
     options,
     pack,
     presets,
@@ -207,10 +206,11 @@ def test_bench_promises_nothing_after_ctrl_c(scored, monkeypatch, capsys):
 
 
 def test_too_few_steps_for_the_expert_name_the_flag(tmp_path, monkeypatch):
-    from starjax.data import demos, trials
+    from starjax.data import demos
+    from starjax.rollouts import chunks
 
     def collect(*_, **settings):
-        raise trials.ExpertFailed("got 0 of 10 at trocar 0")
+        raise chunks.ExpertFailed("got 0 of 10 at trocar 0")
 
     monkeypatch.setattr(demos, "collect", collect)
     few = dataclasses.replace(SMOKE.demos, max_steps=1)
@@ -679,7 +679,7 @@ def test_sweeps_of_other_trials_lie_apart(tmp_path):
 def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, seen, one_wall):
     from starjax import rcm
     from starjax.data import demos
-    from starjax.sim.tasks import expert
+    from starjax.sim.tasks.peg_transfer.task import expert
 
     given = []
     found = {"episodes": 0, "trials": 0, "frames": 0}

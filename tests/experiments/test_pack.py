@@ -12,7 +12,7 @@ import safetensors.numpy
 from starjax import config
 from starjax.data import normalizer
 from starjax.experiments import pack
-from starjax.training import export
+from starjax.policies import policy_file
 
 POLICY = dataclasses.replace(fakes.TINY, dtype="bfloat16", temperature=0.5)
 
@@ -21,8 +21,10 @@ def save(path, scale=1.0):
     kernel = scale * jax.random.normal(jax.random.key(0), (300, 1000))
     box = normalizer.MinMax(-jnp.ones(5), jnp.full(5, 1 / 3))
     stats = normalizer.Normalizer(box, None)
-    made = export.Trained("dp_rcm2", POLICY, config.TrainConfig(steps=7), {"unet": kernel}, stats)
-    export.save(path, made)
+    made = policy_file.Trained(
+        "dp_rcm2", POLICY, config.TrainConfig(steps=7), {"unet": kernel}, stats
+    )
+    policy_file.save(path, made)
     return made
 
 
@@ -37,7 +39,7 @@ def made(tmp_path, monkeypatch):
 def test_a_packed_policy_is_small_and_for_a_cpu(made, tmp_path, capsys, argv, temperature):
     assert pack.main(["mine.safetensors", "out/compact.safetensors", *argv]) == 0
     out = tmp_path / "out" / "compact.safetensors"
-    found = export.load(out)
+    found = policy_file.load(out)
     assert found.policy == dataclasses.replace(POLICY, dtype="float32", temperature=temperature)
     assert (found.method, found.train) == (made.method, made.train)
     np.testing.assert_allclose(found.params["unet"], made.params["unet"], rtol=2**-11, atol=3e-8)

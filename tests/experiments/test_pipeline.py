@@ -10,13 +10,13 @@ import fakes
 import numpy as np
 import pytest
 
-from starjax import config
+from starjax import config, methods
 from starjax.data import normalizer
-from starjax.experiments import demonstrations, folders, methods, pipeline, presets, words
-from starjax.policies import packaged
+from starjax.experiments import demonstrations, folders, pipeline, presets, words
+from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.runtime import files
-from starjax.training import export, loop
+from starjax.training import loop
 
 
 def test_a_damaged_result_of_another_method_is_one_line(tmp_path):
@@ -105,7 +105,7 @@ def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
     env = types.SimpleNamespace(p_world_ref=fakes.P_WORLD_REF)
     pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None)
-    kept = export.load(folders.weights(tmp_path, "stardiff"))
+    kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
     np.testing.assert_array_equal(kept.params["w"], np.ones(3))
 
 
@@ -186,10 +186,10 @@ def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):
 def test_a_packaged_encoder_is_of_this_task(tmp_path, monkeypatch):
     box = normalizer.MinMax(np.zeros(5), np.ones(5))
     stats, policy = normalizer.Normalizer(box, None), config.PolicyConfig(encoder_weights="compact")
-    made = export.Trained("dp_rcm2", policy, config.TrainConfig(), {"unet": np.ones(3)}, stats)
+    made = policy_file.Trained("dp_rcm2", policy, config.TrainConfig(), {"unet": np.ones(3)}, stats)
     monkeypatch.setattr(packaged, "FOLDER", tmp_path)
     assert words.encoder(policy) == "trained further, from compact"
-    export.save(tmp_path / "compact.safetensors", made)
+    policy_file.save(tmp_path / "compact.safetensors", made)
     assert words.encoder(policy) == "trained further, from compact (pretrained on this task)"
 
 
@@ -356,7 +356,7 @@ def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
     settings, env = smoke(tmp_path, "stardiff"), types.SimpleNamespace(p_world_ref=[1.0, 2.0, 3.0])
     pipeline._train(settings, "stardiff", lambda: None, env, None)
-    kept = export.load(folders.weights(tmp_path, "stardiff"))
+    kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
     assert (kept.method, kept.preset, kept.demos) == ("stardiff", "smoke", settings.demos)
     assert (kept.policy, kept.train) == (settings.policy, settings.train)
     assert kept.p_world_ref == (1.0, 2.0, 3.0)

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from starjax.training import export
+from starjax.policies import policy_file
 
 pytestmark = pytest.mark.slow
 TINY = ["--demos.seen-trocars", "4", "--train.steps", "20", "--eval.time-limit-s", "2"]
@@ -83,7 +83,7 @@ def test_report_and_weights_are_there(said, out):
     page = (out / "report" / "index.html").read_text()
     assert "STAR-Diff" in page and "state" in page
     assert (out / "report" / "tables.md").read_text().count("|") > 20
-    trained = export.load(out / "stardiff" / "policy.safetensors")
+    trained = policy_file.load(out / "stardiff" / "policy.safetensors")
     assert trained.policy.observation == "state"
     lines = (out / "stardiff" / "metrics.jsonl").read_text().splitlines()
     assert all(np.isfinite(json.loads(line).get("loss", 0.0)) for line in lines)

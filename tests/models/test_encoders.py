@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import encoders, layers, norms, pooled_norm, resnet, spatial_softmax
+from starjax.models import encoders, layers, resnet, spatial_softmax
+from starjax.models.kernels import norms, pooled_norm
 
 KEY = jax.random.key(0)
 

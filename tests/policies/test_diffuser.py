@@ -9,7 +9,8 @@ import numpy as np
 import optax
 import pytest
 
-from starjax.models import diffusion, parallel_ddim, schedule
+from starjax.models import diffusion, schedule
+from starjax.models.kernels import parallel_ddim
 from starjax.policies import diffuser, features
 
 ACTION = 2

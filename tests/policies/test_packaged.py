@@ -10,14 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config
+from starjax import config, methods
 from starjax.data import normalizer
 from starjax.evaluation import latency
-from starjax.experiments import methods
-from starjax.models import parallel_ddim
-from starjax.policies import packaged
+from starjax.models.kernels import parallel_ddim
+from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
-from starjax.training import export
 
 MOST = 12e6  # bytes of a file
 
@@ -39,7 +37,7 @@ def faults(name):
     path = packaged.find("name", name)
     found = [] if path.stat().st_size <= MOST else [f"{name}: too large"]
     try:
-        trained = export.load(path)
+        trained = policy_file.load(path)
     except ValueError as error:
         return [*found, str(error)]
     if shapes(trained.params) != shapes(initial(trained.method, trained.policy)):
@@ -57,7 +55,7 @@ def test_what_is_packaged_is_whole():
 
 def test_five_evaluations_side_by_side_are_enough_for_what_is_packaged(monkeypatch):
     """Pictures of noise; `benchmarks/bench_ddim.py` takes demonstrations."""
-    trained = export.load(packaged.find("name", "compact"))
+    trained = policy_file.load(packaged.find("name", "compact"))
     policy = policies.make(
         methods.METHODS[trained.method], trained.policy, fakes.P_WORLD_REF, trained.train
     )
@@ -81,11 +79,11 @@ def folder(tmp_path, monkeypatch):
     """A package with one policy, in which nothing is wrong."""
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), initial("dp_rcm2", fakes.TINY))
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
-    made = export.Trained(
+    made = policy_file.Trained(
         "dp_rcm2", fakes.TINY, config.TrainConfig(), params, normalizer.Normalizer(box, None)
     )
     place = tmp_path / "weights"
-    export.save(place / "compact.safetensors", made, half=True)
+    policy_file.save(place / "compact.safetensors", made, half=True)
     (place / "compact.json").write_text('{"method": "dp_rcm2"}')
     monkeypatch.setattr(packaged, "FOLDER", place)
     monkeypatch.chdir(tmp_path)
@@ -95,14 +93,14 @@ def folder(tmp_path, monkeypatch):
 def test_faults_of_a_packaged_policy_are_found(folder):
     assert faults("compact") == []
     path = folder / "compact.safetensors"
-    trained = export.load(path)
+    trained = policy_file.load(path)
     path.with_suffix(".json").write_text('{"method": "stardiff"}')
     assert faults("compact") == ["compact: result of stardiff"]
     path.with_suffix(".json").unlink()
-    export.save(path, trained._replace(policy=dataclasses.replace(fakes.TINY, state_dim=32)))
+    policy_file.save(path, trained._replace(policy=dataclasses.replace(fakes.TINY, state_dim=32)))
     assert faults("compact") == ["compact: of other networks", "compact: no result"]
     large = {**trained.params, "more": jnp.zeros(13_000_000 // 4)}
-    export.save(path, trained._replace(params=large))
+    policy_file.save(path, trained._replace(params=large))
     assert faults("compact")[0] == "compact: too large"
     path.write_bytes(path.read_bytes()[:-1])
     assert len(faults("compact")) == 2 and "not a readable" in faults("compact")[1]

@@ -12,7 +12,7 @@ import pytest
 
 from starjax import config, rcm
 from starjax.data import normalizer, windows
-from starjax.experiments.methods import METHODS
+from starjax.methods import METHODS
 from starjax.models import encoders, roll_net
 from starjax.policies import diffuser, execution, features, hierarchical
 from starjax.policies import policy as policies

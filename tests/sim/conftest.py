@@ -6,15 +6,15 @@ import pytest
 
 from starjax import rcm
 from starjax.sim import env as envs
-from starjax.sim import model
-from starjax.sim.tasks import expert
+from starjax.sim import scene
+from starjax.sim.tasks.peg_transfer.task import expert
 
 LANES = 12  # one episode a trocar
 
 
 @pytest.fixture(scope="session")
-def sim() -> model.SimModel:
-    return model.load()
+def sim() -> scene.SimModel:
+    return scene.load()
 
 
 @pytest.fixture(scope="session")

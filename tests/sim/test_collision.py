@@ -4,13 +4,13 @@ import jax.numpy as jnp
 import pytest
 
 from starjax.sim import collision
-from starjax.sim.tasks import peg_transfer
+from starjax.sim.tasks.peg_transfer.task import task
 from starjax.types import Pose
 
 UP = jnp.full((6, 3), 0.5)  # joints of an arm that is nowhere near
 DOWN = jnp.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]])
 LYING = jnp.array([[0, 0, 1.0], [0, 1.0, 0], [-1.0, 0, 0]])  # a tool along x
-BLOCK, PEG = jnp.array([0.02, 0.0, peg_transfer.RIM_HEIGHT]), jnp.array([[0.02, 0.0]])
+BLOCK, PEG = jnp.array([0.02, 0.0, task.RIM_HEIGHT]), jnp.array([[0.02, 0.0]])
 FAR = 1.0  # m
 
 
@@ -35,7 +35,7 @@ def test_a_shaft_may_touch_no_peg_and_no_block():
 
 @pytest.mark.parametrize(("clearance", "hit"), [(3e-4, False), (-4e-4, False), (-6e-4, True)])
 def test_a_shaft_may_lie_closely_above_a_peg(clearance, hit):
-    height = peg_transfer.PEG_HEIGHT + clearance + collision.SHAFT_RADIUS
+    height = task.PEG_HEIGHT + clearance + collision.SHAFT_RADIUS
     above = [0.02 + collision.SHAFT_END, 0.0, height]
     assert is_hit(LYING, above, peg=0.0) == hit and not is_hit(LYING, above)
 

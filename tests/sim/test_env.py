@@ -8,7 +8,7 @@ import pytest
 from starjax import rcm
 from starjax.sim import env as envs
 from starjax.sim import physics
-from starjax.sim.tasks import expert, peg_transfer
+from starjax.sim.tasks.peg_transfer.task import expert, task
 from starjax.types import Pose
 
 STEPS = 330  # control steps: 11 s, longer than the expert takes
@@ -70,13 +70,13 @@ def test_a_released_block_is_threaded_and_at_rest(episodes, sim):
     state, *_ = episodes
     for lane in np.flatnonzero(state.success):
         block = jax.tree.map(lambda leaf, i=lane: leaf[i], state.block_pose)
-        assert peg_transfer.is_threaded(block, state.target_peg[lane])
+        assert task.is_threaded(block, state.target_peg[lane])
     assert not state.jaw_contact[state.success].any()
 
 
 def test_success_wants_a_block_let_go_and_at_rest_on_its_peg_five_steps_in_a_row(reset, sim):
     state = jax.tree.map(lambda leaf: leaf[0], reset(0))
-    on_target = Pose(jnp.eye(3), jnp.append(state.target_peg, peg_transfer.RIM_HEIGHT))
+    on_target = Pose(jnp.eye(3), jnp.append(state.target_peg, task.RIM_HEIGHT))
     good = state.replace(block_pose=on_target)
     fast = good.sim.replace(qvel=good.sim.qvel.at[sim.block_dof].set(0.02))
     after, successes = good, []
@@ -133,7 +133,7 @@ def test_observations_hold_what_they_say(environment, reset):
 def test_a_collision_is_noticed(reset, begin, drive, sim):
     state = reset(13)
     shaft = state.pose.p[4] - 0.03 * state.pose.R[4, :, 2]
-    around = shaft - jnp.array([peg_transfer.RIM_RADIUS, 0.0, 0.0])  # the block has a wall there
+    around = shaft - jnp.array([task.RIM_RADIUS, 0.0, 0.0])  # the block has a wall there
     qpos = state.sim.qpos.at[4, sim.block : sim.block + 7].set(jnp.array([*around, 1, 0, 0, 0]))
     after, _ = drive(state.replace(sim=state.sim.replace(qpos=qpos)), begin(state, 14))
     np.testing.assert_array_equal(after.collided, np.arange(12) == 4)
@@ -196,7 +196,7 @@ def test_the_expert_takes_the_inner_wall_and_on_the_middle_row_the_one_of_less_t
     for seed in range(8):
         state = reset(seed)
         walls = np.asarray(begin(state, seed).wall)
-        normals = np.asarray(jax.vmap(peg_transfer.wall_normals)(state.block_pose))
+        normals = np.asarray(jax.vmap(task.wall_normals)(state.block_pose))
         for wall, normal, y in zip(walls, normals, np.asarray(state.block_pose.p[:, 1])):
             skew = np.abs(normal[:, 0])
             first, second = np.argsort(skew)[:2]
@@ -215,7 +215,7 @@ def test_with_one_wall_the_expert_takes_the_same_on_the_middle_row_and_else_as_b
     for seed in range(4):
         state = reset(seed)
         walls = np.asarray(begin(jax.random.split(jax.random.key(seed), 12), state).wall)
-        normals = np.asarray(jax.vmap(peg_transfer.wall_normals)(state.block_pose))
+        normals = np.asarray(jax.vmap(task.wall_normals)(state.block_pose))
         for wall, normal, y in zip(walls, normals, np.asarray(state.block_pose.p[:, 1])):
             assert (normal[wall, 1] < 0) == (y > expert.BETWEEN_ROWS)
             middle += abs(y) < expert.BETWEEN_ROWS
@@ -225,11 +225,11 @@ def test_with_one_wall_the_expert_takes_the_same_on_the_middle_row_and_else_as_b
 def test_the_expert_comes_in_from_outside_along_the_wall(reset, begin):
     state = reset(3)
     script = begin(state, 3)
-    normals = np.asarray(jax.vmap(peg_transfer.wall_normals)(state.block_pose))
+    normals = np.asarray(jax.vmap(task.wall_normals)(state.block_pose))
     outward = normals[np.arange(len(normals)), np.asarray(script.wall)]
     away = np.sum(np.asarray(script.goal - state.block_pose.p) * outward, -1)
     # HOVER_SPREAD is left out by the mean over the twelve.
-    assert away.mean() == pytest.approx(peg_transfer.RIM_RADIUS + expert.HOVER_OUT, abs=0.0015)
+    assert away.mean() == pytest.approx(task.RIM_RADIUS + expert.HOVER_OUT, abs=0.0015)
 
 
 def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
@@ -246,8 +246,8 @@ def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
 def test_the_expert_starts_over_when_the_block_is_lost_on_the_way(reset, begin):
     state = reset(6)
     state, script = (jax.tree.map(lambda leaf: leaf[0], x) for x in (state, begin(state, 6)))
-    normal = peg_transfer.wall_normals(state.block_pose)[script.wall]
-    wall = state.block_pose.p + peg_transfer.RIM_RADIUS * normal
+    normal = task.wall_normals(state.block_pose)[script.wall]
+    wall = state.block_pose.p + task.RIM_RADIUS * normal
 
     def after(phase, off):
         there = state.replace(pose=state.pose._replace(p=wall + jnp.array([0.0, 0.0, off])))

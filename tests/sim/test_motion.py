@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim import ik, tracking
+from starjax.sim import control, ik
 from starjax.types import Pose
 
 PERIOD = 1 / 30
@@ -81,7 +81,7 @@ def test_a_near_command_is_reached_at_once():
     here = on_manifold(trocar, jnp.array([0.01, 0.0, 0.03]), 0.1)
     there = on_manifold(trocar, jnp.array([0.0105, 0.0003, 0.0298]), 0.12)
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
-    pose, _ = tracking.toward(here, jnp.zeros(7), there, port, PERIOD)
+    pose, _ = control.toward(here, jnp.zeros(7), there, port, PERIOD)
     np.testing.assert_array_equal(pose.R, there.R)
     np.testing.assert_array_equal(pose.p, there.p)
 
@@ -91,14 +91,14 @@ def test_a_far_command_is_approached_along_the_manifold():
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     pose = on_manifold(trocar, jnp.array([-0.04, 0.02, 0.05]), -1.0)
     goal = on_manifold(trocar, jnp.array([0.04, -0.03, 0.01]), 1.0)
-    velocity, toward = jnp.zeros(7), jax.jit(tracking.toward, static_argnums=4)
+    velocity, toward = jnp.zeros(7), jax.jit(control.toward, static_argnums=4)
     for _ in range(60):
         before, last = pose, velocity
         pose, velocity = toward(pose, velocity, goal, port, PERIOD)
         assert float(rcm.rcm_error(pose, port)) < 1e-6
         change = jnp.linalg.norm(velocity[:3] - last[:3]) / PERIOD
-        assert float(change) <= tracking.MAX_ACCELERATION * 1.001
-        assert float(jnp.linalg.norm(pose.p - before.p)) <= tracking.MAX_SPEED * PERIOD * 1.001
+        assert float(change) <= control.MAX_ACCELERATION * 1.001
+        assert float(jnp.linalg.norm(pose.p - before.p)) <= control.MAX_SPEED * PERIOD * 1.001
     np.testing.assert_allclose(pose.p, goal.p, atol=1e-4)
     np.testing.assert_allclose(pose.R, goal.R, atol=2e-2)
 
@@ -114,7 +114,7 @@ def test_a_tool_at_the_least_depth_moves_along_the_manifold():
         for axis, roll, depth in zip(axes, rolls, (0.03, rcm.MIN_DEPTH))
     )
     velocity = jnp.zeros((64, 7))
-    toward = jax.jit(jax.vmap(lambda *at: tracking.toward(*at, port, PERIOD)))
+    toward = jax.jit(jax.vmap(lambda *at: control.toward(*at, port, PERIOD)))
     for _ in range(90):
         pose, velocity = toward(pose, velocity, goal)
         assert float(rcm.rcm_error(pose, port).max()) < 1e-6
@@ -129,7 +129,7 @@ def test_a_command_off_the_manifold_stays_off_it():
     bad = Pose(good.R, good.p + 0.02 * good.R[:, 0])
     pose, velocity = bad, jnp.zeros(7)
     for _ in range(5):
-        pose, velocity = tracking.toward(pose, velocity, bad, port, PERIOD)
+        pose, velocity = control.toward(pose, velocity, bad, port, PERIOD)
     np.testing.assert_allclose(rcm.rcm_error(pose, port), 0.02, atol=1e-5)
 
 
@@ -139,7 +139,7 @@ def test_a_far_command_off_the_manifold_is_missed_by_a_share_on_the_way():
     pose = on_manifold(trocar, jnp.array([-0.04, 0.0, 0.03]), 0.0)
     good = on_manifold(trocar, jnp.array([0.04, 0.0, 0.03]), 0.0)
     bad = Pose(good.R, good.p + 0.02 * good.R[:, 1])
-    velocity, toward = jnp.zeros(7), jax.jit(tracking.toward, static_argnums=4)
+    velocity, toward = jnp.zeros(7), jax.jit(control.toward, static_argnums=4)
     errors = []
     for _ in range(60):
         pose, velocity = toward(pose, velocity, bad, port, PERIOD)
@@ -152,13 +152,13 @@ def test_the_roll_is_turned_no_faster_than_allowed():
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     pose, goal = (on_manifold(trocar, jnp.array([0.0, 0.0, 0.03]), roll) for roll in (-1.5, 1.5))
-    velocity, toward = jnp.zeros(7), jax.jit(tracking.toward, static_argnums=4)
+    velocity, toward = jnp.zeros(7), jax.jit(control.toward, static_argnums=4)
     spins = [0.0]
     for _ in range(40):
         pose, velocity = toward(pose, velocity, goal, port, PERIOD)
         spins.append(float(velocity[3]))
-    assert np.abs(spins).max() <= tracking.MAX_SPIN * 1.001
-    fastest = tracking.MAX_SPIN_ACCELERATION * PERIOD
+    assert np.abs(spins).max() <= control.MAX_SPIN * 1.001
+    fastest = control.MAX_SPIN_ACCELERATION * PERIOD
     assert np.abs(np.diff(spins)).max() <= fastest * 1.001
     np.testing.assert_allclose(pose.R, goal.R, atol=1e-3)
 
@@ -167,10 +167,10 @@ def test_a_tool_leans_at_the_port_and_stays_at_its_tip():
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     pose = on_manifold(trocar, jnp.array([0.01, 0.02, 0.03]), 0.3)
-    leant = tracking.leaning(pose, port, 2e-3 * pose.R[:, 0])
+    leant = control.leaning(pose, port, 2e-3 * pose.R[:, 0])
     np.testing.assert_array_equal(leant.p, pose.p)
     np.testing.assert_allclose(rcm.rcm_error(leant, port), 2e-3, rtol=1e-3)
-    back = tracking.leaning(leant, port, -2e-3 * pose.R[:, 0])
+    back = control.leaning(leant, port, -2e-3 * pose.R[:, 0])
     np.testing.assert_allclose(rcm.rcm_error(back, port), 0.0, atol=1e-5)
 
 
@@ -178,16 +178,16 @@ def test_a_load_that_stays_is_compensated_at_the_port_up_to_a_limit():
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     reference = on_manifold(trocar, jnp.array([0.01, 0.02, 0.03]), 0.3)
-    hold = jax.jit(tracking.hold)
+    hold = jax.jit(control.hold)
 
     def left_of(load, periods=30):
         lean = jnp.zeros(3)
         for _ in range(periods):
-            measured = tracking.leaning(reference, port, lean + load * reference.R[:, 0])
+            measured = control.leaning(reference, port, lean + load * reference.R[:, 0])
             lean = hold(lean, measured, reference, port)
         return float(rcm.rcm_error(measured, port)), float(jnp.linalg.norm(lean))
 
     assert left_of(1e-3)[0] < 5e-6
     np.testing.assert_allclose(
-        left_of(8e-3), (8e-3 - tracking.MAX_LEAN, tracking.MAX_LEAN), rtol=1e-2
+        left_of(8e-3), (8e-3 - control.MAX_LEAN, control.MAX_LEAN), rtol=1e-2
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starjax.sim import physics, solver
-from starjax.sim.tasks import peg_transfer
+from starjax.sim.tasks.peg_transfer.task import task
 from starjax.types import Pose
 
 REST_SECONDS = 10.0
@@ -49,7 +49,7 @@ def c_step(m, qpos, qvel, ctrl):
 def settled(sim):
     """Coordinates of the block on its peg, arm at home, jaws open; control that holds them."""
     m = sim.mj_model
-    block = Pose(jnp.eye(3), jnp.array([*sim.pegs[4], peg_transfer.RIM_HEIGHT]))
+    block = Pose(jnp.eye(3), jnp.array([*sim.pegs[4], task.RIM_HEIGHT]))
     state = physics.initial(sim, jnp.asarray(sim.home), block)
     return np.array(state.qpos), np.append(sim.home, physics.JAW_OPEN), m
 
@@ -57,7 +57,7 @@ def settled(sim):
 def situations(sim):
     """Name, coordinates, control and the pair that must touch: one of each kind of contact."""
     qpos, ctrl, _ = settled(sim)
-    rim, tube = peg_transfer.RIM_RADIUS, peg_transfer.WALL_RADIUS
+    rim, tube = task.RIM_RADIUS, task.WALL_RADIUS
     peg = sim.pegs[4]
 
     def placed(p, quat=(1, 0, 0, 0)):
@@ -67,7 +67,7 @@ def situations(sim):
         return at
 
     yield "free flight", placed([0.0, 0.0, 0.2]), ctrl, None
-    yield "foot on board", placed([*peg, peg_transfer.RIM_HEIGHT - 2e-4]), ctrl, ("foot0", "table")
+    yield "foot on board", placed([*peg, task.RIM_HEIGHT - 2e-4]), ctrl, ("foot0", "table")
     aside = [peg[0] + rim - tube - 0.001125 + 2e-4, peg[1], 0.0085 + 0.001]
     yield "wall on peg", placed(aside, (0, 0, 0, 1)), ctrl, ("peg4", "wall0")
     data = mujoco.MjData(sim.mj_model)
@@ -153,12 +153,12 @@ def test_constants_in_code_are_those_of_the_model(sim):
 
     m = sim.mj_model
     wall = m.geom("wall0")
-    assert np.isclose(np.linalg.norm(wall.pos[:2]), peg_transfer.RIM_RADIUS, atol=1e-6)
-    assert np.isclose(wall.size[0], peg_transfer.WALL_RADIUS)
-    assert np.isclose(m.body("block").pos[2], peg_transfer.RIM_HEIGHT)
+    assert np.isclose(np.linalg.norm(wall.pos[:2]), task.RIM_RADIUS, atol=1e-6)
+    assert np.isclose(wall.size[0], task.WALL_RADIUS)
+    assert np.isclose(m.body("block").pos[2], task.RIM_HEIGHT)
     assert np.isclose(m.geom("peg0").size[0], collision.PEG_RADIUS)
     top = m.geom("peg0").pos[2] + m.geom("peg0").size[1] + m.geom("peg0").size[0]
-    assert np.isclose(top, peg_transfer.PEG_HEIGHT)
+    assert np.isclose(top, task.PEG_HEIGHT)
     assert np.isclose(m.geom("robot/tool/shaft").size[0], collision.SHAFT_RADIUS)
     inertia = m.actuator_gainprm[:6, 0] / physics.SERVO_FREQUENCY**2
     damping = -m.actuator_biasprm[:6, 2]

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 
 from starjax.sim import physics
-from starjax.sim.tasks import peg_transfer
+from starjax.sim.tasks.peg_transfer.task import task
 from starjax.types import Pose
 
 
@@ -23,7 +23,7 @@ from starjax.types import Pose
     ],
 )
 def test_speeds_and_places_beyond_anything_physical_are_unsound(sim, field, body, value, sound):
-    block = Pose(jnp.eye(3), jnp.array([0.0, 0.0, peg_transfer.RIM_HEIGHT]))
+    block = Pose(jnp.eye(3), jnp.array([0.0, 0.0, task.RIM_HEIGHT]))
     state = physics.initial(sim, jnp.asarray(sim.home), block)
     changed = getattr(state, field).at[getattr(sim, body)].set(value)
     assert bool(physics.is_sound(sim, state.replace(**{field: changed}))) == sound

@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from starjax.sim import model, render
-from starjax.sim.camera import scene as scenes
+from starjax.sim import render
+from starjax.sim import scene as model
+from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import shapes, tiles
 
 # Every primitive, tilted, in a pile, with what must not be drawn: groups 3 and up, alpha 0, sites.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from starjax.sim import linear, model, solver
+from starjax.sim import linear, scene, solver
 from starjax.sim.engine import mjx
 
 VELOCITIES, LIMITS, CONTACTS = 6, 3, 4
@@ -137,7 +137,7 @@ def test_small_systems_are_solved_as_by_lapack():
     ],
 )
 def test_a_model_that_the_solver_does_not_know_is_refused(change, names):
-    m = model.compose()
+    m = scene.compose()
     change(m)
     with pytest.raises(ValueError, match=f"model: expected.*{names}"):
         solver.check(mjx.put_model(m, impl="jax"), mjx.make_data(m, impl="jax"))

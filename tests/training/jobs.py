@@ -10,7 +10,7 @@ from pathlib import Path
 import fakes
 
 from starjax import config
-from starjax.experiments.methods import METHODS
+from starjax.methods import METHODS
 
 SETTINGS = config.TrainConfig(
     steps=12,
@@ -58,7 +58,8 @@ def train(
 
 def train_and_export(directory: Path) -> None:
     """What `starjax train` does, with a policy that compiles at once; its last file is weights."""
-    from starjax.training import export, loop
+    from starjax.policies import policy_file
+    from starjax.training import loop
 
     loop.policies.make = lambda *_: _quadratic_policy()
 
@@ -66,9 +67,9 @@ def train_and_export(directory: Path) -> None:
     if path.exists():
         return
     state = train(directory).state
-    export.save(
+    policy_file.save(
         path,
-        export.Trained("stardiff", fakes.TINY, SETTINGS, state.ema_params, state.normalizer),
+        policy_file.Trained("stardiff", fakes.TINY, SETTINGS, state.ema_params, state.normalizer),
     )
 
 
@@ -77,7 +78,7 @@ def _quadratic_policy():
     import jax
     import jax.numpy as jnp
 
-    from starjax.policies.policy import Policy
+    from starjax.policies.base import Policy
     from starjax.types import Command
 
     def say(params, observation):
@@ -110,10 +111,10 @@ def devices_main(count: int, out: str, observation: str, dtype: str) -> None:
     import numpy as np
 
     from starjax.data import windows
-    from starjax.training import parts, step
+    from starjax.training import sharding, step
 
     assert len(jax.devices()) == count
-    parts.LARGE, parts.JOINS = 256, {"cpu"}  # so that this small policy has some, as on GPUs
+    sharding.LARGE, sharding.JOINS = 256, {"cpu"}  # so that this small policy has some, as on GPUs
     settings = dataclasses.replace(SETTINGS, holdout_demos=0)
     state = train(Path(out), settings, observation=observation, dtype=dtype).state
     key_frames, _ = step.step_keys(state.key, 5)
@@ -130,13 +131,13 @@ def processes_main(out: str, asks: int) -> None:
 
     import jax
 
-    from starjax.training import devices, loop, parts, processes
+    from starjax.training import devices, loop, processes, sharding
 
     processes.join()
     given = jax.numpy.ones(3)
     spread = devices.replicate(given, devices.make_mesh(2), may_alias=None).addressable_data(0)
     assert spread.unsafe_buffer_pointer() == given.unsafe_buffer_pointer(), "held twice"
-    parts.LARGE, parts.JOINS = 18, {"cpu"}  # the matrix, not the vector
+    sharding.LARGE, sharding.JOINS = 18, {"cpu"}  # the matrix, not the vector
     loop.policies.make = lambda *_: _quadratic_policy()
     asked = itertools.count(1)
     try:

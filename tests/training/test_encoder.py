@@ -13,9 +13,9 @@ import safetensors.numpy
 from starjax import config
 from starjax.data import normalizer
 from starjax.models import encoders
-from starjax.policies import diffuser, packaged
+from starjax.policies import diffuser, packaged, policy_file
 from starjax.policies import policy as policies
-from starjax.training import encoder, export
+from starjax.training import encoder
 
 TRAIN = config.TrainConfig()
 IMAGE = dataclasses.replace(fakes.TINY, observation="image")
@@ -37,7 +37,7 @@ def save(path, method="stardiff", policy_config=IMAGE, change=lambda vision: vis
         params = policies.with_vision(params, change(initial()))
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
     stats = normalizer.Normalizer(box, None)
-    export.save(path, export.Trained(method, policy_config, TRAIN, params, stats))
+    policy_file.save(path, policy_file.Trained(method, policy_config, TRAIN, params, stats))
     return params
 
 
@@ -62,7 +62,7 @@ def test_it_is_found_in_both_kinds_of_policy(tmp_path, method):
 def test_a_packaged_policy_is_known_by_its_name_or_its_path(source, tmp_path, monkeypatch):
     path, params = source
     monkeypatch.setattr(packaged, "FOLDER", tmp_path)
-    export.save(tmp_path / "compact.safetensors", export.load(path), half=True)
+    policy_file.save(tmp_path / "compact.safetensors", policy_file.load(path), half=True)
     named = settings("compact", freeze_encoder=True)
     found = encoder.read(named, TRAIN)
     # The folder of a frozen encoder's features is named by this.
@@ -80,7 +80,7 @@ def test_fingerprint_tells_weights_apart(source, tmp_path):
     one, two = (encoder.read(settings(p), TRAIN).fingerprint for p in (path, tmp_path / "p"))
     assert one != two and len(one) == len(two)
     again = encoder.read(settings(path, freeze_encoder=True), TRAIN)
-    assert again.fingerprint == one != export.fingerprint(policies.vision_of(other))
+    assert again.fingerprint == one != policy_file.fingerprint(policies.vision_of(other))
 
 
 def test_a_policy_that_goes_on_learning_starts_with_it(source):

@@ -12,10 +12,10 @@ import pytest
 from starjax import config
 from starjax.data import load, normalizer, windows
 from starjax.experiments import demonstrations, folders, pipeline, presets
-from starjax.experiments.methods import METHODS
-from starjax.policies import diffuser
+from starjax.methods import METHODS
+from starjax.policies import diffuser, policy_file
 from starjax.policies import policy as policies
-from starjax.training import checkpoint, encoder, export, frozen, loop, state
+from starjax.training import checkpoint, encoder, frozen, loop, state
 
 TRAIN = config.TrainConfig(
     steps=6,
@@ -45,7 +45,7 @@ def source(tmp_path_factory):
     params = {"vision": init(jax.random.key(5), jnp.zeros((1, size, size, 3)))}
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
     stats = normalizer.Normalizer(box, None)
-    export.save(path, export.Trained("dp_rcm2", IMAGE, TRAIN, params, stats))
+    policy_file.save(path, policy_file.Trained("dp_rcm2", IMAGE, TRAIN, params, stats))
     settings = dataclasses.replace(IMAGE, encoder_weights=str(path), freeze_encoder=True)
     return settings, encoder.read(settings, TRAIN)
 
@@ -127,7 +127,7 @@ def test_a_killed_run_goes_on_and_damage_is_mended(source, dataset, tmp_path, mo
 def test_another_encoder_crop_or_dataset_has_features_of_its_own(source, dataset, tmp_path):
     settings, found = source
     shifted = jax.tree.map(lambda x: 1.1 * x, found.params)
-    other = encoder.Encoder(shifted, export.fingerprint(shifted)[:16])
+    other = encoder.Encoder(shifted, policy_file.fingerprint(shifted)[:16])
     for kwargs in (
         {},
         {"source": (settings, other)},
@@ -159,7 +159,7 @@ def whole(source, seen, tmp_path_factory):
 
 
 def test_training_leaves_the_encoder_as_it_was(source, whole):
-    found = export.load(whole)
+    found = policy_file.load(whole)
     before = jax.tree_util.tree_leaves_with_path(source[1].params)
     after = dict(jax.tree_util.tree_leaves_with_path(policies.vision_of(found.params)))
     assert len(after) == len(before) > 10
@@ -180,7 +180,7 @@ def test_the_rest_learns(source, whole):
     assert "vision" not in jax.eval_shape(policy.init, jax.random.key(0))["diffuser"]
     lines = loop.metrics.read(whole.parent / "metrics.jsonl")
     assert {"train", "holdout"} == {line["kind"] for line in lines}
-    kernel = export.load(whole).params["diffuser"]["unet"]
+    kernel = policy_file.load(whole).params["diffuser"]["unet"]
     begun = state.init(policy, 0).drawn()["diffuser"]["unet"]
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), kernel, begun)
     assert max(jax.tree.leaves(moved)) > 1e-3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.policies.policy import Policy
+from starjax.policies.base import Policy
 from starjax.training import holdout
 from starjax.types import Command, Pose
 

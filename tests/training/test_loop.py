@@ -20,9 +20,10 @@ import pytest
 
 from starjax import config
 from starjax.data import windows
-from starjax.experiments.methods import METHODS
+from starjax.methods import METHODS
 from starjax.runtime import files
-from starjax.training import advance, checkpoint, loop, metrics, parts, state, step
+from starjax.training import checkpoint, loop, sharding, state, step, stepper
+from starjax.training import log as metrics
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
@@ -88,10 +89,10 @@ def quick(monkeypatch):
 
 
 def test_demonstrations_kept_out_are_neither_trained_on_nor_fitted(quick, monkeypatch, tmp_path):
-    fitted, drawn, fit, resident = [], [], loop.normalizer.fit, advance.resident
+    fitted, drawn, fit, resident = [], [], loop.normalizer.fit, stepper.resident
     monkeypatch.setattr(loop.normalizer, "fit", lambda *a: fitted.append(a[3]) or fit(*a))
     monkeypatch.setattr(
-        advance, "resident", lambda it, *a, **k: drawn.append(it.frames) or resident(it, *a, **k)
+        stepper, "resident", lambda it, *a, **k: drawn.append(it.frames) or resident(it, *a, **k)
     )
     jobs.train(tmp_path, dataclasses.replace(jobs.SETTINGS, steps=1))
     dataset = fakes.dataset(seed=0)
@@ -202,7 +203,7 @@ def test_a_stop_right_after_a_checkpoint_does_not_write_it_again(monkeypatch, tm
 
 def test_a_finished_run_is_only_loaded(whole, monkeypatch):
     directory, result = whole
-    monkeypatch.setattr(advance, "_compiled_beside", lambda *_: pytest.fail("compiles a step"))
+    monkeypatch.setattr(stepper, "_compiled_beside", lambda *_: pytest.fail("compiles a step"))
     before = (directory / "metrics.jsonl").read_bytes()
     again = jobs.train(directory)
     assert_same_bytes(again.state, result.state)
@@ -256,7 +257,7 @@ def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
 
 
 def test_joined_vectors_give_the_same_run_and_resume(whole, tmp_path, monkeypatch):
-    monkeypatch.setattr(parts, "JOINS", {"cpu"})
+    monkeypatch.setattr(sharding, "JOINS", {"cpu"})
     asked = itertools.count(1)
     with pytest.raises(loop.Interrupted):
         jobs.train(tmp_path, should_stop=lambda: next(asked) == 3)
@@ -281,7 +282,7 @@ def test_pictures_train_too_and_resume(tmp_path, dtype, monkeypatch):
     again = jobs.train(tmp_path / "b", settings, **seen)
     assert_same_bytes(again.state, whole.state)
 
-    monkeypatch.setattr(parts, "JOINS", {"cpu"})  # and kernels turned
+    monkeypatch.setattr(sharding, "JOINS", {"cpu"})  # and kernels turned
     joined = jobs.train(tmp_path / "c", settings, **seen)
     for x, y in zip(leaves(joined.state), leaves(whole.state), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)

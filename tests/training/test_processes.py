@@ -18,7 +18,8 @@ import pytest
 from starjax import config
 from starjax.data import load, store
 from starjax.experiments import following, pipeline
-from starjax.training import checkpoint, loop, metrics, processes
+from starjax.training import checkpoint, loop, processes
+from starjax.training import log as metrics
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run

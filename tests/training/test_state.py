@@ -7,7 +7,7 @@ import optax
 import pytest
 
 from starjax import config
-from starjax.models import joined
+from starjax.models.kernels import packed_params
 from starjax.training import state
 
 
@@ -36,11 +36,11 @@ def test_only_kernels_of_the_roll_network_decay_faster(joins):
     kernel, bias = jnp.full((2, 3), 2.0), jnp.full(3, 2.0)
     network = {"params": {"out": {"kernel": kernel, "bias": bias}}}
     params = {"diffuser": network, "roll": network}
-    given = joined.join(params, params) if joins else params
+    given = packed_params.join(params, params) if joins else params
     still = jax.tree.map(jnp.zeros_like, given)
     updates, _ = optimizer.update(still, optimizer.init(given), given)
     if joins:
-        updates = joined.separate(updates, params)
+        updates = packed_params.separate(updates, params)
     slow, fast = -0.1 * 0.25 * 2.0, -0.1 * (0.25 + 0.5) * 2.0
     wanted = jax.tree.map(lambda x: jnp.full_like(x, slow), params)
     wanted["roll"]["params"]["out"]["kernel"] = jnp.full_like(kernel, fast)

@@ -13,12 +13,12 @@ import pytest
 
 from starjax import config
 from starjax.data import normalizer, windows
-from starjax.experiments.methods import METHODS
+from starjax.methods import METHODS
 from starjax.policies import policy as policies
-from starjax.policies.policy import Policy
+from starjax.policies.base import Policy
 from starjax.runtime import xla
 from starjax.training import devices, state, step
-from starjax.training.parts import Parts
+from starjax.training.sharding import Parts
 
 SETTINGS = config.TrainConfig(
     steps=300, batch_size=8, learning_rate=0.1, warmup_steps=0, weight_decay=0.0

@@ -24,8 +24,9 @@ import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.data import episodes, recorder, store, trials, workers
+from starjax.data import store
 from starjax.rcm.trocar import Trocar
+from starjax.rollouts import chunks, cores, episodes, recording
 from starjax.runtime import files, progress, xla
 
 COMMITS = 16  # episodes written at once; most of it is waiting for the disk
@@ -45,12 +46,12 @@ def describe(
     one_wall: bool = False,
 ) -> dict[str, Any]:
     """What a dataset is: the content of dataset.json, and by `store.digest` its name."""
-    frame = recorder.frame(env)
+    frame = recording.frame(env)
     features = {
         name: {
             "shape": list(leaf.shape),
             "dtype": np.dtype(leaf.dtype).str,
-            "what": recorder.FIELDS[name],
+            "what": recording.FIELDS[name],
         }
         for name, leaf in frame.items()
     }
@@ -64,7 +65,7 @@ def describe(
         "control_hz": env.control_hz,
         "features": features,
         "scene": scene_hash(env.model),
-        "seed_rule": f"fold_in(fold_in(fold_in(key(seed), {recorder.STREAM}), trocar), trial)",
+        "seed_rule": f"fold_in(fold_in(fold_in(key(seed), {recording.STREAM}), trocar), trial)",
         "versions": xla.versions(),
         **({"one_wall": True} if one_wall else {}),  # not in the names of datasets without
     }
@@ -116,7 +117,7 @@ def collect(
     trocars = listed(trocars)
     total = per_trocar * len(trocars.radius)
     with files.lock(root):
-        frame = recorder.frame(env)
+        frame = recording.frame(env)
         frame_bytes = sum(math.prod(x.shape) * x.dtype.itemsize for x in frame.values())
         description = describe(
             env,
@@ -136,9 +137,9 @@ def collect(
         )
         fits = int(MEMORY_SHARE * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
         chunk = chunk or max(1, min(_fast(devices, total), fits))
-        at_once = max(1, min(workers.count(), fits // chunk))
+        at_once = max(1, min(cores.count(), fits // chunk))
         chunk = -(-chunk // len(devices or [0])) * len(devices or [0])
-        simulate = recorder.simulator(env, expert, trocars, seed, max_steps, chunk, devices)
+        simulate = recording.simulator(env, expert, trocars, seed, max_steps, chunk, devices)
         known = {(r["trocar"], r["trial"]): r["success"] for r in records.values()}
 
         def commit(episode: episodes.Episode) -> store.Record:
@@ -151,7 +152,7 @@ def collect(
             records[record["key"]] = record
             advance(int(record["success"]))
 
-        needed = trials.run(simulate, known, len(trocars.radius), per_trocar, chunk, at_once)
+        needed = chunks.run(simulate, known, len(trocars.radius), per_trocar, chunk, at_once)
         shown = progress.track("Demonstrations", total, unit="episodes", done=done)
         with shown as advance, _writer(commit, note, chunk) as write:
             for episode in needed:
@@ -236,7 +237,7 @@ def _fast(devices: Sequence[jax.Device] | None, total: int) -> int:
     one would do alone. Not of what is there already, as the size of a batch may change last bits.
     """
     if jax.default_backend() == "cpu":
-        return workers.CPU_LANES
+        return cores.CPU_LANES
     return GPU_LANES * min(len(devices or [0]), -(-total // GPU_LANES))
 
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, rcm
+from starjax import methods, rcm
 from starjax.data import windows
 
 _SMALLEST_RANGE = 1e-4  # m or rad: below it an entry counts as constant, and is only centred
@@ -69,7 +69,7 @@ def encode(
 
 
 def fit(
-    method: config.Method, dataset: windows.Dataset, p_world_ref: Any, frames: np.ndarray
+    method: methods.Method, dataset: windows.Dataset, p_world_ref: Any, frames: np.ndarray
 ) -> Normalizer:
     """Statistics of the commands (and the task state) at the given frames of a dataset.
 

@@ -16,9 +16,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from starjax.data import demos, workers
-from starjax.evaluation import recorded, rollout, table
+from starjax.data import demos
+from starjax.evaluation import recorded
+from starjax.evaluation import trials as table
 from starjax.rcm.trocar import Trocar
+from starjax.rollouts import cores, engine
 from starjax.runtime import files, progress, xla
 
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
@@ -78,12 +80,12 @@ def evaluate(
             f"got {trials}, {time_limit_s}, {chunk}, {lanes}, {video_trials}"
         )
     trocars = demos.listed(trocars)
-    settings = rollout.Settings(
+    settings = engine.Settings(
         obs_horizon=obs_horizon,
         execute=execute,
         max_steps=math.ceil(time_limit_s * env.control_hz - 1e-6),
     )
-    run = rollout.make(env, policy, settings, seed, devices)
+    run = engine.make(env, policy, settings, seed, devices)
     count = len(trocars.radius)
     first_device = (devices or jax.local_devices())[0]
     several = len(devices or [0])
@@ -132,7 +134,7 @@ def evaluate(
                 shown = passed
 
         with progress.track("Evaluation", len(index), unit="trials", done=done) as advance:
-            for passed in workers.run(missing, simulate, workers.count()):
+            for passed in cores.run(missing, simulate, cores.count()):
                 advance(passed)
         tables, kept = zip(*chunks, strict=True)
         if chosen.any():
@@ -146,7 +148,7 @@ def lanes_per_device(device: jax.Device, trials: int) -> int:
     A GPU's are as many as make the fewest chunks, and no more than these need.
     """
     if device.platform == "cpu":
-        return workers.CPU_LANES
+        return cores.CPU_LANES
     limit = (device.memory_stats() or {}).get("bytes_limit", 0)
     most = GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
     chunks = -(-trials // most)
@@ -190,11 +192,11 @@ def _resume(
     return chunk
 
 
-def _fill(trocars: Trocar, index: np.ndarray, trial: np.ndarray, batch: int) -> rollout.Trials:
+def _fill(trocars: Trocar, index: np.ndarray, trial: np.ndarray, batch: int) -> engine.Trials:
     """A full batch: the first trial repeats, unwanted, where there are too few."""
     count = len(index)
     rows = np.where(np.arange(batch) < count, np.arange(batch) % count, 0)
-    return rollout.Trials(
+    return engine.Trials(
         trocar=Trocar(*(field[index[rows]] for field in trocars)),
         index=index[rows].astype(np.int32),
         trial=trial[rows].astype(np.int32),

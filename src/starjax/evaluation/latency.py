@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, rcm
+from starjax import config, methods, rcm
 from starjax.models import roll_net
 from starjax.policies import diffuser, features
 from starjax.policies import policy as policies
@@ -53,7 +53,7 @@ def policy_ms(
 
 
 def table(
-    method: config.Method,
+    method: methods.Method,
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,
     params: Any,

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.evaluation import rollout
+from starjax.rollouts import engine
 
 # One trajectory a trocar is recorded for figures, unless there are more trocars than this.
 FIGURE_TROCARS = 16
@@ -28,7 +28,7 @@ def choose(count: int, trials: int, video_trials: int) -> np.ndarray:
 
 
 def take(
-    done: rollout.Rollouts, here: rollout.Trials, chosen: np.ndarray, p_world_ref: np.ndarray
+    done: engine.Rollouts, here: engine.Trials, chosen: np.ndarray, p_world_ref: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Recorded trials R of a chunk, `[R, T]`, each meaningful up to its `length`."""
     rows = np.flatnonzero(chosen)

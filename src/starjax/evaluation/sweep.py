@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starjax import rcm
-from starjax.evaluation import metrics
-from starjax.evaluation import table as tables
+from starjax.evaluation import statistics
+from starjax.evaluation import trials as tables
 from starjax.rcm.trocar import Trocar
 
 BIN_WIDTH = 0.01  # m, of the distance to the nearest training trocar
@@ -66,20 +66,20 @@ def compose(
     distance = distance_to_nearest(ports, training, p_world_ref)
     bins = bin_of(distance)
     seen = distance < 1e-6
-    trials = metrics.trials(table, seen, seed)
+    trials = statistics.trials(table, seen, seed)
     return {
-        "strict": metrics.rate(table.success),
-        "loose": metrics.rate(table.loose),
-        "safe": metrics.rate(table.safe),
+        "strict": statistics.rate(table.success),
+        "loose": statistics.rate(table.loose),
+        "safe": statistics.rate(table.safe),
         "by_distance": [
             {
                 "low_m": float(b * BIN_WIDTH),
                 "high_m": float((b + 1) * BIN_WIDTH),
-                **metrics.rate(table.success[bins == b]),
+                **statistics.rate(table.success[bins == b]),
             }
             for b in np.unique(bins)
         ],
-        "rcm_error_mm": metrics.rcm_error_mm(table),
+        "rcm_error_mm": statistics.rcm_error_mm(table),
         "trials": [
             {**trial, "distance_m": d} for trial, d in zip(trials, distance.tolist(), strict=True)
         ],

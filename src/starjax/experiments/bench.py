@@ -58,8 +58,9 @@ def _time(run: Path, counts: Sequence[int], calls: int) -> dict[str, Any]:
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
 
+    from starjax import methods
     from starjax.evaluation import latency
-    from starjax.experiments import methods, scoring
+    from starjax.experiments import scoring
 
     who = scoring.subject(run.name, folders.weights(run.parent, run.name))
     trained = who.trained

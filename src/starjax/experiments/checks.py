@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax.experiments import methods, options
+from starjax import methods
+from starjax.experiments import options
 
 SEEDS = 2**32  # a key of jax takes 32 bits: larger seeds would be those of others again
 LEAST_TIME_S, MOST_TIME_S = 0.1, 86_400.0  # of a trial; one control step takes 1/30 s

@@ -14,8 +14,9 @@ from starjax.experiments import clock, words
 def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
     """The folder of a run's demonstrations, and a function that collects what it lacks."""
     from starjax import rcm
-    from starjax.data import demos, lanes, recorder, store, trials
-    from starjax.sim.tasks import expert
+    from starjax.data import demos, store
+    from starjax.rollouts import chunks, placement, recording
+    from starjax.sim.tasks.peg_transfer.task import expert
 
     trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
     wanted = {
@@ -26,7 +27,7 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
         "one_wall": config.demos.one_wall,
     }
     init = expert.init_with_one_wall if config.demos.one_wall else expert.init
-    script = recorder.Expert(init, expert.act)
+    script = recording.Expert(init, expert.act)
     out = Path(config.out)
     root = out / f"demos-{store.digest(demos.describe(env, trocars, **wanted))}"
 
@@ -41,11 +42,11 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
                 words.stage("collect", f"done before, {root}")
                 return
         words.stage("collect", f"into {root}")
-        settings = {"devices": lanes.devices(), "report": words.indented, **wanted}
+        settings = {"devices": placement.devices(), "report": words.indented, **wanted}
         try:
             with clock.timed(out, f"collect {root.name}"):
                 found = demos.collect(root, env, script, trocars, **settings)
-        except trials.ExpertFailed as error:
+        except chunks.ExpertFailed as error:
             raise config_lib.UsageError(
                 "--demos.max-steps: expected enough control steps for a transfer, "
                 f"got {config.demos.max_steps}; {error}"

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from starjax import config as config_lib
-from starjax.experiments import checks, clock, folders, methods, options, presets, words
+from starjax import methods
+from starjax.experiments import checks, clock, folders, options, presets, words
 from starjax.policies import packaged
 from starjax.runtime import files, xla
 
@@ -158,7 +159,7 @@ def _times(result: dict[str, Any], control_hz: float) -> str:
 
 def _film(folder: Path, who: Any) -> str:
     """Writes the video of the recorded trials; says where, or why not."""
-    from starjax.experiments.report import results, video
+    from starjax.report import results, video
 
     try:
         path = video.record([results.load(folder)], who.env.model, folder / "rollout.mp4")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax.experiments import methods
+from starjax import methods
 from starjax.runtime import files
 
 # What decides the weights; the rest may change between two starts.
@@ -76,7 +76,7 @@ def adopt_twin(out: Path, method: str) -> None:
             staged.rename(staged.with_name("evaluation"))
 
 
-def behaviour(method: str) -> config_lib.Method:
+def behaviour(method: str) -> methods.Method:
     """A row of Table II without its names."""
     return methods.METHODS[method]._replace(label="", group="")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax.experiments import methods
+from starjax import methods
 from starjax.runtime import files
 from starjax.runtime.signals import stop_signals
 

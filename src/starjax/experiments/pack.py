@@ -41,21 +41,21 @@ def main(argv: Sequence[str]) -> int:
         raise config_lib.UsageError(f"OUT: expected a file that is not there yet, got {got}")
     checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
-    xla.require_devices("starjax.training.export")
+    xla.require_devices("starjax.policies.policy_file")
 
     import jax
 
-    from starjax.training import export
+    from starjax.policies import policy_file
 
     try:
-        trained = export.load(source)
+        trained = policy_file.load(source)
     except ValueError as error:
         raise config_lib.UsageError(f"POLICY: {error}") from error
     policy = dataclasses.replace(trained.policy, dtype="float32")
     if chosen.temperature is not None:
         policy = dataclasses.replace(policy, temperature=chosen.temperature)
     try:
-        export.save(out, trained._replace(policy=policy), half=True)
+        policy_file.save(out, trained._replace(policy=policy), half=True)
     except ValueError as error:
         raise config_lib.UsageError(f"POLICY: {error}") from error
     count = sum(leaf.size for leaf in jax.tree.leaves(trained.params)) / 1e6

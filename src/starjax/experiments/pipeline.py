@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax.experiments import clock, demonstrations, folders, following, methods, words
+from starjax import methods
+from starjax.experiments import clock, demonstrations, folders, following, words
 from starjax.runtime import files, xla
 from starjax.runtime.signals import stop_signals
 
@@ -77,7 +78,8 @@ def _train(
 ) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
     from starjax.policies import policy as policies
-    from starjax.training import export, loop, processes
+    from starjax.policies import policy_file
+    from starjax.training import loop, processes
 
     out = Path(config.out)
     folder = out / name
@@ -107,7 +109,7 @@ def _train(
             raise config_lib.UsageError(str(error)) from error
     state = processes.own(result.state)
     params = state.ema_params
-    made = export.Trained(
+    made = policy_file.Trained(
         method=name,
         policy=config.policy,
         train=config.train,
@@ -117,7 +119,7 @@ def _train(
         demos=config.demos,
         preset=config.preset,
     )
-    export.save(weights, made)
+    policy_file.save(weights, made)
     errors = ", ".join(f"{key} {value:.3g}" for key, value in result.holdout.items())
     words.indented(f"{result.samples_per_second:.0f} samples/s; held-out {errors or 'none'}")
     # Asked during the last steps, whose loop looks no more. Several processes go on: the others
@@ -200,7 +202,7 @@ def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
 
 def _report(out: Path, names: Sequence[str]) -> None:
     """The report of every method in the folder, and the outcome of this run's."""
-    from starjax.experiments.report import build
+    from starjax.report import build
 
     scored = [out / name for name in methods.METHODS if (out / name / "result.json").exists()]
     words.stage("report", f"of {', '.join(path.name for path in scored)}, into {out / 'report'}")

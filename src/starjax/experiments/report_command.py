@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 from starjax import config as config_lib
-from starjax.experiments import checks, methods, options
+from starjax import methods
+from starjax.experiments import checks, options
 from starjax.runtime import xla
 
 DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
@@ -37,9 +38,9 @@ def main(argv: Sequence[str]) -> int:
     out = Path(chosen.out or (first.parent if first.name in methods.METHODS else first) / "report")
     checks.expect_folder("--out", out)
     xla.prepare_xla()
-    xla.require_devices("starjax.experiments.report.build")
+    xla.require_devices("starjax.report.build")
 
-    from starjax.experiments.report import build
+    from starjax.report import build
 
     try:
         page = build.build(runs, out, with_video=chosen.video)

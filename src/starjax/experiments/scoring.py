@@ -9,14 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from starjax import config as config_lib
-from starjax import rcm
-from starjax.data import lanes
-from starjax.evaluation import evaluate, latency, metrics, table
-from starjax.experiments import folders, methods, options, words
+from starjax import methods, rcm
+from starjax.evaluation import evaluate, latency, statistics
+from starjax.evaluation import trials as table
+from starjax.experiments import folders, options, words
 from starjax.policies import policy as policies
+from starjax.policies import policy_file
+from starjax.rollouts import placement
 from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
-from starjax.training import export
 
 
 class Subject(NamedTuple):
@@ -33,7 +34,7 @@ class Subject(NamedTuple):
     method: str
     env: sim_env.Env
     policy: policies.Policy
-    trained: export.Trained
+    trained: policy_file.Trained
     weights: str
 
 
@@ -52,7 +53,7 @@ def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subje
     if not weights.exists():
         raise config_lib.UsageError(f"{weights}: no weights there; {again} trains them")
     try:
-        trained = export.load(weights)
+        trained = policy_file.load(weights)
     except ValueError as error:
         raise config_lib.UsageError(f"{error}; remove it, and {again} trains it again") from error
     return _subject(method, trained, weights, env)
@@ -65,14 +66,16 @@ def from_file(path: Path) -> Subject:
       config.UsageError: the file is damaged, or not a policy of this version.
     """
     try:
-        trained = export.load(path)
+        trained = policy_file.load(path)
     except ValueError as error:
         raise config_lib.UsageError(f"--policy: {error}") from error
     options.choice(f"{path}: method", trained.method, methods.METHODS)
     return _subject(trained.method, trained, path, None)
 
 
-def _subject(method: str, trained: export.Trained, file: Path, env: sim_env.Env | None) -> Subject:
+def _subject(
+    method: str, trained: policy_file.Trained, file: Path, env: sim_env.Env | None
+) -> Subject:
     env = env or sim_env.make(trained.policy.observation, trained.policy.image_size)
     row = methods.METHODS[method]
     policy = policies.make(row, trained.policy, env.p_world_ref, trained.train)
@@ -98,7 +101,7 @@ def rollouts(
         time_limit_s=settings.time_limit_s,
         chunk=settings.chunk,
         video_trials=settings.video_trials,
-        devices=lanes.devices(),
+        devices=placement.devices(),
         identity={
             **folders.behaviour(who.method)._asdict(),
             "policy": dataclasses.asdict(who.trained.policy),
@@ -152,7 +155,7 @@ def write_result(
     """
     is_seen = np.arange(len(rcm.IS_SEEN)) < config.demos.seen_trocars
     observation = who.trained.policy.observation
-    figures = metrics.compose(
+    figures = statistics.compose(
         trials, is_seen, method=who.method, observation=observation, seed=seed
     )
     result = {

@@ -7,7 +7,7 @@ from typing import Any
 
 import starjax
 from starjax import config as config_lib
-from starjax.experiments import methods
+from starjax import methods
 from starjax.runtime import files, xla
 
 STAGES = ("collect", "train", "evaluate", "report")
@@ -103,10 +103,9 @@ def encoder(policy: config_lib.PolicyConfig) -> str:
 
 def _is_of_this_task(policy: config_lib.PolicyConfig) -> bool:
     """Whether the encoder began in a policy of ours; where its file is gone, as far as we know."""
-    from starjax.policies import packaged
-    from starjax.training import export
+    from starjax.policies import packaged, policy_file
 
-    return policy.freeze_encoder or export.is_policy(packaged.locate(policy.encoder_weights))
+    return policy.freeze_encoder or policy_file.is_policy(packaged.locate(policy.encoder_weights))
 
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:

@@ -8,7 +8,8 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from starjax.models import layers, norms, resnet, spatial_softmax
+from starjax.models import layers, resnet, spatial_softmax
+from starjax.models.kernels import norms
 
 
 class ImageEncoder(nn.Module):

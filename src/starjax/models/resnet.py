@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.models import layers, norms
-from starjax.models.pooled_norm import PooledNorm
+from starjax.models import layers
+from starjax.models.kernels import norms
+from starjax.models.kernels.pooled_norm import PooledNorm
 
 # Images up to which a GPU convolves as a matrix product. cuDNN's convolutions, started one by one
 # between CUDA graphs, then take longer to start than to run: 0.35 ms of a call for one robot, which

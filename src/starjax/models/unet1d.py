@@ -21,8 +21,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from starjax.models import layers, sampling_blocks
-from starjax.models.activated_norm import ActivatedNorm
+from starjax.models import layers
+from starjax.models.kernels import sampling_blocks
+from starjax.models.kernels.activated_norm import ActivatedNorm
 
 
 class ConditionalUnet1D(nn.Module):

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from starjax import config
-from starjax.models import diffusion, encoders, joined, parallel_ddim, schedule, unet1d
+from starjax.models import diffusion, encoders, schedule, unet1d
+from starjax.models.kernels import packed_params, parallel_ddim
 from starjax.policies import features
 
 Params = dict[str, Any]
@@ -63,7 +64,9 @@ def make(
         time_dim=policy_config.time_dim,
         dtype=dtype,
     )
-    of_unet, of_state, of_vision = (joined.applied(network) for network in (unet, state, vision))
+    of_unet, of_state, of_vision = (
+        packed_params.applied(network) for network in (unet, state, vision)
+    )
     noise_schedule = schedule.cosine(policy_config.diffusion_steps)
     shape = (policy_config.horizon, action_dim)
 

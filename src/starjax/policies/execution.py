@@ -5,13 +5,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax import config, rcm
+from starjax import methods, rcm
 from starjax.data import normalizer
 from starjax.types import Command
 
 
 def command(
-    method: config.Method,
+    method: methods.Method,
     stats: normalizer.Normalizer,
     action: jax.Array,
     trocar: rcm.Trocar,

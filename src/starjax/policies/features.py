@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config, rcm
+from starjax import config, methods, rcm
 from starjax.data import augment, normalizer, windows
 from starjax.sim.types import Observation
 
@@ -48,12 +48,12 @@ def trocar_features(trocar: rcm.Trocar, p_world_ref: jax.Array) -> jax.Array:
     return jnp.concatenate([scalars, shift / _LENGTH], axis=-1)
 
 
-def extra_dim(method: config.Method) -> int:
+def extra_dim(method: methods.Method) -> int:
     """Width of `extra`."""
     return TROCAR_FEATURES if method.sees_trocar else 0
 
 
-def extra(method: config.Method, trocar: rcm.Trocar, p_world_ref: jax.Array) -> jax.Array:
+def extra(method: methods.Method, trocar: rcm.Trocar, p_world_ref: jax.Array) -> jax.Array:
     """What conditions the diffusion model beside the observation: the trocar's features or none."""
     return trocar_features(trocar, p_world_ref)[..., : extra_dim(method)]
 

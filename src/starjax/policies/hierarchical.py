@@ -5,11 +5,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config, rcm
+from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
-from starjax.models import diffusion, joined, roll_net
+from starjax.models import diffusion, roll_net
+from starjax.models.kernels import packed_params
 from starjax.policies import diffuser, execution, features
-from starjax.policies.policy import Params, Policy
+from starjax.policies.base import Params, Policy
 from starjax.sim.types import Observation
 from starjax.types import Command
 
@@ -43,7 +44,7 @@ class Prepared(NamedTuple):
 
 
 def make(
-    method: config.Method,
+    method: methods.Method,
     policy_config: config.PolicyConfig,
     p_world_ref: Any,
     train_config: config.TrainConfig,
@@ -68,7 +69,7 @@ def make(
     )
     history_weight = float(policy_config.roll_history)
     trocar_weight = float(policy_config.roll_trocar)
-    predict = joined.applied(rolls)
+    predict = packed_params.applied(rolls)
 
     def init(key: jax.Array) -> Params:
         key_model, key_roll = jax.random.split(key)

@@ -1,46 +1,16 @@
 """A policy of Table II: four pure functions, made from a method's row."""
 
 import pathlib
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from starjax import config, rcm
-from starjax.data import normalizer, windows
-from starjax.models import joined, pretrained, sampling_blocks
-from starjax.sim.types import Observation
-from starjax.types import Command
-
-Params = dict[str, Any]
-
-
-class Policy(NamedTuple):
-    """What training and evaluation know of a method.
-
-    The loss of a batch is `loss(params, prepare(stats, key, batch))`.
-
-    Attributes:
-      init: `key -> params`, those that training changes: a frozen vision encoder's are missing,
-        and `with_vision` adds them for `sample` to see pictures.
-      prepare: `(stats, key, batch) -> prepared`, all that is random and needs no parameters: a
-        pytree of arrays whose leading axis is the batch.
-      loss: `(params, prepared) -> (scalar, {name: scalar})`, the names being `metrics`: means over
-        the batch.
-      sample: `(params, stats, keys [B], Observation [B, O], Trocar [B]) -> Command [B, H]`, finite
-        whatever the networks say. What sample i draws depends on `keys[i]` alone.
-      metrics: names of what `loss` tells beside its value.
-    """
-
-    init: Callable[[jax.Array], Params]
-    prepare: Callable[[normalizer.Normalizer, jax.Array, windows.Batch], Any]
-    loss: Callable[[Params, Any], tuple[jax.Array, dict[str, jax.Array]]]
-    sample: Callable[
-        [Params, normalizer.Normalizer, jax.Array, Observation, Any],
-        Command,
-    ]
-    metrics: tuple[str, ...] = ()
+from starjax import config, methods, rcm
+from starjax.models import pretrained
+from starjax.models.kernels import packed_params, sampling_blocks
+from starjax.policies import hierarchical, single
+from starjax.policies.base import Params, Policy
 
 
 def vision_of(params: Params) -> Params:
@@ -99,12 +69,14 @@ def packed(params: Params) -> Params:
     """Parameters with each network's vectors in one array: a decision for one robot begins the
     later, the more arrays it is handed."""
     if "diffuser" in params:
-        rest = {name: joined.packed(net) for name, net in params.items() if name != "diffuser"}
+        rest = {
+            name: packed_params.packed(net) for name, net in params.items() if name != "diffuser"
+        }
         return {**rest, "diffuser": packed(params["diffuser"])}
-    return {name: joined.packed(net) for name, net in params.items()}
+    return {name: packed_params.packed(net) for name, net in params.items()}
 
 
-def ablated(method: config.Method, policy_config: config.PolicyConfig) -> config.Method:
+def ablated(method: methods.Method, policy_config: config.PolicyConfig) -> methods.Method:
     """The row of Table II as settings change it: what it sees and how its poses are written."""
     if policy_config.sees_trocar != "method":
         method = method._replace(sees_trocar=policy_config.sees_trocar == "always")
@@ -115,7 +87,7 @@ def ablated(method: config.Method, policy_config: config.PolicyConfig) -> config
 
 
 def make(
-    method: config.Method,
+    method: methods.Method,
     policy_config: config.PolicyConfig,
     p_world_ref: Any,
     train_config: config.TrainConfig | None = None,
@@ -128,9 +100,6 @@ def make(
       p_world_ref: `[3]` m, the nominal port.
       train_config: augmentation; its crop also decides what inference sees.
     """
-    # imported here because both of them build on this module's Policy
-    from starjax.policies import hierarchical, single
-
     method = ablated(method, policy_config)
     build = hierarchical.make if method.hierarchical else single.make
     return build(method, policy_config, p_world_ref, train_config or config.TrainConfig())

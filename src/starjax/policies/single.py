@@ -4,11 +4,11 @@ from typing import Any, NamedTuple
 
 import jax
 
-from starjax import config, rcm
+from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
 from starjax.models import diffusion
 from starjax.policies import diffuser, execution, features
-from starjax.policies.policy import Params, Policy
+from starjax.policies.base import Params, Policy
 from starjax.sim.types import Observation
 from starjax.types import Command
 
@@ -22,7 +22,7 @@ class Prepared(NamedTuple):
 
 
 def make(
-    method: config.Method,
+    method: methods.Method,
     policy_config: config.PolicyConfig,
     p_world_ref: Any,
     train_config: config.TrainConfig,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config
-from starjax.runtime import threads
+from starjax.runtime import background
 
 _GROUPS, _GROUPS_OF_THIS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
@@ -94,7 +94,7 @@ def require_devices(*modules: str) -> None:
             with contextlib.suppress(RuntimeError):  # a full one will say so where it is used
                 jax.device_put(0, device)
 
-    started = threads.beside(start)
+    started = background.beside(start)
     for module in modules:
         importlib.import_module(module)
     try:

@@ -10,7 +10,7 @@ pad's corner up to 3 mm into the board unnoticed.
 import jax
 import jax.numpy as jnp
 
-from starjax.sim.tasks import peg_transfer
+from starjax.sim.tasks.peg_transfer.task import task
 from starjax.types import Pose
 
 # Overlap that is called a collision (m): more than the soft contacts' own give.
@@ -40,20 +40,20 @@ def detect(pose: Pose, origins: jax.Array, block: Pose, pegs: jax.Array) -> jax.
     arm_on_board = jnp.min(origins[2:, 2]) < LINK_RADIUS
     jaws_in_board = pose.p[2] + PAD_END * axis[2] < -DEPTH
     shaft_in_board = jnp.min(shaft[:, 2]) < SHAFT_RADIUS - DEPTH
-    peg_end = peg_transfer.PEG_HEIGHT - PEG_RADIUS  # of the capsule's axis
+    peg_end = task.PEG_HEIGHT - PEG_RADIUS  # of the capsule's axis
     above = jnp.maximum(shaft[:, None, 2] - peg_end, 0.0)
     aside = jnp.sum((shaft[:, None, :2] - pegs) ** 2, axis=-1)
     shaft_in_peg = jnp.min(aside + above**2) < (SHAFT_RADIUS + PEG_RADIUS - DEPTH) ** 2
-    gap = SHAFT_RADIUS + peg_transfer.WALL_RADIUS - DEPTH
+    gap = SHAFT_RADIUS + task.WALL_RADIUS - DEPTH
     shaft_in_block = jnp.min(_distance_sq_to_walls(shaft, block)) < gap**2
     return arm_on_board | jaws_in_board | shaft_in_board | shaft_in_peg | shaft_in_block
 
 
 def _distance_sq_to_walls(points: jax.Array, block: Pose) -> jax.Array:
     """`[N, 3]` squared distances (m^2) of `points` `[N, 3]` from the walls' centre lines."""
-    normals = peg_transfer.wall_normals(block)
+    normals = task.wall_normals(block)
     tangents = jnp.cross(block.R[:, 2], normals)
-    half = jnp.sqrt(3.0) * peg_transfer.RIM_RADIUS
-    off = points[:, None] - (block.p + peg_transfer.RIM_RADIUS * normals)
+    half = jnp.sqrt(3.0) * task.RIM_RADIUS
+    off = points[:, None] - (block.p + task.RIM_RADIUS * normals)
     along = jnp.clip(jnp.sum(off * tangents, axis=-1), -half, half)
     return jnp.sum((off - along[..., None] * tangents) ** 2, axis=-1)

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import config, rcm
-from starjax.sim import collision, ik, model, physics, render, tracking
-from starjax.sim.tasks import peg_transfer
+from starjax.sim import collision, control, ik, physics, render, scene
+from starjax.sim.tasks.peg_transfer.task import task
 from starjax.sim.types import Observation
 from starjax.types import Command, Pose
 
@@ -104,7 +104,7 @@ class Env(NamedTuple):
     observe: Callable[[EnvState], Observation]
     camera: Callable[[EnvState], "render.Frame"]
     p_world_ref: np.ndarray
-    model: model.SimModel
+    model: scene.SimModel
     control_hz: float
 
 
@@ -128,12 +128,12 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         raise ValueError(
             f"image_size: expected 16 pixels or more, a whole number, got {image_size!r}"
         )
-    sim = model.load()
+    sim = scene.load()
     draw = render.make(sim.mj_model, "camera", image_size, image_size, shadow=shadow)
     pegs = jnp.asarray(sim.pegs)
 
     def reset(key: jax.Array, params: EnvParams) -> EnvState:
-        layout = peg_transfer.sample_layout(key, pegs)
+        layout = task.sample_layout(key, pegs)
         start = jnp.concatenate([jnp.zeros(1), layout.tip])
         pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, params.trocar, sim.p_world_ref)
         q, ik_error = ik.solve(sim.arm, pose, jnp.asarray(sim.home), RESET_IK_ITERATIONS)
@@ -172,12 +172,12 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
     def step(state: EnvState, command: Command) -> EnvState:
         port = rcm.trocar_position(state.trocar, sim.p_world_ref)
         leant, _, _ = ik.forward(sim.arm, state.q_target)
-        present = tracking.leaning(leant, port, -state.lean)
-        lean = tracking.hold(state.lean, state.pose, present, port)
-        target, velocity = tracking.toward(
+        present = control.leaning(leant, port, -state.lean)
+        lean = control.hold(state.lean, state.pose, present, port)
+        target, velocity = control.toward(
             present, state.velocity, command.pose, port, 1.0 / CONTROL_HZ
         )
-        leant = tracking.leaning(target, port, lean)
+        leant = control.leaning(target, port, lean)
         q, _ = ik.solve(sim.arm, leant, state.q_target, STEP_IK_ITERATIONS)
         usable = _is_usable(command) & jnp.all(jnp.isfinite(q))
         dq = jnp.where(usable, q - state.q_target, 0.0)
@@ -199,7 +199,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
             ik_error=jnp.where(
                 usable,
                 ik.residual(
-                    sim.arm, tracking.leaning(command.pose, port, lean), state.q_target + dq
+                    sim.arm, control.leaning(command.pose, port, lean), state.q_target + dq
                 ),
                 jnp.inf,
             ),
@@ -238,7 +238,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
         if policy_observation == "image":
             image = camera(state).rgb
         else:
-            goal = jnp.append(state.target_peg, peg_transfer.RIM_HEIGHT)
+            goal = jnp.append(state.target_peg, task.RIM_HEIGHT)
             block = state.block_pose
             task_state = jnp.concatenate([block.p, rcm.rot6d_encode(block.R), goal])
         return Observation(pose=state.pose, gripper=state.gripper, image=image, state=task_state)
@@ -254,14 +254,14 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
     )
 
 
-def _judge(sim: model.SimModel, state: EnvState) -> EnvState:
+def _judge(sim: scene.SimModel, state: EnvState) -> EnvState:
     """The measured state with its outcome."""
     velocity = state.sim.qvel[sim.block_dof : sim.block_dof + 6]
-    threaded = peg_transfer.is_threaded(state.block_pose, state.target_peg)
-    good = threaded & peg_transfer.is_at_rest(velocity) & ~state.jaw_contact
+    threaded = task.is_threaded(state.block_pose, state.target_peg)
+    good = threaded & task.is_at_rest(velocity) & ~state.jaw_contact
     settled = jnp.where(good, state.settled + 1, 0)
-    success = settled >= peg_transfer.SETTLE_STEPS
-    loose = state.loose | peg_transfer.is_near(state.block_pose, state.target_peg)
+    success = settled >= task.SETTLE_STEPS
+    loose = state.loose | task.is_near(state.block_pose, state.target_peg)
     return state.replace(settled=settled, success=success, loose=loose, done=success)
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from starjax.sim import solver
 from starjax.sim.engine import mjx
-from starjax.sim.model import SimModel
+from starjax.sim.scene import SimModel
 from starjax.types import Pose
 
 # Jaw targets at gripper -1 and +1 (m a side): past closed, so that the servo squeezes.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 
 from starjax.sim.camera import cast, texture, tiles
-from starjax.sim.camera import scene as scenes
+from starjax.sim.camera import geometry as scenes
 
 geom_rgb = scenes.geom_rgb
 

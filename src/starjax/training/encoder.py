@@ -8,9 +8,8 @@ import jax.numpy as jnp
 
 from starjax import config
 from starjax.models import pretrained
-from starjax.policies import diffuser, features, packaged
+from starjax.policies import diffuser, features, packaged, policy_file
 from starjax.policies import policy as policies
-from starjax.training import export
 
 
 class Encoder(NamedTuple):
@@ -36,11 +35,11 @@ def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -
     """
     name = policy_config.encoder_weights
     path = packaged.find("--policy.encoder-weights", name)
-    if not export.is_policy(path):
+    if not policy_file.is_policy(path):
         _check_torchvision(policy_config, path)
         return None
     try:
-        trained = export.load(path)
+        trained = policy_file.load(path)
     except ValueError as error:
         raise config.UsageError(f"--policy.encoder-weights: {error}") from error
     if differing := _differing(policy_config, train_config, trained):
@@ -50,7 +49,7 @@ def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -
         )
     params = policies.vision_of(trained.params)
     _check_shapes(policy_config, params, name)
-    return Encoder(params, export.fingerprint(params)[:16])
+    return Encoder(params, policy_file.fingerprint(params)[:16])
 
 
 def start(
@@ -64,7 +63,9 @@ def start(
 
 
 def _differing(
-    policy_config: config.PolicyConfig, train_config: config.TrainConfig, trained: export.Trained
+    policy_config: config.PolicyConfig,
+    train_config: config.TrainConfig,
+    trained: policy_file.Trained,
 ) -> list[str]:
     """Settings of the encoder that are not as they were: `--policy.vision-dim 64 (here 128)`."""
     names = ["observation", "encoder", "vision_dim"]

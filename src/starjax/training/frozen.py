@@ -16,9 +16,9 @@ import jax
 import numpy as np
 
 from starjax import config
-from starjax.data import workers
 from starjax.policies import diffuser
 from starjax.policies import features as inputs
+from starjax.rollouts import cores
 from starjax.runtime import files, progress
 from starjax.training.encoder import Encoder
 
@@ -81,7 +81,7 @@ def features(
 
         done = sum(map(len, parts.values()))
         with progress.track("Features", count, unit="frames", done=done) as advance:
-            for seen in workers.run(missing, make, workers.count()):
+            for seen in cores.run(missing, make, cores.count()):
                 advance(seen)
     joined = np.concatenate([parts[path] for path in paths])
     said = "in" if missing else "done before,"

@@ -9,7 +9,7 @@ import numpy as np
 
 from starjax import config, rcm
 from starjax.data import windows
-from starjax.policies.policy import Policy
+from starjax.policies.base import Policy
 from starjax.training.state import TrainState
 
 _WINDOWS = 64

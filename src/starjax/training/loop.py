@@ -9,14 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config
+from starjax import config, methods
 from starjax.data import normalizer, windows
 from starjax.policies import policy as policies
-from starjax.runtime import progress, threads
-from starjax.training import advance as advancing
-from starjax.training import checkpoint, devices, encoder, holdout, metrics, processes
+from starjax.runtime import background, progress
+from starjax.training import checkpoint, devices, encoder, holdout, processes
+from starjax.training import log as metrics
 from starjax.training import state as states
-from starjax.training.parts import Carried
+from starjax.training import stepper as advancing
+from starjax.training.sharding import Carried
 
 _CALL_SECONDS = 1.0  # aim of one compiled call: how long Ctrl-C waits, how often the bar moves
 
@@ -46,7 +47,7 @@ class Result(NamedTuple):
 
 
 def run(
-    method: config.Method,
+    method: methods.Method,
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,
     dataset: windows.Dataset,
@@ -102,7 +103,7 @@ def run(
     checkpoints = directory / "checkpoints"
     begun = states.init(policy, seed)
     new = not checkpoint.steps(checkpoints)  # a restored training may be finished
-    drawn = threads.beside(begun.drawn) if new else begun.drawn
+    drawn = background.beside(begun.drawn) if new else begun.drawn
     like = _like(around, begun, mesh)
     it = advancing.Training(policy, optimizer, policy_config, train_config, mesh, dataset, train)
     advance = advancing.resident(it, like, ahead=new) if windows.on_device(dataset) else None

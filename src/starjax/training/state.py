@@ -10,7 +10,7 @@ import optax
 
 from starjax import config
 from starjax.data import normalizer
-from starjax.policies.policy import Params, Policy
+from starjax.policies.base import Params, Policy
 from starjax.runtime import garbage
 
 

@@ -12,7 +12,7 @@ from starjax.data import windows
 from starjax.policies import policy as policies
 from starjax.training import devices
 from starjax.training import state as states
-from starjax.training.parts import Carried, Parts
+from starjax.training.sharding import Carried, Parts
 
 
 def step_keys(key: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.sim.camera import scene as scenes
+from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import shade, shapes, tiles
 
 Array = jax.Array

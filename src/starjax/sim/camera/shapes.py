@@ -9,7 +9,7 @@ at half a metre keeps its outline to about 1e-3 px.
 import jax
 import jax.numpy as jnp
 
-from starjax.sim.camera import scene as scenes
+from starjax.sim.camera import geometry as scenes
 
 FAR = 2.0**20  # m, depth of a miss; a power of two survives the packing with a slot
 NEAR = 1e-4  # m, nothing closer to the camera is drawn

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from starjax.sim.camera import scene as scenes
+from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import tiles
 
 _LOOKUPS = 6  # texel lookups along each side of a sample: smooths lines thinner than a pixel

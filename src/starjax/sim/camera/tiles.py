@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.sim.camera import scene as scenes
+from starjax.sim.camera import geometry as scenes
 
 _SLACK = 1e-5  # m, and relative: keeps float32 rounding on the safe side
 

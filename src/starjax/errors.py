@@ -1,0 +1,30 @@
+"""A user's mistake: three fields, put into one line in one place. Standard library only."""
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+
+class UsageError(ValueError):
+    """A mistake of whoever typed the command or called the function; shown as one line.
+
+    Attributes:
+      argument: name of the flag, field or array, as the user knows it.
+      expected: what it may be.
+      got: what came.
+      hint: what to do about it, may be empty.
+    """
+
+    def __init__(self, argument: str, expected: str, got: Any, hint: str = "") -> None:
+        self.argument, self.expected, self.got, self.hint = argument, expected, got, hint
+        ending = f"; {hint}" if hint else ""
+        super().__init__(f"{argument}: expected {expected}, got {got}{ending}")
+
+
+def choice(argument: str, value: str, known: Iterable[str]) -> None:
+    """Raises UsageError unless `value` is one of `known`; suggests the nearest one."""
+    names = list(known)
+    if value not in names:
+        near = difflib.get_close_matches(value, names, n=1, cutoff=0.6)
+        hint = f"did you mean {near[0]}?" if near else ""
+        raise UsageError(argument, f"one of {', '.join(names)}", repr(value), hint)

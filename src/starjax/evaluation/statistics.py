@@ -1,0 +1,195 @@
+"""Statistics of an evaluation, and the part of result.json that they are.
+
+Written by `compose`, figures in SI units unless the name says otherwise, intervals are 95%:
+
+    method, observation   names
+    seen, unseen          {successes, trials, rate, ci95 [low, high]}: strict success; Wilson
+    generalization_gap    rate seen - rate unseen (Eq. 20); generalization_gap_ci95: Newcombe
+    strict, loose, safe   {seen, unseen, all}, each as above; safe: strict, and the executed RCM
+                          error never above safe_rcm_mm, within control steps too
+    per_trocar            list of {trocar, radius, polar, azimuth, seen} and strict success as above
+    rcm_error_mm          {commanded {max}, executed {mean, p99, max, p99_of_successes},
+                          within_steps {p99, max, p99_of_successes}}: executed at the ends of
+                          all control steps of all trials (a failed one has many, up to the time
+                          limit), or of the strictly successful ones; within_steps: the largest
+                          at the physics steps of each control step
+    steps                 {mean, median} control steps of the strictly successful trials
+    invalid, collided     number of trials
+    trials                list of {trocar, radius, polar, azimuth, seen, trial, seed, success,
+                          loose, safe, invalid, collided, steps, source, target, rcm_max_mm,
+                          rcm_within_max_mm, rcm_commanded_max_mm}
+
+Rates, intervals and the quantile of successes are null where there are none.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import scipy.stats
+
+from starjax.evaluation import trials as tables
+
+CONFIDENCE = 0.95
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's interval of a success rate."""
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(
+            "successes, trials: expected 0 <= successes <= trials and trials > 0, "
+            f"got {successes}, {trials}"
+        )
+    interval = scipy.stats.binomtest(successes, trials).proportion_ci(CONFIDENCE, "wilson")
+    return float(interval.low), float(interval.high)
+
+
+def rate(success: np.ndarray) -> dict[str, Any]:
+    """Successes `[M]` bool as {successes, trials, rate, ci95}."""
+    successes, trials = int(np.sum(success)), len(success)
+    if not trials:
+        return {"successes": 0, "trials": 0, "rate": None, "ci95": None}
+    return {
+        "successes": successes,
+        "trials": trials,
+        "rate": successes / trials,
+        "ci95": list(wilson(successes, trials)),
+    }
+
+
+def generalization_gap(seen: np.ndarray, unseen: np.ndarray) -> tuple[float, tuple[float, float]]:
+    """SR_seen - SR_unseen (Eq. 20) of successes `[M]` bool, with Newcombe's interval.
+
+    Newcombe's hybrid score method (1998, no. 10): the two Wilson intervals, joined.
+    """
+    a, b = rate(seen), rate(unseen)
+    if a["rate"] is None or b["rate"] is None:
+        raise ValueError(f"seen, unseen: expected trials of both, got {len(seen)}, {len(unseen)}")
+    gap = a["rate"] - b["rate"]
+    low = gap - math.hypot(a["rate"] - a["ci95"][0], b["ci95"][1] - b["rate"])
+    high = gap + math.hypot(a["ci95"][1] - a["rate"], b["rate"] - b["ci95"][0])
+    return gap, (low, high)
+
+
+def mcnemar(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
+    """McNemar's exact test of two methods on the same trials, `[M]` bool each.
+
+    Returns:
+      {only_a, only_b, p_value}: trials that one alone solved, and the two-sided p value.
+    """
+    a, b = np.asarray(a, bool), np.asarray(b, bool)
+    if a.shape != b.shape:
+        raise ValueError(f"a, b: expected outcomes of the same trials, got {a.shape}, {b.shape}")
+    only_a, only_b = int(np.sum(a & ~b)), int(np.sum(b & ~a))
+    differing = only_a + only_b
+    p = scipy.stats.binomtest(only_a, differing).pvalue if differing else 1.0
+    return {"only_a": only_a, "only_b": only_b, "p_value": float(p)}
+
+
+def rcm_error_mm(table: tables.Table) -> dict[str, Any]:
+    """Commanded, executed and within_steps, as documented at the top of this file."""
+    # The mean and the maximum come from float32 figures: float16 is for the quantile only.
+    mean = np.sum(table.rcm_mean * table.steps.astype(np.float64)) / max(np.sum(table.steps), 1)
+    return {
+        "commanded": {"max": 1e3 * _max(table.rcm_commanded_max)},
+        "executed": {
+            "mean": 1e3 * float(mean),
+            **_worst(table, "rcm_error_mm", table.rcm_max),
+        },
+        "within_steps": _worst(table, "rcm_within_mm", table.rcm_within_max),
+    }
+
+
+def _worst(table: tables.Table, column: str, largest: np.ndarray) -> dict[str, float | None]:
+    """Of a column with a row a control step, whose largest of each trial are `largest` `[M]` m."""
+    return {
+        "p99": _p99(getattr(table, column)),
+        "max": 1e3 * _max(largest),
+        "p99_of_successes": _p99(getattr(tables.select(table, table.success), column)),
+    }
+
+
+def _p99(errors: np.ndarray) -> float | None:
+    return float(np.quantile(errors.astype(np.float64), 0.99)) if errors.size else None
+
+
+def compose(
+    table: tables.Table, is_seen: np.ndarray, *, method: str, observation: str, seed: int
+) -> dict[str, Any]:
+    """The figures of an evaluation, as documented at the top of this file.
+
+    Args:
+      table: all trials.
+      is_seen: `[C]` bool, whether a trocar was trained on.
+      method: its name.
+      observation: "image" or "state".
+      seed: of the evaluation.
+    """
+    seen = np.asarray(is_seen, bool)[table.trocar]
+    outcomes = {"strict": table.success, "loose": table.loose, "safe": table.safe}
+    gap, interval = None, None
+    if seen.any() and not seen.all():
+        gap, interval = generalization_gap(table.success[seen], table.success[~seen])
+    taken = table.steps[table.success]
+    return {
+        "method": method,
+        "observation": observation,
+        "seen": rate(table.success[seen]),
+        "unseen": rate(table.success[~seen]),
+        "generalization_gap": gap,
+        "generalization_gap_ci95": list(interval) if interval else None,
+        **{
+            name: {
+                "seen": rate(outcome[seen]),
+                "unseen": rate(outcome[~seen]),
+                "all": rate(outcome),
+            }
+            for name, outcome in outcomes.items()
+        },
+        "safe_rcm_mm": 1e3 * tables.SAFE_RCM_M,
+        "per_trocar": _per_trocar(table, seen),
+        "rcm_error_mm": rcm_error_mm(table),
+        "steps": {
+            "mean": float(taken.mean()) if taken.size else None,
+            "median": float(np.median(taken)) if taken.size else None,
+        },
+        "invalid": int(table.invalid.sum()),
+        "collided": int(table.collided.sum()),
+        "trials": trials(table, seen, seed),
+    }
+
+
+def trials(table: tables.Table, seen: np.ndarray, seed: int) -> list[dict[str, Any]]:
+    """One JSON record a trial; `seen` `[M]` bool."""
+    fields = (
+        "trocar", "radius", "polar", "azimuth", "trial", "success", "loose", "safe", "invalid",
+        "collided", "steps", "source", "target",
+    )  # fmt: skip
+    columns = {name: getattr(table, name).tolist() for name in fields}
+    for name in ("rcm_max", "rcm_within_max", "rcm_commanded_max"):
+        columns[f"{name}_mm"] = (1e3 * getattr(table, name).astype(np.float64)).tolist()
+    columns["seen"] = np.asarray(seen, bool).tolist()
+    rows = zip(*columns.values(), strict=True)
+    return [{**dict(zip(columns, row, strict=True)), "seed": seed} for row in rows]
+
+
+def _per_trocar(table: tables.Table, seen: np.ndarray) -> list[dict[str, Any]]:
+    found = []
+    for trocar in np.unique(table.trocar):
+        rows = table.trocar == trocar
+        first = int(np.argmax(rows))
+        found.append(
+            {
+                "trocar": int(trocar),
+                "radius": float(table.radius[first]),
+                "polar": float(table.polar[first]),
+                "azimuth": float(table.azimuth[first]),
+                "seen": bool(seen[first]),
+                **rate(table.success[rows]),
+            }
+        )
+    return found
+
+
+def _max(values: np.ndarray) -> float:
+    return float(values.max(initial=0.0))

@@ -1,0 +1,104 @@
+"""The eight methods of Table II as data. Standard library only: `--help` reads this."""
+
+from typing import NamedTuple
+
+
+class Method(NamedTuple):
+    """One row of Table II.
+
+    Attributes:
+      action_space: key of `starjax.rcm.ACTION_SPACES`.
+      sees_trocar: whether the diffusion model is conditioned on the trocar.
+      projects: whether poses are projected onto the RCM manifold at execution.
+      hierarchical: diffusion for (position, gripper) and a network for the roll, else one model.
+      weights_of: the method whose weights it shares (its own name if it trains its own).
+      label: name in tables.
+      group: group in Tables II and III.
+    """
+
+    action_space: str
+    sees_trocar: bool
+    projects: bool
+    hierarchical: bool
+    weights_of: str
+    label: str
+    group: str
+
+
+_NAIVE, _RCM, _OURS = "Naive", "RCM action spaces", "Ours"
+
+METHODS: dict[str, Method] = {
+    "dp_ee": Method(
+        action_space="se3",
+        sees_trocar=False,
+        projects=False,
+        hierarchical=False,
+        weights_of="dp_ee",
+        label="DP-EE",
+        group=_NAIVE,
+    ),
+    "dp_ee_proj": Method(
+        action_space="se3",
+        sees_trocar=False,
+        projects=True,
+        hierarchical=False,
+        weights_of="dp_ee",
+        label="DP-EE-Proj",
+        group=_NAIVE,
+    ),
+    "dp_rcm1": Method(
+        action_space="rcm1",
+        sees_trocar=True,
+        projects=False,
+        hierarchical=False,
+        weights_of="dp_rcm1",
+        label="DP-RCM-1",
+        group=_RCM,
+    ),
+    "dp_rcm2": Method(
+        action_space="rcm2",
+        sees_trocar=True,
+        projects=False,
+        hierarchical=False,
+        weights_of="dp_rcm2",
+        label="DP-RCM-2",
+        group=_RCM,
+    ),
+    "dp_rcm3": Method(
+        action_space="rcm3",
+        sees_trocar=True,
+        projects=False,
+        hierarchical=False,
+        weights_of="dp_rcm3",
+        label="DP-RCM-3",
+        group=_RCM,
+    ),
+    "dp_rcm4": Method(
+        action_space="rcm4",
+        sees_trocar=True,
+        projects=False,
+        hierarchical=False,
+        weights_of="dp_rcm4",
+        label="DP-RCM-4",
+        group=_RCM,
+    ),
+    # Table II's own note: STAR-Diff-Single and DP-RCM-4 are one model, listed in both groups.
+    "stardiff_single": Method(
+        action_space="rcm4",
+        sees_trocar=True,
+        projects=False,
+        hierarchical=False,
+        weights_of="dp_rcm4",
+        label="STAR-Diff-Single",
+        group=_OURS,
+    ),
+    "stardiff": Method(
+        action_space="rcm4",
+        sees_trocar=False,
+        projects=False,
+        hierarchical=True,
+        weights_of="stardiff",
+        label="STAR-Diff",
+        group=_OURS,
+    ),
+}

@@ -1,0 +1,1 @@
+"""Variants of the networks for one kind of device, each equal to its reference."""

@@ -1,0 +1,118 @@
+"""GroupNorm, ReLU and max-pooling of a ResNet's stem, with one gradient for all three.
+
+The gradient reaches one entry of each window only. Sums over all entries are then sums over the
+windows, a quarter as many, and what the three hand to each other is never written.
+"""
+
+import functools
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.models.kernels import norms
+
+_NOWHERE = 255  # place of the largest in a window whose largest ReLU has cut
+
+Size = tuple[int, int]
+
+
+class PooledNorm(nn.Module):
+    """GroupNorm, ReLU, then the 3x3 maximum at stride 2, padding 1, of pairs of rows and columns.
+
+    Attributes:
+      groups: of channels.
+      size: rows and columns; where these are odd, what is beside the last is left out.
+    """
+
+    groups: int
+    size: Size
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[N, h, 2, w, 2, C] -> [N, h, w, C]`: of h pairs of rows, w pairs of columns."""
+        return _pooled(x, *norms.scale_and_shift(self, x, self.groups), self.groups, self.size)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
+def _pooled(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int, size: Size) -> jax.Array:
+    return _forward(x, scale, bias, groups, size)[0]
+
+
+def _forward(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int, size: Size):
+    moments = norms.moments(_inside(x, size, 0), entries=size[0] * size[1])
+    gain, shift = norms.affine(*moments, scale, bias, groups)
+    # The largest comes from the largest x, where the gain is negative from the smallest.
+    sign = jnp.where(gain < 0, -1, 1).astype(x.dtype)
+    largest, place = _largest(_inside(norms.beside(sign, x) * x, size, -jnp.inf))
+    chosen = norms.beside(sign, largest) * largest
+    y = nn.relu(norms.normalized(chosen, gain, shift))
+    place = jnp.where(y > 0, place, jnp.uint8(_NOWHERE))
+    return y, (x, scale, bias, moments, place, chosen)
+
+
+def _gradient(
+    groups: int, size: Size, kept, g: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    x, scale, bias, moments, place, chosen = kept
+    affine = functools.partial(norms.affine, groups=groups)
+    (gain, _), back = jax.vjp(affine, *moments, scale, bias)
+    wide = jnp.where(place == _NOWHERE, 0, g).astype(jnp.float32)
+    by_gain = (wide * chosen.astype(jnp.float32)).sum((1, 2))
+    by_mean, by_square, by_scale, by_bias = back((by_gain, wide.sum((1, 2))))
+    everywhere = norms.beside(by_mean, x) + 2 * x.astype(jnp.float32) * norms.beside(by_square, x)
+    by_x = norms.beside(gain, x) * _to_chosen(place, g) + everywhere / (size[0] * size[1])
+    return _inside(by_x.astype(x.dtype), size, 0), by_scale, by_bias
+
+
+_pooled.defvjp(_forward, _gradient)
+
+
+def _inside(x: jax.Array, size: Size, other: float) -> jax.Array:
+    """`[N, h, 2, w, 2, C]` with `other` in what is beside the last row or column."""
+    rows, columns = (np.arange(2 * pairs).reshape(-1, 2) for pairs in (x.shape[1], x.shape[3]))
+    inside = (rows < size[0])[:, :, None, None] & (columns < size[1])
+    return x if inside.all() else jnp.where(inside[..., None], x, other)
+
+
+def _largest(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The largest of each window, and its place there, 0 to 8 (of several the first)."""
+    pads = ((0, 0), (1, 0), (0, 0), (1, 0), (0, 0), (0, 0))
+    x = jnp.pad(x, pads, constant_values=-jnp.inf)
+    # Rows of window i, and columns: the second of pair i - 1 and both of pair i.
+    rows = ((slice(-1), 1), (slice(1, None), 0), (slice(1, None), 1))
+    largest, *others = (x[:, i, a, j, b] for i, a in rows for j, b in rows)
+    place = jnp.zeros(largest.shape, jnp.uint8)
+    for number, other in enumerate(others, 1):
+        place = jnp.where(other > largest, jnp.uint8(number), place)
+        largest = jnp.where(other > largest, other, largest)
+    return largest, place
+
+
+def _to_chosen(place: jax.Array, g: jax.Array) -> jax.Array:
+    """The gradient `g` of each window at its chosen entry: `[N, h, 2, w, 2, C]` float32."""
+    # The first of a pair is the middle of its window; the second the last there and the first of
+    # the next. Element-wise in the entries, so that it can be part of what uses it.
+    places = np.array([[1, 2], [9, 0]])  # of both in their window and in the next one; 9: nowhere
+    gradient = jnp.float32(0)
+    for down, right in np.ndindex(2, 2):
+        here = (3 * places[down][:, None, None] + places[right]).astype(np.uint8)
+        of_window, of_g = (_of_window(z, down, right)[:, :, None, :, None] for z in (place, g))
+        gradient += jnp.where(of_window == here[..., None], of_g, 0).astype(jnp.float32)
+    return gradient
+
+
+def _of_window(z: jax.Array, down: int, right: int) -> jax.Array:
+    """`[N, h, w, C]` of the window so far on, at the end of a row the next row's first and after
+    the last one the first image's.
+
+    These never choose what lies before their row or above their image, where such are looked for.
+    A gather, because of a padded array XLA asks for each number by itself whether it is there.
+    """
+    if not (down or right):
+        return z
+    rows = z.reshape(-1, z.shape[-1])
+    at = jnp.arange(len(rows)) + (down * z.shape[2] + right)
+    at = jnp.where(at < len(rows), at, at - len(rows))
+    return rows.at[at].get(mode="promise_in_bounds").reshape(z.shape)

@@ -1,0 +1,39 @@
+"""What training and evaluation know of a method: a tuple of pure functions."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+from starjax.data import normalizer, windows
+from starjax.sim.types import Observation
+from starjax.types import Command
+
+Params = dict[str, Any]
+
+
+class Policy(NamedTuple):
+    """What training and evaluation know of a method.
+
+    The loss of a batch is `loss(params, prepare(stats, key, batch))`.
+
+    Attributes:
+      init: `key -> params`, those that training changes: a frozen vision encoder's are missing,
+        and `with_vision` adds them for `sample` to see pictures.
+      prepare: `(stats, key, batch) -> prepared`, all that is random and needs no parameters: a
+        pytree of arrays whose leading axis is the batch.
+      loss: `(params, prepared) -> (scalar, {name: scalar})`, the names being `metrics`: means over
+        the batch.
+      sample: `(params, stats, keys [B], Observation [B, O], Trocar [B]) -> Command [B, H]`, finite
+        whatever the networks say. What sample i draws depends on `keys[i]` alone.
+      metrics: names of what `loss` tells beside its value.
+    """
+
+    init: Callable[[jax.Array], Params]
+    prepare: Callable[[normalizer.Normalizer, jax.Array, windows.Batch], Any]
+    loss: Callable[[Params, Any], tuple[jax.Array, dict[str, jax.Array]]]
+    sample: Callable[
+        [Params, normalizer.Normalizer, jax.Array, Observation, Any],
+        Command,
+    ]
+    metrics: tuple[str, ...] = ()

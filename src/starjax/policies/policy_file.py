@@ -1,0 +1,194 @@
+"""The finished policy as one file, policy.safetensors: weights, statistics and settings, no pickle.
+
+The same policy always gives the same bytes. In half precision its parameters are half as large, and
+float32 again once they are loaded.
+"""
+
+import dataclasses
+import hashlib
+import json
+import pathlib
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from starjax import config
+from starjax.data import normalizer
+from starjax.policies.base import Params
+from starjax.runtime import files
+
+SCHEMA = 1
+_KEY = "starjax"  # one metadata entry: the format does not keep the order of several
+_SEPARATOR = "/"
+
+
+class Trained(NamedTuple):
+    """What inference needs.
+
+    Attributes:
+      method: its name, a row of Table II.
+      policy: networks and diffusion.
+      train: augmentation decides what inference sees (the crop); the rest is for the record.
+      params: the averaged (EMA) parameters.
+      normalizer: fitted to the training demonstrations.
+      p_world_ref: `[3]` m, the nominal port, if it was given.
+      demos: what it learned from, if it was given; for the record, and for what it has seen.
+      preset: the preset of its run, if it was given; for the record.
+    """
+
+    method: str
+    policy: config.PolicyConfig
+    train: config.TrainConfig
+    params: Params
+    normalizer: normalizer.Normalizer
+    p_world_ref: tuple[float, ...] | None = None
+    demos: config.DemosConfig | None = None
+    preset: str | None = None
+
+
+def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None:
+    """Writes the file atomically.
+
+    Args:
+      path: of the file.
+      trained: what to write.
+      half: floating-point parameters as float16, within a 2048th of what they were, or 3e-8 where
+        they are below 6e-5. The normaliser stays as it is.
+
+    Raises:
+      ValueError: a parameter is not finite, or too large for float16.
+      StorageError: the file cannot be written.
+    """
+    stats = {
+        name: {key: value for key, value in vars(part).items() if value is not None}
+        for name in ("action", "state")
+        if (part := getattr(trained.normalizer, name)) is not None
+    }
+    arrays = dict(_flatten({"params": trained.params, "normalizer": stats}))
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(f"params: expected finite values, got others in {name}")
+        if half and name.startswith(f"params{_SEPARATOR}"):
+            arrays[name] = _halved(name, array)
+    port = trained.p_world_ref
+    about = {
+        "schema": SCHEMA,
+        "method": trained.method,
+        "policy": dataclasses.asdict(trained.policy),
+        "train": dataclasses.asdict(trained.train),
+        "p_world_ref": None if port is None else [float(x) for x in port],
+        "demos": None if trained.demos is None else dataclasses.asdict(trained.demos),
+        "preset": trained.preset,
+    }
+    envelope = {"about": about, "sha256": _hash(about, arrays)}
+    data = safetensors.numpy.save(arrays, {_KEY: json.dumps(envelope, sort_keys=True)})
+    files.write_bytes(pathlib.Path(path), data)
+
+
+def load(path: pathlib.Path | str) -> Trained:
+    """Reads such a file; its floating-point numbers are float32, however they are stored.
+
+    Raises:
+      ValueError: it is missing, damaged, or not one of this schema; the message names it.
+      OSError: it may not be read.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise ValueError(f"policy: expected a file, got {path}")
+    open(path, "rb").close()  # safetensors would say of one that may not be read that it is missing
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if _KEY not in metadata:
+                raise ValueError("it does not say which policy it is of")
+            envelope = json.loads(metadata[_KEY])
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        about, expected = envelope["about"], envelope["sha256"]
+        schema = about["schema"]
+    except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a readable starjax policy: {error}") from error
+    if schema != SCHEMA:
+        raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}")
+    if _hash(about, arrays) != expected:
+        raise ValueError(f"{path}: damaged, its content is not what was written (sha256)")
+    try:
+        return _trained(about, _unflatten(arrays))
+    except (KeyError, TypeError, ValueError) as error:
+        why = f"no {error} in it" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path}: made by another version of starjax: {why}") from error
+
+
+def is_policy(path: pathlib.Path | str) -> bool:
+    """Whether a file begins as `save` begins one; it may still be damaged."""
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            return _KEY in (file.metadata() or {})
+    except (safetensors.SafetensorError, OSError):
+        return False
+
+
+def fingerprint(params: Params) -> str:
+    """SHA-256 of parameters and of their names."""
+    return _hash({}, dict(_flatten(params)))
+
+
+def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
+    """What `save` was given; raises KeyError, TypeError or ValueError for what it never wrote."""
+    stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
+    port, demos = about["p_world_ref"], about.get("demos")
+    return Trained(
+        method=about["method"],
+        policy=config.from_dict(config.PolicyConfig, about["policy"]),
+        train=config.from_dict(config.TrainConfig, about["train"]),
+        params=tree["params"],
+        normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
+        p_world_ref=None if port is None else tuple(port),
+        demos=None if demos is None else config.from_dict(config.DemosConfig, demos),
+        preset=about.get("preset"),
+    )
+
+
+def _flatten(tree: Any, prefix: str = ""):
+    """(path, numpy array) of every leaf of nested dicts."""
+    for name in sorted(tree):
+        value, path = tree[name], f"{prefix}{name}"
+        if isinstance(value, dict):
+            yield from _flatten(value, path + _SEPARATOR)
+        else:
+            yield path, np.ascontiguousarray(value)
+
+
+def _halved(name: str, array: np.ndarray) -> np.ndarray:
+    """Floating-point numbers as float16, others as they are."""
+    if not np.issubdtype(array.dtype, np.floating):
+        return array
+    most, largest = np.finfo(np.float16).max, np.abs(array).max(initial=0)
+    if largest > most:
+        raise ValueError(
+            f"params: expected at most {most:.0f} for float16, got {largest:g} in {name}"
+        )
+    return array.astype(np.float16)
+
+
+def _unflatten(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for path, array in arrays.items():
+        *parents, name = path.split(_SEPARATOR)
+        node = tree
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        is_number = np.issubdtype(array.dtype, np.floating)
+        node[name] = jnp.asarray(array, jnp.float32 if is_number else None)
+    return tree
+
+
+def _hash(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

@@ -1,0 +1,142 @@
+"""Builds the report of one or many runs: tables.md, figures, rollout.mp4, index.html."""
+
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from starjax import methods
+from starjax.report import figures, page, ports, results, style, tables, trajectories, video
+from starjax.runtime import files
+
+
+def build(
+    runs: Sequence[pathlib.Path],
+    out: pathlib.Path,
+    with_video: bool = True,
+    report: Callable[[str], None] = print,
+) -> pathlib.Path:
+    """Writes the report of the run directories `runs` into `out`; returns its index.html.
+
+    Each directory holds what `results.load` reads; whatever a run did not produce is left out of
+    the report. Without a recorded rollout, or with `with_video` off, there is no video. An earlier
+    report in `out` stays as it is until all of this one has been drawn; then what the page does
+    not show goes, its video too.
+
+    Raises:
+      ValueError: no runs, or a directory without a result.
+      files.StorageError: another process is writing a report into `out`.
+    """
+    if not runs:
+        raise ValueError("runs: expected at least one run directory, got none")
+    loaded = _named_apart(sorted((results.load(path) for path in runs), key=_order))
+    focus = _focus(loaded)
+    sim = _model() if any(run.rollouts for run in loaded) else None
+    with files.lock(out):
+        text = tables.markdown(loaded)
+        pictures, drawn = _figures(loaded, focus, sim)
+        film = _film(loaded, sim, out / _FILM, report) if with_video and sim else None
+        clip = film.read_bytes() if film else None
+        html = page.render(loaded, focus, pictures, clip)
+        made = {"tables.md": text.encode(), **drawn, "index.html": html.encode()}
+        for name, data in made.items():
+            files.write_bytes(out / name, data)
+        for name in _NAMES.difference(made, [film.name] if film else []):
+            (out / name).unlink(missing_ok=True)  # of an earlier report
+    return out / "index.html"
+
+
+_FIGURES = ("training", "ports", "fig3", "fig4")
+_FILM = "rollout.mp4"
+# Of files that a report may have or not.
+_NAMES = {_FILM, *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf"))}
+
+
+def _order(run: results.Run) -> int:
+    return list(methods.METHODS).index(run.result["method"])
+
+
+def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
+    """Labels with what sets runs apart: their numbers of trocars, seeds or, at last, folders."""
+    return [run._replace(label=_name(run, runs)) for run in runs]
+
+
+def _name(run: results.Run, runs: Sequence[results.Run]) -> str:
+    alike = [other for other in runs if other.label == run.label]
+    trocars = [ports.trained_at(other) for other in alike]
+    counts = {ports.trained_at(other) for other in runs if other.trials}
+    if run.trials and len(counts) > 1 and len(set(trocars)) == len(trocars):
+        count = ports.trained_at(run)
+        return f"{run.label} ({count} trocar{'s' if count > 1 else ''})"
+    if len(alike) == 1:
+        return run.label
+    seeds = [other.result.get("config", {}).get("seed") for other in alike]
+    if _all_apart(seeds):
+        return f"{run.label} (seed {run.result['config']['seed']})"
+    seeds = [results.trials_seed(other) for other in alike]
+    if _all_apart(seeds) and not results.differing(alike):
+        return f"{run.label} (trials of seed {results.trials_seed(run)})"
+    return f"{run.label} ({_place(run, alike)})"
+
+
+def _all_apart(seeds: Sequence[int | None]) -> bool:
+    return None not in seeds and len(set(seeds)) == len(seeds)
+
+
+def _place(run: results.Run, others: Sequence[results.Run]) -> str:
+    """As much of a run's path, from its end, as sets it apart."""
+    parts = [other.path.absolute().parts for other in others]
+    for count in range(2, max(map(len, parts))):
+        if len({path[-count:] for path in parts}) == len(parts):
+            return "/".join(run.path.absolute().parts[-count:])
+    return str(run.path)
+
+
+def _film(
+    runs: Sequence[results.Run], sim: Any, path: pathlib.Path, report: Callable[[str], None]
+) -> pathlib.Path | None:
+    """The video, or None after a line that says why there is none: the page is worth more."""
+    try:
+        film = video.record(runs, sim, path, report)
+    except (OSError, RuntimeError) as error:  # the encoder is a program of its own
+        report(f"no video: {error}")
+        return None
+    if film is None:
+        report("no video: no trial was recorded with its joint positions")
+    return film
+
+
+def _focus(runs: Sequence[results.Run]) -> results.Run:
+    """The run whose numbers head the page: the paper's own method if it is there."""
+    return next((run for run in runs if run.result["method"] == "stardiff"), runs[-1])
+
+
+def _model() -> Any:
+    """The simulated scene, which figures and video are drawn from."""
+    from starjax.sim import scene
+
+    return scene.load()
+
+
+def _figures(
+    runs: Sequence[results.Run], focus: results.Run, sim: Any
+) -> tuple[dict[str, tuple[bytes, bytes]], dict[str, bytes]]:
+    """Each figure on light and on dark paper, and the light one's files by name."""
+    drawings: dict[str, Callable[[bool], Any]] = {
+        "training": lambda dark: figures.training(runs, dark),
+    }
+    evaluated = [run for run in runs if run.trials]
+    if evaluated and focus.trials:
+        drawings["ports"] = lambda dark: ports.draw(evaluated, dark)
+        drawings["fig4"] = lambda dark: figures.distance(evaluated, focus, dark)
+    if sim is not None:
+        shown = results.representatives(runs)
+        drawings["fig3"] = lambda dark: trajectories.draw(shown, sim, dark)
+    pictures, drawn = {}, {}
+    for name, draw in drawings.items():
+        light, dark = draw(False), draw(True)
+        if light is not None:
+            pictures[name] = style.save(light, "png"), style.save(dark, "png")
+            drawn[f"{name}.png"] = pictures[name][0]
+            if name != "training":
+                drawn[f"{name}.pdf"] = style.save(light, "pdf")
+    return pictures, drawn

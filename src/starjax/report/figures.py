@@ -1,0 +1,173 @@
+"""Fig. 4 (success against distance from the training trocars, map of the disc) and loss curves."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from starjax.report import captions, outcomes, results, stats, style
+
+_BIN = 0.005  # m of distance pooled in one point
+_SMOOTH = 0.008  # m, width of the kernel behind the heat map
+_FAR = 2.0  # kernel widths from the nearest port: farther off the map shows nothing
+_DISC = 0.05  # m, radius of Eq. 19's disc
+_FEWEST = 2  # panels of a page's width, or a single one would be as large as the page
+
+
+def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False) -> Any:
+    """Fig. 4: success against distance to the nearest training trocar; beside it `focus`'s map."""
+    from matplotlib.figure import Figure
+
+    with style.use(dark) as shades:
+        figure = Figure((7.4, 3.4), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
+        strokes = style.strokes([run.result["method"] for run in runs])
+        for i, run in enumerate(runs):
+            if len(runs) == 1:
+                _band(left, run, shades)
+            else:
+                _whiskers(left, run, (i - (len(runs) - 1) / 2) * 0.35, strokes[i])
+        left.set_xlabel("distance to the nearest training trocar (mm)")
+        left.set_ylabel("success rate, 95% Wilson interval")
+        name = focus.label if len(runs) == 1 else captions.several(runs)
+        left.set_title(f"{name} from {results.observed(runs)}")
+        style.percent_axis(left)
+        if len(runs) > 1:
+            style.legend(figure, *left.get_legend_handles_labels(), side="left")
+        _disc(figure, right, focus, shades)
+    return figure
+
+
+def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
+    """Training loss and held-out action error against steps, or None if nothing was logged.
+
+    Methods that share their weights share a curve.
+    """
+    from matplotlib import ticker
+    from matplotlib.figure import Figure
+
+    runs = list({run.log: run for run in reversed(runs) if run.curves}.values())[::-1]
+    panels = [
+        (name, title)
+        for name, title in CURVES.items()
+        if any(name in line for run in runs for line in run.curves)
+    ]
+    if not panels:
+        return None
+    with style.use(dark):
+        figure = Figure((2.6 * max(len(panels), _FEWEST), 2.4), layout="constrained")
+        strokes = style.strokes([run.result["method"] for run in runs])
+        grid = figure.subplots(1, max(len(panels), _FEWEST), squeeze=False)[0]
+        for unused in grid[len(panels) :]:
+            unused.set_visible(False)
+        for axis, (name, title) in zip(grid, panels):
+            for run, stroke in zip(runs, strokes):
+                points = [(line["step"], line[name]) for line in run.curves if name in line]
+                color, _ = style.method(run.result["method"])
+                if points:
+                    line = {"color": color, "linewidth": 1.3, "linestyle": stroke}
+                    line |= {"marker": "o"} if len(points) == 1 else {}  # else it would not show
+                    axis.plot(*np.array(points).T, label=run.label, **line)
+            axis.set_title(title)
+            axis.set_xlabel(f"training step (from {results.observed(runs)})")
+            axis.set_yscale("log")
+            low, high = axis.get_ylim()
+            subs = _TICKS if high > _TICKS[-1] * low else _CLOSE_TICKS
+            axis.yaxis.set_major_locator(ticker.LogLocator(subs=subs))
+            axis.yaxis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.yaxis.set_minor_locator(ticker.NullLocator())
+        if len(runs) > 1:
+            style.legend(figure, *axis.get_legend_handles_labels())
+    return figure
+
+
+# Ticks of each decade of a logarithmic axis, and of an axis too short for them.
+_TICKS = (1, 2, 5)
+_CLOSE_TICKS = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
+
+# Keys of metrics.jsonl that are drawn.
+CURVES = {
+    "loss": "Training loss",
+    "position_error_mm": "Held-out position error (mm)",
+    "roll_error_deg": "Held-out roll error (deg)",
+}
+
+
+def _pooled(run: results.Run) -> list[tuple[float, stats.Rate]]:
+    """(mean distance in mm, score) of the trials whose distance falls in one bin."""
+    twelve = [] if run.sweep and run.sweep_limit_s != run.limit_s else run.trials
+    trials = [*twelve, *run.sweep]
+    apart = outcomes.distances(trials, results.training_trocars(run))
+    bins = np.round(apart / _BIN).astype(int)
+    inside = [np.flatnonzero(bins == b) for b in np.unique(bins)]
+    return [(1e3 * apart[i].mean(), outcomes.tally(trials[j] for j in i)) for i in inside]
+
+
+def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
+    """One method: pooled rates in their band, the trials behind each, single trocars as dots."""
+    points, color = _pooled(run), style.SUCCESS
+    x, scores = [at for at, _ in points], [score for _, score in points]
+    if not run.sweep:
+        groups = outcomes.by_trocar(run.trials)
+        apart = outcomes.distances([g[0] for g in groups], results.training_trocars(run))
+        rates = [outcomes.tally(g).rate for g in groups]
+        axis.plot(1e3 * apart, rates, "o", color=color, alpha=0.35, markersize=4)
+    low, high = [s.low for s in scores], [s.high for s in scores]
+    axis.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
+    axis.plot(x, [s.rate for s in scores], "o-", color=color, markersize=5)
+    for at, score in points:
+        text, place = f"n {score.trials}", -0.01 if score.rate > 0.1 else score.high + 0.02
+        axis.text(at, place, text, ha="center", va="bottom", fontsize=6.5, color=shades["muted"])
+
+
+def _whiskers(axis: Any, run: results.Run, offset: float, stroke: str) -> None:
+    """One of several methods: a line with whiskers, `offset` mm aside to hide no other."""
+    points = _pooled(run)
+    x, scores = [at + offset for at, _ in points], [score for _, score in points]
+    style.rates(axis, x, scores, run.result["method"], run.label, stroke)
+
+
+def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> None:
+    """Ports from above: a smoothed map where a sweep filled the disc, else a dot a trocar."""
+    trials = run.sweep or run.trials
+    groups = outcomes.by_trocar(trials)
+    at = 1e3 * outcomes.positions([group[0] for group in groups])[:, :2]
+    rates = np.array([outcomes.tally(group).rate for group in groups])
+    if run.sweep:
+        shown = _heat(axis, at, rates, np.array([len(group) for group in groups]))
+        axis.plot(*at.T, ".", color=shades["ink"], markersize=1.6, alpha=0.4)
+        ports = 1e3 * outcomes.positions(results.training_trocars(run))[:, :2]
+        axis.plot(*ports.T, "x", color=style.FAILURE, markersize=6, label="training trocar")
+        axis.legend(loc="upper left", bbox_to_anchor=(0, -0.12), fontsize=7)
+    else:
+        edge = [shades["ink"] if group[0]["seen"] else style.FAILURE for group in groups]
+        shown = axis.scatter(
+            *at.T, c=rates, cmap=style.MAP, vmin=0, vmax=1, s=330, edgecolors=edge, linewidths=1.6
+        )
+        for place, value in zip(at, rates):
+            ink = "black" if value > 0.5 else "white"
+            axis.text(*place, f"{100 * value:.0f}", ha="center", va="center", fontsize=7, color=ink)
+        axis.text(
+            0, -1.5e3 * _DISC, "orange rim: unseen", ha="center", fontsize=7, color=style.FAILURE
+        )
+    turn = np.linspace(0, 2 * np.pi, 181)
+    axis.plot(1e3 * _DISC * np.cos(turn), 1e3 * _DISC * np.sin(turn), color=shades["muted"], lw=0.8)
+    axis.set_aspect("equal")
+    axis.grid(False)
+    axis.set_title(f"by port, from above (mm)\n{run.label}", fontsize=8)
+    bar = figure.colorbar(shown, ax=axis, shrink=0.8, ticks=[0, 0.5, 1])
+    bar.ax.set_yticklabels(["0", "50", "100%"])
+    bar.outline.set_visible(False)
+
+
+def _heat(axis: Any, at: np.ndarray, rates: np.ndarray, weights: np.ndarray) -> Any:
+    """Kernel mean of `rates [N]` at `at [N, 2]` mm, weighed by trials, where the disc has any."""
+    line = 1e3 * np.linspace(-_DISC, _DISC, 161)
+    x, y = np.meshgrid(line, line)
+    near = ((x[..., None] - at[:, 0]) ** 2 + (y[..., None] - at[:, 1]) ** 2) / (1e3 * _SMOOTH) ** 2
+    kernel = np.exp(-near / 2) * weights
+    mean = (kernel @ rates) / np.maximum(kernel.sum(-1), 1e-12)
+    far = near.min(-1) > _FAR**2
+    mean[far | (np.hypot(x, y) > 1e3 * _DISC)] = np.nan
+    edges = (line[0], line[-1], line[0], line[-1])
+    return axis.imshow(mean, extent=edges, origin="lower", cmap=style.MAP, vmin=0, vmax=1)

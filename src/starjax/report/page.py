@@ -1,0 +1,91 @@
+"""One self-contained HTML page of a report: no scripts, no links to other files."""
+
+import importlib.resources
+from collections.abc import Mapping, Sequence
+
+from starjax.report import captions, markup, results, sections
+
+# name -> (light PNG, dark PNG)
+Figures = Mapping[str, tuple[bytes, bytes]]
+
+CAPTIONS = {
+    "fig3": (
+        "Rollouts",
+        "Path of the instrument's tip over the boards (top row: seen trocars, bottom row: unseen). "
+        "Thin lines are the shaft at moments of one rollout, the cross is the trocar. "
+        "Open circle: start. Grey line on the board: the path seen from straight above.",
+    ),
+    "fig4": (
+        "Success and distance from the training trocars",
+        "Left: trials pooled by distance of their trocar to the nearest one in the demonstrations, "
+        "with 95% Wilson intervals. Right: ports from above; where a sweep filled the disc, its "
+        "mean over 8 mm, its ports as dots.",
+    ),
+    "ports": (
+        "Success and the number of training trocars",
+        "Trials at the trocars that none of these runs was trained at, with 95% Wilson intervals.",
+    ),
+    "training": (
+        "Training",
+        "Loss on the training batches, and the error of predicted commands on demonstrations kept "
+        "out of training (open loop).",
+    ),
+}
+
+
+def render(
+    runs: Sequence[results.Run], focus: results.Run, figures: Figures, video: bytes | None
+) -> str:
+    """The page of `runs`, whose headline numbers are those of `focus`."""
+    several = len(runs) > 1
+    title = captions.title(runs)
+    body = [
+        f'<p class="eyebrow">starjax report</p><h1>{markup.escape(title)}</h1>',
+        f'<p class="verdict">{markup.escape(captions.verdict(runs, focus))}</p>',
+        sections.facts(runs),
+        sections.notes(runs),
+        sections.cards(focus),
+        _video(video, results.observed(runs)),
+        sections.comparison(runs) if several else sections.tests(focus),
+        _figure("fig3", figures),
+        _figure("fig4", figures),
+        sections.swept(runs),
+        _figure("ports", figures),
+        sections.matrix(runs) if several else sections.per_trocar(focus),
+        sections.failures(runs),
+        sections.measurements(runs),
+        _figure("training", figures),
+        sections.reproduce(runs),
+    ]
+    style = importlib.resources.files("starjax.experiments.report").joinpath("page.css").read_text()
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{markup.escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>\n"
+        + "\n".join(part for part in body if part)
+        + "\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _figure(name: str, figures: Figures) -> str:
+    if name not in figures:
+        return ""
+    heading, caption = CAPTIONS[name]
+    light, dark = (markup.uri("image/png", picture) for picture in figures[name])
+    return (
+        f"<h2>{heading}</h2>\n<figure><picture>"
+        f'<source media="(prefers-color-scheme: dark)" srcset="{dark}">'
+        f'<img src="{light}" alt="{markup.escape(caption)}"></picture>'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _video(video: bytes | None, observed: str) -> str:
+    if video is None:
+        return ""
+    source = markup.uri("video/mp4", video)
+    return (
+        f'<figure><video controls loop muted autoplay playsinline src="{source}"></video>'
+        f"<figcaption>The policy, which sees the {observed}, at work in real time. The disc on the "
+        "shaft is the trocar; the block belongs on the marked peg.</figcaption></figure>"
+    )

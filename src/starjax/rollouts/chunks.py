@@ -1,0 +1,109 @@
+"""Which trials a dataset needs, and running them: of each trocar all, up to its last success.
+
+Outcomes are known in any order: a trial is needed once the trials before it cannot have all the
+successes, and is not once they do have them.
+"""
+
+import math
+from collections.abc import Callable, Generator, Iterator, Mapping
+
+from starjax.rollouts import cores, episodes
+
+MIN_SUCCESS_RATE = 0.5  # below it at some trocar, the expert is broken and collecting stops
+
+Trial = tuple[int, int]  # trocar, number
+Known = Mapping[Trial, bool]  # whether it succeeded
+
+
+class ExpertFailed(ValueError):
+    """The expert succeeds too rarely to go on collecting."""
+
+
+def run(
+    simulate: Callable[[list[Trial]], Generator[list[episodes.Episode]]],
+    known: dict[Trial, bool],
+    trocars: int,
+    per_trocar: int,
+    chunk: int,
+    at_once: int = 1,
+) -> Iterator[episodes.Episode]:
+    """Simulates what is needed, `chunk` trials together; yields each episode when that is certain.
+
+    Args:
+      simulate: as `recorder.simulator` makes it.
+      known: outcomes of episodes that are there already; the others are added.
+      trocars: how many there are.
+      per_trocar: successes wanted at each.
+      chunk: number of lanes.
+      at_once: chunks that are simulated side by side.
+
+    Raises:
+      ExpertFailed: the expert fails too often.
+    """
+    there = set(known)
+    drawn = [0] * trocars
+    while wave := _wave(known, drawn, per_trocar, chunk):
+        groups = [wave[first : first + chunk] for first in range(0, len(wave), chunk)]
+        waiting: list[episodes.Episode] = []
+
+        def is_wanted(group: list[Trial]) -> bool:
+            return any(_is_open(trial, known, per_trocar) for trial in group)
+
+        for ended in cores.run(groups, simulate, at_once, is_wanted):
+            waiting += ended
+            for episode in ended:
+                # What is on disk stays, also where another machine's last bits end otherwise.
+                known.setdefault(_trial(episode), episode.outcome["success"])
+            ended.clear()  # so that an episode's memory is free once it is written
+            ready = [e for e in waiting if _is_needed(_trial(e), known, per_trocar)]
+            waiting = [e for e in waiting if not _is_needed(_trial(e), known, per_trocar)]
+            while ready:
+                episode = ready.pop()
+                if _trial(episode) not in there:
+                    yield episode
+
+
+def _wave(known: Known, drawn: list[int], per_trocar: int, chunk: int) -> list[Trial]:
+    """The next trials: as many at each trocar as it lacks successes, and more in the lanes left.
+
+    Updates `drawn`, the trials drawn so far at each trocar.
+    """
+    limit = math.ceil(8 + per_trocar / MIN_SUCCESS_RATE)
+    wave, lacking = [], []
+
+    def draw(trocar: int) -> None:
+        wave.append((trocar, drawn[trocar]))
+        drawn[trocar] += 1
+
+    for trocar, first in enumerate(drawn):
+        done = sum(known.get((trocar, i), False) for i in range(first))
+        if done >= per_trocar:
+            continue
+        if first >= limit:
+            raise ExpertFailed(
+                f"expert: expected a success rate above {MIN_SUCCESS_RATE:.0%}, "
+                f"got {done} of {first} at trocar {trocar}"
+            )
+        lacking.append(trocar)
+        for _ in range(min(per_trocar - done, limit - first)):
+            draw(trocar)
+    # A failure then costs no further wave, which would take as long as this one for a few trials.
+    while -len(wave) % chunk and (lacking := [i for i in lacking if drawn[i] < limit]):
+        for trocar in lacking[: -len(wave) % chunk]:
+            draw(trocar)
+    return wave
+
+
+def _is_needed(trial: Trial, known: Known, per_trocar: int) -> bool:
+    """Whether it is, also if all before it that are not over succeed."""
+    return sum(known.get((trial[0], i), True) for i in range(trial[1])) < per_trocar
+
+
+def _is_open(trial: Trial, known: Known, per_trocar: int) -> bool:
+    """Whether it is not over, and may be needed."""
+    before = sum(known.get((trial[0], i), False) for i in range(trial[1]))
+    return trial not in known and before < per_trocar
+
+
+def _trial(episode: episodes.Episode) -> Trial:
+    return episode.outcome["trocar"], episode.outcome["trial"]

@@ -1,0 +1,257 @@
+"""Scripted expert of peg transfer: a phase machine that looks at the block, in pure JAX.
+
+It grasps a wall to the left or right of its middle and, of two walls that are alike, either, at
+random (never by the trocar), at its own pace, is disturbed on purpose, and starts over when the
+block is not where it should be.
+The roll follows from tip positions and trocar alone: the tool turns only once the coming positions
+hold the grasp point, and the jaws' axis then stays on the wall's normal. It comes in along that
+normal, from outside, so that the path says which way the wall faces, and ways to two walls differ.
+"""
+
+import functools
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from starjax import rcm
+from starjax.sim import env
+from starjax.sim.tasks.peg_transfer.task import task
+from starjax.types import Command
+
+RAISE, APPROACH, DESCEND, CLOSE, LIFT, CARRY, LOWER, OPEN, RETREAT, WAIT = range(10)
+
+# Least duration (s) and mean speed (m/s) of each phase, and jaws: +1 open, -1 closed at its end.
+DURATION = (0.5, 1.2, 0.9, 0.4, 0.6, 0.9, 0.7, 0.4, 0.5, 1.0)
+SPEED = (0.04, 0.04, 0.024, 1.0, 0.035, 0.038, 0.024, 1.0, 0.04, 1.0)
+JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
+# How much of the disturbance acts in each phase.
+DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.6, 0.3, 0.0, 0.3, 0.0)
+
+TEMPO = (0.85, 1.2)  # range of an episode's pace
+JAW_TIME = 0.25  # s to close or open
+TURN_LEAD = 0.25  # s before the end of the approach at which the tool begins to turn
+TURN_TIME = 0.80  # s the turn takes
+
+ALIGNED = 0.6  # share of a descent after which it goes straight down
+HOVER = 0.026  # m above the grasp point
+GRASP_DROP = 0.001  # m below the rim's centre line
+RELEASE_HEIGHT = 0.0007  # m above the grasp's height at which the block is let go
+RELEASE_SHIFT = 0.0005  # m further out along the grasped wall's normal: room for the inner pad
+HELD = 0.006  # m from the tip within which the grasped wall counts as held
+GRASP_SIDE = 0.0015  # m along the wall, to either side of its middle
+CANDIDATES = 2  # walls to choose from
+OUTWARD = 0.001  # m off the middle row at which a preference shows
+BETWEEN_ROWS = 0.012  # m off the middle row, half way to the next
+SKEW = 0.1  # sine of the angle between jaws and the world's y at which a preference shows
+
+NOISE_POSITION = 0.0012  # m, standard deviation of the disturbance
+NOISE_ROLL = 0.07  # rad
+NOISE_TIME = 0.4  # s, correlation time
+NOISE_SMOOTHING = 0.15  # s, low-pass: an arm's tool does not jump
+HOVER_OUT = 0.008  # m out from the grasp point along the wall's normal
+HOVER_SPREAD = 0.0015  # m, standard deviation of where it hovers
+NOISE_STREAM = 1 << 20  # folded into the key: apart from every attempt's stream
+
+
+@flax.struct.dataclass
+class ExpertState:
+    """Where the script stands; single episode.
+
+    Attributes:
+      key: typed key, folded with the step for everything random.
+      phase: int32. elapsed, duration: s. attempt: int32, grasps begun.
+      start, goal: `[3]` m, label positions at the phase's ends.
+      wall: int32, the wall grasped; side: -1 or 1, on which side of its middle.
+      normal: `[3]`, the wall's direction, or the opposite: jaws are symmetric, and this keeps the
+        roll on one branch.
+      roll_from: rad, the roll that the next turn begins at. jaws_from: jaws at the phase's start.
+      middle: m, y of the row on which either wall may be taken.
+      tempo: pace. noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
+      label: the undisturbed command, which is what demonstrations record.
+    """
+
+    key: jax.Array
+    phase: jax.Array
+    elapsed: jax.Array
+    duration: jax.Array
+    attempt: jax.Array
+    start: jax.Array
+    goal: jax.Array
+    wall: jax.Array
+    side: jax.Array
+    normal: jax.Array
+    roll_from: jax.Array
+    jaws_from: jax.Array
+    middle: jax.Array
+    tempo: jax.Array
+    noise: jax.Array
+    label: Command
+
+
+def init(key: jax.Array, state: env.EnvState, middle: float = 0.0) -> ExpertState:
+    """The script at the start of an episode. `middle`: see `ExpertState`; the peg rows' by default,
+    and between two rows there is no choice."""
+    key_tempo, key = jax.random.split(key)
+    tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
+    expert = ExpertState(
+        key=key,
+        phase=jnp.asarray(RAISE, jnp.int32),
+        elapsed=jnp.zeros(()),
+        duration=jnp.zeros(()),
+        attempt=jnp.zeros((), jnp.int32),
+        start=state.pose.p,
+        goal=state.pose.p,
+        wall=jnp.zeros((), jnp.int32),
+        side=jnp.ones(()),
+        normal=jnp.array([0.0, -1.0, 0.0]),
+        roll_from=jnp.zeros(()),
+        jaws_from=jnp.ones(()),
+        middle=jnp.asarray(middle, jnp.float32),
+        tempo=tempo,
+        noise=jnp.zeros((2, 4)),
+        label=Command(state.pose, jnp.ones(())),
+    )
+    return _enter(expert, jnp.asarray(APPROACH, jnp.int32), state, jnp.zeros(()))
+
+
+init_with_one_wall = functools.partial(init, middle=BETWEEN_ROWS)
+
+
+def act(expert: ExpertState, state: env.EnvState) -> tuple[Command, ExpertState]:
+    """The disturbed command to execute now; the next state, whose `label` is the clean one."""
+    dt = 1.0 / env.CONTROL_HZ
+    roll = _roll_of(expert, state)
+    is_over = expert.elapsed >= expert.duration - 1e-6
+    following = _enter(expert, _following(expert, state), state, roll)
+    expert = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), following, expert)
+    expert = expert.replace(elapsed=expert.elapsed + dt)
+
+    s = jnp.clip(expert.elapsed / expert.duration, 0.0, 1.0)
+    # On the way down it is over its goal by the time anything can touch.
+    is_down = (expert.phase == DESCEND) | (expert.phase == LOWER)
+    aside = _minimum_jerk(jnp.minimum(s / jnp.where(is_down, ALIGNED, 1.0), 1.0))
+    share = jnp.stack([aside, aside, _minimum_jerk(s)])
+    p = expert.start + share * (expert.goal - expert.start)
+    expert = expert.replace(label=Command(expert.label.pose._replace(p=p), expert.label.gripper))
+    roll = _roll_of(expert, state)
+    jaws = jnp.asarray(JAWS)[expert.phase]
+    gripper = expert.jaws_from + jnp.clip(expert.elapsed / JAW_TIME, 0.0, 1.0) * (
+        jaws - expert.jaws_from
+    )
+
+    weight = jnp.asarray(DISTURBANCE)[expert.phase]
+    noise = _disturb(expert, state.step, dt)
+    moved = weight * noise[1] * jnp.where(expert.phase == DESCEND, 1.0 - s, 1.0)
+    decode = rcm.ACTION_SPACES["rcm4"].decode
+    clean, _ = decode(jnp.append(roll, p), state.trocar, state.p_world_ref)
+    rough, _ = decode(jnp.append(roll + moved[3], p + moved[:3]), state.trocar, state.p_world_ref)
+    expert = expert.replace(noise=noise, label=Command(clean, gripper))
+    return Command(rough, gripper), expert
+
+
+def _following(expert: ExpertState, state: env.EnvState) -> jax.Array:
+    """The phase after the present one, given what the world looks like now."""
+    phase = expert.phase
+    grasped = (
+        state.block_pose.p + task.RIM_RADIUS * task.wall_normals(state.block_pose)[expert.wall]
+    )
+    is_held = jnp.sum((grasped - state.pose.p) ** 2) < HELD**2
+    is_lost = (phase >= LIFT) & (phase <= CARRY) & ~is_held
+    return jnp.where(is_lost | (phase == WAIT), RAISE, phase + 1).astype(jnp.int32)
+
+
+def _enter(
+    expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax.Array
+) -> ExpertState:
+    """Begins `phase`: choose the wall if it is an approach, set goal and duration."""
+    block, tip = state.block_pose, expert.label.pose.p
+    is_approach = phase == APPROACH
+    attempt = expert.attempt + is_approach
+    keys = jax.random.split(jax.random.fold_in(expert.key, attempt), 3)
+    key_wall, key_side, key_hover = keys
+    normals = task.wall_normals(block)
+    # The jaws' axis stays within 60 degrees of the world's y: the roll then never meets its wrap.
+    skew = jnp.abs(normals[:, 0])
+    is_candidate = skew <= jnp.sort(skew)[CANDIDATES - 1]
+    # Of these, the one towards the board's middle, where the shaft leans away from the peg; on the
+    # middle row the one that asks for less of a turn, or either if they are alike.
+    unlike = normals[:, 1] * (block.p[1] - expert.middle) / OUTWARD + skew / SKEW
+    chosen = jax.random.categorical(key_wall, jnp.where(is_candidate, -unlike, -jnp.inf))
+    wall = jnp.where(is_approach, chosen, expert.wall)
+    out = normals[wall] * jnp.array([1.0, 1.0, 0.0])
+    out = out / jnp.maximum(jnp.linalg.norm(out), 1e-6)
+    normal = jnp.where(phase <= DESCEND, out * jnp.where(out[1] > 0, -1.0, 1.0), expert.normal)
+
+    side = jnp.where(is_approach, jax.random.rademacher(key_side, (), jnp.float32), expert.side)
+    tangent = jnp.cross(block.R[:, 2], normals[wall])
+    grasp = block.p + task.RIM_RADIUS * normals[wall] + side * GRASP_SIDE * tangent
+    grasp = grasp - jnp.array([0.0, 0.0, GRASP_DROP])
+    spread = HOVER_SPREAD * jax.random.normal(key_hover, (3,)) * jnp.array([1.0, 1.0, 0.5])
+    hover = task.RIM_HEIGHT - GRASP_DROP + HOVER
+    # Where the tip must be once the block, tilted by now, is pressed upright over the target peg:
+    # on its wall, as far along it as the grasp is.
+    along = jnp.array([-out[1], out[0]])
+    aside = ((state.pose.p - block.p)[:2] @ along) * along
+    over = state.target_peg + (task.RIM_RADIUS + RELEASE_SHIFT) * out[:2] + aside
+    low = task.RIM_HEIGHT - GRASP_DROP + RELEASE_HEIGHT
+    goals = jnp.stack(
+        [
+            tip.at[2].set(jnp.maximum(tip[2], hover)),
+            grasp.at[2].set(hover) + HOVER_OUT * out + spread,
+            grasp,
+            tip,
+            tip.at[2].set(hover),
+            jnp.append(over, hover),
+            jnp.append(over, low),
+            tip,
+            tip.at[2].set(tip[2] + HOVER),
+            tip,
+        ]
+    )
+    goal = goals[phase]
+    least = jnp.maximum(
+        jnp.asarray(DURATION)[phase], jnp.linalg.norm(goal - tip) / jnp.asarray(SPEED)[phase]
+    )
+    return expert.replace(
+        phase=phase,
+        elapsed=jnp.zeros(()),
+        duration=least / expert.tempo,
+        attempt=attempt,
+        start=tip,
+        goal=goal,
+        wall=wall,
+        side=side,
+        normal=normal,
+        roll_from=jnp.where(phase <= APPROACH, roll, expert.roll_from),
+        jaws_from=expert.label.gripper,
+    )
+
+
+def _roll_of(expert: ExpertState, state: env.EnvState) -> jax.Array:
+    """Roll (rad) at the label's position: turning towards, or on, the wall's normal."""
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(
+        jnp.append(0.0, expert.label.pose.p), state.trocar, state.p_world_ref
+    )
+    on_wall = jnp.arctan2(-expert.normal @ pose.R[:, 0], expert.normal @ pose.R[:, 1])
+    lead = TURN_LEAD + jnp.where(
+        expert.phase == APPROACH, expert.elapsed - expert.duration, expert.elapsed
+    )
+    turned = jnp.clip(lead * expert.tempo / TURN_TIME, 0.0, 1.0)
+    turned = jnp.where(expert.phase > DESCEND, 1.0, jnp.where(expert.phase == RAISE, 0.0, turned))
+    weight = 0.5 - 0.5 * jnp.cos(jnp.pi * turned)
+    return expert.roll_from + weight * (on_wall - expert.roll_from)
+
+
+def _disturb(expert: ExpertState, step: jax.Array, dt: float) -> jax.Array:
+    """The next value of an Ornstein-Uhlenbeck process and of its low-passed copy, `[2, 4]`."""
+    keep = jnp.exp(-dt / NOISE_TIME)
+    scale = jnp.array([NOISE_POSITION] * 3 + [NOISE_ROLL]) * jnp.sqrt(1.0 - keep**2)
+    key = jax.random.fold_in(jax.random.fold_in(expert.key, NOISE_STREAM), step)
+    rough = keep * expert.noise[0] + scale * jax.random.normal(key, (4,))
+    smooth = expert.noise[1] + dt / NOISE_SMOOTHING * (rough - expert.noise[1])
+    return jnp.stack([rough, smooth])
+
+
+def _minimum_jerk(s: jax.Array) -> jax.Array:
+    return s**3 * (10.0 + s * (-15.0 + 6.0 * s))

@@ -1,0 +1,347 @@
+"""A policy in someone else's program: the same commands, and mistakes that are named."""
+
+import dataclasses
+
+import fakes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import config, deploy, rcm
+from starjax.data import normalizer
+from starjax.methods import METHODS
+from starjax.policies import policy as policies
+from starjax.policies import policy_file
+
+TRAIN = config.TrainConfig()
+ROBOTS = 3
+PORT = jax.tree.map(lambda field: field[0], rcm.TROCARS)
+
+
+@pytest.fixture(scope="module", params=["state", "image"])
+def made(request, tmp_path_factory):
+    """A file of a policy with random weights; the same policy, loaded."""
+    size = fakes.TINY.image_size
+    settings = dataclasses.replace(fakes.TINY, observation=request.param)
+    dataset = fakes.dataset(seed=0, image_size=size)
+    policy = policies.make(METHODS["stardiff"], settings, fakes.P_WORLD_REF, TRAIN)
+    stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(80))
+    init = jax.jit(policy.init, compiler_options={"xla_backend_optimization_level": 0})
+    trained = policy_file.Trained(
+        "stardiff", settings, TRAIN, init(jax.random.key(0)), stats, tuple(fakes.P_WORLD_REF)
+    )
+    path = tmp_path_factory.mktemp("deploy") / "policy.safetensors"
+    policy_file.save(path, trained)
+    return path, trained, policy
+
+
+def observed(settings, robots=(ROBOTS,)):
+    """Tools through the first trocars, near the board."""
+    moments, rng = (*robots, settings.obs_horizon), np.random.default_rng(0)
+    count = robots[0] if robots else 1
+    port = jax.tree.map(lambda field: field[:count, None], rcm.TROCARS)
+    parts = np.zeros((count, settings.obs_horizon, 4), np.float32)
+    parts[..., 1:] = np.array([0.0, 0.0, 0.02]) + rng.normal(scale=0.01, size=parts[..., 1:].shape)
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(parts, port, fakes.P_WORLD_REF)
+    is_image = settings.observation == "image"
+    size = (*moments, settings.image_size, settings.image_size, 3)
+    return deploy.Observation(
+        pose=jax.tree.map(lambda x: np.asarray(x).reshape(*moments, *x.shape[2:]), pose),
+        gripper=np.ones(moments, np.float32),
+        image=rng.integers(0, 256, size, np.uint8) if is_image else None,
+        state=None if is_image else rng.normal(size=(*moments, 12)).astype(np.float32),
+    )
+
+
+def test_it_decides_as_the_policy_of_an_evaluation_does(made):
+    path, trained, policy = made
+    deployed, observation = deploy.load(path), observed(trained.policy)
+    assert deployed.method == "stardiff" and deployed.settings == trained.policy
+    trocar = jax.tree.map(lambda field: field[:ROBOTS], rcm.TROCARS)
+    keys = jax.random.split(jax.random.key(7), ROBOTS)
+    wanted = jax.jit(policy.sample)(trained.params, trained.normalizer, keys, observation, trocar)
+    got = deployed(jax.random.key(7), observation, trocar)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
+    old = deployed(jax.random.key_data(jax.random.key(7)), observation, trocar)
+    jax.tree.map(np.testing.assert_array_equal, old, got)
+    one = jax.tree.map(lambda x: x[1], (observation, trocar))
+    alone = deployed(keys[1], *one)
+    assert alone.pose.p.shape == (trained.policy.horizon, 3)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[1], atol=1e-5), alone, wanted)
+
+
+def test_it_decides_alike_where_jax_forbids_other_ranks(made):
+    path, trained, _ = made
+    arguments = jax.random.key(7), observed(trained.policy, ()), PORT
+    wanted = deploy.load(path)(*arguments)
+    with jax.numpy_rank_promotion("raise"):
+        deployed = deploy.load(path)
+        got, compiled = deployed(*arguments), jax.jit(deployed)(*arguments)
+    jax.tree.map(np.testing.assert_array_equal, got, wanted)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), compiled, wanted)
+
+
+def test_fields_of_a_trocar_broadcast(made):
+    path, trained, _ = made
+    deployed, observation = deploy.load(path), observed(trained.policy)
+    one = jax.tree.map(lambda x: np.repeat(x[:1], ROBOTS, 0), observation)
+    port = jax.tree.map(lambda field: field[:1].repeat(ROBOTS), rcm.TROCARS)
+    wanted = deployed(jax.random.key(0), one, port)
+    lists = rcm.Trocar(*(field.tolist() for field in port))
+    for given in (port._replace(radius=PORT.radius, azimuth=PORT.azimuth), PORT, lists):
+        got = deployed(jax.random.key(0), one, given)
+        jax.tree.map(np.testing.assert_array_equal, got, wanted)
+
+
+def test_a_mistake_names_the_array(made):
+    path, trained, _ = made
+    deployed, kind = deploy.load(path), trained.policy.observation
+    trocar, good = PORT, observed(trained.policy, ())
+    turned = good.replace(pose=good.pose._replace(p=np.zeros(3)))
+    mistakes = {
+        r"observation.pose.p: expected shape \[2, 3\], got \[3\]": (turned, trocar),
+        rf"observation.{kind}: expected shape .*, got none": (good.replace(**{kind: None}), trocar),
+        r"trocar.polar: .*got 80": (good, trocar._replace(polar=80.0)),
+        r"observation.pose.R: expected shape \[4, 2, 3, 3\]": (
+            good,
+            rcm.Trocar(*np.full((3, 4), 0.1)),
+        ),
+        r"trocar: expected fields of shape \[\] or \[B\]": (
+            good,
+            rcm.Trocar(*np.full((3, 1, 1), 0.1)),
+        ),
+        r"trocar: expected fields of shape \[\] or \[B\], got \[0\]": (
+            observed(trained.policy, (0,)),
+            rcm.Trocar(*np.zeros((3, 0))),
+        ),
+        r"observation.pose.R: expected shape .*, got none": (good.replace(pose=None), trocar),
+        r"observation.pose: expected a deploy.Pose, got ndarray": (
+            good.replace(pose=np.zeros((2, 4, 4))),
+            trocar,
+        ),
+        r"observation.pose: expected a deploy.Pose, got dict": (
+            good.replace(pose=good.pose._asdict()),
+            trocar,
+        ),
+        r"observation.gripper: expected shape .*, got none": (good.replace(gripper=None), trocar),
+        r"observation.gripper: expected real numbers, got complex": (
+            good.replace(gripper=good.gripper * 1j),
+            trocar,
+        ),
+        r"observation.gripper: expected real numbers, got <U": (
+            good.replace(gripper=["open", "shut"]),
+            trocar,
+        ),
+        r"observation: expected a deploy.Observation, got NoneType": (None, trocar),
+    }
+    if kind == "image":
+        bright = good.replace(image=good.image / np.float32(255))
+        mistakes["observation.image: expected uint8, got float32"] = (bright, trocar)
+    for message, given in mistakes.items():
+        with pytest.raises(ValueError, match=message):
+            deployed(jax.random.key(0), *given)
+    with pytest.raises(ValueError, match=r"key: expected a jax\.random\.key, .*got int"):
+        deployed(0, good, trocar)
+    with pytest.raises(ValueError, match=r"key: expected .*one for all robots, got key<fry>\[3\]"):
+        deployed(jax.random.split(jax.random.key(0), 3), good, trocar)
+    with pytest.raises(ValueError, match=r"key: expected .*got uint32\[1, 2\]"):
+        deployed(np.zeros((1, 2), np.uint32), good, trocar)
+    for no_key in (np.zeros(2), np.zeros(3, np.uint32), np.array([0, 1])):
+        with pytest.raises(ValueError, match=r"key: expected .*one for all robots"):
+            deployed(no_key, good, trocar)
+
+
+def test_numbers_that_no_robot_measures_are_refused(made):
+    path, trained, _ = made
+    deployed, key = deploy.load(path), jax.random.key(0)
+    good = observed(trained.policy, ())
+
+    def refused(message, observation=good, trocar=PORT):
+        with pytest.raises(ValueError, match=message):
+            deployed(key, observation, trocar)
+
+    bad = np.full_like(good.gripper, np.nan)
+    refused("observation.gripper: expected finite", good.replace(gripper=bad))
+    for name, turn in (("pose.p", lambda x: x + np.inf), ("pose.R", lambda x: x * np.nan)):
+        part = name.removeprefix("pose.")
+        pose = good.pose._replace(**{part: turn(getattr(good.pose, part))})
+        refused(f"observation.{name}: expected finite", good.replace(pose=pose))
+    for R in (np.zeros_like(good.pose.R), -good.pose.R, 1.1 * good.pose.R):
+        refused("pose.R: expected rotations", good.replace(pose=good.pose._replace(R=R)))
+    refused(r"trocar.radius: expected at most 0.5 m, got 14", trocar=rcm.Trocar(14.0, 1.4, 0.8))
+    refused("trocar: expected an rcm.Trocar, got list", trocar=[0.02, 1.4, 0.8])
+    wrapped = np.full_like(good.gripper, -128, np.int8)  # its own absolute value
+    refused("observation.gripper: .*, got -128", good.replace(gripper=wrapped))
+    refused("observation.gripper: .*, got 3.6", good.replace(gripper=3.6 * good.gripper))
+    in_mm = good.replace(pose=good.pose._replace(p=1e3 * good.pose.p))
+    refused("observation.pose.p: expected tips within 0.5 m", in_mm)
+    other = jax.tree.map(lambda field: field[4], rcm.TROCARS)
+    refused("an axis that misses it by .* mm", trocar=other)
+    with pytest.raises(ValueError, match=r"trocar.radius: expected at most 0.5 m, got 14"):
+        jax.jit(lambda key: deployed(key, good, PORT._replace(radius=14.0)))(key)
+    deployed(key, good, PORT)
+    half = jax.tree.map(lambda x: x.astype(np.float16), good.pose)
+    deployed(key, good.replace(pose=half), PORT)
+
+
+def test_what_the_policy_does_not_look_at_is_not_looked_at(made):
+    path, trained, _ = made
+    deployed, key, good = deploy.load(path), jax.random.key(0), observed(trained.policy, ())
+    wanted = deployed(key, good, PORT)
+    unused = "state" if trained.policy.observation == "image" else "image"
+    more = good.replace(**{unused: np.full((2, 12), np.nan)}, features=np.zeros((2, 5)))
+    jax.tree.map(np.testing.assert_array_equal, deployed(key, more, PORT), wanted)
+    lists = jax.tree.map(lambda x: x.tolist() if x.dtype != np.uint8 else list(x), good)
+    jax.tree.map(np.testing.assert_array_equal, deployed(key, lists, PORT), wanted)
+
+
+def test_a_tool_half_a_turn_away_is_the_same_tool(made):
+    path, trained, _ = made
+    deployed, key, good = deploy.load(path), jax.random.key(0), observed(trained.policy, ())
+    half = np.diag([-1.0, -1.0, 1.0]).astype(np.float32)
+    turned = good.replace(pose=good.pose._replace(R=good.pose.R @ half))
+    wanted, got = deployed(key, good, PORT), deployed(key, turned, PORT)
+    np.testing.assert_array_equal(got.pose.p, wanted.pose.p)
+    np.testing.assert_array_equal(got.pose.R, wanted.pose.R @ half)
+
+
+def test_methods_that_share_weights_are_each_deployed(made, tmp_path):
+    _, trained, _ = made
+    stats = normalizer.fit(METHODS["dp_ee"], fakes.dataset(0), fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.P_WORLD_REF, TRAIN)
+    params = jax.jit(policy.init)(jax.random.key(0))
+    file = tmp_path / "policy.safetensors"
+    policy_file.save(file, trained._replace(method="dp_ee", params=params, normalizer=stats))
+    off = {}
+    for name in ("dp_ee", "dp_ee_proj"):
+        deployed = deploy.load(file, method=name)
+        pose = deployed(jax.random.key(0), observed(trained.policy, ()), PORT).pose
+        off[name] = rcm.rcm_error(pose, rcm.trocar_position(PORT, fakes.P_WORLD_REF)).max()
+    assert deployed.method == "dp_ee_proj" and off["dp_ee_proj"] < 1e-6 < 1e-3 < off["dp_ee"]
+    assert deploy.load(file).method == "dp_ee"
+    with pytest.raises(ValueError, match=r"method: expected one of dp_ee, dp_ee_proj, got 'star"):
+        deploy.load(file, method="stardiff")
+
+
+def test_a_file_that_will_not_do_is_named(made, tmp_path):
+    path, trained, _ = made
+    with pytest.raises(ValueError, match=r"^policy: expected a file or one of .*compact, got no"):
+        deploy.load("no")
+    for steps in (1, 101, 2.5):
+        with pytest.raises(
+            ValueError, match=rf"ddim_steps: expected .* from 2 to 100, got {steps}"
+        ):
+            deploy.load(path, ddim_steps=steps)
+    assert deploy.load(path, ddim_steps=2).settings.ddim_steps == 2
+    small = {"unet": {"kernel": jnp.ones(3)}}
+    policy_file.save(tmp_path / "p", trained._replace(p_world_ref=None, params=small))
+    with pytest.raises(ValueError, match="nominal port"):
+        deploy.load(tmp_path / "p")
+    policy_file.save(tmp_path / "p", trained._replace(method="stardif", params=small))
+    with pytest.raises(ValueError, match=r"/p: method: expected one of .*, got 'stardif'"):
+        deploy.load(tmp_path / "p")
+
+
+def test_a_policy_prints_as_its_settings_without_its_weights(made):
+    path, trained, _ = made
+    said = repr(deploy.load(path))
+    assert repr(trained.policy) in said and "Array" not in said
+
+
+def test_what_sensors_are_off_is_not_refused(made):
+    path, trained, _ = made
+    deployed, key = deploy.load(path), jax.random.key(0)
+    good = observed(trained.policy, ())
+    deployed(key, good.replace(gripper=1.05 * good.gripper), PORT)
+    pose = good.pose._replace(R=1.01 * good.pose.R, p=good.pose.p + 0.01 * good.pose.R[..., 0])
+    deployed(key, good.replace(pose=pose), PORT)
+
+
+def test_a_tool_through_another_port_is_refused_where_the_policy_keeps_to_it(made, tmp_path):
+    _, trained, _ = made
+    stats = normalizer.fit(METHODS["dp_ee"], fakes.dataset(0), fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.P_WORLD_REF, TRAIN)
+    params = jax.jit(policy.init)(jax.random.key(0))
+    file, other = tmp_path / "policy.safetensors", jax.tree.map(lambda x: x[4], rcm.TROCARS)
+    policy_file.save(file, trained._replace(method="dp_ee", params=params, normalizer=stats))
+    given = jax.random.key(0), observed(trained.policy, ()), other
+    deploy.load(file)(*given)
+    with pytest.raises(ValueError, match="an axis that misses it by"):
+        deploy.load(file, method="dp_ee_proj")(*given)
+
+
+@pytest.mark.parametrize("rolls", [(1.4, 1.7), (1.7, 1.4)])
+def test_the_newest_moment_says_which_way_a_tool_is_turned(made, rolls):
+    """An untrained policy commands a roll of about zero, as it reads the tool."""
+    path, trained, _ = made
+    good = observed(trained.policy, ())
+    R = rcm.rotation_from_axis_roll(good.pose.R[..., 2], np.float32(rolls))
+    turned = good.replace(pose=good.pose._replace(R=R))
+    roll = np.abs(rcm.roll_of(deploy.load(path)(jax.random.key(0), turned, PORT).pose.R))
+    assert ((roll > np.pi / 2) == (rolls[1] > np.pi / 2)).all()
+
+
+def test_it_may_be_part_of_a_program(made):
+    path, trained, _ = made
+    deployed, given = deploy.load(path), (observed(trained.policy, ()), PORT)
+    wanted = deployed(jax.random.key(0), *given)
+    got = jax.jit(deployed)(jax.random.key(0), *jax.tree.map(jnp.asarray, given))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
+    port = jax.tree.map(jnp.asarray, PORT)
+    got = jax.jit(lambda key, seen: deployed(key, seen, port))(jax.random.key(0), given[0])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
+
+
+def test_it_plans_the_same_in_a_program_of_double_precision(made):
+    path, trained, _ = made
+    deployed, good, key = deploy.load(path), observed(trained.policy), jax.random.key(0)
+    ports = jax.tree.map(lambda field: field[:ROBOTS], rcm.TROCARS)
+    wanted = deployed(key, good, ports)
+    with jax.enable_x64(True):
+        pose = jax.tree.map(np.float64, good.pose)
+        got = deployed(key, good.replace(pose=pose), ports)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
+
+
+@pytest.mark.parametrize("made", ["image"], indirect=True)
+def test_pictures_are_cropped_as_in_its_training(made, tmp_path):
+    _, trained, _ = made
+    half = dataclasses.replace(TRAIN, crop_fraction=0.5)
+    policy_file.save(tmp_path / "p", trained._replace(train=half))
+    deployed, good = deploy.load(tmp_path / "p"), observed(trained.policy, ())
+    edge = good.image.copy()
+    edge[:, :8] = 0
+    one, other = (deployed(jax.random.key(0), x, PORT) for x in (good, good.replace(image=edge)))
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_one_number_of_one_robot_is_enough_to_refuse(made):
+    path, trained, _ = made
+    deployed, good = deploy.load(path), observed(trained.policy)
+    ports = jax.tree.map(lambda field: field[:ROBOTS].copy(), rcm.TROCARS)
+
+    def changed(x, value):
+        x = np.array(x)
+        x[1, 0] = value(x[1, 0])
+        return x
+
+    pose, mirror = good.pose, np.diag([-1.0, 1.0, 1.0]).astype(np.float32)
+    bad = {
+        "gripper: expected finite": {"gripper": changed(good.gripper, lambda x: np.nan)},
+        "gripper: expected numbers": {"gripper": changed(good.gripper, lambda x: -2.0)},
+        "R: expected rot": {"pose": pose._replace(R=changed(pose.R, lambda x: x @ mirror))},
+        "R: expected rotations": {"pose": pose._replace(R=changed(pose.R, lambda x: 1.1 * x))},
+        "p: expected tips": {"pose": pose._replace(p=changed(pose.p, lambda x: x + 1.0))},
+        "an axis that misses": {
+            "pose": pose._replace(p=changed(pose.p, lambda x: x + np.eye(3)[0] * 0.05))
+        },
+    }
+    if good.state is not None:
+        bad["state: expected finite"] = {"state": changed(good.state, lambda x: x * np.nan)}
+    for message, fields in bad.items():
+        with pytest.raises(ValueError, match=message):
+            deployed(jax.random.key(0), good.replace(**fields), ports)
+    ports.radius[1] = 0.6
+    with pytest.raises(ValueError, match=r"trocar.radius: expected at most 0.5 m, got 0.6"):
+        deployed(jax.random.key(0), good, ports)

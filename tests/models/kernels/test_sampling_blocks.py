@@ -1,0 +1,65 @@
+"""The U-Net's blocks as a GPU samples with them are the functions that were trained."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax.models import unet1d
+from starjax.models.kernels import sampling_blocks
+
+GROUPS = 4
+
+
+def inputs(*shape, seed=1):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+
+
+def made(module, *given):
+    """Its parameters, none of them zero or one, and what they make of the given."""
+    params = jax.jit(module.init)(jax.random.key(0), *given)["params"]
+    leaves, tree = jax.tree.flatten(params)
+    params = tree.unflatten([x + 0.3 * inputs(*x.shape, seed=i) for i, x in enumerate(leaves)])
+    return params, module.apply({"params": params}, *given)
+
+
+@pytest.mark.parametrize("channels", [8, 12])
+@pytest.mark.parametrize(("kernel", "length"), [(5, 16), (5, 3), (5, 2), (5, 1), (3, 2), (1, 4)])
+def test_a_block_is_the_same_function(kernel, length, channels):
+    """With a convolution beside the first one, from 8 channels to 12, and without."""
+    module = unet1d.ResidualBlock(12, kernel, GROUPS)
+    given = inputs(3, length, channels), inputs(3, 24, seed=2)
+    params, expected = made(module, *given)
+    changed = sampling_blocks.prepared(params)
+    assert ("Conv1d_0" in params) == (channels == 8)
+    assert changed.keys() == {"first", "second"}
+    np.testing.assert_allclose(module.apply({"params": changed}, *given), expected, atol=2e-5)
+
+
+def test_the_last_convolution_is_the_same_function():
+    module, x = unet1d.ConvBlock(12, 5, GROUPS), inputs(3, 16, 8)
+    params, expected = made(module, x)
+    changed = {"params": sampling_blocks.prepared(params)}
+    assert "GroupNorm_0" not in changed["params"]
+    np.testing.assert_allclose(module.apply(changed, x), expected, atol=2e-5)
+
+
+def test_a_block_of_equal_numbers_is_finite():
+    module = unet1d.ResidualBlock(8, 5, GROUPS)
+    given = jnp.full((1, 4, 8), 5.0), jnp.ones((1, 16))
+    params, _ = made(module, *given)
+    zeros = jax.tree.map(jnp.zeros_like, params)  # its convolutions then give the same everywhere
+    assert jnp.isfinite(module.apply({"params": sampling_blocks.prepared(zeros)}, *given)).all()
+
+
+def test_statistics_are_float32_where_numbers_are_bfloat16():
+    """Both forms are as far from float32 as bfloat16's eight bits let them be."""
+    module = unet1d.ResidualBlock(32, 5, GROUPS)
+    given = inputs(3, 8, 32), inputs(3, 64, seed=2)
+    params, exact = made(module, *given)
+    narrow = [z.astype(jnp.bfloat16) for z in given]
+    errors = [
+        float(jnp.abs(module.apply({"params": p}, *narrow).astype(jnp.float32) - exact).mean())
+        for p in (params, sampling_blocks.prepared(params))
+    ]
+    assert errors[1] < 1.2 * errors[0] < 0.05

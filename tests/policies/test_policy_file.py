@@ -1,0 +1,190 @@
+"""policy.safetensors: a round trip, the same bytes every time, and damage noticed."""
+
+import json
+
+import fakes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import safetensors
+import safetensors.numpy
+
+from starjax import config
+from starjax.data import normalizer
+from starjax.policies import policy_file
+
+
+def trained(scale=1.0):
+    params = {
+        "diffuser": {"unet": {"kernel": scale * jnp.arange(6.0).reshape(2, 3)}},
+        "roll": {"bias": jnp.ones(3)},
+    }
+    box = normalizer.MinMax(-jnp.ones(5), jnp.arange(5.0))
+    return policy_file.Trained(
+        "stardiff",
+        fakes.TINY,
+        config.TrainConfig(crop_fraction=0.8),
+        params,
+        normalizer.Normalizer(box, None),
+        (0.0, 0.0, 0.15),
+    )
+
+
+def test_round_trip(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, trained())
+    found = policy_file.load(path)
+    assert found.method == "stardiff"
+    assert found.policy == fakes.TINY and found.train.crop_fraction == 0.8
+    assert found.p_world_ref == (0.0, 0.0, 0.15)
+    assert found.normalizer.state is None
+    jax.tree.map(np.testing.assert_array_equal, found.params, trained().params)
+    jax.tree.map(np.testing.assert_array_equal, found.normalizer, trained().normalizer)
+
+
+def test_same_policy_same_bytes(tmp_path):
+    for name in "ab":
+        policy_file.save(tmp_path / name, trained())
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_state_statistics_travel(tmp_path):
+    box = normalizer.MinMax(-jnp.ones(12), jnp.ones(12))
+    policy_file.save(tmp_path / "p", trained()._replace(normalizer=normalizer.Normalizer(box, box)))
+    assert policy_file.load(tmp_path / "p").normalizer.state.high.shape == (12,)
+
+
+def test_how_far_samples_reach_travels(tmp_path):
+    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5), jnp.array([[-1.0] * 5, [1.5] * 5]))
+    policy_file.save(
+        tmp_path / "p", trained()._replace(normalizer=normalizer.Normalizer(box, None))
+    )
+    found = policy_file.load(tmp_path / "p").normalizer.action
+    np.testing.assert_array_equal(found.reach, box.reach)
+
+
+def test_non_finite_weights_are_not_saved(tmp_path):
+    with pytest.raises(ValueError, match=r"expected finite values, got others in .*kernel"):
+        policy_file.save(tmp_path / "p", trained(scale=np.nan))
+    assert not (tmp_path / "p").exists()
+
+
+def random(largest=4.0, size=(100, 300)):
+    """A policy with weights of many magnitudes, some too small for float16."""
+    rng = np.random.default_rng(1)
+    kernel = rng.choice([-1, 1], size) * np.exp(rng.uniform(np.log(1e-9), np.log(largest), size))
+    params = {"unet": {"kernel": jnp.asarray(kernel, jnp.float32), "count": jnp.arange(3)}}
+    return trained()._replace(params=params)
+
+
+def test_a_setting_of_a_newer_version_is_named_with_its_file(tmp_path, monkeypatch):
+    asdict = policy_file.dataclasses.asdict
+    monkeypatch.setattr(policy_file.dataclasses, "asdict", lambda x: {**asdict(x), "future": 1})
+    policy_file.save(tmp_path / "p", trained())
+    with pytest.raises(ValueError, match=r"p: made by another version of starjax: .*'future'"):
+        policy_file.load(tmp_path / "p")
+
+
+def test_half_precision_is_half_the_size_and_rounds(tmp_path):
+    one = random()
+    policy_file.save(tmp_path / "full", one)
+    policy_file.save(tmp_path / "half", one, half=True)
+    full, half = ((tmp_path / name).stat().st_size for name in ("full", "half"))
+    assert 0.5 < half / full < 0.51
+    found, before = policy_file.load(tmp_path / "half"), np.asarray(one.params["unet"]["kernel"])
+    after = np.asarray(found.params["unet"]["kernel"])
+    assert after.dtype == np.float32
+    error = np.abs(after - before)
+    assert (error <= np.maximum(np.abs(before) / 2048, 3e-8)).all() and error.max() > 1e-4
+    np.testing.assert_array_equal(found.params["unet"]["count"], np.arange(3))
+    assert found.params["unet"]["count"].dtype == one.params["unet"]["count"].dtype
+    assert found._replace(params=None, normalizer=None) == one._replace(
+        params=None, normalizer=None
+    )
+
+
+def test_half_precision_leaves_the_statistics_alone(tmp_path):
+    box = normalizer.MinMax(jnp.full(5, -1.0001), jnp.full(5, 70_000.25))
+    policy_file.save(
+        tmp_path / "p", random()._replace(normalizer=normalizer.Normalizer(box, None)), True
+    )
+    found = policy_file.load(tmp_path / "p").normalizer.action
+    jax.tree.map(np.testing.assert_array_equal, found, box)
+
+
+def test_a_rounded_policy_stays_the_same(tmp_path):
+    policy_file.save(tmp_path / "half", random(), half=True)
+    rounded = policy_file.load(tmp_path / "half")
+    policy_file.save(tmp_path / "full", rounded)
+    policy_file.save(tmp_path / "again", rounded, half=True)
+    assert policy_file.is_policy(tmp_path / "half") and policy_file.is_policy(tmp_path / "full")
+    for name in ("full", "again"):
+        found = policy_file.load(tmp_path / name)
+        assert policy_file.fingerprint(found.params) == policy_file.fingerprint(rounded.params)
+    assert (tmp_path / "again").read_bytes() == (tmp_path / "half").read_bytes()
+
+
+def test_weights_too_large_for_half_precision_are_not_saved(tmp_path):
+    policy_file.save(tmp_path / "full", trained(scale=20_000.0))
+    with pytest.raises(ValueError, match=r"at most 65504 for float16, got 100000 in .*kernel"):
+        policy_file.save(tmp_path / "half", trained(scale=20_000.0), half=True)
+    assert not (tmp_path / "half").exists()
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_every_flipped_bit_is_noticed(tmp_path, half):
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, trained(), half)
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for at in rng.integers(len(content), size=200):
+        changed = bytearray(content)
+        changed[at] ^= 1 << rng.integers(8)
+        path.write_bytes(changed)
+        try:
+            found = policy_file.load(path)
+        except ValueError as error:
+            assert str(path) in str(error)
+            continue
+        # what is left is the padding of the header
+        assert found.policy == fakes.TINY and found.train == trained().train
+        jax.tree.map(np.testing.assert_array_equal, found.params, trained().params)
+
+
+@pytest.mark.parametrize("content", [b"", b"x" * 100, (1 << 60).to_bytes(8, "little") + b"{}"])
+def test_other_files_are_refused(tmp_path, content):
+    path = tmp_path / "policy.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="not a readable starjax policy"):
+        policy_file.load(path)
+
+
+@pytest.mark.parametrize("lost", ["p_world_ref", "method", "normalizer", "normalizer/action/low"])
+def test_a_policy_of_another_version_is_named(tmp_path, lost):
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, trained())
+    with safetensors.safe_open(path, "numpy") as file:
+        about = json.loads(file.metadata()["starjax"])["about"]
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    about.pop(lost, None)
+    arrays = {name: array for name, array in arrays.items() if not name.startswith(lost)}
+    envelope = {"about": about, "sha256": policy_file._hash(about, arrays)}
+    safetensors.numpy.save_file(arrays, path, {"starjax": json.dumps(envelope)})
+    with pytest.raises(ValueError, match=r"policy\.safetensors: made by another version"):
+        policy_file.load(path)
+
+
+def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path, monkeypatch):
+    def refused(path, *_):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    (tmp_path / "p").write_bytes(b"whatever")
+    monkeypatch.setattr("builtins.open", refused)
+    with pytest.raises(PermissionError):
+        policy_file.load(tmp_path / "p")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"policy: expected a file, got .*nowhere"):
+        policy_file.load(tmp_path / "nowhere")

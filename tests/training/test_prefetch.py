@@ -1,0 +1,57 @@
+"""Batches that a thread gathers on the host."""
+
+import time
+
+import fakes
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import config
+from starjax.data import windows
+from starjax.training import devices, prefetch, step
+
+
+def test_frames_follow_the_step_from_wherever_it_begins(monkeypatch):
+    monkeypatch.setattr(prefetch, "_CHUNK", 4)  # several of them in ten steps
+    dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
+    frames, key, first = np.arange(40), jax.random.key(3), 3
+    settings, mesh = config.TrainConfig(batch_size=16), devices.make_mesh(16)
+    stream = prefetch.batches(dataset, frames, fakes.TINY, settings, mesh, key, first)
+    for number in range(first, first + 10):
+        drawn = windows.sample_frames(step.step_keys(key, number)[0], jnp.asarray(frames), 16)
+        wanted = windows.gather(
+            dataset, np.asarray(drawn), fakes.TINY.obs_horizon, fakes.TINY.horizon
+        )
+        jax.tree.map(np.testing.assert_array_equal, next(stream), wanted)
+    stream.close()
+
+
+def test_a_closed_feed_gathers_nothing_more(monkeypatch):
+    dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
+    gathered, gather = [], windows.gather
+    monkeypatch.setattr(
+        windows, "gather", lambda *given: gathered.append(time.sleep(0.02)) or gather(*given)
+    )
+    settings, mesh = config.TrainConfig(batch_size=16), devices.make_mesh(16)
+    stream = prefetch.batches(
+        dataset, np.arange(40), fakes.TINY, settings, mesh, jax.random.key(3), 0
+    )
+    next(stream)
+    stream.close()
+    assert len(gathered) < prefetch._CHUNK // 2
+
+
+def test_a_fault_of_the_thread_is_raised_where_the_batch_is_asked_for(monkeypatch):
+    def fail(*_):
+        raise OSError("disk")
+
+    monkeypatch.setattr(windows, "gather", fail)
+    dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
+    settings, mesh = config.TrainConfig(batch_size=16), devices.make_mesh(16)
+    stream = prefetch.batches(
+        dataset, np.arange(40), fakes.TINY, settings, mesh, jax.random.key(3), 0
+    )
+    with pytest.raises(OSError, match="disk"):
+        next(stream)
