@@ -1,6 +1,8 @@
 """Every action space: total for any input, on the manifold, invertible, differentiable."""
 
+import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import transform
@@ -261,3 +263,40 @@ def test_a_roll_needs_a_jaw_and_an_axis(p_world_ref, column):
         space = rcm.ACTION_SPACES[name]
         action = space.encode(rcm.Pose(R, p_world_ref), rcm.Trocar(0.02, 1.5, 0.3), p_world_ref)
         assert np.isnan(action[space.slices["roll"]]).all() and np.isfinite(action[1:]).all()
+
+
+@pytest.mark.parametrize("space", rcm.ACTION_SPACES.values(), ids=lambda space: space.name)
+def test_a_resolved_trocar_gives_the_same_actions_and_poses(space):
+    key_trocar, key_action = jax.random.split(jax.random.key(3))
+    trocar = rcm.sample_trocar(key_trocar, (50,))
+    p_world_ref = jnp.array([0.01, -0.02, 0.15])
+    frame = rcm.trocar_frame(trocar, p_world_ref)
+    action = jax.random.normal(key_action, (50, space.dim))
+    pose, valid = space.decode(action, trocar, p_world_ref)
+    chex.assert_trees_all_close(space.decode(action, frame), (pose, valid), atol=1e-6)
+    chex.assert_trees_all_close(
+        space.encode(pose, frame), space.encode(pose, trocar, p_world_ref), atol=1e-6
+    )
+
+
+def test_rolls_count_from_the_frame_and_never_leave_half_a_turn():
+    frame = rcm.trocar_frame(rcm.Trocar(0.03, 1.5, 0.2), jnp.array([0.0, 0.0, 0.15]), jnp.pi)
+    rolls = jnp.linspace(-3.1, 3.1, 40)
+    action = jnp.concatenate([rolls[:, None], jnp.full((40, 3), 0.01)], -1)
+    for name in ("rcm4", "rcm2"):
+        space = rcm.ACTION_SPACES[name]
+        pose, _ = space.decode(action, frame)
+        np.testing.assert_allclose(space.encode(pose, frame)[:, 0], rolls, atol=1e-4)
+        plain, _ = space.decode(action, frame._replace(roll_zero=0.0))
+        np.testing.assert_allclose(pose.R[..., :2], -plain.R[..., :2], atol=1e-5)
+
+
+def test_a_frame_that_is_not_finite_is_held():
+    frame = rcm.trocar_frame(rcm.Trocar(0.03, 1.5, 0.2), jnp.array([0.0, 0.0, 0.15]))
+    for bad in (
+        frame._replace(roll_zero=jnp.nan),
+        frame._replace(R_world_trocar=frame.R_world_trocar * jnp.inf),
+        frame._replace(p_world_trocar=frame.p_world_trocar * jnp.nan),
+    ):
+        pose, valid = rcm.ACTION_SPACES["rcm2"].decode(jnp.ones(4) * 0.1, bad)
+        assert not valid and all(bool(jnp.isfinite(x).all()) for x in pose)

@@ -36,6 +36,7 @@ MIXED = {
     "rotation_from_axis_roll": (drawn(N, 3), drawn(2, N)),
     "rotation_z": (drawn(N),),
     "sample_trocar": (jax.random.key(0), (N,)),
+    "trocar_frame": (TROCAR, POINT),
     "trocar_from_position": (drawn(N, 3), POINT),
     "trocar_position": (TROCAR, POINT),
     "trocar_rotation": (TROCAR,),

@@ -17,7 +17,7 @@ straight down, degenerate 6-D columns are completed, and SE(3) positions are cli
 signed one of Eq. 3, its roll and rotation those of the pose. What is computed from a NaN is NaN.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -30,8 +30,9 @@ from starjax.rcm import trocar as trocars
 
 MAX_REACH = 10.0  # m; bound of a decoded SE(3) position's coordinates
 
-Encode = Callable[[types.Pose, trocars.Trocar, ArrayLike], jax.Array]
-Decode = Callable[[ArrayLike, trocars.Trocar, ArrayLike], tuple[types.Pose, jax.Array]]
+Where = trocars.Trocar | trocars.TrocarFrame
+Encode = Callable[..., jax.Array]
+Decode = Callable[..., tuple[types.Pose, jax.Array]]
 
 
 class ActionSpace(NamedTuple):
@@ -42,6 +43,7 @@ class ActionSpace(NamedTuple):
       dim: length A of the vector.
       encode: (pose_world_tip `[...]`, trocar `[...]`, p_world_ref `[..., 3]` m) to `[..., A]`.
       decode: (action `[..., A]`, trocar, p_world_ref) to (pose_world_tip, valid bool `[...]`).
+        Both also take a `TrocarFrame` `[...]` in place of trocar and reference.
       slices: where the parts are: "p" m, "R" 6-D, "depth" m, "roll" rad.
     """
 
@@ -74,13 +76,13 @@ def _decode_rcm1(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
 
 def _encode_rcm2(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
     p_trocar_tip = arrays.matvec(frame.R.mT, pose.p - frame.p)
-    return [rotations.roll_of(pose.R)[..., None], p_trocar_tip]
+    return [_roll(pose.R, frame), p_trocar_tip]
 
 
 def _decode_rcm2(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
     offset_world = arrays.matvec(frame.R, parts["p"])
     axis, depth = manifold.axis_and_depth(offset_world, jnp.zeros_like(offset_world))
-    return manifold.pose_on_manifold(axis, parts["roll"][..., 0], depth, frame.p)
+    return manifold.pose_on_manifold(axis, parts["roll"][..., 0] + frame.roll_zero, depth, frame.p)
 
 
 def _encode_rcm3(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
@@ -94,20 +96,27 @@ def _decode_rcm3(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
 
 
 def _encode_rcm4(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
-    return [rotations.roll_of(pose.R)[..., None], pose.p]
+    return [_roll(pose.R, frame), pose.p]
 
 
 def _decode_rcm4(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
     """Algorithm 1, its alignment taken from the z-down frame (`rotation_from_axis_roll`)."""
     axis, depth = manifold.axis_and_depth(parts["p"], frame.p)
-    return manifold.pose_on_manifold(axis, parts["roll"][..., 0], depth, frame.p)
+    return manifold.pose_on_manifold(axis, parts["roll"][..., 0] + frame.roll_zero, depth, frame.p)
+
+
+def _roll(R: jax.Array, frame: "_Frame") -> jax.Array:
+    """Roll `[..., 1]` from the frame's zero, within half a turn either way."""
+    roll = rotations.roll_of(R) - frame.roll_zero
+    return (roll - 2.0 * jnp.pi * jnp.round(roll / (2.0 * jnp.pi)))[..., None]
 
 
 class _Frame(NamedTuple):
-    """The trocar frame {T}, pose_world_trocar."""
+    """The trocar frame {T}, pose_world_trocar, and the roll that counts as zero."""
 
     R: jax.Array
     p: jax.Array
+    roll_zero: jax.Array
 
 
 def _fixed_yaw(encode_or_decode: Callable) -> Callable:
@@ -132,33 +141,40 @@ def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> Actio
         dim += size
 
     @arrays.broadcasting
-    def encode_pose(pose: types.Pose, trocar: trocars.Trocar, p_world_ref: ArrayLike) -> jax.Array:
+    def encode_pose(
+        pose: types.Pose, trocar: Where, p_world_ref: ArrayLike | None = None
+    ) -> jax.Array:
         R, p, *rest = arrays.checked(
             **{"pose.R": (pose.R, (3, 3)), "pose.p": (pose.p, (3,))},
             **_trocar_arguments(trocar, p_world_ref),
         )
-        parts = encode(types.Pose(R=R, p=p), _frame(*rest))
-        batch = jnp.broadcast_shapes(R.shape[:-2], p.shape[:-1], *_batch_shapes(*rest))
+        frame, shape = _frame(rest)
+        parts = encode(types.Pose(R=R, p=p), frame)
+        batch = jnp.broadcast_shapes(R.shape[:-2], p.shape[:-1], shape)
         return jnp.concatenate(
             [jnp.broadcast_to(part, (*batch, part.shape[-1])) for part in parts], axis=-1
         )
 
     @arrays.broadcasting
     def decode_action(
-        action: ArrayLike, trocar: trocars.Trocar, p_world_ref: ArrayLike
+        action: ArrayLike, trocar: Where, p_world_ref: ArrayLike | None = None
     ) -> tuple[types.Pose, jax.Array]:
         action, *rest = arrays.checked(
             action=(action, (dim,)), **_trocar_arguments(trocar, p_world_ref)
         )
-        radius, polar, azimuth, p_ref = rest
+        # Of a frame: its parameters, and a position that is finite if they and the reference are.
+        radius, polar, azimuth, place, *turned = rest
         valid = (
             jnp.isfinite(action).all(axis=-1)
-            & jnp.isfinite(p_ref).all(axis=-1)
+            & jnp.isfinite(place).all(axis=-1)
             & jnp.isfinite(radius)
             & jnp.isfinite(polar)
             & jnp.isfinite(azimuth)
         )
-        frame = _frame(*(arrays.bounded(value) for value in rest))
+        if turned:
+            R_world_trocar, roll_zero = turned
+            valid &= jnp.isfinite(R_world_trocar).all(axis=(-2, -1)) & jnp.isfinite(roll_zero)
+        frame, _ = _frame([arrays.bounded(value) for value in rest])
         bounded = arrays.bounded(action)
         pose = decode({part: bounded[..., where] for part, where in slices.items()}, frame)
         hold = _hold_pose(frame.p)
@@ -169,20 +185,32 @@ def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> Actio
     return ActionSpace(name, dim, encode_pose, decode_action, slices)
 
 
-def _trocar_arguments(trocar: trocars.Trocar, p_world_ref: ArrayLike) -> dict:
+def _trocar_arguments(trocar: Where, p_world_ref: ArrayLike | None) -> dict:
+    if isinstance(trocar, trocars.TrocarFrame):
+        if p_world_ref is not None:
+            raise ValueError("p_world_ref: expected none beside a TrocarFrame, got one")
+        return {
+            **trocars.named_fields(trocar.trocar),
+            "trocar.p_world_trocar": (trocar.p_world_trocar, (3,)),
+            "trocar.R_world_trocar": (trocar.R_world_trocar, (3, 3)),
+            "trocar.roll_zero": (trocar.roll_zero, ()),
+        }
+    if p_world_ref is None:
+        raise ValueError("p_world_ref: expected [..., 3] beside a Trocar, got none")
     return {**trocars.named_fields(trocar), "p_world_ref": (p_world_ref, (3,))}
 
 
-def _frame(
-    radius: jax.Array, polar: jax.Array, azimuth: jax.Array, p_world_ref: jax.Array
-) -> _Frame:
+def _frame(values: Sequence[jax.Array]) -> tuple[_Frame, tuple[int, ...]]:
+    """The frame of `_trocar_arguments`, and its leading axes."""
+    radius, polar, azimuth, place, *turned = values
+    scalars = [x.shape for x in (radius, polar, azimuth, *turned[1:])]
+    shape = jnp.broadcast_shapes(*scalars, place.shape[:-1])
+    if turned:
+        R, roll_zero = turned
+        return _Frame(R, place, roll_zero), shape
     trocar = trocars.Trocar(radius, polar, azimuth)
-    return _Frame(trocars.trocar_rotation(trocar), trocars.trocar_position(trocar, p_world_ref))
-
-
-def _batch_shapes(*trocar_and_ref: jax.Array) -> list[tuple[int, ...]]:
-    *fields, p_ref = trocar_and_ref
-    return [*(field.shape for field in fields), p_ref.shape[:-1]]
+    R, p = trocars.trocar_rotation(trocar), trocars.trocar_position(trocar, place)
+    return _Frame(R, p, jnp.zeros((), p.dtype)), shape
 
 
 def _hold_pose(p_world_trocar: jax.Array) -> types.Pose:

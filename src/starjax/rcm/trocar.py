@@ -32,6 +32,23 @@ class Trocar(NamedTuple):
     azimuth: Any
 
 
+class TrocarFrame(NamedTuple):
+    """A trocar resolved once: where it is, which way {T} points, and where rolls begin.
+
+    Attributes:
+      trocar: the parameters, fields `[...]`.
+      p_world_trocar: `[..., 3]` m (Eq. 2).
+      R_world_trocar: `[..., 3, 3]`, see `trocar_rotation`.
+      roll_zero: `[...]` rad, the roll that counts as zero. Arms that face each other have zeros
+        half a turn apart, so that neither works at the wrap of its roll.
+    """
+
+    trocar: Trocar
+    p_world_trocar: Any
+    R_world_trocar: Any
+    roll_zero: Any
+
+
 def _degrees(rows: list[tuple[float, float, float]]) -> Trocar:
     centimetres, polar, azimuth = np.array(rows, np.float64).T
     fields = (centimetres / 100.0, np.deg2rad(polar), np.deg2rad(azimuth))
@@ -128,6 +145,29 @@ def trocar_rotation(trocar: Trocar) -> jax.Array:
     zero = jnp.zeros_like(cos)
     rows = ([cos, sin, zero], [sin, -cos, zero], [zero, zero, zero - 1.0])
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+@arrays.broadcasting
+def trocar_frame(trocar: Trocar, p_world_ref: ArrayLike, roll_zero: ArrayLike = 0.0) -> TrocarFrame:
+    """Resolves a trocar (Eq. 2 and frame {T}).
+
+    Args:
+      trocar: fields `[...]`.
+      p_world_ref: `[..., 3]` m, the nominal port o_ref.
+      roll_zero: `[...]` rad, see `TrocarFrame`.
+
+    Returns:
+      All fields with the same leading axes `[...]`.
+    """
+    fields = arrays.checked(
+        **named_fields(trocar), p_world_ref=(p_world_ref, (3,)), roll_zero=(roll_zero, ())
+    )
+    *scalars, p_world_ref, roll_zero = fields
+    shapes = [x.shape for x in (*scalars, roll_zero)]
+    shape = jnp.broadcast_shapes(*shapes, p_world_ref.shape[:-1])
+    trocar = Trocar(*(jnp.broadcast_to(x, shape) for x in scalars))
+    p = trocar_position(trocar, p_world_ref)
+    return TrocarFrame(trocar, p, trocar_rotation(trocar), jnp.broadcast_to(roll_zero, shape))
 
 
 def sample_trocar(
