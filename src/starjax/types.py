@@ -1,6 +1,11 @@
-"""The two structs that every layer shares: a pose and a command. Imports jax only."""
+"""The structs that every layer shares. Imports jax only.
 
-from typing import NamedTuple
+Shape letter A: arms. It is the last leading axis wherever arrays have one shape for all arms; a
+task of one arm has A = 1.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 
@@ -22,9 +27,42 @@ class Command(NamedTuple):
     """What the environment is asked to reach by the end of one control step.
 
     Attributes:
-      pose: tip pose in the world frame, `[...]`.
-      gripper: `[...]` in [-1, 1]: -1 squeezes, +1 is fully open.
+      pose: tip poses in the world frame, `[..., A]`.
+      gripper: `[..., A]` in [-1, 1]: -1 squeezes, +1 is fully open.
     """
 
     pose: Pose
     gripper: jax.Array
+
+
+class Observation(NamedTuple):
+    """One measured moment of an episode.
+
+    Attributes:
+      pose: measured tip poses in the world frame, `[..., A]`.
+      gripper: measured openings of the jaws, `[..., A]` in [-1 closed, +1 open].
+      images: camera's name -> `[..., h, w, 3]` uint8, or None where pixels are not observed.
+      state: the task's fields instead of pixels, `[..., S]`, or None.
+      features: what a frozen vision encoder makes of the images, `[..., d_v]` float32, instead of
+        them; only in the data that such a policy is trained on.
+    """
+
+    pose: Pose
+    gripper: jax.Array
+    images: dict[str, jax.Array] | None = None
+    state: jax.Array | None = None
+    features: jax.Array | None = None
+
+
+class Agent(NamedTuple):
+    """Whoever acts in an environment, as pure functions of one episode.
+
+    Attributes:
+      init: (key, EnvState) -> memory.
+      act: (memory, EnvState) -> (Command `[A]` to execute, memory, Command `[A]` to record). The
+        last is what demonstrations teach: an expert that disturbs itself records the undisturbed
+        command, others what they execute.
+    """
+
+    init: Callable[..., Any]
+    act: Callable[..., Any]

@@ -1,0 +1,168 @@
+"""What a task is: a record of data and of pure, single-sample functions. Needs no simulator.
+
+Shape letter A: the arms of the task. `Layout` and `Facts` are the task's own pytrees.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import jax
+
+from starjax.types import Agent, Pose
+
+
+class Field(NamedTuple):
+    """A part of the `state` observation.
+
+    Attributes:
+      name: what it is, e.g. `block.p`.
+      size: how many numbers.
+      kind: `point` m in the world frame, scaled for networks; `rot6d`, `unit`: within [-1, 1].
+    """
+
+    name: str
+    size: int
+    kind: Literal["point", "rot6d", "unit"]
+
+
+class Slot(NamedTuple):
+    """Where one arm of a task works.
+
+    Attributes:
+      workspace: names the region of trocars and targets; mounts are found for a workspace.
+      p_world_ref: `(3,)` m, nominal trocar o_ref.
+      roll_zero: rad, see `rcm.TrocarFrame`.
+      arm, tool: used unless the user chooses others.
+    """
+
+    workspace: str
+    p_world_ref: tuple[float, float, float]
+    roll_zero: float = 0.0
+    arm: str = "fr5"
+    tool: str = "grasper"
+
+
+class Verdict(NamedTuple):
+    """What a task says of one moment.
+
+    Attributes:
+      good: the strict conditions hold now; success is `settle_steps` such steps in a row.
+      loose: a looser published test holds now.
+      lost: the episode cannot succeed any more (a drop that counts as a failure).
+      stage: int32, how far the task is: an index of `Task.stages`.
+      reward: in [0, 1], grows with the stages and within them; 1 where `good`.
+    """
+
+    good: jax.Array
+    loose: jax.Array
+    lost: jax.Array
+    stage: jax.Array
+    reward: jax.Array
+
+
+class Words(NamedTuple):
+    """What reports say of a task, in plain English.
+
+    Attributes:
+      title: e.g. `peg transfer`.
+      done: completes "the policy ...", e.g. `moved the block to its peg`.
+      strict: the conditions of a strict success, in a phrase.
+      loose: those of the loose test, in a phrase.
+      collided: what a collision is here, in a phrase.
+      nearly: a trial that met the loose test but not the strict one, in a phrase.
+    """
+
+    title: str
+    done: str
+    strict: str
+    loose: str
+    collided: str
+    nearly: str
+
+
+class Views(NamedTuple):
+    """What a task may look at, of one moment.
+
+    Attributes:
+      qpos, qvel: generalised coordinates of the whole model.
+      pose: measured tips, Pose `[A]`, and `opening`: `[A]` in [-1, 1].
+      touch: `[A]` bool, whether the jaws touch something that they can grasp.
+      contact: MJX's contacts of the last physics step.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    pose: Pose
+    opening: jax.Array
+    touch: jax.Array
+    contact: Any
+
+
+class Task(NamedTuple):
+    """One task, a row of the registry.
+
+    Attributes:
+      name: key in the registry.
+      mjcf: the world: a part below `mjcf/`, or the path of a file.
+      slots: one for each arm.
+      cameras: of the MJCF, that policies may see; the first one is used unless others are chosen.
+      time_limit_s: s of simulated time that a trial may take.
+      settle_steps: control steps in a row that a strict success must hold.
+      fields: parts of the `state` observation, in order.
+      labels: names of the whole numbers that tell episodes apart, e.g. `source`, `target`.
+      stages: names, from the start to success.
+      words: for reports.
+      experts: variant -> `make() -> Agent` of a scripted demonstrator; the first is used unless
+        another is chosen.
+      graspable: geoms of the MJCF, by name, that jaws can hold.
+      bind: (mj_model) -> Bound, ids resolved once.
+      sample: (Bound, key) -> Layout, what is drawn at reset.
+      tips: (Bound, Layout) -> `[A, 3]` m, where the tools' tips start.
+      place: (Bound, qpos, Layout) -> qpos with the task's objects in it.
+      measure: (Bound, Layout, Views) -> Facts.
+      judge: (Bound, Layout, Facts) -> Verdict.
+      state: (Bound, Layout, Facts) -> `[S]`, the fields one after another.
+      relative: (state `[..., S]`, tips `[..., A, 3]` m) -> `[..., K]` of order one: differences
+        that small networks would not get exactly enough from `state`.
+      label: (Layout) -> name of `labels` -> int32.
+      colours: (Bound, Layout, rgb `[G, 3]`) -> `[G, 3]`, the goal marked.
+      collided: (Bound, Layout, Facts, shafts) -> bool, see `sim.collision`.
+      is_sound: (Bound, qpos, qvel) -> bool, False once an object has diverged.
+      outline: (mj_model) -> flat shapes for figures, see `report.trajectories`.
+    """
+
+    name: str
+    mjcf: str
+    slots: tuple[Slot, ...]
+    cameras: tuple[str, ...]
+    time_limit_s: float
+    settle_steps: int
+    fields: tuple[Field, ...]
+    labels: tuple[str, ...]
+    stages: tuple[str, ...]
+    words: Words
+    experts: Mapping[str, Callable[[], Agent]]
+    graspable: tuple[str, ...]
+    bind: Callable[..., Any]
+    sample: Callable[..., Any]
+    tips: Callable[..., jax.Array]
+    place: Callable[..., jax.Array]
+    measure: Callable[..., Any]
+    judge: Callable[..., Verdict]
+    state: Callable[..., jax.Array]
+    relative: Callable[..., jax.Array]
+    label: Callable[..., dict[str, jax.Array]]
+    colours: Callable[..., jax.Array]
+    collided: Callable[..., jax.Array]
+    is_sound: Callable[..., jax.Array]
+    outline: Callable[..., Any]
+
+    @property
+    def arms(self) -> int:
+        """A."""
+        return len(self.slots)
+
+    @property
+    def state_size(self) -> int:
+        """S."""
+        return sum(field.size for field in self.fields)
