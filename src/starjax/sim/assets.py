@@ -4,7 +4,7 @@ import pathlib
 
 
 def path(name: str) -> pathlib.Path:
-    """The file of one MJCF part, e.g. `robots/fr5/fr5.xml`.
+    """The file of one MJCF part, e.g. `arms/fr5/fr5.xml`.
 
     Raises:
       FileNotFoundError: the part is in neither place; both are named.

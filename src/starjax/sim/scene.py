@@ -15,7 +15,7 @@ from starjax.sim.camera import geometry
 from starjax.sim.engine import mjx
 
 # Which MJCF parts exist. Adding one: a file and a line.
-ROBOTS = {"fr5": "robots/fr5/fr5.xml"}
+ROBOTS = {"fr5": "arms/fr5/fr5.xml"}
 TOOLS = {"grasper": "tools/grasper/grasper.xml"}
 TASKS = {"peg_transfer": "tasks/peg_transfer/peg_transfer.xml"}
 
