@@ -27,23 +27,25 @@ def test_forward_kinematics_are_those_of_mujoco(sim):
     rng = np.random.default_rng(1)
     data = mujoco.MjData(sim.mj_model)
     for _ in range(4):
-        q = sim.home + rng.normal(0, 0.4, 6)
-        data.qpos[sim.arm_q : sim.arm_q + 6] = q
+        q = sim.arms[0].home + rng.normal(0, 0.4, 6)
+        data.qpos[sim.arms[0].q] = q
         mujoco.mj_kinematics(sim.mj_model, data)
-        pose, origins, _ = ik.forward(sim.arm, jnp.asarray(q, jnp.float32))
-        tcp = data.site("robot/tool/tcp")
+        pose, origins, _ = ik.forward(sim.arms[0].chain, jnp.asarray(q, jnp.float32))
+        tcp = data.site("arm0/tool/tcp")
         np.testing.assert_allclose(pose.p, tcp.xpos, atol=1e-6)
         np.testing.assert_allclose(pose.R, tcp.xmat.reshape(3, 3), atol=1e-6)
-        np.testing.assert_allclose(origins[5], data.body("robot/wrist3").xpos, atol=1e-6)
+        np.testing.assert_allclose(origins[5], data.body("arm0/wrist3").xpos, atol=1e-6)
 
 
 def test_inverse_kinematics_reach_every_trocar_and_peg(sim):
     trocars = rcm.Trocar(*(jnp.asarray(field) for field in rcm.TROCARS))
-    tips = jnp.array([[x, y, 0.008] for x, y in sim.pegs])
+    tips = jnp.array([[x, y, 0.008] for x, y in sim.bound.pegs])
 
     def reach(trocar, p, roll):
-        q, residual = ik.solve(sim.arm, on_manifold(trocar, p, roll), jnp.asarray(sim.home), 40)
-        low, high = sim.arm.limits[:, 0], sim.arm.limits[:, 1]
+        q, residual = ik.solve(
+            sim.arms[0].chain, on_manifold(trocar, p, roll), jnp.asarray(sim.arms[0].home), 40
+        )
+        low, high = sim.arms[0].chain.limits[:, 0], sim.arms[0].chain.limits[:, 1]
         return residual, jnp.min(jnp.minimum(q - low, high - q))
 
     grid = jax.vmap(jax.vmap(jax.vmap(reach, (None, None, 0)), (None, 0, None)), (0, None, None))
@@ -53,26 +55,26 @@ def test_inverse_kinematics_reach_every_trocar_and_peg(sim):
 
 
 def test_a_chain_that_does_not_begin_where_it_should_is_named(sim):
-    with pytest.raises(ValueError, match="above the site robot/tool/tcp, got 'robot/first'"):
-        ik.chain_of(sim.mj_model, first="robot/first", site="robot/tool/tcp")
+    with pytest.raises(ValueError, match="arm0/first"):
+        ik.chain_of(sim.mj_model, first="arm0/first", site="arm0/tool/tcp")
 
 
 @pytest.mark.parametrize("turn", [[-1, -1, 1], [1, -1, -1], [-1, 1, -1]])
 def test_half_a_turn_is_as_far_as_it_is(sim, turn):
-    q = jnp.asarray(sim.home)
-    pose, _, _ = ik.forward(sim.arm, q)
+    q = jnp.asarray(sim.arms[0].home)
+    pose, _, _ = ik.forward(sim.arms[0].chain, q)
     target = Pose(pose.R @ np.diag(np.float32(turn)), pose.p)
     far = np.pi * ik.ROTATION_WEIGHT
-    np.testing.assert_allclose(ik.residual(sim.arm, target, q), far, rtol=1e-4)
+    np.testing.assert_allclose(ik.residual(sim.arms[0].chain, target, q), far, rtol=1e-4)
     if turn[2] == 1:  # the jaws exchanged, which the last joint can do but for its limit
-        _, residual = ik.solve(sim.arm, target, q, 40)
+        _, residual = ik.solve(sim.arms[0].chain, target, q, 40)
         assert residual < 0.05 * far
 
 
 def test_joints_stay_within_their_limits(sim):
     out_of_reach = Pose(jnp.eye(3), jnp.array([0.0, 0.0, 2.0]))
-    q, residual = ik.solve(sim.arm, out_of_reach, jnp.asarray(sim.home), 40)
-    low, high = sim.arm.limits.T
+    q, residual = ik.solve(sim.arms[0].chain, out_of_reach, jnp.asarray(sim.arms[0].home), 40)
+    low, high = sim.arms[0].chain.limits.T
     assert residual > 0.1 and (q > low).all() and (q < high).all()
 
 
@@ -167,10 +169,10 @@ def test_a_tool_leans_at_the_port_and_stays_at_its_tip():
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     pose = on_manifold(trocar, jnp.array([0.01, 0.02, 0.03]), 0.3)
-    leant = control.leaning(pose, port, 2e-3 * pose.R[:, 0])
+    leant = control.corrected(pose, port, 2e-3 * pose.R[:, 0])
     np.testing.assert_array_equal(leant.p, pose.p)
     np.testing.assert_allclose(rcm.rcm_error(leant, port), 2e-3, rtol=1e-3)
-    back = control.leaning(leant, port, -2e-3 * pose.R[:, 0])
+    back = control.corrected(leant, port, -2e-3 * pose.R[:, 0])
     np.testing.assert_allclose(rcm.rcm_error(back, port), 0.0, atol=1e-5)
 
 
@@ -178,16 +180,16 @@ def test_a_load_that_stays_is_compensated_at_the_port_up_to_a_limit():
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     reference = on_manifold(trocar, jnp.array([0.01, 0.02, 0.03]), 0.3)
-    hold = jax.jit(control.hold)
+    hold = jax.jit(control.correct)
 
     def left_of(load, periods=30):
         lean = jnp.zeros(3)
         for _ in range(periods):
-            measured = control.leaning(reference, port, lean + load * reference.R[:, 0])
+            measured = control.corrected(reference, port, lean + load * reference.R[:, 0])
             lean = hold(lean, measured, reference, port)
         return float(rcm.rcm_error(measured, port)), float(jnp.linalg.norm(lean))
 
     assert left_of(1e-3)[0] < 5e-6
     np.testing.assert_allclose(
-        left_of(8e-3), (8e-3 - control.MAX_LEAN, control.MAX_LEAN), rtol=1e-2
+        left_of(8e-3), (8e-3 - control.MAX_CORRECTION, control.MAX_CORRECTION), rtol=1e-2
     )

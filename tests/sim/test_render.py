@@ -14,6 +14,7 @@ import pytest
 
 from starjax.sim import render
 from starjax.sim import scene as model
+from starjax.sim.arms import fr5
 from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import shapes, tiles
 
@@ -65,6 +66,12 @@ def pile(copies: int = 2) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(PILE.format(bodies=bodies))
 
 
+@functools.cache
+def composed() -> mujoco.MjModel:
+    """The scene of peg transfer."""
+    return model.compose(model.name())
+
+
 def poses(mj_model: mujoco.MjModel, n: int, seed: int = 0) -> np.ndarray:
     """`[n, nq]` configurations: free bodies anywhere above the board, the arm near home."""
     rng = np.random.default_rng(seed)
@@ -75,8 +82,8 @@ def poses(mj_model: mujoco.MjModel, n: int, seed: int = 0) -> np.ndarray:
             qpos[:, at : at + 3] = rng.uniform(-1, 1, (n, 3)) * spread + (0, 0, 0.1)
             quat = rng.normal(size=(n, 4))
             qpos[:, at + 3 : at + 7] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
-    for k, home in enumerate(model.HOME):
-        name = f"robot/j{k + 1}"
+    for k, home in enumerate(fr5.ARM.mounts["grasper", "board"].home):
+        name = f"arm0/j{k + 1}"
         if mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_JOINT, name) >= 0:
             qpos[:, mj_model.joint(name).qposadr[0]] = home + rng.normal(scale=0.06, size=n)
     return qpos
@@ -195,7 +202,7 @@ def gl_pictures(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("compose", "camera", "height", "width"),
-    [(pile, "camera", 144, 208), (pile, "shifted", 192, 256), (model.compose, "camera", 256, 256)],
+    [(pile, "camera", 144, 208), (pile, "shifted", 192, 256), (composed, "camera", 256, 256)],
 )
 def test_agrees_with_the_gl_renderer(gl_pictures, compose, camera, height, width):
     mj_model = compose()
@@ -285,15 +292,15 @@ def test_supersampling_smooths_outlines_and_nothing_else():
     assert np.mean(one.segmentation == four.segmentation) > 0.97
 
 
-def test_port_reference_is_on_the_optical_axis():
-    """The principal point lies 117 px above the middle of the picture, and the port on it."""
-    mj_model = model.compose()
+def test_the_nominal_trocar_is_on_the_optical_axis():
+    """The principal point lies 117 px above the middle of the image, and the trocar on it."""
+    mj_model = composed()
     xpos, xmat = geoms(mj_model, mj_model.qpos0[None])
-    port = mj_model.geom("port").id
+    marker = mj_model.geom("trocar0").id
     frame = jax.jit(render.make(mj_model, segmentation=True))(
         xpos[0], xmat[0], render.geom_rgb(mj_model)
     )
-    rows, columns = np.nonzero(np.asarray(frame.segmentation) == port)
+    rows, columns = np.nonzero(np.asarray(frame.segmentation) == marker)
     assert abs(columns.mean() - 127.5) < 0.5 and abs(rows.mean() - (127.5 - 117)) < 1.5
 
 

@@ -10,6 +10,8 @@ import jax
 
 from starjax.types import Agent, Pose
 
+CONTROL_HZ = 30.0  # commands a second
+
 
 class Field(NamedTuple):
     """A part of the `state` observation.
@@ -80,6 +82,31 @@ class Words(NamedTuple):
     nearly: str
 
 
+class Contacts(NamedTuple):
+    """Contacts C of one moment.
+
+    Attributes:
+      geom: `[C, 2]` int32 ids.
+      dist: `[C]` m, negative where the two overlap.
+    """
+
+    geom: jax.Array
+    dist: jax.Array
+
+
+class Capsules(NamedTuple):
+    """Obstacles K, in the world.
+
+    Attributes:
+      start, end: `[K, 3]` m, of the axis.
+      radius: `[K]` m.
+    """
+
+    start: jax.Array
+    end: jax.Array
+    radius: jax.Array
+
+
 class Views(NamedTuple):
     """What a task may look at, of one moment.
 
@@ -87,7 +114,7 @@ class Views(NamedTuple):
       qpos, qvel: generalised coordinates of the whole model.
       pose: measured tips, Pose `[A]`, and `opening`: `[A]` in [-1, 1].
       touch: `[A]` bool, whether the jaws touch something that they can grasp.
-      contact: MJX's contacts of the last physics step.
+      contacts: of the last physics step.
     """
 
     qpos: jax.Array
@@ -95,7 +122,7 @@ class Views(NamedTuple):
     pose: Pose
     opening: jax.Array
     touch: jax.Array
-    contact: Any
+    contacts: Contacts
 
 
 class Task(NamedTuple):
@@ -126,7 +153,8 @@ class Task(NamedTuple):
         that small networks would not get exactly enough from `state`.
       label: (Layout) -> name of `labels` -> int32.
       colours: (Bound, Layout, rgb `[G, 3]`) -> `[G, 3]`, the goal marked.
-      collided: (Bound, Layout, Facts, shafts) -> bool, see `sim.collision`.
+      obstacles: (Bound, Layout, Facts) -> Capsules that no shaft may enter, see `sim.collision`.
+      floor: m, the lowest height that jaws may reach.
       is_sound: (Bound, qpos, qvel) -> bool, False once an object has diverged.
       outline: (mj_model) -> flat shapes for figures, see `report.trajectories`.
     """
@@ -153,7 +181,8 @@ class Task(NamedTuple):
     relative: Callable[..., jax.Array]
     label: Callable[..., dict[str, jax.Array]]
     colours: Callable[..., jax.Array]
-    collided: Callable[..., jax.Array]
+    obstacles: Callable[..., Capsules]
+    floor: float
     is_sound: Callable[..., jax.Array]
     outline: Callable[..., Any]
 
