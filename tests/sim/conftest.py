@@ -7,7 +7,7 @@ import pytest
 from starjax import rcm
 from starjax.sim import env as envs
 from starjax.sim import scene
-from starjax.sim.tasks.peg_transfer.task import expert
+from starjax.sim.tasks.peg_transfer import expert
 
 LANES = 12  # one episode a trocar
 

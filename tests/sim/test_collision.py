@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import pytest
 
 from starjax.sim import collision
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 from starjax.types import Pose
 
 UP = jnp.full((6, 3), 0.5)  # joints of an arm that is nowhere near

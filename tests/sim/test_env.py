@@ -8,7 +8,7 @@ import pytest
 from starjax import rcm
 from starjax.sim import env as envs
 from starjax.sim import physics
-from starjax.sim.tasks.peg_transfer.task import expert, task
+from starjax.sim.tasks.peg_transfer import expert, task
 from starjax.types import Pose
 
 STEPS = 330  # control steps: 11 s, longer than the expert takes

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starjax.sim import physics, solver
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 from starjax.types import Pose
 
 REST_SECONDS = 10.0

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 from starjax.types import Pose
 
 PEG = jnp.array([0.02, 0.0])

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 
 from starjax.sim import physics
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 from starjax.types import Pose
 
 

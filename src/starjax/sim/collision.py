@@ -10,7 +10,7 @@ pad's corner up to 3 mm into the board unnoticed.
 import jax
 import jax.numpy as jnp
 
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 from starjax.types import Pose
 
 # Overlap that is called a collision (m): more than the soft contacts' own give.

@@ -16,7 +16,7 @@ import numpy as np
 
 from starjax import config, rcm
 from starjax.sim import collision, control, ik, physics, render, scene
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 from starjax.sim.types import Observation
 from starjax.types import Command, Pose
 

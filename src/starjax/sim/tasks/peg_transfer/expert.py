@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from starjax import rcm
 from starjax.sim import env
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 from starjax.types import Command
 
 RAISE, APPROACH, DESCEND, CLOSE, LIFT, CARRY, LOWER, OPEN, RETREAT, WAIT = range(10)
