@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from starjax.sim import physics, scene
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 from starjax.types import Pose
 
 STEPS = 128  # a timed call

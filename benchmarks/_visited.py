@@ -11,7 +11,7 @@ from starjax.sim import env as envs
 from starjax.sim import physics
 from starjax.sim.engine import mjx
 from starjax.sim.scene import SimModel
-from starjax.sim.tasks.peg_transfer.task import expert
+from starjax.sim.tasks.peg_transfer import expert
 
 STEPS = 240  # control steps an episode, 8 s, so most states hold contacts
 CPU_LANES = 16  # of a program that has a CPU to itself: enough to share its operations out

@@ -25,7 +25,7 @@ from starjax import rcm, runtime
 from starjax.data import demos, store
 from starjax.rollouts import cores, episodes, recording
 from starjax.sim import env as envs
-from starjax.sim.tasks.peg_transfer.task import expert
+from starjax.sim.tasks.peg_transfer import expert
 
 SEEN = 8
 MAX_STEPS = 600

@@ -16,7 +16,7 @@ import numpy as np
 from starjax import rcm, runtime
 from starjax.evaluation import statistics
 from starjax.sim import env as envs
-from starjax.sim.tasks.peg_transfer.task import expert
+from starjax.sim.tasks.peg_transfer import expert
 
 STEPS = 600  # control steps, 20 s; the limit of a policy's trial is 60 s
 CHUNK = {"cpu": 16}  # episodes at once

@@ -15,7 +15,7 @@ import numpy as np
 from starjax import rcm, runtime
 from starjax.rollouts import cores, recording
 from starjax.sim import env as envs
-from starjax.sim.tasks.peg_transfer.task import expert
+from starjax.sim.tasks.peg_transfer import expert
 
 SEGMENTS = 8  # of a measurement: 4 s simulated, in which no episode ends
 

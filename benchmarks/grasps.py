@@ -17,7 +17,7 @@ import numpy as np
 from starjax.report import results
 from starjax.sim import env as envs
 from starjax.sim import physics
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 
 PERIOD_DEG = 60.0  # walls are 120 degrees apart, and jaws look alike after half a turn
 TURNED_DEG = 10.0

@@ -679,7 +679,7 @@ def test_sweeps_of_other_trials_lie_apart(tmp_path):
 def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, seen, one_wall):
     from starjax import rcm
     from starjax.data import demos
-    from starjax.sim.tasks.peg_transfer.task import expert
+    from starjax.sim.tasks.peg_transfer import expert
 
     given = []
     found = {"episodes": 0, "trials": 0, "frames": 0}

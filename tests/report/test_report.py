@@ -704,7 +704,7 @@ def test_an_encoder_that_fails_says_so_and_leaves_what_was_there(tmp_path, monke
 
 
 def test_the_renderer_draws_the_recorded_configuration(one, monkeypatch):
-    made = env.model.load()
+    made = scene.load()
     qpos = np.tile(made.mj_model.qpos0, (3, 1))
     near = one.rollouts[0]._replace(qpos=qpos, p_world_trocar=made.p_world_ref, target_peg=7)
     far = near._replace(p_world_trocar=made.p_world_ref + np.array([0, 0.04, 0], np.float32))

@@ -16,7 +16,7 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
     from starjax import rcm
     from starjax.data import demos, store
     from starjax.rollouts import chunks, placement, recording
-    from starjax.sim.tasks.peg_transfer.task import expert
+    from starjax.sim.tasks.peg_transfer import expert
 
     trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
     wanted = {

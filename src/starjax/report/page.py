@@ -57,7 +57,7 @@ def render(
         _figure("training", figures),
         sections.reproduce(runs),
     ]
-    style = importlib.resources.files("starjax.experiments.report").joinpath("page.css").read_text()
+    style = importlib.resources.files("starjax.report").joinpath("page.css").read_text()
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'

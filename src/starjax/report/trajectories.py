@@ -11,7 +11,7 @@ import numpy as np
 
 from starjax.report import outcomes, results, style
 from starjax.sim.scene import TCP, SimModel
-from starjax.sim.tasks.peg_transfer.task import task
+from starjax.sim.tasks.peg_transfer import task
 from starjax.types import Pose
 
 _AZIMUTH, _ELEVATION = np.deg2rad(-52.0), np.deg2rad(20.0)

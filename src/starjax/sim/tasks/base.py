@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import jax
+import numpy as np
 
 from starjax.types import Agent, Pose
 
@@ -63,23 +64,43 @@ class Verdict(NamedTuple):
 
 
 class Words(NamedTuple):
-    """What reports say of a task, in plain English.
+    """What reports say of a task, in plain English: phrases without a capital or a full stop.
 
     Attributes:
       title: e.g. `peg transfer`.
       done: completes "the policy ...", e.g. `moved the block to its peg`.
-      strict: the conditions of a strict success, in a phrase.
-      loose: those of the loose test, in a phrase.
-      collided: what a collision is here, in a phrase.
-      nearly: a trial that met the loose test but not the strict one, in a phrase.
+      strict: when a trial is a strict success.
+      loose: when it passes the loose test.
+      nearly: a failed trial that passed the loose test.
+      collided: what a collision is here.
+      ground: what the tool works over, e.g. `the boards`.
+      goal: how a picture shows what is asked for, e.g. `the block belongs on the marked peg`.
+      lost: what makes a trial hopeless before its time is up; empty where nothing does.
     """
 
     title: str
     done: str
     strict: str
     loose: str
-    collided: str
     nearly: str
+    collided: str
+    ground: str
+    goal: str
+    lost: str = ""
+
+
+class Outline(NamedTuple):
+    """What stands still in a task, for line drawings. Points are m in the world frame.
+
+    Attributes:
+      areas: closed polygons `[K, 3]`, filled; a drawing shows all of them.
+      lines: open polylines `[K, 3]`, drawn over the areas.
+      ground: m, height of the plane on which a path's shadow lies.
+    """
+
+    areas: tuple[np.ndarray, ...]
+    lines: tuple[np.ndarray, ...]
+    ground: float = 0.0
 
 
 class Contacts(NamedTuple):
@@ -156,7 +177,7 @@ class Task(NamedTuple):
       obstacles: (Bound, Layout, Facts) -> Capsules that no shaft may enter, see `sim.collision`.
       floor: m, the lowest height that jaws may reach.
       is_sound: (Bound, qpos, qvel) -> bool, False once an object has diverged.
-      outline: (mj_model) -> flat shapes for figures, see `report.trajectories`.
+      outline: (mj_model) -> Outline, for figures.
     """
 
     name: str
@@ -184,7 +205,7 @@ class Task(NamedTuple):
     obstacles: Callable[..., Capsules]
     floor: float
     is_sound: Callable[..., jax.Array]
-    outline: Callable[..., Any]
+    outline: Callable[..., Outline]
 
     @property
     def arms(self) -> int:
