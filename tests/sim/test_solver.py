@@ -96,7 +96,7 @@ def test_what_is_not_finite_ends_and_harms_no_other():
     problem = random_problem(np.random.default_rng(4))
     two = jax.jit(jax.vmap(solver.solve, in_axes=(None, 0, None)))
     starts = jnp.stack([jnp.ones(VELOCITIES), jnp.full(VELOCITIES, jnp.nan)])
-    x, _ = two(problem, starts, TIMESTEP)
+    x, _, _ = two(problem, starts, TIMESTEP)
     assert jnp.all(jnp.isnan(x[1]))
     np.testing.assert_array_equal(x[0], two(problem, starts[:1].repeat(2, 0), TIMESTEP)[0][0])
 

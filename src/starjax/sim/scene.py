@@ -166,7 +166,7 @@ def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
     found = []
     for slot, arm_name, tool_name in zip(task.slots, names.arms, names.tools, strict=True):
         arm, tool = registry.arms.get(arm_name), registry.tools.get(tool_name)
-        mount = arm.mounts.get((tool_name, slot.workspace))
+        mount = registry.mount(arm, tool_name, slot.workspace)
         if mount is None:
             known = ", ".join(" in ".join(key) for key in arm.mounts)
             raise errors.UsageError(
