@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import errors, rcm
+from starjax.sim import cameras as views
 from starjax.sim import collision, control, ik, physics, render
 from starjax.sim import scene as scenes
 from starjax.sim.state import Env, EnvParams, EnvState
@@ -39,6 +40,7 @@ def make(
     image_size: int = 256,
     cameras: Sequence[str] = (),
     shadow: bool = True,
+    moving_cameras: bool = False,
 ) -> Env:
     """Builds an environment.
 
@@ -50,6 +52,8 @@ def make(
       image_size: pixels a side of the cameras' square images.
       cameras: of the task; none for its first one.
       shadow: whether the sun throws shadows.
+      moving_cameras: whether `EnvParams.cameras` may move the cameras of an episode; else those
+        that are fixed in the world are drawn faster, and to the same bytes as ever.
 
     Raises:
       errors.UsageError: an unknown name, an unusable size, or jax in double precision.
@@ -61,16 +65,16 @@ def make(
         expected = f"a whole number of pixels, {SMALLEST_IMAGE} or more"
         raise errors.UsageError("image_size", expected, repr(image_size))
     scene = scenes.load(scenes.name(task, arms, tools, cameras))
-    size = (image_size, image_size)
-    draws = {
-        camera: render.make(scene.mj_model, camera, *size, shadow=shadow)
-        for camera in scene.names.cameras
-    }
+    seen = views.make(scene.mj_model, scene.names.cameras, image_size, shadow, moving_cameras)
+
+    def start(key: jax.Array, params: EnvParams) -> EnvState:
+        poses = views.nominal(seen) if params.cameras is None else params.cameras
+        return reset(scene, key, params, poses)
 
     def camera(state: EnvState) -> dict[str, render.Frame]:
-        geoms = physics.geom_poses(scene, state.physics.qpos, state.trocar.p_world_trocar)
+        data = physics.kinematics(scene, state.physics.qpos, state.trocar.p_world_trocar)
         rgb = scene.task.colours(scene.bound, state.layout, jnp.asarray(scene.geom_rgb))
-        return {name: draw(*geoms, rgb) for name, draw in draws.items()}
+        return views.images(seen, state.cameras, data, rgb)
 
     def observe(state: EnvState) -> Observation:
         images = fields = None
@@ -81,7 +85,7 @@ def make(
         return Observation(state.pose, state.gripper, images, fields)
 
     return Env(
-        reset=_precisely(functools.partial(reset, scene)),
+        reset=_precisely(start),
         step=_precisely(functools.partial(step, scene)),
         observe=_precisely(observe),
         camera=_precisely(camera),
@@ -94,8 +98,8 @@ def make(
     )
 
 
-def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams) -> EnvState:
-    """The start of an episode: objects and tips as the task draws them."""
+def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose) -> EnvState:
+    """The start of an episode: objects and tips as the task draws them, cameras `[C]` as given."""
     layout = scene.task.sample(scene.bound, key)
     trocar, told = (
         rcm.trocar_frame(given, scene.p_world_ref, scene.roll_zero)
@@ -124,6 +128,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams) -> EnvState:
         gripper_target=jnp.ones(count),
         trocar=trocar,
         told=told,
+        cameras=cameras,
         layout=layout,
         facts=scene.task.measure(scene.bound, layout, views),
         step=jnp.zeros((), jnp.int32),

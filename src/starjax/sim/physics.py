@@ -146,13 +146,18 @@ def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
     return jnp.clip(jnp.stack(found), -1.0, 1.0)
 
 
+def kinematics(scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array) -> mjx.Data:
+    """Poses of all bodies and geoms, the trocars' markers at `p_world_trocar` `[A, 3]` m."""
+    mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
+    data = scene.mjx_data.replace(qpos=qpos, mocap_pos=mocap_pos)
+    return mjx.kinematics(scene.mjx_model, data)
+
+
 def geom_poses(
     scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """`[G, 3]` m and `[G, 3, 3]` of every geom, the trocars' markers at `p_world_trocar [A, 3]`."""
-    mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
-    data = scene.mjx_data.replace(qpos=qpos, mocap_pos=mocap_pos)
-    data = mjx.kinematics(scene.mjx_model, data)
+    """`[G, 3]` m and `[G, 3, 3]` of every geom, for figures and films."""
+    data = kinematics(scene, qpos, p_world_trocar)
     return data.geom_xpos, data.geom_xmat
 
 

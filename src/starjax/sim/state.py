@@ -21,10 +21,13 @@ class EnvParams(NamedTuple):
     Attributes:
       trocar: where the trocars are, fields `[A]`.
       told: what agents are told of them, fields `[A]`, or None for the truth.
+      cameras: poses `[C]` of the observed cameras in their bodies' frames, or None for those of the
+        MJCF; only an environment with moving cameras looks at those that are fixed in the world.
     """
 
     trocar: rcm.Trocar
     told: rcm.Trocar | None = None
+    cameras: Pose | None = None
 
 
 @flax.struct.dataclass
@@ -39,6 +42,7 @@ class EnvState:
       correction: `[A, 3]` m, feedback correction of the tools' axes at their trocars.
       gripper_target: `[A]` in [-1, 1].
       trocar: where the trocars are, `[A]`. told: what agents are told of them, `[A]`.
+      cameras: `[C]` poses in their bodies' frames.
       layout, facts: the task's own: what was drawn at reset, what is measured now.
       step: int32, control steps taken. settled: consecutive steps that looked like success.
       stage: int32, see `Task.stages`. reward: in [0, 1].
@@ -66,6 +70,7 @@ class EnvState:
     gripper_target: jax.Array
     trocar: rcm.TrocarFrame
     told: rcm.TrocarFrame
+    cameras: Pose
     layout: Any
     facts: Any
     step: jax.Array
