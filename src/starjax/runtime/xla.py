@@ -94,7 +94,7 @@ def require_devices(*modules: str) -> None:
             with contextlib.suppress(RuntimeError):  # a full one will say so where it is used
                 jax.device_put(0, device)
 
-    started = background.beside(start)
+    started = background.run_in_background(start)
     for module in modules:
         importlib.import_module(module)
     try:

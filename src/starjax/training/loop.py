@@ -103,7 +103,7 @@ def run(
     checkpoints = directory / "checkpoints"
     begun = states.init(policy, seed)
     new = not checkpoint.steps(checkpoints)  # a restored training may be finished
-    drawn = background.beside(begun.drawn) if new else begun.drawn
+    drawn = background.run_in_background(begun.drawn) if new else begun.drawn
     like = _like(around, begun, mesh)
     it = advancing.Training(policy, optimizer, policy_config, train_config, mesh, dataset, train)
     advance = advancing.resident(it, like, ahead=new) if windows.on_device(dataset) else None
