@@ -43,7 +43,7 @@ def forward(chain: Chain, q: jax.Array) -> tuple[Pose, jax.Array, jax.Array]:
 
 
 def jacobian(chain: Chain, q: jax.Array, rotation_weight: float) -> jax.Array:
-    """`[6, J]`: motion of the tip, m and rad times `rotation_weight` m, for a unit of each joint."""
+    """`[6, J]`: motion of the tip (m, and rad times `rotation_weight` m) by joint."""
     pose, origins, axes = forward(chain, q)
     return _jacobian(chain, pose, origins, axes, rotation_weight)
 
