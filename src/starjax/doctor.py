@@ -8,8 +8,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from starjax import cli
-from starjax import config as config_lib
+from starjax import cli, errors
 from starjax.experiments import presets
 from starjax.runtime import files, locks, xla
 
@@ -37,7 +36,7 @@ def main(argv: Sequence[str]) -> int:
         print(f"usage: starjax doctor\n\n{__doc__}\nThe exit code is 1 if there is a fault.")
         return 0
     if argv:
-        raise config_lib.UsageError(f"{argv[0]}: expected no argument")
+        raise errors.UsageError("starjax doctor", "no argument", argv[0])
     # The order matters: a wrong XLA flag ends the process as soon as jax starts.
     checks: list[Callable[[], list[Finding]]] = [packages, xla_flags, storage, folder_locks, memory]
     findings = [finding for check in checks for finding in _shown(check)]

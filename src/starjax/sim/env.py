@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, rcm
+from starjax import errors, rcm
 from starjax.sim import collision, control, ik, physics, render, scene
 from starjax.sim.tasks.peg_transfer import task
 from starjax.sim.types import Observation
@@ -119,7 +119,7 @@ def make(policy_observation: str = "image", image_size: int = 256, shadow: bool 
       ValueError: an unknown observation, an unusable size, or jax in double precision.
     """
     if jnp.result_type(float) == jnp.float64:
-        raise config.UsageError("JAX_ENABLE_X64: expected it off, the simulation is in float32")
+        raise errors.UsageError("JAX_ENABLE_X64", "it off", "on", "the simulation is in float32")
     if policy_observation not in ("image", "state"):
         raise ValueError(
             f"policy_observation: expected 'image' or 'state', got {policy_observation!r}"
