@@ -1,5 +1,7 @@
 """The doctor finds what is planted, and gives each fault one remedy."""
 
+import errno
+import fcntl
 import importlib.metadata
 import os
 import subprocess
@@ -100,6 +102,18 @@ def test_unwritable_cache_and_little_memory_are_found(monkeypatch, tmp_path):
     assert faults(doctor.memory())
 
 
+@pytest.mark.parametrize(("name", "broken"), [("ENOLCK", 0), ("EIO", 1)])
+def test_locks_are_tried(monkeypatch, tmp_path, name, broken):
+    def refuse(*_):
+        raise OSError(getattr(errno, name), "flock")
+
+    monkeypatch.chdir(tmp_path)
+    assert doctor.folder_locks() == [doctor.Finding("locks", "the file system's")]
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    (found,) = doctor.folder_locks()
+    assert bool(found.remedy) == broken and not list(tmp_path.iterdir())
+
+
 def test_a_gpu_without_its_plugin_is_found(monkeypatch):
     monkeypatch.setattr(doctor.presets, "has_gpu_device", lambda: True)
     monkeypatch.setattr(doctor.presets, "has_gpu_plugin", lambda: False)
@@ -118,7 +132,16 @@ def test_a_missing_scene_is_found(monkeypatch):
 
 def test_exit_code_and_one_remedy_a_fault(monkeypatch, capsys):
     bad = [doctor.Finding("disk", "full", "make room")]
-    for name in ("packages", "xla_flags", "storage", "memory", "devices", "scene", "video"):
+    for name in (
+        "packages",
+        "xla_flags",
+        "storage",
+        "folder_locks",
+        "memory",
+        "devices",
+        "scene",
+        "video",
+    ):
         monkeypatch.setattr(doctor, name, lambda: [])
     assert doctor.main([]) == 0
     monkeypatch.setattr(doctor, "storage", lambda: bad)

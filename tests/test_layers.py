@@ -8,7 +8,8 @@ import pytest
 SOURCE = pathlib.Path(__file__).parents[1] / "src" / "starjax"
 # From left to right; a layer may import itself and those of the rows before its own.
 ROWS = (
-    ("errors", "types", "methods", "runtime"),
+    ("errors",),
+    ("types", "methods", "runtime"),
     ("config", "rcm"),
     ("models", "sim"),
     ("rollouts",),

@@ -10,9 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from starjax import __version__
-from starjax import config as config_lib
-from starjax.experiments import options
+from starjax import __version__, errors
 
 # Subcommand -> (module with `main(argv) -> exit code`, one line of help).
 COMMANDS: dict[str, tuple[str, str]] = {
@@ -81,8 +79,10 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """
     try:
         return command(argv)
-    except config_lib.UsageError as error:
-        return _fail(error, 2)
+    except errors.UsageError as error:
+        from starjax.experiments import options  # imported late: `--version` need not wait for tyro
+
+        return _fail(options.spelled(error), 2)
     except KeyboardInterrupt as stop:
         text = str(stop) or "stopped; the same command goes on from what is saved"
         return _fail(text, _STOPPED)
@@ -122,7 +122,7 @@ def dispatch(argv: Sequence[str]) -> int:
     if name == "--version":
         print(__version__)
         return 0
-    options.choice("COMMAND", name, COMMANDS)
+    errors.choice("COMMAND", name, COMMANDS)
     return importlib.import_module(COMMANDS[name][0]).main(argv[1:])
 
 

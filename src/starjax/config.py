@@ -9,10 +9,6 @@ from typing import Any, Literal, TypeVar
 SettingsT = TypeVar("SettingsT")
 
 
-class UsageError(ValueError):
-    """A mistake of whoever typed the command: shown as one line, without a traceback."""
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DemosConfig:
     """Demonstrations: how many, and what is recorded."""

@@ -4,13 +4,13 @@ import importlib.metadata
 import os
 import pathlib
 import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from starjax import cli
-from starjax import config as config_lib
+from starjax import cli, errors
 from starjax.experiments import presets
-from starjax.runtime import files, xla
+from starjax.runtime import files, locks, xla
 
 NEEDED_MEMORY = 4e9  # bytes free for the preset `cpu`
 NEEDED_DISK = 2e9
@@ -36,9 +36,9 @@ def main(argv: Sequence[str]) -> int:
         print(f"usage: starjax doctor\n\n{__doc__}\nThe exit code is 1 if there is a fault.")
         return 0
     if argv:
-        raise config_lib.UsageError(f"{argv[0]}: expected no argument")
+        raise errors.UsageError("starjax doctor", "no argument", argv[0])
     # The order matters: a wrong XLA flag ends the process as soon as jax starts.
-    checks: list[Callable[[], list[Finding]]] = [packages, xla_flags, storage, memory]
+    checks: list[Callable[[], list[Finding]]] = [packages, xla_flags, storage, folder_locks, memory]
     findings = [finding for check in checks for finding in _shown(check)]
     if any(finding.name in ("packages", "XLA_FLAGS") and finding.remedy for finding in findings):
         print("       the checks that start jax were left out: it would fail")
@@ -102,6 +102,21 @@ def storage() -> list[Finding]:
         remedy = f"make {files.size(NEEDED_DISK)} free, or use another disk by {option}"
         findings.append(Finding(name, f"{place}, {files.size(free)} free", remedy if short else ""))
     return findings
+
+
+def folder_locks() -> list[Finding]:
+    """Whether a run can hold its folder, if the working folder is on its disk."""
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix=".starjax-", dir=".") as trial,
+            locks.hold(pathlib.Path(trial) / "lock") as is_systems,
+        ):
+            kind = "the file system's" if is_systems else "marker files: the file system has none"
+    except (FileNotFoundError, PermissionError):  # said before
+        return []
+    except (locks.Held, OSError) as error:
+        return [Finding("locks", str(error), "choose a folder on another disk by --out")]
+    return [Finding("locks", kind)]
 
 
 def memory() -> list[Finding]:

@@ -25,6 +25,10 @@ def choice(argument: str, value: str, known: Iterable[str]) -> None:
     """Raises UsageError unless `value` is one of `known`; suggests the nearest one."""
     names = list(known)
     if value not in names:
-        near = difflib.get_close_matches(value, names, n=1, cutoff=0.6)
-        hint = f"did you mean {near[0]}?" if near else ""
-        raise UsageError(argument, f"one of {', '.join(names)}", repr(value), hint)
+        raise UsageError(argument, f"one of {', '.join(names)}", repr(value), nearest(value, names))
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """`did you mean ...?` for the known word that is nearest, empty if none is near."""
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"did you mean {near[0]}?" if near else ""

@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from starjax import config, methods
+from starjax import config, errors, methods
 from starjax.experiments import clock, folders, presets
 from starjax.runtime import files
 
@@ -35,17 +35,17 @@ def changed(**parts):
 @pytest.mark.parametrize(
     ("parts", "word"),
     [
-        ({"train": {"steps": 41}}, "--train.steps"),
-        ({"policy": {"image_size": 65}}, "--policy.image-size"),
-        ({"demos": {"per_trocar": 2}}, "--demos.per-trocar"),
-        ({"seed": 1}, "--seed"),
+        ({"train": {"steps": 41}}, "train.steps"),
+        ({"policy": {"image_size": 65}}, "policy.image_size"),
+        ({"demos": {"per_trocar": 2}}, "demos.per_trocar"),
+        ({"seed": 1}, "seed"),
     ],
 )
 def test_weights_of_other_settings_are_refused_by_name(tmp_path, parts, word):
     claimed(tmp_path)
-    with pytest.raises(config.UsageError, match="--out") as caught:
+    with pytest.raises(errors.UsageError, match="--out") as caught:
         folders.claim(tmp_path, changed(**parts), "demos-a")
-    assert str(caught.value).startswith(f"{word}: ")
+    assert caught.value.argument == word
 
 
 def another(value):
@@ -65,21 +65,25 @@ def test_every_setting_but_three_decides_the_weights(tmp_path, part):
     names = [field.name for field in dataclasses.fields(getattr(SMOKE, part))]
     for name in {*names} - {"keep_checkpoints", "checkpoint_every", "steps_per_call"}:
         other = changed(**{part: {name: another(getattr(getattr(SMOKE, part), name))}})
-        with pytest.raises(config.UsageError, match=f"^--{part}.{name.replace('_', '-')}: "):
+        with pytest.raises(errors.UsageError) as caught:
             folders.claim(tmp_path, other, "demos-a")
+        assert caught.value.argument == f"{part}.{name}"
 
 
 def test_weights_of_another_scene_are_refused(tmp_path):
     claimed(tmp_path)
-    with pytest.raises(config.UsageError, match="demos-a, got demos-b"):
+    with pytest.raises(errors.UsageError) as caught:
         folders.claim(tmp_path, SMOKE, "demos-b")
+    assert "demos-a" in caught.value.expected and caught.value.got == "demos-b"
 
 
 def test_weights_of_another_frozen_encoder_are_refused(tmp_path):
     claimed(tmp_path, "aaaa")
     folders.claim(tmp_path, SMOKE, "demos-a")  # trained by now: the encoder may be gone
-    with pytest.raises(config.UsageError, match=r"--policy.encoder-weights: .*aaaa, got bbbb"):
+    with pytest.raises(errors.UsageError) as caught:
         folders.claim(tmp_path, SMOKE, "demos-a", "bbbb")
+    assert (caught.value.argument, caught.value.got) == ("policy.encoder_weights", "bbbb")
+    assert "aaaa" in caught.value.expected
     assert folders.read_config(tmp_path) == SMOKE
 
 
@@ -109,8 +113,9 @@ def test_a_folder_where_nothing_was_trained_takes_other_settings(tmp_path):
     folders.claim(tmp_path, other, "demos-b")
     assert "encoder" not in json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "checkpoints" / "step_00000020").mkdir()
-    with pytest.raises(config.UsageError, match="learning-rate"):
+    with pytest.raises(errors.UsageError) as caught:
         folders.claim(tmp_path, SMOKE, "demos-b", "bbbb")
+    assert caught.value.argument == "train.learning_rate"
 
 
 @pytest.mark.parametrize("text", [None, "", '{"seed": 0', "[]", "{}", '{"newthing": 1}'])
@@ -119,9 +124,9 @@ def test_weights_whose_settings_are_gone_are_refused(tmp_path, text):
     claimed(tmp_path)
     path = tmp_path / "config.json"
     path.unlink() if text is None else path.write_text(text)
-    with pytest.raises(config.UsageError, match=re.escape(str(tmp_path))):
+    with pytest.raises(errors.UsageError, match=re.escape(str(tmp_path))):
         folders.claim(tmp_path, SMOKE, "demos-a")
-    with pytest.raises(config.UsageError, match=re.escape(str(tmp_path))) as caught:
+    with pytest.raises(errors.UsageError, match=re.escape(str(tmp_path))) as caught:
         folders.read_config(tmp_path)
     weights = tmp_path / "policy.safetensors"
     assert f"starjax evaluate --policy {weights} scores its weights" in str(caught.value)
@@ -160,7 +165,7 @@ def test_an_evaluation_is_under_way_until_its_result_is_there(tmp_path):
     assert folders.is_under_way(tmp_path)
 
 
-def test_settings_that_runs_differ_in_are_named_by_their_flags():
+def test_settings_that_runs_differ_in_are_named():
     def values(**parts):
         return json.loads(json.dumps(dataclasses.asdict(changed(**parts))))
 
@@ -171,21 +176,21 @@ def test_settings_that_runs_differ_in_are_named_by_their_flags():
     newer = values(policy={"trocar_yaw": "fixed"}, demos={"per_trocar": 9})
     newer["policy"]["unheard_of"] = 1
     found = folders.differing([old, newer])
-    flags = ["--demos.per-trocar", "--policy.trocar-yaw", "--policy.unheard-of"]
-    assert found == folders.differing([newer, old, newer]) == flags
+    names = ["demos.per_trocar", "policy.trocar_yaw", "policy.unheard_of"]
+    assert found == folders.differing([newer, old, newer]) == names
 
 
 def test_a_methods_folder_is_found_from_within_and_told_from_others(tmp_path, monkeypatch):
     (tmp_path / "stardiff").mkdir()
     monkeypatch.chdir(tmp_path / "stardiff")
     assert folders.existing(".") == tmp_path / "stardiff"
-    with pytest.raises(config.UsageError, match=r"RUN: .*got \.\.; there is \.\./stardiff$"):
+    with pytest.raises(errors.UsageError, match=r"RUN: .*got \.\.; there is \.\./stardiff$"):
         folders.existing("..")
     (tmp_path / "policy.safetensors").touch()
     for name in ("..", "../policy.safetensors"):
-        with pytest.raises(config.UsageError, match=r"--policy \S*[^s]/policy.safetensors scores"):
+        with pytest.raises(errors.UsageError, match=r"--policy \S*[^s]/policy.safetensors scores"):
             folders.existing(name)
-    with pytest.raises(config.UsageError, match=r"got nowhere$"):
+    with pytest.raises(errors.UsageError, match=r"got nowhere$"):
         folders.existing("nowhere")
 
 
@@ -206,8 +211,9 @@ def test_a_damaged_record_of_times_starts_afresh_and_a_full_disk_hides_nothing(
 
 
 def test_a_folder_without_a_run_is_one_line(tmp_path):
-    with pytest.raises(config.UsageError, match="method folder"):
+    with pytest.raises(errors.UsageError) as caught:
         folders.read_config(tmp_path)
+    assert (caught.value.argument, caught.value.hint) == (str(tmp_path), "")
 
 
 def test_eight_methods_have_six_sets_of_weights(tmp_path):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config, methods
+from starjax import config, errors, methods
 from starjax.data import normalizer
 from starjax.evaluation import latency
 from starjax.models.kernels import parallel_ddim
@@ -118,23 +118,23 @@ def test_other_words_are_paths(folder):
         assert packaged.find("--policy", word) == Path(word)
     assert packaged.locate("nowhere") == Path("nowhere")
     # A file of the package has a name there, a file of the folder that one is in has a path.
-    with pytest.raises(config.UsageError):
+    with pytest.raises(errors.UsageError):
         packaged.find("--policy", "compact.safetensors")
 
 
 def test_a_missing_file_is_one_line_that_lists_the_names(folder, tmp_path, monkeypatch):
     (folder / "large.safetensors").touch()
     expected = "--policy: expected a file or one of compact, large, got compcat"
-    with pytest.raises(config.UsageError) as caught:
+    with pytest.raises(errors.UsageError) as caught:
         packaged.find("--policy", "compcat")
     assert str(caught.value) == expected
     monkeypatch.setattr(packaged, "FOLDER", tmp_path / "none")
-    with pytest.raises(config.UsageError, match=r"^--policy: expected a file, got compact$"):
+    with pytest.raises(errors.UsageError, match=r"^--policy: expected a file, got compact$"):
         packaged.find("--policy", "compact")
 
 
 def test_a_file_that_may_not_be_read_is_no_missing_one(monkeypatch):
     # Not by the file's mode, which does not bind the superuser.
     monkeypatch.setattr(packaged.os, "access", lambda path, mode: False)
-    with pytest.raises(config.UsageError, match=r"^name: expected a file that may be read, got "):
+    with pytest.raises(errors.UsageError, match=r"^name: expected a file that may be read, got "):
         packaged.find("name", packaged.names()[0])

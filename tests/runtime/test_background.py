@@ -1,4 +1,4 @@
-"""Work beside other work: it has begun before anybody asks, and what it raises is raised there."""
+"""Work in a background thread begins at once; its result or error arrives where it is asked for."""
 
 import threading
 
@@ -7,7 +7,7 @@ import pytest
 from starjax.runtime import background
 
 
-def test_work_goes_on_beside_and_its_result_is_kept():
+def test_work_begins_before_anybody_waits_and_its_result_is_kept():
     begun, may_end = threading.Event(), threading.Event()
 
     def work():
@@ -15,13 +15,13 @@ def test_work_goes_on_beside_and_its_result_is_kept():
         assert may_end.wait(10)
         return threading.current_thread().name
 
-    result = background.beside(work)
+    result = background.run_in_background(work)
     assert begun.wait(10)  # while nobody waits for it
     may_end.set()
     assert result() == result() != threading.current_thread().name
 
 
 def test_what_the_work_raises_is_raised_where_it_is_asked_for():
-    result = background.beside(lambda: 1 // 0)
+    result = background.run_in_background(lambda: 1 // 0)
     with pytest.raises(ZeroDivisionError):
         result()

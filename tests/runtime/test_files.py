@@ -2,8 +2,6 @@
 
 import io
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -86,33 +84,3 @@ def test_a_full_disk_keeps_no_probe(tmp_path, monkeypatch):
     with pytest.raises(files.StorageError, match="No space left"):
         files.require_writable(tmp_path)
     assert not os.listdir(tmp_path)
-
-
-_HOLD = """
-import sys, pathlib
-from starjax.runtime import files
-with files.lock(pathlib.Path(sys.argv[1])):
-    print("held", flush=True)
-    sys.stdin.read()
-"""
-
-
-def test_a_second_run_is_refused_until_the_first_is_killed(tmp_path):
-    holder = subprocess.Popen(
-        [sys.executable, "-c", _HOLD, str(tmp_path)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )
-    assert holder.stdout.readline() == b"held\n"
-    with (
-        pytest.raises(files.StorageError, match=f"in use by process {holder.pid}"),
-        files.lock(tmp_path),
-    ):
-        pass
-    holder.kill()
-    holder.wait()
-    holder.stdin.close()
-    holder.stdout.close()
-    with files.lock(tmp_path):
-        pass

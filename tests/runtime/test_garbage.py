@@ -1,4 +1,4 @@
-"""Garbage is kept for a while, and no longer; who had it kept before, still has."""
+"""The collector pauses inside the block, and only there; who had disabled it, still has."""
 
 import gc
 import weakref
@@ -14,7 +14,7 @@ class _Circle:
 
 
 def test_nothing_is_collected_meanwhile():
-    with garbage.kept():
+    with garbage.gc_paused():
         watched = weakref.ref(_Circle())
         made = [[] for _ in range(50 * gc.get_threshold()[0])]
         assert watched() is not None and made
@@ -24,7 +24,7 @@ def test_nothing_is_collected_meanwhile():
 
 
 def test_a_failure_ends_it():
-    with pytest.raises(ZeroDivisionError), garbage.kept():
+    with pytest.raises(ZeroDivisionError), garbage.gc_paused():
         _ = 1 // 0
     assert gc.isenabled()
 
@@ -32,7 +32,7 @@ def test_a_failure_ends_it():
 def test_who_collects_nothing_goes_on_so():
     gc.disable()
     try:
-        with garbage.kept():
+        with garbage.gc_paused():
             pass
         assert not gc.isenabled()
     finally:

@@ -35,7 +35,7 @@ def main(argv: Sequence[str]) -> int:
     config = folders.read_config(run)
     most = config.policy.diffusion_steps
     for count in chosen.ddim_steps:
-        checks.expect(1 <= count <= most, "ddim-steps", f"1 to {most}", count)
+        checks.expect(1 <= count <= most, "ddim_steps", f"1 to {most}", count)
     counts = chosen.ddim_steps or tuple(count for count in DDIM_STEPS if count <= most)
     files.require_writable(run)
     try:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
+from starjax import errors
 from starjax.experiments import clock, words
 
 
@@ -47,9 +48,11 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
             with clock.timed(out, f"collect {root.name}"):
                 found = demos.collect(root, env, script, trocars, **settings)
         except chunks.ExpertFailed as error:
-            raise config_lib.UsageError(
-                "--demos.max-steps: expected enough control steps for a transfer, "
-                f"got {config.demos.max_steps}; {error}"
+            raise errors.UsageError(
+                "demos.max_steps",
+                "enough control steps for the expert",
+                config.demos.max_steps,
+                str(error),
             ) from error
         words.indented(
             "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)

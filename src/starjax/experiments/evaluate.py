@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from starjax import config as config_lib
-from starjax import methods
+from starjax import errors, methods
 from starjax.experiments import checks, clock, folders, options, presets, words
 from starjax.policies import packaged
 from starjax.runtime import files, xla
@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
     )
     if bool(chosen.run) == bool(chosen.policy):
         got = "both" if chosen.run else "none"
-        raise config_lib.UsageError(f"RUN or --policy: expected one of the two, got {got}")
+        raise errors.UsageError("RUN or --policy", "one of the two", got)
     # A mistake should not wait for jax.
     checks.expect_named(chosen.out, argv)
     checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
@@ -129,11 +129,13 @@ def _refuse_foreign(folder: Path, is_ours: bool) -> None:
     """Raises UsageError for a folder in which something else would be lost or hidden."""
     held = [what for what in ("config.json", "demos-*", "*/config.json") if any(folder.glob(what))]
     if held:
-        raise config_lib.UsageError(f"--out: expected a folder of its own, got a run's, {folder}")
+        raise errors.UsageError("--out", "a folder of its own", f"a run's, {folder}")
     if not is_ours:
-        raise config_lib.UsageError(
-            f"--out: expected a folder without a result of other weights, got {folder}; "
-            "choose another, or remove that one"
+        raise errors.UsageError(
+            "--out",
+            "a folder without a result of other weights",
+            folder,
+            "choose another, or remove that one",
         )
 
 

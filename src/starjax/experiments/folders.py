@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import methods
+from starjax import errors, methods
 from starjax.runtime import files
 
 # What decides the weights; the rest may change between two starts.
 TRAINED_WITH = ("seed", "demos", "policy", "train")
 # Of those, what leaves the weights alone.
-_FREE = {"--train.keep-checkpoints", "--train.checkpoint-every", "--train.steps-per-call"}
+_FREE = {"train.keep_checkpoints", "train.checkpoint_every", "train.steps_per_call"}
 _BESIDE = ("dataset", "encoder")  # what a config.json records beside the settings
 
 
@@ -30,7 +30,7 @@ def existing(run: str) -> Path:
     """The absolute path of a method's folder that a command line names.
 
     Raises:
-      config.UsageError: it is not called as a method is.
+      errors.UsageError: it is not called as a method is.
     """
     folder = Path(run).absolute()  # a link is called what its user calls it
     if folder.name not in methods.METHODS:
@@ -42,10 +42,8 @@ def existing(run: str) -> Path:
         )
         within = [f"{run}/{name}" for name in methods.METHODS if (folder / name).is_dir()]
         hint = hint or (f"there is {', '.join(within)}" if within else "")
-        raise config_lib.UsageError(
-            f"RUN: expected a method's folder such as runs/cpu/stardiff, got {run or 'none'}"
-            + (f"; {hint}" if hint else "")
-        )
+        expected = "a method's folder such as runs/cpu/stardiff"
+        raise errors.UsageError("RUN", expected, run or "none", hint)
     return folder
 
 
@@ -106,23 +104,21 @@ def claim(
       encoder: fingerprint of its frozen vision encoder; None if it has none, or is trained.
 
     Raises:
-      config.UsageError: naming the first setting that differs, or what weights are there without.
+      errors.UsageError: naming the first setting that differs, or what weights are there without.
     """
     wanted = _as_json(config)
     started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
     found = _recorded(folder) if (folder / "config.json").exists() else {}
     if started and not found:
-        raise config_lib.UsageError(
-            f"{folder}: expected the config.json that its weights were trained with, got none; "
-            f"{_remedy(folder)}"
-        )
+        expected = "the config.json that its weights were trained with"
+        raise errors.UsageError(str(folder), expected, "none", _remedy(folder))
     if started:
         before = _as_json(_settings(folder, found))
         for name in (name for part in TRAINED_WITH for name in _flat(wanted[part], part)):
-            _refuse(folder, f"--{name}", _value(before, name), _value(wanted, name))
-        _refuse(folder, "demonstrations", found.get("dataset", dataset), dataset)
+            _refuse(folder, name, _value(before, name), _value(wanted, name))
+        _refuse(folder, "the demonstrations", found.get("dataset", dataset), dataset)
         encoder_before = found.get("encoder") or encoder
-        _refuse(folder, "--policy.encoder-weights", encoder_before, encoder or encoder_before)
+        _refuse(folder, "policy.encoder_weights", encoder_before, encoder or encoder_before)
     known = found.get("encoder") if started or config.policy.freeze_encoder else None
     frozen = encoder or known
     extra = {"dataset": dataset} | ({"encoder": frozen} if frozen else {})
@@ -154,7 +150,7 @@ def differing(configs: Sequence[dict[str, Any]]) -> list[str]:
     def flags(values: dict[str, Any]) -> dict[str, Any]:
         full = {part: usual[part] | values.get(part, {}) for part in ("demos", "policy", "train")}
         names = (name for part in full for name in _flat(full[part], part))
-        return {f"--{name}": _value(full, name) for name in names}
+        return {name: _value(full, name) for name in names}
 
     rows = [flags(values) for values in configs]
     return [
@@ -168,19 +164,15 @@ def _recorded(folder: Path) -> dict[str, Any]:
     """The content of a method folder's config.json."""
     path = folder / "config.json"
     if not path.is_file():
-        remedy = f"; {_remedy(folder)}" if (folder / "policy.safetensors").is_file() else ""
-        raise config_lib.UsageError(
-            f"{folder}: expected a run's method folder such as runs/cpu/stardiff, got no "
-            f"config.json{remedy}"
-        )
+        hint = _remedy(folder) if (folder / "policy.safetensors").is_file() else ""
+        expected = "a method's folder such as runs/cpu/stardiff"
+        raise errors.UsageError(str(folder), expected, "no config.json", hint)
     try:
         found = files.read_json(path)
     except ValueError as error:
-        raise config_lib.UsageError(f"{error}; {_remedy(folder)}") from error
+        raise errors.UsageError(str(path), "settings", error, _remedy(folder)) from error
     if not found:
-        raise config_lib.UsageError(
-            f"{path} is damaged: expected settings, got none; {_remedy(folder)}"
-        )
+        raise errors.UsageError(str(path), "settings", "none", _remedy(folder))
     return found
 
 
@@ -195,9 +187,8 @@ def _settings(folder: Path, values: dict[str, Any]) -> config_lib.RunConfig:
     try:
         return _from_json(values)
     except (TypeError, ValueError) as error:
-        raise config_lib.UsageError(
-            f"{folder / 'config.json'}: {error}; {_remedy(folder)}"
-        ) from error
+        file = str(folder / "config.json")
+        raise errors.UsageError(file, "settings of a run", error, _remedy(folder)) from error
 
 
 def _from_json(values: dict[str, Any]) -> config_lib.RunConfig:
@@ -212,18 +203,16 @@ def _as_json(config: config_lib.RunConfig) -> dict[str, Any]:
 
 def _refuse(folder: Path, name: str, before: Any, now: Any) -> None:
     if before != now and name not in _FREE:
-        raise config_lib.UsageError(
-            f"{name}: {folder} was made with {before}, got {now}; choose another folder by --out, "
-            "or remove that one"
-        )
+        hint = "choose another folder by --out, or remove that one"
+        raise errors.UsageError(name, f"{before}, with which {folder} was made", now, hint)
 
 
 def _flat(value: Any, prefix: str) -> list[str]:
     if not isinstance(value, dict):
         return [prefix]
-    return [f"{prefix}.{name.replace('_', '-')}" for name in value]
+    return [f"{prefix}.{name}" for name in value]
 
 
 def _value(values: dict[str, Any], name: str) -> Any:
     part, _, field = name.partition(".")
-    return values[part][field.replace("-", "_")] if field else values[part]
+    return values[part][field] if field else values[part]

@@ -40,20 +40,17 @@ def follow(
         processes.agree(0)  # the first one has checked them, and collected again what was damaged
         demos = dataset()
         with stop_signals() as should_stop:
-            try:
-                loop.run(
-                    methods.METHODS[name],
-                    config.policy,
-                    config.train,
-                    demos,
-                    p_world_ref,
-                    Path(config.out) / name,
-                    config.seed,
-                    should_stop=should_stop,
-                    description=f"Training {name}",
-                )
-            except loop.TrainingFailed as error:
-                raise config_lib.UsageError(str(error)) from error
+            loop.run(
+                methods.METHODS[name],
+                config.policy,
+                config.train,
+                demos,
+                p_world_ref,
+                Path(config.out) / name,
+                config.seed,
+                should_stop=should_stop,
+                description=f"Training {name}",
+            )
     # A process that leaves early would end the others.
     files.wait_until_free(Path(config.out))
 

@@ -5,19 +5,22 @@ argument, what was expected, what came. Imports neither jax nor numpy.
 """
 
 import dataclasses
-import difflib
 import itertools
+import re
 import shlex
 import types
 import typing
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
 from starjax import config as config_lib
+from starjax import errors
 
 SettingsT = TypeVar("SettingsT")
+
+_FIELD = re.compile(r"[a-z][a-z0-9_.]*")
 
 # The words before the flags, as help names them.
 Run = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -45,7 +48,7 @@ def parse(
     """Returns `settings` filled from `argv`; missing fields come from `default`.
 
     Raises:
-      config.UsageError: one line that names the argument, what was expected and what came.
+      errors.UsageError: one line that names the argument, what was expected and what came.
     """
     if not {"-h", "--help"} & set(argv):
         argv = _sorted(settings, argv)
@@ -90,19 +93,23 @@ def typed(name: str, argv: Sequence[str]) -> str:
     return shlex.join(["starjax", name, *argv])
 
 
-def suggest(word: str, known: Iterable[str]) -> str:
-    """`; did you mean ...?` for the nearest known word, else nothing."""
-    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return f"; did you mean {near[0]}?" if near else ""
+def spelled(error: errors.UsageError) -> str:
+    """A mistake's line, with flags instead of the fields that library code names."""
+    line = str(error)
+    if _FIELD.fullmatch(error.argument):
+        line = line.replace(error.argument, _flag(error.argument), 1)
+    # Elsewhere in it a field without a dot would be an ordinary word.
+    fields = [_field(flag) for flag in flags(config_lib.RunConfig) if "." in flag]
+    known = rf"(?<![\w./-])({'|'.join(map(re.escape, fields))})\b"
+    return re.sub(known, lambda found: _flag(found[0]), line)
 
 
-def choice(argument: str, value: str, known: Iterable[str]) -> None:
-    """Raises UsageError unless `value` is one of `known`."""
-    names = list(known)
-    if value not in names:
-        raise config_lib.UsageError(
-            f"{argument}: expected one of {', '.join(names)}, got {value!r}{suggest(value, names)}"
-        )
+def _flag(field: str) -> str:
+    return f"--{field.replace('_', '-')}"
+
+
+def _field(flag: str) -> str:
+    return flag[2:].replace("-", "_")
 
 
 def _spelled(token: str) -> str:
@@ -127,10 +134,10 @@ def _sorted(settings: type, argv: Sequence[str]) -> list[str]:
             index += 1
             continue
         if not token.startswith("--"):
-            raise config_lib.UsageError(f"{token}: expected a flag such as {next(iter(known))}")
+            raise errors.UsageError("FLAG", f"one such as {next(iter(known))}", token)
         flag, end = _spelled(token), index + 1
         if flag not in known:
-            raise config_lib.UsageError(f"{token}: unknown argument{suggest(flag, known)}")
+            raise errors.UsageError("FLAG", "one of --help", token, errors.nearest(flag, known))
         while not equals and end < len(argv) and not argv[end].startswith("--"):
             end += 1
         values = [value] if equals else list(argv[index + 1 : end])
@@ -152,7 +159,7 @@ def _check_words(settings: type, fields: Sequence[dataclasses.Field], words: lis
     if len(words) < needed or (len(words) > len(fields) and not several):
         names, got = " ".join(field.name for field in fields).upper(), " ".join(words) or "none"
         count = "one or more" if several else len(fields)
-        raise config_lib.UsageError(f"{names}: expected {count}, got {got}")
+        raise errors.UsageError(names, str(count), got)
 
 
 def _count(hint: Any, values: Sequence[str]) -> int:
@@ -168,8 +175,7 @@ def _count(hint: Any, values: Sequence[str]) -> int:
 def _check_values(flag: str, hint: Any, values: Sequence[str], count: int) -> None:
     """Checks the words after one flag, of which it takes `count`, against its type."""
     if len(values) != count:
-        got = " ".join(values) or "none"
-        raise config_lib.UsageError(f"{flag}: expected {count} value(s), got {got}")
+        raise errors.UsageError(flag, f"{count} value(s)", " ".join(values) or "none")
     several = typing.get_origin(hint) is tuple
     for value in values:
         _check_value(flag, typing.get_args(hint)[0] if several else hint, value)
@@ -180,10 +186,10 @@ def _check_value(flag: str, hint: Any, value: str) -> None:
     if isinstance(hint, types.UnionType):  # `float | None`: a value, unless nothing was typed
         hint = typing.get_args(hint)[0]
     if typing.get_origin(hint) is Literal:
-        choice(flag, value, [str(arg) for arg in typing.get_args(hint)])
+        errors.choice(flag, value, [str(arg) for arg in typing.get_args(hint)])
     if hint in (int, float):
         try:
             hint(value)
         except ValueError:
             kind = "a whole number" if hint is int else "a number"
-            raise config_lib.UsageError(f"{flag}: expected {kind}, got {value!r}") from None
+            raise errors.UsageError(flag, kind, repr(value)) from None

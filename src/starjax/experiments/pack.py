@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from starjax import config as config_lib
+from starjax import errors
 from starjax.experiments import checks, options
 from starjax.policies import packaged
 from starjax.runtime import files, xla
@@ -34,11 +34,10 @@ def main(argv: Sequence[str]) -> int:
     """Writes the file, says how large it is."""
     chosen = options.parse(Options, argv, prog="starjax pack", description=DESCRIPTION)
     if chosen.temperature is not None and not 0 <= chosen.temperature <= 1:
-        raise config_lib.UsageError(f"--temperature: expected in [0, 1], got {chosen.temperature}")
+        raise errors.UsageError("--temperature", "in [0, 1]", chosen.temperature)
     source, out = packaged.find("POLICY", chosen.policy), Path(chosen.out)
     if out.exists():
-        got = chosen.out or "none"
-        raise config_lib.UsageError(f"OUT: expected a file that is not there yet, got {got}")
+        raise errors.UsageError("OUT", "a file that is not there yet", chosen.out or "none")
     checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
     xla.require_devices("starjax.policies.policy_file")
@@ -50,14 +49,14 @@ def main(argv: Sequence[str]) -> int:
     try:
         trained = policy_file.load(source)
     except ValueError as error:
-        raise config_lib.UsageError(f"POLICY: {error}") from error
+        raise errors.UsageError("POLICY", "a policy of starjax", error) from error
     policy = dataclasses.replace(trained.policy, dtype="float32")
     if chosen.temperature is not None:
         policy = dataclasses.replace(policy, temperature=chosen.temperature)
     try:
         policy_file.save(out, trained._replace(policy=policy), half=True)
     except ValueError as error:
-        raise config_lib.UsageError(f"POLICY: {error}") from error
+        raise errors.UsageError("POLICY", "weights that fit float16", error) from error
     count = sum(leaf.size for leaf in jax.tree.leaves(trained.params)) / 1e6
     before, after = (files.size(path.stat().st_size) for path in (source, out))
     print(f"{out}: {count:.3g} M parameters, {after} ({source}: {before})")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import methods
+from starjax import errors, methods
 from starjax.experiments import clock, demonstrations, folders, following, words
 from starjax.runtime import files, xla
 from starjax.runtime.signals import stop_signals
@@ -32,7 +32,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     processes.join()
     xla.require_devices("starjax.sim.env", "starjax.training.loop")
     if config.policy.freeze_encoder and not processes.is_alone():
-        raise config_lib.UsageError("--policy.freeze-encoder: expected one process, got several")
+        raise errors.UsageError("policy.freeze_encoder", "one process", "several")
     if "train" in stages:
         devices.make_mesh(config.train.batch_size)  # a mistake is found before demonstrations are
     out, names = Path(config.out), folders.selected(config)
@@ -93,20 +93,17 @@ def _train(
     words.stage("train", f"{name}, into {folder}")
     begun = any((folder / "checkpoints").glob("step_*"))
     with clock.timed(out, f"train {name}", begun), stop_signals() as should_stop:
-        try:
-            result = loop.run(
-                methods.METHODS[name],
-                config.policy,
-                config.train,
-                dataset,
-                env.p_world_ref,
-                folder,
-                config.seed,
-                should_stop=should_stop,
-                description=f"Training {name}",
-            )
-        except loop.TrainingFailed as error:
-            raise config_lib.UsageError(str(error)) from error
+        result = loop.run(
+            methods.METHODS[name],
+            config.policy,
+            config.train,
+            dataset,
+            env.p_world_ref,
+            folder,
+            config.seed,
+            should_stop=should_stop,
+            description=f"Training {name}",
+        )
     state = processes.own(result.state)
     params = state.ema_params
     made = policy_file.Trained(
@@ -144,10 +141,11 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
         words.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
         return
     if found and (more := len(found["trials"])) > len(rcm.IS_SEEN) * config.eval.trials:
-        raise config_lib.UsageError(
-            f"--eval.trials: {folder / 'result.json'} has {more} trials of these weights, which "
-            f"{config.eval.trials} at each trocar would replace; "
-            f"starjax evaluate {shlex.quote(str(folder))} keeps them apart"
+        raise errors.UsageError(
+            "eval.trials",
+            f"no fewer than the {more // len(rcm.IS_SEEN)} of {folder / 'result.json'}",
+            config.eval.trials,
+            f"starjax evaluate {shlex.quote(str(folder))} keeps them apart",
         )
     words.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
     folders.adopt_twin(out, name)
@@ -210,6 +208,6 @@ def _report(out: Path, names: Sequence[str]) -> None:
         try:
             page = build.build(scored, out / "report", report=words.indented)
         except ValueError as error:  # of a damaged file, which it names
-            raise config_lib.UsageError(str(error)) from error
+            raise errors.UsageError(str(out), "results that are whole", error) from error
     results = [files.read_json(out / name / "result.json") for name in names]
     print(f"\n{words.outcome(results)}\n\nreport: {page}", flush=True)

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from starjax import config as config_lib
-from starjax import methods
+from starjax import errors, methods
 from starjax.experiments import checks, options
 from starjax.runtime import xla
 
@@ -45,7 +44,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         page = build.build(runs, out, with_video=chosen.video)
     except ValueError as error:  # of a damaged file, which it names
-        raise config_lib.UsageError(str(error)) from error
+        raise errors.UsageError("RUN", "results that are whole", error) from error
     print(f"report: {page}")
     return 0
 
@@ -55,7 +54,5 @@ def _with_results(name: str) -> list[Path]:
     path = Path(name)
     found = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
     if not (name and found):
-        raise config_lib.UsageError(
-            f"RUN: expected a folder with a result.json, or of such, got {name or 'none'}"
-        )
+        raise errors.UsageError("RUN", "a folder with a result.json, or of such", name or "none")
     return [file if file.is_dir() else file.parent for file in found]

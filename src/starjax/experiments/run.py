@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from starjax import cli
+from starjax import cli, errors
 from starjax import config as config_lib
 from starjax.experiments import checks, options, presets
 
@@ -16,14 +16,14 @@ The same command again goes on from what is saved. Values below are those of the
 def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.RunConfig:
     """Settings of a run from its command line: the preset's values under what was typed."""
     name = options.value_of("--preset", argv) or "auto"
-    options.choice("--preset", name, ["auto", *presets.PRESETS])
+    errors.choice("--preset", name, ["auto", *presets.PRESETS])
     default = presets.resolve(name)
     config = options.parse(
         config_lib.RunConfig, argv, prog=prog, description=description, default=default
     )
     if config.policy.observation == "state" and options.value_of("--policy.encoder-weights", argv):
-        raise config_lib.UsageError(
-            "--policy.encoder-weights: expected --policy.observation image, got state"
+        raise errors.UsageError(
+            "policy.encoder_weights", "policy.observation image", config.policy.observation
         )
     if config.policy.observation == "state" and not options.is_given(
         "--policy.freeze-encoder", argv

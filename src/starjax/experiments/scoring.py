@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from starjax import config as config_lib
-from starjax import methods, rcm
+from starjax import errors, methods, rcm
 from starjax.evaluation import evaluate, latency, statistics
 from starjax.evaluation import trials as table
-from starjax.experiments import folders, options, words
+from starjax.experiments import folders, words
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.rollouts import placement
@@ -47,15 +47,16 @@ def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subje
       env: built from what the weights were trained on unless given.
 
     Raises:
-      config.UsageError: the file is missing or damaged.
+      errors.UsageError: the file is missing or damaged.
     """
     again = f"starjax run with its flags and --out {shlex.quote(str(weights.parent.parent))}"
     if not weights.exists():
-        raise config_lib.UsageError(f"{weights}: no weights there; {again} trains them")
+        raise errors.UsageError(str(weights), "trained weights", "none", f"{again} trains them")
     try:
         trained = policy_file.load(weights)
     except ValueError as error:
-        raise config_lib.UsageError(f"{error}; remove it, and {again} trains it again") from error
+        hint = f"remove it, and {again} trains it again"
+        raise errors.UsageError(str(weights), "a policy of starjax", error, hint) from error
     return _subject(method, trained, weights, env)
 
 
@@ -63,13 +64,13 @@ def from_file(path: Path) -> Subject:
     """Loads a policy that says itself which method it is.
 
     Raises:
-      config.UsageError: the file is damaged, or not a policy of this version.
+      errors.UsageError: the file is damaged, or not a policy of this version.
     """
     try:
         trained = policy_file.load(path)
     except ValueError as error:
-        raise config_lib.UsageError(f"--policy: {error}") from error
-    options.choice(f"{path}: method", trained.method, methods.METHODS)
+        raise errors.UsageError("--policy", "a policy of starjax", error) from error
+    errors.choice(f"method of {path}", trained.method, methods.METHODS)
     return _subject(trained.method, trained, path, None)
 
 

@@ -110,17 +110,17 @@ def _check(chosen: Options) -> None:
         checks.expect(1 <= count <= MOST_TROCARS, name, f"1 to {MOST_TROCARS}", count)
     for radius in chosen.radii_cm:
         inside = 0 <= radius <= MOST_RADIUS_CM
-        checks.expect(inside, "radii-cm", f"each 0 to {MOST_RADIUS_CM:g} cm", radius)
+        checks.expect(inside, "radii_cm", f"each 0 to {MOST_RADIUS_CM:g} cm", radius)
     for polar in chosen.polars_deg:
-        checks.expect(0 <= polar <= 180, "polars-deg", "each 0 to 180 degrees", polar)
+        checks.expect(0 <= polar <= 180, "polars_deg", "each 0 to 180 degrees", polar)
     ports = len(chosen.radii_cm) * len(chosen.polars_deg) * chosen.azimuths
     most = f"at most {MOST_TROCARS} ports of its grid"
     checks.expect(ports <= MOST_TROCARS, "azimuths", most, ports)
     is_grid, default = bool(chosen.radii_cm), Options(chosen.run)
     for field in ("trocars",) if is_grid else ("polars_deg", "azimuths"):
-        value, name = getattr(chosen, field), field.replace("_", "-")
+        value = getattr(chosen, field)
         what = "nothing with --radii-cm" if is_grid else "--radii-cm beside it"
-        checks.expect(value == getattr(default, field), name, what, value)
+        checks.expect(value == getattr(default, field), field, what, value)
 
 
 def _folder(run: Path, chosen: Options) -> Path:

@@ -7,7 +7,7 @@ weights/<name>.json           result.json of its evaluation without the trials: 
 import os
 from pathlib import Path
 
-from starjax import config
+from starjax import errors
 
 FOLDER = Path(__file__).with_name("weights")
 _SUFFIX = ".safetensors"
@@ -28,12 +28,12 @@ def find(argument: str, name_or_path: str) -> Path:
     """The file that `locate` gives; `./name` is never a packaged one.
 
     Raises:
-      config.UsageError: there is none; the message begins with `argument`.
+      errors.UsageError: there is none, or it may not be read; of `argument`.
     """
     path = locate(name_or_path)
     if not path.is_file():
         expected = " or one of ".join(filter(None, ["a file", ", ".join(names())]))
-        raise config.UsageError(f"{argument}: expected {expected}, got {name_or_path or 'none'}")
+        raise errors.UsageError(argument, expected, name_or_path or "none")
     if not os.access(path, os.R_OK):
-        raise config.UsageError(f"{argument}: expected a file that may be read, got {path}")
+        raise errors.UsageError(argument, "a file that may be read", path)
     return path

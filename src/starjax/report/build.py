@@ -135,7 +135,7 @@ def _figures(
     for name, draw in drawings.items():
         light, dark = draw(False), draw(True)
         if light is not None:
-            pictures[name] = style.save(light, "png"), style.save(dark, "png")
+            pictures[name] = style.save(light, "png"), style.save(dark, "png", dark=True)
             drawn[f"{name}.png"] = pictures[name][0]
             if name != "training":
                 drawn[f"{name}.pdf"] = style.save(light, "pdf")

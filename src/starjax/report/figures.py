@@ -16,10 +16,8 @@ _FEWEST = 2  # panels of a page's width, or a single one would be as large as th
 
 def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False) -> Any:
     """Fig. 4: success against distance to the nearest training trocar; beside it `focus`'s map."""
-    from matplotlib.figure import Figure
-
     with style.use(dark) as shades:
-        figure = Figure((7.4, 3.4), layout="constrained")
+        figure = style.figure(7.4, 3.4)
         left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
         strokes = style.strokes([run.result["method"] for run in runs])
         for i, run in enumerate(runs):
@@ -43,9 +41,6 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
 
     Methods that share their weights share a curve.
     """
-    from matplotlib import ticker
-    from matplotlib.figure import Figure
-
     runs = list({run.log: run for run in reversed(runs) if run.curves}.values())[::-1]
     panels = [
         (name, title)
@@ -55,7 +50,9 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
     if not panels:
         return None
     with style.use(dark):
-        figure = Figure((2.6 * max(len(panels), _FEWEST), 2.4), layout="constrained")
+        from matplotlib import ticker
+
+        figure = style.figure(2.6 * max(len(panels), _FEWEST), 2.4)
         strokes = style.strokes([run.result["method"] for run in runs])
         grid = figure.subplots(1, max(len(panels), _FEWEST), squeeze=False)[0]
         for unused in grid[len(panels) :]:

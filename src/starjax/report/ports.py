@@ -24,15 +24,14 @@ def draw(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
 
     None unless the runs were trained at different numbers of trocars and have others in common.
     """
-    from matplotlib import ticker
-    from matplotlib.figure import Figure
-
     counts, scored_at = sorted({trained_at(run) for run in runs}), never_seen(runs)
     if len(counts) < 2 or not scored_at:
         return None
     names = list(dict.fromkeys(run.result["method"] for run in runs))
     with style.use(dark):
-        figure = Figure((5.0, 3.2), layout="constrained")
+        from matplotlib import ticker
+
+        figure = style.figure(5.0, 3.2)
         axis = figure.subplots()
         for i, name in enumerate(names):
             ours = sorted((run for run in runs if run.result["method"] == name), key=trained_at)

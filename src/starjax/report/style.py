@@ -1,11 +1,16 @@
 """One look for every figure: colour-blind safe (Okabe-Ito), thin axes, on light or on dark paper.
 
-Figures are made as `matplotlib.figure.Figure`, never through pyplot, so no backend is ever chosen.
+Figures never pass through pyplot, and are made and saved with matplotlib's own defaults under the
+report's settings: neither the user's backend nor a matplotlibrc changes a byte of them.
 """
 
+import importlib
 import io
+import os
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from types import ModuleType
 from typing import Any
 
 from starjax import methods
@@ -23,13 +28,47 @@ _LIGHT = {"ink": "#1d2329", "muted": "#6b7480", "line": "#d9dee3", "paper": "#ff
 _DARK = {"ink": "#e6e9ec", "muted": "#98a2ad", "line": "#39424c", "paper": "#171b20"}
 
 
+_DPI = 180  # of a png
+
+_SETTINGS: dict[str, Any] = {
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.8,
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "pdf.fonttype": 42,  # text stays text, as journals ask
+    "text.parse_math": False,  # a folder's name may hold dollars
+}
+
+
+def library() -> ModuleType:
+    """Imports matplotlib, even where its environment variables or matplotlibrc prevent it."""
+    try:
+        return importlib.import_module("matplotlib")
+    except ValueError:  # an unknown MPLBACKEND, a matplotlibrc that is not text
+        for name in [name for name in sys.modules if name.startswith("matplotlib.")]:
+            del sys.modules[name]  # what the attempt left behind is not whole
+        kept = dict(os.environ)
+        os.environ |= {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
+        try:
+            return importlib.import_module("matplotlib")
+        finally:
+            os.environ.clear()
+            os.environ |= kept
+
+
 @contextmanager
 def use(dark: bool = False) -> Iterator[dict[str, str]]:
     """Draws under the report's style; yields the shades `ink`, `muted`, `line` and `paper`."""
-    import matplotlib
-
+    matplotlib = library()
     shades = _DARK if dark else _LIGHT
-    settings: Any = {
+    colours = {
         "figure.facecolor": shades["paper"],
         "axes.facecolor": shades["paper"],
         "text.color": shades["ink"],
@@ -38,21 +77,18 @@ def use(dark: bool = False) -> Iterator[dict[str, str]]:
         "xtick.color": shades["muted"],
         "ytick.color": shades["muted"],
         "grid.color": shades["line"],
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.linewidth": 0.8,
-        "grid.linewidth": 0.6,
-        "lines.linewidth": 1.8,
-        "font.size": 9.0,
-        "axes.titlesize": 9.5,
-        "axes.titlelocation": "left",
-        "legend.frameon": False,
-        "text.parse_math": False,  # a folder's name may hold dollars
     }
-    with matplotlib.rc_context(settings):
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update({**_SETTINGS, **colours})
         yield shades
+
+
+def figure(width: float, height: float) -> Any:
+    """An empty figure of so many inches; to be called within `use`."""
+    from matplotlib.figure import Figure
+
+    return Figure((width, height), layout="constrained")
 
 
 def method(name: str) -> tuple[str, str]:
@@ -97,14 +133,21 @@ def legend(
     figure.legend(handles, labels, **place, **settings)
 
 
-def save(figure: Any, kind: str) -> bytes:
-    """The figure as the bytes of a png or a pdf file, the same bytes for the same figure."""
-    import matplotlib
+def save(figure: Any, kind: str, dark: bool = False) -> bytes:
+    """The figure as the bytes of a png or a pdf file, the same bytes for the same figure.
 
-    stream = io.BytesIO()
-    meta = {"CreationDate": None} if kind == "pdf" else {"Software": None}
-    with matplotlib.rc_context({"pdf.fonttype": 42}):  # text stays text, as journals ask
-        figure.savefig(stream, format=kind, dpi=180, metadata=meta)
+    Args:
+      figure: drawn under `use(dark)`.
+      kind: `png` or `pdf`.
+      dark: ticks are made when a figure is saved, in the colours of then.
+    """
+    with use(dark):
+        from matplotlib.backends import backend_agg, backend_pdf
+
+        canvases = {"png": backend_agg.FigureCanvasAgg, "pdf": backend_pdf.FigureCanvasPdf}
+        stream = io.BytesIO()
+        meta = {"CreationDate": None} if kind == "pdf" else {"Software": None}
+        canvases[kind](figure).print_figure(stream, format=kind, dpi=_DPI, metadata=meta)
     return stream.getvalue()
 
 

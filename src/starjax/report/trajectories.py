@@ -38,8 +38,6 @@ def draw(runs: Sequence[results.Run], sim: SimModel, dark: bool = False) -> Any 
     paths succeeded, orange ones failed. Several: a colour a method, failures dashed. Shafts are
     those of the recorded joints.
     """
-    from matplotlib.figure import Figure
-
     pegs = sim.pegs
     runs = [run for run in runs if run.rollouts]
     rows = [row for row in (_panels(runs, True), _panels(runs, False)) if row]
@@ -48,7 +46,7 @@ def draw(runs: Sequence[results.Run], sim: SimModel, dark: bool = False) -> Any 
     columns = max(len(row) for row in rows)
     frame = _frame(pegs, runs)
     with style.use(dark) as shades:
-        figure = Figure((2.6 * columns, 3.5 * len(rows) + 0.3), layout="constrained")
+        figure = style.figure(2.6 * columns, 3.5 * len(rows) + 0.3)
         grid = figure.subplots(len(rows), columns, squeeze=False)
         for axes, row in zip(grid, rows):
             for axis in axes[len(row) :]:

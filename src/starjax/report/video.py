@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from starjax.report import outcomes, results
+from starjax.report import outcomes, results, style
 
 Draw = Callable[[results.Rollout, int], np.ndarray]
 
@@ -165,11 +165,11 @@ def write(pictures: Iterable[np.ndarray], path: pathlib.Path, fps: int = FPS) ->
 
 def caption(rows: Sequence[Sequence[tuple[str, str]]], width: int) -> np.ndarray:
     """`[_BAR, width, 3]` uint8: a dark bar with rows of two (text, colour), left and right."""
-    from matplotlib import font_manager
     from PIL import Image, ImageDraw, ImageFont
 
     line = _BAR / len(rows)
-    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), round(0.58 * line))
+    data = style.library().get_data_path()
+    font = ImageFont.truetype(f"{data}/fonts/ttf/DejaVuSans.ttf", round(0.58 * line))
     image = Image.new("RGB", (width, _BAR), "#14181c")
     pen = ImageDraw.Draw(image)
     for i, row in enumerate(rows):

@@ -1,4 +1,4 @@
-"""Work beside other work."""
+"""Runs a function in a background thread, so that its result is there when it is needed."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -7,10 +7,13 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def beside(work: Callable[[], T]) -> Callable[[], T]:
-    """Begins `work` in a thread; the function returned waits for it, and returns or raises what it
-    did."""
-    pool = ThreadPoolExecutor(1, thread_name_prefix="starjax-beside")
+def run_in_background(work: Callable[[], T]) -> Callable[[], T]:
+    """Starts `work` in a thread.
+
+    Returns:
+      a function that waits for `work`, then returns its result or raises its error.
+    """
+    pool = ThreadPoolExecutor(1, thread_name_prefix="starjax-background")
     future = pool.submit(work)
     pool.shutdown(wait=False)
     return future.result

@@ -5,18 +5,18 @@ next run writes over what a killed one left behind; the lock makes sure that the
 """
 
 import contextlib
-import fcntl
 import hashlib
 import io
 import json
 import os
 import shutil
-import socket
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from starjax.runtime import locks
 
 _BLOCK = 1 << 22
 
@@ -162,34 +162,31 @@ def require_writable(directory: Path, free_bytes: int = 0) -> None:
 
 @contextlib.contextmanager
 def lock(directory: Path) -> Iterator[None]:
-    """Holds `directory` for this process; the kernel lets go of it however the process ends.
+    """Holds `directory` for this process, however that ends (see `locks.hold`).
 
     Raises:
-      StorageError: another process holds it, or the folder cannot be written.
+      StorageError: another process holds it, or the folder cannot be written or locked.
     """
     require_writable(directory)
-    with open(directory / ".lock", "a+") as file:
+    with contextlib.ExitStack() as held:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
+            held.enter_context(locks.hold(directory / ".lock"))
+        except locks.Held as holder:
             raise StorageError(
                 f"{directory} is in use by {holder}: wait for it, or choose another folder"
+            ) from holder
+        except OSError as error:
+            raise StorageError(
+                f"{directory} cannot be locked ({error.strerror or error}): choose a folder on "
+                "another disk"
             ) from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        file.flush()
-        try:
-            yield
-        finally:
-            file.truncate(0)
+        yield
 
 
 def wait_until_free(directory: Path) -> None:
     """Waits while another process holds `directory` by `lock`."""
-    with open(directory / ".lock", "a+") as file:
-        fcntl.flock(file, fcntl.LOCK_SH)
+    with locks.hold(directory / ".lock", wait=True):
+        pass
 
 
 def sync_directory(path: Path) -> None:

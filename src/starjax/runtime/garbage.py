@@ -1,4 +1,4 @@
-"""Python's garbage collector, held back."""
+"""Pauses Python's garbage collector while a program is traced."""
 
 import contextlib
 import gc
@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def kept() -> Iterator[None]:
-    """Nothing is collected meanwhile.
+def gc_paused() -> Iterator[None]:
+    """Disables Python's garbage collector inside the block.
 
-    For tracing, which makes a million objects and throws few away: looking through them again and
+    Tracing makes a million objects and throws few of them away. Looking through them again and
     again takes a seventh of its time.
     """
     was_enabled = gc.isenabled()

@@ -1,4 +1,4 @@
-"""A hash of numbers, where jax's own would take too long to draw or to compile."""
+"""An integer hash, for random bits where `jax.random` takes too long to compile or to draw."""
 
 from typing import Any
 
@@ -6,7 +6,11 @@ import numpy as np
 
 
 def lowbias32(x: Any) -> Any:
-    """A hash of uint32 arrays (of C. Wellons), one to one: each bit flips half of the result's."""
+    """Hashes each number of a uint32 array, of numpy or jax (C. Wellons's `lowbias32`).
+
+    No two numbers have the same hash. Changing one bit of a number changes each bit of its hash
+    with a probability of nearly one half.
+    """
     x = (x ^ (x >> 16)) * np.uint32(0x7FEB352D)
     x = (x ^ (x >> 15)) * np.uint32(0x846CA68B)
     return x ^ (x >> 16)

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from starjax import config
+from starjax import errors
 from starjax.runtime import background
 
 _GROUPS, _GROUPS_OF_THIS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
@@ -75,15 +75,17 @@ def require_devices(*modules: str) -> None:
     """Starts jax, and beside it, because a GPU takes two seconds, imports these modules.
 
     Raises:
-      config.UsageError: it cannot use what JAX_PLATFORMS asks for, or its random numbers would
+      errors.UsageError: it cannot use what JAX_PLATFORMS asks for, or its random numbers would
         depend on what is computed beside them.
     """
     import jax
 
     if (generator := jax.config.jax_default_prng_impl) != _GENERATOR:
-        raise config.UsageError(
-            f"JAX_DEFAULT_PRNG_IMPL: expected {_GENERATOR}, got {generator}: with it a trial would "
-            "depend on those beside it"
+        raise errors.UsageError(
+            "JAX_DEFAULT_PRNG_IMPL",
+            _GENERATOR,
+            generator,
+            "with it a trial would depend on those beside it",
         )
     # A shell's JAX_NUMPY_RANK_PROMOTION is meant for programs of its user's own.
     jax.config.update("jax_numpy_rank_promotion", "allow")
@@ -94,7 +96,7 @@ def require_devices(*modules: str) -> None:
             with contextlib.suppress(RuntimeError):  # a full one will say so where it is used
                 jax.device_put(0, device)
 
-    started = background.beside(start)
+    started = background.run_in_background(start)
     for module in modules:
         importlib.import_module(module)
     try:
@@ -102,9 +104,11 @@ def require_devices(*modules: str) -> None:
     except (AssertionError, RuntimeError) as error:  # the first for a platform without its plugin
         asked = os.environ.get("JAX_PLATFORMS", "")
         reason = str(error).splitlines()[0] if str(error) else "its plugin is not installed"
-        raise config.UsageError(
-            f"JAX_PLATFORMS: expected what jax can use here, got {asked!r}: {reason}; "
-            "starjax doctor says more"
+        raise errors.UsageError(
+            "JAX_PLATFORMS",
+            "a platform that jax can use here",
+            f"{asked!r}: {reason}",
+            "starjax doctor says more",
         ) from error
 
 

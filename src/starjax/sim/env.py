@@ -110,7 +110,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     start = jnp.concatenate([jnp.zeros((count, 1)), tips], axis=-1)
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, trocar)
     solved = [
-        ik.solve(bound.chain, _of(pose, a), jnp.asarray(bound.home), RESET_IK_ITERATIONS)
+        _solve(bound, trocar.p_world_trocar[a], _of(pose, a), None, RESET_IK_ITERATIONS)
         for a, bound in enumerate(scene.arms)
     ]
     q = tuple(q for q, _ in solved)
@@ -207,14 +207,15 @@ def _move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
     """What arm a does in a control period: dq, velocity, correction, gripper, residual."""
     bound, p_trocar = scene.arms[a], state.trocar.p_world_trocar[a]
     q_target, given = state.q_target[a], state.correction[a]
-    reference, _, _ = ik.forward(bound.chain, q_target)
+    chain = scenes.chain_at(bound, p_trocar)
+    reference, _, _ = ik.forward(chain, q_target)
     present = control.corrected(reference, p_trocar, -given)
     correction = control.correct(given, _of(state.pose, a), present, p_trocar)
     target, velocity = control.toward(
         present, state.velocity[a], command.pose, p_trocar, 1.0 / CONTROL_HZ
     )
     wanted = control.corrected(target, p_trocar, correction)
-    q, _ = ik.solve(bound.chain, wanted, q_target, STEP_IK_ITERATIONS)
+    q, _ = _solve(bound, p_trocar, wanted, q_target, STEP_IK_ITERATIONS)
     usable = _is_usable(command) & jnp.all(jnp.isfinite(q))
     dq = jnp.where(usable, q - q_target, 0.0)
     fastest = jnp.maximum(jnp.max(jnp.abs(dq) / bound.max_speed), 1e-9)
@@ -225,13 +226,30 @@ def _move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
         jnp.where(usable, velocity, 0.0),
         jnp.where(usable, correction, given),
         jnp.where(usable, jnp.clip(command.gripper, -1.0, 1.0), state.gripper_target[a]),
-        jnp.where(usable, ik.residual(bound.chain, goal, q_target + dq), jnp.inf),
+        jnp.where(usable, ik.residual(chain, goal, q_target + dq), jnp.inf),
     )
+
+
+def _solve(
+    bound: scenes.BoundArm,
+    p_world_trocar: jax.Array,
+    target: Pose,
+    q: jax.Array | None,
+    iterations: int,
+) -> tuple[jax.Array, jax.Array]:
+    """Inverse kinematics of one arm from `q` `[J]`, or from its home."""
+    home = jnp.asarray(bound.home)
+    chain = scenes.chain_at(bound, p_world_trocar)
+    start = home if q is None else q
+    return ik.solve(chain, target, start, iterations, home, bound.arm.rest_gain)
 
 
 def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts") -> EnvState:
     qpos, p_world_trocar = state.physics.qpos, state.trocar.p_world_trocar
-    found = [ik.forward(bound.chain, qpos[bound.q]) for bound in scene.arms]
+    found = [
+        ik.forward(scenes.chain_at(bound, p_world_trocar[a]), qpos[bound.q])
+        for a, bound in enumerate(scene.arms)
+    ]
     pose = jax.tree.map(lambda *x: jnp.stack(x), *(pose for pose, _, _ in found))
     opening = physics.openings(scene, qpos)
     views = Views(qpos, state.physics.qvel, pose, opening, state.touch, contacts)
@@ -259,7 +277,8 @@ def _largest_within(scene: scenes.Scene, qpos: jax.Array, p_world_trocar: jax.Ar
     """`[A]` m: the largest RCM error at the physics steps `qpos` `[substeps, Q]`."""
     largest = []
     for a, bound in enumerate(scene.arms):
-        pose, _, _ = jax.vmap(ik.forward, in_axes=(None, 0))(bound.chain, qpos[:, bound.q])
+        chain = scenes.chain_at(bound, p_world_trocar[a])
+        pose, _, _ = jax.vmap(ik.forward, in_axes=(None, 0))(chain, qpos[:, bound.q])
         largest.append(jnp.max(rcm.rcm_error(pose, p_world_trocar[a])))
     return jnp.stack(largest)
 

@@ -1,118 +1,118 @@
 """Forward and inverse kinematics of a serial arm (Eq. 17), single-sample, in plain JAX."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax.sim import linear
+from starjax.sim.chain import Chain as Chain
+from starjax.sim.chain import chain_of as chain_of
 from starjax.types import Pose
 
 # Rotation errors weigh this many metres a radian against position errors.
 ROTATION_WEIGHT = 0.2
-# Damping of the least squares; small, because the reachable set keeps singular values >= 0.065.
+# Damping of the least squares; small, because mounts keep singular values >= 0.05 (a test).
 DAMPING = 1e-3
-# No joint moves further than this in one iteration (rad).
+# No joint moves further than this in one iteration (rad, m).
 MAX_STEP = 0.35
-# Joint targets stay this far inside the limits (rad).
+# Joint targets stay this far inside the limits (rad, m).
 LIMIT_MARGIN = 0.01
-
-
-class Chain(NamedTuple):
-    """A chain of hinges about their local z axes, numpy constants.
-
-    Attributes:
-      p_base, R_base: `[3]` m, `[3, 3]`: the fixed frame that the first body stands in.
-      offsets: `[J, 3]` m and `rotations`: `[J, 3, 3]`: each body's pose in its parent's frame.
-      p_tip, R_tip: the tip in the last body's frame.
-      limits: `[J, 2]` rad.
-    """
-
-    p_base: np.ndarray
-    R_base: np.ndarray
-    offsets: np.ndarray
-    rotations: np.ndarray
-    p_tip: np.ndarray
-    R_tip: np.ndarray
-    limits: np.ndarray
-
-
-def chain_of(m: mujoco.MjModel, first: str, site: str) -> Chain:
-    """The chain from body `first` down to `site`, read off a compiled model.
-
-    Raises:
-      ValueError: `first` is not above the site.
-    """
-    data = mujoco.MjData(m)
-    mujoco.mj_kinematics(m, data)
-    body = int(m.site(site).bodyid[0])
-    p_tip, R_tip = np.array(m.site(site).pos), _matrix(m.site(site).quat)
-    while body and m.body_jntnum[body] == 0:  # tool bodies fixed to the last link
-        R = _matrix(m.body_quat[body])
-        p_tip, R_tip = m.body_pos[body] + R @ p_tip, R @ R_tip
-        body = int(m.body_parentid[body])
-    bodies = [body]
-    while m.body(bodies[-1]).name != first:
-        if not bodies[-1]:  # the world, which is its own parent
-            raise ValueError(f"first: expected a body above the site {site}, got {first!r}")
-        bodies.append(int(m.body_parentid[bodies[-1]]))
-    bodies = bodies[::-1]
-    root = int(m.body_parentid[bodies[0]])
-    return Chain(
-        p_base=_float32(data.xpos[root]),
-        R_base=_float32(data.xmat[root].reshape(3, 3)),
-        offsets=_float32(m.body_pos[bodies]),
-        rotations=_float32([_matrix(m.body_quat[b]) for b in bodies]),
-        p_tip=_float32(p_tip),
-        R_tip=_float32(R_tip),
-        limits=_float32([m.jnt_range[m.body_jntadr[b]] for b in bodies]),
-    )
+POSE_SIZE = 6  # numbers of a pose: joints beyond as many are redundant
 
 
 def forward(chain: Chain, q: jax.Array) -> tuple[Pose, jax.Array, jax.Array]:
-    """Tip pose of configuration `q` `[J]` rad.
+    """Tip pose of configuration `q` `[J]` rad (m of a slide).
 
     Returns:
       pose_world_tip; the joints' origins `[J, 3]` m; their axes `[J, 3]`, both in the world.
     """
     p, R = jnp.asarray(chain.p_base), jnp.asarray(chain.R_base)
     origins, axes = [], []
-    for i in range(chain.offsets.shape[0]):
+    for i, is_slide in enumerate(chain.slides):
         p = p + R @ chain.offsets[i]
         R = R @ chain.rotations[i]
+        if is_slide:
+            p = p + q[i] * R[:, 2]
         origins.append(p)
         axes.append(R[:, 2])
-        c, s = jnp.cos(q[i]), jnp.sin(q[i])
-        R = jnp.stack([c * R[:, 0] + s * R[:, 1], c * R[:, 1] - s * R[:, 0], R[:, 2]], axis=1)
+        if not is_slide:
+            c, s = jnp.cos(q[i]), jnp.sin(q[i])
+            turned = [c * R[:, 0] + s * R[:, 1], c * R[:, 1] - s * R[:, 0], R[:, 2]]
+            R = jnp.stack(turned, axis=1)
     return Pose(R @ chain.R_tip, p + R @ chain.p_tip), jnp.stack(origins), jnp.stack(axes)
 
 
-def solve(chain: Chain, target: Pose, q: jax.Array, iterations: int) -> tuple[jax.Array, jax.Array]:
+def jacobian(chain: Chain, q: jax.Array, rotation_weight: float) -> jax.Array:
+    """`[6, J]`: motion of the tip (m, and rad times `rotation_weight` m) by joint."""
+    pose, origins, axes = forward(chain, q)
+    return _jacobian(chain, pose, origins, axes, rotation_weight)
+
+
+def solve(
+    chain: Chain,
+    target: Pose,
+    q: jax.Array,
+    iterations: int,
+    home: jax.Array | None = None,
+    gain: float = 0.0,
+) -> tuple[jax.Array, jax.Array]:
     """Damped least squares from `q` towards `target` (Eq. 17).
+
+    What a pose leaves free of more than six joints returns to `home`, in every iteration but the
+    last, so that the pose stays exact. Without that the free joints would drift.
 
     Args:
       target: pose_world_tip wanted, single.
-      q: `[J]` rad, where to start: the present configuration.
-      iterations: 3-4 from a neighbouring pose, 30 from afar.
+      q: `[J]` rad (m of a slide), where to start: the present configuration.
+      iterations: 3-4 from a neighbouring pose, 30 from afar, 40 for the free joints to settle.
+      home: `[J]`, needed with a `gain`.
+      gain: share of the way home that the free joints take in an iteration: 0.1 to 0.3, or 0.
 
     Returns:
-      `[J]` rad within the limits; the residual in m, rotation weighed by `ROTATION_WEIGHT`.
+      `[J]` within the limits; the residual in m, rotation weighed by `ROTATION_WEIGHT`.
     """
     low = chain.limits[:, 0] + LIMIT_MARGIN
     high = chain.limits[:, 1] - LIMIT_MARGIN
+    is_redundant = home is not None and gain > 0 and len(chain.slides) > POSE_SIZE
 
-    def iterate(_, q):
+    def iterate(i, q):
         pose, origins, axes = forward(chain, q)
-        J = jnp.concatenate([jnp.cross(axes, pose.p - origins).T, ROTATION_WEIGHT * axes.T])
-        H = J @ J.T + DAMPING**2 * jnp.eye(6)
-        dq = J.T @ linear.solve_positive(H, _error(pose, target))
+        J = _jacobian(chain, pose, origins, axes, ROTATION_WEIGHT)
+        missing = _error(pose, target)
+        if is_redundant:
+            free = jnp.where(i + 1 < iterations, gain, 0.0) * (home - q)
+            dq = free + _least_squares(J, missing - J @ free)
+        else:
+            dq = _least_squares(J, missing)
         dq = dq * jnp.minimum(1.0, MAX_STEP / jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9))
         return jnp.clip(q + dq, low, high)
 
     q = jax.lax.fori_loop(0, iterations, iterate, q)
     return q, residual(chain, target, q)
+
+
+def residual(chain: Chain, target: Pose, q: jax.Array) -> jax.Array:
+    """Distance (m) of configuration `q` from `target`, rotation weighed by `ROTATION_WEIGHT`."""
+    pose, _, _ = forward(chain, q)
+    return jnp.linalg.norm(_error(pose, target))
+
+
+def _jacobian(
+    chain: Chain, pose: Pose, origins: jax.Array, axes: jax.Array, rotation_weight: float
+) -> jax.Array:
+    moves, turns = jnp.cross(axes, pose.p - origins), axes
+    if any(chain.slides):
+        slides = np.array(chain.slides)[:, None]
+        moves, turns = jnp.where(slides, axes, moves), jnp.where(slides, 0.0, axes)
+    return jnp.concatenate([moves.T, rotation_weight * turns.T])
+
+
+def _least_squares(J: jax.Array, wanted: jax.Array) -> jax.Array:
+    """The damped step `[J]` for a Jacobian `[6, J]`, by the smaller of two normal equations."""
+    joints = J.shape[1]
+    if joints < POSE_SIZE:
+        return linear.solve_positive(J.T @ J + DAMPING**2 * jnp.eye(joints), J.T @ wanted)
+    return J.T @ linear.solve_positive(J @ J.T + DAMPING**2 * jnp.eye(POSE_SIZE), wanted)
 
 
 def _rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
@@ -130,23 +130,7 @@ def _rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
     return jnp.where(is_small & (jnp.trace(E) < 1.0), half, turn)
 
 
-def residual(chain: Chain, target: Pose, q: jax.Array) -> jax.Array:
-    """Distance (m) of configuration `q` from `target`, rotation weighed by `ROTATION_WEIGHT`."""
-    pose, _, _ = forward(chain, q)
-    return jnp.linalg.norm(_error(pose, target))
-
-
 def _error(pose: Pose, target: Pose) -> jax.Array:
     """`[6]` m: what is missing from `pose` to `target`, rotation weighed."""
     turn = _rotation_between(pose.R, target.R)
     return jnp.concatenate([target.p - pose.p, ROTATION_WEIGHT * turn])
-
-
-def _float32(x: object) -> np.ndarray:
-    return np.asarray(x, np.float32)
-
-
-def _matrix(wxyz: np.ndarray) -> np.ndarray:
-    out = np.zeros(9)
-    mujoco.mju_quat2Mat(out, np.asarray(wxyz, np.float64))
-    return out.reshape(3, 3)

@@ -7,6 +7,7 @@ Names of arm i begin with `arm<i>/` in the composed model, those of its tool wit
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import mujoco
 import numpy as np
 
@@ -28,7 +29,8 @@ class BoundArm(NamedTuple):
 
     Attributes:
       arm, tool, mount: its records.
-      chain: from the world to the tcp, see `ik.Chain`.
+      chain: from the world to the tcp, the trocar at its nominal place; `chain_at` has it elsewhere.
+      base_offset: `[3]` m, from the trocar to the base of an arm that stands there.
       home: `[J]` rad. max_speed: `[J]` rad/s.
       q, dof, ctrl: `[J]` where its joints are in qpos, qvel and ctrl.
       jaws: where all joints of the tool are in qpos. jaw: the one that tells the opening, or None.
@@ -40,6 +42,7 @@ class BoundArm(NamedTuple):
     tool: Tool
     mount: Mount
     chain: ik.Chain
+    base_offset: np.ndarray
     home: np.ndarray
     max_speed: np.ndarray
     q: np.ndarray
@@ -148,13 +151,20 @@ def load(names: SceneNames) -> Scene:
         mj_model=m,
         mjx_model=mjx_model,
         mjx_data=mjx_data,
-        arms=tuple(_bind(m, f"arm{i}/", *parts) for i, parts in enumerate(mounted)),
+        arms=tuple(_bind(m, i, *parts) for i, parts in enumerate(mounted)),
         p_world_ref=np.array([slot.p_world_ref for slot in task.slots], np.float32),
         roll_zero=np.array([slot.roll_zero for slot in task.slots], np.float32),
         trocar_mocap=np.array([m.body(f"trocar{i}").mocapid[0] for i in range(task.arms)]),
         graspable=np.array([m.geom(geom).id for geom in task.graspable], int),
         geom_rgb=geometry.geom_rgb(m),
     )
+
+
+def chain_at(bound: BoundArm, p_world_trocar: jax.Array) -> ik.Chain:
+    """The chain of an arm whose trocar is at `p_world_trocar` `[3]` m."""
+    if not bound.arm.remote_centre:
+        return bound.chain
+    return bound.chain.replace(p_base=p_world_trocar + bound.base_offset)
 
 
 def tcp(i: int, tool: Tool) -> str:
@@ -179,14 +189,17 @@ def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
     return found
 
 
-def _bind(m: mujoco.MjModel, at: str, arm: Arm, tool: Tool, mount: Mount) -> BoundArm:
+def _bind(m: mujoco.MjModel, i: int, arm: Arm, tool: Tool, mount: Mount) -> BoundArm:
+    at = f"arm{i}/"
+    chain = ik.chain_of(m, first=at + arm.first, site=at + f"tool/{tool.tcp}")
     joints = [m.joint(at + joint) for joint in arm.joints]
     held = [m.joint(j) for j in range(m.njnt) if m.joint(j).name.startswith(f"{at}tool/")]
     return BoundArm(
         arm=arm,
         tool=tool,
         mount=mount,
-        chain=ik.chain_of(m, first=at + arm.first, site=f"{at}tool/{tool.tcp}"),
+        chain=chain,
+        base_offset=np.array(chain.p_base - m.body(f"trocar{i}").pos, np.float32),
         home=np.array(mount.home, np.float32),
         max_speed=np.array(arm.max_speed, np.float32),
         q=np.array([joint.qposadr[0] for joint in joints]),

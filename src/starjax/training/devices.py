@@ -6,7 +6,7 @@ from typing import Any
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from starjax import config
+from starjax import errors
 from starjax.runtime import xla
 from starjax.training import processes
 
@@ -30,9 +30,10 @@ def make_mesh(batch_size: int, devices: Sequence[jax.Device] | None = None) -> M
     devices = list(jax.devices() if devices is None else devices)
     count = max(n for n in range(1, len(devices) + 1) if batch_size % n == 0)
     if jax.process_count() > 1 and count < len(devices):
-        raise config.UsageError(
-            f"--train.batch-size: expected a multiple of the {len(devices)} devices of all "
-            f"processes, got {batch_size}"
+        raise errors.UsageError(
+            "train.batch_size",
+            f"a multiple of the {len(devices)} devices of all processes",
+            batch_size,
         )
     # Auto: the compiler propagates the batch's sharding
     return jax.make_mesh((count,), (AXIS,), axis_types=(AxisType.Auto,), devices=devices[:count])

@@ -6,10 +6,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config
+from starjax import config, errors
 from starjax.models import pretrained
 from starjax.policies import diffuser, features, packaged, policy_file
 from starjax.policies import policy as policies
+
+_WEIGHTS = "policy.encoder_weights"
 
 
 class Encoder(NamedTuple):
@@ -30,22 +32,24 @@ def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -
     Returns None for torchvision's weights, which fill the ResNet's trunk and nothing else.
 
     Raises:
-      config.UsageError: one line; there is no such file, it is damaged, or the encoder in it is
-        not the one that the settings describe.
+      errors.UsageError: there is no such file, it is damaged, or the encoder in it is not the one
+        that the settings describe.
     """
     name = policy_config.encoder_weights
-    path = packaged.find("--policy.encoder-weights", name)
+    path = packaged.find(_WEIGHTS, name)
     if not policy_file.is_policy(path):
         _check_torchvision(policy_config, path)
         return None
     try:
         trained = policy_file.load(path)
     except ValueError as error:
-        raise config.UsageError(f"--policy.encoder-weights: {error}") from error
+        raise errors.UsageError(_WEIGHTS, "a policy of starjax", error) from error
     if differing := _differing(policy_config, train_config, trained):
-        raise config.UsageError(
-            f"--policy.encoder-weights: the encoder of {name} was made with "
-            f"{', '.join(differing)}: use the same, or other weights"
+        raise errors.UsageError(
+            _WEIGHTS,
+            "an encoder made with these settings",
+            f"{name}, made with {', '.join(differing)}",
+            "use the same, or other weights",
         )
     params = policies.vision_of(trained.params)
     _check_shapes(policy_config, params, name)
@@ -67,13 +71,13 @@ def _differing(
     train_config: config.TrainConfig,
     trained: policy_file.Trained,
 ) -> list[str]:
-    """Settings of the encoder that are not as they were: `--policy.vision-dim 64 (here 128)`."""
+    """Settings of the encoder that are not as they were: `policy.vision_dim 64 (here 128)`."""
     names = ["observation", "encoder", "vision_dim"]
     # Where it goes on learning, it may get used to another picture.
     names += ["image_size"] if policy_config.freeze_encoder else []
     ours, theirs = policy_config, trained.policy
     found = [
-        f"--policy.{name.replace('_', '-')} {getattr(theirs, name)} (here {getattr(ours, name)})"
+        f"policy.{name} {getattr(theirs, name)} (here {getattr(ours, name)})"
         for name in names
         if getattr(ours, name) != getattr(theirs, name)
     ]
@@ -81,26 +85,26 @@ def _differing(
     if policy_config.freeze_encoder and (
         features.crop_size(theirs, trained.train) != features.crop_size(theirs, train_config)
     ):
-        found.append("--train.crop-fraction {:g} (here {:g})".format(*fractions))
+        found.append("train.crop_fraction {:g} (here {:g})".format(*fractions))
     return found
 
 
 def _check_torchvision(policy_config: config.PolicyConfig, path: Path) -> None:
     name = policy_config.encoder_weights
     if policy_config.freeze_encoder:
-        raise config.UsageError(
-            "--policy.freeze-encoder: expected --policy.encoder-weights of a trained starjax "
-            f"policy, got {name}, which would leave the keypoints untrained"
+        raise errors.UsageError(
+            "policy.freeze_encoder",
+            "policy.encoder_weights of a trained starjax policy",
+            f"{name}, which would leave the keypoints untrained",
         )
     if policy_config.encoder != "resnet18":
-        raise config.UsageError(
-            f"--policy.encoder: expected resnet18 with weights of no starjax policy ({name}), "
-            f"got {policy_config.encoder}"
+        raise errors.UsageError(
+            "policy.encoder", f"resnet18 with torchvision's weights {name}", policy_config.encoder
         )
     try:
         pretrained.load_resnet18(_shapes(policy_config)["params"]["trunk"], path)
     except ValueError as error:
-        raise config.UsageError(f"--policy.encoder-weights: {error}") from error
+        raise errors.UsageError(_WEIGHTS, "torchvision's resnet18", error) from error
 
 
 def _check_shapes(
@@ -114,9 +118,7 @@ def _check_shapes(
     for key in sorted({*shapes[0], *shapes[1]}):
         want, got = (shape.get(key, "no such parameter") for shape in shapes)
         if want != got:
-            raise config.UsageError(
-                f"--policy.encoder-weights: {name}: {key}: expected {want}, got {got}"
-            )
+            raise errors.UsageError(_WEIGHTS, f"{want} at {key}", f"{got} in {name}")
 
 
 def _shapes(policy_config: config.PolicyConfig) -> policies.Params:

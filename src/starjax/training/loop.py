@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, methods
+from starjax import config, errors, methods
 from starjax.data import normalizer, windows
 from starjax.policies import policy as policies
 from starjax.runtime import background, progress
@@ -24,10 +24,6 @@ _CALL_SECONDS = 1.0  # aim of one compiled call: how long Ctrl-C waits, how ofte
 
 class Interrupted(KeyboardInterrupt):
     """Training was asked to stop; its checkpoint is written and the same command goes on."""
-
-
-class TrainingFailed(RuntimeError):
-    """Training cannot go on; the message says why and what to change."""
 
 
 class Result(NamedTuple):
@@ -78,11 +74,10 @@ def run(
 
     Raises:
       Interrupted: after `should_stop`.
-      TrainingFailed: no step of a whole stretch of the log was finite.
       StorageError: the disk is full.
       UsageError: the directory holds a training of another seed, of other demonstrations, or of
-        more steps. That its method and settings are these is for the caller to see to, as
-        `experiments.folders.claim` does.
+        more steps; or no loss of a whole stretch of the log was finite. That its method and
+        settings are these is for the caller to see to, as `experiments.folders.claim` does.
     """
     directory = pathlib.Path(directory)
     log = directory / "metrics.jsonl"
@@ -103,7 +98,7 @@ def run(
     checkpoints = directory / "checkpoints"
     begun = states.init(policy, seed)
     new = not checkpoint.steps(checkpoints)  # a restored training may be finished
-    drawn = background.beside(begun.drawn) if new else begun.drawn
+    drawn = background.run_in_background(begun.drawn) if new else begun.drawn
     like = _like(around, begun, mesh)
     it = advancing.Training(policy, optimizer, policy_config, train_config, mesh, dataset, train)
     advance = advancing.resident(it, like, ahead=new) if windows.on_device(dataset) else None
@@ -184,8 +179,8 @@ def _restored(checkpoints, like) -> states.TrainState | None:
     restored = checkpoint.restore(checkpoints, like) if checkpoint.steps(checkpoints) else None
     step = -1 if restored is None else restored[0]
     if processes.agree(step) != (step,):
-        raise TrainingFailed(
-            f"{checkpoints.parent}: processes see other checkpoints; is the folder shared?"
+        raise errors.UsageError(
+            str(checkpoints.parent), "a folder that all processes share", "other checkpoints in it"
         )
     return None if restored is None else restored[1]
 
@@ -193,11 +188,14 @@ def _restored(checkpoints, like) -> states.TrainState | None:
 def _check_same(directory, state, key, stats, steps) -> None:
     """Raises UsageError for a state of another training."""
     if not np.array_equal(jax.random.key_data(state.key), jax.random.key_data(key)):
-        raise config.UsageError(f"{directory}: holds a training of another seed")
+        raise errors.UsageError("seed", f"that of the training in {directory}", "another")
     if not all(map(_alike, jax.tree.leaves(state.normalizer), jax.tree.leaves(stats))):
-        raise config.UsageError(f"{directory}: holds a training of other demonstrations")
+        raise errors.UsageError(
+            "the demonstrations", f"those of the training in {directory}", "others"
+        )
     if int(state.step) > steps:
-        raise config.UsageError(f"{directory}: holds {state.step} steps, expected at most {steps}")
+        done = f"{state.step} or more, which the training in {directory} has done"
+        raise errors.UsageError("train.steps", done, steps)
 
 
 def _alike(one, other) -> bool:
@@ -221,10 +219,11 @@ def _log(log, step, carried, train_config) -> tuple[Carried, str]:
     taken, skipped = int(sums.pop("taken")), int(sums.pop("skipped"))
     # A single step says nothing, as where the training's end cuts a stretch short.
     if taken == 0 and (skipped >= max(train_config.log_every, 2) or 1 < step == int(state.skipped)):
-        raise TrainingFailed(
-            f"the loss was not finite in any of the {skipped} steps before step {step}: "
-            f"lower --train.learning-rate (now {train_config.learning_rate:g}) or use "
-            "--policy.dtype float32"
+        raise errors.UsageError(
+            "train.learning_rate",
+            "one at which losses stay finite",
+            f"{train_config.learning_rate:g}, none finite in {skipped} steps before step {step}",
+            "lower it, or use policy.dtype float32",
         )
     values = {name: value / taken for name, value in sums.items()} if taken else {}
     last = step - 1 - int(state.skipped)  # as the optimiser counts, which sees no skipped step

@@ -14,7 +14,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import NamedSharding
 
-from starjax import config
+from starjax import errors
 
 _VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 _PREEMPTION = "jax_enable_preemption_service"
@@ -30,13 +30,14 @@ def join() -> None:
     if not address and not any(numbers):
         return
     if not address or not all(number.isdigit() for number in numbers):
-        raise config.UsageError(
-            f"{', '.join(_VARIABLES)}: expected all or none of them, the last two whole numbers, "
-            f"got {[address, *numbers]}"
+        raise errors.UsageError(
+            ", ".join(_VARIABLES),
+            "all or none of them, the last two whole numbers",
+            [address, *numbers],
         )
     count, index = map(int, numbers)
     if index >= count:
-        raise config.UsageError(f"JAX_PROCESS_ID: expected 0 to {count - 1}, got {index}")
+        raise errors.UsageError("JAX_PROCESS_ID", f"0 to {count - 1}", index)
     # Its handler of SIGTERM, in C++, would take the signal from Python's.
     if hasattr(jax.config, _PREEMPTION):
         jax.config.update(_PREEMPTION, False)

@@ -100,7 +100,7 @@ def init(policy: Policy, seed: int) -> Init:
     except RuntimeError:  # JAX_PLATFORMS leaves it out
         place = jax.local_devices()[0]
     key = jax.device_put(keys(seed)[0], place)
-    with garbage.kept():
+    with garbage.gc_paused():
         return Init(_quick(policy.init).trace(key), key)
 
 

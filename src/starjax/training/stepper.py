@@ -73,7 +73,7 @@ def resident(it: Training, like: TrainState, ahead: bool) -> Advance:
         return (devices.replicate(np.int32(count), it.mesh),) if looped else ()
 
     if ahead:
-        program = _compiled_beside(program, parts.carried(), *data, *counted(1))
+        program = _compiled_in_background(program, parts.carried(), *data, *counted(1))
 
     def several(carried: Carried, count: int) -> Carried:
         for _ in range(1 if looped else count):
@@ -113,10 +113,10 @@ def _program(body: Callable[..., Any], parts: Parts) -> Any:
     return jax.jit(body, donate_argnums=0, out_shardings=parts.placed(), compiler_options=options)
 
 
-def _compiled_beside(program: Any, *like: Any) -> Callable[..., Carried]:
+def _compiled_in_background(program: Any, *like: Any) -> Callable[..., Carried]:
     """The program, compiled by a thread for arguments like these; its first call waits for it."""
     # Traced here: by a thread it would take turns with what the caller does, both in Python.
-    with garbage.kept():
+    with garbage.gc_paused():
         lowered = program.lower(*like)
-    compiled = background.beside(lowered.compile)
+    compiled = background.run_in_background(lowered.compile)
     return lambda *args: compiled()(*args)

@@ -1,0 +1,136 @@
+"""Reads a serial arm off a compiled model: a chain of hinges and slides."""
+
+import flax.struct
+import mujoco
+import numpy as np
+
+from starjax import errors
+
+
+@flax.struct.dataclass
+class Chain:
+    """A chain of J hinges about, and slides along, local z axes; numpy constants.
+
+    `chain.replace(p_base=...)` makes it stand elsewhere, also where that is traced.
+
+    Attributes:
+      p_base, R_base: `[3]` m, `[3, 3]`: the frame that the first body stands in.
+      offsets: `[J, 3]` m and `rotations`: `[J, 3, 3]`: each joint's frame in the one before it.
+      p_tip, R_tip: the tip in the last joint's frame.
+      limits: `[J, 2]` rad (m of a slide), infinite where there are none.
+      slides: J times whether the joint is a slide.
+    """
+
+    p_base: np.ndarray
+    R_base: np.ndarray
+    offsets: np.ndarray
+    rotations: np.ndarray
+    p_tip: np.ndarray
+    R_tip: np.ndarray
+    limits: np.ndarray
+    slides: tuple[bool, ...] = flax.struct.field(pytree_node=False)
+
+
+def chain_of(m: mujoco.MjModel, first: str, site: str, joints: tuple[str, ...] = ()) -> Chain:
+    """The chain from body `first` down to `site`, read off a compiled model.
+
+    Any axis, anchor, reference and number of joints a body will do; bodies without a joint are
+    merged.
+
+    Args:
+      joints: names that are expected on the way, in order; left out, any.
+
+    Raises:
+      errors.UsageError: `first` is not above the site, or a joint above it would move it; a joint
+        on the way is neither hinge nor slide, or another than expected.
+    """
+    path = _path(m, first, site)
+    data = mujoco.MjData(m)
+    mujoco.mj_kinematics(m, data)
+    root = int(m.body_parentid[path[0]])
+    on_way = [j for body in path for j in _joints(m, body)]
+    _check(m, first, on_way, joints)
+    p, R = np.zeros(3), np.eye(3)  # from the last joint on
+    offsets, rotations = [], []
+    for body in path:
+        p, R = p + R @ m.body_pos[body], R @ _matrix(m.body_quat[body])
+        for j in _joints(m, body):
+            to_axis, zero = _from_z(m.jnt_axis[j]), -m.qpos0[m.jnt_qposadr[j]]
+            is_hinge = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+            anchor = m.jnt_pos[j] if is_hinge else zero * m.jnt_axis[j]
+            offsets.append(p + R @ anchor)
+            rotations.append(R @ to_axis @ _about_z(zero) if is_hinge else R @ to_axis)
+            p, R = (-to_axis.T @ anchor if is_hinge else np.zeros(3)), to_axis.T
+    return Chain(
+        p_base=_float32(data.xpos[root]),
+        R_base=_float32(data.xmat[root].reshape(3, 3)),
+        offsets=_float32(offsets),
+        rotations=_float32(rotations),
+        p_tip=_float32(p + R @ m.site(site).pos),
+        R_tip=_float32(R @ _matrix(m.site(site).quat)),
+        limits=_float32([_limits(m, j) for j in on_way]),
+        slides=tuple(bool(m.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE) for j in on_way),
+    )
+
+
+def _path(m: mujoco.MjModel, first: str, site: str) -> list[int]:
+    """Bodies from `first` down to the site's."""
+    path = [int(m.site(site).bodyid[0])]
+    while m.body(path[-1]).name != first:
+        if not path[-1]:  # the world, which is its own parent
+            raise errors.UsageError("first", f"a body above the site {site}", repr(first))
+        path.append(int(m.body_parentid[path[-1]]))
+    return path[::-1]
+
+
+def _check(m: mujoco.MjModel, first: str, on_way: list[int], joints: tuple[str, ...]) -> None:
+    """Refuses a chain that these kinematics would get wrong."""
+    above = int(m.body_parentid[m.body(first).id])
+    while above:
+        if m.body_jntnum[above]:
+            raise errors.UsageError("first", "a body that no joint above moves", repr(first))
+        above = int(m.body_parentid[above])
+    names = tuple(m.joint(j).name for j in on_way)
+    if not names:
+        raise errors.UsageError("first", "a body with a joint, in it or below", repr(first))
+    for j, name in zip(on_way, names):
+        kind = mujoco.mjtJoint(m.jnt_type[j])
+        if kind not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            raise errors.UsageError(f"joint {name}", "a hinge or a slide", _kind(kind))
+    if joints and names != tuple(joints):
+        raise errors.UsageError("joints", " ".join(names), " ".join(joints))
+
+
+def _kind(kind: mujoco.mjtJoint) -> str:
+    return "a ball" if kind == mujoco.mjtJoint.mjJNT_BALL else "a free joint"
+
+
+def _joints(m: mujoco.MjModel, body: int) -> range:
+    start = int(m.body_jntadr[body])
+    return range(start, start + int(m.body_jntnum[body]))
+
+
+def _limits(m: mujoco.MjModel, j: int) -> np.ndarray:
+    return m.jnt_range[j] if m.jnt_limited[j] else np.array([-np.inf, np.inf])
+
+
+def _from_z(axis: np.ndarray) -> np.ndarray:
+    """A rotation that takes z to the unit vector `axis`."""
+    wxyz = np.zeros(4)
+    mujoco.mju_quatZ2Vec(wxyz, axis)
+    return _matrix(wxyz)
+
+
+def _about_z(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _float32(x: object) -> np.ndarray:
+    return np.asarray(x, np.float32)
+
+
+def _matrix(wxyz: np.ndarray) -> np.ndarray:
+    out = np.zeros(9)
+    mujoco.mju_quat2Mat(out, np.asarray(wxyz, np.float64))
+    return out.reshape(3, 3)

@@ -1,0 +1,39 @@
+"""How a mistake is worded: the argument, what was expected, what came, what to do."""
+
+import mistakes
+import pytest
+
+from starjax import errors
+from starjax.experiments import options
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (errors.UsageError("seed", "0 or more", -1), "--seed: expected 0 or more, got -1"),
+        (
+            errors.UsageError("policy.roll_width", "1 to 9", 10, "lower train.batch_size"),
+            "--policy.roll-width: expected 1 to 9, got 10; lower --train.batch-size",
+        ),
+        (errors.UsageError("RUN", "a folder", "none"), "RUN: expected a folder, got none"),
+        (errors.UsageError("--out", "a folder", "x"), "--out: expected a folder, got x"),
+        (
+            errors.UsageError("runs/train.steps", "settings", "a/policy.dtype.json"),
+            "runs/train.steps: expected settings, got a/policy.dtype.json",
+        ),
+        (errors.UsageError("JAX_PLATFORMS", "x", "y"), "JAX_PLATFORMS: expected x, got y"),
+    ],
+)
+def test_the_commands_spell_fields_as_flags(error, line):
+    assert options.spelled(error) == line
+
+
+def test_a_choice_suggests_the_nearest_name():
+    errors.choice("method", "stardiff", ["dp_ee", "stardiff"])
+    with mistakes.of("method", "stardif") as caught:
+        errors.choice("method", "stardif", ["dp_ee", "stardiff"])
+    assert caught.value.expected == "one of dp_ee, stardiff"
+    assert caught.value.hint == "did you mean stardiff?"
+    with mistakes.of("method", "x") as caught:
+        errors.choice("method", "x", ["dp_ee"])
+    assert caught.value.hint == ""
