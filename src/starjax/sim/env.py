@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from starjax import errors, rcm
 from starjax.sim import cameras as views
-from starjax.sim import collision, control, ik, physics, render
+from starjax.sim import collision, ik, motion, physics, render
 from starjax.sim import scene as scenes
 from starjax.sim.state import Env, EnvParams, EnvState
 from starjax.sim.tasks.base import CONTROL_HZ, Views
@@ -22,9 +22,6 @@ from starjax.types import Command, Observation, Pose
 __all__ = ["CONTROL_HZ", "Env", "EnvParams", "EnvState", "make"]
 
 RESET_IK_ITERATIONS = 40
-STEP_IK_ITERATIONS = 4
-# Of a command's R'R from the identity: float32 and somebody's rounding are far below.
-MAX_SKEW = 0.01
 # Energy (J) of the contact solver's error beyond which a step counts as diverged: it moves a 3 g
 # block by 8 mm/s, and what it threw so far was thrown with a thousand times as much.
 MAX_SOLVER_ERROR = 1e-7
@@ -110,7 +107,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     start = jnp.concatenate([jnp.zeros((count, 1)), tips], axis=-1)
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, trocar)
     solved = [
-        _solve(bound, trocar.p_world_trocar[a], _of(pose, a), None, RESET_IK_ITERATIONS)
+        motion.solve(bound, trocar.p_world_trocar[a], motion.of(pose, a), None, RESET_IK_ITERATIONS)
         for a, bound in enumerate(scene.arms)
     ]
     q = tuple(q for q, _ in solved)
@@ -154,7 +151,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
 
 def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
     """One control period towards `command` `[A]`."""
-    moves = [_move(scene, a, state, _of(command, a)) for a in range(len(scene.arms))]
+    moves = [motion.move(scene, a, state, motion.of(command, a)) for a in range(len(scene.arms))]
     dq, velocity, correction, gripper, ik_error = zip(*moves, strict=True)
     p_world_trocar, period = state.trocar.p_world_trocar, 1.0 / CONTROL_HZ
     after, passed = physics.advance(
@@ -178,7 +175,7 @@ def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
         ik_error=jnp.stack(ik_error),
         solver_error=passed.solver_error,
         touch=passed.touch,
-        rcm_error_within=_largest_within(scene, passed.qpos, p_world_trocar),
+        rcm_error_within=motion.largest_within(scene, passed.qpos, p_world_trocar),
     )
     moved = judge(scene, _measure(scene, moved, passed.contacts))
     stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
@@ -201,47 +198,6 @@ def judge(scene: scenes.Scene, state: EnvState) -> EnvState:
         reward=verdict.reward,
         done=success | state.lost | verdict.lost,
     )
-
-
-def _move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
-    """What arm a does in a control period: dq, velocity, correction, gripper, residual."""
-    bound, p_trocar = scene.arms[a], state.trocar.p_world_trocar[a]
-    q_target, given = state.q_target[a], state.correction[a]
-    chain = scenes.chain_at(bound, p_trocar)
-    reference, _, _ = ik.forward(chain, q_target)
-    present = control.corrected(reference, p_trocar, -given)
-    correction = control.correct(given, _of(state.pose, a), present, p_trocar)
-    target, velocity = control.toward(
-        present, state.velocity[a], command.pose, p_trocar, 1.0 / CONTROL_HZ
-    )
-    wanted = control.corrected(target, p_trocar, correction)
-    q, _ = _solve(bound, p_trocar, wanted, q_target, STEP_IK_ITERATIONS)
-    usable = _is_usable(command) & jnp.all(jnp.isfinite(q))
-    dq = jnp.where(usable, q - q_target, 0.0)
-    fastest = jnp.maximum(jnp.max(jnp.abs(dq) / bound.max_speed), 1e-9)
-    dq = dq * jnp.minimum(1.0, 1.0 / CONTROL_HZ / fastest)
-    goal = control.corrected(command.pose, p_trocar, correction)
-    return (
-        dq,
-        jnp.where(usable, velocity, 0.0),
-        jnp.where(usable, correction, given),
-        jnp.where(usable, jnp.clip(command.gripper, -1.0, 1.0), state.gripper_target[a]),
-        jnp.where(usable, ik.residual(chain, goal, q_target + dq), jnp.inf),
-    )
-
-
-def _solve(
-    bound: scenes.BoundArm,
-    p_world_trocar: jax.Array,
-    target: Pose,
-    q: jax.Array | None,
-    iterations: int,
-) -> tuple[jax.Array, jax.Array]:
-    """Inverse kinematics of one arm from `q` `[J]`, or from its home."""
-    home = jnp.asarray(bound.home)
-    chain = scenes.chain_at(bound, p_world_trocar)
-    start = home if q is None else q
-    return ik.solve(chain, target, start, iterations, home, bound.arm.rest_gain)
 
 
 def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts") -> EnvState:
@@ -273,16 +229,6 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
     )
 
 
-def _largest_within(scene: scenes.Scene, qpos: jax.Array, p_world_trocar: jax.Array) -> jax.Array:
-    """`[A]` m: the largest RCM error at the physics steps `qpos` `[substeps, Q]`."""
-    largest = []
-    for a, bound in enumerate(scene.arms):
-        chain = scenes.chain_at(bound, p_world_trocar[a])
-        pose, _, _ = jax.vmap(ik.forward, in_axes=(None, 0))(chain, qpos[:, bound.q])
-        largest.append(jnp.max(rcm.rcm_error(pose, p_world_trocar[a])))
-    return jnp.stack(largest)
-
-
 def _precisely(f: Callable) -> Callable:
     """`f` with float32 products: a GPU's default, TF32, costs the kinematics 0.2 mm."""
 
@@ -292,20 +238,6 @@ def _precisely(f: Callable) -> Callable:
             return f(*args)
 
     return wrapped
-
-
-def _is_usable(command: Command) -> jax.Array:
-    """Finite, and its R a rotation."""
-    finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), command)
-    R = command.pose.R
-    skew = jnp.max(jnp.abs(R.T @ R - jnp.eye(3)))
-    is_rotation = (skew < MAX_SKEW) & (jnp.cross(R[:, 0], R[:, 1]) @ R[:, 2] > 0)
-    return jax.tree.reduce(jnp.logical_and, finite) & is_rotation
-
-
-def _of(tree: Pose | Command, a: int):
-    """The part of arm a."""
-    return jax.tree.map(lambda leaf: leaf[a], tree)
 
 
 def _select(which: jax.Array, a: EnvState, b: EnvState) -> EnvState:

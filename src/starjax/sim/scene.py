@@ -29,7 +29,7 @@ class BoundArm(NamedTuple):
 
     Attributes:
       arm, tool, mount: its records.
-      chain: from the world to the tcp, the trocar at its nominal place; `chain_at` has it elsewhere.
+      chain: from the world to the tcp, its trocar at the nominal place; see `chain_at`.
       base_offset: `[3]` m, from the trocar to the base of an arm that stands there.
       home: `[J]` rad. max_speed: `[J]` rad/s.
       q, dof, ctrl: `[J]` where its joints are in qpos, qvel and ctrl.
