@@ -115,7 +115,8 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     is_lost = ~jnp.all(jnp.isfinite(trocar.p_world_trocar))
     state = physics.initial(scene, q, layout)
     opening, touch = jnp.ones(count), jnp.zeros(count, bool)
-    views = Views(state.qpos, state.qvel, pose, opening, touch, physics.no_contacts(scene))
+    still, contacts = jnp.zeros((count, 3)), physics.no_contacts(scene)
+    views = Views(state.qpos, state.qvel, pose, still, opening, touch, contacts)
     first = EnvState(
         physics=state,
         q_target=q,
@@ -146,7 +147,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
         pose=pose,
         gripper=opening,
     )
-    return _measure(scene, first, views.contacts)
+    return _measure(scene, first, contacts)
 
 
 def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
@@ -208,7 +209,8 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
     ]
     pose = jax.tree.map(lambda *x: jnp.stack(x), *(pose for pose, _, _ in found))
     opening = physics.openings(scene, qpos)
-    views = Views(qpos, state.physics.qvel, pose, opening, state.touch, contacts)
+    velocity = CONTROL_HZ * (pose.p - state.pose.p)
+    views = Views(qpos, state.physics.qvel, pose, velocity, opening, state.touch, contacts)
     facts = scene.task.measure(scene.bound, state.layout, views)
     hit = collision.detect(
         scene.arms,

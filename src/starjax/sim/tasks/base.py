@@ -134,6 +134,7 @@ class Views(NamedTuple):
     Attributes:
       qpos, qvel: generalised coordinates of the whole model.
       pose: measured tips, Pose `[A]`, and `opening`: `[A]` in [-1, 1].
+      velocity: `[A, 3]` m/s, of the tips over the last control step.
       touch: `[A]` bool, whether the jaws touch something that they can grasp.
       contacts: of the last physics step.
     """
@@ -141,6 +142,7 @@ class Views(NamedTuple):
     qpos: jax.Array
     qvel: jax.Array
     pose: Pose
+    velocity: jax.Array
     opening: jax.Array
     touch: jax.Array
     contacts: Contacts
