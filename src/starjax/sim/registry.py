@@ -52,7 +52,13 @@ class Registry(NamedTuple):
         return list(importlib.metadata.entry_points(group=f"starjax.{self.kind}s"))
 
 
-tasks = Registry("task", {"peg_transfer": "starjax.sim.tasks.peg_transfer.task:TASK"})
+tasks = Registry(
+    "task",
+    {
+        "peg_transfer": "starjax.sim.tasks.peg_transfer.task:TASK",
+        "reach": "starjax.sim.tasks.reach.task:TASK",
+    },
+)
 arms = Registry("arm", {"fr5": "starjax.sim.arms.fr5:ARM"})
 tools = Registry("tool", {"grasper": "starjax.sim.tools.grasper:TOOL"})
 

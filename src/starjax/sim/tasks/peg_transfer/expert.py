@@ -16,6 +16,7 @@ import jax.numpy as jnp
 
 from starjax import rcm
 from starjax.sim.state import EnvState
+from starjax.sim.tasks import scripting
 from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.sim.tasks.peg_transfer import task
 from starjax.types import Agent, Command, Pose
@@ -52,7 +53,6 @@ NOISE_TIME = 0.4  # s, correlation time
 NOISE_SMOOTHING = 0.15  # s, low-pass: an arm's tool does not jump
 HOVER_OUT = 0.008  # m out from the grasp point along the wall's normal
 HOVER_SPREAD = 0.0015  # m, standard deviation of where it hovers
-NOISE_STREAM = 1 << 20  # folded into the key: apart from every attempt's stream
 
 
 @flax.struct.dataclass
@@ -128,8 +128,8 @@ def act(expert: ExpertState, state: EnvState) -> tuple[Command, ExpertState, Com
     s = jnp.clip(expert.elapsed / expert.duration, 0.0, 1.0)
     # On the way down it is over its goal by the time anything can touch.
     is_down = (expert.phase == DESCEND) | (expert.phase == LOWER)
-    aside = _minimum_jerk(jnp.minimum(s / jnp.where(is_down, ALIGNED, 1.0), 1.0))
-    share = jnp.stack([aside, aside, _minimum_jerk(s)])
+    aside = scripting.minimum_jerk(jnp.minimum(s / jnp.where(is_down, ALIGNED, 1.0), 1.0))
+    share = jnp.stack([aside, aside, scripting.minimum_jerk(s)])
     p = expert.start + share * (expert.goal - expert.start)
     expert = expert.replace(label=Command(expert.label.pose._replace(p=p), expert.label.gripper))
     roll = _roll_of(expert, state)
@@ -250,17 +250,15 @@ def _roll_of(expert: ExpertState, state: EnvState) -> jax.Array:
 
 
 def _disturb(expert: ExpertState, step: jax.Array, dt: float) -> jax.Array:
-    """The next value of an Ornstein-Uhlenbeck process and of its low-passed copy, `[2, 4]`."""
-    keep = jnp.exp(-dt / NOISE_TIME)
-    scale = jnp.array([NOISE_POSITION] * 3 + [NOISE_ROLL]) * jnp.sqrt(1.0 - keep**2)
-    key = jax.random.fold_in(jax.random.fold_in(expert.key, NOISE_STREAM), step)
-    rough = keep * expert.noise[0] + scale * jax.random.normal(key, (4,))
-    smooth = expert.noise[1] + dt / NOISE_SMOOTHING * (rough - expert.noise[1])
-    return jnp.stack([rough, smooth])
-
-
-def _minimum_jerk(s: jax.Array) -> jax.Array:
-    return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
+    return scripting.disturb(
+        expert.key,
+        expert.noise,
+        step,
+        deviation=jnp.array([NOISE_POSITION] * 3 + [NOISE_ROLL]),
+        correlation=NOISE_TIME,
+        smoothing=NOISE_SMOOTHING,
+        dt=dt,
+    )
 
 
 AGENT = Agent(init, act)

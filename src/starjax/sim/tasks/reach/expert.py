@@ -1,0 +1,84 @@
+"""Scripted expert of reach: along an arc to the mark, to one side or the other, and rest.
+
+The side is drawn, never by the trocar; so is the pace. It is disturbed on purpose and comes back.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from starjax import rcm
+from starjax.sim.state import EnvState
+from starjax.sim.tasks import scripting
+from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.types import Agent, Command
+
+SPEED = 0.035  # m/s, mean along the straight line
+LEAST_TIME = 0.8  # s
+TEMPO = (0.85, 1.2)  # range of an episode's pace
+BULGE = 0.25  # of the straight line's length, how far the arc leaves it
+DEVIATION = 0.0012  # m, of the disturbance
+CORRELATION = 0.4  # s
+SMOOTHING = 0.15  # s
+CALM = 0.8  # share of the way after which the disturbance has faded
+
+
+@flax.struct.dataclass
+class Script:
+    """One episode's script.
+
+    Attributes:
+      key: of everything random. start: `[3]` m. side: `[3]` m, how far the arc leaves the line.
+      duration, elapsed: s. noise: `[2, 3]` m, disturbance, rough and smooth.
+    """
+
+    key: jax.Array
+    start: jax.Array
+    side: jax.Array
+    duration: jax.Array
+    elapsed: jax.Array
+    noise: jax.Array
+
+
+def init(key: jax.Array, state: EnvState) -> Script:
+    """Draws side and pace."""
+    key, key_side, key_tempo = jax.random.split(key, 3)
+    start, goal = state.pose.p[0], state.layout.p
+    way = goal - start
+    length = jnp.linalg.norm(way)
+    across = jnp.cross(way, jnp.array([0.0, 0.0, 1.0]))
+    across = across / jnp.maximum(jnp.linalg.norm(across), 1e-6)
+    side = jax.random.rademacher(key_side, (), jnp.float32) * BULGE * length * across
+    tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
+    duration = jnp.maximum(length / SPEED, LEAST_TIME) / tempo
+    return Script(key, start, side, duration, jnp.zeros(()), jnp.zeros((2, 3)))
+
+
+def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+    """The disturbed command to execute, the script, and the undisturbed one to record."""
+    dt = 1.0 / CONTROL_HZ
+    elapsed = script.elapsed + dt
+    s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
+    share = scripting.minimum_jerk(s)
+    p = script.start + share * (state.layout.p - script.start)
+    p = p + 4.0 * share * (1.0 - share) * script.side
+    noise = scripting.disturb(
+        script.key,
+        script.noise,
+        state.step,
+        deviation=jnp.full(3, DEVIATION),
+        correlation=CORRELATION,
+        smoothing=SMOOTHING,
+        dt=dt,
+    )
+    weight = jnp.clip((CALM - s) / CALM, 0.0, 1.0)
+    script = script.replace(elapsed=elapsed, noise=noise)
+    return _command(p + weight * noise[1], state), script, _command(p, state)
+
+
+def _command(p: jax.Array, state: EnvState) -> Command:
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(jnp.append(0.0, p)[None], state.told)
+    return Command(pose, -jnp.ones(1))
+
+
+AGENT = Agent(init, act)

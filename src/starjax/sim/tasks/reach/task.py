@@ -1,0 +1,140 @@
+"""Reach: the tip goes to the marked point and rests there. Lengths in m."""
+
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks.reach import words
+from starjax.types import Agent
+
+# Where an episode begins.
+TIP_HOME = (0.0, 0.0, 0.06)
+TIP_SPREAD = 0.015  # each axis, at most
+
+# Strict success: within TOLERANCE and slower than REST_SPEED for SETTLE_STEPS control steps (1 s).
+TOLERANCE = 0.002
+REST_SPEED = 0.005  # m/s
+SETTLE_STEPS = 30
+LOOSE = 0.005  # m from the mark, moving or not: surgical suites ask for no more
+
+STAGES = ("far", "near", "at the mark", "done")
+NEAR = 0.03  # m, the scale of distances that decide
+MARK_RGB = (0.98, 0.62, 0.1)
+
+
+@flax.struct.dataclass
+class Layout:
+    """What is drawn at reset.
+
+    Attributes:
+      goal: `[]` int32, number of the mark. p: `[3]` m, where it is.
+      tip: `[3]` m, where the tool's tip starts.
+    """
+
+    goal: jax.Array
+    p: jax.Array
+    tip: jax.Array
+
+
+@flax.struct.dataclass
+class Facts:
+    """What is measured: the tip `[3]` m, and its speed in m/s."""
+
+    tip: jax.Array
+    speed: jax.Array
+
+
+class Bound(NamedTuple):
+    """Ids in the compiled model.
+
+    Attributes:
+      geoms: `[M]` of the marks. marks: `[M, 3]` m, where they are. posts: `[M]` m, their radii.
+    """
+
+    geoms: np.ndarray
+    marks: np.ndarray
+    posts: np.ndarray
+
+
+def bind(m: mujoco.MjModel) -> Bound:
+    """Resolves the ids of marks and posts."""
+    count = sum(m.geom(g).name.startswith("mark") for g in range(m.ngeom))
+    geoms = np.array([m.geom(f"mark{i}").id for i in range(count)])
+    posts = np.array([m.geom(f"post{i}").size[0] for i in range(count)], np.float32)
+    return Bound(geoms, np.array(m.geom_pos[geoms], np.float32), posts)
+
+
+def sample(bound: Bound, key: jax.Array) -> Layout:
+    """Draws the mark and the tip's start."""
+    key_goal, key_tip = jax.random.split(key)
+    goal = jax.random.randint(key_goal, (), 0, len(bound.marks))
+    spread = jax.random.uniform(key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD)
+    return Layout(goal, jnp.asarray(bound.marks)[goal], jnp.array(TIP_HOME) + spread)
+
+
+def measure(bound: Bound, layout: Layout, views: Views) -> Facts:
+    """The tip and its speed."""
+    return Facts(views.pose.p[0], jnp.linalg.norm(views.velocity[0]))
+
+
+def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+    """Strict: at the mark and at rest. Loose: near it, moving or not."""
+    off = jnp.linalg.norm(facts.tip - layout.p)
+    at_mark, near = off < TOLERANCE, off < LOOSE
+    good = at_mark & (facts.speed < REST_SPEED)
+    stage = near.astype(jnp.int32) + at_mark + good
+    reward = jnp.where(good, 1.0, (stage + jnp.exp(-off / NEAR)) / len(STAGES))
+    return Verdict(good, near, jnp.zeros((), bool), stage, reward)
+
+
+def colours(bound: Bound, layout: Layout, rgb: jax.Array) -> jax.Array:
+    """Marks the goal."""
+    return rgb.at[jnp.asarray(bound.geoms)[layout.goal]].set(jnp.array(MARK_RGB))
+
+
+def obstacles(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+    """The posts below the marks."""
+    marks = jnp.asarray(bound.marks)
+    foot = marks.at[:, 2].set(0.0)
+    return Capsules(foot, marks - jnp.array([0.0, 0.0, TOLERANCE]), jnp.asarray(bound.posts))
+
+
+def _expert() -> Agent:
+    from starjax.sim.tasks.reach import expert
+
+    return expert.AGENT
+
+
+TASK = Task(
+    name="reach",
+    mjcf="tasks/reach/reach.xml",
+    slots=(Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15)),),
+    cameras=("camera",),
+    time_limit_s=15.0,
+    settle_steps=SETTLE_STEPS,
+    fields=(Field("goal.p", 3, "point"),),
+    labels=("goal",),
+    stages=STAGES,
+    words=words.WORDS,
+    experts={"default": _expert},
+    graspable=(),
+    bind=bind,
+    sample=sample,
+    tips=lambda bound, layout: layout.tip[None],
+    place=lambda bound, qpos, layout: qpos,
+    measure=measure,
+    judge=judge,
+    state=lambda bound, layout, facts: layout.p,
+    relative=lambda state, tips: (state - tips[..., 0, :]) / NEAR,
+    label=lambda layout: {"goal": layout.goal},
+    colours=colours,
+    obstacles=obstacles,
+    floor=0.0,
+    is_sound=lambda bound, qpos, qvel: jnp.ones((), bool),
+    outline=words.outline,
+)
