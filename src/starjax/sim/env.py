@@ -128,7 +128,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
         told=told,
         cameras=cameras,
         layout=layout,
-        facts=scene.task.measure(scene.bound, layout, views),
+        facts=scene.task.measure(scene.bound, layout, views, None),
         step=jnp.zeros((), jnp.int32),
         settled=jnp.zeros((), jnp.int32),
         stage=jnp.zeros((), jnp.int32),
@@ -211,7 +211,7 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
     opening = physics.openings(scene, qpos)
     velocity = CONTROL_HZ * (pose.p - state.pose.p)
     views = Views(qpos, state.physics.qvel, pose, velocity, opening, state.touch, contacts)
-    facts = scene.task.measure(scene.bound, state.layout, views)
+    facts = scene.task.measure(scene.bound, state.layout, views, state.facts)
     hit = collision.detect(
         scene.arms,
         pose,

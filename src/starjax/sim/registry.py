@@ -56,6 +56,7 @@ tasks = Registry(
     "task",
     {
         "peg_transfer": "starjax.sim.tasks.peg_transfer.task:TASK",
+        "needle_pick": "starjax.sim.tasks.needle_pick.task:TASK",
         "reach": "starjax.sim.tasks.reach.task:TASK",
     },
 )

@@ -169,7 +169,7 @@ class Task(NamedTuple):
       sample: (Bound, key) -> Layout, what is drawn at reset.
       tips: (Bound, Layout) -> `[A, 3]` m, where the tools' tips start.
       place: (Bound, qpos, Layout) -> qpos with the task's objects in it.
-      measure: (Bound, Layout, Views) -> Facts.
+      measure: (Bound, Layout, Views, Facts of the step before or None at reset) -> Facts.
       judge: (Bound, Layout, Facts) -> Verdict.
       state: (Bound, Layout, Facts) -> `[S]`, the fields one after another.
       relative: (state `[..., S]`, tips `[..., A, 3]` m) -> `[..., K]` of order one: differences

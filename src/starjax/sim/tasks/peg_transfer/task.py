@@ -146,7 +146,7 @@ def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
     return qpos.at[bound.block : bound.block + 7].set(coords)
 
 
-def measure(bound: Bound, layout: Layout, views: Views) -> Facts:
+def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
     """The block's pose and velocity, and what the jaws do."""
     return Facts(
         block=bodies.free_pose(views.qpos, bound.block),

@@ -77,7 +77,7 @@ def sample(bound: Bound, key: jax.Array) -> Layout:
     return Layout(goal, jnp.asarray(bound.marks)[goal], jnp.array(TIP_HOME) + spread)
 
 
-def measure(bound: Bound, layout: Layout, views: Views) -> Facts:
+def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
     """The tip and its speed."""
     return Facts(views.pose.p[0], jnp.linalg.norm(views.velocity[0]))
 

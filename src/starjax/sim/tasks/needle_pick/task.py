@@ -1,0 +1,228 @@
+"""Needle pick: a suture needle is grasped from foam by friction, lifted and held. Lengths in m.
+
+Needle frame: origin at its centre of mass, the arc in the x-y plane, z up as it lies.
+"""
+
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from starjax import rcm
+from starjax.sim import bodies
+from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks.needle_pick import words
+from starjax.types import Agent, Pose
+
+# The needle, as in needle_pick.xml (a test holds these to the compiled model).
+SEGMENTS = 7  # of the wire; the last one ends in the point
+RADIUS = 0.00828  # of the arc
+SWEEP = np.pi  # rad
+
+# Where an episode begins.
+SPREAD = (0.035, 0.025)  # of the needle's centre, either way
+TIP_HOME = (0.0, 0.0, 0.05)
+TIP_SPREAD = 0.01  # each axis, at most
+
+# Strict success: lifted, held by the jaws, without slip, for SETTLE_STEPS control steps (2 s).
+LIFT = 0.020
+SLIP = 0.0005
+SETTLE_STEPS = 60
+
+STAGES = ("approach", "grasped", "lifted", "held", "done")
+NEAR = 0.03  # the distance at which the tool works on the needle
+FLOOR = -0.0035  # the foam gives way to the pads: a straight tool leans by up to 40 degrees
+# Beyond these the simulation has diverged.
+MAX_SPEED = 20.0  # m/s; a flicked needle is fast
+MAX_DISTANCE = 2.0
+
+
+@flax.struct.dataclass
+class Layout:
+    """What is drawn at reset: pose_world_needle, and `[3]` m, where the tool's tip starts."""
+
+    needle: Pose
+    tip: jax.Array
+
+
+@flax.struct.dataclass
+class Facts:
+    """What is measured.
+
+    Attributes:
+      needle: pose_world_needle.
+      tip: `[3]` m, the tool's tip.
+      touch: the jaws hold some of the wire.
+      sticks: the jaws touch the segment with the point.
+      grip: `[3]` m, the tip in the needle's frame when the present lift began.
+      slip: m, how far it has moved along the wire, or off it, since.
+    """
+
+    needle: Pose
+    tip: jax.Array
+    touch: jax.Array
+    sticks: jax.Array
+    grip: jax.Array
+    slip: jax.Array
+
+
+class Bound(NamedTuple):
+    """Ids and shape in the compiled model.
+
+    Attributes:
+      needle, dof: where the needle's coordinates begin in qpos and qvel.
+      height: m, of its centre as it lies.
+      point: geom ids of the segment with the point. pads: of the jaws.
+    """
+
+    needle: int
+    dof: int
+    height: float
+    point: np.ndarray
+    pads: np.ndarray
+
+
+def segments() -> tuple[np.ndarray, np.ndarray]:
+    """Centres `[K, 3]` m and tangents `[K, 3]` of the wire's segments in the needle's frame."""
+    half = SWEEP / SEGMENTS / 2
+    middle = (np.arange(SEGMENTS) - (SEGMENTS - 1) / 2) * 2 * half
+    zero = np.zeros(SEGMENTS)
+    centres = RADIUS * np.cos(half) * np.stack([np.cos(middle), np.sin(middle), zero], -1)
+    tangents = np.stack([-np.sin(middle), np.cos(middle), zero], -1)
+    centres = centres - centres.mean(0)
+    return centres.astype(np.float32), tangents.astype(np.float32)
+
+
+def bind(m: mujoco.MjModel) -> Bound:
+    """Resolves the ids of the needle and of what touches it."""
+    pads = [g for g in range(m.ngeom) if "/pad_" in m.geom(g).name]
+    return Bound(
+        needle=int(m.joint("needle").qposadr[0]),
+        dof=int(m.joint("needle").dofadr[0]),
+        height=float(m.body("needle").pos[2]),
+        point=np.array([m.geom(f"wire{SEGMENTS - 1}{side}").id for side in "ab"]),
+        pads=np.array(pads),
+    )
+
+
+def sample(bound: Bound, key: jax.Array) -> Layout:
+    """Draws the needle's place and yaw, and the tip's start."""
+    key_place, key_yaw, key_tip = jax.random.split(key, 3)
+    xy = jax.random.uniform(key_place, (2,), minval=-1.0) * jnp.array(SPREAD)
+    yaw = jax.random.uniform(key_yaw, minval=-jnp.pi, maxval=jnp.pi)
+    tip = jnp.array(TIP_HOME) + jax.random.uniform(
+        key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD
+    )
+    return Layout(Pose(rcm.rotation_z(yaw), jnp.append(xy, bound.height)), tip)
+
+
+def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
+    """Lays the needle where it was drawn."""
+    R = layout.needle.R
+    half, zero = 0.5 * jnp.arctan2(R[1, 0], R[0, 0]), jnp.zeros(())
+    coords = jnp.concatenate(
+        [layout.needle.p, jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])]
+    )
+    return qpos.at[bound.needle : bound.needle + 7].set(coords)
+
+
+def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+    """The needle, and how it lies in the jaws since it was lifted."""
+    needle = bodies.free_pose(views.qpos, bound.needle)
+    tip = jax.tree.map(lambda leaf: leaf[0], views.pose)
+    here = needle.R.T @ (tip.p - needle.p)
+    geom, close = views.contacts.geom, views.contacts.dist < 0
+    of_point, of_pads = (
+        jnp.any(geom[..., None] == jnp.asarray(ids), axis=(-2, -1))
+        for ids in (bound.point, bound.pads)
+    )
+    touch = views.touch[0]
+    is_up = touch & (needle.p[2] > bound.height + LIFT)
+    was_up = before is not None and (before.needle.p[2] > bound.height + LIFT) & before.touch
+    grip = here if before is None else jnp.where(is_up & was_up, before.grip, here)
+    return Facts(
+        needle=needle,
+        tip=tip.p,
+        touch=touch,
+        sticks=jnp.any(close & of_point & of_pads),
+        grip=grip,
+        slip=jnp.linalg.norm(here - grip),
+    )
+
+
+def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+    """Strict: lifted, held, without slip. Loose: lifted."""
+    height = facts.needle.p[2] - bound.height
+    lifted = height > LIFT
+    good = lifted & facts.touch & (facts.slip < SLIP) & ~facts.sticks
+    stage = jnp.where(facts.touch, 1, 0)
+    stage = jnp.where(facts.touch & lifted, 2, stage)
+    stage = jnp.where(good, 3, stage).astype(jnp.int32)
+    off = jnp.linalg.norm(facts.needle.p - facts.tip)
+    share = jnp.where(facts.touch, jnp.clip(height / LIFT, 0.0, 1.0), jnp.exp(-off / NEAR))
+    reward = jnp.where(good, 1.0, (stage + share) / (len(STAGES) - 1))
+    return Verdict(good, lifted, jnp.zeros((), bool), stage, jnp.minimum(reward, 1.0))
+
+
+def state(bound: Bound, layout: Layout, facts: Facts) -> jax.Array:
+    """`[9]`: the needle's position and rotation."""
+    return jnp.concatenate([facts.needle.p, rcm.rot6d_encode(facts.needle.R)])
+
+
+def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
+    """Tip to needle, in the world's frame and in the needle's: `[..., 6]`."""
+    off = state[..., :3] - tips[..., 0, :]
+    needle = rcm.rot6d_decode(state[..., 3:9])
+    turned = jnp.einsum("...ji,...j->...i", needle, off, precision="highest")
+    return jnp.concatenate([off, turned], axis=-1) / NEAR
+
+
+def is_sound(bound: Bound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+    """Whether the needle is slower, and nearer, than anything physical."""
+    speed = jnp.max(jnp.abs(qvel[bound.dof : bound.dof + 3]))
+    away = jnp.max(jnp.abs(qpos[bound.needle : bound.needle + 3]))
+    return (speed < MAX_SPEED) & (away < MAX_DISTANCE)
+
+
+def _nothing(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+    """The needle is no obstacle: it gives way."""
+    return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
+
+
+def _expert() -> Agent:
+    from starjax.sim.tasks.needle_pick import expert
+
+    return expert.AGENT
+
+
+TASK = Task(
+    name="needle_pick",
+    mjcf="tasks/needle_pick/needle_pick.xml",
+    slots=(Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15)),),
+    cameras=("camera",),
+    time_limit_s=30.0,
+    settle_steps=SETTLE_STEPS,
+    fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
+    labels=(),
+    stages=STAGES,
+    words=words.WORDS,
+    experts={"default": _expert},
+    graspable=tuple(f"wire{k}{side}" for k in range(SEGMENTS) for side in "ab"),
+    bind=bind,
+    sample=sample,
+    tips=lambda bound, layout: layout.tip[None],
+    place=place,
+    measure=measure,
+    judge=judge,
+    state=state,
+    relative=relative,
+    label=lambda layout: {},
+    colours=lambda bound, layout, rgb: rgb,
+    obstacles=_nothing,
+    floor=FLOOR,
+    is_sound=is_sound,
+    outline=words.outline,
+)

@@ -1,0 +1,29 @@
+"""What reports say of needle pick, and how they draw it."""
+
+from typing import Any
+
+import numpy as np
+
+from starjax.sim.tasks.base import Outline, Words
+
+WORDS = Words(
+    title="needle pick",
+    done="picked up the needle",
+    strict="lifted by 20 mm and held for 2 s without slipping by more than 0.5 mm, in time",
+    loose="the needle was lifted by 20 mm, held or thrown",
+    nearly="needle lifted, but it slipped or was not held for 2 s",
+    collided="pressed jaws or shaft into the foam",
+    ground="the foam",
+    goal="the needle is to be lifted",
+)
+
+
+def outline(mj_model: Any) -> Outline:
+    """Reads the foam's rectangle from the compiled model.
+
+    Args:
+      mj_model: `mujoco.MjModel` with this task in it.
+    """
+    foam = mj_model.geom("foam")
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    return Outline((foam.pos * [1, 1, 0] + foam.size * corners,), ())
