@@ -19,7 +19,7 @@ from starjax.types import Agent, Command
 RAISE, APPROACH, DESCEND, CLOSE, LIFT, HOLD = range(6)
 # Least duration (s) and mean speed (m/s) of each phase, and jaws: +1 open, -1 closed at its end.
 DURATION = (0.5, 1.2, 0.9, 0.4, 0.9, 1.0)
-SPEED = (0.04, 0.04, 0.024, 1.0, 0.03, 1.0)
+SPEED = (0.04, 0.04, 0.024, 1.0, 0.02, 1.0)
 JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0)
 DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.1)  # how much of it acts in each phase
 

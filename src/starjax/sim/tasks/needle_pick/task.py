@@ -57,7 +57,7 @@ class Facts:
       tip: `[3]` m, the tool's tip.
       touch: the jaws hold some of the wire.
       sticks: the jaws touch the segment with the point.
-      grip: `[3]` m, the tip in the needle's frame when the present lift began.
+      grip: `[3]` m, the tip in the needle's frame when the present hold began.
       slip: m, how far it has moved along the wire, or off it, since.
     """
 
@@ -141,8 +141,10 @@ def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) ->
     )
     touch = views.touch[0]
     is_up = touch & (needle.p[2] > bound.height + LIFT)
-    was_up = before is not None and (before.needle.p[2] > bound.height + LIFT) & before.touch
-    grip = here if before is None else jnp.where(is_up & was_up, before.grip, here)
+    grip = here
+    if before is not None:  # a hold begins anew once the needle has slipped too far
+        was_up = before.touch & (before.needle.p[2] > bound.height + LIFT)
+        grip = jnp.where(is_up & was_up & (before.slip < SLIP), before.grip, here)
     return Facts(
         needle=needle,
         tip=tip.p,
