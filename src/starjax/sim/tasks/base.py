@@ -180,6 +180,9 @@ class Task(NamedTuple):
       floor: m, the lowest height that jaws may reach.
       is_sound: (Bound, qpos, qvel) -> bool, False once an object has diverged.
       outline: (mj_model) -> Outline, for figures.
+      trocars: configurations of trocars to train and to be scored on, fields `[C, A]`; the seen
+        ones, of which the first may be chosen for training, come first.
+      is_seen: `[C]` bool.
     """
 
     name: str
