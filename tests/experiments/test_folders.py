@@ -77,6 +77,14 @@ def test_weights_of_another_scene_are_refused(tmp_path):
     assert "demos-a" in caught.value.expected and caught.value.got == "demos-b"
 
 
+def test_weights_of_other_settings_of_jax_are_refused(tmp_path, monkeypatch):
+    claimed(tmp_path)
+    monkeypatch.setenv("NVIDIA_TF32_OVERRIDE", "0")
+    with pytest.raises(errors.UsageError) as caught:
+        folders.claim(tmp_path, SMOKE, "demos-a")
+    assert caught.value.argument == "the settings of jax" and "NVIDIA" in str(caught.value.got)
+
+
 def test_weights_of_another_frozen_encoder_are_refused(tmp_path):
     claimed(tmp_path, "aaaa")
     folders.claim(tmp_path, SMOKE, "demos-a")  # trained by now: the encoder may be gone

@@ -23,7 +23,7 @@ from starjax.runtime import files
 TRAINED_WITH = ("seed", "demos", "policy", "train")
 # Of those, what leaves the weights alone.
 _FREE = {"train.keep_checkpoints", "train.checkpoint_every", "train.steps_per_call"}
-_BESIDE = ("dataset", "encoder")  # what a config.json records beside the settings
+_BESIDE = ("dataset", "encoder", "jax_settings")  # what a config.json records beside the settings
 
 
 def existing(run: str) -> Path:
@@ -106,6 +106,9 @@ def claim(
     Raises:
       errors.UsageError: naming the first setting that differs, or what weights are there without.
     """
+    # Imported here, as it imports jax.
+    from starjax.runtime import jax_settings
+
     wanted = _as_json(config)
     started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
     found = _recorded(folder) if (folder / "config.json").exists() else {}
@@ -116,12 +119,14 @@ def claim(
         before = _as_json(_settings(folder, found))
         for name in (name for part in TRAINED_WITH for name in _flat(wanted[part], part)):
             _refuse(folder, name, _value(before, name), _value(wanted, name))
+        settings = (record.get("jax_settings", {}) for record in (found, jax_settings.record()))
+        _refuse(folder, "the settings of jax", *settings)
         _refuse(folder, "the demonstrations", found.get("dataset", dataset), dataset)
         encoder_before = found.get("encoder") or encoder
         _refuse(folder, "policy.encoder_weights", encoder_before, encoder or encoder_before)
     known = found.get("encoder") if started or config.policy.freeze_encoder else None
     frozen = encoder or known
-    extra = {"dataset": dataset} | ({"encoder": frozen} if frozen else {})
+    extra = {"dataset": dataset} | ({"encoder": frozen} if frozen else {}) | jax_settings.record()
     files.write_json(folder / "config.json", {**wanted, **extra})
 
 
