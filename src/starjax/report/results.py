@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from starjax import methods
+from starjax.evaluation import trial_file
 from starjax.experiments import folders
 from starjax.report import outcomes, stats, structure
 from starjax.runtime import files
@@ -146,11 +147,11 @@ def representatives(runs: Sequence[Run]) -> list[Run]:
 
 
 def load(path: Path) -> Run:
-    """Reads the run directory `path`; what a stage did not leave behind is empty."""
-    file = path / "result.json"
+    """Reads the run directory `path`, or a result alone; what a stage did not leave is empty."""
+    file = path if path.is_file() else path / "result.json"
     if not file.is_file():
         raise ValueError(f"path: expected a run directory with a result.json, got {path}")
-    result = files.read_json(file)
+    result = trial_file.read(file)
     structure.check(file, result, structure.RESULT)
     if result["method"] not in methods.METHODS:
         raise ValueError(f"{file}: expected a method of Table II, got {result['method']!r}")
@@ -237,7 +238,7 @@ def _beside(file: Path, result: dict[str, Any]) -> dict[str, Any] | None:
     """What another command left beside result.json; None if it is of other weights."""
     if not file.is_file():
         return {}
-    found = files.read_json(file)
+    found = trial_file.read(file)
     structure.check(file, found, structure.BESIDE[file.name])
     weights = {x["weights"] for x in (found, result) if "weights" in x}  # once neither said it
     return found if len(weights) < 2 else None

@@ -202,9 +202,9 @@ def phases(runs: Sequence[results.Run]) -> Table:
     return table
 
 
-def render(table: Table) -> str:
-    """A table as markdown; columns after the names are set to the right."""
-    names = names_in(table[0])
+def render(table: Table, names: int | None = None) -> str:
+    """A table as markdown; columns after the first `names`, which hold words, are set right."""
+    names = names_in(table[0]) if names is None else names
     rule = ["---"] * names + ["---:"] * (len(table[0]) - names)
     rows = [[cell.replace("|", "\\|") for cell in row] for row in [table[0], rule, *table[1:]]]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
