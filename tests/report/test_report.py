@@ -989,7 +989,7 @@ def test_a_report_of_runs_that_were_trained_otherwise_says_in_what(one):
     other = edited(one, config={**one.result["config"], "policy": policy})
     (*_, note) = captions.notes([one, other])
     assert note.startswith("These runs were not trained alike") and note.endswith(
-        "in --policy.sees-trocar."
+        "in policy.sees_trocar."
     )
     assert captions.notes([one, one]) == one.result["warnings"]
 

@@ -71,6 +71,14 @@ def hardware(found: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
+def machine(found: dict[str, Any]) -> str:
+    """Its GPUs, e.g. `1 x NVIDIA H200`, or its cores where it has none."""
+    if found.get("backend") == "cpu":
+        return f"{found['cores']} cores of {found['cpu']}"
+    devices = found["devices"]
+    return ", ".join(f"{devices.count(kind)} x {kind}" for kind in dict.fromkeys(devices))
+
+
 def listing(value: Any) -> str:
     """A small JSON value as a phrase."""
     if isinstance(value, dict):

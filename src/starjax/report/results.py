@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from starjax import config as config_lib
 from starjax import methods
-from starjax.experiments import folders
+from starjax.evaluation import trial_file
 from starjax.report import outcomes, stats, structure
 from starjax.runtime import files
 
@@ -114,7 +115,7 @@ def trials_seed(run: Run) -> int | None:
 def differing(runs: Sequence[Run]) -> list[str]:
     """Flags of what decides the weights, but for the seed, that the runs do not agree on."""
     configs = [run.result["config"] for run in runs if run.result.get("config")]
-    return folders.differing(configs)
+    return config_lib.differing(configs)
 
 
 def pair(a: Run, b: Run) -> stats.Paired | None:
@@ -146,11 +147,11 @@ def representatives(runs: Sequence[Run]) -> list[Run]:
 
 
 def load(path: Path) -> Run:
-    """Reads the run directory `path`; what a stage did not leave behind is empty."""
-    file = path / "result.json"
+    """Reads the run directory `path`, or a result alone; what a stage did not leave is empty."""
+    file = path if path.is_file() else path / "result.json"
     if not file.is_file():
         raise ValueError(f"path: expected a run directory with a result.json, got {path}")
-    result = files.read_json(file)
+    result = trial_file.read(file)
     structure.check(file, result, structure.RESULT)
     if result["method"] not in methods.METHODS:
         raise ValueError(f"{file}: expected a method of Table II, got {result['method']!r}")
@@ -237,7 +238,7 @@ def _beside(file: Path, result: dict[str, Any]) -> dict[str, Any] | None:
     """What another command left beside result.json; None if it is of other weights."""
     if not file.is_file():
         return {}
-    found = files.read_json(file)
+    found = trial_file.read(file)
     structure.check(file, found, structure.BESIDE[file.name])
     weights = {x["weights"] for x in (found, result) if "weights" in x}  # once neither said it
     return found if len(weights) < 2 else None
@@ -263,7 +264,7 @@ def _is_of(folder: Path, result: dict[str, Any]) -> bool:
     try:
         trained, config = files.read_json(folder / "config.json"), result["config"]
         same_seed = trained["seed"] == config.get("seed", trained["seed"])
-        return same_seed and not folders.differing([trained, config])
+        return same_seed and not config_lib.differing([trained, config])
     except (AttributeError, KeyError, TypeError, ValueError):
         return True  # damaged, or of another version: not known
 

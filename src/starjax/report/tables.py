@@ -3,8 +3,8 @@
 import itertools
 from collections.abc import Callable, Sequence
 
+from starjax import methods
 from starjax.evaluation import sweep
-from starjax.experiments import folders
 from starjax.report import captions, outcomes, results, stats
 
 Table = list[list[str]]  # header first
@@ -202,9 +202,9 @@ def phases(runs: Sequence[results.Run]) -> Table:
     return table
 
 
-def render(table: Table) -> str:
-    """A table as markdown; columns after the names are set to the right."""
-    names = names_in(table[0])
+def render(table: Table, names: int | None = None) -> str:
+    """A table as markdown; columns after the first `names`, which hold words, are set right."""
+    names = names_in(table[0]) if names is None else names
     rule = ["---"] * names + ["---:"] * (len(table[0]) - names)
     rows = [[cell.replace("|", "\\|") for cell in row] for row in [table[0], rule, *table[1:]]]
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
@@ -240,7 +240,7 @@ def _comparison(a: results.Run, b: results.Run, test: stats.Paired) -> tuple[obj
     result does not say whose it is, by their folders, and the trials' outcomes."""
     method = b.result["method"]
     place = b.path.parent if b.path.name == method else b.path
-    return a.path, b.result.get("weights", place), folders.behaviour(method), test
+    return a.path, b.result.get("weights", place), methods.behaviour(method), test
 
 
 def _seen_unseen(

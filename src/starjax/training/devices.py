@@ -12,7 +12,7 @@ from starjax.training import processes
 
 AXIS = "batch"
 # Of a step on several GPUs: matrices are gathered at once beside the encoder's work, gradients are
-# summed in pieces of 128 MB beside the backward pass (benchmarks/LOG.md).
+# summed in pieces of 128 MB beside the backward pass.
 _OVERLAP: dict[str, Any] = {
     "xla_gpu_enable_latency_hiding_scheduler": True,
     "xla_gpu_all_reduce_combine_threshold_bytes": 128 << 20,

@@ -1,0 +1,144 @@
+"""What a table may say of a result: columns, and paired tests."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from starjax.evaluation import trial_file
+from starjax.report import captions, outcomes, results, stats, tables
+
+HIGHEST = 8  # index of the unseen trocar that is above all seen ones
+
+
+class Scored(NamedTuple):
+    """A result with what lies beside it.
+
+    Attributes:
+      run: the result.
+      swept: the same policy through other trocars, None if it was not swept.
+      held_out: its last error on demonstrations kept out of training, empty if not kept.
+    """
+
+    run: results.Run
+    swept: results.Run | None
+    held_out: dict[str, float]
+
+
+def read(file: Path, label: str) -> Scored:
+    """Reads `file`, `sweep.json` beside a `result.json`, and its `.holdout.jsonl`."""
+    run = results.load(file)._replace(label=label)
+    swept, sweep = None, file.with_name("sweep.json")
+    if file.name == "result.json" and sweep.is_file():
+        found = trial_file.read(sweep)
+        swept = run._replace(
+            result={**run.result, **found}, limit_s=found.get("time_limit_s", run.limit_s)
+        )
+    log = file.with_suffix(".holdout.jsonl")
+    lines = log.read_text().splitlines() if log.is_file() else []
+    return Scored(run, swept, json.loads(lines[-1]) if lines else {})
+
+
+def paired(pairs: Sequence[Sequence[Scored]], part: str) -> tables.Table:
+    """McNemar's test of pairs of results on the same trials.
+
+    Raises:
+      ValueError: two results share no trials.
+    """
+    table = [["Method", "Against", "Trials", "Only the first", "Only the second", "p"]]
+    for one, other in pairs:
+        a, b = PARTS[part](one), PARTS[part](other)
+        test = results.pair(a, b)
+        if test is None:
+            raise ValueError(f"{a.label}, {b.label}: expected the same trials, got none")
+        counts = [str(n) for n in (test.pairs, test.only_a, test.only_b)]
+        table.append([a.label, b.label, *counts, tables.p_value(test.p)])
+    return table
+
+
+def rate(trials: Sequence[outcomes.Trial], test: Callable[..., bool] = outcomes.strict) -> str:
+    """E.g. `784/800: 98.0% (96.8-98.8)`."""
+    if not trials:
+        return "–"
+    score = outcomes.tally(trials, test)
+    low, middle, high = (100 * x for x in (score.low, score.rate, score.high))
+    return f"{score.successes}/{score.trials}: {middle:.1f}% ({low:.1f}-{high:.1f})"
+
+
+def _seen(scored: Scored) -> list[outcomes.Trial]:
+    return outcomes.split(scored.run.trials)[0]
+
+
+def _unseen(scored: Scored) -> list[outcomes.Trial]:
+    return outcomes.split(scored.run.trials)[1]
+
+
+def _gap(scored: Scored) -> str:
+    seen, unseen = (outcomes.tally(trials) for trials in outcomes.split(scored.run.trials))
+    middle, low, high = (100 * x for x in stats.gap(seen, unseen))
+    return f"{middle:.1f} ({low:.1f} to {high:.1f})"
+
+
+def _ports(scored: Scored, low: float = 0.0, high: float = 1.0) -> str:
+    trials = scored.swept.trials if scored.swept else []
+    return rate([trial for trial in trials if low <= trial["distance_m"] < high])
+
+
+def _rcm(scored: Scored, kind: str, what: str) -> str:
+    value = (scored.run.result["rcm_error_mm"].get(kind) or {}).get(what)
+    return "–" if value is None else f"{value:.1f}" if value >= 1 else tables.millimetres(value)
+
+
+def _held_out(scored: Scored, name: str) -> str:
+    return f"{scored.held_out[name]:.1f}" if name in scored.held_out else "–"
+
+
+def _safe(scored: Scored) -> str:
+    won = [trial for trial in scored.run.trials if outcomes.strict(trial)]
+    return f"{sum(outcomes.safe(trial) for trial in won)} of {len(won)}"
+
+
+def _time(scored: Scored) -> str:
+    spent = scored.run.result.get("timings_s") or {}
+    return captions.duration(sum(s for name, s in spent.items() if not name.endswith(": compile")))
+
+
+def _replaced(run: results.Run, trials: list[outcomes.Trial]) -> results.Run:
+    return run._replace(result={**run.result, "trials": trials})
+
+
+def _swept(scored: Scored) -> results.Run:
+    if scored.swept is None:
+        raise ValueError(f"{scored.run.label}: expected a sweep, got none")
+    return scored.swept
+
+
+COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
+    "seen": ("seen", lambda x: rate(_seen(x))),
+    "unseen": ("unseen", lambda x: rate(_unseen(x))),
+    "all": ("all", lambda x: rate(x.run.trials)),
+    "safe": ("successes within 2 mm all along", _safe),
+    "gap": ("gap, points", _gap),
+    "highest": ("highest port", lambda x: rate([t for t in _unseen(x) if t["trocar"] == HIGHEST])),
+    "ports": ("other ports", _ports),
+    "near": ("within 10 mm", lambda x: _ports(x, 0.0, 0.01)),
+    "middle": ("10 to 20 mm", lambda x: _ports(x, 0.01, 0.02)),
+    "far": ("farther", lambda x: _ports(x, 0.02)),
+    "rcm_mean": ("RCM error, mean (mm)", lambda x: _rcm(x, "executed", "mean")),
+    "rcm": ("RCM error, p99 (mm)", lambda x: _rcm(x, "executed", "p99")),
+    "rcm_won": ("of successes", lambda x: _rcm(x, "executed", "p99_of_successes")),
+    "rcm_within": ("within steps", lambda x: _rcm(x, "within_steps", "p99")),
+    "rcm_commanded": ("commanded, most", lambda x: _rcm(x, "commanded", "max")),
+    "tip": ("held-out tip (mm)", lambda x: _held_out(x, "position_error_mm")),
+    "roll": ("held-out roll (deg)", lambda x: _held_out(x, "roll_error_deg")),
+    "decision": ("a decision (ms)", lambda x: f"{x.run.result['inference_ms']['p50']:.1f}"),
+    "time": ("all stages", _time),
+}
+
+PARTS: dict[str, Callable[[Scored], Any]] = {
+    "twelve": lambda x: x.run,
+    "seen": lambda x: _replaced(x.run, _seen(x)),
+    "unseen": lambda x: _replaced(x.run, _unseen(x)),
+    "ports": _swept,
+    "far": lambda x: _replaced(_swept(x), [t for t in _swept(x).trials if t["distance_m"] >= 0.02]),
+}
