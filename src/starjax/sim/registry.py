@@ -57,6 +57,7 @@ tasks = Registry(
     {
         "peg_transfer": "starjax.sim.tasks.peg_transfer.task:TASK",
         "needle_pick": "starjax.sim.tasks.needle_pick.task:TASK",
+        "peg_transfer_bimanual": "starjax.sim.tasks.peg_transfer_bimanual.task:TASK",
         "reach": "starjax.sim.tasks.reach.task:TASK",
     },
 )

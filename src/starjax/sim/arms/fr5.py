@@ -18,5 +18,18 @@ ARM = Arm(
             turn=-1.75,  # j6 stays far from its limits over all trocars
             home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
         ),
+        # Two arms at either side of the board.
+        ("grasper", "left"): Mount(
+            position=(-0.58, 0.0, 0.20),
+            yaw=math.pi,
+            turn=-1.75,
+            home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
+        ),
+        ("grasper", "right"): Mount(
+            position=(0.58, 0.0, 0.20),
+            yaw=0.0,
+            turn=-1.75,
+            home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
+        ),
     },
 )

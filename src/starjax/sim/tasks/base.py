@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import numpy as np
 
+from starjax import rcm
 from starjax.types import Agent, Pose
 
 CONTROL_HZ = 30.0  # commands a second
@@ -211,6 +212,8 @@ class Task(NamedTuple):
     floor: float
     is_sound: Callable[..., jax.Array]
     outline: Callable[..., Outline]
+    trocars: rcm.Trocar = rcm.Trocar(*(field[:, None] for field in rcm.TROCARS))
+    is_seen: np.ndarray = rcm.IS_SEEN
 
     @property
     def arms(self) -> int:

@@ -1,0 +1,199 @@
+"""Bimanual peg transfer, the exercise of FLS. Lengths in m.
+
+One tool (arm 0) lifts the block, the other (arm 1) takes it in the air and threads it on the marked
+peg. A drop is a failure.
+"""
+
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from starjax import rcm
+from starjax.sim import bodies
+from starjax.sim.tasks.base import Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks.peg_transfer import task as single
+from starjax.sim.tasks.peg_transfer_bimanual import words
+from starjax.types import Agent, Pose
+
+PARK = ((-0.045, 0.0, 0.06), (0.045, 0.0, 0.06))  # where the tips start, and the idle one waits
+SPREAD = 0.008  # each axis, at most
+DROPPED_STEPS = 15  # control steps without a tool after which a block that was lifted is dropped
+STAGES = ("approach", "grasped", "lifted", "passed", "at the target", "threaded", "done")
+
+
+@flax.struct.dataclass
+class Layout:
+    """What is drawn at reset: see `peg_transfer`; tips `[2, 3]` m."""
+
+    source: jax.Array
+    target: jax.Array
+    target_peg: jax.Array
+    block: Pose
+    tips: jax.Array
+
+
+@flax.struct.dataclass
+class Facts:
+    """What is measured, and what has happened.
+
+    Attributes:
+      block: pose_world_block. velocity: `[6]` of it, m/s and rad/s.
+      tips: `[2, 3]` m. touch: `[2]` bool, whose jaws touch the block.
+      lifted: by arm 0, at some time. passed: held by arm 1 alone in the air, at some time.
+      untouched: int32, control steps in a row without a tool at the block.
+    """
+
+    block: Pose
+    velocity: jax.Array
+    tips: jax.Array
+    touch: jax.Array
+    lifted: jax.Array
+    passed: jax.Array
+    untouched: jax.Array
+
+
+class _Single(NamedTuple):
+    """The facts that the obstacles of the one-armed task look at."""
+
+    block: Pose
+
+
+def sample(bound: single.Bound, key: jax.Array) -> Layout:
+    """As in `peg_transfer`, with two tips."""
+    key_layout, key_tips = jax.random.split(key)
+    drawn = single.sample(bound, key_layout)
+    spread = jax.random.uniform(key_tips, (2, 3), minval=-SPREAD, maxval=SPREAD)
+    tips = jnp.array(PARK) + spread
+    return Layout(drawn.source, drawn.target, drawn.target_peg, drawn.block, tips)
+
+
+def measure(bound: single.Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+    """The block, the jaws, and who has held it."""
+    block = bodies.free_pose(views.qpos, bound.block)
+    touch = views.touch
+    in_air = block.p[2] > single.RIM_HEIGHT + single.LIFTED
+    lifted, passed = in_air & touch[0] & ~touch[1], jnp.zeros((), bool)
+    untouched = jnp.zeros((), jnp.int32)
+    if before is not None:
+        lifted = before.lifted | lifted
+        passed = before.passed | (before.lifted & in_air & touch[1] & ~touch[0])
+        untouched = jnp.where(touch.any(), 0, before.untouched + 1)
+    return Facts(
+        block=block,
+        velocity=views.qvel[bound.block_dof : bound.block_dof + 6],
+        tips=views.pose.p,
+        touch=touch,
+        lifted=lifted,
+        passed=passed,
+        untouched=untouched,
+    )
+
+
+def judge(bound: single.Bound, layout: Layout, facts: Facts) -> Verdict:
+    """Strict: passed in the air, threaded, released, at rest. Loose: SurRoL's test."""
+    block, peg = facts.block, layout.target_peg
+    threaded, near = single.is_threaded(block, peg), single.is_near(block, peg)
+    good = threaded & facts.passed & single.is_at_rest(facts.velocity) & ~facts.touch.any()
+    lost = facts.lifted & (facts.untouched > DROPPED_STEPS) & ~threaded
+    stage = jnp.where(facts.touch[0], 1, 0)
+    stage = jnp.where(facts.lifted, 2, stage)
+    stage = jnp.where(facts.passed, 3, stage)
+    stage = jnp.where(facts.passed & near, 4, stage)
+    stage = jnp.where(facts.passed & threaded, 5, stage)
+    stage = jnp.where(good, 6, stage).astype(jnp.int32)
+    to_giver = jnp.linalg.norm(block.p - facts.tips[0])
+    to_taker = jnp.linalg.norm(block.p - facts.tips[1])
+    to_peg = jnp.linalg.norm(block.p[:2] - peg)
+    left = jnp.stack([to_giver, to_giver, to_taker, to_peg, to_peg, to_peg, to_peg])[stage]
+    reward = jnp.where(good, 1.0, (stage + jnp.exp(-left / single.NEAR)) / len(STAGES))
+    return Verdict(good, near, lost, stage, reward)
+
+
+def state(bound: single.Bound, layout: Layout, facts: Facts) -> jax.Array:
+    """`[12]`: the block's position and rotation, the target's place."""
+    goal = jnp.append(layout.target_peg, single.RIM_HEIGHT)
+    return jnp.concatenate([facts.block.p, rcm.rot6d_encode(facts.block.R), goal])
+
+
+def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
+    """As in `peg_transfer`, from each tip, and from tip to tip: `[..., 21]`."""
+    parts = [single.relative(state, tips[..., a : a + 1, :]) for a in range(2)]
+    return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
+
+
+def _trocars() -> rcm.Trocar:
+    """Twelve pairs of trocars, each on its arm's side, 6 to 10 cm apart; the last four unseen."""
+    turn = (-24.0, -8.0, 8.0, 24.0)
+    pairs = [
+        (
+            (0.04 - 0.01 * (k % 2), 85.0 + 10.0 * (k // 2 % 2), 180.0 + turn[k % 4]),
+            (0.03 + 0.01 * (k % 2), 95.0 - 10.0 * (k // 4), turn[(3 * k + 1) % 4]),
+        )
+        for k in range(8)
+    ]
+    pairs += [
+        ((0.05, 80.0, 151.0), (0.05, 100.0, 29.0)),
+        ((0.05, 100.0, 209.0), (0.05, 80.0, -29.0)),
+        ((0.03, 90.0, 180.0), (0.03, 90.0, 0.0)),
+        ((0.05, 90.0, 180.0), (0.05, 90.0, 0.0)),
+    ]
+    radius, polar, azimuth = np.moveaxis(np.array(pairs), -1, 0)
+    fields = (radius, np.deg2rad(polar), np.deg2rad(azimuth))
+    return rcm.Trocar(*(field.astype(np.float32) for field in fields))
+
+
+def _expert() -> Agent:
+    from starjax.sim.tasks.peg_transfer_bimanual import expert
+
+    return expert.AGENT
+
+
+def _obstacles(bound: single.Bound, layout: Layout, facts: Facts):
+    return single.obstacles(bound, layout, _Single(facts.block))
+
+
+def bind(m: mujoco.MjModel) -> single.Bound:
+    """As in `peg_transfer`."""
+    return single.bind(m)
+
+
+TASK = Task(
+    name="peg_transfer_bimanual",
+    mjcf="tasks/peg_transfer_bimanual/peg_transfer_bimanual.xml",
+    slots=(
+        Slot(workspace="left", p_world_ref=(0.0, 0.0, 0.15)),
+        Slot(workspace="right", p_world_ref=(0.0, 0.0, 0.15), roll_zero=float(np.pi)),
+    ),
+    cameras=("camera",),
+    time_limit_s=60.0,
+    settle_steps=single.SETTLE_STEPS,
+    fields=(
+        Field("block.p", 3, "point"),
+        Field("block.R", 6, "rot6d"),
+        Field("target.p", 3, "point"),
+    ),
+    labels=("source", "target"),
+    stages=STAGES,
+    words=words.WORDS,
+    experts={"default": _expert},
+    graspable=("wall0", "wall1", "wall2"),
+    bind=bind,
+    sample=sample,
+    tips=lambda bound, layout: layout.tips,
+    place=single.place,
+    measure=measure,
+    judge=judge,
+    state=state,
+    relative=relative,
+    label=lambda layout: {"source": layout.source, "target": layout.target},
+    colours=single.colours,
+    obstacles=_obstacles,
+    floor=0.0,
+    is_sound=single.is_sound,
+    outline=words.outline,
+    trocars=_trocars(),
+)

@@ -1,0 +1,14 @@
+"""What reports say of peg transfer with two arms."""
+
+from starjax.sim.tasks.peg_transfer import words
+
+WORDS = words.WORDS._replace(
+    title="bimanual peg transfer",
+    done="handed the block over in the air and put it on its peg",
+    strict="lifted by one tool, passed in the air, threaded on the target peg by the other, "
+    "released and at rest, in time",
+    nearly="block at its peg, but not passed in the air, or not threaded, released and at rest",
+    collided="touched board, peg or block with shaft or arm, or shafts or arms touched",
+    lost="the block was dropped",
+)
+outline = words.outline
