@@ -19,7 +19,8 @@ from starjax.sim.tasks.peg_transfer import task as single
 from starjax.sim.tasks.peg_transfer_bimanual import words
 from starjax.types import Agent, Pose
 
-PARK = ((-0.045, 0.0, 0.06), (0.045, 0.0, 0.06))  # where the tips start, and the idle one waits
+# Where the tips start, and an idle one waits: the shafts lean apart.
+PARK = ((-0.02, 0.0, 0.065), (0.02, 0.0, 0.065))
 SPREAD = 0.008  # each axis, at most
 DROPPED_STEPS = 15  # control steps without a tool after which a block that was lifted is dropped
 STAGES = ("approach", "grasped", "lifted", "passed", "at the target", "threaded", "done")
