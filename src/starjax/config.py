@@ -35,6 +35,7 @@ class PolicyConfig:
     # Pixels as in the paper, or block pose and target position
     observation: Literal["image", "state"] = "image"
     image_size: int = 256  # side of a picture in pixels, before the crop
+    crop_fraction: float = 0.9  # side of the crop, random in training, over the image's
     obs_horizon: int = 2  # T_o, control steps whose observations a decision sees
     horizon: int = 16  # H, commands predicted: t+1 .. t+H
     execute: int = 8  # commands executed before re-planning
@@ -78,7 +79,6 @@ class TrainConfig:
     roll_weight_decay: float = 0.0  # more of it, of the roll network's kernels alone
     warmup_steps: int = 500  # training steps in which the learning rate rises, at most half of all
     ema_max: float = 0.9999  # share of the averaged weights that a training step keeps, at most
-    crop_fraction: float = 0.9  # side of the crop, random in training, over the image's
     jitter: float = 0.1  # of pictures: brightness, contrast, saturation times 1 +- this
     image_noise: float = 0.02  # standard deviation of the noise on pictures in [0, 1]
     state_noise: float = 0.02  # standard deviation of the noise on normalised poses and task state
@@ -137,6 +137,17 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
                 f"{settings.__name__}.{name}: expected {_kind(hints[name])}, got {value!r}"
             )
     return settings(**fields)
+
+
+def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a run from JSON, or parts of them, with those of earlier versions as today's."""
+    found = dict(values)
+    train, policy = found.get("train"), found.get("policy")
+    if isinstance(train, Mapping) and isinstance(policy, Mapping) and "crop_fraction" in train:
+        rest = dict(train)
+        found["policy"] = {**policy, "crop_fraction": rest.pop("crop_fraction")}
+        found["train"] = rest
+    return found
 
 
 def _kind(hint: Any) -> str:

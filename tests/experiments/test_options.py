@@ -90,7 +90,7 @@ def settings(*argv: str) -> config.RunConfig:
         (["--train.jitter", "-1"], ["--train.jitter", "0 or more", "-1"]),
         (
             ["--preset=paper", "--policy.image-size", "34"],
-            ["--policy.image-size", "more than 32 pixels", "train.crop-fraction = 0.9", "got 31"],
+            ["--policy.image-size", "more than 32 pixels", "policy.crop-fraction = 0.9", "got 31"],
         ),
         (
             ["--preset=smoke", "--policy.encoder-weights", "compact"],
@@ -519,7 +519,7 @@ def test_help_shows_no_empty_default(command, capsys):
     ("argv", "said"),
     [
         (["--train.ema-max", "1"], "--train.ema-max: expected in [0, 1), got 1.0"),
-        (["--train.crop-fraction", "1.1"], "--train.crop-fraction: expected in (0, 1], got 1.1"),
+        (["--policy.crop-fraction", "1.1"], "--policy.crop-fraction: expected in (0, 1], got 1.1"),
         (["--train.holdout-demos", "-1"], "--train.holdout-demos: expected 0 or more, got -1"),
         (["--eval.chunk", "-1"], "--eval.chunk: expected 0 or more, got -1"),
         (["--eval.video-trials", "-1"], "--eval.video-trials: expected 0 or more, got -1"),

@@ -131,7 +131,7 @@ def test_what_ends_a_training_is_no_traceback_in_any_process(tmp_path, monkeypat
     monkeypatch.setattr(load, "load", lambda root: types.SimpleNamespace(dataset=None))
     settings = config.RunConfig(out=str(tmp_path))
     with pytest.raises(config.UsageError, match="the loss was not finite"):
-        following.follow(settings, ["stardiff"], tmp_path, fakes.P_WORLD_REF)
+        following.follow(settings, ["stardiff"], tmp_path, fakes.env())
 
 
 def test_half_of_the_variables_is_a_mistake(monkeypatch):

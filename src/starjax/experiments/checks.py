@@ -69,14 +69,14 @@ def check(config: config_lib.RunConfig) -> None:
     for name, value in not_negative.items():
         expect(value >= 0, name, "0 or more", value)
     expect(0 <= config.seed < SEEDS, "seed", f"0 to {SEEDS - 1}", config.seed)
-    seen, fraction = demos.seen_trocars, train.crop_fraction
+    seen, fraction = demos.seen_trocars, policy.crop_fraction
     expect(1 <= seen <= 8, "demos.seen-trocars", "1 to 8", seen)
-    expect(0 < fraction <= 1, "train.crop-fraction", "in (0, 1]", fraction)
+    expect(0 < fraction <= 1, "policy.crop-fraction", "in (0, 1]", fraction)
     expect(0 <= train.ema_max < 1, "train.ema-max", "in [0, 1)", train.ema_max)
     _check_sizes(config)
     _check_networks(policy)
     _check_sampling(policy)
-    _check_encoder(policy, fraction)
+    _check_encoder(policy)
     trials, seconds = evaluation.trials, evaluation.time_limit_s
     limits = f"{LEAST_TIME_S:g} to {MOST_TIME_S:g} s"
     expect(1 <= trials <= MOST_TRIALS, "eval.trials", f"1 to {MOST_TRIALS}", trials)
@@ -133,14 +133,14 @@ def _check_sampling(policy: config_lib.PolicyConfig) -> None:
     expect(0 <= policy.temperature <= 1, "policy.temperature", "in [0, 1]", policy.temperature)
 
 
-def _check_encoder(policy: config_lib.PolicyConfig, crop_fraction: float) -> None:
+def _check_encoder(policy: config_lib.PolicyConfig) -> None:
     expect(policy.image_size >= 32, "policy.image-size", "32 pixels or more", policy.image_size)
     if policy.observation == "image":
-        cell, crop = _CELL[policy.encoder], round(policy.image_size * crop_fraction)
+        cell, crop = _CELL[policy.encoder], round(policy.image_size * policy.crop_fraction)
         expect(
             crop > cell,
             "policy.image-size",
-            f"more than {cell} pixels left by train.crop-fraction = {crop_fraction:g}",
+            f"more than {cell} pixels left by policy.crop-fraction = {policy.crop_fraction:g}",
             crop,
         )
     if policy.freeze_encoder:

@@ -156,7 +156,7 @@ def differing(configs: Sequence[dict[str, Any]]) -> list[str]:
         names = (name for part in full for name in _flat(full[part], part))
         return {f"--{name}": _value(full, name) for name in names}
 
-    rows = [flags(values) for values in configs]
+    rows = [flags(config_lib.upgraded(values)) for values in configs]
     return [
         flag
         for flag in dict.fromkeys(flag for row in rows for flag in row)
@@ -203,7 +203,7 @@ def _settings(folder: Path, values: dict[str, Any]) -> config_lib.RunConfig:
 def _from_json(values: dict[str, Any]) -> config_lib.RunConfig:
     """Settings from a config.json, without what else it records."""
     kept = {name: value for name, value in dict(values).items() if name not in _BESIDE}
-    return config_lib.from_dict(config_lib.RunConfig, kept)
+    return config_lib.from_dict(config_lib.RunConfig, config_lib.upgraded(kept))
 
 
 def _as_json(config: config_lib.RunConfig) -> dict[str, Any]:
