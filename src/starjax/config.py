@@ -44,6 +44,8 @@ class PolicyConfig:
     # pixels as in the paper, or what the task says of its state
     observation: Literal["image", "state"] = "image"
     image_size: Annotated[int, Range(32, 4_096)] = 256  # pixels a side of an image, before the crop
+    # side of the crop, random in training, over the image's
+    crop_fraction: Annotated[float, Range(0.0, 1.0, "(]")] = 0.9
     obs_horizon: Count = 2  # T_o, control steps whose observations a decision sees
     horizon: Annotated[int, Range(1, 4_096)] = 16  # H, commands predicted: t+1 .. t+H
     execute: Count = 8  # commands executed before re-planning
@@ -94,8 +96,6 @@ class TrainConfig:
     warmup_steps: CountOrZero = 500
     # share of the averaged weights that a training step keeps, at most
     ema_max: Annotated[float, Range(0.0, 1.0, "[)")] = 0.9999
-    # side of the crop, random in training, over the image's
-    crop_fraction: Annotated[float, Range(0.0, 1.0, "(]")] = 0.9
     jitter: NotNegative = 0.1  # of images: brightness, contrast, saturation times 1 +- this
     image_noise: NotNegative = 0.02  # standard deviation of the noise on images in [0, 1]
     # standard deviation of the noise on normalised poses and task state
@@ -183,6 +183,7 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
     """
     if not isinstance(values, Mapping):
         raise ValueError(f"{settings.__name__}: expected an object, got {values!r}")
+    values = upgraded(values)
     hints = typing.get_type_hints(settings)
     unknown = sorted(set(values) - set(hints))
     if unknown:
@@ -198,6 +199,17 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
                 f"{settings.__name__}.{name}: expected {_kind(hints[name])}, got {value!r}"
             )
     return settings(**fields)
+
+
+def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a run from JSON, or parts of them, with those of earlier versions as today's."""
+    found = dict(values)
+    train, policy = found.get("train"), found.get("policy")
+    if isinstance(train, Mapping) and isinstance(policy, Mapping) and "crop_fraction" in train:
+        rest = dict(train)
+        found["policy"] = {**policy, "crop_fraction": rest.pop("crop_fraction")}
+        found["train"] = rest
+    return found
 
 
 def _kind(hint: Any) -> str:

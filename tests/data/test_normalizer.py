@@ -20,7 +20,7 @@ def dataset():
 
 def fitted(space, dataset):
     row = METHODS["dp_rcm1"]._replace(action_space=space)
-    return normalizer.fit(row, dataset, fakes.P_WORLD_REF, FRAMES).action
+    return normalizer.fit(row, fakes.TASK, dataset, FRAMES).action
 
 
 @pytest.mark.parametrize("name", RELATIVE)
@@ -30,9 +30,9 @@ def test_a_demonstrated_tip_is_within_reach_through_every_port(dataset, name):
     ports = jax.tree.map(lambda *fields: np.concatenate(fields), rcm.TROCARS, drawn)
 
     def through(port):
-        p_world_trocar = rcm.trocar_position(port, fakes.P_WORLD_REF)
-        pose = rcm.project(dataset.command.pose, p_world_trocar)
-        return space.encode(pose, port, fakes.P_WORLD_REF)
+        frame = rcm.trocar_frame(port, fakes.P_WORLD_REF)
+        pose = rcm.project(dataset.command.pose, frame.p_world_trocar)
+        return space.encode(pose, frame)
 
     actions = np.asarray(jax.jit(jax.vmap(through))(ports)).reshape(-1, space.dim)
     low, high = np.asarray(jax.vmap(box.denormalize)(box.reach))
@@ -55,7 +55,7 @@ def test_rotations_roll_and_gripper_reach_as_far_as_they_were_shown(dataset, nam
 @pytest.mark.parametrize("name", ["se3", "rcm4"])
 def test_a_position_in_the_world_reaches_as_far_as_it_was_shown(dataset, name):
     box, position = fitted(name, dataset), rcm.ACTION_SPACES[name].slices["p"]
-    p = np.asarray(dataset.command.pose.p)
+    p = np.asarray(dataset.command.pose.p[:, 0])
     assert box.reach is None
     np.testing.assert_array_equal(np.asarray(box.low)[position], p.min(axis=0))
     np.testing.assert_array_equal(np.asarray(box.high)[position], p.max(axis=0))

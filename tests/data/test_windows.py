@@ -26,11 +26,12 @@ def test_window_repeats_first_and_last_frame():
 def test_windows_stay_inside_their_demonstration(dataset):
     frames = jnp.arange(60, dtype=jnp.int32)
     # the position of every frame is made to say which frame it is
-    numbered = dataset.observation.replace(gripper=frames.astype(jnp.float32))
+    numbered = dataset.observation._replace(gripper=frames.astype(jnp.float32)[:, None])
     batch = windows.gather(dataset.replace(observation=numbered), frames, 2, 8)
-    owner = np.asarray(batch.observation.gripper).astype(int) // 20
+    owner = np.asarray(batch.observation.gripper)[..., 0].astype(int) // 20
     np.testing.assert_array_equal(owner, np.repeat(np.arange(60) // 20, 2).reshape(60, 2))
-    np.testing.assert_array_equal(batch.trocar.radius, np.repeat(dataset.trocar.radius, 20))
+    radius = np.repeat(dataset.trocar.trocar.radius, 20, axis=0)
+    np.testing.assert_array_equal(batch.trocar.trocar.radius, radius)
 
 
 def test_host_and_device_gather_the_same(dataset):
@@ -38,13 +39,14 @@ def test_host_and_device_gather_the_same(dataset):
     on_device = windows.gather(dataset, jnp.asarray(frames), 2, 16)
     on_host = windows.gather(jax.tree.map(np.asarray, dataset), frames, 2, 16)
     assert isinstance(on_host.command.gripper, np.ndarray)
-    assert on_device.command.pose.R.shape == (2, 3, 16, 3, 3)
+    assert on_device.command.pose.R.shape == (2, 3, 16, 1, 3, 3)
     jax.tree.map(np.testing.assert_array_equal, on_device, on_host)
 
 
 def ports(numbers):
-    """A trocar for each number, at one distance from the nominal port."""
-    return rcm.Trocar(np.full(len(numbers), 0.02), np.full(len(numbers), 1.5), 0.1 * numbers)
+    """A trocar for each number, at one distance from the nominal one."""
+    count = len(numbers)
+    return fakes.told(rcm.Trocar(np.full(count, 0.02), np.full(count, 1.5), 0.1 * numbers))
 
 
 def test_holdout_is_whole_demonstrations_spread_over_the_dataset():
@@ -84,15 +86,10 @@ def test_sampled_frames_are_training_frames():
 @pytest.mark.parametrize("name", METHODS)
 def test_normalised_actions_fill_the_box(dataset, name):
     method = METHODS[name]
-    stats = normalizer.fit(method, dataset, fakes.P_WORLD_REF, np.arange(60))
-    trocar = jax.tree.map(lambda x: jnp.repeat(x, 20), dataset.trocar)
-    raw = normalizer.encode(
-        method.action_space,
-        dataset.command.pose,
-        dataset.command.gripper,
-        trocar,
-        fakes.P_WORLD_REF,
-    )
+    stats = normalizer.fit(method, fakes.TASK, dataset, np.arange(60))
+    told = jax.tree.map(lambda x: jnp.repeat(x, 20, axis=0), dataset.trocar)
+    command = dataset.command
+    raw = normalizer.encode(method.action_space, command.pose, command.gripper, told)
     scaled = np.asarray(stats.action.normalize(raw))
     space = rcm.ACTION_SPACES[method.action_space]
     for part, where in space.slices.items():
@@ -106,7 +103,7 @@ def test_normalised_actions_fill_the_box(dataset, name):
 
 
 def test_state_statistics_leave_the_rotation(dataset):
-    stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(60))
+    stats = normalizer.fit(METHODS["stardiff"], fakes.TASK, dataset, np.arange(60))
     np.testing.assert_array_equal(stats.state.low[3:9], -1.0)
     np.testing.assert_array_equal(stats.state.high[3:9], 1.0)
     state = np.asarray(stats.state.normalize(dataset.observation.state))
@@ -116,17 +113,15 @@ def test_state_statistics_leave_the_rotation(dataset):
 
 
 def test_only_the_given_frames_are_fitted(dataset):
-    few = normalizer.fit(METHODS["dp_ee"], dataset, fakes.P_WORLD_REF, np.arange(20))
-    p = np.asarray(dataset.command.pose.p[:20])
+    few = normalizer.fit(METHODS["dp_ee"], fakes.TASK, dataset, np.arange(20))
+    p = np.asarray(dataset.command.pose.p[:20, 0])
     np.testing.assert_allclose(few.action.low[:3], p.min(0), atol=1e-7)
 
 
 def test_non_finite_demonstrations_are_refused(dataset):
     broken = dataset.command._replace(gripper=dataset.command.gripper.at[7].set(jnp.nan))
     with pytest.raises(ValueError, match="dataset: expected finite"):
-        normalizer.fit(
-            METHODS["dp_ee"], dataset.replace(command=broken), fakes.P_WORLD_REF, np.arange(60)
-        )
+        normalizer.fit(METHODS["dp_ee"], fakes.TASK, dataset.replace(command=broken), np.arange(60))
 
 
 def test_methods_are_table_two():
@@ -139,7 +134,7 @@ def test_methods_are_table_two():
 
 
 def test_only_the_given_frames_states_are_fitted(dataset):
-    few = normalizer.fit(METHODS["dp_ee"], dataset, fakes.P_WORLD_REF, np.arange(40))
+    few = normalizer.fit(METHODS["dp_ee"], fakes.TASK, dataset, np.arange(40))
     state = np.asarray(dataset.observation.state)
     np.testing.assert_allclose(few.state.low[:2], state[:40, :2].min(0), atol=1e-7)
     np.testing.assert_allclose(few.state.high[:2], state[:40, :2].max(0), atol=1e-7)
@@ -149,10 +144,10 @@ def test_over_frames_is_of_every_chunk(dataset, monkeypatch):
     frames = np.arange(60)[::-1]
     monkeypatch.setattr(windows, "_CHUNK", 7)
     found = windows.over_frames(
-        dataset, frames, lambda _, command, trocar: np.c_[command.pose.p, trocar.radius]
+        dataset, frames, lambda _, command, told: np.c_[command.pose.p[:, 0], told.trocar.radius]
     )
-    radius = np.repeat(np.asarray(dataset.trocar.radius), 20)
-    np.testing.assert_array_equal(found, np.c_[dataset.command.pose.p, radius][frames])
+    radius = np.repeat(np.asarray(dataset.trocar.trocar.radius), 20)
+    np.testing.assert_array_equal(found, np.c_[dataset.command.pose.p[:, 0], radius][frames])
 
 
 def test_a_millimetre_is_a_range_and_less_than_a_tenth_is_not():

@@ -1,6 +1,7 @@
 """A policy in someone else's program: the same commands, and mistakes that are named."""
 
 import dataclasses
+import pathlib
 
 import fakes
 import jax
@@ -10,13 +11,28 @@ import pytest
 
 from starjax import config, deploy, rcm
 from starjax.data import normalizer
+from starjax.errors import UsageError
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
+from starjax.sim import names, registry
+from starjax.types import Observation
 
 TRAIN = config.TrainConfig()
+GOLDEN = pathlib.Path(__file__).parents[1] / "golden"
 ROBOTS = 3
 PORT = jax.tree.map(lambda field: field[0], rcm.TROCARS)
+P_WORLD_REF = fakes.P_WORLD_REF[0]
+SCENE = names.SceneNames("fake", ("fr5",), ("grasper",), ("camera",))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def registered():
+    """Policies find the fake tasks by their names."""
+    with pytest.MonkeyPatch.context() as patch:
+        tasks = registry.Registry("task", {"fake": "fakes:TASK", "fakes": "fakes:TWO_ARMS"})
+        patch.setattr(registry, "tasks", tasks)
+        yield
 
 
 @pytest.fixture(scope="module", params=["state", "image"])
@@ -25,11 +41,11 @@ def made(request, tmp_path_factory):
     size = fakes.TINY.image_size
     settings = dataclasses.replace(fakes.TINY, observation=request.param)
     dataset = fakes.dataset(seed=0, image_size=size)
-    policy = policies.make(METHODS["stardiff"], settings, fakes.P_WORLD_REF, TRAIN)
-    stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS["stardiff"], settings, fakes.TASK, TRAIN)
+    stats = normalizer.fit(METHODS["stardiff"], fakes.TASK, dataset, np.arange(80))
     init = jax.jit(policy.init, compiler_options={"xla_backend_optimization_level": 0})
-    trained = policy_file.Trained(
-        "stardiff", settings, TRAIN, init(jax.random.key(0)), stats, tuple(fakes.P_WORLD_REF)
+    trained = fakes.trained(
+        policy=settings, params=init(jax.random.key(0)), normalizer=stats, scene=SCENE
     )
     path = tmp_path_factory.mktemp("deploy") / "policy.safetensors"
     policy_file.save(path, trained)
@@ -43,7 +59,7 @@ def observed(settings, robots=(ROBOTS,)):
     port = jax.tree.map(lambda field: field[:count, None], rcm.TROCARS)
     parts = np.zeros((count, settings.obs_horizon, 4), np.float32)
     parts[..., 1:] = np.array([0.0, 0.0, 0.02]) + rng.normal(scale=0.01, size=parts[..., 1:].shape)
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(parts, port, fakes.P_WORLD_REF)
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(parts, port, P_WORLD_REF)
     is_image = settings.observation == "image"
     size = (*moments, settings.image_size, settings.image_size, 3)
     return deploy.Observation(
@@ -54,13 +70,23 @@ def observed(settings, robots=(ROBOTS,)):
     )
 
 
+def of_one_arm(observation):
+    """As the policy itself takes it."""
+    pose = deploy.Pose(observation.pose.R[:, :, None], observation.pose.p[:, :, None])
+    images = None if observation.image is None else {"camera": observation.image}
+    return Observation(pose, observation.gripper[..., None], images, observation.state)
+
+
 def test_it_decides_as_the_policy_of_an_evaluation_does(made):
     path, trained, policy = made
     deployed, observation = deploy.load(path), observed(trained.policy)
     assert deployed.method == "stardiff" and deployed.settings == trained.policy
     trocar = jax.tree.map(lambda field: field[:ROBOTS], rcm.TROCARS)
     keys = jax.random.split(jax.random.key(7), ROBOTS)
-    wanted = jax.jit(policy.sample)(trained.params, trained.normalizer, keys, observation, trocar)
+    given = keys, of_one_arm(observation), fakes.told(trocar)
+    said = jax.jit(policy.sample)(trained.params, trained.normalizer, *given)
+    R, p = (part[:, :, 0] for part in said.pose)
+    wanted = deploy.Command(deploy.Pose(R, p), said.gripper[..., 0])
     got = deployed(jax.random.key(7), observation, trocar)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
     old = deployed(jax.random.key_data(jax.random.key(7)), observation, trocar)
@@ -190,7 +216,7 @@ def test_what_the_policy_does_not_look_at_is_not_looked_at(made):
     deployed, key, good = deploy.load(path), jax.random.key(0), observed(trained.policy, ())
     wanted = deployed(key, good, PORT)
     unused = "state" if trained.policy.observation == "image" else "image"
-    more = good.replace(**{unused: np.full((2, 12), np.nan)}, features=np.zeros((2, 5)))
+    more = good.replace(**{unused: np.full((2, 12), np.nan)})
     jax.tree.map(np.testing.assert_array_equal, deployed(key, more, PORT), wanted)
     lists = jax.tree.map(lambda x: x.tolist() if x.dtype != np.uint8 else list(x), good)
     jax.tree.map(np.testing.assert_array_equal, deployed(key, lists, PORT), wanted)
@@ -208,8 +234,8 @@ def test_a_tool_half_a_turn_away_is_the_same_tool(made):
 
 def test_methods_that_share_weights_are_each_deployed(made, tmp_path):
     _, trained, _ = made
-    stats = normalizer.fit(METHODS["dp_ee"], fakes.dataset(0), fakes.P_WORLD_REF, np.arange(80))
-    policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.P_WORLD_REF, TRAIN)
+    stats = normalizer.fit(METHODS["dp_ee"], fakes.TASK, fakes.dataset(0), np.arange(80))
+    policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.TASK, TRAIN)
     params = jax.jit(policy.init)(jax.random.key(0))
     file = tmp_path / "policy.safetensors"
     policy_file.save(file, trained._replace(method="dp_ee", params=params, normalizer=stats))
@@ -217,7 +243,7 @@ def test_methods_that_share_weights_are_each_deployed(made, tmp_path):
     for name in ("dp_ee", "dp_ee_proj"):
         deployed = deploy.load(file, method=name)
         pose = deployed(jax.random.key(0), observed(trained.policy, ()), PORT).pose
-        off[name] = rcm.rcm_error(pose, rcm.trocar_position(PORT, fakes.P_WORLD_REF)).max()
+        off[name] = rcm.rcm_error(pose, rcm.trocar_position(PORT, P_WORLD_REF)).max()
     assert deployed.method == "dp_ee_proj" and off["dp_ee_proj"] < 1e-6 < 1e-3 < off["dp_ee"]
     assert deploy.load(file).method == "dp_ee"
     with pytest.raises(ValueError, match=r"method: expected one of dp_ee, dp_ee_proj, got 'star"):
@@ -236,7 +262,7 @@ def test_a_file_that_will_not_do_is_named(made, tmp_path):
     assert deploy.load(path, ddim_steps=2).settings.ddim_steps == 2
     small = {"unet": {"kernel": jnp.ones(3)}}
     policy_file.save(tmp_path / "p", trained._replace(p_world_ref=None, params=small))
-    with pytest.raises(ValueError, match="nominal port"):
+    with pytest.raises(ValueError, match="nominal trocar"):
         deploy.load(tmp_path / "p")
     policy_file.save(tmp_path / "p", trained._replace(method="stardif", params=small))
     with pytest.raises(ValueError, match=r"/p: method: expected one of .*, got 'stardif'"):
@@ -260,8 +286,8 @@ def test_what_sensors_are_off_is_not_refused(made):
 
 def test_a_tool_through_another_port_is_refused_where_the_policy_keeps_to_it(made, tmp_path):
     _, trained, _ = made
-    stats = normalizer.fit(METHODS["dp_ee"], fakes.dataset(0), fakes.P_WORLD_REF, np.arange(80))
-    policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.P_WORLD_REF, TRAIN)
+    stats = normalizer.fit(METHODS["dp_ee"], fakes.TASK, fakes.dataset(0), np.arange(80))
+    policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.TASK, TRAIN)
     params = jax.jit(policy.init)(jax.random.key(0))
     file, other = tmp_path / "policy.safetensors", jax.tree.map(lambda x: x[4], rcm.TROCARS)
     policy_file.save(file, trained._replace(method="dp_ee", params=params, normalizer=stats))
@@ -307,8 +333,8 @@ def test_it_plans_the_same_in_a_program_of_double_precision(made):
 @pytest.mark.parametrize("made", ["image"], indirect=True)
 def test_pictures_are_cropped_as_in_its_training(made, tmp_path):
     _, trained, _ = made
-    half = dataclasses.replace(TRAIN, crop_fraction=0.5)
-    policy_file.save(tmp_path / "p", trained._replace(train=half))
+    half = dataclasses.replace(trained.policy, crop_fraction=0.5)
+    policy_file.save(tmp_path / "p", trained._replace(policy=half))
     deployed, good = deploy.load(tmp_path / "p"), observed(trained.policy, ())
     edge = good.image.copy()
     edge[:, :8] = 0
@@ -345,3 +371,86 @@ def test_one_number_of_one_robot_is_enough_to_refuse(made):
     ports.radius[1] = 0.6
     with pytest.raises(ValueError, match=r"trocar.radius: expected at most 0.5 m, got 0.6"):
         deployed(jax.random.key(0), good, ports)
+
+
+@pytest.fixture(scope="module")
+def two_arms(tmp_path_factory):
+    """A policy of two arms that face each other, with two cameras, and its file's content."""
+    settings = dataclasses.replace(fakes.TINY, observation="image")
+    dataset = fakes.dataset(seed=0, image_size=settings.image_size, arms=2)
+    row = METHODS["stardiff"]
+    cameras = ("wrist", "camera")
+    policy = policies.make(row, settings, fakes.TWO_ARMS, TRAIN, cameras)
+    stats = normalizer.fit(row, fakes.TWO_ARMS, dataset, np.arange(80))
+    init = jax.jit(policy.init, compiler_options={"xla_backend_optimization_level": 0})
+    trained = fakes.trained(
+        policy=settings,
+        params=init(jax.random.key(0)),
+        normalizer=stats,
+        scene=names.SceneNames("fakes", ("fr5", "fr5"), ("grasper", "grasper"), cameras),
+        p_world_ref=tuple(slot.p_world_ref for slot in fakes.TWO_ARMS.slots),
+        roll_zero=tuple(slot.roll_zero for slot in fakes.TWO_ARMS.slots),
+    )
+    path = tmp_path_factory.mktemp("two") / "policy.safetensors"
+    policy_file.save(path, trained)
+    return deploy.load(path), dataset
+
+
+def test_several_arms_have_an_axis_and_several_cameras_names(two_arms):
+    deployed, dataset = two_arms
+    frames, rng = np.array([3, 4]), np.random.default_rng(0)
+    pose = jax.tree.map(lambda x: np.asarray(x)[frames], dataset.observation.pose)
+    images = {name: rng.integers(0, 256, (2, 32, 32, 3), np.uint8) for name in ("camera", "wrist")}
+    good = deploy.Observation(pose, np.ones((2, 2)), images=images)
+    trocar = jax.tree.map(lambda x: np.asarray(x)[0], dataset.trocar.trocar)
+    command = deployed(jax.random.key(0), good, trocar)
+    assert command.pose.R.shape == (16, 2, 3, 3) and command.gripper.shape == (16, 2)
+    through = dataset.trocar.p_world_trocar[0]
+    assert np.asarray(rcm.rcm_error(command.pose, through)).max() < 1e-6
+    both = jax.tree.map(lambda x: np.stack([x, x]), good)
+    assert deployed(jax.random.key(0), both, trocar).pose.p.shape == (2, 16, 2, 3)
+    # An untrained policy says a roll of about the zero of each arm, which face each other.
+    roll = np.asarray(rcm.roll_of(command.pose.R))
+    assert (np.abs(roll[:, 0]) < np.pi / 2).all() and (np.abs(roll[:, 1]) > np.pi / 2).all()
+    swapped = {"camera": images["wrist"], "wrist": images["camera"]}
+    other = deployed(jax.random.key(0), good.replace(images=swapped), trocar)
+    assert np.abs(other.pose.p - command.pose.p).max() > 1e-5
+
+
+def test_a_mistake_of_several_arms_or_cameras_is_named(two_arms):
+    deployed, dataset = two_arms
+    pose = jax.tree.map(lambda x: np.asarray(x)[np.array([3, 4])], dataset.observation.pose)
+    images = {"camera": np.zeros((2, 32, 32, 3), np.uint8)}
+    good = deploy.Observation(pose, np.ones((2, 2)), images=images)
+    trocar = jax.tree.map(lambda x: np.asarray(x)[0], dataset.trocar.trocar)
+    mistakes = {
+        "observation.images['wrist']": (good, trocar),
+        "observation.gripper": (good.replace(gripper=np.ones(2)), trocar),
+        "trocar": (good, jax.tree.map(lambda x: np.repeat(x, 2)[:3], trocar)),
+    }
+    for argument, given in mistakes.items():
+        with pytest.raises(UsageError) as caught:
+            deployed(jax.random.key(0), *given)
+        assert caught.value.argument == argument
+
+
+def test_the_packaged_policy_commands_what_it_did(monkeypatch):
+    tasks = registry.Registry("task", {"peg_transfer": "fakes:TASK"})
+    monkeypatch.setattr(registry, "tasks", tasks)
+    before, deployed = np.load(GOLDEN / "compact_commands.npz"), deploy.load("compact")
+    i, j, c = np.ogrid[:128, :128, :3]
+    images = [(37 * i + 91 * j + 17 * c + 53 * o) % 256 for o in range(6)]
+    observation = deploy.Observation(
+        pose=deploy.Pose(before["seen_R"], before["seen_p"]),
+        gripper=np.array([[1, 1], [0.5, 0.2], [-1, -1]], np.float32),
+        image=np.stack(images).astype(np.uint8).reshape(3, 2, 128, 128, 3),
+    )
+    trocars = jax.tree.map(lambda field: field[:3], rcm.TROCARS)
+    one = jax.tree.map(lambda x: x[1], (observation, trocars))
+    for prefix, command in (
+        ("", deployed(jax.random.key(7), observation, trocars)),
+        ("one_", deployed(jax.random.key(3), *one)),
+    ):
+        np.testing.assert_allclose(command.pose.p, before[f"{prefix}p"], atol=1e-6)
+        np.testing.assert_allclose(command.pose.R, before[f"{prefix}R"], atol=1e-6)
+        np.testing.assert_allclose(command.gripper, before[f"{prefix}gripper"], atol=1e-6)

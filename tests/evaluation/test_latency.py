@@ -8,6 +8,9 @@ import pytest
 from starjax.evaluation import latency
 from starjax.methods import METHODS
 from starjax.models import roll_net
+from starjax.policies import features
+
+SEEN = features.sensors(fakes.TASK)
 
 
 def test_the_roll_network_is_timed_with_what_it_is_told(monkeypatch):
@@ -20,7 +23,7 @@ def test_the_roll_network_is_timed_with_what_it_is_told(monkeypatch):
     monkeypatch.setattr(roll_net.RollNet, "init", noted)
     for told in (False, True):
         settings = dataclasses.replace(fakes.TINY, observation="state", roll_observation=told)
-        assert latency.roll_ms(settings, calls=1)["n"] >= 1
+        assert latency.roll_ms(settings, SEEN, calls=1)["n"] >= 1
     assert given[1] == [*given[0], fakes.TINY.state_dim]
 
 
@@ -38,9 +41,9 @@ def test_percentiles_are_named_by_what_they_are(monkeypatch):
 
 def test_every_row_of_the_table_has_its_own_sampler(monkeypatch):
     made = []
-    monkeypatch.setattr(latency.policies, "make", lambda _, chosen, *__: made.append(chosen))
+    monkeypatch.setattr(latency.policies, "make", lambda _, chosen, *__, **___: made.append(chosen))
     monkeypatch.setattr(latency, "policy_ms", lambda *_, **__: {})
-    given = METHODS["stardiff"], fakes.TINY, None, None, None, None
+    given = METHODS["stardiff"], fakes.TINY, None, None, SEEN
     rows = list(latency.table(*given, ddim_steps=(1, 5)))
     assert [chosen.ddim_steps for chosen in made] == [row["ddim_steps"] for row in rows] == [1, 5]
 

@@ -36,7 +36,7 @@ def file(tmp_path, monkeypatch):
     monkeypatch.setattr(video, "record", lambda runs, sim, path: path)
     monkeypatch.chdir(tmp_path)
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
-    made = policy_file.Trained(
+    made = fakes.trained(
         method="dp_rcm2",
         policy=POLICY,
         train=config.TrainConfig(steps=77),
@@ -189,15 +189,14 @@ def test_a_method_of_a_run_of_several_is_scored_under_its_own_name(
 def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
     said = {}
     monkeypatch.setattr(scoring.evaluate, "evaluate", lambda *_, **given: said.update(given))
-    policy = dataclasses.replace(POLICY, obs_horizon=3)
-    train = config.TrainConfig(crop_fraction=0.5)
-    trained = types.SimpleNamespace(policy=policy, train=train, params=None, normalizer=None)
+    policy = dataclasses.replace(POLICY, obs_horizon=3, crop_fraction=0.5)
+    trained = types.SimpleNamespace(policy=policy, params=None, normalizer=None)
     who = types.SimpleNamespace(method="stardiff", env=None, policy=None, trained=trained)
     flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
     scoring.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
     wanted = {**flags, "seed": 9, "obs_horizon": 3, "execute": 4}
     assert {name: said.get(name) for name in wanted} == wanted
-    assert said["identity"]["crop_fraction"] == 0.5  # of what the encoder sees
+    assert said["identity"]["policy"]["crop_fraction"] == 0.5  # of what the encoder sees
 
 
 def test_a_machine_without_a_video_encoder_still_gets_the_result(file, monkeypatch, capsys):

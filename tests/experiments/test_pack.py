@@ -21,8 +21,9 @@ def save(path, scale=1.0):
     kernel = scale * jax.random.normal(jax.random.key(0), (300, 1000))
     box = normalizer.MinMax(-jnp.ones(5), jnp.full(5, 1 / 3))
     stats = normalizer.Normalizer(box, None)
-    made = policy_file.Trained(
-        "dp_rcm2", POLICY, config.TrainConfig(steps=7), {"unet": kernel}, stats
+    train = config.TrainConfig(steps=7)
+    made = fakes.trained(
+        method="dp_rcm2", policy=POLICY, train=train, params={"unet": kernel}, normalizer=stats
     )
     policy_file.save(path, made)
     return made

@@ -104,7 +104,7 @@ def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
     raw, average = {"w": np.zeros(3)}, {"w": np.ones(3)}
     state = types.SimpleNamespace(params=raw, ema_params=average, normalizer=stats)
     monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
-    env = types.SimpleNamespace(p_world_ref=fakes.P_WORLD_REF)
+    env = fakes.env()
     pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None)
     kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
     np.testing.assert_array_equal(kept.params["w"], np.ones(3))
@@ -119,7 +119,7 @@ def test_a_stop_during_the_last_steps_ends_the_run_after_the_weights(tmp_path, m
         return loop.Result(state, 1.0, 0, {})
 
     monkeypatch.setattr(loop, "run", last_steps)
-    env = types.SimpleNamespace(p_world_ref=fakes.P_WORLD_REF)
+    env = fakes.env()
     with pytest.raises(KeyboardInterrupt, match=r"stopped after training stardiff;.*same command"):
         pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None)
     assert folders.weights(tmp_path, "stardiff").exists()
@@ -185,9 +185,8 @@ def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):
 
 
 def test_a_packaged_encoder_is_of_this_task(tmp_path, monkeypatch):
-    box = normalizer.MinMax(np.zeros(5), np.ones(5))
-    stats, policy = normalizer.Normalizer(box, None), config.PolicyConfig(encoder_weights="compact")
-    made = policy_file.Trained("dp_rcm2", policy, config.TrainConfig(), {"unet": np.ones(3)}, stats)
+    policy = config.PolicyConfig(encoder_weights="compact")
+    made = fakes.trained(method="dp_rcm2", policy=policy, params={"unet": np.ones(3)})
     monkeypatch.setattr(packaged, "FOLDER", tmp_path)
     assert words.encoder(policy) == "trained further, from compact"
     policy_file.save(tmp_path / "compact.safetensors", made)

@@ -102,7 +102,7 @@ def test_a_sample_starts_as_the_settings_say():
     shapes = jax.eval_shape(model.init, jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
     keys = jax.random.split(jax.random.key(2), 2)
-    given = (jnp.zeros((2, diffuser.observed_dim(settings))), jnp.zeros((2, 0)))
+    given = (jnp.zeros((2, diffuser.observed_dim(settings, cameras=1))), jnp.zeros((2, 0)))
     found = jax.jit(model.sample)(params, keys, *given, 1e9 * jnp.array([[-1.0], [1.0]]))
     start = 0.25 * diffusion.sample_noise(keys, (settings.horizon, ACTION))
     first = schedule.ddim_table(50, 5).sqrt_alpha_bar[0]

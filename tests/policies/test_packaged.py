@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config, errors, methods
-from starjax.data import normalizer
+from starjax import errors, methods, rcm
 from starjax.evaluation import latency
 from starjax.models.kernels import parallel_ddim
-from starjax.policies import packaged, policy_file
+from starjax.policies import features, packaged, policy_file
 from starjax.policies import policy as policies
 
 MOST = 12e6  # bytes of a file
@@ -28,7 +27,7 @@ def shapes(params):
 def initial(method, policy_config):
     """Shapes of the parameters that the networks have today."""
     whole = dataclasses.replace(policy_config, freeze_encoder=False)
-    policy = policies.make(methods.METHODS[method], whole, fakes.P_WORLD_REF)
+    policy = policies.make(methods.METHODS[method], whole, fakes.TASK)
     return jax.eval_shape(policy.init, jax.random.key(0))
 
 
@@ -56,14 +55,13 @@ def test_what_is_packaged_is_whole():
 def test_five_evaluations_side_by_side_are_enough_for_what_is_packaged(monkeypatch):
     """Pictures of noise; `benchmarks/bench_ddim.py` takes demonstrations."""
     trained = policy_file.load(packaged.find("name", "compact"))
-    policy = policies.make(
-        methods.METHODS[trained.method], trained.policy, fakes.P_WORLD_REF, trained.train
-    )
-    observation, trocar = latency.example(trained.policy, fakes.P_WORLD_REF, 4)
+    policy = policies.make(methods.METHODS[trained.method], trained.policy, fakes.TASK)
+    observation, trocar = latency.example(trained.policy, features.sensors(fakes.TASK), 4)
+    told = rcm.trocar_frame(trocar, fakes.P_WORLD_REF)
     keys = jax.random.split(jax.random.key(1), 4)
 
     def planned():
-        given = (trained.params, trained.normalizer, keys, observation, trocar)
+        given = (trained.params, trained.normalizer, keys, observation, told)
         return jax.jit(lambda *given: policy.sample(*given))(*given)
 
     wanted = planned()
@@ -78,10 +76,7 @@ def test_five_evaluations_side_by_side_are_enough_for_what_is_packaged(monkeypat
 def folder(tmp_path, monkeypatch):
     """A package with one policy, in which nothing is wrong."""
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), initial("dp_rcm2", fakes.TINY))
-    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
-    made = policy_file.Trained(
-        "dp_rcm2", fakes.TINY, config.TrainConfig(), params, normalizer.Normalizer(box, None)
-    )
+    made = fakes.trained(method="dp_rcm2", params=params)
     place = tmp_path / "weights"
     policy_file.save(place / "compact.safetensors", made, half=True)
     (place / "compact.json").write_text('{"method": "dp_rcm2"}')

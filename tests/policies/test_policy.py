@@ -18,6 +18,7 @@ from starjax.policies import diffuser, execution, features, hierarchical
 from starjax.policies import policy as policies
 
 TRAIN = config.TrainConfig(state_noise=0.0)
+SEEN = features.sensors(fakes.TASK)
 B = 3
 
 
@@ -38,8 +39,8 @@ class Made:
         self.method, self.observation, self.dataset = METHODS[name], observation, dataset
         settings = dataclasses.replace(fakes.TINY, observation=observation, **changed)
         self.settings = settings
-        self.policy = policies.make(self.method, settings, fakes.P_WORLD_REF, TRAIN)
-        self.stats = normalizer.fit(self.method, dataset, fakes.P_WORLD_REF, np.arange(80))
+        self.policy = policies.make(self.method, settings, fakes.TASK, TRAIN)
+        self.stats = normalizer.fit(self.method, fakes.TASK, dataset, np.arange(80))
         self.params = jit(self.policy.init)(jax.random.key(0))
         self.batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
         self.sample = jit(self.policy.sample)
@@ -84,10 +85,10 @@ def test_every_parameter_learns(made, name):
 def test_samples_are_finite_and_respect_the_manifold(made, name):
     it = made(name)
     command = it.commands()
-    assert command.pose.R.shape == (B, 16, 3, 3)
+    assert command.pose.R.shape == (B, 16, 1, 3, 3)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(command))
     assert np.abs(command.gripper).max() <= 1.0
-    port = rcm.trocar_position(it.batch.trocar, fakes.P_WORLD_REF)[:, None]
+    port = it.batch.trocar.p_world_trocar[:, None]
     error = np.asarray(rcm.rcm_error(command.pose, port)).max()
     assert (error <= 1e-6) == (name != "dp_ee")
 
@@ -111,9 +112,9 @@ def test_samples_reach_as_far_as_the_normaliser_says(dataset, hierarchical, monk
 
     def scaled(stats):
         pose = it.sample(it.params, stats, *arguments).pose
-        per_step = jax.tree.map(lambda leaf: leaf[:, None], it.batch.trocar)
-        vector = rcm.ACTION_SPACES["rcm2"].encode(pose, per_step, fakes.P_WORLD_REF)
-        return stats.action.normalize(jnp.append(vector, jnp.zeros((B, 16, 1)), -1))[..., part]
+        told = features.per_step(it.batch.trocar)
+        vector = normalizer.encode("rcm2", pose, jnp.zeros((B, 16, 1)), told)
+        return stats.action.normalize(vector)[..., part]
 
     low, high = np.asarray(it.stats.action.reach)[:, part]
     assert (scaled(it.stats) > low - 1e-3).all() and (scaled(it.stats) < high + 1e-3).all()
@@ -126,7 +127,7 @@ def test_a_sample_depends_on_its_own_key_alone(made, name):
     keys = jax.random.split(jax.random.key(1), B)
     first = it.commands(keys)
     second = it.commands(keys.at[1].set(jax.random.key(99)))
-    same = np.asarray(jnp.abs(first.pose.p - second.pose.p).max((1, 2)))
+    same = np.asarray(jnp.abs(first.pose.p - second.pose.p).max((1, 2, 3)))
     np.testing.assert_array_equal(same == 0.0, [True, False, True])
 
 
@@ -163,7 +164,7 @@ def test_images_work(made, name):
 
 def test_a_missing_observation_is_named(made, dataset):
     it = made("stardiff")
-    blind = it.batch.replace(observation=it.batch.observation.replace(state=None))
+    blind = it.batch.replace(observation=it.batch.observation._replace(state=None))
     with pytest.raises(ValueError, match=r"observation.state: expected"):
         it.policy.prepare(it.stats, jax.random.key(0), blind)
 
@@ -193,15 +194,16 @@ def test_only_relative_actions_have_a_trocar_frame_to_turn():
 def turned(observation):
     pose = observation.pose
     half_a_turn = np.diag([-1.0, -1.0, 1.0]).astype(np.float32)
-    return observation.replace(pose=pose._replace(R=pose.R @ half_a_turn))
+    return observation._replace(pose=pose._replace(R=pose.R @ half_a_turn))
 
 
 def elsewhere(observation):
-    return observation.replace(state=observation.state + 0.01)
+    return observation._replace(state=observation.state + 0.01)
 
 
 def moved(trocar):
-    return trocar._replace(radius=trocar.radius + 0.01)
+    wider = trocar.trocar._replace(radius=trocar.trocar.radius + 0.01)
+    return rcm.trocar_frame(wider, fakes.P_WORLD_REF)
 
 
 @pytest.mark.parametrize(
@@ -223,9 +225,7 @@ def test_what_the_roll_network_reads(dataset, changed, matters):
 
     def roll(observation, trocar):
         command = it.sample(params, it.stats, keys, observation, trocar)
-        per_step = jax.tree.map(lambda leaf: leaf[:, None], trocar)
-        space = rcm.ACTION_SPACES["rcm4"]
-        return space.encode(command.pose, per_step, fakes.P_WORLD_REF)[..., 0]
+        return rcm.ACTION_SPACES["rcm4"].encode(command.pose, features.per_step(trocar))[..., 0]
 
     seen, trocar = it.batch.observation, it.batch.trocar
     before = roll(seen, trocar)
@@ -246,14 +246,14 @@ def test_what_both_networks_read_is_encoded_once(dataset, monkeypatch):
 def test_hierarchy_needs_a_roll():
     method = METHODS["dp_rcm1"]._replace(hierarchical=True)
     with pytest.raises(ValueError, match=r"method.action_space: expected one of roll and position"):
-        hierarchical.make(method, fakes.TINY, fakes.P_WORLD_REF, TRAIN)
+        policies.make(method, fakes.TINY, fakes.TASK, TRAIN)
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_demonstrated_actions_become_the_demonstrated_commands(made, name, dataset):
     it = made(name)
-    action = features.demonstrated(it.stats, it.method.action_space, it.batch, fakes.P_WORLD_REF)
-    command = execution.command(it.method, it.stats, action, it.batch.trocar, fakes.P_WORLD_REF)
+    action = features.demonstrated(it.stats, it.method.action_space, it.batch)
+    command = execution.command(it.method, it.stats, action, it.batch.trocar)
     np.testing.assert_allclose(command.pose.p, it.batch.command.pose.p, atol=2e-6)
     np.testing.assert_allclose(command.pose.R, it.batch.command.pose.R, atol=2e-5)
     np.testing.assert_allclose(command.gripper, it.batch.command.gripper, atol=1e-6)
@@ -265,14 +265,14 @@ def test_no_action_breaks_a_command(made, name, bad):
     it = made(name)
     dim = it.stats.action.low.shape[0]
     action = jnp.zeros((B, dim, dim)).at[:, jnp.arange(dim), jnp.arange(dim)].set(bad)
-    command = execution.command(it.method, it.stats, action, it.batch.trocar, fakes.P_WORLD_REF)
+    command = execution.command(it.method, it.stats, action, it.batch.trocar)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(command))
     assert np.abs(command.gripper).max() <= 1.0
 
 
 def test_trocar_features():
     trocar = rcm.Trocar(jnp.float32(0.05), jnp.float32(np.pi / 2), jnp.float32(np.pi))
-    found = features.trocar_features(trocar, fakes.P_WORLD_REF)
+    found = features.trocar_features(trocar)
     np.testing.assert_allclose(found, [1, 0, -1, 0, -1, 0, 0], atol=1e-6)
 
 
@@ -280,16 +280,17 @@ def test_noise_is_in_normalised_units(made):
     it = made("stardiff")
     noisy = dataclasses.replace(TRAIN, state_noise=0.5)
     clean = jnp.zeros((B, 2, 4))
-    args = (fakes.TINY, noisy, it.stats)
-    drawn = features.for_training(*args, jax.random.key(0), it.batch.observation, clean)
-    exact = features.for_sampling(*args, it.batch.observation, clean)
+    seen = (SEEN, it.stats)
+    key = jax.random.key(0)
+    drawn = features.for_training(fakes.TINY, noisy, *seen, key, it.batch.observation, clean)
+    exact = features.for_sampling(fakes.TINY, *seen, it.batch.observation, clean)
     spread = float(jnp.std(drawn.history - exact.history))
     assert 0.4 < spread < 0.6
 
 
 def test_state_features_tell_block_and_target_from_the_tip(made):
     it = made("stardiff")
-    tip = it.batch.observation.pose.p
+    tip = it.batch.observation.pose.p[:, :, 0]
     quarter_turn = jnp.array([0.0, 1.0, 0.0, -1.0, 0.0, 0.0])
     state = jnp.concatenate(
         [
@@ -299,16 +300,16 @@ def test_state_features_tell_block_and_target_from_the_tip(made):
         ],
         axis=-1,
     )
-    observation = it.batch.observation.replace(state=state)
-    inputs = features.for_sampling(fakes.TINY, TRAIN, it.stats, observation, jnp.zeros((B, 2, 4)))
+    observation = it.batch.observation._replace(state=state)
+    inputs = features.for_sampling(fakes.TINY, SEEN, it.stats, observation, jnp.zeros((B, 2, 4)))
     expected = np.broadcast_to([1, 0, 0, 0, -1, 0, 0, 0, -2], (B, 2, 9))
     np.testing.assert_allclose(inputs.history[..., -9:], expected, atol=1e-5)
 
 
 def test_large_matrices_are_rounded_once_to_what_sample_rounds_them_to(dataset):
     settings = dataclasses.replace(fakes.TINY, observation="image", dtype="bfloat16")
-    policy = policies.make(METHODS["stardiff"], settings, fakes.P_WORLD_REF, TRAIN)
-    stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS["stardiff"], settings, fakes.TASK, TRAIN)
+    stats = normalizer.fit(METHODS["stardiff"], fakes.TASK, dataset, np.arange(80))
     params = jit(policy.init)(jax.random.key(0))
     rounded = policies.for_sampling(params, "bfloat16")
     batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
@@ -327,8 +328,8 @@ def test_large_matrices_are_rounded_once_to_what_sample_rounds_them_to(dataset):
 
 @pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
 def test_the_blocks_of_a_gpu_sample_the_same(dataset, name):
-    policy = policies.make(METHODS[name], fakes.TINY, fakes.P_WORLD_REF, TRAIN)
-    stats = normalizer.fit(METHODS[name], dataset, fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS[name], fakes.TINY, fakes.TASK, TRAIN)
+    stats = normalizer.fit(METHODS[name], fakes.TASK, dataset, np.arange(80))
     params = jit(policy.init)(jax.random.key(0))
     changed = policies.with_sampling_blocks(params)
     assert "second" in str(jax.tree.structure(changed))
@@ -341,8 +342,8 @@ def test_the_blocks_of_a_gpu_sample_the_same(dataset, name):
 @pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
 def test_packed_parameters_are_fewer_arrays_and_say_the_same(dataset, name):
     settings = dataclasses.replace(fakes.TINY, observation="image")
-    policy = policies.make(METHODS[name], settings, fakes.P_WORLD_REF, TRAIN)
-    stats = normalizer.fit(METHODS[name], dataset, fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS[name], settings, fakes.TASK, TRAIN)
+    stats = normalizer.fit(METHODS[name], fakes.TASK, dataset, np.arange(80))
     params = jit(policy.init)(jax.random.key(0))
     packed = policies.packed(params)
     assert len(jax.tree.leaves(packed)) < 0.6 * len(jax.tree.leaves(params))
@@ -353,7 +354,7 @@ def test_packed_parameters_are_fewer_arrays_and_say_the_same(dataset, name):
 
 
 def test_a_gpu_is_handed_packed_blocks_and_a_cpu_the_parameters(monkeypatch):
-    policy = policies.make(METHODS["stardiff"], fakes.TINY, fakes.P_WORLD_REF, TRAIN)
+    policy = policies.make(METHODS["stardiff"], fakes.TINY, fakes.TASK, TRAIN)
     params = jit(policy.init)(jax.random.key(0))
     chex.assert_trees_all_equal(policies.for_sampling(params, "float32"), params)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
@@ -365,7 +366,7 @@ def prepared(it, **changed):
     """What 64 windows are learned as, with other settings of training; the windows."""
     train = dataclasses.replace(TRAIN, **changed)
     settings = dataclasses.replace(fakes.TINY, observation=it.observation)
-    policy = policies.make(it.method, settings, fakes.P_WORLD_REF, train)
+    policy = policies.make(it.method, settings, fakes.TASK, train)
     batch = windows.gather(it.dataset, jnp.arange(64), 2, 16)
     return policy.prepare(it.stats, jax.random.key(0), batch), batch
 
@@ -382,13 +383,14 @@ def test_the_losses_are_weighed(made):
 def test_the_roll_network_learns_from_inexact_inputs_what_is_exact(made):
     it = made("stardiff")
     given, batch = prepared(it)
-    exact = features.demonstrated(it.stats, "rcm4", batch, fakes.P_WORLD_REF)
-    seen = features.measured(it.stats, "rcm4", batch.observation, batch.trocar, fakes.P_WORLD_REF)
-    p, roll = np.ravel(given.p - exact[..., 1:4]), np.ravel(given.history - seen[..., 0])
+    exact = features.demonstrated(it.stats, "rcm4", batch)
+    seen = features.measured(it.stats, "rcm4", batch.observation, batch.trocar)
+    p = np.ravel(given.p[:, :, 0] - exact[..., 1:4])
+    roll = np.ravel(given.history - seen[..., :1])
     assert p.std() == pytest.approx(hierarchical.POSITION_NOISE, rel=0.1)
     assert roll.std() == pytest.approx(hierarchical.ROLL_NOISE, rel=0.2)
     assert abs(np.corrcoef(p[: roll.size], roll)[0, 1]) < 0.4
-    np.testing.assert_allclose(given.roll, exact[..., 0], atol=1e-6)
+    np.testing.assert_allclose(given.roll, exact[..., :1], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
@@ -401,10 +403,10 @@ def test_training_adds_noise_to_what_is_measured(made, name):
 def test_training_sees_random_crops_and_is_told_where_they_are(made, name):
     it = made(name, "image")
     inputs = prepared(it, jitter=0.0, image_noise=0.0)[0].inputs
-    assert inputs.image.shape == (64, 2, 29, 29, 3)
+    assert inputs.images.shape == (64, 2, 1, 29, 29, 3)
     assert len(np.unique(np.asarray(inputs.offset).reshape(-1, 2), axis=0)) == 16
     jittered = prepared(it, jitter=0.5, image_noise=0.0)[0].inputs
-    assert np.abs(jittered.image - inputs.image).max() > 0.5
+    assert np.abs(jittered.images - inputs.images).max() > 0.5
     model = diffuser.make(it.settings, 4, 4, 0)
     params = it.params.get("diffuser", it.params)
     here = inputs._replace(history=inputs.history[..., :4])
@@ -425,13 +427,13 @@ def test_rolls_stay_in_the_demonstrated_range(made):
 def test_what_is_held_is_not_dropped(made):
     it = made("stardiff")
     action = jnp.ones((B, 16, 5)).at[:, 3, -1].set(jnp.nan).at[:, 5, 0].set(jnp.nan)
-    command = execution.command(it.method, it.stats, action, it.batch.trocar, fakes.P_WORLD_REF)
+    command = execution.command(it.method, it.stats, action, it.batch.trocar)
     np.testing.assert_array_equal(command.gripper[:, [3, 5]], -1.0)
     np.testing.assert_array_equal(command.gripper[:, 4], 1.0)
 
 
 def test_features_of_any_trocar():
-    found = features.trocar_features(rcm.Trocar(0.02, 1.2, -0.7), fakes.P_WORLD_REF)
+    found = features.trocar_features(rcm.Trocar(0.02, 1.2, -0.7))
     cos, sin = np.cos([1.2, -0.7]), np.sin([1.2, -0.7])
     shift = 0.4 * np.array([sin[0] * cos[1], sin[0] * sin[1], cos[0]])
     np.testing.assert_allclose(found, [0.4, *cos, sin[1], *shift], atol=1e-6)
@@ -441,34 +443,32 @@ def test_what_is_measured_is_of_the_scale_of_what_is_learned(made):
     """A pose measured where one was commanded is the same number; states are in [-1, 1]."""
     it = made("stardiff")
     batch, command = it.batch, it.batch.command
-    reached = batch.observation.replace(pose=command.pose, gripper=command.gripper)
+    reached = batch.observation._replace(pose=command.pose, gripper=command.gripper)
     where = (it.stats, "rcm4")
     np.testing.assert_allclose(
-        features.measured(*where, reached, batch.trocar, fakes.P_WORLD_REF),
-        features.demonstrated(*where, batch, fakes.P_WORLD_REF),
+        features.measured(*where, reached, batch.trocar),
+        features.demonstrated(*where, batch),
         atol=1e-6,
     )
     zeros = jnp.zeros((B, 2, 4))
-    inputs = features.for_sampling(fakes.TINY, TRAIN, it.stats, batch.observation, zeros)
+    inputs = features.for_sampling(fakes.TINY, SEEN, it.stats, batch.observation, zeros)
     state = it.stats.state.normalize(batch.observation.state)
     np.testing.assert_array_equal(inputs.history[..., 4:16], state)
 
 
 def test_inference_crops_as_training_did(made, dataset):
-    """The crop of `train_config`, whatever the default is."""
     it = made("dp_rcm1", "image")
-    half = dataclasses.replace(TRAIN, crop_fraction=0.5)
-    settings = dataclasses.replace(fakes.TINY, observation="image")
-    policy = policies.make(it.method, settings, fakes.P_WORLD_REF, half)
+    settings = dataclasses.replace(fakes.TINY, observation="image", crop_fraction=0.5)
+    policy = policies.make(it.method, settings, fakes.TASK, TRAIN)
     given = (it.stats, jax.random.split(jax.random.key(1), B))
-    edge = it.batch.observation.image.at[..., :8, :, :].set(0)
-    seen = it.batch.observation.replace(image=edge)
+    edge = it.batch.observation.images["camera"].at[..., :8, :, :].set(0)
+    seen = it.batch.observation._replace(images={"camera": edge})
     one, other = (
         jit(policy.sample)(it.params, *given, o, it.batch.trocar).pose.p
         for o in (it.batch.observation, seen)
     )
     np.testing.assert_array_equal(one, other)
-    assert features.crop_size(settings, half) == 16
+    assert features.crop_size(settings) == 16
 
 
 def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
@@ -483,11 +483,11 @@ def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
     _, parts = it.policy.loss(it.params, given)
     expected = jnp.mean((given.roll - given.history[:, -1:] - given.p[..., 0]) ** 2)
     assert float(parts["roll_loss"]) == pytest.approx(float(expected), rel=1e-5)
-    policy = policies.make(it.method, it.settings, fakes.P_WORLD_REF, TRAIN)
+    policy = policies.make(it.method, it.settings, fakes.TASK, TRAIN)
     seen, trocar = it.batch.observation, it.batch.trocar
     keys = jax.random.split(jax.random.key(1), B)
     pose = jit(policy.sample)(it.params, it.stats, keys, seen, trocar).pose
-    measured = features.measured(it.stats, "rcm4", seen, trocar, fakes.P_WORLD_REF)[..., 0]
+    measured = features.measured(it.stats, "rcm4", seen, trocar)[..., :1]
     assert np.abs(measured[:, 1] - measured[:, 0]).max() > 1e-2
     low, high = it.stats.action.low, it.stats.action.high
     p = (pose.p[..., 0] - low[1]) * 2.0 / (high - low)[1] - 1.0
@@ -498,43 +498,43 @@ def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
 
 def test_inference_reads_what_training_read(made):
     it = made("stardiff")
-    where = (it.stats, "rcm4", it.batch.observation, it.batch.trocar, fakes.P_WORLD_REF)
+    where = (it.stats, "rcm4", it.batch.observation, it.batch.trocar)
     given = it.batch.observation, features.measured(*where)
-    exact = features.for_training(fakes.TINY, TRAIN, it.stats, jax.random.key(0), *given)
-    again = features.for_sampling(fakes.TINY, TRAIN, it.stats, *given)
+    exact = features.for_training(fakes.TINY, TRAIN, SEEN, it.stats, jax.random.key(0), *given)
+    again = features.for_sampling(fakes.TINY, SEEN, it.stats, *given)
     assert (exact.history[:, 0] != exact.history[:, 1]).any()
     np.testing.assert_array_equal(exact.history, again.history)
 
 
 def test_training_adds_noise_to_pictures(made):
     it = made("dp_rcm1", "image")
-    noisy, exact = (prepared(it, jitter=0.0, image_noise=x)[0].inputs.image for x in (0.05, 0.0))
+    noisy, exact = (prepared(it, jitter=0.0, image_noise=x)[0].inputs.images for x in (0.05, 0.0))
     assert np.abs(noisy - exact).max() > 0.1
 
 
-@pytest.mark.parametrize("missing", ["image", "features", "state"])
+@pytest.mark.parametrize("missing", ["images", "features", "state"])
 def test_what_is_not_observed_is_named(made, missing):
     it = made("stardiff")
     kind = "state" if missing == "state" else "image"
     frozen = {"freeze_encoder": missing == "features"}
     settings = dataclasses.replace(fakes.TINY, observation=kind, **frozen)
-    blind = it.batch.observation.replace(image=None)
+    blind = it.batch.observation._replace(images=None)
     stats = it.stats.replace(state=None)
     with pytest.raises(ValueError, match=rf"observation\.{missing}: expected .*got None"):
         features.for_training(
-            settings, TRAIN, stats, jax.random.key(0), blind, jnp.zeros((B, 2, 4))
+            settings, TRAIN, SEEN, stats, jax.random.key(0), blind, jnp.zeros((B, 2, 4))
         )
 
 
 def test_the_roll_network_is_as_the_settings_say(made):
     it = made("stardiff")
     half = dataclasses.replace(fakes.TINY, roll_blocks=2, dtype="bfloat16")
-    policy = policies.make(it.method, half, fakes.P_WORLD_REF, TRAIN)
+    policy = policies.make(it.method, half, fakes.TASK, TRAIN)
     shapes = jax.eval_shape(policy.init, jax.random.key(0))["roll"]["params"]
     assert sum(name.startswith("LayerNorm") for name in shapes) == 2
     given, _ = prepared(it)
     params = jax.tree.map(lambda leaf: leaf + 0.01, it.params)
     kinds = [dataclasses.replace(fakes.TINY, dtype=dtype) for dtype in ("float32", "bfloat16")]
-    makers = (policies.make(it.method, kind, fakes.P_WORLD_REF, TRAIN) for kind in kinds)
+    makers = (policies.make(it.method, kind, fakes.TASK, TRAIN) for kind in kinds)
     exact, rough = (jit(one.loss)(params, given)[1]["roll_loss"] for one in makers)
     assert exact != rough and float(rough) == pytest.approx(float(exact), rel=0.1)

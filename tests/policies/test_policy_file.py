@@ -1,5 +1,6 @@
 """policy.safetensors: a round trip, the same bytes every time, and damage noticed."""
 
+import dataclasses
 import json
 
 import fakes
@@ -10,9 +11,12 @@ import pytest
 import safetensors
 import safetensors.numpy
 
-from starjax import config
 from starjax.data import normalizer
-from starjax.policies import policy_file
+from starjax.policies import packaged, policy_file
+from starjax.sim import names
+
+POLICY = dataclasses.replace(fakes.TINY, crop_fraction=0.8)
+SCENE = names.SceneNames("hand_over", ("fr5", "panda"), ("grasper", "scope"), ("wrist", "camera"))
 
 
 def trained(scale=1.0):
@@ -21,13 +25,13 @@ def trained(scale=1.0):
         "roll": {"bias": jnp.ones(3)},
     }
     box = normalizer.MinMax(-jnp.ones(5), jnp.arange(5.0))
-    return policy_file.Trained(
-        "stardiff",
-        fakes.TINY,
-        config.TrainConfig(crop_fraction=0.8),
-        params,
-        normalizer.Normalizer(box, None),
-        (0.0, 0.0, 0.15),
+    return fakes.trained(
+        policy=POLICY,
+        params=params,
+        normalizer=normalizer.Normalizer(box, None),
+        scene=SCENE,
+        p_world_ref=((0.0, 0.0, 0.15), (0.0, 0.1, 0.15)),
+        roll_zero=(0.0, 3.14),
     )
 
 
@@ -36,11 +40,41 @@ def test_round_trip(tmp_path):
     policy_file.save(path, trained())
     found = policy_file.load(path)
     assert found.method == "stardiff"
-    assert found.policy == fakes.TINY and found.train.crop_fraction == 0.8
-    assert found.p_world_ref == (0.0, 0.0, 0.15)
+    assert found._replace(params=None, normalizer=None) == trained()._replace(
+        params=None, normalizer=None
+    )
     assert found.normalizer.state is None
     jax.tree.map(np.testing.assert_array_equal, found.params, trained().params)
     jax.tree.map(np.testing.assert_array_equal, found.normalizer, trained().normalizer)
+
+
+def of_schema_1(path, p_world_ref):
+    """Writes `trained` as versions before scenes had names did."""
+    with safetensors.safe_open(path, "numpy") as file:
+        about = json.loads(file.metadata()["starjax"])["about"]
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    del about["scene"], about["roll_zero"]
+    about["train"]["crop_fraction"] = about["policy"].pop("crop_fraction")
+    about |= {"schema": 1, "p_world_ref": p_world_ref}
+    envelope = {"about": about, "sha256": policy_file._hash(about, arrays)}
+    safetensors.numpy.save_file(arrays, path, {"starjax": json.dumps(envelope)})
+
+
+@pytest.mark.parametrize("place", [[0.0, 0.0, 0.15], None])
+def test_a_policy_of_schema_1_is_of_the_first_scene(tmp_path, place):
+    policy_file.save(tmp_path / "p", trained())
+    of_schema_1(tmp_path / "p", place)
+    found = policy_file.load(tmp_path / "p")
+    assert found.scene == names.FIRST and found.roll_zero == (0.0,)
+    assert found.p_world_ref == (place and (tuple(place),))
+    assert found.policy == POLICY
+    jax.tree.map(np.testing.assert_array_equal, found.params, trained().params)
+
+
+def test_the_packaged_policy_is_of_schema_1():
+    found = policy_file.load(packaged.find("policy", "compact"))
+    assert (found.scene, found.policy.crop_fraction) == (names.FIRST, 0.9)
+    np.testing.assert_allclose(found.p_world_ref, [[0.0, 0.0, 0.15]], atol=1e-6)
 
 
 def test_same_policy_same_bytes(tmp_path):
@@ -148,7 +182,7 @@ def test_every_flipped_bit_is_noticed(tmp_path, half):
             assert str(path) in str(error)
             continue
         # what is left is the padding of the header
-        assert found.policy == fakes.TINY and found.train == trained().train
+        assert found.policy == POLICY and found.train == trained().train
         jax.tree.map(np.testing.assert_array_equal, found.params, trained().params)
 
 
@@ -160,7 +194,9 @@ def test_other_files_are_refused(tmp_path, content):
         policy_file.load(path)
 
 
-@pytest.mark.parametrize("lost", ["p_world_ref", "method", "normalizer", "normalizer/action/low"])
+@pytest.mark.parametrize(
+    "lost", ["scene", "roll_zero", "method", "normalizer", "normalizer/action/low"]
+)
 def test_a_policy_of_another_version_is_named(tmp_path, lost):
     path = tmp_path / "policy.safetensors"
     policy_file.save(path, trained())

@@ -49,7 +49,7 @@ def train(
         dataclasses.replace(fakes.TINY, observation=observation, dtype=dtype),
         settings,
         dataset,
-        fakes.P_WORLD_REF,
+        fakes.TASK,
         directory,
         seed,
         **kwargs,
@@ -69,7 +69,7 @@ def train_and_export(directory: Path) -> None:
     state = train(directory).state
     policy_file.save(
         path,
-        policy_file.Trained("stardiff", fakes.TINY, SETTINGS, state.ema_params, state.normalizer),
+        fakes.trained(params=state.ema_params, normalizer=state.normalizer, train=SETTINGS),
     )
 
 
@@ -94,7 +94,7 @@ def _quadratic_policy():
         return jnp.mean((say(params, observation) - p) ** 2), {}
 
     def sample(params, stats, keys, observation, trocar):
-        p = jnp.broadcast_to(say(params, observation), (len(keys), 16, 3))
+        p = jnp.broadcast_to(say(params, observation), (len(keys), 16, 1, 3))
         pose = jax.tree.map(lambda x: x[:, -1:], observation.pose)
         return Command(pose._replace(p=p), observation.gripper[:, -1:])
 
@@ -172,7 +172,7 @@ def stopped_main(out: str, trains: bool) -> None:
             time.sleep(60)
         if not processes.is_first():
             run = config.RunConfig(out=out, policy=fakes.TINY, train=settings)
-            following.follow(run, ["stardiff"], Path(out), fakes.P_WORLD_REF)
+            following.follow(run, ["stardiff"], Path(out), fakes.env())
         for _ in range(3):  # as `pipeline`: the folder is held, nothing done, demonstrations there
             processes.agree(0)
         with stop_signals() as should_stop:

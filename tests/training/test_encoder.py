@@ -11,14 +11,11 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from starjax import config
-from starjax.data import normalizer
 from starjax.models import encoders
 from starjax.policies import diffuser, packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.training import encoder
 
-TRAIN = config.TrainConfig()
 IMAGE = dataclasses.replace(fakes.TINY, observation="image")
 
 
@@ -36,9 +33,7 @@ def save(path, method="stardiff", policy_config=IMAGE, change=lambda vision: vis
     params = {"diffuser": rest, "roll": {"bias": jnp.ones(3)}} if method == "stardiff" else rest
     if policy_config.observation == "image":
         params = policies.with_vision(params, change(initial()))
-    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
-    stats = normalizer.Normalizer(box, None)
-    policy_file.save(path, policy_file.Trained(method, policy_config, TRAIN, params, stats))
+    policy_file.save(path, fakes.trained(method=method, policy=policy_config, params=params))
     return params
 
 
@@ -56,7 +51,7 @@ def settings(path, **changed):
 @pytest.mark.parametrize("method", ["stardiff", "dp_rcm1"])
 def test_it_is_found_in_both_kinds_of_policy(tmp_path, method):
     save(tmp_path / "p", method)
-    found = encoder.read(settings(tmp_path / "p"), TRAIN)
+    found = encoder.read(settings(tmp_path / "p"))
     jax.tree.map(np.testing.assert_array_equal, found.params, initial())
 
 
@@ -65,11 +60,11 @@ def test_a_packaged_policy_is_known_by_its_name_or_its_path(source, tmp_path, mo
     monkeypatch.setattr(packaged, "FOLDER", tmp_path)
     policy_file.save(tmp_path / "compact.safetensors", policy_file.load(path), half=True)
     named = settings("compact", freeze_encoder=True)
-    found = encoder.read(named, TRAIN)
+    found = encoder.read(named)
     # The folder of a frozen encoder's features is named by this.
-    assert found.fingerprint == encoder.read(settings(tmp_path / "compact.safetensors"), TRAIN)[1]
-    assert found.fingerprint != encoder.read(settings(path), TRAIN).fingerprint
-    begun = encoder.start(jax.tree.map(jnp.zeros_like, params), named, TRAIN)
+    assert found.fingerprint == encoder.read(settings(tmp_path / "compact.safetensors"))[1]
+    assert found.fingerprint != encoder.read(settings(path)).fingerprint
+    begun = encoder.start(jax.tree.map(jnp.zeros_like, params), named)
     for leaf, stored in zip(*map(jax.tree.leaves, (policies.vision_of(begun), initial()))):
         assert leaf.dtype == jnp.float32
         np.testing.assert_allclose(leaf, stored, rtol=2**-11, atol=3e-8)
@@ -78,9 +73,9 @@ def test_a_packaged_policy_is_known_by_its_name_or_its_path(source, tmp_path, mo
 def test_fingerprint_tells_weights_apart(source, tmp_path):
     path, _ = source
     other = save(tmp_path / "p", change=lambda v: jax.tree.map(lambda x: x + 1e-3, v))
-    one, two = (encoder.read(settings(p), TRAIN).fingerprint for p in (path, tmp_path / "p"))
+    one, two = (encoder.read(settings(p)).fingerprint for p in (path, tmp_path / "p"))
     assert one != two and len(one) == len(two)
-    again = encoder.read(settings(path, freeze_encoder=True), TRAIN)
+    again = encoder.read(settings(path, freeze_encoder=True))
     assert again.fingerprint == one != policy_file.fingerprint(policies.vision_of(other))
 
 
@@ -90,7 +85,7 @@ def test_a_policy_that_goes_on_learning_starts_with_it(source):
         jax.tree.map(jnp.ones_like, params),
         jax.tree.map(jnp.zeros_like, policies.vision_of(params)),
     )
-    found = encoder.start(begun, settings(path), TRAIN)
+    found = encoder.start(begun, settings(path))
     jax.tree.map(
         np.testing.assert_array_equal, policies.vision_of(found), policies.vision_of(params)
     )
@@ -98,37 +93,35 @@ def test_a_policy_that_goes_on_learning_starts_with_it(source):
 
 
 @pytest.mark.parametrize(
-    ("ours", "train", "fields"),
+    ("ours", "fields"),
     [
-        ({"vision_dim": 32}, {}, ["policy.vision_dim 16 (here 32)"]),
+        ({"vision_dim": 32}, ["policy.vision_dim 16 (here 32)"]),
         (
             {"encoder": "resnet18", "vision_dim": 32},
-            {},
             ["policy.encoder small (here resnet18)", "policy.vision_dim 16 (here 32)"],
         ),
         (
-            {"freeze_encoder": True, "image_size": 48},
-            {"crop_fraction": 0.5},
-            ["policy.image_size 32 (here 48)", "train.crop_fraction 0.9 (here 0.5)"],
+            {"freeze_encoder": True, "image_size": 48, "crop_fraction": 0.5},
+            ["policy.image_size 32 (here 48)", "policy.crop_fraction 0.9 (here 0.5)"],
         ),
     ],
 )
-def test_another_architecture_is_a_mistake_that_names_all_that_differs(source, ours, train, fields):
+def test_another_architecture_is_a_mistake_that_names_all_that_differs(source, ours, fields):
     path, _ = source
     with mistakes.of("policy.encoder_weights", path) as caught:
-        encoder.read(settings(path, **ours), dataclasses.replace(TRAIN, **train))
+        encoder.read(settings(path, **ours))
     assert all(field in caught.value.got for field in fields)
 
 
 def test_another_picture_is_fine_where_it_goes_on_learning(source):
     path, _ = source
-    assert encoder.read(settings(path, image_size=48), TRAIN) is not None
+    assert encoder.read(settings(path, image_size=48)) is not None
 
 
 def test_a_policy_without_a_camera_is_refused(tmp_path):
     save(tmp_path / "p", policy_config=fakes.TINY)
     with mistakes.of("policy.encoder_weights", "policy.observation state (here image)"):
-        encoder.read(settings(tmp_path / "p"), TRAIN)
+        encoder.read(settings(tmp_path / "p"))
 
 
 def test_parameters_of_another_network_are_named(tmp_path):
@@ -138,7 +131,7 @@ def test_parameters_of_another_network_are_named(tmp_path):
 
     save(tmp_path / "p", change=change)
     with mistakes.of("policy.encoder_weights", "(63, 8)") as caught:
-        encoder.read(settings(tmp_path / "p"), TRAIN)
+        encoder.read(settings(tmp_path / "p"))
     assert "(64, 8)" in caught.value.expected and "keypoints" in caught.value.expected
 
 
@@ -147,23 +140,23 @@ def test_a_damaged_file_is_one_line(source, tmp_path):
     content[-5] ^= 1
     (tmp_path / "p").write_bytes(content)
     with mistakes.of("policy.encoder_weights", "damaged"):
-        encoder.read(settings(tmp_path / "p"), TRAIN)
+        encoder.read(settings(tmp_path / "p"))
 
 
 def test_a_missing_file_is_one_line():
     with mistakes.of("policy.encoder_weights", "nowhere"):
-        encoder.read(settings("nowhere"), TRAIN)
+        encoder.read(settings("nowhere"))
 
 
 def test_torchvision_fills_a_trunk_only(tmp_path):
     path = tmp_path / "resnet18.safetensors"
     safetensors.numpy.save_file({"conv1.weight": np.zeros((64, 3, 7, 7), np.float32)}, path)
     with mistakes.of("policy.encoder_weights", "weight is missing"):
-        encoder.read(settings(path, encoder="resnet18", image_size=64), TRAIN)
+        encoder.read(settings(path, encoder="resnet18", image_size=64))
     with mistakes.of("policy.encoder", "small"):
-        encoder.read(settings(path), TRAIN)
+        encoder.read(settings(path))
     with mistakes.of("policy.freeze_encoder", "keypoints untrained"):
-        encoder.read(settings(path, encoder="resnet18", freeze_encoder=True), TRAIN)
+        encoder.read(settings(path, encoder="resnet18", freeze_encoder=True))
 
 
 def test_torchvision_still_starts_a_policy(tmp_path):
@@ -182,7 +175,7 @@ def test_torchvision_still_starts_a_policy(tmp_path):
     path = tmp_path / "resnet18.safetensors"
     safetensors.numpy.save_file(flat, path)
     ours = settings(path, encoder="resnet18", image_size=64)
-    assert encoder.read(ours, TRAIN) is None
-    found = encoder.start(begun, ours, TRAIN)["vision"]["params"]
+    assert encoder.read(ours) is None
+    found = encoder.start(begun, ours)["vision"]["params"]
     assert (found["trunk"]["conv1"]["kernel"] == 0.5).all()
     assert (found["keypoints"] == 0.25).all()

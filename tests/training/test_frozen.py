@@ -1,7 +1,6 @@
 """A frozen encoder: what it saw is what inference sees, and nothing ever changes it."""
 
 import dataclasses
-import types
 
 import fakes
 import jax
@@ -43,23 +42,21 @@ def source(tmp_path_factory):
     vision, size = diffuser.vision_encoder(IMAGE), IMAGE.image_size
     init = jax.jit(vision.init, compiler_options=QUICK)
     params = {"vision": init(jax.random.key(5), jnp.zeros((1, size, size, 3)))}
-    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
-    stats = normalizer.Normalizer(box, None)
-    policy_file.save(path, policy_file.Trained("dp_rcm2", IMAGE, TRAIN, params, stats))
+    policy_file.save(path, fakes.trained(method="dp_rcm2", policy=IMAGE, params=params))
     settings = dataclasses.replace(IMAGE, encoder_weights=str(path), freeze_encoder=True)
-    return settings, encoder.read(settings, TRAIN)
+    return settings, encoder.read(settings)
 
 
-def features(source, dataset, root, train=TRAIN, digest="demos", frames=None, said=None):
+def features(source, dataset, root, digest="demos", camera="camera", frames=None, said=None):
     settings, found = source
-    pictures = np.asarray(dataset.observation.image)
+    pictures = np.asarray(dataset.observation.images["camera"])
     return frozen.features(
         found,
         settings,
-        train,
         root,
         digest,
         len(pictures),
+        camera,
         frames or (lambda: pictures),
         [].append if said is None else said.append,
     )
@@ -73,15 +70,15 @@ def never():
 def seen(source, dataset, tmp_path_factory):
     """The dataset with features in the place of pictures."""
     found = features(source, dataset, tmp_path_factory.mktemp("seen"))
-    observation = dataset.observation.replace(image=None, features=jnp.asarray(found))
+    observation = dataset.observation._replace(images=None, features=jnp.asarray(found))
     return dataset.replace(observation=observation)
 
 
 @pytest.mark.parametrize("name", ["stardiff", "dp_rcm1"])
 def test_inference_sees_the_features_that_training_saw(source, dataset, seen, name):
     settings, found = source
-    policy = policies.make(METHODS[name], settings, fakes.P_WORLD_REF, TRAIN)
-    stats = normalizer.fit(METHODS[name], dataset, fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS[name], settings, fakes.TASK, TRAIN)
+    stats = normalizer.fit(METHODS[name], fakes.TASK, dataset, np.arange(80))
     params = jax.jit(policy.init, compiler_options=QUICK)(jax.random.key(0))
     sample = jax.jit(policy.sample, compiler_options=QUICK)
     keys, frames = jax.random.split(jax.random.key(1), 3), jnp.array([3, 25, 70])
@@ -94,7 +91,7 @@ def test_inference_sees_the_features_that_training_saw(source, dataset, seen, na
     from_frames = say(dataset, policies.with_vision(params, found.params))
     np.testing.assert_allclose(from_frames, from_features, atol=1e-5)
     rolled = jnp.roll(seen.observation.features, 1, axis=0)
-    others = seen.replace(observation=seen.observation.replace(features=rolled))
+    others = seen.replace(observation=seen.observation._replace(features=rolled))
     assert np.abs(say(others, params) - from_features).max() > 1e-4
 
 
@@ -131,12 +128,13 @@ def test_another_encoder_crop_or_dataset_has_features_of_its_own(source, dataset
     for kwargs in (
         {},
         {"source": (settings, other)},
-        {"train": dataclasses.replace(TRAIN, crop_fraction=0.8)},
+        {"source": (dataclasses.replace(settings, crop_fraction=0.8), found)},
+        {"camera": "wrist"},
         {"digest": "other"},
         {"source": (dataclasses.replace(settings, dtype="bfloat16"), found)},
     ):
         features(**{"source": source, "dataset": dataset, "root": tmp_path, **kwargs})
-    assert len(list((tmp_path / "features").iterdir())) == 5
+    assert len(list((tmp_path / "features").iterdir())) == 6
     features(source, dataset, tmp_path, frames=never)
 
 
@@ -147,8 +145,7 @@ def run_config(settings, out):
 def train(source, seen, out, name):
     """What `starjax train` does after the features are there."""
     settings, found = source
-    env = types.SimpleNamespace(p_world_ref=fakes.P_WORLD_REF)
-    pipeline._train(run_config(settings, out), name, lambda: seen, env, found)
+    pipeline._train(run_config(settings, out), name, lambda: seen, fakes.env(), found)
     return folders.weights(out, name)
 
 
@@ -176,7 +173,7 @@ def test_the_encoder_has_no_optimiser_and_no_average(source, whole):
 
 
 def test_the_rest_learns(source, whole):
-    policy = policies.make(METHODS["stardiff"], source[0], fakes.P_WORLD_REF, TRAIN)
+    policy = policies.make(METHODS["stardiff"], source[0], fakes.TASK, TRAIN)
     assert "vision" not in jax.eval_shape(policy.init, jax.random.key(0))["diffuser"]
     lines = loop.metrics.read(whole.parent / "metrics.jsonl")
     assert {"train", "holdout"} == {line["kind"] for line in lines}
@@ -194,7 +191,7 @@ def test_interrupted_and_resumed_is_the_same_policy(source, seen, whole, tmp_pat
             source[0],
             TRAIN,
             seen,
-            fakes.P_WORLD_REF,
+            fakes.TASK,
             tmp_path / "stardiff",
             0,
             should_stop=lambda: next(asked) == 2,
@@ -203,8 +200,8 @@ def test_interrupted_and_resumed_is_the_same_policy(source, seen, whole, tmp_pat
 
 
 def test_a_single_model_trains_on_features_too(source, seen):
-    policy = policies.make(METHODS["dp_rcm1"], source[0], fakes.P_WORLD_REF, TRAIN)
-    stats = normalizer.fit(METHODS["dp_rcm1"], seen, fakes.P_WORLD_REF, np.arange(80))
+    policy = policies.make(METHODS["dp_rcm1"], source[0], fakes.TASK, TRAIN)
+    stats = normalizer.fit(METHODS["dp_rcm1"], fakes.TASK, seen, np.arange(80))
     params = jax.jit(policy.init, compiler_options=QUICK)(jax.random.key(0))
     batch = windows.gather(seen, jnp.array([3, 25, 70]), 2, 16)
     given = policy.prepare(stats, jax.random.key(1), batch)
@@ -217,14 +214,15 @@ def test_a_single_model_trains_on_features_too(source, seen):
 def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, monkeypatch):
     def without_pictures(root, pictures, report):
         assert not pictures
-        blind = dataset.replace(observation=dataset.observation.replace(image=None))
+        blind = dataset.replace(observation=dataset.observation._replace(images=None))
         return load.Demos(blind, "digest", "device", 0, {})
 
     monkeypatch.setattr(load, "load", without_pictures)
-    monkeypatch.setattr(load, "frames", lambda root: np.asarray(dataset.observation.image))
+    pictures = np.asarray(dataset.observation.images["camera"])
+    monkeypatch.setattr(load, "frames", lambda root: pictures)
     settings, found = source
     loaded = demonstrations.load(run_config(settings, tmp_path), tmp_path, lambda: None, found)
-    assert loaded.observation.image is None and windows.on_device(loaded)
+    assert loaded.observation.images is None and windows.on_device(loaded)
     wanted = features(source, dataset, tmp_path / "other")
     np.testing.assert_array_equal(loaded.observation.features, wanted)
     assert "features" in pipeline.clock.timings(tmp_path)
@@ -232,12 +230,13 @@ def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, 
 
 def test_pictures_in_the_place_of_features_are_an_error(source, dataset, tmp_path):
     with pytest.raises(ValueError, match=r"observation.features: expected .*frozen"):
-        loop.run(METHODS["stardiff"], source[0], TRAIN, dataset, fakes.P_WORLD_REF, tmp_path, 0)
+        loop.run(METHODS["stardiff"], source[0], TRAIN, dataset, fakes.TASK, tmp_path, 0)
 
 
 def test_every_frame_has_its_own_features(source, dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(frozen, "PART", 30)  # of batches that its end cuts
     settings, found = source
-    see, pictures = frozen._make_see(found, settings, TRAIN), np.asarray(dataset.observation.image)
+    see = frozen._make_see(found, settings)
+    pictures = np.asarray(dataset.observation.images["camera"])
     wanted = np.concatenate([see(pictures[first : first + 16]) for first in range(0, 80, 16)])
     np.testing.assert_allclose(features(source, dataset, tmp_path), wanted, atol=1e-5)

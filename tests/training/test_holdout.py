@@ -17,7 +17,7 @@ from starjax.types import Command, Pose
 def test_the_average_is_what_is_judged():
     def sample(params, stats, keys, observation, trocar):
         last = observation.pose.p[:, -1:]
-        p = jnp.broadcast_to(last + params, (len(keys), fakes.TINY.horizon, 3))
+        p = jnp.broadcast_to(last + params, (len(keys), fakes.TINY.horizon, 1, 3))
         return Command(Pose(observation.pose.R[:, -1:], p), observation.gripper[:, -1:])
 
     nothing: Any = None

@@ -75,7 +75,7 @@ def test_statistics_are_of_the_action_space_that_is_trained(monkeypatch, tmp_pat
 
     monkeypatch.setattr(loop.normalizer, "fit", fit)
     fixed = dataclasses.replace(fakes.TINY, trocar_yaw="fixed")
-    given = METHODS["dp_rcm2"], fixed, jobs.SETTINGS, fakes.dataset(seed=0), fakes.P_WORLD_REF
+    given = METHODS["dp_rcm2"], fixed, jobs.SETTINGS, fakes.dataset(seed=0), fakes.TASK
     with pytest.raises(InterruptedError, match="rcm2_fixed_yaw"):
         loop.run(*given, tmp_path, 0)
 

@@ -99,9 +99,9 @@ def test_it_learns_the_given_frames_only(start, dataset):
 def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset):
     small = dataclasses.replace(fakes.TINY, dtype="bfloat16")
     settings = dataclasses.replace(SETTINGS, learning_rate=1e-3)
-    policy = policies.make(METHODS["stardiff"], small, fakes.P_WORLD_REF, settings)
+    policy = policies.make(METHODS["stardiff"], small, fakes.TASK, settings)
     optimizer = state.make_optimizer(settings)
-    stats = normalizer.fit(METHODS["stardiff"], dataset, fakes.P_WORLD_REF, np.arange(80))
+    stats = normalizer.fit(METHODS["stardiff"], fakes.TASK, dataset, np.arange(80))
     first = state.create(policy, optimizer, state.init(policy, 0).drawn(), stats, seed=0)
     it = parts(first, "bfloat16")
     given = (policy, optimizer, small, settings, it)
@@ -125,7 +125,7 @@ def test_a_broken_loss_is_left_out_and_counted(start, dataset):
     given = (policy, optimizer, SETTINGS, it)
     once = jax.jit(lambda s, b: it.end(step.train_step(*given, it.begin(s), b)))
     good = windows.gather(dataset, jnp.arange(8), 2, 16)
-    bad = good.replace(observation=good.observation.replace(gripper=jnp.full((8, 2), 2.0)))
+    bad = good.replace(observation=good.observation._replace(gripper=jnp.full((8, 2), 2.0)))
     before = once(first, good)
     after = once(before, bad)
     assert int(after.step) == 2 and int(after.skipped) == 1

@@ -5,8 +5,10 @@ unchanged. Proprioception is the measured pose in the method's own action space 
 actions' statistics: what was commanded and what was measured stay comparable.
 
 A policy's samples are clipped to [-1, 1], so what was demonstrated is as far as a tool can be sent.
-Where positions or depths count from the port, samples reach farther: to the demonstrated tips as
-seen from any port that may be drawn (Eq. 19), since from a higher port a tip is farther away.
+Where positions or depths count from the trocar, samples reach farther: to the demonstrated tips as
+seen from any trocar that may be drawn (Eq. 19), since from a higher one a tip is farther away.
+
+Vectors hold the arms one after another: each its pose in the action space, then its gripper.
 """
 
 from typing import Any
@@ -18,11 +20,11 @@ import numpy as np
 
 from starjax import methods, rcm
 from starjax.data import windows
+from starjax.sim.tasks.base import Field, Task
 
 _SMALLEST_RANGE = 1e-4  # m or rad: below it an entry counts as constant, and is only centred
-_ABSOLUTE = ("se3", "rcm4")  # action spaces whose positions are the world's, whatever the port
-_EDGE_AZIMUTHS = 16  # of ports on the edge of Eq. 19: between two of them up to 1 mm is missing
-_STATE_SCALED = np.r_[0:3, 9:12]  # block position and target peg position; 3:9 is a rotation
+_ABSOLUTE = ("se3", "rcm4")  # action spaces whose positions are the world's, whatever the trocar
+_EDGE_AZIMUTHS = 16  # of trocars on the edge of Eq. 19: between two of them up to 1 mm is missing
 
 
 @flax.struct.dataclass
@@ -51,90 +53,101 @@ class Normalizer:
     """All scalings of one method.
 
     Attributes:
-      action: of the encoded pose and the gripper, `[A + 1]`.
-      state: of the task state, `[12]`, or None where it is not observed.
+      action: of what `encode` gives, `[A * (dim + 1)]`.
+      state: of the task state, `[S]`, or None where it is not observed.
     """
 
     action: MinMax
     state: MinMax | None
 
 
-def encode(
-    action_space: str, pose: Any, gripper: Any, trocar: rcm.Trocar, p_world_ref: Any
-) -> jax.Array:
-    """A pose and a gripper as one vector `[..., A + 1]` of the action space, not yet scaled."""
-    space = rcm.ACTION_SPACES[action_space]
-    encoded = space.encode(pose, trocar, p_world_ref)
-    return jnp.concatenate([encoded, jnp.asarray(gripper)[..., None]], axis=-1)
+def encode(action_space: str, pose: Any, gripper: Any, told: rcm.TrocarFrame) -> jax.Array:
+    """Poses and grippers `[..., A]` as one vector `[..., A * (dim + 1)]`, not yet scaled.
+
+    Args:
+      action_space: key of `rcm.ACTION_SPACES`, whose vectors have `dim` entries.
+      pose: of the tips, `[..., A]`.
+      gripper: `[..., A]`.
+      told: what broadcasts against them.
+    """
+    encoded = rcm.ACTION_SPACES[action_space].encode(pose, told)
+    vector = jnp.concatenate([encoded, jnp.asarray(gripper)[..., None]], axis=-1)
+    return vector.reshape(*vector.shape[:-2], -1)
 
 
 def fit(
-    method: methods.Method, dataset: windows.Dataset, p_world_ref: Any, frames: np.ndarray
+    method: methods.Method, task: Task, dataset: windows.Dataset, frames: np.ndarray
 ) -> Normalizer:
     """Statistics of the commands (and the task state) at the given frames of a dataset.
 
     Args:
       method: whose action space to use.
+      task: whose state's points are scaled, and whose arms' trocars may be drawn elsewhere.
       dataset: the demonstrations, wherever they are.
-      p_world_ref: `[3]` m nominal port.
       frames: `[n]` frame numbers, those trained on.
     """
     encode_commands = jax.jit(
-        lambda command, trocar: encode(
-            method.action_space, command.pose, command.gripper, trocar, p_world_ref
-        )
+        lambda command, told: encode(method.action_space, command.pose, command.gripper, told)
     )
     actions = windows.over_frames(
-        dataset, frames, lambda _, command, trocar: encode_commands(command, trocar)
+        dataset, frames, lambda _, command, told: encode_commands(command, told)
     )
     space = rcm.ACTION_SPACES[method.action_space]
-    action = _min_max(actions, _entries_but(space, "R"))
+    action = _min_max(actions, _entries_but(space, task.arms, "R"))
     if method.action_space not in _ABSOLUTE:
-        action = action.replace(reach=_reach(action, space, dataset, frames, p_world_ref))
+        action = action.replace(reach=_reach(action, space, task, dataset, frames))
     state = None
     if dataset.observation.state is not None:
         states = windows.over_frames(dataset, frames, lambda observation, *_: observation.state)
-        state = _min_max(states, _STATE_SCALED)
+        state = _min_max(states, _points(task.fields))
     return Normalizer(action=action, state=state)
 
 
 def _reach(
-    box: MinMax,
-    space: rcm.ActionSpace,
-    dataset: windows.Dataset,
-    frames: np.ndarray,
-    p_world_ref: Any,
+    box: MinMax, space: rcm.ActionSpace, task: Task, dataset: windows.Dataset, frames: np.ndarray
 ) -> jax.Array:
-    """`[2, A + 1]`, scaled: what the commanded tips ask for through the ports of the edge.
+    """`[2, A * (dim + 1)]`, scaled: what the commanded tips ask for through trocars of the edge.
 
-    Those are the highest, lowest and outermost ones of Eq. 19, and the centre: {T} turns there too.
+    Those are the highest, lowest and outermost ones of Eq. 19 about each arm's nominal trocar, and
+    the centre: {T} turns there too.
     """
     around = np.linspace(*rcm.AZIMUTH_RANGE, _EDGE_AZIMUTHS, endpoint=False)
     heights = [*rcm.POLAR_RANGE, np.mean(rcm.POLAR_RANGE)]
-    ports = rcm.Trocar(*(x.ravel() for x in np.meshgrid(rcm.RADIUS_RANGE, heights, around)))
+    trocars = rcm.Trocar(*(x.ravel() for x in np.meshgrid(rcm.RADIUS_RANGE, heights, around)))
+    p_world_ref = np.array([slot.p_world_ref for slot in task.slots], np.float32)
+    roll_zero = np.array([slot.roll_zero for slot in task.slots], np.float32)
 
     @jax.jit
     def ends(command):
-        def through(port):
-            pose = rcm.project(command.pose, rcm.trocar_position(port, p_world_ref))
-            scaled = box.normalize(encode(space.name, pose, command.gripper, port, p_world_ref))
+        def through(trocar):
+            frame = rcm.trocar_frame(trocar, p_world_ref, roll_zero)
+            pose = rcm.project(command.pose, frame.p_world_trocar)
+            scaled = box.normalize(encode(space.name, pose, command.gripper, frame))
             return scaled.min(axis=0), scaled.max(axis=0)
 
-        low, high = jax.vmap(through)(ports)
+        low, high = jax.vmap(through)(trocars)
         return jnp.concatenate([low, high])
 
     edge = windows.over_frames(dataset, frames, lambda _, command, __: ends(command))
     reach = np.stack([np.full(edge.shape[-1], -1.0), np.full(edge.shape[-1], 1.0)])
-    counted = _entries_but(space, "R", "roll")
+    counted = _entries_but(space, task.arms, "R", "roll")
     reach[0, counted] = np.minimum(edge[:, counted].min(axis=0), -1.0)
     reach[1, counted] = np.maximum(edge[:, counted].max(axis=0), 1.0)
     return jnp.asarray(reach, jnp.float32)
 
 
-def _entries_but(space: rcm.ActionSpace, *names: str) -> np.ndarray:
-    """Where the parts lie in the space's vector, without those of these names."""
+def _entries_but(space: rcm.ActionSpace, arms: int, *names: str) -> np.ndarray:
+    """Where the parts of each arm's action lie in the vector, without those of these names."""
     parts = [part for name, part in space.slices.items() if name not in names]
-    return np.concatenate([np.arange(part.start, part.stop) for part in parts])
+    of_one = np.concatenate([np.arange(part.start, part.stop) for part in parts])
+    first = np.arange(arms) * (space.dim + 1)
+    return (first[:, None] + of_one).ravel()
+
+
+def _points(fields: tuple[Field, ...]) -> np.ndarray:
+    """Where the points lie in the task state."""
+    is_point = np.repeat([field.kind == "point" for field in fields], [f.size for f in fields])
+    return np.flatnonzero(is_point)
 
 
 def _min_max(values: np.ndarray, scaled: np.ndarray) -> MinMax:

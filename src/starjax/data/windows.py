@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.sim.types import Observation
-from starjax.types import Command
+from starjax.types import Command, Observation
 
 _CHUNK = 1 << 16
 
@@ -27,9 +26,9 @@ class Dataset:
     `dtype` and `[int array [N]] -> numpy array [N, ...]`.
 
     Attributes:
-      observation: Observation `[F]`.
-      command: Command `[F]`; the one issued at frame t is the pose for t + 1.
-      trocar: Trocar `[D]`.
+      observation: Observation `[F, A]`, its images `[F, h, w, 3]`.
+      command: Command `[F, A]`; the one issued at frame t is the pose for t + 1.
+      trocar: TrocarFrame `[D, A]`.
       episode: `[F]` int32, which demonstration a frame belongs to.
       start: `[D]` int32, first frame of each demonstration.
       length: `[D]` int32, its number of frames.
@@ -37,7 +36,7 @@ class Dataset:
 
     observation: Observation
     command: Command
-    trocar: rcm.Trocar
+    trocar: rcm.TrocarFrame
     episode: Any
     start: Any
     length: Any
@@ -48,34 +47,34 @@ class Batch:
     """B windows.
 
     Attributes:
-      observation: Observation `[B, O]` of frames t - O + 1 .. t.
-      command: Command `[B, H]` issued at frames t .. t + H - 1.
-      trocar: Trocar `[B]`.
+      observation: Observation `[B, O, A]` of frames t - O + 1 .. t.
+      command: Command `[B, H, A]` issued at frames t .. t + H - 1.
+      trocar: TrocarFrame `[B, A]`.
     """
 
     observation: Observation
     command: Command
-    trocar: rcm.Trocar
+    trocar: rcm.TrocarFrame
 
 
 def split_holdout(
-    start: Any, length: Any, trocar: rcm.Trocar, holdout: int
+    start: Any, length: Any, trocar: rcm.TrocarFrame, holdout: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frames to train on and frames kept out, by whole demonstrations.
 
     Args:
       start: `[D]` first frame of each demonstration.
       length: `[D]` frames in each.
-      trocar: fields `[D]`.
+      trocar: fields `[D, A]`.
       holdout: demonstrations to keep out, spread evenly over the dataset; at most a quarter of
-        them all, and none that is the last one at its trocar.
+        them all, and none that is the last one at its trocars.
 
     Returns:
       `[F_train]` and `[F_holdout]` int32 frame numbers.
     """
     start, length = np.asarray(start), np.asarray(length)
     count = min(holdout, len(start) // 4)
-    places = np.stack([np.asarray(field) for field in trocar], -1)
+    places = np.concatenate([np.asarray(field) for field in trocar.trocar], -1)
     place = np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
     left = np.bincount(place)
     kept_out = []
@@ -144,9 +143,9 @@ def gather(dataset: Dataset, frame: Any, obs_horizon: int, horizon: int) -> Batc
 def over_frames(dataset: Dataset, frames: np.ndarray, fn: Callable[..., np.ndarray]) -> np.ndarray:
     """`fn(observation, command, trocar)` of every given frame, in chunks, as one numpy array.
 
-    Pictures and their features are left out: what is computed over all frames is low-dimensional.
+    Images and their features are left out: what is computed over all frames is low-dimensional.
     """
-    low = (dataset.observation.replace(image=None, features=None), dataset.command)
+    low = (dataset.observation._replace(images=None, features=None), dataset.command)
     parts = []
     for i in range(0, len(frames), _CHUNK):
         frame = frames[i : i + _CHUNK]

@@ -13,7 +13,8 @@ from starjax import config, methods, rcm
 from starjax.models import roll_net
 from starjax.policies import diffuser, features
 from starjax.policies import policy as policies
-from starjax.sim.types import Observation
+from starjax.sim.tasks.base import Field
+from starjax.types import Observation
 
 _WARM_UP = 3  # calls before the clock starts
 
@@ -23,7 +24,7 @@ def policy_ms(
     policy_config: config.PolicyConfig,
     params: Any,
     stats: Any,
-    p_world_ref: Any,
+    seen: features.Sensors,
     *,
     batch: int = 1,
     calls: int = 100,
@@ -36,7 +37,7 @@ def policy_ms(
       policy_config: shapes of its observations.
       params: of the policy.
       stats: its normaliser.
-      p_world_ref: `[3]` m, the nominal port.
+      seen: the task and the cameras that it was made for.
       batch: robots that are served at once.
       calls: timed calls, fewer if they take longer than `seconds` altogether.
       seconds: see `calls`; at least five calls are made.
@@ -44,8 +45,12 @@ def policy_ms(
     Returns:
       {p50, p95, p99} in ms, and n, the number of calls.
     """
-    observation, trocar = example(policy_config, p_world_ref, batch)
-    sample = jax.jit(policy.sample)
+    observation, trocar = example(policy_config, seen, batch)
+
+    @jax.jit
+    def sample(params, stats, keys, observation, trocar):
+        return policy.sample(params, stats, keys, observation, _told(seen, trocar))
+
     keys = jax.random.split(jax.random.key(0), batch)
     # Weights on the host would be copied again at each call.
     params, stats = jax.device_put((params, stats))
@@ -55,10 +60,9 @@ def policy_ms(
 def table(
     method: methods.Method,
     policy_config: config.PolicyConfig,
-    train_config: config.TrainConfig,
     params: Any,
     stats: Any,
-    p_world_ref: Any,
+    seen: features.Sensors,
     *,
     ddim_steps: Sequence[int],
     calls: int = 100,
@@ -67,15 +71,21 @@ def table(
     """Rows {ddim_steps, p50, p95, p99, n} of one method at batch 1, times in ms, as they come."""
     for steps in ddim_steps:
         changed = dataclasses.replace(policy_config, ddim_steps=steps)
-        policy = policies.make(method, changed, p_world_ref, train_config)
-        given = (policy, changed, params, stats, p_world_ref)
+        policy = policies.make(method, changed, seen.task, cameras=seen.cameras)
+        given = (policy, changed, params, stats, seen)
         yield {"ddim_steps": steps, **policy_ms(*given, calls=calls, seconds=seconds)}
 
 
 def roll_ms(
-    policy_config: config.PolicyConfig, *, batch: int = 1, calls: int = 200, seconds: float = 5.0
+    policy_config: config.PolicyConfig,
+    seen: features.Sensors,
+    *,
+    batch: int = 1,
+    calls: int = 200,
+    seconds: float = 5.0,
 ) -> dict[str, float]:
     """Time of the roll network alone, the hierarchy's overhead; its weights do not matter."""
+    batch *= seen.task.arms
     net = roll_net.RollNet(
         width=policy_config.roll_width,
         blocks=policy_config.roll_blocks,
@@ -87,31 +97,48 @@ def roll_ms(
         jnp.zeros((batch, policy_config.obs_horizon)),
     ]
     if policy_config.roll_observation:
-        inputs.append(jnp.zeros((batch, diffuser.observed_dim(policy_config))))
+        inputs.append(jnp.zeros((batch, diffuser.observed_dim(policy_config, len(seen.cameras)))))
     params = net.init(jax.random.key(0), *inputs)
     apply = jax.jit(net.apply)
     return _percentiles(lambda: apply(params, *inputs), calls, seconds)
 
 
 def example(
-    policy_config: config.PolicyConfig, p_world_ref: Any, batch: int
+    policy_config: config.PolicyConfig, seen: features.Sensors, batch: int
 ) -> tuple[Observation, rcm.Trocar]:
-    """A plausible observation `[batch, O]` and the trocars `[batch]`: a tool above the board."""
-    trocar = rcm.sample_trocar(jax.random.key(1), (batch,))
+    """A plausible observation `[batch, O, A]`, tools above the ground, and trocars `[batch, A]`."""
+    trocar = rcm.sample_trocar(jax.random.key(1), (batch, seen.task.arms))
     shape = (batch, policy_config.obs_horizon)
-    per_frame = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], shape), trocar)
-    action = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 0.02]), (*shape, 4))
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, per_frame, p_world_ref)
-    image = state = None
-    if policy_config.observation == "image":
-        size = (*shape, policy_config.image_size, policy_config.image_size, 3)
-        image = jax.random.randint(jax.random.key(2), size, 0, 256, jnp.uint8)
-    else:
-        state = jnp.broadcast_to(
-            jnp.array([0.02, 0.0, 0.01, 1.0, 0, 0, 0, 1.0, 0, -0.02, 0.0, 0.01]),
-            (*shape, features.TASK_STATE),
-        )
-    return Observation(pose, jnp.ones(shape), image, state), trocar
+    action = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 0.02]), (*shape, seen.task.arms, 4))
+    frame = features.per_step(_told(seen, trocar))
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, frame)
+    observation = Observation(pose, jnp.ones((*shape, seen.task.arms)))
+    if policy_config.observation == "state":
+        state = jnp.concatenate([_plausible(field) for field in seen.task.fields])
+        return observation._replace(state=jnp.broadcast_to(state, (*shape, len(state)))), trocar
+    size = (*shape, policy_config.image_size, policy_config.image_size, 3)
+    keys = jax.random.split(jax.random.key(2), len(seen.cameras))
+    images = {
+        name: jax.random.randint(key, size, 0, 256, jnp.uint8)
+        for name, key in zip(seen.cameras, keys, strict=True)
+    }
+    return observation._replace(images=images), trocar
+
+
+def _told(seen: features.Sensors, trocar: rcm.Trocar) -> rcm.TrocarFrame:
+    """Trocars `[B, A]` about the nominal ones of the task's arms."""
+    slots = seen.task.slots
+    p_world_ref = np.array([slot.p_world_ref for slot in slots], np.float32)
+    return rcm.trocar_frame(trocar, p_world_ref, np.array([slot.roll_zero for slot in slots]))
+
+
+def _plausible(field: Field) -> jax.Array:
+    """Numbers that a part of the state may have: a point 1 cm above the origin, no rotation."""
+    if field.kind == "point":
+        return jnp.resize(jnp.array([0.0, 0.0, 0.01]), (field.size,))
+    if field.kind == "rot6d":
+        return jnp.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    return jnp.zeros(field.size)
 
 
 def _percentiles(call: Callable[[], Any], calls: int, seconds: float) -> dict[str, float]:

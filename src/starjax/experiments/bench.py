@@ -61,18 +61,19 @@ def _time(run: Path, counts: Sequence[int], calls: int) -> dict[str, Any]:
     from starjax import methods
     from starjax.evaluation import latency
     from starjax.experiments import scoring
+    from starjax.policies import features
 
     who = scoring.subject(run.name, folders.weights(run.parent, run.name))
     trained = who.trained
+    seen = features.sensors(who.env.task, trained.scene.cameras)
     print("  DDIM steps      p50      p95      p99 ms       Hz")
     found = {}
     rows = latency.table(
         methods.METHODS[run.name],
         trained.policy,
-        trained.train,
         trained.params,
         trained.normalizer,
-        who.env.p_world_ref,
+        seen,
         ddim_steps=counts,
         calls=calls,
     )
@@ -82,7 +83,7 @@ def _time(run: Path, counts: Sequence[int], calls: int) -> dict[str, Any]:
         print(_row(count, row), flush=True)
     roll = None
     if methods.METHODS[run.name].hierarchical:
-        roll = latency.roll_ms(trained.policy, calls=calls)
+        roll = latency.roll_ms(trained.policy, seen, calls=calls)
         print(_row("roll net", roll))
     return {
         "weights": who.weights,

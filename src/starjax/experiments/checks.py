@@ -40,9 +40,9 @@ def check(config: config_lib.RunConfig) -> None:
         value = getattr(policy, name)
         expect(value <= most, f"policy.{name}", f"at most {of} = {most}", value)
     if policy.observation == "image":
-        fraction, cell = config.train.crop_fraction, _CELL[policy.encoder]
+        fraction, cell = policy.crop_fraction, _CELL[policy.encoder]
         crop = round(policy.image_size * fraction)
-        left = f"more than {cell} pixels left by train.crop_fraction = {fraction:g}"
+        left = f"more than {cell} pixels left by policy.crop_fraction = {fraction:g}"
         expect(crop > cell, "policy.image_size", left, crop)
     for name in ("encoder_weights", "freeze_encoder"):
         sees = policy.observation == "image" or not getattr(policy, name)

@@ -92,15 +92,15 @@ def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder
         found = frozen.features(
             encoder,
             config.policy,
-            config.train,
             root,
             demos.digest,
             len(dataset.episode),
+            "camera",
             lambda: loading.frames(root),
             words.indented,
         )
     features = jax.device_put(found) if windows.on_device(dataset) else found
-    return dataset.replace(observation=dataset.observation.replace(features=features))
+    return dataset.replace(observation=dataset.observation._replace(features=features))
 
 
 def frozen_encoder(config: config_lib.RunConfig) -> Any:
@@ -109,5 +109,5 @@ def frozen_encoder(config: config_lib.RunConfig) -> Any:
         return None
     from starjax.training import encoder
 
-    found = encoder.read(config.policy, config.train)
+    found = encoder.read(config.policy)
     return found if config.policy.freeze_encoder else None

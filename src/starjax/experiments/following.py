@@ -16,7 +16,7 @@ def follow(
     config: config_lib.RunConfig,
     trained: Sequence[str],
     root: Path,
-    p_world_ref: Any,
+    env: Any,
 ) -> None:
     """Trains along with the first process, then waits until that one has done the rest.
 
@@ -24,7 +24,7 @@ def follow(
       config: settings of the run.
       trained: names of the methods that are trained, in order; none if the run does not train.
       root: folder of the demonstrations, which the first process collects.
-      p_world_ref: `[3]` m, the nominal port.
+      env: `sim.env.Env` of the run's scene.
     """
     from starjax.data import load
     from starjax.training import loop, processes
@@ -45,9 +45,10 @@ def follow(
                 config.policy,
                 config.train,
                 demos,
-                p_world_ref,
+                env.task,
                 Path(config.out) / name,
                 config.seed,
+                cameras=env.names.cameras,
                 should_stop=should_stop,
                 description=f"Training {name}",
             )

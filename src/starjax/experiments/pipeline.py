@@ -48,7 +48,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     if not processes.is_first():
         env = _environment(config)
         root, _ = demonstrations.plan(config, env)
-        return following.follow(config, trained if "train" in stages else [], root, env.p_world_ref)
+        return following.follow(config, trained if "train" in stages else [], root, env)
     with files.lock(out):
         processes.agree(0)
         print(words.plan(config, stages), flush=True)
@@ -103,9 +103,10 @@ def _train(
             config.policy,
             config.train,
             dataset,
-            env.p_world_ref,
+            env.task,
             folder,
             config.seed,
+            cameras=env.names.cameras,
             should_stop=should_stop,
             description=f"Training {name}",
         )
@@ -117,7 +118,9 @@ def _train(
         train=config.train,
         params=policies.with_vision(params, encoder.params) if encoder else params,
         normalizer=state.normalizer,
-        p_world_ref=tuple(float(x) for x in env.p_world_ref),
+        scene=env.names,
+        p_world_ref=tuple(map(tuple, env.p_world_ref)),
+        roll_zero=tuple(slot.roll_zero for slot in env.task.slots),
         demos=config.demos,
         preset=config.preset,
     )

@@ -12,8 +12,8 @@ from starjax import errors, methods, rcm
 from starjax.evaluation import evaluate, latency, statistics
 from starjax.evaluation import trials as table
 from starjax.experiments import words
+from starjax.policies import features, policy_file
 from starjax.policies import policy as policies
-from starjax.policies import policy_file
 from starjax.rollouts import placement
 from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
@@ -76,9 +76,17 @@ def from_file(path: Path) -> Subject:
 def _subject(
     method: str, trained: policy_file.Trained, file: Path, env: sim_env.Env | None
 ) -> Subject:
-    env = env or sim_env.make(trained.policy.observation, trained.policy.image_size)
+    scene = trained.scene
+    env = env or sim_env.make(
+        scene.task,
+        scene.arms,
+        scene.tools,
+        observation=trained.policy.observation,
+        image_size=trained.policy.image_size,
+        cameras=scene.cameras,
+    )
     row = methods.METHODS[method]
-    policy = policies.make(row, trained.policy, env.p_world_ref, trained.train)
+    policy = policies.make(row, trained.policy, env.task, cameras=scene.cameras)
     params = policies.for_sampling(trained.params, trained.policy.dtype)
     return Subject(method, env, policy, trained._replace(params=params), files.sha256(file))
 
@@ -105,7 +113,6 @@ def rollouts(
         identity={
             **methods.behaviour(who.method)._asdict(),
             "policy": dataclasses.asdict(who.trained.policy),
-            "crop_fraction": who.trained.train.crop_fraction,
         },
         report=words.indented,
     )
@@ -128,7 +135,7 @@ def decision_ms(who: Subject) -> dict[str, float]:
         trained.policy,
         trained.params,
         trained.normalizer,
-        who.env.p_world_ref,
+        features.sensors(who.env.task, trained.scene.cameras),
         seconds=5.0,
     )
 

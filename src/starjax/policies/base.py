@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 
+from starjax import rcm
 from starjax.data import normalizer, windows
-from starjax.sim.types import Observation
-from starjax.types import Command
+from starjax.types import Command, Observation
 
 Params = dict[str, Any]
 
@@ -19,13 +19,13 @@ class Policy(NamedTuple):
 
     Attributes:
       init: `key -> params`, those that training changes: a frozen vision encoder's are missing,
-        and `with_vision` adds them for `sample` to see pictures.
+        and `with_vision` adds them for `sample` to read images.
       prepare: `(stats, key, batch) -> prepared`, all that is random and needs no parameters: a
         pytree of arrays whose leading axis is the batch.
       loss: `(params, prepared) -> (scalar, {name: scalar})`, the names being `metrics`: means over
         the batch.
-      sample: `(params, stats, keys [B], Observation [B, O], Trocar [B]) -> Command [B, H]`, finite
-        whatever the networks say. What sample i draws depends on `keys[i]` alone.
+      sample: `(params, stats, keys [B], Observation [B, O, A], told [B, A]) -> Command [B, H, A]`,
+        finite whatever the networks say. What sample i draws depends on `keys[i]` alone.
       metrics: names of what `loss` tells beside its value.
     """
 
@@ -33,7 +33,7 @@ class Policy(NamedTuple):
     prepare: Callable[[normalizer.Normalizer, jax.Array, windows.Batch], Any]
     loss: Callable[[Params, Any], tuple[jax.Array, dict[str, jax.Array]]]
     sample: Callable[
-        [Params, normalizer.Normalizer, jax.Array, Observation, Any],
+        [Params, normalizer.Normalizer, jax.Array, Observation, rcm.TrocarFrame],
         Command,
     ]
     metrics: tuple[str, ...] = ()

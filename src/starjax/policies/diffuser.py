@@ -1,4 +1,4 @@
-"""Encoders and U-Net put together: a conditional diffusion model over `[H, A]` sequences."""
+"""Encoders and U-Net put together: a conditional diffusion model over `[H, D]` sequences."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,10 +20,10 @@ class Diffuser(NamedTuple):
     Attributes:
       init: `key -> params`, those that training changes: none for a frozen vision encoder.
       observe: `(params, inputs) -> [B, N]`, those numbers.
-      noised: `(key, x0 [B, H, A]) -> Noised`, what is learned from clean sequences.
+      noised: `(key, x0 [B, H, D]) -> Noised`, what is learned from clean sequences.
       loss: `(params, observed [B, N], extra [B, E], Noised) -> scalar` of Eq. 9.
-      sample: `(params, keys [B], observed [B, N], extra [B, E], reach=None) -> [B, H, A]` by DDIM,
-        within `reach` `[2, A]`, lowest and highest, or if it is None within [-1, 1].
+      sample: `(params, keys [B], observed [B, N], extra [B, E], reach=None) -> [B, H, D]` by DDIM,
+        within `reach` `[2, D]`, lowest and highest, or if it is None within [-1, 1].
     """
 
     init: Callable[[jax.Array], Params]
@@ -33,23 +33,27 @@ class Diffuser(NamedTuple):
     sample: Callable[..., jax.Array]
 
 
-def observed_dim(policy_config: config.PolicyConfig) -> int:
-    """N, numbers that the networks make of an observation."""
-    sees_image = policy_config.observation == "image"
-    vision_dim = policy_config.obs_horizon * policy_config.vision_dim if sees_image else 0
-    return vision_dim + policy_config.state_dim
+def observed_dim(policy_config: config.PolicyConfig, cameras: int) -> int:
+    """N, numbers that the networks make of an observation by so many cameras."""
+    images = policy_config.obs_horizon * cameras if policy_config.observation == "image" else 0
+    return images * policy_config.vision_dim + policy_config.state_dim
 
 
 def make(
-    policy_config: config.PolicyConfig, action_dim: int, history_dim: int, extra_dim: int
+    policy_config: config.PolicyConfig,
+    action_dim: int,
+    history_dim: int,
+    extra_dim: int,
+    cameras: int = 1,
 ) -> Diffuser:
-    """The model of `policy_config` for vectors of A entries.
+    """The model of `policy_config` for vectors of D entries.
 
     Args:
       policy_config: networks and diffusion.
-      action_dim: A.
+      action_dim: D.
       history_dim: width of `Inputs.history`.
       extra_dim: E, numbers appended to the condition (trocar features), possibly 0.
+      cameras: K, whose images one encoder reads, one by one.
     """
     dtype = jnp.dtype(policy_config.dtype)
     sees_image = policy_config.observation == "image"
@@ -57,7 +61,7 @@ def make(
     state = encoders.StateEncoder(features=policy_config.state_dim, dtype=dtype)
     unet = unet1d.ConditionalUnet1D(
         action_dim=action_dim,
-        cond_dim=observed_dim(policy_config) + extra_dim,
+        cond_dim=observed_dim(policy_config, cameras) + extra_dim,
         channels=tuple(policy_config.unet_channels),
         kernel_size=policy_config.kernel_size,
         groups=policy_config.groups,
@@ -88,13 +92,13 @@ def make(
         parts: list[Any] = [of_state(params["state"], inputs.history)]
         if inputs.features is not None:
             parts.insert(0, inputs.features.reshape(len(inputs.features), -1))
-        elif inputs.image is not None:
-            batch, horizon = inputs.image.shape[:2]
+        elif inputs.images is not None:
+            batch, size = len(inputs.images), inputs.images.shape[3:]
             offset = inputs.offset
             seen = of_vision(
                 params["vision"],
-                inputs.image.reshape(batch * horizon, *inputs.image.shape[2:]),
-                None if offset is None else offset.reshape(batch * horizon, 2),
+                inputs.images.reshape(-1, *size),
+                None if offset is None else offset.reshape(-1, 2),
             )
             parts.insert(0, seen.reshape(batch, -1))
         return jnp.concatenate(parts, axis=-1)
@@ -119,7 +123,7 @@ def make(
         film = of_unet(params["unet"], cond, method="condition")
 
         def eps_fn(x: jax.Array, film_k: jax.Array) -> jax.Array:
-            """Of `[B, H, A]` at one step, or of `[steps, B, H, A]`."""
+            """Of `[B, H, D]` at one step, or of `[steps, B, H, D]`."""
             rows = (film + film_k[..., None, :]).reshape(-1, film.shape[-1])
             eps = of_unet(params["unet"], x.reshape(-1, *shape), rows, method="denoise")
             return eps.reshape(x.shape)
@@ -139,7 +143,7 @@ def make(
 
 
 def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:
-    """The network that sees pictures, whose parameters are `params["vision"]`."""
+    """The network that reads images, whose parameters are `params["vision"]`."""
     return encoders.ImageEncoder(
         trunk=policy_config.encoder,
         features=policy_config.vision_dim,

@@ -1,5 +1,6 @@
 """What the networks are fed: trocar features, and observations with and without augmentation."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -7,14 +8,24 @@ import jax.numpy as jnp
 
 from starjax import config, methods, rcm
 from starjax.data import augment, normalizer, windows
-from starjax.sim.types import Observation
+from starjax.sim.tasks.base import Task
+from starjax.types import Observation
 
-TROCAR_FEATURES = 7
-TASK_STATE = 12  # numbers that a "state" observation has in the place of pixels
-TASK_FEATURES = TASK_STATE + 9  # that the networks are fed of it
+TROCAR_FEATURES = 7  # of each arm
 
-_NEAR = 0.03  # m, the distance at which the tool works on the block
-_LENGTH = 0.05  # m, the largest port displacement of Eq. 19: features are of order one
+_LENGTH = 0.05  # m, the largest displacement of a trocar in Eq. 19: features are of order one
+
+
+class Sensors(NamedTuple):
+    """What can be observed.
+
+    Attributes:
+      task: says what the state is made of.
+      cameras: K names, in the order in which the networks read their images.
+    """
+
+    task: Task
+    cameras: tuple[str, ...]
 
 
 class Inputs(NamedTuple):
@@ -22,20 +33,30 @@ class Inputs(NamedTuple):
 
     Attributes:
       history: `[B, O, S]` normalised low-dimensional measurements.
-      image: `[B, O, c, c, 3]` cropped and normalised frames, or None.
-      offset: `[B, O, 2]` pixels from the centre crop, or None for centre crops.
-      features: `[B, O, d_v]` of the vision encoder, computed before, in the place of `image`.
+      images: `[B, O, K, c, c, 3]` cropped and normalised, or None.
+      offset: `[B, O, K, 2]` pixels from the centre crop, or None for centre crops.
+      features: `[B, O, K * d_v]` of the vision encoder, computed before, instead of `images`.
     """
 
     history: jax.Array
-    image: jax.Array | None = None
+    images: jax.Array | None = None
     offset: jax.Array | None = None
     features: jax.Array | None = None
 
 
-def trocar_features(trocar: rcm.Trocar, p_world_ref: jax.Array) -> jax.Array:
+def sensors(task: Task, cameras: Sequence[str] = ()) -> Sensors:
+    """The given cameras of a task, or its first one."""
+    return Sensors(task, tuple(cameras) or task.cameras[:1])
+
+
+def per_step(told: rcm.TrocarFrame) -> rcm.TrocarFrame:
+    """Frames `[B, A]` as `[B, 1, A]`, beside what has a time axis."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], told)
+
+
+def trocar_features(trocar: rcm.Trocar) -> jax.Array:
     """A trocar `[...]` as `[..., 7]` numbers of order one, continuous in the azimuth."""
-    shift = rcm.trocar_position(trocar, p_world_ref) - jnp.asarray(p_world_ref)
+    shift = rcm.trocar_position(trocar, jnp.zeros(3))  # from the nominal one
     scalars = jnp.stack(
         [
             trocar.radius / _LENGTH,
@@ -48,107 +69,109 @@ def trocar_features(trocar: rcm.Trocar, p_world_ref: jax.Array) -> jax.Array:
     return jnp.concatenate([scalars, shift / _LENGTH], axis=-1)
 
 
-def extra_dim(method: methods.Method) -> int:
+def extra_dim(method: methods.Method, task: Task) -> int:
     """Width of `extra`."""
-    return TROCAR_FEATURES if method.sees_trocar else 0
+    return TROCAR_FEATURES * task.arms if method.sees_trocar else 0
 
 
-def extra(method: methods.Method, trocar: rcm.Trocar, p_world_ref: jax.Array) -> jax.Array:
-    """What conditions the diffusion model beside the observation: the trocar's features or none."""
-    return trocar_features(trocar, p_world_ref)[..., : extra_dim(method)]
+def extra(method: methods.Method, told: rcm.TrocarFrame) -> jax.Array:
+    """What conditions a model beside the observation: all trocars' features `[B, E]`, or none."""
+    found = trocar_features(told.trocar)
+    return found.reshape(len(found), -1) if method.sees_trocar else jnp.zeros((len(found), 0))
+
+
+def history_dim(policy_config: config.PolicyConfig, task: Task, proprioception: int) -> int:
+    """Width of `Inputs.history`, of which so much is proprioception."""
+    if policy_config.observation == "image":
+        return proprioception
+    state, tips = jnp.zeros(task.state_size), jnp.zeros((task.arms, 3))
+    relative = jax.eval_shape(task.relative, state, tips)
+    return proprioception + task.state_size + relative.shape[-1]
 
 
 def measured(
     stats: normalizer.Normalizer,
     action_space: str,
     observation: Observation,
-    trocar: rcm.Trocar,
-    p_world_ref: jax.Array,
+    told: rcm.TrocarFrame,
 ) -> jax.Array:
-    """Proprioception `[B, O, A + 1]`: measured pose and gripper as a normalised action."""
-    per_frame = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], trocar)
-    encoded = normalizer.encode(
-        action_space, observation.pose, observation.gripper, per_frame, p_world_ref
-    )
+    """Proprioception `[B, O, D]`: measured poses and grippers as normalised actions."""
+    encoded = normalizer.encode(action_space, observation.pose, observation.gripper, per_step(told))
     return stats.action.normalize(encoded)
 
 
 def demonstrated(
-    stats: normalizer.Normalizer, action_space: str, batch: windows.Batch, p_world_ref: jax.Array
+    stats: normalizer.Normalizer, action_space: str, batch: windows.Batch
 ) -> jax.Array:
-    """Demonstrated commands of a batch as normalised actions `[B, H, A + 1]`."""
-    per_step = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], batch.trocar)
-    encoded = normalizer.encode(
-        action_space, batch.command.pose, batch.command.gripper, per_step, p_world_ref
-    )
+    """Demonstrated commands of a batch as normalised actions `[B, H, D]`."""
+    command = batch.command
+    encoded = normalizer.encode(action_space, command.pose, command.gripper, per_step(batch.trocar))
     return stats.action.normalize(encoded)
 
 
 def for_sampling(
     policy_config: config.PolicyConfig,
-    train_config: config.TrainConfig,
+    seen: Sensors,
     stats: normalizer.Normalizer,
     observation: Observation,
     proprioception: jax.Array,
 ) -> Inputs:
     """Inputs as they are at inference: centre crops, no noise."""
-    history = _history(policy_config, stats, observation, proprioception)
+    history = _history(policy_config, seen.task, stats, observation, proprioception)
     if policy_config.observation == "state":
         return Inputs(history)
     if observation.features is not None:
         return Inputs(history, features=observation.features)
-    return Inputs(history, centre_crop(policy_config, train_config, _frames(observation)))
+    return Inputs(history, centre_crop(policy_config, _images(seen, observation)))
 
 
 def for_training(
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,
+    seen: Sensors,
     stats: normalizer.Normalizer,
     key: jax.Array,
     observation: Observation,
     proprioception: jax.Array,
 ) -> Inputs:
-    """Augmented inputs: noise on every low-dimensional number; crop, jitter, noise on pictures.
+    """Augmented inputs: noise on every low-dimensional number; crop, jitter, noise on images.
 
     What a frozen encoder saw in centre crops stays as it is, so that inference sees the same.
     """
     key_history, key_image = jax.random.split(key)
-    history = _history(policy_config, stats, observation, proprioception)
+    history = _history(policy_config, seen.task, stats, observation, proprioception)
     noise = jax.random.normal(key_history, history.shape, history.dtype)
     history = history + train_config.state_noise * noise
     if policy_config.observation == "state":
         return Inputs(history)
     if policy_config.freeze_encoder:
         return Inputs(history, features=_features(observation))
-    image, offset = augment.augment(
+    images, offset = augment.augment(
         key_image,
-        _frames(observation),
-        crop=crop_size(policy_config, train_config),
+        _images(seen, observation),
+        crop=crop_size(policy_config),
         jitter=train_config.jitter,
         noise=train_config.image_noise,
         dtype=jnp.dtype(policy_config.dtype),
     )
-    return Inputs(history, image, offset)
+    return Inputs(history, images, offset)
 
 
-def centre_crop(
-    policy_config: config.PolicyConfig, train_config: config.TrainConfig, frames: jax.Array
-) -> jax.Array:
-    """Frames `[..., h, w, 3]` uint8 as the vision encoder sees them at inference."""
+def centre_crop(policy_config: config.PolicyConfig, images: jax.Array) -> jax.Array:
+    """Images `[..., h, w, 3]` uint8 as the vision encoder sees them at inference."""
     return augment.center(
-        frames,
-        crop=crop_size(policy_config, train_config),
-        dtype=jnp.dtype(policy_config.dtype),
+        images, crop=crop_size(policy_config), dtype=jnp.dtype(policy_config.dtype)
     )
 
 
-def crop_size(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -> int:
+def crop_size(policy_config: config.PolicyConfig) -> int:
     """Side of the crop in pixels."""
-    return round(policy_config.image_size * train_config.crop_fraction)
+    return round(policy_config.image_size * policy_config.crop_fraction)
 
 
 def _history(
     policy_config: config.PolicyConfig,
+    task: Task,
     stats: normalizer.Normalizer,
     observation: Observation,
     proprioception: jax.Array,
@@ -157,39 +180,30 @@ def _history(
         return proprioception
     if observation.state is None or stats.state is None:
         raise ValueError(
-            'observation.state: expected [..., 12] for a policy with observation="state", got None'
+            f"observation.state: expected [..., {task.state_size}] for a policy with "
+            'observation="state", got None'
         )
-    task = jnp.concatenate([stats.state.normalize(observation.state), _relative(observation)], -1)
-    return jnp.concatenate([proprioception, task], axis=-1)
-
-
-def _relative(observation: Observation) -> jax.Array:
-    """Tip to block, in the world's frame and in the block's, and tip to target: `[..., 9]`.
-
-    They decide a grasp, and a small network does not get such small differences exactly enough from
-    positions in the scale of the workspace.
-    """
     state = jnp.asarray(observation.state)
-    tip = observation.pose.p
-    to_block, to_target = state[..., :3] - tip, state[..., 9:12] - tip
-    block = rcm.rot6d_decode(state[..., 3:9])
-    turned = jnp.einsum("...ji,...j->...i", block, to_block, precision="highest")
-    return jnp.concatenate([to_block, turned, to_target], axis=-1) / _NEAR
+    relative = task.relative(state, observation.pose.p)
+    return jnp.concatenate([proprioception, stats.state.normalize(state), relative], axis=-1)
 
 
-def _frames(observation: Observation) -> jax.Array:
-    if observation.image is None:
+def _images(seen: Sensors, observation: Observation) -> jax.Array:
+    """`[B, O, K, h, w, 3]`."""
+    given = observation.images or {}
+    missing = [name for name in seen.cameras if name not in given]
+    if missing:
         raise ValueError(
-            "observation.image: expected [..., h, w, 3] for a policy with "
-            'observation="image", got None'
+            f"observation.images: expected {', '.join(seen.cameras)} for a policy with "
+            f'observation="image", got {", ".join(given) or "None"}'
         )
-    return observation.image
+    return jnp.stack([given[name] for name in seen.cameras], axis=-4)
 
 
 def _features(observation: Observation) -> jax.Array:
     if observation.features is None:
         raise ValueError(
-            "observation.features: expected [..., d_v] to train a policy with a frozen encoder, "
-            "got None"
+            "observation.features: expected [..., K * d_v] to train a policy with a frozen "
+            "encoder, got None"
         )
     return observation.features

@@ -1,6 +1,7 @@
 """A policy of Table II: four pure functions, made from a method's row."""
 
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -9,8 +10,9 @@ import jax.numpy as jnp
 from starjax import config, methods, rcm
 from starjax.models import pretrained
 from starjax.models.kernels import packed_params, sampling_blocks
-from starjax.policies import hierarchical, single
+from starjax.policies import features, hierarchical, single
 from starjax.policies.base import Params, Policy
+from starjax.sim.tasks.base import Task
 
 
 def vision_of(params: Params) -> Params:
@@ -89,17 +91,21 @@ def ablated(method: methods.Method, policy_config: config.PolicyConfig) -> metho
 def make(
     method: methods.Method,
     policy_config: config.PolicyConfig,
-    p_world_ref: Any,
+    task: Task,
     train_config: config.TrainConfig | None = None,
+    cameras: Sequence[str] = (),
 ) -> Policy:
     """The policy of a method.
 
     Args:
       method: a row of Table II.
       policy_config: networks and diffusion.
-      p_world_ref: `[3]` m, the nominal port.
-      train_config: augmentation; its crop also decides what inference sees.
+      task: gives the number of arms, and what a state observation is made of.
+      train_config: augmentation, which inference does not need.
+      cameras: that are observed, in the order in which the networks read them; empty: the task's
+        first one.
     """
     method = ablated(method, policy_config)
     build = hierarchical.make if method.hierarchical else single.make
-    return build(method, policy_config, p_world_ref, train_config or config.TrainConfig())
+    seen = features.sensors(task, cameras)
+    return build(method, policy_config, seen, train_config or config.TrainConfig())

@@ -1,7 +1,7 @@
 """The finished policy as one file, policy.safetensors: weights, statistics and settings, no pickle.
 
 The same policy always gives the same bytes. In half precision its parameters are half as large, and
-float32 again once they are loaded.
+float32 again once they are loaded. Files of schema 1, which name no scene, are of the first one.
 """
 
 import dataclasses
@@ -19,8 +19,9 @@ from starjax import config
 from starjax.data import normalizer
 from starjax.policies.base import Params
 from starjax.runtime import files
+from starjax.sim import names
 
-SCHEMA = 1
+SCHEMA = 2
 _KEY = "starjax"  # one metadata entry: the format does not keep the order of several
 _SEPARATOR = "/"
 
@@ -31,10 +32,12 @@ class Trained(NamedTuple):
     Attributes:
       method: its name, a row of Table II.
       policy: networks and diffusion.
-      train: augmentation decides what inference sees (the crop); the rest is for the record.
+      train: how it was trained, for the record.
       params: the averaged (EMA) parameters.
       normalizer: fitted to the training demonstrations.
-      p_world_ref: `[3]` m, the nominal port, if it was given.
+      scene: names of its task, arms and tools, and of the cameras in the order that it reads them.
+      p_world_ref: `[A][3]` m, each arm's nominal trocar, None in old files that do not say it.
+      roll_zero: `[A]` rad, see `rcm.TrocarFrame`.
       demos: what it learned from, if it was given; for the record, and for what it has seen.
       preset: the preset of its run, if it was given; for the record.
     """
@@ -44,7 +47,9 @@ class Trained(NamedTuple):
     train: config.TrainConfig
     params: Params
     normalizer: normalizer.Normalizer
-    p_world_ref: tuple[float, ...] | None = None
+    scene: names.SceneNames
+    p_world_ref: tuple[tuple[float, ...], ...] | None
+    roll_zero: tuple[float, ...]
     demos: config.DemosConfig | None = None
     preset: str | None = None
 
@@ -73,13 +78,14 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
             raise ValueError(f"params: expected finite values, got others in {name}")
         if half and name.startswith(f"params{_SEPARATOR}"):
             arrays[name] = _halved(name, array)
-    port = trained.p_world_ref
     about = {
         "schema": SCHEMA,
         "method": trained.method,
         "policy": dataclasses.asdict(trained.policy),
         "train": dataclasses.asdict(trained.train),
-        "p_world_ref": None if port is None else [float(x) for x in port],
+        "scene": trained.scene._asdict(),
+        "p_world_ref": _floats(trained.p_world_ref),
+        "roll_zero": _floats(trained.roll_zero),
         "demos": None if trained.demos is None else dataclasses.asdict(trained.demos),
         "preset": trained.preset,
     }
@@ -110,12 +116,12 @@ def load(path: pathlib.Path | str) -> Trained:
         schema = about["schema"]
     except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a readable starjax policy: {error}") from error
-    if schema != SCHEMA:
-        raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}")
+    if schema not in (1, SCHEMA):
+        raise ValueError(f"{path}: expected schema 1 or {SCHEMA}, got {schema!r}")
     if _hash(about, arrays) != expected:
         raise ValueError(f"{path}: damaged, its content is not what was written (sha256)")
     try:
-        return _trained(about, _unflatten(arrays))
+        return _trained(_of_first_scene(about) if schema == 1 else about, _unflatten(arrays))
     except (KeyError, TypeError, ValueError) as error:
         why = f"no {error} in it" if isinstance(error, KeyError) else error
         raise ValueError(f"{path}: made by another version of starjax: {why}") from error
@@ -135,20 +141,40 @@ def fingerprint(params: Params) -> str:
     return _hash({}, dict(_flatten(params)))
 
 
+def _of_first_scene(about: dict[str, Any]) -> dict[str, Any]:
+    """What a file of schema 1 says, as one of today would."""
+    one = about["p_world_ref"]
+    return {
+        **config.upgraded(about),
+        "scene": names.FIRST._asdict(),
+        "p_world_ref": None if one is None else [one],
+        "roll_zero": [0.0],
+    }
+
+
 def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
     """What `save` was given; raises KeyError, TypeError or ValueError for what it never wrote."""
     stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
-    port, demos = about["p_world_ref"], about.get("demos")
+    places, demos, scene = about["p_world_ref"], about.get("demos"), about["scene"]
     return Trained(
         method=about["method"],
         policy=config.from_dict(config.PolicyConfig, about["policy"]),
         train=config.from_dict(config.TrainConfig, about["train"]),
         params=tree["params"],
         normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
-        p_world_ref=None if port is None else tuple(port),
+        scene=names.SceneNames(
+            scene["task"], *(tuple(scene[part]) for part in ("arms", "tools", "cameras"))
+        ),
+        p_world_ref=None if places is None else tuple(map(tuple, places)),
+        roll_zero=tuple(about["roll_zero"]),
         demos=None if demos is None else config.from_dict(config.DemosConfig, demos),
         preset=about.get("preset"),
     )
+
+
+def _floats(values: Any) -> Any:
+    """Nested sequences of numbers, of numpy or not, as lists for JSON."""
+    return None if values is None else np.asarray(values, np.float64).tolist()
 
 
 def _flatten(tree: Any, prefix: str = ""):

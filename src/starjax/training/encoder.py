@@ -1,5 +1,6 @@
 """The vision encoder of another policy: where a new policy's begins, or what stays frozen in it."""
 
+import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ class Encoder(NamedTuple):
     fingerprint: str
 
 
-def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -> Encoder | None:
+def read(policy_config: config.PolicyConfig) -> Encoder | None:
     """The encoder that the settings name, if a starjax policy holds it.
 
     Returns None for torchvision's weights, which fill the ResNet's trunk and nothing else.
@@ -44,7 +45,7 @@ def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -
         trained = policy_file.load(path)
     except ValueError as error:
         raise errors.UsageError(_WEIGHTS, "a policy of starjax", error) from error
-    if differing := _differing(policy_config, train_config, trained):
+    if differing := _differing(policy_config, trained):
         raise errors.UsageError(
             _WEIGHTS,
             "an encoder made with these settings",
@@ -56,21 +57,15 @@ def read(policy_config: config.PolicyConfig, train_config: config.TrainConfig) -
     return Encoder(params, policy_file.fingerprint(params)[:16])
 
 
-def start(
-    params: policies.Params, policy_config: config.PolicyConfig, train_config: config.TrainConfig
-) -> policies.Params:
+def start(params: policies.Params, policy_config: config.PolicyConfig) -> policies.Params:
     """A policy's parameters before the first step, with the encoder that the settings name."""
-    found = read(policy_config, train_config)
+    found = read(policy_config)
     if found is None:
         return policies.with_resnet18(params, policy_config.encoder_weights)
     return policies.with_vision(params, found.params)
 
 
-def _differing(
-    policy_config: config.PolicyConfig,
-    train_config: config.TrainConfig,
-    trained: policy_file.Trained,
-) -> list[str]:
+def _differing(policy_config: config.PolicyConfig, trained: policy_file.Trained) -> list[str]:
     """Settings of the encoder that are not as they were: `policy.vision_dim 64 (here 128)`."""
     names = ["observation", "encoder", "vision_dim"]
     # Where it goes on learning, it may get used to another picture.
@@ -81,11 +76,10 @@ def _differing(
         for name in names
         if getattr(ours, name) != getattr(theirs, name)
     ]
-    fractions = trained.train.crop_fraction, train_config.crop_fraction
-    if policy_config.freeze_encoder and (
-        features.crop_size(theirs, trained.train) != features.crop_size(theirs, train_config)
-    ):
-        found.append("train.crop_fraction {:g} (here {:g})".format(*fractions))
+    fractions = theirs.crop_fraction, ours.crop_fraction
+    cropped = dataclasses.replace(theirs, crop_fraction=ours.crop_fraction)
+    if ours.freeze_encoder and features.crop_size(theirs) != features.crop_size(cropped):
+        found.append("policy.crop_fraction {:g} (here {:g})".format(*fractions))
     return found
 
 

@@ -31,10 +31,10 @@ BATCH = 16
 def features(
     encoder: Encoder,
     policy_config: config.PolicyConfig,
-    train_config: config.TrainConfig,
     root: Path,
     digest: str,
     count: int,
+    camera: str,
     frames: Callable[[], Any],
     report: Callable[[str], None] = print,
 ) -> np.ndarray:
@@ -43,10 +43,10 @@ def features(
     Args:
       encoder: stays as it is.
       policy_config: networks.
-      train_config: gives the crop.
       root: folder of the demonstrations.
       digest: hash that names their content.
       count: F.
+      camera: whose images they are, by name.
       frames: gives them, uint8 `[F, h, w, 3]` as `windows.Dataset` may hold them; called only if
         something is missing.
       report: gets lines for the user.
@@ -54,7 +54,7 @@ def features(
     Raises:
       StorageError: the folder cannot be written.
     """
-    folder = root / "features" / _key(encoder, policy_config, train_config, digest)
+    folder = root / "features" / _key(encoder, policy_config, digest, camera)
     spans = [(first, min(first + PART, count)) for first in range(0, count, PART)]
     paths = [folder / f"part_{number:04d}.npz" for number in range(len(spans))]
     parts: dict[Path, np.ndarray] = {}
@@ -66,7 +66,7 @@ def features(
         else:
             parts[path] = found
     if missing:
-        see, pictures = _make_see(encoder, policy_config, train_config), frames()
+        see, pictures = _make_see(encoder, policy_config), frames()
 
         def make(part: tuple[Path, int, int]) -> Generator[int]:
             """Yields how many frames it has seen in between."""
@@ -90,32 +90,28 @@ def features(
 
 
 def _make_see(
-    encoder: Encoder, policy_config: config.PolicyConfig, train_config: config.TrainConfig
+    encoder: Encoder, policy_config: config.PolicyConfig
 ) -> Callable[[np.ndarray], jax.Array]:
     """Frames `[BATCH, h, w, 3]` uint8 to features `[BATCH, d_v]`."""
     vision = diffuser.vision_encoder(policy_config)
 
     @jax.jit
     def see(params: Any, frames: jax.Array) -> Any:
-        return vision.apply(params, inputs.centre_crop(policy_config, train_config, frames))
+        return vision.apply(params, inputs.centre_crop(policy_config, frames))
 
     params = jax.device_put(encoder.params)
     return lambda frames: see(params, frames)
 
 
-def _key(
-    encoder: Encoder,
-    policy_config: config.PolicyConfig,
-    train_config: config.TrainConfig,
-    digest: str,
-) -> str:
+def _key(encoder: Encoder, policy_config: config.PolicyConfig, digest: str, camera: str) -> str:
     """Names the features by what they are made of."""
     about = {
         "encoder": encoder.fingerprint,
         "trunk": policy_config.encoder,
         "dtype": policy_config.dtype,
-        "crop": inputs.crop_size(policy_config, train_config),
+        "crop": inputs.crop_size(policy_config),
         "demonstrations": digest,
+        "camera": camera,
     }
     return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -3,7 +3,7 @@
 import pathlib
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,10 @@ import numpy as np
 
 from starjax import config, errors, methods
 from starjax.data import normalizer, windows
+from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.runtime import background, progress
+from starjax.sim.tasks.base import Task
 from starjax.training import checkpoint, devices, encoder, holdout, processes
 from starjax.training import log as metrics
 from starjax.training import state as states
@@ -47,10 +49,11 @@ def run(
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,
     dataset: windows.Dataset,
-    p_world_ref: Any,
+    task: Task,
     directory: pathlib.Path | str,
     seed: int,
     *,
+    cameras: Sequence[str] = (),
     mesh_devices: Sequence[jax.Device] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     description: str = "train",
@@ -63,11 +66,12 @@ def run(
       method: row of Table II, whose own weights are trained.
       policy_config: networks and diffusion.
       train_config: optimisation.
-      dataset: on the device (jax arrays) or on the host, see `windows.Dataset`; with features in
-        the place of pictures for a frozen vision encoder, whose parameters stay out of the state.
-      p_world_ref: `[3]` m, the nominal port.
+      dataset: on the device (jax arrays) or on the host, see `windows.Dataset`; with features
+        instead of images for a frozen vision encoder, whose parameters stay out of the state.
+      task: that was demonstrated.
       directory: gets `checkpoints/` and, from the first process, `metrics.jsonl`.
       seed: of everything random.
+      cameras: that the policy reads, in this order; empty: the task's first one.
       mesh_devices: all of jax's by default.
       should_stop: asked about once a second; True saves and raises Interrupted.
       description: name of the progress bar.
@@ -82,15 +86,14 @@ def run(
     directory = pathlib.Path(directory)
     log = directory / "metrics.jsonl"
     mesh = devices.make_mesh(train_config.batch_size, mesh_devices)
-    p_world_ref = np.asarray(p_world_ref, np.float32)
-    dataset = _observed(dataset, policy_config)
-    policy = policies.make(method, policy_config, p_world_ref, train_config)
+    dataset = _observed(dataset, policy_config, features.sensors(task, cameras))
+    policy = policies.make(method, policy_config, task, train_config, cameras)
     optimizer = states.make_optimizer(train_config)
     train, held_out = windows.split_holdout(
         dataset.start, dataset.length, dataset.trocar, train_config.holdout_demos
     )
     row = policies.ablated(method, policy_config)
-    stats = normalizer.fit(row, dataset, p_world_ref, train)
+    stats = normalizer.fit(row, task, dataset, train)
 
     def around(params):
         return states.create(policy, optimizer, params, stats, seed)
@@ -104,7 +107,7 @@ def run(
     advance = advancing.resident(it, like, ahead=new) if windows.on_device(dataset) else None
     state = _restored(checkpoints, like)
     if state is None:
-        state = states.run_once(around, _begun(drawn(), policy_config, train_config))
+        state = states.run_once(around, _begun(drawn(), policy_config))
         state = devices.replicate(state, mesh)
     else:
         _check_same(directory, state, states.keys(seed)[1], stats, train_config.steps)
@@ -159,11 +162,16 @@ def run(
     return Result(state, rate.samples_per_second, int(state.skipped), errors)
 
 
-def _observed(dataset: windows.Dataset, policy_config: config.PolicyConfig) -> windows.Dataset:
+def _observed(
+    dataset: windows.Dataset, policy_config: config.PolicyConfig, seen: features.Sensors
+) -> windows.Dataset:
     """The dataset without what the policy does not look at, so that nobody gathers it."""
-    seen = "features" if policy_config.freeze_encoder else policy_config.observation
-    unseen = {name: None for name in ("image", "state", "features") if name != seen}
-    return dataset.replace(observation=dataset.observation.replace(**unseen))
+    given = dataset.observation
+    kept = "images" if policy_config.observation == "image" else "state"
+    kept = "features" if policy_config.freeze_encoder else kept
+    images = {name: (given.images or {}).get(name) for name in seen.cameras}
+    unseen = {name: None for name in ("images", "state", "features") if name != kept}
+    return dataset.replace(observation=given._replace(**{"images": images, **unseen}))
 
 
 def _like(around, begun, mesh) -> states.TrainState:
@@ -203,12 +211,12 @@ def _alike(one, other) -> bool:
     return np.shape(one) == np.shape(other) and np.allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
-def _begun(drawn, policy_config, train_config) -> policies.Params:
+def _begun(drawn, policy_config) -> policies.Params:
     """Parameters of a new training, of drawn ones."""
     params = states.on_device(drawn)
     begins = policy_config.observation == "image" and not policy_config.freeze_encoder
     if begins and policy_config.encoder_weights:
-        params = encoder.start(params, policy_config, train_config)
+        params = encoder.start(params, policy_config)
     return params
 
 
