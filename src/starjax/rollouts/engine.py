@@ -174,7 +174,7 @@ def _starter(env: Any, agent: BatchAgent) -> Callable[..., Carry]:
     def start_one(key: jax.Array, trials: Trials) -> tuple[Any, jax.Array]:
         key = jax.random.fold_in(jax.random.fold_in(key, trials.index), trials.trial)
         key_env, key_agent = jax.random.split(key)
-        return env.reset(key_env, sim_env.EnvParams(trials.trocar, None)), key_agent
+        return env.reset(key_env, sim_env.EnvParams(trials.trocar)), key_agent
 
     def start(key: jax.Array, params: Any, trials: Trials) -> Carry:
         state, keys = jax.vmap(start_one, in_axes=(None, 0))(key, trials)
@@ -217,9 +217,7 @@ def _advancer(
             t, carry, records = loop
             carry, fields = step(params, carry, t)
             # In place: not `.at[:, i].set`, a scatter, which may move the whole of the images.
-            put = functools.partial(
-                jax.lax.dynamic_update_index_in_dim, index=t - first, axis=1
-            )
+            put = functools.partial(jax.lax.dynamic_update_index_in_dim, index=t - first, axis=1)
             return t + 1, carry, jax.tree.map(put, records, fields)
 
         _, carry, records = jax.lax.while_loop(is_running, body, (first, carry, blank))
@@ -241,7 +239,7 @@ def frame(env: Any, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
 
     def one(key: jax.Array) -> dict[str, jax.Array]:
         zeros = jnp.zeros(np.shape(env.p_world_ref)[0])
-        state = env.reset(key, sim_env.EnvParams(Trocar(zeros, zeros, zeros), None))
+        state = env.reset(key, sim_env.EnvParams(Trocar(zeros, zeros, zeros)))
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
         return jax.tree.map(lambda x: x[0], _fields(env, record, batch))
 
