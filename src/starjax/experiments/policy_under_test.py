@@ -11,7 +11,7 @@ from starjax import config as config_lib
 from starjax import errors, methods, rcm
 from starjax.evaluation import evaluate, latency, statistics
 from starjax.evaluation import trials as table
-from starjax.experiments import words
+from starjax.experiments import messages
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.rollouts import placement
@@ -37,7 +37,7 @@ class Subject(NamedTuple):
     weights: str
 
 
-def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subject:
+def load(method: str, weights: Path, env: sim_env.Env | None = None) -> Subject:
     """Loads a method's weights.
 
     Args:
@@ -56,7 +56,7 @@ def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subje
     except ValueError as error:
         hint = f"remove it, and {again} trains it again"
         raise errors.UsageError(str(weights), "a policy of starjax", error, hint) from error
-    return _subject(method, trained, weights, env)
+    return _load(method, trained, weights, env)
 
 
 def from_file(path: Path) -> Subject:
@@ -70,10 +70,10 @@ def from_file(path: Path) -> Subject:
     except ValueError as error:
         raise errors.UsageError("--policy", "a policy of starjax", error) from error
     errors.choice(f"method of {path}", trained.method, methods.METHODS)
-    return _subject(trained.method, trained, path, None)
+    return _load(trained.method, trained, path, None)
 
 
-def _subject(
+def _load(
     method: str, trained: policy_file.Trained, file: Path, env: sim_env.Env | None
 ) -> Subject:
     env = env or sim_env.make(trained.policy.observation, trained.policy.image_size)
@@ -107,7 +107,7 @@ def rollouts(
             "policy": dataclasses.asdict(who.trained.policy),
             "crop_fraction": who.trained.train.crop_fraction,
         },
-        report=words.indented,
+        report=messages.indented,
     )
 
 
@@ -167,7 +167,7 @@ def write_result(
         "config": config_lib.as_json(config),
         "command": command,
         "timings_s": timings_s or {},
-        "warnings": words.warnings(config, figures),
+        "warnings": messages.warnings(config, figures),
         "versions": xla.versions(),
         "hardware": xla.hardware(),
     }
