@@ -26,7 +26,7 @@ import numpy as np
 
 from starjax import rcm, runtime
 from starjax.evaluation import evaluate, latency
-from starjax.experiments import scoring
+from starjax.experiments import policy_under_test
 from starjax.policies import packaged
 from starjax.rollouts import cores, engine
 from starjax.sim import env as envs
@@ -112,7 +112,7 @@ def main() -> None:
 def subject(asked: argparse.Namespace):
     """Policy, parameters, statistics and settings: trained ones, or new ones of the right size."""
     if asked.policy:
-        who = scoring.from_file(packaged.find("--policy", asked.policy))
+        who = policy_under_test.from_file(packaged.find("--policy", asked.policy))
         trained = jax.device_put((who.trained.params, who.trained.normalizer))
         return who.policy, *trained, who.trained.policy
     case = _setup.paper(224) if _peer.platform() == "gpu" else _setup.small(1, asked.image)

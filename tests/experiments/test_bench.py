@@ -68,13 +68,13 @@ def test_only_the_hierarchy_has_a_roll_network_to_time(
     monkeypatch, capsys, tmp_path, method, timed
 ):
     from starjax.evaluation import latency
-    from starjax.experiments import scoring
+    from starjax.experiments import policy_under_test
 
     ms = {"p50": 4.0, "p95": 5.0, "p99": 8.0}
     trained = types.SimpleNamespace(policy=None, train=None, params=None, normalizer=None)
     env = types.SimpleNamespace(p_world_ref=None)
     who = types.SimpleNamespace(trained=trained, env=env, weights="a")
-    monkeypatch.setattr(scoring, "subject", lambda *_: who)
+    monkeypatch.setattr(policy_under_test, "load", lambda *_: who)
     monkeypatch.setattr(latency, "table", lambda *_, **__: iter([{"ddim_steps": 2, **ms}]))
     monkeypatch.setattr(latency, "roll_ms", lambda *_, **__: ms)
     assert bool(bench._time(tmp_path / method, (2,), 1)["roll_network_ms"]) == timed

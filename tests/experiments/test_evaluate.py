@@ -15,7 +15,7 @@ import stubs
 from starjax import config, rcm
 from starjax.data import normalizer
 from starjax.evaluation import sweep as sweeping
-from starjax.experiments import evaluate, folders, presets, scoring, sweep
+from starjax.experiments import evaluate, folders, policy_under_test, presets, sweep
 from starjax.policies import packaged, policy_file
 from starjax.report import video
 from starjax.runtime import files, gpu
@@ -31,8 +31,8 @@ def file(tmp_path, monkeypatch):
     def sample(_, stats, keys, observation, trocar):
         return network.sample(params, 1.0, keys, observation, trocar)
 
-    monkeypatch.setattr(scoring.sim_env, "make", lambda *_: stubs.make_env())
-    monkeypatch.setattr(scoring.policies, "make", lambda *_: stubs.Policy(sample))
+    monkeypatch.setattr(policy_under_test.sim_env, "make", lambda *_: stubs.make_env())
+    monkeypatch.setattr(policy_under_test.policies, "make", lambda *_: stubs.Policy(sample))
     monkeypatch.setattr(video, "record", lambda runs, sim, path: path)
     monkeypatch.chdir(tmp_path)
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
@@ -188,12 +188,14 @@ def test_a_method_of_a_run_of_several_is_scored_under_its_own_name(
 
 def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
     said = {}
-    monkeypatch.setattr(scoring.evaluate, "evaluate", lambda *_, **given: said.update(given))
+    monkeypatch.setattr(
+        policy_under_test.evaluate, "evaluate", lambda *_, **given: said.update(given)
+    )
     policy = dataclasses.replace(POLICY, obs_horizon=3, crop_fraction=0.5)
     trained = types.SimpleNamespace(policy=policy, params=None, normalizer=None)
     who = types.SimpleNamespace(method="stardiff", env=None, policy=None, trained=trained)
     flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
-    scoring.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
+    policy_under_test.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
     wanted = {**flags, "seed": 9, "obs_horizon": 3, "execute": 4}
     assert {name: said.get(name) for name in wanted} == wanted
     assert said["identity"]["policy"]["crop_fraction"] == 0.5  # of what the encoder sees

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from starjax import config, errors, methods
-from starjax.experiments import clock, folders, presets
+from starjax.experiments import folders, presets, stage_times
 from starjax.runtime import files
 
 SMOKE = presets.PRESETS["smoke"]
@@ -206,15 +206,15 @@ def test_a_damaged_record_of_times_starts_afresh_and_a_full_disk_hides_nothing(
     tmp_path, monkeypatch
 ):
     (tmp_path / "timings.json").write_text('{"train": 1')
-    with clock.timed(tmp_path, "train"):
+    with stage_times.timed(tmp_path, "train"):
         pass
-    assert clock.timings(tmp_path)["train"] < 1
+    assert stage_times.read(tmp_path)["train"] < 1
 
     def full(path, value):
         raise OSError("no room for timings.json")
 
-    monkeypatch.setattr(clock.files, "write_json", full)
-    with pytest.raises(OSError, match="checkpoint"), clock.timed(tmp_path, "train"):
+    monkeypatch.setattr(stage_times.files, "write_json", full)
+    with pytest.raises(OSError, match="checkpoint"), stage_times.timed(tmp_path, "train"):
         raise OSError("no room for the checkpoint")
 
 
@@ -270,8 +270,8 @@ def test_a_linked_method_is_called_as_its_link(tmp_path):
 
 def test_time_of_another_work_does_not_outlive_a_kill(tmp_path):
     (tmp_path / "timings.json").write_text(json.dumps({"x": 1.0, "x: compile": 1.0, "y": 2.0}))
-    with clock.timed(tmp_path, "x", goes_on=False):
-        assert clock.timings(tmp_path) == {"y": 2.0}  # a kill -9 here would leave this
+    with stage_times.timed(tmp_path, "x", goes_on=False):
+        assert stage_times.read(tmp_path) == {"y": 2.0}  # a kill -9 here would leave this
 
 
 def test_time_adds_up_over_starts_also_after_an_interruption(tmp_path):
@@ -279,13 +279,13 @@ def test_time_adds_up_over_starts_also_after_an_interruption(tmp_path):
 
     unknown = time.time() % 1.0  # makes it a program that no cache holds: those are too quick
     (tmp_path / "timings.json").write_text(json.dumps({"train x": 100.0}))
-    with pytest.raises(KeyboardInterrupt), clock.timed(tmp_path, "train x"):
+    with pytest.raises(KeyboardInterrupt), stage_times.timed(tmp_path, "train x"):
         jax.block_until_ready(jax.jit(lambda x: jax.numpy.sort(x * unknown))(np.arange(8.0)))
         raise KeyboardInterrupt
-    spent = clock.timings(tmp_path)
+    spent = stage_times.read(tmp_path)
     assert 100.0 < spent["train x"] < 160.0
     # Both are rounded to hundredths of a second.
     assert 0.0 < spent["train x: compile"] <= round(spent["train x"] - 100.0, 2)
-    with clock.timed(tmp_path, "train x", goes_on=False):  # nothing of the others is left
+    with stage_times.timed(tmp_path, "train x", goes_on=False):  # nothing of the others is left
         pass
-    assert clock.timings(tmp_path)["train x"] < 60.0
+    assert stage_times.read(tmp_path)["train x"] < 60.0

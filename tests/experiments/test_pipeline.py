@@ -13,7 +13,7 @@ import pytest
 
 from starjax import config, methods
 from starjax.data import normalizer
-from starjax.experiments import demonstrations, folders, pipeline, presets, words
+from starjax.experiments import demonstrations, folders, messages, pipeline, presets
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.runtime import files
@@ -152,45 +152,45 @@ def test_a_signal_that_is_ignored_asks_nothing():
 
 def test_plan_names_the_observation_and_the_flag(tmp_path):
     preset = presets.PRESETS["smoke"]
-    said = words.plan(preset, pipeline.STAGES)
+    said = messages.plan(preset, pipeline.STAGES)
     assert "state" in said and "--policy.observation image" in said and "preset smoke" in said
     policy = dataclasses.replace(preset.policy, observation="image")
-    said = words.plan(dataclasses.replace(preset, policy=policy), pipeline.STAGES)
+    said = messages.plan(dataclasses.replace(preset, policy=policy), pipeline.STAGES)
     assert "image, 64 px" in said and "from scratch" in said and "state" not in said
 
 
 def test_plan_says_where_devices_cannot_share_a_batch(monkeypatch):
     smoke = presets.PRESETS["smoke"]
-    assert "devices" not in words.plan(smoke, pipeline.STAGES)
+    assert "devices" not in messages.plan(smoke, pipeline.STAGES)
     monkeypatch.setattr("jax.device_count", lambda: 8)
     monkeypatch.setattr(
         "starjax.training.devices.make_mesh", lambda _: types.SimpleNamespace(size=5)
     )
-    assert "on 5 of 8 devices" in words.plan(smoke, pipeline.STAGES)
-    assert "on 5 of 8 devices" not in words.plan(smoke, ("collect",))
+    assert "on 5 of 8 devices" in messages.plan(smoke, pipeline.STAGES)
+    assert "on 5 of 8 devices" not in messages.plan(smoke, ("collect",))
 
 
 def test_plan_and_warnings_say_that_an_encoder_is_frozen():
     cpu = presets.PRESETS["cpu"]
     said = "frozen, from compact (pretrained on this task); small"
-    assert f"  encoder         {said}\n" in words.plan(cpu, pipeline.STAGES)
-    found = words.warnings(cpu, {"method": "stardiff", "invalid": 0})
+    assert f"  encoder         {said}\n" in messages.plan(cpu, pipeline.STAGES)
+    found = messages.warnings(cpu, {"method": "stardiff", "invalid": 0})
     assert found == [f"Image encoder: {said}, 128 px."]
 
 
 def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):
     path = str(tmp_path / "resnet18.pth")
     policy = config.PolicyConfig(encoder_weights=path)
-    assert words.encoder(policy) == f"trained further, from {path}"
+    assert messages.encoder(policy) == f"trained further, from {path}"
 
 
 def test_a_packaged_encoder_is_of_this_task(tmp_path, monkeypatch):
     policy = config.PolicyConfig(encoder_weights="compact")
     made = fakes.trained(method="dp_rcm2", policy=policy, params={"unet": np.ones(3)})
     monkeypatch.setattr(packaged, "FOLDER", tmp_path)
-    assert words.encoder(policy) == "trained further, from compact"
+    assert messages.encoder(policy) == "trained further, from compact"
     policy_file.save(tmp_path / "compact.safetensors", made)
-    assert words.encoder(policy) == "trained further, from compact (pretrained on this task)"
+    assert messages.encoder(policy) == "trained further, from compact (pretrained on this task)"
 
 
 def test_a_wrong_encoder_is_found_before_anything_is_collected(tmp_path, done):
@@ -270,7 +270,7 @@ def test_more_trials_than_asked_for_are_not_thrown_away(tmp_path):
 
 
 def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
-    from starjax.experiments import scoring
+    from starjax.experiments import policy_under_test
 
     preset = smoke(tmp_path, "stardiff_single")
     for name in ("dp_rcm4", "stardiff_single"):
@@ -279,9 +279,11 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
     (tmp_path / "dp_rcm4" / "evaluation").mkdir()
     (tmp_path / "dp_rcm4" / "evaluation" / "chunk_0000.npz").write_bytes(b"trials")
     found = []
-    monkeypatch.setattr(scoring, "subject", lambda *_: None)
-    monkeypatch.setattr(scoring, "rollouts", lambda at, *_: found.extend(at.glob("*.npz")))
-    monkeypatch.setattr(scoring, "write_result", lambda *_: None)
+    monkeypatch.setattr(policy_under_test, "load", lambda *_: None)
+    monkeypatch.setattr(
+        policy_under_test, "rollouts", lambda at, *_: found.extend(at.glob("*.npz"))
+    )
+    monkeypatch.setattr(policy_under_test, "write_result", lambda *_: None)
     pipeline._evaluate(preset, "stardiff_single", None, "demos-a", "")
     assert found == [tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz"]
 
@@ -292,9 +294,9 @@ def _json(settings):
 
 def test_warnings_name_what_a_reader_must_know():
     figures = {"method": "stardiff", "invalid": 2}
-    smoke_words = " ".join(words.warnings(presets.PRESETS["smoke"], figures))
+    smoke_words = " ".join(messages.warnings(presets.PRESETS["smoke"], figures))
     assert "not pixels" in smoke_words and "too short" in smoke_words and "2 trial" in smoke_words
-    (paper,) = words.warnings(config.RunConfig(), {**figures, "invalid": 0})
+    (paper,) = messages.warnings(config.RunConfig(), {**figures, "invalid": 0})
     assert "Image encoder: trained from scratch; resnet18, 256 px" in paper
 
 
@@ -314,19 +316,19 @@ def test_an_ablation_is_named_where_it_changes_the_method(switch, flag, changes,
 
     def said(method):
         settings = config.RunConfig(method=method, policy=policy)
-        (_, *found) = words.warnings(settings, {"method": method, "invalid": 0})
-        return found, words.plan(settings, ()).count(f"(--policy.{flag})")
+        (_, *found) = messages.warnings(settings, {"method": method, "invalid": 0})
+        return found, messages.plan(settings, ()).count(f"(--policy.{flag})")
 
     assert said(leaves) == ([], 0)
     (warning,), planned = said(changes)
     assert warning.startswith("Ablation: ") and f"(--policy.{flag})" in warning and planned == 1
     everything = config.RunConfig(method="all", policy=policy)
-    assert f"(--policy.{flag})" in words.plan(everything, ())
+    assert f"(--policy.{flag})" in messages.plan(everything, ())
 
 
 def test_the_ablation_of_the_frame_is_named_for_those_that_have_one():
     policy = config.PolicyConfig(trocar_yaw="fixed")
-    named = {name for name in methods.METHODS if words._ablations(name, policy)}
+    named = {name for name in methods.METHODS if messages._ablations(name, policy)}
     assert named == {
         name for name, row in methods.METHODS.items() if policies.ablated(row, policy) != row
     }
@@ -344,7 +346,7 @@ def test_seen_comes_before_unseen_in_the_outcome():
         "safe": {"all": rate(3, 12)},
         "rcm_error_mm": {"executed": {"mean": 0.1, "max": 0.2}},
     }
-    head, row = words.outcome([result]).splitlines()
+    head, row = messages.outcome([result]).splitlines()
     assert row.index("1/8") == head.index(" seen") + 1
     assert row.index("2/4") == head.index("unseen")
     assert row.index("3/12") == head.index("safe")
@@ -375,5 +377,5 @@ def test_the_outcome_has_intervals_and_the_worst_within_steps():
     rate = {"successes": 1, "trials": 4, "rate": 0.25, "ci95": [0.1, 0.6]}
     errors = {"executed": {"mean": 0.1, "max": 0.2}, "within_steps": {"max": 0.3}}
     result = {"method": "stardiff", "seen": rate, "unseen": rate, "safe": {"all": rate}}
-    (_, row) = words.outcome([{**result, "rcm_error_mm": errors}]).splitlines()
+    (_, row) = messages.outcome([{**result, "rcm_error_mm": errors}]).splitlines()
     assert row.count("1/4 = 25% [10, 60]") == 3 and row.endswith("0.100 mm, at most 0.30")

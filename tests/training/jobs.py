@@ -156,7 +156,7 @@ def stopped_main(out: str, trains: bool) -> None:
 
     from starjax import cli
     from starjax.data import load, store
-    from starjax.experiments import following
+    from starjax.experiments import other_processes
     from starjax.runtime.signals import stop_signals
     from starjax.training import loop, processes
 
@@ -172,7 +172,7 @@ def stopped_main(out: str, trains: bool) -> None:
             time.sleep(60)
         if not processes.is_first():
             run = config.RunConfig(out=out, policy=fakes.TINY, train=settings)
-            following.follow(run, ["stardiff"], Path(out), fakes.env())
+            other_processes.follow(run, ["stardiff"], Path(out), fakes.env())
         for _ in range(3):  # as `pipeline`: the folder is held, nothing done, demonstrations there
             processes.agree(0)
         with stop_signals() as should_stop:

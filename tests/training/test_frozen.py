@@ -225,7 +225,7 @@ def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, 
     assert loaded.observation.images is None and windows.on_device(loaded)
     wanted = features(source, dataset, tmp_path / "other")
     np.testing.assert_array_equal(loaded.observation.features, wanted)
-    assert "features" in pipeline.clock.timings(tmp_path)
+    assert "features" in pipeline.stage_times.read(tmp_path)
 
 
 def test_pictures_in_the_place_of_features_are_an_error(source, dataset, tmp_path):

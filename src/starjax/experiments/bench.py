@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from starjax.experiments import checks, folders, options, words
+from starjax.experiments import checks, folders, messages, options
 from starjax.limits import MOST, Count, Range
 from starjax.runtime import files, xla
 
@@ -49,21 +49,21 @@ def main(argv: Sequence[str]) -> int:
         "hardware": xla.hardware(),
     }
     files.write_json(run / "bench.json", {**about, **figures})
-    print(f"\nresult: {run / 'bench.json'}; {words.hint(run, figures['weights'], 'shows')}")
+    print(f"\nresult: {run / 'bench.json'}; {messages.hint(run, figures['weights'], 'shows')}")
     return 0
 
 
 def _time(run: Path, counts: Sequence[int], calls: int) -> dict[str, Any]:
     """Times and prints; returns the rows of Table IV."""
     xla.prepare_xla()
-    xla.require_devices("starjax.experiments.scoring")
+    xla.require_devices("starjax.experiments.policy_under_test")
 
     from starjax import methods
     from starjax.evaluation import latency
-    from starjax.experiments import scoring
+    from starjax.experiments import policy_under_test
     from starjax.policies import features
 
-    who = scoring.subject(run.name, folders.weights(run.parent, run.name))
+    who = policy_under_test.load(run.name, folders.weights(run.parent, run.name))
     trained = who.trained
     seen = features.sensors(who.env.task, trained.scene.cameras)
     print("  DDIM steps      p50      p95      p99 ms       Hz")

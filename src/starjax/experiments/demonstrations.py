@@ -9,7 +9,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.experiments import clock, words
+from starjax.experiments import messages, stage_times
 
 
 def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
@@ -37,15 +37,15 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
             try:
                 store.read_seal(root)
             except ValueError as error:
-                words.indented(f"damaged, collected again: {error}")
+                messages.indented(f"damaged, collected again: {error}")
                 (root / "SEALED.json").unlink()
             else:
-                words.stage("collect", f"done before, {root}")
+                messages.stage("collect", f"done before, {root}")
                 return
-        words.stage("collect", f"into {root}")
-        settings = {"devices": placement.devices(), "report": words.indented, **wanted}
+        messages.stage("collect", f"into {root}")
+        settings = {"devices": placement.devices(), "report": messages.indented, **wanted}
         try:
-            with clock.timed(out, f"collect {root.name}"):
+            with stage_times.timed(out, f"collect {root.name}"):
                 found = demos.collect(root, env, script, trocars, **settings)
         except chunks.ExpertFailed as error:
             raise errors.UsageError(
@@ -54,7 +54,7 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
                 config.demos.max_steps,
                 str(error),
             ) from error
-        words.indented(
+        messages.indented(
             "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
         )
 
@@ -69,11 +69,11 @@ def load(
     from starjax.data import store
 
     collect()
-    settings = {"pictures": encoder is None, "report": words.indented}
+    settings = {"pictures": encoder is None, "report": messages.indented}
     try:
         found = loading.load(root, **settings)
     except store.DamagedEpisode as error:
-        words.indented(f"damaged, collected again: {error}")
+        messages.indented(f"damaged, collected again: {error}")
         (root / "SEALED.json").unlink()
         collect()
         found = loading.load(root, **settings)
@@ -88,7 +88,7 @@ def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder
     from starjax.training import frozen
 
     dataset = demos.dataset
-    with clock.timed(Path(config.out), "features"):
+    with stage_times.timed(Path(config.out), "features"):
         found = frozen.features(
             encoder,
             config.policy,
@@ -97,7 +97,7 @@ def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder
             len(dataset.episode),
             "camera",
             lambda: loading.frames(root),
-            words.indented,
+            messages.indented,
         )
     features = jax.device_put(found) if windows.on_device(dataset) else found
     return dataset.replace(observation=dataset.observation._replace(features=features))

@@ -8,7 +8,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.experiments import checks, clock, folders, options, words
+from starjax.experiments import checks, folders, messages, options, stage_times
 from starjax.policies import packaged
 from starjax.runtime import files, gpu, xla
 
@@ -39,32 +39,32 @@ def main(argv: Sequence[str]) -> int:
     guess = gpu.is_likely()
     asked = _asked(argv, guess)  # a mistake should not wait for jax
     xla.prepare_xla()
-    xla.require_devices("starjax.experiments.scoring")
+    xla.require_devices("starjax.experiments.policy_under_test")
     chosen, file, run, folder = asked if gpu.is_used() == guess else _asked(argv, not guess)
 
     from starjax import rcm
-    from starjax.experiments import scoring
+    from starjax.experiments import policy_under_test
 
     method, config = (run.name, folders.read_config(run)) if run else (None, None)
-    who = scoring.subject(method, file) if method else scoring.from_file(file)
-    config = scoring.settings(who, config) if config else _config(who.trained)
+    who = policy_under_test.load(method, file) if method else policy_under_test.from_file(file)
+    config = policy_under_test.settings(who, config) if config else _config(who.trained)
     config = dataclasses.replace(config, method=who.method, out=str(folder), eval=chosen.eval)
-    about = words.about(config, chosen.policy or chosen.run, chosen.seed)
+    about = messages.about(config, chosen.policy or chosen.run, chosen.seed)
     with files.lock(folder):
         before = _before(folder)
         same = _identity(before) == (who.weights, chosen.seed, dataclasses.asdict(chosen.eval))
         if chosen.out != options.AUTO:
             _refuse_foreign(folder, before.get("weights", who.weights) == who.weights)
         print(f"{about}, into {folder}\n", flush=True)
-        with clock.timed(folder, "evaluate", same or folders.is_under_way(folder)):
-            table = scoring.rollouts(
+        with stage_times.timed(folder, "evaluate", same or folders.is_under_way(folder)):
+            table = policy_under_test.rollouts(
                 folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed
             )
         command = options.typed("evaluate", argv)
-        result = scoring.write_result(
-            folder, who, table, config, chosen.seed, command, clock.timings(folder)
+        result = policy_under_test.write_result(
+            folder, who, table, config, chosen.seed, command, stage_times.read(folder)
         )
-        print(f"\n{words.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
+        print(f"\n{messages.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
         if not same:
             (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
         if chosen.video:

@@ -8,11 +8,11 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.experiments import clock, demonstrations, folders, following, words
+from starjax.experiments import demonstrations, folders, messages, other_processes, stage_times
 from starjax.runtime import files, xla
 from starjax.runtime.signals import stop_signals
 
-STAGES = words.STAGES
+STAGES = messages.STAGES
 LEAST_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints ask for their own
 
 
@@ -48,10 +48,10 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     if not processes.is_first():
         env = _environment(config)
         root, _ = demonstrations.plan(config, env)
-        return following.follow(config, trained if "train" in stages else [], root, env)
+        return other_processes.follow(config, trained if "train" in stages else [], root, env)
     with files.lock(out):
         processes.agree(0)
-        print(words.plan(config, stages), flush=True)
+        print(messages.plan(config, stages), flush=True)
         env = _environment(config)
         root, collect = demonstrations.plan(config, env)
         if "train" in stages:
@@ -91,13 +91,13 @@ def _train(
     weights = folders.weights(out, name)
     (done,) = processes.agree(weights.exists())
     if done:
-        words.stage("train", f"{name}: done before, {weights}")
+        messages.stage("train", f"{name}: done before, {weights}")
         return
     dataset = demos()
     processes.agree(0)  # the others may read them
-    words.stage("train", f"{name}, into {folder}")
+    messages.stage("train", f"{name}, into {folder}")
     begun = any((folder / "checkpoints").glob("step_*"))
-    with clock.timed(out, f"train {name}", begun), stop_signals() as should_stop:
+    with stage_times.timed(out, f"train {name}", begun), stop_signals() as should_stop:
         result = loop.run(
             methods.METHODS[name],
             config.policy,
@@ -126,7 +126,7 @@ def _train(
     )
     policy_file.save(weights, made)
     errors = ", ".join(f"{key} {value:.3g}" for key, value in result.holdout.items())
-    words.indented(f"{result.samples_per_second:.0f} samples/s; held-out {errors or 'none'}")
+    messages.indented(f"{result.samples_per_second:.0f} samples/s; held-out {errors or 'none'}")
     # Asked during the last steps, whose loop looks no more. Several processes go on: the others
     # would wait for this one.
     if should_stop() and processes.is_alone():
@@ -139,13 +139,13 @@ def _train(
 def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, command: str) -> None:
     """Closed-loop trials of one method; `result.json` is its last file."""
     from starjax import rcm
-    from starjax.experiments import scoring
+    from starjax.experiments import policy_under_test
 
     out = Path(config.out)
     folder, weights = out / name, folders.weights(out, name)
     found = _scored(folder, files.sha256(weights))
     if found and _is_of(found, config):
-        words.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
+        messages.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
         return
     if found and (more := len(found["trials"])) > len(rcm.IS_SEEN) * config.eval.trials:
         raise errors.UsageError(
@@ -154,13 +154,15 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
             config.eval.trials,
             f"starjax evaluate {shlex.quote(str(folder))} keeps them apart",
         )
-    words.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
+    messages.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
     folders.adopt_twin(out, name)
-    with clock.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
-        who = scoring.subject(name, weights, env)
-        table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, config.eval, config.seed)
+    with stage_times.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
+        who = policy_under_test.load(name, weights, env)
+        table = policy_under_test.rollouts(
+            folder / "evaluation", who, rcm.TROCARS, config.eval, config.seed
+        )
     timings = _timings(out, name, demos)
-    scoring.write_result(folder, who, table, config, config.seed, command, timings)
+    policy_under_test.write_result(folder, who, table, config, config.seed, command, timings)
 
 
 def _scored(folder: Path, weights: str) -> dict[str, Any]:
@@ -179,7 +181,7 @@ def _is_of(found: dict[str, Any], config: config_lib.RunConfig) -> bool:
     """Whether a result is of these settings, and has what a run says of it at its end."""
     try:
         before = config_lib.from_dict(config_lib.RunConfig, found["config"])
-        words.outcome([found])
+        messages.outcome([found])
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
     alike = config_lib.trained_with(before) == config_lib.trained_with(config)
@@ -197,7 +199,7 @@ def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
         "train": f"train {methods.METHODS[name].weights_of}",
         "evaluate": f"evaluate {name}",
     }
-    spent = clock.timings(out)
+    spent = stage_times.read(out)
     return {
         f"{stage}{part}": spent[f"{key}{part}"]
         for stage, key in stages.items()
@@ -211,11 +213,11 @@ def _report(out: Path, names: Sequence[str]) -> None:
     from starjax.report import build
 
     scored = [out / name for name in methods.METHODS if (out / name / "result.json").exists()]
-    words.stage("report", f"of {', '.join(path.name for path in scored)}, into {out / 'report'}")
-    with clock.timed(out, "report"):
+    messages.stage("report", f"of {', '.join(path.name for path in scored)}, into {out / 'report'}")
+    with stage_times.timed(out, "report"):
         try:
-            page = build.build(scored, out / "report", report=words.indented)
+            page = build.build(scored, out / "report", report=messages.indented)
         except ValueError as error:  # of a damaged file, which it names
             raise errors.UsageError(str(out), "results that are whole", error) from error
     results = [files.read_json(out / name / "result.json") for name in names]
-    print(f"\n{words.outcome(results)}\n\nreport: {page}", flush=True)
+    print(f"\n{messages.outcome(results)}\n\nreport: {page}", flush=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from starjax import config as config_lib
-from starjax.experiments import checks, folders, options, words
+from starjax.experiments import checks, folders, messages, options
 from starjax.limits import CountOrZero, Range
 from starjax.runtime import files, xla
 
@@ -61,18 +61,18 @@ def main(argv: Sequence[str]) -> int:
         like_run = dataclasses.replace(chosen.eval, time_limit_s=_time_limit_s(run, config))
         chosen = dataclasses.replace(chosen, eval=like_run)
     xla.prepare_xla()
-    xla.require_devices("starjax.experiments.scoring")
+    xla.require_devices("starjax.experiments.policy_under_test")
     files.require_writable(run)
 
     from starjax import rcm
     from starjax.evaluation import sweep
-    from starjax.experiments import scoring
+    from starjax.experiments import policy_under_test
 
     trocars = _trocars(chosen)
-    who = scoring.subject(run.name, folders.weights(run.parent, run.name))
+    who = policy_under_test.load(run.name, folders.weights(run.parent, run.name))
     trials = config_lib.EvalConfig(**vars(chosen.eval))
-    table = scoring.rollouts(_folder(run, chosen), who, trocars, trials, chosen.seed)
-    demos = scoring.settings(who, config).demos
+    table = policy_under_test.rollouts(_folder(run, chosen), who, trocars, trials, chosen.seed)
+    demos = policy_under_test.settings(who, config).demos
     seen = rcm.Trocar(*(field[: demos.seen_trocars] for field in rcm.TROCARS))
     figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)
     about = {
@@ -86,7 +86,7 @@ def main(argv: Sequence[str]) -> int:
     }
     files.write_json(run / "sweep.json", {**about, **figures})
     print(_outcome(figures))
-    print(f"\nresult: {run / 'sweep.json'}; {words.hint(run, who.weights, 'draws')}")
+    print(f"\nresult: {run / 'sweep.json'}; {messages.hint(run, who.weights, 'draws')}")
     return 0
 
 

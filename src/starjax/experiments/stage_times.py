@@ -23,13 +23,13 @@ def timed(out: Path, stage: str, goes_on: bool = True) -> Iterator[None]:
     """
     start, compiling = time.monotonic(), _CompileSeconds()
     names = (stage, f"{stage}: compile")
-    before = timings(out)
+    before = read(out)
     if not goes_on and any(name in before for name in names):  # at once: a kill leaves no chance
         kept = {name: seconds for name, seconds in before.items() if name not in names}
         files.write_json(out / "timings.json", kept)
 
     def note() -> None:
-        spent = timings(out)
+        spent = read(out)
         for name, seconds in zip(names, (time.monotonic() - start, compiling.seconds)):
             spent[name] = round(spent.get(name, 0.0) + seconds, 2)
         files.write_json(out / "timings.json", spent)
@@ -44,7 +44,7 @@ def timed(out: Path, stage: str, goes_on: bool = True) -> Iterator[None]:
     note()
 
 
-def timings(out: Path) -> dict[str, float]:
+def read(out: Path) -> dict[str, float]:
     """Seconds a stage so far; of a damaged file none."""
     try:
         return files.read_json(out / "timings.json")

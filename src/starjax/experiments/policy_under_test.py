@@ -11,8 +11,12 @@ from starjax import config as config_lib
 from starjax import errors, methods, rcm
 from starjax.evaluation import evaluate, latency, statistics
 from starjax.evaluation import trials as table
+<<<<<<< HEAD:src/starjax/experiments/scoring.py
 from starjax.experiments import words
 from starjax.policies import features, policy_file
+=======
+from starjax.experiments import messages
+>>>>>>> commands:src/starjax/experiments/policy_under_test.py
 from starjax.policies import policy as policies
 from starjax.rollouts import placement
 from starjax.runtime import files, xla
@@ -37,7 +41,7 @@ class Subject(NamedTuple):
     weights: str
 
 
-def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subject:
+def load(method: str, weights: Path, env: sim_env.Env | None = None) -> Subject:
     """Loads a method's weights.
 
     Args:
@@ -56,7 +60,7 @@ def subject(method: str, weights: Path, env: sim_env.Env | None = None) -> Subje
     except ValueError as error:
         hint = f"remove it, and {again} trains it again"
         raise errors.UsageError(str(weights), "a policy of starjax", error, hint) from error
-    return _subject(method, trained, weights, env)
+    return _load(method, trained, weights, env)
 
 
 def from_file(path: Path) -> Subject:
@@ -70,10 +74,10 @@ def from_file(path: Path) -> Subject:
     except ValueError as error:
         raise errors.UsageError("--policy", "a policy of starjax", error) from error
     errors.choice(f"method of {path}", trained.method, methods.METHODS)
-    return _subject(trained.method, trained, path, None)
+    return _load(trained.method, trained, path, None)
 
 
-def _subject(
+def _load(
     method: str, trained: policy_file.Trained, file: Path, env: sim_env.Env | None
 ) -> Subject:
     scene = trained.scene
@@ -114,7 +118,7 @@ def rollouts(
             **methods.behaviour(who.method)._asdict(),
             "policy": dataclasses.asdict(who.trained.policy),
         },
-        report=words.indented,
+        report=messages.indented,
     )
 
 
@@ -174,7 +178,7 @@ def write_result(
         "config": config_lib.as_json(config),
         "command": command,
         "timings_s": timings_s or {},
-        "warnings": words.warnings(config, figures),
+        "warnings": messages.warnings(config, figures),
         "versions": xla.versions(),
         "hardware": xla.hardware(),
     }
