@@ -21,6 +21,16 @@ TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneConfig:
+    """What is simulated, by name; `starjax list` shows what there is."""
+
+    task: str = "peg_transfer"  # what is to be done
+    arm: tuple[str, ...] = ()  # one for each slot of the task, or one for all; left out, the task's
+    tool: tuple[str, ...] = ()  # held by the arms, likewise
+    camera: tuple[str, ...] = ()  # that are observed; left out, the task's first
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class DemosConfig:
     """Demonstrations: how many, and what is recorded."""
 
@@ -28,7 +38,7 @@ class DemosConfig:
     # how many of the eight seen trocars to train with, from the first on
     seen_trocars: Annotated[int, Range(1, 8)] = 8
     keep_failures: bool = False  # store failed episodes too; training leaves them out
-    one_wall: bool = False  # on the middle row the expert always takes the wall of one side
+    expert: str = ""  # which of the task's scripted demonstrators; left out, its first
     max_steps: Count = 600  # control steps, at 30 Hz, that the expert may take
 
 
@@ -128,6 +138,7 @@ class RunConfig:
     preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"
     seed: Seed = 0  # of everything random
     out: str = "auto"  # folder of results; auto: runs/PRESET, other seeds and observations apart
+    scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
     demos: DemosConfig = dataclasses.field(default_factory=DemosConfig)
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
@@ -135,7 +146,7 @@ class RunConfig:
 
 
 # What decides a policy's weights; the rest may change between two starts of a run.
-_TRAINED_WITH = ("seed", "demos", "policy", "train")
+_TRAINED_WITH = ("seed", "scene", "demos", "policy", "train")
 _BESIDE = {"train.keep_checkpoints", "train.checkpoint_every", "train.steps_per_call"}  # of those
 
 
@@ -153,7 +164,9 @@ def differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """
     usual = as_json(RunConfig())
     parts = [part for part in _TRAINED_WITH if part != "seed"]
-    filled = [{part: usual[part] | values.get(part, {}) for part in parts} for values in configs]
+    filled = [
+        {part: usual[part] | old.get(part, {}) for part in parts} for old in map(upgraded, configs)
+    ]
     rows = [_flat(values) for values in filled]
     return [
         name
@@ -209,6 +222,11 @@ def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
         rest = dict(train)
         found["policy"] = {**policy, "crop_fraction": rest.pop("crop_fraction")}
         found["train"] = rest
+    demos = found.get("demos", found)
+    if isinstance(demos, Mapping) and "one_wall" in demos:
+        rest = {name: value for name, value in demos.items() if name != "one_wall"}
+        rest.setdefault("expert", "one_wall" if demos["one_wall"] else "")
+        found = {**found, "demos": rest} if "demos" in found else rest
     return found
 
 

@@ -180,7 +180,7 @@ def scene() -> list[Finding]:
     except (ImportError, RuntimeError) as error:
         return [Finding("scene", _first_line(error), "pip install -e . in starjax's folder")]
     try:
-        made = model.compose()
+        made = model.compose(model.name())
     except (OSError, ValueError) as error:
         return [Finding("scene", str(error), "reinstall starjax: parts of its scene are missing")]
     return [Finding("scene", f"{made.ngeom} geoms, {made.nq} coordinates")]

@@ -94,7 +94,7 @@ def test_how_many_trials_jax_decides_not_the_system(file, monkeypatch, guess, us
 
     monkeypatch.setattr(gpu, "is_likely", lambda: guess)
     monkeypatch.setattr(gpu, "is_used", lambda: used)
-    monkeypatch.setattr(scoring, "rollouts", scored)
+    monkeypatch.setattr(policy_under_test, "rollouts", scored)
     with pytest.raises(KeyboardInterrupt, match=f"^{trials} in mine-.*-{trials}x"):
         evaluate.main(["--policy", "mine.safetensors"])
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import ArrayLike
+from jax.typing import ArrayLike
 
 from starjax import errors, rcm
 from starjax.evaluation import statistics

@@ -3,6 +3,7 @@
 What brings jax is imported where it is used, after XLA has been prepared.
 """
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,23 +15,22 @@ from starjax.experiments import messages, stage_times
 
 def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
     """The folder of a run's demonstrations, and a function that collects what it lacks."""
-    from starjax import rcm
-    from starjax.data import demos, store
-    from starjax.rollouts import chunks, placement, recording
-    from starjax.sim.tasks.peg_transfer import expert
+    from starjax.data import demos, schema, store
+    from starjax.rollouts import agent, placement, trocars, waves
 
-    trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
-    wanted = {
-        "per_trocar": config.demos.per_trocar,
-        "seed": config.seed,
-        "max_steps": config.demos.max_steps,
-        "keep_failures": config.demos.keep_failures,
-        "one_wall": config.demos.one_wall,
-    }
-    init = expert.init_with_one_wall if config.demos.one_wall else expert.init
-    script = recording.Expert(init, expert.act)
+    task, name = env.task, config.demos.expert or next(iter(env.task.experts))
+    errors.choice("demos.expert", name, task.experts)
+    chosen = trocars.select(task.trocars, slice(config.demos.seen_trocars))
+    settings = schema.Settings(
+        per_trocar=config.demos.per_trocar,
+        seed=config.seed,
+        max_steps=config.demos.max_steps,
+        keep_failures=config.demos.keep_failures,
+        expert=name,
+    )
+    expert = agent.from_single(task.experts[name]())
     out = Path(config.out)
-    root = out / f"demos-{store.digest(demos.describe(env, trocars, **wanted))}"
+    root = out / f"demos-{store.digest(schema.describe(env, chosen, settings))}"
 
     def collect() -> None:
         if store.is_sealed(root):
@@ -43,11 +43,13 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
                 messages.stage("collect", f"done before, {root}")
                 return
         messages.stage("collect", f"into {root}")
-        settings = {"devices": placement.devices(), "report": messages.indented, **wanted}
+        place = placement.Place(devices=placement.devices())
         try:
             with stage_times.timed(out, f"collect {root.name}"):
-                found = demos.collect(root, env, script, trocars, **settings)
-        except chunks.ExpertFailed as error:
+                found = demos.collect(
+                    root, env, expert, chosen, settings, place=place, report=messages.indented
+                )
+        except waves.ExpertFailed as error:
             raise errors.UsageError(
                 "demos.max_steps",
                 "enough control steps for the expert",
@@ -64,12 +66,12 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
 def load(
     config: config_lib.RunConfig, root: Path, collect: Callable[[], None], encoder: Any
 ) -> Any:
-    """The dataset to train on, with what a frozen encoder sees in the place of pictures."""
+    """The dataset to train on, with what a frozen encoder sees instead of images."""
     from starjax.data import load as loading
     from starjax.data import store
 
     collect()
-    settings = {"pictures": encoder is None, "report": messages.indented}
+    settings = {"images": encoder is None, "report": messages.indented}
     try:
         found = loading.load(root, **settings)
     except store.DamagedEpisode as error:
@@ -82,25 +84,35 @@ def load(
 
 def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder: Any) -> Any:
     import jax
+    import numpy as np
 
-    from starjax.data import load as loading
     from starjax.data import windows
     from starjax.training import frozen
 
     dataset = demos.dataset
     with stage_times.timed(Path(config.out), "features"):
-        found = frozen.features(
-            encoder,
-            config.policy,
-            root,
-            demos.digest,
-            len(dataset.episode),
-            "camera",
-            lambda: loading.frames(root),
-            messages.indented,
-        )
+        parts = [
+            frozen.features(
+                encoder,
+                config.policy,
+                root,
+                demos.digest,
+                len(dataset.episode),
+                camera,
+                functools.partial(_frames, root, camera),
+                messages.indented,
+            )
+            for camera in demos.description["scene"]["cameras"]
+        ]
+    found = np.concatenate(parts, axis=-1)
     features = jax.device_put(found) if windows.on_device(dataset) else found
     return dataset.replace(observation=dataset.observation._replace(features=features))
+
+
+def _frames(root: Path, camera: str) -> Any:
+    from starjax.data import load as loading
+
+    return loading.frames(root)[camera]
 
 
 def frozen_encoder(config: config_lib.RunConfig) -> Any:

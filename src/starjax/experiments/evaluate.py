@@ -42,7 +42,6 @@ def main(argv: Sequence[str]) -> int:
     xla.require_devices("starjax.experiments.policy_under_test")
     chosen, file, run, folder = asked if gpu.is_used() == guess else _asked(argv, not guess)
 
-    from starjax import rcm
     from starjax.experiments import policy_under_test
 
     method, config = (run.name, folders.read_config(run)) if run else (None, None)
@@ -58,7 +57,7 @@ def main(argv: Sequence[str]) -> int:
         print(f"{about}, into {folder}\n", flush=True)
         with stage_times.timed(folder, "evaluate", same or folders.is_under_way(folder)):
             table = policy_under_test.rollouts(
-                folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed
+                folder / "evaluation", who, who.env.task.trocars, chosen.eval, chosen.seed
             )
         command = options.typed("evaluate", argv)
         result = policy_under_test.write_result(

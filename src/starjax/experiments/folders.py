@@ -163,3 +163,11 @@ def _refuse(folder: Path, name: str, before: Any, now: Any) -> None:
     if before != now:
         hint = "choose another folder by --out, or remove that one"
         raise errors.UsageError(name, f"{before}, with which {folder} was made", now, hint)
+
+
+def demos_digest(root: Path) -> str | None:
+    """The digest of a sealed dataset, None of one that is not there."""
+    try:
+        return files.read_json(root / "SEALED.json")["digest"]
+    except (FileNotFoundError, KeyError, TypeError, ValueError):
+        return None

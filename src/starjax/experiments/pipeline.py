@@ -75,7 +75,14 @@ def _environment(config: config_lib.RunConfig) -> Any:
     # Here and below, what brings jax is imported where it is used, after XLA has been prepared.
     from starjax.sim import env
 
-    return env.make(config.policy.observation, config.policy.image_size)
+    return env.make(
+        config.scene.task,
+        config.scene.arm,
+        config.scene.tool,
+        observation=config.policy.observation,
+        image_size=config.policy.image_size,
+        cameras=config.scene.camera,
+    )
 
 
 def _train(
@@ -138,7 +145,6 @@ def _train(
 
 def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, command: str) -> None:
     """Closed-loop trials of one method; `result.json` is its last file."""
-    from starjax import rcm
     from starjax.experiments import policy_under_test
 
     out = Path(config.out)
@@ -147,10 +153,11 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
     if found and _is_of(found, config):
         messages.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
         return
-    if found and (more := len(found["trials"])) > len(rcm.IS_SEEN) * config.eval.trials:
+    count = len(env.task.is_seen)
+    if found and (more := len(found["trials"])) > count * config.eval.trials:
         raise errors.UsageError(
             "eval.trials",
-            f"no fewer than the {more // len(rcm.IS_SEEN)} of {folder / 'result.json'}",
+            f"no fewer than the {more // count} of {folder / 'result.json'}",
             config.eval.trials,
             f"starjax evaluate {shlex.quote(str(folder))} keeps them apart",
         )
@@ -159,10 +166,13 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
     with stage_times.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
         who = policy_under_test.load(name, weights, env)
         table = policy_under_test.rollouts(
-            folder / "evaluation", who, rcm.TROCARS, config.eval, config.seed
+            folder / "evaluation", who, env.task.trocars, config.eval, config.seed
         )
     timings = _timings(out, name, demos)
-    policy_under_test.write_result(folder, who, table, config, config.seed, command, timings)
+    digest = folders.demos_digest(out / demos)
+    policy_under_test.write_result(
+        folder, who, table, config, config.seed, command, timings, dataset_digest=digest
+    )
 
 
 def _scored(folder: Path, weights: str) -> dict[str, Any]:

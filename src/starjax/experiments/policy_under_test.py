@@ -10,16 +10,13 @@ import numpy as np
 from starjax import config as config_lib
 from starjax import errors, methods, rcm
 from starjax.evaluation import evaluate, latency, statistics
+from starjax.evaluation import result as results
 from starjax.evaluation import trials as table
-<<<<<<< HEAD:src/starjax/experiments/scoring.py
-from starjax.experiments import words
-from starjax.policies import features, policy_file
-=======
 from starjax.experiments import messages
->>>>>>> commands:src/starjax/experiments/policy_under_test.py
+from starjax.policies import features, policy_file
 from starjax.policies import policy as policies
-from starjax.rollouts import placement
-from starjax.runtime import files, xla
+from starjax.rollouts import agent, placement
+from starjax.runtime import files
 from starjax.sim import env as sim_env
 
 
@@ -99,24 +96,27 @@ def rollouts(
     directory: Path, who: Subject, trocars: rcm.Trocar, settings: config_lib.EvalConfig, seed: int
 ) -> table.Table:
     """Runs what is missing of an evaluation."""
+    trained = who.trained
+    planner = agent.from_policy(
+        who.policy.sample, trained.policy.obs_horizon, trained.policy.execute
+    )
     return evaluate.evaluate(
         directory,
         who.env,
-        who.policy,
-        who.trained.params,
-        who.trained.normalizer,
+        planner,
+        (trained.params, trained.normalizer),
         trocars,
-        trials=settings.trials,
-        seed=seed,
-        obs_horizon=who.trained.policy.obs_horizon,
-        execute=who.trained.policy.execute,
-        time_limit_s=settings.time_limit_s,
-        chunk=settings.chunk,
-        video_trials=settings.video_trials,
-        devices=placement.devices(),
+        evaluate.Settings(
+            trials=settings.trials,
+            seed=seed,
+            time_limit_s=settings.time_limit_s,
+            video_trials=settings.video_trials,
+            chunk=settings.chunk,
+        ),
+        place=placement.Place(devices=placement.devices()),
         identity={
             **methods.behaviour(who.method)._asdict(),
-            "policy": dataclasses.asdict(who.trained.policy),
+            "policy": dataclasses.asdict(trained.policy),
         },
         report=messages.indented,
     )
@@ -152,35 +152,38 @@ def write_result(
     seed: int,
     command: str,
     timings_s: dict[str, float] | None = None,
+    dataset_digest: str | None = None,
 ) -> dict[str, Any]:
     """Writes and returns `<folder>/result.json`: `metrics.compose`'s figures and what made them.
 
     Args:
       folder: of the result.
       who: was evaluated.
-      trials: of the twelve trocars.
+      trials: of the task's trocars.
       config: settings of the run and of this evaluation.
       seed: of the trials; the run's own is in `config`.
       command: what was typed.
       timings_s: seconds by stage.
+      dataset_digest: of the demonstrations, if they are there.
     """
-    is_seen = np.arange(len(rcm.IS_SEEN)) < config.demos.seen_trocars
+    task = who.env.task
+    is_seen = task.is_seen & (np.arange(len(task.is_seen)) < config.demos.seen_trocars)
     observation = who.trained.policy.observation
     figures = statistics.compose(
         trials, is_seen, method=who.method, observation=observation, seed=seed
     )
-    result = {
-        **figures,
+    about = {
+        "control_hz": who.env.control_hz,
         "inference_ms": decision_ms(who),
         "preset": config.preset,
         "seed": seed,
         "weights": who.weights,
+        "dataset_digest": dataset_digest,
         "config": config_lib.as_json(config),
         "command": command,
         "timings_s": timings_s or {},
         "warnings": messages.warnings(config, figures),
-        "versions": xla.versions(),
-        "hardware": xla.hardware(),
     }
-    files.write_json(folder / "result.json", result)
-    return result
+    file = folder / "result.json"
+    results.write(file, who.env.names, figures, about)
+    return files.read_json(file)

@@ -37,7 +37,7 @@ PRESETS: dict[str, RunConfig] = {
     # it comes from the compact policy, which learned this task on a GPU.
     "cpu": RunConfig(
         preset="cpu",
-        demos=DemosConfig(one_wall=True),
+        demos=DemosConfig(expert="one_wall"),
         policy=PolicyConfig(
             image_size=128,
             encoder="small",

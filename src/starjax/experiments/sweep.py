@@ -64,27 +64,28 @@ def main(argv: Sequence[str]) -> int:
     xla.require_devices("starjax.experiments.policy_under_test")
     files.require_writable(run)
 
-    from starjax import rcm
-    from starjax.evaluation import sweep
+    from starjax.evaluation import result, sweep
     from starjax.experiments import policy_under_test
+    from starjax.rollouts import trocars
 
-    trocars = _trocars(chosen)
     who = policy_under_test.load(run.name, folders.weights(run.parent, run.name))
+    task = who.env.task
+    drawn = _trocars(chosen, task.arms)
     trials = config_lib.EvalConfig(**vars(chosen.eval))
-    table = policy_under_test.rollouts(_folder(run, chosen), who, trocars, trials, chosen.seed)
+    table = policy_under_test.rollouts(_folder(run, chosen), who, drawn, trials, chosen.seed)
     demos = policy_under_test.settings(who, config).demos
-    seen = rcm.Trocar(*(field[: demos.seen_trocars] for field in rcm.TROCARS))
+    seen = trocars.select(task.trocars, slice(demos.seen_trocars))
     figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)
     about = {
         "method": who.method,
         "observation": who.trained.policy.observation,
         "command": options.typed("sweep", argv),
         "weights": who.weights,
+        "control_hz": who.env.control_hz,
+        "seed": chosen.seed,
         "time_limit_s": chosen.eval.time_limit_s,
-        "versions": xla.versions(),
-        "hardware": xla.hardware(),
     }
-    files.write_json(run / "sweep.json", {**about, **figures})
+    result.write(run / "sweep.json", who.env.names, figures, about)
     print(_outcome(figures))
     print(f"\nresult: {run / 'sweep.json'}; {messages.hint(run, who.weights, 'draws')}")
     return 0
@@ -123,17 +124,17 @@ def _folder(run: Path, chosen: Options) -> Path:
     return run / "sweep" / f"seed{chosen.seed}-{digest[:8]}"
 
 
-def _trocars(chosen: Options) -> Any:
+def _trocars(chosen: Options, arms: int) -> Any:
     """The trocars that the flags describe."""
     import numpy as np
 
     from starjax.evaluation import sweep
 
     if not chosen.radii_cm:
-        return sweep.sample(chosen.seed, chosen.trocars)
+        return sweep.sample(chosen.seed, chosen.trocars, arms)
     azimuths = 2 * np.pi * np.arange(chosen.azimuths) / chosen.azimuths
     radii = np.array(chosen.radii_cm) / 100
-    return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths)
+    return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths, arms)
 
 
 def _outcome(figures: dict[str, Any]) -> str:

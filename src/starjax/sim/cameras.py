@@ -23,14 +23,15 @@ class Camera(NamedTuple):
     Attributes:
       name: in the MJCF.
       body: that it rides on, 0 for the world.
-      pose: in that body's frame, x to the right, y up, looking along -z; numpy.
+      R, p: `[3, 3]` and `[3]` m, pose in that body's frame: x to the right, y up, looking along -z.
       moves: whether its pose comes with every image.
       draw: see `render.make`.
     """
 
     name: str
     body: int
-    pose: Pose
+    R: np.ndarray
+    p: np.ndarray
     moves: bool
     draw: render.Render
 
@@ -48,16 +49,16 @@ def make(
         camera = mj_model.camera(name)
         body, R = int(camera.bodyid[0]), np.zeros(9)
         mujoco.mju_quat2Mat(R, camera.quat)
-        pose = Pose(R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32))
+        R, p = R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32)
         moves = moving or body != 0
         draw = render.make(mj_model, name, image_size, image_size, shadow=shadow, moves=moves)
-        found.append(Camera(name, body, pose, moves, draw))
+        found.append(Camera(name, body, R, p, moves, draw))
     return tuple(found)
 
 
 def nominal(cameras: Sequence[Camera]) -> Pose:
     """Poses `[C]` of the cameras in their bodies' frames, as the MJCF has them."""
-    return Pose(*(jnp.stack([jnp.asarray(c.pose[i]) for c in cameras]) for i in range(2)))
+    return Pose(jnp.stack([c.R for c in cameras]), jnp.stack([c.p for c in cameras]))
 
 
 def images(

@@ -93,10 +93,10 @@ def make(
                 f"got {shape}"
             )
         inputs = [jnp.asarray(v, jnp.float32) for v in (geom_xpos, geom_xmat, geom_rgb)]
-        if (pose_world_cam is not None) != moves:
+        view = still if pose_world_cam is None else views.moving(scene, grid, pose_world_cam)
+        if view is None or (still is not None and pose_world_cam is not None):
             got = "none" if pose_world_cam is None else "one"
             raise errors.UsageError("pose_world_cam", "one" if moves else "none", got)
-        view = still or views.moving(scene, grid, pose_world_cam)
         t, face, word = cast.cast(scene, grid, view, shadow, *inputs)
         frame = Frame(rgb=_bytes(grid, word, samples))
         if depth:

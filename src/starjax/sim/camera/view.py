@@ -14,7 +14,7 @@ from starjax.sim.camera import geometry, texture, tiles
 from starjax.types import Pose
 
 # A texture: visible points x, y, z in the camera frame, `[T, Q]` m each, to red, green and blue.
-Look = Callable[[Sequence[Any]], Sequence[Any]]
+Look = Callable[[Sequence[Any]], Any]
 
 
 class View(NamedTuple):

@@ -203,13 +203,18 @@ def colours(bound: Bound, layout: Layout, rgb: jax.Array) -> jax.Array:
 
 
 def obstacles(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
-    """Pegs, and the walls of the block: the sides of a full triangle, 3.5 mm longer at either end
-    than they are."""
+    """Pegs and the block's walls."""
+    return around(bound, facts.block)
+
+
+def around(bound: Bound, block: Pose) -> Capsules:
+    """Pegs, and the walls of a block at this pose: the sides of a full triangle, 3.5 mm longer at
+    either end than they are."""
     pegs = jnp.asarray(bound.pegs)
     foot = jnp.concatenate([pegs, jnp.zeros((len(pegs), 1))], axis=-1)
-    normals = wall_normals(facts.block)
-    half = jnp.sqrt(3.0) * RIM_RADIUS * jnp.cross(facts.block.R[:, 2], normals)
-    middle = facts.block.p + RIM_RADIUS * normals
+    normals = wall_normals(block)
+    half = jnp.sqrt(3.0) * RIM_RADIUS * jnp.cross(block.R[:, 2], normals)
+    middle = block.p + RIM_RADIUS * normals
     return Capsules(
         start=jnp.concatenate([foot, middle - half]),
         end=jnp.concatenate([foot.at[:, 2].set(PEG_HEIGHT - PEG_RADIUS), middle + half]),

@@ -4,8 +4,6 @@ One tool (arm 0) lifts the block, the other (arm 1) takes it in the air and thre
 peg. A drop is a failure.
 """
 
-from typing import NamedTuple
-
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -14,7 +12,7 @@ import numpy as np
 
 from starjax import rcm
 from starjax.sim import bodies
-from starjax.sim.tasks.base import Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
 from starjax.sim.tasks.peg_transfer import task as single
 from starjax.sim.tasks.peg_transfer_bimanual import words
 from starjax.types import Agent, Pose
@@ -55,12 +53,6 @@ class Facts:
     lifted: jax.Array
     passed: jax.Array
     untouched: jax.Array
-
-
-class _Single(NamedTuple):
-    """The facts that the obstacles of the one-armed task look at."""
-
-    block: Pose
 
 
 def sample(bound: single.Bound, key: jax.Array) -> Layout:
@@ -153,8 +145,8 @@ def _expert() -> Agent:
     return expert.AGENT
 
 
-def _obstacles(bound: single.Bound, layout: Layout, facts: Facts):
-    return single.obstacles(bound, layout, _Single(facts.block))
+def _obstacles(bound: single.Bound, layout: Layout, facts: Facts) -> Capsules:
+    return single.around(bound, facts.block)
 
 
 def bind(m: mujoco.MjModel) -> single.Bound:
