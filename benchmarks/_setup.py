@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from starjax.sim.types import Observation
 
 from starjax import rcm
 from starjax.config import PolicyConfig, TrainConfig
@@ -15,7 +16,6 @@ from starjax.data import normalizer, windows
 from starjax.methods import METHODS
 from starjax.policies import features
 from starjax.policies import policy as policies
-from starjax.sim.types import Observation
 from starjax.training import devices, state, step
 from starjax.training.sharding import Carried, Parts
 from starjax.types import Command, Pose

@@ -3,10 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from starjax.sim.types import Observation
 
 from starjax import config, rcm
 from starjax.data import windows
-from starjax.sim.types import Observation
 from starjax.types import Command, Pose
 
 P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)

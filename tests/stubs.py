@@ -7,9 +7,9 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from starjax.sim.types import Observation
 
 from starjax import rcm
-from starjax.sim.types import Observation
 from starjax.types import Command, Pose
 
 P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)

@@ -7,19 +7,23 @@ import pytest
 from starjax import rcm
 from starjax.sim import env as envs
 from starjax.sim import scene
-from starjax.sim.tasks.peg_transfer import expert
 
 LANES = 12  # one episode a trocar
 
 
 @pytest.fixture(scope="session")
-def sim() -> scene.SimModel:
-    return scene.load()
+def sim(environment) -> scene.Scene:
+    return environment.scene
 
 
 @pytest.fixture(scope="session")
 def environment() -> envs.Env:
-    return envs.make("state")
+    return envs.make(observation="state")
+
+
+@pytest.fixture(scope="session")
+def agent(environment):
+    return environment.task.experts["default"]()
 
 
 @pytest.fixture(scope="session")
@@ -27,9 +31,11 @@ def reset(environment):
     """`seed -> EnvState` of the twelve trocars, or of others."""
     compiled = jax.jit(jax.vmap(environment.reset))
 
-    def reset(seed, trocars=rcm.TROCARS):
-        params = envs.EnvParams(rcm.Trocar(*(jnp.asarray(field) for field in trocars)))
-        return compiled(jax.random.split(jax.random.key(seed), LANES), params)
+    def reset(seed, trocars=rcm.TROCARS, told=None):
+        given = (
+            jax.tree.map(lambda field: jnp.asarray(field)[:, None], x) for x in (trocars, told)
+        )
+        return compiled(jax.random.split(jax.random.key(seed), LANES), envs.EnvParams(*given))
 
     return reset
 
@@ -41,18 +47,18 @@ def step(environment):
 
 
 @pytest.fixture(scope="session")
-def drive(environment):
-    """`(state, expert state) -> the same after one control step under the expert`."""
+def drive(environment, agent):
+    """`(state, memory) -> the same after one control step under the expert`."""
 
-    def one(state, script):
-        command, script = expert.act(script, state)
-        return environment.step(state, command), script
+    def one(state, memory):
+        command, memory, _ = agent.act(memory, state)
+        return environment.step(state, command), memory
 
     return jax.jit(jax.vmap(one))
 
 
 @pytest.fixture(scope="session")
-def begin():
-    """`(state, seed) -> expert state`."""
-    compiled = jax.jit(jax.vmap(expert.init))
+def begin(agent):
+    """`(state, seed) -> the expert's memory`."""
+    compiled = jax.jit(jax.vmap(agent.init))
     return lambda state, seed: compiled(jax.random.split(jax.random.key(seed), LANES), state)

@@ -33,8 +33,8 @@ def follow(reset, step):
 
 
 def constant(poses):
-    poses = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    return Command(poses, jnp.ones(LANES))
+    poses = jax.tree.map(lambda *leaves: jnp.stack(leaves)[:, None], *poses)
+    return Command(poses, jnp.ones((LANES, 1)))
 
 
 def tilted(degrees):
@@ -57,17 +57,17 @@ def test_what_is_asked_of_the_arm_is_approached_and_not_leapt_at(follow):
     after = follow([*(Pose(tilted(a), TIP) for a in tilts), *leaning, *retracted])
     assert not after.invalid.any()
     wanted = 0.1 * np.abs(np.sin(np.radians(tilts)))  # m, as the tip is 0.1 m below the port
-    error = after.rcm_error_within[:, : len(tilts)]
+    error = after.rcm_error_within[:, : len(tilts), 0]
     assert (error.max(axis=0) < wanted + 1e-3).all()
     np.testing.assert_allclose(error[-1], wanted, atol=3e-4)
-    off = np.linalg.norm(after.pose.p[:, : len(tilts)] - TIP, axis=-1)
+    off = np.linalg.norm(after.pose.p[:, : len(tilts), 0] - TIP, axis=-1)
     assert off.max() < 2e-3
-    on_manifold = after.rcm_error[:, len(tilts) :]
+    on_manifold = after.rcm_error[:, len(tilts) :, 0]
     assert on_manifold.max() < 4e-3 and on_manifold[-1].max() < 1e-4
     # a tool that is drawn out of the port stays as it points
-    axis = after.pose.R[:, -3:, :, 2]
+    axis = after.pose.R[:, -3:, 0, :, 2]
     assert (axis[..., 2] < -0.999).all()
-    np.testing.assert_allclose(after.pose.p[-1, -3:, 2], [0.13, 0.15, 0.2], atol=1e-3)
+    np.testing.assert_allclose(after.pose.p[-1, -3:, 0, 2], [0.13, 0.15, 0.2], atol=1e-3)
 
 
 def test_a_tool_near_the_port_comes_to_rest(follow):
@@ -86,19 +86,19 @@ def test_what_is_no_command_holds_the_arm_and_a_good_one_is_followed_again(reset
     bad = [not_finite, np.zeros((3, 3), np.float32), 1.1 * DOWN, mirrored]
     held = np.arange(LANES) <= len(bad)
     R = np.array(state.pose.R)
-    R[: len(bad)] = bad
-    close = np.where(np.arange(LANES) == len(bad), np.nan, -1.0).astype(np.float32)
+    R[: len(bad), 0] = bad
+    close = np.where(np.arange(LANES) == len(bad), np.nan, -1.0)[:, None].astype(np.float32)
     after = step(state, Command(Pose(jnp.asarray(R), state.pose.p), jnp.asarray(close)))
     assert not after.invalid.any()
-    np.testing.assert_array_equal(np.isinf(after.ik_error), held)
-    np.testing.assert_array_equal(after.q_target[held], state.q_target[held])
-    np.testing.assert_array_equal(after.gripper_target, np.where(held, 1.0, -1.0))
+    np.testing.assert_array_equal(np.isinf(after.ik_error[:, 0]), held)
+    np.testing.assert_array_equal(after.q_target[0][held], state.q_target[0][held])
+    np.testing.assert_array_equal(after.gripper_target[:, 0], np.where(held, 1.0, -1.0))
     np.testing.assert_array_equal(after.velocity[held], 0.0)
     off = np.linalg.norm(after.pose.p - state.pose.p, axis=-1)
     assert off.max() < 1e-4
-    back = state.pose.p - 3e-3 * state.pose.R[:, :, 2]
+    back = state.pose.p - 3e-3 * state.pose.R[..., 2]
     for _ in range(12):
-        after = step(after, Command(Pose(state.pose.R, back), jnp.ones(LANES)))
+        after = step(after, Command(Pose(state.pose.R, back), jnp.ones((LANES, 1))))
     np.testing.assert_allclose(after.pose.p, back, atol=3e-4)
 
 

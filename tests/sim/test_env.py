@@ -5,11 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import rcm
+from starjax import errors, rcm
 from starjax.sim import env as envs
-from starjax.sim import physics
 from starjax.sim.tasks.peg_transfer import expert, task
-from starjax.types import Pose
+from starjax.types import Command, Pose
 
 STEPS = 330  # control steps: 11 s, longer than the expert takes
 
@@ -19,16 +18,16 @@ def episodes(reset, begin, drive):
     """Final states of twelve expert episodes; executed RCM errors and labels' rolls on the way."""
     state = reset(7)
     script = begin(state, 8)
-    errors, labels, running = [], [], []
+    found, labels, running = [], [], []
     for _ in range(STEPS):
         running.append(np.asarray(~state.done))
         state, script = drive(state, script)
-        errors.append(np.stack([state.rcm_error, state.rcm_error_within]))
+        found.append(np.stack([state.rcm_error[:, 0], state.rcm_error_within[:, 0]]))
         labels.append(jax.tree.map(np.asarray, script.label))
         if bool(state.done.all()):
             break
     rolls = [rcm.roll_of(jnp.asarray(label.pose.R)) for label in labels]
-    return state, np.array(errors), np.array(rolls), np.array(running), labels
+    return state, np.array(found), np.array(rolls), np.array(running), labels
 
 
 def test_the_expert_succeeds_on_every_trocar(episodes):
@@ -58,7 +57,7 @@ def test_the_error_within_a_control_step_is_the_largest_of_its_physics_steps(epi
 
 def test_labels_are_on_the_manifold_and_their_roll_never_wraps(episodes):
     state, _, rolls, running, labels = episodes
-    port = rcm.trocar_position(state.trocar, state.p_world_ref)
+    port = state.trocar.p_world_trocar[:, 0]
     worst = max(float(rcm.rcm_error(label.pose, port).max()) for label in labels)
     assert worst < 1e-6
     assert np.abs(rolls[running]).max() < np.pi / 2
@@ -69,23 +68,27 @@ def test_labels_are_on_the_manifold_and_their_roll_never_wraps(episodes):
 def test_a_released_block_is_threaded_and_at_rest(episodes, sim):
     state, *_ = episodes
     for lane in np.flatnonzero(state.success):
-        block = jax.tree.map(lambda leaf, i=lane: leaf[i], state.block_pose)
-        assert task.is_threaded(block, state.target_peg[lane])
-    assert not state.jaw_contact[state.success].any()
+        block = jax.tree.map(lambda leaf, i=lane: leaf[i], state.facts.block)
+        assert task.is_threaded(block, state.layout.target_peg[lane])
+    assert not state.touch[state.success].any()
 
 
 def test_success_wants_a_block_let_go_and_at_rest_on_its_peg_five_steps_in_a_row(reset, sim):
     state = jax.tree.map(lambda leaf: leaf[0], reset(0))
-    on_target = Pose(jnp.eye(3), jnp.append(state.target_peg, task.RIM_HEIGHT))
-    good = state.replace(block_pose=on_target)
-    fast = good.sim.replace(qvel=good.sim.qvel.at[sim.block_dof].set(0.02))
+    on_target = Pose(jnp.eye(3), jnp.append(state.layout.target_peg, task.RIM_HEIGHT))
+    facts = state.facts.replace(block=on_target)
+    good = state.replace(facts=facts)
+    fast = facts.replace(velocity=facts.velocity.at[0].set(0.02))
+    held = facts.replace(touch=jnp.ones((), bool))
     after, successes = good, []
     for _ in range(5):
-        last, after = after, envs._judge(sim, after)
+        last, after = after, envs.judge(sim, after)
         successes.append(bool(after.success) and bool(after.done))
     assert successes == [False] * 4 + [True]
-    for bad in (state, good.replace(sim=fast), good.replace(jaw_contact=jnp.ones((), bool))):
-        again = envs._judge(sim, bad.replace(settled=last.settled))
+    assert float(after.reward) == 1.0 and int(after.stage) == len(task.STAGES) - 1
+    for bad in (state, good.replace(facts=fast), good.replace(facts=held)):
+        again = envs.judge(sim, bad.replace(settled=last.settled))
+        assert float(again.reward) < 1.0
         assert int(again.settled) == 0 and not again.success and not again.done
 
 
@@ -94,9 +97,9 @@ def test_a_diverged_lane_is_frozen_and_leaves_its_neighbours_alone(reset, begin,
     state = reset(3)
     script = begin(state, 4)
     broken = state.replace(
-        sim=state.sim.replace(
-            qpos=state.sim.qpos.at[2, 0].set(jnp.nan),
-            qvel=state.sim.qvel.at[5, 0].set(1e20).at[7, 9].set(jnp.inf),
+        physics=state.physics.replace(
+            qpos=state.physics.qpos.at[2, 0].set(jnp.nan),
+            qvel=state.physics.qvel.at[5, 0].set(1e20).at[7, 9].set(jnp.inf),
         )
     )
     for _ in range(3):
@@ -108,34 +111,38 @@ def test_a_diverged_lane_is_frozen_and_leaves_its_neighbours_alone(reset, begin,
     np.testing.assert_array_equal(broken.invalid, sick)
     assert np.all(np.asarray(broken.done)[sick]) and not np.asarray(broken.success)[sick].any()
     for name in ("qpos", "qvel"):
-        ours, theirs = (np.asarray(getattr(s.sim, name))[~sick] for s in (state, broken))
+        ours, theirs = (np.asarray(getattr(s.physics, name))[~sick] for s in (state, broken))
         np.testing.assert_array_equal(ours, theirs)
     assert int(broken.step[2]) == 0, "the last sound state is kept"
 
 
 def test_the_same_key_gives_the_same_episode_and_another_another(reset):
     first, again, other = reset(11), reset(11), reset(12)
-    np.testing.assert_array_equal(first.sim.qpos, again.sim.qpos)
-    assert not np.array_equal(first.sim.qpos, other.sim.qpos)
+    np.testing.assert_array_equal(first.physics.qpos, again.physics.qpos)
+    assert not np.array_equal(first.physics.qpos, other.physics.qpos)
 
 
 def test_observations_hold_what_they_say(environment, reset):
     state = jax.tree.map(lambda leaf: leaf[4], reset(2))
     seen = environment.observe(state)
-    assert seen.image is None and seen.state.shape == (12,)
-    np.testing.assert_allclose(seen.state[:3], state.block_pose.p)
-    np.testing.assert_allclose(rcm.rot6d_decode(seen.state[3:9]), state.block_pose.R, atol=1e-6)
-    np.testing.assert_allclose(seen.state[9:11], environment.model.pegs[int(state.target)])
-    half_open = state.replace(gripper=jnp.float32(0.3), gripper_target=-jnp.ones(()))
-    assert float(environment.observe(half_open).gripper) == jnp.float32(0.3), "measured"
+    assert seen.images is None and seen.state.shape == (environment.task.state_size,) == (12,)
+    np.testing.assert_allclose(seen.state[:3], state.facts.block.p)
+    np.testing.assert_allclose(rcm.rot6d_decode(seen.state[3:9]), state.facts.block.R, atol=1e-6)
+    np.testing.assert_allclose(
+        seen.state[9:11], environment.scene.bound.pegs[int(state.layout.target)]
+    )
+    half_open = state.replace(gripper=jnp.full(1, 0.3), gripper_target=-jnp.ones(1))
+    assert float(environment.observe(half_open).gripper[0]) == jnp.float32(0.3), "measured"
 
 
 def test_a_collision_is_noticed(reset, begin, drive, sim):
     state = reset(13)
-    shaft = state.pose.p[4] - 0.03 * state.pose.R[4, :, 2]
+    shaft = state.pose.p[4, 0] - 0.03 * state.pose.R[4, 0, :, 2]
     around = shaft - jnp.array([task.RIM_RADIUS, 0.0, 0.0])  # the block has a wall there
-    qpos = state.sim.qpos.at[4, sim.block : sim.block + 7].set(jnp.array([*around, 1, 0, 0, 0]))
-    after, _ = drive(state.replace(sim=state.sim.replace(qpos=qpos)), begin(state, 14))
+    start = sim.bound.block
+    qpos = state.physics.qpos.at[4, start : start + 7].set(jnp.array([*around, 1, 0, 0, 0]))
+    moved = state.replace(physics=state.physics.replace(qpos=qpos))
+    after, _ = drive(moved, begin(state, 14))
     np.testing.assert_array_equal(after.collided, np.arange(12) == 4)
 
 
@@ -146,49 +153,62 @@ def test_a_collision_and_a_near_miss_are_remembered(reset, begin, drive):
     assert after.collided.all() and after.loose.all()
 
 
-def test_the_picture_shows_the_port_and_the_target_of_its_episode(reset):
+def test_the_image_shows_the_trocar_and_the_target_of_its_episode(reset, sim):
     state = jax.tree.map(lambda leaf: leaf[0], reset(2))
-    observe = jax.jit(envs.make("image", 32).observe)
+    observe = jax.jit(envs.make(image_size=32).observe)
 
-    def picture(**other):
-        return np.asarray(observe(state.replace(**other)).image)
+    def picture(trocar=state.trocar, **other):
+        layout = state.layout.replace(**other)
+        return np.asarray(observe(state.replace(trocar=trocar, layout=layout)).images["camera"])
 
     here = picture()
     assert here.shape == (32, 32, 3) and here.dtype == np.uint8
-    elsewhere = jax.tree.map(lambda field: jnp.asarray(field[9]), rcm.Trocar(*rcm.TROCARS))
+    ninth = jax.tree.map(lambda field: jnp.asarray(field[9:10]), rcm.TROCARS)
+    elsewhere = rcm.trocar_frame(ninth, sim.p_world_ref)
     assert (picture(trocar=elsewhere) != here).any()
-    assert (picture(target=6 + (state.target - 5) % 6) != here).any()
-    assert (picture(source=(state.source + 1) % 6) == here).all()
+    assert (picture(target=6 + (state.layout.target - 5) % 6) != here).any()
+    assert (picture(source=(state.layout.source + 1) % 6) == here).all()
 
 
 def test_the_target_peg_is_marked_in_the_picture(sim):
-    plain, marked = (np.asarray(physics.colours(sim, jnp.asarray(peg))) for peg in (6, 9))
+    layout = task.sample(sim.bound, jax.random.key(0))
+    plain, marked = (
+        np.asarray(task.colours(sim.bound, layout.replace(target=peg), jnp.asarray(sim.geom_rgb)))
+        for peg in (6, 9)
+    )
     changed = np.flatnonzero(np.any(plain != marked, axis=1))
     assert set(changed) == {
-        sim.peg_geoms[6],
-        sim.peg_geoms[9],
-        sim.seat_geoms[6],
-        sim.seat_geoms[9],
+        sim.bound.peg_geoms[6],
+        sim.bound.peg_geoms[9],
+        sim.bound.seat_geoms[6],
+        sim.bound.seat_geoms[9],
     }
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("pixels",), "policy_observation"),
-        (("image", 8), "image_size"),
-        (("image", 16.5), "image_size"),
-        (("image", "32"), "image_size"),
+        ({"observation": "pixels"}, "observation"),
+        ({"image_size": 8}, "image_size"),
+        ({"image_size": 16.5}, "image_size"),
+        ({"image_size": "32"}, "image_size"),
+        ({"task": "pegtransfer"}, "task"),
+        ({"arms": ["fr6"]}, "arm"),
+        ({"arms": ["fr5", "fr5"]}, "arm"),
+        ({"tools": ["graspers"]}, "tool"),
+        ({"cameras": ["overview"]}, "camera"),
     ],
 )
 def test_unusable_settings_are_named(arguments, named):
-    with pytest.raises(ValueError, match=named):
-        envs.make(*arguments)
+    with pytest.raises(errors.UsageError) as raised:
+        envs.make(**arguments)
+    assert raised.value.argument == named
 
 
 def test_double_precision_is_refused_in_a_line():
-    with jax.enable_x64(True), pytest.raises(ValueError, match="JAX_ENABLE_X64"):
-        envs.make("state")
+    with jax.enable_x64(True), pytest.raises(errors.UsageError) as raised:
+        envs.make()
+    assert raised.value.argument == "JAX_ENABLE_X64"
 
 
 def test_the_expert_takes_the_inner_wall_and_on_the_middle_row_the_one_of_less_turn(reset, begin):
@@ -196,8 +216,8 @@ def test_the_expert_takes_the_inner_wall_and_on_the_middle_row_the_one_of_less_t
     for seed in range(8):
         state = reset(seed)
         walls = np.asarray(begin(state, seed).wall)
-        normals = np.asarray(jax.vmap(task.wall_normals)(state.block_pose))
-        for wall, normal, y in zip(walls, normals, np.asarray(state.block_pose.p[:, 1])):
+        normals = np.asarray(jax.vmap(task.wall_normals)(state.facts.block))
+        for wall, normal, y in zip(walls, normals, np.asarray(state.facts.block.p[:, 1])):
             skew = np.abs(normal[:, 0])
             first, second = np.argsort(skew)[:2]
             if abs(y) > 0.015:
@@ -210,13 +230,13 @@ def test_the_expert_takes_the_inner_wall_and_on_the_middle_row_the_one_of_less_t
 
 
 def test_with_one_wall_the_expert_takes_the_same_on_the_middle_row_and_else_as_before(reset):
-    begin = jax.jit(jax.vmap(expert.init_with_one_wall))
+    begin = jax.jit(jax.vmap(expert.WITH_ONE_WALL.init))
     middle = 0
     for seed in range(4):
         state = reset(seed)
         walls = np.asarray(begin(jax.random.split(jax.random.key(seed), 12), state).wall)
-        normals = np.asarray(jax.vmap(task.wall_normals)(state.block_pose))
-        for wall, normal, y in zip(walls, normals, np.asarray(state.block_pose.p[:, 1])):
+        normals = np.asarray(jax.vmap(task.wall_normals)(state.facts.block))
+        for wall, normal, y in zip(walls, normals, np.asarray(state.facts.block.p[:, 1])):
             assert (normal[wall, 1] < 0) == (y > expert.BETWEEN_ROWS)
             middle += abs(y) < expert.BETWEEN_ROWS
     assert middle >= 8
@@ -225,9 +245,9 @@ def test_with_one_wall_the_expert_takes_the_same_on_the_middle_row_and_else_as_b
 def test_the_expert_comes_in_from_outside_along_the_wall(reset, begin):
     state = reset(3)
     script = begin(state, 3)
-    normals = np.asarray(jax.vmap(task.wall_normals)(state.block_pose))
+    normals = np.asarray(jax.vmap(task.wall_normals)(state.facts.block))
     outward = normals[np.arange(len(normals)), np.asarray(script.wall)]
-    away = np.sum(np.asarray(script.goal - state.block_pose.p) * outward, -1)
+    away = np.sum(np.asarray(script.goal - state.facts.block.p) * outward, -1)
     # HOVER_SPREAD is left out by the mean over the twelve.
     assert away.mean() == pytest.approx(task.RIM_RADIUS + expert.HOVER_OUT, abs=0.0015)
 
@@ -236,7 +256,7 @@ def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
     """What is multimodal never depends on the trocar, or positions would not be invariant."""
     state = reset(5)
     one = jax.tree.map(lambda leaf: jnp.stack([leaf[0]] * 12), state)
-    moved = one.replace(trocar=state.trocar)
+    moved = one.replace(trocar=state.trocar, told=state.told)
     begin = jax.jit(jax.vmap(expert.init, in_axes=(None, 0)))
     script = begin(jax.random.key(0), moved)
     assert len(np.unique(script.wall)) == 1 and len(np.unique(script.side)) == 1
@@ -246,11 +266,11 @@ def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
 def test_the_expert_starts_over_when_the_block_is_lost_on_the_way(reset, begin):
     state = reset(6)
     state, script = (jax.tree.map(lambda leaf: leaf[0], x) for x in (state, begin(state, 6)))
-    normal = task.wall_normals(state.block_pose)[script.wall]
-    wall = state.block_pose.p + task.RIM_RADIUS * normal
+    normal = task.wall_normals(state.facts.block)[script.wall]
+    wall = state.facts.block.p + task.RIM_RADIUS * normal
 
     def after(phase, off):
-        there = state.replace(pose=state.pose._replace(p=wall + jnp.array([0.0, 0.0, off])))
+        there = state.replace(pose=state.pose._replace(p=wall[None] + jnp.array([[0.0, 0.0, off]])))
         return int(expert._following(script.replace(phase=jnp.asarray(phase)), there))
 
     for phase in range(expert.RAISE, expert.WAIT):
@@ -273,3 +293,34 @@ def test_the_expert_is_disturbed_by_a_millimetre_and_a_few_degrees(reset, begin)
     spread = np.std(rough[60:], axis=(0, 1))  # once it has forgotten its start
     np.testing.assert_allclose(spread, [1.2e-3, 1.2e-3, 1.2e-3, 0.07], rtol=0.3)
     assert (np.std(smooth[60:], axis=(0, 1)) / spread > 0.5).all()
+
+
+def test_the_contact_solver_converges_and_a_step_where_it_does_not_is_invalid(
+    reset, begin, drive, monkeypatch
+):
+    state = reset(3)
+    after, _ = drive(state, begin(state, 4))
+    assert float(after.solver_error.max()) < envs.MAX_SOLVER_ERROR and not after.invalid.any()
+    monkeypatch.setattr(envs, "MAX_SOLVER_ERROR", 0.0)
+    environment = envs.make(observation="state")
+    command = Command(state.pose, state.gripper)
+    stopped = jax.jit(jax.vmap(environment.step))(state, command)
+    assert stopped.invalid.all() and stopped.done.all()
+    np.testing.assert_array_equal(stopped.physics.qpos, state.physics.qpos)
+
+
+def test_experts_act_on_the_trocar_that_they_are_told_and_errors_count_from_the_true_one(
+    reset, begin, drive
+):
+    state = reset(3)
+    away = jax.tree.map(lambda field: np.roll(field, 1), rcm.TROCARS)
+    told = reset(3, told=away)
+    np.testing.assert_array_equal(told.trocar.p_world_trocar, state.trocar.p_world_trocar)
+    np.testing.assert_allclose(
+        told.told.p_world_trocar[1:], state.trocar.p_world_trocar[:-1], atol=1e-7
+    )
+    right, wrong = (drive(s, begin(s, 4))[1].label.pose for s in (state, told))
+    p_true, p_told = (frame.p_world_trocar[:, 0] for frame in (told.trocar, told.told))
+    assert float(rcm.rcm_error(right, p_true).max()) < 1e-6
+    assert float(rcm.rcm_error(wrong, p_told).max()) < 1e-6
+    assert float(rcm.rcm_error(wrong, p_true).min()) > 1e-3

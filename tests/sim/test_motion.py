@@ -23,11 +23,13 @@ def first_trocar():
 
 def test_inverse_kinematics_reach_every_trocar_and_peg(sim):
     trocars = rcm.Trocar(*(jnp.asarray(field) for field in rcm.TROCARS))
-    tips = jnp.array([[x, y, 0.008] for x, y in sim.pegs])
+    tips = jnp.array([[x, y, 0.008] for x, y in sim.bound.pegs])
 
     def reach(trocar, p, roll):
-        q, residual = ik.solve(sim.arm, on_manifold(trocar, p, roll), jnp.asarray(sim.home), 40)
-        low, high = sim.arm.limits[:, 0], sim.arm.limits[:, 1]
+        q, residual = ik.solve(
+            sim.arms[0].chain, on_manifold(trocar, p, roll), jnp.asarray(sim.arms[0].home), 40
+        )
+        low, high = sim.arms[0].chain.limits[:, 0], sim.arms[0].chain.limits[:, 1]
         return residual, jnp.min(jnp.minimum(q - low, high - q))
 
     grid = jax.vmap(jax.vmap(jax.vmap(reach, (None, None, 0)), (None, 0, None)), (0, None, None))
@@ -127,10 +129,10 @@ def test_a_tool_leans_at_the_port_and_stays_at_its_tip():
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     pose = on_manifold(trocar, jnp.array([0.01, 0.02, 0.03]), 0.3)
-    leant = control.leaning(pose, port, 2e-3 * pose.R[:, 0])
+    leant = control.corrected(pose, port, 2e-3 * pose.R[:, 0])
     np.testing.assert_array_equal(leant.p, pose.p)
     np.testing.assert_allclose(rcm.rcm_error(leant, port), 2e-3, rtol=1e-3)
-    back = control.leaning(leant, port, -2e-3 * pose.R[:, 0])
+    back = control.corrected(leant, port, -2e-3 * pose.R[:, 0])
     np.testing.assert_allclose(rcm.rcm_error(back, port), 0.0, atol=1e-5)
 
 
@@ -138,16 +140,16 @@ def test_a_load_that_stays_is_compensated_at_the_port_up_to_a_limit():
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     reference = on_manifold(trocar, jnp.array([0.01, 0.02, 0.03]), 0.3)
-    hold = jax.jit(control.hold)
+    hold = jax.jit(control.correct)
 
     def left_of(load, periods=30):
         lean = jnp.zeros(3)
         for _ in range(periods):
-            measured = control.leaning(reference, port, lean + load * reference.R[:, 0])
+            measured = control.corrected(reference, port, lean + load * reference.R[:, 0])
             lean = hold(lean, measured, reference, port)
         return float(rcm.rcm_error(measured, port)), float(jnp.linalg.norm(lean))
 
     assert left_of(1e-3)[0] < 5e-6
     np.testing.assert_allclose(
-        left_of(8e-3), (8e-3 - control.MAX_LEAN, control.MAX_LEAN), rtol=1e-2
+        left_of(8e-3), (8e-3 - control.MAX_CORRECTION, control.MAX_CORRECTION), rtol=1e-2
     )

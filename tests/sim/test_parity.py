@@ -10,7 +10,6 @@ import pytest
 
 from starjax.sim import physics, solver
 from starjax.sim.tasks.peg_transfer import task
-from starjax.types import Pose
 
 REST_SECONDS = 10.0
 # How far a resting block may creep in that time (m): 0.23 mm in float32, 0 in float64.
@@ -28,7 +27,7 @@ def step(sim):
     @jax.jit
     def one(qpos, qvel, ctrl):
         data = sim.mjx_data.replace(qpos=qpos, qvel=qvel, ctrl=ctrl)
-        data = solver.step(sim.mjx_model, data)
+        data, _ = solver.step(sim.mjx_model, data)
         return data.qvel, data.qacc_warmstart
 
     return one
@@ -49,21 +48,26 @@ def c_step(m, qpos, qvel, ctrl):
 def settled(sim):
     """Coordinates of the block on its peg, arm at home, jaws open; control that holds them."""
     m = sim.mj_model
-    block = Pose(jnp.eye(3), jnp.array([*sim.pegs[4], task.RIM_HEIGHT]))
-    state = physics.initial(sim, jnp.asarray(sim.home), block)
-    return np.array(state.qpos), np.append(sim.home, physics.JAW_OPEN), m
+    [arm] = sim.arms
+    layout = task.sample(sim.bound, jax.random.key(0))
+    place = jnp.array([*sim.bound.pegs[4], task.RIM_HEIGHT])
+    layout = layout.replace(block=layout.block._replace(R=jnp.eye(3), p=place))
+    state = physics.initial(sim, [jnp.asarray(arm.home)], layout)
+    ctrl = np.zeros(m.nu)
+    ctrl[arm.ctrl], ctrl[arm.jaw_ctrl] = arm.home, arm.tool.open
+    return np.array(state.qpos), ctrl, m
 
 
 def situations(sim):
     """Name, coordinates, control and the pair that must touch: one of each kind of contact."""
     qpos, ctrl, _ = settled(sim)
     rim, tube = task.RIM_RADIUS, task.WALL_RADIUS
-    peg = sim.pegs[4]
+    peg = sim.bound.pegs[4]
 
     def placed(p, quat=(1, 0, 0, 0)):
         at = qpos.copy()
-        at[sim.block : sim.block + 3] = p
-        at[sim.block + 3 : sim.block + 7] = quat
+        at[sim.bound.block : sim.bound.block + 3] = p
+        at[sim.bound.block + 3 : sim.bound.block + 7] = quat
         return at
 
     yield "free flight", placed([0.0, 0.0, 0.2]), ctrl, None
@@ -73,7 +77,7 @@ def situations(sim):
     data = mujoco.MjData(sim.mj_model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(sim.mj_model, data)
-    tcp = data.site("robot/tool/tcp")
+    tcp = data.site("arm0/tool/tcp")
     # The wall between the pads: wall 0 along the gap, the block tilted as the tool is.
     R = np.array(tcp.xmat).reshape(3, 3)
     out, up = R[:, 1], -R[:, 2]
@@ -81,20 +85,21 @@ def situations(sim):
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, block.flatten())
     grasped = placed(np.array(tcp.xpos) - rim * out, quat)
-    grasped[sim.jaw : sim.jaw + 2] = tube - 5e-5
-    yield "pads on wall", grasped, ctrl, ("robot/tool/pad_left", "wall0")
+    grasped[sim.arms[0].jaws] = tube - 5e-5
+    yield "pads on wall", grasped, ctrl, ("arm0/tool/pad_left", "wall0")
 
 
 def test_kinematics_agree(sim):
     rng = np.random.default_rng(0)
     qpos, _, m = settled(sim)
-    port = np.array([0.01, -0.02, 0.16])
-    poses = jax.jit(lambda q: physics.geom_poses(sim, q, jnp.asarray(port)))
+    p_trocar = np.array([[0.01, -0.02, 0.16]])
+    poses = jax.jit(lambda q: physics.geom_poses(sim, q, jnp.asarray(p_trocar)))
+    start = sim.bound.block + 3
     for _ in range(5):
         q = qpos + rng.normal(0, 0.2, m.nq)
-        q[sim.block + 3 : sim.block + 7] /= np.linalg.norm(q[sim.block + 3 : sim.block + 7])
+        q[start : start + 4] /= np.linalg.norm(q[start : start + 4])
         data = mujoco.MjData(m)
-        data.qpos[:], data.mocap_pos[0] = q, port
+        data.qpos[:], data.mocap_pos[:] = q, p_trocar
         mujoco.mj_kinematics(m, data)
         xpos, xmat = poses(jnp.asarray(q, jnp.float32))
         np.testing.assert_allclose(xpos, data.geom_xpos, atol=2e-6)
@@ -132,7 +137,7 @@ def test_a_block_rests_on_its_peg_for_ten_seconds(sim):
             data = sim.mjx_data.replace(
                 qpos=carry[0], qvel=carry[1], qacc_warmstart=carry[2], ctrl=jnp.asarray(ctrl)
             )
-            data = solver.step(sim.mjx_model, data)
+            data, _ = solver.step(sim.mjx_model, data)
             return data.qpos, data.qvel, data.qacc_warmstart
 
         still = jnp.zeros(m.nv)
@@ -143,23 +148,23 @@ def test_a_block_rests_on_its_peg_for_ten_seconds(sim):
     data.qpos[:], data.ctrl[:] = qpos, ctrl
     for _ in range(steps):
         mujoco.mj_step(m, data)
-    block = slice(sim.block, sim.block + 7)
+    block = slice(sim.bound.block, sim.bound.block + 7)
     np.testing.assert_allclose(ours[block], data.qpos[block], atol=REST_DRIFT)
     np.testing.assert_allclose(data.qpos[block], qpos[block], atol=REST_DRIFT)
 
 
 def test_constants_in_code_are_those_of_the_model(sim):
-    from starjax.sim import collision
-
     m = sim.mj_model
+    [bound] = sim.arms
     wall = m.geom("wall0")
     assert np.isclose(np.linalg.norm(wall.pos[:2]), task.RIM_RADIUS, atol=1e-6)
     assert np.isclose(wall.size[0], task.WALL_RADIUS)
     assert np.isclose(m.body("block").pos[2], task.RIM_HEIGHT)
-    assert np.isclose(m.geom("peg0").size[0], collision.PEG_RADIUS)
+    assert np.isclose(m.geom("peg0").size[0], task.PEG_RADIUS)
     top = m.geom("peg0").pos[2] + m.geom("peg0").size[1] + m.geom("peg0").size[0]
     assert np.isclose(top, task.PEG_HEIGHT)
-    assert np.isclose(m.geom("robot/tool/shaft").size[0], collision.SHAFT_RADIUS)
-    inertia = m.actuator_gainprm[:6, 0] / physics.SERVO_FREQUENCY**2
-    damping = -m.actuator_biasprm[:6, 2]
-    np.testing.assert_allclose(damping, 2 * physics.SERVO_FREQUENCY * inertia, rtol=1e-6)
+    assert np.isclose(m.geom("arm0/tool/shaft").size[0], bound.tool.shaft_radius)
+    w = bound.arm.servo_frequency
+    inertia = m.actuator_gainprm[bound.ctrl, 0] / w**2
+    damping = -m.actuator_biasprm[bound.ctrl, 2]
+    np.testing.assert_allclose(damping, 2 * w * inertia, rtol=1e-6)

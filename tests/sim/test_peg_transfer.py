@@ -44,7 +44,7 @@ def test_a_block_at_rest_neither_moves_nor_spins():
 
 
 def test_every_peg_and_the_whole_of_each_range_are_drawn(sim):
-    draw = jax.vmap(lambda key: task.sample_layout(key, jnp.asarray(sim.pegs)))
+    draw = jax.vmap(lambda key: task.sample(sim.bound, key))
     found = jax.jit(draw)(jax.random.split(jax.random.key(0), 400))
     assert set(np.unique(found.source)) == set(range(6))
     assert set(np.unique(found.target)) == set(range(6, 12))

@@ -1,41 +1,41 @@
 """When physics counts as diverged, and when the jaws touch the block."""
 
-import types
-
+import jax
 import jax.numpy as jnp
 import pytest
 
 from starjax.sim import physics
+from starjax.sim.tasks.base import Contacts
 from starjax.sim.tasks.peg_transfer import task
-from starjax.types import Pose
 
 
 @pytest.mark.parametrize(
     ("field", "body", "value", "sound"),
     [
-        ("qvel", "arm_dof", 10.0, True),
-        ("qvel", "arm_dof", -30.0, False),
+        ("qvel", "arm", 10.0, True),
+        ("qvel", "arm", -30.0, False),
         ("qvel", "block_dof", 3.0, True),
         ("qvel", "block_dof", -8.0, False),
         ("qpos", "block", 0.5, True),
         ("qpos", "block", -1.5, False),
-        ("qacc_warmstart", "arm_dof", jnp.nan, False),
+        ("qacc_warmstart", "arm", jnp.nan, False),
     ],
 )
 def test_speeds_and_places_beyond_anything_physical_are_unsound(sim, field, body, value, sound):
-    block = Pose(jnp.eye(3), jnp.array([0.0, 0.0, task.RIM_HEIGHT]))
-    state = physics.initial(sim, jnp.asarray(sim.home), block)
-    changed = getattr(state, field).at[getattr(sim, body)].set(value)
+    layout = task.sample(sim.bound, jax.random.key(0))
+    state = physics.initial(sim, [jnp.asarray(sim.arms[0].home)], layout)
+    at = {"arm": sim.arms[0].dof[0], "block_dof": sim.bound.block_dof, "block": sim.bound.block}
+    changed = getattr(state, field).at[at[body]].set(value)
     assert bool(physics.is_sound(sim, state.replace(**{field: changed}))) == sound
 
 
 def test_jaws_touch_the_block_where_a_pad_overlaps_a_wall(sim):
-    pad, wall, peg = sim.pad_geoms[0], sim.wall_geoms[0], sim.peg_geoms[0]
+    pad, wall, peg = sim.arms[0].pads[0], sim.graspable[0], sim.bound.peg_geoms[0]
 
     def touches(distance, *pair):
-        contact = types.SimpleNamespace(geom=jnp.array([pair]), dist=jnp.array([distance]))
-        data = types.SimpleNamespace(_impl=types.SimpleNamespace(contact=contact))
-        return bool(physics._jaw_contact(sim, data))
+        found = physics.touching(sim, Contacts(jnp.array([pair]), jnp.array([distance])))
+        assert found.shape == (1,)
+        return bool(found[0])
 
     assert touches(-1e-5, pad, wall) and touches(-1e-5, wall, pad)
     assert not touches(1e-5, pad, wall)

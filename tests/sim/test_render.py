@@ -12,10 +12,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from starjax import errors
 from starjax.sim import render
 from starjax.sim import scene as model
+from starjax.sim.arms import fr5
 from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import shapes, tiles
+from starjax.types import Pose
 
 # Every primitive, tilted, in a pile, with what must not be drawn: groups 3 and up, alpha 0, sites.
 PILE = """
@@ -55,14 +58,21 @@ SHAPES = {
 
 
 @functools.cache
-def pile(copies: int = 2) -> mujoco.MjModel:
-    """The pile, `copies` of each shape on a free body."""
+def pile(copies: int = 2, marks: bool = True) -> mujoco.MjModel:
+    """The pile, `copies` of each shape on a free body; lines mark the edges of its checkers."""
     bodies = ""
     for kind, size in SHAPES.items():
         for i in range(copies):
             look = 'material="shiny"' if i % 2 else f'rgba="{0.2 + 0.3 * i} .5 .3 1"'
             bodies += f'<body><freejoint/><geom type="{kind}" size="{size}" {look}/></body>'
-    return mujoco.MjModel.from_xml_string(PILE.format(bodies=bodies))
+    xml = PILE if marks else PILE.replace('mark="edge"', "")
+    return mujoco.MjModel.from_xml_string(xml.format(bodies=bodies))
+
+
+@functools.cache
+def composed() -> mujoco.MjModel:
+    """The scene of peg transfer."""
+    return model.compose(model.name())
 
 
 def poses(mj_model: mujoco.MjModel, n: int, seed: int = 0) -> np.ndarray:
@@ -75,8 +85,8 @@ def poses(mj_model: mujoco.MjModel, n: int, seed: int = 0) -> np.ndarray:
             qpos[:, at : at + 3] = rng.uniform(-1, 1, (n, 3)) * spread + (0, 0, 0.1)
             quat = rng.normal(size=(n, 4))
             qpos[:, at + 3 : at + 7] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
-    for k, home in enumerate(model.HOME):
-        name = f"robot/j{k + 1}"
+    for k, home in enumerate(fr5.ARM.mounts["grasper", "board"].home):
+        name = f"arm0/j{k + 1}"
         if mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_JOINT, name) >= 0:
             qpos[:, mj_model.joint(name).qposadr[0]] = home + rng.normal(scale=0.06, size=n)
     return qpos
@@ -195,7 +205,7 @@ def gl_pictures(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("compose", "camera", "height", "width"),
-    [(pile, "camera", 144, 208), (pile, "shifted", 192, 256), (model.compose, "camera", 256, 256)],
+    [(pile, "camera", 144, 208), (pile, "shifted", 192, 256), (composed, "camera", 256, 256)],
 )
 def test_agrees_with_the_gl_renderer(gl_pictures, compose, camera, height, width):
     mj_model = compose()
@@ -285,15 +295,15 @@ def test_supersampling_smooths_outlines_and_nothing_else():
     assert np.mean(one.segmentation == four.segmentation) > 0.97
 
 
-def test_port_reference_is_on_the_optical_axis():
-    """The principal point lies 117 px above the middle of the picture, and the port on it."""
-    mj_model = model.compose()
+def test_the_nominal_trocar_is_on_the_optical_axis():
+    """The principal point lies 117 px above the middle of the image, and the trocar on it."""
+    mj_model = composed()
     xpos, xmat = geoms(mj_model, mj_model.qpos0[None])
-    port = mj_model.geom("port").id
+    marker = mj_model.geom("trocar0").id
     frame = jax.jit(render.make(mj_model, segmentation=True))(
         xpos[0], xmat[0], render.geom_rgb(mj_model)
     )
-    rows, columns = np.nonzero(np.asarray(frame.segmentation) == port)
+    rows, columns = np.nonzero(np.asarray(frame.segmentation) == marker)
     assert abs(columns.mean() - 127.5) < 0.5 and abs(rows.mean() - (127.5 - 117)) < 1.5
 
 
@@ -329,3 +339,40 @@ def test_wrong_shapes_are_named():
     caster = render.make(pile(), height=8, width=8)
     with pytest.raises(ValueError, match="geom_xpos, geom_xmat, geom_rgb: expected"):
         caster(jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), jnp.zeros((2, 3)))
+
+
+@pytest.mark.parametrize("compose", [lambda: pile(marks=False), composed])
+def test_a_moving_camera_sees_what_a_fixed_one_sees_from_there(compose):
+    mj_model = compose()
+    qpos = poses(mj_model, 2)
+    fixed = draw(mj_model, qpos, segmentation=True, height=96, width=96)
+    scene = scenes.read(mj_model, "camera", 1.0)
+    here = Pose(jnp.asarray(scene.R_world_cam), jnp.asarray(scene.p_world_cam))
+    take = render.make(mj_model, segmentation=True, height=96, width=96, moves=True)
+    rgb = render.geom_rgb(mj_model)
+    xpos, xmat = geoms(mj_model, qpos)
+    moved = jax.jit(jax.vmap(lambda p, R: take(p, R, rgb, here)))(xpos, xmat)
+    same = np.asarray(moved.segmentation) == fixed.segmentation
+    assert same.mean() > 0.999
+    off = np.abs(np.asarray(moved.rgb).astype(int) - fixed.rgb).max(-1)
+    assert off.mean() < 0.5  # of 255: the edges of the checkers are smoothed otherwise
+
+
+def test_a_camera_that_moves_sees_the_scene_turn():
+    """Turned about the vertical with the whole of the scene, it sees the same."""
+    mj_model = pile(marks=False)
+    take = jax.jit(render.make(mj_model, height=64, width=64, moves=True, shadow=False))
+    scene = scenes.read(mj_model, "camera", 1.0)
+    xpos, xmat = (x[0] for x in geoms(mj_model, poses(mj_model, 1)))
+    rgb = render.geom_rgb(mj_model)
+    up = np.array([0.0, 0.0, 0.02])
+    here = Pose(jnp.asarray(scene.R_world_cam), jnp.asarray(scene.p_world_cam))
+    there = here._replace(p=here.p + up)
+    first, second = take(xpos, xmat, rgb, here), take(xpos + up, xmat, rgb, there)
+    static = np.asarray(first.rgb) == np.asarray(second.rgb)
+    assert static.mean() > 0.9 and (np.asarray(take(xpos, xmat, rgb, there).rgb) != first.rgb).any()
+
+
+def test_what_a_moving_camera_cannot_draw_is_refused():
+    with pytest.raises(errors.UsageError):
+        render.make(pile(), moves=True)

@@ -52,11 +52,14 @@ def cost(problem, x):
 def test_the_minimum_is_that_of_a_general_optimiser(seed):
     rng = np.random.default_rng(seed)
     problem = random_problem(rng, active=CONTACTS - seed % 3)
-    x, force = solve(problem, jnp.asarray(rng.normal(size=VELOCITIES), jnp.float32), TIMESTEP)
+    x, force, error = solve(
+        problem, jnp.asarray(rng.normal(size=VELOCITIES), jnp.float32), TIMESTEP
+    )
     best = scipy.optimize.minimize(lambda x: cost(problem, x), np.asarray(x, float), tol=1e-14)
     np.testing.assert_allclose(x, best.x, atol=3e-4)
     # At the minimum the forces balance.
     np.testing.assert_allclose(problem.M @ x, problem.f + force, atol=1e-3)
+    assert error <= solver.MAX_ERROR_ENERGY
 
 
 def test_half_the_hessian_is_the_slope_of_the_pull():
@@ -84,8 +87,8 @@ def test_a_contact_at_rest_on_its_axis_pulls_nothing():
 
 def test_a_solved_problem_stays_as_it_is():
     problem = random_problem(np.random.default_rng(3))
-    x, _ = solve(problem, jnp.zeros(VELOCITIES), TIMESTEP)
-    again, _ = solve(problem, x, TIMESTEP)
+    x, _, _ = solve(problem, jnp.zeros(VELOCITIES), TIMESTEP)
+    again, _, _ = solve(problem, x, TIMESTEP)
     np.testing.assert_array_equal(x, again)
 
 
@@ -93,7 +96,7 @@ def test_what_is_not_finite_ends_and_harms_no_other():
     problem = random_problem(np.random.default_rng(4))
     two = jax.jit(jax.vmap(solver.solve, in_axes=(None, 0, None)))
     starts = jnp.stack([jnp.ones(VELOCITIES), jnp.full(VELOCITIES, jnp.nan)])
-    x, _ = two(problem, starts, TIMESTEP)
+    x, _, _ = two(problem, starts, TIMESTEP)
     assert jnp.all(jnp.isnan(x[1]))
     np.testing.assert_array_equal(x[0], two(problem, starts[:1].repeat(2, 0), TIMESTEP)[0][0])
 
@@ -126,10 +129,21 @@ def test_small_systems_are_solved_as_by_lapack():
         np.testing.assert_allclose(x, np.linalg.solve(H, g), atol=2e-3 * np.abs(x).max())
 
 
+def test_a_solution_that_did_not_converge_says_so(monkeypatch):
+    rng = np.random.default_rng(0)
+    problem = random_problem(rng)
+    monkeypatch.setattr(solver, "MAX_ITERATIONS", 0)
+    _, _, error = solver.solve(problem, jnp.zeros(VELOCITIES), TIMESTEP)
+    gradient = -problem.f - solver.pull(problem, -problem.b) @ -problem.A
+    left = 0.5 * TIMESTEP**2 * np.sum(np.square(gradient) / np.diag(problem.M))
+    np.testing.assert_allclose(error, left, rtol=1e-4)
+    assert error > 1e3 * solver.MAX_ERROR_ENERGY
+
+
 @pytest.mark.parametrize(
     ("change", "names"),
     [
-        (lambda m: m.geom("robot/tool/pad_left").__setattr__("condim", 4), "condim"),
+        (lambda m: m.geom("arm0/tool/pad_left").__setattr__("condim", 4), "condim"),
         (lambda m: setattr(m.opt, "cone", mujoco.mjtCone.mjCONE_PYRAMIDAL), "PYRAMIDAL"),
         (lambda m: setattr(m.opt, "integrator", mujoco.mjtIntegrator.mjINT_EULER), "EULER"),
         (lambda m: setattr(m.opt, "disableflags", 0), "eulerdamp"),
@@ -137,7 +151,7 @@ def test_small_systems_are_solved_as_by_lapack():
     ],
 )
 def test_a_model_that_the_solver_does_not_know_is_refused(change, names):
-    m = scene.compose()
+    m = scene.compose(scene.name())
     change(m)
     with pytest.raises(ValueError, match=f"model: expected.*{names}"):
         solver.check(mjx.put_model(m, impl="jax"), mjx.make_data(m, impl="jax"))

@@ -4,10 +4,10 @@ import pathlib
 
 
 def path(name: str) -> pathlib.Path:
-    """The file of one MJCF part, e.g. `arms/fr5/fr5.xml`.
+    """The file of one MJCF part, e.g. `arms/fr5/fr5.xml`, or an absolute path as it is.
 
     Raises:
-      FileNotFoundError: the part is in neither place; both are named.
+      FileNotFoundError: the part is in no such place; all are named.
     """
     package = pathlib.Path(__file__).resolve().parents[1]
     places = [package / "mjcf" / name, package.parents[1] / "mjcf" / name]

@@ -1,59 +1,86 @@
-"""Notices where arm, shaft and jaws touch things they have no modelled contact with.
+"""Notices where arms, shafts and jaws touch things they have no modelled contact with.
 
-The physics models pads against walls and pegs, walls against pegs, feet against the board. The rest
-is watched here. It is a flag beside the outcome of a trial, which it does not decide, and a rough
-one: walls count as the sides of a full triangle, 3.5 mm longer at either end than they are, and of
-the jaws only the end of their axis is looked at, so that a tool that leans by 30 degrees gets a
-pad's corner up to 3 mm into the board unnoticed.
+The physics models what each part's MJCF gives contact bits. The rest is watched here, as a
+diagnostic flag: it does not affect success. Approximations: obstacles are the task's capsules, a
+shaft is a row of points, and of the jaws only the end of their axis is looked at, so that a tool
+that leans by 30 degrees gets a pad's corner up to 3 mm below the floor unnoticed.
 """
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 
-from starjax.sim.tasks.peg_transfer import task
+from starjax.sim.scene import BoundArm
+from starjax.sim.tasks.base import Capsules
 from starjax.types import Pose
 
 # Overlap that is called a collision (m): more than the soft contacts' own give.
 DEPTH = 0.0005
-SHAFT_RADIUS = 0.0025
-# The shaft's lower end lies this far before the tcp (m), the pads' ends this far past it.
-SHAFT_END = 0.012
-PAD_END = 0.0025
-# Length of shaft above its end that can reach a peg or the block (m), and points taken on it.
-SHAFT_REACH = 0.036
-SHAFT_POINTS = 7
-# Radius of the arm's links (m).
-LINK_RADIUS = 0.05
-PEG_RADIUS = 0.001125
+SHAFT_POINTS = 7  # looked at along the end of a shaft
 
 
-def detect(pose: Pose, origins: jax.Array, block: Pose, pegs: jax.Array) -> jax.Array:
+def detect(
+    arms: Sequence[BoundArm],
+    pose: Pose,
+    origins: Sequence[jax.Array],
+    p_world_trocar: jax.Array,
+    obstacles: Capsules,
+    floor: float,
+) -> jax.Array:
     """Whether something overlaps by more than `DEPTH`.
 
     Args:
-      pose: pose_world_tip. origins: `[6, 3]` m, the joints' origins.
-      block: pose_world_block. pegs: `[P, 2]` m.
+      arms: A of them.
+      pose: pose_world_tip `[A]`.
+      origins: of every arm its joints' origins, `[J, 3]` m.
+      p_world_trocar: `[A, 3]` m, the upper ends of the shafts that are inside.
+      obstacles: of the task.
+      floor: m, the lowest height that jaws may reach; the table is at 0.
     """
-    axis = pose.R[:, 2]
-    along = SHAFT_END + jnp.linspace(0.0, SHAFT_REACH, SHAFT_POINTS)
-    shaft = pose.p - along[:, None] * axis
-    arm_on_board = jnp.min(origins[2:, 2]) < LINK_RADIUS
-    jaws_in_board = pose.p[2] + PAD_END * axis[2] < -DEPTH
-    shaft_in_board = jnp.min(shaft[:, 2]) < SHAFT_RADIUS - DEPTH
-    peg_end = task.PEG_HEIGHT - PEG_RADIUS  # of the capsule's axis
-    above = jnp.maximum(shaft[:, None, 2] - peg_end, 0.0)
-    aside = jnp.sum((shaft[:, None, :2] - pegs) ** 2, axis=-1)
-    shaft_in_peg = jnp.min(aside + above**2) < (SHAFT_RADIUS + PEG_RADIUS - DEPTH) ** 2
-    gap = SHAFT_RADIUS + task.WALL_RADIUS - DEPTH
-    shaft_in_block = jnp.min(_distance_sq_to_walls(shaft, block)) < gap**2
-    return arm_on_board | jaws_in_board | shaft_in_board | shaft_in_peg | shaft_in_block
+    hit = jnp.zeros((), bool)
+    for a, bound in enumerate(arms):
+        tool, axis = bound.tool, pose.R[a, :, 2]
+        along = tool.shaft_end + jnp.linspace(0.0, tool.shaft_reach, SHAFT_POINTS)
+        shaft = pose.p[a] - along[:, None] * axis
+        watched = origins[a][bound.arm.watched :, 2]
+        hit |= jnp.min(watched, initial=jnp.inf) < bound.arm.link_radius
+        hit |= pose.p[a, 2] + tool.pad_end * axis[2] < floor - DEPTH
+        hit |= jnp.min(shaft[:, 2]) < tool.shaft_radius - DEPTH
+        gap = tool.shaft_radius + obstacles.radius - DEPTH
+        apart = distance_sq(shaft[:, None], obstacles.start, obstacles.end)
+        hit |= jnp.any(apart < gap**2)
+    return hit | _shafts_meet(arms, pose, p_world_trocar) | _links_meet(arms, origins)
 
 
-def _distance_sq_to_walls(points: jax.Array, block: Pose) -> jax.Array:
-    """`[N, 3]` squared distances (m^2) of `points` `[N, 3]` from the walls' centre lines."""
-    normals = task.wall_normals(block)
-    tangents = jnp.cross(block.R[:, 2], normals)
-    half = jnp.sqrt(3.0) * task.RIM_RADIUS
-    off = points[:, None] - (block.p + task.RIM_RADIUS * normals)
-    along = jnp.clip(jnp.sum(off * tangents, axis=-1), -half, half)
-    return jnp.sum((off - along[..., None] * tangents) ** 2, axis=-1)
+def distance_sq(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Array:
+    """Squared distances (m^2) of `points` `[..., 3]` from segments `[..., 3]`, which broadcast."""
+    way, off = end - start, points - start
+    square = jnp.maximum(jnp.sum(way * way, axis=-1), 1e-12)
+    share = jnp.clip(jnp.sum(off * way, axis=-1) / square, 0.0, 1.0)
+    return jnp.sum((off - share[..., None] * way) ** 2, axis=-1)
+
+
+def _shafts_meet(arms: Sequence[BoundArm], pose: Pose, p_world_trocar: jax.Array) -> jax.Array:
+    """Whether two shafts overlap between trocar and tip."""
+    hit = jnp.zeros((), bool)
+    share = jnp.linspace(0.0, 1.0, 4 * SHAFT_POINTS)[:, None]
+    for a, first in enumerate(arms):
+        ends = pose.p[a] - first.tool.shaft_end * pose.R[a, :, 2]
+        points = p_world_trocar[a] + share * (ends - p_world_trocar[a])
+        for b, second in list(enumerate(arms))[a + 1 :]:
+            end = pose.p[b] - second.tool.shaft_end * pose.R[b, :, 2]
+            gap = first.tool.shaft_radius + second.tool.shaft_radius - DEPTH
+            hit |= jnp.min(distance_sq(points, p_world_trocar[b], end)) < gap**2
+    return hit
+
+
+def _links_meet(arms: Sequence[BoundArm], origins: Sequence[jax.Array]) -> jax.Array:
+    """Whether joints of two arms come closer than their links are thick."""
+    hit = jnp.zeros((), bool)
+    for a, first in enumerate(arms):
+        for b, second in list(enumerate(arms))[a + 1 :]:
+            apart = jnp.sum((origins[a][:, None] - origins[b]) ** 2, axis=-1)
+            gap = first.arm.link_radius + second.arm.link_radius
+            hit |= jnp.min(apart) < gap**2
+    return hit

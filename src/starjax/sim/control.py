@@ -1,11 +1,11 @@
-"""The low-level controller between two commands: bounded speed and acceleration, about the port.
+"""The low-level controller between two commands: bounded speed and acceleration, about the trocar.
 
 A command far from where the tool is (a policy's next plan rarely begins where the last one ended)
-is approached, not leapt at. On the way the tool's axis keeps to the port as well as both ends do: a
-command on the RCM manifold is reached along the manifold, one that misses the port by d misses it
-by a share of d, and its axis passes the port no faster than the tip may move.
+is approached, not leapt at. On the way the tool's axis keeps to the trocar as well as both ends do:
+a command on the RCM manifold is reached along the manifold, one that misses the trocar by d misses
+it by a share of d, and its axis passes the trocar no faster than the tip may move.
 
-Servos give way under load, at the tip as they must, but at the port 0.1 mm is much. There the
+Servos give way under load, at the tip as they must, but at the trocar 0.1 mm is much. There the
 measured axis is brought back to where the reference has it, by turning the tool about its tip.
 """
 
@@ -19,38 +19,38 @@ from starjax.types import Pose
 # follow with the torque they have, and the tip no faster than half of that (the joint that turns
 # the roll then still has its own limit, 3.15 rad/s). A policy that is lost
 # jumps from plan to plan, and the joints' servos do not answer a jerk alike: with 1.8 m/s^2 the
-# axis missed the port by 0.14 mm then (99th percentile of five such trials), with 0.9 by 0.08.
+# axis missed the trocar by 0.14 mm then (99th percentile of five such trials), with 0.9 by 0.08.
 MAX_SPEED = 0.2
 MAX_ACCELERATION = 0.9
 MAX_SPIN = 4.0
 MAX_SPIN_ACCELERATION = 40.0
-# Share of the axis's deviation at the port that is taken back each control period: that under a
+# Share of the axis's deviation at the trocar that is taken back each control period: that under a
 # load that stays shrinks to a third in 0.17 s. Deviations of single periods, which no feedback can
 # foresee, grow by a twentieth; with twice the gain by an eighth.
 HOLD_GAIN = 0.2
-# m of depth up to which that share grows, with the square: a small turn about a tip near the port
+# m of depth up to which that share grows, with the square: a small turn about a tip near the trocar
 # is a large one of the joints, and with the whole share the arm swings there for ever.
 FIRM_DEPTH = 0.03
-MAX_LEAN = 5e-3  # m at the port: servos that give way by more are not just elastic
-MAX_TURN = 0.05  # rad, of the tool for it: near the port turning moves nothing there
+MAX_CORRECTION = 5e-3  # m at the trocar: servos that give way by more are not just elastic
+MAX_TURN = 0.05  # rad, of the tool for it: near the trocar turning moves nothing there
 # m, of a deviation that one period answers: a larger one is of servos that have reached their
 # limits, where more would be asked of them for ever
 MAX_DEVIATION = 1e-3
-# m between tip and port within which the axis stays as it is, having no certain direction: well
+# m between tip and trocar within which the axis stays as it is, having no certain direction: well
 # below the least depth that actions may ask for (`rcm.MIN_DEPTH`)
 NO_DIRECTION = 1e-3
 
 
 def toward(
-    present: Pose, velocity: jax.Array, wanted: Pose, port: jax.Array, period: float
+    present: Pose, velocity: jax.Array, wanted: Pose, p_trocar: jax.Array, period: float
 ) -> tuple[Pose, jax.Array]:
     """The pose to be at after `period` s, single-sample.
 
     Args:
       present: reference pose of the tip now.
-      velocity: `[7]`, of the reference: tip (3) m/s, roll rad/s, its axis at the port (3) m/s.
+      velocity: `[7]`, of the reference: tip (3) m/s, roll rad/s, its axis at the trocar (3) m/s.
       wanted: the commanded pose.
-      port: `[3]` m.
+      p_trocar: `[3]` m.
 
     Returns:
       the next reference pose, equal to `wanted` if that is near enough; its velocity `[7]`.
@@ -63,14 +63,14 @@ def toward(
     share = jnp.where(length > 0, jnp.clip(share, 0.0, 1.0), 1.0)
 
     z_present, z_wanted = present.R[:, 2], wanted.R[:, 2]
-    here, there = _nearest(present, port), _nearest(wanted, port)
+    here, there = _nearest(present, p_trocar), _nearest(wanted, p_trocar)
     shift, most = share * (there - here), MAX_ACCELERATION * period**2
     slower = _step(there - here, velocity[4:] * period, speed, most)
     is_slowed = jnp.sum(slower**2) < jnp.sum(shift**2)  # never on the manifold, where both are 0
     shift = jnp.where(is_slowed, slower, shift)
     through = jnp.where(is_slowed, here + slower, (1.0 - share) * here + share * there)
     axis = p - through
-    axis = axis * jnp.where(axis @ z_present < 0, -1.0, 1.0)  # the tip is above the port
+    axis = axis * jnp.where(axis @ z_present < 0, -1.0, 1.0)  # the tip is above the trocar
     axis = jnp.where(jnp.linalg.norm(axis) < NO_DIRECTION, z_present, axis)
     z = axis / jnp.maximum(jnp.linalg.norm(axis), 1e-6)
     carried = rcm.rotation_align(z_present, z_wanted) @ present.R
@@ -85,24 +85,26 @@ def toward(
     return pose, jnp.concatenate([step, spin, shift]) / period
 
 
-def hold(lean: jax.Array, measured: Pose, reference: Pose, port: jax.Array) -> jax.Array:
-    """The `lean` `[3]` m to go on with, given the last one, the measured pose and its reference."""
-    deviation = _nearest(measured, port) - _nearest(reference, port)
+def correct(
+    correction: jax.Array, measured: Pose, reference: Pose, p_trocar: jax.Array
+) -> jax.Array:
+    """The next correction `[3]` m of the axis at the trocar, from the measured deviation."""
+    deviation = _nearest(measured, p_trocar) - _nearest(reference, p_trocar)
     far = jnp.maximum(jnp.linalg.norm(deviation), MAX_DEVIATION)
-    lever = jnp.abs((reference.p - port) @ reference.R[:, 2])
+    lever = jnp.abs((reference.p - p_trocar) @ reference.R[:, 2])
     gain = HOLD_GAIN * jnp.minimum(1.0, lever / FIRM_DEPTH) ** 2
-    lean = lean - gain * deviation * (MAX_DEVIATION / far)
-    most = jnp.minimum(MAX_LEAN, MAX_TURN * lever)
-    return lean * jnp.minimum(1.0, most / jnp.maximum(jnp.linalg.norm(lean), 1e-9))
+    correction = correction - gain * deviation * (MAX_DEVIATION / far)
+    most = jnp.minimum(MAX_CORRECTION, MAX_TURN * lever)
+    return correction * jnp.minimum(1.0, most / jnp.maximum(jnp.linalg.norm(correction), 1e-9))
 
 
-def leaning(pose: Pose, port: jax.Array, lean: jax.Array) -> Pose:
-    """The pose turned about its tip until its axis passes the port by `lean` `[3]` m more."""
+def corrected(pose: Pose, p_trocar: jax.Array, correction: jax.Array) -> Pose:
+    """The pose turned about its tip until its axis passes `correction` `[3]` m further on."""
     z = pose.R[:, 2]
-    depth = (pose.p - port) @ z
-    lean = jnp.where(depth < 0, -lean, lean)  # of a tip above the port
+    depth = (pose.p - p_trocar) @ z
+    correction = jnp.where(depth < 0, -correction, correction)  # of a tip above the trocar
     lever = jnp.maximum(jnp.abs(depth), rcm.MIN_DEPTH)
-    return Pose(rcm.rotation_align(z, lever * z - lean) @ pose.R, pose.p)
+    return Pose(rcm.rotation_align(z, lever * z - correction) @ pose.R, pose.p)
 
 
 def _step(way: jax.Array, last: jax.Array, most: float, change: jax.Array | float) -> jax.Array:
@@ -120,7 +122,7 @@ def _step(way: jax.Array, last: jax.Array, most: float, change: jax.Array | floa
     return jnp.where(size <= change, target, last + bend * (change / size))
 
 
-def _nearest(pose: Pose, port: jax.Array) -> jax.Array:
-    """The point `[3]` of the tool's axis nearest to the port."""
+def _nearest(pose: Pose, p_trocar: jax.Array) -> jax.Array:
+    """The point `[3]` of the tool's axis nearest to the trocar."""
     z = pose.R[:, 2]
-    return pose.p + ((port - pose.p) @ z) * z
+    return pose.p + ((p_trocar - pose.p) @ z) * z

@@ -1,25 +1,19 @@
 """MJX under the environment: what is carried between steps, and one control period of it."""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import flax.struct
 import jax
 import jax.numpy as jnp
 
 from starjax.sim import solver
 from starjax.sim.engine import mjx
-from starjax.sim.scene import SimModel
-from starjax.types import Pose
+from starjax.sim.scene import BoundArm, Scene
+from starjax.sim.tasks.base import Contacts
 
-# Jaw targets at gripper -1 and +1 (m a side): past closed, so that the servo squeezes.
-JAW_CLOSED = -0.001
-JAW_OPEN = 0.0032
-# Natural frequency of the joint servos (rad/s), as in fr5.xml.
-SERVO_FREQUENCY = 100.0
-# Beyond these the solver has diverged.
-MAX_ARM_SPEED = 20.0  # rad/s
-MAX_BLOCK_SPEED = 5.0  # m/s
-MAX_BLOCK_DISTANCE = 1.0  # m from the board's centre
-
-TARGET_RGB = (0.98, 0.62, 0.1)
+# Beyond it the solver has diverged (rad/s, of an arm's joints).
+MAX_ARM_SPEED = 20.0
 
 
 @flax.struct.dataclass
@@ -27,7 +21,7 @@ class PhysicsState:
     """All of `mjx.Data` that the next step needs.
 
     Attributes:
-      qpos: `[15]`: block (7), arm (6) rad, jaws (2) m. qvel: `[14]`. qacc_warmstart: `[14]`.
+      qpos: `[Q]`. qvel, qacc_warmstart: `[V]`.
     """
 
     qpos: jax.Array
@@ -35,115 +29,152 @@ class PhysicsState:
     qacc_warmstart: jax.Array
 
 
-def initial(sim: SimModel, q: jax.Array, block: Pose) -> PhysicsState:
-    """At rest: arm at `q` `[6]` rad, jaws open, block upright at `block`."""
-    half = 0.5 * jnp.arctan2(block.R[1, 0], block.R[0, 0])
-    zero = jnp.zeros(())
-    quat = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])
-    qpos = jnp.zeros(sim.mj_model.nq)
-    qpos = qpos.at[sim.block : sim.block + 7].set(jnp.concatenate([block.p, quat]))
-    qpos = qpos.at[sim.arm_q : sim.arm_q + 6].set(q)
-    qpos = qpos.at[sim.jaw : sim.jaw + 2].set(JAW_OPEN)
-    still = jnp.zeros(sim.mj_model.nv)
+class Passed(NamedTuple):
+    """What a control period leaves behind.
+
+    Attributes:
+      touch: `[A]` bool, whether a pad touches something graspable in the last substep.
+      contacts: of the last substep.
+      qpos: `[substeps, Q]` where each substep began.
+      solver_error: J, the largest energy that the contact solver's error may hold in a substep.
+    """
+
+    touch: jax.Array
+    contacts: Contacts
+    qpos: jax.Array
+    solver_error: jax.Array
+
+
+def initial(scene: Scene, q: Sequence[jax.Array], layout: object) -> PhysicsState:
+    """At rest: arms at `q`, `[J]` rad each, jaws open, the task's objects in place."""
+    qpos = jnp.asarray(scene.mj_model.qpos0, jnp.float32)
+    for bound, q_arm in zip(scene.arms, q, strict=True):
+        qpos = qpos.at[bound.q].set(q_arm)
+        if bound.jaws.size:
+            qpos = qpos.at[bound.jaws].set(bound.tool.open)
+    qpos = scene.task.place(scene.bound, qpos, layout)
+    still = jnp.zeros(scene.mj_model.nv)
     return PhysicsState(qpos=qpos, qvel=still, qacc_warmstart=still)
 
 
-def advance(
-    sim: SimModel,
-    state: PhysicsState,
-    q: jax.Array,
-    dq: jax.Array,
-    velocity: jax.Array,
-    gripper: jax.Array,
-    period: float,
-) -> tuple[PhysicsState, jax.Array, jax.Array]:
-    """One control period: the joint target moves smoothly from `q` to `q + dq`.
+def no_contacts(scene: Scene) -> Contacts:
+    """Before the first step: contacts at a distance."""
+    contact = scene.mjx_data._impl.contact
+    shape = contact.dist.shape
+    return Contacts(jnp.zeros((*shape, 2), jnp.int32), jnp.ones(shape))
 
-    The target follows the cubic that begins at `velocity` and ends at `dq / period`; velocity and
-    acceleration are fed forward, or each change of speed would swing the long tool off its port.
+
+def advance(
+    scene: Scene,
+    state: PhysicsState,
+    q: Sequence[jax.Array],
+    dq: Sequence[jax.Array],
+    velocity: Sequence[jax.Array],
+    gripper: jax.Array,
+    p_world_trocar: jax.Array,
+    period: float,
+) -> tuple[PhysicsState, Passed]:
+    """One control period: the joint targets move smoothly from `q` to `q + dq`.
+
+    A target follows the cubic that begins at `velocity` and ends at `dq / period`; velocity and
+    acceleration are fed forward, or each change of speed would swing the long tool off its trocar.
 
     Args:
-      q, dq: `[6]` rad. velocity: `[6]` rad/s, of the target before. gripper: `[]` in [-1, 1].
+      q, dq: of every arm, `[J]` rad. velocity: of every arm, `[J]` rad/s, of the target before.
+      gripper: `[A]` in [-1, 1].
+      p_world_trocar: `[A, 3]` m.
       period: s.
-
-    Returns:
-      the state after; whether a pad touches a wall of the block in the last substep; the arm's
-      joints where each substep began, `[substeps, 6]` rad.
     """
-    substeps = round(period / sim.mj_model.opt.timestep)
-    jaw = JAW_CLOSED + 0.5 * (gripper + 1.0) * (JAW_OPEN - JAW_CLOSED)
-    turn = period * velocity - dq
+    substeps = round(period / scene.mj_model.opt.timestep)
+    mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
+    turn = [period * v - d for v, d in zip(velocity, dq, strict=True)]
+
+    def target(i: jax.Array) -> jax.Array:
+        """All servos' targets `[nu]` of substep i."""
+        s = (i + 1) / substeps
+        ctrl = jnp.zeros(scene.mj_model.nu)
+        for a, bound in enumerate(scene.arms):
+            # Cubic Hermite: the straight line, and the bend that its first slope asks for.
+            x = q[a] + s * dq[a] + s * (1 - s) ** 2 * turn[a]
+            v = (dq[a] + (1 - s) * (1 - 3 * s) * turn[a]) / period
+            acceleration = (6 * s - 4) * turn[a] / period**2
+            w = bound.arm.servo_frequency
+            ctrl = ctrl.at[bound.ctrl].set(x + 2.0 / w * v + acceleration / w**2)
+            if bound.jaw_ctrl is not None:
+                ctrl = ctrl.at[bound.jaw_ctrl].set(_jaw_target(bound, gripper[a]))
+        return ctrl
 
     def substep(i, carry):
-        state, _, passed = carry
-        passed = passed.at[i].set(state.qpos[sim.arm_q : sim.arm_q + 6])
-        s = (i + 1) / substeps
-        # Cubic Hermite: the straight line, and the bend that its first slope asks for.
-        x = q + s * dq + s * (1 - s) ** 2 * turn
-        v = (dq + (1 - s) * (1 - 3 * s) * turn) / period
-        a = (6 * s - 4) * turn / period**2
-        target = x + 2.0 / SERVO_FREQUENCY * v + a / SERVO_FREQUENCY**2
-        data = sim.mjx_data.replace(
+        state, passed = carry
+        before = passed.qpos.at[i].set(state.qpos)
+        data = scene.mjx_data.replace(
             qpos=state.qpos,
             qvel=state.qvel,
             qacc_warmstart=state.qacc_warmstart,
-            ctrl=jnp.append(target, jaw),
+            ctrl=target(i),
+            mocap_pos=mocap_pos,
         )
-        data = solver.step(sim.mjx_model, data)
+        data, error = solver.step(scene.mjx_model, data)
+        found = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
+        error = jnp.maximum(passed.solver_error, error)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-        return state, _jaw_contact(sim, data), passed
+        return state, Passed(touching(scene, found), found, before, error)
 
-    first = state, jnp.zeros((), bool), jnp.zeros((substeps, 6))
-    return jax.lax.fori_loop(0, substeps, substep, first)
-
-
-def is_sound(sim: SimModel, state: PhysicsState) -> jax.Array:
-    """False once the simulation has diverged: not finite, or faster than anything physical."""
-    finite = jax.tree.reduce(lambda ok, x: ok & jnp.all(jnp.isfinite(x)), state, jnp.ones((), bool))
-    arm = jnp.max(jnp.abs(state.qvel[sim.arm_dof : sim.arm_dof + 6]))
-    block = jnp.max(jnp.abs(state.qvel[sim.block_dof : sim.block_dof + 3]))
-    away = jnp.max(jnp.abs(state.qpos[sim.block : sim.block + 3]))
-    return finite & (arm < MAX_ARM_SPEED) & (block < MAX_BLOCK_SPEED) & (away < MAX_BLOCK_DISTANCE)
-
-
-def block_pose(sim: SimModel, state: PhysicsState) -> Pose:
-    """pose_world_block."""
-    coords = state.qpos[sim.block : sim.block + 7]
-    w, x, y, z = coords[3:] / jnp.linalg.norm(coords[3:])
-    rows = (
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    blank = Passed(
+        jnp.zeros(len(scene.arms), bool),
+        no_contacts(scene),
+        jnp.zeros((substeps, scene.mj_model.nq)),
+        jnp.zeros(()),
     )
-    return Pose(jnp.stack([jnp.stack(row) for row in rows]), coords[:3])
+    return jax.lax.fori_loop(0, substeps, substep, (state, blank))
 
 
-def opening(sim: SimModel, state: PhysicsState) -> jax.Array:
-    """Measured opening of the jaws in [-1, 1]: -1 closed on nothing, +1 fully open."""
-    return jnp.clip(2.0 * state.qpos[sim.jaw] / JAW_OPEN - 1.0, -1.0, 1.0)
+def is_sound(scene: Scene, state: PhysicsState) -> jax.Array:
+    """False once the simulation has diverged: not finite, or faster than anything physical."""
+    sound = jax.tree.reduce(lambda ok, x: ok & jnp.all(jnp.isfinite(x)), state, jnp.ones((), bool))
+    for bound in scene.arms:
+        sound &= jnp.max(jnp.abs(state.qvel[bound.dof])) < MAX_ARM_SPEED
+    return sound & scene.task.is_sound(scene.bound, state.qpos, state.qvel)
 
 
-def geom_poses(sim: SimModel, qpos: jax.Array, port: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """`[G, 3]` m and `[G, 3, 3]` of every geom, the port's marker at `port` `[3]` m."""
-    data = sim.mjx_data.replace(qpos=qpos, mocap_pos=port[None])
-    data = mjx.kinematics(sim.mjx_model, data)
+def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
+    """Measured openings of the jaws, `[A]` in [-1, 1]: -1 closed on nothing, +1 fully open."""
+    found = [
+        jnp.ones(()) if bound.jaw is None else 2.0 * qpos[bound.jaw] / bound.tool.open - 1.0
+        for bound in scene.arms
+    ]
+    return jnp.clip(jnp.stack(found), -1.0, 1.0)
+
+
+def kinematics(scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array) -> mjx.Data:
+    """Poses of all bodies and geoms, the trocars' markers at `p_world_trocar` `[A, 3]` m."""
+    mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
+    data = scene.mjx_data.replace(qpos=qpos, mocap_pos=mocap_pos)
+    return mjx.kinematics(scene.mjx_model, data)
+
+
+def geom_poses(
+    scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """`[G, 3]` m and `[G, 3, 3]` of every geom, for figures and films."""
+    data = kinematics(scene, qpos, p_world_trocar)
     return data.geom_xpos, data.geom_xmat
 
 
-def colours(sim: SimModel, target: jax.Array) -> jax.Array:
-    """`[G, 3]` in [0, 1]: the model's colours, with the target peg and its seat marked."""
-    rgb = jnp.asarray(sim.geom_rgb)
-    marked = jnp.stack([jnp.asarray(sim.peg_geoms)[target], jnp.asarray(sim.seat_geoms)[target]])
-    return rgb.at[marked].set(jnp.array(TARGET_RGB))
+def touching(scene: Scene, contacts: Contacts) -> jax.Array:
+    """`[A]` bool: whether a pad overlaps something graspable."""
+    close = contacts.dist < 0
+    held = jnp.any(_any_of(contacts.geom, scene.graspable), axis=-1)
+    touched = [
+        jnp.any(close & held & jnp.any(_any_of(contacts.geom, bound.pads), axis=-1))
+        for bound in scene.arms
+    ]
+    return jnp.stack(touched)
 
 
-def _jaw_contact(sim: SimModel, data: mjx.Data) -> jax.Array:
-    contact = data._impl.contact
-    geom = contact.geom
-    pad = _any_of(geom, sim.pad_geoms)
-    wall = _any_of(geom, sim.wall_geoms)
-    return jnp.any((contact.dist < 0) & jnp.any(pad, axis=-1) & jnp.any(wall, axis=-1))
+def _jaw_target(bound: BoundArm, gripper: jax.Array) -> jax.Array:
+    return bound.tool.closed + 0.5 * (gripper + 1.0) * (bound.tool.open - bound.tool.closed)
 
 
 def _any_of(geom: jax.Array, ids) -> jax.Array:
-    return jnp.any(jnp.asarray(geom)[..., None] == jnp.asarray(ids), axis=-1)
+    return jnp.any(geom[..., None] == jnp.asarray(ids), axis=-1)

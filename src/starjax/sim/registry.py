@@ -1,7 +1,8 @@
 """What exists by name: tasks, arms, tools. Others add theirs by an entry point of their package.
 
 A row of `starjax.tasks`, `starjax.arms` or `starjax.tools` in somebody's `[project.entry-points]`
-names an object that is a `Task`, an `Arm` or a `Tool`.
+names an object that is a `Task`, an `Arm` or a `Tool`; a row of `starjax.mounts` a dict from
+(arm, tool, workspace) to `Mount`, for arms that are not theirs.
 """
 
 import importlib
@@ -10,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from starjax import errors
+from starjax.sim.arms.base import Arm, Mount
 
 
 class Registry(NamedTuple):
@@ -53,3 +55,13 @@ class Registry(NamedTuple):
 tasks = Registry("task", {"peg_transfer": "starjax.sim.tasks.peg_transfer.task:TASK"})
 arms = Registry("arm", {"fr5": "starjax.sim.arms.fr5:ARM"})
 tools = Registry("tool", {"grasper": "starjax.sim.tools.grasper:TOOL"})
+
+
+def mount(arm: Arm, tool: str, workspace: str) -> Mount | None:
+    """Where an arm with a tool stands in a workspace; None if nobody has said."""
+    if (tool, workspace) in arm.mounts:
+        return arm.mounts[tool, workspace]
+    for entry in importlib.metadata.entry_points(group="starjax.mounts"):
+        if found := entry.load().get((arm.name, tool, workspace)):
+            return found
+    return None

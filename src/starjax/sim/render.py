@@ -11,12 +11,15 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from starjax import errors
 from starjax.sim.camera import cast, texture, tiles
 from starjax.sim.camera import geometry as scenes
+from starjax.sim.camera import view as views
+from starjax.types import Pose
 
 geom_rgb = scenes.geom_rgb
 
-Render = Callable[[jax.Array, jax.Array, jax.Array], "Frame"]
+Render = Callable[..., "Frame"]
 
 
 @flax.struct.dataclass
@@ -44,8 +47,13 @@ def make(
     depth: bool = False,
     segmentation: bool = False,
     samples: int = 1,
+    moves: bool = False,
 ) -> Render:
     """Makes `render(geom_xpos, geom_xmat, geom_rgb) -> Frame` for a camera fixed in the world.
+
+    For a camera that `moves` it is `render(geom_xpos, geom_xmat, geom_rgb, pose_world_cam)`: x to
+    the right, y up, the camera looks along -z. Textures are then checkers only, and their edges
+    differ from the fixed camera's by the way they are smoothed.
 
     Geoms of group 3 and above, fully transparent ones and sites are not drawn. `geom_xpos [G, 3]`
     m and `geom_xmat [G, 3, 3]` are the simulation's; `geom_rgb [G, 3]` in [0, 1] starts from
@@ -58,17 +66,25 @@ def make(
       shadow: whether the first directional light throws shadows.
       depth, segmentation: whether these come with the picture (of a pixel's last sample).
       samples: rays along each side of a pixel: 1, 2 or 4; 2 smooths outlines at 4 times the cost.
+      moves: whether the camera's pose comes with every image.
     """
     for name, value in (("height", height), ("width", width)):
         if value < 1:
             raise ValueError(f"{name}: expected a positive number of pixels, got {value}")
     if samples not in (1, 2, 4):
         raise ValueError(f"samples: expected 1, 2 or 4 rays a pixel side, got {samples}")
-    scene = scenes.read(mj_model, camera, width / height)
+    scene = scenes.read(mj_model, camera, width / height, moves)
     grid = tiles.grid(scene, height * samples, width * samples)
-    textures = texture.draw(scene, grid)
+    if moves and not all(map(texture.is_checker, scene.textures.values())):
+        raise errors.UsageError("mj_model", "checkers as textures for a moving camera", "others")
+    still = None if moves else views.fixed(scene, grid)
 
-    def render(geom_xpos: jax.Array, geom_xmat: jax.Array, geom_rgb: jax.Array) -> Frame:
+    def render(
+        geom_xpos: jax.Array,
+        geom_xmat: jax.Array,
+        geom_rgb: jax.Array,
+        pose_world_cam: Pose | None = None,
+    ) -> Frame:
         shape = geom_xpos.shape, geom_xmat.shape, geom_rgb.shape
         n = mj_model.ngeom
         if shape != ((n, 3), (n, 3, 3), (n, 3)):
@@ -77,7 +93,11 @@ def make(
                 f"got {shape}"
             )
         inputs = [jnp.asarray(v, jnp.float32) for v in (geom_xpos, geom_xmat, geom_rgb)]
-        t, face, word = cast.cast(scene, grid, textures, shadow, *inputs)
+        if (pose_world_cam is not None) != moves:
+            got = "none" if pose_world_cam is None else "one"
+            raise errors.UsageError("pose_world_cam", "one" if moves else "none", got)
+        view = still or views.moving(scene, grid, pose_world_cam)
+        t, face, word = cast.cast(scene, grid, view, shadow, *inputs)
         frame = Frame(rgb=_bytes(grid, word, samples))
         if depth:
             frame = frame.replace(

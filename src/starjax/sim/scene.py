@@ -1,112 +1,230 @@
-"""Composes robot, tool and task into one MuJoCo model and resolves every id once.
+"""Composes a task with its arms and tools into one MuJoCo model, and resolves every id once.
 
-A second robot or tool is one more MJCF file with the sites and names of the others: a task offers
-`robot_base`, a robot ends in `flange`, a tool brings `tcp` (`mjcf/README.md` has the rest). In the
-composed model the robot's names begin with `robot/`, the tool's with `robot/tool/`.
+Names of arm i begin with `arm<i>/` in the composed model, those of its tool with `arm<i>/tool/`.
+`mjcf/README.md` says what a part must offer.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import jax
 import mujoco
 import numpy as np
 
-from starjax.sim import assets, ik, solver
+from starjax import errors
+from starjax.sim import assets, ik, registry, solver
+from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
 from starjax.sim.engine import mjx
+from starjax.sim.names import SceneNames
+from starjax.sim.tasks.base import Task
+from starjax.sim.tools.base import Tool
 
-# Which MJCF parts exist. Adding one: a file and a line.
-ROBOTS = {"fr5": "arms/fr5/fr5.xml"}
-TOOLS = {"grasper": "tools/grasper/grasper.xml"}
-TASKS = {"peg_transfer": "tasks/peg_transfer/peg_transfer.xml"}
-
-# The grasper turned on the flange so that j6 stays far from its limits over all trocars (rad).
-TOOL_MOUNT = -1.75
-# Arm configuration above the board's centre, port nominal (rad); IK starts from here.
-HOME = (-0.18, -1.10, 1.90, -2.36, -1.571, 0.0)
+# Sizes that MJX compiles in. Each part says what it adds; the scene has the sum.
+CONTACT_LIMITS = ("max_geom_pairs", "max_contact_points")
 
 
-TCP = "robot/tool/tcp"  # site of the tip, {E}
+class BoundArm(NamedTuple):
+    """An arm with its tool in a compiled model.
+
+    Attributes:
+      arm, tool, mount: its records.
+      chain: from the world to the tcp, its trocar at the nominal place; see `chain_at`.
+      base_offset: `[3]` m, from the trocar to the base of an arm that stands there.
+      home: `[J]` rad. max_speed: `[J]` rad/s.
+      q, dof, ctrl: `[J]` where its joints are in qpos, qvel and ctrl.
+      jaws: where all joints of the tool are in qpos. jaw: the one that tells the opening, or None.
+      jaw_ctrl: of the jaws' servo, or None.
+      pads: geom ids.
+    """
+
+    arm: Arm
+    tool: Tool
+    mount: Mount
+    chain: ik.Chain
+    base_offset: np.ndarray
+    home: np.ndarray
+    max_speed: np.ndarray
+    q: np.ndarray
+    dof: np.ndarray
+    ctrl: np.ndarray
+    jaws: np.ndarray
+    jaw: int | None
+    jaw_ctrl: int | None
+    pads: np.ndarray
 
 
-class SimModel(NamedTuple):
+class Scene(NamedTuple):
     """What never varies in an environment.
 
     Attributes:
+      names: of the parts.
+      task: its record. bound: the ids that it resolved.
       mj_model: the C model; `mjx_model`: its MJX copy; `mjx_data`: a template of the state.
-      arm: kinematic chain from the world to the tcp, see `ik.Chain`.
-      home: `[6]` rad, where inverse kinematics starts.
-      p_world_ref: `[3]` m, the nominal port o_ref.
-      arm_q, jaw, block: where the arm's, the jaws' and the block's coordinates start in qpos;
-        `arm_dof`, `block_dof`: in qvel.
-      geom_rgb: `[G, 3]` colours; peg_geoms, seat_geoms: `[P]` geom ids; pad_geoms, wall_geoms.
-      pegs: `[P, 2]` m, the pegs' axes on the board.
+      arms: one for each slot of the task.
+      p_world_ref: `[A, 3]` m, nominal trocars. roll_zero: `[A]` rad, see `rcm.TrocarFrame`.
+      trocar_mocap: `[A]` mocap bodies that mark the trocars.
+      graspable: geom ids. geom_rgb: `[G, 3]` colours.
     """
 
+    names: SceneNames
+    task: Task
+    bound: Any
     mj_model: mujoco.MjModel
     mjx_model: mjx.Model
     mjx_data: mjx.Data
-    arm: ik.Chain
-    home: np.ndarray
+    arms: tuple[BoundArm, ...]
     p_world_ref: np.ndarray
-    arm_q: int
-    arm_dof: int
-    jaw: int
-    block: int
-    block_dof: int
+    roll_zero: np.ndarray
+    trocar_mocap: np.ndarray
+    graspable: np.ndarray
     geom_rgb: np.ndarray
-    peg_geoms: np.ndarray
-    seat_geoms: np.ndarray
-    pad_geoms: np.ndarray
-    wall_geoms: np.ndarray
-    pegs: np.ndarray
 
 
-def compose(
-    robot: str = "fr5", tool: str = "grasper", task: str = "peg_transfer"
-) -> mujoco.MjModel:
-    """The C model of `robot` holding `tool` in `task`; ValueError for an unknown name."""
-    for kind, name, known in (
-        ("robot", robot, ROBOTS),
-        ("tool", tool, TOOLS),
-        ("task", task, TASKS),
-    ):
-        if name not in known:
-            raise ValueError(f"{kind}: expected one of {sorted(known)}, got {name!r}")
-    geometry = mujoco.MjSpec.from_file(str(assets.path(TASKS[task])))
-    arm = mujoco.MjSpec.from_file(str(assets.path(ROBOTS[robot])))
-    hand = mujoco.MjSpec.from_file(str(assets.path(TOOLS[tool])))
-    flange = arm.site("flange")
-    flange.quat = [np.cos(TOOL_MOUNT / 2), 0.0, 0.0, np.sin(TOOL_MOUNT / 2)]
-    arm.attach(hand, site=flange, prefix="tool/")
-    geometry.attach(arm, site=geometry.site("robot_base"), prefix="robot/")
-    return geometry.compile()
+def name(
+    task: str = "peg_transfer",
+    arms: Sequence[str] = (),
+    tools: Sequence[str] = (),
+    cameras: Sequence[str] = (),
+) -> SceneNames:
+    """The names of a scene: those of the task where none are given.
+
+    Raises:
+      errors.UsageError: a name is unknown, or there are not as many as the task has slots.
+    """
+    record: Task = registry.tasks.get(task)
+    given = {"arm": (arms, registry.arms), "tool": (tools, registry.tools)}
+    chosen = {}
+    for kind, (names, known) in given.items():
+        names = tuple(names) or tuple(getattr(slot, kind) for slot in record.slots)
+        if len(names) == 1:  # the same for all
+            names *= record.arms
+        if len(names) != record.arms:
+            raise errors.UsageError(kind, f"{record.arms} for {task}", " ".join(names))
+        for one in names:
+            errors.choice(kind, one, known.names())
+        chosen[kind] = names
+    cameras = tuple(cameras) or record.cameras[:1]
+    for one in cameras:
+        errors.choice("camera", one, record.cameras)
+    return SceneNames(task, chosen["arm"], chosen["tool"], cameras)
 
 
-def load(robot: str = "fr5", tool: str = "grasper", task: str = "peg_transfer") -> SimModel:
-    """`compose`d, copied to MJX, ids resolved."""
-    m = compose(robot, tool, task)
+def compose(names: SceneNames) -> mujoco.MjModel:
+    """The C model of a scene.
+
+    Raises:
+      errors.UsageError: no mount of an arm with its tool is known for the task's workspace.
+    """
+    task: Task = registry.tasks.get(names.task)
+    world = _spec(task.mjcf)
+    limits = _taken(world)
+    for i, (arm, tool, mount) in enumerate(_mounted(task, names)):
+        robot, hand = _spec(arm.mjcf), _spec(tool.mjcf)
+        robot.site("flange").quat = _about_z(mount.turn)
+        for part in (robot, hand):
+            limits = limits + _taken(part)
+        robot.attach(hand, site=robot.site("flange"), prefix="tool/")
+        parent = world.body(f"trocar{i}") if arm.remote_centre else world.worldbody
+        base = parent.add_site(
+            name=f"base{i}", pos=mount.position, quat=_about_z(mount.yaw), group=3, size=[0.003] * 3
+        )
+        world.attach(robot, site=base, prefix=f"arm{i}/")
+    for limit, size in zip(CONTACT_LIMITS, limits):
+        world.add_numeric(name=limit, data=[float(size)], size=1)
+    return world.compile()
+
+
+def load(names: SceneNames) -> Scene:
+    """The scene of these names, copied to MJX, ids resolved."""
+    task: Task = registry.tasks.get(names.task)
+    m = compose(names)
     # XLA's MJX implementation everywhere: the warp one needs CUDA.
     mjx_model = mjx.put_model(m, impl="jax")
     mjx_data = mjx.make_data(m, impl="jax")
     solver.check(mjx_model, mjx_data)
-    numbered = sum(m.geom(g).name.startswith("peg") for g in range(m.ngeom))
-    peg_geoms = np.array([m.geom(f"peg{i}").id for i in range(numbered)])
-    return SimModel(
+    mounted = _mounted(task, names)
+    return Scene(
+        names=names,
+        task=task,
+        bound=task.bind(m),
         mj_model=m,
         mjx_model=mjx_model,
         mjx_data=mjx_data,
-        arm=ik.chain_of(m, first="robot/shoulder", site=TCP),
-        home=np.array(HOME, np.float32),
-        p_world_ref=np.array(m.site("port_reference").pos, np.float32),
-        arm_q=int(m.joint("robot/j1").qposadr[0]),
-        jaw=int(m.joint("robot/tool/jaw_left").qposadr[0]),
-        arm_dof=int(m.joint("robot/j1").dofadr[0]),
-        block=int(m.joint("block").qposadr[0]),
-        block_dof=int(m.joint("block").dofadr[0]),
+        arms=tuple(_bind(m, i, *parts) for i, parts in enumerate(mounted)),
+        p_world_ref=np.array([slot.p_world_ref for slot in task.slots], np.float32),
+        roll_zero=np.array([slot.roll_zero for slot in task.slots], np.float32),
+        trocar_mocap=np.array([m.body(f"trocar{i}").mocapid[0] for i in range(task.arms)]),
+        graspable=np.array([m.geom(geom).id for geom in task.graspable], int),
         geom_rgb=geometry.geom_rgb(m),
-        peg_geoms=peg_geoms,
-        seat_geoms=np.array([m.geom(f"seat{i}").id for i in range(numbered)]),
-        pad_geoms=np.array([m.geom(f"robot/tool/pad_{side}").id for side in ("left", "right")]),
-        wall_geoms=np.array([m.geom(f"wall{i}").id for i in range(3)]),
-        pegs=np.array(m.geom_pos[peg_geoms, :2], np.float32),
     )
+
+
+def chain_at(bound: BoundArm, p_world_trocar: jax.Array) -> ik.Chain:
+    """The chain of an arm whose trocar is at `p_world_trocar` `[3]` m."""
+    if not bound.arm.remote_centre:
+        return bound.chain
+    return bound.chain.replace(p_base=p_world_trocar + bound.base_offset)
+
+
+def tcp(i: int, tool: Tool) -> str:
+    """Site of arm i's tip in the composed model."""
+    return f"arm{i}/tool/{tool.tcp}"
+
+
+def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
+    found = []
+    for slot, arm_name, tool_name in zip(task.slots, names.arms, names.tools, strict=True):
+        arm, tool = registry.arms.get(arm_name), registry.tools.get(tool_name)
+        mount = registry.mount(arm, tool_name, slot.workspace)
+        if mount is None:
+            known = ", ".join(" in ".join(key) for key in arm.mounts)
+            raise errors.UsageError(
+                f"arm {arm_name}",
+                f"a mount with the tool {tool_name} in the workspace {slot.workspace}",
+                known or "none",
+                f"starjax place {arm_name} {tool_name} {task.name} searches one",
+            )
+        found.append((arm, tool, mount))
+    return found
+
+
+def _bind(m: mujoco.MjModel, i: int, arm: Arm, tool: Tool, mount: Mount) -> BoundArm:
+    at = f"arm{i}/"
+    chain = ik.chain_of(m, first=at + arm.first, site=at + f"tool/{tool.tcp}")
+    joints = [m.joint(at + joint) for joint in arm.joints]
+    held = [m.joint(j) for j in range(m.njnt) if m.joint(j).name.startswith(f"{at}tool/")]
+    return BoundArm(
+        arm=arm,
+        tool=tool,
+        mount=mount,
+        chain=chain,
+        base_offset=np.array(chain.p_base - m.body(f"trocar{i}").pos, np.float32),
+        home=np.array(mount.home, np.float32),
+        max_speed=np.array(arm.max_speed, np.float32),
+        q=np.array([joint.qposadr[0] for joint in joints]),
+        dof=np.array([joint.dofadr[0] for joint in joints]),
+        ctrl=np.array([m.actuator(at + joint).id for joint in arm.joints]),
+        jaws=np.array([joint.qposadr[0] for joint in held], int),
+        jaw=None if tool.jaw is None else int(m.joint(f"{at}tool/{tool.jaw}").qposadr[0]),
+        jaw_ctrl=None if tool.servo is None else int(m.actuator(f"{at}tool/{tool.servo}").id),
+        pads=np.array([m.geom(f"{at}tool/{pad}").id for pad in tool.pads], int),
+    )
+
+
+def _spec(mjcf: str) -> mujoco.MjSpec:
+    return mujoco.MjSpec.from_file(str(assets.path(mjcf)))
+
+
+def _taken(part: mujoco.MjSpec) -> np.ndarray:
+    """The contact limits that a part asks for, taken out of it."""
+    sizes = np.zeros(len(CONTACT_LIMITS))
+    for numeric in list(part.numerics):
+        if numeric.name in CONTACT_LIMITS:
+            sizes[CONTACT_LIMITS.index(numeric.name)] += numeric.data[0]
+            part.delete(numeric)
+    return sizes
+
+
+def _about_z(angle: float) -> list[float]:
+    return [float(np.cos(angle / 2)), 0.0, 0.0, float(np.sin(angle / 2))]

@@ -62,23 +62,27 @@ class Iterate(NamedTuple):
     gradient: jax.Array
 
 
-def step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
+def step(m: mjx.Model, d: mjx.Data) -> tuple[mjx.Data, jax.Array]:
     """`mjx.step`: kinematics, contacts, forces, and the implicit integrator.
 
     For models that pass `check`, and no forces from outside (`qfrc_applied`, `xfrc_applied`).
+
+    Returns:
+      the state after; J `[]`, the energy that the error left in the solution may hold.
     """
     d = mjx.fwd_position(m, d)
     d = mjx.fwd_velocity(m, d)
     d = mjx.fwd_actuation(m, d)
     d = d.replace(qfrc_smooth=d.qfrc_passive - d.qfrc_bias + d.qfrc_actuator)
-    x, force = solve(problem(m, d), d.qacc_warmstart, m.opt.timestep)
+    x, force, error = solve(problem(m, d), d.qacc_warmstart, m.opt.timestep)
     # As `mjx.implicit`: servos and dampers at the velocity after the step. `mjx.euler` then only
     # integrates, since the model lets it do nothing about damping (flag eulerdamp).
     by_velocity = mjx.deriv_smooth_vel(m, d)
     assert by_velocity is not None, "a model without actuators and dampers"
     damped = d._impl.M - m.opt.timestep * by_velocity
     d = d.replace(qacc=linear.solve_positive(damped, d.qfrc_smooth + force))
-    return mjx.euler(m, d).replace(qacc=x, qacc_warmstart=x, qfrc_constraint=force)
+    d = mjx.euler(m, d).replace(qacc=x, qacc_warmstart=x, qfrc_constraint=force)
+    return d, error
 
 
 def problem(m: mjx.Model, d: mjx.Data) -> Problem:
@@ -112,13 +116,14 @@ def check(m: mjx.Model, d: mjx.Data) -> None:
 
 def solve(
     problem: Problem, x: jax.Array, timestep: float | jax.Array
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The minimum by Newton's method from `x` `[V]`, single-sample.
 
     A lane that is not finite stays so and ends at once.
 
     Returns:
-      acceleration `[V]`; the constraints' force on the velocities `[V]`.
+      acceleration `[V]`; the constraints' force on the velocities `[V]`; J `[]`, the energy that
+      the error left may hold: above `MAX_ERROR_ENERGY` it did not converge.
     """
     M, f, A, b, _, _ = problem
     # An error e in x has e M e <= gradient M^-1 gradient, for the Hessian is at least M. Of M the
@@ -148,7 +153,8 @@ def solve(
 
     start = at(x, M @ x, A @ x - b)
     _, end = jax.lax.while_loop(is_coarse, improve, (jnp.zeros((), jnp.int32), start))
-    return end.x, -pull(problem, end.r) @ A
+    error = 0.5 * timestep**2 * jnp.sum(end.gradient**2 * weights)
+    return end.x, -pull(problem, end.r) @ A, error
 
 
 def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> jax.Array:

@@ -1,31 +1,32 @@
 """One picture: the nearest face along every ray, the sun's shadow, the colour."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import shade, shapes, tiles
+from starjax.sim.camera.view import View
 
 Array = jax.Array
 
 
 def cast(
-    scene: scenes.Scene, grid: tiles.Grid, textures: dict[int, np.ndarray], shadow: bool,
+    scene: scenes.Scene, grid: tiles.Grid, view: View, shadow: bool,
     geom_xpos: Array, geom_xmat: Array, geom_rgb: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Depth in m, face (-1 background) and colour (bytes of an int32); each `[T, Q]`."""
-    R_cam_world = jnp.asarray(scene.R_world_cam.T, jnp.float32)
-    offset = geom_xpos[scene.ids] - jnp.asarray(scene.p_world_cam, jnp.float32)
-    c = jnp.einsum("ij,gj->gi", R_cam_world, offset, precision="highest")
-    R = jnp.einsum("ij,gjk->gik", R_cam_world, geom_xmat[scene.ids], precision="highest")
+    offset = geom_xpos[scene.ids] - view.p_world_cam
+    c = jnp.einsum("ij,gj->gi", view.R_cam_world, offset, precision="highest")
+    R = jnp.einsum("ij,gjk->gik", view.R_cam_world, geom_xmat[scene.ids], precision="highest")
     t, face = _nearest(scene, grid, c, R)
     shaded = jnp.zeros_like(face, bool)
-    if shadow and scene.sun is not None:
-        shaded = _shaded(scene, grid, scene.sun, c, R, t, face)
+    if shadow and view.R_light_cam is not None:
+        shaded = _shaded(scene, grid, view.R_light_cam, c, R, t, face)
     depth = jnp.where(face >= 0, t, 1.0)
     p = [grid.x * depth, grid.y * depth, -depth]
-    return t, face, shade.light(scene, textures, geom_rgb[scene.ids], c, R, p, face, shaded)
+    return t, face, shade.light(scene, view, geom_rgb[scene.ids], c, R, p, face, shaded)
 
 
 def _nearest(scene: scenes.Scene, grid: tiles.Grid, c: Array, R: Array) -> tuple[Array, Array]:
@@ -62,11 +63,10 @@ def _nearest(scene: scenes.Scene, grid: tiles.Grid, c: Array, R: Array) -> tuple
 
 
 def _shaded(
-    scene: scenes.Scene, grid: tiles.Grid, sun: scenes.Light, c: Array, R: Array, t: Array,
+    scene: scenes.Scene, grid: tiles.Grid, R_light_cam: Any, c: Array, R: Array, t: Array,
     face: Array,
 ) -> Array:  # fmt: skip
     """Which visible points another geom hides from the sun. No convex shape hides itself."""
-    R_light_cam = _frame(-sun.direction)
     c = jnp.einsum("ij,gj->gi", R_light_cam, c, precision="highest")
     R = jnp.einsum("ij,gjk->gik", R_light_cam, R, precision="highest")
     x, y = jnp.asarray(grid.x), jnp.asarray(grid.y)
@@ -96,10 +96,3 @@ def _shaded(
 
 def _bounds(scene: scenes.Scene) -> tuple[Array, Array]:
     return jnp.asarray(scene.axes, jnp.float32), jnp.asarray(scene.rounding, jnp.float32)
-
-
-def _frame(z: np.ndarray) -> np.ndarray:
-    """A rotation whose third row is the unit vector `z`, float32."""
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z]).astype(np.float32)

@@ -20,7 +20,7 @@ class Light(NamedTuple):
     """A directional light; colours are RGB in [0, 1].
 
     Attributes:
-      direction: `[3]` unit vector along which the light travels, in the camera frame.
+      direction: `[3]` unit vector along which the light travels, in the frame of the scene.
     """
 
     direction: np.ndarray
@@ -36,7 +36,8 @@ class Texture(NamedTuple):
       texels: `[h, w, 3]` RGB.
       scale: `[2]` texture coordinates per metre along the geom's x and y.
       corner: `[2]` m, where both are 0.
-      R_cam_geom, p_cam_top: `[3, 3]` and `[3]` m, pose of the textured face.
+      R_cam_geom, p_cam_top: `[3, 3]` and `[3]` m, pose of the textured face in the frame of the
+        scene: the camera's, or the world's for a camera that moves.
     """
 
     texels: np.ndarray
@@ -100,18 +101,27 @@ class Scene(NamedTuple):
         return np.repeat(np.arange(len(self.kind)), np.take(FACES, self.kind))
 
 
-def read(mj_model: mujoco.MjModel, camera: str, aspect: float) -> Scene:
-    """Reads the scene; `aspect` is width over height, for cameras given by `fovy` alone."""
+def read(mj_model: mujoco.MjModel, camera: str, aspect: float, moves: bool = False) -> Scene:
+    """Reads the scene.
+
+    Args:
+      mj_model: the model.
+      camera: name of the camera.
+      aspect: width over height, for cameras given by `fovy` alone.
+      moves: whether the camera's pose comes with every image. Sun and textures are then in the
+        world's frame; else in the camera's, which must be fixed in the world.
+    """
     cam = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
     if cam < 0:
         names = [mj_model.camera(i).name for i in range(mj_model.ncam)]
         raise ValueError(f"camera: expected one of {names}, got {camera!r}")
-    if mj_model.cam_bodyid[cam] != 0:
+    if mj_model.cam_bodyid[cam] != 0 and not moves:
         raise ValueError(f"camera: expected one fixed in the world, got {camera!r} on a body")
     data = mujoco.MjData(mj_model)
     mujoco.mj_kinematics(mj_model, data)
     mujoco.mj_camlight(mj_model, data)
-    R_world_cam = data.cam_xmat[cam].reshape(3, 3)
+    R_world_cam, p_world_cam = data.cam_xmat[cam].reshape(3, 3), data.cam_xpos[cam].copy()
+    frame = (np.eye(3), np.zeros(3)) if moves else (R_world_cam, p_world_cam)
 
     alpha = _rgba(mj_model)[:, 3]
     drawn = [g for g in range(mj_model.ngeom) if mj_model.geom_group[g] < 3 and alpha[g] > 0]
@@ -142,14 +152,14 @@ def read(mj_model: mujoco.MjModel, camera: str, aspect: float) -> Scene:
         specular=specular,
         exponent=128 * shininess,
         emission=emission,
-        textures=_textures(mj_model, data, ids, R_world_cam, data.cam_xpos[cam]),
+        textures=_textures(mj_model, data, ids, *frame),
         R_world_cam=R_world_cam,
-        p_world_cam=data.cam_xpos[cam].copy(),
+        p_world_cam=p_world_cam,
         left=left,
         right=right,
         bottom=bottom,
         top=top,
-        sun=_sun(mj_model, data, R_world_cam),
+        sun=_sun(mj_model, data, frame[0]),
         headlight=Light(
             np.array([0.0, 0.0, -1.0]), lit * head.ambient, lit * head.diffuse, lit * head.specular
         ),

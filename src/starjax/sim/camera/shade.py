@@ -1,23 +1,27 @@
 """Colour of the visible points: MuJoCo's fixed-function lighting, evaluated at every sample."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import shapes
+from starjax.sim.camera.view import View
 
 Array = jax.Array
 
 
 def light(
-    scene: scenes.Scene, textures: dict[int, np.ndarray], rgb: Array, c: Array, R: Array,
+    scene: scenes.Scene, view: View, rgb: Array, c: Array, R: Array,
     p: list[Array], face: Array, shaded: Array,
 ) -> Array:  # fmt: skip
     """Lit colour of every sample, `[T, Q]` int32 with red in the lowest byte.
 
     Args:
-      textures: by row, its texture as every sample sees it, `[3, T, Q]`.
+      view: where the camera is.
       rgb: `[N, 3]` colour of every row.
       c, R: `[N, 3]` m and `[N, 3, 3]` geom poses in the camera frame.
       p: x, y, z of the visible points in the camera frame; `[T, Q]` m each.
@@ -31,11 +35,16 @@ def light(
         _constant(v[row]) for v in (scene.specular, scene.exponent, scene.emission)
     ]
     lights = [source for source in (scene.headlight, scene.sun) if source is not None]
-    terms = [_reflect(source, p, normal, _pick(exponent, at)) for source in lights]
-    on = {r: _between(face, np.flatnonzero(row == r)) for r in textures}
+    ways = [[-float(v) for v in scene.headlight.direction], view.to_sun]
+    terms = [
+        _reflect(source, to_light, p, normal, _pick(exponent, at))
+        for source, to_light in zip(lights, ways)
+    ]
+    on = {r: _between(face, np.flatnonzero(row == r)) for r in view.textures}
     # Where fusion would compute them for each of the three colours, the barrier shares them.
     at, terms = jax.lax.optimization_barrier((at, terms))
 
+    textures = {r: look(p) for r, look in view.textures.items()}
     word = jnp.zeros_like(face)
     for k in range(3):
         base = _pick(rgb[row, k], at)
@@ -76,10 +85,10 @@ def _constant(column: np.ndarray) -> Array:
 
 
 def _reflect(
-    source: scenes.Light, p: list[Array], normal: list[Array], exponent: Array
-) -> tuple[Array, Array | None]:
+    source: scenes.Light, to_light: Sequence[Any], p: list[Array], normal: list[Array],
+    exponent: Array,
+) -> tuple[Array, Array | None]:  # fmt: skip
     """Diffuse and, if any, specular factor of a directional light (Blinn and Phong)."""
-    to_light = [-float(v) for v in source.direction]
     diffuse = jnp.maximum(sum(n * v for n, v in zip(normal, to_light)), 0.0)
     if not np.any(source.specular > 0):
         return diffuse, None

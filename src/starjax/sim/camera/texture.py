@@ -1,5 +1,9 @@
-"""Textures as the camera sees them: it and what wears them stand still, so they are drawn once."""
+"""Textures as a camera sees them: drawn once for a fixed one, looked up for one that moves."""
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim.camera import geometry as scenes
@@ -36,3 +40,57 @@ def _look(texture: scenes.Texture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     column = np.floor((u - np.floor(u)) * w).astype(int) % w
     line = np.floor((v - np.floor(v)) * h).astype(int) % h
     return np.moveaxis(texture.texels[line, column], -1, 0)
+
+
+def looker(
+    texture: scenes.Texture, step: float, R_world_cam: Any, p_world_cam: Any
+) -> Callable[[Sequence[Any]], list[Any]]:
+    """A texture of two colours in squares, filtered over each pixel, from any pose.
+
+    Args:
+      texture: in the world's frame, a checker. Its first and last texel of a row are the colours.
+      step: width of a pixel in the plane at depth 1.
+      R_world_cam, p_world_cam: `[3, 3]` and `[3]` m, the camera's pose, traced.
+
+    Returns:
+      visible points x, y, z in the camera frame, `[T, Q]` m each -> red, green and blue.
+    """
+    first, second = texture.texels[0, 0], texture.texels[0, -1]
+    R_geom_world = jnp.asarray(texture.R_cam_geom.T, jnp.float32)
+    R_geom_cam = jnp.matmul(R_geom_world, R_world_cam, precision="highest")
+    offset = p_world_cam - jnp.asarray(texture.p_cam_top, jnp.float32)
+    origin = jnp.matmul(R_geom_world, offset, precision="highest")
+
+    def look(p: Sequence[Any]) -> list[Any]:
+        wave = 1.0
+        for k in range(2):
+            at = R_geom_cam[k, 0] * p[0] + R_geom_cam[k, 1] * p[1] + R_geom_cam[k, 2] * p[2]
+            scale = float(texture.scale[k])
+            u = (at + origin[k] - float(texture.corner[k])) * scale
+            # What a pixel covers at the depth of the point, if it is met head on.
+            wave = wave * _square_wave(u, -p[2] * step * abs(scale))
+        middle, half = 0.5 * (first + second), 0.5 * (first - second)
+        return [float(m) + float(h) * wave for m, h in zip(middle, half)]
+
+    return look
+
+
+def is_checker(texture: scenes.Texture) -> bool:
+    """Whether `looker` can draw it: two colours in four equal squares."""
+    texels, (h, w) = texture.texels, np.array(texture.texels.shape[:2]) // 2
+    same = np.all(texels[:h, :w] == texels[0, 0]) and np.all(texels[h:, w:] == texels[0, 0])
+    return bool(
+        same and np.all(texels[:h, w:] == texels[0, -1]) and np.all(texels[h:, :w] == texels[0, -1])
+    )
+
+
+def _square_wave(u: Any, width: Any) -> Any:
+    """Mean over `width` of the wave that is 1 on the first half of each unit and -1 on the rest."""
+
+    def integral(x: Any) -> Any:
+        share = x - jnp.floor(x)
+        return jnp.where(share < 0.5, share, 1.0 - share)
+
+    width = jnp.maximum(width, 1e-6)
+    mean = (integral(u + 0.5 * width) - integral(u - 0.5 * width)) / width
+    return jnp.clip(mean, -1.0, 1.0)

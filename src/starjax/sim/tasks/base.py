@@ -11,6 +11,8 @@ import numpy as np
 
 from starjax.types import Agent, Pose
 
+CONTROL_HZ = 30.0  # commands a second
+
 
 class Field(NamedTuple):
     """A part of the `state` observation.
@@ -101,6 +103,31 @@ class Outline(NamedTuple):
     ground: float = 0.0
 
 
+class Contacts(NamedTuple):
+    """Contacts C of one moment.
+
+    Attributes:
+      geom: `[C, 2]` int32 ids.
+      dist: `[C]` m, negative where the two overlap.
+    """
+
+    geom: jax.Array
+    dist: jax.Array
+
+
+class Capsules(NamedTuple):
+    """Obstacles K, in the world.
+
+    Attributes:
+      start, end: `[K, 3]` m, of the axis.
+      radius: `[K]` m.
+    """
+
+    start: jax.Array
+    end: jax.Array
+    radius: jax.Array
+
+
 class Views(NamedTuple):
     """What a task may look at, of one moment.
 
@@ -108,7 +135,7 @@ class Views(NamedTuple):
       qpos, qvel: generalised coordinates of the whole model.
       pose: measured tips, Pose `[A]`, and `opening`: `[A]` in [-1, 1].
       touch: `[A]` bool, whether the jaws touch something that they can grasp.
-      contact: MJX's contacts of the last physics step.
+      contacts: of the last physics step.
     """
 
     qpos: jax.Array
@@ -116,7 +143,7 @@ class Views(NamedTuple):
     pose: Pose
     opening: jax.Array
     touch: jax.Array
-    contact: Any
+    contacts: Contacts
 
 
 class Task(NamedTuple):
@@ -147,7 +174,8 @@ class Task(NamedTuple):
         that small networks would not get exactly enough from `state`.
       label: (Layout) -> name of `labels` -> int32.
       colours: (Bound, Layout, rgb `[G, 3]`) -> `[G, 3]`, the goal marked.
-      collided: (Bound, Layout, Facts, shafts) -> bool, see `sim.collision`.
+      obstacles: (Bound, Layout, Facts) -> Capsules that no shaft may enter, see `sim.collision`.
+      floor: m, the lowest height that jaws may reach.
       is_sound: (Bound, qpos, qvel) -> bool, False once an object has diverged.
       outline: (mj_model) -> Outline, for figures.
     """
@@ -174,7 +202,8 @@ class Task(NamedTuple):
     relative: Callable[..., jax.Array]
     label: Callable[..., dict[str, jax.Array]]
     colours: Callable[..., jax.Array]
-    collided: Callable[..., jax.Array]
+    obstacles: Callable[..., Capsules]
+    floor: float
     is_sound: Callable[..., jax.Array]
     outline: Callable[..., Outline]
 

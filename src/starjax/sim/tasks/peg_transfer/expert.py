@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
-from starjax.sim import env
+from starjax.sim.state import EnvState
+from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.sim.tasks.peg_transfer import task
-from starjax.types import Command
+from starjax.types import Agent, Command, Pose
 
 RAISE, APPROACH, DESCEND, CLOSE, LIFT, CARRY, LOWER, OPEN, RETREAT, WAIT = range(10)
 
@@ -68,7 +69,7 @@ class ExpertState:
       roll_from: rad, the roll that the next turn begins at. jaws_from: jaws at the phase's start.
       middle: m, y of the row on which either wall may be taken.
       tempo: pace. noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
-      label: the undisturbed command, which is what demonstrations record.
+      label: the undisturbed command of the one arm.
     """
 
     key: jax.Array
@@ -89,7 +90,7 @@ class ExpertState:
     label: Command
 
 
-def init(key: jax.Array, state: env.EnvState, middle: float = 0.0) -> ExpertState:
+def init(key: jax.Array, state: EnvState, middle: float = 0.0) -> ExpertState:
     """The script at the start of an episode. `middle`: see `ExpertState`; the peg rows' by default,
     and between two rows there is no choice."""
     key_tempo, key = jax.random.split(key)
@@ -100,8 +101,8 @@ def init(key: jax.Array, state: env.EnvState, middle: float = 0.0) -> ExpertStat
         elapsed=jnp.zeros(()),
         duration=jnp.zeros(()),
         attempt=jnp.zeros((), jnp.int32),
-        start=state.pose.p,
-        goal=state.pose.p,
+        start=state.pose.p[0],
+        goal=state.pose.p[0],
         wall=jnp.zeros((), jnp.int32),
         side=jnp.ones(()),
         normal=jnp.array([0.0, -1.0, 0.0]),
@@ -110,17 +111,14 @@ def init(key: jax.Array, state: env.EnvState, middle: float = 0.0) -> ExpertStat
         middle=jnp.asarray(middle, jnp.float32),
         tempo=tempo,
         noise=jnp.zeros((2, 4)),
-        label=Command(state.pose, jnp.ones(())),
+        label=Command(_tip(state), jnp.ones(())),
     )
     return _enter(expert, jnp.asarray(APPROACH, jnp.int32), state, jnp.zeros(()))
 
 
-init_with_one_wall = functools.partial(init, middle=BETWEEN_ROWS)
-
-
-def act(expert: ExpertState, state: env.EnvState) -> tuple[Command, ExpertState]:
-    """The disturbed command to execute now; the next state, whose `label` is the clean one."""
-    dt = 1.0 / env.CONTROL_HZ
+def act(expert: ExpertState, state: EnvState) -> tuple[Command, ExpertState, Command]:
+    """The disturbed command to execute now, the next state, and the clean command to record."""
+    dt = 1.0 / CONTROL_HZ
     roll = _roll_of(expert, state)
     is_over = expert.elapsed >= expert.duration - 1e-6
     following = _enter(expert, _following(expert, state), state, roll)
@@ -144,28 +142,38 @@ def act(expert: ExpertState, state: env.EnvState) -> tuple[Command, ExpertState]
     noise = _disturb(expert, state.step, dt)
     moved = weight * noise[1] * jnp.where(expert.phase == DESCEND, 1.0 - s, 1.0)
     decode = rcm.ACTION_SPACES["rcm4"].decode
-    clean, _ = decode(jnp.append(roll, p), state.trocar, state.p_world_ref)
-    rough, _ = decode(jnp.append(roll + moved[3], p + moved[:3]), state.trocar, state.p_world_ref)
+    clean, _ = decode(jnp.append(roll, p), _told(state))
+    rough, _ = decode(jnp.append(roll + moved[3], p + moved[:3]), _told(state))
     expert = expert.replace(noise=noise, label=Command(clean, gripper))
-    return Command(rough, gripper), expert
+    return _of_one_arm(rough, gripper), expert, _of_one_arm(clean, gripper)
 
 
-def _following(expert: ExpertState, state: env.EnvState) -> jax.Array:
+def _of_one_arm(pose: Pose, gripper: jax.Array) -> Command:
+    return jax.tree.map(lambda leaf: leaf[None], Command(pose, gripper))
+
+
+def _told(state: EnvState) -> rcm.TrocarFrame:
+    return jax.tree.map(lambda leaf: leaf[0], state.told)
+
+
+def _tip(state: EnvState) -> Pose:
+    return jax.tree.map(lambda leaf: leaf[0], state.pose)
+
+
+def _following(expert: ExpertState, state: EnvState) -> jax.Array:
     """The phase after the present one, given what the world looks like now."""
     phase = expert.phase
     grasped = (
-        state.block_pose.p + task.RIM_RADIUS * task.wall_normals(state.block_pose)[expert.wall]
+        state.facts.block.p + task.RIM_RADIUS * task.wall_normals(state.facts.block)[expert.wall]
     )
-    is_held = jnp.sum((grasped - state.pose.p) ** 2) < HELD**2
+    is_held = jnp.sum((grasped - state.pose.p[0]) ** 2) < HELD**2
     is_lost = (phase >= LIFT) & (phase <= CARRY) & ~is_held
     return jnp.where(is_lost | (phase == WAIT), RAISE, phase + 1).astype(jnp.int32)
 
 
-def _enter(
-    expert: ExpertState, phase: jax.Array, state: env.EnvState, roll: jax.Array
-) -> ExpertState:
+def _enter(expert: ExpertState, phase: jax.Array, state: EnvState, roll: jax.Array) -> ExpertState:
     """Begins `phase`: choose the wall if it is an approach, set goal and duration."""
-    block, tip = state.block_pose, expert.label.pose.p
+    block, tip = state.facts.block, expert.label.pose.p
     is_approach = phase == APPROACH
     attempt = expert.attempt + is_approach
     keys = jax.random.split(jax.random.fold_in(expert.key, attempt), 3)
@@ -192,8 +200,8 @@ def _enter(
     # Where the tip must be once the block, tilted by now, is pressed upright over the target peg:
     # on its wall, as far along it as the grasp is.
     along = jnp.array([-out[1], out[0]])
-    aside = ((state.pose.p - block.p)[:2] @ along) * along
-    over = state.target_peg + (task.RIM_RADIUS + RELEASE_SHIFT) * out[:2] + aside
+    aside = ((state.pose.p[0] - block.p)[:2] @ along) * along
+    over = state.layout.target_peg + (task.RIM_RADIUS + RELEASE_SHIFT) * out[:2] + aside
     low = task.RIM_HEIGHT - GRASP_DROP + RELEASE_HEIGHT
     goals = jnp.stack(
         [
@@ -228,11 +236,9 @@ def _enter(
     )
 
 
-def _roll_of(expert: ExpertState, state: env.EnvState) -> jax.Array:
+def _roll_of(expert: ExpertState, state: EnvState) -> jax.Array:
     """Roll (rad) at the label's position: turning towards, or on, the wall's normal."""
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(
-        jnp.append(0.0, expert.label.pose.p), state.trocar, state.p_world_ref
-    )
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(jnp.append(0.0, expert.label.pose.p), _told(state))
     on_wall = jnp.arctan2(-expert.normal @ pose.R[:, 0], expert.normal @ pose.R[:, 1])
     lead = TURN_LEAD + jnp.where(
         expert.phase == APPROACH, expert.elapsed - expert.duration, expert.elapsed
@@ -255,3 +261,8 @@ def _disturb(expert: ExpertState, step: jax.Array, dt: float) -> jax.Array:
 
 def _minimum_jerk(s: jax.Array) -> jax.Array:
     return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
+
+
+AGENT = Agent(init, act)
+# On the middle row it always takes the wall of one side.
+WITH_ONE_WALL = Agent(functools.partial(init, middle=BETWEEN_ROWS), act)

@@ -1,14 +1,22 @@
-"""Peg transfer: what varies from episode to episode, and when it counts as done.
+"""Peg transfer: a hollow block goes from a peg of one board to the marked peg of the other.
 
 Lengths in m. Block frame: origin at the rim's centre, z up when it stands; wall i's outward normal
 is at 120 i degrees from x.
 """
 
+from typing import NamedTuple
+
 import flax.struct
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
-from starjax.types import Pose
+from starjax import rcm
+from starjax.sim import bodies
+from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks.peg_transfer import words
+from starjax.types import Agent, Pose
 
 # The block, as in peg_transfer.xml (a test holds these to the compiled model).
 RIM_RADIUS = 0.007  # from the axis to a wall's centre line
@@ -16,6 +24,7 @@ WALL_RADIUS = 0.0015  # of the capsules
 RIM_HEIGHT = 0.009  # above the board when it stands
 WALLS = 3
 PEG_HEIGHT = 0.012
+PEG_RADIUS = 0.001125
 
 # Where an episode begins.
 BLOCK_OFFSET = 0.001  # block's centre from its peg, each axis, at most
@@ -34,6 +43,15 @@ SETTLE_STEPS = 5
 LOOSE_XY = 0.005
 LOOSE_Z = 0.004
 
+# Beyond these the simulation has diverged.
+MAX_BLOCK_SPEED = 5.0  # m/s
+MAX_BLOCK_DISTANCE = 1.0  # m from the board's centre
+
+STAGES = ("approach", "grasped", "lifted", "at the target", "threaded", "done")
+LIFTED = 0.004  # m above its resting height at which the block counts as lifted
+NEAR = 0.03  # m, the distance at which the tool works on the block
+TARGET_RGB = (0.98, 0.62, 0.1)
+
 
 @flax.struct.dataclass
 class Layout:
@@ -41,23 +59,68 @@ class Layout:
 
     Attributes:
       source, target: `[]` int32 peg indices, 0-5 and 6-11.
+      target_peg: `[2]` m, the target's axis.
       block: pose_world_block at the start.
       tip: `[3]` m, where the tool's tip starts.
     """
 
     source: jax.Array
     target: jax.Array
+    target_peg: jax.Array
     block: Pose
     tip: jax.Array
 
 
-def sample_layout(key: jax.Array, pegs: jax.Array) -> Layout:
-    """Draws source and target peg, the block's offset and yaw, and the tip's start.
+@flax.struct.dataclass
+class Facts:
+    """What is measured.
 
-    Args:
-      pegs: `[P, 2]` m; the first half are sources, the second targets.
+    Attributes:
+      block: pose_world_block.
+      velocity: `[6]` of the block, m/s and rad/s.
+      tip: `[3]` m, the tool's tip.
+      touch: the jaws touch the block.
     """
+
+    block: Pose
+    velocity: jax.Array
+    tip: jax.Array
+    touch: jax.Array
+
+
+class Bound(NamedTuple):
+    """Ids in the compiled model.
+
+    Attributes:
+      block, block_dof: where the block's coordinates begin in qpos and qvel.
+      peg_geoms, seat_geoms: `[P]` geom ids.
+      pegs: `[P, 2]` m, the pegs' axes; the first half are sources, the second targets.
+    """
+
+    block: int
+    block_dof: int
+    peg_geoms: np.ndarray
+    seat_geoms: np.ndarray
+    pegs: np.ndarray
+
+
+def bind(m: mujoco.MjModel) -> Bound:
+    """Resolves the ids of block, pegs and seats."""
+    count = sum(m.geom(g).name.startswith("peg") for g in range(m.ngeom))
+    peg_geoms = np.array([m.geom(f"peg{i}").id for i in range(count)])
+    return Bound(
+        block=int(m.joint("block").qposadr[0]),
+        block_dof=int(m.joint("block").dofadr[0]),
+        peg_geoms=peg_geoms,
+        seat_geoms=np.array([m.geom(f"seat{i}").id for i in range(count)]),
+        pegs=np.array(m.geom_pos[peg_geoms, :2], np.float32),
+    )
+
+
+def sample(bound: Bound, key: jax.Array) -> Layout:
+    """Draws source and target peg, the block's offset and yaw, and the tip's start."""
     key_source, key_target, key_offset, key_yaw, key_tip = jax.random.split(key, 5)
+    pegs = jnp.asarray(bound.pegs)
     half = pegs.shape[0] // 2
     source = jax.random.randint(key_source, (), 0, half)
     target = jax.random.randint(key_target, (), half, 2 * half)
@@ -71,7 +134,94 @@ def sample_layout(key: jax.Array, pegs: jax.Array) -> Layout:
     c, s, o, one = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros(()), jnp.ones(())
     R = jnp.stack([jnp.stack([c, -s, o]), jnp.stack([s, c, o]), jnp.stack([o, o, one])])
     block = Pose(R, jnp.append(xy, RIM_HEIGHT))
-    return Layout(source=source, target=target, block=block, tip=tip)
+    return Layout(source=source, target=target, target_peg=pegs[target], block=block, tip=tip)
+
+
+def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
+    """Puts the block upright where it was drawn."""
+    half = 0.5 * jnp.arctan2(layout.block.R[1, 0], layout.block.R[0, 0])
+    zero = jnp.zeros(())
+    quat = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])
+    coords = jnp.concatenate([layout.block.p, quat])
+    return qpos.at[bound.block : bound.block + 7].set(coords)
+
+
+def measure(bound: Bound, layout: Layout, views: Views) -> Facts:
+    """The block's pose and velocity, and what the jaws do."""
+    return Facts(
+        block=bodies.free_pose(views.qpos, bound.block),
+        velocity=views.qvel[bound.block_dof : bound.block_dof + 6],
+        tip=views.pose.p[0],
+        touch=views.touch[0],
+    )
+
+
+def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+    """Strict: threaded, released, at rest. Loose: SurRoL's test."""
+    block, peg = facts.block, layout.target_peg
+    threaded = is_threaded(block, peg)
+    good = threaded & is_at_rest(facts.velocity) & ~facts.touch
+    near, lifted = is_near(block, peg), block.p[2] > RIM_HEIGHT + LIFTED
+    stage = jnp.where(facts.touch, 1, 0)
+    stage = jnp.where(facts.touch & lifted, 2, stage)
+    over = jnp.sum((block.p[:2] - peg) ** 2) < LOOSE_XY**2
+    stage = jnp.where(over & (facts.touch | near), 3, stage)
+    stage = jnp.where(threaded, 4, stage)
+    stage = jnp.where(good, 5, stage).astype(jnp.int32)
+    to_block = jnp.linalg.norm(block.p - facts.tip)
+    to_target = jnp.linalg.norm(block.p[:2] - peg)
+    left = jnp.where(stage == 0, to_block, to_target)
+    share = jnp.where(good, 1.0, jnp.exp(-left / NEAR))
+    reward = jnp.where(good, 1.0, (stage + share) / len(STAGES))
+    return Verdict(good, near, jnp.zeros((), bool), stage, reward)
+
+
+def state(bound: Bound, layout: Layout, facts: Facts) -> jax.Array:
+    """`[12]`: the block's position and rotation, the target's place."""
+    goal = jnp.append(layout.target_peg, RIM_HEIGHT)
+    return jnp.concatenate([facts.block.p, rcm.rot6d_encode(facts.block.R), goal])
+
+
+def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
+    """Tip to block, in the world's frame and in the block's, and tip to target: `[..., 9]`.
+
+    They decide a grasp, and a small network does not get such small differences exactly enough
+    from positions in the scale of the workspace.
+    """
+    tip = tips[..., 0, :]
+    to_block, to_target = state[..., :3] - tip, state[..., 9:12] - tip
+    block = rcm.rot6d_decode(state[..., 3:9])
+    turned = jnp.einsum("...ji,...j->...i", block, to_block, precision="highest")
+    return jnp.concatenate([to_block, turned, to_target], axis=-1) / NEAR
+
+
+def colours(bound: Bound, layout: Layout, rgb: jax.Array) -> jax.Array:
+    """Marks the target peg and its seat."""
+    seats, pegs = jnp.asarray(bound.seat_geoms), jnp.asarray(bound.peg_geoms)
+    marked = jnp.stack([pegs[layout.target], seats[layout.target]])
+    return rgb.at[marked].set(jnp.array(TARGET_RGB))
+
+
+def obstacles(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+    """Pegs, and the walls of the block: the sides of a full triangle, 3.5 mm longer at either end
+    than they are."""
+    pegs = jnp.asarray(bound.pegs)
+    foot = jnp.concatenate([pegs, jnp.zeros((len(pegs), 1))], axis=-1)
+    normals = wall_normals(facts.block)
+    half = jnp.sqrt(3.0) * RIM_RADIUS * jnp.cross(facts.block.R[:, 2], normals)
+    middle = facts.block.p + RIM_RADIUS * normals
+    return Capsules(
+        start=jnp.concatenate([foot, middle - half]),
+        end=jnp.concatenate([foot.at[:, 2].set(PEG_HEIGHT - PEG_RADIUS), middle + half]),
+        radius=jnp.asarray(np.repeat([PEG_RADIUS, WALL_RADIUS], [len(pegs), WALLS]), jnp.float32),
+    )
+
+
+def is_sound(bound: Bound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+    """Whether the block is slower, and nearer, than anything physical."""
+    speed = jnp.max(jnp.abs(qvel[bound.block_dof : bound.block_dof + 3]))
+    away = jnp.max(jnp.abs(qpos[bound.block : bound.block + 3]))
+    return (speed < MAX_BLOCK_SPEED) & (away < MAX_BLOCK_DISTANCE)
 
 
 def wall_normals(block: Pose) -> jax.Array:
@@ -98,3 +248,49 @@ def is_at_rest(velocity: jax.Array) -> jax.Array:
     """Whether the block's free-joint velocity `[6]` (m/s, rad/s) is that of a block at rest."""
     slow = jnp.sum(velocity[:3] ** 2) < REST_SPEED**2
     return slow & (jnp.sum(velocity[3:] ** 2) < REST_SPIN**2)
+
+
+def _expert() -> Agent:
+    from starjax.sim.tasks.peg_transfer import expert
+
+    return expert.AGENT
+
+
+def _expert_with_one_wall() -> Agent:
+    from starjax.sim.tasks.peg_transfer import expert
+
+    return expert.WITH_ONE_WALL
+
+
+TASK = Task(
+    name="peg_transfer",
+    mjcf="tasks/peg_transfer/peg_transfer.xml",
+    slots=(Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15)),),
+    cameras=("camera",),
+    time_limit_s=60.0,
+    settle_steps=SETTLE_STEPS,
+    fields=(
+        Field("block.p", 3, "point"),
+        Field("block.R", 6, "rot6d"),
+        Field("target.p", 3, "point"),
+    ),
+    labels=("source", "target"),
+    stages=STAGES,
+    words=words.WORDS,
+    experts={"default": _expert, "one_wall": _expert_with_one_wall},
+    graspable=("wall0", "wall1", "wall2"),
+    bind=bind,
+    sample=sample,
+    tips=lambda bound, layout: layout.tip[None],
+    place=place,
+    measure=measure,
+    judge=judge,
+    state=state,
+    relative=relative,
+    label=lambda layout: {"source": layout.source, "target": layout.target},
+    colours=colours,
+    obstacles=obstacles,
+    floor=0.0,
+    is_sound=is_sound,
+    outline=words.outline,
+)

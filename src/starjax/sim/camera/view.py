@@ -1,0 +1,75 @@
+"""Where the camera is in one image: known on the host for a fixed camera, traced for a moving one.
+
+A fixed camera's sun and textures are worked out once, on the host. A moving one's scene is read
+with the camera frame at the world's, and the pose comes with every image.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.sim.camera import geometry, texture, tiles
+from starjax.types import Pose
+
+# A texture: visible points x, y, z in the camera frame, `[T, Q]` m each, to red, green and blue.
+Look = Callable[[Sequence[Any]], Sequence[Any]]
+
+
+class View(NamedTuple):
+    """One camera in one image; numpy or traced.
+
+    Attributes:
+      R_cam_world: `[3, 3]`. p_world_cam: `[3]` m.
+      R_light_cam: `[3, 3]`, to a frame whose z axis points to the sun, or None without one.
+      to_sun: x, y, z in the camera frame, or None.
+      textures: by row.
+    """
+
+    R_cam_world: Any
+    p_world_cam: Any
+    R_light_cam: Any
+    to_sun: Sequence[Any] | None
+    textures: dict[int, Look]
+
+
+def fixed(scene: geometry.Scene, grid: tiles.Grid) -> View:
+    """The view of a camera that is fixed in the world, of a scene read in its frame."""
+    drawn = texture.draw(scene, grid)
+    direction = None if scene.sun is None else scene.sun.direction
+    return View(
+        R_cam_world=jnp.asarray(scene.R_world_cam.T, jnp.float32),
+        p_world_cam=jnp.asarray(scene.p_world_cam, jnp.float32),
+        R_light_cam=None if direction is None else _frame(-direction),
+        to_sun=None if direction is None else [-float(v) for v in direction],
+        textures={row: lambda p, rgb=rgb: rgb for row, rgb in drawn.items()},
+    )
+
+
+def moving(scene: geometry.Scene, grid: tiles.Grid, pose_world_cam: Pose) -> View:
+    """The view from a pose, of a scene read in the world's frame."""
+    R_world_cam, p_world_cam = (jnp.asarray(x, jnp.float32) for x in pose_world_cam)
+    R_light_cam = to_sun = None
+    if scene.sun is not None:
+        R_light_world = _frame(-scene.sun.direction)
+        R_light_cam = jnp.einsum("ij,jk->ik", R_light_world, R_world_cam, precision="highest")
+        to_sun = list(R_light_cam[2])
+    step = abs(scene.right - scene.left) / grid.width
+    return View(
+        R_cam_world=R_world_cam.T,
+        p_world_cam=p_world_cam,
+        R_light_cam=R_light_cam,
+        to_sun=to_sun,
+        textures={
+            row: texture.looker(found, step, R_world_cam, p_world_cam)
+            for row, found in scene.textures.items()
+        },
+    )
+
+
+def _frame(z: np.ndarray) -> np.ndarray:
+    """A rotation whose third row is the unit vector `z`, float32."""
+    x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z]).astype(np.float32)

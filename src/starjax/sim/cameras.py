@@ -1,0 +1,84 @@
+"""The cameras of a scene: where each one is, and what it sees.
+
+A camera that is fixed in the world draws its textures and its sun once. One that rides on a body,
+and every one of an environment with moving cameras, takes its pose from the state.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from starjax.sim import render
+from starjax.sim.engine import mjx
+from starjax.types import Pose
+
+
+class Camera(NamedTuple):
+    """One camera of a scene.
+
+    Attributes:
+      name: in the MJCF.
+      body: that it rides on, 0 for the world.
+      pose: in that body's frame, x to the right, y up, looking along -z; numpy.
+      moves: whether its pose comes with every image.
+      draw: see `render.make`.
+    """
+
+    name: str
+    body: int
+    pose: Pose
+    moves: bool
+    draw: render.Render
+
+
+def make(
+    mj_model: mujoco.MjModel,
+    names: Sequence[str],
+    image_size: int,
+    shadow: bool = True,
+    moving: bool = False,
+) -> tuple[Camera, ...]:
+    """The cameras of these names, for square images; with `moving` all of them may move."""
+    found = []
+    for name in names:
+        camera = mj_model.camera(name)
+        body, R = int(camera.bodyid[0]), np.zeros(9)
+        mujoco.mju_quat2Mat(R, camera.quat)
+        pose = Pose(R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32))
+        moves = moving or body != 0
+        draw = render.make(mj_model, name, image_size, image_size, shadow=shadow, moves=moves)
+        found.append(Camera(name, body, pose, moves, draw))
+    return tuple(found)
+
+
+def nominal(cameras: Sequence[Camera]) -> Pose:
+    """Poses `[C]` of the cameras in their bodies' frames, as the MJCF has them."""
+    return Pose(*(jnp.stack([jnp.asarray(c.pose[i]) for c in cameras]) for i in range(2)))
+
+
+def images(
+    cameras: Sequence[Camera], poses: Pose, data: mjx.Data, rgb: jax.Array
+) -> dict[str, render.Frame]:
+    """What every camera sees.
+
+    Args:
+      cameras: C of them.
+      poses: `[C]` in their bodies' frames; not looked at for cameras that do not move.
+      data: with the poses of bodies and geoms.
+      rgb: `[G, 3]` colours in [0, 1].
+    """
+    found: dict[str, render.Frame] = {}
+    for i, camera in enumerate(cameras):
+        draw: Callable[..., render.Frame] = camera.draw
+        seen = (data.geom_xpos, data.geom_xmat, rgb)
+        if not camera.moves:
+            found[camera.name] = draw(*seen)
+            continue
+        R_world_body, p_world_body = data.xmat[camera.body], data.xpos[camera.body]
+        pose = Pose(R_world_body @ poses.R[i], p_world_body + R_world_body @ poses.p[i])
+        found[camera.name] = draw(*seen, pose)
+    return found

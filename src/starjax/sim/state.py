@@ -1,0 +1,119 @@
+"""What an environment is made of: its functions, its parameters and its state."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import numpy as np
+
+from starjax import rcm
+from starjax.sim import physics, render
+from starjax.sim.names import SceneNames
+from starjax.sim.scene import Scene
+from starjax.sim.tasks.base import Task
+from starjax.types import Command, Observation, Pose
+
+
+class EnvParams(NamedTuple):
+    """What the caller chooses for an episode.
+
+    Attributes:
+      trocar: where the trocars are, fields `[A]`.
+      told: what agents are told of them, fields `[A]`, or None for the truth.
+      cameras: poses `[C]` of the observed cameras in their bodies' frames, or None for those of the
+        MJCF; only an environment with moving cameras looks at those that are fixed in the world.
+    """
+
+    trocar: rcm.Trocar
+    told: rcm.Trocar | None = None
+    cameras: Pose | None = None
+
+
+@flax.struct.dataclass
+class EnvState:
+    """One episode. Every array is `[]` or as said; batches come from vmap.
+
+    Attributes:
+      physics: joint positions, velocities, warm start.
+      q_target: of every arm, `[J]` rad, joint target of the last command. q_velocity: of every
+        arm, `[J]` rad/s, the target's.
+      velocity: `[A, 7]` of the reference poses, see `control`.
+      correction: `[A, 3]` m, feedback correction of the tools' axes at their trocars.
+      gripper_target: `[A]` in [-1, 1].
+      trocar: where the trocars are, `[A]`. told: what agents are told of them, `[A]`.
+      cameras: `[C]` poses in their bodies' frames.
+      layout, facts: the task's own: what was drawn at reset, what is measured now.
+      step: int32, control steps taken. settled: consecutive steps that looked like success.
+      stage: int32, see `Task.stages`. reward: in [0, 1].
+      done: nothing moves any more: success, lost, or invalid.
+      success: strict. loose: the task's looser test was met at some step. lost: the task cannot
+        succeed any more.
+      invalid: the simulation diverged or its contact solver did not converge, and the last sound
+        state is kept; or a trocar is not finite.
+      collided: an arm, shaft or jaw was where it has no modelled contact.
+      rcm_error: `[A]` m, executed: distance of the trocar from the measured tool axis.
+      rcm_error_within: `[A]` m, the largest such distance at any physics step of the last control
+        step.
+      ik_error: `[A]` m, residual of the inverse kinematics, rotations weighed; inf after a command
+        that is not finite, or whose R is no rotation: the arm holds.
+      solver_error: J, see `physics.Passed`, of the last control step.
+      touch: `[A]` bool, the jaws touch something that they can grasp.
+      pose: `[A]` measured tips in the world. gripper: `[A]` measured openings, [-1, 1].
+    """
+
+    physics: physics.PhysicsState
+    q_target: tuple[jax.Array, ...]
+    q_velocity: tuple[jax.Array, ...]
+    velocity: jax.Array
+    correction: jax.Array
+    gripper_target: jax.Array
+    trocar: rcm.TrocarFrame
+    told: rcm.TrocarFrame
+    cameras: Pose
+    layout: Any
+    facts: Any
+    step: jax.Array
+    settled: jax.Array
+    stage: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    success: jax.Array
+    loose: jax.Array
+    lost: jax.Array
+    invalid: jax.Array
+    collided: jax.Array
+    rcm_error: jax.Array
+    rcm_error_within: jax.Array
+    ik_error: jax.Array
+    solver_error: jax.Array
+    touch: jax.Array
+    pose: Pose
+    gripper: jax.Array
+
+
+class Env(NamedTuple):
+    """The simulation as pure functions of one episode.
+
+    Attributes:
+      reset: (key, EnvParams) -> EnvState.
+      step: (EnvState, Command `[A]`) -> EnvState, one control period; the state of a done episode
+        stays.
+      observe: EnvState -> Observation `[A]`.
+      camera: EnvState -> camera's name -> render.Frame, at the observation's size.
+      labels: EnvState -> name of `Task.labels` -> int32.
+      scene: the static scene; task: its task; names: of its parts.
+      p_world_ref: `[A, 3]` m, the nominal trocars.
+      control_hz: commands a second.
+    """
+
+    reset: Callable[[jax.Array, EnvParams], EnvState]
+    step: Callable[[EnvState, Command], EnvState]
+    observe: Callable[[EnvState], Observation]
+    camera: Callable[[EnvState], dict[str, render.Frame]]
+    labels: Callable[[EnvState], dict[str, jax.Array]]
+    scene: Scene
+    task: Task
+    names: SceneNames
+    p_world_ref: np.ndarray
+    control_hz: float
