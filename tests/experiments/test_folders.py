@@ -180,12 +180,12 @@ def test_settings_that_runs_differ_in_are_named():
     old = values()
     del old["policy"]["trocar_yaw"]
     same = values(seed=5, train={"keep_checkpoints": 9}, eval={"trials": 9})
-    assert folders.differing([]) == folders.differing([values(), old, same]) == []
+    assert config.differing([]) == config.differing([values(), old, same]) == []
     newer = values(policy={"trocar_yaw": "fixed"}, demos={"per_trocar": 9})
     newer["policy"]["unheard_of"] = 1
-    found = folders.differing([old, newer])
+    found = config.differing([old, newer])
     names = ["demos.per_trocar", "policy.trocar_yaw", "policy.unheard_of"]
-    assert found == folders.differing([newer, old, newer]) == names
+    assert found == config.differing([newer, old, newer]) == names
 
 
 def test_a_methods_folder_is_found_from_within_and_told_from_others(tmp_path, monkeypatch):

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from starjax import config as config_lib
 from starjax import methods
 from starjax.evaluation import trial_file
-from starjax.experiments import folders
 from starjax.report import outcomes, stats, structure
 from starjax.runtime import files
 
@@ -115,7 +115,7 @@ def trials_seed(run: Run) -> int | None:
 def differing(runs: Sequence[Run]) -> list[str]:
     """Flags of what decides the weights, but for the seed, that the runs do not agree on."""
     configs = [run.result["config"] for run in runs if run.result.get("config")]
-    return folders.differing(configs)
+    return config_lib.differing(configs)
 
 
 def pair(a: Run, b: Run) -> stats.Paired | None:
@@ -264,7 +264,7 @@ def _is_of(folder: Path, result: dict[str, Any]) -> bool:
     try:
         trained, config = files.read_json(folder / "config.json"), result["config"]
         same_seed = trained["seed"] == config.get("seed", trained["seed"])
-        return same_seed and not folders.differing([trained, config])
+        return same_seed and not config_lib.differing([trained, config])
     except (AttributeError, KeyError, TypeError, ValueError):
         return True  # damaged, or of another version: not known
 

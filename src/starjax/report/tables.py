@@ -3,8 +3,8 @@
 import itertools
 from collections.abc import Callable, Sequence
 
+from starjax import methods
 from starjax.evaluation import sweep
-from starjax.experiments import folders
 from starjax.report import captions, outcomes, results, stats
 
 Table = list[list[str]]  # header first
@@ -240,7 +240,7 @@ def _comparison(a: results.Run, b: results.Run, test: stats.Paired) -> tuple[obj
     result does not say whose it is, by their folders, and the trials' outcomes."""
     method = b.result["method"]
     place = b.path.parent if b.path.name == method else b.path
-    return a.path, b.result.get("weights", place), folders.behaviour(method), test
+    return a.path, b.result.get("weights", place), methods.behaviour(method), test
 
 
 def _seen_unseen(
