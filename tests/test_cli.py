@@ -6,7 +6,8 @@ import textwrap
 
 import pytest
 
-from starjax import cli
+from starjax import cli, errors
+from starjax.runtime import files
 
 
 def started(code):
@@ -26,6 +27,36 @@ def test_too_little_memory_is_one_line_that_names_what_to_lower(capsys):
     assert cli.guard(command, []) == 71
     said = capsys.readouterr().err
     assert "9 bytes. Too much" in said and "--train.batch-size" in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "word"),
+    [
+        (errors.UsageError("seed", "0 or more", -1), 2, "--seed"),
+        (KeyboardInterrupt(), 130, "same command"),
+        (OSError(28, "No space left on device", "runs/x"), 74, "runs/x"),
+        (OSError(28, "No space left on device", "runs/x"), 74, "cannot write:"),
+        (PermissionError(13, "Permission denied", "runs/y"), 74, "cannot read or write: runs/y"),
+        (OSError(36, "File name too long", "runs/y"), 74, "File name too long"),
+        (MemoryError("Unable to allocate 9 GiB"), 71, "too little memory (Unable to allocate 9"),
+        (files.StorageError("runs/z: the disk is full"), 74, "runs/z"),
+    ],
+)
+def test_guard_turns_what_a_user_can_mend_into_one_line(error, code, word, capsys):
+    def command(argv):
+        raise error
+
+    assert cli.guard(command, []) == code
+    said = capsys.readouterr().err
+    assert word in said and len(said.strip().splitlines()) == 1
+
+
+def test_guard_lets_a_fault_of_the_program_through():
+    def command(argv):
+        raise ValueError("a bug")
+
+    with pytest.raises(ValueError, match="a bug"):
+        cli.guard(command, [])
 
 
 @pytest.mark.parametrize("closed", ["stdout", "stderr"])

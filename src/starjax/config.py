@@ -1,65 +1,83 @@
-"""Settings of a run as frozen dataclasses. Standard library only: `--help` must not import jax."""
+"""Settings of a run as frozen dataclasses. Standard library only: `--help` must not import jax.
+
+A field's comment is its help, its type has its range (`limits`).
+"""
 
 import dataclasses
+import json
 import types
 import typing
-from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, TypeVar
+
+from starjax.limits import Count, CountOrZero, NotNegative, Positive, Range
 
 SettingsT = TypeVar("SettingsT")
+
+
+# A key of jax takes 32 bits: larger seeds would alias smaller ones.
+Seed = Annotated[int, Range(0, 2**32 - 1)]
+TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DemosConfig:
     """Demonstrations: how many, and what is recorded."""
 
-    per_trocar: int = 30  # successful demonstrations at each seen trocar (V-A3)
-    seen_trocars: int = 8  # how many of the eight seen trocars to train with, the first ones
+    per_trocar: Count = 30  # successful demonstrations at each seen trocar (V-A3)
+    # how many of the eight seen trocars to train with, from the first on
+    seen_trocars: Annotated[int, Range(1, 8)] = 8
     keep_failures: bool = False  # store failed episodes too; training leaves them out
     one_wall: bool = False  # on the middle row the expert always takes the wall of one side
-    max_steps: int = 600  # control steps, at 30 Hz, that the expert may take
+    max_steps: Count = 600  # control steps, at 30 Hz, that the expert may take
 
 
 # One DDIM step alone returns the noise that it began with (`models.schedule.ddim_table`).
 FEWEST_DDIM_STEPS = 2
+DiffusionSteps = Annotated[int, Range(FEWEST_DDIM_STEPS, 1_000_000)]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PolicyConfig:
     """Networks and diffusion (IV-G)."""
 
-    # Pixels as in the paper, or block pose and target position
+    # pixels as in the paper, or what the task says of its state
     observation: Literal["image", "state"] = "image"
-    image_size: int = 256  # side of a picture in pixels, before the crop
-    obs_horizon: int = 2  # T_o, control steps whose observations a decision sees
-    horizon: int = 16  # H, commands predicted: t+1 .. t+H
-    execute: int = 8  # commands executed before re-planning
-    encoder: Literal["resnet18", "small"] = "resnet18"  # network that reads the pictures
-    # Where the encoder's weights begin: a policy that ships with starjax, by its name; a
+    image_size: Annotated[int, Range(32, 4_096)] = 256  # pixels a side of an image, before the crop
+    obs_horizon: Count = 2  # T_o, control steps whose observations a decision sees
+    horizon: Annotated[int, Range(1, 4_096)] = 16  # H, commands predicted: t+1 .. t+H
+    execute: Count = 8  # commands executed before re-planning
+    encoder: Literal["resnet18", "small"] = "resnet18"  # network that reads the images
+    # where the encoder's weights begin: a policy that ships with starjax, by its name; a
     # policy.safetensors of yours; a file of torchvision's (pth or safetensors). Empty: from scratch
     encoder_weights: str = ""
     freeze_encoder: bool = False  # train the rest only, on features computed once a frame
-    vision_dim: int = 512  # d_v, numbers that the encoder makes of a picture
-    state_dim: int = 256  # d_s, numbers made of the low-dimensional history (Eq. 11)
-    unet_channels: tuple[int, ...] = (256, 512, 1024, 2048)  # of each level of the U-Net
-    kernel_size: int = 5  # of the U-Net's convolutions, in commands; odd
-    groups: int = 8  # of the U-Net's GroupNorms; divides all of its channels
-    time_dim: int = 128  # width of the embedding of the diffusion step
-    roll_width: int = 256  # width of the roll network
-    roll_blocks: int = 3  # residual blocks of the roll network
+    vision_dim: Annotated[int, Range(2, 65_536)] = 512  # d_v, numbers that an image becomes
+    # d_s, numbers that the low-dimensional history becomes (Eq. 11)
+    state_dim: Annotated[int, Range(4, 65_536)] = 256
+    # of each level of the U-Net
+    unet_channels: Annotated[tuple[int, ...], Range(1, 65_536)] = (256, 512, 1024, 2048)
+    # of the U-Net's convolutions, in commands
+    kernel_size: Annotated[int, Range(1, 4_095, step=2)] = 5
+    groups: Count = 8  # of the U-Net's GroupNorms; divides all of its channels
+    # width of the embedding of the diffusion step
+    time_dim: Annotated[int, Range(4, 65_536, step=2)] = 128
+    roll_width: Annotated[int, Range(1, 65_536)] = 256  # width of the roll network
+    roll_blocks: Annotated[int, Range(0, 1_000)] = 3  # residual blocks of the roll network
     # Ablations of the roll network, which reads tip positions, trocar and measured rolls (Eq. 13)
     roll_history: bool = True  # the roll network reads the measured rolls
     roll_trocar: bool = True  # the roll network reads the trocar
-    roll_observation: bool = False  # the roll network reads the picture or the task state too
-    # Whether the diffusion model is given the trocar: as Table II says, or an ablation
+    roll_observation: bool = False  # the roll network reads the image or the task state too
+    # whether the diffusion model is given the trocar: as Table II says, or an ablation
     sees_trocar: Literal["method", "always", "never"] = "method"
-    # Which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
+    # which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
     # trocar's azimuth, or an ablation
     trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
-    diffusion_steps: int = 100  # K, diffusion steps in training
-    ddim_steps: int = 10  # denoising steps of a decision, 2 to K
-    temperature: float = 1.0  # 0 to 1, of a sample's first noise; lower: nearer to the likeliest
-    roll_loss_weight: float = 0.1  # lambda of Eq. 15
+    diffusion_steps: DiffusionSteps = 100  # K, diffusion steps in training
+    ddim_steps: DiffusionSteps = 10  # denoising steps of a decision, at most K
+    # of a sample's first noise; lower: nearer to the likeliest
+    temperature: Annotated[float, Range(0.0, 1.0)] = 1.0
+    roll_loss_weight: NotNegative = 0.1  # lambda of Eq. 15
     dtype: Literal["float32", "bfloat16"] = "float32"  # of the networks' arithmetic
 
 
@@ -67,32 +85,38 @@ class PolicyConfig:
 class TrainConfig:
     """Optimisation (IV-G; warm-up, betas and EMA are Diffusion Policy's)."""
 
-    steps: int = 100_000  # training steps
-    batch_size: int = 256  # samples a training step
-    learning_rate: float = 1e-4  # AdamW's after the warm-up; half a cosine takes it to 0
-    weight_decay: float = 1e-6  # AdamW's, of all weights
-    roll_weight_decay: float = 0.0  # more of it, of the roll network's kernels alone
-    warmup_steps: int = 500  # training steps in which the learning rate rises, at most half of all
-    ema_max: float = 0.9999  # share of the averaged weights that a training step keeps, at most
-    crop_fraction: float = 0.9  # side of the crop, random in training, over the image's
-    jitter: float = 0.1  # of pictures: brightness, contrast, saturation times 1 +- this
-    image_noise: float = 0.02  # standard deviation of the noise on pictures in [0, 1]
-    state_noise: float = 0.02  # standard deviation of the noise on normalised poses and task state
-    steps_per_call: int = 100  # training steps handed to the device between two looks, at most
-    checkpoint_every: int = 5_000  # training steps between two checkpoints
-    keep_checkpoints: int = 2  # how many of the newest checkpoints stay on disk
-    log_every: int = 100  # training steps between two lines of metrics.jsonl
-    holdout_demos: int = 8  # demonstrations kept out of training, for the action error
+    steps: Count = 100_000  # training steps
+    batch_size: Count = 256  # samples a training step
+    learning_rate: Positive = 1e-4  # AdamW's after the warm-up; half a cosine takes it to 0
+    weight_decay: NotNegative = 1e-6  # AdamW's, of all weights
+    roll_weight_decay: NotNegative = 0.0  # more of it, of the roll network's kernels alone
+    # training steps in which the learning rate rises, at most half of all
+    warmup_steps: CountOrZero = 500
+    # share of the averaged weights that a training step keeps, at most
+    ema_max: Annotated[float, Range(0.0, 1.0, "[)")] = 0.9999
+    # side of the crop, random in training, over the image's
+    crop_fraction: Annotated[float, Range(0.0, 1.0, "(]")] = 0.9
+    jitter: NotNegative = 0.1  # of images: brightness, contrast, saturation times 1 +- this
+    image_noise: NotNegative = 0.02  # standard deviation of the noise on images in [0, 1]
+    # standard deviation of the noise on normalised poses and task state
+    state_noise: NotNegative = 0.02
+    # training steps handed to the device between two looks, at most
+    steps_per_call: Count = 100
+    checkpoint_every: Count = 5_000  # training steps between two checkpoints
+    keep_checkpoints: Count = 2  # how many of the newest checkpoints stay on disk
+    log_every: Count = 100  # training steps between two lines of metrics.jsonl
+    # demonstrations kept out of training, for the action error
+    holdout_demos: CountOrZero = 8
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EvalConfig:
     """Closed-loop evaluation (V-A4)."""
 
-    trials: int = 30  # trials at each trocar
-    time_limit_s: float = 60.0  # s of simulated time that a trial may take
-    chunk: int = 0  # trials between two savings, at most; 0: as many as a program runs
-    video_trials: int = 4  # trials recorded for the video and the figures
+    trials: Annotated[int, Range(1, 1_000_000)] = 30  # trials at each trocar
+    time_limit_s: Annotated[float, TIME_LIMIT] = 60.0  # s of simulated time that a trial may take
+    chunk: CountOrZero = 0  # trials between two savings, at most; 0: as many as a program runs
+    video_trials: CountOrZero = 4  # trials recorded for the video and the figures
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -100,14 +124,55 @@ class RunConfig:
     """One run of `python -m starjax.experiments.run`."""
 
     method: str = "stardiff"  # a row of Table II, or all
-    # Starting values of the rest; auto: gpu where jax can use one, else cpu
+    # starting values of the rest; auto: gpu where jax can use one, else cpu
     preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"
-    seed: int = 0  # of everything random
-    out: str = "runs"  # folder of results; left out, other seeds and observations have their own
+    seed: Seed = 0  # of everything random
+    out: str = "auto"  # folder of results; auto: runs/PRESET, other seeds and observations apart
     demos: DemosConfig = dataclasses.field(default_factory=DemosConfig)
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     eval: EvalConfig = dataclasses.field(default_factory=EvalConfig)
+
+
+# What decides a policy's weights; the rest may change between two starts of a run.
+_TRAINED_WITH = ("seed", "demos", "policy", "train")
+_BESIDE = {"train.keep_checkpoints", "train.checkpoint_every", "train.steps_per_call"}  # of those
+
+
+def trained_with(config: RunConfig) -> dict[str, Any]:
+    """The settings that decide a policy's weights, e.g. `train.steps`, as JSON has them."""
+    values = as_json(config)
+    flat = _flat({name: values[name] for name in _TRAINED_WITH})
+    return {name: value for name, value in flat.items() if name not in _BESIDE}
+
+
+def differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Settings, but for the seed, that decide weights and that configurations disagree on.
+
+    The configurations are from JSON. Settings that one of them lacks have their default there.
+    """
+    usual = as_json(RunConfig())
+    parts = [part for part in _TRAINED_WITH if part != "seed"]
+    filled = [{part: usual[part] | values.get(part, {}) for part in parts} for values in configs]
+    rows = [_flat(values) for values in filled]
+    return [
+        name
+        for name in dict.fromkeys(name for row in rows for name in row)
+        if name not in _BESIDE and any(row.get(name) != rows[0].get(name) for row in rows)
+    ]
+
+
+def as_json(settings: Any) -> dict[str, Any]:
+    """Settings as values of JSON, which knows no tuples."""
+    return json.loads(json.dumps(dataclasses.asdict(settings)))
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found = {}
+    for name, value in values.items():
+        inner = isinstance(value, dict)
+        found |= _flat(value, f"{prefix}{name}.") if inner else {f"{prefix}{name}": value}
+    return found
 
 
 def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT:

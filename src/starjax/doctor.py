@@ -43,7 +43,9 @@ def main(argv: Sequence[str]) -> int:
     if any(finding.name in ("packages", "XLA_FLAGS") and finding.remedy for finding in findings):
         print("       the checks that start jax were left out: it would fail")
     else:
-        findings += [finding for check in (devices, scene, video) for finding in _shown(check)]
+        findings += [
+            finding for check in (settings, devices, scene, video) for finding in _shown(check)
+        ]
     faults = sum(bool(finding.remedy) for finding in findings)
     print(f"\n{faults} fault(s)" if faults else "\nno fault found")
     return 1 if faults else 0
@@ -81,6 +83,17 @@ def xla_flags() -> list[Finding]:
         return [Finding("XLA_FLAGS", typed, f"physics is 300 times slower so: set {flag}=false")]
     xla.prepare_xla()
     return [Finding("XLA_FLAGS", os.environ.get("XLA_FLAGS", "") or "(none needed)")]
+
+
+def settings() -> list[Finding]:
+    """Which settings of jax a command passes over, and which it records with its results."""
+    try:
+        from starjax.runtime import jax_settings
+    except (ImportError, RuntimeError):  # `devices` says why
+        return []
+    found = jax_settings.recorded() | dict.fromkeys(jax_settings.fix(), "not used")
+    words = (f"{name.upper() if name[0] != '-' else name} {value}" for name, value in found.items())
+    return [Finding("settings", ", ".join(words) or "jax's own")]
 
 
 def storage() -> list[Finding]:

@@ -102,3 +102,8 @@ METHODS: dict[str, Method] = {
         group=_OURS,
     ),
 }
+
+
+def behaviour(name: str) -> Method:
+    """A row without its names: methods with the same one act alike."""
+    return METHODS[name]._replace(label="", group="")

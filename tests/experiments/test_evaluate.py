@@ -257,7 +257,7 @@ def test_a_sweep_has_the_time_limit_of_its_run(file):
     [
         ([], "RUN or --policy", "none"),
         (["runs/x", "--policy", "y"], "RUN or --policy", "both"),
-        (["a", "b"], "RUN", "a b"),
+        (["a", "b"], "FLAG", "b"),
         (["-x"], "FLAG", "-x"),
         (["--policy", "nowhere"], "--policy", "nowhere"),
         (["--policy", "x", "--eval.trials", "0"], "eval.trials", 0),

@@ -77,6 +77,14 @@ def test_weights_of_another_scene_are_refused(tmp_path):
     assert "demos-a" in caught.value.expected and caught.value.got == "demos-b"
 
 
+def test_weights_of_other_settings_of_jax_are_refused(tmp_path, monkeypatch):
+    claimed(tmp_path)
+    monkeypatch.setenv("NVIDIA_TF32_OVERRIDE", "0")
+    with pytest.raises(errors.UsageError) as caught:
+        folders.claim(tmp_path, SMOKE, "demos-a")
+    assert caught.value.argument == "the settings of jax" and "NVIDIA" in str(caught.value.got)
+
+
 def test_weights_of_another_frozen_encoder_are_refused(tmp_path):
     claimed(tmp_path, "aaaa")
     folders.claim(tmp_path, SMOKE, "demos-a")  # trained by now: the encoder may be gone
@@ -172,12 +180,12 @@ def test_settings_that_runs_differ_in_are_named():
     old = values()
     del old["policy"]["trocar_yaw"]
     same = values(seed=5, train={"keep_checkpoints": 9}, eval={"trials": 9})
-    assert folders.differing([]) == folders.differing([values(), old, same]) == []
+    assert config.differing([]) == config.differing([values(), old, same]) == []
     newer = values(policy={"trocar_yaw": "fixed"}, demos={"per_trocar": 9})
     newer["policy"]["unheard_of"] = 1
-    found = folders.differing([old, newer])
+    found = config.differing([old, newer])
     names = ["demos.per_trocar", "policy.trocar_yaw", "policy.unheard_of"]
-    assert found == folders.differing([newer, old, newer]) == names
+    assert found == config.differing([newer, old, newer]) == names
 
 
 def test_a_methods_folder_is_found_from_within_and_told_from_others(tmp_path, monkeypatch):

@@ -217,7 +217,8 @@ def test_a_finished_run_needs_its_encoder_no_more(tmp_path, done):
 
 
 def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
-    settings = _json(presets.PRESETS["smoke"])
+    smoke = presets.PRESETS["smoke"]
+    settings = _json(smoke)
     none = {"successes": 0, "trials": 0}
     figures = {
         "method": "stardiff",
@@ -228,7 +229,7 @@ def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
     }
     result = {"config": settings, "trials": [], **figures}
 
-    def is_done(found, wanted=settings, weights="a"):
+    def is_done(found, wanted=smoke, weights="a"):
         (tmp_path / "result.json").write_text(
             found if isinstance(found, str) else json.dumps(found)
         )
@@ -242,7 +243,8 @@ def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
     del older["config"]["policy"]["freeze_encoder"]
     assert is_done(older)
     assert not is_done({**result, "seed": settings["seed"] + 1})  # of `starjax evaluate --out`
-    assert not is_done(result, {**settings, "eval": {**settings["eval"], "trials": 9}})
+    more = dataclasses.replace(smoke, eval=dataclasses.replace(smoke.eval, trials=9))
+    assert not is_done(result, more)
     for damaged in ("{", "{}", '{"config": 1}', '{"config": {"of": "another"}, "trials": []}'):
         assert not is_done(damaged)
     for missing in figures:  # of another version

@@ -27,7 +27,7 @@ from starjax import rcm
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import chunks, cores, episodes, recording
-from starjax.runtime import files, progress, xla
+from starjax.runtime import files, jax_settings, progress, xla
 
 COMMITS = 16  # episodes written at once; most of it is waiting for the disk
 FRAME_GUESS = 300  # control steps of a typical demonstration, for estimates of disk and memory
@@ -67,6 +67,7 @@ def describe(
         "scene": scene_hash(env.model),
         "seed_rule": f"fold_in(fold_in(fold_in(key(seed), {recording.STREAM}), trocar), trial)",
         "versions": xla.versions(),
+        **jax_settings.record(),
         **({"one_wall": True} if one_wall else {}),  # not in the names of datasets without
     }
 

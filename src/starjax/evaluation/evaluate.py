@@ -21,7 +21,7 @@ from starjax.evaluation import recorded
 from starjax.evaluation import trials as table
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import cores, engine
-from starjax.runtime import files, progress, xla
+from starjax.runtime import files, jax_settings, progress, xla
 
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
 GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
@@ -105,6 +105,7 @@ def evaluate(
             "identity": dict(identity or {}),
             "scene": demos.scene_hash(env.model),
             "versions": xla.versions(),
+            **jax_settings.record(),
         }
         chunk = _resume(directory, plan, min(chunk or batch, batch), batch, report)
         spans = [

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from starjax.experiments import checks, folders, options, words
+from starjax.limits import MOST, Count, Range
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Times one decision at batch 1: observation in, commands out, compilation apart.
@@ -23,19 +24,18 @@ class Options:
 
     run: options.Run  # a method's folder, such as runs/cpu/stardiff
     # numbers of denoising steps, a row for each; left out: Table IV's 1 2 5 10 20 50 100
-    ddim_steps: Annotated[tuple[int, ...], options.in_words] = ()
-    calls: int = 100  # decisions timed for each, fewer if they take longer than 10 s
+    ddim_steps: Annotated[tuple[int, ...], Range(1, MOST)] = ()
+    calls: Count = 100  # decisions timed for each, fewer if they take longer than 10 s
 
 
 def main(argv: Sequence[str]) -> int:
     """Times, prints and records."""
     chosen = options.parse(Options, argv, prog="starjax bench", description=DESCRIPTION)
-    checks.expect(chosen.calls >= 1, "calls", "1 or more", chosen.calls)
     run = folders.existing(chosen.run)
     config = folders.read_config(run)
     most = config.policy.diffusion_steps
     for count in chosen.ddim_steps:
-        checks.expect(1 <= count <= most, "ddim_steps", f"1 to {most}", count)
+        checks.expect(count <= most, "--ddim-steps", f"1 to {most}", count)
     counts = chosen.ddim_steps or tuple(count for count in DDIM_STEPS if count <= most)
     files.require_writable(run)
     try:

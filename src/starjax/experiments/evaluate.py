@@ -4,7 +4,7 @@ import dataclasses
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
@@ -25,11 +25,11 @@ class Options:
     """Flags of the command."""
 
     run: options.RunOrNone = ""  # a method's folder, such as runs/cpu/stardiff
-    # a policy.safetensors, or the name of a policy that ships with starjax, in the place of RUN
-    policy: Annotated[str, options.in_words] = ""
-    seed: int = 0  # of the trials
-    # folder of the result; left out: one in RUN or in runs/evaluate
-    out: Annotated[str, options.in_words] = ""
+    # a policy.safetensors, or the name of a policy that ships with starjax, instead of RUN
+    policy: str = ""
+    seed: config_lib.Seed = 0  # of the trials
+    # folder of the result; auto: one in RUN or in runs/evaluate
+    out: str = options.AUTO
     video: bool = True  # write rollout.mp4
     eval: config_lib.EvalConfig = dataclasses.field(default_factory=config_lib.EvalConfig)
 
@@ -42,9 +42,6 @@ def main(argv: Sequence[str]) -> int:
     if bool(chosen.run) == bool(chosen.policy):
         got = "both" if chosen.run else "none"
         raise errors.UsageError("RUN or --policy", "one of the two", got)
-    # A mistake should not wait for jax.
-    checks.expect_named(chosen.out, argv)
-    checks.check(config_lib.RunConfig(seed=chosen.seed, eval=chosen.eval))
     if chosen.policy:
         file = packaged.find("--policy", chosen.policy)
         default = Path("runs/evaluate") / f"{_label(file)}-{_trials(chosen)}"
@@ -54,8 +51,9 @@ def main(argv: Sequence[str]) -> int:
         method, config = run.name, folders.read_config(run)
         file = folders.weights(run.parent, method)
         default = Path(chosen.run) / f"evaluate-{_trials(chosen)}"
-    folder = Path(chosen.out or default)
-    checks.expect_folder("--out", folder)
+    is_ours = chosen.out == options.AUTO
+    checks.expect_folder("--out", default if is_ours else chosen.out)  # before jax starts
+    folder = Path(default if is_ours else chosen.out)
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
 
@@ -69,7 +67,7 @@ def main(argv: Sequence[str]) -> int:
     with files.lock(folder):
         before = _before(folder)
         same = _identity(before) == (who.weights, chosen.seed, dataclasses.asdict(chosen.eval))
-        if chosen.out:
+        if not is_ours:
             _refuse_foreign(folder, before.get("weights", who.weights) == who.weights)
         print(f"{about}, into {folder}\n", flush=True)
         with clock.timed(folder, "evaluate", same or folders.is_under_way(folder)):

@@ -7,11 +7,8 @@
 <out>/report/              tables, figures, video, page
 """
 
-import dataclasses
-import json
 import shlex
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +16,7 @@ from starjax import config as config_lib
 from starjax import errors, methods
 from starjax.runtime import files
 
-# What decides the weights; the rest may change between two starts.
-TRAINED_WITH = ("seed", "demos", "policy", "train")
-# Of those, what leaves the weights alone.
-_FREE = {"train.keep_checkpoints", "train.checkpoint_every", "train.steps_per_call"}
-_BESIDE = ("dataset", "encoder")  # what a config.json records beside the settings
+_BESIDE = ("dataset", "encoder", "jax_settings")  # what a config.json records beside the settings
 
 
 def existing(run: str) -> Path:
@@ -55,7 +48,9 @@ def weights(out: Path, method: str) -> Path:
 def twins(method: str) -> list[str]:
     """Other methods that behave just as `method` does, so that one evaluation serves both."""
     return [
-        name for name in methods.METHODS if name != method and behaviour(name) == behaviour(method)
+        name
+        for name in methods.METHODS
+        if name != method and methods.behaviour(name) == methods.behaviour(method)
     ]
 
 
@@ -72,11 +67,6 @@ def adopt_twin(out: Path, method: str) -> None:
                 source, _, why = error.args[0][0]
                 raise files.StorageError(f"cannot copy {source} to {staged}: {why}") from error
             staged.rename(staged.with_name("evaluation"))
-
-
-def behaviour(method: str) -> methods.Method:
-    """A row of Table II without its names."""
-    return methods.METHODS[method]._replace(label="", group="")
 
 
 def selected(config: config_lib.RunConfig) -> list[str]:
@@ -106,58 +96,32 @@ def claim(
     Raises:
       errors.UsageError: naming the first setting that differs, or what weights are there without.
     """
-    wanted = _as_json(config)
+    # Imported here, as it imports jax.
+    from starjax.runtime import jax_settings
+
     started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
     found = _recorded(folder) if (folder / "config.json").exists() else {}
     if started and not found:
         expected = "the config.json that its weights were trained with"
         raise errors.UsageError(str(folder), expected, "none", _remedy(folder))
     if started:
-        before = _as_json(_settings(folder, found))
-        for name in (name for part in TRAINED_WITH for name in _flat(wanted[part], part)):
-            _refuse(folder, name, _value(before, name), _value(wanted, name))
+        before, now = map(config_lib.trained_with, (_settings(folder, found), config))
+        for name, value in now.items():
+            _refuse(folder, name, before[name], value)
+        settings = (record.get("jax_settings", {}) for record in (found, jax_settings.record()))
+        _refuse(folder, "the settings of jax", *settings)
         _refuse(folder, "the demonstrations", found.get("dataset", dataset), dataset)
         encoder_before = found.get("encoder") or encoder
         _refuse(folder, "policy.encoder_weights", encoder_before, encoder or encoder_before)
     known = found.get("encoder") if started or config.policy.freeze_encoder else None
     frozen = encoder or known
-    extra = {"dataset": dataset} | ({"encoder": frozen} if frozen else {})
-    files.write_json(folder / "config.json", {**wanted, **extra})
+    extra = {"dataset": dataset} | ({"encoder": frozen} if frozen else {}) | jax_settings.record()
+    files.write_json(folder / "config.json", {**config_lib.as_json(config), **extra})
 
 
 def read_config(folder: Path) -> config_lib.RunConfig:
     """Settings of a finished or running method folder."""
     return _settings(folder, _recorded(folder))
-
-
-def trained_alike(one: dict[str, Any], other: dict[str, Any], *parts: str) -> bool:
-    """Whether two configurations from JSON agree on what decides the weights, and on `parts`.
-
-    Settings that did not exist yet when one of them was written have their default.
-    """
-    one, other = (_as_json(_from_json(values)) for values in (one, other))
-    return all(one[part] == other[part] for part in (*TRAINED_WITH, *parts))
-
-
-def differing(configs: Sequence[dict[str, Any]]) -> list[str]:
-    """Flags of demonstrations, policy and training that configurations from JSON disagree on.
-
-    Settings that one of them lacks have their default there; what leaves the weights alone is left
-    out.
-    """
-    usual = _as_json(config_lib.RunConfig())
-
-    def flags(values: dict[str, Any]) -> dict[str, Any]:
-        full = {part: usual[part] | values.get(part, {}) for part in ("demos", "policy", "train")}
-        names = (name for part in full for name in _flat(full[part], part))
-        return {name: _value(full, name) for name in names}
-
-    rows = [flags(values) for values in configs]
-    return [
-        flag
-        for flag in dict.fromkeys(flag for row in rows for flag in row)
-        if flag not in _FREE and any(row.get(flag) != rows[0].get(flag) for row in rows)
-    ]
 
 
 def _recorded(folder: Path) -> dict[str, Any]:
@@ -185,34 +149,17 @@ def _remedy(folder: Path) -> str:
 
 def _settings(folder: Path, values: dict[str, Any]) -> config_lib.RunConfig:
     try:
-        return _from_json(values)
+        return config_lib.from_dict(config_lib.RunConfig, _without_extra(values))
     except (TypeError, ValueError) as error:
         file = str(folder / "config.json")
         raise errors.UsageError(file, "settings of a run", error, _remedy(folder)) from error
 
 
-def _from_json(values: dict[str, Any]) -> config_lib.RunConfig:
-    """Settings from a config.json, without what else it records."""
-    kept = {name: value for name, value in dict(values).items() if name not in _BESIDE}
-    return config_lib.from_dict(config_lib.RunConfig, kept)
-
-
-def _as_json(config: config_lib.RunConfig) -> dict[str, Any]:
-    return json.loads(json.dumps(dataclasses.asdict(config)))
+def _without_extra(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name not in _BESIDE}
 
 
 def _refuse(folder: Path, name: str, before: Any, now: Any) -> None:
-    if before != now and name not in _FREE:
+    if before != now:
         hint = "choose another folder by --out, or remove that one"
         raise errors.UsageError(name, f"{before}, with which {folder} was made", now, hint)
-
-
-def _flat(value: Any, prefix: str) -> list[str]:
-    if not isinstance(value, dict):
-        return [prefix]
-    return [f"{prefix}.{name}" for name in value]
-
-
-def _value(values: dict[str, Any], name: str) -> Any:
-    part, _, field = name.partition(".")
-    return values[part][field] if field else values[part]

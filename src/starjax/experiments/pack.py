@@ -9,6 +9,7 @@ import tyro
 
 from starjax import errors
 from starjax.experiments import checks, options
+from starjax.limits import Range
 from starjax.policies import packaged
 from starjax.runtime import files, xla
 
@@ -26,19 +27,17 @@ class Options:
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     # the file to write
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    # 0 to 1, of a sample's first noise; left out: POLICY's
-    temperature: options.FloatOrNone = None
+    # of a sample's first noise; left out: POLICY's
+    temperature: Annotated[options.FloatOrNone, Range(0.0, 1.0)] = None
 
 
 def main(argv: Sequence[str]) -> int:
     """Writes the file, says how large it is."""
     chosen = options.parse(Options, argv, prog="starjax pack", description=DESCRIPTION)
-    if chosen.temperature is not None and not 0 <= chosen.temperature <= 1:
-        raise errors.UsageError("--temperature", "in [0, 1]", chosen.temperature)
     source, out = packaged.find("POLICY", chosen.policy), Path(chosen.out)
+    checks.expect_folder("folder of OUT", out.parent)
     if out.exists():
         raise errors.UsageError("OUT", "a file that is not there yet", chosen.out or "none")
-    checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
     xla.require_devices("starjax.policies.policy_file")
 

@@ -1,8 +1,6 @@
 """The stages of a run, one after another, each skipped when its result is there."""
 
-import dataclasses
 import functools
-import json
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -135,9 +133,8 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
 
     out = Path(config.out)
     folder, weights = out / name, folders.weights(out, name)
-    settings = json.loads(json.dumps(dataclasses.asdict(config)))
     found = _scored(folder, files.sha256(weights))
-    if found and _is_of(found, settings):
+    if found and _is_of(found, config):
         words.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
         return
     if found and (more := len(found["trials"])) > len(rcm.IS_SEEN) * config.eval.trials:
@@ -168,14 +165,15 @@ def _scored(folder: Path, weights: str) -> dict[str, Any]:
     return found if is_whole and found.get("weights", weights) == weights else {}
 
 
-def _is_of(found: dict[str, Any], settings: dict[str, Any]) -> bool:
+def _is_of(found: dict[str, Any], config: config_lib.RunConfig) -> bool:
     """Whether a result is of these settings, and has what a run says of it at its end."""
     try:
-        alike = folders.trained_alike(found["config"], settings, "eval")
+        before = config_lib.from_dict(config_lib.RunConfig, found["config"])
         words.outcome([found])
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
-    return alike and found.get("seed", settings["seed"]) == settings["seed"]
+    alike = config_lib.trained_with(before) == config_lib.trained_with(config)
+    return alike and before.eval == config.eval and found.get("seed", config.seed) == config.seed
 
 
 def _timings(out: Path, name: str, demos: str) -> dict[str, float]:

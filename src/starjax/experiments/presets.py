@@ -13,7 +13,6 @@ PRESETS: dict[str, RunConfig] = {
     # Every stage once, too short to learn anything.
     "smoke": RunConfig(
         preset="smoke",
-        out="runs/smoke",
         demos=DemosConfig(per_trocar=1),
         policy=PolicyConfig(
             observation="state",
@@ -41,7 +40,6 @@ PRESETS: dict[str, RunConfig] = {
     # it comes from the compact policy, which learned this task on a GPU.
     "cpu": RunConfig(
         preset="cpu",
-        out="runs/cpu",
         demos=DemosConfig(one_wall=True),
         policy=PolicyConfig(
             image_size=128,
@@ -68,7 +66,6 @@ PRESETS: dict[str, RunConfig] = {
     # would learn the rolls by heart.
     "gpu": RunConfig(
         preset="gpu",
-        out="runs/gpu",
         demos=DemosConfig(per_trocar=100),
         policy=PolicyConfig(
             image_size=128,
@@ -87,7 +84,6 @@ PRESETS: dict[str, RunConfig] = {
     # One modern GPU: a policy small enough to be carried to a laptop, from more demonstrations.
     "compact": RunConfig(
         preset="compact",
-        out="runs/compact",
         demos=DemosConfig(per_trocar=100),
         policy=PolicyConfig(
             image_size=128,
@@ -107,7 +103,7 @@ PRESETS: dict[str, RunConfig] = {
         ),
     ),
     # The paper: 100k iterations, batch 256, 256 x 256 pixels.
-    "paper": RunConfig(preset="paper", out="runs/paper"),
+    "paper": RunConfig(preset="paper"),
 }
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 from starjax import errors, methods
 from starjax.experiments import checks, options
@@ -19,22 +18,23 @@ class Options:
     """Flags of the command."""
 
     run: options.Runs  # methods' folders, or folders of them
-    # folder of the report; left out: `report` beside a method's folder, or in an evaluation's
-    out: Annotated[str, options.in_words] = ""
+    # folder of the report; auto: `report` beside a method's folder, or in an evaluation's
+    out: str = options.AUTO
     video: bool = True  # write rollout.mp4
 
 
 def main(argv: Sequence[str]) -> int:
     """Builds the report."""
     chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
-    checks.expect_named(chosen.out, argv)
+    checks.expect(bool(chosen.run), "RUN", "one folder or more", "none")
     once: dict[Path, Path] = {}
     for name in chosen.run:
         for found in _with_results(name):
             once.setdefault(found.resolve(), found)
     runs = list(once.values())
     first = runs[0].resolve()
-    out = Path(chosen.out or (first.parent if first.name in methods.METHODS else first) / "report")
+    beside = (first.parent if first.name in methods.METHODS else first) / "report"
+    out = beside if chosen.out == options.AUTO else chosen.out
     checks.expect_folder("--out", out)
     xla.prepare_xla()
     xla.require_devices("starjax.report.build")
@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     from starjax.report import build
 
     try:
-        page = build.build(runs, out, with_video=chosen.video)
+        page = build.build(runs, Path(out), with_video=chosen.video)
     except ValueError as error:  # of a damaged file, which it names
         raise errors.UsageError("RUN", "results that are whole", error) from error
     print(f"report: {page}")

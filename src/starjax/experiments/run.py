@@ -2,9 +2,8 @@
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 
-from starjax import cli, errors
+from starjax import cli
 from starjax import config as config_lib
 from starjax.experiments import checks, options, presets
 
@@ -15,41 +14,39 @@ The same command again goes on from what is saved. Values below are those of the
 
 def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.RunConfig:
     """Settings of a run from its command line: the preset's values under what was typed."""
-    name = options.value_of("--preset", argv) or "auto"
-    errors.choice("--preset", name, ["auto", *presets.PRESETS])
-    default = presets.resolve(name)
+    default = _default(argv)
     config = options.parse(
         config_lib.RunConfig, argv, prog=prog, description=description, default=default
     )
-    if config.policy.observation == "state" and options.value_of("--policy.encoder-weights", argv):
-        raise errors.UsageError(
-            "policy.encoder_weights", "policy.observation image", config.policy.observation
-        )
-    if config.policy.observation == "state" and not options.is_given(
-        "--policy.freeze-encoder", argv
-    ):
-        # A preset's encoder; one that was asked for is refused below.
-        policy = dataclasses.replace(config.policy, encoder_weights="", freeze_encoder=False)
-        config = dataclasses.replace(config, policy=policy)
-    checks.expect_named(config.out, argv)
-    out = config.out if options.is_given("--out", argv) else _folder(config, default)
+    out = config.out if config.out != options.AUTO else _folder(config)
     config = dataclasses.replace(config, preset=default.preset, out=out)
     checks.check(config)
-    checks.expect_folder("--out", Path(out))
+    checks.expect_folder("--out", out)
     return config
 
 
-def _folder(config: config_lib.RunConfig, default: config_lib.RunConfig) -> str:
+def _default(argv: Sequence[str]) -> config_lib.RunConfig:
+    """Values of what is not typed: the preset's, without its encoder where nothing is seen."""
+    start = config_lib.RunConfig()
+    default = presets.resolve(options.peek(config_lib.RunConfig, argv, start).preset)
+    policy = options.peek(config_lib.RunConfig, argv, default).policy
+    if policy.observation == "state":
+        blind = dataclasses.replace(default.policy, encoder_weights="", freeze_encoder=False)
+        return dataclasses.replace(default, policy=blind)
+    return default
+
+
+def _folder(config: config_lib.RunConfig) -> str:
     """Folder of a run that names none: other observations, encoders frozen or not, and seeds have
     one each; trainings of one method that differ in anything else meet in it, and are refused."""
-    policy, usual = config.policy, default.policy
-    parts = [default.out]
-    parts += [policy.observation] if policy.observation != usual.observation else []
+    policy, usual = config.policy, presets.resolve(config.preset)
+    parts = [usual.preset]
+    parts += [policy.observation] if policy.observation != usual.policy.observation else []
     sees, freezes = policy.observation == "image", policy.freeze_encoder
-    if sees and freezes != usual.freeze_encoder:
+    if sees and freezes != usual.policy.freeze_encoder:
         parts.append("frozen" if freezes else "unfrozen")
-    parts += [f"seed{config.seed}"] if config.seed != default.seed else []
-    return "-".join(parts)
+    parts += [f"seed{config.seed}"] if config.seed != usual.seed else []
+    return f"runs/{'-'.join(parts)}"
 
 
 def main(argv: Sequence[str]) -> int:

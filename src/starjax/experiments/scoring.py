@@ -1,7 +1,6 @@
 """A trained policy in closed loop: rollouts of a method, and the result.json that they become."""
 
 import dataclasses
-import json
 import shlex
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +11,7 @@ from starjax import config as config_lib
 from starjax import errors, methods, rcm
 from starjax.evaluation import evaluate, latency, statistics
 from starjax.evaluation import trials as table
-from starjax.experiments import folders, words
+from starjax.experiments import words
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.rollouts import placement
@@ -104,7 +103,7 @@ def rollouts(
         video_trials=settings.video_trials,
         devices=placement.devices(),
         identity={
-            **folders.behaviour(who.method)._asdict(),
+            **methods.behaviour(who.method)._asdict(),
             "policy": dataclasses.asdict(who.trained.policy),
             "crop_fraction": who.trained.train.crop_fraction,
         },
@@ -165,7 +164,7 @@ def write_result(
         "preset": config.preset,
         "seed": seed,
         "weights": who.weights,
-        "config": json.loads(json.dumps(dataclasses.asdict(config))),
+        "config": config_lib.as_json(config),
         "command": command,
         "timings_s": timings_s or {},
         "warnings": words.warnings(config, figures),

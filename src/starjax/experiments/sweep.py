@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from starjax import config as config_lib
 from starjax.experiments import checks, folders, options, words
+from starjax.limits import CountOrZero, Range
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Scores a trained policy on a random sample (Eq. 19) or a grid of trocars.
@@ -19,7 +20,7 @@ command again only puts its figures together."""
 
 # More is a slip of the hand.
 MOST_TROCARS = 1_000_000
-MOST_RADIUS_CM = 10.0
+Several = Annotated[int, Range(1, MOST_TROCARS)]
 
 
 # The fields of `config.EvalConfig`, with other defaults.
@@ -27,11 +28,11 @@ MOST_RADIUS_CM = 10.0
 class Trials:
     """Closed-loop trials."""
 
-    trials: int = 1  # trials at each trocar
+    trials: Several = 1  # trials at each trocar
     # s of simulated time that a trial may take; left out: RUN's
-    time_limit_s: options.FloatOrNone = None
-    chunk: int = 0  # trials between two savings, at most; 0: as many as a program runs
-    video_trials: int = 0  # trials whose joint positions are recorded
+    time_limit_s: Annotated[options.FloatOrNone, config_lib.TIME_LIMIT] = None
+    chunk: CountOrZero = 0  # trials between two savings, at most; 0: as many as a program runs
+    video_trials: CountOrZero = 0  # trials whose joint positions are recorded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,12 +40,13 @@ class Options:
     """Flags of the command."""
 
     run: options.Run  # a method's folder, such as runs/cpu/stardiff
-    trocars: int = 200  # how many to draw; not used with a grid
-    # distances of a grid from the nominal port in cm, 0 is one point; left out: no grid
-    radii_cm: Annotated[tuple[float, ...], options.in_words] = ()
-    polars_deg: tuple[float, ...] = (90.0,)  # angles of a grid from straight up, in degrees
-    azimuths: int = 12  # how many directions of a grid, evenly around
-    seed: int = 0  # of the sample and of the trials
+    trocars: Several = 200  # how many to draw; not used with a grid
+    # distances of a grid from the nominal trocar in cm, 0 is one point; left out: no grid
+    radii_cm: Annotated[tuple[float, ...], Range(0.0, 10.0)] = ()
+    # angles of a grid from straight up, in degrees
+    polars_deg: Annotated[tuple[float, ...], Range(0.0, 180.0)] = (90.0,)
+    azimuths: Several = 12  # how many directions of a grid, evenly around
+    seed: config_lib.Seed = 0  # of the sample and of the trials
     eval: Trials = dataclasses.field(default_factory=Trials)
 
 
@@ -102,20 +104,10 @@ def _parse(argv: Sequence[str]) -> Options:
 
 
 def _check(chosen: Options) -> None:
-    """Raises UsageError for the first value that is out of its range, or that would do nothing."""
-    checks.expect_finite(chosen)
-    typed = {name: value for name, value in vars(chosen.eval).items() if value is not None}
-    checks.check(config_lib.RunConfig(seed=chosen.seed, eval=config_lib.EvalConfig(**typed)))
-    for name, count in (("trocars", chosen.trocars), ("azimuths", chosen.azimuths)):
-        checks.expect(1 <= count <= MOST_TROCARS, name, f"1 to {MOST_TROCARS}", count)
-    for radius in chosen.radii_cm:
-        inside = 0 <= radius <= MOST_RADIUS_CM
-        checks.expect(inside, "radii_cm", f"each 0 to {MOST_RADIUS_CM:g} cm", radius)
-    for polar in chosen.polars_deg:
-        checks.expect(0 <= polar <= 180, "polars_deg", "each 0 to 180 degrees", polar)
-    ports = len(chosen.radii_cm) * len(chosen.polars_deg) * chosen.azimuths
-    most = f"at most {MOST_TROCARS} ports of its grid"
-    checks.expect(ports <= MOST_TROCARS, "azimuths", most, ports)
+    """Raises UsageError for a flag that asks for too much beside others, or would do nothing."""
+    count = len(chosen.radii_cm) * len(chosen.polars_deg) * chosen.azimuths
+    most = f"at most {MOST_TROCARS} trocars of its grid"
+    checks.expect(count <= MOST_TROCARS, "azimuths", most, count)
     is_grid, default = bool(chosen.radii_cm), Options(chosen.run)
     for field in ("trocars",) if is_grid else ("polars_deg", "azimuths"):
         value = getattr(chosen, field)

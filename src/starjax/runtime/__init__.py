@@ -1,4 +1,7 @@
-"""What all the rest stands on: safe files, progress, signals, XLA settings, a hash. No jax."""
+"""What all the rest stands on: safe files, progress, signals, settings of jax and XLA, a hash.
+
+Only `jax_settings` imports jax.
+"""
 
 from starjax.runtime.xla import prepare_xla
 

@@ -19,7 +19,6 @@ from starjax.runtime import background
 
 _GROUPS, _GROUPS_OF_THIS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
-_GENERATOR = "threefry2x32"  # under `vmap` a number depends on its own key alone
 _PACKAGES = (
     "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "numpy", "scipy",
 )  # fmt: skip
@@ -35,9 +34,9 @@ def prepare_xla() -> None:
     which jax alone would not keep: the hundred of them that begin a training take longer to compile
     than the rest to load.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if _jaxlib_version() < (0, 11) and _FUSION_FLAG not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {_FUSION_FLAG}=false".strip()
+    for name, value in usual_flags().items():
+        if name not in (there := flags()):
+            os.environ["XLA_FLAGS"] = f"{there} {name}={value}".strip()
     _set_default("jax_persistent_cache_min_compile_time_secs", 0.0)
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
@@ -47,6 +46,22 @@ def prepare_xla() -> None:
     except OSError:
         return  # no cache: every start compiles again, nothing else changes
     _set_default("jax_compilation_cache_dir", str(cache))
+
+
+def usual_flags() -> dict[str, str]:
+    """The flags that `prepare_xla` sets with this jaxlib."""
+    return {_FUSION_FLAG: "false"} if _jaxlib_version() < (0, 11) else {}
+
+
+def flags(variable: str = "XLA_FLAGS") -> str:
+    """The flags in a variable of the environment, or in the file that it names, as XLA reads it."""
+    text = os.environ.get(variable, "").strip()
+    if not text or text.startswith("-"):
+        return text
+    try:
+        return " ".join(Path(text).read_text().split())
+    except (OSError, ValueError):  # XLA passes over it
+        return ""
 
 
 def options_without_kinematics() -> dict[str, Any]:
@@ -72,23 +87,22 @@ def cache_directory() -> Path:
 
 
 def require_devices(*modules: str) -> None:
-    """Starts jax, and beside it, because a GPU takes two seconds, imports these modules.
+    """Starts jax for a command, and beside it, because a GPU takes two seconds, imports `modules`.
+
+    Settings of jax that would change results or end programs are set as always; a line names those
+    that the user's environment has otherwise.
 
     Raises:
-      errors.UsageError: it cannot use what JAX_PLATFORMS asks for, or its random numbers would
-        depend on what is computed beside them.
+      errors.UsageError: jax cannot use what JAX_PLATFORMS asks for.
     """
     import jax
 
-    if (generator := jax.config.jax_default_prng_impl) != _GENERATOR:
-        raise errors.UsageError(
-            "JAX_DEFAULT_PRNG_IMPL",
-            _GENERATOR,
-            generator,
-            "with it a trial would depend on those beside it",
-        )
-    # A shell's JAX_NUMPY_RANK_PROMOTION is meant for programs of its user's own.
-    jax.config.update("jax_numpy_rank_promotion", "allow")
+    from starjax.runtime import jax_settings
+
+    typed = [name.upper() for name in jax_settings.fix() if name.upper() in os.environ]
+    if typed:
+        why = "results of all users have the same"
+        print(f"starjax: {', '.join(typed)} of the environment: not used, {why}", file=sys.stderr)
 
     def start() -> None:
         for device in jax.local_devices():

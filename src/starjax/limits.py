@@ -1,0 +1,84 @@
+"""Ranges of settings. They stand on the fields: the check and `--help` read them there.
+
+Standard library only.
+"""
+
+import dataclasses
+import math
+import operator
+import typing
+from collections.abc import Iterator
+from typing import Annotated, Any, NamedTuple
+
+from starjax import errors
+
+MOST = 2**31 - 1  # whole numbers of compiled programs have 32 bits
+_OPEN = (MOST, math.inf)  # bounds that need not be said
+
+
+class Range(NamedTuple):
+    """What a number may be; of a tuple, each number. Written on a field as `Annotated[int, Range]`.
+
+    Attributes:
+      low, high: bounds.
+      ends: brackets as in mathematics; beside a round one the bound itself is left out.
+      step: between two whole numbers, from `low` on.
+    """
+
+    low: float
+    high: float
+    ends: str = "[]"
+    step: int = 1
+
+    def __str__(self) -> str:
+        if self.high in _OPEN:
+            return f"more than {self.low:g}" if self.ends[0] == "(" else f"{self.low:g} or more"
+        if isinstance(self.low, float):
+            return f"in {self.ends[0]}{self.low:g}, {self.high:g}{self.ends[1]}"
+        between = f", {self.low + self.step}, ... " if self.step > 1 else " to "
+        return f"{self.low}{between}{self.high}"
+
+    def holds(self, value: float) -> bool:
+        """Whether a number is in the range; nan never is."""
+        above = value >= self.low if self.ends[0] == "[" else value > self.low
+        below = value <= self.high if self.ends[1] == "]" else value < self.high
+        return above and below and (isinstance(value, float) or not (value - self.low) % self.step)
+
+
+# The usual ones.
+Count = Annotated[int, Range(1, MOST)]
+CountOrZero = Annotated[int, Range(0, MOST)]
+Positive = Annotated[float, Range(0.0, math.inf, "()")]
+NotNegative = Annotated[float, Range(0.0, math.inf, "[)")]
+
+
+def fields(settings: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The fields of a (nested) dataclass, e.g. `train.steps`, with their types."""
+    for name, hint in typing.get_type_hints(settings, include_extras=True).items():
+        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+            yield from fields(hint, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", hint
+
+
+def within(hint: Any) -> Range | None:
+    """The range that stands on a field with this type, if one does."""
+    found = [item for item in getattr(hint, "__metadata__", ()) if isinstance(item, Range)]
+    return found[-1] if found else None
+
+
+def check(settings: Any) -> None:
+    """Raises UsageError for the first field that is out of its range; None has none."""
+    for name, hint in fields(type(settings)):
+        value, limit = operator.attrgetter(name)(settings), within(hint)
+        for number in value if isinstance(value, tuple) else (value,):
+            if limit and number is not None and not limit.holds(number):
+                each = "each " if isinstance(value, tuple) else ""
+                raise errors.UsageError(name, each + _expected(limit, number), number)
+
+
+def _expected(limit: Range, number: float) -> str:
+    """What a number that is out of range should have been."""
+    if isinstance(number, float) and not math.isfinite(number):
+        return "a finite number"
+    return f"at most {MOST}" if number > limit.high == MOST else str(limit)

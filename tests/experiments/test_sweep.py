@@ -1,0 +1,48 @@
+"""`starjax sweep`: which trocars, whose trials, and flags that would do nothing."""
+
+import dataclasses
+
+import mistakes
+import numpy as np
+import pytest
+
+from starjax.experiments import bench, sweep
+
+
+@pytest.mark.parametrize(
+    ("typed", "argument", "got"),
+    [
+        ("--radii-cm 2 3 --azimuths 600000", "azimuths", 1200000),
+        ("--azimuths 6", "azimuths", 6),
+        ("--polars-deg 80", "polars_deg", 80),
+        ("--radii-cm 2 --trocars 9", "trocars", 9),
+        ("--radii-cm 2 -1", "radii_cm", -1),
+        ("", "no/stardiff", "no config.json"),
+    ],
+)
+def test_a_mistake_names_its_flag(typed, argument, got, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with mistakes.of(str(tmp_path / argument) if "/" in argument else argument, got):
+        sweep.main(["no/stardiff", *typed.split()])
+
+
+@pytest.mark.parametrize("command", [sweep, bench])
+def test_a_renamed_folder_is_explained(command, tmp_path):
+    with mistakes.of("RUN", tmp_path):
+        command.main([str(tmp_path / "policy2")])
+
+
+def test_a_grid_is_in_centimetres_and_degrees():
+    grid = {"radii_cm": (2.0, 5.0), "polars_deg": (70.0,), "azimuths": 4}
+    found = sweep._trocars(sweep.Options(run="x", **grid))
+    np.testing.assert_allclose(np.unique(found.radius), [0.02, 0.05], rtol=1e-6)
+    np.testing.assert_allclose(np.rad2deg(found.polar), 70, rtol=1e-6)
+    np.testing.assert_allclose(np.rad2deg(found.azimuth[:4]), [0, 90, 180, 270], atol=1e-4)
+
+
+def test_sweeps_of_other_trials_lie_apart(tmp_path):
+    one = sweep.Options("run")
+    other = dataclasses.replace(one, eval=dataclasses.replace(one.eval, trials=2))
+    same = dataclasses.replace(one, eval=dataclasses.replace(one.eval, chunk=2))
+    assert sweep._folder(tmp_path, one) == sweep._folder(tmp_path, same)
+    assert sweep._folder(tmp_path, one) != sweep._folder(tmp_path, other)
