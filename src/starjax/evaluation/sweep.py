@@ -35,11 +35,18 @@ def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray) -> Trocar:
     return Trocar(*combined[np.sort(first)].T)
 
 
-def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: np.ndarray) -> np.ndarray:
-    """Distance `[C]` in m of each port to the nearest one of training."""
+def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: ArrayLike) -> np.ndarray:
+    """Distance `[C]` in m of each configuration to the nearest one of training.
+
+    Between two configurations it is that of the arm whose trocars are farthest apart.
+
+    Args:
+      trocars: fields `[C, A]`. training: fields `[K, A]`. p_world_ref: `[A, 3]` m.
+    """
     here = np.asarray(rcm.trocar_position(trocars, p_world_ref))
     there = np.asarray(rcm.trocar_position(training, p_world_ref))
-    return np.linalg.norm(here[:, None] - there[None], axis=-1).min(axis=1)
+    apart = np.linalg.norm(here[:, None] - there[None], axis=-1)
+    return apart.max(axis=-1).min(axis=1)
 
 
 def bin_of(distance: ArrayLike) -> np.ndarray:
@@ -62,7 +69,8 @@ def compose(
       {strict, loose, safe: as in result.json, by_distance: list of {low_m, high_m, successes,
       trials, rate, ci95}, rcm_error_mm, trials: as in result.json, with distance_m}.
     """
-    ports = Trocar(table.radius, table.polar, table.azimuth)
+    ports = Trocar(table.radius[:, None], table.polar[:, None], table.azimuth[:, None])
+    training = Trocar(*(x[:, None] for x in training))
     distance = distance_to_nearest(ports, training, p_world_ref)
     bins = bin_of(distance)
     seen = distance < 1e-6

@@ -161,7 +161,7 @@ def per_trocar(run: results.Run) -> str:
         part = "seen" if group[0].seen else "unseen"
         times = outcomes.times(group, run.result.control_hz)
         worst = max((e for t in group if (e := outcomes.worst_rcm_mm(t)) is not None), default=None)
-        row = [Cell(f"{group[0]['trocar']}"), Cell(part)]
+        row = [Cell(f"{group[0].trocar}"), Cell(part)]
         row += [markup.number(text) for text in outcomes.place(group[0])]
         row += markup.score(outcomes.tally(group), part)
         row.append(markup.number(f"{statistics.median(times):.1f} s" if times else "–"))
@@ -182,7 +182,7 @@ def matrix(runs: Sequence[results.Run]) -> str:
         return ""
     header, rows = [Cell("Method")], []
     for group in columns:
-        header.append(Cell(f"{group[0]['trocar']}", "tint"))
+        header.append(Cell(f"{group[0].trocar}", "tint"))
     for run in runs:
         own = {group[0].trocar: group for group in outcomes.by_trocar(run.trials)}
         cells = [_at_trocar(own.get(group[0].trocar)) for group in columns]

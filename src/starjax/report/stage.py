@@ -8,7 +8,6 @@ import numpy as np
 
 from starjax.sim.names import SceneNames
 from starjax.sim.tasks.base import Outline
-from starjax.types import Pose
 
 BATCH = 16  # images drawn in one call
 
@@ -18,11 +17,12 @@ class Stage(NamedTuple):
 
     Attributes:
       outline: of the task.
-      tips: (qpos `[T, Q]`, p_world_trocar `[A, 3]` m) -> poses of the tips, Pose `[T, A]`, numpy.
+      tips: (qpos `[T, Q]`, p_world_trocar `[A, 3]` m) -> positions of the tips in m, and the
+        directions of their shafts, away from the arm: `[T, A, 3]` each.
     """
 
     outline: Outline
-    tips: Callable[[np.ndarray, np.ndarray], Pose]
+    tips: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def load(names: SceneNames) -> Stage:
@@ -39,14 +39,14 @@ def load(names: SceneNames) -> Stage:
     marks = [model.body(f"trocar{i}").mocapid[0] for i in range(len(names.arms))]
     sites = [scene.tcp(i, registry.tools.get(tool)) for i, tool in enumerate(names.tools)]
 
-    def tips(qpos: np.ndarray, p_world_trocar: np.ndarray) -> Pose:
+    def tips(qpos: np.ndarray, p_world_trocar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         data, found = mujoco.MjData(model), []
         data.mocap_pos[marks] = p_world_trocar
         for data.qpos[:] in qpos:
             mujoco.mj_kinematics(model, data)
-            found.append([(data.site(s).xmat.reshape(3, 3), data.site(s).xpos) for s in sites])
-        R, p = ([[pose[i].copy() for pose in row] for row in found] for i in range(2))
-        return Pose(np.array(R), np.array(p))
+            found.append([np.stack([data.site(s).xpos, data.site(s).xmat[2::3]]) for s in sites])
+        p, axis = np.moveaxis(np.array(found), 2, 0)
+        return p, axis
 
     return Stage(registry.tasks.get(names.task).outline(model), tips)
 
@@ -61,17 +61,19 @@ def camera(names: SceneNames, size: int) -> Draw:
     import jax
     import jax.numpy as jnp
 
-    from starjax.sim import cameras, physics, scene
+    from starjax.sim import cameras, physics, render, scene
 
     # Smooth outlines cost four times as much: a matter of seconds on a GPU, of minutes on a CPU.
     samples = 1 if jax.default_backend() == "cpu" else 2
     made = scene.load(names)
-    seen = cameras.make(made.mj_model, names.cameras[:1], size, samples=samples)
-    poses = cameras.nominal(seen)
+    (shown,) = cameras.make(made.mj_model, names.cameras[:1], size)
+    smooth = {"samples": samples, "moves": shown.moves}
+    shown = shown._replace(draw=render.make(made.mj_model, shown.name, size, size, **smooth))
+    poses = cameras.nominal([shown])
 
     def one(qpos: jax.Array, p_world_trocar: jax.Array, rgb: jax.Array) -> jax.Array:
         data = physics.kinematics(made, qpos, p_world_trocar)
-        return cameras.images(seen, poses, data, rgb)[names.cameras[0]].rgb
+        return cameras.images([shown], poses, data, rgb)[shown.name].rgb
 
     @jax.jit
     def batch(qpos: jax.Array, p_world_trocar: jax.Array, labels: dict[str, Any]) -> jax.Array:

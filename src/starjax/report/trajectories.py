@@ -142,9 +142,9 @@ def _shafts(axis: Any, rollout: results.Rollout, color: str, stage: Stage) -> No
     """The shafts at moments of a rollout, from the tips to beyond the trocars."""
     assert rollout.qpos is not None
     rows = np.linspace(0, len(rollout.qpos) - 1, _FAN).round().astype(int)
-    poses = stage.tips(rollout.qpos[rows], rollout.p_world_trocar)
-    length = np.linalg.norm(rollout.p_world_trocar - poses.p, axis=-1) + _BEYOND  # [T, A]
-    ends = np.stack([poses.p - length[..., None] * poses.R[..., 2], poses.p])
+    p, axis_of_shaft = stage.tips(rollout.qpos[rows], rollout.p_world_trocar)
+    length = np.linalg.norm(rollout.p_world_trocar - p, axis=-1) + _BEYOND  # [T, A]
+    ends = np.stack([p - length[..., None] * axis_of_shaft, p])
     for shaft in ends.reshape(2, -1, 3).swapaxes(0, 1):
         axis.plot(*_flat(shaft).T, color=color, linewidth=0.6, alpha=0.34)
 

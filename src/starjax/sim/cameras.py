@@ -41,12 +41,8 @@ def make(
     image_size: int,
     shadow: bool = True,
     moving: bool = False,
-    samples: int = 1,
 ) -> tuple[Camera, ...]:
-    """The cameras of these names, for square images; with `moving` all of them may move.
-
-    `samples`: see `render.make`.
-    """
+    """The cameras of these names, for square images; with `moving` all of them may move."""
     found = []
     for name in names:
         camera = mj_model.camera(name)
@@ -54,8 +50,7 @@ def make(
         mujoco.mju_quat2Mat(R, camera.quat)
         pose = Pose(R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32))
         moves = moving or body != 0
-        size = {"height": image_size, "width": image_size}
-        draw = render.make(mj_model, name, **size, shadow=shadow, samples=samples, moves=moves)
+        draw = render.make(mj_model, name, image_size, image_size, shadow=shadow, moves=moves)
         found.append(Camera(name, body, pose, moves, draw))
     return tuple(found)
 
