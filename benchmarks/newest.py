@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from starjax.report import captions, tables
+from starjax.report import formats
 
 HERE = Path(__file__).parent
 _VALUE = re.compile(r"\{([^:{}]+):?([^{}]*)\}")
@@ -22,8 +22,8 @@ def table() -> str:
     for said in tomllib.loads((HERE / "newest.toml").read_text())["rows"]:
         found = json.loads((HERE / "results" / f"{said['file']}.json").read_text())
         cells = [_filled(said.get(cell, ""), found) for cell in ("here", "peer", "floor")]
-        rows.append([said["work"], *cells, captions.machine(found["hardware"])])
-    return tables.render(rows, names=len(rows[0]))
+        rows.append([said["work"], *cells, formats.machine(found["hardware"])])
+    return formats.render(rows, names=len(rows[0]))
 
 
 def _filled(text: str, results: dict[str, Any]) -> str:

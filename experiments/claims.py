@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import columns
 
-from starjax.report import captions, tables
+from starjax.report import formats
 
 HERE = Path(__file__).parent
 
@@ -60,11 +60,11 @@ def table(claim: Claim, name: str) -> str:
             header = ["Method", *(columns.COLUMNS[column][0] for column in said["columns"])]
             draws = [columns.COLUMNS[column][1] for column in said["columns"]]
             body = [[run.run.label, *(draw(run) for draw in draws)] for run in rows]
-            return tables.render([header, *body])
+            return formats.render([header, *body])
     for said in claim.said.get("pairs", []):
         if said["name"] == name:
             pairs = [[claim.runs[one] for one in row] for row in said["rows"]]
-            return tables.render(columns.paired(pairs, said.get("part", "twelve")))
+            return formats.render(columns.paired(pairs, said.get("part", "twelve")))
     raise KeyError(f"{claim.name}: no table {name}")
 
 
@@ -84,10 +84,11 @@ def readme(claim: Claim) -> str:
 def provenance(claim: Claim) -> str:
     """Where the results are from: commits, date, machines, versions of jax."""
     found = [run.run.result for run in claim.runs.values()]
-    commits = dict.fromkeys(_commit(result) for result in found if result.get("commit"))
-    code = ", ".join(commits) or claim.said.get("code", "before commits were recorded")
-    machines = dict.fromkeys(captions.machine(result["hardware"]) for result in found)
-    jax = dict.fromkeys(result["versions"]["jax"] for result in found)
+    commits = [formats.code(result.commit, result.dirty) for result in found]
+    code = ", ".join(dict.fromkeys(filter(None, commits)))
+    code = code or claim.said.get("code", "before results recorded their commits")
+    machines = dict.fromkeys(formats.machine(result.about["hardware"]) for result in found)
+    jax = dict.fromkeys(result.about["versions"]["jax"] for result in found)
     return (
         f"{claim.said['date']}; code: {code}; {'; '.join(machines)}; jax {', '.join(jax)}. "
         "How to read the tables: [experiments](../README.md)."
@@ -100,11 +101,7 @@ def index(claims: list[Claim]) -> str:
         [f"[{claim.said['title']}]({claim.name}/README.md)", claim.said["claim"].strip()]
         for claim in claims
     ]
-    return tables.render([["Claim", "What was found"], *rows], 2)
-
-
-def _commit(result: dict[str, Any]) -> str:
-    return f"`{result['commit'][:10]}`" + (" with local changes" if result.get("dirty") else "")
+    return formats.render([["Claim", "What was found"], *rows], 2)
 
 
 def _date(folder: Path) -> str:

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from starjax.evaluation import trial_file
-from starjax.report import captions, outcomes, results, stats, tables
+from starjax.evaluation.result import Trial, read_sweep
+from starjax.report import compare, formats, outcomes, results, stats
 
 HIGHEST = 8  # index of the unseen trocar that is above all seen ones
 
@@ -30,16 +30,13 @@ def read(file: Path, label: str) -> Scored:
     run = results.load(file)._replace(label=label)
     swept, sweep = None, file.with_name("sweep.json")
     if file.name == "result.json" and sweep.is_file():
-        found = trial_file.read(sweep)
-        swept = run._replace(
-            result={**run.result, **found}, limit_s=found.get("time_limit_s", run.limit_s)
-        )
+        (swept,) = results.swept([run._replace(sweep=read_sweep(sweep))])
     log = file.with_suffix(".holdout.jsonl")
     lines = log.read_text().splitlines() if log.is_file() else []
     return Scored(run, swept, json.loads(lines[-1]) if lines else {})
 
 
-def paired(pairs: Sequence[Sequence[Scored]], part: str) -> tables.Table:
+def paired(pairs: Sequence[Sequence[Scored]], part: str) -> formats.Table:
     """McNemar's test of pairs of results on the same trials.
 
     Raises:
@@ -48,15 +45,15 @@ def paired(pairs: Sequence[Sequence[Scored]], part: str) -> tables.Table:
     table = [["Method", "Against", "Trials", "Only the first", "Only the second", "p"]]
     for one, other in pairs:
         a, b = PARTS[part](one), PARTS[part](other)
-        test = results.pair(a, b)
+        test = compare.pair(a, b)
         if test is None:
             raise ValueError(f"{a.label}, {b.label}: expected the same trials, got none")
         counts = [str(n) for n in (test.pairs, test.only_a, test.only_b)]
-        table.append([a.label, b.label, *counts, tables.p_value(test.p)])
+        table.append([a.label, b.label, *counts, formats.p_value(test.p)])
     return table
 
 
-def rate(trials: Sequence[outcomes.Trial], test: Callable[..., bool] = outcomes.strict) -> str:
+def rate(trials: Sequence[Trial], test: Callable[..., bool] = outcomes.strict) -> str:
     """E.g. `784/800: 98.0% (96.8-98.8)`."""
     if not trials:
         return "–"
@@ -65,11 +62,11 @@ def rate(trials: Sequence[outcomes.Trial], test: Callable[..., bool] = outcomes.
     return f"{score.successes}/{score.trials}: {middle:.1f}% ({low:.1f}-{high:.1f})"
 
 
-def _seen(scored: Scored) -> list[outcomes.Trial]:
+def _seen(scored: Scored) -> list[Trial]:
     return outcomes.split(scored.run.trials)[0]
 
 
-def _unseen(scored: Scored) -> list[outcomes.Trial]:
+def _unseen(scored: Scored) -> list[Trial]:
     return outcomes.split(scored.run.trials)[1]
 
 
@@ -81,12 +78,16 @@ def _gap(scored: Scored) -> str:
 
 def _ports(scored: Scored, low: float = 0.0, high: float = 1.0) -> str:
     trials = scored.swept.trials if scored.swept else []
-    return rate([trial for trial in trials if low <= trial["distance_m"] < high])
+    return rate([trial for trial in trials if low <= (trial.distance_m or 0.0) < high])
+
+
+def _beyond(run: results.Run, distance_m: float) -> list[Trial]:
+    return [trial for trial in run.trials if (trial.distance_m or 0.0) >= distance_m]
 
 
 def _rcm(scored: Scored, kind: str, what: str) -> str:
-    value = (scored.run.result["rcm_error_mm"].get(kind) or {}).get(what)
-    return "–" if value is None else f"{value:.1f}" if value >= 1 else tables.millimetres(value)
+    value = (scored.run.rcm_error_mm.get(kind) or {}).get(what)
+    return "–" if value is None else f"{value:.1f}" if value >= 1 else formats.millimetres(value)
 
 
 def _held_out(scored: Scored, name: str) -> str:
@@ -99,12 +100,8 @@ def _safe(scored: Scored) -> str:
 
 
 def _time(scored: Scored) -> str:
-    spent = scored.run.result.get("timings_s") or {}
-    return captions.duration(sum(s for name, s in spent.items() if not name.endswith(": compile")))
-
-
-def _replaced(run: results.Run, trials: list[outcomes.Trial]) -> results.Run:
-    return run._replace(result={**run.result, "trials": trials})
+    spent = scored.run.result.about.get("timings_s") or {}
+    return formats.duration(sum(s for name, s in spent.items() if not name.endswith(": compile")))
 
 
 def _swept(scored: Scored) -> results.Run:
@@ -119,7 +116,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "all": ("all", lambda x: rate(x.run.trials)),
     "safe": ("successes within 2 mm all along", _safe),
     "gap": ("gap, points", _gap),
-    "highest": ("highest port", lambda x: rate([t for t in _unseen(x) if t["trocar"] == HIGHEST])),
+    "highest": ("highest port", lambda x: rate([t for t in _unseen(x) if t.trocar == HIGHEST])),
     "ports": ("other ports", _ports),
     "near": ("within 10 mm", lambda x: _ports(x, 0.0, 0.01)),
     "middle": ("10 to 20 mm", lambda x: _ports(x, 0.01, 0.02)),
@@ -131,14 +128,16 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "rcm_commanded": ("commanded, most", lambda x: _rcm(x, "commanded", "max")),
     "tip": ("held-out tip (mm)", lambda x: _held_out(x, "position_error_mm")),
     "roll": ("held-out roll (deg)", lambda x: _held_out(x, "roll_error_deg")),
-    "decision": ("a decision (ms)", lambda x: f"{x.run.result['inference_ms']['p50']:.1f}"),
+    "decision": ("a decision (ms)", lambda x: f"{x.run.result.about['inference_ms']['p50']:.1f}"),
     "time": ("all stages", _time),
 }
 
 PARTS: dict[str, Callable[[Scored], Any]] = {
     "twelve": lambda x: x.run,
-    "seen": lambda x: _replaced(x.run, _seen(x)),
-    "unseen": lambda x: _replaced(x.run, _unseen(x)),
+    "seen": lambda x: results.with_trials(x.run, _seen(x)),
+    "unseen": lambda x: results.with_trials(x.run, _unseen(x)),
     "ports": _swept,
-    "far": lambda x: _replaced(_swept(x), [t for t in _swept(x).trials if t["distance_m"] >= 0.02]),
+    "far": lambda x: results.with_trials(
+        _swept(x), [t for t in _swept(x).trials if t.distance_m >= 0.02]
+    ),
 }

@@ -169,7 +169,7 @@ def _film(folder: Path, who: Any) -> str:
     from starjax.report import results, video
 
     try:
-        path = video.record([results.load(folder)], who.env.model, folder / "rollout.mp4")
+        path = video.record([results.load(folder)], folder / "rollout.mp4")
     except (OSError, RuntimeError) as error:  # the encoder is a program of its own
         return f"no video: {error}"
     method = methods.METHODS[who.method].label

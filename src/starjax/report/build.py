@@ -1,12 +1,25 @@
 """Builds the report of one or many runs: tables.md, figures, rollout.mp4, index.html."""
 
+import functools
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from starjax import methods
-from starjax.report import figures, page, ports, results, style, tables, trajectories, video
+from starjax.report import (
+    compare,
+    figures,
+    page,
+    ports,
+    results,
+    stage,
+    style,
+    tables,
+    trajectories,
+    video,
+)
 from starjax.runtime import files
+from starjax.sim.names import SceneNames
 
 
 def build(
@@ -23,20 +36,20 @@ def build(
     not show goes, its video too.
 
     Raises:
-      ValueError: no runs, or a directory without a result.
+      ValueError: no runs, of several tasks, or a directory without a result.
       files.StorageError: another process is writing a report into `out`.
     """
     if not runs:
         raise ValueError("runs: expected at least one run directory, got none")
     loaded = _named_apart(sorted((results.load(path) for path in runs), key=_order))
     focus = _focus(loaded)
-    sim = _model() if any(run.rollouts for run in loaded) else None
+    recorded = any(run.rollouts for run in loaded)
     with files.lock(out):
         text = tables.markdown(loaded)
-        pictures, drawn = _figures(loaded, focus, sim)
-        film = _film(loaded, sim, out / _FILM, report) if with_video and sim else None
+        pairs, drawn = _figures(loaded, focus)
+        film = _film(loaded, out / _FILM, report) if with_video and recorded else None
         clip = film.read_bytes() if film else None
-        html = page.render(loaded, focus, pictures, clip)
+        html = page.render(loaded, focus, pairs, clip)
         made = {"tables.md": text.encode(), **drawn, "index.html": html.encode()}
         for name, data in made.items():
             files.write_bytes(out / name, data)
@@ -52,7 +65,7 @@ _NAMES = {_FILM, *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pd
 
 
 def _order(run: results.Run) -> int:
-    return list(methods.METHODS).index(run.result["method"])
+    return list(methods.METHODS).index(run.result.method)
 
 
 def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
@@ -69,12 +82,10 @@ def _name(run: results.Run, runs: Sequence[results.Run]) -> str:
         return f"{run.label} ({count} trocar{'s' if count > 1 else ''})"
     if len(alike) == 1:
         return run.label
-    seeds = [other.result.get("config", {}).get("seed") for other in alike]
-    if _all_apart(seeds):
-        return f"{run.label} (seed {run.result['config']['seed']})"
-    seeds = [results.trials_seed(other) for other in alike]
-    if _all_apart(seeds) and not results.differing(alike):
-        return f"{run.label} (trials of seed {results.trials_seed(run)})"
+    if _all_apart([results.trained_seed(other) for other in alike]):
+        return f"{run.label} (seed {results.trained_seed(run)})"
+    if _all_apart([other.result.seed for other in alike]) and not compare.differing(alike):
+        return f"{run.label} (trials of seed {run.result.seed})"
     return f"{run.label} ({_place(run, alike)})"
 
 
@@ -92,11 +103,11 @@ def _place(run: results.Run, others: Sequence[results.Run]) -> str:
 
 
 def _film(
-    runs: Sequence[results.Run], sim: Any, path: pathlib.Path, report: Callable[[str], None]
+    runs: Sequence[results.Run], path: pathlib.Path, report: Callable[[str], None]
 ) -> pathlib.Path | None:
     """The video, or None after a line that says why there is none: the page is worth more."""
     try:
-        film = video.record(runs, sim, path, report)
+        film = video.record(runs, path, report)
     except (OSError, RuntimeError) as error:  # the encoder is a program of its own
         report(f"no video: {error}")
         return None
@@ -107,18 +118,11 @@ def _film(
 
 def _focus(runs: Sequence[results.Run]) -> results.Run:
     """The run whose numbers head the page: the paper's own method if it is there."""
-    return next((run for run in runs if run.result["method"] == "stardiff"), runs[-1])
-
-
-def _model() -> Any:
-    """The simulated scene, which figures and video are drawn from."""
-    from starjax.sim import scene
-
-    return scene.load()
+    return next((run for run in runs if run.result.method == compare.OURS), runs[-1])
 
 
 def _figures(
-    runs: Sequence[results.Run], focus: results.Run, sim: Any
+    runs: Sequence[results.Run], focus: results.Run
 ) -> tuple[dict[str, tuple[bytes, bytes]], dict[str, bytes]]:
     """Each figure on light and on dark paper, and the light one's files by name."""
     drawings: dict[str, Callable[[bool], Any]] = {
@@ -128,15 +132,20 @@ def _figures(
     if evaluated and focus.trials:
         drawings["ports"] = lambda dark: ports.draw(evaluated, dark)
         drawings["fig4"] = lambda dark: figures.distance(evaluated, focus, dark)
-    if sim is not None:
-        shown = results.representatives(runs)
-        drawings["fig3"] = lambda dark: trajectories.draw(shown, sim, dark)
-    pictures, drawn = {}, {}
+    if any(run.rollouts for run in runs):
+        shown = compare.representatives(runs)
+        drawings["fig3"] = lambda dark: trajectories.draw(shown, _stage, dark)
+    pairs, drawn = {}, {}
     for name, draw in drawings.items():
         light, dark = draw(False), draw(True)
         if light is not None:
-            pictures[name] = style.save(light, "png"), style.save(dark, "png", dark=True)
-            drawn[f"{name}.png"] = pictures[name][0]
+            pairs[name] = style.save(light, "png"), style.save(dark, "png", dark=True)
+            drawn[f"{name}.png"] = pairs[name][0]
             if name != "training":
                 drawn[f"{name}.pdf"] = style.save(light, "pdf")
-    return pictures, drawn
+    return pairs, drawn
+
+
+@functools.cache
+def _stage(names: SceneNames) -> stage.Stage:
+    return stage.load(names)

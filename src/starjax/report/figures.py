@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from starjax.report import captions, outcomes, results, stats, style
+from starjax.evaluation.result import Trial
+from starjax.report import captions, compare, outcomes, results, stats, style
 
 _BIN = 0.005  # m of distance pooled in one point
 _SMOOTH = 0.008  # m, width of the kernel behind the heat map
@@ -19,7 +20,7 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
     with style.use(dark) as shades:
         figure = style.figure(7.4, 3.4)
         left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
-        strokes = style.strokes([run.result["method"] for run in runs])
+        strokes = style.strokes([run.result.method for run in runs])
         for i, run in enumerate(runs):
             if len(runs) == 1:
                 _band(left, run, shades)
@@ -28,7 +29,7 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
         left.set_xlabel("distance to the nearest training trocar (mm)")
         left.set_ylabel("success rate, 95% Wilson interval")
         name = focus.label if len(runs) == 1 else captions.several(runs)
-        left.set_title(f"{name} from {results.observed(runs)}")
+        left.set_title(f"{name} from {compare.observed(runs)}")
         style.percent_axis(left)
         if len(runs) > 1:
             style.legend(figure, *left.get_legend_handles_labels(), side="left")
@@ -53,20 +54,20 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
         from matplotlib import ticker
 
         figure = style.figure(2.6 * max(len(panels), _FEWEST), 2.4)
-        strokes = style.strokes([run.result["method"] for run in runs])
+        strokes = style.strokes([run.result.method for run in runs])
         grid = figure.subplots(1, max(len(panels), _FEWEST), squeeze=False)[0]
         for unused in grid[len(panels) :]:
             unused.set_visible(False)
         for axis, (name, title) in zip(grid, panels):
             for run, stroke in zip(runs, strokes):
                 points = [(line["step"], line[name]) for line in run.curves if name in line]
-                color, _ = style.method(run.result["method"])
+                color, _ = style.method(run.result.method)
                 if points:
                     line = {"color": color, "linewidth": 1.3, "linestyle": stroke}
                     line |= {"marker": "o"} if len(points) == 1 else {}  # else it would not show
                     axis.plot(*np.array(points).T, label=run.label, **line)
             axis.set_title(title)
-            axis.set_xlabel(f"training step (from {results.observed(runs)})")
+            axis.set_xlabel(f"training step (from {compare.observed(runs)})")
             axis.set_yscale("log")
             low, high = axis.get_ylim()
             subs = _TICKS if high > _TICKS[-1] * low else _CLOSE_TICKS
@@ -92,8 +93,9 @@ CURVES = {
 
 def _pooled(run: results.Run) -> list[tuple[float, stats.Rate]]:
     """(mean distance in mm, score) of the trials whose distance falls in one bin."""
-    twelve = [] if run.sweep and run.sweep_limit_s != run.limit_s else run.trials
-    trials = [*twelve, *run.sweep]
+    swept = run.sweep.trials if run.sweep else ()
+    alike = not run.sweep or results.sweep_limit_s(run) == run.limit_s
+    trials = [*(run.trials if alike else ()), *swept]
     apart = outcomes.distances(trials, results.training_trocars(run))
     bins = np.round(apart / _BIN).astype(int)
     inside = [np.flatnonzero(bins == b) for b in np.unique(bins)]
@@ -121,23 +123,24 @@ def _whiskers(axis: Any, run: results.Run, offset: float, stroke: str) -> None:
     """One of several methods: a line with whiskers, `offset` mm aside to hide no other."""
     points = _pooled(run)
     x, scores = [at + offset for at, _ in points], [score for _, score in points]
-    style.rates(axis, x, scores, run.result["method"], run.label, stroke)
+    style.rates(axis, x, scores, run.result.method, run.label, stroke)
 
 
 def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> None:
     """Ports from above: a smoothed map where a sweep filled the disc, else a dot a trocar."""
-    trials = run.sweep or run.trials
-    groups = outcomes.by_trocar(trials)
-    at = 1e3 * outcomes.positions([group[0] for group in groups])[:, :2]
-    rates = np.array([outcomes.tally(group).rate for group in groups])
+    groups = outcomes.by_trocar(run.sweep.trials if run.sweep else run.trials)
+    arms = len(groups[0][0].radius)
+    at = _from_above([group[0] for group in groups])
+    rates = np.repeat([outcomes.tally(group).rate for group in groups], arms)
     if run.sweep:
-        shown = _heat(axis, at, rates, np.array([len(group) for group in groups]))
+        shown = _heat(axis, at, rates, np.repeat([len(group) for group in groups], arms))
         axis.plot(*at.T, ".", color=shades["ink"], markersize=1.6, alpha=0.4)
-        ports = 1e3 * outcomes.positions(results.training_trocars(run))[:, :2]
+        ports = _from_above(results.training_trocars(run))
         axis.plot(*ports.T, "x", color=style.FAILURE, markersize=6, label="training trocar")
         axis.legend(loc="upper left", bbox_to_anchor=(0, -0.12), fontsize=7)
     else:
-        edge = [shades["ink"] if group[0]["seen"] else style.FAILURE for group in groups]
+        colours = [shades["ink"] if group[0].seen else style.FAILURE for group in groups]
+        edge = np.repeat(colours, arms)
         shown = axis.scatter(
             *at.T, c=rates, cmap=style.MAP, vmin=0, vmax=1, s=330, edgecolors=edge, linewidths=1.6
         )
@@ -155,6 +158,11 @@ def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> N
     bar = figure.colorbar(shown, ax=axis, shrink=0.8, ticks=[0, 0.5, 1])
     bar.ax.set_yticklabels(["0", "50", "100%"])
     bar.outline.set_visible(False)
+
+
+def _from_above(trials: Sequence[Trial]) -> np.ndarray:
+    """Trocars `[N * A, 2]` in mm, those of every arm about its nominal one."""
+    return 1e3 * outcomes.positions(trials)[..., :2].reshape(-1, 2)
 
 
 def _heat(axis: Any, at: np.ndarray, rates: np.ndarray, weights: np.ndarray) -> Any:

@@ -5,7 +5,7 @@ import html
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from starjax.report import stats, tables
+from starjax.report import formats, stats
 
 
 class Cell(NamedTuple):
@@ -35,9 +35,9 @@ def table(header: Sequence[Cell], rows: Sequence[Sequence[Cell]]) -> str:
     return f'<div class="scroll"><table>{top}<tbody>\n{body}</tbody></table></div>'
 
 
-def plain(rows: tables.Table, note: str) -> str:
-    """A table of `tables` with the note under it; numbers to the right."""
-    names = tables.names_in(rows[0])
+def plain(rows: formats.Table, note: str) -> str:
+    """A table of text with the note under it; numbers to the right."""
+    names = formats.names_in(rows[0])
     cells = [[Cell(escape(t)) if i < names else number(t) for i, t in enumerate(r)] for r in rows]
     return table(cells[0], cells[1:]) + small(note)
 

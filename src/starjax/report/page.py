@@ -3,7 +3,8 @@
 import importlib.resources
 from collections.abc import Mapping, Sequence
 
-from starjax.report import captions, markup, results, sections
+from starjax.report import captions, compare, markup, results, sections
+from starjax.sim.tasks.base import Words
 
 # name -> (light PNG, dark PNG)
 Figures = Mapping[str, tuple[bytes, bytes]]
@@ -11,9 +12,9 @@ Figures = Mapping[str, tuple[bytes, bytes]]
 CAPTIONS = {
     "fig3": (
         "Rollouts",
-        "Path of the instrument's tip over the boards (top row: seen trocars, bottom row: unseen). "
+        "Path of the instrument's tip over {ground} (top row: seen trocars, bottom row: unseen). "
         "Thin lines are the shaft at moments of one rollout, the cross is the trocar. "
-        "Open circle: start. Grey line on the board: the path seen from straight above.",
+        "Open circle: start. Grey line: the path seen from straight above.",
     ),
     "fig4": (
         "Success and distance from the training trocars",
@@ -38,23 +39,23 @@ def render(
 ) -> str:
     """The page of `runs`, whose headline numbers are those of `focus`."""
     several = len(runs) > 1
-    title = captions.title(runs)
+    title, words = captions.title(runs), compare.words(runs)
     body = [
         f'<p class="eyebrow">starjax report</p><h1>{markup.escape(title)}</h1>',
         f'<p class="verdict">{markup.escape(captions.verdict(runs, focus))}</p>',
         sections.facts(runs),
-        sections.notes(runs),
+        sections.warnings(runs),
         sections.cards(focus),
-        _video(video, results.observed(runs)),
+        _video(video, compare.observed(runs), words),
         sections.comparison(runs) if several else sections.tests(focus),
-        _figure("fig3", figures),
-        _figure("fig4", figures),
+        _figure("fig3", figures, words),
+        _figure("fig4", figures, words),
         sections.swept(runs),
-        _figure("ports", figures),
+        _figure("ports", figures, words),
         sections.matrix(runs) if several else sections.per_trocar(focus),
         sections.failures(runs),
         sections.measurements(runs),
-        _figure("training", figures),
+        _figure("training", figures, words),
         sections.reproduce(runs),
     ]
     style = importlib.resources.files("starjax.report").joinpath("page.css").read_text()
@@ -67,11 +68,11 @@ def render(
     )
 
 
-def _figure(name: str, figures: Figures) -> str:
+def _figure(name: str, figures: Figures, words: Words) -> str:
     if name not in figures:
         return ""
-    heading, caption = CAPTIONS[name]
-    light, dark = (markup.uri("image/png", picture) for picture in figures[name])
+    heading, caption = CAPTIONS[name][0], CAPTIONS[name][1].format(ground=words.ground)
+    light, dark = (markup.uri("image/png", image) for image in figures[name])
     return (
         f"<h2>{heading}</h2>\n<figure><picture>"
         f'<source media="(prefers-color-scheme: dark)" srcset="{dark}">'
@@ -80,12 +81,12 @@ def _figure(name: str, figures: Figures) -> str:
     )
 
 
-def _video(video: bytes | None, observed: str) -> str:
+def _video(video: bytes | None, observed: str, words: Words) -> str:
     if video is None:
         return ""
     source = markup.uri("video/mp4", video)
     return (
         f'<figure><video controls loop muted autoplay playsinline src="{source}"></video>'
         f"<figcaption>The policy, which sees the {observed}, at work in real time. The disc on the "
-        "shaft is the trocar; the block belongs on the marked peg.</figcaption></figure>"
+        f"shaft is the trocar; {words.goal}.</figcaption></figure>"
     )

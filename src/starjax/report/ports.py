@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from starjax import methods
-from starjax.report import outcomes, results, stats, style
+from starjax.report import compare, outcomes, results, stats, style
 
 
 def trained_at(run: results.Run) -> int:
@@ -14,8 +14,8 @@ def trained_at(run: results.Run) -> int:
 
 def never_seen(runs: Sequence[results.Run]) -> set[int]:
     """Indices of the trocars that every run was scored at and none was trained at."""
-    scored = [{int(trial["trocar"]) for trial in run.trials} for run in runs]
-    seen = {int(trial["trocar"]) for run in runs for trial in run.trials if trial["seen"]}
+    scored = [{trial.trocar for trial in run.trials} for run in runs]
+    seen = {trial.trocar for run in runs for trial in run.trials if trial.seen}
     return set.intersection(*scored) - seen
 
 
@@ -27,14 +27,14 @@ def draw(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
     counts, scored_at = sorted({trained_at(run) for run in runs}), never_seen(runs)
     if len(counts) < 2 or not scored_at:
         return None
-    names = list(dict.fromkeys(run.result["method"] for run in runs))
+    names = list(dict.fromkeys(run.result.method for run in runs))
     with style.use(dark):
         from matplotlib import ticker
 
         figure = style.figure(5.0, 3.2)
         axis = figure.subplots()
         for i, name in enumerate(names):
-            ours = sorted((run for run in runs if run.result["method"] == name), key=trained_at)
+            ours = sorted((run for run in runs if run.result.method == name), key=trained_at)
             scores = [_score(run, scored_at) for run in ours]
             x = [trained_at(run) * 1.025 ** (i - (len(names) - 1) / 2) for run in ours]
             style.rates(axis, x, scores, name, methods.METHODS[name].label)
@@ -45,7 +45,7 @@ def draw(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
         axis.set_ylabel("success rate")
         axis.set_title(
             f"At the {len(scored_at)} trocars that no run was trained at "
-            f"(from {results.observed(runs)})"
+            f"(from {compare.observed(runs)})"
         )
         style.percent_axis(axis)
         style.legend(figure, *axis.get_legend_handles_labels(), side="left")
@@ -53,4 +53,4 @@ def draw(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
 
 
 def _score(run: results.Run, trocars: set[int]) -> stats.Rate:
-    return outcomes.tally(trial for trial in run.trials if int(trial["trocar"]) in trocars)
+    return outcomes.tally(trial for trial in run.trials if trial.trocar in trocars)

@@ -4,8 +4,20 @@ import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from starjax.report import captions, markup, outcomes, results, stats, tables
+from starjax.evaluation.result import Trial
+from starjax.report import (
+    captions,
+    compare,
+    formats,
+    markup,
+    notes,
+    outcomes,
+    results,
+    stats,
+    tables,
+)
 from starjax.report.markup import Cell
+from starjax.sim.names import SceneNames
 
 _BARS_NOTE = (
     "Bars are 95% Wilson intervals, ticks the rates. The gap is seen minus unseen with Newcombe's "
@@ -16,14 +28,15 @@ _SCORES = (Cell("Seen", span=2), Cell("Unseen", span=2))
 
 def facts(runs: Sequence[results.Run]) -> str:
     """What was run, on what: of several runs all that there is, each once."""
-    configs = [run.result.get("config") or {} for run in runs]
     items = {
-        "Observation": [results.observed(runs)],
+        "Observation": [compare.observed(runs)],
         "Trials" if len(runs) == 1 else "Trials a run": [_trials(run) for run in runs],
-        "Preset": [config.get("preset") for config in configs],
-        "Seed": [config.get("seed") for config in configs],
+        "Robot": [_robot(run.result.scene) for run in runs],
+        "Preset": [run.result.config.get("preset") for run in runs],
+        "Seed": [results.trained_seed(run) for run in runs],
         "Seed of the trials": _trials_seeds(runs),
-        "Hardware": [captions.hardware(run.result.get("hardware") or {}) for run in runs],
+        "Code": [formats.code(run.result.commit, run.result.dirty) for run in runs],
+        "Hardware": [formats.hardware(run.result.about.get("hardware") or {}) for run in runs],
     }
     inner = ""
     for name, values in items.items():
@@ -35,9 +48,15 @@ def facts(runs: Sequence[results.Run]) -> str:
 
 def _trials_seeds(runs: Sequence[results.Run]) -> list[int | None]:
     """Seeds of the trials, unless each is that of its training."""
-    trained = [(run.result.get("config") or {}).get("seed") for run in runs]
-    scored = [results.trials_seed(run) for run in runs]
+    trained = [results.trained_seed(run) for run in runs]
+    scored = [run.result.seed for run in runs]
     return [] if scored == trained else scored
+
+
+def _robot(scene: SceneNames) -> str:
+    """E.g. `fr5 with grasper`."""
+    arms = zip(scene.arms, scene.tools, strict=True)
+    return " and ".join(f"{arm} with {tool}" for arm, tool in arms)
 
 
 def _trials(run: results.Run) -> str:
@@ -45,7 +64,7 @@ def _trials(run: results.Run) -> str:
     return f"{len(run.trials)} over {trocars} trocars" if trocars else ""
 
 
-def notes(runs: Sequence[results.Run]) -> str:
+def warnings(runs: Sequence[results.Run]) -> str:
     """Warnings, each once."""
     return "\n".join(f'<p class="note">{markup.escape(text)}</p>' for text in captions.notes(runs))
 
@@ -65,7 +84,7 @@ def _headlines(run: results.Run) -> Iterator[tuple[str, str, str, str]]:
     scores = [outcomes.tally(t) if t else None for t in outcomes.split(run.trials)]
     for name, score in zip(("seen", "unseen"), scores):
         if score:
-            more = f"{score.successes} of {score.trials}, {captions.interval(score)}"
+            more = f"{score.successes} of {score.trials}, {formats.interval(score)}"
             bar = markup.interval(score, name)
             yield f"Success, {name} trocars", f"{100 * score.rate:.0f}", "%", bar + more
     seen, unseen = scores
@@ -73,18 +92,16 @@ def _headlines(run: results.Run) -> Iterator[tuple[str, str, str, str]]:
         middle, low, high = (100 * x for x in stats.gap(seen, unseen))
         more = f"seen minus unseen, 95% interval {low:+.0f} to {high:+.0f}"
         yield "Generalization gap", f"{middle:+.0f}", " points", more
-    errors = run.result.get("rcm_error_mm") or {}
+    errors = run.rcm_error_mm
     executed = errors.get("executed") or {}
     if executed.get("p99") is not None:
         worst = max(executed["max"], (errors.get("within_steps") or {}).get("max", 0.0))
-        more = f"99th percentile of steps' ends; {tables.millimetres(worst)} mm at worst"
-        yield "Shaft off the trocar", tables.millimetres(executed["p99"]), " mm", more
-    seconds = outcomes.transfer_times(run.trials)
-    if seconds:
+        more = f"99th percentile of steps' ends; {formats.millimetres(worst)} mm at worst"
+        yield "Shaft off the trocar", formats.millimetres(executed["p99"]), " mm", more
+    if seconds := outcomes.times(run.trials, run.result.control_hz):
         more = f"median of {len(seconds)} successes"
-        yield "Time a transfer", f"{statistics.median(seconds):.1f}", " s", more
-    if run.result.get("inference_ms"):
-        ms = run.result["inference_ms"]
+        yield "Time of a success", f"{statistics.median(seconds):.1f}", " s", more
+    if ms := run.result.about.get("inference_ms"):
         more = f"median; 99th percentile {ms['p99']:.1f} ms"
         yield "One policy call", f"{ms['p50']:.1f}", " ms", more
 
@@ -94,8 +111,10 @@ def tests(run: results.Run) -> str:
     if not run.trials:
         return ""
     rows = []
-    for name, (test, meaning) in tables.TESTS.items():
-        rows.append([Cell(f"<b>{name.capitalize()}</b><br>{markup.escape(meaning)}", "wide")])
+    meanings = notes.tests(compare.words([run]))
+    for name, test in tables.TESTS.items():
+        said = f"<b>{name.capitalize()}</b><br>{markup.escape(meanings[name])}"
+        rows.append([Cell(said, "wide")])
         for part, trials in zip(("seen", "unseen"), outcomes.split(run.trials)):
             rows[-1] += markup.score(outcomes.tally(trials, test) if trials else None, part)
     return "<h2>Success</h2>\n" + markup.table([Cell("Test"), *_SCORES], rows)
@@ -111,7 +130,7 @@ def comparison(runs: Sequence[results.Run]) -> str:
                 rows.append([Cell(markup.escape(group), "group"), *[Cell("", "group")] * 5])
             scores = [outcomes.tally(t) if t else None for t in outcomes.split(run.trials)]
             seen, unseen = scores
-            gap = tables.points(stats.gap(seen, unseen)) if seen and unseen else "–"
+            gap = formats.points(stats.gap(seen, unseen)) if seen and unseen else "–"
             rows.append([Cell(markup.escape(run.label)), *markup.score(seen, "seen")])
             rows[-1] += [*markup.score(unseen, "unseen"), markup.number(gap)]
     if not rows:
@@ -120,16 +139,17 @@ def comparison(runs: Sequence[results.Run]) -> str:
     text = "<h2>Success</h2>\n" + markup.table(header, rows) + markup.small(_BARS_NOTE)
     pairs = tables.paired(runs)
     if len(pairs) > 1:
-        text += "<h2>Paired with STAR-Diff</h2>\n" + markup.plain(pairs, tables.PAIRED_NOTE)
-    others = markup.plain(tables.by_test(runs, _brief), tables.TESTS_NOTE)
+        text += "<h2>Paired with STAR-Diff</h2>\n" + markup.plain(pairs, notes.PAIRED)
+    words = compare.words(runs)
+    others = markup.plain(tables.by_test(runs, formats.brief), notes.by_test(words))
     return text + "<h2>Success by three tests (%)</h2>\n" + others
 
 
 def swept(runs: Sequence[results.Run]) -> str:
     """Success through the trocars of sweeps; of several methods, paired tests too."""
     parts = (
-        (tables.SWEPT, tables.swept(runs, _brief), tables.SWEPT_NOTE),
-        (tables.SWEPT_PAIRED, tables.paired(results.swept(runs)), tables.PAIRED_NOTE),
+        (tables.SWEPT, tables.swept(runs, formats.brief), notes.SWEPT),
+        (tables.SWEPT_PAIRED, tables.paired(results.swept(runs)), notes.PAIRED),
     )
     return _titled(parts)
 
@@ -138,14 +158,14 @@ def per_trocar(run: results.Run) -> str:
     """One method: a row a trocar."""
     rows = []
     for group in outcomes.by_trocar(run.trials):
-        part = "seen" if group[0]["seen"] else "unseen"
-        times = outcomes.transfer_times(group)
+        part = "seen" if group[0].seen else "unseen"
+        times = outcomes.times(group, run.result.control_hz)
         worst = max((e for t in group if (e := outcomes.worst_rcm_mm(t)) is not None), default=None)
-        row = [Cell(f"{group[0]['trocar']}"), Cell(part)]
+        row = [Cell(f"{group[0].trocar}"), Cell(part)]
         row += [markup.number(text) for text in outcomes.place(group[0])]
         row += markup.score(outcomes.tally(group), part)
         row.append(markup.number(f"{statistics.median(times):.1f} s" if times else "–"))
-        row.append(markup.number("–" if worst is None else f"{tables.millimetres(worst)} mm"))
+        row.append(markup.number("–" if worst is None else f"{formats.millimetres(worst)} mm"))
         rows.append(row)
     if not rows:
         return ""
@@ -162,73 +182,70 @@ def matrix(runs: Sequence[results.Run]) -> str:
         return ""
     header, rows = [Cell("Method")], []
     for group in columns:
-        header.append(Cell(f"{group[0]['trocar']}", "tint"))
+        header.append(Cell(f"{group[0].trocar}", "tint"))
     for run in runs:
-        own = {group[0]["trocar"]: group for group in outcomes.by_trocar(run.trials)}
-        cells = [_at_trocar(own.get(group[0]["trocar"])) for group in columns]
+        own = {group[0].trocar: group for group in outcomes.by_trocar(run.trials)}
+        cells = [_at_trocar(own.get(group[0].trocar)) for group in columns]
         rows.append([Cell(markup.escape(run.label)), *cells])
     note = "Success in percent of the trials at each trocar; * where it was not trained on."
     return "<h2>Trocar by trocar</h2>\n" + markup.table(header, rows) + markup.small(note)
 
 
-def _at_trocar(trials: Sequence[outcomes.Trial] | None) -> Cell:
+def _at_trocar(trials: Sequence[Trial] | None) -> Cell:
     if not trials:
         return Cell("", "tint")
-    return markup.tint(outcomes.tally(trials), "" if trials[0]["seen"] else "*")
+    return markup.tint(outcomes.tally(trials), "" if trials[0].seen else "*")
 
 
 def failures(runs: Sequence[results.Run]) -> str:
     """How the failed trials failed: bars for one method, a table for several."""
     if len(runs) > 1:
         table = tables.failures(runs)
-        said = markup.plain(table, tables.FAILURES_NOTE)
+        said = markup.plain(table, notes.FAILURES)
         return f"<h2>Failed trials</h2>\n{said}" if len(table) > 1 else ""
     found = outcomes.failures(runs[0].trials)
     if not found:
         return ""
+    meanings = outcomes.meanings(compare.words(runs))
     lines = "".join(
-        f"<div>{outcomes.FAILURES[key]}</div>"
+        f"<div>{markup.escape(meanings[key])}</div>"
         f'<span class="unseen"><i style="width:{80 * n / max(found.values()):.1f}%"></i>{n}</span>'
         for key, n in found.items()
     )
     said = f"{sum(found.values())} of {len(runs[0].trials)} trials failed."
-    note = markup.small(tables.FAILURES_NOTE)
+    note = markup.small(notes.FAILURES)
     return f'<h2>How it failed</h2>\n<p>{said}</p><div class="bars">{lines}</div>{note}'
 
 
 def measurements(runs: Sequence[results.Run]) -> str:
     """RCM error, inference time (Table IV), wall-clock time a phase."""
     parts = (
-        ("RCM error (mm)", tables.rcm(runs), tables.RCM_NOTE),
-        ("Inference time", tables.inference(runs), tables.inference_note(runs)),
-        ("Where the time went", tables.phases(runs), tables.PHASES_NOTE),
+        ("RCM error (mm)", tables.rcm(runs), notes.RCM),
+        ("Inference time", tables.inference(runs), notes.inference(runs)),
+        ("Where the time went", tables.phases(runs), notes.PHASES),
     )
     return _titled(parts)
 
 
 def reproduce(runs: Sequence[results.Run]) -> str:
     """Commands, settings, versions."""
-    commands = dict.fromkeys(run.result["command"] for run in runs if run.result.get("command"))
-    text = "<h2>Run it again</h2>\n" if commands else ""
-    text += "".join(f"<pre>{markup.escape(command)}</pre>" for command in commands)
+    commands = dict.fromkeys(run.result.about.get("command") for run in runs)
+    text = "<h2>Run it again</h2>\n" if any(commands) else ""
+    text += "".join(f"<pre>{markup.escape(command)}</pre>" for command in commands if command)
     for run in runs:
-        lines = "\n".join(_flat(run.result.get("config") or {}))
+        lines = "\n".join(_flat(run.result.config))
         if lines:
             summary = f"<summary>Settings of {markup.escape(run.label)}</summary>"
             text += f"<details>{summary}<pre>{markup.escape(lines)}</pre></details>\n"
-    versions = runs[0].result.get("versions")
+    versions = runs[0].result.about.get("versions")
     return text + (
-        f"<footer>{markup.escape(captions.listing(versions))}</footer>" if versions else ""
+        f"<footer>{markup.escape(formats.listing(versions))}</footer>" if versions else ""
     )
 
 
-def _titled(parts: Iterable[tuple[str, tables.Table, str]]) -> str:
+def _titled(parts: Iterable[tuple[str, formats.Table, str]]) -> str:
     """Tables under their headings, each with its note, those of no rows left out."""
     return "\n".join(f"<h2>{h}</h2>\n{markup.plain(t, n)}" for h, t, n in parts if len(t) > 1)
-
-
-def _brief(rate: stats.Rate) -> str:
-    return f"{100 * rate.rate:.0f} ({rate.successes}/{rate.trials})"
 
 
 def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
@@ -236,4 +253,4 @@ def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
         if isinstance(value, Mapping):
             yield from _flat(value, f"{prefix}{name}.")
         else:
-            yield f"{prefix}{name} = {captions.listing(value)}"
+            yield f"{prefix}{name} = {formats.listing(value)}"

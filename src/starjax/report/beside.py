@@ -1,0 +1,79 @@
+"""What lies beside a result.json: the sweep, the bench, and the log of the training."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from starjax import config, methods
+from starjax.evaluation import result, structure
+from starjax.evaluation.structure import NUMBER
+from starjax.runtime import files
+
+_MS = {"p50": NUMBER, "p95": NUMBER, "p99": NUMBER}
+_BENCH = {
+    "weights?": str,
+    "inference_ms_by_ddim_steps": {"*": _MS},
+    "roll_network_ms?": _MS,
+    "hardware?": {"devices?": [str], "memory_gb?": NUMBER},
+}
+_LINE = {"step": int, "loss?": NUMBER, "position_error_mm?": NUMBER, "roll_error_deg?": NUMBER}
+
+Lines = list[dict[str, Any]]
+
+
+def sweep(folder: Path) -> result.Result | None:
+    """The last sweep of a run, or None."""
+    file = folder / "sweep.json"
+    return result.read_sweep(file) if file.is_file() else None
+
+
+def bench(folder: Path) -> dict[str, Any]:
+    """bench.json of a run, empty if there is none.
+
+    Raises:
+      ValueError: it is damaged; the message names it.
+    """
+    file = folder / "bench.json"
+    if not file.is_file():
+        return {}
+    found = files.read_json(file)
+    structure.check(file, found, _BENCH)
+    return found
+
+
+def curves(folder: Path, scored: result.Result) -> tuple[Path | None, Lines]:
+    """The log of the training of a result's weights, and its lines.
+
+    Another method's folder has it where the two share weights. No lines: it is of a training with
+    other settings.
+    """
+    places = [folder]
+    if folder.name == scored.method:
+        places.insert(0, folder.parent / methods.METHODS[scored.method].weights_of)
+    for place in places:
+        file = place / "metrics.jsonl"
+        if lines := _lines(file):
+            return file.resolve(), lines if _is_of(place, scored) else []
+    return None, []
+
+
+def _is_of(folder: Path, scored: result.Result) -> bool:
+    """Whether a folder's training had the settings of a result, if it says so."""
+    try:
+        trained = files.read_json(folder / "config.json")
+        same_seed = trained["seed"] == scored.config.get("seed", trained["seed"])
+        return same_seed and not config.differing([trained, scored.config])
+    except (FileNotFoundError, AttributeError, KeyError, TypeError, ValueError):
+        return True  # none, damaged, or of another version: not known
+
+
+def _lines(file: Path) -> Lines:
+    """What is whole of a log: a kill may have cut its last line short."""
+    lines = file.read_bytes().splitlines(keepends=True) if file.is_file() else []
+    try:
+        found = [json.loads(line) for line in lines if line.endswith(b"\n")]
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged: {error}") from error
+    for number, line in enumerate(found, 1):
+        structure.check(file, line, _LINE, f"line {number}")
+    return found

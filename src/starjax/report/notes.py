@@ -1,0 +1,62 @@
+"""How to read the tables."""
+
+from collections.abc import Sequence
+
+from starjax.report import formats, results
+from starjax.sim.tasks.base import Words
+
+CELL = "Successes/trials and the 95% Wilson interval in brackets."
+SUCCESS = (
+    f"{CELL[:-1]}; the gap is seen minus unseen in percentage points with Newcombe's 95% "
+    "interval, and means little where both are low."
+)
+PAIRED = (
+    "McNemar's exact test on trials with the same trocar and seed; Holm corrects for the number "
+    "of comparisons."
+)
+SWEPT = (
+    "Trials of the sweep, all of them and by the distance of their trocar to the nearest one in "
+    "the demonstrations."
+)
+FAILURES = "Each failed trial is counted under the first class that applies."
+RCM = (
+    "Distance of the shaft's axis from the trocar. Commanded: as the policy asked for it. "
+    "Executed: as the simulated arm did it, at the ends of all control steps of all trials or of "
+    "the successful ones; a trial that fails has up to ten times as many steps. Within steps: the "
+    "largest at any physics step of each control step, where the servos have not answered yet."
+)
+PHASES = (
+    "Wall-clock time, summed over every start. Methods share the demonstrations, and some weights "
+    "and trials."
+)
+INFERENCE = (
+    "One decision for one environment: observation in, commands out; compiling is not counted. "
+    "One DDIM step is a time only: its plan is the noise that it began with."
+)
+
+
+def tests(words: Words) -> dict[str, str]:
+    """What each test of success asks for, in the task's words."""
+    return {
+        "strict": words.strict,
+        "loose": words.loose,
+        "safe": "strict, and the executed RCM error never passed 2 mm",
+    }
+
+
+def by_test(words: Words) -> str:
+    """All tests in one line."""
+    return ". ".join(f"{name.capitalize()}: {what}" for name, what in tests(words).items()) + "."
+
+
+def inference(runs: Sequence[results.Run]) -> str:
+    """How to read Table IV, and where `starjax bench` ran if not on the machine of the run."""
+    note = INFERENCE
+    for run in runs:
+        timed, scored = (
+            formats.hardware(x.get("hardware") or {}) for x in (run.bench, run.result.about)
+        )
+        if timed and timed != scored:
+            rows = ", ".join(sorted(run.bench["inference_ms_by_ddim_steps"], key=int))
+            note += f" {run.label}'s rows of {rows} steps are of {timed}."
+    return note

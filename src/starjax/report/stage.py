@@ -1,0 +1,100 @@
+"""The simulated scene of a result, set up again for figures and the video."""
+
+import types
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from starjax.sim.names import SceneNames
+from starjax.sim.tasks.base import Outline
+
+BATCH = 16  # images drawn in one call
+
+
+class Stage(NamedTuple):
+    """What figures need of a scene.
+
+    Attributes:
+      outline: of the task.
+      tips: (qpos `[T, Q]`, p_world_trocar `[A, 3]` m) -> positions of the tips in m, and the
+        directions of their shafts, away from the arm: `[T, A, 3]` each.
+    """
+
+    outline: Outline
+    tips: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def load(names: SceneNames) -> Stage:
+    """Composes the scene of these names; nothing is compiled for a device.
+
+    Raises:
+      errors.UsageError: one of the names is unknown here.
+    """
+    import mujoco
+
+    from starjax.sim import registry, scene
+
+    model = scene.compose(names)
+    marks = [model.body(f"trocar{i}").mocapid[0] for i in range(len(names.arms))]
+    sites = [scene.tcp(i, registry.tools.get(tool)) for i, tool in enumerate(names.tools)]
+
+    def tips(qpos: np.ndarray, p_world_trocar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        data, found = mujoco.MjData(model), []
+        data.mocap_pos[marks] = p_world_trocar
+        for data.qpos[:] in qpos:
+            mujoco.mj_kinematics(model, data)
+            found.append([np.stack([data.site(s).xpos, data.site(s).xmat[2::3]]) for s in sites])
+        p, axis = np.moveaxis(np.array(found), 2, 0)
+        return p, axis
+
+    return Stage(registry.tasks.get(names.task).outline(model), tips)
+
+
+# (qpos `[T, Q]`, p_world_trocar `[A, 3]` m, labels, first) -> `[BATCH, size, size, 3]` uint8 of
+# the steps from `first` on, the last one repeated.
+Draw = Callable[[np.ndarray, np.ndarray, dict[str, int], int], np.ndarray]
+
+
+def camera(names: SceneNames, size: int) -> Draw:
+    """Compiles the first camera of a scene, for square images of `size` pixels a side."""
+    import jax
+    import jax.numpy as jnp
+
+    from starjax.sim import cameras, physics, render, scene
+
+    # Smooth outlines cost four times as much: a matter of seconds on a GPU, of minutes on a CPU.
+    samples = 1 if jax.default_backend() == "cpu" else 2
+    made = scene.load(names)
+    (shown,) = cameras.make(made.mj_model, names.cameras[:1], size)
+    smooth = {"samples": samples, "moves": shown.moves}
+    shown = shown._replace(draw=render.make(made.mj_model, shown.name, size, size, **smooth))
+    poses = cameras.nominal([shown])
+
+    def one(qpos: jax.Array, p_world_trocar: jax.Array, rgb: jax.Array) -> jax.Array:
+        data = physics.kinematics(made, qpos, p_world_trocar)
+        return cameras.images([shown], poses, data, rgb)[shown.name].rgb
+
+    @jax.jit
+    def batch(qpos: jax.Array, p_world_trocar: jax.Array, labels: dict[str, Any]) -> jax.Array:
+        rgb = _marked(made, labels, jnp.asarray(made.geom_rgb))
+        return jax.lax.map(lambda q: one(q, p_world_trocar, rgb), qpos)
+
+    def draw(
+        qpos: np.ndarray, p_world_trocar: np.ndarray, labels: dict[str, int], first: int
+    ) -> np.ndarray:
+        rows = np.minimum(np.arange(first, first + BATCH), len(qpos) - 1)
+        shown = {name: np.int32(value) for name, value in labels.items()}
+        with jax.default_matmul_precision("highest"):  # poses to float32, as the environment's
+            found = batch(qpos[rows].astype(np.float32), p_world_trocar.astype(np.float32), shown)
+            return np.asarray(found)
+
+    return draw
+
+
+def _marked(made: Any, labels: dict[str, Any], rgb: Any) -> Any:
+    """Colours with the goal marked, as far as the labels of an episode tell it."""
+    try:
+        return made.task.colours(made.bound, types.SimpleNamespace(**labels), rgb)
+    except AttributeError:  # the task's colours ask for more of the layout than was recorded
+        return rgb
