@@ -28,7 +28,9 @@ def run(path: pathlib.Path, method="stardiff", skill=(0.85, 0.7), trials=6, swee
         chance = skill[0] - 6 * np.maximum(0, ports.radius - 0.03)
         spread = outcomes(rng, ports, np.arange(sweep_of), chance)
         training = rcm.Trocar(*(field[rcm.IS_SEEN] for field in rcm.TROCARS))
-        (path / "sweep.json").write_text(json.dumps(sweep.compose(spread, training, P_REF, seed=0)))
+        about = {"method": method, "observation": "state"}
+        figures = sweep.compose(spread, training, P_REF, seed=0)
+        (path / "sweep.json").write_text(json.dumps(about | figures))
     return path
 
 

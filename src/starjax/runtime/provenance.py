@@ -1,0 +1,69 @@
+"""Names the code that runs: a commit of its checkout, or what its installation says of itself."""
+
+import functools
+import importlib.metadata
+import json
+import re
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+_PACKAGE = Path(__file__).parents[1]
+_TIMEOUT_S = 10.0  # of git, which may wait for a network's file system
+
+
+class Code(NamedTuple):
+    """Which code runs.
+
+    Attributes:
+      version: of the package.
+      commit: hexadecimal, None where neither a checkout nor the installation says it.
+      dirty: whether the package's tracked files differ from it, None where there is none.
+    """
+
+    version: str
+    commit: str | None
+    dirty: bool | None
+
+
+@functools.cache
+def code() -> Code:
+    """The code of this process. Never fails; asked early, it is not that of a later checkout."""
+    try:
+        version = importlib.metadata.version("starjax")
+    except importlib.metadata.PackageNotFoundError:
+        from starjax import __version__ as version
+    found = _of_checkout(_PACKAGE) or _of_origin() or of_version(version)
+    return Code(version, *(found or (None, None)))
+
+
+def of_version(version: str) -> tuple[str, bool] | None:
+    """Commit and dirty flag in a version that was made from git tags: `1.2.dev3+g0a1b2c3.d2025`."""
+    found = re.search(r"\+g([0-9a-f]{7,40})(\.d\d+)?$", version)
+    return (found[1], bool(found[2])) if found else None
+
+
+def _of_checkout(package: Path) -> tuple[str, bool] | None:
+    """What git says, if it tracks the package: it may also lie in somebody's repository."""
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(package), *words]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S)
+        done.check_returncode()
+        return done.stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", "__init__.py")
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":/mjcf")
+        return git("rev-parse", "HEAD"), bool(changed)
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _of_origin() -> tuple[str, bool] | None:
+    """The commit that an installation from a repository records (PEP 610)."""
+    try:
+        said = importlib.metadata.distribution("starjax").read_text("direct_url.json")
+        return str(json.loads(said or "")["vcs_info"]["commit_id"]), False
+    except (importlib.metadata.PackageNotFoundError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,132 @@
+"""Results of both schemas are read as one type; damage is named; what made them is written."""
+
+import copy
+import json
+import pathlib
+
+import numpy as np
+import pytest
+import synthetic
+
+from starjax import errors, rcm
+from starjax.evaluation import result, trial_file
+from starjax.runtime import provenance
+from starjax.sim import names
+
+SCENE = names.SceneNames("hand_over", ("fr5", "panda"), ("grasper", "grasper"), ("left", "right"))
+RESULTS = sorted((pathlib.Path(__file__).parents[2] / "experiments").rglob("result.json"))
+
+
+def first():
+    """A file's content as schema 1 has it."""
+    index = np.repeat(np.arange(12), 2)
+    ports = rcm.Trocar(*(field[index] for field in rcm.TROCARS))
+    rows = synthetic.outcomes(np.random.default_rng(0), ports, index, np.full(24, 0.7))
+    return synthetic.result("stardiff", rows)
+
+
+def second():
+    """Figures as schema 2 has them, of two arms."""
+    raw = result._upgraded(first())
+    for row in [*raw["trials"], *raw["per_trocar"]]:
+        row |= {name: row[name] + [0.5] for name in ("radius", "polar", "azimuth")}
+    for row in raw["trials"]:
+        row["stage"] = 2
+    return {name: raw[name] for name in ("method", "observation", "trials", *result._FIGURES[:9])}
+
+
+def written(tmp_path, value):
+    file = tmp_path / "result.json"
+    file.write_text(json.dumps(value))
+    return file
+
+
+def test_every_result_of_the_repository_is_read():
+    assert RESULTS
+    for file in RESULTS:
+        found, raw = result.read(file), json.loads(file.read_bytes())
+        assert len(found.trials) == found.figures["strict"]["all"]["trials"] > 0
+        won = sum(trial.success for trial in found.trials)
+        assert won == raw["strict"]["all"]["successes"]
+
+
+def test_schema_1_is_peg_transfer_with_one_arm(tmp_path):
+    raw = first()
+    found = result.read(written(tmp_path, raw))
+    assert found.schema == 1 and found.scene == names.FIRST and found.control_hz == 30.0
+    assert (found.commit, found.dirty, found.dataset_digest) == (None, None, None)
+    trial, row = found.trials[-1], raw["trials"][-1]
+    assert trial.radius == (row["radius"],) and trial.azimuth == (row["azimuth"],)
+    assert trial.labels == {"source": row["source"], "target": row["target"]}
+    assert (trial.lost, trial.stage) == (False, None)
+    assert found.figures["per_trocar"][0]["polar"] == [raw["per_trocar"][0]["polar"]]
+    assert found.time_limit_s == raw["config"]["eval"]["time_limit_s"]
+
+
+@pytest.fixture
+def made(tmp_path):
+    raw = first()
+    about = {name: raw[name] for name in ("config", "command", "timings_s", "inference_ms")}
+    about |= {"control_hz": 25.0, "seed": 3, "weights": "a" * 64, "dataset_digest": "b" * 64}
+    file = tmp_path / "result.json"
+    return file, result.write(file, SCENE, second(), about)
+
+
+def test_what_is_written_is_read_again(made):
+    file, written = made
+    found = result.read(file)
+    assert found == written and found.schema == 2 and found.scene == SCENE
+    assert (found.version, found.commit, found.dirty) == provenance.code()
+    assert found.dataset_digest == "b" * 64 and found.control_hz == 25.0 and found.seed == 3
+    assert found.about["command"] == first()["command"]
+    assert len(found.trials[0].radius) == 2 and found.trials[0].stage == 2
+
+
+def test_trials_in_a_file_beside_it_are_found(made):
+    file, before = made
+    trial_file.detach(file)
+    after = result.read(file)
+    assert after._replace(trials=()) == before._replace(trials=())
+    for ours, theirs in zip(after.trials, before.trials, strict=True):
+        assert ours.labels == theirs.labels and ours.steps == theirs.steps
+        np.testing.assert_allclose(ours.radius, theirs.radius, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "argument"),
+    [
+        (("trials", 3, "polar"), "x", "trials[3].polar"),
+        (("trials", 0, "success"), 1, "trials[0].success"),
+        (("per_trocar", 0, "seen"), None, "per_trocar[0].seen"),
+        (("config", "policy", "ddim_steps"), 0.5, "config.policy.ddim_steps"),
+        (("strict", "all", "successes"), "x", "strict.all.successes"),
+        (("method",), None, "method"),
+    ],
+)
+def test_what_is_not_as_expected_is_named(tmp_path, place, value, argument):
+    raw = at = copy.deepcopy(first())
+    for name in place[:-1]:
+        at = at[name]
+    at[place[-1]] = value
+    file = written(tmp_path, raw)
+    with pytest.raises(errors.UsageError) as raised:
+        result.read(file)
+    assert raised.value.argument == f"{file}: {argument}"
+
+
+def test_a_later_schema_and_a_damaged_file_are_named(tmp_path):
+    file = written(tmp_path, first() | {"schema": 9})
+    with pytest.raises(ValueError, match="expected schema 1 or 2, got 9"):
+        result.read(file)
+    file.write_bytes(b"{")
+    with pytest.raises(ValueError, match=r"result\.json is damaged"):
+        result.read(file)
+    with pytest.raises(FileNotFoundError):
+        result.read(tmp_path / "nothing.json")
+
+
+def test_a_sweep_says_its_distances(tmp_path):
+    synthetic.run(tmp_path, sweep_of=20)
+    found = result.read_sweep(tmp_path / "sweep.json")
+    assert len(found.trials) == 20 and all(t.distance_m is not None for t in found.trials)
+    assert found.config == {}
