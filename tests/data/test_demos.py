@@ -5,31 +5,34 @@ import os
 import resource
 import shutil
 import types
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import kill
 import mujoco
 import numpy as np
 import pytest
 import stubs
 
-from starjax import rcm
-from starjax.data import demos, load, store
-from starjax.rollouts import chunks as trials
-from starjax.rollouts import cores, episodes, recording
+from starjax import errors, rcm
+from starjax.data import demos, load, schema, store
+from starjax.rollouts import agent, cores, engine, episodes, fetching, waves
+from starjax.rollouts.placement import Place
 from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
-from starjax.types import Command
+from starjax.types import Agent
 
-TROCARS = rcm.Trocar(*(field[[0, 8]] for field in rcm.TROCARS))
-KWARGS = {"per_trocar": 4, "seed": 0, "max_steps": 100}
+TROCARS = stubs.trocars(0, 8)
+SETTINGS = schema.Settings(per_trocar=4, seed=0, max_steps=100)
+EXPERT = agent.from_single(stubs.EXPERT)
 
 
-def collect(root, observation="state", chunk=5, trocars=TROCARS, **kwargs):
-    env = stubs.make_env(observation, unlucky=0.4)
-    return demos.collect(root, env, stubs.Expert(), trocars, chunk=chunk, **{**KWARGS, **kwargs})
+def collect(root, observation="state", chunk=5, trocars=TROCARS, report=print, env=None, **changed):
+    env = env or stubs.make_env(observation, unlucky=0.4)
+    settings = SETTINGS._replace(**changed)
+    return demos.collect(
+        root, env, EXPERT, trocars, settings, place=Place(lanes=chunk), report=report
+    )
 
 
 def job(root):
@@ -44,8 +47,8 @@ def sealed(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def pictures(tmp_path_factory):
-    root = tmp_path_factory.mktemp("pictures") / "d"
+def images(tmp_path_factory):
+    root = tmp_path_factory.mktemp("images") / "d"
     collect(root, "image", per_trocar=2)
     return root
 
@@ -70,12 +73,17 @@ def test_an_episode_is_what_the_expert_did(sealed):
     root, _ = sealed
     demo = load.load(root, report=lambda _: None).dataset
     first, last = int(demo.start[1]), int(demo.start[1] + demo.length[1] - 1)
-    p, command = np.asarray(demo.observation.pose.p), np.asarray(demo.command.pose.p)
+    p, command = np.asarray(demo.observation.pose.p)[:, 0], np.asarray(demo.command.pose.p)[:, 0]
     np.testing.assert_allclose(p[first + 1 : last + 1], command[first:last], atol=1e-5)
     goal = np.asarray(demo.observation.state)[first, :3]
     assert np.linalg.norm(command[last] - goal) < 0.004 < np.linalg.norm(p[last] - goal)
-    np.testing.assert_allclose(demo.trocar.radius, np.repeat(TROCARS.radius, 4))
+    np.testing.assert_allclose(demo.trocar.trocar.radius, np.repeat(TROCARS.radius, 4, axis=0))
     assert int(demo.length.sum()) == len(p) == len(demo.episode)
+
+
+def short_segments(monkeypatch, frames):
+    shorter = episodes.DEMONSTRATION._replace(frames=frames)
+    monkeypatch.setattr(episodes, "DEMONSTRATION", shorter)
 
 
 def test_kills_leave_no_trace(tmp_path):
@@ -87,58 +95,59 @@ def test_kills_leave_no_trace(tmp_path):
 
 @pytest.mark.parametrize(("chunk", "segment"), [(4, 16), (8, 3), (16, 5)])
 def test_chunk_and_segment_do_not_matter(sealed, tmp_path, monkeypatch, chunk, segment):
-    monkeypatch.setattr(recording, "SEGMENT", segment)
+    short_segments(monkeypatch, segment)
     collect(tmp_path / "other", chunk=chunk)
     assert kill.tree(tmp_path / "other") == kill.tree(sealed[0])
 
 
-def test_pictures_do_not_depend_on_the_segment(pictures, tmp_path, monkeypatch):
-    monkeypatch.setattr(recording, "SEGMENT", 3)
+def test_images_do_not_depend_on_the_segment(images, tmp_path, monkeypatch):
+    short_segments(monkeypatch, 3)
     collect(tmp_path / "other", "image", chunk=8, per_trocar=2)
-    assert kill.tree(tmp_path / "other") == kill.tree(pictures)
+    assert kill.tree(tmp_path / "other") == kill.tree(images)
 
 
-def test_pictures_are_those_of_their_own_episode(pictures):
-    observation = load.load(pictures, report=lambda _: None).dataset.observation
-    drawn = np.asarray(observation.image)[:, :3, 0, 0]
-    np.testing.assert_allclose(drawn, np.asarray(observation.pose.p) * 1000 + 128, atol=1.01)
+def test_images_are_those_of_their_own_episode(images):
+    observation = load.load(images, report=lambda _: None).dataset.observation
+    drawn = np.asarray(observation.images[stubs.CAMERA])[:, :3, 0, 0]
+    p = np.asarray(observation.pose.p)[:, 0]
+    np.testing.assert_allclose(drawn, p * 1000 + 128, atol=1.01)
 
 
 def test_an_episode_ends_at_the_last_step(tmp_path, monkeypatch):
-    monkeypatch.setattr(recording, "SEGMENT", 4)
+    short_segments(monkeypatch, 4)
     root = tmp_path / "d"
     collect(root, per_trocar=2, max_steps=14, keep_failures=True)
     records = [store.verify(root, key) for key in store.keys(root)]
     late = [r for r in records if not (r["success"] or r["invalid"])]
     assert late and all(r["length"] == 14 for r in late)
-    assert all(r["files"]["p.npy"]["shape"] == [r["length"], 3] for r in records)
+    assert all(r["files"]["p.npy"]["shape"] == [r["length"], 1, 3] for r in records)
 
 
 def test_free_lanes_take_the_place_of_failures(tmp_path, monkeypatch):
     groups = []
-    simulator = recording.simulator
+    make = engine.make
 
     def counted(*args):
-        simulate = simulator(*args)
-        return lambda group: groups.append(group) or simulate(group)
+        run = make(*args)
+        return lambda params, group: groups.append(group) or run(params, group)
 
-    monkeypatch.setattr(recording, "simulator", counted)
+    monkeypatch.setattr(engine, "make", counted)
     summary = collect(tmp_path / "d", chunk=16)
     assert [len(group) for group in groups] == [16]
     assert summary["episodes"] == 8 < summary["trials"] < 16
 
 
 @pytest.mark.parametrize(("chunks", "lanes", "at_once"), [(9.5, 8, 4), (2.5, 8, 2), (0.5, 4, 1)])
-def test_pictures_of_all_that_is_simulated_fit_the_memory(
+def test_images_of_all_that_is_simulated_fit_the_memory(
     tmp_path, monkeypatch, chunks, lanes, at_once
 ):
-    frame = recording.frame(stubs.make_env("image", unlucky=0.4))
+    frame = engine.frame(stubs.make_env("image", unlucky=0.4), episodes.DEMONSTRATION)
     lane = 2 * demos.FRAME_GUESS * sum(np.dtype(x.dtype).itemsize * x.size for x in frame.values())
     memory = int(chunks * cores.CPU_LANES * lane / demos.MEMORY_SHARE)
     monkeypatch.setattr(xla, "memory_bytes", lambda: memory)
     monkeypatch.setattr(cores, "count", lambda: 4)
     asked = []
-    monkeypatch.setattr(trials, "run", lambda *args: asked.append(args[-2:]) or [])
+    monkeypatch.setattr(waves, "run", lambda *args: asked.append(args[-2:]) or [])
     collect(tmp_path / "d", "image", chunk=0)
     assert asked == [(lanes, at_once)]
 
@@ -156,7 +165,7 @@ def _full_disk(monkeypatch):
 
 
 def _interrupt(monkeypatch):
-    fetch, calls = episodes.fetch, []
+    fetch, calls = fetching.fetch, []
 
     def interrupted(slices):
         calls.append(slices)
@@ -164,23 +173,23 @@ def _interrupt(monkeypatch):
             raise KeyboardInterrupt
         return fetch(slices)
 
-    monkeypatch.setattr(episodes, "fetch", interrupted)
+    monkeypatch.setattr(fetching, "fetch", interrupted)
 
 
 @pytest.mark.parametrize(
     ("stop", "error"), [(_full_disk, files.StorageError), (_interrupt, KeyboardInterrupt)]
 )
 def test_stopped_in_the_middle_the_same_command_completes_it(
-    pictures, tmp_path, monkeypatch, stop, error
+    images, tmp_path, monkeypatch, stop, error
 ):
     root = tmp_path / "d"
-    monkeypatch.setattr(recording, "SEGMENT", 4)
+    short_segments(monkeypatch, 4)
     with monkeypatch.context() as patch, pytest.raises(error):
         stop(patch)
         collect(root, "image", per_trocar=2)
-    assert 0 < len(store.keys(root)) < len(store.keys(pictures))
+    assert 0 < len(store.keys(root)) < len(store.keys(images))
     collect(root, "image", per_trocar=2)
-    assert kill.tree(root) == kill.tree(pictures)
+    assert kill.tree(root) == kill.tree(images)
 
 
 def test_failures_are_kept_on_request(tmp_path, sealed):
@@ -252,26 +261,14 @@ def test_a_disk_that_fails_deletes_no_episode(copy, monkeypatch):
 def test_episodes_of_another_seed_are_not_taken_for_these(copy):
     (copy / "dataset.json").unlink()
     (copy / "SEALED.json").unlink()
-    with pytest.raises(files.StorageError, match=rf"is of seed {KWARGS['seed']}, not 77"):
+    with pytest.raises(files.StorageError, match=rf"is of seed {SETTINGS.seed}, not 77"):
         collect(copy, seed=77)
 
 
 def test_what_only_the_dataset_that_is_there_has_counts(tmp_path):
-    collect(tmp_path, one_wall=True)
-    with pytest.raises(files.StorageError, match="its one_wall is True, not None"):
+    collect(tmp_path, expert="one_wall")
+    with pytest.raises(files.StorageError, match="its expert is one_wall, not default"):
         collect(tmp_path)
-
-
-@pytest.mark.parametrize("shape", [0, (1, 2)])
-def test_trocars_are_a_row_of_one_or_more(tmp_path, shape):
-    few = rcm.Trocar(np.full(shape, 0.02), np.full(shape, 1.4), np.zeros(shape))
-    with pytest.raises(ValueError, match=r"trocars: expected fields \[C\]"):
-        demos.collect(tmp_path, stubs.make_env(), stubs.Expert(), few, **KWARGS)
-
-
-def test_trocars_broadcast():
-    port = demos.listed(rcm.Trocar(0.02, [1.4, 1.5], 0.0))
-    assert [len(field) for field in port] == [2, 2, 2]
 
 
 def test_an_incomplete_dataset_is_not_loaded(copy):
@@ -289,14 +286,9 @@ def test_another_dataset_is_not_mixed_in(copy):
 
 @pytest.mark.parametrize("bad", [{"per_trocar": 0}, {"max_steps": 0}, {"chunk": -1}])
 def test_bad_arguments_are_named(tmp_path, bad):
-    with pytest.raises(ValueError, match=next(iter(bad))):
+    with pytest.raises(errors.UsageError) as raised:
         collect(tmp_path / "d", **bad)
-
-
-def test_a_trocar_in_degrees_is_named(tmp_path):
-    degrees = rcm.Trocar(np.full(1, 0.02), np.full(1, 80.0), np.zeros(1))
-    with pytest.raises(ValueError, match=r"trocar\.polar: .*got 80"):
-        demos.collect(tmp_path, stubs.make_env(), stubs.Expert(), degrees, **KWARGS)
+    assert next(iter(bad)).replace("chunk", "lanes") in raised.value.argument
 
 
 def test_files_that_a_desktop_leaves_among_the_episodes_are_left_alone(copy, sealed):
@@ -327,16 +319,14 @@ def test_every_key_is_found_again(tmp_path):
 
 def test_a_hopeless_expert_is_an_error(tmp_path):
     env = stubs.make_env(unlucky=1.0)
-    with pytest.raises(ValueError, match="expert: expected a success rate above 50%"):
-        demos.collect(tmp_path, env, stubs.Expert(), TROCARS, chunk=8, **{**KWARGS, "max_steps": 9})
+    with pytest.raises(waves.ExpertFailed, match="expert: expected a success rate above 50%"):
+        collect(tmp_path, env=env, chunk=8, max_steps=9)
 
 
 def test_no_space_is_said_before_anything_runs(tmp_path, monkeypatch):
     usage = files.shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr(files.shutil, "disk_usage", lambda _: usage)
-    monkeypatch.setattr(
-        demos.recorder, "simulator", lambda *_: pytest.fail("it was about to compile")
-    )
+    monkeypatch.setattr(engine, "make", lambda *_: pytest.fail("it was about to compile"))
     with pytest.raises(files.StorageError, match=r"will be written, the disk has 1 kB free"):
         collect(tmp_path / "d")
 
@@ -347,25 +337,24 @@ def test_a_read_only_folder_is_said_before_anything_runs(tmp_path, monkeypatch):
 
     # Not by the folder's mode, which does not bind the superuser.
     monkeypatch.setattr(files.Path, "write_bytes", refuse)
-    monkeypatch.setattr(
-        demos.recorder, "simulator", lambda *_: pytest.fail("it was about to compile")
-    )
+    monkeypatch.setattr(engine, "make", lambda *_: pytest.fail("it was about to compile"))
     with pytest.raises(files.StorageError, match="cannot write"):
         collect(tmp_path / "d")
 
 
 @pytest.mark.parametrize("residency", ["device", "host", "disk"])
-def test_all_residencies_hold_the_same(pictures, residency):
+def test_all_residencies_hold_the_same(images, residency):
     said = []
-    loaded = load.load(pictures, residency=residency, report=said.append)
-    reference = load.load(pictures, report=said.append)
+    loaded = load.load(images, residency=residency, report=said.append)
+    reference = load.load(images, report=said.append)
     assert reference.residency == "device" and "resident on the device" in said[1]
     assert f"{files.size(loaded.bytes)}" in said[0]
-    image = loaded.dataset.observation.image
+    image = loaded.dataset.observation.images[stubs.CAMERA]
     assert isinstance(image, jax.Array) == (residency == "device")
     assert isinstance(image, load.Frames) == (residency == "disk")
     order = np.array([7, 0, 3, 3, image.shape[0] - 1])
-    np.testing.assert_array_equal(image[order], reference.dataset.observation.image[order])
+    whole = reference.dataset.observation.images[stubs.CAMERA]
+    np.testing.assert_array_equal(image[order], whole[order])
     assert image[order].dtype == np.uint8 and image.shape[1:] == (6, 6, 3)
     for ours, theirs in zip(
         jax.tree.leaves(loaded.dataset.command), jax.tree.leaves(reference.dataset.command)
@@ -373,17 +362,17 @@ def test_all_residencies_hold_the_same(pictures, residency):
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_pictures_may_stay_on_disk_and_are_found_there(pictures):
+def test_images_may_stay_on_disk_and_are_found_there(images):
     said = []
-    whole = load.load(pictures, report=said.append)
-    without = load.load(pictures, pictures=False, report=said.append)
-    assert without.dataset.observation.image is None and without.bytes < whole.bytes
-    assert "without pictures" in said[1]
-    observation = whole.dataset.observation.replace(image=None)
+    whole = load.load(images, report=said.append)
+    without = load.load(images, images=False, report=said.append)
+    assert without.dataset.observation.images is None and without.bytes < whole.bytes
+    assert "without images" in said[1]
+    observation = whole.dataset.observation._replace(images=None)
     jax.tree.map(np.testing.assert_array_equal, without.dataset.observation, observation)
-    frames = load.frames(pictures)
+    frames, drawn = load.frames(images)[stubs.CAMERA], whole.dataset.observation.images
     some = np.array([0, 7, frames.shape[0] - 1])
-    np.testing.assert_array_equal(frames[some], np.asarray(whole.dataset.observation.image)[some])
+    np.testing.assert_array_equal(frames[some], np.asarray(drawn[stubs.CAMERA])[some])
 
 
 def test_more_episodes_than_a_process_may_open_files(tmp_path):
@@ -403,9 +392,10 @@ def test_more_episodes_than_a_process_may_open_files(tmp_path):
     np.testing.assert_array_equal(some, whole[::2])
 
 
-def test_demonstrations_without_pictures_have_no_frames(sealed):
-    with pytest.raises(ValueError, match="root: expected demonstrations with pictures"):
+def test_demonstrations_without_images_have_no_frames(sealed):
+    with pytest.raises(errors.UsageError) as raised:
         load.frames(sealed[0])
+    assert raised.value.argument == "root"
 
 
 def test_place_depends_on_what_is_free(monkeypatch):
@@ -425,8 +415,8 @@ def test_what_does_not_fit_the_host_does_not_pass_through_it(monkeypatch):
     assert [load._place(n) for n in (599, 601)] == ["device", "disk"]
 
 
-def test_nothing_is_unpickled(pictures, tmp_path):
-    root = shutil.copytree(pictures, tmp_path / "d")
+def test_nothing_is_unpickled(images, tmp_path):
+    root = shutil.copytree(images, tmp_path / "d")
     key = next(k for k in store.keys(root) if store.verify(root, k)["success"])
     np.save(root / "episodes" / key / "p.npy", np.array([{}]), allow_pickle=True)
     with pytest.raises(ValueError, match=r"pickle|Python objects"):
@@ -437,15 +427,15 @@ def test_an_episode_starts_and_steps_as_its_seed_says(sealed):
     """Of the seed rule in dataset.json: never the states of an evaluation with this seed."""
     root, _ = sealed
     env = stubs.make_env("state", unlucky=0.4)
-    stream = jax.random.fold_in(jax.random.key(0), recording.STREAM)
+    stream = jax.random.fold_in(jax.random.key(0), schema.STREAM)
     for record in load._successful(root, store.read_seal(root), True):
         key = jax.random.fold_in(jax.random.fold_in(stream, record["trocar"]), record["trial"])
         key_env, key_expert = jax.random.split(key)
         trocar = rcm.Trocar(*(field[record["trocar"]] for field in TROCARS))
         state = env.reset(key_env, sim_env.EnvParams(trocar))
-        command, _ = stubs.Expert().act(stubs.Expert().init(key_expert, state), state)
+        command, _, _ = stubs.EXPERT.act(stubs.EXPERT.init(key_expert, state), state)
         wanted = {
-            "qpos": state.sim.qpos,
+            "qpos": state.physics.qpos,
             "state": env.observe(state).state,
             "command_p": command.pose.p,
             "rcm_error": env.step(state, command).rcm_error,
@@ -454,58 +444,79 @@ def test_an_episode_starts_and_steps_as_its_seed_says(sealed):
             found = np.load(root / "episodes" / record["key"] / f"{name}.npy")[0]
             np.testing.assert_allclose(found, value, atol=1e-6, err_msg=name)
         for name in rcm.Trocar._fields:
-            assert record[name] == float(getattr(trocar, name))
-
-
-class _Labelled(NamedTuple):
-    key: jax.Array
-    label: Command
+            np.testing.assert_array_equal(record[name], getattr(trocar, name))
+        assert record["labels"] == {k: int(v) for k, v in env.labels(state).items()}
 
 
 def test_the_label_of_a_disturbed_command_is_what_is_recorded(tmp_path):
-    def act(state, env_state):
-        label, key = stubs.Expert().act(state.key, env_state)
-        moved = label._replace(pose=label.pose._replace(p=label.pose.p + 0.001))
-        return moved, _Labelled(key, label._replace(gripper=-label.gripper))
+    def act(key, state):
+        command, key, label = stubs.EXPERT.act(key, state)
+        moved = command._replace(pose=command.pose._replace(p=command.pose.p + 0.001))
+        return moved, key, label._replace(gripper=-label.gripper)
 
-    def init(key, env_state):
-        return _Labelled(key, stubs.Expert().act(key, env_state)[0])
-
-    env = stubs.make_env(unlucky=0.0)
-    demos.collect(
-        tmp_path, env, recording.Expert(init, act), TROCARS, chunk=2, **KWARGS | {"per_trocar": 1}
-    )
+    disturbed = agent.from_single(Agent(stubs.EXPERT.init, act))
+    env, settings = stubs.make_env(unlucky=0.0), SETTINGS._replace(per_trocar=1)
+    demos.collect(tmp_path, env, disturbed, TROCARS, settings, place=Place(lanes=2))
     dataset = load.load(tmp_path, report=lambda _: None).dataset
     np.testing.assert_array_equal(dataset.command.gripper, -1.0)
     np.testing.assert_array_equal(dataset.observation.gripper, 1.0)
 
 
 def test_every_field_is_loaded_as_itself(tmp_path):
-    shapes = {"p": (3,), "R": (3, 3), "gripper": (), "state": (12,)}
-    shapes |= {"command_p": (3,), "command_R": (3, 3), "command_gripper": ()}
+    """Of two arms and two cameras."""
+    env = stubs.make_env("image", arms=2, cameras=("left", "right"))
+    settings = SETTINGS._replace(per_trocar=1)
+    description = schema.describe(env, stubs.trocars(0, 8, arms=2), settings)
     rng = np.random.default_rng(0)
-    arrays = {n: [rng.random((3, *s), np.float32)] for n, s in shapes.items()}
-    outcome = {"success": True, "length": 3, "radius": 0.01, "polar": 1.0, "azimuth": 2.0}
-    store.create(tmp_path, {})
+    arrays = {
+        name: [rng.integers(0, 200, (3, *feature["shape"])).astype(feature["dtype"])]
+        for name, feature in description["features"].items()
+    }
+    place = {"radius": [0.01, 0.02], "polar": [1.0, 1.1], "azimuth": [2.0, 2.1]}
+    store.create(tmp_path, description)
+    outcome = {"success": True, "length": 3, **place}
     store.seal(tmp_path, {"k": store.commit(tmp_path, "k", outcome, arrays)})
     it = load.load(tmp_path, report=lambda _: None).dataset
     seen, said = it.observation, it.command
-    found = (
-        seen.pose.p,
-        seen.pose.R,
-        seen.gripper,
-        seen.state,
-        said.pose.p,
-        said.pose.R,
-        said.gripper,
+    found = {
+        "p": seen.pose.p,
+        "R": seen.pose.R,
+        "gripper": seen.gripper,
+        "image_left": seen.images["left"],
+        "image_right": seen.images["right"],
+        "command_p": said.pose.p,
+        "command_R": said.pose.R,
+        "command_gripper": said.gripper,
+    }
+    assert seen.pose.p.shape == (3, 2, 3) and seen.state is None
+    for name, leaf in found.items():
+        np.testing.assert_array_equal(leaf, arrays[name][0], name)
+    told = rcm.trocar_frame(
+        rcm.Trocar(*np.float32(list(place.values()))),
+        env.p_world_ref,
+        np.array(stubs.ROLL_ZERO, np.float32),
     )
-    for leaf, parts in zip(found, arrays.values(), strict=True):
-        np.testing.assert_array_equal(leaf, parts[0])
-    np.testing.assert_array_equal(jnp.stack(it.trocar)[:, 0], np.float32([0.01, 1.0, 2.0]))
+    jax.tree.map(lambda ours, x: np.testing.assert_array_equal(ours[0], x), it.trocar, told)
+
+
+def test_two_arms_and_two_cameras_are_collected(tmp_path):
+    env = stubs.make_env("image", unlucky=0.0, arms=2, cameras=("left", "right"))
+    collect(tmp_path, trocars=stubs.trocars(0, 8, arms=2), env=env, per_trocar=1, max_steps=60)
+    found = load.load(tmp_path, report=lambda _: None)
+    seen = found.dataset.observation
+    assert seen.pose.p.shape[1:] == (2, 3) and seen.images.keys() == {"left", "right"}
+    np.testing.assert_array_equal(np.asarray(seen.images["left"]) + 1, seen.images["right"])
+    assert found.description["scene"] == {
+        "task": "reach",
+        "arms": ["point", "point"],
+        "tools": ["tip", "tip"],
+        "cameras": ["left", "right"],
+    }
+    np.testing.assert_allclose(found.dataset.trocar.roll_zero[0], stubs.ROLL_ZERO, rtol=1e-6)
 
 
 def test_software_versions_bind_an_unfinished_dataset_only(tmp_path):
-    one, two = ({"seed": 0, "versions": {"jax": v}} for v in "12")
+    one, two = ({"schema": 2, "seed": 0, "versions": {"jax": v}} for v in "12")
     assert store.digest(one) == store.digest(two) != store.digest({**one, "seed": 1})
     store.create(tmp_path, one)
     with pytest.raises(
@@ -516,23 +527,29 @@ def test_software_versions_bind_an_unfinished_dataset_only(tmp_path):
     store.create(tmp_path, two)
 
 
-def test_the_description_tells_scenes_ports_and_experts_apart():
+def test_the_description_tells_scenes_trocars_and_experts_apart():
     def scene(x):
         xml = f'<mujoco><worldbody><geom size="{x}"/></worldbody></mujoco>'
         return types.SimpleNamespace(mj_model=mujoco.MjModel.from_xml_string(xml))
 
-    def name(env, **kwargs):
-        return store.digest(demos.describe(env, TROCARS, **KWARGS, **kwargs))
+    def name(env, trocars=TROCARS, **changed):
+        return store.digest(schema.describe(env, trocars, SETTINGS._replace(**changed)))
 
-    env = stubs.make_env()._replace(model=scene(0.1))
-    assert name(env) == name(env._replace(model=scene(0.1)))
+    env = stubs.make_env()._replace(scene=scene(0.1))
+    same = {
+        name(env),
+        name(env._replace(scene=scene(0.1))),
+        name(env, expert="default"),
+    }
     others = [
-        name(env, one_wall=True),
+        name(env, expert="one_wall"),
         name(env, keep_failures=True),
-        name(env._replace(model=scene(0.2))),
-        name(env._replace(p_world_ref=np.float32([0, 0, 0.1]))),
+        name(env, trocars=stubs.trocars(0, 9)),
+        name(env._replace(scene=scene(0.2))),
+        name(env._replace(p_world_ref=np.float32([[0, 0, 0.1]]))),
+        name(env._replace(names=env.names._replace(arms=("other",)))),
     ]
-    assert len({name(env), *others}) == 5
+    assert len(same) == 1 and len({*same, *others}) == 7
 
 
 def test_a_folder_under_another_name_is_damage(copy):

@@ -1,106 +1,61 @@
-"""Collects demonstrations: the expert in every trocar, as one program over (trocar, trial).
+"""Collects demonstrations: an agent at every configuration of trocars, all trials as one program.
 
-What ends up on disk is a function of the description, the seed and, in the last bits, the size of
-the batch, which a machine's memory and devices decide: of each trocar, all trials up to the one
-that completes its successes. They are drawn in waves, at first `per_trocar` at each trocar, then as
-many as failed; lanes that a wave leaves free run the trials that come next, and those of them that
-were not needed are dropped. A wave's chunks are the same in every run, and a chunk with a missing
-episode is simulated again as a whole: after any interruption the same command on the same machine
-ends in the same bytes.
-
-Episodes are written as they end, while the rest of their chunk and the next are simulated.
+- What is drawn: of each configuration all trials up to the one that completes its successes.
+- In which order: in waves, at first `per_trocar` of each, then as many as failed. Lanes that a wave
+  leaves free run the trials that come next; those that were not needed are dropped.
+- What makes it reproducible: the description and the seed decide it and, in the last bits, the size
+  of the batch, which a machine's memory and devices decide. A wave's chunks are the same in every
+  run, and a chunk with a missing episode is simulated again as a whole.
+- After a kill: the same command on the same machine ends in the same bytes. Episodes are written as
+  they end, while the rest of their chunk and the next are simulated.
 """
 
 import collections
 import concurrent.futures
 import contextlib
-import hashlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from starjax import rcm
-from starjax.data import store
+from starjax import errors
+from starjax.data import schema, store
+from starjax.data.schema import Settings
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import chunks, cores, episodes, recording
-from starjax.runtime import files, jax_settings, progress, xla
+from starjax.rollouts import cores, engine, episodes, waves
+from starjax.rollouts import trocars as configurations
+from starjax.rollouts.agent import BatchAgent
+from starjax.rollouts.placement import ANYWHERE, Place
+from starjax.runtime import files, progress, xla
 
 COMMITS = 16  # episodes written at once; most of it is waiting for the disk
 FRAME_GUESS = 300  # control steps of a typical demonstration, for estimates of disk and memory
-MEMORY_SHARE = 0.25  # of the host's, for pictures of the episodes that are simulated together
+MEMORY_SHARE = 0.25  # of the host's, for images of the episodes that are simulated together
 GPU_LANES = 256  # episodes a GPU simulates together
-
-
-def describe(
-    env: Any,
-    trocars: Trocar,
-    *,
-    per_trocar: int,
-    seed: int,
-    max_steps: int,
-    keep_failures: bool = False,
-    one_wall: bool = False,
-) -> dict[str, Any]:
-    """What a dataset is: the content of dataset.json, and by `store.digest` its name."""
-    frame = recording.frame(env)
-    features = {
-        name: {
-            "shape": list(leaf.shape),
-            "dtype": np.dtype(leaf.dtype).str,
-            "what": recording.FIELDS[name],
-        }
-        for name, leaf in frame.items()
-    }
-    return {
-        "seed": seed,
-        "per_trocar": per_trocar,
-        "max_steps": max_steps,
-        "keep_failures": keep_failures,
-        "trocars": np.stack([np.asarray(f, np.float64) for f in trocars], -1).tolist(),
-        "p_world_ref": np.asarray(env.p_world_ref, np.float64).tolist(),
-        "control_hz": env.control_hz,
-        "features": features,
-        "scene": scene_hash(env.model),
-        "seed_rule": f"fold_in(fold_in(fold_in(key(seed), {recording.STREAM}), trocar), trial)",
-        "versions": xla.versions(),
-        **jax_settings.record(),
-        **({"one_wall": True} if one_wall else {}),  # not in the names of datasets without
-    }
 
 
 def collect(
     root: Path,
     env: Any,
-    expert: Any,
+    agent: BatchAgent,
     trocars: Trocar,
+    settings: Settings,
     *,
-    per_trocar: int,
-    seed: int,
-    max_steps: int,
-    keep_failures: bool = False,
-    one_wall: bool = False,
-    chunk: int = 0,
-    devices: Sequence[jax.Device] | None = None,
+    params: Any = None,
+    place: Place = ANYWHERE,
     report: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Collects what is missing of a dataset, and seals it.
 
     Args:
       root: folder of the dataset.
-      env: `sim.env.Env`; its observation decides whether pictures or task states are stored.
-      expert: has the functions of `recorder.Expert`.
-      trocars: fields `[C]`.
-      per_trocar: successful episodes wanted at each.
-      max_steps: control steps after which an episode has failed.
-      keep_failures: store failed episodes too.
-      one_wall: what the description says of the expert.
-      chunk: episodes simulated together; 0 for what suits the machine. On a CPU each of its cores
-        has so many of its own.
-      devices: to split a chunk over.
+      env: `sim.env.Env`; its observation decides whether images or task states are stored.
+      agent: what it says is to be recorded is the command of a demonstration.
+      trocars: fields `[C, A]`.
+      params: of the agent.
       report: gets lines for the user.
 
     Returns:
@@ -110,52 +65,42 @@ def collect(
     Raises:
       StorageError: the folder cannot be read or written, is in use, holds another dataset, or is
         too small.
-      ValueError: an argument out of range, a trocar that is none, an expert that fails too often.
+      ValueError: an argument out of range, a trocar that is none, an agent that fails too often.
     """
-    if per_trocar < 1 or max_steps < 1 or chunk < 0:
-        got = {"per_trocar": per_trocar, "max_steps": max_steps, "chunk": chunk}
-        raise ValueError(f"per_trocar, max_steps: expected 1 or more, chunk: 0 or more, got {got}")
-    trocars = listed(trocars)
-    total = per_trocar * len(trocars.radius)
+    if settings.per_trocar < 1 or settings.max_steps < 1 or place.lanes < 0:
+        got = (settings.per_trocar, settings.max_steps, place.lanes)
+        raise errors.UsageError("per_trocar, max_steps, lanes", "1, 1 and 0 or more", got)
+    trocars = configurations.listed(trocars, len(env.p_world_ref))
+    total = settings.per_trocar * len(trocars.radius)
     with files.lock(root):
-        frame = recording.frame(env)
-        frame_bytes = sum(math.prod(x.shape) * x.dtype.itemsize for x in frame.values())
-        description = describe(
-            env,
-            trocars,
-            per_trocar=per_trocar,
-            seed=seed,
-            max_steps=max_steps,
-            keep_failures=keep_failures,
-            one_wall=one_wall,
-        )
+        description = schema.describe(env, trocars, settings)
         store.create(root, description)
         store.clean(root)
-        records = _sound(root, seed, report)
+        records = _sound(root, settings.seed, report)
         done = sum(r["success"] for r in records.values())
+        frame_bytes = _frame_bytes(description)
         files.require_writable(
-            root, max(total - done, 0) * min(max_steps, FRAME_GUESS) * frame_bytes
+            root, max(total - done, 0) * min(settings.max_steps, FRAME_GUESS) * frame_bytes
         )
-        fits = int(MEMORY_SHARE * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
-        chunk = chunk or max(1, min(_fast(devices, total), fits))
-        at_once = max(1, min(cores.count(), fits // chunk))
-        chunk = -(-chunk // len(devices or [0])) * len(devices or [0])
-        simulate = recording.simulator(env, expert, trocars, seed, max_steps, chunk, devices)
+        lanes, at_once = _size(place, total, frame_bytes)
+        simulate = _simulator(env, agent, params, trocars, settings, place._replace(lanes=lanes))
         known = {(r["trocar"], r["trial"]): r["success"] for r in records.values()}
 
         def commit(episode: episodes.Episode) -> store.Record:
             outcome = episode.outcome
-            key = store.key(outcome["trocar"], outcome["trial"], seed)
-            kept = outcome["success"] or keep_failures
+            key = store.key(*episode.trial, settings.seed)
+            kept = outcome["success"] or settings.keep_failures
             return store.commit(root, key, outcome, episode.arrays if kept else {})
 
         def note(record: store.Record) -> None:
             records[record["key"]] = record
             advance(int(record["success"]))
 
-        needed = chunks.run(simulate, known, len(trocars.radius), per_trocar, chunk, at_once)
+        needed = waves.run(
+            simulate, known, len(trocars.radius), settings.per_trocar, lanes, at_once
+        )
         shown = progress.track("Demonstrations", total, unit="episodes", done=done)
-        with shown as advance, _writer(commit, note, chunk) as write:
+        with shown as advance, _writer(commit, note, lanes) as write:
             for episode in needed:
                 write(episode)
         digest = store.seal(root, records)
@@ -167,19 +112,22 @@ def collect(
     }
 
 
-def listed(trocars: Trocar) -> Trocar:
-    """Concrete trocars as float32 fields `[C]`.
+def _simulator(
+    env: Any,
+    agent: BatchAgent,
+    params: Any,
+    trocars: Trocar,
+    settings: Settings,
+    place: Place,
+) -> Callable[[list[episodes.Trial]], Generator[list[episodes.Episode]]]:
+    rules = engine.Settings(settings.seed, schema.STREAM, settings.max_steps, place.lanes)
+    run = engine.make(env, agent, trocars, rules, episodes.DEMONSTRATION, place.devices)
 
-    Raises:
-      ValueError: one is none, there are none, or they have more axes than one.
-    """
-    rcm.check_trocar(trocars)
-    fields = (np.atleast_1d(np.asarray(field, np.float32)) for field in trocars)
-    trocars = Trocar(*np.broadcast_arrays(*fields))
-    if trocars.radius.ndim != 1 or not trocars.radius.size:
-        got = list(trocars.radius.shape)
-        raise ValueError(f"trocars: expected fields [C] of one trocar or more, got shape {got}")
-    return trocars
+    def simulate(group: list[episodes.Trial]) -> Generator[list[episodes.Episode]]:
+        for segment in run(params, group):
+            yield segment.ended
+
+    return simulate
 
 
 def _sound(root: Path, seed: int, report: Callable[[str], None]) -> dict[str, store.Record]:
@@ -233,6 +181,21 @@ def _writer(
         pool.shutdown(cancel_futures=True)
 
 
+def _frame_bytes(description: dict[str, Any]) -> int:
+    """Of one recorded control step."""
+    features = description["features"].values()
+    return sum(math.prod(x["shape"]) * np.dtype(x["dtype"]).itemsize for x in features)
+
+
+def _size(place: Place, total: int, frame_bytes: int) -> tuple[int, int]:
+    """Lanes of a chunk, and chunks that are simulated side by side."""
+    fits = int(MEMORY_SHARE * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
+    lanes = place.lanes or max(1, min(_fast(place.devices, total), fits))
+    at_once = max(1, min(cores.count(), fits // lanes))
+    several = len(place.devices or [0])
+    return -(-lanes // several) * several, at_once
+
+
 def _fast(devices: Sequence[jax.Device] | None, total: int) -> int:
     """Episodes that make the most of a program, where `total` are wanted: several GPUs share what
     one would do alone. Not of what is there already, as the size of a batch may change last bits.
@@ -240,15 +203,3 @@ def _fast(devices: Sequence[jax.Device] | None, total: int) -> int:
     if jax.default_backend() == "cpu":
         return cores.CPU_LANES
     return GPU_LANES * min(len(devices or [0]), -(-total // GPU_LANES))
-
-
-def scene_hash(model: Any) -> str:
-    """Identifies the simulated scene; empty where the environment has no MuJoCo model."""
-    mj_model = getattr(model, "mj_model", None)
-    if mj_model is None:
-        return ""
-    import mujoco
-
-    buffer = np.zeros(mujoco.mj_sizeModel(mj_model), np.uint8)
-    mujoco.mj_saveModel(mj_model, None, buffer)
-    return hashlib.sha256(buffer.tobytes()).hexdigest()

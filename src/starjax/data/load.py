@@ -1,18 +1,18 @@
 """Reads collected demonstrations: checked, and placed where they fit (device, host, or disk)."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 
-from starjax.data import store, windows
-from starjax.rcm.trocar import Trocar
+from starjax import errors, rcm
+from starjax.data import schema, store, windows
+from starjax.rollouts import episodes
 from starjax.runtime import files, xla
-from starjax.sim.types import Observation
-from starjax.types import Command, Pose
+from starjax.types import Command, Observation, Pose
 
 Residency = Literal["auto", "device", "host", "disk"]
 
@@ -29,7 +29,7 @@ class Demos(NamedTuple):
       digest: hash that names the content on disk.
       residency: where the frames are.
       bytes: memory they take there (on the disk: what is read from there).
-      description: dataset.json.
+      description: dataset.json as schema 2 says it.
     """
 
     dataset: windows.Dataset
@@ -44,7 +44,7 @@ def load(
     *,
     residency: Residency = "auto",
     verify: bool = True,
-    pictures: bool = True,
+    images: bool = True,
     report: Callable[[str], None] = print,
 ) -> Demos:
     """Loads the successful episodes of a sealed dataset, after checking every byte of them.
@@ -52,10 +52,10 @@ def load(
     Args:
       root: folder of the dataset.
       residency: "auto" takes the device if the frames fit there, else the host, else leaves
-        pictures on disk, memory-mapped.
+        images on disk, memory-mapped.
       verify: without it only the episodes' records are checked, not their arrays: for a caller
         that has just run `demos.collect`, which checks all.
-      pictures: without them they stay on disk, whatever the residency; `frames` reads them.
+      images: without them they stay on disk, whatever the residency; `frames` reads them.
       report: gets one line with the place and the bytes, before any is allocated.
 
     Raises:
@@ -63,32 +63,39 @@ def load(
       ValueError: no dataset, or not complete.
     """
     root = Path(root)
-    description = store.read_description(root)
+    description = schema.upgraded(store.read_description(root))
     sealed = store.read_seal(root)
     records = _successful(root, sealed, verify)
-    names = [name for name in _FIELDS if pictures or name != "image"]
-    total = sum(file["bytes"] for r in records for file in _read(r, names).values())
+    fields = _fields(description, records[0], images)
+    total = sum(r["files"][file]["bytes"] for r in records for file in fields.values())
     place = _place(total) if residency == "auto" else residency
-    without = "" if pictures else " without pictures"
+    without = "" if images else " without images"
     report(f"{len(records)} demonstrations, {files.size(total)}{without}: {_WHERE[place]}")
-    dataset = _dataset(root, records, place, names)
+    dataset = _dataset(root, description, records, place, fields)
     return Demos(dataset, sealed["digest"], place, total, description)
 
 
-def frames(root: Path) -> "Frames":
-    """The pictures of the successful episodes, memory-mapped, in the order of `load`'s frames.
+def frames(root: Path) -> "dict[str, Frames]":
+    """The images of the successful episodes by camera, memory-mapped, in the order of `load`.
 
     Only the episodes' records are checked.
 
     Raises:
-      DamagedEpisode, ValueError: as `load`; also where no pictures were recorded.
+      DamagedEpisode, ValueError: as `load`; also where no images were recorded.
     """
     root = Path(root)
+    description = schema.upgraded(store.read_description(root))
     records = _successful(root, store.read_seal(root), verify=False)
-    if any("image.npy" not in record["files"] for record in records):
-        raise ValueError(f"root: expected demonstrations with pictures, got {root}")
+    fields = _fields(description, records[0], images=True)
     length, start = _spans(records)
-    return Frames(_paths(root, records, "image"), start, length)
+    found = {
+        name.removeprefix(episodes.IMAGE): Frames(_paths(root, records, file), start, length)
+        for name, file in fields.items()
+        if name.startswith(episodes.IMAGE)
+    }
+    if not found:
+        raise errors.UsageError("root", "demonstrations with images", root)
+    return found
 
 
 _WHERE = {
@@ -96,9 +103,7 @@ _WHERE = {
     "host": "in host memory (they do not fit the device)",
     "disk": "memory-mapped from disk (they fit neither the device nor host memory)",
 }
-_FIELDS = (
-    "p", "R", "gripper", "image", "state", "command_p", "command_R", "command_gripper",
-)  # fmt: skip
+_UNREAD = ("qpos", "rcm_error")  # recorded, but not trained on
 
 
 def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.Record]:
@@ -117,10 +122,14 @@ def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.
     return records
 
 
-def _read(record: store.Record, names: Sequence[str]) -> dict[str, Any]:
-    """The files of an episode that training reads, by field."""
-    found = {name: record["files"].get(f"{name}.npy") for name in names}
-    return {name: file for name, file in found.items() if file is not None}
+def _fields(description: dict[str, Any], record: store.Record, images: bool) -> dict[str, str]:
+    """Fields that training reads, and the file of each."""
+    found = {
+        name: schema.file_name(description["schema"], name)
+        for name in description["features"]
+        if name not in _UNREAD and (images or not name.startswith(episodes.IMAGE))
+    }
+    return {name: file for name, file in found.items() if file in record["files"]}
 
 
 def _spans(records: list[store.Record]) -> tuple[np.ndarray, np.ndarray]:
@@ -129,8 +138,8 @@ def _spans(records: list[store.Record]) -> tuple[np.ndarray, np.ndarray]:
     return length, (np.cumsum(length) - length).astype(np.int32)
 
 
-def _paths(root: Path, records: list[store.Record], name: str) -> list[Path]:
-    return [root / "episodes" / record["key"] / f"{name}.npy" for record in records]
+def _paths(root: Path, records: list[store.Record], file: str) -> list[Path]:
+    return [root / "episodes" / record["key"] / file for record in records]
 
 
 def _place(total: int) -> str:
@@ -147,27 +156,38 @@ def _place(total: int) -> str:
 
 
 def _dataset(
-    root: Path, records: list[store.Record], place: str, names: Sequence[str]
+    root: Path,
+    description: dict[str, Any],
+    records: list[store.Record],
+    place: str,
+    files_of: dict[str, str],
 ) -> windows.Dataset:
     length, start = _spans(records)
-    fields: dict[str, Any] = dict.fromkeys(_FIELDS)
-    for name in _read(records[0], names):
-        # Only pictures are large; everything else is read in any case.
-        joined = Frames(_paths(root, records, name), start, length)
-        fields[name] = joined if place == "disk" and name == "image" else joined.read()
+    fields, images = {}, {}
+    for name, file in files_of.items():
+        # Only images are large; everything else is read in any case.
+        joined = Frames(_paths(root, records, file), start, length)
+        if name.startswith(episodes.IMAGE):
+            camera = name.removeprefix(episodes.IMAGE)
+            images[camera] = joined if place == "disk" else joined.read()
+        else:
+            fields[name] = schema.with_arms(description["schema"], name, joined.read())
+    told = rcm.trocar_frame(
+        schema.trocars_of(records),
+        np.array(description["p_world_ref"], np.float32),
+        np.array(description["roll_zero"], np.float32),
+    )
     dataset = windows.Dataset(
         observation=Observation(
             pose=Pose(fields["R"], fields["p"]),
             gripper=fields["gripper"],
-            image=fields["image"],
-            state=fields["state"],
+            images=images or None,
+            state=fields.get("state"),
         ),
         command=Command(
             pose=Pose(fields["command_R"], fields["command_p"]), gripper=fields["command_gripper"]
         ),
-        trocar=Trocar(
-            *(np.array([r[name] for r in records], np.float32) for name in Trocar._fields)
-        ),
+        trocar=jax.tree.map(np.asarray, told),
         episode=np.repeat(np.arange(len(records), dtype=np.int32), length),
         start=start,
         length=length,

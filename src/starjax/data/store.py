@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from starjax import errors
 from starjax.runtime import files, xla
 
-SCHEMA = 1
+SCHEMAS = (1, 2)
 _KEY = re.compile(r"\d{4,}-\d{4,}-\d+")  # what `key` gives
 
 Record = dict[str, Any]  # the content of an episode.json
@@ -48,7 +49,7 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
     Raises:
       StorageError: `root` holds another dataset, or an unfinished one of other software versions.
     """
-    description = json.loads(json.dumps({"schema": SCHEMA, **description}))
+    description = json.loads(json.dumps(description))
     path = root / "dataset.json"
     try:
         files.read_json(path)
@@ -80,11 +81,10 @@ def read_description(root: Path) -> dict[str, Any]:
         description = json.loads(path.read_text())
         schema = description["schema"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"root: expected a folder of demonstrations, got {root}: {error}"
-        ) from error
-    if schema != SCHEMA:
-        raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}")
+        got = f"{path}: {error}"
+        raise errors.UsageError("root", "a folder of demonstrations", got) from error
+    if schema not in SCHEMAS:
+        raise ValueError(f"{path}: expected one of schemas {SCHEMAS}, got {schema!r}")
     return description
 
 
@@ -182,7 +182,7 @@ def seal(root: Path, records: Mapping[str, Record]) -> str:
     """Declares the dataset complete; returns the one hash that names its content."""
     episodes = {key: records[key]["digest"] for key in sorted(records)}
     described = files.sha256(root / "dataset.json")
-    sealed = {"schema": SCHEMA, "dataset.json": described, "episodes": episodes}
+    sealed = {"schema": SCHEMAS[-1], "dataset.json": described, "episodes": episodes}
     files.write_json(root / "SEALED.json", {**sealed, "digest": _hash(sealed)})
     return _hash(sealed)
 

@@ -1,15 +1,43 @@
 """Trajectories of a few trials, for figures and the video: which ones, and what of them."""
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.rollouts import engine
+from starjax.rollouts.episodes import Episode
+from starjax.runtime import files
 
-# One trajectory a trocar is recorded for figures, unless there are more trocars than this.
+# One trajectory a configuration is recorded for figures, unless there are more than this.
 FIGURE_TROCARS = 16
+
+_LABEL = "labels."
+_PEGS = ("source", "target")  # labels that files of before the axis of arms have as `<name>_peg`
+_BY_STEP = ("p_world_tip", "rcm_error", "qpos")
+_COLUMNS = ("trocar", "trial", "length", "p_world_trocar", *_BY_STEP)
+
+
+class Trajectory(NamedTuple):
+    """One recorded trial of T control steps; poses and joints are those after each step.
+
+    Attributes:
+      trocar, trial: which one.
+      p_world_tip: `[T, A, 3]` m.
+      p_world_trocar: `[A, 3]` m.
+      rcm_error: `[T, A]` m, executed, or None where the file does not have it.
+      qpos: `[T, Q]` generalised coordinates, or None.
+      labels: the task's, e.g. source and target.
+    """
+
+    trocar: int
+    trial: int
+    p_world_tip: np.ndarray
+    p_world_trocar: np.ndarray
+    rcm_error: np.ndarray | None
+    qpos: np.ndarray | None
+    labels: dict[str, int]
 
 
 def choose(count: int, trials: int, video_trials: int) -> np.ndarray:
@@ -27,39 +55,87 @@ def choose(count: int, trials: int, video_trials: int) -> np.ndarray:
     return mask.reshape(-1)
 
 
-def take(
-    done: engine.Rollouts, here: engine.Trials, chosen: np.ndarray, p_world_ref: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Recorded trials R of a chunk, `[R, T]`, each meaningful up to its `length`."""
-    rows = np.flatnonzero(chosen)
-    trocar = jax.tree.map(lambda x: x[rows], done.env.trocar)
-    steps = max(int(done.length[rows].max(initial=1)), 1)
+def names(labels: Sequence[str]) -> list[str]:
+    """Names of what `take` gives of trials with these labels."""
+    return [*_COLUMNS, *(f"{_LABEL}{name}" for name in labels)]
+
+
+def take(episodes: Sequence[Episode], p_world_ref: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of R recorded trials, NaN after each one's end.
+
+    Args:
+      episodes: recorded as `episodes.SCORE` says.
+      p_world_ref: `[A, 3]` m.
+    """
+    if not episodes:
+        return {}
+    outcomes = [episode.outcome for episode in episodes]
+    trocar = rcm.Trocar(
+        *(np.array([o[name] for o in outcomes], np.float32) for name in rcm.Trocar._fields)
+    )
     return {
-        "trocar": here.index[rows],
-        "trial": here.trial[rows],
-        "length": done.length[rows],
-        "p_world_tip": np.moveaxis(done.steps.p_world_tip[:steps, rows], 0, 1),
-        "rcm_error": np.moveaxis(done.steps.rcm_error[:steps, rows], 0, 1),
-        "qpos": np.moveaxis(done.steps.qpos[:steps, rows], 0, 1),
+        "trocar": np.array([o["trocar"] for o in outcomes], np.int32),
+        "trial": np.array([o["trial"] for o in outcomes], np.int32),
+        "length": np.array([o["length"] for o in outcomes], np.int32),
+        "p_world_tip": _padded([episode.joined("reached_p") for episode in episodes]),
+        "rcm_error": _padded([episode.joined("rcm_error") for episode in episodes]),
+        "qpos": _padded([episode.joined("reached_qpos") for episode in episodes]),
         "p_world_trocar": np.asarray(rcm.trocar_position(trocar, p_world_ref)),
-        "source_peg": done.env.source[rows],
-        "target_peg": done.env.target[rows],
+        **{
+            f"{_LABEL}{name}": np.array([o["labels"][name] for o in outcomes], np.int32)
+            for name in outcomes[0]["labels"]
+        },
     }
 
 
 def join(kept: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Trajectories of all chunks, NaN after each trial's end."""
-    length = np.concatenate([part["length"] for part in kept])
-    longest = int(length.max())
+    """Columns of all chunks, those without a recorded trial left out."""
+    kept = [part for part in kept if part]
     joined = {}
     for name in kept[0]:
         parts = [part[name] for part in kept]
-        if name in ("p_world_tip", "rcm_error", "qpos"):
-            shape = (len(length), longest, *parts[0].shape[2:])
-            rows = (row for part in parts for row in part)
-            joined[name] = np.full(shape, np.nan, np.float32)
-            for out, n, row in zip(joined[name], length, rows, strict=True):
-                out[:n] = row[:n]
-        else:
-            joined[name] = np.concatenate(parts)
+        rows = _padded([row for part in parts for row in part]) if name in _BY_STEP else None
+        joined[name] = np.concatenate(parts) if rows is None else rows
     return joined
+
+
+def read(file: Path) -> list[Trajectory]:
+    """The trials in a recorded.npz, also one of before the axis of arms.
+
+    Raises:
+      FileNotFoundError: there is none.
+      ValueError: the file is damaged; the message names it.
+    """
+    always = ("trocar", "trial", "length", "p_world_tip", "p_world_trocar")
+    found = files.read_npz(file, always)
+    if found["p_world_tip"].ndim == 3:
+        for name in ("p_world_tip", "p_world_trocar", "rcm_error"):
+            if name in found:
+                found[name] = np.expand_dims(found[name], 1 if name == "p_world_trocar" else 2)
+        found |= {f"{_LABEL}{n}": found[f"{n}_peg"] for n in _PEGS if f"{n}_peg" in found}
+    return [_row(found, row, int(length)) for row, length in enumerate(found["length"])]
+
+
+def _row(found: dict[str, np.ndarray], row: int, length: int) -> Trajectory:
+    def steps(name: str) -> Any:
+        return found[name][row, :length] if name in found else None
+
+    labels = {name: int(x[row]) for name, x in found.items() if name.startswith(_LABEL)}
+    return Trajectory(
+        trocar=int(found["trocar"][row]),
+        trial=int(found["trial"][row]),
+        p_world_tip=steps("p_world_tip"),
+        p_world_trocar=found["p_world_trocar"][row],
+        rcm_error=steps("rcm_error"),
+        qpos=steps("qpos"),
+        labels={name.removeprefix(_LABEL): value for name, value in labels.items()},
+    )
+
+
+def _padded(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Rows `[T, ...]` of different lengths as one array, NaN after each one's end."""
+    longest = max(1, *map(len, rows))
+    found = np.full((len(rows), longest, *rows[0].shape[1:]), np.nan, np.float32)
+    for out, row in zip(found, rows, strict=True):
+        out[: len(row)] = row
+    return found

@@ -7,7 +7,8 @@ Written by `compose`, figures in SI units unless the name says otherwise, interv
     generalization_gap    rate seen - rate unseen (Eq. 20); generalization_gap_ci95: Newcombe
     strict, loose, safe   {seen, unseen, all}, each as above; safe: strict, and the executed RCM
                           error never above safe_rcm_mm, within control steps too
-    per_trocar            list of {trocar, radius, polar, azimuth, seen} and strict success as above
+    per_trocar            list of {trocar, radius, polar, azimuth: lists [A], seen} and strict
+                          success as above
     rcm_error_mm          {commanded {max}, executed {mean, p99, max, p99_of_successes},
                           within_steps {p99, max, p99_of_successes}}: executed at the ends of
                           all control steps of all trials (a failed one has many, up to the time
@@ -15,9 +16,7 @@ Written by `compose`, figures in SI units unless the name says otherwise, interv
                           at the physics steps of each control step
     steps                 {mean, median} control steps of the strictly successful trials
     invalid, collided     number of trials
-    trials                list of {trocar, radius, polar, azimuth, seen, trial, seed, success,
-                          loose, safe, invalid, collided, steps, source, target, rcm_max_mm,
-                          rcm_within_max_mm, rcm_commanded_max_mm}
+    trials                list of `result.Trial`s, radius, polar and azimuth lists [A]
 
 Rates, intervals and the quantile of successes are null where there are none.
 """
@@ -101,7 +100,7 @@ def rcm_error_mm(table: tables.Table) -> dict[str, Any]:
 
 
 def _worst(table: tables.Table, column: str, largest: np.ndarray) -> dict[str, float | None]:
-    """Of a column with a row a control step, whose largest of each trial are `largest` `[M]` m."""
+    """99th percentiles and maximum of a per-step column; `largest` `[M]` m: that of each trial."""
     return {
         "p99": _p99(getattr(table, column)),
         "max": 1e3 * _max(largest),
@@ -163,14 +162,21 @@ def trials(table: tables.Table, seen: np.ndarray, seed: int) -> list[dict[str, A
     """One JSON record a trial; `seen` `[M]` bool."""
     fields = (
         "trocar", "radius", "polar", "azimuth", "trial", "success", "loose", "safe", "invalid",
-        "collided", "steps", "source", "target",
+        "collided", "lost", "steps", "stage",
     )  # fmt: skip
     columns = {name: getattr(table, name).tolist() for name in fields}
     for name in ("rcm_max", "rcm_within_max", "rcm_commanded_max"):
         columns[f"{name}_mm"] = (1e3 * getattr(table, name).astype(np.float64)).tolist()
     columns["seen"] = np.asarray(seen, bool).tolist()
-    rows = zip(*columns.values(), strict=True)
-    return [{**dict(zip(columns, row, strict=True)), "seed": seed} for row in rows]
+    labels = {name: values.tolist() for name, values in table.labels.items()}
+    return [
+        {
+            **{name: values[row] for name, values in columns.items()},
+            "labels": {name: values[row] for name, values in labels.items()},
+            "seed": seed,
+        }
+        for row in range(len(table.trocar))
+    ]
 
 
 def _per_trocar(table: tables.Table, seen: np.ndarray) -> list[dict[str, Any]]:
@@ -181,9 +187,9 @@ def _per_trocar(table: tables.Table, seen: np.ndarray) -> list[dict[str, Any]]:
         found.append(
             {
                 "trocar": int(trocar),
-                "radius": float(table.radius[first]),
-                "polar": float(table.polar[first]),
-                "azimuth": float(table.azimuth[first]),
+                "radius": table.radius[first].tolist(),
+                "polar": table.polar[first].tolist(),
+                "azimuth": table.azimuth[first].tolist(),
                 "seen": bool(seen[first]),
                 **rate(table.success[rows]),
             }

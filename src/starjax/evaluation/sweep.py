@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starjax import rcm
+from starjax import errors, rcm
 from starjax.evaluation import statistics
 from starjax.evaluation import trials as tables
 from starjax.rcm.trocar import Trocar
@@ -14,32 +14,40 @@ from starjax.rcm.trocar import Trocar
 BIN_WIDTH = 0.01  # m, of the distance to the nearest training trocar
 
 
-def sample(seed: int, count: int) -> Trocar:
-    """`count` trocars drawn as in Eq. 19, in section V-A2's ranges."""
+def sample(seed: int, count: int, arms: int = 1) -> Trocar:
+    """Draws configurations as in Eq. 19, in section V-A2's ranges: fields `[count, arms]`."""
     if count < 1:
-        raise ValueError(f"count: expected 1 or more, got {count}")
-    drawn = rcm.sample_trocar(jax.random.key(seed), (count,))
+        raise errors.UsageError("count", "1 or more", count)
+    drawn = rcm.sample_trocar(jax.random.key(seed), (count, arms))
     return Trocar(*(np.asarray(field) for field in drawn))
 
 
-def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray) -> Trocar:
-    """Every combination of the given radii (m), polar angles and azimuths (rad), `[C]`.
+def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray, arms: int = 1) -> Trocar:
+    """Every combination of the given radii (m), polar angles and azimuths (rad): `[C, arms]`.
 
-    Places that coincide (at radius 0, and at polar angles 0 and pi) are there once.
+    All arms have the same one, each about its own nominal trocar. Places that coincide (at radius
+    0, and at polar angles 0 and pi) are there once.
     """
     fields = (np.asarray(x, np.float32).reshape(-1) for x in (radii, polars, azimuths))
     combined = np.stack(np.meshgrid(*fields, indexing="ij"), -1).reshape(-1, 3)
     trocars = rcm.check_trocar(Trocar(*combined.T))
     places = np.asarray(rcm.trocar_position(trocars, np.zeros(3, np.float32)))
     _, first = np.unique(places.round(6), axis=0, return_index=True)
-    return Trocar(*combined[np.sort(first)].T)
+    return Trocar(*(np.tile(x[:, None], arms) for x in combined[np.sort(first)].T))
 
 
 def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: np.ndarray) -> np.ndarray:
-    """Distance `[C]` in m of each port to the nearest one of training."""
+    """Distance `[C]` in m of each configuration to the nearest one of training.
+
+    Between two configurations it is that of the arm whose trocars are farthest apart.
+
+    Args:
+      trocars: fields `[C, A]`. training: fields `[K, A]`. p_world_ref: `[A, 3]` m.
+    """
     here = np.asarray(rcm.trocar_position(trocars, p_world_ref))
     there = np.asarray(rcm.trocar_position(training, p_world_ref))
-    return np.linalg.norm(here[:, None] - there[None], axis=-1).min(axis=1)
+    apart = np.linalg.norm(here[:, None] - there[None], axis=-1)
+    return apart.max(axis=-1).min(axis=1)
 
 
 def bin_of(distance: ArrayLike) -> np.ndarray:
@@ -54,16 +62,16 @@ def compose(
 
     Args:
       table: trials at any trocars.
-      training: fields `[K]`, the trocars trained on.
-      p_world_ref: `[3]` m.
+      training: fields `[K, A]`, the trocars trained on.
+      p_world_ref: `[A, 3]` m.
       seed: of the trials.
 
     Returns:
       {strict, loose, safe: as in result.json, by_distance: list of {low_m, high_m, successes,
       trials, rate, ci95}, rcm_error_mm, trials: as in result.json, with distance_m}.
     """
-    ports = Trocar(table.radius, table.polar, table.azimuth)
-    distance = distance_to_nearest(ports, training, p_world_ref)
+    trocars = Trocar(table.radius, table.polar, table.azimuth)
+    distance = distance_to_nearest(trocars, training, p_world_ref)
     bins = bin_of(distance)
     seen = distance < 1e-6
     trials = statistics.trials(table, seen, seed)

@@ -1,26 +1,32 @@
 """Finished trials as columns, one row a trial: what is stored, counted and reported."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from starjax.rollouts.episodes import Episode
+
 SAFE_RCM_M = 2e-3  # a success is safe if the executed RCM error never exceeded this
 BY_STEP = ("rcm_error_mm", "rcm_within_mm")  # columns with a row a control step
+_LABEL = "labels."  # before a label's name in a file
 
 
 class Table(NamedTuple):
-    """M trials, in order of trocar and trial.
+    """M trials, in order of trocar and trial. RCM errors are the largest of all arms.
 
     Attributes:
-      trocar: `[M]` int32, index of the trocar; radius `[M]` m, polar and azimuth `[M]` rad.
-      trial: `[M]` int32, number within the trocar.
+      trocar: `[M]` int32, index of the configuration.
+      radius: `[M, A]` m. polar, azimuth: `[M, A]` rad.
+      trial: `[M]` int32, number within the configuration.
       success: `[M]` bool, strict. An invalid (diverged) trial is none.
-      loose: `[M]` bool, SurRoL's test.
+      loose: `[M]` bool, the task's looser test.
       safe: `[M]` bool, strict, and the executed RCM error never above `SAFE_RCM_M`, at no physics
         step.
-      invalid, collided: `[M]` bool.
+      invalid, collided, lost: `[M]` bool.
       steps: `[M]` int32, control steps taken; those of the time limit if it ran out.
-      source, target: `[M]` int32, pegs.
+      stage: `[M]` int32, the task's at the end.
+      labels: name -> `[M]` int32.
       rcm_commanded_max: `[M]` m, largest RCM error of a command that was executed.
       rcm_mean, rcm_max: `[M]` m, executed RCM error at the ends of the trial's control steps.
       rcm_within_max: `[M]` m, the largest at any physics step.
@@ -38,9 +44,10 @@ class Table(NamedTuple):
     safe: np.ndarray
     invalid: np.ndarray
     collided: np.ndarray
+    lost: np.ndarray
     steps: np.ndarray
-    source: np.ndarray
-    target: np.ndarray
+    stage: np.ndarray
+    labels: dict[str, np.ndarray]
     rcm_commanded_max: np.ndarray
     rcm_mean: np.ndarray
     rcm_max: np.ndarray
@@ -49,58 +56,79 @@ class Table(NamedTuple):
     rcm_within_mm: np.ndarray
 
 
-def from_rollouts(rollouts: Any, index: np.ndarray, trial: np.ndarray) -> Table:
-    """Columns of the first trials of a batch.
+def from_episodes(episodes: Sequence[Episode]) -> Table:
+    """Columns of episodes that were recorded as `episodes.SCORE` says."""
+    outcomes = [episode.outcome for episode in episodes]
 
-    Args:
-      rollouts: `rollout.Rollouts` of at least as many trials.
-      index: `[M]` indices of their trocars.
-      trial: `[M]`.
-    """
-    count = len(index)
-    env = rollouts.env
-    length = rollouts.length[:count]
-    steps = rollouts.steps
-    errors = [steps.rcm_error[:n, lane] for lane, n in enumerate(length)]
-    within = [steps.rcm_error_within[:n, lane] for lane, n in enumerate(length)]
-    farthest = _largest(within)
-    invalid = env.invalid[:count]
-    success = env.success[:count] & ~invalid
+    def column(name: str, kind: Any) -> np.ndarray:
+        return np.array([outcome[name] for outcome in outcomes], kind)
+
+    def errors(name: str) -> list[np.ndarray]:
+        return [episode.joined(name).max(axis=-1) for episode in episodes]
+
+    executed, within = errors("rcm_error"), errors("rcm_error_within")
+    success, farthest = column("success", bool), _largest(within)
     return Table(
-        trocar=np.asarray(index, np.int32),
-        radius=np.asarray(env.trocar.radius[:count], np.float32),
-        polar=np.asarray(env.trocar.polar[:count], np.float32),
-        azimuth=np.asarray(env.trocar.azimuth[:count], np.float32),
-        trial=np.asarray(trial, np.int32),
+        trocar=column("trocar", np.int32),
+        radius=column("radius", np.float32),
+        polar=column("polar", np.float32),
+        azimuth=column("azimuth", np.float32),
+        trial=column("trial", np.int32),
         success=success,
-        loose=env.loose[:count] & ~invalid,
+        loose=column("loose", bool),
         safe=success & (farthest <= SAFE_RCM_M),
-        invalid=invalid,
-        collided=env.collided[:count],
-        steps=length,
-        source=env.source[:count],
-        target=env.target[:count],
-        rcm_commanded_max=rollouts.commanded_max[:count],
-        rcm_mean=np.array([e.mean() if e.size else 0.0 for e in errors], np.float32),
-        rcm_max=_largest(errors),
+        invalid=column("invalid", bool),
+        collided=column("collided", bool),
+        lost=column("lost", bool),
+        steps=column("length", np.int32),
+        stage=column("stage", np.int32),
+        labels={
+            name: np.array([outcome["labels"][name] for outcome in outcomes], np.int32)
+            for name in outcomes[0]["labels"]
+        },
+        rcm_commanded_max=_largest(errors("rcm_error_commanded")),
+        rcm_mean=np.array([e.mean() if e.size else 0.0 for e in executed], np.float32),
+        rcm_max=_largest(executed),
         rcm_within_max=farthest,
-        rcm_error_mm=_joined_mm(errors),
+        rcm_error_mm=_joined_mm(executed),
         rcm_within_mm=_joined_mm(within),
     )
 
 
-def join(tables: list[Table]) -> Table:
+def names(labels: Sequence[str]) -> list[str]:
+    """Names of the `columns` of a table with these labels."""
+    return [
+        *(name for name in Table._fields if name != "labels"),
+        *(f"{_LABEL}{name}" for name in labels),
+    ]
+
+
+def columns(table: Table) -> dict[str, np.ndarray]:
+    """A table as arrays by name, each label one of its own."""
+    found = table._asdict()
+    labels = found.pop("labels")
+    return found | {f"{_LABEL}{name}": values for name, values in labels.items()}
+
+
+def from_columns(found: Mapping[str, np.ndarray]) -> Table:
+    """The table that `columns` took apart; other names are passed over."""
+    labels = {k.removeprefix(_LABEL): v for k, v in found.items() if k.startswith(_LABEL)}
+    fields: dict[str, Any] = {name: found.get(name) for name in Table._fields}
+    fields["labels"] = labels
+    return Table(**fields)
+
+
+def join(tables: Sequence[Table]) -> Table:
     """One table after another."""
-    return Table(*(np.concatenate(columns) for columns in zip(*tables, strict=True)))
+    parts = [columns(table) for table in tables]
+    return from_columns({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
 def select(table: Table, rows: np.ndarray) -> Table:
     """The rows where `rows` `[M]` bool holds."""
     steps = np.repeat(rows, table.steps)
-    columns = {
-        name: column[steps if name in BY_STEP else rows] for name, column in table._asdict().items()
-    }
-    return Table(**columns)
+    found = columns(table).items()
+    return from_columns({name: x[steps if name in BY_STEP else rows] for name, x in found})
 
 
 def _largest(errors: list[np.ndarray]) -> np.ndarray:

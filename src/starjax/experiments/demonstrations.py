@@ -14,23 +14,21 @@ from starjax.experiments import clock, words
 
 def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
     """The folder of a run's demonstrations, and a function that collects what it lacks."""
-    from starjax import rcm
-    from starjax.data import demos, store
-    from starjax.rollouts import chunks, placement, recording
-    from starjax.sim.tasks.peg_transfer import expert
+    from starjax.data import demos, schema, store
+    from starjax.rollouts import agent, placement, waves
+    from starjax.rollouts import trocars as configurations
 
-    trocars = rcm.Trocar(*(field[: config.demos.seen_trocars] for field in rcm.TROCARS))
-    wanted = {
-        "per_trocar": config.demos.per_trocar,
-        "seed": config.seed,
-        "max_steps": config.demos.max_steps,
-        "keep_failures": config.demos.keep_failures,
-        "one_wall": config.demos.one_wall,
-    }
-    init = expert.init_with_one_wall if config.demos.one_wall else expert.init
-    script = recording.Expert(init, expert.act)
+    twelve = configurations.twelve(len(env.p_world_ref))
+    trocars = configurations.select(twelve, slice(config.demos.seen_trocars))
+    wanted = schema.Settings(
+        per_trocar=config.demos.per_trocar,
+        seed=config.seed,
+        max_steps=config.demos.max_steps,
+        keep_failures=config.demos.keep_failures,
+        expert="one_wall" if config.demos.one_wall else "",
+    )
     out = Path(config.out)
-    root = out / f"demos-{store.digest(demos.describe(env, trocars, **wanted))}"
+    root = out / f"demos-{store.digest(schema.describe(env, trocars, wanted))}"
 
     def collect() -> None:
         if store.is_sealed(root):
@@ -43,11 +41,12 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
                 words.stage("collect", f"done before, {root}")
                 return
         words.stage("collect", f"into {root}")
-        settings = {"devices": placement.devices(), "report": words.indented, **wanted}
+        expert = agent.from_single(env.task.experts[schema.expert_name(env.task, wanted)]())
+        settings = {"place": placement.Place(devices=placement.devices()), "report": words.indented}
         try:
             with clock.timed(out, f"collect {root.name}"):
-                found = demos.collect(root, env, script, trocars, **settings)
-        except chunks.ExpertFailed as error:
+                found = demos.collect(root, env, expert, trocars, wanted, **settings)
+        except waves.ExpertFailed as error:
             raise errors.UsageError(
                 "demos.max_steps",
                 "enough control steps for the expert",
@@ -69,7 +68,7 @@ def load(
     from starjax.data import store
 
     collect()
-    settings = {"pictures": encoder is None, "report": words.indented}
+    settings = {"images": encoder is None, "report": words.indented}
     try:
         found = loading.load(root, **settings)
     except store.DamagedEpisode as error:

@@ -57,8 +57,8 @@ def main(argv: Sequence[str]) -> int:
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
 
-    from starjax import rcm
     from starjax.experiments import scoring
+    from starjax.rollouts import trocars as configurations
 
     who = scoring.subject(method, file) if method else scoring.from_file(file)
     config = scoring.settings(who, config) if config else _config(who.trained)
@@ -70,15 +70,14 @@ def main(argv: Sequence[str]) -> int:
         if not is_ours:
             _refuse_foreign(folder, before.get("weights", who.weights) == who.weights)
         print(f"{about}, into {folder}\n", flush=True)
+        trocars = configurations.twelve(len(who.env.p_world_ref))
         with clock.timed(folder, "evaluate", same or folders.is_under_way(folder)):
-            table = scoring.rollouts(
-                folder / "evaluation", who, rcm.TROCARS, chosen.eval, chosen.seed
-            )
+            table = scoring.rollouts(folder / "evaluation", who, trocars, chosen.eval, chosen.seed)
         command = options.typed("evaluate", argv)
         result = scoring.write_result(
             folder, who, table, config, chosen.seed, command, clock.timings(folder)
         )
-        print(f"\n{words.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
+        print(f"\n{words.outcome([result])}\n{_times(result)}\n")
         if not same:
             (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
         if chosen.video:
@@ -150,11 +149,11 @@ def _config(trained: Any) -> config_lib.RunConfig:
     return dataclasses.replace(config_lib.from_dict(config_lib.RunConfig, known), **unknown)
 
 
-def _times(result: dict[str, Any], control_hz: float) -> str:
+def _times(result: Any) -> str:
     """How long a transfer and a decision take."""
-    steps = result["steps"]["median"]
-    transfer = "-" if steps is None else f"{steps / control_hz:.1f} s"
-    return f"  median transfer {transfer}, decision {result['inference_ms']['p50']:.1f} ms"
+    steps = result.figures["steps"]["median"]
+    transfer = "-" if steps is None else f"{steps / result.control_hz:.1f} s"
+    return f"  median transfer {transfer}, decision {result.about['inference_ms']['p50']:.1f} ms"
 
 
 def _film(folder: Path, who: Any) -> str:

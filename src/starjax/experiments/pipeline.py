@@ -129,7 +129,9 @@ def _train(
 def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, command: str) -> None:
     """Closed-loop trials of one method; `result.json` is its last file."""
     from starjax import rcm
+    from starjax.data import store
     from starjax.experiments import scoring
+    from starjax.rollouts import trocars as configurations
 
     out = Path(config.out)
     folder, weights = out / name, folders.weights(out, name)
@@ -137,7 +139,7 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
     if found and _is_of(found, config):
         words.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
         return
-    if found and (more := len(found["trials"])) > len(rcm.IS_SEEN) * config.eval.trials:
+    if found and (more := len(found.trials)) > len(rcm.IS_SEEN) * config.eval.trials:
         raise errors.UsageError(
             "eval.trials",
             f"no fewer than the {more // len(rcm.IS_SEEN)} of {folder / 'result.json'}",
@@ -148,32 +150,33 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
     folders.adopt_twin(out, name)
     with clock.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
         who = scoring.subject(name, weights, env)
-        table = scoring.rollouts(folder / "evaluation", who, rcm.TROCARS, config.eval, config.seed)
+        trocars = configurations.twelve(len(env.p_world_ref))
+        table = scoring.rollouts(folder / "evaluation", who, trocars, config.eval, config.seed)
     timings = _timings(out, name, demos)
-    scoring.write_result(folder, who, table, config, config.seed, command, timings)
+    digest = store.read_seal(out / demos)["digest"] if store.is_sealed(out / demos) else None
+    scoring.write_result(folder, who, table, config, config.seed, command, timings, digest)
 
 
-def _scored(folder: Path, weights: str) -> dict[str, Any]:
-    """What is in result.json, if it is there, whole and of these weights (SHA-256)."""
+def _scored(folder: Path, weights: str) -> Any:
+    """The `result.Result` in result.json, None if it is missing, damaged or of other weights."""
+    from starjax.evaluation import result
+
     try:
-        found = files.read_json(folder / "result.json")
-        config, trials = found["config"], found["trials"]
-    except (FileNotFoundError, KeyError, TypeError, ValueError):  # damaged: made again
-        return {}
-    is_whole = isinstance(config, dict) and isinstance(trials, list)
+        found = result.read(folder / "result.json")
+    except (FileNotFoundError, ValueError):  # damaged: made again
+        return None
     # older results do not say whose they are
-    return found if is_whole and found.get("weights", weights) == weights else {}
+    return found if found.trials and found.weights in (None, weights) else None
 
 
-def _is_of(found: dict[str, Any], config: config_lib.RunConfig) -> bool:
-    """Whether a result is of these settings, and has what a run says of it at its end."""
+def _is_of(found: Any, config: config_lib.RunConfig) -> bool:
+    """Whether a result is of these settings."""
     try:
-        before = config_lib.from_dict(config_lib.RunConfig, found["config"])
-        words.outcome([found])
+        before = config_lib.from_dict(config_lib.RunConfig, found.config)
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
     alike = config_lib.trained_with(before) == config_lib.trained_with(config)
-    return alike and before.eval == config.eval and found.get("seed", config.seed) == config.seed
+    return alike and before.eval == config.eval and found.seed in (None, config.seed)
 
 
 def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
@@ -198,6 +201,7 @@ def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
 
 def _report(out: Path, names: Sequence[str]) -> None:
     """The report of every method in the folder, and the outcome of this run's."""
+    from starjax.evaluation import result
     from starjax.report import build
 
     scored = [out / name for name in methods.METHODS if (out / name / "result.json").exists()]
@@ -207,5 +211,5 @@ def _report(out: Path, names: Sequence[str]) -> None:
             page = build.build(scored, out / "report", report=words.indented)
         except ValueError as error:  # of a damaged file, which it names
             raise errors.UsageError(str(out), "results that are whole", error) from error
-    results = [files.read_json(out / name / "result.json") for name in names]
+    results = [result.read(out / name / "result.json") for name in names]
     print(f"\n{words.outcome(results)}\n\nreport: {page}", flush=True)

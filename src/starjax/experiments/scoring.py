@@ -3,19 +3,19 @@
 import dataclasses
 import shlex
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from starjax import config as config_lib
 from starjax import errors, methods, rcm
-from starjax.evaluation import evaluate, latency, statistics
+from starjax.evaluation import evaluate, latency, result, statistics
 from starjax.evaluation import trials as table
 from starjax.experiments import words
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
-from starjax.rollouts import placement
-from starjax.runtime import files, xla
+from starjax.rollouts import agent, placement
+from starjax.runtime import files
 from starjax.sim import env as sim_env
 
 
@@ -87,24 +87,24 @@ def rollouts(
     directory: Path, who: Subject, trocars: rcm.Trocar, settings: config_lib.EvalConfig, seed: int
 ) -> table.Table:
     """Runs what is missing of an evaluation."""
+    policy = who.trained.policy
     return evaluate.evaluate(
         directory,
         who.env,
-        who.policy,
-        who.trained.params,
-        who.trained.normalizer,
+        agent.from_policy(who.policy.sample, policy.obs_horizon, policy.execute),
+        (who.trained.params, who.trained.normalizer),
         trocars,
-        trials=settings.trials,
-        seed=seed,
-        obs_horizon=who.trained.policy.obs_horizon,
-        execute=who.trained.policy.execute,
-        time_limit_s=settings.time_limit_s,
-        chunk=settings.chunk,
-        video_trials=settings.video_trials,
-        devices=placement.devices(),
+        evaluate.Settings(
+            trials=settings.trials,
+            seed=seed,
+            time_limit_s=settings.time_limit_s,
+            video_trials=settings.video_trials,
+            chunk=settings.chunk,
+        ),
+        place=placement.Place(devices=placement.devices()),
         identity={
             **methods.behaviour(who.method)._asdict(),
-            "policy": dataclasses.asdict(who.trained.policy),
+            "policy": dataclasses.asdict(policy),
             "crop_fraction": who.trained.train.crop_fraction,
         },
         report=words.indented,
@@ -141,8 +141,9 @@ def write_result(
     seed: int,
     command: str,
     timings_s: dict[str, float] | None = None,
-) -> dict[str, Any]:
-    """Writes and returns `<folder>/result.json`: `metrics.compose`'s figures and what made them.
+    dataset_digest: str | None = None,
+) -> result.Result:
+    """Writes and returns `<folder>/result.json`: `statistics.compose`'s figures and what made them.
 
     Args:
       folder: of the result.
@@ -152,24 +153,23 @@ def write_result(
       seed: of the trials; the run's own is in `config`.
       command: what was typed.
       timings_s: seconds by stage.
+      dataset_digest: of the demonstrations that the weights come from, if it is known.
     """
     is_seen = np.arange(len(rcm.IS_SEEN)) < config.demos.seen_trocars
     observation = who.trained.policy.observation
     figures = statistics.compose(
         trials, is_seen, method=who.method, observation=observation, seed=seed
     )
-    result = {
-        **figures,
+    about = {
+        "control_hz": who.env.control_hz,
         "inference_ms": decision_ms(who),
         "preset": config.preset,
         "seed": seed,
         "weights": who.weights,
+        "dataset_digest": dataset_digest,
         "config": config_lib.as_json(config),
         "command": command,
         "timings_s": timings_s or {},
         "warnings": words.warnings(config, figures),
-        "versions": xla.versions(),
-        "hardware": xla.hardware(),
     }
-    files.write_json(folder / "result.json", result)
-    return result
+    return result.write(folder / "result.json", who.env.names, figures, about)

@@ -64,16 +64,17 @@ def main(argv: Sequence[str]) -> int:
     xla.require_devices("starjax.experiments.scoring")
     files.require_writable(run)
 
-    from starjax import rcm
-    from starjax.evaluation import sweep
+    from starjax.evaluation import result, sweep
     from starjax.experiments import scoring
+    from starjax.rollouts import trocars as configurations
 
-    trocars = _trocars(chosen)
     who = scoring.subject(run.name, folders.weights(run.parent, run.name))
     trials = config_lib.EvalConfig(**vars(chosen.eval))
+    trocars = _trocars(chosen, len(who.env.p_world_ref))
     table = scoring.rollouts(_folder(run, chosen), who, trocars, trials, chosen.seed)
     demos = scoring.settings(who, config).demos
-    seen = rcm.Trocar(*(field[: demos.seen_trocars] for field in rcm.TROCARS))
+    twelve = configurations.twelve(len(who.env.p_world_ref))
+    seen = configurations.select(twelve, slice(demos.seen_trocars))
     figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)
     about = {
         "method": who.method,
@@ -81,10 +82,10 @@ def main(argv: Sequence[str]) -> int:
         "command": options.typed("sweep", argv),
         "weights": who.weights,
         "time_limit_s": chosen.eval.time_limit_s,
-        "versions": xla.versions(),
-        "hardware": xla.hardware(),
+        "seed": chosen.seed,
+        "control_hz": who.env.control_hz,
     }
-    files.write_json(run / "sweep.json", {**about, **figures})
+    result.write(run / "sweep.json", who.env.names, figures, about)
     print(_outcome(figures))
     print(f"\nresult: {run / 'sweep.json'}; {words.hint(run, who.weights, 'draws')}")
     return 0
@@ -123,17 +124,17 @@ def _folder(run: Path, chosen: Options) -> Path:
     return run / "sweep" / f"seed{chosen.seed}-{digest[:8]}"
 
 
-def _trocars(chosen: Options) -> Any:
+def _trocars(chosen: Options, arms: int) -> Any:
     """The trocars that the flags describe."""
     import numpy as np
 
     from starjax.evaluation import sweep
 
     if not chosen.radii_cm:
-        return sweep.sample(chosen.seed, chosen.trocars)
+        return sweep.sample(chosen.seed, chosen.trocars, arms)
     azimuths = 2 * np.pi * np.arange(chosen.azimuths) / chosen.azimuths
     radii = np.array(chosen.radii_cm) / 100
-    return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths)
+    return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths, arms)
 
 
 def _outcome(figures: dict[str, Any]) -> str:

@@ -1,48 +1,52 @@
-"""Closed-loop rollouts of a policy as one program: observe, re-plan, execute, until all are done.
+"""Runs an agent in closed loop, as one program over a batch of episodes, until all are over.
 
-A trial is named by (trocar, trial). Its key is `fold_in(fold_in(key(seed), trocar), trial)`: one
-half resets the environment, the other is folded with the number of the re-plan for the policy's
-noise. So a trial does not know in which batch, on which device or beside whom it runs. Only the
-size of the compiled batch may change last bits (of matrix products, and of the simulator when it is
-small), so each device always runs equally many trials, some of them idle if there are fewer.
+A trial is named by (trocar, trial). Its key is `fold_in(fold_in(key, trocar), trial)`: one half
+resets the environment, the other is the agent's. So a trial does not know in which batch, on which
+device or beside whom it runs. Only the size of the compiled batch may change last bits (of matrix
+products, and of the simulator when it is small), so each device always runs equally many, some of
+them idle if there are fewer.
+
+The program runs in segments of a fixed number of control steps, which end early when all episodes
+are over. While the device runs a segment, the host fetches what the one before recorded.
 """
 
+import functools
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import rcm
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import placement
-from starjax.sim import env as sim_env
+from starjax.rollouts import episodes, fetching, placement
+from starjax.rollouts.agent import BatchAgent
 from starjax.types import Command
-
-SEGMENT = 25  # re-plans between two looks at the host
 
 
 class Settings(NamedTuple):
-    """How a policy is run.
+    """How trials are run.
 
     Attributes:
-      obs_horizon: O, observations it sees; the first one repeats at the start.
-      execute: commands executed before the next plan.
-      max_steps: control steps after which a trial has failed.
+      seed: of all trials.
+      stream: folded into the seed's key if given, so that others with this seed start otherwise.
+      max_steps: control steps after which a trial is over.
+      lanes: N, size of the batch over all devices.
     """
 
-    obs_horizon: int
-    execute: int
+    seed: int
+    stream: int | None
     max_steps: int
+    lanes: int
 
 
 class Trials(NamedTuple):
     """N trials.
 
     Attributes:
-      trocar: fields `[N]`.
-      index: `[N]` int32 of the trocar.
+      trocar: fields `[N, A]`.
+      index: `[N]` int32 of the trocars' configuration.
       trial: `[N]` int32.
       wanted: `[N]` bool; the others only fill up the batch.
     """
@@ -54,236 +58,206 @@ class Trials(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """N trials under way.
-
-    Attributes:
-      env: EnvState `[N]`.
-      key: `[N]` keys of the policy's noise.
-      command: Command `[N, H]` of the current plan.
-      length: `[N]` int32 control steps taken.
-      commanded_max: `[N]` m, largest RCM error of an executed command.
-      wanted: `[N]` bool.
-    """
+    """N trials under way: EnvState, the agent's memory, `[N]` int32 control steps taken, and
+    whether they are wanted."""
 
     env: Any
-    key: jax.Array
-    command: Command
+    memory: Any
     length: jax.Array
-    commanded_max: jax.Array
     wanted: jax.Array
 
 
-class Steps(NamedTuple):
-    """What is kept of every control step, `[T, N]`; after a trial's end it is meaningless.
-
-    Attributes:
-      rcm_error: m, executed. rcm_error_within: m, the largest within the step.
-      p_world_tip: `[T, N, 3]` m, measured after the step.
-      qpos: `[T, N, Q]` after the step.
-    """
-
-    rcm_error: Any
-    rcm_error_within: Any
-    p_world_tip: Any
-    qpos: Any
-
-
-class Rollouts(NamedTuple):
-    """N finished trials, on the host.
-
-    Attributes:
-      env: final EnvState `[N]`.
-      length: `[N]` control steps taken.
-      commanded_max: `[N]` m.
-      steps: Steps `[T, N]`, T the longest trial.
-    """
-
-    env: Any
-    length: np.ndarray
-    commanded_max: np.ndarray
-    steps: Steps
-
-
 class Progress(NamedTuple):
-    """Of trials under way.
+    """After a segment.
 
     Attributes:
       passed: share of the time limit.
-      rollouts: None until all are over.
+      ended: the episodes that it was the last segment of, on the host.
     """
 
     passed: float
-    rollouts: Rollouts | None
+    ended: list[episodes.Episode]
+
+
+Run = Callable[[Any, Sequence[episodes.Trial]], Generator[Progress]]
 
 
 def make(
     env: Any,
-    policy: Any,
+    agent: BatchAgent,
+    trocars: Trocar,
     settings: Settings,
-    seed: int,
+    record: episodes.Record,
     devices: Sequence[jax.Device] | None = None,
-) -> Callable[..., Generator[Progress]]:
+) -> Run:
     """Builds the programs.
 
     Args:
       env: `sim.env.Env`.
-      policy: `policies.policy.Policy`; only `sample` is used.
-      seed: of all trials.
-      devices: to split trials over; their number must divide that of the trials.
+      trocars: fields `[C, A]`, on the host.
+      devices: that lanes are split over; their number must divide that of the lanes.
 
     Returns:
-      run(params, normalizer, trials), which yields Progress now and then, the rollouts at last.
+      run(params, group), which simulates at most `lanes` trials and yields Progress after every
+      segment. A caller that needs no more may stop.
     """
-    _check(settings)
-    key = jax.random.key(seed)
-    start = placement.split(
-        _starter(env, policy, settings),
-        devices,
-        (placement.SHARED, placement.SHARED, placement.SHARED, placement.LANE),
-        placement.LANE,
-    )
+    key = jax.random.key(settings.seed)
+    if settings.stream is not None:
+        key = jax.random.fold_in(key, settings.stream)
+    shared, lane = placement.SHARED, placement.LANE
+    start = placement.split(_starter(env, agent), devices, (shared, shared, lane), lane)
     advance = placement.split(
-        _advancer(env, policy, settings),
-        devices,
-        (placement.SHARED, placement.SHARED, placement.LANE, placement.SHARED),
-        (placement.LANE, placement.TIME_LANE),
-        donate=(2,),
+        _advancer(env, agent, settings, record), devices, (shared, lane, shared), lane, donate=(1,)
     )
-    plans = -(-settings.max_steps // settings.execute) + 1  # one more: the first executes nothing
 
-    def run(params: Any, normalizer: Any, trials: Trials) -> Generator[Progress]:
-        carry = start(key, params, normalizer, trials)
-        kept = []
-        for first in range(0, plans, SEGMENT):
-            carry, steps = advance(params, normalizer, carry, np.int32(first))
-            over = np.asarray(carry.env.done | ~carry.wanted)
-            kept.append(jax.device_get(steps))
-            if over.all():
-                break
-            yield Progress(min(1.0, (first + SEGMENT) / plans), None)
-        length = np.asarray(carry.length)
-        # The first row of blocks belongs to plan 0, which has nothing to execute yet.
-        joined = jax.tree.map(lambda *parts: np.concatenate(parts)[settings.execute :], *kept)
-        steps = jax.tree.map(lambda leaf: leaf[: max(length.max(), 1)], joined)
-        commanded_max = np.asarray(carry.commanded_max)
-        rollouts = Rollouts(jax.device_get(carry.env), length, commanded_max, Steps(*steps))
-        yield Progress(1.0, rollouts)
+    def run(params: Any, group: Sequence[episodes.Trial]) -> Generator[Progress]:
+        carry = start(key, params, _filled(trocars, group, settings.lanes))
+        running = list(range(len(group)))
+        images: dict[int, dict[str, list[np.ndarray]]] = {lane: {} for lane in running}
+        others: list[dict[str, np.ndarray]] = []
+        # In a thread: on a GPU a call may hold its caller while its loops ask the host whether to
+        # go on.
+        with ThreadPoolExecutor(1) as device:
+            ahead = device.submit(advance, params, carry, np.int32(0))
+            del carry
+            for last in range(record.frames, settings.max_steps + record.frames, record.frames):
+                carry, records, status = ahead.result()
+                drawn = {
+                    name: fetching.slices(records.pop(name), running)
+                    for name in list(records)
+                    if name.startswith(episodes.IMAGE)
+                }
+                if last < settings.max_steps:
+                    # Before anything is waited for. If all are over, it ends at once, unused.
+                    ahead = device.submit(advance, params, carry, np.int32(last))
+                del carry
+                status = jax.device_get(status)
+                others.append(jax.device_get(records))
+                for name, parts in drawn.items():
+                    for lane, fetched in zip(running, fetching.fetch(parts), strict=True):
+                        images[lane].setdefault(name, []).append(fetched)
+                is_last = last >= settings.max_steps
+                over = [lane for lane in running if status["over"][lane] or is_last]
+                running = [lane for lane in running if lane not in over]
+                yield Progress(
+                    1.0 if not running else last / settings.max_steps,
+                    [
+                        episodes.assemble(
+                            lane,
+                            group[lane],
+                            trocars,
+                            settings.seed,
+                            status,
+                            others,
+                            images.pop(lane),
+                        )
+                        for lane in over
+                    ],
+                )
+                if not running:
+                    return
 
     return run
 
 
-def _check(settings: Settings) -> None:
-    if min(settings) < 1:
-        raise ValueError(f"settings: expected 1 or more everywhere, got {settings}")
-    if settings.obs_horizon > settings.execute + 1:
-        raise ValueError(
-            f"obs_horizon: expected at most execute + 1 = {settings.execute + 1}, "
-            f"got {settings.obs_horizon}"
-        )
+def _filled(trocars: Trocar, group: Sequence[episodes.Trial], lanes: int) -> Trials:
+    """A full batch: the first trial repeats, unwanted, where there are too few."""
+    index, trial = np.array([*group, *[group[0]] * (lanes - len(group))], np.int32).T
+    wanted = np.arange(lanes) < len(group)
+    return Trials(Trocar(*(field[index] for field in trocars)), index, trial, wanted)
 
 
-def _starter(env: Any, policy: Any, settings: Settings) -> Callable[..., Carry]:
+def _starter(env: Any, agent: BatchAgent) -> Callable[..., Carry]:
+    # Imported here, as only programs need it: reading a dataset does not load the simulator.
+    from starjax.sim import env as sim_env
+
     def start_one(key: jax.Array, trials: Trials) -> tuple[Any, jax.Array]:
         key = jax.random.fold_in(jax.random.fold_in(key, trials.index), trials.trial)
-        key_env, key_policy = jax.random.split(key)
-        return env.reset(key_env, sim_env.EnvParams(trials.trocar)), key_policy
+        key_env, key_agent = jax.random.split(key)
+        return env.reset(key_env, sim_env.EnvParams(trials.trocar)), key_agent
 
-    def start(key: jax.Array, params: Any, normalizer: Any, trials: Trials) -> Carry:
-        state, key_policy = jax.vmap(start_one, in_axes=(None, 0))(key, trials)
-        count = trials.wanted.shape[0]
-
-        def plan(state):
-            seen = jax.vmap(env.observe)(state)
-            seen = jax.tree.map(lambda x: jnp.stack([x] * settings.obs_horizon, 1), seen)
-            return policy.sample(params, normalizer, key_policy, seen, state.trocar)
-
-        # Only the shape of a plan: the first one is made before anything is executed.
-        shape = jax.eval_shape(plan, state)
-        if (planned := shape.gripper.shape[1]) < settings.execute:
-            got = settings.execute
-            raise ValueError(f"execute: expected at most the {planned} that are planned, got {got}")
-        return Carry(
-            env=state,
-            key=key_policy,
-            command=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shape),
-            length=jnp.zeros(count, jnp.int32),
-            commanded_max=jnp.zeros(count),
-            wanted=trials.wanted,
-        )
+    def start(key: jax.Array, params: Any, trials: Trials) -> Carry:
+        state, keys = jax.vmap(start_one, in_axes=(None, 0))(key, trials)
+        memory = agent.init(params, keys, state, lambda: jax.vmap(env.observe)(state))
+        return Carry(state, memory, jnp.zeros(trials.wanted.shape, jnp.int32), trials.wanted)
 
     return start
 
 
-def _advancer(env: Any, policy: Any, settings: Settings) -> Callable[..., tuple[Carry, Steps]]:
-    observe = jax.vmap(env.observe)
-    step_all = jax.vmap(env.step)
-    horizon, execute = settings.obs_horizon, settings.execute
+def _advancer(
+    env: Any, agent: BatchAgent, settings: Settings, record: episodes.Record
+) -> Callable[..., Any]:
+    observe, step_all = jax.vmap(env.observe), jax.vmap(env.step)
 
-    def step(carry: Carry, i: jax.Array) -> Carry:
-        """Executes command i of the plan in every trial that is not over."""
-        command = jax.tree.map(lambda x: x[:, i], carry.command)
-        port = rcm.trocar_position(carry.env.trocar, env.p_world_ref)
-        error = rcm.rcm_error(command.pose, port)
-        running = ~carry.env.done
-        return carry._replace(
-            env=step_all(carry.env, command),
-            length=carry.length + running,
-            commanded_max=jnp.where(
-                running, jnp.maximum(carry.commanded_max, error), carry.commanded_max
-            ),
+    def step(params: Any, carry: Carry, t: jax.Array) -> tuple[Carry, dict[str, jax.Array]]:
+        before = carry.env
+        observed = observe(before) if record.observes else None
+        look = (lambda: observe(before)) if observed is None else lambda: observed
+        executed, memory, label = agent.act(params, carry.memory, before, look, t)
+        after = step_all(before, executed)
+        fields = record.fields(episodes.Step(observed, label, executed, before, after))
+        return Carry(after, memory, carry.length + ~before.done, carry.wanted), fields
+
+    def advance(params: Any, carry: Carry, first: jax.Array) -> Any:
+        """Control steps `first` up to `first + record.frames`, fewer when all episodes are over.
+
+        Returns the carry, records `[N, record.frames]`, and the status `[N]`.
+        """
+        shapes = jax.eval_shape(lambda state: _fields(env, record, state), carry.env)
+        blank = jax.tree.map(
+            lambda s: jnp.zeros((s.shape[0], record.frames, *s.shape[1:]), s.dtype), shapes
         )
-
-    def execute_and_observe(carry: Carry, count: jax.Array, record: Callable[..., Any], kept: Any):
-        """Executes `count` commands; observes before the last O - 1 of them, and after all."""
-
-        def block(state, before):
-            first, last = before
-
-            def one(i, state):
-                carry, kept = state
-                carry = step(carry, i)
-                return carry, record(kept, i, carry)
-
-            state = jax.lax.fori_loop(first, last, one, state)
-            return state, observe(state[0].env)
-
-        ends = jnp.maximum(count - jnp.arange(horizon - 1, -1, -1, dtype=jnp.int32), 0)
-        starts = jnp.concatenate([jnp.zeros(1, jnp.int32), ends[:-1]])
-        # A scan, so that the simulator and the renderer are each compiled once.
-        state, seen = jax.lax.scan(block, (carry, kept), (starts, ends))
-        return state, jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), seen)
-
-    def advance(params: Any, normalizer: Any, carry: Carry, first: jax.Array):
-        """Plans `first` up to `first + SEGMENT`; plan r follows the execution of plan r - 1."""
-        kept = jax.tree.map(
-            lambda x: jnp.zeros((SEGMENT * execute, *x.shape), x.dtype), _steps(carry)
-        )
-        stop = jnp.minimum(first + SEGMENT, -(-settings.max_steps // execute) + 1)
+        last = jnp.minimum(first + record.frames, settings.max_steps)
 
         def is_running(loop):
-            r, carry, _ = loop
-            return (r < stop) & jnp.any(carry.wanted & ~carry.env.done)
+            t, carry, _ = loop
+            return (t < last) & jnp.any(carry.wanted & ~carry.env.done)
 
         def body(loop):
-            r, carry, kept = loop
-            taken = (r - 1) * execute
-            count = jnp.where(r == 0, 0, jnp.minimum(execute, settings.max_steps - taken))
+            t, carry, records = loop
+            carry, fields = step(params, carry, t)
+            # In place: not `.at[:, i].set`, a scatter, which may move the whole of the images.
+            put = functools.partial(jax.lax.dynamic_update_index_in_dim, index=t - first, axis=1)
+            return t + 1, carry, jax.tree.map(put, records, fields)
 
-            def record(kept, i, carry):
-                at = (r - first) * execute + i
-                return jax.tree.map(lambda all_, one: all_.at[at].set(one), kept, _steps(carry))
-
-            (carry, kept), seen = execute_and_observe(carry, count, record, kept)
-            keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(carry.key, r)
-            command = policy.sample(params, normalizer, keys, seen, carry.env.trocar)
-            return r + 1, carry._replace(command=command), kept
-
-        _, carry, kept = jax.lax.while_loop(is_running, body, (first, carry, kept))
-        return carry, kept
+        _, carry, records = jax.lax.while_loop(is_running, body, (first, carry, blank))
+        return carry, records, _status(env, carry)
 
     return advance
 
 
-def _steps(carry: Carry) -> Steps:
-    env = carry.env
-    return Steps(env.rcm_error, env.rcm_error_within, env.pose.p, env.sim.qpos)
+def _fields(env: Any, record: episodes.Record, state: Any) -> dict[str, jax.Array]:
+    """What would be recorded of N episodes that stand still: for its shapes."""
+    observed = jax.vmap(env.observe)(state) if record.observes else None
+    command = Command(state.pose, state.gripper)
+    return record.fields(episodes.Step(observed, command, command, state, state))
+
+
+def frame(env: Any, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shapes of one recorded control step, without computing anything."""
+    from starjax.sim import env as sim_env
+
+    def one(key: jax.Array) -> dict[str, jax.Array]:
+        zeros = jnp.zeros(np.shape(env.p_world_ref)[0])
+        state = env.reset(key, sim_env.EnvParams(Trocar(zeros, zeros, zeros)))
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
+        return jax.tree.map(lambda x: x[0], _fields(env, record, batch))
+
+    return jax.eval_shape(one, jax.random.key(0))
+
+
+def _status(env: Any, carry: Carry) -> dict[str, Any]:
+    state = carry.env
+    status = {
+        "over": state.done,
+        "length": carry.length,
+        "success": state.success & ~state.invalid,
+        "loose": state.loose & ~state.invalid,
+        "invalid": state.invalid,
+        "collided": state.collided,
+        "lost": state.lost,
+        "stage": state.stage,
+        "labels": jax.vmap(env.labels)(state),
+    }
+    # Copied, as the next segment is given the carry's memory before the host has read this.
+    return jax.tree.map(jnp.copy, status)

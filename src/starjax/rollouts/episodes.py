@@ -1,16 +1,38 @@
-"""Recorded episodes on their way from the device to the host."""
+"""What an episode is once it is over: which trial it was, how it ended, what was recorded of it.
 
-import concurrent.futures
-from collections.abc import Sequence
-from typing import NamedTuple
+The fields that are recorded of each control step are chosen by whoever receives the episodes.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from starjax.data import store
+from starjax import rcm
 from starjax.rcm.trocar import Trocar
+from starjax.types import Command, Observation
 
-FETCHES = 8  # pictures of episodes that are copied to the host at once
+Trial = tuple[int, int]  # index of the trocars' configuration, number there
+
+IMAGE = "image_"  # before a camera's name
+
+# How an episode ended: fields of EnvState.
+FLAGS = ("collided", "invalid", "loose", "lost", "success")
+
+# Of a demonstration; images and state are there where they are observed.
+FIELDS = {
+    "p": "m, measured tip positions, world frame",
+    "R": "measured tip rotations R_world_tip",
+    "gripper": "measured openings, -1 closed to +1 open",
+    IMAGE: "uint8 RGB",
+    "state": "fields of the task, one after another",
+    "command_p": "m, commanded tip positions, world frame",
+    "command_R": "commanded R_world_tip",
+    "command_gripper": "-1 squeeze to +1 open",
+    "qpos": "generalised coordinates of the model, before the command",
+    "rcm_error": "m, executed by the command",
+}
 
 
 class Episode(NamedTuple):
@@ -18,72 +40,123 @@ class Episode(NamedTuple):
 
     Attributes:
       outcome: JSON values: which trial it is, and how it ended.
-      arrays: of each of `recorder.FIELDS`, parts that make `[length, ...]` along the first axis.
+      arrays: of each field, parts that make `[length, ...]` along the first axis.
     """
 
-    outcome: store.Record
+    outcome: dict[str, Any]
     arrays: dict[str, list[np.ndarray]]
 
+    @property
+    def trial(self) -> Trial:
+        """Which one it is."""
+        return self.outcome["trocar"], self.outcome["trial"]
 
-@jax.jit
-def _lane(records: jax.Array, lane: jax.Array) -> jax.Array:
-    return records[lane]
-
-
-def slices(images: jax.Array | None, running: Sequence[int]) -> list[jax.Array]:
-    """The pictures of each running lane apart: those of the others are neither copied nor kept."""
-    if images is None:
-        return []
-    share = images.sharding.shard_shape(images.shape)[0]
-    on = {(shard.index[0].start or 0) // share: shard.data for shard in images.addressable_shards}
-    return [_lane(on[lane // share], np.int32(lane % share)) for lane in running]
+    def joined(self, name: str) -> np.ndarray:
+        """A field, `[length, ...]`."""
+        return np.concatenate(self.arrays[name])
 
 
-def fetch(arrays: Sequence[jax.Array]) -> list[np.ndarray]:
-    """The arrays on the host, several copied at once."""
-    copy = np.asarray if jax.default_backend() == "cpu" else _through_pinned
-    with concurrent.futures.ThreadPoolExecutor(FETCHES) as pool:
-        return list(pool.map(copy, arrays))
+class Step(NamedTuple):
+    """One control step of N episodes.
 
-
-def _through_pinned(array: jax.Array) -> np.ndarray:
-    """A copy by way of pinned memory, which a GPU writes at its full speed.
-
-    It takes that long to come by that it must be used again and again: what is returned holds none.
+    Attributes:
+      observed: Observation before it, None where nothing that is recorded needs one.
+      label: Command `[N, A]` to record. executed: Command `[N, A]`.
+      before, after: EnvState.
     """
-    return np.array(jax.device_put(array, array.sharding.with_memory_kind("pinned_host")))
+
+    observed: Observation | None
+    label: Command
+    executed: Command
+    before: Any
+    after: Any
+
+
+class Record(NamedTuple):
+    """What is recorded of every control step.
+
+    Attributes:
+      fields: (Step) -> name -> `[N, ...]`.
+      observes: whether it needs `Step.observed`.
+      frames: control steps between two looks of the host; it bounds the memory that images take on
+        the device.
+    """
+
+    fields: Callable[[Step], dict[str, jax.Array]]
+    observes: bool
+    frames: int
+
+
+def _demonstrated(step: Step) -> dict[str, jax.Array]:
+    seen, label = step.observed, step.label
+    assert seen is not None
+    found = {
+        "p": seen.pose.p,
+        "R": seen.pose.R,
+        "gripper": seen.gripper,
+        **{f"{IMAGE}{camera}": image for camera, image in (seen.images or {}).items()},
+        "state": seen.state,
+        "command_p": label.pose.p,
+        "command_R": label.pose.R,
+        "command_gripper": label.gripper,
+        "qpos": step.before.physics.qpos,
+        "rcm_error": step.after.rcm_error,
+    }
+    return {name: leaf for name, leaf in found.items() if leaf is not None}
+
+
+def _scored(step: Step) -> dict[str, jax.Array]:
+    after = step.after
+    commanded = rcm.rcm_error(step.executed.pose, after.trocar.p_world_trocar)
+    return {
+        "rcm_error": after.rcm_error,
+        "rcm_error_within": after.rcm_error_within,
+        "rcm_error_commanded": commanded,
+        "reached_p": after.pose.p,
+        "reached_qpos": after.physics.qpos,
+    }
+
+
+DEMONSTRATION = Record(_demonstrated, observes=True, frames=16)
+# Errors of each step, and where the arms were after it.
+SCORE = Record(_scored, observes=False, frames=200)
+
+
+def what(field: str) -> str:
+    """What a field of `DEMONSTRATION` is."""
+    return FIELDS[IMAGE if field.startswith(IMAGE) else field]
 
 
 def assemble(
     lane: int,
-    trial: tuple[int, int],
+    trial: Trial,
     trocars: Trocar,
     seed: int,
-    status: dict[str, np.ndarray],
+    status: Mapping[str, Any],
     others: list[dict[str, np.ndarray]],
-    pictures: list[np.ndarray],
+    images: Mapping[str, list[np.ndarray]],
 ) -> Episode:
-    """The episode of a lane that is over, of what was fetched after every segment.
+    """Puts together the episode of a lane that is over, of what was fetched after every segment.
 
     Args:
-      status: `[N]` each, after the last of them.
-      others: all but the pictures, `[N, T, ...]` each.
-      pictures: of this lane alone, `[T, ...]`.
+      trocars: fields `[C, A]`.
+      status: `[N]` each, and `labels`, after the last segment.
+      others: all but the images, `[N, T, ...]` each.
+      images: of this lane alone, `[T, ...]`.
     """
     length = int(status["length"][lane])
     outcome = {
         "trocar": trial[0],
-        "radius": float(trocars.radius[trial[0]]),
-        "polar": float(trocars.polar[trial[0]]),
-        "azimuth": float(trocars.azimuth[trial[0]]),
+        **{name: field[trial[0]].tolist() for name, field in trocars._asdict().items()},
         "trial": trial[1],
         "seed": seed,
         "length": length,
-        **{name: bool(status[name][lane]) for name in ("collided", "invalid", "loose", "success")},
+        **{name: bool(status[name][lane]) for name in FLAGS},
+        "stage": int(status["stage"][lane]),
+        "labels": {name: int(label[lane]) for name, label in status["labels"].items()},
     }
     fields = {name: [segment[name][lane] for segment in others] for name in others[0]}
-    if pictures:
-        fields["image"] = pictures
+    fields |= images
     # It ends in the last segment.
     for parts in fields.values():
         parts[-1] = parts[-1][: length - sum(map(len, parts[:-1]))]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -10,7 +10,22 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 SHARED = PartitionSpec()
 LANE = PartitionSpec("lane")
-TIME_LANE = PartitionSpec(None, "lane")
+
+
+class Place(NamedTuple):
+    """Where a batch runs.
+
+    Attributes:
+      lanes: episodes simulated together on all devices; of a CPU with one, each core has as many.
+        0 for what suits the machine. It decides memory, and may change last bits.
+      devices: that lanes are split over, None for the default one.
+    """
+
+    lanes: int = 0
+    devices: Sequence[jax.Device] | None = None
+
+
+ANYWHERE = Place()
 
 
 def devices() -> list[jax.Device] | None:
@@ -31,7 +46,7 @@ def split(
     Args:
       fn: acts on lanes independently; shapes inside are those of one device's share.
       devices: None for the default one.
-      in_specs: SHARED, LANE (leading axis) or TIME_LANE (second axis) for each argument.
+      in_specs: SHARED or LANE (leading axis) for each argument.
       out_specs: the same for the result, or for its parts.
       donate: arguments whose memory may be reused.
     """

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from starjax.rollouts import chunks, episodes
+from starjax.rollouts import episodes, waves
 
 
 class World:
@@ -31,7 +31,7 @@ class World:
     def collected(self, known, per_trocar, chunk, at_once=1):
         """The trials that are yielded, once each."""
         self.groups = []
-        given = chunks.run(self.simulate, dict(known), self.trocars, per_trocar, chunk, at_once)
+        given = waves.run(self.simulate, dict(known), self.trocars, per_trocar, chunk, at_once)
         found = [(e.outcome["trocar"], e.outcome["trial"]) for e in given]
         assert len(set(found)) == len(found)
         return set(found)

@@ -7,11 +7,11 @@ successes, and is not once they do have them.
 import math
 from collections.abc import Callable, Generator, Iterator, Mapping
 
-from starjax.rollouts import cores, episodes
+from starjax.rollouts import cores
+from starjax.rollouts.episodes import Episode, Trial
 
 MIN_SUCCESS_RATE = 0.5  # below it at some trocar, the expert is broken and collecting stops
 
-Trial = tuple[int, int]  # trocar, number
 Known = Mapping[Trial, bool]  # whether it succeeded
 
 
@@ -20,17 +20,17 @@ class ExpertFailed(ValueError):
 
 
 def run(
-    simulate: Callable[[list[Trial]], Generator[list[episodes.Episode]]],
+    simulate: Callable[[list[Trial]], Generator[list[Episode]]],
     known: dict[Trial, bool],
     trocars: int,
     per_trocar: int,
     chunk: int,
     at_once: int = 1,
-) -> Iterator[episodes.Episode]:
+) -> Iterator[Episode]:
     """Simulates what is needed, `chunk` trials together; yields each episode when that is certain.
 
     Args:
-      simulate: as `recorder.simulator` makes it.
+      simulate: yields a group's episodes as they end.
       known: outcomes of episodes that are there already; the others are added.
       trocars: how many there are.
       per_trocar: successes wanted at each.
@@ -44,7 +44,7 @@ def run(
     drawn = [0] * trocars
     while wave := _wave(known, drawn, per_trocar, chunk):
         groups = [wave[first : first + chunk] for first in range(0, len(wave), chunk)]
-        waiting: list[episodes.Episode] = []
+        waiting: list[Episode] = []
 
         def is_wanted(group: list[Trial]) -> bool:
             return any(_is_open(trial, known, per_trocar) for trial in group)
@@ -53,13 +53,13 @@ def run(
             waiting += ended
             for episode in ended:
                 # What is on disk stays, also where another machine's last bits end otherwise.
-                known.setdefault(_trial(episode), episode.outcome["success"])
+                known.setdefault(episode.trial, episode.outcome["success"])
             ended.clear()  # so that an episode's memory is free once it is written
-            ready = [e for e in waiting if _is_needed(_trial(e), known, per_trocar)]
-            waiting = [e for e in waiting if not _is_needed(_trial(e), known, per_trocar)]
+            ready = [e for e in waiting if _is_needed(e.trial, known, per_trocar)]
+            waiting = [e for e in waiting if not _is_needed(e.trial, known, per_trocar)]
             while ready:
                 episode = ready.pop()
-                if _trial(episode) not in there:
+                if episode.trial not in there:
                     yield episode
 
 
@@ -103,7 +103,3 @@ def _is_open(trial: Trial, known: Known, per_trocar: int) -> bool:
     """Whether it is not over, and may be needed."""
     before = sum(known.get((trial[0], i), False) for i in range(trial[1]))
     return trial not in known and before < per_trocar
-
-
-def _trial(episode: episodes.Episode) -> Trial:
-    return episode.outcome["trocar"], episode.outcome["trial"]

@@ -1,10 +1,11 @@
-"""Closed-loop rollouts: what a trial is, and that neither its neighbours nor kills change it."""
+"""Evaluations: their trials are those of the seed, and neither chunks nor kills change them."""
 
 import json
+import os
+import pathlib
 import shutil
 import subprocess
 import sys
-import types
 from typing import Any
 
 import fakes
@@ -18,29 +19,43 @@ import stubs
 from starjax import rcm
 from starjax.data import normalizer
 from starjax.evaluation import evaluate, recorded, statistics
-from starjax.evaluation import trials as table
+from starjax.evaluation import trials as tables
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
-from starjax.rollouts import engine
-from starjax.rollouts import placement as splitting
+from starjax.rollouts import agent, engine, placement
+from starjax.rollouts.episodes import Episode
+from starjax.rollouts.placement import Place
 from starjax.runtime import files
-from starjax.types import Command, Pose
 
-TROCARS = rcm.Trocar(*(field[[0, 4, 8]] for field in rcm.TROCARS))
-KWARGS = {"trials": 2, "seed": 0, "obs_horizon": 2, "execute": 4, "time_limit_s": 1.0, "lanes": 6}
+TROCARS = stubs.trocars(0, 4, 8)
+SETTINGS = evaluate.Settings(trials=2, seed=0, time_limit_s=1.0)
+GOLDEN = pathlib.Path(__file__).parents[1] / "golden" / "evaluation"
 
 
-def run(directory, policy=None, params=None, env=None, stats=1.0, report=lambda _: None, **kwargs):
+def run(
+    directory,
+    sample=None,
+    params=None,
+    env=None,
+    stats=1.0,
+    report=lambda _: None,
+    obs_horizon=2,
+    execute=4,
+    lanes=6,
+    devices=None,
+    trocars=TROCARS,
+    **changed,
+):
     stub, weights = stubs.make_policy(width=32)
     return evaluate.evaluate(
         directory,
         env or stubs.make_env(),
-        policy or stub,
-        weights if params is None else params,
-        jnp.float32(stats),
-        kwargs.pop("trocars", TROCARS),
+        agent.from_policy(sample or stub, obs_horizon, execute),
+        (weights if params is None else params, jnp.float32(stats)),
+        trocars,
+        SETTINGS._replace(**changed),
+        place=Place(lanes, devices),
         report=report,
-        **{**KWARGS, **kwargs},
     )
 
 
@@ -58,8 +73,10 @@ def whole(tmp_path_factory):
 
 
 def assert_same(a, b):
-    for name in table.Table._fields:
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), name)
+    ours, theirs = tables.columns(a), tables.columns(b)
+    assert ours.keys() == theirs.keys()
+    for name, column in ours.items():
+        np.testing.assert_array_equal(column, theirs[name], name)
 
 
 def test_outcomes_are_those_of_the_environment(whole):
@@ -68,7 +85,7 @@ def test_outcomes_are_those_of_the_environment(whole):
     assert not (found.success & found.invalid).any()
     np.testing.assert_array_equal(found.trocar, [0, 0, 1, 1, 2, 2])
     np.testing.assert_array_equal(found.trial, [0, 1, 0, 1, 0, 1])
-    np.testing.assert_array_equal(found.radius, np.repeat(TROCARS.radius, 2))
+    np.testing.assert_array_equal(found.radius, np.repeat(TROCARS.radius, 2, axis=0))
     timeout = ~found.success & ~found.invalid
     assert (found.steps[timeout] == 30).all() and (found.steps[~timeout] < 30).all()
 
@@ -78,29 +95,37 @@ def test_the_chunk_does_not_change_a_bit(whole, tmp_path, chunk):
     assert_same(run(tmp_path, chunk=chunk), whole[1])
 
 
+def test_the_same_seed_gives_the_same_trials(whole):
+    """Those of the code at f5ed409, with the stub of its day."""
+    before = np.load(GOLDEN / "table.npz")
+    ours = tables.columns(whole[1])
+    for name in before.files:
+        mine = ours.get(name, ours.get(f"labels.{name}"))
+        mine = mine[:, 0] if name in rcm.Trocar._fields else mine
+        np.testing.assert_array_equal(mine, before[name], name)
+
+
 def test_the_chunk_does_not_change_a_bit_of_a_network(tmp_path):
     """The same with convolutions and matrix products, whose last bits may depend on the batch."""
-    row, p_world_ref = METHODS["stardiff"], stubs.P_WORLD_REF
-    policy = policies.make(row, fakes.TINY, p_world_ref)
+    row = METHODS["stardiff"]
+    policy = policies.make(row, fakes.TINY, fakes.TASK)
     dataset = fakes.dataset(seed=0, demos=4, length=20, image_size=fakes.TINY.image_size)
-    stats = normalizer.fit(row, dataset, p_world_ref, np.arange(80))
+    stats = normalizer.fit(row, fakes.TASK, dataset, np.arange(80))
     params = jax.jit(policy.init)(jax.random.key(0))
-    tables = [
+    found = [
         evaluate.evaluate(
             tmp_path / str(chunk),
             stubs.make_env(),
-            policy,
-            params,
-            stats,
+            agent.from_policy(policy.sample, 2, 4),
+            (params, stats),
             TROCARS,
-            chunk=chunk,
-            video_trials=6,
-            **KWARGS,
+            SETTINGS._replace(chunk=chunk, video_trials=6),
+            place=Place(6),
         )
         for chunk in (2, 3, 6)
     ]
-    assert_same(tables[0], tables[2])
-    assert_same(tables[1], tables[2])
+    assert_same(found[0], found[2])
+    assert_same(found[1], found[2])
     paths = [(tmp_path / chunk / "recorded.npz").read_bytes() for chunk in "236"]
     assert paths[0] == paths[1] == paths[2]
 
@@ -112,7 +137,7 @@ def test_trials_depend_on_the_seed_and_on_nothing_else(whole, tmp_path):
 
 
 def _first_trials(found):
-    return table.select(found, found.trial == 0)
+    return tables.select(found, found.trial == 0)
 
 
 def test_kills_leave_no_trace(tmp_path):
@@ -142,7 +167,7 @@ def test_other_weights_start_afresh(tmp_path, whole):
     "other",
     [
         {"seed": 1},
-        {"trocars": rcm.Trocar(*(field[[0, 4, 9]] for field in rcm.TROCARS))},
+        {"trocars": stubs.trocars(0, 4, 9)},
         {"time_limit_s": 0.5},
         {"execute": 3},
         {"stats": 2.0},
@@ -162,10 +187,10 @@ def test_trials_of_other_settings_are_not_taken_for_these(whole, tmp_path, monke
     assert "another evaluation" in said[0]
 
 
-@pytest.mark.parametrize("what", ["scene", "versions"])
+@pytest.mark.parametrize("what", ["model", "versions"])
 def test_another_simulator_starts_afresh(tmp_path, whole, monkeypatch, what):
     run(tmp_path, chunk=3)
-    change = {"scene": (evaluate.demos, "scene_hash"), "versions": (evaluate.xla, "versions")}
+    change = {"model": (evaluate.schema, "model_hash"), "versions": (evaluate.xla, "versions")}
     monkeypatch.setattr(*change[what], lambda *_: "another")
     said = []
     assert_same(run(tmp_path, chunk=3, report=said.append), whole[1])
@@ -216,12 +241,14 @@ def test_no_flipped_bit_of_a_chunk_gets_into_the_table(tmp_path, whole):
     path = tmp_path / "chunk_0000.npz"
     good = path.read_bytes()
     rng = np.random.default_rng(0)
+    names = tables.names(stubs.make_env().task.labels)
     noticed = 0
     for bit in rng.integers(0, 8 * len(good), 200):
         bad = bytearray(good)
         bad[bit // 8] ^= 1 << (bit % 8)
         path.write_bytes(bad)
-        found = evaluate._read(path, whole[1].trocar, whole[1].trial, lambda _: None)
+        group = [*zip(whole[1].trocar.tolist(), whole[1].trial.tolist(), strict=True)]
+        found = evaluate._read(path, group, names, lambda _: None)
         noticed += found is None
         if found is not None:  # a byte that means nothing, such as a date
             assert_same(found[0], whole[1])
@@ -237,26 +264,36 @@ def test_recorded_trajectories_are_those_of_the_trials(whole):
         at = np.flatnonzero((found.trocar == trocar) & (found.trial == trial))[0]
         length = kept["length"][row]
         assert length == found.steps[at]
-        path = kept["p_world_tip"][row]
+        path = kept["p_world_tip"][row, :, 0]
         assert np.isfinite(path[:length]).all() and np.isnan(path[length:]).all()
         speed = np.linalg.norm(np.diff(path[:length], axis=0), axis=-1)
         assert (speed <= stubs.SPEED + 1e-6).all()
         np.testing.assert_allclose(kept["qpos"][row, :length, :3], path[:length])
-        assert kept["target_peg"][row] == found.target[at]
-        assert kept["source_peg"][row] == found.source[at]
+        for name in ("source", "target"):
+            assert kept[f"labels.{name}"][row] == found.labels[name][at]
         start = found.steps[:at].sum()
         np.testing.assert_allclose(
-            1e3 * kept["rcm_error"][row, :length],
+            1e3 * kept["rcm_error"][row, :length, 0],
             found.rcm_error_mm[start : start + length],
             rtol=1e-3,
         )
         np.testing.assert_allclose(1e3 * found.rcm_max[at], recorded_max(kept, row), rtol=1e-6)
 
 
-def test_recorded_ports_are_those_of_the_trials(whole):
+def test_recorded_trocars_are_those_of_the_trials(whole):
     with np.load(whole[0] / "recorded.npz", allow_pickle=False) as kept:
-        ports = np.asarray(rcm.trocar_position(TROCARS, stubs.P_WORLD_REF))
-        np.testing.assert_allclose(kept["p_world_trocar"], ports[kept["trocar"]], atol=1e-7)
+        places = np.asarray(rcm.trocar_position(TROCARS, stubs.P_WORLD_REF[:1]))
+        np.testing.assert_allclose(kept["p_world_trocar"], places[kept["trocar"]], atol=1e-7)
+
+
+def test_recorded_files_of_both_forms_are_read_alike(whole):
+    """The golden one is of before the axis of arms."""
+    ours, theirs = (recorded.read(x / "recorded.npz") for x in (whole[0], GOLDEN))
+    assert len(ours) == len(theirs) == 4
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.labels == other.labels and (one.trocar, one.trial) == (other.trocar, other.trial)
+        for name in ("p_world_tip", "p_world_trocar", "rcm_error", "qpos"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-7)
 
 
 def recorded_max(kept, row):
@@ -270,126 +307,62 @@ def test_few_of_many_trocars_are_recorded_evenly():
     assert recorded.choose(3, 2, 50).all()
 
 
-def _spy(horizon):
-    """A policy whose commands spell the first and last step that it saw, and its plan's key."""
-
-    def sample(params, normalizer, keys, observation, trocar):
-        seen = observation.gripper  # what the environment below shows: the step's number
-        p = jnp.stack([seen[:, 0], seen[:, -1], jax.vmap(jax.random.uniform)(keys)], -1)
-        count = p.shape[0]
-        poses = Pose(
-            jnp.broadcast_to(jnp.eye(3), (count, horizon, 3, 3)),
-            jnp.broadcast_to(p[:, None], (count, horizon, 3)),
-        )
-        return Command(poses, jnp.broadcast_to(jnp.arange(float(horizon)), (count, horizon)))
-
-    return stubs.Policy(sample)
-
-
-def _counting():
-    """An environment that never ends and logs the commands that it gets in qpos."""
-    base = stubs.make_env(unlucky=0.0)
-
-    def reset(key, params):
-        state = base.reset(key, params)
-        return state.replace(sim=stubs.Physics(jnp.zeros(4)), gripper=jnp.zeros(()))
-
-    def step(state, command):
-        log = jnp.concatenate([command.pose.p, command.gripper[None]])
-        number = state.step + 1
-        return state.replace(
-            sim=stubs.Physics(log), step=number, gripper=number.astype(jnp.float32)
-        )
-
-    return base._replace(reset=reset, step=step)
-
-
-@pytest.mark.parametrize("horizon", [1, 2, 3])
-def test_history_and_plans_follow_the_paper(tmp_path, horizon):
-    """Observes steps t - O + 1 .. t, executes the plan's first commands, then plans anew."""
-    run(
-        tmp_path,
-        policy=_spy(6),
-        env=_counting(),
-        obs_horizon=horizon,
-        trocars=rcm.Trocar(*(f[:1] for f in rcm.TROCARS)),
-        trials=1,
-        time_limit_s=10 / 30,
-        video_trials=1,
-    )
-    with np.load(tmp_path / "recorded.npz", allow_pickle=False) as archive:
-        log = archive["qpos"][0]
-    t = np.array([0, 0, 0, 0, 4, 4, 4, 4, 8, 8])
-    np.testing.assert_array_equal(log[:, 3], [0, 1, 2, 3, 0, 1, 2, 3, 0, 1])
-    np.testing.assert_array_equal(log[:, 1], t)
-    np.testing.assert_array_equal(log[:, 0], np.maximum(t - horizon + 1, 0))
-    assert len(np.unique(log[:, 2])) == 3  # fresh noise for every plan
-
-
 def test_commanded_error_counts_executed_commands_only(whole):
     """The stub's commands keep R = 1, so the error of a command is its distance to the vertical."""
-    _, found = whole
+    directory, found = whole
     assert (found.rcm_commanded_max > 1e-4).all()
-    env, (policy, params) = stubs.make_env(), stubs.make_policy(width=32)
-    settings = engine.Settings(2, 4, 30)
-    trials = engine.Trials(
-        trocar=rcm.Trocar(*(f[:1] for f in TROCARS)),
-        index=np.zeros(1, np.int32),
-        trial=np.zeros(1, np.int32),
-        wanted=np.ones(1, bool),
+    for trial in recorded.read(directory / "recorded.npz"):
+        # Where the plan is followed exactly, the tip has been at every command that was executed.
+        aside = trial.p_world_tip[:, 0, :2] - trial.p_world_trocar[0, :2]
+        at = np.flatnonzero((found.trocar == trial.trocar) & (found.trial == trial.trial))[0]
+        far = np.linalg.norm(aside, axis=-1).max()
+        np.testing.assert_allclose(found.rcm_commanded_max[at], far, atol=2e-3)
+
+
+def test_errors_of_several_arms_are_those_of_the_worst(tmp_path):
+    trocars = stubs.trocars(0, 4, arms=2)
+    env = stubs.make_env(arms=2, unlucky=0.0)
+    found = run(tmp_path, env=env, trocars=trocars, video_trials=4)
+    assert found.radius.shape == (4, 2)
+    for trial in recorded.read(tmp_path / "recorded.npz"):
+        at = np.flatnonzero((found.trocar == trial.trocar) & (found.trial == trial.trial))[0]
+        assert trial.rcm_error is not None and trial.rcm_error.shape[1] == 2
+        np.testing.assert_allclose(found.rcm_max[at], trial.rcm_error.max(), rtol=1e-6)
+        worst = trial.rcm_error.max(axis=1)
+        np.testing.assert_allclose(found.rcm_mean[at], worst.mean(), rtol=1e-5)
+
+
+def test_a_trial_is_safe_if_its_executed_error_stayed_small():
+    executed = [[1e-3, 1.8e-3], [1e-3, 1.9e-3], [9.0, 9.0]]
+    within = [[1.9e-3, 1.8e-3], [1e-3, 2.1e-3], [9.0, 9.0]]
+    outcomes = [
+        {"success": True, "collided": False, "invalid": False, "loose": True},
+        {"success": True, "collided": True, "invalid": False, "loose": False},
+        {"success": False, "collided": False, "invalid": True, "loose": False},
+    ]
+    same = {"trocar": 0, "radius": [0.0], "polar": [0.0], "azimuth": [0.0], "trial": 0}
+    same |= {"length": 2, "lost": False, "stage": 1, "labels": {"source": 3}}
+    found = tables.from_episodes(
+        [
+            Episode(
+                {**same, **outcome},
+                {
+                    "rcm_error": [np.float32(at_ends)[:, None]],
+                    "rcm_error_within": [np.float32(inside)[:, None]],
+                    "rcm_error_commanded": [np.zeros((2, 1), np.float32)],
+                },
+            )
+            for outcome, at_ends, inside in zip(outcomes, executed, within)
+        ]
     )
-    *_, (_, done) = engine.make(env, policy, settings, 0)(params, jnp.float32(1.0), trials)
-    port = np.asarray(rcm.trocar_position(trials.trocar, stubs.P_WORLD_REF))[0]
-    # Where the plan is followed exactly, the tip has been at every command that was executed.
-    path = done.steps.p_world_tip[: done.length[0], 0]
-    far = np.linalg.norm(path[:, :2] - port[:2], axis=-1).max()
-    np.testing.assert_allclose(done.commanded_max[0], far, atol=2e-3)
-
-
-def test_the_commanded_error_of_a_trial_is_its_largest(tmp_path):
-    """At step t the command misses the port by 20 mm less 1 mm for each step from the sixth."""
-
-    def sample(params, normalizer, keys, observation, trocar):
-        t = observation.gripper[:, -1:] + jnp.arange(6.0)
-        aside = 0.02 - 0.001 * jnp.abs(t - 5.0)
-        R = jnp.broadcast_to(jnp.eye(3), (*t.shape, 3, 3))
-        return Command(Pose(R, aside[..., None] * jnp.array([1.0, 0.0, 0.0])), t)
-
-    centre = rcm.Trocar(*(field[11:] for field in rcm.TROCARS))
-    found = run(
-        tmp_path,
-        policy=stubs.Policy(sample),
-        env=_counting(),
-        trocars=centre,
-        trials=1,
-        time_limit_s=10 / 30,
-    )
-    np.testing.assert_allclose(found.rcm_commanded_max, 0.02, rtol=1e-5)
-
-
-def test_a_trial_is_safe_if_its_executed_error_stayed_small_and_nothing_if_it_diverged():
-    pegs = np.zeros(3, int)
-    env = types.SimpleNamespace(
-        trocar=rcm.Trocar(*(np.zeros(3, np.float32),) * 3),
-        success=np.array([True, True, False]),
-        loose=np.array([True, False, True]),
-        invalid=np.array([False, False, True]),
-        collided=np.array([False, True, False]),
-        **dict.fromkeys(("source", "target"), pegs),
-    )
-    executed = np.array([[1e-3, 1e-3, 0], [1.8e-3, 1.9e-3, 0], [9, 9, 9]], np.float32)
-    within = np.array([[1.9e-3, 1e-3, 0], [1.8e-3, 2.1e-3, 0], [9, 9, 9]], np.float32)
-    commanded = np.array([5e-3, 0, 0])
-    steps = engine.Steps(executed, within, None, None)
-    done = engine.Rollouts(env, np.array([2, 2, 2]), commanded, steps)
-    found = table.from_rollouts(done, np.arange(3), np.zeros(3, int))
     np.testing.assert_array_equal(found.safe, [True, False, False])
     np.testing.assert_array_equal(found.loose, [True, False, False])
-    np.testing.assert_allclose(found.rcm_max, [1.8e-3, 1.9e-3, 0])
-    np.testing.assert_allclose(found.rcm_mean, [1.4e-3, 1.45e-3, 0])
     np.testing.assert_array_equal(found.collided, [False, True, False])
-    np.testing.assert_allclose(found.rcm_within_max, [1.9e-3, 2.1e-3, 0])
-    np.testing.assert_allclose(found.rcm_within_mm, [1.9, 1.8, 1, 2.1, 0, 0], rtol=1e-3)
+    np.testing.assert_allclose(found.rcm_max, [1.8e-3, 1.9e-3, 9.0])
+    np.testing.assert_allclose(found.rcm_mean, [1.4e-3, 1.45e-3, 9.0])
+    np.testing.assert_allclose(found.rcm_within_max, [1.9e-3, 2.1e-3, 9.0])
+    np.testing.assert_allclose(found.rcm_within_mm[:4], [1.9, 1.8, 1, 2.1], rtol=1e-3)
+    assert found.labels["source"].tolist() == [3, 3, 3]
 
 
 @pytest.mark.parametrize(
@@ -399,11 +372,10 @@ def test_a_trial_is_safe_if_its_executed_error_stayed_small_and_nothing_if_it_di
         ({"time_limit_s": 0.0}, "time_limit_s"),
         ({"chunk": -1}, "chunk"),
         ({"lanes": -1}, "lanes"),
-        ({"execute": 0}, "settings"),
-        ({"obs_horizon": 6}, "obs_horizon"),
-        ({"trocars": rcm.Trocar(0.02, 80.0, 0.0)}, "trocar.polar"),
-        ({"trocars": rcm.Trocar(0.02, np.nan, 0.0)}, "trocar.polar"),
-        ({"trocars": rcm.Trocar(*np.zeros((3, 0)))}, "trocars: expected .* one trocar or more"),
+        ({"video_trials": -1}, "video_trials"),
+        ({"trocars": rcm.Trocar(*np.full((3, 1, 1), 80.0))}, "trocar.polar"),
+        ({"trocars": rcm.Trocar(*np.zeros((3, 0, 1)))}, "trocars"),
+        ({"trocars": stubs.trocars(0, arms=2)}, "trocars"),
     ],
 )
 def test_bad_arguments_are_named_and_cost_nothing(tmp_path, bad, name):
@@ -413,51 +385,35 @@ def test_bad_arguments_are_named_and_cost_nothing(tmp_path, bad, name):
     assert (tmp_path / "chunk_0000.npz").exists()
 
 
-def test_no_more_commands_are_executed_than_planned(tmp_path):
-    with pytest.raises(ValueError, match=r"execute: expected at most the \d+ that are planned"):
-        run(tmp_path, execute=20)
-
-
-def test_each_program_is_traced_once(tmp_path):
-    traces = []
-    policy, _ = stubs.make_policy(width=32)
-
-    def sample(*args):
-        traces.append(1)
-        return policy.sample(*args)
-
-    run(tmp_path, policy=stubs.Policy(sample), chunk=2, time_limit_s=5.0)
-    assert len(traces) == 2  # for the shape of a plan, and for the program
-
-
 _DEVICES = """
 import sys, json, pathlib
 import jax, numpy as np
-import test_rollout
+import test_evaluate
 out = pathlib.Path(sys.argv[1])
 assert len(jax.devices()) == 2
-one = test_rollout.run(out / "1", lanes=2, devices=jax.devices()[:1])
-two = test_rollout.run(out / "2", lanes=2, devices=jax.devices())
-test_rollout.assert_same(one, two)
+one = test_evaluate.run(out / "1", lanes=2, devices=jax.devices()[:1])
+two = test_evaluate.run(out / "2", lanes=2, devices=jax.devices())
+test_evaluate.assert_same(one, two)
 from starjax.evaluation import evaluate
 evaluate.lanes_per_device = lambda _, trials: trials
-test_rollout.run(out / "3", lanes=0, devices=jax.devices())
-from starjax.data import demos, lanes
-last = lanes.split(lambda x: x + 1, jax.devices()[1:], [lanes.LANE], lanes.LANE)(np.ones(2))
+test_evaluate.run(out / "3", lanes=0, devices=jax.devices())
+from starjax.rollouts import agent, placement
+split = [placement.LANE], placement.LANE
+last = placement.split(lambda x: x + 1, jax.devices()[1:], *split)(np.ones(2))
 assert last.devices() == {jax.devices()[1]}
 import stubs, kill
+from starjax.data import demos, schema
 for count in (1, 2):
-    demos.collect(out / f"demos{count}", stubs.make_env(), stubs.Expert(), test_rollout.TROCARS,
-                  per_trocar=2, seed=0, max_steps=100, chunk=4, devices=jax.devices()[:count])
+    demos.collect(
+        out / f"demos{count}", stubs.make_env(), agent.from_single(stubs.EXPERT),
+        test_evaluate.TROCARS, schema.Settings(per_trocar=2, seed=0, max_steps=100),
+        place=placement.Place(4, jax.devices()[:count]))
 assert kill.tree(out / "demos1") == kill.tree(out / "demos2")
 print("same")
 """
 
 
 def test_two_devices_give_the_same_bits(tmp_path):
-    import os
-    import pathlib
-
     here = pathlib.Path(__file__).parent
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
     environment = {
@@ -499,7 +455,7 @@ def test_a_gpu_runs_as_many_lanes_as_make_the_fewest_chunks(gigabytes, trials, l
 def test_lanes_are_split_over_all_devices_of_several(monkeypatch):
     for count, expected in ((1, None), (2, [_Device, _Device])):
         monkeypatch.setattr(jax, "local_devices", lambda n=count: [_Device] * n)
-        assert splitting.devices() == expected
+        assert placement.devices() == expected
 
 
 def test_a_folder_in_use_is_refused(tmp_path):
