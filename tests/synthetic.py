@@ -7,52 +7,61 @@ import pathlib
 import numpy as np
 
 from starjax import config, rcm
-from starjax.evaluation import statistics, sweep
+from starjax.evaluation import result, statistics, sweep
 from starjax.evaluation import trials as table
+from starjax.rollouts import trocars
+from starjax.sim import names
 
-P_REF = np.array([0.0, 0.0, 0.15], np.float32)
+P_REF = np.array([[0.0, 0.0, 0.15]], np.float32)
+WEIGHTS = "0" * 64
 
 
 def run(path: pathlib.Path, method="stardiff", skill=(0.85, 0.7), trials=6, sweep_of=0, seed=0):
     """Writes result.json, metrics.jsonl, evaluation/recorded.npz (and sweep.json) under `path`."""
     rng = np.random.default_rng(seed)
     index = np.repeat(np.arange(12), trials)
-    ports = rcm.Trocar(*(field[index] for field in rcm.TROCARS))
-    rows = outcomes(rng, ports, index, np.where(rcm.IS_SEEN[index], *skill))
+    twelve = trocars.select(trocars.twelve(), index)
+    rows = outcomes(rng, twelve, index, np.where(rcm.IS_SEEN[index], *skill))
     (path / "evaluation").mkdir(parents=True)
-    (path / "result.json").write_text(json.dumps(result(method, rows, seed)))
+    write(path / "result.json", method, rows, seed)
     (path / "metrics.jsonl").write_text("\n".join(json.dumps(line) for line in curves(rng)))
     np.savez(path / "evaluation" / "recorded.npz", **recorded(rng, rows, 3))
     if sweep_of:
-        ports = sweep.sample(seed, sweep_of)
-        chance = skill[0] - 6 * np.maximum(0, ports.radius - 0.03)
-        spread = outcomes(rng, ports, np.arange(sweep_of), chance)
-        training = rcm.Trocar(*(field[rcm.IS_SEEN] for field in rcm.TROCARS))
-        about = {"method": method, "observation": "state"}
-        figures = sweep.compose(spread, training, P_REF, seed=0)
-        (path / "sweep.json").write_text(json.dumps(about | figures))
+        places = sweep.sample(seed, sweep_of)
+        chance = skill[0] - 6 * np.maximum(0, places.radius[:, 0] - 0.03)
+        spread = outcomes(rng, places, np.arange(sweep_of), chance)
+        figures = sweep.compose(
+            spread, trocars.select(trocars.twelve(), rcm.IS_SEEN), P_REF, seed=0
+        )
+        about = {"method": method, "observation": "state", "weights": WEIGHTS}
+        about |= {"control_hz": 30.0, "time_limit_s": 60.0, "seed": 0}
+        result.write(path / "sweep.json", names.FIRST, figures, about)
     return path
 
 
-def outcomes(rng, ports, index, chance):
-    """A table of trials that succeed with the given chances."""
+def outcomes(rng, places, index, chance):
+    """A table of trials that succeed with the given chances, at trocars `[M, A]`."""
     success = rng.random(len(index)) < chance
     steps = np.where(success, rng.integers(180, 420, len(index)), 1800).astype(np.int32)
     largest = rng.gamma(2, 1e-4, len(index)).astype(np.float32)
     return table.Table(
         trocar=index.astype(np.int32),
-        radius=ports.radius,
-        polar=ports.polar,
-        azimuth=ports.azimuth,
+        radius=places.radius,
+        polar=places.polar,
+        azimuth=places.azimuth,
         trial=np.concatenate([np.arange(n) for n in np.bincount(index)]),
         success=success,
         loose=success | (rng.random(len(index)) < 0.2),
         safe=success & (rng.random(len(index)) < 0.97),
         invalid=np.zeros(len(index), bool),
         collided=~success & (rng.random(len(index)) < 0.25),
+        lost=np.zeros(len(index), bool),
         steps=steps,
-        source=rng.integers(0, 6, len(index)),
-        target=rng.integers(6, 12, len(index)),
+        stage=np.where(success, 3, 1),
+        labels={
+            "source": rng.integers(0, 6, len(index)),
+            "target": rng.integers(6, 12, len(index)),
+        },
         rcm_commanded_max=np.full(len(index), 3.1e-8, np.float32),
         rcm_mean=largest / 8,
         rcm_max=largest,
@@ -62,25 +71,32 @@ def outcomes(rng, ports, index, chance):
     )
 
 
-def result(method, rows, seed=0):
-    """result.json of an evaluation."""
+def figures(method, rows):
+    """What an evaluation counts."""
+    return statistics.compose(rows, rcm.IS_SEEN, method=method, observation="state", seed=0)
+
+
+def about(method, seed=0):
+    """What a run says beside its figures."""
+    settings = config.RunConfig(
+        method=method, preset="cpu", seed=seed, policy=config.PolicyConfig(observation="state")
+    )
     return {
-        **statistics.compose(rows, rcm.IS_SEEN, method=method, observation="state", seed=0),
+        "control_hz": 30.0,
+        "seed": seed,
+        "weights": WEIGHTS,
+        "preset": "cpu",
         "inference_ms": {"p50": 18.4, "p95": 21.0, "p99": 24.9},
-        "config": dataclasses.asdict(
-            config.RunConfig(
-                method=method,
-                preset="cpu",
-                seed=seed,
-                policy=config.PolicyConfig(observation="state"),
-            )
-        ),
-        "versions": {"python": "3.11.9", "jax": "0.10.2", "mujoco": "4.0.0", "starjax": "0.1.0"},
-        "hardware": {"cpu": "AMD EPYC 9654", "cores": 2, "memory_gb": 7.6, "backend": "cpu"},
+        "config": json.loads(json.dumps(dataclasses.asdict(settings))),
         "timings_s": {"collect": 142.0, "collect: compile": 31.0, "train": 421.5, "evaluate": 133},
         "command": f"python -m starjax.experiments.run --method {method}",
         "warnings": ["The policy observes the simulator's state, not pixels as in the paper."],
     }
+
+
+def write(file, method, rows, seed=0):
+    """result.json of an evaluation."""
+    return result.write(file, names.FIRST, figures(method, rows), about(method, seed))
 
 
 def curves(rng):
@@ -101,15 +117,15 @@ def recorded(rng, rows, per_trocar):
     tip = np.full((len(kept), length.max(), 3), np.nan, np.float32)
     for out, row, steps in zip(tip, kept, length):
         out[:steps] = path(rng, steps, rows.success[row])
-    ports = rcm.Trocar(rows.radius[kept], rows.polar[kept], rows.azimuth[kept])
+    places = rcm.Trocar(rows.radius[kept], rows.polar[kept], rows.azimuth[kept])
     return {
         "trocar": rows.trocar[kept],
         "trial": rows.trial[kept],
         "length": length,
-        "p_world_tip": tip,
-        "rcm_error": np.where(np.isnan(tip[..., 0]), np.nan, rows.rcm_max[kept, None]),
-        "p_world_trocar": np.asarray(rcm.trocar_position(ports, P_REF)),
-        "target_peg": rows.target[kept],
+        "p_world_tip": tip[:, :, None],
+        "rcm_error": np.where(np.isnan(tip[..., :1]), np.nan, rows.rcm_max[kept, None, None]),
+        "p_world_trocar": np.asarray(rcm.trocar_position(places, P_REF)),
+        **{f"labels.{name}": values[kept] for name, values in rows.labels.items()},
     }
 
 

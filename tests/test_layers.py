@@ -9,7 +9,7 @@ SOURCE = pathlib.Path(__file__).parents[1] / "src" / "starjax"
 # From left to right; a layer may import itself and those of the rows before its own.
 ROWS = (
     ("errors",),
-    ("types", "methods", "limits", "runtime"),
+    ("extras", "types", "methods", "limits", "runtime"),
     ("config", "rcm"),
     ("models", "sim"),
     ("rollouts",),

@@ -4,4 +4,4 @@ Importing the package imports nothing heavy: `starjax.rcm`, `starjax.sim` and th
 their own import, so that `--help` and configuration errors answer at once.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

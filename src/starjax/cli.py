@@ -10,22 +10,45 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
-from starjax import __version__, errors
+from starjax import __version__, errors, extras
 
-# Subcommand -> (module with `main(argv) -> exit code`, one line of help).
-COMMANDS: dict[str, tuple[str, str]] = {
-    "run": ("starjax.experiments.run", "collect, train, evaluate and report: the whole of it"),
-    "collect": ("starjax.experiments.collect", "demonstrations only"),
-    "train": ("starjax.experiments.train", "demonstrations and training, no evaluation"),
-    "evaluate": ("starjax.experiments.evaluate", "score a trained policy on the twelve trocars"),
-    "sweep": ("starjax.experiments.sweep", "score a trained policy on a grid or sample of trocars"),
-    "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)"),
-    "pack": ("starjax.experiments.pack", "a policy in a file of half the size, to pass on"),
+_LEARNING = ("sim", "train")
+_ALL = (*_LEARNING, "report")
+# Subcommand -> (module with `main(argv) -> exit code`, one line of help, extras that it needs).
+COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "run": (
+        "starjax.experiments.run",
+        "collect, train, evaluate and report: the whole of it",
+        _ALL,
+    ),
+    "collect": ("starjax.experiments.collect", "demonstrations only", _LEARNING),
+    "train": (
+        "starjax.experiments.train",
+        "demonstrations and training, no evaluation",
+        _LEARNING,
+    ),
+    "evaluate": (
+        "starjax.experiments.evaluate",
+        "score a trained policy on the twelve trocars",
+        _ALL,
+    ),
+    "sweep": (
+        "starjax.experiments.sweep",
+        "score a trained policy on a grid or sample of trocars",
+        _LEARNING,
+    ),
+    "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)", _LEARNING),
+    "pack": ("starjax.experiments.pack", "a policy in a file of half the size", _LEARNING),
     "report": (
         "starjax.experiments.report_command",
         "tables, figures, video, page from results",
+        ("sim", "report"),
     ),
-    "doctor": ("starjax.doctor", "what of this machine and installation works, and what to do"),
+    "doctor": (
+        "starjax.doctor",
+        "what of this machine and installation works, and what to do",
+        ("sim",),
+    ),
 }
 
 
@@ -80,9 +103,7 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     try:
         return command(argv)
     except errors.UsageError as error:
-        from starjax.experiments import options  # imported late: `--version` need not wait for tyro
-
-        return _fail(options.spelled(error), 2)
+        return _fail(_spelled(error), 2)
     except KeyboardInterrupt as stop:
         text = str(stop) or "stopped; the same command goes on from what is saved"
         return _fail(text, _STOPPED)
@@ -117,13 +138,15 @@ def dispatch(argv: Sequence[str]) -> int:
     if name in ("-h", "--help"):
         width = max(map(len, COMMANDS))
         print("usage: starjax COMMAND [OPTIONS]      (starjax COMMAND --help for its options)\n")
-        print("\n".join(f"  {name:{width}}  {text}" for name, (_, text) in COMMANDS.items()))
+        print("\n".join(f"  {name:{width}}  {text}" for name, (_, text, _) in COMMANDS.items()))
         return 0
     if name == "--version":
         print(__version__)
         return 0
     errors.choice("COMMAND", name, COMMANDS)
-    return importlib.import_module(COMMANDS[name][0]).main(argv[1:])
+    module, _, needed = COMMANDS[name]
+    extras.require(name, *needed)
+    return importlib.import_module(module).main(argv[1:])
 
 
 class _Stop:
@@ -167,6 +190,15 @@ def _warning(message: Warning | str, kind: type[Warning], place: str, *rest: Any
     if os.path.abspath(place).startswith(_OURS):
         return f"starjax: {message}\n"
     return _with_its_place(message, kind, place, *rest)
+
+
+def _spelled(error: errors.UsageError) -> str:
+    """A mistake's line, with flags instead of fields if tyro is there to read them."""
+    try:
+        from starjax.experiments import options  # late: `--version` need not wait for tyro
+    except ModuleNotFoundError:
+        return str(error)
+    return options.spelled(error)
 
 
 def _fail(message: object, code: int) -> int:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import synthetic
 
-from starjax import errors, rcm
+from starjax import errors
 from starjax.evaluation import result, trial_file
+from starjax.rollouts import trocars
 from starjax.runtime import provenance
 from starjax.sim import names
 
@@ -17,22 +18,22 @@ SCENE = names.SceneNames("hand_over", ("fr5", "panda"), ("grasper", "grasper"), 
 RESULTS = sorted((pathlib.Path(__file__).parents[2] / "experiments").rglob("result.json"))
 
 
+def rows(arms):
+    index = np.repeat(np.arange(12), 2)
+    places = trocars.select(trocars.twelve(arms), index)
+    return synthetic.outcomes(np.random.default_rng(0), places, index, np.full(24, 0.7))
+
+
 def first():
     """A file's content as schema 1 has it."""
-    index = np.repeat(np.arange(12), 2)
-    ports = rcm.Trocar(*(field[index] for field in rcm.TROCARS))
-    rows = synthetic.outcomes(np.random.default_rng(0), ports, index, np.full(24, 0.7))
-    return synthetic.result("stardiff", rows)
-
-
-def second():
-    """Figures as schema 2 has them, of two arms."""
-    raw = result._upgraded(first())
-    for row in [*raw["trials"], *raw["per_trocar"]]:
-        row |= {name: row[name] + [0.5] for name in ("radius", "polar", "azimuth")}
-    for row in raw["trials"]:
-        row["stage"] = 2
-    return {name: raw[name] for name in ("method", "observation", "trials", *result._FIGURES[:9])}
+    found = {**synthetic.figures("stardiff", rows(1)), **synthetic.about("stardiff")}
+    for row in [*found["trials"], *found["per_trocar"]]:
+        row |= {name: row[name][0] for name in ("radius", "polar", "azimuth")}
+    for row in found["trials"]:
+        row |= row.pop("labels")
+        del row["lost"], row["stage"]
+    del found["control_hz"], found["weights"]
+    return found
 
 
 def written(tmp_path, value):
@@ -65,11 +66,9 @@ def test_schema_1_is_peg_transfer_with_one_arm(tmp_path):
 
 @pytest.fixture
 def made(tmp_path):
-    raw = first()
-    about = {name: raw[name] for name in ("config", "command", "timings_s", "inference_ms")}
-    about |= {"control_hz": 25.0, "seed": 3, "weights": "a" * 64, "dataset_digest": "b" * 64}
-    file = tmp_path / "result.json"
-    return file, result.write(file, SCENE, second(), about)
+    about = synthetic.about("stardiff") | {"control_hz": 25.0, "dataset_digest": "b" * 64}
+    file, figures = tmp_path / "result.json", synthetic.figures("stardiff", rows(2))
+    return file, result.write(file, SCENE, figures, about)
 
 
 def test_what_is_written_is_read_again(made):
@@ -77,9 +76,10 @@ def test_what_is_written_is_read_again(made):
     found = result.read(file)
     assert found == written and found.schema == 2 and found.scene == SCENE
     assert (found.version, found.commit, found.dirty) == provenance.code()
-    assert found.dataset_digest == "b" * 64 and found.control_hz == 25.0 and found.seed == 3
-    assert found.about["command"] == first()["command"]
-    assert len(found.trials[0].radius) == 2 and found.trials[0].stage == 2
+    assert found.dataset_digest == "b" * 64 and found.control_hz == 25.0 and found.seed == 0
+    assert found.about["command"] == synthetic.about("stardiff")["command"]
+    assert [len(trial.radius) for trial in found.trials] == [2] * 24
+    assert {trial.stage for trial in found.trials} == {1, 3}
 
 
 def test_trials_in_a_file_beside_it_are_found(made):
@@ -129,4 +129,4 @@ def test_a_sweep_says_its_distances(tmp_path):
     synthetic.run(tmp_path, sweep_of=20)
     found = result.read_sweep(tmp_path / "sweep.json")
     assert len(found.trials) == 20 and all(t.distance_m is not None for t in found.trials)
-    assert found.config == {}
+    assert found.time_limit_s == 60.0 and found.config == {}

@@ -14,9 +14,12 @@ def trials(success, trocar=None, **columns):
     zeros = np.zeros(count, np.float32)
     base = dict.fromkeys(table.Table._fields, zeros)
     base |= {"success": np.array(success, bool), "steps": np.full(count, 2, np.int32)}
-    base |= {name: np.zeros(count, bool) for name in ("loose", "safe", "invalid", "collided")}
+    base |= dict.fromkeys(("radius", "polar", "azimuth"), zeros[:, None])
+    flags = ("loose", "safe", "invalid", "collided", "lost")
+    base |= {name: np.zeros(count, bool) for name in flags}
     base |= {"trocar": np.zeros(count, np.int32) if trocar is None else np.array(trocar, np.int32)}
-    base |= {name: np.zeros(count, np.int32) for name in ("trial", "source", "target")}
+    base |= {name: np.zeros(count, np.int32) for name in ("trial", "stage")}
+    base |= {"labels": {name: np.arange(count, dtype=np.int32) for name in ("source", "target")}}
     by_step = np.zeros(base["steps"].sum(), np.float16)
     base |= dict.fromkeys(table.BY_STEP, by_step)
     return table.Table(**(base | columns))
@@ -172,8 +175,10 @@ def test_selection_keeps_steps_with_their_trials():
     np.testing.assert_array_equal(joined.success, [1, 1, 0])
 
 
-def test_each_count_and_place_is_its_own():
-    port = {"radius": [0.01, 0.02], "polar": [1.5, 1.6], "azimuth": [3.0, 4.0]}
+@pytest.mark.parametrize("arms", [1, 2])
+def test_each_count_and_place_is_its_own(arms):
+    places = {"radius": [0.01, 0.02], "polar": [1.5, 1.6], "azimuth": [3.0, 4.0]}
+    places = {name: np.add.outer(values, 0.1 * np.arange(arms)) for name, values in places.items()}
     steps = np.array([1, 2, 6, 9], np.int32)
     found = statistics.compose(
         trials(
@@ -182,7 +187,8 @@ def test_each_count_and_place_is_its_own():
             steps=steps,
             invalid=np.array([0, 0, 0, 1], bool),
             collided=np.array([0, 1, 0, 1], bool),
-            **{name: np.repeat(np.float32(x), 2) for name, x in port.items()},
+            lost=np.array([0, 0, 1, 0], bool),
+            **{name: np.repeat(np.float32(x), 2, axis=0) for name, x in places.items()},
             **dict.fromkeys(table.BY_STEP, np.zeros(steps.sum(), np.float16)),
         ),
         np.array([True, False]),
@@ -192,7 +198,8 @@ def test_each_count_and_place_is_its_own():
     )
     assert (found["invalid"], found["collided"], found["safe_rcm_mm"]) == (1, 2, 2.0)
     assert found["steps"] == {"mean": 3.0, "median": 2.0}
-    for rows, places in ((found["per_trocar"], [0, 1]), (found["trials"], [0, 0, 1, 1])):
-        for name, values in port.items():
-            assert [row[name] for row in rows] == pytest.approx([values[i] for i in places])
-    assert {"source", "target"} <= found["trials"][0].keys()
+    for rows, at in ((found["per_trocar"], [0, 1]), (found["trials"], [0, 0, 1, 1])):
+        for name, values in places.items():
+            np.testing.assert_allclose([row[name] for row in rows], values[at], rtol=1e-6)
+    assert [row["lost"] for row in found["trials"]] == [False, False, True, False]
+    assert found["trials"][3]["labels"] == {"source": 3, "target": 3}

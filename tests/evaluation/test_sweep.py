@@ -11,15 +11,17 @@ import synthetic
 
 from starjax import rcm
 from starjax.evaluation import evaluate, sweep
-from starjax.report import tables
+from starjax.rollouts import agent, trocars
 
-TRAINING = rcm.Trocar(*(field[:8] for field in rcm.TROCARS))
+TRAINING = stubs.trocars(*range(8))
+P_REF = stubs.P_WORLD_REF[:1]
 
 
 def test_samples_stay_in_their_ranges_and_repeat():
     drawn = sweep.sample(3, 500)
     assert (drawn.radius <= 0.05).all() and (np.abs(np.rad2deg(drawn.polar) - 90) <= 20).all()
     np.testing.assert_array_equal(drawn.radius, sweep.sample(3, 500).radius)
+    assert drawn.radius.shape == (500, 1) and sweep.sample(3, 5, arms=2).radius.shape == (5, 2)
     with pytest.raises(ValueError, match="count"):
         sweep.sample(0, 0)
 
@@ -29,47 +31,50 @@ def test_a_grid_has_every_place_once(polars, places):
     """The centre, and those straight above and below it, which every azimuth gives."""
     polars, azimuths = np.deg2rad(polars), np.deg2rad(np.arange(0, 360, 30))
     found = sweep.grid([0.0, 0.02, 0.05], polars, azimuths)
-    ports = np.asarray(rcm.trocar_position(found, stubs.P_WORLD_REF))
-    assert len(found.radius) == places == len(np.unique(ports.round(6), axis=0))
+    there = np.asarray(rcm.trocar_position(found, P_REF))[:, 0]
+    assert len(found.radius) == places == len(np.unique(there.round(6), axis=0))
     with pytest.raises(ValueError, match="radius"):
         sweep.grid([-0.01], polars, azimuths)
 
 
 def test_distance_is_to_the_nearest_training_trocar():
-    far = sweep.distance_to_nearest(rcm.TROCARS, TRAINING, stubs.P_WORLD_REF)
+    far = sweep.distance_to_nearest(trocars.twelve(), TRAINING, P_REF)
     np.testing.assert_allclose(far[:8], 0, atol=1e-7)
     assert far[11] == pytest.approx(0.02, abs=1e-6)  # the centre, 2 cm from the inner four
     assert (far[8:] > 0.01).all()
 
 
+def test_distance_of_a_configuration_is_that_of_its_farthest_arm():
+    training = stubs.trocars(*range(8), arms=2)
+    here = stubs.trocars(*range(8), arms=2)
+    here.radius[3, 1] += 0.004
+    far = sweep.distance_to_nearest(here, training, stubs.P_WORLD_REF)
+    np.testing.assert_allclose(far, np.where(np.arange(8) == 3, 0.004, 0.0), atol=1e-7)
+
+
 def test_seen_are_the_training_trocars_and_none_beside_them():
-    radius, polar, azimuth = (field[[0, 1, 0]] for field in rcm.TROCARS)
-    near = rcm.Trocar(radius + np.float32([0, 0, 0.004]), polar, azimuth)
+    radius, polar, azimuth = stubs.trocars(0, 1, 0)
+    near = rcm.Trocar(radius + np.float32([[0], [0], [0.004]]), polar, azimuth)
     found = synthetic.outcomes(np.random.default_rng(0), near, np.arange(3), np.ones(3))
-    result = sweep.compose(found, TRAINING, stubs.P_WORLD_REF, seed=0)
+    result = sweep.compose(found, TRAINING, P_REF, seed=0)
     assert [trial["seen"] for trial in result["trials"]] == [True, True, False]
 
 
 def test_a_sweep_of_a_policy(tmp_path):
-    policy, params = stubs.make_policy(width=32)
-    trocars = sweep.sample(0, 12)
+    sample, params = stubs.make_policy(width=32)
+    drawn = sweep.sample(0, 12)
     found = evaluate.evaluate(
         tmp_path,
         stubs.make_env(),
-        policy,
-        params,
-        jnp.float32(1.0),
-        trocars,
-        trials=1,
-        seed=0,
-        obs_horizon=2,
-        execute=4,
-        time_limit_s=1.0,
+        agent.from_policy(sample, 2, 4),
+        (params, jnp.float32(1.0)),
+        drawn,
+        evaluate.Settings(trials=1, seed=0, time_limit_s=1.0),
     )
-    result = sweep.compose(found, TRAINING, stubs.P_WORLD_REF, seed=0)
+    result = sweep.compose(found, TRAINING, P_REF, seed=0)
     assert sum(b["trials"] for b in result["by_distance"]) == 12 == result["strict"]["trials"]
     assert sum(b["successes"] for b in result["by_distance"]) == result["strict"]["successes"]
-    far = sweep.distance_to_nearest(trocars, TRAINING, stubs.P_WORLD_REF)
+    far = sweep.distance_to_nearest(drawn, TRAINING, P_REF)
     np.testing.assert_allclose([t["distance_m"] for t in result["trials"]], far, atol=1e-6)
     for each in result["by_distance"]:
         inside = (far >= each["low_m"]) & (far < each["high_m"])
@@ -79,15 +84,15 @@ def test_a_sweep_of_a_policy(tmp_path):
 
 def test_outcomes_of_a_sweep_are_their_own_and_its_bins_those_of_the_report():
     azimuths = 2 * np.pi * np.arange(12) / 12
-    ports = sweep.grid(np.arange(6) / 100, np.deg2rad([70, 90, 110]), azimuths)
-    count = len(ports.radius)
+    places = sweep.grid(np.arange(6) / 100, np.deg2rad([70, 90, 110]), azimuths)
+    count = len(places.radius)
     rows = synthetic.outcomes(
-        np.random.default_rng(0), ports, np.arange(count), np.full(count, 0.5)
+        np.random.default_rng(0), places, np.arange(count), np.full(count, 0.5)
     )
     rows = rows._replace(safe=rows.success & (np.arange(count) % 2 == 0))
-    found = sweep.compose(rows, TRAINING, stubs.P_WORLD_REF, seed=0)
+    found = sweep.compose(rows, TRAINING, P_REF, seed=0)
     for name, column in (("strict", rows.success), ("loose", rows.loose), ("safe", rows.safe)):
         assert found[name]["successes"] == column.sum()
     assert sum(b["successes"] for b in found["by_distance"]) == rows.success.sum()
-    there = collections.Counter(tables._bin(trial) for trial in found["trials"])
+    there = collections.Counter(int(sweep.bin_of(t["distance_m"])) for t in found["trials"])
     assert [b["trials"] for b in found["by_distance"]] == [there[b] for b in sorted(there)]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from starjax import errors
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import engine, episodes
 from starjax.runtime import jax_settings, xla
@@ -61,7 +62,7 @@ def describe(env: Any, trocars: Trocar, settings: Settings) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         **settings._asdict(),
-        "expert": settings.expert or next(iter(env.task.experts)),
+        "expert": expert_name(env.task, settings),
         "scene": env.names._asdict(),
         "trocars": np.stack([np.asarray(f, np.float64) for f in trocars], -1).tolist(),
         "p_world_ref": np.asarray(env.p_world_ref, np.float64).tolist(),
@@ -78,6 +79,13 @@ def describe(env: Any, trocars: Trocar, settings: Settings) -> dict[str, Any]:
         "versions": xla.versions(),
         **jax_settings.record(),
     }
+
+
+def expert_name(task: Any, settings: Settings) -> str:
+    """Which of the task's experts the settings mean."""
+    name = settings.expert or next(iter(task.experts))
+    errors.choice("expert", name, task.experts)
+    return name
 
 
 def upgraded(description: Mapping[str, Any]) -> dict[str, Any]:

@@ -110,7 +110,17 @@ def evaluate(
         chunk = _resume(directory, plan, min(settings.chunk or batch, batch), batch, report)
         spans = [slice(first, first + chunk) for first in range(0, len(group), chunk)]
         paths = [directory / f"chunk_{number:04d}.npz" for number in range(len(spans))]
-        chunks = [_read(path, group[rows], report) for path, rows in zip(paths, spans, strict=True)]
+        labels = env.task.labels
+        beside = [f"{_RECORDED}{name}" for name in recorded.names(labels)]
+        chunks = [
+            _read(
+                path,
+                group[rows],
+                tables.names(labels) + (beside if chosen[rows].any() else []),
+                report,
+            )
+            for path, rows in zip(paths, spans, strict=True)
+        ]
         missing = [number for number, found in enumerate(chunks) if found is None]
         done = len(group) - sum(len(group[spans[number]]) for number in missing)
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jax.typing import ArrayLike
 
 from starjax import rcm
 from starjax.rollouts.episodes import Episode
@@ -61,7 +60,7 @@ def names(labels: Sequence[str]) -> list[str]:
     return [*_COLUMNS, *(f"{_LABEL}{name}" for name in labels)]
 
 
-def take(episodes: Sequence[Episode], p_world_ref: ArrayLike) -> dict[str, np.ndarray]:
+def take(episodes: Sequence[Episode], p_world_ref: np.ndarray) -> dict[str, np.ndarray]:
     """Columns of R recorded trials, NaN after each one's end.
 
     Args:

@@ -36,7 +36,7 @@ def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray, arms: int 
     return Trocar(*(np.tile(x[:, None], arms) for x in combined[np.sort(first)].T))
 
 
-def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: ArrayLike) -> np.ndarray:
+def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: np.ndarray) -> np.ndarray:
     """Distance `[C]` in m of each configuration to the nearest one of training.
 
     Between two configurations it is that of the arm whose trocars are farthest apart.
@@ -56,7 +56,7 @@ def bin_of(distance: ArrayLike) -> np.ndarray:
 
 
 def compose(
-    table: tables.Table, training: Trocar, p_world_ref: ArrayLike, *, seed: int
+    table: tables.Table, training: Trocar, p_world_ref: np.ndarray, *, seed: int
 ) -> dict[str, Any]:
     """A sweep's result as JSON values: figures over all, over distance, and every trial.
 

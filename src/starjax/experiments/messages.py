@@ -151,19 +151,20 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
     return found
 
 
-def outcome(results: Sequence[Mapping[str, Any]]) -> str:
-    """Seen against unseen trocars, one line a method, for the end of a run."""
+def outcome(results: Sequence[Any]) -> str:
+    """Seen against unseen trocars, one line for each `result.Result`, for the end of a run."""
     rows = [("success [95% interval]", "seen", "unseen", "safe", "RCM executed")]
     for result in results:
-        error = result["rcm_error_mm"]["executed"]
+        figures = result.figures
+        error = figures["rcm_error_mm"]["executed"]
         # results of earlier versions do not have it
-        within = result["rcm_error_mm"].get("within_steps", error)
+        within = figures["rcm_error_mm"].get("within_steps", error)
         rows.append(
             (
-                methods.METHODS[result["method"]].label,
-                _rate(result["seen"]),
-                _rate(result["unseen"]),
-                _rate(result["safe"]["all"]),
+                methods.METHODS[result.method].label,
+                _rate(figures["seen"]),
+                _rate(figures["unseen"]),
+                _rate(figures["safe"]["all"]),
                 f"{error['mean']:.3f} mm, at most {within['max']:.2f}",
             )
         )

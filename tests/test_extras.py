@@ -1,0 +1,66 @@
+"""What works without any extra, and what a command says whose extra is missing."""
+
+import importlib.metadata
+import pathlib
+import re
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+from starjax import cli, errors, extras
+
+ROOT = pathlib.Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+# A process that has only jax, numpy and what these bring.
+BARE = """
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {absent}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Absent())
+"""
+
+
+def bare(program: str) -> subprocess.CompletedProcess:
+    absent = {name for names in extras.PACKAGES.values() for name in names} - {"scipy"}  # jax's
+    code = BARE.format(absent=sorted(absent)) + program
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+
+
+def test_rcm_needs_no_extra():
+    done = bare("from starjax import rcm, types; print(rcm.TROCARS.radius.shape)")
+    assert done.stdout == "(12,)\n", done.stderr
+
+
+@pytest.mark.parametrize("extra", extras.PACKAGES)
+def test_extras_bring_what_their_names_say(extra):
+    """The requirements of pyproject.toml, by the names that Python imports them by."""
+    imported = importlib.metadata.packages_distributions()
+    wanted = [re.split(r"[<>=\[]", text)[0] for text in PROJECT["optional-dependencies"][extra]]
+    brought = {name for name, dists in imported.items() if set(wanted) & set(dists)}
+    missing = set(extras.PACKAGES[extra]) - brought
+    assert {name for name in missing if name in imported} == set()
+    assert len(extras.PACKAGES[extra]) == len(set(wanted) - {"starjax", "mujoco-mjx"})
+
+
+def test_all_has_every_extra():
+    (everything,) = PROJECT["optional-dependencies"]["all"]
+    names = everything.removeprefix("starjax[").removesuffix("]")
+    assert set(names.split(",")) == set(extras.PACKAGES)
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_a_command_without_its_extra_names_it(monkeypatch, command, capsys):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(errors.UsageError) as raised:
+        cli.dispatch([command, "--help"])
+    assert raised.value.argument == command and "starjax[sim]" in raised.value.hint
+    assert cli.guard(cli.dispatch, [command]) == 2 and capsys.readouterr().err.count("\n") == 1
+
+
+def test_an_installation_without_extras_lists_the_commands():
+    done = bare("from starjax import cli; cli.dispatch(['--help'])")
+    assert done.returncode == 0 and "evaluate" in done.stdout
