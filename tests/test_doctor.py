@@ -92,14 +92,23 @@ def test_a_missing_encoder_is_found(monkeypatch):
 
 def test_unwritable_cache_and_little_memory_are_found(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setenv("STARJAX_CACHE", str(tmp_path / "file" / "below"))
     assert any("STARJAX_CACHE" in fault.remedy for fault in faults(doctor.storage()))
     monkeypatch.setenv("STARJAX_CACHE", str(tmp_path))
     monkeypatch.setattr(doctor, "NEEDED_DISK", 1e18)
-    folder, cache = (fault.remedy for fault in faults(doctor.storage()))
-    assert folder.endswith("by --out") and cache.endswith("by STARJAX_CACHE")
+    folder, *caches = (fault.remedy for fault in faults(doctor.storage()))
+    assert folder.endswith("by --out") and all("by STARJAX_CACHE" in cache for cache in caches)
     monkeypatch.setattr(doctor, "NEEDED_MEMORY", 1e15)
     assert faults(doctor.memory())
+
+
+def test_a_cache_of_compiled_programs_that_takes_none_is_found(monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/proc/self/task")  # there, not even for root
+    (fault,) = faults(doctor.storage())
+    assert fault.name == "programs" and "JAX_COMPILATION_CACHE_DIR" in fault.remedy
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "gs://a/b")  # jax alone can tell
+    assert not faults(doctor.storage())
 
 
 @pytest.mark.parametrize(("name", "broken"), [("ENOLCK", 0), ("EIO", 1)])

@@ -59,6 +59,8 @@ _STOPPED = 130  # exit code after a stop, see `signals`
 _UNREAD = 141  # exit code where nobody reads the output any more (128 + SIGPIPE), as in `| head`
 _OURS = os.path.join(os.path.dirname(os.path.abspath(__file__)), "")
 _with_its_place = warnings.formatwarning
+_CACHE_ENTRY = "persistent compilation cache entry"  # in jax's warnings
+_told: set[str] = set()  # warnings that are said once
 
 
 def main() -> NoReturn:
@@ -151,10 +153,24 @@ def _without_interrupts(ignored: Any) -> None:
 
 
 def _warning(message: Warning | str, kind: type[Warning], place: str, *rest: Any) -> str:
-    """What is printed: of our own warnings a line, of others also where they come from."""
+    """What is printed: of our own warnings a line, of others also where they come from.
+
+    jax warns of every program, hundreds of them, that its cache cannot keep or read: one line says
+    so, once.
+    """
     if os.path.abspath(place).startswith(_OURS):
         return f"starjax: {message}\n"
-    return _with_its_place(message, kind, place, *rest)
+    what, found, why = str(message).partition(_CACHE_ENTRY)
+    if not found:
+        return _with_its_place(message, kind, place, *rest)
+    if _CACHE_ENTRY in _told:
+        return ""
+    _told.add(_CACHE_ENTRY)
+    reason = " ".join(why.partition(": ")[2].split())
+    return (
+        f"starjax: {what.strip().lower()} compiled programs: {reason}; the work goes on, and every "
+        "start compiles them again (starjax doctor says more)\n"
+    )
 
 
 def _spelled(error: errors.UsageError) -> str:

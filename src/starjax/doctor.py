@@ -97,18 +97,23 @@ def settings() -> list[Finding]:
 
 
 def storage() -> list[Finding]:
-    """Room and rights in the working folder and in the cache."""
+    """Room and rights in the working folder, in the cache, and where compiled programs are kept."""
+    programs = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
+    places = [
+        ("folder", pathlib.Path.cwd, "another working folder", "--out"),  # it may have been removed
+        ("cache", xla.cache_directory, "STARJAX_CACHE", "STARJAX_CACHE"),
+    ]
+    if "://" not in programs:
+        ours = xla.compilation_cache().is_relative_to(xla.cache_directory())
+        option = "STARJAX_CACHE" if ours else "JAX_COMPILATION_CACHE_DIR"
+        places.append(("programs", xla.compilation_cache, option, option))
     findings = []
-    for name, find, option in (
-        ("folder", pathlib.Path.cwd, "--out"),  # which may have been removed
-        ("cache", xla.cache_directory, "STARJAX_CACHE"),
-    ):
+    for name, find, elsewhere, option in places:
         try:
             place = find()
             files.require_writable(place)
         except OSError as error:
-            variable = "another working folder" if name == "folder" else "STARJAX_CACHE"
-            findings.append(Finding(name, str(error), f"choose a writable place by {variable}"))
+            findings.append(Finding(name, str(error), f"choose a writable place by {elsewhere}"))
             continue
         free = shutil.disk_usage(place).free
         short = free < NEEDED_DISK

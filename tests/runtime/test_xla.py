@@ -61,9 +61,10 @@ def test_small_programs_are_kept_unless_the_user_set_a_time(monkeypatch, tmp_pat
     assert os.environ[SMALLEST] == "2"
 
 
-def test_no_cache_where_none_can_be_made(monkeypatch, tmp_path):
+def test_no_cache_where_none_can_be_made(monkeypatch, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert _prepared(monkeypatch, tmp_path / "file", (0, 10))[1] is None
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_who_has_no_home_has_a_cache_too(monkeypatch):
