@@ -18,7 +18,7 @@ from starjax.evaluation import sweep as sweeping
 from starjax.experiments import evaluate, folders, presets, scoring, sweep
 from starjax.policies import packaged, policy_file
 from starjax.report import video
-from starjax.runtime import files
+from starjax.runtime import files, gpu
 
 POLICY = dataclasses.replace(fakes.TINY, execute=4)
 
@@ -84,6 +84,19 @@ def test_a_packaged_policy_is_scored_by_its_name(file, monkeypatch, capsys):
     assert "DP-RCM-2 of compact\n" in said and "into runs/evaluate/compact-seed0-1x1s\n" in said
     assert (file.parent / "runs" / "evaluate" / "compact-seed0-1x1s" / "result.json").is_file()
     assert [path.name for path in packaged.FOLDER.iterdir()] == ["compact.safetensors"]
+
+
+@pytest.mark.parametrize("guess", [False, True])
+@pytest.mark.parametrize(("used", "trials"), [(False, 4), (True, 30)])
+def test_how_many_trials_jax_decides_not_the_system(file, monkeypatch, guess, used, trials):
+    def scored(folder, who, trocars, settings, seed):
+        raise KeyboardInterrupt(f"{settings.trials} in {folder.parent.name}")
+
+    monkeypatch.setattr(gpu, "is_likely", lambda: guess)
+    monkeypatch.setattr(gpu, "is_used", lambda: used)
+    monkeypatch.setattr(scoring, "rollouts", scored)
+    with pytest.raises(KeyboardInterrupt, match=f"^{trials} in mine-.*-{trials}x"):
+        evaluate.main(["--policy", "mine.safetensors"])
 
 
 @pytest.mark.parametrize("change", [{"temperature": 0.25}, {"ddim_steps": 1}])

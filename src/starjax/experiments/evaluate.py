@@ -8,9 +8,9 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.experiments import checks, clock, folders, options, presets, words
+from starjax.experiments import checks, clock, folders, options, words
 from starjax.policies import packaged
-from starjax.runtime import files, xla
+from starjax.runtime import files, gpu, xla
 
 DESCRIPTION = """Scores a trained policy on the twelve trocars, and films it.
 
@@ -36,30 +36,16 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Runs the trials that are missing; writes result.json and rollout.mp4."""
-    chosen = options.parse(
-        Options, argv, prog="starjax evaluate", description=DESCRIPTION, default=_default()
-    )
-    if bool(chosen.run) == bool(chosen.policy):
-        got = "both" if chosen.run else "none"
-        raise errors.UsageError("RUN or --policy", "one of the two", got)
-    if chosen.policy:
-        file = packaged.find("--policy", chosen.policy)
-        default = Path("runs/evaluate") / f"{_label(file)}-{_trials(chosen)}"
-        method = config = None
-    else:
-        run = folders.existing(chosen.run)
-        method, config = run.name, folders.read_config(run)
-        file = folders.weights(run.parent, method)
-        default = Path(chosen.run) / f"evaluate-{_trials(chosen)}"
-    is_ours = chosen.out == options.AUTO
-    checks.expect_folder("--out", default if is_ours else chosen.out)  # before jax starts
-    folder = Path(default if is_ours else chosen.out)
+    guess = gpu.is_likely()
+    asked = _asked(argv, guess)  # a mistake should not wait for jax
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.scoring")
+    chosen, file, run, folder = asked if gpu.is_used() == guess else _asked(argv, not guess)
 
     from starjax import rcm
     from starjax.experiments import scoring
 
+    method, config = (run.name, folders.read_config(run)) if run else (None, None)
     who = scoring.subject(method, file) if method else scoring.from_file(file)
     config = scoring.settings(who, config) if config else _config(who.trained)
     config = dataclasses.replace(config, method=who.method, out=str(folder), eval=chosen.eval)
@@ -67,7 +53,7 @@ def main(argv: Sequence[str]) -> int:
     with files.lock(folder):
         before = _before(folder)
         same = _identity(before) == (who.weights, chosen.seed, dataclasses.asdict(chosen.eval))
-        if not is_ours:
+        if chosen.out != options.AUTO:
             _refuse_foreign(folder, before.get("weights", who.weights) == who.weights)
         print(f"{about}, into {folder}\n", flush=True)
         with clock.timed(folder, "evaluate", same or folders.is_under_way(folder)):
@@ -88,9 +74,31 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _default() -> Options:
+def _asked(argv: Sequence[str], has_gpu: bool) -> tuple[Options, Path, Path | None, Path]:
+    """What the command line asks for: its flags, the weights, RUN if given, the result's folder."""
+    chosen = options.parse(
+        Options, argv, prog="starjax evaluate", description=DESCRIPTION, default=_default(has_gpu)
+    )
+    if bool(chosen.run) == bool(chosen.policy):
+        got = "both" if chosen.run else "none"
+        raise errors.UsageError("RUN or --policy", "one of the two", got)
+    run = None
+    if chosen.policy:
+        file = packaged.find("--policy", chosen.policy)
+        default = Path("runs/evaluate") / f"{_label(file)}-{_trials(chosen)}"
+    else:
+        run = folders.existing(chosen.run)
+        folders.read_config(run)
+        file = folders.weights(run.parent, run.name)
+        default = Path(chosen.run) / f"evaluate-{_trials(chosen)}"
+    folder = default if chosen.out == options.AUTO else chosen.out
+    checks.expect_folder("--out", folder)
+    return chosen, file, run, Path(folder)
+
+
+def _default(has_gpu: bool) -> Options:
     """Two cores get through 48 trials in the time of a coffee, a GPU through the paper's 360."""
-    if presets.has_gpu():
+    if has_gpu:
         return Options()
     return Options(eval=config_lib.EvalConfig(trials=4, time_limit_s=30.0))
 

@@ -16,6 +16,15 @@ STAGES = words.STAGES
 LEAST_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints ask for their own
 
 
+def start() -> None:
+    """Starts jax, in all processes of the run together."""
+    xla.prepare_xla()
+    from starjax.training import processes
+
+    processes.join()
+    xla.require_devices("starjax.sim.env", "starjax.training.loop")
+
+
 def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> None:
     """Does what is missing of the given stages, in the order of `STAGES`.
 
@@ -24,11 +33,9 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
       stages: some of `STAGES`; one needs those before it.
       command: what was typed, for the record.
     """
-    xla.prepare_xla()
+    start()
     from starjax.training import devices, processes
 
-    processes.join()
-    xla.require_devices("starjax.sim.env", "starjax.training.loop")
     if config.policy.freeze_encoder and not processes.is_alone():
         raise errors.UsageError("policy.freeze_encoder", "one process", "several")
     if "train" in stages:
