@@ -8,7 +8,7 @@ import sys
 import time
 from typing import Any
 
-from starjax.experiments import presets
+from starjax.runtime import gpu
 
 SCRIPT = pathlib.Path(__file__).with_name("peer_torch.py")
 
@@ -26,7 +26,7 @@ def add_flag(parser: argparse.ArgumentParser) -> None:
 
 def platform() -> str:
     """`gpu` or `cpu`, told without starting jax, which would take the memory a peer needs."""
-    return "gpu" if presets.has_gpu() else "cpu"
+    return "gpu" if gpu.is_likely() else "cpu"
 
 
 def ask(python: str | None, *arguments: str | int, tiny: bool = False) -> dict[str, Any]:

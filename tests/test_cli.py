@@ -1,5 +1,6 @@
 """How a process of ours ends."""
 
+import os
 import subprocess
 import sys
 import textwrap
@@ -10,12 +11,13 @@ from starjax import cli, errors
 from starjax.runtime import files
 
 
-def started(code):
+def started(code, **environment):
     """A process that runs this, with its output in pipes."""
     return subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(code)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
+        env={**os.environ, **environment},
         text=True,
     )
 
@@ -211,3 +213,26 @@ def test_a_warning_of_ours_is_a_line_and_of_others_says_where():
     )
     said = process.communicate(timeout=60)[1].splitlines()
     assert said == ["starjax: step 3 is damaged", "elsewhere/starjax.py:9: UserWarning: old"]
+
+
+def test_a_cache_that_takes_no_program_is_one_line_and_work_goes_on():
+    process = started(
+        """
+        from starjax import cli
+        from starjax.runtime import xla
+
+        def work(argv):
+            xla.prepare_xla()
+            xla.require_devices()
+            import jax, jax.numpy as jnp
+            for i in range(3):
+                print(float(jax.jit(lambda x: x + i)(jnp.ones(3 + i)).sum()))
+            return 0
+
+        cli.run(work)
+        """,
+        JAX_COMPILATION_CACHE_DIR="/proc/self/task",  # it is there, and takes no file of anybody's
+    )
+    said, warned = process.communicate(timeout=60)
+    assert process.returncode == 0 and said.split() == ["3.0", "8.0", "15.0"]
+    assert warned.count("\n") == 1 and "/proc/self/task" in warned and "doctor" in warned

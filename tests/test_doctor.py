@@ -10,6 +10,7 @@ import sys
 import pytest
 
 from starjax import doctor
+from starjax.runtime import gpu
 
 
 def faults(findings):
@@ -92,14 +93,23 @@ def test_a_missing_encoder_is_found(monkeypatch):
 
 def test_unwritable_cache_and_little_memory_are_found(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setenv("STARJAX_CACHE", str(tmp_path / "file" / "below"))
     assert any("STARJAX_CACHE" in fault.remedy for fault in faults(doctor.storage()))
     monkeypatch.setenv("STARJAX_CACHE", str(tmp_path))
     monkeypatch.setattr(doctor, "NEEDED_DISK", 1e18)
-    folder, cache = (fault.remedy for fault in faults(doctor.storage()))
-    assert folder.endswith("by --out") and cache.endswith("by STARJAX_CACHE")
+    folder, *caches = (fault.remedy for fault in faults(doctor.storage()))
+    assert folder.endswith("by --out") and all("by STARJAX_CACHE" in cache for cache in caches)
     monkeypatch.setattr(doctor, "NEEDED_MEMORY", 1e15)
     assert faults(doctor.memory())
+
+
+def test_a_cache_of_compiled_programs_that_takes_none_is_found(monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/proc/self/task")  # there, not even for root
+    (fault,) = faults(doctor.storage())
+    assert fault.name == "programs" and "JAX_COMPILATION_CACHE_DIR" in fault.remedy
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "gs://a/b")  # jax alone can tell
+    assert not faults(doctor.storage())
 
 
 @pytest.mark.parametrize(("name", "broken"), [("ENOLCK", 0), ("EIO", 1)])
@@ -114,10 +124,26 @@ def test_locks_are_tried(monkeypatch, tmp_path, name, broken):
     assert bool(found.remedy) == broken and not list(tmp_path.iterdir())
 
 
-def test_a_gpu_without_its_plugin_is_found(monkeypatch):
-    monkeypatch.setattr(doctor.presets, "has_gpu_device", lambda: True)
-    monkeypatch.setattr(doctor.presets, "has_gpu_plugin", lambda: False)
-    assert "cuda" in faults(doctor.devices())[0].remedy
+@pytest.mark.parametrize(
+    ("environment", "plugin", "remedy"),
+    [
+        ({}, False, "cuda"),
+        ({}, True, "nvidia-smi"),  # its driver is too old, or the plugin fails
+        ({"JAX_PLATFORM_NAME": "cpu"}, True, None),
+    ],
+)
+def test_a_gpu_that_jax_does_not_use_is_found(monkeypatch, environment, plugin, remedy):
+    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME", "CUDA_VISIBLE_DEVICES"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(gpu, "is_shown", lambda: True)
+    monkeypatch.setattr(gpu, "has_plugin", lambda: plugin)
+    monkeypatch.setattr(gpu, "is_used", lambda: False)
+    findings = doctor.devices()
+    assert [remedy in fault.remedy for fault in faults(findings)] == [True] * (remedy is not None)
+    (preset,) = (finding.value for finding in findings if finding.name == "preset")
+    assert "auto means cpu" in preset and "not on the GPU" in preset
 
 
 def test_a_missing_scene_is_found(monkeypatch):

@@ -3,14 +3,13 @@
 import errno
 import importlib
 import os
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from starjax import __version__, errors, extras
+from starjax.runtime import signals
 
 _LEARNING = ("sim", "train")
 _ALL = (*_LEARNING, "report")
@@ -56,11 +55,12 @@ _WRITING = (errno.ENOSPC, errno.EROFS, errno.EDQUOT)
 _STORAGE = (
     *_WRITING, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG
 )  # fmt: skip
-_STOPPED = 130  # exit code after Ctrl-C or SIGTERM
-_AGAIN_S = 0.5  # s until a stop that was lost is asked for again
-_UNREAD = 141  # exit code of a program whose reader went away (128 + SIGPIPE), as in `| head`
+_STOPPED = 130  # exit code after a stop, see `signals`
+_UNREAD = 141  # exit code where nobody reads the output any more (128 + SIGPIPE), as in `| head`
 _OURS = os.path.join(os.path.dirname(os.path.abspath(__file__)), "")
 _with_its_place = warnings.formatwarning
+_CACHE_ENTRY = "persistent compilation cache entry"  # in jax's warnings
+_told: set[str] = set()  # warnings that are said once
 
 
 def main() -> NoReturn:
@@ -70,22 +70,19 @@ def main() -> NoReturn:
 
 def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
     """The whole of a process: `command` with the words of its command line."""
-    # Those that were closed by whoever started this.
+    # None for an output that was closed before the process began, as by `>&-`.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    stop = _Stop()
     sys.unraisablehook = _without_interrupts
     warnings.formatwarning = _warning
-    signal.signal(signal.SIGTERM, stop)
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # as of a shell's background job
-        signal.signal(signal.SIGINT, stop)
+    signals.interrupt_on_stops()
     code = _STOPPED
     try:
         code = guard(command, sys.argv[1:])
         if code == _STOPPED:
-            _ignore_stops()
+            signals.ignore_stops()
     except KeyboardInterrupt:  # once more, between two lines of ours
-        _ignore_stops()
+        signals.ignore_stops()
     if code == _STOPPED:  # jax's threads may still run, and would meet an interpreter that is gone
         sys.stdout.flush()
         sys.stderr.flush()
@@ -97,8 +94,8 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """Runs a command; what its user can mend becomes one line and an exit code, no traceback.
 
     Returns 2 for a mistake on the command line, 71 for too little memory, 74 for a disk that is
-    full or cannot be used, 130 after Ctrl-C or SIGTERM (whatever was running has saved by then,
-    and says how to go on), 141 once nobody reads the output.
+    full or cannot be used, 130 after a stop such as Ctrl-C or SIGTERM (whatever was running has
+    saved by then, and says how to go on), 141 once nobody reads the output.
     """
     try:
         return command(argv)
@@ -149,47 +146,31 @@ def dispatch(argv: Sequence[str]) -> int:
     return importlib.import_module(module).main(argv[1:])
 
 
-class _Stop:
-    """Handler of Ctrl-C and SIGTERM that lasts: KeyboardInterrupt, again where it was lost.
-
-    Python drops what is raised in a callback of its collector, and jax's C++ some of what is raised
-    while it calls Python, at every start for some milliseconds.
-    """
-
-    def __init__(self) -> None:
-        self._main = threading.get_ident()
-        self._insists = False
-
-    def __call__(self, number: int, frame: Any) -> None:
-        insists, self._insists = self._insists, False
-        timer = threading.Timer(_AGAIN_S, self._insist, [number])
-        timer.daemon = True
-        timer.start()
-        # Whatever is cleaning up because of the first one is left in peace.
-        if not (insists and isinstance(sys.exc_info()[1], KeyboardInterrupt)):
-            raise KeyboardInterrupt
-
-    def _insist(self, number: int) -> None:
-        self._insists = True
-        signal.pthread_kill(self._main, number)  # a real one, which wakes what waits
-
-
-def _ignore_stops() -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-
-
 def _without_interrupts(ignored: Any) -> None:
-    """Says what Python dropped, but for Ctrl-C, which comes again."""
+    """Says what Python dropped, but for a stop, which is raised again."""
     if ignored.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(ignored)
 
 
 def _warning(message: Warning | str, kind: type[Warning], place: str, *rest: Any) -> str:
-    """What is printed: of our own warnings a line, of others also where they come from."""
+    """What is printed: of our own warnings a line, of others also where they come from.
+
+    jax warns of every program, hundreds of them, that its cache cannot keep or read: one line says
+    so, once.
+    """
     if os.path.abspath(place).startswith(_OURS):
         return f"starjax: {message}\n"
-    return _with_its_place(message, kind, place, *rest)
+    what, found, why = str(message).partition(_CACHE_ENTRY)
+    if not found:
+        return _with_its_place(message, kind, place, *rest)
+    if _CACHE_ENTRY in _told:
+        return ""
+    _told.add(_CACHE_ENTRY)
+    reason = " ".join(why.partition(": ")[2].split())
+    return (
+        f"starjax: {what.strip().lower()} compiled programs: {reason}; the work goes on, and every "
+        "start compiles them again (starjax doctor says more)\n"
+    )
 
 
 def _spelled(error: errors.UsageError) -> str:

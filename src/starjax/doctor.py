@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from starjax import cli, errors
 from starjax.experiments import presets
-from starjax.runtime import files, locks, xla
+from starjax.runtime import files, gpu, locks, xla
 
 NEEDED_MEMORY = 4e9  # bytes free for the preset `cpu`
 NEEDED_DISK = 2e9
@@ -97,18 +97,23 @@ def settings() -> list[Finding]:
 
 
 def storage() -> list[Finding]:
-    """Room and rights in the working folder and in the cache."""
+    """Room and rights in the working folder, in the cache, and where compiled programs are kept."""
+    programs = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
+    places = [
+        ("folder", pathlib.Path.cwd, "another working folder", "--out"),  # it may have been removed
+        ("cache", xla.cache_directory, "STARJAX_CACHE", "STARJAX_CACHE"),
+    ]
+    if "://" not in programs:
+        ours = xla.compilation_cache().is_relative_to(xla.cache_directory())
+        option = "STARJAX_CACHE" if ours else "JAX_COMPILATION_CACHE_DIR"
+        places.append(("programs", xla.compilation_cache, option, option))
     findings = []
-    for name, find, option in (
-        ("folder", pathlib.Path.cwd, "--out"),  # which may have been removed
-        ("cache", xla.cache_directory, "STARJAX_CACHE"),
-    ):
+    for name, find, elsewhere, option in places:
         try:
             place = find()
             files.require_writable(place)
         except OSError as error:
-            variable = "another working folder" if name == "folder" else "STARJAX_CACHE"
-            findings.append(Finding(name, str(error), f"choose a writable place by {variable}"))
+            findings.append(Finding(name, str(error), f"choose a writable place by {elsewhere}"))
             continue
         free = shutil.disk_usage(place).free
         short = free < NEEDED_DISK
@@ -141,29 +146,36 @@ def memory() -> list[Finding]:
 
 
 def devices() -> list[Finding]:
-    """What jax runs on, and whether it can compile and run a program there."""
-    if presets.has_gpu_device() and not presets.has_gpu_plugin():
-        remedy = "jax cannot use this GPU yet: pip install -e '.[cuda]'"
-        gpu = [Finding("GPU", "an NVIDIA device, no CUDA plugin of jax", remedy)]
-    else:
-        gpu = []
+    """What jax runs on, whether it can compile and run a program there, and a GPU left unused."""
     try:
         import jax
         import jax.numpy as jnp
     except (ImportError, RuntimeError) as error:  # the second from jax's check of jaxlib
-        return [*gpu, Finding("jax", _first_line(error), "reinstall jax and jaxlib")]
+        return [Finding("jax", _first_line(error), "reinstall jax and jaxlib")]
     try:
         kinds = [device.device_kind for device in jax.devices()]
         total = float(jax.jit(jnp.sum)(jnp.arange(5.0)))
     except (AssertionError, RuntimeError) as error:  # the first for a platform without its plugin
         remedy = "start with JAX_PLATFORMS=cpu, then see to the GPU's driver (nvidia-smi)"
         reason = str(error) or f"no plugin for JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')}"
-        return [*gpu, Finding("jax", reason.splitlines()[0], remedy)]
+        return [Finding("jax", reason.splitlines()[0], remedy)]
     if total != 10.0:
-        return [*gpu, Finding("jax", f"0+1+2+3+4 = {total}", "reinstall jax and jaxlib")]
+        return [Finding("jax", f"0+1+2+3+4 = {total}", "reinstall jax and jaxlib")]
     value = f"{jax.default_backend()}, {len(kinds)} x {kinds[0]}, {xla.cores()} cores"
-    preset = presets.resolve("auto").preset
-    return [*gpu, Finding("jax", value), Finding("preset", f"auto means {preset}")]
+    preset = presets.resolve("auto", gpu.is_used())
+    taken = f"auto means {preset.preset}: {presets.reason(gpu.is_used())}"
+    return [*_unused_gpu(), Finding("jax", value), Finding("preset", taken)]
+
+
+def _unused_gpu() -> list[Finding]:
+    """A fault where jax cannot use the GPU that the system shows, though nothing forbids it."""
+    if gpu.is_used() or not gpu.is_shown() or gpu.forbidden():
+        return []
+    if gpu.has_plugin():
+        remedy = "see to its driver: nvidia-smi, and a version that jax's CUDA asks for"
+    else:
+        remedy = "jax cannot use this GPU yet: pip install -e '.[cuda]'"
+    return [Finding("GPU", f"shown by the system, not used by jax: {gpu.why_unused()}", remedy)]
 
 
 def scene() -> list[Finding]:

@@ -20,6 +20,7 @@ from starjax.experiments import (
     run,
     sweep,
 )
+from starjax.runtime import gpu
 
 OPTIONS = {
     **dict.fromkeys(("run", "collect", "train"), config.RunConfig),
@@ -180,8 +181,8 @@ def test_help_shows_ranges_and_defaults(capsys, monkeypatch):
     said = helped("run", capsys)[1]
     assert said["--policy.kernel-size"].endswith("(1, 3, ... 4095; default: 5)")
     assert helped("sweep", capsys)[1]["--eval.time-limit-s"].endswith("RUN's (in [0.1, 86400])")
-    for gpu, trials, limit in ((False, 4, 30.0), (True, 30, 60.0)):
-        monkeypatch.setattr(presets, "has_gpu", lambda gpu=gpu: gpu)
+    for likely, trials, limit in ((False, 4, 30.0), (True, 30, 60.0)):
+        monkeypatch.setattr(gpu, "is_likely", lambda likely=likely: likely)
         said = helped("evaluate", capsys)[1]
         assert f"default: {trials})" in said["--eval.trials"]
         assert f"default: {limit})" in said["--eval.time-limit-s"]

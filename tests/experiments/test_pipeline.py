@@ -16,7 +16,7 @@ from starjax.data import normalizer
 from starjax.experiments import demonstrations, folders, messages, pipeline, presets
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
-from starjax.runtime import files
+from starjax.runtime import files, signals
 from starjax.training import loop
 
 
@@ -110,44 +110,22 @@ def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
     np.testing.assert_array_equal(kept.params["w"], np.ones(3))
 
 
-def test_a_stop_during_the_last_steps_ends_the_run_after_the_weights(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", signals.STOPS)
+def test_a_stop_during_the_last_steps_ends_the_run_after_the_weights(tmp_path, monkeypatch, number):
     stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
     state = types.SimpleNamespace(ema_params={"w": np.ones(3)}, normalizer=stats)
 
     def last_steps(*_, **__):
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         return loop.Result(state, 1.0, 0, {})
 
+    before = signal.signal(number, signal.default_int_handler)  # it may be ignored
     monkeypatch.setattr(loop, "run", last_steps)
     env = fakes.env()
     with pytest.raises(KeyboardInterrupt, match=r"stopped after training stardiff;.*same command"):
         pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None)
+    signal.signal(number, before)
     assert folders.weights(tmp_path, "stardiff").exists()
-
-
-def test_first_signal_asks_and_second_ends():
-    # Ignored where the tests were started in the background.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pipeline.stop_signals() as should_stop:
-            assert not should_stop()
-            os.kill(os.getpid(), signal.SIGTERM)
-            assert should_stop()
-            with pytest.raises(KeyboardInterrupt):
-                os.kill(os.getpid(), signal.SIGINT)
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def test_a_signal_that_is_ignored_asks_nothing():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with pipeline.stop_signals() as should_stop:
-            os.kill(os.getpid(), signal.SIGINT)
-            assert not should_stop()
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def test_plan_names_the_observation_and_the_flag(tmp_path):

@@ -5,44 +5,29 @@ import json
 
 import pytest
 
-from starjax import config
+from starjax import config, errors
 from starjax.experiments import presets, run
+from starjax.runtime import gpu
 
 
-def test_auto_is_named_by_what_it_picked(monkeypatch):
-    monkeypatch.setattr(presets, "has_gpu", lambda: False)
-    assert run.settings([], "", "").preset == "cpu"
-    monkeypatch.setattr(presets, "has_gpu", lambda: True)
-    assert run.settings(["--preset", "auto"], "", "").preset == "gpu"
+@pytest.mark.parametrize("guess", [False, True])
+@pytest.mark.parametrize(("used", "preset"), [(False, "cpu"), (True, "gpu")])
+def test_auto_is_what_jax_says_not_what_the_system_shows(monkeypatch, capsys, guess, used, preset):
+    monkeypatch.setattr(gpu, "is_likely", lambda: guess)
+    monkeypatch.setattr(gpu, "is_used", lambda: used)
+    for argv in ([], ["--preset", "auto"]):
+        found = run.settings([*argv, "--train.steps", "7"], "", "")
+        assert (found.preset, found.out) == (preset, f"runs/{preset}") and found.train.steps == 7
+        assert found.policy == presets.PRESETS[preset].policy
+        said = capsys.readouterr().out
+        assert said.count("\n") == 1 and said.startswith(f"preset auto: {preset}")
 
 
-def test_jax_platforms_forbids_the_gpu(monkeypatch):
-    monkeypatch.setattr(presets, "has_gpu_device", lambda: True)
-    monkeypatch.setattr(presets, "has_gpu_plugin", lambda: True)
-    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    assert not presets.has_gpu()
-    monkeypatch.setenv("JAX_PLATFORMS", "cpu,cuda")  # jax takes the first
-    assert not presets.has_gpu()
-    monkeypatch.setenv("JAX_PLATFORMS", "cuda,cpu")
-    assert presets.has_gpu()
-
-
-@pytest.mark.parametrize(("visible", "seen"), [("", False), ("-1", False), ("1", True)])
-def test_a_gpu_may_be_hidden(monkeypatch, visible, seen):
-    monkeypatch.setattr(presets, "has_gpu_device", lambda: True)
-    monkeypatch.setattr(presets, "has_gpu_plugin", lambda: True)
-    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    assert presets.has_gpu() == seen
-
-
-@pytest.mark.parametrize(("device", "plugin"), [(True, False), (False, True)])
-def test_a_gpu_is_a_device_with_its_plugin(monkeypatch, device, plugin):
-    monkeypatch.setattr(presets, "has_gpu_device", lambda: device)
-    monkeypatch.setattr(presets, "has_gpu_plugin", lambda: plugin)
-    for name in ("JAX_PLATFORMS", "CUDA_VISIBLE_DEVICES"):
-        monkeypatch.delenv(name, raising=False)
-    assert not presets.has_gpu()
+def test_a_mistake_is_told_before_jax_is_asked(monkeypatch):
+    monkeypatch.setattr(gpu, "is_used", lambda: pytest.fail("jax was asked"))
+    with pytest.raises(errors.UsageError):
+        run.settings(["--train.steps", "0"], "", "")
+    assert run.settings(["--preset", "smoke"], "", "").preset == "smoke"
 
 
 def test_paper_preset_is_the_default_configuration():

@@ -9,8 +9,7 @@ import threading
 
 import pytest
 
-from starjax.experiments import presets
-from starjax.runtime import xla
+from starjax.runtime import gpu, xla
 
 SMALLEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 FLAG = "--xla_cpu_use_fusion_emitters=false"
@@ -61,9 +60,10 @@ def test_small_programs_are_kept_unless_the_user_set_a_time(monkeypatch, tmp_pat
     assert os.environ[SMALLEST] == "2"
 
 
-def test_no_cache_where_none_can_be_made(monkeypatch, tmp_path):
+def test_no_cache_where_none_can_be_made(monkeypatch, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert _prepared(monkeypatch, tmp_path / "file", (0, 10))[1] is None
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_who_has_no_home_has_a_cache_too(monkeypatch):
@@ -84,7 +84,7 @@ def test_a_platform_that_jax_cannot_use_is_a_mistake():
         xla.prepare_xla()
         sys.exit(cli.guard(lambda argv: xla.require_devices("starjax.sim.env"), []))
     """
-    for name in ("nonsense",) if presets.has_gpu_plugin() else ("nonsense", "cuda"):
+    for name in ("nonsense",) if gpu.has_plugin() else ("nonsense", "cuda"):
         environment = {**_env(), "JAX_PLATFORMS": name}
         command = [sys.executable, "-c", textwrap.dedent(code)]
         found = subprocess.run(command, capture_output=True, text=True, env=environment)

@@ -3,11 +3,8 @@
 Data, not code: what a preset changes from `config.RunConfig()` (the paper) stands in one literal.
 """
 
-import importlib.util
-import os
-import pathlib
-
 from starjax.config import DemosConfig, EvalConfig, PolicyConfig, RunConfig, TrainConfig
+from starjax.runtime import gpu
 
 PRESETS: dict[str, RunConfig] = {
     # Every stage once, too short to learn anything.
@@ -107,28 +104,15 @@ PRESETS: dict[str, RunConfig] = {
 }
 
 
-def resolve(name: str) -> RunConfig:
-    """Returns the values of a preset; `auto` is `gpu` where jax can use one, else `cpu`."""
-    return PRESETS[("gpu" if has_gpu() else "cpu") if name == "auto" else name]
+def resolve(name: str, has_gpu: bool) -> RunConfig:
+    """Returns the values of a preset; `auto` is `gpu` where jax has one, else `cpu`."""
+    return PRESETS[("gpu" if has_gpu else "cpu") if name == "auto" else name]
 
 
-def has_gpu() -> bool:
-    """Whether jax would run on a GPU: its plugin is installed, a device is there, none forbids it.
-
-    Asked without importing jax, which takes seconds.
-    """
-    first = os.environ.get("JAX_PLATFORMS", "").split(",")[0]
-    hidden = os.environ.get("CUDA_VISIBLE_DEVICES", "0").strip() in ("", "-1")
-    allowed = first in ("", "cuda", "gpu") and not hidden
-    return allowed and has_gpu_device() and has_gpu_plugin()
-
-
-def has_gpu_device() -> bool:
-    """Whether the system shows an NVIDIA device."""
-    return pathlib.Path("/dev/nvidiactl").exists()
-
-
-def has_gpu_plugin() -> bool:
-    """Whether one of jax's CUDA plugins is installed."""
-    names = ("jax_cuda12_plugin", "jax_cuda13_plugin")
-    return any(importlib.util.find_spec(name) for name in names)
+def reason(has_gpu: bool) -> str:
+    """Why `auto` takes the preset that it does, once jax has started; one line."""
+    if has_gpu:
+        return "jax runs on a GPU"
+    why = gpu.why_unused()
+    shown = f", not on the GPU that the system shows: {why}" if why else ""
+    return f"jax runs on the CPU{shown}"

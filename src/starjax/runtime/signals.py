@@ -1,30 +1,134 @@
-"""Ctrl-C and SIGTERM as a question that training asks, so that it can save before it ends."""
+"""Requests to stop: Ctrl-C, SIGTERM, a closed terminal (SIGHUP), a scheduler's warning (SIGUSR1).
+
+A command answers them with KeyboardInterrupt, training with a checkpoint. What is ignored, as
+Ctrl-C by a shell's background job and SIGHUP under nohup, stays so.
+"""
 
 import contextlib
+import os
+import select
 import signal
+import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
+
+# Some systems do not have all of them.
+STOPS = tuple(
+    getattr(signal, name)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+    if hasattr(signal, name)
+)
+_AGAIN_S = 0.5  # until a KeyboardInterrupt that was lost is raised again
+_SILENT_S = 1.0  # that may pass until a stop is answered, or a line says that it was heard
+_READERS_MS = 200  # in which the readers of our output end with the terminal
+
+_answered = False
+
+
+def interrupt_on_stops() -> None:
+    """Lets every stop raise KeyboardInterrupt in the main thread, from now on.
+
+    Python drops what is raised in a callback of its collector, and jax's C++ some of what is raised
+    while it calls Python, at every start for some milliseconds. So it is raised again and again,
+    but not into the cleaning up that the first one began.
+    """
+    _announce_unanswered()
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, _interrupt_again)
+    for number in _heard():
+        signal.signal(number, _interrupt)
+
+
+def ignore_stops() -> None:
+    """Lets no stop interrupt what is left of the process."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    for number in STOPS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextlib.contextmanager
 def stop_signals() -> Iterator[Callable[[], bool]]:
-    """Yields `should_stop`: true after Ctrl-C or SIGTERM; the second one ends at once.
+    """Yields `should_stop`: true after a stop; the second one raises KeyboardInterrupt.
 
-    What is ignored, as Ctrl-C by a shell's background job, stays so.
+    In a thread, where Python handles no signals, it stays false: they are the main thread's.
     """
     asked = False
 
     def ask(number: int, frame: Any) -> None:
         nonlocal asked
+        _drop_dead_outputs(number)
         if asked:
             raise KeyboardInterrupt
         asked = True
 
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    heard = [number for number in numbers if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, ask) for number in heard}
+    def should_stop() -> bool:
+        global _answered
+        _answered = _answered or asked
+        return asked
+
+    if threading.current_thread() is not threading.main_thread():
+        yield should_stop
+        return
+    before = {number: signal.signal(number, ask) for number in _heard()}
     try:
-        yield lambda: asked
+        yield should_stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _heard() -> list[signal.Signals]:
+    return [number for number in STOPS if signal.getsignal(number) != signal.SIG_IGN]
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    global _answered
+    _answered = True
+    _drop_dead_outputs(number)
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S, _AGAIN_S)
+    raise KeyboardInterrupt
+
+
+def _interrupt_again(number: int, frame: Any) -> None:
+    if not isinstance(sys.exc_info()[1], KeyboardInterrupt):
+        raise KeyboardInterrupt
+
+
+def _announce_unanswered() -> None:
+    """Says of a stop that it was heard, where the main thread does not answer it.
+
+    That thread does not see a signal while it compiles a program or waits for one. The system
+    writes the number of each into a pipe at once, which a thread reads.
+    """
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+
+    def listen() -> None:
+        while number := os.read(read, 1):
+            if number[0] in STOPS:
+                time.sleep(_SILENT_S)
+                if not _answered:
+                    line = "starjax: stop heard; it waits for the program that compiles or runs now"
+                    print(line, file=sys.stderr, flush=True)
+                    return
+
+    threading.Thread(target=listen, name="starjax-stops", daemon=True).start()
+
+
+def _drop_dead_outputs(number: int) -> None:
+    """After SIGHUP, sends lines nowhere whose terminal or reader is gone: they would end the work
+    before it has saved."""
+    if number != getattr(signal, "SIGHUP", None):
+        return
+    for output in (1, 2):
+        poller = select.poll()
+        poller.register(output, 0)  # errors alone
+        if poller.poll(_READERS_MS):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, output)
+            os.close(nowhere)

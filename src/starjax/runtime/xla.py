@@ -40,11 +40,13 @@ def prepare_xla() -> None:
     _set_default("jax_persistent_cache_min_compile_time_secs", 0.0)
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
-    cache = cache_directory() / "xla" / _machine()
+    cache = compilation_cache()
     try:
         cache.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return  # no cache: every start compiles again, nothing else changes
+    except OSError as error:
+        line = f"starjax: no cache of compiled programs ({error}): every start compiles them again"
+        print(line, file=sys.stderr)
+        return
     _set_default("jax_compilation_cache_dir", str(cache))
 
 
@@ -84,6 +86,12 @@ def cache_directory() -> Path:
         return Path.home() / ".cache" / "starjax"
     except RuntimeError:
         return Path(tempfile.gettempdir()) / f"starjax-{os.getuid()}"
+
+
+def compilation_cache() -> Path:
+    """Folder of compiled programs: JAX_COMPILATION_CACHE_DIR, else this machine's own in ours."""
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    return Path(chosen) if chosen else cache_directory() / "xla" / _machine()
 
 
 def require_devices(*modules: str) -> None:

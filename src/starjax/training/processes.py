@@ -21,13 +21,13 @@ _PREEMPTION = "jax_enable_preemption_service"
 
 
 def join() -> None:
-    """Joins the run that the variables name, if they do; call it before the first jax array.
+    """Joins the run that the variables name, once, if they do; call it before the first jax array.
 
     Raises:
       UsageError: some of the variables are missing or are no numbers.
     """
     address, *numbers = (os.environ.get(name, "") for name in _VARIABLES)
-    if not address and not any(numbers):
+    if jax.distributed.is_initialized() or (not address and not any(numbers)):
         return
     if not address or not all(number.isdigit() for number in numbers):
         raise errors.UsageError(

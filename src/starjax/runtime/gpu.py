@@ -1,0 +1,64 @@
+"""Whether jax runs on a GPU: what the system shows before jax has started, what jax says after.
+
+Only what is asked after the start imports jax.
+"""
+
+import importlib.util
+import os
+from pathlib import Path
+
+# Of NVIDIA's driver, of a container that was given one card, of Linux inside Windows (WSL2).
+_DEVICES = ("nvidiactl", "nvidia[0-9]*", "dxg")
+_PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
+_DEV = Path("/dev")
+
+
+def is_shown() -> bool:
+    """Whether the system shows a device that may be an NVIDIA GPU."""
+    return any(any(_DEV.glob(pattern)) for pattern in _DEVICES)
+
+
+def has_plugin() -> bool:
+    """Whether one of jax's CUDA plugins is installed."""
+    return any(importlib.util.find_spec(name) for name in _PLUGINS)
+
+
+def forbidden() -> str:
+    """The variable of the environment that keeps jax from a GPU, with its value; else empty."""
+    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        first = os.environ.get(name, "").split(",")[0]
+        if first not in ("", "cuda", "gpu"):
+            return f"{name}={os.environ[name]}"
+    name = "CUDA_VISIBLE_DEVICES"
+    if os.environ.get(name, "0").strip() in ("", "-1"):
+        return f"{name}={os.environ[name]}"
+    return ""
+
+
+def is_likely() -> bool:
+    """Whether jax will run on a GPU, as far as that shows before it has started (2 s)."""
+    return is_shown() and has_plugin() and not forbidden()
+
+
+def is_used() -> bool:
+    """Whether jax runs on a GPU; starts jax."""
+    import jax
+
+    return jax.default_backend() == "gpu"
+
+
+def why_unused() -> str:
+    """Why jax does not run on the GPU that the system shows; empty if it shows none."""
+    if not is_shown():
+        return ""
+    if by_variable := forbidden():
+        return by_variable
+    if not has_plugin():
+        return "no CUDA plugin of jax is installed"
+    import jax
+
+    try:
+        jax.devices("cuda")
+    except RuntimeError as error:
+        return str(error).splitlines()[0]
+    return "jax prefers another device"
