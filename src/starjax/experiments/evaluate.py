@@ -63,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
         result = policy_under_test.write_result(
             folder, who, table, config, chosen.seed, command, stage_times.read(folder)
         )
-        print(f"\n{messages.outcome([result])}\n{_times(result, who.env.control_hz)}\n")
+        print(f"\n{messages.outcome([result])}\n{_times(result)}\n")
         if not same:
             (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
         if chosen.video:
@@ -153,15 +153,22 @@ def _config(trained: Any) -> config_lib.RunConfig:
         "train": dataclasses.asdict(trained.train),
         "demos": dataclasses.asdict(trained.demos or config_lib.DemosConfig()),
     }
+    scene = trained.scene
+    known["scene"] = {
+        "task": scene.task,
+        "arm": scene.arms,
+        "tool": scene.tools,
+        "camera": scene.cameras,
+    }
     unknown = {"seed": None}  # no file of weights says it
     return dataclasses.replace(config_lib.from_dict(config_lib.RunConfig, known), **unknown)
 
 
-def _times(result: dict[str, Any], control_hz: float) -> str:
-    """How long a transfer and a decision take."""
-    steps = result["steps"]["median"]
-    transfer = "-" if steps is None else f"{steps / control_hz:.1f} s"
-    return f"  median transfer {transfer}, decision {result['inference_ms']['p50']:.1f} ms"
+def _times(result: Any) -> str:
+    """How long a success and a decision take."""
+    steps = result.figures["steps"]["median"]
+    success = "-" if steps is None else f"{steps / result.control_hz:.1f} s"
+    return f"  median success {success}, decision {result.about['inference_ms']['p50']:.1f} ms"
 
 
 def _film(folder: Path, who: Any) -> str:

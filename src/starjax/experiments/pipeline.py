@@ -154,7 +154,7 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
         messages.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
         return
     count = len(env.task.is_seen)
-    if found and (more := len(found["trials"])) > count * config.eval.trials:
+    if found and (more := len(found.trials)) > count * config.eval.trials:
         raise errors.UsageError(
             "eval.trials",
             f"no fewer than the {more // count} of {folder / 'result.json'}",
@@ -175,27 +175,26 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
     )
 
 
-def _scored(folder: Path, weights: str) -> dict[str, Any]:
-    """What is in result.json, if it is there, whole and of these weights (SHA-256)."""
+def _scored(folder: Path, weights: str) -> Any:
+    """The `result.Result` in result.json, None if it is missing, damaged or of other weights."""
+    from starjax.evaluation import result
+
     try:
-        found = files.read_json(folder / "result.json")
-        config, trials = found["config"], found["trials"]
-    except (FileNotFoundError, KeyError, TypeError, ValueError):  # damaged: made again
-        return {}
-    is_whole = isinstance(config, dict) and isinstance(trials, list)
+        found = result.read(folder / "result.json")
+    except (FileNotFoundError, ValueError):  # damaged: made again
+        return None
     # older results do not say whose they are
-    return found if is_whole and found.get("weights", weights) == weights else {}
+    return found if found.trials and found.weights in (None, weights) else None
 
 
-def _is_of(found: dict[str, Any], config: config_lib.RunConfig) -> bool:
-    """Whether a result is of these settings, and has what a run says of it at its end."""
+def _is_of(found: Any, config: config_lib.RunConfig) -> bool:
+    """Whether a result is of these settings."""
     try:
-        before = config_lib.from_dict(config_lib.RunConfig, found["config"])
-        messages.outcome([found])
+        before = config_lib.from_dict(config_lib.RunConfig, found.config)
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
     alike = config_lib.trained_with(before) == config_lib.trained_with(config)
-    return alike and before.eval == config.eval and found.get("seed", config.seed) == config.seed
+    return alike and before.eval == config.eval and found.seed in (None, config.seed)
 
 
 def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
@@ -220,6 +219,7 @@ def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
 
 def _report(out: Path, names: Sequence[str]) -> None:
     """The report of every method in the folder, and the outcome of this run's."""
+    from starjax.evaluation import result
     from starjax.report import build
 
     scored = [out / name for name in methods.METHODS if (out / name / "result.json").exists()]
@@ -229,5 +229,5 @@ def _report(out: Path, names: Sequence[str]) -> None:
             page = build.build(scored, out / "report", report=messages.indented)
         except ValueError as error:  # of a damaged file, which it names
             raise errors.UsageError(str(out), "results that are whole", error) from error
-    results = [files.read_json(out / name / "result.json") for name in names]
+    results = [result.read(out / name / "result.json") for name in names]
     print(f"\n{messages.outcome(results)}\n\nreport: {page}", flush=True)

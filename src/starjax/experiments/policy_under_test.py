@@ -3,7 +3,7 @@
 import dataclasses
 import shlex
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -153,8 +153,8 @@ def write_result(
     command: str,
     timings_s: dict[str, float] | None = None,
     dataset_digest: str | None = None,
-) -> dict[str, Any]:
-    """Writes and returns `<folder>/result.json`: `metrics.compose`'s figures and what made them.
+) -> results.Result:
+    """Writes and returns `<folder>/result.json`: `statistics.compose`'s figures and what made them.
 
     Args:
       folder: of the result.
@@ -184,6 +184,4 @@ def write_result(
         "timings_s": timings_s or {},
         "warnings": messages.warnings(config, figures),
     }
-    file = folder / "result.json"
-    results.write(file, who.env.names, figures, about)
-    return files.read_json(file)
+    return results.write(folder / "result.json", who.env.names, figures, about)
