@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starjax.models import encoders, layers, resnet, spatial_softmax
-from starjax.models.kernels import norms, pooled_norm
+from starjax.models.group_norm import GroupNorm
 
 KEY = jax.random.key(0)
 
@@ -103,65 +103,12 @@ def test_resnet18_shrinks_by_32():
     assert shape == (2, 7, 8, 512)
 
 
-@pytest.fixture(scope="module", params=[(16, 20), (15, 18), (13, 9)])
-def stem(request):
-    """Our convolution, GroupNorm, ReLU and max-pooling, and jax's: outputs and gradients."""
-    x, size = normal(3, *request.param, 3), tuple(-(-side // 2) for side in request.param)
-    ours, norm = resnet.Stem(32), pooled_norm.PooledNorm(2, size)
-    plain, plain_norm = resnet.Conv2d(32, 7, 2), norms.GroupNorm(2)
-    params = plain.init(KEY, x), plain_norm.init(KEY, normal(3, *size, 32))
-    # half of the gains negative, where the largest comes from the smallest
-    params = jax.tree.map(lambda leaf: leaf * normal(*leaf.shape), params)
-
-    def actual(params, x):
-        return norm.apply(params[1], ours.apply(params[0], x))
-
-    def expected(params, x):
-        y = jax.nn.relu(plain_norm.apply(params[1], plain.apply(params[0], x)))
-        pads = [(0, 0), (1, 1), (1, 1), (0, 0)]
-        return jax.lax.reduce_window(y, -jnp.inf, jax.lax.max, (1, 3, 3, 1), (1, 2, 2, 1), pads)
-
-    def outputs(start):
-        y, pullback = jax.vjp(start, params, x)
-        return y, pullback(normal(*y.shape))
-
-    return [outputs(jax.jit(start)) for start in (actual, expected)]
-
-
-def test_the_stem_is_what_it_stands_for(stem):
-    (actual, _), (expected, _) = stem
-    assert actual.shape == expected.shape
-    assert (expected == 0).any()
-    np.testing.assert_allclose(actual, expected, atol=1e-5 * float(jnp.abs(expected).max()))
-
-
-def test_the_stems_gradient_is_too(stem):
-    (_, actual), (_, expected) = stem
-    for ours, jaxs in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(ours, jaxs, atol=1e-5 * float(jnp.abs(jaxs).max()))
-
-
 def test_the_gradient_of_a_blocks_end_is_jaxs():
     x, y, g = normal(4, 5), normal(5, 4).T, normal(20).reshape(4, 5)
     _, actual = jax.vjp(resnet._relu_of_sum, x, y)
     _, expected = jax.vjp(lambda x, y: jax.nn.relu(x + y), x, y)
     for ours, jaxs in zip(actual(g), expected(g), strict=True):
         np.testing.assert_array_equal(ours, jaxs)
-
-
-@pytest.mark.parametrize("size", [(7, 9), (8, 6)])
-@pytest.mark.parametrize(("kernel", "stride", "pad"), [(3, 1, 1), (3, 2, 1), (1, 2, 0), (4, 1, 0)])
-def test_a_convolution_as_a_product_is_the_same(size, kernel, stride, pad):
-    x, w = normal(2, *size, 5), normal(kernel, kernel, 5, 3)
-    actual = resnet._product(x, w, stride, pad)
-    np.testing.assert_allclose(actual, resnet._convolution(x, w, stride, pad), atol=1e-4)
-
-
-def test_a_strided_slice_is_kept_out_of_a_products_kernel():
-    # XLA's compiler for GPUs aborts on it, which no test without a GPU would see
-    program = jax.jit(lambda x, w: resnet._product(x, w, 2, 0))
-    text = program.lower(normal(2, 29, 29, 8), normal(1, 1, 8, 16)).as_text()
-    assert "optimization_barrier" in text
 
 
 def test_unknown_trunk_is_named():
@@ -189,13 +136,13 @@ def test_a_block_is_torchvisions_with_groups_of_16_channels(stride, into):
     x = normal(3, 8, 8, into)
     block = resnet.BasicBlock(32, stride)
     params = block.init(KEY, x)["params"]
-    norm = norms.GroupNorm(2).init(KEY, normal(3, 8, 8, 32))["params"]
+    norm = GroupNorm(2).init(KEY, normal(3, 8, 8, 32))["params"]
 
     def conv(name, x, size, stride=1):
         return resnet.Conv2d(32, size, stride).apply({"params": params[name]}, x)
 
     def group_norm(x):
-        return norms.GroupNorm(2).apply({"params": norm}, x)
+        return GroupNorm(2).apply({"params": norm}, x)
 
     y = jax.nn.relu(group_norm(conv("conv1", x, 3, stride)))
     y = group_norm(conv("conv2", y, 3))
@@ -217,7 +164,7 @@ def test_the_small_trunks_layers_are_cut_by_relu():
     ):
         params = variables["params"]
         x = resnet.Conv2d(16 << doubling, 3, stride).apply({"params": params[f"Conv2d_{size}"]}, x)
-        norm = norms.GroupNorm((16 << doubling) // 8)
+        norm = GroupNorm((16 << doubling) // 8)
         x = jax.nn.relu(norm.apply({"params": params[f"GroupNorm_{size}"]}, x))
     np.testing.assert_allclose(module.apply(variables, frames()), x, atol=1e-4)
 

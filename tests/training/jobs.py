@@ -111,10 +111,12 @@ def devices_main(count: int, out: str, observation: str, dtype: str) -> None:
     import numpy as np
 
     from starjax.data import windows
+    from starjax.models.kernels import packed_params
     from starjax.training import sharding, step
 
     assert len(jax.devices()) == count
-    sharding.LARGE, sharding.JOINS = 256, {"cpu"}  # so that this small policy has some, as on GPUs
+    # so that this small policy has some, as on GPUs
+    sharding.LARGE, packed_params.PLATFORMS = 256, {"cpu"}
     settings = dataclasses.replace(SETTINGS, holdout_demos=0)
     state = train(Path(out), settings, observation=observation, dtype=dtype).state
     key_frames, _ = step.step_keys(state.key, 5)
@@ -131,13 +133,14 @@ def processes_main(out: str, asks: int) -> None:
 
     import jax
 
+    from starjax.models.kernels import packed_params
     from starjax.training import devices, loop, processes, sharding
 
     processes.join()
     given = jax.numpy.ones(3)
     spread = devices.replicate(given, devices.make_mesh(2), may_alias=None).addressable_data(0)
     assert spread.unsafe_buffer_pointer() == given.unsafe_buffer_pointer(), "held twice"
-    sharding.LARGE, sharding.JOINS = 18, {"cpu"}  # the matrix, not the vector
+    sharding.LARGE, packed_params.PLATFORMS = 18, {"cpu"}  # the matrix, not the vector
     loop.policies.make = lambda *_: _quadratic_policy()
     asked = itertools.count(1)
     try:

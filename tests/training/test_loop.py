@@ -21,8 +21,9 @@ import pytest
 
 from starjax.data import windows
 from starjax.methods import METHODS
+from starjax.models.kernels import packed_params
 from starjax.runtime import files
-from starjax.training import checkpoint, loop, sharding, state, step, stepper
+from starjax.training import checkpoint, loop, state, step, stepper
 from starjax.training import log as metrics
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -256,8 +257,8 @@ def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
     np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
 
 
-def test_joined_vectors_give_the_same_run_and_resume(whole, tmp_path, monkeypatch):
-    monkeypatch.setattr(sharding, "JOINS", {"cpu"})
+def test_packed_parameters_give_the_same_run_and_resume(whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(packed_params, "PLATFORMS", {"cpu"})
     asked = itertools.count(1)
     with pytest.raises(loop.Interrupted):
         jobs.train(tmp_path, should_stop=lambda: next(asked) == 3)
@@ -282,9 +283,9 @@ def test_pictures_train_too_and_resume(tmp_path, dtype, monkeypatch):
     again = jobs.train(tmp_path / "b", settings, **seen)
     assert_same_bytes(again.state, whole.state)
 
-    monkeypatch.setattr(sharding, "JOINS", {"cpu"})  # and kernels turned
-    joined = jobs.train(tmp_path / "c", settings, **seen)
-    for x, y in zip(leaves(joined.state), leaves(whole.state), strict=True):
+    monkeypatch.setattr(packed_params, "PLATFORMS", {"cpu"})  # and kernels turned
+    packed = jobs.train(tmp_path / "c", settings, **seen)
+    for x, y in zip(leaves(packed.state), leaves(whole.state), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)
 
 

@@ -27,8 +27,8 @@ def test_the_optimiser_is_adamw_with_the_momenta_of_the_paper():
     chex.assert_trees_all_close((adam.mu, adam.nu), wanted, rtol=1e-4)
 
 
-@pytest.mark.parametrize("joins", [False, True])
-def test_only_kernels_of_the_roll_network_decay_faster(joins):
+@pytest.mark.parametrize("packs", [False, True])
+def test_only_kernels_of_the_roll_network_decay_faster(packs):
     settings = config.TrainConfig(
         warmup_steps=0, weight_decay=0.25, roll_weight_decay=0.5, learning_rate=0.1
     )
@@ -36,11 +36,11 @@ def test_only_kernels_of_the_roll_network_decay_faster(joins):
     kernel, bias = jnp.full((2, 3), 2.0), jnp.full(3, 2.0)
     network = {"params": {"out": {"kernel": kernel, "bias": bias}}}
     params = {"diffuser": network, "roll": network}
-    given = packed_params.join(params, params) if joins else params
+    given = packed_params.pack(params, params) if packs else params
     still = jax.tree.map(jnp.zeros_like, given)
     updates, _ = optimizer.update(still, optimizer.init(given), given)
-    if joins:
-        updates = packed_params.separate(updates, params)
+    if packs:
+        updates = packed_params.unpack(updates, params)
     slow, fast = -0.1 * 0.25 * 2.0, -0.1 * (0.25 + 0.5) * 2.0
     wanted = jax.tree.map(lambda x: jnp.full_like(x, slow), params)
     wanted["roll"]["params"]["out"]["kernel"] = jnp.full_like(kernel, fast)

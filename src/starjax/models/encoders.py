@@ -1,7 +1,7 @@
-"""What turns observations into the condition: images to keypoints (Eq. 10), histories to a vector.
+"""Encodes observations: images to keypoints (Eq. 10), histories of measurements to a vector.
 
 Both image encoders are a trunk, one map per keypoint, spatial softmax and a linear layer, and are
-called alike; they see one frame at a time.
+called alike. They see one image at a time.
 """
 
 import flax.linen as nn
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax.models import layers, resnet, spatial_softmax
-from starjax.models.kernels import norms
+from starjax.models.group_norm import GroupNorm
 
 
 class ImageEncoder(nn.Module):
@@ -67,7 +67,7 @@ class SmallTrunk(nn.Module):
         x = image.astype(self.dtype)
         for doubling, stride in ((0, 2), (0, 1), (1, 2), (1, 1), (2, 2), (2, 1), (2, 1)):
             x = resnet.Conv2d(self.width << doubling, 3, stride)(x)
-            x = nn.relu(norms.GroupNorm(x.shape[-1] // 8)(x))
+            x = nn.relu(GroupNorm(x.shape[-1] // 8)(x))
         return x
 
 

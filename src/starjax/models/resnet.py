@@ -3,23 +3,17 @@
 Names and shapes follow torchvision's, so that `pretrained` can fill in its ImageNet weights.
 """
 
-import functools
 import math
 from collections.abc import Callable
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from starjax.models import layers
-from starjax.models.kernels import norms
+from starjax.models.group_norm import GroupNorm
+from starjax.models.kernels import few_images
 from starjax.models.kernels.pooled_norm import PooledNorm
-
-# Images up to which a GPU convolves as a matrix product. cuDNN's convolutions, started one by one
-# between CUDA graphs, then take longer to start than to run: 0.35 ms of a call for one robot, which
-# sees two frames.
-_FEW = 2
 
 
 class ResNet18(nn.Module):
@@ -105,7 +99,7 @@ class Conv2d(nn.Module):
 
 def group_norm(name: str, x: jax.Array) -> jax.Array:
     """GroupNorm with 16 channels a group, inside a compact module."""
-    return norms.GroupNorm(_groups(x), name=name)(x)
+    return GroupNorm(_groups(x), name=name)(x)
 
 
 def _groups(x: jax.Array) -> int:
@@ -114,7 +108,7 @@ def _groups(x: jax.Array) -> int:
 
 @jax.custom_vjp
 def _relu_of_sum(x: jax.Array, y: jax.Array) -> jax.Array:
-    """ReLU of x + y; its gradient asks what came out, which is kept anyway, not both summands."""
+    """ReLU of x + y, whose gradient reads the output, which is kept anyway, not both summands."""
     return nn.relu(x + y)
 
 
@@ -124,7 +118,7 @@ def _relu_of_sum_forward(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Arr
 
 
 def _relu_of_sum_gradient(out: jax.Array, g: jax.Array) -> tuple[jax.Array, jax.Array]:
-    # without a barrier XLA asks the sum again
+    # Without the barrier XLA computes the sum again.
     g = jnp.where(jax.lax.optimization_barrier(out) > 0, g, 0)
     return g, g
 
@@ -138,15 +132,9 @@ def _kernel_init(size: int, features: int) -> Callable[..., jax.Array]:
 
 
 def _convolve(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.Array:
-    """Convolution of `[N, h, w, C]` with `[rows, columns, C, features]`."""
-    if len(x) > _FEW:
-        return _convolution(x, kernel, stride, pad)
-    product = functools.partial(_product, stride=stride, pad=pad)
-    default = functools.partial(_convolution, stride=stride, pad=pad)
-    return jax.lax.platform_dependent(x, kernel, cuda=product, default=default)
-
-
-def _convolution(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.Array:
+    """Convolves `[N, h, w, C]` with `[rows, columns, C, features]`, `pad` zeros on every side."""
+    if few_images.pays(len(x)):
+        return few_images.convolution(x, kernel, stride, pad)
     return jax.lax.conv_general_dilated(
         x,
         kernel,
@@ -156,24 +144,8 @@ def _convolution(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.
     )
 
 
-def _product(x: jax.Array, kernel: jax.Array, stride: int, pad: int) -> jax.Array:
-    """The same as one matrix product of the shifted inputs."""
-    sides = kernel.shape[:2]
-    x = jnp.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0)))
-    down, right = (
-        (side - size) // stride * stride + 1 for side, size in zip(x.shape[1:3], sides, strict=True)
-    )
-    shifted = [x[:, i : i + down : stride, j : j + right : stride] for i, j in np.ndindex(*sides)]
-    columns = jnp.concatenate(shifted, -1)
-    if sides == (1, 1):
-        # XLA would take the strided slice into the product's kernel, and abort the process where
-        # its sides are odd (jaxlib 0.11, 29 pixels to 15).
-        columns = jax.lax.optimization_barrier(columns)
-    return columns @ kernel.reshape(-1, kernel.shape[-1])
-
-
 def _to_blocks(kernel: jax.Array) -> jax.Array:
-    """`[7, 7, C, F] -> [4, 2, 16 C, 4 F]`: of blocks of 2x8 pixels to their four outputs."""
+    """Rewrites a kernel `[7, 7, C, F]` for `_blocks`: `[4, 2, 16 C, 4 F]`, four outputs a block."""
     rows, none = (1, 0), (0, 0)
     shifts = [(1 + 2 * output, 8 - 2 * output) for output in range(4)]
     wide = jnp.stack([jnp.pad(kernel, (rows, columns, none, none)) for columns in shifts], -2)
@@ -183,7 +155,7 @@ def _to_blocks(kernel: jax.Array) -> jax.Array:
 
 
 def _blocks(x: jax.Array) -> jax.Array:
-    """Blocks of 2x8 pixels as channels: `[N, 2 h, 8 w, C] -> [N, h, w, 16 C]`."""
+    """Turns blocks of 2x8 pixels into channels: `[N, 2 h, 8 w, C] -> [N, h, w, 16 C]`."""
     batch, height, width, channels = x.shape
     x = x.reshape(batch, height // 2, 2, width // 8, 8, channels)
     return jnp.moveaxis(x, 2, 3).reshape(batch, height // 2, width // 8, -1)

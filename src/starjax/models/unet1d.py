@@ -15,6 +15,7 @@ latter is computed once for all DDIM steps:
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
@@ -22,8 +23,38 @@ import jax
 import jax.numpy as jnp
 
 from starjax.models import layers
-from starjax.models.kernels import sampling_blocks
-from starjax.models.kernels.activated_norm import ActivatedNorm
+from starjax.models.group_norm import GroupNorm
+
+
+class ResidualBlock(nn.Module):
+    """Two convolution blocks with FiLM between them, and a skip (1x1 where the width changes)."""
+
+    features: int
+    kernel_size: int
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array, film: jax.Array) -> jax.Array:
+        """`x` `[B, L, C]`, `film` `[B, 2 features]` (scale, then bias) -> `[B, L, features]`."""
+        scale, bias = jnp.split(film[:, None, :], 2, axis=-1)
+        h = ConvBlock(self.features, self.kernel_size, self.groups)(x)
+        h = ConvBlock(self.features, self.kernel_size, self.groups)(scale * h + bias)
+        skip = x if x.shape[-1] == self.features else layers.Conv1d(self.features, 1)(x)
+        return h + skip
+
+
+class ConvBlock(nn.Module):
+    """Conv1d, GroupNorm, Mish."""
+
+    features: int
+    kernel_size: int
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[B, L, C] -> [B, L, features]`."""
+        x = layers.Conv1d(self.features, self.kernel_size)(x)
+        return layers.mish(GroupNorm(self.groups)(x))
 
 
 class ConditionalUnet1D(nn.Module):
@@ -37,6 +68,8 @@ class ConditionalUnet1D(nn.Module):
       groups: of GroupNorm.
       time_dim: width of the sinusoidal embedding of the diffusion step; even.
       dtype: of the arithmetic; parameters, statistics and the output are float32.
+      residual_block: module of the blocks, called as `ResidualBlock`.
+      conv_block: module of the last convolution, called as `ConvBlock`.
     """
 
     action_dim: int
@@ -46,6 +79,8 @@ class ConditionalUnet1D(nn.Module):
     groups: int = 8
     time_dim: int = 128
     dtype: jnp.dtype = jnp.float32
+    residual_block: Callable[..., nn.Module] = ResidualBlock
+    conv_block: Callable[..., nn.Module] = ConvBlock
 
     def setup(self):
         widths = self.channels
@@ -55,7 +90,7 @@ class ConditionalUnet1D(nn.Module):
         self.middle = [self._block(widths[-1]), self._block(widths[-1])]
         self.up = [[self._block(c), self._block(c)] for c in upward]
         self.double = [layers.Upsample1d() for _ in upward]
-        self.last = ConvBlock(widths[0], self.kernel_size, self.groups)
+        self.last = self.conv_block(widths[0], self.kernel_size, self.groups)
         self.out = layers.Conv1d(self.action_dim, 1)
 
         self.time_in = layers.Dense(4 * self.time_dim)
@@ -111,43 +146,8 @@ class ConditionalUnet1D(nn.Module):
             x = double(second(first(x, next(films)), next(films)))
         return self.out(self.last(x)).astype(jnp.float32)
 
-    def _block(self, features: int) -> "ResidualBlock":
-        return ResidualBlock(features, self.kernel_size, self.groups)
-
-
-class ResidualBlock(nn.Module):
-    """Two convolution blocks with FiLM between them, and a skip (1x1 where the width changes)."""
-
-    features: int
-    kernel_size: int
-    groups: int
-
-    @nn.compact
-    def __call__(self, x: jax.Array, film: jax.Array) -> jax.Array:
-        """`x` `[B, L, C]`, `film` `[B, 2 features]` (scale, then bias) -> `[B, L, features]`."""
-        if self.has_variable("params", "first"):  # of `sampling_blocks.prepared`
-            return sampling_blocks.residual_block(self.variables["params"], x, film, self.groups)
-        scale, bias = jnp.split(film[:, None, :], 2, axis=-1)
-        h = ConvBlock(self.features, self.kernel_size, self.groups)(x)
-        h = ConvBlock(self.features, self.kernel_size, self.groups)(scale * h + bias)
-        skip = x if x.shape[-1] == self.features else layers.Conv1d(self.features, 1)(x)
-        return h + skip
-
-
-class ConvBlock(nn.Module):
-    """Conv1d, GroupNorm, Mish."""
-
-    features: int
-    kernel_size: int
-    groups: int
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        """`[B, L, C] -> [B, L, features]`."""
-        if self.has_variable("params", "kernel"):  # of `sampling_blocks.prepared`
-            return sampling_blocks.conv_block(self.variables["params"], x, self.groups)
-        product, bias = layers.Conv1d(self.features, self.kernel_size).apart(x)
-        return ActivatedNorm(self.groups, name="GroupNorm_0")(product, bias)
+    def _block(self, features: int) -> nn.Module:
+        return self.residual_block(features, self.kernel_size, self.groups)
 
 
 @jax.custom_vjp

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from starjax import config
 from starjax.models import diffusion, encoders, schedule, unet1d
-from starjax.models.kernels import packed_params, parallel_ddim
+from starjax.models.kernels import packed_params, parallel_ddim, sampling_unet
 from starjax.policies import features
 
 Params = dict[str, Any]
@@ -69,7 +69,8 @@ def make(
         dtype=dtype,
     )
     of_unet, of_state, of_vision = (
-        packed_params.applied(network) for network in (unet, state, vision)
+        packed_params.applied(apply)
+        for apply in (sampling_unet.applied(unet), state.apply, vision.apply)
     )
     noise_schedule = schedule.cosine(policy_config.diffusion_steps)
     shape = (policy_config.horizon, action_dim)

@@ -74,7 +74,7 @@ def make(
     )
     history_weight = float(policy_config.roll_history)
     trocar_weight = float(policy_config.roll_trocar)
-    predict = packed_params.applied(rolls)
+    predict = packed_params.applied(rolls.apply)
 
     def init(key: jax.Array) -> Params:
         key_model, key_roll = jax.random.split(key)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from starjax import config, methods, rcm
 from starjax.models import pretrained
-from starjax.models.kernels import packed_params, sampling_blocks
+from starjax.models.kernels import packed_params, sampling_unet
 from starjax.policies import features, hierarchical, single
 from starjax.policies.base import Params, Policy
 from starjax.sim.tasks.base import Task
@@ -37,12 +37,13 @@ def with_resnet18(params: Params, path: str | pathlib.Path) -> Params:
 def for_sampling(params: Params, dtype: str) -> Params:
     """Parameters as `sample` uses them fastest: for evaluation, not for training.
 
-    `rounded`, and on a GPU those of the U-Net's blocks are as `sampling_blocks` takes them and all
-    of them `packed`.
+    `rounded`, and on a GPU those of the U-Net as `sampling_unet` takes them and all of them
+    `packed`.
     """
-    if jax.default_backend() == "gpu":  # a CPU would be slower with them
-        return packed(rounded(with_sampling_blocks(params), dtype))
-    return rounded(params, dtype)
+    if sampling_unet.pays():
+        params = with_sampling_blocks(params)
+    params = rounded(params, dtype)
+    return packed(params) if packed_params.pays(jax.default_backend()) else params
 
 
 def rounded(params: Params, dtype: str) -> Params:
@@ -61,10 +62,10 @@ def rounded(params: Params, dtype: str) -> Params:
 
 
 def with_sampling_blocks(params: Params) -> Params:
-    """Parameters of `sample` with its U-Net's blocks as `sampling_blocks` takes them."""
+    """Parameters of `sample` with its U-Net's as `sampling_unet` takes them."""
     if "diffuser" in params:
         return {**params, "diffuser": with_sampling_blocks(params["diffuser"])}
-    return {**params, "unet": sampling_blocks.prepared(params["unet"])}
+    return {**params, "unet": sampling_unet.prepared(params["unet"])}
 
 
 def packed(params: Params) -> Params:

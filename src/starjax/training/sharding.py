@@ -21,7 +21,6 @@ from starjax.training.state import TrainState
 Carried = tuple[TrainState, policies.Params]
 
 LARGE = 1 << 18  # entries of a matrix: smaller ones take longer to send than to update everywhere
-JOINS = {"gpu"}  # on a CPU a vector is updated as fast alone
 _ROW = 1 << 10  # entries: what a block of a GPU's threads adds up at once
 _SMALL = 1 << 16  # entries: a leaf below takes a GPU longer to start on than to read
 
@@ -146,14 +145,14 @@ class Parts(NamedTuple):
         return jax.eval_shape(self._join, like)
 
     def _join(self, tree: Any) -> Any:
-        return packed_params.join_all(tree, self.like.params) if self._joins else tree
+        return packed_params.pack_all(tree, self.like.params) if self._joins else tree
 
     def _separate(self, tree: Any) -> Any:
-        return packed_params.separate_all(tree, self.like.params) if self._joins else tree
+        return packed_params.unpack_all(tree, self.like.params) if self._joins else tree
 
     @property
     def _joins(self) -> bool:
-        return self.mesh.devices.flat[0].platform in JOINS
+        return packed_params.pays(self.mesh.devices.flat[0].platform)
 
     def _is_split(self, path: tuple[Any, ...], x: Any) -> bool:
         """Whether a leaf of what is carried lies in parts: not the vision encoder's, which is the

@@ -62,7 +62,7 @@ def make_optimizer(train_config: config.TrainConfig) -> optax.GradientTransforma
 
 
 def _are_of_roll(params: Any) -> Any:
-    """Which leaves are kernels of the roll network, joined (`models.joined`) or not."""
+    """Which leaves are kernels of the roll network, packed or not."""
 
     def is_one(path: tuple[Any, ...], _: Any) -> bool:
         names = [getattr(entry, "key", None) for entry in path]

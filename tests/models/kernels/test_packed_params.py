@@ -1,4 +1,4 @@
-"""Vectors joined into one, and as they were."""
+"""Packed parameters, unpacked, are what they were."""
 
 import chex
 import jax
@@ -17,44 +17,44 @@ def params():
     return {"net": dict(zip(names, arrays, strict=True))}
 
 
-def test_what_is_joined_can_be_separated():
+def test_what_is_packed_can_be_unpacked():
     given = params()
-    found = packed_params.join(given, given)
+    found = packed_params.pack(given, given)
     assert found.vectors.shape == (6,)
     assert jax.tree.leaves(found.matrices)[0].shape == (2, 4)
-    chex.assert_trees_all_equal(packed_params.separate(found, given), given)
+    chex.assert_trees_all_equal(packed_params.unpack(found, given), given)
 
 
 def test_a_matrix_that_is_held_flat_is_no_vector():
     given = params()
     flat = {"net": {**given["net"], "kernel": given["net"]["kernel"].ravel()}}
-    found = packed_params.join(flat, given)
+    found = packed_params.pack(flat, given)
     assert found.vectors.shape == (6,)
-    chex.assert_trees_all_equal(packed_params.separate(found, given), flat)
+    chex.assert_trees_all_equal(packed_params.unpack(found, given), flat)
 
 
 def test_kernels_of_convolutions_are_turned():
     kernel = np.random.default_rng(0).random((3, 2, 4, 5), np.float32)
     given = {"bias": np.zeros(5, np.float32), "kernel": kernel}
-    found = packed_params.join(given, given)
+    found = packed_params.pack(given, given)
     np.testing.assert_array_equal(found.matrices["kernel"][1], kernel[..., 1])
-    chex.assert_trees_all_equal(packed_params.separate(found, given), given)
+    chex.assert_trees_all_equal(packed_params.unpack(found, given), given)
 
 
-def test_all_that_holds_parameters_is_joined():
+def test_all_that_holds_parameters_is_packed():
     given = params()
     held = {"params": given, "opt_state": make_optimizer(TrainConfig()).init(given), "step": 3}
-    found = packed_params.join_all(held, given)
+    found = packed_params.pack_all(held, given)
     vectors = [x for x in jax.tree.leaves(found) if np.shape(x) == (6,)]
     assert len(vectors) == 3  # parameters and both moments
     assert len(jax.tree.leaves(found)) == len(jax.tree.leaves(held)) - 3 * 2
-    chex.assert_trees_all_equal(packed_params.separate_all(found, given), held)
+    chex.assert_trees_all_equal(packed_params.unpack_all(found, given), held)
 
 
-def test_without_vectors_nothing_is_joined():
+def test_without_vectors_nothing_is_lost():
     given = {"kernel": np.ones((2, 2), np.float32)}
     chex.assert_trees_all_equal(
-        packed_params.separate(packed_params.join(given, given), given), given
+        packed_params.unpack(packed_params.pack(given, given), given), given
     )
 
 
@@ -64,5 +64,5 @@ def test_a_network_takes_packed_parameters_as_it_takes_others():
     params = network.init(jax.random.key(1), image)
     packed = packed_params.packed(params)
     assert len(jax.tree.leaves(packed)) == len(jax.tree.leaves(params)) - 2 * 7 + 1
-    apply = jax.jit(packed_params.applied(network))
+    apply = jax.jit(packed_params.applied(network.apply))
     chex.assert_trees_all_equal(apply(packed, image), apply(params, image))

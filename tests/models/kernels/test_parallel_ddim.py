@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import diffusion, layers, schedule
+from starjax.models import diffusion, kernels, schedule
 from starjax.models.kernels import parallel_ddim
 
 SCHEDULE = schedule.cosine(100)
@@ -109,7 +109,7 @@ def test_more_steps_need_few_more_evaluations(steps, evaluations):
 
 def test_it_pays_for_few_robots_on_a_gpu(monkeypatch):
     assert not parallel_ddim.pays(1, 10)
-    monkeypatch.setattr(layers, "on_gpu", lambda: True)
+    monkeypatch.setattr(kernels, "on_gpu", lambda: True)
     most = {
         steps: max([0, *(batch for batch in range(1, 400) if parallel_ddim.pays(batch, steps))])
         for steps in (1, 5, 6, 10, 100)

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax.models import layers
+from starjax.models import kernels
 from starjax.models import schedule as schedules
 
 # So many evaluations for so many steps, and one more for twice as many, come equally near
@@ -38,7 +38,7 @@ def evaluations_for(steps: int) -> int:
 def pays(batch: int, steps: int) -> bool:
     """Whether so many robots' sequences take less time here than step by step."""
     beside = evaluations_for(steps) * (_WEIGHTS_IN_SEQUENCES + batch * steps)
-    return layers.on_gpu() and beside < steps * (_WEIGHTS_IN_SEQUENCES + batch)
+    return kernels.on_gpu() and beside < steps * (_WEIGHTS_IN_SEQUENCES + batch)
 
 
 def ddim_sample(

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.models.kernels import norms
+from starjax.models import group_norm
 
 _NOWHERE = 255  # place of the largest in a window whose largest ReLU has cut
 
@@ -32,7 +32,7 @@ class PooledNorm(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[N, h, 2, w, 2, C] -> [N, h, w, C]`: of h pairs of rows, w pairs of columns."""
-        return _pooled(x, *norms.scale_and_shift(self, x, self.groups), self.groups, self.size)
+        return _pooled(x, *group_norm.scale_and_shift(self, x, self.groups), self.groups, self.size)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3, 4))
@@ -41,13 +41,13 @@ def _pooled(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int, size: 
 
 
 def _forward(x: jax.Array, scale: jax.Array, bias: jax.Array, groups: int, size: Size):
-    moments = norms.moments(_inside(x, size, 0), entries=size[0] * size[1])
-    gain, shift = norms.affine(*moments, scale, bias, groups)
+    moments = group_norm.moments(_inside(x, size, 0), entries=size[0] * size[1])
+    gain, shift = group_norm.affine(*moments, scale, bias, groups)
     # The largest comes from the largest x, where the gain is negative from the smallest.
     sign = jnp.where(gain < 0, -1, 1).astype(x.dtype)
-    largest, place = _largest(_inside(norms.beside(sign, x) * x, size, -jnp.inf))
-    chosen = norms.beside(sign, largest) * largest
-    y = nn.relu(norms.normalized(chosen, gain, shift))
+    largest, place = _largest(_inside(group_norm.over_positions(sign, x) * x, size, -jnp.inf))
+    chosen = group_norm.over_positions(sign, largest) * largest
+    y = nn.relu(group_norm.normalized(chosen, gain, shift))
     place = jnp.where(y > 0, place, jnp.uint8(_NOWHERE))
     return y, (x, scale, bias, moments, place, chosen)
 
@@ -56,13 +56,17 @@ def _gradient(
     groups: int, size: Size, kept, g: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     x, scale, bias, moments, place, chosen = kept
-    affine = functools.partial(norms.affine, groups=groups)
+    affine = functools.partial(group_norm.affine, groups=groups)
     (gain, _), back = jax.vjp(affine, *moments, scale, bias)
     wide = jnp.where(place == _NOWHERE, 0, g).astype(jnp.float32)
     by_gain = (wide * chosen.astype(jnp.float32)).sum((1, 2))
     by_mean, by_square, by_scale, by_bias = back((by_gain, wide.sum((1, 2))))
-    everywhere = norms.beside(by_mean, x) + 2 * x.astype(jnp.float32) * norms.beside(by_square, x)
-    by_x = norms.beside(gain, x) * _to_chosen(place, g) + everywhere / (size[0] * size[1])
+    everywhere = group_norm.over_positions(by_mean, x) + 2 * x.astype(
+        jnp.float32
+    ) * group_norm.over_positions(by_square, x)
+    by_x = group_norm.over_positions(gain, x) * _to_chosen(place, g) + everywhere / (
+        size[0] * size[1]
+    )
     return _inside(by_x.astype(x.dtype), size, 0), by_scale, by_bias
 
 

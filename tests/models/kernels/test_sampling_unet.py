@@ -1,4 +1,4 @@
-"""The U-Net's blocks as a GPU samples with them are the functions that were trained."""
+"""A U-Net's blocks for sampling are the functions that were trained."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starjax.models import unet1d
-from starjax.models.kernels import sampling_blocks
+from starjax.models.kernels import sampling_unet
 
 GROUPS = 4
 
@@ -23,6 +23,16 @@ def made(module, *given):
     return params, module.apply({"params": params}, *given)
 
 
+def sample(module, params, *given):
+    """What the block for sampling makes of a trained block's parameters."""
+    of = {
+        unet1d.ResidualBlock: sampling_unet.SamplingBlock,
+        unet1d.ConvBlock: sampling_unet.SamplingConv,
+    }[type(module)]
+    block = of(module.features, module.kernel_size, module.groups)
+    return block.apply({"params": sampling_unet.prepared(params).params}, *given)
+
+
 @pytest.mark.parametrize("channels", [8, 12])
 @pytest.mark.parametrize(("kernel", "length"), [(5, 16), (5, 3), (5, 2), (5, 1), (3, 2), (1, 4)])
 def test_a_block_is_the_same_function(kernel, length, channels):
@@ -30,18 +40,29 @@ def test_a_block_is_the_same_function(kernel, length, channels):
     module = unet1d.ResidualBlock(12, kernel, GROUPS)
     given = inputs(3, length, channels), inputs(3, 24, seed=2)
     params, expected = made(module, *given)
-    changed = sampling_blocks.prepared(params)
     assert ("Conv1d_0" in params) == (channels == 8)
-    assert changed.keys() == {"first", "second"}
-    np.testing.assert_allclose(module.apply({"params": changed}, *given), expected, atol=2e-5)
+    np.testing.assert_allclose(sample(module, params, *given), expected, atol=2e-5)
 
 
 def test_the_last_convolution_is_the_same_function():
     module, x = unet1d.ConvBlock(12, 5, GROUPS), inputs(3, 16, 8)
     params, expected = made(module, x)
-    changed = {"params": sampling_blocks.prepared(params)}
-    assert "GroupNorm_0" not in changed["params"]
-    np.testing.assert_allclose(module.apply(changed, x), expected, atol=2e-5)
+    np.testing.assert_allclose(sample(module, params, x), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_a_whole_unet_takes_either_parameters(dtype):
+    unet = unet1d.ConditionalUnet1D(
+        action_dim=4, cond_dim=10, channels=(8, 16), groups=GROUPS, time_dim=16, dtype=dtype
+    )
+    given = inputs(3, 4, 4), jnp.arange(3) * 30, inputs(3, 10, seed=2)
+    params = {"params": made(unet, *given)[0]}
+    apply = jax.jit(sampling_unet.applied(unet))
+    prepared = sampling_unet.prepared(params)
+    assert jax.tree.structure(prepared.params) != jax.tree.structure(params)
+    expected, found = apply(params, *given), apply(prepared, *given)
+    tolerance = 2e-5 if dtype == jnp.float32 else 0.05
+    np.testing.assert_allclose(found, expected, atol=tolerance * float(jnp.abs(expected).max()))
 
 
 def test_a_block_of_equal_numbers_is_finite():
@@ -49,7 +70,7 @@ def test_a_block_of_equal_numbers_is_finite():
     given = jnp.full((1, 4, 8), 5.0), jnp.ones((1, 16))
     params, _ = made(module, *given)
     zeros = jax.tree.map(jnp.zeros_like, params)  # its convolutions then give the same everywhere
-    assert jnp.isfinite(module.apply({"params": sampling_blocks.prepared(zeros)}, *given)).all()
+    assert jnp.isfinite(sample(module, zeros, *given)).all()
 
 
 def test_statistics_are_float32_where_numbers_are_bfloat16():
@@ -58,8 +79,6 @@ def test_statistics_are_float32_where_numbers_are_bfloat16():
     given = inputs(3, 8, 32), inputs(3, 64, seed=2)
     params, exact = made(module, *given)
     narrow = [z.astype(jnp.bfloat16) for z in given]
-    errors = [
-        float(jnp.abs(module.apply({"params": p}, *narrow).astype(jnp.float32) - exact).mean())
-        for p in (params, sampling_blocks.prepared(params))
-    ]
+    found = module.apply({"params": params}, *narrow), sample(module, params, *narrow)
+    errors = [float(jnp.abs(y.astype(jnp.float32) - exact).mean()) for y in found]
     assert errors[1] < 1.2 * errors[0] < 0.05
