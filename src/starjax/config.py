@@ -61,7 +61,7 @@ class PolicyConfig:
     execute: Count = 8  # commands executed before re-planning
     encoder: Literal["resnet18", "small"] = "resnet18"  # network that reads the images
     # where the encoder's weights begin: a policy that ships with starjax, by its name; a
-    # policy.safetensors of yours; a file of torchvision's (pth or safetensors). Empty: from scratch
+    # policy.safetensors of yours; a .safetensors of a ResNet-18 (ImageNet). Empty: from scratch
     encoder_weights: str = ""
     freeze_encoder: bool = False  # train the rest only, on features computed once a frame
     vision_dim: Annotated[int, Range(2, 65_536)] = 512  # d_v, numbers that an image becomes

@@ -157,7 +157,7 @@ def test_plan_and_warnings_say_that_an_encoder_is_frozen():
 
 
 def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):
-    path = str(tmp_path / "resnet18.pth")
+    path = str(tmp_path / "resnet18.safetensors")
     policy = config.PolicyConfig(encoder_weights=path)
     assert messages.encoder(policy) == f"trained further, from {path}"
 

@@ -151,7 +151,7 @@ def test_a_missing_file_is_one_line():
 def test_torchvision_fills_a_trunk_only(tmp_path):
     path = tmp_path / "resnet18.safetensors"
     safetensors.numpy.save_file({"conv1.weight": np.zeros((64, 3, 7, 7), np.float32)}, path)
-    with mistakes.of("policy.encoder_weights", "weight is missing"):
+    with mistakes.of("policy.encoder_weights", "conv1.weight"):
         encoder.read(settings(path, encoder="resnet18", image_size=64))
     with mistakes.of("policy.encoder", "small"):
         encoder.read(settings(path))

@@ -1,13 +1,14 @@
-"""Fills the ResNet-18 trunk with ImageNet weights from a file that the user has.
+"""Fills the ResNet-18 trunk with ImageNet weights from a `.safetensors` file of the user's.
 
-Either torchvision's `resnet18-*.pth` (never unpickled, see `torch_file`) or a `.safetensors` with
-the same names, as timm publishes. BatchNorm's parameters are ignored and GroupNorm starts at its
-default, as in Diffusion Policy; the classifier is dropped.
+Names are torchvision's and timm's (`layer1.0.conv1.weight`), under any prefix: `module.`,
+`state_dict.`, `model.`, `encoder.`, `backbone.`, MoCo's `module.encoder_q.`, R3M's
+`module.convnet.`. BatchNorm's parameters are ignored and GroupNorm starts at its default, as in
+Diffusion Policy; the classifier is dropped.
 """
 
-import hashlib
 import pathlib
 import re
+from collections.abc import Collection
 from typing import Any
 
 import flax.traverse_util
@@ -16,68 +17,91 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from starjax.models import torch_file
+from starjax import errors
+
+_PICKLES = (".pth", ".pt", ".pth.tar", ".bin", ".ckpt", ".pkl")
+# Copies beside the encoder in a file of MoCo (its momentum encoder) or DINO (its student).
+_COPIES = ("encoder_k.", "momentum_encoder.", "student.")
+_SHOWN = 4  # names in a message
 
 
 def load_resnet18(trunk: dict[str, Any], path: str | pathlib.Path) -> dict[str, Any]:
-    """`trunk` with every convolution replaced by the file's.
+    """Returns `trunk` with every convolution replaced by the file's.
 
     Args:
       trunk: parameters of `resnet.ResNet18`: `params["params"]["trunk"]` of an `ImageEncoder`.
-      path: `.pth`, `.pt` or `.safetensors`.
+      path: of the `.safetensors` file.
 
     Raises:
-      ValueError: a weight is missing, has another shape or is not finite, the file is damaged, or
-        its hash is not the one in its name.
+      errors.UsageError: the file is of another kind or damaged, its weights are not a ResNet-18's,
+        or one of them has another shape or is not finite.
     """
+    flat = flax.traverse_util.flatten_dict(trunk)
+    convolutions = {_name(names): names for names in flat if names[-1] == "kernel"}
     weights = read_weights(path)
-    filled = {}
-    for names, value in flax.traverse_util.flatten_dict(trunk).items():
-        if names[-1] == "kernel":
-            # ("layer2_0", "downsample_0", "kernel") is torchvision's layer2.0.downsample.0.weight.
-            name = ".".join(names[:-1]).replace("_", ".") + ".weight"
-            filled[names] = jnp.asarray(_convolution(weights, name, value.shape, path), value.dtype)
-        else:
-            filled[names] = value
-    return flax.traverse_util.unflatten_dict(filled)
+    prefix = _prefix(weights, convolutions, path)
+    filled = {
+        convolutions[name]: _kernel(weights[prefix + name], flat[names], prefix + name, path)
+        for name, names in convolutions.items()
+    }
+    return flax.traverse_util.unflatten_dict({**flat, **filled})
 
 
 def read_weights(path: str | pathlib.Path) -> dict[str, np.ndarray]:
-    """All tensors of a weight file, by name, once the hash of torch's agrees with its name."""
-    path = pathlib.Path(path)
-    if not path.is_file():
-        raise ValueError(f"encoder weights: expected a file, got {path}")
-    if path.suffix in (".pth", ".pt"):
-        _check_hash(path)
-        return torch_file.read(path)
-    if path.suffix != ".safetensors":
-        raise ValueError(f"encoder weights: expected .pth, .pt or .safetensors, got {path}")
+    """Reads all tensors of a `.safetensors` file, by name."""
+    path, expected = pathlib.Path(path), "a .safetensors file"
+    if path.name.endswith(_PICKLES):
+        hint = (
+            "convert it where torch is installed: safetensors.torch.save_file of what torch.load "
+            "returns (docs/howto/encoder-weights.md)"
+        )
+        raise errors.UsageError(str(path), expected, f"{path.name}, a pickle of torch's", hint)
     try:
         return safetensors.numpy.load_file(path)
-    except (safetensors.SafetensorError, AttributeError) as error:  # as of types numpy lacks
-        raise ValueError(f"{path}: not a readable safetensors file: {error}") from error
+    except (safetensors.SafetensorError, OSError) as error:
+        raise errors.UsageError(str(path), expected, f"{path.name}: {error}") from error
+    except (AttributeError, KeyError, TypeError) as error:  # a type that numpy lacks
+        got = f"{path.name} with a tensor of type {error}"
+        raise errors.UsageError(str(path), f"{expected} of float types", got) from error
 
 
-def _convolution(
-    weights: dict[str, np.ndarray], name: str, shape: tuple[int, ...], path: str | pathlib.Path
-) -> np.ndarray:
-    """The kernel `name`, from torch's OIHW to HWIO, checked against the `shape` expected."""
-    if name not in weights:
-        raise ValueError(f"{path}: expected ResNet-18 weights, {name} is missing")
-    kernel = weights[name]
-    expected = (shape[3], shape[2], shape[0], shape[1])
-    if kernel.shape != expected:
-        raise ValueError(f"{path}: {name}: expected shape {expected}, got {kernel.shape}")
-    if not np.isfinite(kernel).all():
-        raise ValueError(f"{path}: {name}: expected finite values")
-    return kernel.transpose(2, 3, 1, 0)
+def _name(names: tuple[str, ...]) -> str:
+    """torchvision's name: `layer2.0.downsample.0.weight` of (layer2_0, downsample_0, kernel)."""
+    return ".".join(names[:-1]).replace("_", ".") + ".weight"
 
 
-def _check_hash(path: pathlib.Path) -> None:
-    """torchvision's names end in the start of the file's sha256: `resnet18-f37072fd.pth`."""
-    found = re.search(r"-([0-9a-f]{8,64})$", path.stem)
-    if found:
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        if not digest.startswith(found[1]):
-            raise ValueError(f"{path}: expected sha256 {found[1]}.., got {digest[:16]}..")
+def _prefix(found: Collection[str], wanted: Collection[str], path: str | pathlib.Path) -> str:
+    """What stands before the names of the one ResNet-18 that is found."""
+    first = "conv1.weight"
+    prefixes = [
+        name.removesuffix(first) for name in found if re.search(r"(^|\.)conv1\.weight$", name)
+    ]
+    complete = [prefix for prefix in prefixes if all(prefix + name in found for name in wanted)]
+    encoders = [prefix for prefix in complete if not any(copy in prefix for copy in _COPIES)]
+    if len(encoders) > 1:
+        raise errors.UsageError(str(path), "one ResNet-18", f"several: {_listed(encoders)}")
+    if not encoders:
+        expected = f"a ResNet-18's names ({_listed(wanted)})"
+        raise errors.UsageError(str(path), expected, _listed(found) or "none")
+    (prefix,) = encoders
+    blocks = re.compile(re.escape(prefix) + r"(layer\d\.\d+\.conv\d\.weight)$")
+    more = [name for name in found if (block := blocks.match(name)) and block[1] not in wanted]
+    if more:
+        raise errors.UsageError(str(path), "a ResNet-18", f"a larger one, with {_listed(more)}")
+    return prefix
+
+
+def _listed(names: Collection[str]) -> str:
+    shown = ", ".join(list(names)[:_SHOWN])
+    return f"{shown} and {len(names) - _SHOWN} more" if len(names) > _SHOWN else shown
+
+
+def _kernel(weight: np.ndarray, like: Any, name: str, path: str | pathlib.Path) -> Any:
+    """A kernel, from torch's OIHW to HWIO, checked against the one that it replaces."""
+    expected = (like.shape[3], like.shape[2], like.shape[0], like.shape[1])
+    if weight.shape != expected:
+        raise errors.UsageError(str(path), f"shape {expected} of {name}", weight.shape)
+    weight = np.asarray(weight, np.float32)  # of float16 and bfloat16 too
+    if not np.isfinite(weight).all():
+        raise errors.UsageError(str(path), f"finite values in {name}", "others")
+    return jnp.asarray(weight.transpose(2, 3, 1, 0), like.dtype)

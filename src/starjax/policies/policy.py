@@ -28,7 +28,7 @@ def with_vision(params: Params, vision: Params) -> Params:
 
 
 def with_resnet18(params: Params, path: str | pathlib.Path) -> Params:
-    """Parameters whose ResNet-18 trunk is filled from torchvision's weight file."""
+    """Parameters whose ResNet-18 trunk is filled from a file of ImageNet weights."""
     vision = vision_of(params)["params"]
     filled = {**vision, "trunk": pretrained.load_resnet18(vision["trunk"], path)}
     return with_vision(params, {"params": filled})

@@ -30,7 +30,7 @@ class Encoder(NamedTuple):
 def read(policy_config: config.PolicyConfig) -> Encoder | None:
     """The encoder that the settings name, if a starjax policy holds it.
 
-    Returns None for torchvision's weights, which fill the ResNet's trunk and nothing else.
+    Returns None for a ResNet-18's ImageNet weights, which fill the ResNet's trunk and nothing else.
 
     Raises:
       errors.UsageError: there is no such file, it is damaged, or the encoder in it is not the one
@@ -39,7 +39,7 @@ def read(policy_config: config.PolicyConfig) -> Encoder | None:
     name = policy_config.encoder_weights
     path = packaged.find(_WEIGHTS, name)
     if not policy_file.is_policy(path):
-        _check_torchvision(policy_config, path)
+        _check_resnet18(policy_config, path)
         return None
     try:
         trained = policy_file.load(path)
@@ -83,7 +83,7 @@ def _differing(policy_config: config.PolicyConfig, trained: policy_file.Trained)
     return found
 
 
-def _check_torchvision(policy_config: config.PolicyConfig, path: Path) -> None:
+def _check_resnet18(policy_config: config.PolicyConfig, path: Path) -> None:
     name = policy_config.encoder_weights
     if policy_config.freeze_encoder:
         raise errors.UsageError(
@@ -93,12 +93,13 @@ def _check_torchvision(policy_config: config.PolicyConfig, path: Path) -> None:
         )
     if policy_config.encoder != "resnet18":
         raise errors.UsageError(
-            "policy.encoder", f"resnet18 with torchvision's weights {name}", policy_config.encoder
+            "policy.encoder", f"resnet18 with the weights {name}", policy_config.encoder
         )
     try:
         pretrained.load_resnet18(_shapes(policy_config)["params"]["trunk"], path)
-    except ValueError as error:
-        raise errors.UsageError(_WEIGHTS, "torchvision's resnet18", error) from error
+    except errors.UsageError as error:
+        got = f"{error.got} in {path}"
+        raise errors.UsageError(_WEIGHTS, error.expected, got, error.hint) from error
 
 
 def _check_shapes(
