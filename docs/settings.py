@@ -1,0 +1,127 @@
+"""Draws the reference of commands and settings from the dataclasses that `--help` is made of."""
+
+import dataclasses
+import importlib
+import inspect
+import re
+import typing
+
+from starjax import cli, config, limits
+from starjax.experiments import options, presets
+
+_TRAILING = re.compile(r"^\s+(\w+): .*?#\s*(.*)$")
+
+
+def comments(settings: type) -> dict[str, str]:
+    """Field -> its comment: what stands after it, else the lines above it."""
+    found, above = {}, []
+    for line in inspect.getsource(settings).splitlines():
+        text = line.strip()
+        if text.startswith("#"):
+            above.append(text.lstrip("# "))
+            continue
+        name = re.match(r"\s+(\w+): ", line)
+        if name and name[1] in {field.name for field in dataclasses.fields(settings)}:
+            trailing = _TRAILING.match(line)
+            found[name[1]] = trailing[2] if trailing else " ".join(above)
+        above = []
+    return found
+
+
+def rows(settings: type, default: object, prefix: str = "") -> list[tuple[str, str, str, str]]:
+    """(flag, what it takes, default, help) of every field, nested ones too."""
+    found, said = [], comments(settings)
+    for name, hint in typing.get_type_hints(settings, include_extras=True).items():
+        value = getattr(default, name, dataclasses.MISSING)
+        if dataclasses.is_dataclass(hint):
+            found += rows(hint, value, f"{prefix}{name}.")
+            continue
+        is_word = options.tyro.conf.Positional in getattr(hint, "__metadata__", ())
+        flag = name.upper() if is_word else options.flag(prefix + name)
+        found.append((flag, takes(hint), shown(value), said[name]))
+    return found
+
+
+def takes(hint: object) -> str:
+    """A field's type and range in words."""
+    limit = limits.within(hint)
+    while typing.get_origin(hint) is typing.Annotated:
+        hint = typing.get_args(hint)[0]
+    if typing.get_origin(hint) is typing.Literal:
+        return ", ".join(f"`{choice}`" for choice in typing.get_args(hint))
+    several = typing.get_origin(hint) is tuple
+    kind = typing.get_args(hint)[0] if several or typing.get_args(hint) else hint
+    words = {int: "whole number", float: "number", str: "text", bool: "switch"}.get(kind, "text")
+    words = f"{words}s" if several else words
+    return f"{words}, {limit}" if limit else words
+
+
+def shown(value: object) -> str:
+    """A default in a table's cell."""
+    if value is dataclasses.MISSING or value in ("", None, ()):
+        return ""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return " ".join(map(str, value)) if isinstance(value, tuple) else f"{value}"
+
+
+def table(head: list[str], lines: list[tuple[str, ...]]) -> str:
+    """A table in Markdown."""
+    cells = [head, ["---"] * len(head), *lines]
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
+def commands() -> str:
+    """The page of all commands."""
+    parts = [
+        "---",
+        "hide: [toc]",
+        "---",
+        "# Commands",
+        "",
+        "`starjax COMMAND --help` says the same. Ranges are checked.",
+    ]
+    for name, (module, summary, needed) in cli.COMMANDS.items():
+        loaded = importlib.import_module(module)
+        parts += ["", f"## starjax {name}", "", getattr(loaded, "DESCRIPTION", f"{summary}.")]
+        parts += ["", f"Needs the extras {', '.join(f'`{extra}`' for extra in needed)}."]
+        if name in ("run", "collect", "train"):
+            parts += ["", "Flags: the [settings of a run](config.md)."]
+        elif hasattr(loaded, "Options"):
+            lines = rows(loaded.Options, loaded.Options)
+            lines = [(f"`{flag}`", *rest) for flag, *rest in lines]
+            parts += ["", table(["flag", "takes", "default", "meaning"], lines)]
+    return "\n".join(parts) + "\n"
+
+
+def settings() -> str:
+    """The page of all settings of a run, with the values of every preset."""
+    names = list(presets.PRESETS)
+    parts = [
+        *("---", "hide: [toc]", "---"),
+        "# Settings of a run",
+        "",
+        "Flags of `starjax run`, `collect` and `train`; a switch has a twin, `--demos.no-...`.",
+        "Columns of presets show what a preset changes; elsewhere the default holds, which is the",
+        "paper's where the paper says it.",
+    ]
+    groups: dict[str, list] = {}
+    for row in rows(config.RunConfig, config.RunConfig()):
+        first, dot, _ = row[0].removeprefix("--").partition(".")
+        groups.setdefault(first if dot else "run", []).append(row)
+    changed = {
+        name: {flag: value for flag, _, value, _ in rows(config.RunConfig, preset)}
+        for name, preset in presets.PRESETS.items()
+    }
+    for group, lines in groups.items():
+        parts += ["", f"## {group}", ""]
+        drawn = []
+        for flag, kind, value, said in lines:
+            cells = [changed[name][flag] for name in names]
+            differs = [cell if cell != value and group != "run" else "" for cell in cells]
+            drawn.append((f"`{flag}`", value, differs, kind, said))
+        used = [i for i in range(len(names)) if any(line[2][i] for line in drawn)]
+        lines = [(flag, value, *(d[i] for i in used), *rest) for flag, value, d, *rest in drawn]
+        head = ["flag", "default", *(names[i] for i in used), "takes", "meaning"]
+        parts.append(table(head, lines))
+    return "\n".join(parts) + "\n"

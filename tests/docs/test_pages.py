@@ -1,0 +1,130 @@
+"""Programs of the documentation run, its commands parse, its links and files are there."""
+
+import contextlib
+import importlib.util
+import io
+import itertools
+import re
+import shlex
+
+import pytest
+
+from starjax import cli, errors
+from starjax.sim import registry
+
+FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+HEADER = re.compile(r"\A---\n(.*?)\n---\n", re.DOTALL)
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
+
+
+@pytest.fixture(scope="module")
+def root(pytestconfig):
+    return pytestconfig.rootpath
+
+
+def found(root):
+    """Every page that a person wrote."""
+    return [*sorted(root.glob("docs/**/*.md")), root / "README.md", root / "CONTRIBUTING.md"]
+
+
+def pytest_generate_tests(metafunc):
+    root = metafunc.config.rootpath
+    if "page" in metafunc.fixturenames:
+        pages = [page for page in found(root) if wanted(metafunc.function, page)]
+        metafunc.parametrize("page", [marked(root, page) for page in pages])
+
+
+def wanted(function, page):
+    languages = {language for language, _ in FENCE.findall(page.read_text())}
+    needed = {test_programs_run: "python", test_commands_parse: "bash"}.get(function)
+    return needed is None or needed in languages
+
+
+def marked(root, page):
+    """A page as a parameter: `tests: slow` and `needs: PACKAGE` in its header are heeded."""
+    header = HEADER.match(page.read_text())
+    said = dict(line.split(": ", 1) for line in header[1].splitlines()) if header else {}
+    package = said.get("needs")
+    marks = [pytest.mark.slow] if said.get("tests") == "slow" else []
+    if package and not importlib.util.find_spec(package):
+        marks.append(pytest.mark.skip(reason=f"{package} is not installed"))
+    return pytest.param(page, id=str(page.relative_to(root)), marks=marks)
+
+
+def test_programs_run(page, tmp_path, monkeypatch):
+    """The blocks of a page are one program, so each goes on where the one before ended."""
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": page.stem}
+    text = page.read_text()
+    for block in FENCE.finditer(text):
+        if block[1] == "python":
+            line = text[: block.start()].count("\n") + 1
+            exec(compile("\n" * line + block[2], str(page), "exec"), names)
+
+
+def commands(page):
+    """(command, flags and their values) of all `starjax` lines of a page's shell blocks."""
+    for language, block in FENCE.findall(page.read_text()):
+        if language != "bash":
+            continue
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            for i, word in enumerate(words):
+                module = re.fullmatch(r"starjax\.experiments\.(\w+)", word)
+                if module or word.rpartition("/")[2] == "starjax":
+                    yield [module[1], *words[i + 1 :]] if module else words[i + 1 :]
+
+
+@pytest.fixture(scope="module")
+def flags():
+    """Command -> its flags -> the choices of each, read from its help."""
+    found = {}
+    for name in cli.COMMANDS:
+        said = io.StringIO()
+        with contextlib.suppress(SystemExit), contextlib.redirect_stdout(said):
+            cli.dispatch([name, "--help"])
+        text = re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue())
+        found[name] = dict(re.findall(r"(--\w[\w.-]+)(?: \{([\w,]+)\})?", text))
+    return found
+
+
+def test_commands_parse(page, flags):
+    for name, *words in commands(page):
+        if name in ("--help", "--version"):
+            continue
+        errors.choice("COMMAND", name, cli.COMMANDS)
+        for word, value in itertools.zip_longest(words, words[1:]):
+            if word.startswith("--"):
+                errors.choice(f"{name}: flag", word, flags[name])
+                choices = flags[name][word]
+                assert not choices or value in choices.split(","), (word, value)
+
+
+def test_links_lead_somewhere(page, root):
+    """The site's own builder looks at them too, but for those of README and CONTRIBUTING."""
+    made = {"config", "cli", "mjcf", "index", "benchmarks"} | {
+        folder.parent.name for folder in root.glob("experiments/*/claim.toml")
+    }
+    for target in LINK.findall(FENCE.sub("", page.read_text())):
+        if "://" in target or not page.is_relative_to(root / "docs"):
+            assert "://" in target or (page.parent / target).exists(), target
+        else:
+            path = page.parent / target
+            assert path.exists() or path.stem in made or path.suffix in (".png", ".gif"), target
+
+
+def test_snippets_are_there(page, root):
+    for path in re.findall(r'--8<-- "([^":]+)', page.read_text()):
+        assert (root / path).exists(), path
+
+
+def test_readme_is_short(root):
+    assert len((root / "README.md").read_text().splitlines()) <= 130
+
+
+def test_what_exists_is_named(root):
+    """Every built-in task, arm and tool stands in a page."""
+    text = "\n".join(page.read_text() for page in found(root))
+    for kind in (registry.tasks, registry.arms, registry.tools):
+        for name in kind.built_in:
+            assert name in text, name
