@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import parts
 import settings
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -31,7 +32,11 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the pages and their images."""
-    made = {"reference/cli.md": settings.commands(), "reference/config.md": settings.settings()}
+    made = {
+        "reference/cli.md": settings.commands(),
+        "reference/config.md": settings.settings(),
+        "reference/parts.md": parts.page(),
+    }
     made |= {page: relinked(ROOT / source, page) for page, source in COPIES.items()}
     for folder in claims():
         page = f"results/{folder.name}.md"

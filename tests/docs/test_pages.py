@@ -10,7 +10,6 @@ import shlex
 import pytest
 
 from starjax import cli, errors
-from starjax.sim import registry
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 HEADER = re.compile(r"\A---\n(.*?)\n---\n", re.DOTALL)
@@ -102,7 +101,7 @@ def test_commands_parse(page, flags):
 
 def test_links_lead_somewhere(page, root):
     """The site's own builder looks at them too, but for those of README and CONTRIBUTING."""
-    made = {"config", "cli", "mjcf", "index", "benchmarks"} | {
+    made = {"config", "cli", "parts", "mjcf", "index", "benchmarks"} | {
         folder.parent.name for folder in root.glob("experiments/*/claim.toml")
     }
     for target in LINK.findall(FENCE.sub("", page.read_text())):
@@ -121,10 +120,3 @@ def test_snippets_are_there(page, root):
 def test_readme_is_short(root):
     assert len((root / "README.md").read_text().splitlines()) <= 130
 
-
-def test_what_exists_is_named(root):
-    """Every built-in task, arm and tool stands in a page."""
-    text = "\n".join(page.read_text() for page in found(root))
-    for kind in (registry.tasks, registry.arms, registry.tools):
-        for name in kind.built_in:
-            assert name in text, name
