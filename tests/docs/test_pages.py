@@ -30,7 +30,10 @@ def pytest_generate_tests(metafunc):
     root = metafunc.config.rootpath
     if "page" in metafunc.fixturenames:
         pages = [page for page in found(root) if wanted(metafunc.function, page)]
-        metafunc.parametrize("page", [marked(root, page) for page in pages])
+        names = [str(page.relative_to(root)) for page in pages]
+        if metafunc.function is test_programs_run:
+            pages = [marked(page) for page in pages]
+        metafunc.parametrize("page", pages, ids=names)
 
 
 def wanted(function, page):
@@ -39,15 +42,15 @@ def wanted(function, page):
     return needed is None or needed in languages
 
 
-def marked(root, page):
-    """A page as a parameter: `tests: slow` and `needs: PACKAGE` in its header are heeded."""
+def marked(page):
+    """A page as a parameter; its header may say `tests: slow` and `needs: PACKAGE`."""
     header = HEADER.match(page.read_text())
     said = dict(line.split(": ", 1) for line in header[1].splitlines()) if header else {}
     package = said.get("needs")
     marks = [pytest.mark.slow] if said.get("tests") == "slow" else []
     if package and not importlib.util.find_spec(package):
         marks.append(pytest.mark.skip(reason=f"{package} is not installed"))
-    return pytest.param(page, id=str(page.relative_to(root)), marks=marks)
+    return pytest.param(page, marks=marks)
 
 
 def test_programs_run(page, tmp_path, monkeypatch):
@@ -119,4 +122,3 @@ def test_snippets_are_there(page, root):
 
 def test_readme_is_short(root):
     assert len((root / "README.md").read_text().splitlines()) <= 130
-
