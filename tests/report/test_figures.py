@@ -1,5 +1,6 @@
 """What figures draw, read back from their artists."""
 
+import mujoco
 import numpy as np
 import pytest
 from matplotlib import colors
@@ -109,6 +110,9 @@ def test_paths_are_over_the_outline_seen_trocars_above_unseen_ones(one):
         run = one._replace(rollouts=[one.rollouts[0]._replace(trial=trial)])
         lines = trajectories.draw([run], bare).axes[0].lines
         assert {x.get_color() for x in lines} & set(colour.values()) == {wanted}
+        (shadow,) = [line.get_xydata() for line in lines if line.get_alpha() == 0.4]
+        below = one.rollouts[0].p_world_tip[:, 0] * [1, 1, 0]
+        np.testing.assert_allclose(shadow, trajectories._flat(below))
 
 
 def test_several_methods_are_drawn_at_the_trial_that_most_of_them_met(several):
@@ -148,17 +152,19 @@ def test_each_arm_has_its_path_its_trocar_and_its_port(one):
 
 
 def test_shafts_are_drawn_where_the_joints_had_them(one):
-    from starjax.sim import scene
+    from starjax.sim import registry, scene
 
-    qpos = np.tile(scene.compose(one.result.scene).qpos0, (20, 1))
+    names = one.result.scene
+    data = mujoco.MjData(scene.compose(names))
+    mujoco.mj_kinematics(data.model, data)
+    tcp = data.site(scene.tcp(0, registry.tools.get(names.tools[0])))
+    qpos = np.tile(data.qpos, (20, 1))
     rollout = one.rollouts[0]._replace(p_world_tip=one.rollouts[0].p_world_tip[:20], qpos=qpos)
     axis = trajectories.draw([one._replace(rollouts=[rollout])], stage.load).axes[0]
     fan = [line.get_xydata() for line in axis.lines if line.get_alpha() == 0.34]
-    made = stage.load(one.result.scene)
-    ((p,),), ((direction,),) = made.tips(qpos[:1], rollout.p_world_trocar)
-    length = np.linalg.norm(p - rollout.p_world_trocar[0]) + trajectories._BEYOND
-    wanted = trajectories._flat(np.stack([p - length * direction, p]))
-    np.testing.assert_allclose(fan, trajectories._FAN * [wanted], atol=1e-9)
+    length = np.linalg.norm(tcp.xpos - rollout.p_world_trocar[0]) + trajectories._BEYOND
+    ends = np.stack([tcp.xpos - length * tcp.xmat.reshape(3, 3)[:, 2], tcp.xpos])
+    np.testing.assert_allclose(fan, trajectories._FAN * [trajectories._flat(ends)], atol=1e-9)
 
 
 def test_a_tool_that_flew_off_does_not_shrink_the_scene(one):
