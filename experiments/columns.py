@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from starjax.evaluation.result import Trial, read_sweep
-
 from starjax.report import compare, formats, outcomes, results, stats
 
 HIGHEST = 8  # index of the unseen trocar that is above all seen ones
