@@ -34,6 +34,8 @@ def rows(settings: type, default: object, prefix: str = "") -> list[tuple[str, s
     for name, hint in typing.get_type_hints(settings, include_extras=True).items():
         value = getattr(default, name, dataclasses.MISSING)
         if dataclasses.is_dataclass(hint):
+            if value is dataclasses.MISSING and hint.__module__ == settings.__module__:
+                value = hint()  # a command's own; another module's depends on the machine
             found += rows(hint, value, f"{prefix}{name}.")
             continue
         is_word = options.tyro.conf.Positional in getattr(hint, "__metadata__", ())
