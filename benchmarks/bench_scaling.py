@@ -25,8 +25,8 @@ import numpy as np
 
 from starjax import runtime
 from starjax.rollouts import engine
+from starjax.runtime import processes
 from starjax.sim import env as envs
-from starjax.training import processes
 
 BATCH = 256  # a device
 LANES = {"gpu": 360, "cpu": 4}  # trials a device

@@ -25,7 +25,7 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
     from starjax.experiments import pipeline
 
     pipeline.start()
-    from starjax.training import processes
+    from starjax.runtime import processes
 
     is_used = gpu.is_used()
     config = config if is_used == guess else _settings(argv, prog, description, is_used)
