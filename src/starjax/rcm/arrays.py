@@ -15,14 +15,19 @@ Result = TypeVar("Result")
 
 
 def broadcasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """`function`, whose arrays may differ in their number of axes.
+    """`function`, whose arrays may differ in number of axes and in type, and be numpy's.
 
-    Also in a program that has told jax to refuse that (`jax_numpy_rank_promotion`).
+    Also in a program that has told jax to refuse that (`jax_numpy_rank_promotion`,
+    `jax_numpy_dtype_promotion`, `jax_transfer_guard`).
     """
 
     @functools.wraps(function)
     def mapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        with jax.numpy_rank_promotion("allow"):
+        with (
+            jax.numpy_rank_promotion("allow"),
+            jax.numpy_dtype_promotion("standard"),
+            jax.transfer_guard("allow"),
+        ):
             return function(*args, **kwargs)
 
     return mapped

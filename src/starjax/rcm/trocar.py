@@ -170,6 +170,7 @@ def trocar_frame(trocar: Trocar, p_world_ref: ArrayLike, roll_zero: ArrayLike = 
     return TrocarFrame(trocar, p, trocar_rotation(trocar), jnp.broadcast_to(roll_zero, shape))
 
 
+@arrays.broadcasting
 def sample_trocar(
     key: jax.Array,
     shape: tuple[int, ...] = (),
@@ -202,6 +203,7 @@ def sample_trocar(
     )
 
 
+@arrays.broadcasting
 def check_trocar(trocar: Trocar) -> Trocar:
     """Return `trocar` if it is one, for use where values are concrete; traced values pass.
 
