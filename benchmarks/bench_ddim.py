@@ -5,7 +5,7 @@
         [--ddim-steps 100]
 
 A policy plans at frames of demonstrations that it did not learn from, each way with the same noise;
-beside it, what calculating in bfloat16 in the place of float32 moves, step after step and side by
+beside it, what calculating in bfloat16 instead of float32 moves, step after step and side by
 side. No time is measured here: bench_inference.py does that.
 """
 
@@ -27,7 +27,7 @@ from starjax.models import diffusion
 from starjax.models.kernels import parallel_ddim
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
-from starjax.sim import env as envs
+from starjax.sim import registry
 from starjax.types import Command
 
 FRAMES = 128
@@ -53,8 +53,7 @@ def main() -> None:
     batch = windows.gather(
         found.dataset, jnp.asarray(frames), trained.policy.obs_horizon, trained.policy.horizon
     )
-    port = envs.make(trained.policy.observation, trained.policy.image_size).p_world_ref
-    plan = functools.partial(planned, trained, port, batch)
+    plan = functools.partial(planned, trained, batch)
     steps, temperature = trained.policy.ddim_steps, trained.policy.temperature
     used = parallel_ddim.evaluations_for(steps)
     wanted = plan("float32", diffusion.ddim_sample)
@@ -73,14 +72,14 @@ def main() -> None:
 
 def planned(
     trained: policy_file.Trained,
-    port: np.ndarray,
     batch: windows.Batch,
     dtype: str,
     ddim_sample: Callable,
 ) -> Command:
-    """Commands `[FRAMES, H]` with this way to sample."""
+    """Commands `[FRAMES, H, A]` with this way to sample."""
     settings = dataclasses.replace(trained.policy, dtype=dtype)
-    policy = policies.make(methods.METHODS[trained.method], settings, port, trained.train)
+    method, task = methods.METHODS[trained.method], registry.tasks.get(trained.scene.task)
+    policy = policies.make(method, settings, task, trained.train, trained.scene.cameras)
     keys = jax.random.split(jax.random.key(1), FRAMES)
     given = (trained.params, trained.normalizer, keys, batch.observation, batch.trocar)
     # what a policy takes for so many robots

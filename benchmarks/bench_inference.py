@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import runtime
+from starjax import rcm, runtime
 from starjax.evaluation import latency
 from starjax.experiments import bench
 from starjax.models import roll_net
@@ -30,6 +30,7 @@ from starjax.policies import features
 from starjax.policies import policy as policies
 
 CHAIN = 100  # roll networks in one program, each fed by the one before
+SEEN = features.sensors(_setup.TASK)
 
 # name: case, batch, DDIM steps
 CASES = {
@@ -102,13 +103,14 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
         case.policy,
         params,
         stats,
-        _setup.P_WORLD_REF,
+        SEEN,
         batch=batch,
         calls=200,
         seconds=seconds,
     )
-    observation, trocar = latency.example(case.policy, _setup.P_WORLD_REF, batch)
-    traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, trocar)
+    observation, trocar = latency.example(case.policy, SEEN, batch)
+    told = rcm.trocar_frame(trocar, _setup.P_WORLD_REF)
+    traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, told)
     work = _arithmetic.operations(policy.sample, *traced)
     sequences = batch
     steps = evaluations = case.policy.ddim_steps
@@ -178,7 +180,7 @@ def roll_network(policy_config, batch: int) -> dict:
         return jax.lax.fori_loop(0, CHAIN, one, history)
 
     within = _timing.time_jitted(chain, params, history).median_s / CHAIN
-    return {"in_a_program_ms": 1e3 * within, **latency.roll_ms(policy_config, batch=batch)}
+    return {"in_a_program_ms": 1e3 * within, **latency.roll_ms(policy_config, SEEN, batch=batch)}
 
 
 if __name__ == "__main__":
