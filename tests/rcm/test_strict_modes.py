@@ -108,6 +108,31 @@ def test_values_are_those_of_jaxs_own_settings(name, dtype):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), found, wanted)
 
 
+@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.filterwarnings("error")
+def test_a_program_in_double_precision_has_the_same_values(name):
+    function, given = FUNCTIONS[name]
+    wanted = jax.device_get(function(*jax.tree.map(np.float32, given)))
+    with mode({**STRICT, "jax_enable_x64": True}):
+        first, *others = jax.device_put(given)
+        arguments = (first, *jax.tree.map(np.float32, others))
+        found = jax.device_get(
+            (function if name == "check_trocar" else jax.jit(function))(*jax.device_put(arguments))
+        )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), found, wanted)
+
+
+@pytest.mark.parametrize("name", ["project", "roll_of", "trocar_from_position"])
+def test_a_program_that_looks_for_nan_finds_none_where_inputs_are_finite(name):
+    """These return NaN for inputs that are not; without jit each operation is looked at."""
+    function, given = FUNCTIONS[name]
+    with mode({"jax_debug_nans": True, "jax_disable_jit": True}):
+        function(*given)
+        first, *others = jax.tree.map(lambda x: np.where(x == x.max(), np.nan, x), given)
+        with pytest.raises(FloatingPointError):
+            function(first, *others)
+
+
 def test_draws_are_those_of_jaxs_own_settings():
     wanted = jax.device_get(rcm.sample_trocar(jax.random.key(0), (N,)))
     with jax.transfer_guard("allow"):

@@ -69,6 +69,14 @@ def bounded(x: jax.Array) -> jax.Array:
     return jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), -_BOUND, _BOUND)
 
 
+def taint(x: jax.Array) -> jax.Array:
+    """`[..., 1]`: 0 where all of `x` `[..., n]` are finite, else NaN.
+
+    Unlike a constant NaN it is nothing that `jax_debug_nans` finds where no input is at fault.
+    """
+    return jnp.sum(x - x, axis=-1, keepdims=True)
+
+
 def epsilon(dtype: Any) -> float:
     """Below this length (m, or sine of an angle) a direction counts as undefined.
 
