@@ -40,6 +40,15 @@ def test_programs_that_simulate_nothing_get_back_what_it_turns_off(monkeypatch):
     assert xla.options_without_kinematics() == {}
 
 
+@pytest.mark.parametrize("started", [False, True])
+def test_a_program_in_which_jax_has_started_is_told_that_the_flag_comes_too_late(started):
+    code = "import jax; from starjax.runtime import xla; xla._jaxlib_version = lambda: (0, 10);"
+    code += "jax.numpy.ones(1);" * started + "xla.prepare_xla()"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=_env(), capture_output=True, text=True, check=True)
+    assert done.stderr.count("prepare_xla") == started
+
+
 def test_the_users_flags_stay_and_win(monkeypatch, tmp_path):
     flags, _ = _prepared(monkeypatch, tmp_path, (0, 10), XLA_FLAGS="--a=1")
     assert flags == f"--a=1 {FLAG}"
@@ -63,7 +72,7 @@ def test_small_programs_are_kept_unless_the_user_set_a_time(monkeypatch, tmp_pat
 def test_no_cache_where_none_can_be_made(monkeypatch, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert _prepared(monkeypatch, tmp_path / "file", (0, 10))[1] is None
-    assert capsys.readouterr().err.count("\n") == 1
+    assert capsys.readouterr().err.count("no cache") == 1
 
 
 def test_who_has_no_home_has_a_cache_too(monkeypatch):

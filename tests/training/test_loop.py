@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import types
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ import pytest
 from starjax.data import windows
 from starjax.methods import METHODS
 from starjax.models.kernels import packed_params
-from starjax.runtime import files
+from starjax.runtime import files, signals
 from starjax.training import checkpoint, loop, state, step, stepper
 from starjax.training import log as metrics
 
@@ -53,6 +54,19 @@ def whole(tmp_path_factory):
         result = jobs.train(directory)
     assert len(traces) == 1
     return directory, result
+
+
+def test_a_thread_trains_the_same_weights(tmp_path, monkeypatch):
+    """As in a notebook that stays usable; Python handles no signals there."""
+    monkeypatch.setattr(loop.policies, "make", lambda *_, **__: jobs._quadratic_policy())
+
+    def train(directory):
+        with signals.stop_signals() as should_stop:
+            return jobs.train(directory, should_stop=should_stop).state
+
+    with ThreadPoolExecutor(1) as pool:
+        found = pool.submit(train, tmp_path / "thread").result()
+    assert_same_bytes(found, train(tmp_path / "main"))
 
 
 def test_a_run_leaves_its_log_and_checkpoints(whole):

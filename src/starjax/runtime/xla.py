@@ -37,6 +37,7 @@ def prepare_xla() -> None:
     for name, value in usual_flags().items():
         if name not in (there := flags()):
             os.environ["XLA_FLAGS"] = f"{there} {name}={value}".strip()
+            _warn_if_started()
     _set_default("jax_persistent_cache_min_compile_time_secs", 0.0)
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
@@ -48,6 +49,15 @@ def prepare_xla() -> None:
         print(line, file=sys.stderr)
         return
     _set_default("jax_compilation_cache_dir", str(cache))
+
+
+def _warn_if_started() -> None:
+    """Says that jax has read XLA's flags already, as in a notebook that has used it before."""
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    has_started = getattr(bridge, "backends_are_initialized", lambda: False)
+    if has_started():
+        line = "jax had started before: physics on a CPU is 300 times slower; in a new program call"
+        print(f"starjax: {line} starjax.runtime.prepare_xla() first", file=sys.stderr)
 
 
 def usual_flags() -> dict[str, str]:
