@@ -8,7 +8,7 @@ from starjax.sim import registry
 def page() -> str:
     """Everything that exists by name; `starjax list` shows it too."""
     lines = ["---", "hide: [toc]", "---", "# Tasks, arms, tools", ""]
-    lines += ["Names for `--scene.task`, `--scene.arm` and `--scene.tool`.", "", "## Tasks", ""]
+    lines += ["Names for `--task`, `--arm` and `--tool`.", "", "## Tasks", ""]
     rows = []
     for name in registry.tasks.built_in:
         task = registry.tasks.get(name)

@@ -28,7 +28,7 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "evaluate": (
         "starjax.experiments.evaluate",
-        "score a trained policy on the twelve trocars",
+        "score a trained policy on its task's trocars",
         _ALL,
     ),
     "sweep": (
@@ -43,6 +43,7 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "tables, figures, video, page from results",
         ("sim", "report"),
     ),
+    "list": ("starjax.experiments.list_command", "what flags can name", ("sim",)),
     "doctor": (
         "starjax.doctor",
         "what of this machine and installation works, and what to do",

@@ -22,12 +22,13 @@ TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneConfig:
-    """What is simulated, by name; `starjax list` shows what there is."""
+    """What is simulated, by the names that `starjax list` shows."""
 
-    task: str = "peg_transfer"  # what is to be done
-    arm: tuple[str, ...] = ()  # one for each slot of the task, or one for all; left out, the task's
-    tool: tuple[str, ...] = ()  # held by the arms, likewise
-    camera: tuple[str, ...] = ()  # that are observed; left out, the task's first
+    task: str = "peg_transfer"  # what is to be done; starjax list shows what there is
+    # robots, one for each that the task asks for, or one for all; left out: the task's
+    arm: tuple[str, ...] = ()
+    tool: tuple[str, ...] = ()  # instruments that the arms hold; left out: the task's
+    camera: tuple[str, ...] = ()  # cameras that the policy sees; left out: the task's first
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,8 +36,7 @@ class DemosConfig:
     """Demonstrations: how many, and what is recorded."""
 
     per_trocar: Count = 30  # successful demonstrations at each seen trocar (V-A3)
-    # how many of the eight seen trocars to train with, from the first on
-    seen_trocars: Annotated[int, Range(1, 8)] = 8
+    seen_trocars: Count = 8  # of the task's, to train with, from the first on
     keep_failures: bool = False  # store failed episodes too; training leaves them out
     expert: str = ""  # which of the task's scripted demonstrators; left out, its first
     max_steps: Count = 600  # control steps, at 30 Hz, that the expert may take
@@ -214,10 +214,16 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
     return settings(**fields)
 
 
+# What runs were in before scenes had names, `sim.names.FIRST`.
+_FIRST_SCENE = SceneConfig(arm=("fr5",), tool=("grasper",), camera=("camera",))
+
+
 def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of a run from JSON, or parts of them, with those of earlier versions as today's."""
     found = dict(values)
     train, policy = found.get("train"), found.get("policy")
+    if train is not None:  # a whole run's
+        found.setdefault("scene", as_json(_FIRST_SCENE))
     if isinstance(train, Mapping) and isinstance(policy, Mapping) and "crop_fraction" in train:
         rest = dict(train)
         found["policy"] = {**policy, "crop_fraction": rest.pop("crop_fraction")}

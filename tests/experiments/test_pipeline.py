@@ -15,7 +15,7 @@ import synthetic
 
 from starjax import config, methods
 from starjax.data import normalizer
-from starjax.experiments import demonstrations, folders, messages, pipeline, presets
+from starjax.experiments import demonstrations, folders, messages, pipeline, presets, scenes
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.runtime import files, signals
@@ -160,17 +160,20 @@ def test_plan_and_warnings_say_that_an_encoder_is_frozen():
 
 def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):
     path = str(tmp_path / "resnet18.safetensors")
-    policy = config.PolicyConfig(encoder_weights=path)
-    assert messages.encoder(policy) == f"trained further, from {path}"
+    settings = config.RunConfig(policy=config.PolicyConfig(encoder_weights=path))
+    assert messages.encoder(settings) == f"trained further, from {path}"
 
 
-def test_a_packaged_encoder_is_of_this_task(tmp_path, monkeypatch):
+def test_a_policys_encoder_says_for_which_task_it_was_trained(tmp_path, monkeypatch):
     policy = config.PolicyConfig(encoder_weights="compact")
+    settings = config.RunConfig(policy=policy)
     made = fakes.trained(method="dp_rcm2", policy=policy, params={"unet": np.ones(3)})
     monkeypatch.setattr(packaged, "FOLDER", tmp_path)
-    assert messages.encoder(policy) == "trained further, from compact"
+    assert messages.encoder(settings) == "trained further, from compact"
     policy_file.save(tmp_path / "compact.safetensors", made)
-    assert messages.encoder(policy) == "trained further, from compact (pretrained on this task)"
+    assert messages.encoder(settings) == "trained further, from compact (pretrained on this task)"
+    elsewhere = dataclasses.replace(settings, scene=config.SceneConfig(task="reach"))
+    assert messages.encoder(elsewhere).endswith("(pretrained on peg_transfer)")
 
 
 def test_a_wrong_encoder_is_found_before_anything_is_collected(tmp_path, done):
@@ -188,7 +191,7 @@ def test_a_finished_run_needs_its_encoder_no_more(tmp_path, done):
     policy = dataclasses.replace(
         preset.policy, observation="image", encoder_weights="nowhere", freeze_encoder=True
     )
-    settings = dataclasses.replace(preset, policy=policy)
+    settings = scenes.resolved(dataclasses.replace(preset, policy=policy))
     folders.claim(tmp_path / "stardiff", settings, "demos-a", "abcd")
     (tmp_path / "stardiff" / "policy.safetensors").touch()
     pipeline.run(settings, pipeline.STAGES, "")
@@ -196,7 +199,7 @@ def test_a_finished_run_needs_its_encoder_no_more(tmp_path, done):
 
 
 def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
-    smoke = dataclasses.replace(presets.PRESETS["smoke"], seed=0)
+    smoke = scenes.resolved(dataclasses.replace(presets.PRESETS["smoke"], seed=0))
     synthetic.run(tmp_path / "stardiff")
     file = tmp_path / "stardiff" / "result.json"
     result = {**files.read_json(file), "config": _json(smoke), "seed": 0, "weights": "a"}

@@ -8,11 +8,11 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.experiments import checks, folders, messages, options, stage_times
+from starjax.experiments import checks, folders, messages, options, scenes, stage_times
 from starjax.policies import packaged
 from starjax.runtime import files, gpu, xla
 
-DESCRIPTION = """Scores a trained policy on the twelve trocars, and films it.
+DESCRIPTION = """Scores a trained policy on its task's trocars, and films it.
 
 RUN is a method's folder, such as runs/cpu/stardiff; or --policy names a policy.safetensors, from
 anywhere, or a policy that ships with starjax. Trials and their time limit are those that the flags
@@ -152,13 +152,7 @@ def _config(trained: Any) -> config_lib.RunConfig:
         "policy": dataclasses.asdict(trained.policy),
         "train": dataclasses.asdict(trained.train),
         "demos": dataclasses.asdict(trained.demos or config_lib.DemosConfig()),
-    }
-    scene = trained.scene
-    known["scene"] = {
-        "task": scene.task,
-        "arm": scene.arms,
-        "tool": scene.tools,
-        "camera": scene.cameras,
+        "scene": dataclasses.asdict(scenes.settings(trained.scene)),
     }
     unknown = {"seed": None}  # no file of weights says it
     return dataclasses.replace(config_lib.from_dict(config_lib.RunConfig, known), **unknown)

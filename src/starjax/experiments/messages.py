@@ -8,6 +8,7 @@ from typing import Any
 import starjax
 from starjax import config as config_lib
 from starjax import methods
+from starjax.experiments import estimate
 from starjax.runtime import files, xla
 
 STAGES = ("collect", "train", "evaluate", "report")
@@ -18,35 +19,45 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
     lines = [
         f"starjax {starjax.__version__}: method {config.method}, preset {config.preset}, "
         f"seed {config.seed}, folder {config.out}",
-        _device(),
-        *_seeing(config.policy),
-        *(f"  ablation        {what}" for what in _ablations(config.method, config.policy)),
+        *_setting(config),
         _learning_from(config.demos),
     ]
     lines += [_training(config), *_idle(config.train.batch_size)] if "train" in stages else []
-    lines += [_evaluation(config.eval)] if "evaluate" in stages else []
-    return "\n".join(lines)
+    lines += [_evaluation(config)] if "evaluate" in stages else []
+    return "\n".join([*lines, _time(config, stages)])
 
 
 def about(config: config_lib.RunConfig, name: str, seed: int) -> str:
     """What is going to be scored: the policy `name`, how it was made, the trials and their seed."""
     lines = [
         f"starjax {starjax.__version__}: {methods.METHODS[config.method].label} of {name}",
-        _device(),
-        *_seeing(config.policy),
-        *(f"  ablation        {what}" for what in _ablations(config.method, config.policy)),
+        *_setting(config),
         _learning_from(config.demos),
         _training(config),
-        f"{_evaluation(config.eval)}, seed {seed}",
+        f"{_evaluation(config)}, seed {seed}",
     ]
     return "\n".join(lines)
 
 
-def _device() -> str:
+def _setting(config: config_lib.RunConfig) -> list[str]:
+    """Lines that say where it happens, and what the policy sees."""
     import jax
 
-    devices = jax.devices()
-    return f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores"
+    devices, scene = jax.devices(), config.scene
+    robots = ", ".join(f"{arm} with {tool}" for arm, tool in zip(scene.arm, scene.tool))
+    parts = [_task(config).words.title, robots, ", ".join(scene.camera)]
+    return [
+        f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores",
+        f"  scene           {'; '.join(filter(None, parts))}",
+        *_seeing(config),
+        *(f"  ablation        {what}" for what in _ablations(config.method, config.policy)),
+    ]
+
+
+def _task(config: config_lib.RunConfig) -> Any:
+    from starjax.sim import registry
+
+    return registry.tasks.get(config.scene.task)
 
 
 def _learning_from(demos: config_lib.DemosConfig) -> str:
@@ -74,42 +85,59 @@ def _idle(batch_size: int) -> list[str]:
     return [f"                  on {used} of {there} devices, as the batch must divide by them"]
 
 
-def _evaluation(evaluation: config_lib.EvalConfig) -> str:
-    limit = f"at most {evaluation.time_limit_s:g} s each"
-    return f"  evaluation      12 trocars x {evaluation.trials} trials, {limit}"
+def _evaluation(config: config_lib.RunConfig) -> str:
+    trocars, trials = len(_task(config).is_seen), config.eval.trials
+    limit = f"at most {config.eval.time_limit_s:g} s each"
+    return f"  evaluation      {trocars} trocars x {trials} trials, {limit}"
 
 
-def _seeing(policy: config_lib.PolicyConfig) -> list[str]:
+def _time(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
+    import jax
+
+    trocars, backend = len(_task(config).is_seen), jax.default_backend()
+    return f"  time            {estimate.line(config, stages, trocars, backend)}"
+
+
+def _seeing(config: config_lib.RunConfig) -> list[str]:
     """Lines that say what the policy sees, and with which encoder."""
+    policy = config.policy
     if policy.observation == "state":
         return [
-            "  observation     state: block pose and target position in the place of pixels "
+            f"  observation     state instead of pixels: {_fields(config)} "
             "(--policy.observation image turns the camera on)"
         ]
     return [
         f"  observation     image, {policy.image_size} px",
-        f"  encoder         {encoder(policy)}; {policy.encoder}",
+        f"  encoder         {encoder(config)}; {policy.encoder}",
     ]
 
 
-def encoder(policy: config_lib.PolicyConfig) -> str:
+def _fields(config: config_lib.RunConfig) -> str:
+    return ", ".join(field.name for field in _task(config).fields)
+
+
+def encoder(config: config_lib.RunConfig) -> str:
     """Where the weights of the image encoder come from, and whether they still learn."""
-    name = policy.encoder_weights
+    policy, name = config.policy, config.policy.encoder_weights
     if not name:
         return "trained from scratch"
-    known = " (pretrained on this task)" if _is_of_this_task(policy) else ""
+    task = _task_of(name)
+    known = f" (pretrained on {'this task' if task == config.scene.task else task})" if task else ""
     return f"{'frozen' if policy.freeze_encoder else 'trained further'}, from {name}{known}"
 
 
-def _is_of_this_task(policy: config_lib.PolicyConfig) -> bool:
-    """Whether the encoder began in a policy of ours; where its file is gone, as far as we know."""
+def _task_of(encoder_weights: str) -> str:
+    """The task that an encoder's policy was trained on; empty of a file that is none, or gone."""
     from starjax.policies import packaged, policy_file
 
-    return policy.freeze_encoder or policy_file.is_policy(packaged.locate(policy.encoder_weights))
+    try:
+        return policy_file.load(packaged.locate(encoder_weights)).scene.task
+    except (OSError, ValueError):
+        return ""
 
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
-    """What settings make otherwise than the row of Table II says, or than one of `all` says."""
+    """Active ablations: settings that deviate from the method's row of Table II."""
     rows = methods.METHODS.values() if method == "all" else [methods.METHODS[method]]
     sees, yaw = policy.sees_trocar, policy.trocar_yaw
     given = "given" if sees == "always" else "not given"
@@ -137,12 +165,12 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
     found = []
     if config.policy.observation == "state":
         found.append(
-            "The policy observes the simulator's state (block pose, target position), not pixels "
-            "as in the paper; --policy.observation image turns the camera on."
+            f"The policy observes the task's state ({_fields(config)}), not pixels as in the "
+            "paper; --policy.observation image turns the camera on."
         )
     else:
         policy = config.policy
-        found.append(f"Image encoder: {encoder(policy)}; {policy.encoder}, {policy.image_size} px.")
+        found.append(f"Image encoder: {encoder(config)}; {policy.encoder}, {policy.image_size} px.")
     found += [f"Ablation: {what}." for what in _ablations(figures["method"], config.policy)]
     if config.preset == "smoke":
         found.append("Preset smoke is too short to learn anything: its rates mean nothing.")

@@ -32,6 +32,7 @@ Runs = Annotated[
 ]
 FloatOrNone = Annotated[float | None, tyro.conf.arg(metavar="FLOAT")]
 
+_UNNAMED = "scene"  # the part of settings whose flags do not name it
 _registry = tyro.constructors.ConstructorRegistry()
 _FIELD = re.compile(r"[a-z][a-z0-9_.]*")
 
@@ -80,8 +81,8 @@ def flags(settings: type, prefix: str = "") -> list[str]:
 
 
 def flag(field: str) -> str:
-    """How a field is typed: `--train.batch-size` for `train.batch_size`."""
-    return f"--{field.replace('_', '-')}"
+    """How a field is typed: `train.steps` as `--train.steps`, `scene.task` as `--task`."""
+    return f"--{field.removeprefix(f'{_UNNAMED}.').replace('_', '-')}"
 
 
 def spelled(error: errors.UsageError) -> str:
@@ -149,7 +150,9 @@ def _with_ranges(
         return None
     fields = []
     for field in spec.fields:
-        hint = tyro.conf.arg(help_behavior_hint=functools.partial(_hint, limits.within(field.type)))
+        name = "" if field.name == _UNNAMED else None
+        range_and_default = functools.partial(_hint, limits.within(field.type))
+        hint = tyro.conf.arg(name=name, help_behavior_hint=range_and_default)
         # What stands on the field itself comes later, and wins.
         kind, *rest = typing.get_args(field.type) if _is_annotated(field.type) else [field.type]
         fields.append(dataclasses.replace(field, type=Annotated[(kind, hint, *rest)]))

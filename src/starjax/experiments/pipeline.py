@@ -8,7 +8,14 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.experiments import demonstrations, folders, messages, other_processes, stage_times
+from starjax.experiments import (
+    demonstrations,
+    folders,
+    messages,
+    other_processes,
+    scenes,
+    stage_times,
+)
 from starjax.runtime import files, xla
 from starjax.runtime.signals import stop_signals
 
@@ -37,6 +44,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     from starjax.runtime import processes
     from starjax.training import devices
 
+    config = scenes.resolved(config)
     if config.policy.freeze_encoder and not processes.is_alone():
         raise errors.UsageError("policy.freeze_encoder", "one process", "several")
     if "train" in stages:

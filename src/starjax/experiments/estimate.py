@@ -1,0 +1,103 @@
+"""About how long a run takes, from runs that were timed."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from starjax import config as config_lib
+from starjax import methods
+from starjax.experiments import folders, presets
+
+
+class Stage(NamedTuple):
+    """A stage that was timed.
+
+    Attributes:
+      count: demonstrations, training steps or trials.
+      seconds: for all of them.
+      compiling: seconds of these in which jax compiled, which do not grow with the count.
+    """
+
+    count: int
+    seconds: float
+    compiling: float
+
+    def expected(self, count: int) -> float:
+        """Seconds for another count; none for nothing."""
+        return self.compiling + (self.seconds - self.compiling) * count / self.count if count else 0
+
+
+class Timed(NamedTuple):
+    """A run of a preset, with method stardiff.
+
+    Attributes:
+      machine: in words, and backend: as jax calls it.
+      source: its result below experiments/, which a test holds these figures to.
+      collect, features, train, evaluate: its stages.
+    """
+
+    machine: str
+    backend: str
+    source: str
+    collect: Stage
+    features: Stage
+    train: Stage
+    evaluate: Stage
+
+
+TIMED = {
+    "cpu": Timed(
+        machine="2 cores of an AMD EPYC",
+        backend="cpu",
+        source="cpu_main_job/result.json",
+        collect=Stage(240, 168.4, 30.61),
+        features=Stage(240, 33.97, 0.56),
+        train=Stage(8_000, 512.54, 36.09),
+        evaluate=Stage(72, 84.24, 38.57),
+    ),
+    "gpu": Timed(
+        machine="an NVIDIA H200 with 32 cores",
+        backend="gpu",
+        source="gpu_main_job/result.json",
+        collect=Stage(800, 67.79, 34.46),
+        features=Stage(0, 0.0, 0.0),
+        train=Stage(16_000, 212.95, 47.46),
+        evaluate=Stage(360, 67.49, 45.03),
+    ),
+}
+
+
+def seconds(config: config_lib.RunConfig, stages: Sequence[str], trocars: int) -> float | None:
+    """Seconds that a run takes from nothing on a machine that was timed.
+
+    Args:
+      config: settings of the run.
+      stages: some of collect, train, evaluate.
+      trocars: configurations that are evaluated.
+
+    Returns None for other networks, batches and scenes than were timed.
+    """
+    usual, timed = presets.PRESETS.get(config.preset), TIMED.get(config.preset)
+    if usual is None or timed is None or config.scene.task != usual.scene.task:
+        return None
+    networks = [(each.policy, each.train.batch_size) for each in (config, usual)]
+    if {"train", "evaluate"} & {*stages} and networks[0] != networks[1]:
+        return None
+    names = folders.selected(config)
+    weights = {methods.METHODS[name].weights_of for name in names}
+    demonstrations = config.demos.per_trocar * config.demos.seen_trocars
+    spent = timed.collect.expected(demonstrations) if "collect" in stages else 0.0
+    if "train" in stages:
+        spent += timed.features.expected(demonstrations) if config.policy.freeze_encoder else 0.0
+        spent += len(weights) * timed.train.expected(config.train.steps)
+    if "evaluate" in stages:
+        spent += len(names) * timed.evaluate.expected(trocars * config.eval.trials)
+    return spent
+
+
+def line(config: config_lib.RunConfig, stages: Sequence[str], trocars: int, backend: str) -> str:
+    """What the plan says of it."""
+    timed, spent = TIMED.get(config.preset), seconds(config, stages, trocars)
+    if timed is None or spent is None or timed.backend != backend:
+        return "not known for these settings; each stage's bar says it after some steps"
+    minutes = max(1, round(spent / 60))
+    return f"about {minutes} min from the start on {timed.machine}"

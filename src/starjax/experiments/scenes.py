@@ -1,0 +1,35 @@
+"""The scene of a run: names that are left out become the task's own."""
+
+import dataclasses
+
+from starjax import config as config_lib
+from starjax import errors
+from starjax.sim.names import SceneNames
+
+
+def settings(names: SceneNames) -> config_lib.SceneConfig:
+    """The settings that name a scene in full."""
+    return config_lib.SceneConfig(
+        task=names.task, arm=names.arms, tool=names.tools, camera=names.cameras
+    )
+
+
+def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
+    """Settings that name their scene in full, and train with trocars that its task has.
+
+    Raises:
+      errors.UsageError: a name is unknown, or the task has fewer seen trocars than were asked for.
+    """
+    # Imported here, as it imports jax and MuJoCo.
+    from starjax.sim import registry, scene
+
+    asked, demos = config.scene, config.demos
+    names = scene.name(asked.task, asked.arm, asked.tool, asked.camera)
+    most = int(registry.tasks.get(names.task).is_seen.sum())
+    is_default = demos.seen_trocars == config_lib.DemosConfig().seen_trocars
+    if demos.seen_trocars > most and not is_default:  # the default is all of them
+        raise errors.UsageError("demos.seen_trocars", f"1 to {most}", demos.seen_trocars)
+    seen = min(demos.seen_trocars, most)
+    return dataclasses.replace(
+        config, scene=settings(names), demos=dataclasses.replace(demos, seen_trocars=seen)
+    )

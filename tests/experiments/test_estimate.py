@@ -1,0 +1,66 @@
+"""How long a run is said to take: as runs that were timed did."""
+
+import dataclasses
+import json
+import pathlib
+
+import pytest
+
+from starjax.experiments import estimate, presets
+
+RESULTS = pathlib.Path(__file__).parents[2] / "experiments"
+STAGES = ("collect", "train", "evaluate", "report")
+
+
+@pytest.mark.parametrize("name", estimate.TIMED)
+def test_what_was_timed_is_a_committed_result(name):
+    timed = estimate.TIMED[name]
+    found = json.loads((RESULTS / timed.source).read_text())
+    demos, settings = found["config"]["demos"], found["config"]
+    counts = {
+        "collect": demos["per_trocar"] * demos["seen_trocars"],
+        "features": demos["per_trocar"] * demos["seen_trocars"],
+        "train": settings["train"]["steps"],
+        "evaluate": 12 * settings["eval"]["trials"],
+    }
+    for stage, count in counts.items():
+        figures = tuple(found["timings_s"].get(f"{stage}{part}") for part in ("", ": compile"))
+        if figures != (None, None):
+            assert getattr(timed, stage) == (count, *figures)
+    assert (found["preset"], found["method"]) == (name, "stardiff")
+    assert found["hardware"]["backend"] == timed.backend
+
+
+@pytest.mark.parametrize("name", estimate.TIMED)
+def test_a_preset_takes_as_long_as_it_did(name):
+    timed = estimate.TIMED[name]
+    took = timed.collect.seconds + timed.features.seconds
+    took += timed.train.seconds + timed.evaluate.seconds
+    expected = estimate.seconds(presets.PRESETS[name], STAGES, 12)
+    assert expected == pytest.approx(took)
+
+
+def changed(**parts):
+    cpu = presets.PRESETS["cpu"]
+    made = {part: dataclasses.replace(getattr(cpu, part), **new) for part, new in parts.items()}
+    return dataclasses.replace(cpu, **made)
+
+
+def test_more_of_anything_takes_longer_and_compiles_once():
+    once = estimate.seconds(presets.PRESETS["cpu"], STAGES, 12)
+    more = {"demos": {"per_trocar": 60}, "train": {"steps": 16_000}, "eval": {"trials": 12}}
+    for part, new in more.items():
+        assert once < estimate.seconds(changed(**{part: new}), STAGES, 12) < 2 * once
+    assert estimate.seconds(changed(**more), STAGES, 12) < 2 * once
+    everything = dataclasses.replace(presets.PRESETS["cpu"], method="all")
+    assert estimate.seconds(everything, STAGES, 12) > 4 * once
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [{"policy": {"horizon": 32}}, {"train": {"batch_size": 7}}, {"scene": {"task": "reach"}}],
+)
+def test_what_was_not_timed_is_not_known(parts):
+    assert estimate.seconds(changed(**parts), STAGES, 12) is None
+    assert "not known" in estimate.line(changed(**parts), STAGES, 12, "cpu")
+    assert "not known" in estimate.line(presets.PRESETS["cpu"], STAGES, 12, "gpu")
