@@ -137,7 +137,7 @@ class RunConfig:
     # starting values of the rest; auto: gpu where jax can use one, else cpu
     preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"
     seed: Seed = 0  # of everything random
-    out: str = "auto"  # folder of results; auto: runs/PRESET, other seeds and observations apart
+    out: str = "auto"  # folder of results; auto: runs/PRESET; other scenes, images and seeds apart
     scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
     demos: DemosConfig = dataclasses.field(default_factory=DemosConfig)
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)

@@ -109,6 +109,7 @@ def test_flags_override_the_preset_and_nothing_else():
     [
         ("--preset cpu", "runs/cpu"),
         ("--preset cpu --seed=3", "runs/cpu-seed3"),
+        ("--preset cpu --task reach --arm fr5 --camera side", "runs/cpu-reach-fr5-side"),
         ("--preset cpu --policy.observation state --seed 3", "runs/cpu-state-seed3"),
         ("--preset cpu --policy.observation state --seed 3 --out runs/cpu", "runs/cpu"),
         ("--preset cpu --policy.no-freeze-encoder", "runs/cpu-unfrozen"),
@@ -119,7 +120,7 @@ def test_flags_override_the_preset_and_nothing_else():
         ),
     ],
 )
-def test_other_observations_encoders_and_seeds_have_folders_of_their_own(typed, folder):
+def test_other_scenes_observations_encoders_and_seeds_have_folders_of_their_own(typed, folder):
     assert settings(typed).out == folder
 
 
@@ -130,6 +131,12 @@ def test_a_presets_encoder_is_no_part_of_a_run_that_sees_the_state():
     for name, value in (("freeze_encoder", ""), ("encoder_weights", " compact")):
         with mistakes.of(f"policy.{name}", "state"):
             settings(f"--preset cpu --policy.observation state --policy.{name}{value}")
+
+
+def test_a_presets_expert_is_for_its_own_task():
+    assert settings("--preset cpu").demos.expert == "one_wall"
+    assert settings("--preset cpu --task reach").demos.expert == ""
+    assert settings("--preset cpu --task reach --demos.expert slow").demos.expert == "slow"
 
 
 @pytest.mark.parametrize(

@@ -45,21 +45,29 @@ def _settings(
 
 
 def _default(argv: Sequence[str], has_gpu: bool) -> config_lib.RunConfig:
-    """Values of what is not typed: the preset's, without its encoder where nothing is seen."""
+    """Values of what is not typed: the preset's, without what does not go with what is typed."""
     start = config_lib.RunConfig()
     default = presets.resolve(options.peek(config_lib.RunConfig, argv, start).preset, has_gpu)
-    policy = options.peek(config_lib.RunConfig, argv, default).policy
-    if policy.observation == "state":
-        blind = dataclasses.replace(default.policy, encoder_weights="", freeze_encoder=False)
-        return dataclasses.replace(default, policy=blind)
-    return default
+    asked = options.peek(config_lib.RunConfig, argv, default)
+    policy, demos = default.policy, default.demos
+    if asked.policy.observation == "state":
+        policy = dataclasses.replace(policy, encoder_weights="", freeze_encoder=False)
+    if asked.scene.task != default.scene.task:
+        demos = dataclasses.replace(demos, expert="")
+    return dataclasses.replace(default, policy=policy, demos=demos)
 
 
 def _folder(config: config_lib.RunConfig) -> str:
-    """Folder of a run that names none: other observations, encoders frozen or not, and seeds have
-    one each; trainings of one method that differ in anything else meet in it, and are refused."""
+    """Folder of a run that names none.
+
+    Other scenes, observations, encoders frozen or not, and seeds have one each; trainings of one
+    method that differ in anything else meet in it, and are refused.
+    """
     policy, usual = config.policy, presets.PRESETS[config.preset]
+    scene = config.scene
     parts = [usual.preset]
+    parts += [scene.task] if scene.task != usual.scene.task else []
+    parts += [*scene.arm, *scene.tool, *scene.camera]
     parts += [policy.observation] if policy.observation != usual.policy.observation else []
     sees, freezes = policy.observation == "image", policy.freeze_encoder
     if sees and freezes != usual.policy.freeze_encoder:
