@@ -43,6 +43,11 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "tables, figures, video, page from results",
         ("sim", "report"),
     ),
+    "place": (
+        "starjax.experiments.place",
+        "search where an arm must stand for a task",
+        ("sim", "train"),
+    ),
     "doctor": (
         "starjax.doctor",
         "what of this machine and installation works, and what to do",
