@@ -91,6 +91,7 @@ def _figures(fit: "Fit") -> str:
 
 def _record(tool: str, workspace: str, mount: "Mount", fit: "Fit") -> str:
     """The row of `Arm.mounts`, its figures in a comment."""
-    fields = [f"{field}={value!r}" for field, value in zip(mount._fields, mount)]
-    inside = "".join(f"\n    {field}," for field in fields)
+    usual = mount._field_defaults
+    said = {name: value for name, value in mount._asdict().items() if value != usual.get(name)}
+    inside = "".join(f"\n    {name}={value!r}," for name, value in said.items())
     return f"# {_figures(fit)}\n({tool!r}, {workspace!r}): Mount({inside}\n),".replace("'", '"')

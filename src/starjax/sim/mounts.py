@@ -188,4 +188,4 @@ _compiled = jax.jit(reach, static_argnames=("settings", "iterations"))
 
 
 def frame_of(trocar: rcm.Trocar, workspace: Workspace) -> rcm.TrocarFrame:
-    return rcm.trocarframe_of(trocar, np.array(workspace.p_world_ref), workspace.roll_zero)
+    return rcm.trocar_frame(trocar, np.array(workspace.p_world_ref), workspace.roll_zero)

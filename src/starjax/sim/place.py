@@ -160,10 +160,9 @@ def _mount(at: Bench, middle: Targets, x: np.ndarray) -> Mount:
     """The record of a candidate `[6 + J]`, rounded as it is printed."""
     place, guess = jnp.asarray(x[:6], jnp.float32), jnp.asarray(x[6:], jnp.float32)
     home, _ = _home(mounts.standing(at.flange, at.tip, place), middle, guess, at.settings)
-    position, angles, home = (
-        tuple(round(float(v), 3) for v in part) for part in (x[:3], x[3:6], home)
+    position, (yaw, turn, tilt), home = (
+        tuple(round(float(v), 3) + 0.0 for v in part) for part in (x[:3], x[3:6], home)
     )
-    yaw, turn, tilt = angles
     return Mount(position, yaw, turn, home, tilt)
 
 
