@@ -44,6 +44,11 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         ("sim", "report"),
     ),
     "list": ("starjax.experiments.list_command", "what flags can name", ("sim",)),
+    "place": (
+        "starjax.experiments.place",
+        "search where an arm must stand for a task",
+        ("sim", "train"),
+    ),
     "doctor": (
         "starjax.doctor",
         "what of this machine and installation works, and what to do",

@@ -1,8 +1,8 @@
-"""What exists by name: tasks, arms, tools. Others add theirs by an entry point of their package.
+"""What exists by name: tasks, arms, tools, workspaces. Others add theirs by entry points.
 
-A row of `starjax.tasks`, `starjax.arms` or `starjax.tools` in somebody's `[project.entry-points]`
-names an object that is a `Task`, an `Arm` or a `Tool`; a row of `starjax.mounts` a dict from
-(arm, tool, workspace) to `Mount`, for arms that are not theirs.
+A row of `starjax.tasks`, `starjax.arms`, `starjax.tools` or `starjax.workspaces` in somebody's
+`[project.entry-points]` names an object that is a `Task`, an `Arm`, a `Tool` or a `Workspace`; a
+row of `starjax.mounts` a dict from (arm, tool, workspace) to `Mount`, for arms that are not theirs.
 """
 
 import importlib
@@ -61,8 +61,15 @@ tasks = Registry(
         "reach": "starjax.sim.tasks.reach.task:TASK",
     },
 )
-arms = Registry("arm", {"fr5": "starjax.sim.arms.fr5:ARM"})
+arms = Registry(
+    "arm",
+    {name: f"starjax.sim.arms.{name}:ARM" for name in ("fr5", "ur5e", "panda", "iiwa14", "rcm4")},
+)
 tools = Registry("tool", {"grasper": "starjax.sim.tools.grasper:TOOL"})
+workspaces = Registry(
+    "workspace",
+    {name: f"starjax.sim.workspaces:{name.upper()}" for name in ("board", "left", "right")},
+)
 
 
 def mount(arm: Arm, tool: str, workspace: str) -> Mount | None:

@@ -127,7 +127,7 @@ def compose(names: SceneNames) -> mujoco.MjModel:
         robot.attach(hand, site=robot.site("flange"), prefix="tool/")
         parent = world.body(f"trocar{i}") if arm.remote_centre else world.worldbody
         base = parent.add_site(
-            name=f"base{i}", pos=mount.position, quat=_about_z(mount.yaw), group=3, size=[0.003] * 3
+            name=f"base{i}", pos=mount.position, quat=mount.wxyz_base, group=3, size=[0.003] * 3
         )
         world.attach(robot, site=base, prefix=f"arm{i}/")
     for limit, size in zip(CONTACT_LIMITS, limits):
@@ -191,8 +191,9 @@ def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
 
 def _bind(m: mujoco.MjModel, i: int, arm: Arm, tool: Tool, mount: Mount) -> BoundArm:
     at = f"arm{i}/"
-    chain = ik.chain_of(m, first=at + arm.first, site=at + f"tool/{tool.tcp}")
-    joints = [m.joint(at + joint) for joint in arm.joints]
+    names = tuple(at + joint for joint in arm.joints)
+    chain = ik.chain_of(m, first=at + arm.first, site=at + f"tool/{tool.tcp}", joints=names)
+    joints = [m.joint(name) for name in names]
     held = [m.joint(j) for j in range(m.njnt) if m.joint(j).name.startswith(f"{at}tool/")]
     return BoundArm(
         arm=arm,
@@ -204,7 +205,7 @@ def _bind(m: mujoco.MjModel, i: int, arm: Arm, tool: Tool, mount: Mount) -> Boun
         max_speed=np.array(arm.max_speed, np.float32),
         q=np.array([joint.qposadr[0] for joint in joints]),
         dof=np.array([joint.dofadr[0] for joint in joints]),
-        ctrl=np.array([m.actuator(at + joint).id for joint in arm.joints]),
+        ctrl=np.array([m.actuator(name).id for name in names]),
         jaws=np.array([joint.qposadr[0] for joint in held], int),
         jaw=None if tool.jaw is None else int(m.joint(f"{at}tool/{tool.jaw}").qposadr[0]),
         jaw_ctrl=None if tool.servo is None else int(m.actuator(f"{at}tool/{tool.servo}").id),

@@ -1,5 +1,6 @@
 """What an arm is, and where it stands: what its MJCF does not say. Data only."""
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -8,17 +9,32 @@ class Mount(NamedTuple):
     """An arm with a tool in a workspace; found by `starjax place`, held by a test.
 
     Attributes:
-      position: `(3,)` m, of the arm's base in the world.
+      position: `(3,)` m, of the arm's base in the world; for a remote centre from the trocar.
       yaw: rad, of the base about the world's z axis.
       turn: rad, of the tool about the flange's z axis.
       home: rad (m for a slide), one a joint: where inverse kinematics starts, and what redundant
         joints return to.
+      tilt: rad, of the base about its own y axis, after the yaw: pi/2 on a wall, pi hanging.
     """
 
     position: tuple[float, float, float]
     yaw: float
     turn: float
     home: tuple[float, ...]
+    tilt: float = 0.0
+
+    @property
+    def wxyz_base(self) -> tuple[float, float, float, float]:
+        """Orientation of the base in the world, a quaternion."""
+        (c, s), (a, b) = ((math.cos(v / 2), math.sin(v / 2)) for v in (self.yaw, self.tilt))
+        return (c * a, -s * b, c * b, s * a)
+
+
+def opposite(mount: Mount) -> Mount:
+    """The mount on the other side of the world's z axis: as good, in the opposite workspace."""
+    x, y, z = mount.position
+    yaw = math.remainder(mount.yaw + math.pi, 2 * math.pi)
+    return mount._replace(position=(-x, -y, z), yaw=yaw)
 
 
 class Arm(NamedTuple):

@@ -1,0 +1,32 @@
+"""Franka Emika Panda: seven joints, 3 kg. Figures from the maker's documentation."""
+
+from starjax.sim.arms.base import Arm, Mount, opposite
+
+_LEFT = Mount(
+    position=(-0.422, -0.006, -0.399),
+    yaw=0.289,
+    turn=-1.056,
+    home=(-0.276, -0.869, 0.005, -2.188, -0.003, 1.752, 1.073),
+)
+
+ARM = Arm(
+    name="panda",
+    mjcf="arms/panda/panda.xml",
+    first="link1",
+    joints=("j1", "j2", "j3", "j4", "j5", "j6", "j7"),
+    max_speed=(2.175,) * 4 + (2.61,) * 3,
+    servo_frequency=100.0,
+    mounts={
+        ("grasper", "board"): Mount(
+            position=(-0.363, -0.085, -0.333),
+            yaw=-0.277,
+            turn=-0.221,
+            home=(0.499, -0.513, 0.005, -1.939, 0.002, 1.426, 0.448),
+        ),
+        ("grasper", "left"): _LEFT,
+        ("grasper", "right"): opposite(_LEFT),
+    },
+    rest_gain=0.1,
+    link_radius=0.055,
+    watched=4,  # it stands beside the table and lower, and so does its elbow
+)

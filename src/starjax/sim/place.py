@@ -1,0 +1,170 @@
+"""Finds where an arm must stand, how its tool is turned, and its home, for a workspace.
+
+Placement decides whether an arm is of use: the same one reaches every trocar with room to spare, or
+almost none, by where its base is.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import optimize
+
+from starjax.sim import ik, linear, mounts
+from starjax.sim.arms.base import Mount
+from starjax.sim.mounts import Bench, Fit, Targets
+from starjax.sim.workspaces import Workspace
+
+SINGULAR_WORTH = 4.0  # rad of margin that a metre of singular value is worth
+MEAN_WORTH = 0.1  # of the mean over the poses, beside the worst
+TABLE_WORTH = 5.0  # rad of margin that a metre of link in the table costs
+ITERATIONS = 20  # of inverse kinematics from home
+# Differential evolution in rounds; after each the worst poses take the place of easy ones.
+ROUNDS, GENERATIONS, CANDIDATES = 3, 20, 64
+POSES, REPLACED = 144, 48
+
+
+def search(
+    at: Bench,
+    workspace: Workspace,
+    seed: int = 0,
+    tilts: bool = False,
+    tell: Callable[[Fit], None] = lambda _: None,
+) -> tuple[Mount, Fit]:
+    """The best mount that differential evolution finds, and its worst figures.
+
+    Args:
+      tilts: whether the base may also lean, or hang.
+      seed: the same one gives the same mount on the same machine.
+      tell: called with the worst figures after each round.
+    """
+    every = mounts.targets(workspace)
+    middle = mounts.middle(workspace)
+    low, high = _bounds(at, workspace, tilts)
+    free = low < high
+    chosen = np.random.default_rng(seed).choice(len(every.p_world_trocar), POSES, replace=False)
+    population, best = "sobol", None
+    for round_ in range(ROUNDS):
+        merit = functools.partial(_merit, at.flange, at.tip, middle, _at(every, chosen))
+
+        def cost(x: np.ndarray, merit: Callable[..., jax.Array] = merit) -> np.ndarray:
+            whole = np.tile(low[:, None], x.shape[1])
+            whole[free] = x
+            with jax.default_matmul_precision("highest"):
+                return -np.asarray(merit(jnp.asarray(whole.T, jnp.float32), at.settings))
+
+        found = optimize.differential_evolution(
+            cost,
+            list(zip(low[free], high[free])),
+            vectorized=True,
+            updating="deferred",
+            popsize=max(1, CANDIDATES // int(free.sum())),
+            maxiter=GENERATIONS,
+            tol=0,
+            polish=False,
+            mutation=(0.4, 0.9),
+            recombination=0.8,
+            init=population,
+            rng=seed + round_,
+        )
+        population = found.population
+        x = low.copy()
+        x[free] = found.x
+        mount = _mount(at, middle, x)
+        reached = mounts.fit(at, mount, every)
+        least = mounts.worst(reached)
+        tell(least)
+        if best is None or _score(least) > _score(best[1]):
+            best = mount, least
+        chosen = _harder(reached, chosen)
+    assert best
+    return best
+
+
+def _score(least: Fit) -> float:
+    """What is sought for: rad, of the worst pose."""
+    if least.residual > mounts.REACHED:
+        return -float(least.residual)
+    ease = min(least.margin, SINGULAR_WORTH * least.singular)
+    return float(ease + TABLE_WORTH * min(least.height, 0.0))
+
+
+def _harder(reached: Fit, chosen: np.ndarray) -> np.ndarray:
+    """The poses to go on with: the easiest of the chosen ones give way to the worst of all."""
+    ease = np.minimum(reached.margin, SINGULAR_WORTH * reached.singular) - reached.residual
+    kept = chosen[np.argsort(ease[chosen])][: POSES - REPLACED]
+    others = np.setdiff1d(np.argsort(ease)[:POSES], kept, assume_unique=True)
+    return np.concatenate([kept, others[np.argsort(ease[others])][:REPLACED]])
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _merit(
+    flange: ik.Chain,
+    tip: ik.Chain,
+    middle: Targets,
+    poses: Targets,
+    candidates: jax.Array,
+    settings: mounts.Settings,
+) -> jax.Array:
+    """How good candidates `[S, 6 + J]` are, `[S]` rad; negative where a pose is not reached."""
+
+    def one(x: jax.Array) -> jax.Array:
+        chain = mounts.standing(flange, tip, x[:6])
+        home, missed = _home(chain, middle, x[6:], settings)
+        residual, margin, height, J = mounts.reach(chain, home, poses, settings, ITERATIONS)
+        ease = jnp.minimum(margin, SINGULAR_WORTH * _least_singular(J))
+        sunk = jnp.minimum(jnp.min(height) - settings.link_radius, 0.0)
+        good = jnp.min(ease) + MEAN_WORTH * jnp.mean(ease) + TABLE_WORTH * sunk
+        far = -jnp.minimum(missed, 1.0) - jnp.mean(jnp.minimum(residual, 1.0))
+        merit = jnp.where(jnp.max(residual) < 10 * mounts.REACHED, good, far)
+        return jnp.where(jnp.isfinite(merit), merit, -jnp.inf)
+
+    return jax.vmap(one)(candidates)
+
+
+def _home(
+    chain: ik.Chain, middle: Targets, guess: jax.Array, settings: mounts.Settings
+) -> tuple[jax.Array, jax.Array]:
+    """The configuration at the middle of the workspace that is found from a guess `[J]`."""
+    if settings.remote_centre:
+        chain = chain.replace(p_base=chain.p_base + middle.p_world_trocar)
+    return ik.solve(chain, middle.pose, guess, mounts.ITERATIONS, guess, settings.rest_gain)
+
+
+def _least_singular(J: jax.Array) -> jax.Array:
+    """A smooth lower bound `[P]` of the least singular value of `J` `[P, 6, J]`: all count a bit.
+
+    Without LAPACK, see `sim.linear`.
+    """
+    small = J @ J.mT if J.shape[-1] >= ik.POSE_SIZE else J.mT @ J
+    columns = jnp.eye(small.shape[-1])
+    inverse = jax.vmap(jax.vmap(linear.solve_positive, (None, 0)), (0, None))(small, columns)
+    return 1.0 / jnp.sqrt(jnp.trace(inverse, axis1=-2, axis2=-1))
+
+
+def _bounds(at: Bench, workspace: Workspace, tilts: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges `[6 + J]` of a mount's numbers; where both ends are equal there is no choice."""
+    limits = np.clip(at.tip.limits, -np.pi, np.pi).astype(np.float64).T
+    box = np.array([workspace.base_low, workspace.base_high])
+    if at.settings.remote_centre:
+        box = np.zeros((2, 3))
+    most = np.array([np.pi, np.pi, np.pi * tilts])  # yaw, turn, tilt
+    angles = np.stack([-most, most])
+    low, high = np.concatenate([box, angles, limits], axis=1)
+    return low, high
+
+
+def _mount(at: Bench, middle: Targets, x: np.ndarray) -> Mount:
+    """The record of a candidate `[6 + J]`, rounded as it is printed."""
+    place, guess = jnp.asarray(x[:6], jnp.float32), jnp.asarray(x[6:], jnp.float32)
+    home, _ = _home(mounts.standing(at.flange, at.tip, place), middle, guess, at.settings)
+    position, (yaw, turn, tilt), home = (
+        tuple(round(float(v), 3) + 0.0 for v in part) for part in (x[:3], x[3:6], home)
+    )
+    return Mount(position, yaw, turn, home, tilt)
+
+
+def _at(poses: Targets, index: np.ndarray) -> Targets:
+    return jax.tree.map(lambda x: x[index], poses)

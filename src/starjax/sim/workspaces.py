@@ -1,0 +1,59 @@
+"""Where the trocar and the tip of one arm may be: mounts are found, and tested, for a workspace."""
+
+import math
+from typing import NamedTuple
+
+from starjax.rcm import trocar
+
+
+class Workspace(NamedTuple):
+    """A region of trocars and targets, a row of the registry.
+
+    Attributes:
+      p_world_ref: `(3,)` m, nominal trocar o_ref.
+      radius, polar, azimuth: ranges of the trocar about it (Eq. 19), m and rad.
+      low, high: `(3,)` m, the box of the tip.
+      rolls: range, rad from `roll_zero`.
+      roll_zero: rad, see `rcm.TrocarFrame`.
+      base_low, base_high: `(3,)` m, the box in which an arm's base may stand.
+    """
+
+    p_world_ref: tuple[float, float, float]
+    radius: trocar.Range
+    polar: trocar.Range
+    azimuth: trocar.Range
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    rolls: tuple[float, float]
+    roll_zero: float
+    base_low: tuple[float, float, float]
+    base_high: tuple[float, float, float]
+
+
+# Both boards of pegs, from a grasp to the start; the camera looks on from x > 0.
+BOARD = Workspace(
+    p_world_ref=(0.0, 0.0, 0.15),
+    radius=trocar.RADIUS_RANGE,
+    polar=trocar.POLAR_RANGE,
+    azimuth=trocar.AZIMUTH_RANGE,
+    low=(-0.045, -0.033, 0.006),
+    high=(0.045, 0.033, 0.045),
+    rolls=(-1.4, 1.4),
+    roll_zero=0.0,
+    base_low=(-0.8, -0.3, -0.4),
+    base_high=(-0.2, 0.3, 1.2),
+)
+
+
+# Two arms at either side, their trocars apart and their rolls' zeros half a turn apart.
+LEFT = BOARD._replace(
+    radius=(0.03, 0.085),
+    polar=(math.radians(80), math.radians(100)),
+    azimuth=(math.radians(151), math.radians(209)),
+)
+RIGHT = LEFT._replace(
+    azimuth=(math.radians(-29), math.radians(29)),
+    roll_zero=math.pi,
+    base_low=(0.2, -0.3, -0.4),
+    base_high=(0.8, 0.3, 1.2),
+)
