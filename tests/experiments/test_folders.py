@@ -8,6 +8,7 @@ import re
 import shutil
 import time
 
+import mistakes
 import numpy as np
 import pytest
 
@@ -32,22 +33,6 @@ def changed(**parts):
     return dataclasses.replace(SMOKE, **fields)
 
 
-@pytest.mark.parametrize(
-    ("parts", "word"),
-    [
-        ({"train": {"steps": 41}}, "train.steps"),
-        ({"policy": {"image_size": 65}}, "policy.image_size"),
-        ({"demos": {"per_trocar": 2}}, "demos.per_trocar"),
-        ({"seed": 1}, "seed"),
-    ],
-)
-def test_weights_of_other_settings_are_refused_by_name(tmp_path, parts, word):
-    claimed(tmp_path)
-    with pytest.raises(errors.UsageError, match="--out") as caught:
-        folders.claim(tmp_path, changed(**parts), "demos-a")
-    assert caught.value.argument == word
-
-
 def another(value):
     match value:
         case bool():
@@ -55,26 +40,32 @@ def another(value):
         case str():
             return value + "x"
         case tuple():
-            return value + value[:1]
+            return (*value, "x")
     return value + 1
 
 
-@pytest.mark.parametrize("part", ["demos", "policy", "train"])
+def test_weights_of_another_seed_are_refused(tmp_path):
+    claimed(tmp_path)
+    with mistakes.of("seed", 1) as caught:
+        folders.claim(tmp_path, changed(seed=1), "demos-a")
+    assert "--out" in caught.value.hint
+
+
+@pytest.mark.parametrize("part", ["scene", "demos", "policy", "train"])
 def test_every_setting_but_three_decides_the_weights(tmp_path, part):
     claimed(tmp_path)
     names = [field.name for field in dataclasses.fields(getattr(SMOKE, part))]
     for name in {*names} - {"keep_checkpoints", "checkpoint_every", "steps_per_call"}:
         other = changed(**{part: {name: another(getattr(getattr(SMOKE, part), name))}})
-        with pytest.raises(errors.UsageError) as caught:
+        with mistakes.of(f"{part}.{name}"):
             folders.claim(tmp_path, other, "demos-a")
-        assert caught.value.argument == f"{part}.{name}"
 
 
 def test_weights_of_another_scene_are_refused(tmp_path):
     claimed(tmp_path)
-    with pytest.raises(errors.UsageError) as caught:
+    with mistakes.of("the demonstrations", "demos-b") as caught:
         folders.claim(tmp_path, SMOKE, "demos-b")
-    assert "demos-a" in caught.value.expected and caught.value.got == "demos-b"
+    assert "demos-a" in caught.value.expected
 
 
 def test_weights_of_other_settings_of_jax_are_refused(tmp_path, monkeypatch):
@@ -88,20 +79,9 @@ def test_weights_of_other_settings_of_jax_are_refused(tmp_path, monkeypatch):
 def test_weights_of_another_frozen_encoder_are_refused(tmp_path):
     claimed(tmp_path, "aaaa")
     folders.claim(tmp_path, SMOKE, "demos-a")  # trained by now: the encoder may be gone
-    with pytest.raises(errors.UsageError) as caught:
+    with mistakes.of("policy.encoder_weights", "bbbb") as caught:
         folders.claim(tmp_path, SMOKE, "demos-a", "bbbb")
-    assert (caught.value.argument, caught.value.got) == ("policy.encoder_weights", "bbbb")
     assert "aaaa" in caught.value.expected
-    assert folders.read_config(tmp_path) == SMOKE
-
-
-def test_a_folder_from_before_a_setting_existed_goes_on(tmp_path):
-    claimed(tmp_path)
-    path = tmp_path / "config.json"
-    old = json.loads(path.read_text())
-    del old["policy"]["freeze_encoder"]
-    path.write_text(json.dumps(old))
-    folders.claim(tmp_path, SMOKE, "demos-a")
     assert folders.read_config(tmp_path) == SMOKE
 
 
@@ -121,9 +101,8 @@ def test_a_folder_where_nothing_was_trained_takes_other_settings(tmp_path):
     folders.claim(tmp_path, other, "demos-b")
     assert "encoder" not in json.loads((tmp_path / "config.json").read_text())
     (tmp_path / "checkpoints" / "step_00000020").mkdir()
-    with pytest.raises(errors.UsageError) as caught:
+    with mistakes.of("train.learning_rate"):
         folders.claim(tmp_path, SMOKE, "demos-b", "bbbb")
-    assert caught.value.argument == "train.learning_rate"
 
 
 @pytest.mark.parametrize("text", [None, "", '{"seed": 0', "[]", "{}", '{"newthing": 1}'])
@@ -141,20 +120,17 @@ def test_weights_whose_settings_are_gone_are_refused(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "name"),
     [
-        ({"eval": {"time_limit_s": "4"}}, "EvalConfig.time_limit_s: expected float, got '4'"),
-        ({"seed": True}, "RunConfig.seed: expected int, got True"),
-        ({"eval": 3}, "EvalConfig: expected an object, got 3"),
-        ({"policy": {"unet_channels": [1, "2"]}}, "unet_channels: expected tuple"),
-        (
-            {"policy": {"observation": "sound"}},
-            "observation: expected one of image, state",
-        ),
+        ({"eval": {"time_limit_s": "4"}}, "EvalConfig.time_limit_s"),
+        ({"seed": True}, "RunConfig.seed"),
+        ({"eval": 3}, "EvalConfig"),
+        ({"policy": {"unet_channels": [1, "2"]}}, "PolicyConfig.unet_channels"),
+        ({"policy": {"observation": "sound"}}, "PolicyConfig.observation"),
     ],
 )
-def test_settings_of_other_types_are_named(values, said):
-    with pytest.raises(ValueError, match=re.escape(said)):
+def test_settings_of_other_types_are_named(values, name):
+    with pytest.raises(ValueError, match=f"^{name}: "):
         config.from_dict(config.RunConfig, values)
 
 
@@ -216,12 +192,6 @@ def test_a_damaged_record_of_times_starts_afresh_and_a_full_disk_hides_nothing(
     monkeypatch.setattr(stage_times.files, "write_json", full)
     with pytest.raises(OSError, match="checkpoint"), stage_times.timed(tmp_path, "train"):
         raise OSError("no room for the checkpoint")
-
-
-def test_a_folder_without_a_run_is_one_line(tmp_path):
-    with pytest.raises(errors.UsageError) as caught:
-        folders.read_config(tmp_path)
-    assert (caught.value.argument, caught.value.hint) == (str(tmp_path), "")
 
 
 def test_eight_methods_have_six_sets_of_weights(tmp_path):

@@ -15,9 +15,8 @@ import synthetic
 
 from starjax import config, methods
 from starjax.data import normalizer
-from starjax.experiments import demonstrations, folders, messages, pipeline, presets, scenes
-from starjax.policies import packaged, policy_file
-from starjax.policies import policy as policies
+from starjax.experiments import demonstrations, folders, pipeline, presets, scenes
+from starjax.policies import policy_file
 from starjax.runtime import files, signals
 from starjax.training import loop
 
@@ -130,52 +129,6 @@ def test_a_stop_during_the_last_steps_ends_the_run_after_the_weights(tmp_path, m
     assert folders.weights(tmp_path, "stardiff").exists()
 
 
-def test_plan_names_the_observation_and_the_flag(tmp_path):
-    preset = presets.PRESETS["smoke"]
-    said = messages.plan(preset, pipeline.STAGES)
-    assert "state" in said and "--policy.observation image" in said and "preset smoke" in said
-    policy = dataclasses.replace(preset.policy, observation="image")
-    said = messages.plan(dataclasses.replace(preset, policy=policy), pipeline.STAGES)
-    assert "image, 64 px" in said and "from scratch" in said and "state" not in said
-
-
-def test_plan_says_where_devices_cannot_share_a_batch(monkeypatch):
-    smoke = presets.PRESETS["smoke"]
-    assert "devices" not in messages.plan(smoke, pipeline.STAGES)
-    monkeypatch.setattr("jax.device_count", lambda: 8)
-    monkeypatch.setattr(
-        "starjax.training.devices.make_mesh", lambda _: types.SimpleNamespace(size=5)
-    )
-    assert "on 5 of 8 devices" in messages.plan(smoke, pipeline.STAGES)
-    assert "on 5 of 8 devices" not in messages.plan(smoke, ("collect",))
-
-
-def test_plan_and_warnings_say_that_an_encoder_is_frozen():
-    cpu = presets.PRESETS["cpu"]
-    said = "frozen, from compact (pretrained on this task); small"
-    assert f"  encoder         {said}\n" in messages.plan(cpu, pipeline.STAGES)
-    found = messages.warnings(cpu, {"method": "stardiff", "invalid": 0})
-    assert found == [f"Image encoder: {said}, 128 px."]
-
-
-def test_an_encoder_that_learns_further_names_its_beginning(tmp_path):
-    path = str(tmp_path / "resnet18.safetensors")
-    settings = config.RunConfig(policy=config.PolicyConfig(encoder_weights=path))
-    assert messages.encoder(settings) == f"trained further, from {path}"
-
-
-def test_a_policys_encoder_says_for_which_task_it_was_trained(tmp_path, monkeypatch):
-    policy = config.PolicyConfig(encoder_weights="compact")
-    settings = config.RunConfig(policy=policy)
-    made = fakes.trained(method="dp_rcm2", policy=policy, params={"unet": np.ones(3)})
-    monkeypatch.setattr(packaged, "FOLDER", tmp_path)
-    assert messages.encoder(settings) == "trained further, from compact"
-    policy_file.save(tmp_path / "compact.safetensors", made)
-    assert messages.encoder(settings) == "trained further, from compact (pretrained on this task)"
-    elsewhere = dataclasses.replace(settings, scene=config.SceneConfig(task="reach"))
-    assert messages.encoder(elsewhere).endswith("(pretrained on peg_transfer)")
-
-
 def test_a_wrong_encoder_is_found_before_anything_is_collected(tmp_path, done):
     preset = smoke(tmp_path, "stardiff")
     policy = dataclasses.replace(
@@ -266,66 +219,6 @@ def _json(settings):
     return json.loads(json.dumps(dataclasses.asdict(settings)))
 
 
-def test_warnings_name_what_a_reader_must_know():
-    figures = {"method": "stardiff", "invalid": 2}
-    smoke_words = " ".join(messages.warnings(presets.PRESETS["smoke"], figures))
-    assert "not pixels" in smoke_words and "too short" in smoke_words and "2 trial" in smoke_words
-    (paper,) = messages.warnings(config.RunConfig(), {**figures, "invalid": 0})
-    assert "Image encoder: trained from scratch; resnet18, 256 px" in paper
-
-
-@pytest.mark.parametrize(
-    ("switch", "flag", "changes", "leaves"),
-    [
-        ({"sees_trocar": "always"}, "sees-trocar always", "stardiff", "dp_rcm4"),
-        ({"sees_trocar": "never"}, "sees-trocar never", "dp_rcm4", "stardiff"),
-        ({"trocar_yaw": "fixed"}, "trocar-yaw fixed", "dp_rcm2", "dp_rcm4"),
-        ({"roll_history": False}, "no-roll-history", "stardiff", "dp_rcm4"),
-        ({"roll_trocar": False}, "no-roll-trocar", "stardiff", "dp_ee"),
-        ({"roll_observation": True}, "roll-observation", "stardiff", "stardiff_single"),
-    ],
-)
-def test_an_ablation_is_named_where_it_changes_the_method(switch, flag, changes, leaves):
-    policy = config.PolicyConfig(**switch)
-
-    def said(method):
-        settings = config.RunConfig(method=method, policy=policy)
-        (_, *found) = messages.warnings(settings, {"method": method, "invalid": 0})
-        return found, messages.plan(settings, ()).count(f"(--policy.{flag})")
-
-    assert said(leaves) == ([], 0)
-    (warning,), planned = said(changes)
-    assert warning.startswith("Ablation: ") and f"(--policy.{flag})" in warning and planned == 1
-    everything = config.RunConfig(method="all", policy=policy)
-    assert f"(--policy.{flag})" in messages.plan(everything, ())
-
-
-def test_the_ablation_of_the_frame_is_named_for_those_that_have_one():
-    policy = config.PolicyConfig(trocar_yaw="fixed")
-    named = {name for name in methods.METHODS if messages._ablations(name, policy)}
-    assert named == {
-        name for name, row in methods.METHODS.items() if policies.ablated(row, policy) != row
-    }
-
-
-def test_seen_comes_before_unseen_in_the_outcome():
-    def rate(successes, trials):
-        found = {"successes": successes, "trials": trials, "rate": successes / trials}
-        return {**found, "ci95": [0.0, 1.0]}
-
-    figures = {
-        "seen": rate(1, 8),
-        "unseen": rate(2, 4),
-        "safe": {"all": rate(3, 12)},
-        "rcm_error_mm": {"executed": {"mean": 0.1, "max": 0.2}},
-    }
-    result = types.SimpleNamespace(method="stardiff", figures=figures)
-    head, row = messages.outcome([result]).splitlines()
-    assert row.index("1/8") == head.index(" seen") + 1
-    assert row.index("2/4") == head.index("unseen")
-    assert row.index("3/12") == head.index("safe")
-
-
 def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):
     stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
     state = types.SimpleNamespace(ema_params={"w": np.ones(3)}, normalizer=stats)
@@ -346,12 +239,3 @@ def test_times_of_a_result_are_of_the_weights_that_it_has(tmp_path):
     assert pipeline._timings(tmp_path, "dp_ee_proj", "demos-a") == {
         "collect": 1.0, "train": 3.0, "train: compile": 4.0, "evaluate": 6.0
     }  # fmt: skip
-
-
-def test_the_outcome_has_intervals_and_the_worst_within_steps():
-    rate = {"successes": 1, "trials": 4, "rate": 0.25, "ci95": [0.1, 0.6]}
-    errors = {"executed": {"mean": 0.1, "max": 0.2}, "within_steps": {"max": 0.3}}
-    figures = {"seen": rate, "unseen": rate, "safe": {"all": rate}, "rcm_error_mm": errors}
-    result = types.SimpleNamespace(method="stardiff", figures=figures)
-    (_, row) = messages.outcome([result]).splitlines()
-    assert row.count("1/4 = 25% [10, 60]") == 3 and row.endswith("0.100 mm, at most 0.30")
