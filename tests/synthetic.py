@@ -5,6 +5,7 @@ import json
 import pathlib
 
 import numpy as np
+import stubs
 
 from starjax import config, rcm
 from starjax.evaluation import result, statistics, sweep
@@ -20,7 +21,7 @@ def run(path: pathlib.Path, method="stardiff", skill=(0.85, 0.7), trials=6, swee
     """Writes result.json, metrics.jsonl, evaluation/recorded.npz (and sweep.json) under `path`."""
     rng = np.random.default_rng(seed)
     index = np.repeat(np.arange(12), trials)
-    twelve = trocars.select(trocars.twelve(), index)
+    twelve = trocars.select(stubs.trocars(*range(12)), index)
     rows = outcomes(rng, twelve, index, np.where(rcm.IS_SEEN[index], *skill))
     (path / "evaluation").mkdir(parents=True)
     write(path / "result.json", method, rows, seed)
@@ -31,7 +32,7 @@ def run(path: pathlib.Path, method="stardiff", skill=(0.85, 0.7), trials=6, swee
         chance = skill[0] - 6 * np.maximum(0, places.radius[:, 0] - 0.03)
         spread = outcomes(rng, places, np.arange(sweep_of), chance)
         figures = sweep.compose(
-            spread, trocars.select(trocars.twelve(), rcm.IS_SEEN), P_REF, seed=0
+            spread, trocars.select(stubs.trocars(*range(12)), rcm.IS_SEEN), P_REF, seed=0
         )
         about = {"method": method, "observation": "state", "weights": WEIGHTS}
         about |= {"control_hz": 30.0, "time_limit_s": 60.0, "seed": 0}

@@ -6,6 +6,7 @@ import pathlib
 
 import numpy as np
 import pytest
+import stubs
 import synthetic
 
 from starjax import errors
@@ -20,7 +21,7 @@ RESULTS = sorted((pathlib.Path(__file__).parents[2] / "experiments").rglob("resu
 
 def rows(arms):
     index = np.repeat(np.arange(12), 2)
-    places = trocars.select(trocars.twelve(arms), index)
+    places = trocars.select(stubs.trocars(*range(12), arms=arms), index)
     return synthetic.outcomes(np.random.default_rng(0), places, index, np.full(24, 0.7))
 
 

@@ -11,7 +11,7 @@ import synthetic
 
 from starjax import rcm
 from starjax.evaluation import evaluate, sweep
-from starjax.rollouts import agent, trocars
+from starjax.rollouts import agent
 
 TRAINING = stubs.trocars(*range(8))
 P_REF = stubs.P_WORLD_REF[:1]
@@ -38,7 +38,7 @@ def test_a_grid_has_every_place_once(polars, places):
 
 
 def test_distance_is_to_the_nearest_training_trocar():
-    far = sweep.distance_to_nearest(trocars.twelve(), TRAINING, P_REF)
+    far = sweep.distance_to_nearest(stubs.trocars(*range(12)), TRAINING, P_REF)
     np.testing.assert_allclose(far[:8], 0, atol=1e-7)
     assert far[11] == pytest.approx(0.02, abs=1e-6)  # the centre, 2 cm from the inner four
     assert (far[8:] > 0.01).all()

@@ -9,6 +9,7 @@ import stubs
 
 from starjax import config
 from starjax.experiments import demonstrations, presets
+from starjax.rollouts import sharing
 
 SMOKE = presets.PRESETS["smoke"]
 
@@ -23,7 +24,7 @@ def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
     monkeypatch.setattr(demos, "collect", collect)
     few = dataclasses.replace(SMOKE.demos, max_steps=1)
     tried = dataclasses.replace(SMOKE, demos=few, out=str(tmp_path))
-    _, missing = demonstrations.plan(tried, stubs.make_env())
+    _, missing = demonstrations.plan(tried, stubs.make_env(), sharing.ALONE)
     with mistakes.of("demos.max_steps", 1) as caught:
         missing()
     assert "0 of 10" in caught.value.hint
@@ -39,7 +40,7 @@ def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, see
     monkeypatch.setattr(demos, "collect", lambda *a, **_: given.append(a) or found)
     asked = config.DemosConfig(per_trocar=3, seen_trocars=seen, max_steps=7, expert=expert)
     chosen = dataclasses.replace(SMOKE, demos=asked, seed=5, out=str(tmp_path))
-    demonstrations.plan(chosen, stubs.make_env())[1]()
+    demonstrations.plan(chosen, stubs.make_env(), sharing.ALONE)[1]()
     ((_, _, _, trocars, settings),) = given
     np.testing.assert_array_equal(trocars, [field[:seen, None] for field in rcm.TROCARS])
     wanted = {"per_trocar": 3, "seed": 5, "max_steps": 7, "expert": expert or "default"}
@@ -49,4 +50,6 @@ def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, see
 def test_an_expert_that_the_task_lacks_is_a_mistake(tmp_path):
     asked = dataclasses.replace(SMOKE.demos, expert="two_walls")
     with mistakes.of("demos.expert", "two_walls"):
-        demonstrations.plan(dataclasses.replace(SMOKE, demos=asked), stubs.make_env())
+        demonstrations.plan(
+            dataclasses.replace(SMOKE, demos=asked), stubs.make_env(), sharing.ALONE
+        )

@@ -17,6 +17,7 @@ from starjax import config, methods
 from starjax.data import normalizer
 from starjax.experiments import demonstrations, folders, pipeline, presets, scenes
 from starjax.policies import policy_file
+from starjax.rollouts import sharing
 from starjax.runtime import files, signals
 from starjax.training import loop
 
@@ -33,16 +34,16 @@ def done(monkeypatch):
     """Stages replaced by stubs that write down their names."""
     calls = []
 
-    def plan(settings, env):
+    def plan(settings, env, share):
         return pipeline.Path(settings.out) / "demos-a", lambda: calls.append("collect")
 
-    def train(settings, name, demos, env, encoder):
+    def train(settings, name, demos, env, encoder, share):
         demos()
         calls.append(f"train {name}")
 
     monkeypatch.setattr(pipeline, "_environment", lambda settings: None)
     monkeypatch.setattr(demonstrations, "plan", plan)
-    monkeypatch.setattr(demonstrations, "load", lambda _, root, collect, encoder: collect())
+    monkeypatch.setattr(demonstrations, "load", lambda _, root, collect, encoder, share: collect())
     monkeypatch.setattr(pipeline, "_train", train)
     monkeypatch.setattr(pipeline, "_evaluate", lambda c, name, *_: calls.append(f"score {name}"))
     monkeypatch.setattr(pipeline, "_report", lambda out, names: calls.append("report"))
@@ -106,7 +107,7 @@ def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
     state = types.SimpleNamespace(params=raw, ema_params=average, normalizer=stats)
     monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
     env = fakes.env()
-    pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None)
+    pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None, sharing.ALONE)
     kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
     np.testing.assert_array_equal(kept.params["w"], np.ones(3))
 
@@ -124,7 +125,9 @@ def test_a_stop_during_the_last_steps_ends_the_run_after_the_weights(tmp_path, m
     monkeypatch.setattr(loop, "run", last_steps)
     env = fakes.env()
     with pytest.raises(KeyboardInterrupt, match=r"stopped after training stardiff;.*same command"):
-        pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None)
+        pipeline._train(
+            smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None, sharing.ALONE
+        )
     signal.signal(number, before)
     assert folders.weights(tmp_path, "stardiff").exists()
 
@@ -191,7 +194,7 @@ def test_more_trials_than_asked_for_are_not_thrown_away(tmp_path):
     )
     many = files.read_json(folder / "result.json")
     with mistakes.of("eval.trials", preset.eval.trials) as told:
-        pipeline._evaluate(preset, "stardiff", stubs.make_env(), "demos-a", "")
+        pipeline._evaluate(preset, "stardiff", stubs.make_env(), "demos-a", "", sharing.ALONE)
     assert f"starjax evaluate {folder}" in told.value.hint
     assert files.read_json(folder / "result.json") == many
 
@@ -211,7 +214,7 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
         policy_under_test, "rollouts", lambda at, *_: found.extend(at.glob("*.npz"))
     )
     monkeypatch.setattr(policy_under_test, "write_result", lambda *_, **__: None)
-    pipeline._evaluate(preset, "stardiff_single", stubs.make_env(), "demos-a", "")
+    pipeline._evaluate(preset, "stardiff_single", stubs.make_env(), "demos-a", "", sharing.ALONE)
     assert found == [tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz"]
 
 
@@ -224,7 +227,7 @@ def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):
     state = types.SimpleNamespace(ema_params={"w": np.ones(3)}, normalizer=stats)
     monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
     settings, env = smoke(tmp_path, "stardiff"), stubs.make_env()
-    pipeline._train(settings, "stardiff", lambda: None, env, None)
+    pipeline._train(settings, "stardiff", lambda: None, env, None, sharing.ALONE)
     kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
     assert (kept.method, kept.preset, kept.demos) == ("stardiff", "smoke", settings.demos)
     assert (kept.policy, kept.train) == (settings.policy, settings.train)

@@ -4,7 +4,6 @@ import dataclasses
 import signal
 import sys
 import time
-import types
 from pathlib import Path
 
 import fakes
@@ -154,34 +153,40 @@ def processes_main(out: str, asks: int) -> None:
     save(Path(out) / f"found-{jax.process_index()}.npz", processes.own(result.state))
 
 
-def stopped_main(out: str, trains: bool) -> None:
-    """Is one process of several, as of `starjax train`, until it is told to stop."""
+def run_main(out: str, mode: str) -> None:
+    """Is one process of several of `starjax run`: `waits` before it, `trains` without an end until
+    it is told to stop, or does the `whole` of a run with a stub of the simulator."""
     import jax
+    import stubs
 
     from starjax import cli
-    from starjax.data import load, store
-    from starjax.experiments import other_processes
+    from starjax.experiments import demonstrations, pipeline, policy_under_test
+    from starjax.policies import policy as policies
     from starjax.runtime import processes
-    from starjax.runtime.signals import stop_signals
-    from starjax.training import loop
 
-    settings = dataclasses.replace(SETTINGS, steps=10**6, checkpoint_every=10**6)
-    loop.policies.make = lambda *_: _quadratic_policy()
-    store.is_sealed = lambda root: True
-    load.load = lambda root: types.SimpleNamespace(dataset=fakes.dataset(seed=0))
+    policies.make = lambda *_, **__: _quadratic_policy()
+    policies.for_sampling = lambda params, dtype: params
+    policy_under_test.decision_ms = lambda who: {"p50": 1.0, "p95": 1.0, "p99": 1.0}
+    training, stages = SETTINGS, ["collect", "train", "evaluate"]
+    if mode == "trains":
+        training = dataclasses.replace(SETTINGS, steps=10**6, checkpoint_every=10**6)
+        demonstrations.plan = lambda *_: (Path(out) / "demos", lambda: None)
+        demonstrations.load = lambda *_: fakes.dataset(seed=0)
+    pipeline._environment = lambda _: fakes.env() if mode == "trains" else stubs.make_env()
+    settings = config.RunConfig(
+        out=out,
+        policy=dataclasses.replace(fakes.TINY, execute=1),  # more are not planned
+        train=training,
+        demos=config.DemosConfig(per_trocar=2, seen_trocars=3, max_steps=100),
+        eval=config.EvalConfig(trials=2, time_limit_s=1.0),
+    )
 
     def command(argv) -> int:
         processes.join()
-        if not trains:
+        if mode == "waits":
             (Path(out) / f"waits-{jax.process_index()}").touch()
             time.sleep(60)
-        if not processes.is_first():
-            run = config.RunConfig(out=out, policy=fakes.TINY, train=settings)
-            other_processes.follow(run, ["stardiff"], Path(out), fakes.env())
-        for _ in range(3):  # as `pipeline`: the folder is held, nothing done, demonstrations there
-            processes.agree(0)
-        with stop_signals() as should_stop:
-            train(Path(out) / "stardiff", settings, should_stop=should_stop)
+        pipeline.run(settings, stages, "a test")
         return 0
 
     # Ignored where the tests were started in the background.
@@ -204,7 +209,7 @@ if __name__ == "__main__":
     runtime.prepare_xla()
     if sys.argv[1] == "process":
         processes_main(sys.argv[2], int(sys.argv[3]))
-    elif sys.argv[1] in ("trains", "waits"):
-        stopped_main(sys.argv[2], sys.argv[1] == "trains")
+    elif sys.argv[1] in ("trains", "waits", "whole"):
+        run_main(sys.argv[2], sys.argv[1])
     else:
         devices_main(int(sys.argv[1]), *sys.argv[2:])

@@ -14,6 +14,7 @@ from starjax.experiments import demonstrations, folders, pipeline, presets
 from starjax.methods import METHODS
 from starjax.policies import diffuser, policy_file
 from starjax.policies import policy as policies
+from starjax.rollouts import sharing
 from starjax.training import checkpoint, encoder, frozen, loop, state
 
 TRAIN = config.TrainConfig(
@@ -145,7 +146,9 @@ def run_config(settings, out):
 def train(source, seen, out, name):
     """What `starjax train` does after the features are there."""
     settings, found = source
-    pipeline._train(run_config(settings, out), name, lambda: seen, fakes.env(), found)
+    pipeline._train(
+        run_config(settings, out), name, lambda: seen, fakes.env(), found, sharing.ALONE
+    )
     return folders.weights(out, name)
 
 
@@ -217,11 +220,14 @@ def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, 
         blind = dataset.replace(observation=dataset.observation._replace(images=None))
         return load.Demos(blind, "digest", "device", 0, {"scene": {"cameras": ["camera"]}})
 
+    monkeypatch.setattr(load, "verify", lambda root: None)
     monkeypatch.setattr(load, "load", without_images)
     images = {"camera": np.asarray(dataset.observation.images["camera"])}
     monkeypatch.setattr(load, "frames", lambda root: images)
     settings, found = source
-    loaded = demonstrations.load(run_config(settings, tmp_path), tmp_path, lambda: None, found)
+    loaded = demonstrations.load(
+        run_config(settings, tmp_path), tmp_path, lambda: None, found, sharing.ALONE
+    )
     assert loaded.observation.images is None and windows.on_device(loaded)
     wanted = features(source, dataset, tmp_path / "other")
     np.testing.assert_array_equal(loaded.observation.features, wanted)

@@ -14,6 +14,8 @@ import pytest
 import several
 
 from starjax import config
+from starjax.data import store
+from starjax.evaluation import result
 from starjax.experiments import pipeline
 from starjax.runtime import processes
 from starjax.training import checkpoint, loop
@@ -52,6 +54,18 @@ def test_two_processes_are_one_run(tmp_path, monkeypatch):
     logs = [metrics.read(tmp_path / name / "metrics.jsonl") for name in ("run", "alone")]
     ours, theirs = ([(line["step"], line["kind"]) for line in log] for log in logs)
     assert ours == theirs  # the log of the first process alone
+
+
+def test_the_whole_of_a_run_is_done_together(tmp_path):
+    for said in (f"into {tmp_path / 'stardiff'}", "done before"):
+        started = start_two("whole", str(tmp_path))
+        found = several.finish(started)
+        assert [process.returncode for process in started] == [0, 0], found
+        assert said in found[0][0] and "[1/4]" not in found[1][0]  # the first one speaks
+    made = result.read(tmp_path / "stardiff/result.json")
+    assert len(made.trials) == 24 and made.scene.task == "reach"
+    assert made.dataset_digest and not list(tmp_path.rglob(".shared"))
+    assert len(store.keys(next(tmp_path.glob("demos-*")))) >= 6
 
 
 def stop_two(

@@ -75,6 +75,11 @@ def load(
     return Demos(dataset, sealed["digest"], place, total, description)
 
 
+def verify(root: Path) -> None:
+    """Checks every byte of the successful episodes; raises as `load`."""
+    _successful(Path(root), store.read_seal(Path(root)), verify=True)
+
+
 def frames(root: Path) -> "dict[str, Frames]":
     """The images of the successful episodes by camera, memory-mapped, in the order of `load`.
 

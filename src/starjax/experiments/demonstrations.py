@@ -4,6 +4,7 @@ What brings jax is imported where it is used, after XLA has been prepared.
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,11 @@ from starjax import errors
 from starjax.experiments import messages, stage_times
 
 
-def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], None]]:
-    """The folder of a run's demonstrations, and a function that collects what it lacks."""
+def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Callable[[], None]]:
+    """The folder of a run's demonstrations, and a function that collects what it lacks.
+
+    `share` is the run's: all processes collect together.
+    """
     from starjax.data import demos, schema, store
     from starjax.rollouts import agent, placement, trocars, waves
 
@@ -32,16 +36,23 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
     out = Path(config.out)
     root = out / f"demos-{store.digest(schema.describe(env, chosen, settings))}"
 
+    def is_there() -> bool:
+        if not store.is_sealed(root):
+            return False
+        try:
+            store.read_seal(root)
+        except ValueError as error:
+            messages.indented(f"damaged, collected again: {error}")
+            (root / "SEALED.json").unlink()
+            return False
+        return True
+
+    asked = itertools.count()
+
     def collect() -> None:
-        if store.is_sealed(root):
-            try:
-                store.read_seal(root)
-            except ValueError as error:
-                messages.indented(f"damaged, collected again: {error}")
-                (root / "SEALED.json").unlink()
-            else:
-                messages.stage("collect", f"done before, {root}")
-                return
+        if share.first(f"collected {next(asked)}", is_there):
+            messages.stage("collect", f"done before, {root}")
+            return
         messages.stage("collect", f"into {root}")
         place = placement.Place(devices=placement.devices())
         try:
@@ -64,21 +75,25 @@ def plan(config: config_lib.RunConfig, env: Any) -> tuple[Path, Callable[[], Non
 
 
 def load(
-    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], encoder: Any
+    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], encoder: Any, share: Any
 ) -> Any:
     """The dataset to train on, with what a frozen encoder sees instead of images."""
     from starjax.data import load as loading
     from starjax.data import store
 
+    def is_whole() -> bool:
+        try:
+            loading.verify(root)
+        except store.DamagedEpisode as error:
+            messages.indented(f"damaged, collected again: {error}")
+            (root / "SEALED.json").unlink()
+            return False
+        return True
+
     collect()
-    settings = {"images": encoder is None, "report": messages.indented}
-    try:
-        found = loading.load(root, **settings)
-    except store.DamagedEpisode as error:
-        messages.indented(f"damaged, collected again: {error}")
-        (root / "SEALED.json").unlink()
+    if not share.first("whole", is_whole):
         collect()
-        found = loading.load(root, **settings)
+    found = loading.load(root, verify=False, images=encoder is None, report=messages.indented)
     return found.dataset if encoder is None else _with_features(config, root, found, encoder)
 
 

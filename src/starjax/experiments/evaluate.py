@@ -39,38 +39,49 @@ def main(argv: Sequence[str]) -> int:
     guess = gpu.is_likely()
     asked = _asked(argv, guess)  # a mistake should not wait for jax
     xla.prepare_xla()
+    from starjax.runtime import processes
+
+    processes.join()
     xla.require_devices("starjax.experiments.policy_under_test")
     chosen, file, run, folder = asked if gpu.is_used() == guess else _asked(argv, not guess)
 
     from starjax.experiments import policy_under_test
+    from starjax.rollouts import sharing
 
     method, config = (run.name, folders.read_config(run)) if run else (None, None)
     who = policy_under_test.load(method, file) if method else policy_under_test.from_file(file)
     config = policy_under_test.settings(who, config) if config else _config(who.trained)
     config = dataclasses.replace(config, method=who.method, out=str(folder), eval=chosen.eval)
     about = messages.about(config, chosen.policy or chosen.run, chosen.seed)
-    with files.lock(folder):
-        before = _before(folder)
-        same = _identity(before) == (who.weights, chosen.seed, dataclasses.asdict(chosen.eval))
-        if chosen.out != options.AUTO:
-            _refuse_foreign(folder, before.get("weights", who.weights) == who.weights)
+    with sharing.shared(folder) as share, messages.heard(share.is_first):
+        same = share.first("same", lambda: _goes_on(folder, who.weights, chosen))
         print(f"{about}, into {folder}\n", flush=True)
         with stage_times.timed(folder, "evaluate", same or folders.is_under_way(folder)):
             table = policy_under_test.rollouts(
                 folder / "evaluation", who, who.env.task.trocars, chosen.eval, chosen.seed
             )
-        command = options.typed("evaluate", argv)
-        result = policy_under_test.write_result(
-            folder, who, table, config, chosen.seed, command, stage_times.read(folder)
-        )
-        print(f"\n{messages.outcome([result])}\n{_times(result)}\n")
-        if not same:
-            (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
-        if chosen.video:
-            print(_film(folder, who))
-    hint = f"starjax report {shlex.quote(str(folder))} draws tables and figures"
-    print(f"result: {folder / 'result.json'}; {hint}")
+        if share.is_first:
+            command = options.typed("evaluate", argv)
+            result = policy_under_test.write_result(
+                folder, who, table, config, chosen.seed, command, stage_times.read(folder)
+            )
+            print(f"\n{messages.outcome([result])}\n{_times(result)}\n")
+            if not same:
+                (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
+            if chosen.video:
+                print(_film(folder, who))
+            hint = f"starjax report {shlex.quote(str(folder))} draws tables and figures"
+            print(f"result: {folder / 'result.json'}; {hint}")
+        share.meet("over")
     return 0
+
+
+def _goes_on(folder: Path, weights: str, chosen: Options) -> bool:
+    """Whether the folder's result is of these weights and trials; refuses what it must not hold."""
+    before = _before(folder)
+    if chosen.out != options.AUTO:
+        _refuse_foreign(folder, before.get("weights", weights) == weights)
+    return _identity(before) == (weights, chosen.seed, dataclasses.asdict(chosen.eval))
 
 
 def _asked(argv: Sequence[str], has_gpu: bool) -> tuple[Options, Path, Path | None, Path]:

@@ -1,7 +1,9 @@
 """What a run tells its user: the plan, the stages, the outcome."""
 
+import contextlib
+import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +213,15 @@ def hint(run: Path, weights: str, does: str) -> str:
         scored = None
     typed = f"starjax report {shlex.quote(str(run))} {does} it"
     return typed if scored == weights else f"{typed} once starjax run has scored these weights"
+
+
+@contextlib.contextmanager
+def heard(is_first: bool) -> Iterator[None]:
+    """Keeps what is printed to the first process of several."""
+    with open(os.devnull, "w") as nowhere, contextlib.ExitStack() as changed:
+        if not is_first:
+            changed.enter_context(contextlib.redirect_stdout(nowhere))
+        yield
 
 
 def stage(name: str, text: str) -> None:

@@ -8,14 +8,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.experiments import (
-    demonstrations,
-    folders,
-    messages,
-    other_processes,
-    scenes,
-    stage_times,
-)
+from starjax.experiments import demonstrations, folders, messages, scenes, stage_times
 from starjax.runtime import files, xla
 from starjax.runtime.signals import stop_signals
 
@@ -41,6 +34,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
       command: what was typed, for the record.
     """
     start()
+    from starjax.rollouts import sharing
     from starjax.runtime import processes
     from starjax.training import devices
 
@@ -54,30 +48,28 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     untrained = any(not folders.weights(out, name).exists() for name in trained)
     encoder = demonstrations.frozen_encoder(config) if "train" in stages and untrained else None
     files.require_writable(out, LEAST_FREE_BYTES)
-    if not processes.is_first():
-        env = _environment(config)
-        root, _ = demonstrations.plan(config, env)
-        return other_processes.follow(config, trained if "train" in stages else [], root, env)
-    with files.lock(out):
-        processes.agree(0)
+    with sharing.shared(out) as share, messages.heard(share.is_first):
         print(messages.plan(config, stages), flush=True)
         env = _environment(config)
-        root, collect = demonstrations.plan(config, env)
-        if "train" in stages:
+        root, collect = demonstrations.plan(config, env, share)
+
+        def claim() -> None:
             for name in dict.fromkeys([*trained, *names]):
                 folders.claim(out / name, config, root.name, encoder and encoder.fingerprint)
+
         # Loaded once, and only if something is still to be trained with them.
-        demos = functools.cache(lambda: demonstrations.load(config, root, collect, encoder))
+        demos = functools.cache(lambda: demonstrations.load(config, root, collect, encoder, share))
         if "train" not in stages:
             collect()
         else:
+            share.first("claimed", claim)
             for name in trained:
-                _train(config, name, demos, env, encoder)
+                _train(config, name, demos, env, encoder, share)
         if "evaluate" in stages:
             for name in names:
-                _evaluate(config, name, env, root.name, command)
+                _evaluate(config, name, env, root.name, command, share)
         if "report" in stages:
-            _report(out, names)
+            share.first("reported", lambda: _report(out, names))
 
 
 def _environment(config: config_lib.RunConfig) -> Any:
@@ -95,7 +87,12 @@ def _environment(config: config_lib.RunConfig) -> Any:
 
 
 def _train(
-    config: config_lib.RunConfig, name: str, demos: Callable[[], Any], env: Any, encoder: Any
+    config: config_lib.RunConfig,
+    name: str,
+    demos: Callable[[], Any],
+    env: Any,
+    encoder: Any,
+    share: Any,
 ) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
     from starjax.policies import policy as policies
@@ -106,12 +103,10 @@ def _train(
     out = Path(config.out)
     folder = out / name
     weights = folders.weights(out, name)
-    (done,) = processes.agree(weights.exists())
-    if done:
+    if share.first(f"{name} was trained", weights.exists):
         messages.stage("train", f"{name}: done before, {weights}")
         return
     dataset = demos()
-    processes.agree(0)  # the others may read them
     messages.stage("train", f"{name}, into {folder}")
     begun = any((folder / "checkpoints").glob("step_*"))
     with stage_times.timed(out, f"train {name}", begun), stop_signals() as should_stop:
@@ -141,7 +136,7 @@ def _train(
         demos=config.demos,
         preset=config.preset,
     )
-    policy_file.save(weights, made)
+    share.first(f"{name} is saved", lambda: policy_file.save(weights, made))
     errors = ", ".join(f"{key} {value:.3g}" for key, value in result.holdout.items())
     messages.indented(f"{result.samples_per_second:.0f} samples/s; held-out {errors or 'none'}")
     # Asked during the last steps, whose loop looks no more. Several processes go on: the others
@@ -153,16 +148,44 @@ def _train(
         )
 
 
-def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, command: str) -> None:
+def _evaluate(
+    config: config_lib.RunConfig, name: str, env: Any, demos: str, command: str, share: Any
+) -> None:
     """Closed-loop trials of one method; `result.json` is its last file."""
     from starjax.experiments import policy_under_test
 
     out = Path(config.out)
     folder, weights = out / name, folders.weights(out, name)
-    found = _scored(folder, files.sha256(weights))
-    if found and _is_of(found, config):
+    if share.first(f"{name} was scored", lambda: _was_scored(config, folder, weights, env)):
         messages.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
         return
+    messages.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
+    share.first(f"{name} has its twin", lambda: folders.adopt_twin(out, name))
+    with stage_times.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
+        who = policy_under_test.load(name, weights, env)
+        table = policy_under_test.rollouts(
+            folder / "evaluation", who, env.task.trocars, config.eval, config.seed
+        )
+
+    def write() -> None:
+        timings = _timings(out, name, demos)
+        digest = folders.demos_digest(out / demos)
+        policy_under_test.write_result(
+            folder, who, table, config, config.seed, command, timings, dataset_digest=digest
+        )
+
+    share.first(f"{name} is scored", write)
+
+
+def _was_scored(config: config_lib.RunConfig, folder: Path, weights: Path, env: Any) -> bool:
+    """Whether a method's result is there.
+
+    Raises:
+      errors.UsageError: fewer trials would replace it.
+    """
+    found = _scored(folder, files.sha256(weights))
+    if found and _is_of(found, config):
+        return True
     count = len(env.task.is_seen)
     if found and (more := len(found.trials)) > count * config.eval.trials:
         raise errors.UsageError(
@@ -171,18 +194,7 @@ def _evaluate(config: config_lib.RunConfig, name: str, env: Any, demos: str, com
             config.eval.trials,
             f"starjax evaluate {shlex.quote(str(folder))} keeps them apart",
         )
-    messages.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
-    folders.adopt_twin(out, name)
-    with stage_times.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
-        who = policy_under_test.load(name, weights, env)
-        table = policy_under_test.rollouts(
-            folder / "evaluation", who, env.task.trocars, config.eval, config.seed
-        )
-    timings = _timings(out, name, demos)
-    digest = folders.demos_digest(out / demos)
-    policy_under_test.write_result(
-        folder, who, table, config, config.seed, command, timings, dataset_digest=digest
-    )
+    return False
 
 
 def _scored(folder: Path, weights: str) -> Any:

@@ -19,8 +19,13 @@ def timed(out: Path, stage: str, goes_on: bool = True) -> Iterator[None]:
     """Adds the seconds spent inside to `<out>/timings.json`, also after Ctrl-C.
 
     `stage` is all of them, `stage: compile` those in which jax compiled. Unless the work `goes_on`
-    from an earlier start, what that took does not count.
+    from an earlier start, what that took does not count. Of several processes, the first one does.
     """
+    from starjax.runtime import processes
+
+    if not processes.is_first():  # the first one's time is the run's
+        yield
+        return
     start, compiling = time.monotonic(), _CompileSeconds()
     names = (stage, f"{stage}: compile")
     before = read(out)

@@ -61,6 +61,9 @@ def main(argv: Sequence[str]) -> int:
         like_run = dataclasses.replace(chosen.eval, time_limit_s=_time_limit_s(run, config))
         chosen = dataclasses.replace(chosen, eval=like_run)
     xla.prepare_xla()
+    from starjax.runtime import processes
+
+    processes.join()
     xla.require_devices("starjax.experiments.policy_under_test")
     files.require_writable(run)
 
@@ -73,6 +76,8 @@ def main(argv: Sequence[str]) -> int:
     drawn = _trocars(chosen, task.arms)
     trials = config_lib.EvalConfig(**vars(chosen.eval))
     table = policy_under_test.rollouts(_folder(run, chosen), who, drawn, trials, chosen.seed)
+    if not processes.is_first():
+        return 0
     demos = policy_under_test.settings(who, config).demos
     seen = trocars.select(task.trocars, slice(demos.seen_trocars))
     figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)

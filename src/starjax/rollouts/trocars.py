@@ -3,18 +3,7 @@
 import numpy as np
 
 from starjax import errors, rcm
-from starjax.rcm.trocar import IS_SEEN, TROCARS, Trocar
-
-
-def twelve(arms: int = 1) -> Trocar:
-    """The twelve of section V-A2 for each arm, those of `rcm.IS_SEEN` first: fields `[12, A]`.
-
-    A further arm has them in another order, in which seen ones stay seen.
-    """
-    seen = np.flatnonzero(IS_SEEN)
-    unseen = np.flatnonzero(~IS_SEEN)
-    rows = np.stack([np.r_[np.roll(seen, -a), np.roll(unseen, -a)] for a in range(arms)], -1)
-    return Trocar(*(field[rows] for field in TROCARS))
+from starjax.rcm.trocar import Trocar
 
 
 def select(trocars: Trocar, rows: slice | np.ndarray) -> Trocar:
