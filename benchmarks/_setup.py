@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from starjax.sim.types import Observation
 
 from starjax import rcm
 from starjax.config import PolicyConfig, TrainConfig
@@ -16,23 +15,28 @@ from starjax.data import normalizer, windows
 from starjax.methods import METHODS
 from starjax.policies import features
 from starjax.policies import policy as policies
+from starjax.policies.learners.diffusion import DiffusionConfig
+from starjax.sim import registry
 from starjax.training import devices, state, step
 from starjax.training.sharding import Carried, Parts
-from starjax.types import Command, Pose
+from starjax.types import Command, Observation, Pose
 
-P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)
 METHOD = METHODS["stardiff"]
+TASK = registry.tasks.get("peg_transfer")
+SEEN = features.sensors(TASK)
 
 IMAGE = {96: 108, 224: 256}  # side of the stored picture for each crop
 SMALL = PolicyConfig(
     observation="state",
     encoder="small",
     vision_dim=128,
-    unet_channels=(64, 128, 256),
-    time_dim=64,
+    options=DiffusionConfig(unet_channels=(64, 128, 256), time_dim=64),
 )
 MINIATURE = dataclasses.replace(
-    SMALL, vision_dim=32, state_dim=32, unet_channels=(32, 64), time_dim=32
+    SMALL,
+    vision_dim=32,
+    state_dim=32,
+    options=DiffusionConfig(unet_channels=(32, 64), time_dim=32),
 )
 
 
@@ -46,7 +50,7 @@ class Case(NamedTuple):
     def crop(self) -> int:
         """Side of the crop in pixels, 0 without pictures."""
         sees = self.policy.observation == "image"
-        return features.crop_size(self.policy, self.train) if sees else 0
+        return features.crop_size(self.policy) if sees else 0
 
 
 class Job(NamedTuple):
@@ -78,8 +82,8 @@ class Job(NamedTuple):
 def paper(crop: int, batch: int = 256, dtype: str = "bfloat16") -> Case:
     """The paper's networks (ResNet-18, U-Net 256-512-1024-2048) on crops of this side."""
     size = IMAGE[crop]
-    policy_config = PolicyConfig(image_size=size, dtype=dtype)
-    return Case(policy_config, TrainConfig(batch_size=batch, crop_fraction=crop / size))
+    policy_config = PolicyConfig(image_size=size, crop_fraction=crop / size, dtype=dtype)
+    return Case(policy_config, TrainConfig(batch_size=batch))
 
 
 def small(batch: int, image_size: int = 0) -> Case:
@@ -89,8 +93,8 @@ def small(batch: int, image_size: int = 0) -> Case:
 
 def miniature(batch: int = 4, image_size: int = 54) -> Case:
     """To see in seconds that a benchmark runs."""
-    train_config = TrainConfig(batch_size=batch, crop_fraction=48 / 54)
-    return looking(Case(MINIATURE, train_config), image_size)
+    cropped = dataclasses.replace(MINIATURE, crop_fraction=48 / 54)
+    return looking(Case(cropped, TrainConfig(batch_size=batch)), image_size)
 
 
 def looking(case: Case, image_size: int) -> Case:
@@ -103,7 +107,7 @@ def looking(case: Case, image_size: int) -> Case:
 def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frames: int = 0) -> Job:
     """The case's training on the given devices (default: the first one)."""
     on = jax.devices()[:1] if on is None else on
-    policy = policies.make(METHOD, case.policy, P_WORLD_REF, case.train)
+    policy = policies.make(METHOD, case.policy, TASK, case.train)
     optimizer = state.make_optimizer(case.train)
     count = frames or (512 if on[0].platform == "cpu" else 4096)
     dataset = made_up(case.policy, count)
@@ -114,7 +118,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     first = state.create(policy, optimizer, drawn(policy, seed), stats, seed)
     mesh = devices.make_mesh(batch, on)
     like = jax.eval_shape(lambda x: x, first)
-    parts = Parts(mesh, case.policy.dtype, like)
+    parts = Parts(mesh, policy.rounded, like)
     settings = (policy, optimizer, case.policy, case.train, parts)
     looped = step.runs_in_a_loop(case.policy)
 
@@ -133,8 +137,8 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
 
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:
     """A policy, its first parameters as an evaluation holds them, and its statistics."""
-    policy = policies.make(METHOD, case.policy, P_WORLD_REF, case.train)
-    params = policies.for_sampling(drawn(policy), case.policy.dtype)
+    policy = policies.make(METHOD, case.policy, TASK, case.train)
+    params = policy.for_sampling(drawn(policy))
     return policy, params, statistics(case.policy)
 
 
@@ -146,7 +150,7 @@ def drawn(policy: policies.Policy, seed: int = 0) -> policies.Params:
 def statistics(policy_config: PolicyConfig) -> normalizer.Normalizer:
     """Of commands that are in [-1, 1] already."""
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
-    wide = normalizer.MinMax(-jnp.ones(features.TASK_STATE), jnp.ones(features.TASK_STATE))
+    wide = normalizer.MinMax(-jnp.ones(TASK.state_size), jnp.ones(TASK.state_size))
     return normalizer.Normalizer(box, wide if policy_config.observation == "state" else None)
 
 
@@ -156,19 +160,21 @@ def made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
 
     Made by numpy: no program is compiled for what a training reads from a disk.
     """
-    image = state = None
+    images = state = None
     if policy_config.observation == "image":
         size = (count, policy_config.image_size, policy_config.image_size, 3)
-        image = np.random.default_rng(0).integers(0, 256, size, np.uint8)
+        images = {"camera": np.random.default_rng(0).integers(0, 256, size, np.uint8)}
     else:
-        state = np.full((count, features.TASK_STATE), 0.5, np.float32)
-    down = np.tile(np.diag([1.0, -1.0, -1.0]).astype(np.float32), (count, 1, 1))
-    pose = Pose(down, np.full((count, 3), 0.02, np.float32))
-    gripper = np.ones(count, np.float32)
+        state = np.full((count, TASK.state_size), 0.5, np.float32)
+    down = np.tile(np.diag([1.0, -1.0, -1.0]).astype(np.float32), (count, 1, 1, 1))
+    pose = Pose(down, np.full((count, 1, 3), 0.02, np.float32))
+    gripper = np.ones((count, 1), np.float32)
+    trocar = rcm.Trocar(*(np.asarray(leaf)[:1, None] for leaf in rcm.TROCARS))
+    told = rcm.trocar_frame(trocar, np.array([slot.p_world_ref for slot in TASK.slots], np.float32))
     dataset = windows.Dataset(
-        observation=Observation(pose, gripper, image, state),
+        observation=Observation(pose, gripper, images, state),
         command=Command(pose, gripper),
-        trocar=jax.tree.map(lambda leaf: np.asarray(leaf)[:1], rcm.TROCARS),
+        trocar=jax.tree.map(np.asarray, told),
         episode=np.zeros(count, np.int32),
         start=np.zeros(1, np.int32),
         length=np.full(1, count, np.int32),

@@ -21,13 +21,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import methods, runtime
+from starjax import config, methods, runtime
 from starjax.data import load, windows
 from starjax.models import diffusion
 from starjax.models.kernels import parallel_ddim
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
-from starjax.sim import env as envs
+from starjax.sim import registry
 from starjax.types import Command
 
 FRAMES = 128
@@ -47,15 +47,14 @@ def main() -> None:
     trained = policy_file.load(packaged.locate(asked.policy))
     given = {"temperature": asked.temperature, "ddim_steps": asked.ddim_steps}
     changed = {name: value for name, value in given.items() if value is not None}
-    trained = trained._replace(policy=dataclasses.replace(trained.policy, **changed))
+    trained = trained._replace(policy=config.with_options(trained.policy, **changed))
     found = load.load(asked.demos)
     frames = np.linspace(0, len(found.dataset.episode) - 1, FRAMES).astype(int)
     batch = windows.gather(
         found.dataset, jnp.asarray(frames), trained.policy.obs_horizon, trained.policy.horizon
     )
-    port = envs.make(trained.policy.observation, trained.policy.image_size).p_world_ref
-    plan = functools.partial(planned, trained, port, batch)
-    steps, temperature = trained.policy.ddim_steps, trained.policy.temperature
+    plan = functools.partial(planned, trained, batch)
+    steps, temperature = trained.policy.options.ddim_steps, trained.policy.options.temperature
     used = parallel_ddim.evaluations_for(steps)
     wanted = plan("float32", diffusion.ddim_sample)
     ways = {"rounded to bfloat16": ("bfloat16", diffusion.ddim_sample)}
@@ -73,14 +72,15 @@ def main() -> None:
 
 def planned(
     trained: policy_file.Trained,
-    port: np.ndarray,
     batch: windows.Batch,
     dtype: str,
     ddim_sample: Callable,
 ) -> Command:
     """Commands `[FRAMES, H]` with this way to sample."""
     settings = dataclasses.replace(trained.policy, dtype=dtype)
-    policy = policies.make(methods.METHODS[trained.method], settings, port, trained.train)
+    task = registry.tasks.get(trained.scene.task)
+    row = methods.METHODS[trained.method]
+    policy = policies.make(row, settings, task, cameras=trained.scene.cameras)
     keys = jax.random.split(jax.random.key(1), FRAMES)
     given = (trained.params, trained.normalizer, keys, batch.observation, batch.trocar)
     # what a policy takes for so many robots

@@ -10,7 +10,6 @@ on the same cores.
 """
 
 import argparse
-import dataclasses
 
 import _arithmetic
 import _machine
@@ -21,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import runtime
+from starjax import config, runtime
 from starjax.evaluation import latency
 from starjax.experiments import bench
 from starjax.models import roll_net
@@ -74,7 +73,7 @@ def main() -> None:
         _timing.report("inference", {**facts, "results": {name: row}}, asked.tiny)
 
     for name, (case, batch, steps) in cases.items():
-        case = case._replace(policy=dataclasses.replace(case.policy, ddim_steps=steps))
+        case = case._replace(policy=config.with_options(case.policy, ddim_steps=steps))
         row = measure(case, batch, rates[case.policy.dtype], asked.seconds)
         row |= _peer.compared(peers.get(name, {}), row["p50"])
         speed = row.get("times_peer_speed", row.get("times_numpy_speed", float("nan")))
@@ -102,16 +101,17 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
         case.policy,
         params,
         stats,
-        _setup.P_WORLD_REF,
+        _setup.SEEN,
         batch=batch,
         calls=200,
         seconds=seconds,
     )
-    observation, trocar = latency.example(case.policy, _setup.P_WORLD_REF, batch)
-    traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, trocar)
+    observation, trocar = latency.example(case.policy, _setup.SEEN, batch)
+    told = latency.told(_setup.SEEN, trocar)
+    traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, told)
     work = _arithmetic.operations(policy.sample, *traced)
     sequences = batch
-    steps = evaluations = case.policy.ddim_steps
+    steps = evaluations = case.policy.options.ddim_steps
     if parallel_ddim.pays(batch, steps):
         sequences, evaluations = batch * steps, parallel_ddim.evaluations_for(steps)
     work -= sequences * evaluations * _arithmetic.of_padding(case.policy)
@@ -120,7 +120,7 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
     floor = max(arithmetic_s, reading_s)
     row = {
         "batch": batch,
-        "ddim_steps": case.policy.ddim_steps,
+        "ddim_steps": case.policy.options.ddim_steps,
         "evaluations": evaluations,
         **times,
         "floor_ms": 1e3 * floor,
@@ -178,7 +178,10 @@ def roll_network(policy_config, batch: int) -> dict:
         return jax.lax.fori_loop(0, CHAIN, one, history)
 
     within = _timing.time_jitted(chain, params, history).median_s / CHAIN
-    return {"in_a_program_ms": 1e3 * within, **latency.roll_ms(policy_config, batch=batch)}
+    return {
+        "in_a_program_ms": 1e3 * within,
+        **latency.roll_ms(policy_config, _setup.SEEN, batch=batch),
+    }
 
 
 if __name__ == "__main__":

@@ -103,7 +103,7 @@ def child(asked: argparse.Namespace) -> None:
                 case.policy,
                 case.train,
                 dataset,
-                _setup.P_WORLD_REF,
+                _setup.TASK,
                 folder,
                 seed=0,
                 should_stop=should_stop,

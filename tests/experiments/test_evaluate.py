@@ -40,7 +40,7 @@ def file(tmp_path, monkeypatch):
         method="dp_rcm2",
         policy=POLICY,
         train=config.TrainConfig(steps=77),
-        params={"unet": {"kernel": jnp.ones(3)}},
+        params={"learner": {"unet": {"kernel": jnp.ones(3)}}},
         normalizer=normalizer.Normalizer(box, None),
         demos=config.DemosConfig(per_trocar=2, seen_trocars=4),
         preset="smoke",
@@ -103,7 +103,7 @@ def test_how_many_trials_jax_decides_not_the_system(file, monkeypatch, guess, us
 def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
     score("--out", "here")
     made = policy_file.load(file)
-    policy_file.save(file, made._replace(policy=dataclasses.replace(POLICY, **change)))
+    policy_file.save(file, made._replace(policy=config.with_options(POLICY, **change)))
     with mistakes.of("--out", "here"):
         score("--out", "here")
     (file.parent / "here" / "result.json").unlink()

@@ -1,6 +1,5 @@
 """How long a policy takes to answer: the rows of Table IV."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from starjax import config, methods, rcm
 from starjax.models import roll_net
-from starjax.policies import diffuser, features
+from starjax.policies import features, generator
 from starjax.policies import policy as policies
 from starjax.sim.tasks.base import Field
 from starjax.types import Observation
@@ -49,7 +48,7 @@ def policy_ms(
 
     @jax.jit
     def sample(params, stats, keys, observation, trocar):
-        return policy.sample(params, stats, keys, observation, _told(seen, trocar))
+        return policy.sample(params, stats, keys, observation, told(seen, trocar))
 
     keys = jax.random.split(jax.random.key(0), batch)
     # Weights on the host would be copied again at each call.
@@ -68,9 +67,12 @@ def table(
     calls: int = 100,
     seconds: float = 10.0,
 ) -> Iterator[dict[str, float]]:
-    """Rows {ddim_steps, p50, p95, p99, n} of one method at batch 1, times in ms, as they come."""
+    """Rows {ddim_steps, p50, p95, p99, n} of one method at batch 1, times in ms, as they come.
+
+    Its learner must have the option `ddim_steps`.
+    """
     for steps in ddim_steps:
-        changed = dataclasses.replace(policy_config, ddim_steps=steps)
+        changed = config.with_options(policy_config, ddim_steps=steps)
         policy = policies.make(method, changed, seen.task, cameras=seen.cameras)
         given = (policy, changed, params, stats, seen)
         yield {"ddim_steps": steps, **policy_ms(*given, calls=calls, seconds=seconds)}
@@ -97,7 +99,7 @@ def roll_ms(
         jnp.zeros((batch, policy_config.obs_horizon)),
     ]
     if policy_config.roll_observation:
-        inputs.append(jnp.zeros((batch, diffuser.observed_dim(policy_config, len(seen.cameras)))))
+        inputs.append(jnp.zeros((batch, generator.sizes(policy_config, seen, action=4).observed)))
     params = net.init(jax.random.key(0), *inputs)
     apply = jax.jit(net.apply)
     return _percentiles(lambda: apply(params, *inputs), calls, seconds)
@@ -110,7 +112,7 @@ def example(
     trocar = rcm.sample_trocar(jax.random.key(1), (batch, seen.task.arms))
     shape = (batch, policy_config.obs_horizon)
     action = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 0.02]), (*shape, seen.task.arms, 4))
-    frame = features.per_step(_told(seen, trocar))
+    frame = features.per_step(told(seen, trocar))
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, frame)
     observation = Observation(pose, jnp.ones((*shape, seen.task.arms)))
     if policy_config.observation == "state":
@@ -125,7 +127,7 @@ def example(
     return observation._replace(images=images), trocar
 
 
-def _told(seen: features.Sensors, trocar: rcm.Trocar) -> rcm.TrocarFrame:
+def told(seen: features.Sensors, trocar: rcm.Trocar) -> rcm.TrocarFrame:
     """Trocars `[B, A]` about the nominal ones of the task's arms."""
     slots = seen.task.slots
     p_world_ref = np.array([slot.p_world_ref for slot in slots], np.float32)

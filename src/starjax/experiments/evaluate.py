@@ -149,9 +149,9 @@ def _config(trained: Any) -> config_lib.RunConfig:
     known = {
         "method": trained.method,
         "preset": trained.preset or "auto",
-        "policy": dataclasses.asdict(trained.policy),
-        "train": dataclasses.asdict(trained.train),
-        "demos": dataclasses.asdict(trained.demos or config_lib.DemosConfig()),
+        "policy": config_lib.as_json(trained.policy),
+        "train": config_lib.as_json(trained.train),
+        "demos": config_lib.as_json(trained.demos or config_lib.DemosConfig()),
     }
     scene = trained.scene
     known["scene"] = {

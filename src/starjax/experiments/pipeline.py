@@ -89,7 +89,6 @@ def _train(
     config: config_lib.RunConfig, name: str, demos: Callable[[], Any], env: Any, encoder: Any
 ) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
-    from starjax.policies import policy as policies
     from starjax.policies import policy_file
     from starjax.training import loop, processes
 
@@ -123,7 +122,7 @@ def _train(
         method=name,
         policy=config.policy,
         train=config.train,
-        params=policies.with_vision(params, encoder.params) if encoder else params,
+        params={**params, "vision": encoder.params} if encoder else params,
         normalizer=state.normalizer,
         scene=env.names,
         p_world_ref=tuple(map(tuple, env.p_world_ref)),

@@ -2,15 +2,30 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Literal
 
-from starjax import cli
+from starjax import cli, errors
 from starjax import config as config_lib
 from starjax.experiments import checks, options, presets
+from starjax.learners import LEARNERS
 from starjax.runtime import gpu
 
 DESCRIPTION = """Collects demonstrations, trains, evaluates and writes the report.
 
 The same command again goes on from what is saved. Values below are those of the chosen preset."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Learning:
+    learner: str = ""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _First:
+    """What the other flags and their defaults depend on."""
+
+    preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"
+    policy: _Learning = _Learning()
 
 
 def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.RunConfig:
@@ -20,7 +35,7 @@ def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.Run
     """
     guess = gpu.is_likely()
     config = _settings(argv, prog, description, guess)
-    if options.peek(config_lib.RunConfig, argv, config_lib.RunConfig()).preset != "auto":
+    if options.peek(_First, argv, _First()).preset != "auto":
         return config
     from starjax.experiments import pipeline
 
@@ -51,8 +66,12 @@ def _settings(
 
 def _default(argv: Sequence[str], has_gpu: bool) -> config_lib.RunConfig:
     """Values of what is not typed: the preset's, without its encoder where nothing is seen."""
-    start = config_lib.RunConfig()
-    default = presets.resolve(options.peek(config_lib.RunConfig, argv, start).preset, has_gpu)
+    first = options.peek(_First, argv, _First())
+    default = presets.resolve(first.preset, has_gpu)
+    if first.policy.learner:
+        errors.choice("policy.learner", first.policy.learner, LEARNERS.names())
+        learning = config_lib.with_learner(default.policy, first.policy.learner)
+        default = dataclasses.replace(default, policy=learning)
     policy = options.peek(config_lib.RunConfig, argv, default).policy
     if policy.observation == "state":
         blind = dataclasses.replace(default.policy, encoder_weights="", freeze_encoder=False)
@@ -61,10 +80,12 @@ def _default(argv: Sequence[str], has_gpu: bool) -> config_lib.RunConfig:
 
 
 def _folder(config: config_lib.RunConfig) -> str:
-    """Folder of a run that names none: other observations, encoders frozen or not, and seeds have
-    one each; trainings of one method that differ in anything else meet in it, and are refused."""
+    """Folder of a run that names none: other learners, observations, encoders frozen or not, and
+    seeds have one each; trainings of one method that differ otherwise meet in it, and are refused.
+    """
     policy, usual = config.policy, presets.PRESETS[config.preset]
     parts = [usual.preset]
+    parts += [policy.learner] if policy.learner != usual.policy.learner else []
     parts += [policy.observation] if policy.observation != usual.policy.observation else []
     sees, freezes = policy.observation == "image", policy.freeze_encoder
     if sees and freezes != usual.policy.freeze_encoder:
