@@ -21,9 +21,9 @@ from starjax.training import devices, state, step
 from starjax.training.sharding import Carried, Parts
 from starjax.types import Command, Observation, Pose
 
-METHOD = METHODS["stardiff"]
 TASK = registry.tasks.get("peg_transfer")
-SEEN = features.sensors(TASK)
+P_WORLD_REF = np.array([slot.p_world_ref for slot in TASK.slots], np.float32)
+METHOD = METHODS["stardiff"]
 
 IMAGE = {96: 108, 224: 256}  # side of the stored picture for each crop
 SMALL = PolicyConfig(
@@ -93,8 +93,8 @@ def small(batch: int, image_size: int = 0) -> Case:
 
 def miniature(batch: int = 4, image_size: int = 54) -> Case:
     """To see in seconds that a benchmark runs."""
-    cropped = dataclasses.replace(MINIATURE, crop_fraction=48 / 54)
-    return looking(Case(cropped, TrainConfig(batch_size=batch)), image_size)
+    policy_config = dataclasses.replace(MINIATURE, crop_fraction=48 / 54)
+    return looking(Case(policy_config, TrainConfig(batch_size=batch)), image_size)
 
 
 def looking(case: Case, image_size: int) -> Case:
@@ -163,18 +163,19 @@ def made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
     images = state = None
     if policy_config.observation == "image":
         size = (count, policy_config.image_size, policy_config.image_size, 3)
-        images = {"camera": np.random.default_rng(0).integers(0, 256, size, np.uint8)}
+        images = {TASK.cameras[0]: np.random.default_rng(0).integers(0, 256, size, np.uint8)}
     else:
         state = np.full((count, TASK.state_size), 0.5, np.float32)
     down = np.tile(np.diag([1.0, -1.0, -1.0]).astype(np.float32), (count, 1, 1, 1))
     pose = Pose(down, np.full((count, 1, 3), 0.02, np.float32))
     gripper = np.ones((count, 1), np.float32)
-    trocar = rcm.Trocar(*(np.asarray(leaf)[:1, None] for leaf in rcm.TROCARS))
-    told = rcm.trocar_frame(trocar, np.array([slot.p_world_ref for slot in TASK.slots], np.float32))
     dataset = windows.Dataset(
         observation=Observation(pose, gripper, images, state),
         command=Command(pose, gripper),
-        trocar=jax.tree.map(np.asarray, told),
+        trocar=jax.tree.map(
+            np.asarray,
+            rcm.trocar_frame(jax.tree.map(lambda leaf: leaf[:1], TASK.trocars), P_WORLD_REF),
+        ),
         episode=np.zeros(count, np.int32),
         start=np.zeros(1, np.int32),
         length=np.full(1, count, np.int32),

@@ -1,38 +1,69 @@
 """States in which physics is at work: those of the scripted expert's episodes."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
+import _c_mujoco
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import rcm
 from starjax.sim import env as envs
-from starjax.sim import physics
+from starjax.sim import physics, solver
 from starjax.sim.engine import mjx
-from starjax.sim.scene import SimModel
-from starjax.sim.tasks.peg_transfer import expert
+from starjax.sim.scene import Scene
+from starjax.types import Agent
 
 STEPS = 240  # control steps an episode, 8 s, so most states hold contacts
 CPU_LANES = 16  # of a program that has a CPU to itself: enough to share its operations out
 
+Step = Callable[[mjx.Model, mjx.Data], mjx.Data]
 
-def states(env: envs.Env, episodes: int) -> tuple[physics.PhysicsState, np.ndarray]:
-    """States `[N]`, N = 240 x episodes, and the servos' targets `[N, 7]` there: the jaws close."""
-    index = jnp.arange(episodes)
-    trocars = jax.tree.map(lambda field: jnp.asarray(field)[index % 12], rcm.TROCARS)
+
+class Moment(NamedTuple):
+    """All that one physics step depends on.
+
+    Attributes:
+      state: positions, velocities, warm start.
+      ctrl: `[nu]` the servos' targets.
+      p_world_trocar: `[A, 3]` m.
+    """
+
+    state: physics.PhysicsState
+    ctrl: jax.Array
+    p_world_trocar: jax.Array
+
+
+def at_rest(scene: Scene) -> Moment:
+    """Arms at home, the task's objects where an episode begins, trocars at the nominal places."""
+    p_world_trocar = jnp.asarray(scene.p_world_ref)
+    return Moment(_c_mujoco.at_rest(scene), _c_mujoco.home(scene), p_world_trocar)
+
+
+def expert(env: envs.Env) -> Agent:
+    """The task's first scripted expert."""
+    return next(iter(env.task.experts.values()))()
+
+
+def moments(env: envs.Env, episodes: int) -> Moment:
+    """Moments `[N]`, N = 240 x episodes, at the task's trocars in turn; the jaws close."""
+    agent, count = expert(env), len(env.task.trocars.radius)
+    index = jnp.arange(episodes) % count
+    trocars = jax.tree.map(lambda field: jnp.asarray(field)[index], env.task.trocars)
 
     def episode(inputs):
         key, trocar = inputs
         state = env.reset(key, envs.EnvParams(trocar))
 
         def act(carry, _):
-            state, script = carry
-            command, script = expert.act(script, state)
+            state, memory = carry
+            command, memory, _ = agent.act(memory, state)
             after = env.step(state, command)
-            return (after, script), (state.sim, jnp.append(after.q_target, physics.JAW_CLOSED))
+            ctrl = _c_mujoco.servos(env.scene, after.q_target, "closed")
+            moment = Moment(state.physics, ctrl, state.trocar.p_world_trocar)
+            return (after, memory), moment
 
-        return jax.lax.scan(act, (state, expert.init(key, state)), None, length=STEPS)[1]
+        return jax.lax.scan(act, (state, agent.init(key, state)), None, length=STEPS)[1]
 
     keys = jax.random.split(jax.random.key(11), episodes)
     batch = CPU_LANES if jax.default_backend() == "cpu" else episodes
@@ -40,15 +71,25 @@ def states(env: envs.Env, episodes: int) -> tuple[physics.PhysicsState, np.ndarr
     return jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), found)
 
 
-def stepper(sim: SimModel, step: Callable[[mjx.Model, mjx.Data], mjx.Data], model: mjx.Model):
-    """`(PhysicsState, ctrl [7]) -> PhysicsState` after one `step` of `model`, single-sample."""
+def starjax_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """One step with our contact solver."""
+    return solver.step(model, data)[0]
 
-    def one(state: physics.PhysicsState, ctrl: jax.Array) -> physics.PhysicsState:
-        data = sim.mjx_data.replace(
-            qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl
+
+def stepper(scene: Scene, step: Step) -> Callable[[Moment], Moment]:
+    """One `step` of the scene's model, single-sample; targets and trocars stay."""
+
+    def one(now: Moment) -> Moment:
+        state = now.state
+        data = scene.mjx_data.replace(
+            qpos=state.qpos,
+            qvel=state.qvel,
+            qacc_warmstart=state.qacc_warmstart,
+            ctrl=now.ctrl,
+            mocap_pos=scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(now.p_world_trocar),
         )
         with jax.default_matmul_precision("highest"):  # as in `sim.env`
-            data = step(model, data)
-        return physics.PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+            data = step(scene.mjx_model, data)
+        return now._replace(state=physics.PhysicsState(data.qpos, data.qvel, data.qacc_warmstart))
 
     return one

@@ -19,13 +19,13 @@ from unittest import mock
 import _c_mujoco
 import _peer
 import _timing
+import _visited
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.data import demos, store
-from starjax.rollouts import cores, episodes, recording
+from starjax.data import demos, schema, store
+from starjax.rollouts import agent, cores, engine, episodes, fetching, placement, trocars
 from starjax.sim import env as envs
-from starjax.sim.tasks.peg_transfer import expert
 
 SEEN = 8
 MAX_STEPS = 600
@@ -44,20 +44,21 @@ def main() -> None:
     runtime.prepare_xla()
     if asked.tiny:
         asked.image, asked.per_trocar, asked.chunk = 16, 1, SEEN
-    env = envs.make("image", asked.image)
-    trocars = rcm.Trocar(*(np.asarray(field[:SEEN], np.float32) for field in rcm.TROCARS))
-    simulate = recording.simulator(env, expert, trocars, 0, MAX_STEPS, asked.chunk, None)
+    env = envs.make(image_size=asked.image)
+    expert, chosen = agent.from_single(_visited.expert(env)), seen(env)
+    rules = engine.Settings(0, schema.STREAM, MAX_STEPS, asked.chunk)
+    simulate = engine.make(env, expert, chosen, rules, episodes.DEMONSTRATION)
     group = [(lane % SEEN, lane // SEEN) for lane in range(asked.chunk)]
-    first_s, again_s = (_timing.time_once(lambda: next(simulate(group))) for _ in range(2))
+    first_s, again_s = (_timing.time_once(lambda: next(simulate(None, group))) for _ in range(2))
     with tempfile.TemporaryDirectory(dir=asked.folder) as folder:
         root = pathlib.Path(folder) / "demos"
-        spent = collect(root, simulate, env, trocars, asked)
+        spent = collect(root, simulate, env, expert, asked)
         plain_rate = plain_write(pathlib.Path(folder) / "plain", 1 << 24 if asked.tiny else 0)
         records = [store.verify(root, key, arrays=False) for key in store.keys(root)]
     frames = sum(record["length"] for record in records)
     stored = sum(file["bytes"] for r in records for file in r["files"].values())
-    substeps = round(1 / env.control_hz / env.model.mj_model.opt.timestep)
-    c_s = frames * substeps / _c_mujoco.steps_per_s(env.model)
+    substeps = round(1 / env.control_hz / env.scene.mj_model.opt.timestep)
+    c_s = frames * substeps / _c_mujoco.steps_per_s(env.scene)
     row = {
         "demonstrations": sum(record["success"] for record in records),
         "trials": len(records),
@@ -81,25 +82,36 @@ def main() -> None:
     _timing.report("collect", {"results": {f"{asked.image} px": row}}, asked.tiny)
 
 
-def collect(root: pathlib.Path, simulate, env, trocars, asked) -> dict:
+def seen(env: envs.Env) -> rcm.Trocar:
+    """The configurations of trocars that demonstrations are collected at."""
+    return trocars.select(env.task.trocars, slice(SEEN))
+
+
+def collect(
+    root: pathlib.Path,
+    simulate: engine.Run,
+    env: envs.Env,
+    expert: agent.BatchAgent,
+    asked: argparse.Namespace,
+) -> dict:
     """Collects with programs that are compiled; how long it took, and for what it waited."""
     begun, segments, fetches = [], [], []  # s; appended to by all threads
-    fetch, chunks = episodes.fetch, []
+    fetch, chunks = fetching.fetch, []
 
     def begin(*_):
         begun.append(time.perf_counter())
         return timed_simulate
 
-    def timed_simulate(group):
+    def timed_simulate(params, group):
         chunks.append(len(group))
-        simulation = simulate(group)
+        simulation = simulate(params, group)
         while True:
             start = time.perf_counter()
-            finished = next(simulation, None)
+            segment = next(simulation, None)
             segments.append(time.perf_counter() - start)
-            if finished is None:
+            if segment is None:
                 return
-            yield finished
+            yield segment
 
     def timed_fetch(slices):
         start = time.perf_counter()
@@ -107,12 +119,13 @@ def collect(root: pathlib.Path, simulate, env, trocars, asked) -> dict:
         fetches.append(time.perf_counter() - start)
         return fetched
 
-    wanted = {"per_trocar": asked.per_trocar, "seed": 0, "max_steps": MAX_STEPS}
+    settings = schema.Settings(asked.per_trocar, seed=0, max_steps=MAX_STEPS)
+    place = placement.Place(asked.chunk)
     with (
-        mock.patch.object(recording, "simulator", begin),
-        mock.patch.object(episodes, "fetch", timed_fetch),
+        mock.patch.object(engine, "make", begin),
+        mock.patch.object(fetching, "fetch", timed_fetch),
     ):
-        demos.collect(root, env, expert, trocars, chunk=asked.chunk, **wanted)
+        demos.collect(root, env, expert, seen(env), settings, place=place)
     run_s = time.perf_counter() - begun[0]
     simulated, copied = (sum(spent) / cores.count() for spent in (segments, fetches))
     return {

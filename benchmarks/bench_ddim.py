@@ -5,7 +5,7 @@
         [--ddim-steps 100]
 
 A policy plans at frames of demonstrations that it did not learn from, each way with the same noise;
-beside it, what calculating in bfloat16 in the place of float32 moves, step after step and side by
+beside it, what calculating in bfloat16 instead of float32 moves, step after step and side by
 side. No time is measured here: bench_inference.py does that.
 """
 
@@ -76,11 +76,10 @@ def planned(
     dtype: str,
     ddim_sample: Callable,
 ) -> Command:
-    """Commands `[FRAMES, H]` with this way to sample."""
+    """Commands `[FRAMES, H, A]` with this way to sample."""
     settings = dataclasses.replace(trained.policy, dtype=dtype)
-    task = registry.tasks.get(trained.scene.task)
-    row = methods.METHODS[trained.method]
-    policy = policies.make(row, settings, task, cameras=trained.scene.cameras)
+    method, task = methods.METHODS[trained.method], registry.tasks.get(trained.scene.task)
+    policy = policies.make(method, settings, task, trained.train, trained.scene.cameras)
     keys = jax.random.split(jax.random.key(1), FRAMES)
     given = (trained.params, trained.normalizer, keys, batch.observation, batch.trocar)
     # what a policy takes for so many robots

@@ -5,7 +5,7 @@
 Without `--policy` an untrained policy is run: nothing ends early, so this is the worst case. With
 one, a trial ends when the block stands on its peg, and what is compared ends there too. The
 programs are those of `starjax evaluate`, on as many trials at once, a CPU's cores side by side;
-compiling them is timed apart, by a call in which no trial is wanted. Beside it: what C MuJoCo on
+compiling them is timed apart, by a trial that is over before it begins. Beside it: what C MuJoCo on
 one thread would need for the physics steps alone, and, as the floor, the sum of the parts timed one
 by one in this process (on a CPU each has all cores, so less is possible).
 """
@@ -27,8 +27,8 @@ import numpy as np
 from starjax import rcm, runtime
 from starjax.evaluation import evaluate, latency
 from starjax.experiments import policy_under_test
-from starjax.policies import packaged
-from starjax.rollouts import cores, engine
+from starjax.policies import features, packaged
+from starjax.rollouts import agent, cores, engine, episodes
 from starjax.sim import env as envs
 from starjax.types import Command
 
@@ -46,40 +46,37 @@ def main() -> None:
     runtime.prepare_xla()
     if asked.tiny:
         asked.trials, asked.limit, asked.lanes = 1, 0.5, 4
-    policy, params, stats, settings = subject(asked)
+    env, policy, params, stats, settings = subject(asked)
     subject_name = pathlib.Path(asked.policy).stem if asked.policy else "untrained"
-    env = envs.make(settings.observation, settings.image_size)
     steps = math.ceil(asked.limit * env.control_hz)
-    lanes = asked.lanes or evaluate.lanes_per_device(
-        jax.devices()[0], len(rcm.IS_SEEN) * asked.trials
-    )
-    rules = engine.Settings(settings.obs_horizon, settings.execute, steps)
-    run = engine.make(env, policy, rules, seed=0)
-    chunks = trials_in_chunks(asked.trials, lanes)
+    trials = listed(env, asked.trials)
+    lanes = asked.lanes or evaluate.lanes_per_device(jax.devices()[0], len(trials))
+    run = runner(env, policy, settings, steps, lanes)
+    chunks = [trials[first : first + lanes] for first in range(0, len(trials), lanes)]
 
-    def simulate(trials: engine.Trials) -> Generator[np.ndarray]:
-        for _, done in run(params, stats, trials):
-            yield np.zeros(0, int) if done is None else done.length[trials.wanted]
+    def simulate(group: list[episodes.Trial]) -> Generator[np.ndarray]:
+        found = []
+        for segment in run((params, stats), group):
+            found += [episode.outcome["length"] for episode in segment.ended]
+            yield np.array(found if segment.passed == 1.0 else [], int)
 
-    start = time.perf_counter()
-    list(simulate(chunks[0]._replace(wanted=np.zeros(lanes, bool))))
-    compile_s = time.perf_counter() - start
+    compile_s = _timing.time_once(lambda: list(run((params, stats), over_at_once(env))))
     start = time.perf_counter()
     lengths = [found for found in cores.run(chunks, simulate, cores.count()) if len(found)]
     run_s = time.perf_counter() - start
 
     control_steps = int(sum(found.sum() for found in lengths))
-    substeps = round(1 / env.control_hz / env.model.mj_model.opt.timestep)
-    c_s = control_steps * substeps / _c_mujoco.steps_per_s(env.model)
-    plans = sum(math.ceil(found.max() / rules.execute) for found in lengths)
+    substeps = round(1 / env.control_hz / env.scene.mj_model.opt.timestep)
+    c_s = control_steps * substeps / _c_mujoco.steps_per_s(env.scene)
+    plans = sum(math.ceil(found.max() / settings.execute) for found in lengths)
     found = parts(env, policy, params, stats, settings, lanes)
     floor = (
         1e-3
         * plans
         * (
             found["policy_ms"]
-            + rules.execute * found["step_ms"]
-            + rules.obs_horizon * found["observe_ms"]
+            + settings.execute * found["step_ms"]
+            + settings.obs_horizon * found["observe_ms"]
         )
     )
     row = {
@@ -110,42 +107,56 @@ def main() -> None:
 
 
 def subject(asked: argparse.Namespace):
-    """Policy, parameters, statistics and settings: trained ones, or new ones of the right size."""
+    """Environment, policy, parameters, statistics and settings: of a trained policy, or of a new
+    one of the right size."""
     if asked.policy:
         who = policy_under_test.from_file(packaged.find("--policy", asked.policy))
         trained = jax.device_put((who.trained.params, who.trained.normalizer))
-        return who.policy, *trained, who.trained.policy
+        return who.env, who.policy, *trained, who.trained.policy
     case = _setup.paper(224) if _peer.platform() == "gpu" else _setup.small(1, asked.image)
     case = _setup.looking(_setup.miniature() if asked.tiny else case, asked.image)
-    return *_setup.untrained(case), case.policy
+    seen = {"image_size": case.policy.image_size, "observation": case.policy.observation}
+    return envs.make(**seen), *_setup.untrained(case), case.policy
 
 
-def trials_in_chunks(trials: int, lanes: int) -> list[engine.Trials]:
-    """All trials of the twelve trocars, `lanes` at once, the last chunk filled up."""
-    index, trial = np.divmod(np.arange(len(rcm.IS_SEEN) * trials, dtype=np.int32), trials)
-    chunks = []
-    for first in range(0, len(index), lanes):
-        rows = first + np.arange(lanes)
-        wanted = rows < len(index)
-        rows = np.where(wanted, rows, first)
-        trocar = rcm.Trocar(*(field[index[rows]] for field in rcm.TROCARS))
-        chunks.append(engine.Trials(trocar, index[rows], trial[rows], wanted))
-    return chunks
+def listed(env: envs.Env, trials: int) -> list[episodes.Trial]:
+    """All trials of the task's configurations of trocars."""
+    return [(i, trial) for i in range(len(env.task.is_seen)) for trial in range(trials)]
+
+
+def over_at_once(env: envs.Env) -> list[episodes.Trial]:
+    """A trial of `runner` that is over before it begins."""
+    return [(len(env.task.is_seen), 0)]
+
+
+def runner(env, policy, settings, max_steps: int, lanes: int, devices=None) -> engine.Run:
+    """The programs of an evaluation.
+
+    Beside the task's configurations of trocars there is one that is nowhere, see `over_at_once`.
+    """
+    nowhere = np.full((1, env.task.arms), np.nan, np.float32)
+    trocars = rcm.Trocar(*(np.concatenate([field, nowhere]) for field in env.task.trocars))
+    planner = agent.from_policy(policy.sample, settings.obs_horizon, settings.execute)
+    rules = engine.Settings(0, None, max_steps, lanes)
+    return engine.make(env, planner, trocars, rules, episodes.SCORE, devices)
 
 
 def parts(env, policy, params, stats, settings, lanes: int) -> dict[str, float]:
     """ms: one policy call, one control step and one look, each of all lanes."""
-    observation, trocar = latency.example(settings, env.p_world_ref, lanes)
+    observation, trocar = latency.example(
+        settings, features.sensors(env.task, env.names.cameras), lanes
+    )
+    told = rcm.trocar_frame(trocar, env.p_world_ref, env.scene.roll_zero)
     keys = jax.random.split(jax.random.key(0), lanes)
     state = jax.jit(jax.vmap(env.reset))(keys, envs.EnvParams(trocar))
-    command = Command(state.pose, jnp.ones(lanes))
+    command = Command(state.pose, jnp.ones_like(state.gripper))
 
     def some_steps(state, command):
         step = jax.vmap(env.step)
         return jax.lax.fori_loop(0, settings.execute, lambda _, s: step(s, command), state)
 
     step, state = _timing.time_carried(some_steps, state, command, repeats=3)
-    call = _timing.time_jitted(policy.sample, params, stats, keys, observation, trocar, repeats=3)
+    call = _timing.time_jitted(policy.sample, params, stats, keys, observation, told, repeats=3)
     look = _timing.time_jitted(jax.vmap(env.observe), state, repeats=3)
     return {
         "policy_ms": 1e3 * call.median_s,

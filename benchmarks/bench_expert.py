@@ -1,6 +1,7 @@
-"""Success of the scripted expert: the twelve trocars, and ports drawn from Eq. 19.
+"""Success of the scripted expert: the task's trocars, and others drawn from Eq. 19.
 
-    python benchmarks/bench_expert.py [--per-trocar 100] [--sampled 500] [--seed 2026]
+    python benchmarks/bench_expert.py [--per-trocar 100] [--sampled 500] [--seed 2026] \\
+        [--task peg_transfer] [--arm fr5] [--expert default]
 
 Demonstrations are worth as much as their expert: this is printed before any figure of a policy.
 """
@@ -8,15 +9,16 @@ Demonstrations are worth as much as their expert: this is printed before any fig
 import argparse
 import time
 
+import _scene
 import _timing
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import rcm, runtime
+from starjax import errors, rcm, runtime
 from starjax.evaluation import statistics
 from starjax.sim import env as envs
-from starjax.sim.tasks.peg_transfer import expert
+from starjax.types import Agent
 
 STEPS = 600  # control steps, 20 s; the limit of a policy's trial is 60 s
 CHUNK = {"cpu": 16}  # episodes at once
@@ -29,27 +31,37 @@ def main() -> None:
     parser.add_argument("--per-trocar", type=int, default=100)
     parser.add_argument("--sampled", type=int, default=500)
     parser.add_argument("--seed", type=int, default=2026)
+    parser.add_argument("--expert", default="", help="by default the task's first one")
+    _scene.add_flags(parser)
     arguments = parser.parse_args()
-    environment = envs.make("state")
+    environment = _scene.make(arguments, observation="state")
+    experts = environment.task.experts
+    expert = arguments.expert or next(iter(experts))
+    errors.choice("expert", expert, experts)
+    agent, listed = experts[expert](), environment.task.trocars
     key = jax.random.key(arguments.seed)
-    twelve = rcm.Trocar(
-        *(jnp.repeat(jnp.asarray(f), arguments.per_trocar, axis=0) for f in rcm.TROCARS)
-    )
-    drawn = rcm.sample_trocar(jax.random.fold_in(key, 1), (arguments.sampled,))
+    twelve = rcm.Trocar(*(jnp.repeat(jnp.asarray(f), arguments.per_trocar, axis=0) for f in listed))
+    shape = (arguments.sampled, environment.task.arms)
+    drawn = rcm.sample_trocar(jax.random.fold_in(key, 1), shape)
     results = {
         "seed": arguments.seed,
-        "twelve": _score(environment, twelve, jax.random.fold_in(key, 2), "the twelve"),
-        "eq19": _score(environment, drawn, jax.random.fold_in(key, 3), "from Eq. 19"),
+        "scene": environment.names._asdict(),
+        "expert": expert,
+        "twelve": _score(environment, agent, twelve, jax.random.fold_in(key, 2), "the task's"),
+        "eq19": _score(environment, agent, drawn, jax.random.fold_in(key, 3), "from Eq. 19"),
     }
-    print("written to", _timing.write("expert", results))
+    name = _scene.result_name("expert", environment.names)
+    print("written to", _timing.write(name, results))
 
 
-def _score(environment: envs.Env, trocars: rcm.Trocar, key: jax.Array, name: str) -> dict:
-    """Outcome of one expert episode at each trocar `[N]`."""
+def _score(
+    environment: envs.Env, agent: Agent, trocars: rcm.Trocar, key: jax.Array, name: str
+) -> dict:
+    """Outcome of one expert episode at each configuration of trocars `[N, A]`."""
     count = len(trocars.radius)
     chunk = min(count, CHUNK.get(jax.default_backend(), CHUNK_GPU))
     keys = jax.random.split(key, count)
-    run = jax.jit(jax.vmap(lambda key, trocar: _episode(environment, key, trocar)))
+    run = jax.jit(jax.vmap(lambda key, trocar: _episode(environment, agent, key, trocar)))
     start, parts = time.perf_counter(), []
     for first in range(0, count, chunk):
         # The last chunk is filled up with its first lanes, which are not counted.
@@ -57,9 +69,9 @@ def _score(environment: envs.Env, trocars: rcm.Trocar, key: jax.Array, name: str
         part = run(keys[index], jax.tree.map(lambda leaf, i=index: leaf[i], trocars))
         parts.append(jax.tree.map(lambda leaf, f=first: np.asarray(leaf)[: count - f], part))
     outcome = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    success, steps, errors, live = (outcome[k] for k in ("success", "step", "errors", "live"))
+    success, steps, distances, live = (outcome[k] for k in ("success", "step", "errors", "live"))
     low, high = statistics.wilson(int(success.sum()), count)
-    executed = errors[live] * 1e3
+    executed = distances[live] * 1e3  # of the arm that is farthest off
     summary = {
         "episodes": count,
         "successes": int(success.sum()),
@@ -79,21 +91,23 @@ def _score(environment: envs.Env, trocars: rcm.Trocar, key: jax.Array, name: str
     return summary
 
 
-def _episode(environment: envs.Env, key: jax.Array, trocar: rcm.Trocar) -> dict[str, jax.Array]:
+def _episode(
+    environment: envs.Env, agent: Agent, key: jax.Array, trocar: rcm.Trocar
+) -> dict[str, jax.Array]:
     key_reset, key_expert = jax.random.split(key)
     state = environment.reset(key_reset, envs.EnvParams(trocar))
 
     def step(carry):
-        state, script, errors = carry
-        command, script = expert.act(script, state)
+        state, memory, largest = carry
+        command, memory, _ = agent.act(memory, state)
         after = environment.step(state, command)
-        return after, script, errors.at[state.step].set(after.rcm_error)
+        return after, memory, largest.at[state.step].set(jnp.max(after.rcm_error))
 
-    start = (state, expert.init(key_expert, state), jnp.zeros(STEPS))
-    state, _, errors = jax.lax.while_loop(lambda c: ~c[0].done & (c[0].step < STEPS), step, start)
+    start = (state, agent.init(key_expert, state), jnp.zeros(STEPS))
+    state, _, largest = jax.lax.while_loop(lambda c: ~c[0].done & (c[0].step < STEPS), step, start)
     names = ("success", "step", "collided", "invalid")
     live = jnp.arange(STEPS) < state.step
-    return {"errors": errors, "live": live, **{name: getattr(state, name) for name in names}}
+    return {"errors": largest, "live": live, **{name: getattr(state, name) for name in names}}
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, runtime
+from starjax import config, rcm, runtime
 from starjax.evaluation import latency
 from starjax.experiments import bench
 from starjax.models import roll_net
@@ -29,6 +29,7 @@ from starjax.policies import features
 from starjax.policies import policy as policies
 
 CHAIN = 100  # roll networks in one program, each fed by the one before
+SEEN = features.sensors(_setup.TASK)
 
 # name: case, batch, DDIM steps
 CASES = {
@@ -101,13 +102,13 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
         case.policy,
         params,
         stats,
-        _setup.SEEN,
+        SEEN,
         batch=batch,
         calls=200,
         seconds=seconds,
     )
-    observation, trocar = latency.example(case.policy, _setup.SEEN, batch)
-    told = latency.told(_setup.SEEN, trocar)
+    observation, trocar = latency.example(case.policy, SEEN, batch)
+    told = rcm.trocar_frame(trocar, _setup.P_WORLD_REF)
     traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, told)
     work = _arithmetic.operations(policy.sample, *traced)
     sequences = batch
@@ -178,10 +179,7 @@ def roll_network(policy_config, batch: int) -> dict:
         return jax.lax.fori_loop(0, CHAIN, one, history)
 
     within = _timing.time_jitted(chain, params, history).median_s / CHAIN
-    return {
-        "in_a_program_ms": 1e3 * within,
-        **latency.roll_ms(policy_config, _setup.SEEN, batch=batch),
-    }
+    return {"in_a_program_ms": 1e3 * within, **latency.roll_ms(policy_config, SEEN, batch=batch)}
 
 
 if __name__ == "__main__":

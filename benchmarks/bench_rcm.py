@@ -8,6 +8,7 @@ is the usual loop over single poses with `Rotation` objects.
 
 import argparse
 import functools
+from collections.abc import Callable
 
 import _timing
 import jax
@@ -37,19 +38,25 @@ def main() -> None:
     print(f"batch {batch}, maps/s in millions (scipy: thousands)")
     print("space  way     starjax   numpy   scipy  x numpy  x scipy  compile s  max gap")
     for name, space in rcm.ACTION_SPACES.items():
-        action = np.asarray(jax.jit(space.encode)(pose, trocar, P_WORLD_REF))
+        action = np.asarray(jax.jit(framed(space.encode))(pose, trocar))
         ways = {
-            "encode": (space.encode, pose, numpy_encode, wide_pose, scipy_encode),
-            "decode": (space.decode, action, numpy_decode, action.astype(np.float64), scipy_decode),
+            "encode": (framed(space.encode), pose, numpy_encode, wide_pose, scipy_encode),
+            "decode": (
+                framed(space.decode),
+                action,
+                numpy_decode,
+                action.astype(np.float64),
+                scipy_decode,
+            ),
         }
         for way, (ours, ours_in, peer, peer_in, loop) in ways.items():
-            time_ours = _timing.time_jitted(ours, ours_in, trocar, P_WORLD_REF)
+            time_ours = _timing.time_jitted(ours, ours_in, trocar)
             vectorised = functools.partial(peer, name, peer_in, wide_trocar, P_WORLD_REF)
             one_by_one = functools.partial(loop, name, peer_in, wide_trocar, P_WORLD_REF)
             numpy_rate = batch / _timing.time_plain(vectorised, repeats=3).median_s
             scipy_rate = LOOP / _timing.time_plain(one_by_one, repeats=3).median_s
             rate = batch / time_ours.median_s
-            gap = largest_gap(ours(ours_in, trocar, P_WORLD_REF), vectorised(), one_by_one())
+            gap = largest_gap(ours(ours_in, trocar), vectorised(), one_by_one())
             rows[f"{name}.{way}"] = {
                 "maps_per_s": rate,
                 "numpy_maps_per_s": numpy_rate,
@@ -65,6 +72,11 @@ def main() -> None:
                 f"{time_ours.compile_s:10.2f} {gap:8.1e}"
             )
     _timing.report("rcm", {"batch": batch, "dtype": "float32", "results": rows}, asked.tiny)
+
+
+def framed(way: Callable) -> Callable:
+    """A map with the trocar's frame made in it, as the peers make theirs."""
+    return lambda given, trocar: way(given, rcm.trocar_frame(trocar, P_WORLD_REF))
 
 
 def sample_poses(trocar: rcm.Trocar, batch: int) -> rcm.Pose:

@@ -24,7 +24,8 @@ import mujoco
 import numpy as np
 
 from starjax import runtime
-from starjax.sim import render, scene
+from starjax.sim import render
+from starjax.sim import scene as scenes
 
 GL_RENDERER = pathlib.Path(__file__).parents[1] / "tests/sim/gl_renderer.py"
 SIZES = (96, 128, 256)
@@ -40,8 +41,8 @@ def main() -> None:
     batch = asked.batch
     runtime.prepare_xla()
     rates = _machine.measure("float32")
-    mj_model = scene.compose()
-    qpos = states(mj_model, STEPS * batch)
+    scene = scenes.load(scenes.name())
+    mj_model, qpos = scene.mj_model, states(scene, STEPS * batch)
     geoms = poses(mj_model, qpos, batch)
     print(f"{mj_model.ngeom} geoms, batch {batch}, pictures/s")
     print("size  starjax  C renderer  ratio  x floor  MB a picture  compile s")
@@ -73,14 +74,14 @@ def main() -> None:
     print(f"wrote {path}")
 
 
-def states(mj_model: mujoco.MjModel, n: int) -> np.ndarray:
+def states(scene: scenes.Scene, n: int) -> np.ndarray:
     """`[n, nq]` configurations: the tool somewhere over the boards, the block on them."""
     rng = np.random.default_rng(0)
-    qpos = np.tile(mj_model.qpos0, (n, 1))
-    for k, home in enumerate(scene.HOME):
-        joint = mj_model.joint(f"robot/j{k + 1}").qposadr[0]
+    qpos = np.tile(scene.mj_model.qpos0, (n, 1))
+    (arm,) = scene.arms
+    for joint, home in zip(arm.q, arm.home, strict=True):
         qpos[:, joint] = home + rng.normal(scale=0.05, size=n)
-    block = mj_model.joint("block").qposadr[0]
+    block = scene.bound.block
     qpos[:, block : block + 2] = rng.uniform(-0.03, 0.03, (n, 2))
     return qpos
 

@@ -24,9 +24,8 @@ import jax
 import numpy as np
 
 from starjax import runtime
-from starjax.rollouts import engine
+from starjax.runtime import processes
 from starjax.sim import env as envs
-from starjax.training import processes
 
 BATCH = 256  # a device
 LANES = {"gpu": 360, "cpu": 4}  # trials a device
@@ -92,15 +91,15 @@ def evaluate(count: int, tiny: bool) -> dict:
     platform = _peer.platform()
     case = _setup.paper(96) if platform == "gpu" and not tiny else _setup.miniature()
     policy, params, stats = _setup.untrained(case)
-    env = envs.make("image", case.policy.image_size)
+    env = envs.make(image_size=case.policy.image_size)
     limit = round((0.3 if tiny else LIMIT_S) * env.control_hz)
-    rules = engine.Settings(case.policy.obs_horizon, case.policy.execute, limit)
-    run = engine.make(env, policy, rules, 0, jax.devices()[:count])
-    lanes = LANES[platform] * count
-    (trials,) = bench_evaluate.trials_in_chunks(-(-lanes // 12), lanes)[:1]
-    idle = trials._replace(wanted=np.zeros(lanes, bool))
-    compiling = _timing.time_once(lambda: list(run(params, stats, idle)))
-    timing = _timing.time_plain(lambda: list(run(params, stats, trials)), repeats=2)
+    lanes, given = LANES[platform] * count, (params, stats)
+    on = jax.devices()[:count]
+    run = bench_evaluate.runner(env, policy, case.policy, limit, lanes, on)
+    trials = bench_evaluate.listed(env, -(-lanes // len(env.task.is_seen)))[:lanes]
+    idle = bench_evaluate.over_at_once(env)
+    compiling = _timing.time_once(lambda: list(run(given, idle)))
+    timing = _timing.time_plain(lambda: list(run(given, trials)), repeats=2)
     return {"seconds": timing.min_s, "trials": lanes, "compile_s": compiling}
 
 

@@ -16,9 +16,8 @@ import numpy as np
 
 from starjax import runtime
 from starjax.sim import env as envs
-from starjax.sim import solver
 from starjax.sim.engine import mjx
-from starjax.sim.scene import SimModel
+from starjax.sim.scene import Scene
 
 # Of MJX's solver: iterations, line-search turns, tolerance.
 EXACT = (100, 50, 1e-14)
@@ -31,21 +30,22 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=48)
     asked = parser.parse_args()
     runtime.prepare_xla()
-    env = envs.make("state")
-    sim = env.model
-    inputs = _visited.states(env, asked.episodes)
+    env = envs.make(observation="state")
+    scene, inputs = env.scene, _visited.moments(env, asked.episodes)
     with jax.enable_x64(True):
-        double = jax.tree.map(in_float64, (sim, inputs))
-        exact = np.asarray(program(double[0], mjx.step, with_settings(double[0], EXACT))(double[1]))
+        models = scene.mjx_model, scene.mjx_data, inputs
+        model, data, wide = jax.tree.map(in_float64, models)
+        double = with_settings(scene._replace(mjx_model=model, mjx_data=data), EXACT)
+        exact = np.asarray(program(double, mjx.step)(wide))
     print("error of the block, mm/s: 50%, 99%, 99.9%, all; us a step")
-    found = {"starjax": (solver.step, sim.mjx_model)}
+    found = {"starjax": (_visited.starjax_step, scene)}
     for settings in SETTINGS:
         name = "MJX, {} iterations, {} turns, tolerance {:g}".format(*settings)
-        found[name] = mjx.step, with_settings(sim, settings)
+        found[name] = mjx.step, with_settings(scene, settings)
     rows = {}
-    block = slice(sim.block_dof, sim.block_dof + 3)
-    for name, (step, model) in found.items():
-        run = program(sim, step, model)
+    block = slice(scene.bound.block_dof, scene.bound.block_dof + 3)
+    for name, (step, changed) in found.items():
+        run = program(changed, step)
         error = np.abs(np.asarray(run(inputs)) - exact)[:, block].max(-1)
         seconds = _timing.time_plain(lambda run=run: jax.block_until_ready(run(inputs)), repeats=3)
         quantiles = 1e3 * np.quantile(error, QUANTILES)
@@ -61,24 +61,25 @@ def in_float64(leaf):
     return jnp.asarray(leaf, jnp.float64) if is_float else leaf
 
 
-def with_settings(sim: SimModel, settings: tuple[int, int, float]) -> mjx.Model:
-    """MJX's model with other limits of its solver."""
+def with_settings(scene: Scene, settings: tuple[int, int, float]) -> Scene:
+    """The scene with other limits of MJX's solver."""
     iterations, turns, tolerance = settings
-    option = sim.mjx_model.opt
-    return sim.mjx_model.replace(
+    option = scene.mjx_model.opt
+    model = scene.mjx_model.replace(
         opt=option.replace(
             iterations=iterations,
             ls_iterations=turns,
             tolerance=jnp.asarray(tolerance, option.tolerance.dtype),
         )
     )
+    return scene._replace(mjx_model=model)
 
 
-def program(sim: SimModel, step, model: mjx.Model):
-    """Compiled: velocities `[N, V]` after one step of N states."""
-    one = _visited.stepper(sim, step, model)
+def program(scene: Scene, step: _visited.Step):
+    """Compiled: velocities `[N, V]` after one step of N moments."""
+    one = _visited.stepper(scene, step)
     batch = _visited.CPU_LANES
-    return jax.jit(lambda x: jax.lax.map(lambda y: one(*y).qvel, x, batch_size=batch))
+    return jax.jit(lambda x: jax.lax.map(lambda y: one(y).state.qvel, x, batch_size=batch))
 
 
 if __name__ == "__main__":

@@ -10,12 +10,11 @@ from collections.abc import Generator
 
 import _timing
 import _visited
-import numpy as np
 
-from starjax import rcm, runtime
-from starjax.rollouts import cores, recording
+from starjax import runtime
+from starjax.data import schema
+from starjax.rollouts import agent, cores, engine, episodes
 from starjax.sim import env as envs
-from starjax.sim.tasks.peg_transfer import expert
 
 SEGMENTS = 8  # of a measurement: 4 s simulated, in which no episode ends
 
@@ -27,7 +26,7 @@ def main() -> None:
     asked = parser.parse_args()
     runtime.prepare_xla()
     side, segments = (16, 1) if asked.tiny else (asked.image, SEGMENTS)
-    env = envs.make("image", side)
+    env = envs.make(image_size=side)
     rows = {}
     for name, lanes, at_once in (
         ("one program", _visited.CPU_LANES, 1),
@@ -49,15 +48,16 @@ def main() -> None:
 
 def measure(env: envs.Env, lanes: int, at_once: int, segments: int) -> dict:
     """Rate of `at_once` simulations of `lanes` episodes each."""
-    trocars = rcm.Trocar(*(np.asarray(field, np.float32) for field in rcm.TROCARS))
-    steps = segments * recording.SEGMENT
-    script = recording.Expert(expert.init, expert.act)
-    simulator = recording.simulator(env, script, trocars, 0, steps, lanes, None)
+    trocars, record = env.task.trocars, episodes.DEMONSTRATION
+    steps, configurations = segments * record.frames, len(trocars.radius)
+    rules = engine.Settings(0, schema.STREAM, steps, lanes)
+    expert = agent.from_single(_visited.expert(env))
+    simulation = engine.make(env, expert, trocars, rules, record)
 
     def simulate(number: int) -> Generator[int]:
-        group = [(lane % 12, number * lanes + lane) for lane in range(lanes)]
-        for ended in simulator(group):
-            yield len(ended)
+        group = [(lane % configurations, number * lanes + lane) for lane in range(lanes)]
+        for segment in simulation(None, group):
+            yield len(segment.ended)
 
     def run() -> None:
         sum(cores.run(range(at_once), simulate, at_once))

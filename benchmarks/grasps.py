@@ -15,8 +15,7 @@ import mujoco
 import numpy as np
 
 from starjax.report import results
-from starjax.sim import env as envs
-from starjax.sim import physics
+from starjax.sim import registry, scene
 from starjax.sim.tasks.peg_transfer import task
 
 PERIOD_DEG = 60.0  # walls are 120 degrees apart, and jaws look alike after half a turn
@@ -25,19 +24,21 @@ BESIDE = 0.001  # m
 ABOVE = 0.0065  # m over the block's frame: coming down
 AROUND = 0.014  # m from the block's axis
 MIDDLE = 0.012  # m: blocks nearer than this to y = 0 are on the middle row
-JAW = "robot/tool/jaw_left"
+TOOL = registry.tools.get("grasper")
+JAW = f"arm0/tool/{TOOL.jaw}"
+TIP = scene.tcp(0, TOOL)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="+", type=pathlib.Path)
-    model = envs.make("state").model.mj_model
+    model = scene.compose(scene.name())
     for path in parser.parse_args().runs:
         report(model, results.load(path))
 
 
 def report(model: mujoco.MjModel, run: results.Run) -> None:
-    success = np.array([bool(it.trial["success"]) for it in run.rollouts])
+    success = np.array([bool(it.trial.success) for it in run.rollouts])
     print(f"{run.path}: {success.sum()} of {len(success)} recorded trials succeed")
     angle, radius, _ = measure(model, run, closes).T
     near, turned = np.abs(radius - task.RIM_RADIUS) < BESIDE, np.abs(angle) < TURNED_DEG
@@ -64,7 +65,7 @@ def measure(model: mujoco.MjModel, run: results.Run, moment: Callable[..., int])
     for it in run.rollouts:
         assert it.qpos is not None
         data = mujoco.MjData(model)
-        tip, block = data.site("robot/tool/tcp"), data.body("block")
+        tip, block = data.site(TIP), data.body("block")
         place(model, data, it.qpos[0])
         first, step = (block.xpos.copy(), block.xmat.copy()), moment(model, data, it.qpos)
         if step < 0:
@@ -84,7 +85,7 @@ def closes(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> int:
     of their opening closed."""
     jaw = qpos[:, model.joint(JAW).qposadr[0]]
     closed = np.abs(jaw - jaw[0]) > 0.5 * np.ptp(jaw)
-    return int(closed.argmax()) if np.ptp(jaw) > 0.25 * physics.JAW_OPEN else -1
+    return int(closed.argmax()) if np.ptp(jaw) > 0.25 * TOOL.open else -1
 
 
 def comes_down(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> int:
@@ -92,7 +93,7 @@ def comes_down(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> 
     block = data.body("block").xpos.copy()
     for step, now in enumerate(qpos):
         place(model, data, now)
-        away = data.site("robot/tool/tcp").xpos - block
+        away = data.site(TIP).xpos - block
         if away[2] < ABOVE and np.hypot(*away[:2]) < AROUND:
             return step
     return -1

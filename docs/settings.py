@@ -40,6 +40,8 @@ def rows(settings: type, default: object, prefix: str = "") -> list[tuple[str, s
             found += rows(type(value), value, prefix)
             continue
         if dataclasses.is_dataclass(hint):
+            if value is dataclasses.MISSING and hint.__module__ == settings.__module__:
+                value = hint()  # a command's own; another module's depends on the machine
             found += rows(hint, value, f"{prefix}{name}.")
             continue
         is_word = options.tyro.conf.Positional in getattr(hint, "__metadata__", ())

@@ -50,6 +50,8 @@ def task(arms: int = 1, **changed: Any) -> base.Task:
     nothing = dict.fromkeys(base.Task._fields)
     given = {
         "name": "peg_transfer",
+        "trocars": rcm.Trocar(*(field[:, None] for field in rcm.TROCARS)),
+        "is_seen": rcm.IS_SEEN,
         "slots": slots[:arms],
         "cameras": ("camera", "wrist"),
         "fields": (

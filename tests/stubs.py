@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.rollouts import trocars as configurations
 from starjax.sim import names
 from starjax.sim.tasks import base
 from starjax.types import Agent, Command, Observation, Pose
@@ -90,6 +91,8 @@ def make_task(arms: int = 1) -> base.Task:
         "experts": {"default": lambda: EXPERT, "one_wall": lambda: EXPERT},
         "label": lambda layout: layout.labels,
         "relative": lambda state, tips: state[..., None, :3] - tips,
+        "trocars": configurations.twelve(arms),
+        "is_seen": rcm.IS_SEEN,
     }
     return base.Task(**{**dict.fromkeys(base.Task._fields), **given})
 

@@ -3,11 +3,11 @@
 import sys
 
 from starjax import rcm
-from starjax.training import sharding
+from starjax.models.kernels import packed_params
 
 
 def test_the_training_step_is_timed(monkeypatch, capsys, pytestconfig):
-    monkeypatch.setattr(sharding, "JOINS", {"cpu"})
+    monkeypatch.setattr(packed_params, "PLATFORMS", {"cpu"})
     monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
     monkeypatch.setattr(sys, "argv", ["bench_train.py", "--tiny"])
     import bench_train  # from the folder of benchmarks, which is no package

@@ -14,14 +14,7 @@ from starjax import cli, errors, extras
 ROOT = pathlib.Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # A process that has only jax, numpy and what these bring.
-BARE = """
-import sys
-class Absent:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {absent}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
-sys.meta_path.insert(0, Absent())
-"""
+BARE = "import sys\nsys.modules |= dict.fromkeys({absent})\n"
 
 
 def bare(program: str) -> subprocess.CompletedProcess:
@@ -64,3 +57,10 @@ def test_a_command_without_its_extra_names_it(monkeypatch, command, capsys):
 def test_an_installation_without_extras_lists_the_commands():
     done = bare("from starjax import cli; cli.dispatch(['--help'])")
     assert done.returncode == 0 and "evaluate" in done.stdout
+
+
+def test_the_main_command_without_its_extra_is_one_line():
+    program = "import runpy, sys\nsys.argv = ['run']\n"
+    done = bare(program + "runpy.run_module('starjax.experiments.run', run_name='__main__')")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "starjax[sim,train,report]" in done.stderr

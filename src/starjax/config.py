@@ -18,6 +18,7 @@ SettingsT = TypeVar("SettingsT")
 
 # A key of jax takes 32 bits: larger seeds would alias smaller ones.
 Seed = Annotated[int, Range(0, 2**32 - 1)]
+Preset = Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"]
 TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
 
 
@@ -133,7 +134,7 @@ class RunConfig:
 
     method: str = "stardiff"  # a row of Table II, or all
     # starting values of the rest; auto: gpu where jax can use one, else cpu
-    preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"
+    preset: Preset = "auto"
     seed: Seed = 0  # of everything random
     out: str = "auto"  # folder of results; auto: runs/PRESET, other seeds and observations apart
     scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)

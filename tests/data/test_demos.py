@@ -147,7 +147,7 @@ def test_images_of_all_that_is_simulated_fit_the_memory(
     monkeypatch.setattr(xla, "memory_bytes", lambda: memory)
     monkeypatch.setattr(cores, "count", lambda: 4)
     asked = []
-    monkeypatch.setattr(waves, "run", lambda *args: asked.append(args[-2:]) or [])
+    monkeypatch.setattr(waves, "run", lambda *args: asked.append(args[4:6]) or [])
     collect(tmp_path / "d", "image", chunk=0)
     assert asked == [(lanes, at_once)]
 
@@ -575,6 +575,9 @@ def test_a_sound_episode_that_was_not_sealed_is_noticed(copy):
 def test_several_gpus_share_what_one_would_do(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     devices: Any = [None] * 4
-    lanes = [demos._fast(devices, total) for total in (240, 257, 4000)]
+    lanes = [demos._fast(devices, total, 1) for total in (240, 257, 4000)]
     assert lanes == [demos.GPU_LANES, 2 * demos.GPU_LANES, 4 * demos.GPU_LANES]
-    assert demos._fast(None, 4000) == demos.GPU_LANES
+    assert demos._fast(None, 4000, 1) == demos.GPU_LANES
+    # as several processes do
+    lanes = [demos._fast(None, total, 2) for total in (240, 4000)]
+    assert lanes == [demos.GPU_LANES // 2, demos.GPU_LANES]

@@ -22,7 +22,7 @@ from starjax.evaluation import evaluate, recorded, statistics
 from starjax.evaluation import trials as tables
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
-from starjax.rollouts import agent, engine, placement
+from starjax.rollouts import agent, chunks, engine, placement
 from starjax.rollouts.episodes import Episode
 from starjax.rollouts.placement import Place
 from starjax.runtime import files
@@ -215,7 +215,7 @@ def test_a_chunk_of_other_trials_is_named_and_run_again(tmp_path):
     shutil.copy(second, first)
     said = []
     assert_same(run(tmp_path, chunk=3, report=said.append), found)
-    assert said == [f"{first} holds other trials; evaluated again"]
+    assert said == [f"{first} is damaged: it holds other trials; made again"]
 
 
 def test_a_plan_that_does_not_say_its_chunk_is_another(tmp_path, whole):
@@ -241,17 +241,18 @@ def test_no_flipped_bit_of_a_chunk_gets_into_the_table(tmp_path, whole):
     path = tmp_path / "chunk_0000.npz"
     good = path.read_bytes()
     rng = np.random.default_rng(0)
-    names = tables.names(stubs.make_env().task.labels)
+    group = [*zip(whole[1].trocar.tolist(), whole[1].trial.tolist(), strict=True)]
+    none = np.zeros(len(group), bool)
+    parts = evaluate._parts(tmp_path, stubs.make_env(), pytest.fail, group, [slice(6)], none)
     noticed = 0
     for bit in rng.integers(0, 8 * len(good), 200):
         bad = bytearray(good)
         bad[bit // 8] ^= 1 << (bit % 8)
         path.write_bytes(bad)
-        group = [*zip(whole[1].trocar.tolist(), whole[1].trial.tolist(), strict=True)]
-        found = evaluate._read(path, group, names, lambda _: None)
+        found = chunks._read(parts, 0, lambda _: None)
         noticed += found is None
         if found is not None:  # a byte that means nothing, such as a date
-            assert_same(found[0], whole[1])
+            assert_same(tables.from_columns(found), whole[1])
     assert noticed > 100
 
 

@@ -82,6 +82,15 @@ def test_what_is_written_is_read_again(made):
     assert {trial.stage for trial in found.trials} == {1, 3}
 
 
+def test_settings_of_jax_that_are_not_the_usual_ones_are_written(made, monkeypatch):
+    file, written = made
+    assert "jax_settings" not in written.about
+    monkeypatch.setenv("NVIDIA_TF32_OVERRIDE", "0")
+    about = {**synthetic.about("stardiff"), "control_hz": 25.0}
+    result.write(file, SCENE, synthetic.figures("stardiff", rows(2)), about)
+    assert result.read(file).about["jax_settings"] == {"NVIDIA_TF32_OVERRIDE": "0"}
+
+
 def test_trials_in_a_file_beside_it_are_found(made):
     file, before = made
     trial_file.detach(file)

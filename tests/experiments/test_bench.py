@@ -4,10 +4,11 @@ import dataclasses
 import json
 import types
 
+import fakes
 import mistakes
 import pytest
 
-from starjax import cli
+from starjax import cli, config
 from starjax.experiments import bench, folders, presets
 
 SMOKE = presets.PRESETS["smoke"]
@@ -71,8 +72,8 @@ def test_only_the_hierarchy_has_a_roll_network_to_time(
     from starjax.experiments import policy_under_test
 
     ms = {"p50": 4.0, "p95": 5.0, "p99": 8.0}
-    trained = types.SimpleNamespace(policy=None, train=None, params=None, normalizer=None)
-    env = types.SimpleNamespace(p_world_ref=None)
+    trained = fakes.trained()
+    env = fakes.env()
     who = types.SimpleNamespace(trained=trained, env=env, weights="a")
     monkeypatch.setattr(policy_under_test, "load", lambda *_: who)
     monkeypatch.setattr(latency, "table", lambda *_, **__: iter([{"ddim_steps": 2, **ms}]))

@@ -15,10 +15,10 @@ SMOKE = presets.PRESETS["smoke"]
 
 def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
     from starjax.data import demos
-    from starjax.rollouts import chunks
+    from starjax.rollouts import waves
 
     def collect(*_, **settings):
-        raise chunks.ExpertFailed("got 0 of 10 at trocar 0")
+        raise waves.ExpertFailed("got 0 of 10 at trocar 0")
 
     monkeypatch.setattr(demos, "collect", collect)
     few = dataclasses.replace(SMOKE.demos, max_steps=1)
@@ -29,22 +29,24 @@ def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
     assert "0 of 10" in caught.value.hint
 
 
-@pytest.mark.parametrize(("seen", "one_wall"), [(1, True), (8, False)])
-def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, seen, one_wall):
+@pytest.mark.parametrize(("seen", "expert"), [(1, "one_wall"), (8, "")])
+def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, seen, expert):
     from starjax import rcm
     from starjax.data import demos
-    from starjax.sim.tasks.peg_transfer import expert
 
     given = []
     found = {"episodes": 0, "trials": 0, "frames": 0}
-    monkeypatch.setattr(
-        demos, "collect", lambda *a, **settings: given.append((a, settings)) or found
-    )
-    asked = config.DemosConfig(per_trocar=3, seen_trocars=seen, max_steps=7, one_wall=one_wall)
+    monkeypatch.setattr(demos, "collect", lambda *a, **_: given.append(a) or found)
+    asked = config.DemosConfig(per_trocar=3, seen_trocars=seen, max_steps=7, expert=expert)
     chosen = dataclasses.replace(SMOKE, demos=asked, seed=5, out=str(tmp_path))
     demonstrations.plan(chosen, stubs.make_env())[1]()
-    (((_, _, script, trocars), settings),) = given
-    np.testing.assert_array_equal(trocars, [field[:seen] for field in rcm.TROCARS])
-    assert script.init is (expert.init_with_one_wall if one_wall else expert.init)
-    wanted = {"per_trocar": 3, "seed": 5, "max_steps": 7, "one_wall": one_wall}
-    assert {name: settings[name] for name in wanted} == wanted
+    ((_, _, _, trocars, settings),) = given
+    np.testing.assert_array_equal(trocars, [field[:seen, None] for field in rcm.TROCARS])
+    wanted = {"per_trocar": 3, "seed": 5, "max_steps": 7, "expert": expert or "default"}
+    assert {name: settings._asdict()[name] for name in wanted} == wanted
+
+
+def test_an_expert_that_the_task_lacks_is_a_mistake(tmp_path):
+    asked = dataclasses.replace(SMOKE.demos, expert="two_walls")
+    with mistakes.of("demos.expert", "two_walls"):
+        demonstrations.plan(dataclasses.replace(SMOKE, demos=asked), stubs.make_env())

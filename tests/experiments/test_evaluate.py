@@ -29,11 +29,13 @@ def file(tmp_path, monkeypatch):
     network, params = stubs.make_policy()
 
     def sample(_, stats, keys, observation, trocar):
-        return network.sample(params, 1.0, keys, observation, trocar)
+        return network(params, 1.0, keys, observation, trocar)
 
-    monkeypatch.setattr(policy_under_test.sim_env, "make", lambda *_: stubs.make_env())
-    monkeypatch.setattr(policy_under_test.policies, "make", lambda *_: stubs.Policy(sample))
-    monkeypatch.setattr(video, "record", lambda runs, sim, path: path)
+    policy = types.SimpleNamespace(sample=sample)
+
+    monkeypatch.setattr(policy_under_test.sim_env, "make", lambda *_, **__: stubs.make_env())
+    monkeypatch.setattr(policy_under_test.policies, "make", lambda *_, **__: policy)
+    monkeypatch.setattr(video, "record", lambda runs, path: path)
     monkeypatch.chdir(tmp_path)
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
     made = fakes.trained(
@@ -189,20 +191,22 @@ def test_a_method_of_a_run_of_several_is_scored_under_its_own_name(
 def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
     said = {}
     monkeypatch.setattr(
-        policy_under_test.evaluate, "evaluate", lambda *_, **given: said.update(given)
+        policy_under_test.evaluate, "evaluate", lambda *args, **given: said.update(given, args=args)
     )
     policy = dataclasses.replace(POLICY, obs_horizon=3, crop_fraction=0.5)
     trained = types.SimpleNamespace(policy=policy, params=None, normalizer=None)
-    who = types.SimpleNamespace(method="stardiff", env=None, policy=None, trained=trained)
+    policy = types.SimpleNamespace(sample=None)
+    who = types.SimpleNamespace(method="stardiff", env=None, policy=policy, trained=trained)
     flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
     policy_under_test.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
-    wanted = {**flags, "seed": 9, "obs_horizon": 3, "execute": 4}
-    assert {name: said.get(name) for name in wanted} == wanted
+    _, _, planner, _, _, settings = said["args"]
+    assert settings._asdict() == {**flags, "seed": 9}
+    assert planner.about == {"obs_horizon": 3, "execute": 4}
     assert said["identity"]["policy"]["crop_fraction"] == 0.5  # of what the encoder sees
 
 
 def test_a_machine_without_a_video_encoder_still_gets_the_result(file, monkeypatch, capsys):
-    def broken(runs, sim, path):
+    def broken(runs, path):
         raise RuntimeError("no ffmpeg")
 
     monkeypatch.setattr(video, "record", broken)
@@ -242,9 +246,8 @@ def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):
     assert first["strict"]["trials"] == len(first["trials"]) == 5 and chunks
     assert {trial["trial"] for trial in first["trials"]} == {0}
     assert swept(*drawn, "--seed", "1")["trials"] != first["trials"]
-    assert [trial["radius"] for trial in swept(*grid)["trials"]] == pytest.approx(
-        [0, 0.02, 0.02, 0.02]
-    )
+    radii = [trial["radius"] for trial in swept(*grid)["trials"]]
+    assert radii == [pytest.approx([radius]) for radius in (0, 0.02, 0.02, 0.02)]
     assert swept(*drawn, "--eval.chunk", "2")["trials"] == first["trials"]
     assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
     said = capsys.readouterr().out
@@ -311,8 +314,11 @@ def test_a_file_that_is_no_policy_leaves_nothing(file):
 
 def test_the_times_of_an_evaluation_are_medians_in_seconds():
     ms = {"p50": 1.0, "p95": 2.0, "p99": 3.0}
-    said = evaluate._times({"steps": {"median": 60.0}, "inference_ms": ms}, 30.0)
-    assert said == "  median transfer 2.0 s, decision 1.0 ms"
+    result = types.SimpleNamespace(
+        figures={"steps": {"median": 60.0}}, about={"inference_ms": ms}, control_hz=30.0
+    )
+    words = evaluate._times(result).split()
+    assert words[2:4] == ["2.0", "s,"] and words[-2:] == ["1.0", "ms"]
 
 
 def test_distances_of_a_sweep_are_to_the_trocars_of_the_weights(file):
@@ -323,6 +329,6 @@ def test_distances_of_a_sweep_are_to_the_trocars_of_the_weights(file):
     assert sweep.main([str(run), "--trocars", "9", "--eval.time-limit-s", "1"]) == 0
     trials = json.loads((run / "sweep.json").read_text())["trials"]
     ports = rcm.Trocar(*(np.float32([t[name] for t in trials]) for name in rcm.Trocar._fields))
-    training = rcm.Trocar(*(field[:4] for field in rcm.TROCARS))
-    far = sweeping.distance_to_nearest(ports, training, np.zeros(3))
+    training = rcm.Trocar(*(field[:4, None] for field in rcm.TROCARS))
+    far = sweeping.distance_to_nearest(ports, training, np.zeros((1, 3)))
     assert [t["distance_m"] for t in trials] == pytest.approx(far, abs=1e-6)

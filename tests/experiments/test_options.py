@@ -17,7 +17,7 @@ from starjax.experiments import (
     pack,
     presets,
     report_command,
-    run,
+    run_settings,
     sweep,
 )
 from starjax.runtime import gpu
@@ -30,7 +30,7 @@ OPTIONS = {
 
 
 def settings(typed: str) -> config.RunConfig:
-    return run.settings(typed.split(), "starjax run", "")
+    return run_settings.parse(typed.split(), "starjax run", "")
 
 
 @pytest.mark.parametrize(

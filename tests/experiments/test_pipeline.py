@@ -10,6 +10,8 @@ import fakes
 import mistakes
 import numpy as np
 import pytest
+import stubs
+import synthetic
 
 from starjax import config, methods
 from starjax.data import normalizer
@@ -194,55 +196,46 @@ def test_a_finished_run_needs_its_encoder_no_more(tmp_path, done):
 
 
 def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
-    smoke = presets.PRESETS["smoke"]
-    settings = _json(smoke)
-    none = {"successes": 0, "trials": 0}
-    figures = {
-        "method": "stardiff",
-        "seen": none,
-        "unseen": none,
-        "safe": {"all": none},
-        "rcm_error_mm": {"executed": {"mean": 0.1, "max": 0.2}},
-    }
-    result = {"config": settings, "trials": [], **figures}
+    smoke = dataclasses.replace(presets.PRESETS["smoke"], seed=0)
+    synthetic.run(tmp_path / "stardiff")
+    file = tmp_path / "stardiff" / "result.json"
+    result = {**files.read_json(file), "config": _json(smoke), "seed": 0, "weights": "a"}
 
     def is_done(found, wanted=smoke, weights="a"):
-        (tmp_path / "result.json").write_text(
-            found if isinstance(found, str) else json.dumps(found)
-        )
-        found = pipeline._scored(tmp_path, weights)
+        file.write_text(found if isinstance(found, str) else json.dumps(found))
+        found = pipeline._scored(file.parent, weights)
         return bool(found) and pipeline._is_of(found, wanted)
 
-    assert not pipeline._scored(tmp_path, "a")
-    assert is_done(result) and is_done({**result, "weights": "a"})
-    assert not is_done({**result, "weights": "b"})
+    assert is_done(result) and not is_done(result, weights="b")
     older = json.loads(json.dumps(result))
-    del older["config"]["policy"]["freeze_encoder"]
+    del older["config"]["policy"]["freeze_encoder"], older["config"]["scene"]
+    older["config"]["demos"]["one_wall"] = False
+    del older["config"]["demos"]["expert"]
     assert is_done(older)
-    assert not is_done({**result, "seed": settings["seed"] + 1})  # of `starjax evaluate --out`
+    assert not is_done({**result, "seed": 1})  # of `starjax evaluate --out`
     more = dataclasses.replace(smoke, eval=dataclasses.replace(smoke.eval, trials=9))
     assert not is_done(result, more)
+    other = dataclasses.replace(smoke, scene=config.SceneConfig(task="reach"))
+    assert not is_done(result, other)
     for damaged in ("{", "{}", '{"config": 1}', '{"config": {"of": "another"}, "trials": []}'):
         assert not is_done(damaged)
-    for missing in figures:  # of another version
-        assert not is_done({key: value for key, value in result.items() if key != missing})
-    assert not is_done({**result, "rcm_error_mm": 3})
 
 
 def test_more_trials_than_asked_for_are_not_thrown_away(tmp_path):
     preset = smoke(tmp_path, "stardiff")
-    folder, settings = tmp_path / "stardiff", _json(preset)
-    folder.mkdir()
+    synthetic.run(tmp_path / "stardiff", trials=2)
+    folder = tmp_path / "stardiff"
     (folder / "policy.safetensors").write_bytes(b"weights")
+    weights = files.sha256(folder / "policy.safetensors")
+    settings = _json(preset)
     settings["eval"]["trials"] = 2
-    many = {
-        "config": settings,
-        "trials": [{}] * 24,
-        "weights": files.sha256(folder / "policy.safetensors"),
-    }
-    files.write_json(folder / "result.json", many)
+    files.write_json(
+        folder / "result.json",
+        {**files.read_json(folder / "result.json"), "config": settings, "weights": weights},
+    )
+    many = files.read_json(folder / "result.json")
     with mistakes.of("eval.trials", preset.eval.trials) as told:
-        pipeline._evaluate(preset, "stardiff", None, "demos-a", "")
+        pipeline._evaluate(preset, "stardiff", stubs.make_env(), "demos-a", "")
     assert f"starjax evaluate {folder}" in told.value.hint
     assert files.read_json(folder / "result.json") == many
 
@@ -261,8 +254,8 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
     monkeypatch.setattr(
         policy_under_test, "rollouts", lambda at, *_: found.extend(at.glob("*.npz"))
     )
-    monkeypatch.setattr(policy_under_test, "write_result", lambda *_: None)
-    pipeline._evaluate(preset, "stardiff_single", None, "demos-a", "")
+    monkeypatch.setattr(policy_under_test, "write_result", lambda *_, **__: None)
+    pipeline._evaluate(preset, "stardiff_single", stubs.make_env(), "demos-a", "")
     assert found == [tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz"]
 
 
@@ -317,13 +310,13 @@ def test_seen_comes_before_unseen_in_the_outcome():
         found = {"successes": successes, "trials": trials, "rate": successes / trials}
         return {**found, "ci95": [0.0, 1.0]}
 
-    result = {
-        "method": "stardiff",
+    figures = {
         "seen": rate(1, 8),
         "unseen": rate(2, 4),
         "safe": {"all": rate(3, 12)},
         "rcm_error_mm": {"executed": {"mean": 0.1, "max": 0.2}},
     }
+    result = types.SimpleNamespace(method="stardiff", figures=figures)
     head, row = messages.outcome([result]).splitlines()
     assert row.index("1/8") == head.index(" seen") + 1
     assert row.index("2/4") == head.index("unseen")
@@ -334,12 +327,13 @@ def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):
     stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
     state = types.SimpleNamespace(ema_params={"w": np.ones(3)}, normalizer=stats)
     monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
-    settings, env = smoke(tmp_path, "stardiff"), types.SimpleNamespace(p_world_ref=[1.0, 2.0, 3.0])
+    settings, env = smoke(tmp_path, "stardiff"), stubs.make_env()
     pipeline._train(settings, "stardiff", lambda: None, env, None)
     kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
     assert (kept.method, kept.preset, kept.demos) == ("stardiff", "smoke", settings.demos)
     assert (kept.policy, kept.train) == (settings.policy, settings.train)
-    assert kept.p_world_ref == (1.0, 2.0, 3.0)
+    assert kept.scene == env.names and kept.roll_zero == (0.0,)
+    np.testing.assert_array_equal(kept.p_world_ref, env.p_world_ref)
 
 
 def test_times_of_a_result_are_of_the_weights_that_it_has(tmp_path):
@@ -354,6 +348,7 @@ def test_times_of_a_result_are_of_the_weights_that_it_has(tmp_path):
 def test_the_outcome_has_intervals_and_the_worst_within_steps():
     rate = {"successes": 1, "trials": 4, "rate": 0.25, "ci95": [0.1, 0.6]}
     errors = {"executed": {"mean": 0.1, "max": 0.2}, "within_steps": {"max": 0.3}}
-    result = {"method": "stardiff", "seen": rate, "unseen": rate, "safe": {"all": rate}}
-    (_, row) = messages.outcome([{**result, "rcm_error_mm": errors}]).splitlines()
+    figures = {"seen": rate, "unseen": rate, "safe": {"all": rate}, "rcm_error_mm": errors}
+    result = types.SimpleNamespace(method="stardiff", figures=figures)
+    (_, row) = messages.outcome([result]).splitlines()
     assert row.count("1/4 = 25% [10, 60]") == 3 and row.endswith("0.100 mm, at most 0.30")

@@ -34,10 +34,10 @@ def test_a_renamed_folder_is_explained(command, tmp_path):
 
 def test_a_grid_is_in_centimetres_and_degrees():
     grid = {"radii_cm": (2.0, 5.0), "polars_deg": (70.0,), "azimuths": 4}
-    found = sweep._trocars(sweep.Options(run="x", **grid))
+    found = sweep._trocars(sweep.Options(run="x", **grid), 1)
     np.testing.assert_allclose(np.unique(found.radius), [0.02, 0.05], rtol=1e-6)
     np.testing.assert_allclose(np.rad2deg(found.polar), 70, rtol=1e-6)
-    np.testing.assert_allclose(np.rad2deg(found.azimuth[:4]), [0, 90, 180, 270], atol=1e-4)
+    np.testing.assert_allclose(np.rad2deg(found.azimuth[:4, 0]), [0, 90, 180, 270], atol=1e-4)
 
 
 def test_sweeps_of_other_trials_lie_apart(tmp_path):

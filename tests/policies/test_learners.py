@@ -14,7 +14,7 @@ import toy_learner
 
 from starjax import config, deploy, errors, learners, rcm
 from starjax.data import normalizer, windows
-from starjax.experiments import options, run
+from starjax.experiments import options, run_settings
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
@@ -93,7 +93,7 @@ def test_it_is_trained_stored_and_deployed(tmp_path):
 
 
 def settings(*argv):
-    return run._settings([*argv, "--out", "x"], "starjax run", "", has_gpu=False)
+    return run_settings._settings([*argv, "--out", "x"], "starjax run", "", has_gpu=False)
 
 
 def test_its_options_are_flags_and_stand_in_the_settings_of_a_run():
@@ -145,9 +145,9 @@ def test_settings_import_no_jax():
     program = """
 import sys
 from starjax import config, learners
-from starjax.experiments import run
+from starjax.experiments import run_settings
 config.PolicyConfig()
-run._settings(["--preset", "cpu", "--out", "x"], "starjax run", "", has_gpu=False)
+run_settings._settings(["--preset", "cpu", "--out", "x"], "starjax run", "", has_gpu=False)
 assert not {"jax", "numpy", "mujoco"} & sys.modules.keys()
 """
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -233,11 +233,12 @@ def test_what_the_roll_network_reads(dataset, changed, matters):
 
 
 def test_what_both_networks_read_is_encoded_once(dataset, monkeypatch):
-    it = Made("stardiff", dataset, roll_observation=True)
     calls, encode = [], encoders.StateEncoder.apply
     monkeypatch.setattr(
         encoders.StateEncoder, "apply", lambda *args: calls.append(1) or encode(*args)
     )
+    it = Made("stardiff", dataset, roll_observation=True)
+    calls.clear()
     jax.eval_shape(it.loss, *it.loss_arguments)
     assert len(calls) == 1
 
@@ -461,11 +462,11 @@ def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
         return history[:, -1:] + p[..., 0]
 
     monkeypatch.setattr(roll_net.RollNet, "apply", newest)
+    policy = policies.make(it.method, it.settings, fakes.TASK, TRAIN)
     given, _ = prepared(it)
-    _, parts = it.policy.loss(it.params, given)
+    _, parts = policy.loss(it.params, given)
     expected = jnp.mean((given.roll - given.history[:, -1:] - given.p[..., 0]) ** 2)
     assert float(parts["roll_loss"]) == pytest.approx(float(expected), rel=1e-5)
-    policy = policies.make(it.method, it.settings, fakes.TASK, TRAIN)
     seen, trocar = it.batch.observation, it.batch.trocar
     keys = jax.random.split(jax.random.key(1), B)
     pose = jit(policy.sample)(it.params, it.stats, keys, seen, trocar).pose

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from report.conftest import edited
 
-from starjax.report import compare, formats, outcomes, results, stats, tables
+from starjax.report import captions, compare, formats, outcomes, results, stats, tables
 
 
 def only(ours, theirs):
@@ -47,6 +47,15 @@ def test_pairs_are_trials_both_ran_with_one_limit_at_one_place(several):
     assert [str(n) for n in found[:3]] == only(first.trials[5:], second.trials[5:])
     assert compare.pair(first, edited(second, [])) is None
     assert compare.pair(first, edited(second, time_limit_s=4.0)) is None
+
+
+def test_trials_under_other_settings_of_jax_are_not_paired(several):
+    first, second = several[0], several[2]
+    settings = {"jax_settings": {"jax_default_matmul_precision": "highest"}}
+    other = edited(second, about=settings)
+    assert compare.pair(first, second) and compare.pair(first, other) is None
+    assert compare.pair(other, other)
+    assert captions.notes([first, other]) != captions.notes([first, second])
 
 
 @pytest.mark.parametrize("first", ["timeout", "loose", "lost", "collided", "invalid"])

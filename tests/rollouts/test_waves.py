@@ -1,10 +1,13 @@
 """Which trials are needed: the law, whatever the chunk, the order of ending, and what is there."""
 
+import concurrent.futures
+import itertools
+import pathlib
 import random
 
 import pytest
 
-from starjax.rollouts import episodes, waves
+from starjax.rollouts import episodes, sharing, waves
 
 
 class World:
@@ -21,6 +24,9 @@ class World:
     def simulate(self, group):
         assert len(set(group)) == len(group)
         self.groups.append(group)
+        yield from self.simulate_quietly(group)
+
+    def simulate_quietly(self, group):
         for segment in range(1, 6):
             yield [
                 episodes.Episode({"trocar": t[0], "trial": t[1], "success": self.fate(t)[0]}, {})
@@ -84,6 +90,37 @@ def test_what_is_there_stays_as_it_is(seed):
     wanted = needed(here, 5)
     elsewhere.fates = here.fates | fates
     assert elsewhere.collected(known, 5, 4) == wanted - set(known)
+
+
+def collected_by(world, disk, count, chunk):
+    """What this many processes write, which begin with what is on the disk."""
+    known, written = dict(disk), []
+
+    def process(index):
+        share = sharing.Share(pathlib.Path(), index, count, "")
+        simulate, news = world.simulate_quietly, lambda: dict(disk)
+        for episode in waves.run(simulate, dict(known), 3, 5, chunk, 1, share, news):
+            written.append(episode.trial)
+            disk[episode.trial] = episode.outcome["success"]
+
+    with concurrent.futures.ThreadPoolExecutor(count) as pool:
+        list(pool.map(process, range(count)))
+    return written
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_processes_that_share_collect_what_one_collects(seed, monkeypatch):
+    """Each knows of the others only what they have written."""
+    monkeypatch.setattr(waves.sharing, "POLL_S", 0.001)
+    for count, chunk in ((2, 4), (3, 2), (2, 64)):
+        world = World(seed)
+        wanted = needed(world, 5)
+        for trial in itertools.product(range(3), range(40)):
+            world.fate(trial)  # threads draw no fates
+        there = set(world.rng.sample(sorted(wanted), 5))
+        disk = {trial: world.fate(trial)[0] for trial in there}
+        written = collected_by(world, disk, count, chunk)
+        assert sorted(written) == sorted(wanted - there)
 
 
 def test_a_failure_costs_no_second_wave_where_lanes_are_free():

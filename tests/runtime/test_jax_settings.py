@@ -12,11 +12,10 @@ import jax
 import pytest
 import stubs
 
-from starjax import rcm
-from starjax.data import demos, store
+from starjax.data import schema, store
 from starjax.runtime import jax_settings
 
-JOBS = pathlib.Path(__file__).parents[1] / "rollouts" / "test_engine.py"  # an evaluation of stubs
+JOBS = pathlib.Path(__file__).parents[1] / "evaluation" / "test_evaluate.py"  # of stubs
 
 # A value other than jax's own of every setting that commands set.
 OTHERS = {
@@ -170,14 +169,16 @@ def test_a_program_with_other_settings_mixes_no_trials(
     assert len(replaced) == 1 and "another evaluation" in replaced[0]
     plan = json.loads((tmp_path / "mixed" / "plan.json").read_text())
     assert plan["jax_settings"] == {name: str(value)}
-    assert (mixed.steps == whole.steps).all() and (mixed.source == whole.source).all()
-    assert (mixed.source != usual.source).any() == draws_others
+    assert (mixed.steps == whole.steps).all() and (
+        mixed.labels["source"] == whole.labels["source"]
+    ).all()
+    assert (mixed.labels["source"] != usual.labels["source"]).any() == draws_others
 
 
 def test_demonstrations_of_other_settings_are_another_dataset(changed):
     def named():
-        wanted = {"per_trocar": 1, "seed": 0, "max_steps": 9}
-        return store.digest(demos.describe(stubs.make_env(), rcm.TROCARS, **wanted))
+        wanted = schema.Settings(per_trocar=1, seed=0, max_steps=9)
+        return store.digest(schema.describe(stubs.make_env(), stubs.trocars(0, 4), wanted))
 
     usual = named()
     changed("jax_random_seed_offset", 1)

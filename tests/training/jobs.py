@@ -134,7 +134,8 @@ def processes_main(out: str, asks: int) -> None:
     import jax
 
     from starjax.models.kernels import packed_params
-    from starjax.training import devices, loop, processes, sharding
+    from starjax.runtime import processes
+    from starjax.training import devices, loop, sharding
 
     processes.join()
     given = jax.numpy.ones(3)
@@ -160,8 +161,9 @@ def stopped_main(out: str, trains: bool) -> None:
     from starjax import cli
     from starjax.data import load, store
     from starjax.experiments import other_processes
+    from starjax.runtime import processes
     from starjax.runtime.signals import stop_signals
-    from starjax.training import loop, processes
+    from starjax.training import loop
 
     settings = dataclasses.replace(SETTINGS, steps=10**6, checkpoint_every=10**6)
     loop.policies.make = lambda *_: _quadratic_policy()

@@ -212,14 +212,14 @@ def test_a_single_model_trains_on_features_too(source, seen):
 
 
 def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, monkeypatch):
-    def without_pictures(root, pictures, report):
-        assert not pictures
+    def without_images(root, images, report, **_):
+        assert not images
         blind = dataset.replace(observation=dataset.observation._replace(images=None))
-        return load.Demos(blind, "digest", "device", 0, {})
+        return load.Demos(blind, "digest", "device", 0, {"scene": {"cameras": ["camera"]}})
 
-    monkeypatch.setattr(load, "load", without_pictures)
-    pictures = np.asarray(dataset.observation.images["camera"])
-    monkeypatch.setattr(load, "frames", lambda root: pictures)
+    monkeypatch.setattr(load, "load", without_images)
+    images = {"camera": np.asarray(dataset.observation.images["camera"])}
+    monkeypatch.setattr(load, "frames", lambda root: images)
     settings, found = source
     loaded = demonstrations.load(run_config(settings, tmp_path), tmp_path, lambda: None, found)
     assert loaded.observation.images is None and windows.on_device(loaded)

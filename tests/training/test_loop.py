@@ -203,7 +203,9 @@ def test_a_stop_right_after_a_checkpoint_does_not_write_it_again(monkeypatch, tm
 
 def test_a_finished_run_is_only_loaded(whole, monkeypatch):
     directory, result = whole
-    monkeypatch.setattr(stepper, "_compiled_beside", lambda *_: pytest.fail("compiles a step"))
+    monkeypatch.setattr(
+        stepper, "_compiled_in_background", lambda *_: pytest.fail("compiles a step")
+    )
     before = (directory / "metrics.jsonl").read_bytes()
     again = jobs.train(directory)
     assert_same_bytes(again.state, result.state)

@@ -1,8 +1,6 @@
 """Two processes that train together are one run, interrupted and resumed or not."""
 
-import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,10 +11,12 @@ import jax
 import mistakes
 import numpy as np
 import pytest
+import several
 
 from starjax import config
 from starjax.experiments import pipeline
-from starjax.training import checkpoint, loop, processes
+from starjax.runtime import processes
+from starjax.training import checkpoint, loop
 from starjax.training import log as metrics
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -25,22 +25,7 @@ import jobs  # it lies beside this file, for processes to run
 
 def start_two(*words: str) -> list[subprocess.Popen]:
     """Two processes of one run, of what these words ask of `jobs`."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    started = []
-    for index in range(2):
-        environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-            "JAX_COORDINATOR_ADDRESS": f"localhost:{port}",
-            "JAX_NUM_PROCESSES": "2",
-            "JAX_PROCESS_ID": str(index),
-        }
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        command = [sys.executable, str(Path(jobs.__file__)), *words]
-        started.append(subprocess.Popen(command, env=environment, **pipes))
-    return started
+    return several.start(jobs.__file__, *words)
 
 
 def run_two(folder: Path, asks: int) -> list[str]:
@@ -141,6 +126,21 @@ def test_variables_that_cannot_be_are_a_mistake(monkeypatch, address, count, ind
         monkeypatch.setenv(name, value)
     with mistakes.of(argument):
         processes.join()
+
+
+@pytest.mark.parametrize(("tasks", "apart", "joins"), [("2", "", 1), ("1", "", 0), ("2", "1", 0)])
+def test_the_tasks_of_a_step_of_srun_are_one_run_unless_kept_apart(
+    monkeypatch, tasks, apart, joins
+):
+    given = []
+    monkeypatch.setattr(processes, "_initialize", lambda **kwargs: given.append(kwargs))
+    for name in processes._VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", tasks)
+    if apart:
+        monkeypatch.setenv("JAX_NUM_PROCESSES", apart)
+    processes.join()
+    assert given == [{}] * joins
 
 
 def test_one_process_agrees_with_itself():

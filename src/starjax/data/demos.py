@@ -6,6 +6,7 @@
 - What makes it reproducible: the description and the seed decide it and, in the last bits, the size
   of the batch, which a machine's memory and devices decide. A wave's chunks are the same in every
   run, and a chunk with a missing episode is simulated again as a whole.
+- By whom: several processes simulate the chunks of a wave in turn, and write into one folder.
 - After a kill: the same command on the same machine ends in the same bytes. Episodes are written as
   they end, while the rest of their chunk and the next are simulated.
 """
@@ -14,7 +15,7 @@ import collections
 import concurrent.futures
 import contextlib
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from starjax import errors
 from starjax.data import schema, store
 from starjax.data.schema import Settings
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import cores, engine, episodes, waves
+from starjax.rollouts import cores, engine, episodes, sharing, waves
 from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import ANYWHERE, Place
@@ -72,17 +73,13 @@ def collect(
         raise errors.UsageError("per_trocar, max_steps, lanes", "1, 1 and 0 or more", got)
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     total = settings.per_trocar * len(trocars.radius)
-    with files.lock(root):
-        description = schema.describe(env, trocars, settings)
-        store.create(root, description)
-        store.clean(root)
-        records = _sound(root, settings.seed, report)
-        done = sum(r["success"] for r in records.values())
+    description = schema.describe(env, trocars, settings)
+    with sharing.shared(root) as share:
+        share.first("sound", lambda: _prepare(root, description, settings, total, report))
+        records = _records(root, store.keys(root))
         frame_bytes = _frame_bytes(description)
-        files.require_writable(
-            root, max(total - done, 0) * min(settings.max_steps, FRAME_GUESS) * frame_bytes
-        )
-        lanes, at_once = _size(place, total, frame_bytes)
+        lanes = share.first("lanes", lambda: _lanes(place, total, frame_bytes, share.count))
+        at_once = max(1, min(cores.count(), _fitting(frame_bytes) // lanes))
         simulate = _simulator(env, agent, params, trocars, settings, place._replace(lanes=lanes))
         known = {(r["trocar"], r["trial"]): r["success"] for r in records.values()}
 
@@ -96,20 +93,62 @@ def collect(
             records[record["key"]] = record
             advance(int(record["success"]))
 
+        def news() -> dict[episodes.Trial, bool]:
+            """What other processes have written."""
+            if share.count == 1:
+                return {}
+            found = _records(root, set(store.keys(root)) - records.keys() - written)
+            for record in found.values():
+                note(record)
+            return {(r["trocar"], r["trial"]): r["success"] for r in found.values()}
+
+        written: set[str] = set()  # by this process, but for those that `records` has
         needed = waves.run(
-            simulate, known, len(trocars.radius), settings.per_trocar, lanes, at_once
+            simulate, known, len(trocars.radius), settings.per_trocar, lanes, at_once, share, news
         )
-        shown = progress.track("Demonstrations", total, unit="episodes", done=done)
-        with shown as advance, _writer(commit, note, lanes) as write:
+        with _shown(share, total, records) as advance, _writer(commit, note, lanes) as write:
             for episode in needed:
+                written.add(store.key(*episode.trial, settings.seed))
                 write(episode)
-        digest = store.seal(root, records)
+        share.meet("written")
+        records |= _records(root, set(store.keys(root)) - records.keys())
+        digest = share.first("sealed", lambda: store.seal(root, records))
     return {
         "digest": digest,
         "episodes": sum(record["success"] for record in records.values()),
         "trials": len(records),
         "frames": sum(record["length"] for record in records.values() if record["files"]),
     }
+
+
+def _prepare(
+    root: Path,
+    description: dict[str, Any],
+    settings: Settings,
+    total: int,
+    report: Callable[[str], None],
+) -> None:
+    """Leaves only sound episodes of this dataset in its folder, and sees whether the rest fits."""
+    store.create(root, description)
+    store.clean(root)
+    done = _check_episodes(root, settings.seed, report)
+    guess = min(settings.max_steps, FRAME_GUESS) * _frame_bytes(description)
+    files.require_writable(root, max(total - done, 0) * guess)
+
+
+def _records(root: Path, keys: Iterable[str]) -> dict[str, store.Record]:
+    """Records of sound episodes."""
+    return {key: store.verify(root, key, arrays=False) for key in keys}
+
+
+def _shown(
+    share: sharing.Share, total: int, records: dict[str, store.Record]
+) -> contextlib.AbstractContextManager[Any]:
+    """The progress, which the first process shows for all."""
+    if not share.is_first:
+        return contextlib.nullcontext(lambda count: None)
+    done = sum(record["success"] for record in records.values())
+    return progress.track("Demonstrations", total, unit="episodes", done=done)
 
 
 def _simulator(
@@ -130,13 +169,13 @@ def _simulator(
     return simulate
 
 
-def _sound(root: Path, seed: int, report: Callable[[str], None]) -> dict[str, store.Record]:
-    """Records of the episodes on disk; damaged ones are removed, to be collected again.
+def _check_episodes(root: Path, seed: int, report: Callable[[str], None]) -> int:
+    """Removes damaged episodes, to be collected again; returns how many successes there are.
 
     Raises:
       StorageError: one is of another seed, so that a lost dataset.json was of another dataset.
     """
-    records = {}
+    successes = 0
     for key, found in store.verify_all(root, store.keys(root)).items():
         if isinstance(found, store.DamagedEpisode):
             report(f"damaged, collected again: {found}")
@@ -148,8 +187,8 @@ def _sound(root: Path, seed: int, report: Callable[[str], None]) -> dict[str, st
                 "choose another folder, or remove this one"
             )
         else:
-            records[key] = found
-    return records
+            successes += found["success"]
+    return successes
 
 
 @contextlib.contextmanager
@@ -187,19 +226,24 @@ def _frame_bytes(description: dict[str, Any]) -> int:
     return sum(math.prod(x["shape"]) * np.dtype(x["dtype"]).itemsize for x in features)
 
 
-def _size(place: Place, total: int, frame_bytes: int) -> tuple[int, int]:
-    """Lanes of a chunk, and chunks that are simulated side by side."""
-    fits = int(MEMORY_SHARE * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
-    lanes = place.lanes or max(1, min(_fast(place.devices, total), fits))
-    at_once = max(1, min(cores.count(), fits // lanes))
+def _fitting(frame_bytes: int) -> int:
+    """Episodes whose images fit the memory, twice: being simulated and being written."""
+    return int(MEMORY_SHARE * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
+
+
+def _lanes(place: Place, total: int, frame_bytes: int, processes: int) -> int:
+    """Lanes of a chunk."""
+    fast = _fast(place.devices, total, processes)
+    lanes = place.lanes or max(1, min(fast, _fitting(frame_bytes)))
     several = len(place.devices or [0])
-    return -(-lanes // several) * several, at_once
+    return -(-lanes // several) * several
 
 
-def _fast(devices: Sequence[jax.Device] | None, total: int) -> int:
+def _fast(devices: Sequence[jax.Device] | None, total: int, processes: int) -> int:
     """Episodes that make the most of a program, where `total` are wanted: several GPUs share what
     one would do alone. Not of what is there already, as the size of a batch may change last bits.
     """
     if jax.default_backend() == "cpu":
         return cores.CPU_LANES
-    return GPU_LANES * min(len(devices or [0]), -(-total // GPU_LANES))
+    count = len(devices or [0]) * processes
+    return -(-GPU_LANES * min(count, -(-total // GPU_LANES)) // processes)

@@ -73,10 +73,11 @@ def given(asks: Asks, observation: Any, trocar: Any) -> tuple[types.Observation,
     """
     if not isinstance(trocar, rcm.Trocar):
         raise UsageError("trocar", "an rcm.Trocar", type(trocar).__name__)
-    trocar = rcm.Trocar(*map(jnp.asarray, rcm.check_trocar(trocar)))
+    trocar = rcm.check_trocar(trocar)
     farthest = 0.0 if _is_traced(trocar.radius) else np.asarray(trocar.radius).max(initial=0.0)
     if farthest > FARTHEST:
         raise UsageError("trocar.radius", f"at most {FARTHEST} m", f"{farthest:g}")
+    trocar = rcm.Trocar(*map(jnp.asarray, trocar))  # within a program a traced one
     if not isinstance(observation, Observation):
         raise UsageError("observation", "a deploy.Observation", type(observation).__name__)
     pose = (None, None) if observation.pose is None else observation.pose

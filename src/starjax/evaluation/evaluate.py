@@ -1,5 +1,7 @@
 """Evaluates an agent over all trocars x trials, chunk by chunk, going on where a run was killed.
 
+Several processes share the chunks out; each has all trials at the end.
+
 <directory>/plan.json          what is being evaluated; other weights, settings, scenes or versions
                                start afresh
 <directory>/chunk_<n>.npz      a `trials.Table` of the chunk's trials; its recorded trials
@@ -21,11 +23,11 @@ from starjax.data import schema
 from starjax.evaluation import recorded
 from starjax.evaluation import trials as tables
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import cores, engine, episodes
+from starjax.rollouts import chunks, cores, engine, episodes, sharing
 from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import ANYWHERE, Place
-from starjax.runtime import files, jax_settings, progress, xla
+from starjax.runtime import files, jax_settings, xla
 
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
 GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
@@ -83,67 +85,39 @@ def evaluate(
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     count = len(trocars.radius)
     group = [(i, trial) for i in range(count) for trial in range(settings.trials)]
-    several = len(place.devices or [0])
-    first_device = (place.devices or jax.local_devices())[0]
-    lanes = place.lanes or lanes_per_device(first_device, -(-len(group) // several))
-    batch = lanes * several
     max_steps = math.ceil(settings.time_limit_s * env.control_hz - 1e-6)
-    rules = engine.Settings(settings.seed, None, max_steps, batch)
-    run = engine.make(env, agent, trocars, rules, episodes.SCORE, place.devices)
     chosen = recorded.choose(count, settings.trials, settings.video_trials)
-    with files.lock(directory):
+    several = len(place.devices or [0])
+    device = (place.devices or jax.local_devices())[0]
+    with sharing.shared(directory) as share:
         plan = {
             "seed": settings.seed,
             "trials": settings.trials,
             "trocars": np.stack(trocars, -1).astype(float).tolist(),
             "max_steps": max_steps,
-            "lanes": lanes,
             "recorded": int(chosen.sum()),
             "weights": fingerprint(params),
             "agent": agent.about,
             "identity": dict(identity or {}),
             "scene": env.names._asdict(),
             "model": schema.model_hash(env.scene),
+            "platform": device.platform,
             "versions": xla.versions(),
             **jax_settings.record(),
         }
-        chunk = _resume(directory, plan, min(settings.chunk or batch, batch), batch, report)
+        each = -(-len(group) // (several * share.count))
+        sizes = _Sizes(place.lanes or lanes_per_device(device, each), settings.chunk)
+        most = place.lanes or most_lanes(device)
+        found = share.first("sizes", lambda: _resume(directory, plan, sizes, most, several, report))
+        lanes, chunk = found
+        rules = engine.Settings(settings.seed, None, max_steps, lanes * several)
+        run = engine.make(env, agent, trocars, rules, episodes.SCORE, place.devices)
         spans = [slice(first, first + chunk) for first in range(0, len(group), chunk)]
-        paths = [directory / f"chunk_{number:04d}.npz" for number in range(len(spans))]
-        labels = env.task.labels
-        beside = [f"{_RECORDED}{name}" for name in recorded.names(labels)]
-        chunks = [
-            _read(
-                path,
-                group[rows],
-                tables.names(labels) + (beside if chosen[rows].any() else []),
-                report,
-            )
-            for path, rows in zip(paths, spans, strict=True)
-        ]
-        missing = [number for number, found in enumerate(chunks) if found is None]
-        done = len(group) - sum(len(group[spans[number]]) for number in missing)
-
-        def simulate(number: int) -> Generator[float]:
-            """Makes a chunk; yields how many trials, or parts of them, have passed in between."""
-            here, passed, ended = group[spans[number]], 0.0, []
-            for segment in run(params, here):
-                ended += segment.ended
-                yield (segment.passed - passed) * len(here)
-                passed = segment.passed
-            ended.sort(key=lambda episode: episode.trial)
-            kept = [e for e, keep in zip(ended, chosen[spans[number]], strict=True) if keep]
-            made = tables.from_episodes(ended), recorded.take(kept, env.p_world_ref)
-            _write(paths[number], *made)
-            chunks[number] = made
-
-        with progress.track("Evaluation", len(group), unit="trials", done=done) as advance:
-            for passed in cores.run(missing, simulate, cores.count()):
-                advance(passed)
-        found, kept = zip(*chunks, strict=True)
-        if chosen.any():
-            files.write_npz(directory / "recorded.npz", recorded.join(kept))
-    return tables.join(found)
+        parts = _parts(directory, env, lambda trials: run(params, trials), group, spans, chosen)
+        made = chunks.complete(share, parts, "Evaluation", "trials", report)
+        if share.is_first and chosen.any():
+            files.write_npz(directory / "recorded.npz", recorded.join([*map(_recorded, made)]))
+    return tables.join([*map(tables.from_columns, made)])
 
 
 def lanes_per_device(device: jax.Device, trials: int) -> int:
@@ -151,12 +125,19 @@ def lanes_per_device(device: jax.Device, trials: int) -> int:
 
     A GPU's are as many as make the fewest chunks, and no more than these need.
     """
+    most = most_lanes(device)
+    if device.platform == "cpu":
+        return most
+    count = -(-trials // most)
+    return min(most, 8 * -(-trials // (8 * count)))
+
+
+def most_lanes(device: jax.Device) -> int:
+    """Trials that a device of this kind can run together."""
     if device.platform == "cpu":
         return cores.CPU_LANES
     limit = (device.memory_stats() or {}).get("bytes_limit", 0)
-    most = GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
-    chunks = -(-trials // most)
-    return min(most, 8 * -(-trials // (8 * chunks)))
+    return GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
 
 
 def fingerprint(tree: Any) -> str:
@@ -179,59 +160,86 @@ def _check(settings: Settings, place: Place) -> None:
             raise errors.UsageError(name, "0 or more", value)
 
 
+class _Sizes(NamedTuple):
+    """Lanes of each device, and trials of a chunk, 0 for as many as all lanes."""
+
+    lanes: int
+    chunk: int
+
+
 def _resume(
     directory: Path,
     plan: dict[str, Any],
-    chunk: int,
-    batch: int,
+    sizes: _Sizes,
+    most: int,
+    several: int,
     report: Callable[[str], None],
-) -> int:
-    """Keeps the chunks of an earlier run of the same plan, removes others; returns their size."""
+) -> list[int]:
+    """Keeps the chunks of an earlier run of the same plan, whose sizes are kept too, where a device
+    takes so many lanes; removes others. Returns lanes and chunk."""
     path = directory / "plan.json"
     try:
         found = files.read_json(path) if path.exists() else {}
     except ValueError as error:
         report(str(error))
         found = {}
-    same = {k: v for k, v in found.items() if k != "chunk"} == json.loads(json.dumps(plan))
-    if same and 1 <= found.get("chunk", 0) <= batch:
-        return found["chunk"]
+    before = [found.pop(name, 0) for name in _Sizes._fields]
+    fits = 1 <= before[0] <= most and 1 <= before[1] <= before[0] * several
+    if fits and found == json.loads(json.dumps(plan)):
+        return before
     old = len(list(directory.glob("chunk_*.npz")))
     if old:
         report(f"{directory}: {old} chunks of another evaluation are replaced")
     # The plan goes first: chunks without one belong to nothing.
     for file in [path, directory / "recorded.npz", *directory.glob("chunk_*.npz")]:
         file.unlink(missing_ok=True)
-    files.write_json(path, {**plan, "chunk": chunk})
-    return chunk
+    batch = sizes.lanes * several
+    chosen = _Sizes(sizes.lanes, min(sizes.chunk or batch, batch))
+    files.write_json(path, {**plan, **chosen._asdict()})
+    return list(chosen)
 
 
-def _write(path: Path, table: tables.Table, kept: dict[str, np.ndarray]) -> None:
-    beside = {f"{_RECORDED}{name}": value for name, value in kept.items()}
-    files.write_npz(path, tables.columns(table) | beside)
-
-
-def _read(
-    path: Path,
+def _parts(
+    directory: Path,
+    env: Any,
+    run: Callable[..., Generator[engine.Progress]],
     group: list[episodes.Trial],
-    names: list[str],
-    report: Callable[[str], None],
-) -> tuple[tables.Table, dict[str, np.ndarray]] | None:
-    """A finished chunk, or None if it is missing, damaged or of other trials than these."""
-    try:
-        arrays = files.read_npz(path, names)
-    except FileNotFoundError:
-        return None
-    except ValueError as error:
-        report(f"{error}; evaluated again")
-        return None
-    table = tables.from_columns(arrays)
-    if list(zip(table.trocar.tolist(), table.trial.tolist(), strict=True)) != group:
-        report(f"{path} holds other trials; evaluated again")
-        return None
-    kept = {
-        name.removeprefix(_RECORDED): value
-        for name, value in arrays.items()
+    spans: list[slice],
+    chosen: np.ndarray,
+) -> chunks.Parts:
+    """Chunks of trials: their table, and of those that are `chosen` `[M]` the trajectories."""
+    labels = env.task.labels
+    beside = {f"{_RECORDED}{name}" for name in recorded.names(labels)}
+
+    def check(number: int, arrays: chunks.Arrays) -> None:
+        rows = spans[number]
+        wanted = {*tables.names(labels), *(beside if chosen[rows].any() else ())}
+        if different := wanted ^ arrays.keys():
+            raise ValueError(f"{min(different)} is missing or too much")
+        trials = [arrays[name].tolist() for name in ("trocar", "trial")]
+        if list(zip(*trials, strict=True)) != group[rows]:
+            raise ValueError("it holds other trials")
+
+    def make(number: int) -> Generator[float, None, chunks.Arrays]:
+        rows, passed, ended = spans[number], 0.0, []
+        for segment in run(group[rows]):
+            ended += segment.ended
+            yield (segment.passed - passed) * len(group[rows])
+            passed = segment.passed
+        ended.sort(key=lambda episode: episode.trial)
+        kept = [e for e, keep in zip(ended, chosen[rows], strict=True) if keep]
+        found = recorded.take(kept, env.p_world_ref)
+        trajectories = {f"{_RECORDED}{name}": values for name, values in found.items()}
+        return tables.columns(tables.from_episodes(ended)) | trajectories
+
+    paths = [directory / f"chunk_{number:04d}.npz" for number in range(len(spans))]
+    return chunks.Parts(paths, [len(group[rows]) for rows in spans], check, make)
+
+
+def _recorded(arrays: chunks.Arrays) -> chunks.Arrays:
+    """The trajectories of a chunk."""
+    return {
+        name.removeprefix(_RECORDED): values
+        for name, values in arrays.items()
         if name.startswith(_RECORDED)
     }
-    return table, kept

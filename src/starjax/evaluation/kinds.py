@@ -52,6 +52,7 @@ def _kind(number: Any, labels: Any) -> dict[str, Any]:
         "warnings?": [str],
         "versions?": {"*": str},
         "hardware?": {"devices?": [str], "memory_gb?": NUMBER},
+        "jax_settings?": {"*": str},
         "command?": str,
     }
 

@@ -48,7 +48,7 @@ def policy_ms(
 
     @jax.jit
     def sample(params, stats, keys, observation, trocar):
-        return policy.sample(params, stats, keys, observation, told(seen, trocar))
+        return policy.sample(params, stats, keys, observation, _told(seen, trocar))
 
     keys = jax.random.split(jax.random.key(0), batch)
     # Weights on the host would be copied again at each call.
@@ -112,7 +112,7 @@ def example(
     trocar = rcm.sample_trocar(jax.random.key(1), (batch, seen.task.arms))
     shape = (batch, policy_config.obs_horizon)
     action = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 0.02]), (*shape, seen.task.arms, 4))
-    frame = features.per_step(told(seen, trocar))
+    frame = features.per_step(_told(seen, trocar))
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, frame)
     observation = Observation(pose, jnp.ones((*shape, seen.task.arms)))
     if policy_config.observation == "state":
@@ -127,7 +127,7 @@ def example(
     return observation._replace(images=images), trocar
 
 
-def told(seen: features.Sensors, trocar: rcm.Trocar) -> rcm.TrocarFrame:
+def _told(seen: features.Sensors, trocar: rcm.Trocar) -> rcm.TrocarFrame:
     """Trocars `[B, A]` about the nominal ones of the task's arms."""
     slots = seen.task.slots
     p_world_ref = np.array([slot.p_world_ref for slot in slots], np.float32)

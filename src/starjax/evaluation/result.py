@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from starjax.evaluation import kinds, structure, trial_file
-from starjax.runtime import files, provenance, xla
+from starjax.runtime import files, jax_settings, provenance, xla
 from starjax.sim import names
 
 SCHEMA = kinds.NEWEST
@@ -136,6 +136,7 @@ def write(
         **provenance.code()._asdict(),
         "versions": xla.versions(),
         "hardware": xla.hardware(),
+        **jax_settings.record(),
     }
     found = json.loads(json.dumps(content))
     result = _parse(file, found, kinds.SWEEP if "by_distance" in found else kinds.EVALUATION)

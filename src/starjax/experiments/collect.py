@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from starjax.experiments import options, run
+from starjax.experiments import options, run_settings
 
 DESCRIPTION = """Collects the demonstrations of a run (the flags are those of `starjax run`).
 
@@ -11,7 +11,7 @@ Episodes are committed one by one: the same command again goes on from what is t
 
 def main(argv: Sequence[str]) -> int:
     """Collects what is missing."""
-    config = run.settings(argv, "starjax collect", DESCRIPTION)
+    config = run_settings.parse(argv, "starjax collect", DESCRIPTION)
     from starjax.experiments import pipeline
 
     pipeline.run(config, stages=("collect",), command=options.typed("collect", argv))

@@ -27,7 +27,8 @@ def follow(
       env: `sim.env.Env` of the run's scene.
     """
     from starjax.data import load
-    from starjax.training import loop, processes
+    from starjax.runtime import processes
+    from starjax.training import loop
 
     dataset = functools.cache(lambda: load.load(root).dataset)
 

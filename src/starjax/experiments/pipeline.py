@@ -19,7 +19,7 @@ LEAST_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoin
 def start() -> None:
     """Starts jax, in all processes of the run together."""
     xla.prepare_xla()
-    from starjax.training import processes
+    from starjax.runtime import processes
 
     processes.join()
     xla.require_devices("starjax.sim.env", "starjax.training.loop")
@@ -34,7 +34,8 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
       command: what was typed, for the record.
     """
     start()
-    from starjax.training import devices, processes
+    from starjax.runtime import processes
+    from starjax.training import devices
 
     if config.policy.freeze_encoder and not processes.is_alone():
         raise errors.UsageError("policy.freeze_encoder", "one process", "several")
@@ -90,7 +91,8 @@ def _train(
 ) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
     from starjax.policies import policy_file
-    from starjax.training import loop, processes
+    from starjax.runtime import processes
+    from starjax.training import loop
 
     out = Path(config.out)
     folder = out / name

@@ -1,103 +1,20 @@
 """The main command, `python -m starjax.experiments.run`: from trocar to table."""
 
-import dataclasses
 from collections.abc import Sequence
-from typing import Literal
 
-from starjax import cli, errors
-from starjax import config as config_lib
-from starjax.experiments import checks, options, presets
-from starjax.learners import LEARNERS
-from starjax.runtime import gpu
+from starjax import cli
 
 DESCRIPTION = """Collects demonstrations, trains, evaluates and writes the report.
 
 The same command again goes on from what is saved. Values below are those of the chosen preset."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Learning:
-    learner: str = ""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _First:
-    """What the other flags and their defaults depend on."""
-
-    preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"
-    policy: _Learning = _Learning()
-
-
-def settings(argv: Sequence[str], prog: str, description: str) -> config_lib.RunConfig:
-    """Settings of a run from its command line: the preset's values under what was typed.
-
-    Preset `auto` is a guess until jax has started, which is after the first mistake is found.
-    """
-    guess = gpu.is_likely()
-    config = _settings(argv, prog, description, guess)
-    if options.peek(_First, argv, _First()).preset != "auto":
-        return config
-    from starjax.experiments import pipeline
-
-    pipeline.start()
-    from starjax.training import processes
-
-    is_used = gpu.is_used()
-    config = config if is_used == guess else _settings(argv, prog, description, is_used)
-    if processes.is_first():
-        print(f"preset auto: {config.preset}, as {presets.reason(is_used)}", flush=True)
-    return config
-
-
-def _settings(
-    argv: Sequence[str], prog: str, description: str, has_gpu: bool
-) -> config_lib.RunConfig:
-    default = _default(argv, has_gpu)
-    config = options.parse(
-        config_lib.RunConfig, argv, prog=prog, description=description, default=default
-    )
-    config = dataclasses.replace(config, preset=default.preset)
-    out = config.out if config.out != options.AUTO else _folder(config)
-    config = dataclasses.replace(config, out=out)
-    checks.check(config)
-    checks.expect_folder("--out", out)
-    return config
-
-
-def _default(argv: Sequence[str], has_gpu: bool) -> config_lib.RunConfig:
-    """Values of what is not typed: the preset's, without its encoder where nothing is seen."""
-    first = options.peek(_First, argv, _First())
-    default = presets.resolve(first.preset, has_gpu)
-    if first.policy.learner:
-        errors.choice("policy.learner", first.policy.learner, LEARNERS.names())
-        learning = config_lib.with_learner(default.policy, first.policy.learner)
-        default = dataclasses.replace(default, policy=learning)
-    policy = options.peek(config_lib.RunConfig, argv, default).policy
-    if policy.observation == "state":
-        blind = dataclasses.replace(default.policy, encoder_weights="", freeze_encoder=False)
-        return dataclasses.replace(default, policy=blind)
-    return default
-
-
-def _folder(config: config_lib.RunConfig) -> str:
-    """Folder of a run that names none: other learners, observations, encoders frozen or not, and
-    seeds have one each; trainings of one method that differ otherwise meet in it, and are refused.
-    """
-    policy, usual = config.policy, presets.PRESETS[config.preset]
-    parts = [usual.preset]
-    parts += [policy.learner] if policy.learner != usual.policy.learner else []
-    parts += [policy.observation] if policy.observation != usual.policy.observation else []
-    sees, freezes = policy.observation == "image", policy.freeze_encoder
-    if sees and freezes != usual.policy.freeze_encoder:
-        parts.append("frozen" if freezes else "unfrozen")
-    parts += [f"seed{config.seed}"] if config.seed != usual.seed else []
-    return f"runs/{'-'.join(parts)}"
-
-
 def main(argv: Sequence[str]) -> int:
     """Runs every stage that is not already done."""
-    config = settings(argv, "starjax run", DESCRIPTION)
-    # Imported late: `--help` and mistakes answer before jax loads.
+    # Imported late: `--help` and mistakes answer before jax loads, and missing packages before all.
+    from starjax.experiments import options, run_settings
+
+    config = run_settings.parse(argv, "starjax run", DESCRIPTION)
     from starjax.experiments import pipeline
 
     pipeline.run(config, pipeline.STAGES, options.typed("run", argv))
@@ -105,4 +22,4 @@ def main(argv: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(lambda argv: cli.dispatch(["run", *argv]))

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from starjax.experiments import options, run
+from starjax.experiments import options, run_settings
 
 DESCRIPTION = """Collects and trains, without evaluation (the flags are those of `starjax run`).
 
@@ -11,7 +11,7 @@ The same command again goes on from the last checkpoint."""
 
 def main(argv: Sequence[str]) -> int:
     """Collects and trains what is missing."""
-    config = run.settings(argv, "starjax train", DESCRIPTION)
+    config = run_settings.parse(argv, "starjax train", DESCRIPTION)
     from starjax.experiments import pipeline
 
     pipeline.run(config, stages=("collect", "train"), command=options.typed("train", argv))

@@ -107,19 +107,26 @@ def ddim_sample(
     """
     table = schedules.ddim_table(diffusion_steps, steps)
     prepared = prepare(jnp.asarray(table.k))
-    low, high = (-1.0, 1.0) if reach is None else reach
 
     def step(x, inputs):
         row, at_k = inputs
         eps = eps_fn(x, at_k)
         x0 = (x - row.sqrt_one_minus_alpha_bar * eps) / row.sqrt_alpha_bar
-        x0 = jnp.clip(x0, low, high)
+        x0 = within(x0, reach)
         x = row.sqrt_alpha_bar_next * x0 + row.sqrt_one_minus_alpha_bar_next * eps
         return x, None
 
     rows = jax.tree.map(jnp.asarray, table)
     x, _ = jax.lax.scan(step, noise, (rows, prepared))
     return x
+
+
+def within(x: jax.Array, reach: Any) -> jax.Array:
+    """Clips `x` to the lowest and highest value of `reach`, None: to [-1, 1]."""
+    if reach is None:
+        return jnp.clip(x, -1.0, 1.0)
+    low, high = (jnp.broadcast_to(jnp.asarray(bound), x.shape) for bound in reach)
+    return jnp.clip(x, low, high)
 
 
 def _at(table: np.ndarray, k: jax.Array, ndim: int) -> jax.Array:

@@ -31,8 +31,8 @@ def scale_and_shift(module: nn.Module, x: jax.Array, groups: int) -> tuple[jax.A
     channels = x.shape[-1]
     if channels % groups:
         raise ValueError(f"groups: expected a divisor of {channels} channels, got {groups}")
-    scale = module.param("scale", nn.initializers.ones, (channels,))
-    return scale, module.param("bias", nn.initializers.zeros, (channels,))
+    scale = module.param("scale", nn.initializers.ones, (channels,), jnp.float32)
+    return scale, module.param("bias", nn.initializers.zeros, (channels,), jnp.float32)
 
 
 @functools.partial(jax.jit, static_argnames="groups")  # traced once a shape

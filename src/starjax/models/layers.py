@@ -79,7 +79,8 @@ class Dense(nn.Module):
         init = uniform_init(x.shape[-1], gain=0.0 if self.zero else 1.0)
         kernel = self.param("kernel", init, (x.shape[-1], self.features))
         bias = self.param("bias", init, (self.features,))
-        return x @ kernel.astype(x.dtype) + bias.astype(x.dtype)
+        y = x @ kernel.astype(x.dtype)
+        return y + spread(bias.astype(x.dtype), y.shape)
 
 
 class Conv1d(nn.Module):

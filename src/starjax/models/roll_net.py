@@ -56,7 +56,7 @@ class RollNet(nn.Module):
         x = jnp.concatenate([part.astype(self.dtype) for part in inputs], -1)
         x = layers.Dense(self.width, name="project")(x)
         for _ in range(self.blocks):
-            h = nn.LayerNorm(dtype=self.dtype)(x)
+            h = nn.LayerNorm()(x.astype(jnp.float32)).astype(self.dtype)
             h = nn.gelu(layers.Dense(self.width)(h))
             x = x + layers.Dense(self.width)(h)
         return layers.Dense(horizon, zero=True, name="out")(x).astype(jnp.float32)

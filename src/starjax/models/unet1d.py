@@ -103,8 +103,8 @@ class ConditionalUnet1D(nn.Module):
         self.film_bias = self.param("film_bias", init, (size,))
 
     def __call__(self, x: jax.Array, k: jax.Array, cond: jax.Array) -> jax.Array:
-        """Noise in `x` `[B, H, A]` at step `k` (int `[B]`, or `[]` where nobody differentiates),
-        given `cond` `[B, C]`."""
+        """Noise in `x` `[B, H, A]` at step `k` (int `[B]` or `[]`), given `cond` `[B, C]`."""
+        k = jnp.broadcast_to(k, x.shape[:1])
         return self.denoise(x, self.condition(cond) + self.embed_step(k))
 
     def condition(self, cond: jax.Array) -> jax.Array:
@@ -112,13 +112,17 @@ class ConditionalUnet1D(nn.Module):
         if cond.shape[-1] != self.cond_dim:
             raise ValueError(f"cond: expected [B, {self.cond_dim}], got {cond.shape}")
         active = layers.mish(cond.astype(self.dtype))
-        return _matmul_f32(active, self.film_cond) + self.film_bias
+        film = _matmul_f32(active, self.film_cond)
+        return film + layers.spread(self.film_bias, film.shape)
 
     def embed_step(self, k: jax.Array) -> jax.Array:
         """The diffusion step's part of every FiLM: int `[...] -> float32 [..., F]`."""
         half = self.time_dim // 2
-        frequency = jnp.exp(jnp.arange(half) * (-math.log(10_000.0) / max(half - 1, 1)))
-        angle = jnp.asarray(k, jnp.float32)[..., None] * frequency
+        fall = -math.log(10_000.0) / max(half - 1, 1)
+        frequency = jnp.exp(jnp.arange(half, dtype=jnp.float32) * fall)
+        angle = jnp.asarray(k, jnp.float32)[..., None] * frequency.reshape(
+            (1,) * jnp.ndim(k) + (-1,)
+        )
         wave = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1).astype(self.dtype)
         embedding = self.time_out(layers.mish(self.time_in(wave)))
         return _matmul_f32(layers.mish(embedding), self.film_time)

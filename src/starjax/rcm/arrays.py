@@ -15,14 +15,19 @@ Result = TypeVar("Result")
 
 
 def broadcasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """`function`, whose arrays may differ in their number of axes.
+    """`function`, whose arrays may differ in number of axes and in type, and be numpy's.
 
-    Also in a program that has told jax to refuse that (`jax_numpy_rank_promotion`).
+    Also in a program that has told jax to refuse that (`jax_numpy_rank_promotion`,
+    `jax_numpy_dtype_promotion`, `jax_transfer_guard`).
     """
 
     @functools.wraps(function)
     def mapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        with jax.numpy_rank_promotion("allow"):
+        with (
+            jax.numpy_rank_promotion("allow"),
+            jax.numpy_dtype_promotion("standard"),
+            jax.transfer_guard("allow"),
+        ):
             return function(*args, **kwargs)
 
     return mapped
@@ -62,6 +67,14 @@ def checked(**named: tuple[Any, tuple[int, ...]]) -> list[jax.Array]:
 def bounded(x: jax.Array) -> jax.Array:
     """`x` with non-finite entries set to 0 and the others clipped to where sums stay finite."""
     return jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), -_BOUND, _BOUND)
+
+
+def taint(x: jax.Array) -> jax.Array:
+    """`[..., 1]`: 0 where all of `x` `[..., n]` are finite, else NaN.
+
+    Unlike a constant NaN it is nothing that `jax_debug_nans` finds where no input is at fault.
+    """
+    return jnp.sum(x - x, axis=-1, keepdims=True)
 
 
 def epsilon(dtype: Any) -> float:

@@ -110,17 +110,15 @@ def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
     """
     given = _checked(pose, p_world_trocar)
     R, p, p_world_trocar = given
-    is_known = (
-        jnp.isfinite(R).all((-2, -1))
-        & jnp.isfinite(p).all(-1)
-        & jnp.isfinite(p_world_trocar).all(-1)
-    )
+    unknown = arrays.taint(R.reshape(*R.shape[:-2], 9)) + arrays.taint(p)
+    unknown = unknown + arrays.taint(p_world_trocar)
     R, p, p_world_trocar = (arrays.bounded(x) for x in given)
     target, _ = arrays.direction(p - p_world_trocar, R[..., :, 2])
     R = arrays.matmul(rotations.rotation_align(R[..., :, 2], target), R)
+    is_known = jnp.isfinite(unknown)
     return types.Pose(
-        R=jnp.where(is_known[..., None, None], R, jnp.nan),
-        p=jnp.where(is_known[..., None], jnp.broadcast_to(p, R.shape[:-1]), jnp.nan),
+        R=jnp.where(is_known[..., None], R, unknown[..., None]),
+        p=jnp.where(is_known, jnp.broadcast_to(p, R.shape[:-1]), unknown),
     )
 
 

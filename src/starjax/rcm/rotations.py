@@ -119,7 +119,8 @@ def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     is_degenerate = cos**2 + sin**2 <= arrays.epsilon(x.dtype) ** 2
     roll = jnp.arctan2(sin, jnp.where(is_degenerate, 1.0, cos))
     # `_base_rotation` takes any axis, a NaN as a tool that points straight down.
-    return jnp.where(jnp.isnan(R_world_tip[..., :, 2]).any(-1), jnp.nan, roll)
+    axis = R_world_tip[..., :, 2]
+    return jnp.where(jnp.isnan(axis).any(-1), arrays.taint(axis)[..., 0], roll)
 
 
 @arrays.broadcasting

@@ -126,7 +126,8 @@ def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> T
         p_world_trocar=(p_world_trocar, (3,)), p_world_ref=(p_world_ref, (3,))
     )
     offset = p_world_trocar - p_world_ref
-    offset = jnp.where(jnp.isfinite(offset).all(-1, keepdims=True), offset, jnp.nan)
+    unknown = arrays.taint(offset)
+    offset = jnp.where(jnp.isfinite(unknown), offset, unknown)
     radius, across = arrays.norm(offset), arrays.norm(offset[..., :2])
     x, y, z = (offset[..., i] for i in range(3))
     # Where arctan2 has no derivative, or one that grows without bound.
@@ -170,6 +171,7 @@ def trocar_frame(trocar: Trocar, p_world_ref: ArrayLike, roll_zero: ArrayLike = 
     return TrocarFrame(trocar, p, trocar_rotation(trocar), jnp.broadcast_to(roll_zero, shape))
 
 
+@arrays.broadcasting
 def sample_trocar(
     key: jax.Array,
     shape: tuple[int, ...] = (),
@@ -202,6 +204,7 @@ def sample_trocar(
     )
 
 
+@arrays.broadcasting
 def check_trocar(trocar: Trocar) -> Trocar:
     """Return `trocar` if it is one, for use where values are concrete; traced values pass.
 

@@ -91,6 +91,8 @@ def notes(runs: Sequence[results.Run]) -> list[str]:
     if len(limits) > 1:
         allowed = ", ".join(f"{limit:g}" for limit in limits)
         found.append(f"Trials were given {allowed} s; runs with different limits are not paired.")
+    if len({tuple(sorted(results.jax_settings(run).items())) for run in runs if run.trials}) > 1:
+        found.append("These runs had other settings of jax; such runs are not paired.")
     found += [
         f"{run.label}: the sweep's trials were given {results.sweep_limit_s(run):g} s, those "
         f"through the twelve trocars {run.limit_s:g} s; Fig. 4 shows the sweep's alone."

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 
 from starjax import config, errors
 from starjax.evaluation.result import Trial
-from starjax.report import outcomes, stats
+from starjax.report import outcomes, results, stats
 from starjax.report.results import Run
 from starjax.sim import registry
 from starjax.sim.tasks.base import Task, Words
@@ -54,8 +54,9 @@ def differing(runs: Sequence[Run]) -> list[str]:
 
 
 def pair(a: Run, b: Run) -> stats.Paired | None:
-    """McNemar's test over the trials that both methods ran with the same trocar, seed and limit."""
-    if a.limit_s != b.limit_s:
+    """McNemar's test over the trials that both methods ran with the same trocar, seed and limit,
+    under the same settings of jax."""
+    if a.limit_s != b.limit_s or results.jax_settings(a) != results.jax_settings(b):
         return None
     ours, theirs = ({identity(t): t for t in run.trials} for run in (a, b))
     both = [(ours[k], theirs[k]) for k in sorted(ours.keys() & theirs.keys())]

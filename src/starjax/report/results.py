@@ -113,11 +113,18 @@ def swept(runs: Iterable[Run]) -> list[Run]:
     """The runs that have a sweep, its trials instead of those through the twelve trocars."""
     return [
         run._replace(
-            result=run.result._replace(trials=run.sweep.trials, time_limit_s=sweep_limit_s(run))
+            result=run.result._replace(
+                trials=run.sweep.trials, time_limit_s=sweep_limit_s(run), about=run.sweep.about
+            )
         )
         for run in runs
         if run.sweep
     ]
+
+
+def jax_settings(run: Run) -> dict[str, str]:
+    """Settings of jax that were not the usual ones (`runtime.jax_settings`) in a run's trials."""
+    return run.result.about.get("jax_settings") or {}
 
 
 def sweep_limit_s(run: Run) -> float:

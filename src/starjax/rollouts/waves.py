@@ -1,13 +1,15 @@
 """Which trials a dataset needs, and running them: of each trocar all, up to its last success.
 
 Outcomes are known in any order: a trial is needed once the trials before it cannot have all the
-successes, and is not once they do have them.
+successes, and is not once they do have them. Several processes simulate the groups of a wave in
+turn and learn from each other's files how the other trials ended: the trials before the first one
+that is not known are, so its owner can always say whether it is needed.
 """
 
 import math
 from collections.abc import Callable, Generator, Iterator, Mapping
 
-from starjax.rollouts import cores
+from starjax.rollouts import cores, sharing
 from starjax.rollouts.episodes import Episode, Trial
 
 MIN_SUCCESS_RATE = 0.5  # below it at some trocar, the expert is broken and collecting stops
@@ -26,6 +28,8 @@ def run(
     per_trocar: int,
     chunk: int,
     at_once: int = 1,
+    share: sharing.Share = sharing.ALONE,
+    news: Callable[[], Known] = dict,
 ) -> Iterator[Episode]:
     """Simulates what is needed, `chunk` trials together; yields each episode when that is certain.
 
@@ -36,31 +40,44 @@ def run(
       per_trocar: successes wanted at each.
       chunk: number of lanes.
       at_once: chunks that are simulated side by side.
+      share: of this process.
+      news: outcomes that other processes have written since it was last asked.
 
     Raises:
       ExpertFailed: the expert fails too often.
     """
     there = set(known)
     drawn = [0] * trocars
+    waiting: list[Episode] = []
+
+    def learn(outcomes: Known) -> Iterator[Episode]:
+        """Yields the episodes of which it is certain, with these outcomes, that they are needed."""
+        nonlocal waiting
+        for trial, success in outcomes.items():
+            # What is on disk stays, also where another machine's last bits end otherwise.
+            known.setdefault(trial, success)
+        ready = [e for e in waiting if _is_needed(e.trial, known, per_trocar)]
+        waiting = [e for e in waiting if not _is_needed(e.trial, known, per_trocar)]
+        while ready:  # so that an episode's memory is free once it is written
+            episode = ready.pop()
+            if episode.trial not in there:
+                yield episode
+
     while wave := _wave(known, drawn, per_trocar, chunk):
         groups = [wave[first : first + chunk] for first in range(0, len(wave), chunk)]
-        waiting: list[Episode] = []
+        waiting.clear()  # of the wave before, and not needed
 
         def is_wanted(group: list[Trial]) -> bool:
             return any(_is_open(trial, known, per_trocar) for trial in group)
 
-        for ended in cores.run(groups, simulate, at_once, is_wanted):
+        for ended in cores.run(share.mine(groups), simulate, at_once, is_wanted):
             waiting += ended
-            for episode in ended:
-                # What is on disk stays, also where another machine's last bits end otherwise.
-                known.setdefault(episode.trial, episode.outcome["success"])
-            ended.clear()  # so that an episode's memory is free once it is written
-            ready = [e for e in waiting if _is_needed(e.trial, known, per_trocar)]
-            waiting = [e for e in waiting if not _is_needed(e.trial, known, per_trocar)]
-            while ready:
-                episode = ready.pop()
-                if episode.trial not in there:
-                    yield episode
+            outcomes = {episode.trial: episode.outcome["success"] for episode in ended}
+            ended.clear()
+            yield from learn({**news(), **outcomes})
+        while any(_is_open(trial, known, per_trocar) for trial in wave):
+            share.pause()
+            yield from learn(news())
 
 
 def _wave(known: Known, drawn: list[int], per_trocar: int, chunk: int) -> list[Trial]:

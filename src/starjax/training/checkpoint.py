@@ -17,8 +17,7 @@ from typing import Any
 import jax
 from orbax.checkpoint import v1 as ocp
 
-from starjax.runtime import files
-from starjax.training import processes
+from starjax.runtime import files, processes
 
 _MANIFEST = "manifest.json"
 _STATE = "state"

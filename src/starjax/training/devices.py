@@ -7,8 +7,7 @@ import jax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from starjax import errors
-from starjax.runtime import xla
-from starjax.training import processes
+from starjax.runtime import processes, xla
 
 AXIS = "batch"
 # Of a step on several GPUs: matrices are gathered at once beside the encoder's work, gradients are

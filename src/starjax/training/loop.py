@@ -13,9 +13,9 @@ from starjax import config, errors, methods
 from starjax.data import normalizer, windows
 from starjax.policies import features
 from starjax.policies import policy as policies
-from starjax.runtime import background, progress
+from starjax.runtime import background, processes, progress
 from starjax.sim.tasks.base import Task
-from starjax.training import checkpoint, devices, encoder, holdout, processes
+from starjax.training import checkpoint, devices, encoder, holdout
 from starjax.training import log as metrics
 from starjax.training import state as states
 from starjax.training import stepper as advancing

@@ -13,8 +13,8 @@ from jax.sharding import Mesh
 from starjax import config
 from starjax.data import windows
 from starjax.policies.base import Policy
-from starjax.runtime import background, garbage
-from starjax.training import devices, prefetch, processes
+from starjax.runtime import background, garbage, processes
+from starjax.training import devices, prefetch
 from starjax.training import step as steps
 from starjax.training.sharding import Carried, Parts
 from starjax.training.state import TrainState

@@ -10,6 +10,7 @@ Where the iteration ends is `diffusion.ddim_sample`'s own sequence; after as man
 steps it is there whatever the network.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax.models import kernels
+from starjax.models import diffusion, kernels
 from starjax.models import schedule as schedules
 
 # So many evaluations for so many steps, and one more for twice as many, come equally near
@@ -67,14 +68,14 @@ def ddim_sample(
     """
     table = schedules.ddim_table(diffusion_steps, steps)
     prepared = prepare(jnp.asarray(table.k))
-    low, high = (-1.0, 1.0) if reach is None else reach
+    within = functools.partial(diffusion.within, reach=reach)
     signal, spread, signal_next, spread_next = (
         jnp.asarray(row)[:, None, None, None] for row in table[1:]
     )
 
     def through(x0: jax.Array, at: jax.Array, slope: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The end, and every step's noisy sequence, were x0 + slope (x - at) the clean ones."""
-        clipped = jnp.clip(x0, low, high)
+        clipped = within(x0)
         # what one more of the clean sequence adds to the next noisy one
         gain = jnp.where(clipped == x0, signal_next, 0.0) - spread_next * signal / spread
         factor = spread_next / spread + gain * slope
@@ -82,7 +83,7 @@ def ddim_sample(
         end, before = jax.lax.scan(
             lambda x, row: (row[0] * x + row[1], x), noise, (factor, rest), unroll=True
         )
-        return jnp.clip(end, low, high), before
+        return within(end), before
 
     def evaluate(carry, _):
         _, x, x_before, x0_before = carry

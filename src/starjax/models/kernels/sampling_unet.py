@@ -129,7 +129,7 @@ def _normalized(params: Params, x: jax.Array, groups: int) -> tuple[jax.Array, j
     y = (centred * jax.lax.rsqrt(variance + group_norm.EPSILON)).reshape(rows.shape)
     y = y * _per_group(params["gain"], groups) + _per_group(params["shift"], groups)
     y = layers.mish(y).astype(x.dtype).swapaxes(1, 2)
-    return y, skip + bias[features:].astype(x.dtype) if more else None
+    return y, skip + bias[None, None, features:].astype(x.dtype) if more else None
 
 
 def _shifted_sum(products: jax.Array, bias: jax.Array) -> jax.Array:
@@ -137,7 +137,7 @@ def _shifted_sum(products: jax.Array, bias: jax.Array) -> jax.Array:
     batch, length, width = products.shape
     taps = width // len(bias)
     of_tap = products.reshape(batch, length, taps, -1)
-    total = bias.astype(jnp.float32)
+    total = jnp.broadcast_to(bias.astype(jnp.float32), (batch, length, len(bias)))
     for tap in range(taps):
         ahead = tap - taps // 2  # output i takes input i + ahead
         part = of_tap[:, max(0, ahead) : length + min(0, ahead), tap].astype(jnp.float32)
@@ -155,4 +155,4 @@ def _flat(x: jax.Array) -> jax.Array:
 
 def _per_group(vector: jax.Array, groups: int) -> jax.Array:
     """`[features]` for rows `[B, groups, L, features / groups]`."""
-    return vector.reshape(groups, 1, -1)
+    return vector.reshape(1, groups, 1, -1)

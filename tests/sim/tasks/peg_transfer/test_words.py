@@ -7,7 +7,7 @@ from starjax.sim.tasks.peg_transfer import task, words
 
 
 def test_the_outline_is_the_models():
-    model = scene.compose()
+    model = scene.compose(scene.name())
     drawn = words.outline(model)
     pegs = np.array([line[0, :2] for line in drawn.lines])
     np.testing.assert_allclose(pegs, [model.geom(f"peg{i}").pos[:2] for i in range(12)])

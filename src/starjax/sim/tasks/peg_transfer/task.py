@@ -131,9 +131,7 @@ def sample(bound: Bound, key: jax.Array) -> Layout:
     tip = jnp.array(TIP_HOME) + jax.random.uniform(
         key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD
     )
-    c, s, o, one = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros(()), jnp.ones(())
-    R = jnp.stack([jnp.stack([c, -s, o]), jnp.stack([s, c, o]), jnp.stack([o, o, one])])
-    block = Pose(R, jnp.append(xy, RIM_HEIGHT))
+    block = Pose(rcm.rotation_z(yaw), jnp.append(xy, RIM_HEIGHT))
     return Layout(source=source, target=target, target_peg=pegs[target], block=block, tip=tip)
 
 

@@ -1,12 +1,15 @@
-"""Several processes as one training run: joining it, agreeing, and acting alone.
+"""Several processes as one run: joining it, agreeing, and acting alone.
 
 Every process runs the same command on a shared folder, with JAX_COORDINATOR_ADDRESS (host:port of
-the first one), JAX_NUM_PROCESSES and JAX_PROCESS_ID set. All train together and write the arrays of
-checkpoints; whatever else there is to do, other files above all, the first does alone. With one
-process nothing here does anything.
+the first one), JAX_NUM_PROCESSES and JAX_PROCESS_ID set, or as a step of `srun`, whose variables
+say the same. All train together and write the arrays of checkpoints, and each makes its share of
+demonstrations and trials (`rollouts.sharing`); whatever else there is to do, other files above all,
+the first does alone. With one process nothing here does anything.
 """
 
+import functools
 import os
+import secrets
 from typing import Any
 
 import jax
@@ -15,19 +18,30 @@ from jax.experimental import multihost_utils
 from jax.sharding import NamedSharding
 
 from starjax import errors
+from starjax.runtime import lost
 
 _VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+_SLURM_TASKS = "SLURM_STEP_NUM_TASKS"
 _PREEMPTION = "jax_enable_preemption_service"
+# A process that ended without a word is missed after so long; jax's own is 100.
+_HEARTBEAT_S = 30
 
 
 def join() -> None:
     """Joins the run that the variables name, once, if they do; call it before the first jax array.
 
+    In a step of `srun` with several tasks they need not be set; JAX_NUM_PROCESSES=1 alone keeps its
+    tasks apart.
+
     Raises:
       UsageError: some of the variables are missing or are no numbers.
     """
     address, *numbers = (os.environ.get(name, "") for name in _VARIABLES)
-    if jax.distributed.is_initialized() or (not address and not any(numbers)):
+    if jax.distributed.is_initialized() or [address, *numbers] == ["", "1", ""]:
+        return
+    if not address and not any(numbers):
+        if int(os.environ.get(_SLURM_TASKS, "1")) > 1:
+            _initialize()
         return
     if not address or not all(number.isdigit() for number in numbers):
         raise errors.UsageError(
@@ -38,10 +52,16 @@ def join() -> None:
     count, index = map(int, numbers)
     if index >= count:
         raise errors.UsageError("JAX_PROCESS_ID", f"0 to {count - 1}", index)
+    _initialize(coordinator_address=address, num_processes=count, process_id=index)
+
+
+def _initialize(**given: Any) -> None:
+    """Connects to the others; what is not given, jax finds in the variables of `srun`."""
     # Its handler of SIGTERM, in C++, would take the signal from Python's.
     if hasattr(jax.config, _PREEMPTION):
         jax.config.update(_PREEMPTION, False)
-    jax.distributed.initialize(address, num_processes=count, process_id=index)
+    lost.watch()
+    jax.distributed.initialize(heartbeat_timeout_seconds=_HEARTBEAT_S, **given)
 
 
 def is_alone() -> bool:
@@ -52,6 +72,12 @@ def is_alone() -> bool:
 def is_first() -> bool:
     """Whether this process is the one that writes."""
     return jax.process_index() == 0
+
+
+@functools.cache
+def run_number() -> int:
+    """A number that all processes of this run have, and hardly any other run."""
+    return agree(secrets.randbelow(2**31))[0]
 
 
 def agree(*values: int) -> tuple[int, ...]:

@@ -1,0 +1,25 @@
+"""Which scene a benchmark simulates: its flags, its environment, and its name in results."""
+
+import argparse
+from typing import Any
+
+from starjax.sim import env as envs
+from starjax.sim import names, scene
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """`--task` and `--arm`."""
+    parser.add_argument("--task", default="peg_transfer", help="of the registry")
+    parser.add_argument("--arm", nargs="+", default=[], help="one for each slot, or one for all")
+
+
+def make(asked: argparse.Namespace, **settings: Any) -> envs.Env:
+    """The environment that the flags ask for; `settings` are those of `env.make`."""
+    return envs.make(asked.task, asked.arm, **settings)
+
+
+def result_name(benchmark: str, found: names.SceneNames) -> str:
+    """Name of a benchmark's result file; other scenes than the usual one have their own."""
+    if found == scene.name():
+        return benchmark
+    return "_".join([benchmark, found.task, *found.arms])

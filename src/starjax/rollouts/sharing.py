@@ -1,0 +1,136 @@
+"""Shares out work in one folder among the processes of a run.
+
+Every process runs the same command on a shared folder. Its parts belong to the processes in turn;
+what one makes, the others read from the folder. They wait for each other by small files in
+`<folder>/.shared`, named by the run and by the piece of work, so that those of a killed run mean
+nothing. With one process there are no such files, and nothing waits.
+"""
+
+import contextlib
+import itertools
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+
+from starjax.runtime import files, processes
+
+POLL_S = 0.2  # between two looks for what another process writes
+_SIGNS = ".shared"
+_FAILED = "failed"
+
+Part = TypeVar("Part")
+_works = itertools.count()
+
+
+class ProcessFailed(files.StorageError):
+    """Another process of the run ended with an error."""
+
+
+class Share(NamedTuple):
+    """What this process has to do with a piece of work.
+
+    Attributes:
+      folder: of the work.
+      index, count: of this process, and how many there are.
+      name: of the piece of work, the same in all processes.
+    """
+
+    folder: Path
+    index: int
+    count: int
+    name: str
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this process does what is done once."""
+        return self.index == 0
+
+    def mine(self, parts: Sequence[Part]) -> list[Part]:
+        """The parts that this process makes."""
+        return list(parts[self.index :: self.count])
+
+    def first(self, what: str, act: Callable[[], Any]) -> Any:
+        """What `act()` gives in the first process, a JSON value, in all of them; others wait."""
+        if self.is_first:
+            value = act()
+            self._sign(what, value)
+            return value
+        return self._wait(what)
+
+    def meet(self, what: str) -> None:
+        """Waits until all processes are here."""
+        self._sign(f"{what}-{self.index}", None)
+        for index in range(self.count):
+            self._wait(f"{what}-{index}")
+
+    def pause(self) -> None:
+        """Waits a moment for what others write.
+
+        Raises:
+          ProcessFailed: one of them ended with an error.
+        """
+        time.sleep(POLL_S)
+        with contextlib.suppress(FileNotFoundError):
+            raise ProcessFailed(files.read_json(self._path(_FAILED))["value"])
+
+    def _path(self, what: str) -> Path:
+        return self.folder / _SIGNS / f"{self.name}-{what}.json"
+
+    def _sign(self, what: str, value: Any) -> None:
+        if self.count > 1:
+            files.write_json(self._path(what), {"value": value})
+
+    def _wait(self, what: str) -> Any:
+        path = self._path(what)
+        while self.count > 1:
+            with contextlib.suppress(FileNotFoundError):
+                return files.read_json(path)["value"]
+            self.pause()
+        return None
+
+
+ALONE = Share(Path(), 0, 1, "")
+
+
+@contextlib.contextmanager
+def shared(folder: Path) -> Iterator[Share]:
+    """Holds `folder` for this run, all of whose processes come here with it.
+
+    Yields:
+      The share of this process. The first one's `first` comes before any `meet`.
+
+    Raises:
+      StorageError: another run holds it, or the folder cannot be written.
+    """
+    index, count = jax.process_index(), jax.process_count()
+    number = processes.run_number() if count > 1 else 0
+    share = Share(folder, index, count, f"{number:x}-{next(_works)}")
+    if not share.is_first:
+        with _told(share):
+            yield share
+        share._sign(f"end-{index}", None)
+        return
+    with files.lock(folder):
+        shutil.rmtree(folder / _SIGNS, ignore_errors=True)  # a killed run's
+        with _told(share):
+            yield share
+        for other in range(1, count):
+            share._wait(f"end-{other}")
+        shutil.rmtree(folder / _SIGNS, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _told(share: Share) -> Iterator[None]:
+    """Tells the others of an error."""
+    try:
+        yield
+    except ProcessFailed:
+        raise
+    except BaseException as error:
+        message = f"process {share.index} of {share.count} ended: {error}"
+        share._sign(_FAILED, message)
+        raise

@@ -1,0 +1,142 @@
+"""Every public map works, with the same values, whatever a surrounding program makes jax refuse."""
+
+import contextlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import rcm
+
+N = 5
+DRAWN = np.random.default_rng(0)
+
+# What a program may turn on to find its own mistakes; all at once.
+STRICT = {
+    "jax_array_garbage_collection_guard": "log",
+    "jax_check_static_indices": True,
+    "jax_check_tracer_leaks": True,
+    "jax_debug_infs": True,
+    "jax_debug_key_reuse": True,
+    "jax_debug_nans": True,
+    "jax_disallow_mesh_context_manager": True,
+    "jax_enable_checks": True,
+    "jax_error_checking_behavior_divide": "raise",
+    "jax_error_checking_behavior_nan": "raise",
+    "jax_error_checking_behavior_oob": "raise",
+    "jax_explicit_x64_dtypes": "error",
+    "jax_legacy_prng_key": "error",
+    "jax_numpy_dtype_promotion": "strict",
+    "jax_numpy_rank_promotion": "raise",
+    "jax_thread_guard": True,
+    "jax_transfer_guard": "disallow",
+}
+
+
+@contextlib.contextmanager
+def mode(settings):
+    """Sets settings of jax inside the block."""
+    guards = [name for name in jax.config.values if "transfer_guard" in name]
+    before = {name: jax.config.values[name] for name in {*settings, *guards}}
+    try:
+        for name, value in settings.items():
+            jax.config.update(name, value)
+        yield
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+
+
+def drawn(*shape):
+    """Numbers that bfloat16 has, and some that are whole."""
+    return np.round(DRAWN.normal(size=shape, scale=2.0) * 4) / 4
+
+
+ROTATION = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+POSE = rcm.Pose(ROTATION, drawn(N, 3))
+TROCAR = rcm.Trocar(np.full(N, 2.0), np.ones(N), np.full(N, 3.0))
+POINT = drawn(3)
+# Of each public function numbers that it takes; every axis and type that jax may refuse to mix.
+GIVEN = {
+    "check_trocar": (TROCAR,),
+    "insertion_depth": (POSE, POINT),
+    "pose_at_depth": (ROTATION, drawn(N), POINT),
+    "pose_on_manifold": (drawn(N, 3), drawn(N), 2.0, POINT),
+    "project": (POSE, drawn(2, N, 3)),
+    "rcm_error": (POSE, drawn(2, N, 3)),
+    "roll_of": (ROTATION,),
+    "rot6d_decode": (drawn(N, 6),),
+    "rot6d_encode": (ROTATION,),
+    "rotation_align": (drawn(N, 3), POINT),
+    "rotation_from_axis_roll": (drawn(N, 3), drawn(2, N)),
+    "rotation_z": (drawn(N),),
+    "trocar_frame": (TROCAR, POINT),
+    "trocar_from_position": (drawn(N, 3), POINT),
+    "trocar_position": (TROCAR, POINT),
+    "trocar_rotation": (TROCAR,),
+}
+SPACES = rcm.ACTION_SPACES.values()
+FUNCTIONS = {name: (getattr(rcm, name), given) for name, given in GIVEN.items()}
+FUNCTIONS |= {f"{s.name}.decode": (s.decode, (drawn(N, s.dim), TROCAR, POINT)) for s in SPACES}
+FUNCTIONS |= {f"{s.name}.encode": (s.encode, (POSE, TROCAR, POINT)) for s in SPACES}
+TYPES = {"bfloat16": jnp.bfloat16, "int32": jnp.int32}
+
+
+def as_type(given, dtype):
+    """The first argument in this type, the others in float32."""
+    first, *others = jax.tree.map(lambda x: np.asarray(x, np.float32), given)
+    return (jax.tree.map(lambda x: x.astype(dtype), first), *others)
+
+
+def test_all_public_functions_are_here():
+    public = {name for name in rcm.__all__ if callable(getattr(rcm, name))}
+    assert public - {"ActionSpace", "Pose", "Trocar", "TrocarFrame"} == {*GIVEN, "sample_trocar"}
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.filterwarnings("error")
+def test_values_are_those_of_jaxs_own_settings(name, dtype):
+    function, given = FUNCTIONS[name]
+    arguments = as_type(given, TYPES[dtype])
+    wanted = jax.device_get(function(*jax.tree.map(np.float32, arguments)))
+    with mode(STRICT):
+        placed = jax.device_put(arguments)
+        call = function if name == "check_trocar" else jax.jit(function)
+        found = jax.device_get(call(*placed))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), found, wanted)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.filterwarnings("error")
+def test_a_program_in_double_precision_has_the_same_values(name):
+    function, given = FUNCTIONS[name]
+    wanted = jax.device_get(function(*jax.tree.map(np.float32, given)))
+    with mode({**STRICT, "jax_enable_x64": True}):
+        first, *others = jax.device_put(given)
+        arguments = (first, *jax.tree.map(np.float32, others))
+        found = jax.device_get(
+            (function if name == "check_trocar" else jax.jit(function))(*jax.device_put(arguments))
+        )
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), found, wanted)
+
+
+@pytest.mark.parametrize("name", ["project", "roll_of", "trocar_from_position"])
+def test_a_program_that_looks_for_nan_finds_none_where_inputs_are_finite(name):
+    """These return NaN for inputs that are not; without jit each operation is looked at."""
+    function, given = FUNCTIONS[name]
+    with mode({"jax_debug_nans": True, "jax_disable_jit": True}):
+        function(*given)
+        first, *others = jax.tree.map(lambda x: np.where(x == x.max(), np.nan, x), given)
+        with pytest.raises(FloatingPointError):
+            function(first, *others)
+
+
+def test_draws_are_those_of_jaxs_own_settings():
+    wanted = jax.device_get(rcm.sample_trocar(jax.random.key(0), (N,)))
+    with jax.transfer_guard("allow"):
+        key = jax.random.key(0)
+    with mode(STRICT):
+        found = jax.device_get(rcm.sample_trocar(key, (N,)))
+    jax.tree.map(np.testing.assert_array_equal, found, wanted)

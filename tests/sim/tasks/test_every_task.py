@@ -1,0 +1,79 @@
+"""What every task of the registry owes: sizes, ranges, and an expert that succeeds."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from starjax import rcm
+from starjax.sim import env as envs
+from starjax.sim import registry, scene
+from starjax.sim.tasks.needle_pick import task as needle
+
+LANES = 4
+# Peg transfer's own tests run its expert through every trocar.
+EXPERTS = {"reach": 120, "needle_pick": 240, "peg_transfer_bimanual": 460}  # control steps
+# The script with two arms has no second try, and drops about one block in ten.
+DROPS = {"peg_transfer_bimanual": 1}
+
+
+@pytest.mark.parametrize("name", registry.tasks.names())
+def test_a_task_is_what_it_says(name):
+    task = registry.tasks.get(name)
+    assert task.name == name and task.cameras and task.time_limit_s > 0 and task.experts
+    bound = task.bind(scene.compose(scene.name(name)))
+    layout = task.sample(bound, jax.random.key(0))
+    tips = task.tips(bound, layout)
+    assert tips.shape == (task.arms, 3) and set(task.label(layout)) == set(task.labels)
+    rcm.check_trocar(task.trocars)
+    assert task.trocars.radius.shape == (len(task.is_seen), task.arms)
+    seen = np.flatnonzero(task.is_seen)
+    np.testing.assert_array_equal(seen, np.arange(len(seen)))  # the seen ones come first
+    state = jnp.zeros((2, 5, task.state_size))
+    relative = task.relative(state, jnp.zeros((2, 5, task.arms, 3)))
+    assert relative.shape[:2] == (2, 5) and bool(jnp.isfinite(relative).all())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXPERTS)
+def test_the_expert_of_a_task_succeeds(name):
+    environment = envs.make(name, observation="state")
+    task, agent = environment.task, environment.task.experts[next(iter(environment.task.experts))]()
+    rows = np.linspace(0, len(task.is_seen) - 1, LANES).astype(int)
+    trocars = jax.tree.map(lambda field: jnp.asarray(field[rows]), task.trocars)
+    keys = jax.random.split(jax.random.key(7), LANES)
+    state = jax.jit(jax.vmap(environment.reset))(keys, envs.EnvParams(trocars))
+    memory = jax.jit(jax.vmap(agent.init))(keys, state)
+
+    @jax.jit
+    @jax.vmap
+    def drive(state, memory):
+        command, memory, _ = agent.act(memory, state)
+        return environment.step(state, command), memory
+
+    for _ in range(EXPERTS[name]):
+        state, memory = drive(state, memory)
+        assert ((state.reward >= 0) & (state.reward <= 1)).all()
+        assert (state.stage >= 0).all() and (state.stage < len(task.stages)).all()
+        if bool(state.done.all()):
+            break
+    won = np.asarray(state.success)
+    assert won.sum() >= LANES - DROPS.get(name, 0) and not state.invalid.any()
+    assert (np.asarray(state.reward)[won] == 1.0).all()
+    assert float(state.rcm_error_within[won].max()) < 0.5e-3
+    fields = jax.vmap(environment.observe)(state).state
+    assert fields.shape == (LANES, task.state_size)
+
+
+def test_the_needle_is_that_of_the_model():
+    m = scene.compose(scene.name("needle_pick"))
+    middles, tangents = needle.segments()
+    for k in range(needle.SEGMENTS):
+        pair = [m.geom(f"wire{k}{side}") for side in "ab"]
+        np.testing.assert_allclose(np.mean([g.pos for g in pair], 0), middles[k], atol=1e-6)
+        R = np.zeros(9)
+
+        mujoco.mju_quat2Mat(R, pair[0].quat)
+        assert abs(R.reshape(3, 3)[:, 2] @ tangents[k]) > 1 - 1e-6
+    assert 0.065e-3 < m.body("needle").mass[0] < 0.075e-3  # kg, of steel
