@@ -260,7 +260,7 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
 
 
 def _json(settings):
-    return json.loads(json.dumps(dataclasses.asdict(settings)))
+    return config.as_json(settings)
 
 
 def test_warnings_name_what_a_reader_must_know():
