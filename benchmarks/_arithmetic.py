@@ -31,11 +31,12 @@ def products(function: Callable, *arguments: Any) -> list[Product]:
 
 def of_padding(policy_config: PolicyConfig, action_dim: int = 4) -> float:
     """Operations of one U-Net evaluation of one sample that multiply padding: no work either."""
-    widths, length, inputs = policy_config.unet_channels, policy_config.horizon, action_dim
+    options, length, inputs = policy_config.options, policy_config.horizon, action_dim
+    widths = options.unet_channels
     total = 0
 
     def block(inputs: int, width: int) -> int:
-        taps = range(-(policy_config.kernel_size // 2), policy_config.kernel_size // 2 + 1)
+        taps = range(-(options.kernel_size // 2), options.kernel_size // 2 + 1)
         outside = [[not 0 <= i + tap < length for i in range(length)] for tap in taps]
         # A tap that is outside everywhere is not made at all.
         zeros = sum(sum(tap) for tap in outside if not all(tap))

@@ -15,6 +15,7 @@ from starjax.data import normalizer, windows
 from starjax.methods import METHODS
 from starjax.policies import features
 from starjax.policies import policy as policies
+from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.sim import registry
 from starjax.training import devices, state, step
 from starjax.training.sharding import Carried, Parts
@@ -29,11 +30,13 @@ SMALL = PolicyConfig(
     observation="state",
     encoder="small",
     vision_dim=128,
-    unet_channels=(64, 128, 256),
-    time_dim=64,
+    options=DiffusionConfig(unet_channels=(64, 128, 256), time_dim=64),
 )
 MINIATURE = dataclasses.replace(
-    SMALL, vision_dim=32, state_dim=32, unet_channels=(32, 64), time_dim=32
+    SMALL,
+    vision_dim=32,
+    state_dim=32,
+    options=DiffusionConfig(unet_channels=(32, 64), time_dim=32),
 )
 
 
@@ -115,7 +118,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     first = state.create(policy, optimizer, drawn(policy, seed), stats, seed)
     mesh = devices.make_mesh(batch, on)
     like = jax.eval_shape(lambda x: x, first)
-    parts = Parts(mesh, case.policy.dtype, like)
+    parts = Parts(mesh, policy.rounded, like)
     settings = (policy, optimizer, case.policy, case.train, parts)
     looped = step.runs_in_a_loop(case.policy)
 
@@ -135,7 +138,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:
     """A policy, its first parameters as an evaluation holds them, and its statistics."""
     policy = policies.make(METHOD, case.policy, TASK, case.train)
-    params = policies.for_sampling(drawn(policy), case.policy.dtype)
+    params = policy.for_sampling(drawn(policy))
     return policy, params, statistics(case.policy)
 
 

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import methods, runtime
+from starjax import config, methods, runtime
 from starjax.data import load, windows
 from starjax.models import diffusion
 from starjax.models.kernels import parallel_ddim
@@ -47,14 +47,14 @@ def main() -> None:
     trained = policy_file.load(packaged.locate(asked.policy))
     given = {"temperature": asked.temperature, "ddim_steps": asked.ddim_steps}
     changed = {name: value for name, value in given.items() if value is not None}
-    trained = trained._replace(policy=dataclasses.replace(trained.policy, **changed))
+    trained = trained._replace(policy=config.with_options(trained.policy, **changed))
     found = load.load(asked.demos)
     frames = np.linspace(0, len(found.dataset.episode) - 1, FRAMES).astype(int)
     batch = windows.gather(
         found.dataset, jnp.asarray(frames), trained.policy.obs_horizon, trained.policy.horizon
     )
     plan = functools.partial(planned, trained, batch)
-    steps, temperature = trained.policy.ddim_steps, trained.policy.temperature
+    steps, temperature = trained.policy.options.ddim_steps, trained.policy.options.temperature
     used = parallel_ddim.evaluations_for(steps)
     wanted = plan("float32", diffusion.ddim_sample)
     ways = {"rounded to bfloat16": ("bfloat16", diffusion.ddim_sample)}

@@ -10,7 +10,6 @@ on the same cores.
 """
 
 import argparse
-import dataclasses
 
 import _arithmetic
 import _machine
@@ -21,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import rcm, runtime
+from starjax import config, rcm, runtime
 from starjax.evaluation import latency
 from starjax.experiments import bench
 from starjax.models import roll_net
@@ -75,7 +74,7 @@ def main() -> None:
         _timing.report("inference", {**facts, "results": {name: row}}, asked.tiny)
 
     for name, (case, batch, steps) in cases.items():
-        case = case._replace(policy=dataclasses.replace(case.policy, ddim_steps=steps))
+        case = case._replace(policy=config.with_options(case.policy, ddim_steps=steps))
         row = measure(case, batch, rates[case.policy.dtype], asked.seconds)
         row |= _peer.compared(peers.get(name, {}), row["p50"])
         speed = row.get("times_peer_speed", row.get("times_numpy_speed", float("nan")))
@@ -113,7 +112,7 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
     traced = (params, stats, jax.random.split(jax.random.key(0), batch), observation, told)
     work = _arithmetic.operations(policy.sample, *traced)
     sequences = batch
-    steps = evaluations = case.policy.ddim_steps
+    steps = evaluations = case.policy.options.ddim_steps
     if parallel_ddim.pays(batch, steps):
         sequences, evaluations = batch * steps, parallel_ddim.evaluations_for(steps)
     work -= sequences * evaluations * _arithmetic.of_padding(case.policy)
@@ -122,7 +121,7 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
     floor = max(arithmetic_s, reading_s)
     row = {
         "batch": batch,
-        "ddim_steps": case.policy.ddim_steps,
+        "ddim_steps": case.policy.options.ddim_steps,
         "evaluations": evaluations,
         **times,
         "floor_ms": 1e3 * floor,

@@ -31,8 +31,14 @@ def comments(settings: type) -> dict[str, str]:
 def rows(settings: type, default: object, prefix: str = "") -> list[tuple[str, str, str, str]]:
     """(flag, what it takes, default, help) of every field, nested ones too."""
     found, said = [], comments(settings)
+    inline = {
+        field.name for field in dataclasses.fields(settings) if field.metadata == limits.INLINE
+    }
     for name, hint in typing.get_type_hints(settings, include_extras=True).items():
         value = getattr(default, name, dataclasses.MISSING)
+        if name in inline:
+            found += rows(type(value), value, prefix)
+            continue
         if dataclasses.is_dataclass(hint):
             if value is dataclasses.MISSING and hint.__module__ == settings.__module__:
                 value = hint()  # a command's own; another module's depends on the machine

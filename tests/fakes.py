@@ -10,6 +10,7 @@ import numpy as np
 from starjax import config, rcm
 from starjax.data import normalizer, windows
 from starjax.policies import policy_file
+from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.sim import names
 from starjax.sim.tasks import base
 from starjax.types import Command, Observation, Pose
@@ -24,12 +25,9 @@ TINY = config.PolicyConfig(
     encoder="small",
     vision_dim=16,
     state_dim=16,
-    unet_channels=(16,),
-    time_dim=16,
-    groups=4,
     roll_width=16,
     roll_blocks=1,
-    ddim_steps=2,
+    options=DiffusionConfig(unet_channels=(16,), time_dim=16, groups=4, ddim_steps=2),
 )
 
 

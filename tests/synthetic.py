@@ -1,6 +1,5 @@
 """A believable run directory made from a seed, for the report's tests."""
 
-import dataclasses
 import json
 import pathlib
 
@@ -88,7 +87,7 @@ def about(method, seed=0):
         "weights": WEIGHTS,
         "preset": "cpu",
         "inference_ms": {"p50": 18.4, "p95": 21.0, "p99": 24.9},
-        "config": json.loads(json.dumps(dataclasses.asdict(settings))),
+        "config": config.as_json(settings),
         "timings_s": {"collect": 142.0, "collect: compile": 31.0, "train": 421.5, "evaluate": 133},
         "command": f"python -m starjax.experiments.run --method {method}",
         "warnings": ["The policy observes the simulator's state, not pixels as in the paper."],

@@ -12,16 +12,16 @@ from starjax.experiments import bench, evaluate, pack, sweep
 
 STARTS = (config.RunConfig(), evaluate.Options(), sweep.Options("x"), bench.Options("x"))
 RANGES = [
-    (start, name, found)
+    (start, setting, found)
     for start in (*STARTS, pack.Options("x", "y"))
-    for name, hint in limits.fields(type(start))
-    if (found := limits.within(hint))
+    for setting in limits.fields(start)
+    if (found := limits.within(setting.hint))
 ]
 
 
-def changed(settings, name, value):
+def changed(settings, path, value):
     """`settings` with another value of a nested field."""
-    part, _, rest = name.partition(".")
+    part, _, rest = path.partition(".")
     value = changed(getattr(settings, part), rest, value) if rest else value
     return dataclasses.replace(settings, **{part: value})
 
@@ -46,16 +46,19 @@ def inside(limit):
 
 
 @pytest.mark.parametrize(
-    ("start", "name", "limit"), RANGES, ids=[f"{type(s).__module__}.{n}" for s, n, _ in RANGES]
+    ("start", "setting", "limit"),
+    RANGES,
+    ids=[f"{type(start).__module__}.{setting.name}" for start, setting, _ in RANGES],
 )
-def test_every_range_names_its_field_its_bounds_and_the_value(start, name, limit):
-    several = isinstance(operator.attrgetter(name)(start), tuple)
+def test_every_range_names_its_field_its_bounds_and_the_value(start, setting, limit):
+    name, path, _ = setting
+    several = isinstance(operator.attrgetter(path)(start), tuple)
     for number in inside(limit):
-        limits.check(changed(start, name, (number,) if several else number))
+        limits.check(changed(start, path, (number,) if several else number))
     for number in outside(limit):
         value = (*inside(limit), number) if several else number
         with mistakes.of(name, number) as caught:
-            limits.check(changed(start, name, value))
+            limits.check(changed(start, path, value))
         bounds = {f"{limit.low:g}", f"{limit.high:g}", str(limit.high), "finite"}
         assert any(bound in caught.value.expected for bound in bounds)
 
@@ -64,11 +67,11 @@ def test_every_number_has_a_range():
     numbers = [
         name
         for start in STARTS
-        for name, _ in limits.fields(type(start))
-        if isinstance(operator.attrgetter(name)(start), int | float)
-        and not isinstance(operator.attrgetter(name)(start), bool)
+        for name, path, _ in limits.fields(start)
+        if isinstance(operator.attrgetter(path)(start), int | float)
+        and not isinstance(operator.attrgetter(path)(start), bool)
     ]
-    ranged = {name for _, name, _ in RANGES}
+    ranged = {setting.name for _, setting, _ in RANGES}
     assert len(numbers) > 40 and set(numbers) <= ranged
 
 

@@ -10,13 +10,15 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
-from starjax.limits import Count, CountOrZero, NotNegative, Positive, Range
+from starjax.learners import LEARNERS
+from starjax.limits import INLINE, Count, CountOrZero, NotNegative, Positive, Range
 
 SettingsT = TypeVar("SettingsT")
 
 
 # A key of jax takes 32 bits: larger seeds would alias smaller ones.
 Seed = Annotated[int, Range(0, 2**32 - 1)]
+Preset = Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"]
 TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
 
 
@@ -42,14 +44,11 @@ class DemosConfig:
     max_steps: Count = 600  # control steps, at 30 Hz, that the expert may take
 
 
-# One DDIM step alone returns the noise that it began with (`models.schedule.ddim_table`).
-FEWEST_DDIM_STEPS = 2
-DiffusionSteps = Annotated[int, Range(FEWEST_DDIM_STEPS, 1_000_000)]
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PolicyConfig:
-    """Networks and diffusion (IV-G)."""
+    """What policies of all learners share (IV-G); the learner's own options follow."""
+
+    learner: str = "diffusion"  # how sequences of actions are generated
 
     # pixels as in the paper, or what the task says of its state
     observation: Literal["image", "state"] = "image"
@@ -67,30 +66,30 @@ class PolicyConfig:
     vision_dim: Annotated[int, Range(2, 65_536)] = 512  # d_v, numbers that an image becomes
     # d_s, numbers that the low-dimensional history becomes (Eq. 11)
     state_dim: Annotated[int, Range(4, 65_536)] = 256
-    # of each level of the U-Net
-    unet_channels: Annotated[tuple[int, ...], Range(1, 65_536)] = (256, 512, 1024, 2048)
-    # of the U-Net's convolutions, in commands
-    kernel_size: Annotated[int, Range(1, 4_095, step=2)] = 5
-    groups: Count = 8  # of the U-Net's GroupNorms; divides all of its channels
-    # width of the embedding of the diffusion step
-    time_dim: Annotated[int, Range(4, 65_536, step=2)] = 128
     roll_width: Annotated[int, Range(1, 65_536)] = 256  # width of the roll network
     roll_blocks: Annotated[int, Range(0, 1_000)] = 3  # residual blocks of the roll network
     # Ablations of the roll network, which reads tip positions, trocar and measured rolls (Eq. 13)
     roll_history: bool = True  # the roll network reads the measured rolls
     roll_trocar: bool = True  # the roll network reads the trocar
     roll_observation: bool = False  # the roll network reads the image or the task state too
-    # whether the diffusion model is given the trocar: as Table II says, or an ablation
+    # whether the learner's model is given the trocar: as Table II says, or an ablation
     sees_trocar: Literal["method", "always", "never"] = "method"
     # which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
     # trocar's azimuth, or an ablation
     trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
-    diffusion_steps: DiffusionSteps = 100  # K, diffusion steps in training
-    ddim_steps: DiffusionSteps = 10  # denoising steps of a decision, at most K
-    # of a sample's first noise; lower: nearer to the likeliest
-    temperature: Annotated[float, Range(0.0, 1.0)] = 1.0
     roll_loss_weight: NotNegative = 0.1  # lambda of Eq. 15
     dtype: Literal["float32", "bfloat16"] = "float32"  # of the networks' arithmetic
+    # Of the learner, see `learners.Learner`; None: its defaults. In JSON, and as flags, they stand
+    # among the others.
+    options: Any = dataclasses.field(default=None, metadata=INLINE)
+
+    def __post_init__(self) -> None:
+        settings = LEARNERS.get(self.learner).settings
+        if self.options is None:
+            object.__setattr__(self, "options", settings())
+        elif not isinstance(self.options, settings):
+            got = type(self.options).__name__
+            raise ValueError(f"options: expected {settings.__name__}, got {got}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -135,7 +134,7 @@ class RunConfig:
 
     method: str = "stardiff"  # a row of Table II, or all
     # starting values of the rest; auto: gpu where jax can use one, else cpu
-    preset: Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"] = "auto"
+    preset: Preset = "auto"
     seed: Seed = 0  # of everything random
     out: str = "auto"  # folder of results; auto: runs/PRESET; other scenes, images and seeds apart
     scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
@@ -175,9 +174,37 @@ def differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
+def with_learner(policy: PolicyConfig, learner: str) -> PolicyConfig:
+    """The settings with another learner, whose options are as they were where both have them."""
+    settings = LEARNERS.get(learner).settings
+    ours, theirs = (
+        {field.name for field in dataclasses.fields(one)} for one in (policy.options, settings)
+    )
+    kept = {name: getattr(policy.options, name) for name in ours & theirs}
+    return dataclasses.replace(policy, learner=learner, options=settings(**kept))
+
+
+def with_options(policy: PolicyConfig, **changed: Any) -> PolicyConfig:
+    """The settings with some of the learner's options changed."""
+    return dataclasses.replace(policy, options=dataclasses.replace(policy.options, **changed))
+
+
 def as_json(settings: Any) -> dict[str, Any]:
     """Settings as values of JSON, which knows no tuples."""
-    return json.loads(json.dumps(dataclasses.asdict(settings)))
+    return json.loads(json.dumps(_plain(settings)))
+
+
+def _plain(settings: Any) -> dict[str, Any]:
+    found = {}
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if not dataclasses.is_dataclass(value):
+            found[field.name] = value
+        elif field.metadata == INLINE:
+            found |= _plain(value)
+        else:
+            found[field.name] = _plain(value)
+    return found
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -189,7 +216,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT:
-    """Inverse of `dataclasses.asdict`, also after a trip through JSON (which knows no tuples).
+    """Inverse of `as_json`.
 
     Fields that `values` lacks keep their default; names that `settings` lacks, and values of other
     types, raise ValueError.
@@ -198,12 +225,17 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
         raise ValueError(f"{settings.__name__}: expected an object, got {values!r}")
     values = upgraded(values)
     hints = typing.get_type_hints(settings)
+    if settings is PolicyConfig:
+        values = _nested(values)
+        hints["options"] = type(values["options"])
     unknown = sorted(set(values) - set(hints))
     if unknown:
         raise ValueError(f"{settings.__name__}: expected {sorted(hints)}, got {unknown}")
     fields = {}
     for name, value in values.items():
-        if dataclasses.is_dataclass(hints[name]):
+        if dataclasses.is_dataclass(value):
+            fields[name] = value
+        elif dataclasses.is_dataclass(hints[name]):
             fields[name] = from_dict(hints[name], value)
         elif _fits(value, hints[name]):
             fields[name] = tuple(value) if isinstance(value, list) else value
@@ -212,6 +244,18 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
                 f"{settings.__name__}.{name}: expected {_kind(hints[name])}, got {value!r}"
             )
     return settings(**fields)
+
+
+def _nested(policy: Mapping[str, Any]) -> dict[str, Any]:
+    """A policy's settings with the learner's options by themselves."""
+    learner = policy.get("learner", PolicyConfig.learner)
+    if not isinstance(learner, str):
+        raise ValueError(f"PolicyConfig.learner: expected str, got {learner!r}")
+    settings = LEARNERS.get(learner).settings
+    shared = {field.name for field in dataclasses.fields(PolicyConfig)} - {"options"}
+    options = {name: value for name, value in policy.items() if name not in shared}
+    rest = {name: value for name, value in policy.items() if name in shared}
+    return {**rest, "options": from_dict(settings, options)}
 
 
 # What runs were in before scenes had names, `sim.names.FIRST`.

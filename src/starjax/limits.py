@@ -13,6 +13,8 @@ from typing import Annotated, Any, NamedTuple
 from starjax import errors
 
 MOST = 2**31 - 1  # whole numbers of compiled programs have 32 bits
+# Metadata of a field that holds settings whose names stand among those of the dataclass itself.
+INLINE = {"inline": True}
 _OPEN = (MOST, math.inf)  # bounds that need not be said
 
 
@@ -52,13 +54,34 @@ Positive = Annotated[float, Range(0.0, math.inf, "()")]
 NotNegative = Annotated[float, Range(0.0, math.inf, "[)")]
 
 
-def fields(settings: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """The fields of a (nested) dataclass, e.g. `train.steps`, with their types."""
-    for name, hint in typing.get_type_hints(settings, include_extras=True).items():
-        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            yield from fields(hint, f"{prefix}{name}.")
+class Setting(NamedTuple):
+    """A field of a (nested) dataclass.
+
+    Attributes:
+      name: as flags and mistakes call it, e.g. `train.steps`.
+      path: of attributes, e.g. `policy.options.ddim_steps`.
+      hint: its type.
+    """
+
+    name: str
+    path: str
+    hint: Any
+
+
+def fields(settings: Any, prefix: str = "", path: str = "") -> Iterator[Setting]:
+    """The settings of a dataclass, or of an instance, which says what its parts are."""
+    kind = settings if isinstance(settings, type) else type(settings)
+    hints = typing.get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        hint, where = hints[field.name], f"{path}{field.name}"
+        value = None if settings is kind else getattr(settings, field.name)
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint) and value is None:
+            value = hint()
+        if dataclasses.is_dataclass(value):
+            inner = prefix if field.metadata == INLINE else f"{prefix}{field.name}."
+            yield from fields(value, inner, f"{where}.")
         else:
-            yield f"{prefix}{name}", hint
+            yield Setting(f"{prefix}{field.name}", where, hint)
 
 
 def within(hint: Any) -> Range | None:
@@ -69,8 +92,8 @@ def within(hint: Any) -> Range | None:
 
 def check(settings: Any) -> None:
     """Raises UsageError for the first field that is out of its range; None has none."""
-    for name, hint in fields(type(settings)):
-        value, limit = operator.attrgetter(name)(settings), within(hint)
+    for name, path, hint in fields(settings):
+        value, limit = operator.attrgetter(path)(settings), within(hint)
         for number in value if isinstance(value, tuple) else (value,):
             if limit and number is not None and not limit.holds(number):
                 each = "each " if isinstance(value, tuple) else ""

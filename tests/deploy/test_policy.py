@@ -254,12 +254,11 @@ def test_a_file_that_will_not_do_is_named(made, tmp_path):
     path, trained, _ = made
     with pytest.raises(ValueError, match=r"^policy: expected a file or one of .*compact, got no"):
         deploy.load("no")
-    for steps in (1, 101, 2.5):
-        with pytest.raises(
-            ValueError, match=rf"ddim_steps: expected .* from 2 to 100, got {steps}"
-        ):
-            deploy.load(path, ddim_steps=steps)
-    assert deploy.load(path, ddim_steps=2).settings.ddim_steps == 2
+    for options in ({"ddim_steps": 1}, {"ddim_steps": 101}, {"ddim_steps": 2.5}, {"steps": 2}):
+        with pytest.raises(ValueError, match="ddim_steps"):
+            deploy.load(path, **options)
+    changed = deploy.load(path, ddim_steps=np.int32(3), temperature=0.5)
+    assert changed.settings == config.with_options(trained.policy, ddim_steps=3, temperature=0.5)
     small = {"unet": {"kernel": jnp.ones(3)}}
     policy_file.save(tmp_path / "p", trained._replace(p_world_ref=None, params=small))
     with pytest.raises(ValueError, match="nominal trocar"):

@@ -45,7 +45,8 @@ def test_every_row_of_the_table_has_its_own_sampler(monkeypatch):
     monkeypatch.setattr(latency, "policy_ms", lambda *_, **__: {})
     given = METHODS["stardiff"], fakes.TINY, None, None, SEEN
     rows = list(latency.table(*given, ddim_steps=(1, 5)))
-    assert [chosen.ddim_steps for chosen in made] == [row["ddim_steps"] for row in rows] == [1, 5]
+    steps = [chosen.options.ddim_steps for chosen in made]
+    assert steps == [row["ddim_steps"] for row in rows] == [1, 5]
 
 
 def test_a_slow_policy_is_timed_five_times_until_its_answer_is_there(monkeypatch):

@@ -8,7 +8,7 @@ import fakes
 import mistakes
 import pytest
 
-from starjax import cli
+from starjax import cli, config
 from starjax.experiments import bench, folders, presets
 
 SMOKE = presets.PRESETS["smoke"]
@@ -43,7 +43,7 @@ def test_bench_writes_beside_the_result_of_the_folder_it_is_in(scored, monkeypat
     ("flags", "counts"), [([], (1, 2, 5, 10, 20, 50)), (["--ddim-steps", "3", "60"], (3, 60))]
 )
 def test_bench_times_what_table_iv_has_and_the_policy_can(scored, monkeypatch, flags, counts):
-    few = dataclasses.replace(SMOKE.policy, diffusion_steps=60)
+    few = config.with_options(SMOKE.policy, diffusion_steps=60)
     folders.claim(scored, dataclasses.replace(SMOKE, policy=few), "demos-a")
     timed = []
     monkeypatch.setattr(bench, "_time", lambda *given: timed.append(given) or {"weights": "a"})

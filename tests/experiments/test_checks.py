@@ -15,10 +15,7 @@ from starjax.experiments import checks, presets, report_command
     [
         ("policy.execute", {"execute": 17}),
         ("policy.obs_horizon", {"obs_horizon": 10}),
-        ("policy.ddim_steps", {"ddim_steps": 101}),
         ("policy.horizon", {"horizon": 10}),
-        ("policy.unet_channels", {"unet_channels": (64, 100)}),
-        ("policy.unet_channels", {"unet_channels": ()}),
         ("policy.image_size", {"image_size": 34}),  # 31 pixels are left by the crop
         ("policy.image_size", {"image_size": 36}),  # 32
         ("policy.freeze_encoder", {"freeze_encoder": True}),

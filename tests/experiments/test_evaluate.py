@@ -31,7 +31,7 @@ def file(tmp_path, monkeypatch):
     def sample(_, stats, keys, observation, trocar):
         return network(params, 1.0, keys, observation, trocar)
 
-    policy = types.SimpleNamespace(sample=sample)
+    policy = types.SimpleNamespace(sample=sample, for_sampling=lambda params: params)
 
     monkeypatch.setattr(policy_under_test.sim_env, "make", lambda *_, **__: stubs.make_env())
     monkeypatch.setattr(policy_under_test.policies, "make", lambda *_, **__: policy)
@@ -42,7 +42,7 @@ def file(tmp_path, monkeypatch):
         method="dp_rcm2",
         policy=POLICY,
         train=config.TrainConfig(steps=77),
-        params={"unet": {"kernel": jnp.ones(3)}},
+        params={"learner": {"unet": {"kernel": jnp.ones(3)}}},
         normalizer=normalizer.Normalizer(box, None),
         demos=config.DemosConfig(per_trocar=2, seen_trocars=4),
         preset="smoke",
@@ -63,7 +63,7 @@ def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
     assert result["method"] == "dp_rcm2" and len(result["trials"]) == 24
     assert (result["seen"]["trials"], result["unseen"]["trials"]) == (8, 16)
     assert result["config"]["train"]["steps"] == 77 and result["preset"] == "smoke"
-    assert result["config"]["policy"] == json.loads(json.dumps(dataclasses.asdict(POLICY)))
+    assert result["config"]["policy"] == config.as_json(POLICY)
     assert result["timings_s"]["evaluate"] > 0
     assert any("Preset smoke" in text for text in result["warnings"])
     said = capsys.readouterr().out
@@ -105,7 +105,7 @@ def test_how_many_trials_jax_decides_not_the_system(file, monkeypatch, guess, us
 def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
     score("--out", "here")
     made = policy_file.load(file)
-    policy_file.save(file, made._replace(policy=dataclasses.replace(POLICY, **change)))
+    policy_file.save(file, made._replace(policy=config.with_options(POLICY, **change)))
     with mistakes.of("--out", "here"):
         score("--out", "here")
     (file.parent / "here" / "result.json").unlink()

@@ -54,9 +54,14 @@ def test_weights_of_another_seed_are_refused(tmp_path):
 @pytest.mark.parametrize("part", ["scene", "demos", "policy", "train"])
 def test_every_setting_but_three_decides_the_weights(tmp_path, part):
     claimed(tmp_path)
-    names = [field.name for field in dataclasses.fields(getattr(SMOKE, part))]
-    for name in {*names} - {"keep_checkpoints", "checkpoint_every", "steps_per_call"}:
-        other = changed(**{part: {name: another(getattr(getattr(SMOKE, part), name))}})
+    settings = getattr(SMOKE, part)
+    free = {"keep_checkpoints", "checkpoint_every", "steps_per_call", "learner"}
+    for name in config.as_json(settings).keys() - free:
+        if hasattr(settings, name):
+            now = dataclasses.replace(settings, **{name: another(getattr(settings, name))})
+        else:  # of the learner's
+            now = config.with_options(settings, **{name: another(getattr(settings.options, name))})
+        other = dataclasses.replace(SMOKE, **{part: now})
         with mistakes.of(f"{part}.{name}"):
             folders.claim(tmp_path, other, "demos-a")
 
@@ -125,7 +130,7 @@ def test_weights_whose_settings_are_gone_are_refused(tmp_path, text):
         ({"eval": {"time_limit_s": "4"}}, "EvalConfig.time_limit_s"),
         ({"seed": True}, "RunConfig.seed"),
         ({"eval": 3}, "EvalConfig"),
-        ({"policy": {"unet_channels": [1, "2"]}}, "PolicyConfig.unet_channels"),
+        ({"policy": {"unet_channels": [1, "2"]}}, "DiffusionConfig.unet_channels"),
         ({"policy": {"observation": "sound"}}, "PolicyConfig.observation"),
     ],
 )
@@ -151,7 +156,7 @@ def test_an_evaluation_is_under_way_until_its_result_is_there(tmp_path):
 
 def test_settings_that_runs_differ_in_are_named():
     def values(**parts):
-        return json.loads(json.dumps(dataclasses.asdict(changed(**parts))))
+        return config.as_json(changed(**parts))
 
     old = values()
     del old["policy"]["trocar_yaw"]

@@ -99,7 +99,7 @@ def test_flags_override_the_preset_and_nothing_else():
     smoke = presets.PRESETS["smoke"]
     changed = settings("--preset=smoke --train.steps 7 --policy.unet_channels 32 --out x")
     train = dataclasses.replace(smoke.train, steps=7)
-    policy = dataclasses.replace(smoke.policy, unet_channels=(32,))
+    policy = config.with_options(smoke.policy, unet_channels=(32,))
     assert changed == dataclasses.replace(smoke, train=train, policy=policy, out="x")
     assert settings("--preset smoke --seed 1 --preset paper").preset == "paper"
 

@@ -14,7 +14,7 @@ from starjax.data import normalizer
 from starjax.experiments import pack
 from starjax.policies import policy_file
 
-POLICY = dataclasses.replace(fakes.TINY, dtype="bfloat16", temperature=0.5)
+POLICY = config.with_options(dataclasses.replace(fakes.TINY, dtype="bfloat16"), temperature=0.5)
 
 
 def save(path, scale=1.0):
@@ -23,7 +23,7 @@ def save(path, scale=1.0):
     stats = normalizer.Normalizer(box, None)
     train = config.TrainConfig(steps=7)
     made = fakes.trained(
-        method="dp_rcm2", policy=POLICY, train=train, params={"unet": kernel}, normalizer=stats
+        method="dp_rcm2", policy=POLICY, train=train, params={"learner": kernel}, normalizer=stats
     )
     policy_file.save(path, made)
     return made
@@ -41,9 +41,12 @@ def test_a_packed_policy_is_small_and_for_a_cpu(made, tmp_path, capsys, argv, te
     assert pack.main(["mine.safetensors", "out/compact.safetensors", *argv]) == 0
     out = tmp_path / "out" / "compact.safetensors"
     found = policy_file.load(out)
-    assert found.policy == dataclasses.replace(POLICY, dtype="float32", temperature=temperature)
+    float32 = dataclasses.replace(POLICY, dtype="float32")
+    assert found.policy == config.with_options(float32, temperature=temperature)
     assert (found.method, found.train) == (made.method, made.train)
-    np.testing.assert_allclose(found.params["unet"], made.params["unet"], rtol=2**-11, atol=3e-8)
+    np.testing.assert_allclose(
+        found.params["learner"], made.params["learner"], rtol=2**-11, atol=3e-8
+    )
     jax.tree.map(np.testing.assert_array_equal, found.normalizer, made.normalizer)
     assert 600_000 < out.stat().st_size < 605_000
     said = capsys.readouterr().out
@@ -62,7 +65,7 @@ def test_a_packed_policy_is_small_and_for_a_cpu(made, tmp_path, capsys, argv, te
         ("nowhere out", "POLICY", "nowhere"),
         ("other out", "POLICY", "other: not a readable"),
         ("nameless out", "POLICY", "does not say which policy"),
-        ("large out", "POLICY", "unet"),
+        ("large out", "POLICY", "learner"),
         ("mine.safetensors ./mine.safetensors", "OUT", "./mine.safetensors"),
         ("mine.safetensors .", "OUT", "."),
         ("mine.safetensors out --temperature 2", "temperature", "2.0"),

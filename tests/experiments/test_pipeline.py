@@ -103,13 +103,13 @@ def test_a_mistaken_encoder_leaves_no_folder(tmp_path, done):
 
 def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
     stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
-    raw, average = {"w": np.zeros(3)}, {"w": np.ones(3)}
+    raw, average = {"learner": {"w": np.zeros(3)}}, {"learner": {"w": np.ones(3)}}
     state = types.SimpleNamespace(params=raw, ema_params=average, normalizer=stats)
     monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
     env = fakes.env()
     pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None, sharing.ALONE)
     kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
-    np.testing.assert_array_equal(kept.params["w"], np.ones(3))
+    np.testing.assert_array_equal(kept.params["learner"]["w"], np.ones(3))
 
 
 @pytest.mark.parametrize("number", signals.STOPS)
@@ -219,7 +219,7 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
 
 
 def _json(settings):
-    return json.loads(json.dumps(dataclasses.asdict(settings)))
+    return config.as_json(settings)
 
 
 def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):

@@ -1,7 +1,6 @@
 """Presets: starting values of a run, and which of them `auto` means."""
 
 import dataclasses
-import json
 
 import pytest
 
@@ -38,7 +37,7 @@ def test_paper_preset_is_the_default_configuration():
 
 @pytest.mark.parametrize("name", presets.PRESETS)
 def test_configuration_survives_json(name):
-    values = json.loads(json.dumps(dataclasses.asdict(presets.PRESETS[name])))
+    values = config.as_json(presets.PRESETS[name])
     assert config.from_dict(config.RunConfig, values) == presets.PRESETS[name]
     with pytest.raises(ValueError, match="stepps"):
         config.from_dict(config.TrainConfig, {"stepps": 1})

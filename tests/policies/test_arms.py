@@ -11,7 +11,7 @@ import pytest
 from starjax import config, rcm
 from starjax.data import normalizer, windows
 from starjax.methods import METHODS
-from starjax.policies import diffuser, execution, features
+from starjax.policies import execution, features, generator
 from starjax.policies import policy as policies
 
 TRAIN = config.TrainConfig(state_noise=0.0)
@@ -129,19 +129,17 @@ def test_cameras_share_an_encoder_and_keep_their_order():
     observation = batch.observation._replace(images=images)
     history = jnp.zeros((2, 2, 4))
     stats: normalizer.Normalizer = normalizer.Normalizer(normalizer.MinMax(-1.0, 1.0), None)
-    one = diffuser.make(settings, 4, 4, 0)
+    one = generator.make(METHODS["stardiff"], settings, features.sensors(fakes.TASK), 4)
     params = jit(one.init)(jax.random.key(0))
 
     def observed(*cameras):
         seen = features.sensors(fakes.TASK, cameras)
         inputs = features.for_sampling(settings, seen, stats, observation, history)
-        return np.asarray(one.observe(params, inputs))
+        return np.asarray(one.observe(params, inputs, jnp.zeros((2, 0))).vision)
 
     pair, camera, wrist = observed("wrist", "camera"), observed("camera"), observed("wrist")
-    dim = settings.vision_dim
-    moments = [(wrist, 0), (camera, 0), (wrist, 1), (camera, 1)]
-    wanted = [x[:, moment * dim :][:, :dim] for x, moment in moments]
-    np.testing.assert_allclose(pair[:, : 4 * dim], np.concatenate(wanted, -1), atol=1e-6)
-    assert pair.shape[1] == diffuser.observed_dim(settings, cameras=2)
+    np.testing.assert_allclose(pair, np.concatenate([wrist, camera], -1), atol=1e-6)
+    seen = features.sensors(fakes.TASK, ("wrist", "camera"))
+    assert pair.shape == (2, 2, generator.sizes(settings, seen, 4).vision)
     with pytest.raises(ValueError, match=r"observation.images: expected camera, side"):
         observed("camera", "side")

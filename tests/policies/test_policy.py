@@ -14,7 +14,8 @@ from starjax import config, rcm
 from starjax.data import normalizer, windows
 from starjax.methods import METHODS
 from starjax.models import encoders, roll_net
-from starjax.policies import diffuser, execution, features, hierarchical
+from starjax.models.kernels import packed_params, sampling_unet
+from starjax.policies import execution, features, generator, hierarchical
 from starjax.policies import policy as policies
 
 TRAIN = config.TrainConfig(state_noise=0.0)
@@ -157,8 +158,7 @@ def test_images_work(made, name):
     it = made(name, "image")
     (loss, _), gradient = it.gradient(it.params, it.stats, jax.random.key(0), it.batch)
     assert np.isfinite(loss)
-    vision = gradient["diffuser"] if name == "stardiff" else gradient
-    assert all(np.abs(g).max() > 0 for g in jax.tree.leaves(vision["vision"]))
+    assert all(np.abs(g).max() > 0 for g in jax.tree.leaves(gradient["vision"]))
     assert np.isfinite(it.commands().pose.p).all()
 
 
@@ -179,8 +179,7 @@ def test_a_method_may_be_given_the_trocar_or_not(made, dataset, name, sees, wide
     assert np.isfinite(changed.commands().pose.p).all()
     widths = []
     for it in (changed, made(name)):
-        unet = it.params.get("diffuser", it.params)["unet"]["params"]
-        widths.append(unet["film_cond"].shape[0])
+        widths.append(it.params["learner"]["unet"]["params"]["film_cond"].shape[0])
     assert widths[0] - widths[1] == wider * features.TROCAR_FEATURES
 
 
@@ -220,7 +219,7 @@ def test_what_the_roll_network_reads(dataset, changed, matters):
     it = Made("stardiff", dataset, **changed)
     params = jax.tree.map(lambda leaf: leaf + 0.01, it.params)
     # the same positions whatever is observed
-    params["diffuser"]["unet"] = jax.tree.map(jnp.zeros_like, params["diffuser"]["unet"])
+    params["learner"] = jax.tree.map(jnp.zeros_like, params["learner"])
     keys = jax.random.split(jax.random.key(0), B)
 
     def roll(observation, trocar):
@@ -312,7 +311,7 @@ def test_large_matrices_are_rounded_once_to_what_sample_rounds_them_to(dataset):
     policy = policies.make(METHODS["stardiff"], settings, fakes.TASK, TRAIN)
     stats = normalizer.fit(METHODS["stardiff"], fakes.TASK, dataset, np.arange(80))
     params = jit(policy.init)(jax.random.key(0))
-    rounded = policies.for_sampling(params, "bfloat16")
+    rounded = policy.for_sampling(params)
     batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
     given = (stats, jax.random.split(jax.random.key(1), B), batch.observation, batch.trocar)
     sample = jit(policy.sample)
@@ -328,39 +327,21 @@ def test_large_matrices_are_rounded_once_to_what_sample_rounds_them_to(dataset):
 
 
 @pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
-def test_the_blocks_of_a_gpu_sample_the_same(dataset, name):
-    policy = policies.make(METHODS[name], fakes.TINY, fakes.TASK, TRAIN)
-    stats = normalizer.fit(METHODS[name], fakes.TASK, dataset, np.arange(80))
-    params = jit(policy.init)(jax.random.key(0))
-    changed = policies.with_sampling_blocks(params)
-    assert "second" in str(jax.tree.structure(changed))
-    batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
-    given = (stats, jax.random.split(jax.random.key(1), B), batch.observation, batch.trocar)
-    sample = jit(policy.sample)
-    chex.assert_trees_all_close(sample(params, *given), sample(changed, *given), atol=2e-5)
-
-
-@pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
-def test_packed_parameters_are_fewer_arrays_and_say_the_same(dataset, name):
+def test_a_gpu_is_handed_fewer_arrays_that_say_the_same(dataset, name, monkeypatch):
     settings = dataclasses.replace(fakes.TINY, observation="image")
     policy = policies.make(METHODS[name], settings, fakes.TASK, TRAIN)
     stats = normalizer.fit(METHODS[name], fakes.TASK, dataset, np.arange(80))
     params = jit(policy.init)(jax.random.key(0))
-    packed = policies.packed(params)
-    assert len(jax.tree.leaves(packed)) < 0.6 * len(jax.tree.leaves(params))
+    chex.assert_trees_all_equal(policy.for_sampling(params), params)  # as a CPU is handed them
     batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
     given = (stats, jax.random.split(jax.random.key(1), B), batch.observation, batch.trocar)
-    sample = jit(policy.sample)
-    chex.assert_trees_all_close(sample(params, *given), sample(packed, *given), atol=1e-6)
-
-
-def test_a_gpu_is_handed_packed_blocks_and_a_cpu_the_parameters(monkeypatch):
-    policy = policies.make(METHODS["stardiff"], fakes.TINY, fakes.TASK, TRAIN)
-    params = jit(policy.init)(jax.random.key(0))
-    chex.assert_trees_all_equal(policies.for_sampling(params, "float32"), params)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    wanted = policies.packed(policies.with_sampling_blocks(params))
-    chex.assert_trees_all_equal(policies.for_sampling(params, "float32"), wanted)
+    wanted = jit(policy.sample)(params, *given)
+    monkeypatch.setattr(sampling_unet, "pays", lambda: True)
+    monkeypatch.setattr(packed_params, "PLATFORMS", {"cpu"})
+    ready = policy.for_sampling(params)
+    assert len(jax.tree.leaves(ready)) < 0.6 * len(jax.tree.leaves(params))
+    assert "second" in str(jax.tree.structure(ready))
+    chex.assert_trees_all_close(jit(policy.sample)(ready, *given), wanted, atol=2e-5)
 
 
 def prepared(it, **changed):
@@ -408,12 +389,13 @@ def test_training_sees_random_crops_and_is_told_where_they_are(made, name):
     assert len(np.unique(np.asarray(inputs.offset).reshape(-1, 2), axis=0)) == 16
     jittered = prepared(it, jitter=0.5, image_noise=0.0)[0].inputs
     assert np.abs(jittered.images - inputs.images).max() > 0.5
-    model = diffuser.make(it.settings, 4, 4, 0)
-    params = it.params.get("diffuser", it.params)
-    here = inputs._replace(history=inputs.history[..., :4])
-    there = here._replace(offset=here.offset + 4.0)
-    params = {**params, "state": model.init(jax.random.key(0))["state"]}
-    assert np.abs(model.observe(params, here) - model.observe(params, there)).max() > 1e-3
+    width = inputs.history.shape[-1]
+    networks = generator.make(it.method, it.settings, SEEN, width)
+    here, there = (
+        networks.observe(it.params, x, jnp.zeros((64, 0))).vision
+        for x in (inputs, inputs._replace(offset=inputs.offset + 4.0))
+    )
+    assert np.abs(here - there).max() > 1e-3
 
 
 def test_rolls_stay_in_the_demonstrated_range(made):

@@ -21,7 +21,8 @@ SCENE = names.SceneNames("hand_over", ("fr5", "panda"), ("grasper", "scope"), ("
 
 def trained(scale=1.0):
     params = {
-        "diffuser": {"unet": {"kernel": scale * jnp.arange(6.0).reshape(2, 3)}},
+        "learner": {"unet": {"kernel": scale * jnp.arange(6.0).reshape(2, 3)}},
+        "vision": {"bias": jnp.ones(2)},
         "roll": {"bias": jnp.ones(3)},
     }
     box = normalizer.MinMax(-jnp.ones(5), jnp.arange(5.0))
@@ -53,7 +54,11 @@ def of_schema_1(path, p_world_ref):
     with safetensors.safe_open(path, "numpy") as file:
         about = json.loads(file.metadata()["starjax"])["about"]
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    del about["scene"], about["roll_zero"]
+    kernel = arrays.pop("params/learner/unet/kernel")
+    names = {"params/vision/bias": "params/diffuser/vision/bias"}
+    arrays = {names.get(name, name): array for name, array in arrays.items()}
+    arrays["params/diffuser/unet/kernel"] = kernel
+    del about["scene"], about["roll_zero"], about["policy"]["learner"]
     about["train"]["crop_fraction"] = about["policy"].pop("crop_fraction")
     about |= {"schema": 1, "p_world_ref": p_world_ref}
     envelope = {"about": about, "sha256": policy_file._hash(about, arrays)}
@@ -69,6 +74,15 @@ def test_a_policy_of_schema_1_is_of_the_first_scene(tmp_path, place):
     assert found.p_world_ref == (place and (tuple(place),))
     assert found.policy == POLICY
     jax.tree.map(np.testing.assert_array_equal, found.params, trained().params)
+
+
+def test_parameters_of_a_single_model_lay_side_by_side(tmp_path):
+    unet, roll = {"kernel": jnp.ones((2, 3))}, {"bias": jnp.ones(3)}
+    policy_file.save(tmp_path / "p", trained()._replace(params={"unet": unet, "state": roll}))
+    found = policy_file.load(tmp_path / "p").params
+    assert jax.tree.structure(found) == jax.tree.structure(
+        {"learner": {"unet": unet}, "state": roll}
+    )
 
 
 def test_the_packaged_policy_is_of_schema_1():
@@ -108,13 +122,13 @@ def random(largest=4.0, size=(100, 300)):
     """A policy with weights of many magnitudes, some too small for float16."""
     rng = np.random.default_rng(1)
     kernel = rng.choice([-1, 1], size) * np.exp(rng.uniform(np.log(1e-9), np.log(largest), size))
-    params = {"unet": {"kernel": jnp.asarray(kernel, jnp.float32), "count": jnp.arange(3)}}
-    return trained()._replace(params=params)
+    unet = {"kernel": jnp.asarray(kernel, jnp.float32), "count": jnp.arange(3)}
+    return trained()._replace(params={"learner": {"unet": unet}})
 
 
 def test_a_setting_of_a_newer_version_is_named_with_its_file(tmp_path, monkeypatch):
-    asdict = policy_file.dataclasses.asdict
-    monkeypatch.setattr(policy_file.dataclasses, "asdict", lambda x: {**asdict(x), "future": 1})
+    as_json = policy_file.config.as_json
+    monkeypatch.setattr(policy_file.config, "as_json", lambda x: {**as_json(x), "future": 1})
     policy_file.save(tmp_path / "p", trained())
     with pytest.raises(ValueError, match=r"p: made by another version of starjax: .*'future'"):
         policy_file.load(tmp_path / "p")
@@ -126,13 +140,19 @@ def test_half_precision_is_half_the_size_and_rounds(tmp_path):
     policy_file.save(tmp_path / "half", one, half=True)
     full, half = ((tmp_path / name).stat().st_size for name in ("full", "half"))
     assert 0.5 < half / full < 0.51
-    found, before = policy_file.load(tmp_path / "half"), np.asarray(one.params["unet"]["kernel"])
-    after = np.asarray(found.params["unet"]["kernel"])
+    found, before = (
+        policy_file.load(tmp_path / "half"),
+        np.asarray(one.params["learner"]["unet"]["kernel"]),
+    )
+    after = np.asarray(found.params["learner"]["unet"]["kernel"])
     assert after.dtype == np.float32
     error = np.abs(after - before)
     assert (error <= np.maximum(np.abs(before) / 2048, 3e-8)).all() and error.max() > 1e-4
-    np.testing.assert_array_equal(found.params["unet"]["count"], np.arange(3))
-    assert found.params["unet"]["count"].dtype == one.params["unet"]["count"].dtype
+    np.testing.assert_array_equal(found.params["learner"]["unet"]["count"], np.arange(3))
+    assert (
+        found.params["learner"]["unet"]["count"].dtype
+        == one.params["learner"]["unet"]["count"].dtype
+    )
     assert found._replace(params=None, normalizer=None) == one._replace(
         params=None, normalizer=None
     )

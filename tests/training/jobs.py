@@ -165,7 +165,6 @@ def run_main(out: str, mode: str) -> None:
     from starjax.runtime import processes
 
     policies.make = lambda *_, **__: _quadratic_policy()
-    policies.for_sampling = lambda params, dtype: params
     policy_under_test.decision_ms = lambda who: {"p50": 1.0, "p95": 1.0, "p99": 1.0}
     training, stages = SETTINGS, ["collect", "train", "evaluate"]
     if mode == "trains":

@@ -12,8 +12,7 @@ import pytest
 import safetensors.numpy
 
 from starjax.models import encoders
-from starjax.policies import diffuser, packaged, policy_file
-from starjax.policies import policy as policies
+from starjax.policies import generator, packaged, policy_file
 from starjax.training import encoder
 
 IMAGE = dataclasses.replace(fakes.TINY, observation="image")
@@ -22,17 +21,18 @@ IMAGE = dataclasses.replace(fakes.TINY, observation="image")
 @functools.cache
 def initial():
     """Parameters of the encoder of `IMAGE`."""
-    vision, size = diffuser.vision_encoder(IMAGE), IMAGE.image_size
+    vision, size = generator.vision_encoder(IMAGE), IMAGE.image_size
     init = jax.jit(vision.init, compiler_options={"xla_backend_optimization_level": 0})
     return init(jax.random.key(5), jnp.zeros((1, size, size, 3)))
 
 
 def save(path, method="stardiff", policy_config=IMAGE, change=lambda vision: vision):
     """A file of a policy that is little more than its encoder; returns its parameters."""
-    rest = {"unet": {"kernel": jnp.ones((2, 3))}}
-    params = {"diffuser": rest, "roll": {"bias": jnp.ones(3)}} if method == "stardiff" else rest
+    params = {"learner": {"unet": {"kernel": jnp.ones((2, 3))}}}
+    if method == "stardiff":
+        params["roll"] = {"bias": jnp.ones(3)}
     if policy_config.observation == "image":
-        params = policies.with_vision(params, change(initial()))
+        params["vision"] = change(initial())
     policy_file.save(path, fakes.trained(method=method, policy=policy_config, params=params))
     return params
 
@@ -65,7 +65,7 @@ def test_a_packaged_policy_is_known_by_its_name_or_its_path(source, tmp_path, mo
     assert found.fingerprint == encoder.read(settings(tmp_path / "compact.safetensors"))[1]
     assert found.fingerprint != encoder.read(settings(path)).fingerprint
     begun = encoder.start(jax.tree.map(jnp.zeros_like, params), named)
-    for leaf, stored in zip(*map(jax.tree.leaves, (policies.vision_of(begun), initial()))):
+    for leaf, stored in zip(*map(jax.tree.leaves, (begun["vision"], initial()))):
         assert leaf.dtype == jnp.float32
         np.testing.assert_allclose(leaf, stored, rtol=2**-11, atol=3e-8)
 
@@ -76,19 +76,15 @@ def test_fingerprint_tells_weights_apart(source, tmp_path):
     one, two = (encoder.read(settings(p)).fingerprint for p in (path, tmp_path / "p"))
     assert one != two and len(one) == len(two)
     again = encoder.read(settings(path, freeze_encoder=True))
-    assert again.fingerprint == one != policy_file.fingerprint(policies.vision_of(other))
+    assert again.fingerprint == one != policy_file.fingerprint(other["vision"])
 
 
 def test_a_policy_that_goes_on_learning_starts_with_it(source):
     path, params = source
-    begun = policies.with_vision(
-        jax.tree.map(jnp.ones_like, params),
-        jax.tree.map(jnp.zeros_like, policies.vision_of(params)),
-    )
+    begun = jax.tree.map(jnp.ones_like, params)
+    begun["vision"] = jax.tree.map(jnp.zeros_like, params["vision"])
     found = encoder.start(begun, settings(path))
-    jax.tree.map(
-        np.testing.assert_array_equal, policies.vision_of(found), policies.vision_of(params)
-    )
+    jax.tree.map(np.testing.assert_array_equal, found["vision"], params["vision"])
     assert all((leaf == 1).all() for leaf in jax.tree.leaves(found["roll"]))
 
 

@@ -12,7 +12,7 @@ from starjax import config
 from starjax.data import load, normalizer, windows
 from starjax.experiments import demonstrations, folders, pipeline, presets
 from starjax.methods import METHODS
-from starjax.policies import diffuser, policy_file
+from starjax.policies import generator, policy_file
 from starjax.policies import policy as policies
 from starjax.rollouts import sharing
 from starjax.training import checkpoint, encoder, frozen, loop, state
@@ -40,7 +40,7 @@ def dataset():
 def source(tmp_path_factory):
     """Settings of a frozen policy, whose encoder another policy has; and that encoder."""
     path = tmp_path_factory.mktemp("source") / "policy.safetensors"
-    vision, size = diffuser.vision_encoder(IMAGE), IMAGE.image_size
+    vision, size = generator.vision_encoder(IMAGE), IMAGE.image_size
     init = jax.jit(vision.init, compiler_options=QUICK)
     params = {"vision": init(jax.random.key(5), jnp.zeros((1, size, size, 3)))}
     policy_file.save(path, fakes.trained(method="dp_rcm2", policy=IMAGE, params=params))
@@ -89,7 +89,7 @@ def test_inference_sees_the_features_that_training_saw(source, dataset, seen, na
         return sample(params, stats, keys, batch.observation, batch.trocar).pose.p
 
     from_features = say(seen, params)
-    from_frames = say(dataset, policies.with_vision(params, found.params))
+    from_frames = say(dataset, {**params, "vision": found.params})
     np.testing.assert_allclose(from_frames, from_features, atol=1e-5)
     rolled = jnp.roll(seen.observation.features, 1, axis=0)
     others = seen.replace(observation=seen.observation._replace(features=rolled))
@@ -161,7 +161,7 @@ def whole(source, seen, tmp_path_factory):
 def test_training_leaves_the_encoder_as_it_was(source, whole):
     found = policy_file.load(whole)
     before = jax.tree_util.tree_leaves_with_path(source[1].params)
-    after = dict(jax.tree_util.tree_leaves_with_path(policies.vision_of(found.params)))
+    after = dict(jax.tree_util.tree_leaves_with_path(found.params["vision"]))
     assert len(after) == len(before) > 10
     for path, leaf in before:
         assert np.asarray(leaf).tobytes() == np.asarray(after[path]).tobytes(), path
@@ -177,11 +177,11 @@ def test_the_encoder_has_no_optimiser_and_no_average(source, whole):
 
 def test_the_rest_learns(source, whole):
     policy = policies.make(METHODS["stardiff"], source[0], fakes.TASK, TRAIN)
-    assert "vision" not in jax.eval_shape(policy.init, jax.random.key(0))["diffuser"]
+    assert "vision" not in jax.eval_shape(policy.init, jax.random.key(0))
     lines = loop.metrics.read(whole.parent / "metrics.jsonl")
     assert {"train", "holdout"} == {line["kind"] for line in lines}
-    kernel = policy_file.load(whole).params["diffuser"]["unet"]
-    begun = state.init(policy, 0).drawn()["diffuser"]["unet"]
+    kernel = policy_file.load(whole).params["learner"]["unet"]
+    begun = state.init(policy, 0).drawn()["learner"]["unet"]
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), kernel, begun)
     assert max(jax.tree.leaves(moved)) > 1e-3
 
@@ -210,7 +210,7 @@ def test_a_single_model_trains_on_features_too(source, seen):
     given = policy.prepare(stats, jax.random.key(1), batch)
     gradient = jax.jit(jax.grad(policy.loss, has_aux=True), compiler_options=QUICK)
     found, _ = gradient(params, given)
-    assert set(found) == {"state", "unet"}
+    assert set(found) == {"state", "learner"}
     assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(found))
 
 

@@ -35,7 +35,7 @@ def test_only_kernels_of_the_roll_network_decay_faster(packs):
     optimizer = state.make_optimizer(settings)
     kernel, bias = jnp.full((2, 3), 2.0), jnp.full(3, 2.0)
     network = {"params": {"out": {"kernel": kernel, "bias": bias}}}
-    params = {"diffuser": network, "roll": network}
+    params = {"learner": network, "roll": network}
     given = packed_params.pack(params, params) if packs else params
     still = jax.tree.map(jnp.zeros_like, given)
     updates, _ = optimizer.update(still, optimizer.init(given), given)

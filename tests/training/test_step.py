@@ -53,8 +53,8 @@ def start():
     return policy, optimizer, devices.replicate(first, devices.make_mesh(SETTINGS.batch_size))
 
 
-def parts(like, dtype="float32"):
-    return Parts(devices.make_mesh(SETTINGS.batch_size), dtype, like)
+def parts(like, policy=None):
+    return Parts(devices.make_mesh(SETTINGS.batch_size), (policy or regression()).rounded, like)
 
 
 def program(policy, optimizer):
@@ -103,7 +103,7 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
     optimizer = state.make_optimizer(settings)
     stats = normalizer.fit(METHODS["stardiff"], fakes.TASK, dataset, np.arange(80))
     first = state.create(policy, optimizer, state.init(policy, 0).drawn(), stats, seed=0)
-    it = parts(first, "bfloat16")
+    it = parts(first, policy)
     given = (policy, optimizer, small, settings, it)
     frames, nothing = jnp.arange(80), jax.tree.map(lambda _: None, first.params)
     unrounded = jax.jit(

@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, errors, methods, rcm, types
+from starjax import config, errors, limits, methods, rcm, types
 from starjax.deploy import measured
 from starjax.deploy.measured import Observation
+from starjax.learners import LEARNERS
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
@@ -103,30 +104,27 @@ def _is_key(array: jax.Array | np.ndarray) -> bool:
     return (array.dtype, array.shape) == (old.dtype, old.shape)
 
 
-def load(policy: str | Path, ddim_steps: int | None = None, method: str | None = None) -> Deployed:
+def load(policy: str | Path, method: str | None = None, **options: Any) -> Deployed:
     """A policy from its file.
 
     Args:
       policy: a policy.safetensors, or the name of one that ships with starjax, such as "compact".
-      ddim_steps: denoising steps of a decision, those of its training's settings unless given:
-        fewer are faster.
       method: of several with the same weights the one to run: `dp_ee_proj` runs those of `dp_ee`.
         By default the one that trained them.
+      options: of the policy's learner that decisions are made with, those of its training unless
+        given. Of diffusion: `ddim_steps`, denoising steps of a decision, of which fewer are faster,
+        and `temperature`.
 
     Raises:
-      ValueError: there is no such file, it is damaged or of another version, `ddim_steps` is out
-        of range, `method` has other weights, or its task or a tool is not installed.
+      ValueError: there is no such file, it is damaged or of another version, an option is unknown
+        or out of range, `method` has other weights, or its task, a tool or its learner is not
+        installed.
     """
     path = packaged.find("policy", str(policy))
     trained = policy_file.load(path)
     if trained.p_world_ref is None:
         raise errors.UsageError("policy", "one that says its nominal trocar", path)
-    settings = trained.policy
-    if ddim_steps is not None:
-        fewest, most = config.FEWEST_DDIM_STEPS, settings.diffusion_steps
-        if not (isinstance(ddim_steps, int | np.integer) and fewest <= ddim_steps <= most):
-            raise errors.UsageError("ddim_steps", f"an integer from {fewest} to {most}", ddim_steps)
-        settings = dataclasses.replace(settings, ddim_steps=ddim_steps)
+    settings = _with_options(trained.policy, options)
     errors.choice(f"{path}: method", trained.method, methods.METHODS)
     method = method or trained.method
     sharing = [name for name, row in methods.METHODS.items() if row.weights_of == trained.method]
@@ -134,7 +132,7 @@ def load(policy: str | Path, ddim_steps: int | None = None, method: str | None =
     row = methods.METHODS[method]
     task = registry.tasks.get(trained.scene.task)
     made = policies.make(row, settings, task, cameras=trained.scene.cameras)
-    params = policies.for_sampling(trained.params, settings.dtype)
+    params = made.for_sampling(trained.params)
     places = np.asarray(trained.p_world_ref, np.float32)
     arms = () if len(places) == 1 else (len(places),)
     asks = measured.Asks(
@@ -149,6 +147,19 @@ def load(policy: str | Path, ddim_steps: int | None = None, method: str | None =
     decide = jax.jit(_decider(made.sample, trained, not arms))
     weights = jax.device_put((params, trained.normalizer))
     return Deployed(method, settings, trained.scene, asks.p_world_ref, asks, decide, weights)
+
+
+def _with_options(settings: config.PolicyConfig, options: dict[str, Any]) -> config.PolicyConfig:
+    """The settings with these options of their learner; UsageError for others, or other values."""
+    known = [field.name for field in dataclasses.fields(settings.options)]
+    given = {}
+    for name, value in options.items():
+        errors.choice("option", name, known)
+        given[name] = value.item() if isinstance(value, np.generic) else value
+    changed = config.from_dict(config.PolicyConfig, {**config.as_json(settings), **given})
+    limits.check(changed)
+    LEARNERS.get(changed.learner).check(changed.options, changed)
+    return changed
 
 
 def _decider(

@@ -39,7 +39,7 @@ def _kind(number: Any, labels: Any) -> dict[str, Any]:
         "config?": {
             "seed?": int,
             "demos": dict,
-            "policy": {"ddim_steps": int},
+            "policy": {"ddim_steps?": int},
             "train": dict,
             "eval?": {"time_limit_s?": NUMBER},
         },

@@ -1,6 +1,5 @@
 """How long a policy takes to answer: the rows of Table IV."""
 
-import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from starjax import config, methods, rcm
 from starjax.models import roll_net
-from starjax.policies import diffuser, features
+from starjax.policies import features, generator
 from starjax.policies import policy as policies
 from starjax.sim.tasks.base import Field
 from starjax.types import Observation
@@ -68,9 +67,12 @@ def table(
     calls: int = 100,
     seconds: float = 10.0,
 ) -> Iterator[dict[str, float]]:
-    """Rows {ddim_steps, p50, p95, p99, n} of one method at batch 1, times in ms, as they come."""
+    """Rows {ddim_steps, p50, p95, p99, n} of one method at batch 1, times in ms, as they come.
+
+    Its learner must have the option `ddim_steps`.
+    """
     for steps in ddim_steps:
-        changed = dataclasses.replace(policy_config, ddim_steps=steps)
+        changed = config.with_options(policy_config, ddim_steps=steps)
         policy = policies.make(method, changed, seen.task, cameras=seen.cameras)
         given = (policy, changed, params, stats, seen)
         yield {"ddim_steps": steps, **policy_ms(*given, calls=calls, seconds=seconds)}
@@ -97,7 +99,7 @@ def roll_ms(
         jnp.zeros((batch, policy_config.obs_horizon)),
     ]
     if policy_config.roll_observation:
-        inputs.append(jnp.zeros((batch, diffuser.observed_dim(policy_config, len(seen.cameras)))))
+        inputs.append(jnp.zeros((batch, generator.sizes(policy_config, seen, action=4).observed)))
     params = net.init(jax.random.key(0), *inputs)
     apply = jax.jit(net.apply)
     return _percentiles(lambda: apply(params, *inputs), calls, seconds)

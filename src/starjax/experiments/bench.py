@@ -33,7 +33,9 @@ def main(argv: Sequence[str]) -> int:
     chosen = options.parse(Options, argv, prog="starjax bench", description=DESCRIPTION)
     run = folders.existing(chosen.run)
     config = folders.read_config(run)
-    most = config.policy.diffusion_steps
+    learner, expected = config.policy.learner, "a method's folder of the learner diffusion"
+    checks.expect(learner == "diffusion", "RUN", expected, f"one of {learner}")
+    most = config.policy.options.diffusion_steps
     for count in chosen.ddim_steps:
         checks.expect(count <= most, "--ddim-steps", f"1 to {most}", count)
     counts = chosen.ddim_steps or tuple(count for count in DDIM_STEPS if count <= most)

@@ -9,6 +9,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
+from starjax.learners import LEARNERS
 
 _CELL = {"resnet18": 32, "small": 8}  # pixels that an encoder makes one of its maps' cells
 
@@ -17,25 +18,10 @@ def check(config: config_lib.RunConfig) -> None:
     """Raises UsageError for the first setting that does not go with another."""
     errors.choice("method", config.method, [*methods.METHODS, "all"])
     policy = config.policy
-    levels, channels = len(policy.unet_channels), policy.unet_channels
-    expect(levels > 0, "policy.unet_channels", "at least one level", channels)
-    expect(
-        not any(width % policy.groups for width in channels),
-        "policy.unet_channels",
-        f"multiples of policy.groups = {policy.groups}",
-        channels,
-    )
-    halvings = 2 ** (levels - 1)
-    expect(
-        policy.horizon % halvings == 0,
-        "policy.horizon",
-        f"a multiple of {halvings} for {levels} U-Net levels",
-        policy.horizon,
-    )
+    LEARNERS.get(policy.learner).check(policy.options, policy)
     for name, most, of in (
         ("execute", policy.horizon, "policy.horizon"),
         ("obs_horizon", policy.execute + 1, "policy.execute + 1"),
-        ("ddim_steps", policy.diffusion_steps, "policy.diffusion_steps"),
     ):
         value = getattr(policy, name)
         expect(value <= most, f"policy.{name}", f"at most {of} = {most}", value)

@@ -160,10 +160,10 @@ def _config(trained: Any) -> config_lib.RunConfig:
     known = {
         "method": trained.method,
         "preset": trained.preset or "auto",
-        "policy": dataclasses.asdict(trained.policy),
-        "train": dataclasses.asdict(trained.train),
-        "demos": dataclasses.asdict(trained.demos or config_lib.DemosConfig()),
-        "scene": dataclasses.asdict(scenes.settings(trained.scene)),
+        "policy": config_lib.as_json(trained.policy),
+        "train": config_lib.as_json(trained.train),
+        "demos": config_lib.as_json(trained.demos or config_lib.DemosConfig()),
+        "scene": config_lib.as_json(scenes.settings(trained.scene)),
     }
     unknown = {"seed": None}  # no file of weights says it
     return dataclasses.replace(config_lib.from_dict(config_lib.RunConfig, known), **unknown)

@@ -69,10 +69,11 @@ def _learning_from(demos: config_lib.DemosConfig) -> str:
 
 def _training(config: config_lib.RunConfig) -> str:
     policy, train = config.policy, config.train
-    channels = "-".join(map(str, policy.unet_channels))
+    channels = "-".join(map(str, getattr(policy.options, "unet_channels", ())))
+    network = f"{policy.learner}, U-Net {channels}" if channels else policy.learner
     dtype = "" if policy.dtype == "float32" else f", {policy.dtype}"
     steps = f"{train.steps} steps of {train.batch_size}"
-    return f"  training        {steps}, U-Net {channels}{dtype}"
+    return f"  training        {steps}, {network}{dtype}"
 
 
 def _idle(batch_size: int) -> list[str]:

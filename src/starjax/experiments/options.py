@@ -52,7 +52,7 @@ def parse(
     """
     start = tyro.MISSING_NONPROP if default is None else default
     about = {"prog": prog, "description": description, "default": start, "registry": _registry}
-    with tyro_errors.on_parse_error(functools.partial(_refuse, settings)):
+    with tyro_errors.on_parse_error(functools.partial(_refuse, default or settings)):
         found = tyro.cli(settings, args=list(argv), **about)
     limits.check(found)
     return found
@@ -68,15 +68,14 @@ def peek(settings: type[SettingsT], argv: Sequence[str], default: SettingsT) -> 
     return found
 
 
-def flags(settings: type, prefix: str = "") -> list[str]:
+def flags(settings: Any) -> list[str]:
     """Every flag of a (nested) dataclass, e.g. `--train.steps`; switches have a `no-` twin."""
     found = []
-    for name, hint in typing.get_type_hints(settings, include_extras=True).items():
-        if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-            found += flags(hint, f"{prefix}{name}.")
-        elif tyro.conf.Positional not in getattr(hint, "__metadata__", ()):
-            found += [flag(f"{prefix}{name}")]
-            found += [flag(f"{prefix}no_{name}")] if hint is bool else []
+    for name, _, hint in limits.fields(settings):
+        if tyro.conf.Positional not in getattr(hint, "__metadata__", ()):
+            found += [flag(name)]
+            before, dot, last = name.rpartition(".")
+            found += [flag(f"{before}{dot}no_{last}")] if hint is bool else []
     return found
 
 
@@ -91,7 +90,7 @@ def spelled(error: errors.UsageError) -> str:
     if _FIELD.fullmatch(error.argument):
         line = line.replace(error.argument, flag(error.argument), 1)
     # Elsewhere in it a field without a dot would be an ordinary word.
-    known = [name for name, _ in limits.fields(config_lib.RunConfig) if "." in name]
+    known = [name for name, *_ in limits.fields(config_lib.RunConfig) if "." in name]
     within = rf"(?<![\w./-])({'|'.join(map(re.escape, known))})\b"
     return re.sub(within, lambda found: flag(found[0]), line)
 
@@ -101,7 +100,7 @@ def typed(name: str, argv: Sequence[str]) -> str:
     return shlex.join(["starjax", name, *argv])
 
 
-def _refuse(settings: type, event: Any) -> NoReturn:
+def _refuse(settings: Any, event: Any) -> NoReturn:
     """Raises UsageError for what tyro is about to refuse.
 
     tyro prints a box of five lines, and its public interface hands out neither the argument nor the
@@ -148,8 +147,12 @@ def _with_ranges(
         _busy.pop()
     if not isinstance(spec, tyro.constructors.StructConstructorSpec):
         return None
-    fields = []
+    fields, given = [], {field.name: field for field in dataclasses.fields(info.type)}
     for field in spec.fields:
+        if given[field.name].metadata == limits.INLINE:
+            inline = Annotated[type(field.default), tyro.conf.arg(name="")]
+            fields.append(dataclasses.replace(field, type=inline))
+            continue
         name = "" if field.name == _UNNAMED else None
         range_and_default = functools.partial(_hint, limits.within(field.type))
         hint = tyro.conf.arg(name=name, help_behavior_hint=range_and_default)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from starjax import errors
+from starjax import config, errors
 from starjax.experiments import checks, options
 from starjax.limits import Range
 from starjax.policies import packaged
@@ -51,7 +51,9 @@ def main(argv: Sequence[str]) -> int:
         raise errors.UsageError("POLICY", "a policy of starjax", error) from error
     policy = dataclasses.replace(trained.policy, dtype="float32")
     if chosen.temperature is not None:
-        policy = dataclasses.replace(policy, temperature=chosen.temperature)
+        if not hasattr(policy.options, "temperature"):
+            raise errors.UsageError("POLICY", "one with a temperature", f"one of {policy.learner}")
+        policy = config.with_options(policy, temperature=chosen.temperature)
     try:
         policy_file.save(out, trained._replace(policy=policy), half=True)
     except ValueError as error:
@@ -59,5 +61,7 @@ def main(argv: Sequence[str]) -> int:
     count = sum(leaf.size for leaf in jax.tree.leaves(trained.params)) / 1e6
     before, after = (files.size(path.stat().st_size) for path in (source, out))
     print(f"{out}: {count:.3g} M parameters, {after} ({source}: {before})")
-    print(f"temperature {policy.temperature:g}, arithmetic in {policy.dtype}")
+    temperature = getattr(policy.options, "temperature", None)
+    said = [] if temperature is None else [f"temperature {temperature:g}"]
+    print(", ".join([*said, f"arithmetic in {policy.dtype}"]))
     return 0

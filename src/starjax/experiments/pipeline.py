@@ -95,7 +95,6 @@ def _train(
     share: Any,
 ) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
-    from starjax.policies import policy as policies
     from starjax.policies import policy_file
     from starjax.runtime import processes
     from starjax.training import loop
@@ -128,7 +127,7 @@ def _train(
         method=name,
         policy=config.policy,
         train=config.train,
-        params=policies.with_vision(params, encoder.params) if encoder else params,
+        params={**params, "vision": encoder.params} if encoder else params,
         normalizer=state.normalizer,
         scene=env.names,
         p_world_ref=tuple(map(tuple, env.p_world_ref)),

@@ -88,8 +88,8 @@ def _load(
     )
     row = methods.METHODS[method]
     policy = policies.make(row, trained.policy, env.task, cameras=scene.cameras)
-    params = policies.for_sampling(trained.params, trained.policy.dtype)
-    return Subject(method, env, policy, trained._replace(params=params), files.sha256(file))
+    ready = trained._replace(params=policy.for_sampling(trained.params))
+    return Subject(method, env, policy, ready, files.sha256(file))
 
 
 def rollouts(
@@ -116,7 +116,7 @@ def rollouts(
         place=placement.Place(devices=placement.devices()),
         identity={
             **methods.behaviour(who.method)._asdict(),
-            "policy": dataclasses.asdict(trained.policy),
+            "policy": config_lib.as_json(trained.policy),
         },
         report=messages.indented,
     )

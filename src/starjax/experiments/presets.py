@@ -1,9 +1,11 @@
 """Presets: starting values of a run, any field of which the command line can override.
 
 Data, not code: what a preset changes from `config.RunConfig()` (the paper) stands in one literal.
+Other learners begin with a preset's options where they have them too (`config.with_learner`).
 """
 
 from starjax.config import DemosConfig, EvalConfig, PolicyConfig, RunConfig, TrainConfig
+from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.runtime import gpu
 
 PRESETS: dict[str, RunConfig] = {
@@ -17,9 +19,8 @@ PRESETS: dict[str, RunConfig] = {
             encoder="small",
             vision_dim=64,
             state_dim=64,
-            unet_channels=(32, 64),
-            time_dim=32,
             roll_width=64,
+            options=DiffusionConfig(unet_channels=(32, 64), time_dim=32),
         ),
         train=TrainConfig(
             steps=40,
@@ -44,9 +45,7 @@ PRESETS: dict[str, RunConfig] = {
             encoder_weights="compact",
             freeze_encoder=True,
             vision_dim=128,
-            unet_channels=(32, 64, 128),
-            time_dim=64,
-            temperature=0.5,
+            options=DiffusionConfig(unet_channels=(32, 64, 128), time_dim=64, temperature=0.5),
         ),
         train=TrainConfig(
             steps=8_000,
@@ -66,9 +65,8 @@ PRESETS: dict[str, RunConfig] = {
         demos=DemosConfig(per_trocar=100),
         policy=PolicyConfig(
             image_size=128,
-            unet_channels=(256, 512, 1024),
-            temperature=0.5,
             dtype="bfloat16",
+            options=DiffusionConfig(unet_channels=(256, 512, 1024), temperature=0.5),
         ),
         train=TrainConfig(
             steps=16_000,
@@ -86,10 +84,8 @@ PRESETS: dict[str, RunConfig] = {
             image_size=128,
             encoder="small",
             vision_dim=128,
-            unet_channels=(64, 128, 224),
-            time_dim=64,
-            temperature=0.5,
             dtype="bfloat16",
+            options=DiffusionConfig(unet_channels=(64, 128, 224), time_dim=64, temperature=0.5),
         ),
         train=TrainConfig(
             steps=40_000,

@@ -4,8 +4,23 @@ import dataclasses
 from collections.abc import Sequence
 
 from starjax import config as config_lib
+from starjax import errors
 from starjax.experiments import checks, options, presets
+from starjax.learners import LEARNERS
 from starjax.runtime import gpu
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Learning:
+    learner: str = ""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _First:
+    """What other flags and their defaults depend on."""
+
+    preset: config_lib.Preset = "auto"
+    policy: _Learning = _Learning()
 
 
 def parse(argv: Sequence[str], prog: str, description: str) -> config_lib.RunConfig:
@@ -15,7 +30,7 @@ def parse(argv: Sequence[str], prog: str, description: str) -> config_lib.RunCon
     """
     guess = gpu.is_likely()
     config = _settings(argv, prog, description, guess)
-    if options.peek(config_lib.RunConfig, argv, config_lib.RunConfig()).preset != "auto":
+    if options.peek(_First, argv, _First()).preset != "auto":
         return config
     from starjax.experiments import pipeline
 
@@ -46,8 +61,12 @@ def _settings(
 
 def _default(argv: Sequence[str], has_gpu: bool) -> config_lib.RunConfig:
     """Values of what is not typed: the preset's, without what does not go with what is typed."""
-    start = config_lib.RunConfig()
-    default = presets.resolve(options.peek(config_lib.RunConfig, argv, start).preset, has_gpu)
+    first = options.peek(_First, argv, _First())
+    default = presets.resolve(first.preset, has_gpu)
+    if first.policy.learner:
+        errors.choice("policy.learner", first.policy.learner, LEARNERS.names())
+        learning = config_lib.with_learner(default.policy, first.policy.learner)
+        default = dataclasses.replace(default, policy=learning)
     asked = options.peek(config_lib.RunConfig, argv, default)
     policy, demos = default.policy, default.demos
     if asked.policy.observation == "state":
@@ -60,14 +79,15 @@ def _default(argv: Sequence[str], has_gpu: bool) -> config_lib.RunConfig:
 def _folder(config: config_lib.RunConfig) -> str:
     """Folder of a run that names none.
 
-    Other scenes, observations, encoders frozen or not, and seeds have one each; trainings of one
-    method that differ in anything else meet in it, and are refused.
+    Other scenes, learners, observations, encoders frozen or not, and seeds have one each; trainings
+    of one method that differ in anything else meet in it, and are refused.
     """
     policy, usual = config.policy, presets.PRESETS[config.preset]
     scene = config.scene
     parts = [usual.preset]
     parts += [scene.task] if scene.task != usual.scene.task else []
     parts += [*scene.arm, *scene.tool, *scene.camera]
+    parts += [policy.learner] if policy.learner != usual.policy.learner else []
     parts += [policy.observation] if policy.observation != usual.policy.observation else []
     sees, freezes = policy.observation == "image", policy.freeze_encoder
     if sees and freezes != usual.policy.freeze_encoder:

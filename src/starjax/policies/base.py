@@ -1,4 +1,4 @@
-"""What training and evaluation know of a method: a tuple of pure functions."""
+"""What training and evaluation know of a policy: a tuple of pure functions."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,19 +7,20 @@ import jax
 
 from starjax import rcm
 from starjax.data import normalizer, windows
+from starjax.policies.sequences import Params
 from starjax.types import Command, Observation
 
-Params = dict[str, Any]
+__all__ = ["Params", "Policy"]
 
 
 class Policy(NamedTuple):
-    """What training and evaluation know of a method.
+    """What training and evaluation know of a policy.
 
     The loss of a batch is `loss(params, prepare(stats, key, batch))`.
 
     Attributes:
-      init: `key -> params`, those that training changes: a frozen vision encoder's are missing,
-        and `with_vision` adds them for `sample` to read images.
+      init: `key -> params`, those that training changes. A vision encoder's are `vision`; of a
+        frozen one they are missing, and must be added for `sample` to read images.
       prepare: `(stats, key, batch) -> prepared`, all that is random and needs no parameters: a
         pytree of arrays whose leading axis is the batch.
       loss: `(params, prepared) -> (scalar, {name: scalar})`, the names being `metrics`: means over
@@ -27,6 +28,9 @@ class Policy(NamedTuple):
       sample: `(params, stats, keys [B], Observation [B, O, A], told [B, A]) -> Command [B, H, A]`,
         finite whatever the networks say. What sample i draws depends on `keys[i]` alone.
       metrics: names of what `loss` tells beside its value.
+      rounded: `params -> params` whose large matrices are in the type that is calculated in.
+      for_sampling: `params -> params` as `sample` uses them fastest here: for evaluation, not for
+        training.
     """
 
     init: Callable[[jax.Array], Params]
@@ -37,3 +41,5 @@ class Policy(NamedTuple):
         Command,
     ]
     metrics: tuple[str, ...] = ()
+    rounded: Callable[[Params], Params] = lambda params: params
+    for_sampling: Callable[[Params], Params] = lambda params: params

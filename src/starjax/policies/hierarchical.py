@@ -1,19 +1,19 @@
-"""STAR-Diff: diffusion for (position, gripper), not told the trocar, and a network for the roll.
+"""STAR-Diff: a model of (position, gripper), not told the trocar, and a network for the roll.
 
-Of several arms, positions and grippers are diffused together; one roll network serves each arm in
+Of several arms, positions and grippers are generated together; one roll network serves each arm in
 turn, with that arm's path, trocar and measured rolls.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
-from starjax.models import diffusion, roll_net
+from starjax.models import roll_net
 from starjax.models.kernels import packed_params
-from starjax.policies import diffuser, execution, features
+from starjax.policies import execution, features, generator, sequences
 from starjax.policies.base import Params, Policy
 from starjax.types import Command, Observation
 
@@ -28,9 +28,9 @@ class Prepared(NamedTuple):
     """A batch as the networks learn from it.
 
     Attributes:
-      inputs: of the diffusion model.
-      extra: `[B, E]`, what conditions it beside them.
-      noised: its sequences.
+      inputs: what was observed.
+      told: `[B, E]`, what conditions the model of positions beside it.
+      given: what that model learns from.
       p: `[B, H, A, 3]` demonstrated positions with noise, for the roll network.
       trocar: `[B, A, 7]` features.
       history: `[B, O, A]` measured rolls with noise.
@@ -38,8 +38,8 @@ class Prepared(NamedTuple):
     """
 
     inputs: features.Inputs
-    extra: jax.Array
-    noised: diffusion.Noised
+    told: jax.Array
+    given: Any
     p: jax.Array
     trocar: jax.Array
     history: jax.Array
@@ -59,14 +59,9 @@ def make(
             f"method.action_space: expected one of roll and position, got {method.action_space!r}"
         )
     arms, position, roll = seen.task.arms, space.slices["p"], space.slices["roll"].start
-    dim = 4 * arms  # of what is diffused, see `diffused`
-    model = diffuser.make(
-        policy_config,
-        dim,
-        features.history_dim(policy_config, seen.task, dim),
-        features.extra_dim(method, seen.task),
-        len(seen.cameras),
-    )
+    dim = 4 * arms  # of what is generated, see `generated`
+    networks = generator.make(method, policy_config, seen, dim)
+    model = networks.model
     rolls = roll_net.RollNet(
         width=policy_config.roll_width,
         blocks=policy_config.roll_blocks,
@@ -81,10 +76,10 @@ def make(
         p = jnp.zeros((1, policy_config.horizon, 3))
         trocar = jnp.zeros((1, features.TROCAR_FEATURES))
         history = jnp.zeros((1, policy_config.obs_horizon))
-        observed = jnp.zeros((1, diffuser.observed_dim(policy_config, len(seen.cameras))))
-        more = observed if policy_config.roll_observation else None
+        observed = generator.sizes(policy_config, seen, dim).observed
+        more = jnp.zeros((1, observed)) if policy_config.roll_observation else None
         return {
-            "diffuser": model.init(key_model),
+            **networks.init(key_model),
             "roll": rolls.init(key_roll, p, trocar, history, more),
         }
 
@@ -93,11 +88,13 @@ def make(
         p: jax.Array,
         trocar: jax.Array,
         history: jax.Array,
-        observed: jax.Array,
+        condition: sequences.Condition,
     ) -> jax.Array:
         """Eq. 13 `[B, H, A]`, but for what an ablation adds or leaves out."""
         batch, horizon = p.shape[:2]
-        more = jnp.repeat(observed, arms, axis=0) if policy_config.roll_observation else None
+        more = None
+        if policy_config.roll_observation:
+            more = jnp.repeat(sequences.observed(condition), arms, axis=0)
         found = predict(
             params["roll"],
             p.swapaxes(1, 2).reshape(batch * arms, horizon, 3),
@@ -108,7 +105,7 @@ def make(
         return found.reshape(batch, arms, horizon).swapaxes(1, 2)
 
     def prepare(stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch) -> Prepared:
-        key_inputs, key_diffusion, key_p, key_roll = jax.random.split(key, 4)
+        key_inputs, key_model, key_p, key_roll = jax.random.split(key, 4)
         action = features.demonstrated(stats, method.action_space, batch)
         measured = _measured(stats, batch.observation, batch.trocar)
         inputs = features.for_training(
@@ -118,28 +115,29 @@ def make(
             stats,
             key_inputs,
             batch.observation,
-            diffused(measured),
+            generated(measured),
         )
         wanted = by_arm(action)
         p, history = wanted[..., position], by_arm(measured)[..., roll]
         return Prepared(
             inputs=inputs,
-            extra=features.extra(method, batch.trocar),
-            noised=model.noised(key_diffusion, diffused(action)),
+            told=features.extra(method, batch.trocar),
+            given=model.prepare(key_model, generated(action)),
             p=p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
             trocar=features.trocar_features(batch.trocar.trocar),
             history=history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
             roll=wanted[..., roll],
         )
 
-    def loss(params: Params, given: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def loss(params: Params, prepared: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Eq. 15."""
-        observed = model.observe(params["diffuser"], given.inputs)
-        position_loss = model.loss(params["diffuser"], observed, given.extra, given.noised)
-        predicted = rolls_along(params, given.p, given.trocar, given.history, observed)
-        roll_loss = jnp.mean((given.roll - predicted) ** 2)  # Eq. 14
+        condition = networks.observe(params, prepared.inputs, prepared.told)
+        position_loss, metrics = model.loss(params["learner"], condition, prepared.given)
+        path = prepared.p, prepared.trocar, prepared.history
+        predicted = rolls_along(params, *path, condition)
+        roll_loss = jnp.mean((prepared.roll - predicted) ** 2)  # Eq. 14
         total = position_loss + policy_config.roll_loss_weight * roll_loss
-        return total, {"position_loss": position_loss, "roll_loss": roll_loss}
+        return total, {"position_loss": position_loss, "roll_loss": roll_loss, **metrics}
 
     def sample(
         params: Params,
@@ -149,16 +147,15 @@ def make(
         told: rcm.TrocarFrame,
     ) -> Command:
         measured = _measured(stats, observation, told)
-        inputs = features.for_sampling(policy_config, seen, stats, observation, diffused(measured))
-        extra = features.extra(method, told)
-        observed = model.observe(params["diffuser"], inputs)
+        inputs = features.for_sampling(policy_config, seen, stats, observation, generated(measured))
+        condition = networks.observe(params, inputs, features.extra(method, told))
         reach = stats.action.reach
-        reach = None if reach is None else diffused(reach)
-        x0 = model.sample(params["diffuser"], keys, observed, extra, reach)
+        reach = None if reach is None else generated(reach)
+        x0 = model.sample(params["learner"], keys, condition, reach)
         p, gripper = jnp.split(by_arm(x0), [3], axis=-1)
         about = features.trocar_features(told.trocar)
-        gamma = rolls_along(params, p, about, by_arm(measured)[..., roll], observed)
-        # within the demonstrated range, as the diffused part is
+        gamma = rolls_along(params, p, about, by_arm(measured)[..., roll], condition)
+        # within the demonstrated range, as what is generated
         gamma = jnp.clip(gamma, -1.0, 1.0)[..., None]
         parts = {"roll": gamma, "p": p}
         ordered = sorted(parts, key=lambda name: space.slices[name].start)
@@ -170,7 +167,7 @@ def make(
         """`[..., A * n]` as `[..., A, n]`."""
         return vector.reshape(*vector.shape[:-1], arms, -1)
 
-    def diffused(vector: jax.Array) -> jax.Array:
+    def generated(vector: jax.Array) -> jax.Array:
         """Each arm's position and gripper `[..., A * 4]` of actions `[..., A * (dim + 1)]`."""
         parts = by_arm(vector)
         kept = jnp.concatenate([parts[..., position], parts[..., -1:]], axis=-1)
@@ -179,4 +176,10 @@ def make(
     def _measured(stats, observation, told):
         return features.measured(stats, method.action_space, observation, told)
 
-    return Policy(init, prepare, loss, sample, ("position_loss", "roll_loss"))
+    def for_sampling(params: Params) -> Params:
+        found, of_rolls = networks.for_sampling(params), params["roll"]
+        packs = packed_params.pays(jax.default_backend())
+        return {**found, "roll": packed_params.packed(of_rolls) if packs else of_rolls}
+
+    metrics = ("position_loss", "roll_loss", *model.metrics)
+    return Policy(init, prepare, loss, sample, metrics, networks.rounded, for_sampling)

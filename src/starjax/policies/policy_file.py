@@ -4,7 +4,6 @@ The same policy always gives the same bytes. In half precision its parameters ar
 float32 again once they are loaded. Files of schema 1, which name no scene, are of the first one.
 """
 
-import dataclasses
 import hashlib
 import json
 import pathlib
@@ -81,12 +80,12 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
     about = {
         "schema": SCHEMA,
         "method": trained.method,
-        "policy": dataclasses.asdict(trained.policy),
-        "train": dataclasses.asdict(trained.train),
+        "policy": config.as_json(trained.policy),
+        "train": config.as_json(trained.train),
         "scene": trained.scene._asdict(),
         "p_world_ref": _floats(trained.p_world_ref),
         "roll_zero": _floats(trained.roll_zero),
-        "demos": None if trained.demos is None else dataclasses.asdict(trained.demos),
+        "demos": None if trained.demos is None else config.as_json(trained.demos),
         "preset": trained.preset,
     }
     envelope = {"about": about, "sha256": _hash(about, arrays)}
@@ -160,7 +159,7 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
         method=about["method"],
         policy=config.from_dict(config.PolicyConfig, about["policy"]),
         train=config.from_dict(config.TrainConfig, about["train"]),
-        params=tree["params"],
+        params=_by_parts(tree["params"]),
         normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
         scene=names.SceneNames(
             scene["task"], *(tuple(scene[part]) for part in ("arms", "tools", "cameras"))
@@ -170,6 +169,16 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
         demos=None if demos is None else config.from_dict(config.DemosConfig, demos),
         preset=about.get("preset"),
     )
+
+
+def _by_parts(params: Params) -> Params:
+    """Parameters as policies have them today, of files in which the learner's lie among others."""
+    if "learner" in params:
+        return params
+    found = dict(params.get("diffuser", params))
+    around = {name: found.pop(name) for name in ("vision", "state", "roll") if name in found}
+    rest = {name: params[name] for name in ("roll",) if name in params}
+    return {**around, **rest, "learner": found}
 
 
 def _floats(values: Any) -> Any:

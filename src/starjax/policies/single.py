@@ -1,13 +1,12 @@
-"""One diffusion model for the whole action: every row of Table II but the hierarchical one."""
+"""One model for the whole action: every row of Table II but the hierarchical one."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
 from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
-from starjax.models import diffusion
-from starjax.policies import diffuser, execution, features
+from starjax.policies import execution, features, generator
 from starjax.policies.base import Params, Policy
 from starjax.types import Command, Observation
 
@@ -16,8 +15,8 @@ class Prepared(NamedTuple):
     """A batch as the loss needs it, with everything random drawn."""
 
     inputs: features.Inputs
-    extra: jax.Array
-    noised: diffusion.Noised
+    told: jax.Array
+    given: Any
 
 
 def make(
@@ -26,18 +25,13 @@ def make(
     seen: features.Sensors,
     train_config: config.TrainConfig,
 ) -> Policy:
-    """Diffusion over (pose in the method's action space, gripper) of all arms."""
+    """The policy that generates (pose in the method's action space, gripper) of all arms."""
     dim = seen.task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
-    model = diffuser.make(
-        policy_config,
-        dim,
-        features.history_dim(policy_config, seen.task, dim),
-        features.extra_dim(method, seen.task),
-        len(seen.cameras),
-    )
+    networks = generator.make(method, policy_config, seen, dim)
+    model = networks.model
 
     def prepare(stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch) -> Prepared:
-        key_inputs, key_diffusion = jax.random.split(key)
+        key_inputs, key_model = jax.random.split(key)
         x0 = features.demonstrated(stats, method.action_space, batch)
         inputs = features.for_training(
             policy_config,
@@ -48,12 +42,12 @@ def make(
             batch.observation,
             _proprioception(stats, batch.observation, batch.trocar),
         )
-        extra = features.extra(method, batch.trocar)
-        return Prepared(inputs, extra, model.noised(key_diffusion, x0))
+        told = features.extra(method, batch.trocar)
+        return Prepared(inputs, told, model.prepare(key_model, x0))
 
-    def loss(params: Params, given: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
-        observed = model.observe(params, given.inputs)
-        return model.loss(params, observed, given.extra, given.noised), {}
+    def loss(params: Params, prepared: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
+        condition = networks.observe(params, prepared.inputs, prepared.told)
+        return model.loss(params["learner"], condition, prepared.given)
 
     def sample(
         params: Params,
@@ -64,12 +58,19 @@ def make(
     ) -> Command:
         proprioception = _proprioception(stats, observation, told)
         inputs = features.for_sampling(policy_config, seen, stats, observation, proprioception)
-        observed = model.observe(params, inputs)
-        extra = features.extra(method, told)
-        action = model.sample(params, keys, observed, extra, stats.action.reach)
+        condition = networks.observe(params, inputs, features.extra(method, told))
+        action = model.sample(params["learner"], keys, condition, stats.action.reach)
         return execution.command(method, stats, action, told)
 
     def _proprioception(stats, observation, told):
         return features.measured(stats, method.action_space, observation, told)
 
-    return Policy(model.init, prepare, loss, sample)
+    return Policy(
+        networks.init,
+        prepare,
+        loss,
+        sample,
+        model.metrics,
+        networks.rounded,
+        networks.for_sampling,
+    )

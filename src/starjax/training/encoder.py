@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from starjax import config, errors
 from starjax.models import pretrained
-from starjax.policies import diffuser, features, packaged, policy_file
-from starjax.policies import policy as policies
+from starjax.policies import features, generator, packaged, policy_file
+from starjax.policies.base import Params
 
 _WEIGHTS = "policy.encoder_weights"
 
@@ -23,7 +23,7 @@ class Encoder(NamedTuple):
       fingerprint: start of the hash of the parameters, in hexadecimal.
     """
 
-    params: policies.Params
+    params: Params
     fingerprint: str
 
 
@@ -52,17 +52,19 @@ def read(policy_config: config.PolicyConfig) -> Encoder | None:
             f"{name}, made with {', '.join(differing)}",
             "use the same, or other weights",
         )
-    params = policies.vision_of(trained.params)
+    params = trained.params["vision"]
     _check_shapes(policy_config, params, name)
     return Encoder(params, policy_file.fingerprint(params)[:16])
 
 
-def start(params: policies.Params, policy_config: config.PolicyConfig) -> policies.Params:
+def start(params: Params, policy_config: config.PolicyConfig) -> Params:
     """A policy's parameters before the first step, with the encoder that the settings name."""
     found = read(policy_config)
-    if found is None:
-        return policies.with_resnet18(params, policy_config.encoder_weights)
-    return policies.with_vision(params, found.params)
+    if found is not None:
+        return {**params, "vision": found.params}
+    vision = params["vision"]["params"]
+    trunk = pretrained.load_resnet18(vision["trunk"], policy_config.encoder_weights)
+    return {**params, "vision": {"params": {**vision, "trunk": trunk}}}
 
 
 def _differing(policy_config: config.PolicyConfig, trained: policy_file.Trained) -> list[str]:
@@ -102,9 +104,7 @@ def _check_resnet18(policy_config: config.PolicyConfig, path: Path) -> None:
         raise errors.UsageError(_WEIGHTS, error.expected, got, error.hint) from error
 
 
-def _check_shapes(
-    policy_config: config.PolicyConfig, params: policies.Params, name: str | Path
-) -> None:
+def _check_shapes(policy_config: config.PolicyConfig, params: Params, name: str | Path) -> None:
     """UsageError unless the network of today has these parameters."""
     shapes = [
         {jax.tree_util.keystr(path): leaf.shape for path, leaf in leaves}
@@ -116,7 +116,7 @@ def _check_shapes(
             raise errors.UsageError(_WEIGHTS, f"{want} at {key}", f"{got} in {name}")
 
 
-def _shapes(policy_config: config.PolicyConfig) -> policies.Params:
+def _shapes(policy_config: config.PolicyConfig) -> Params:
     """The vision encoder's parameters without their numbers."""
-    vision, size = diffuser.vision_encoder(policy_config), policy_config.image_size
+    vision, size = generator.vision_encoder(policy_config), policy_config.image_size
     return jax.eval_shape(vision.init, jax.random.key(0), jnp.zeros((1, size, size, 3)))

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 
 from starjax import config
-from starjax.policies import diffuser
 from starjax.policies import features as inputs
+from starjax.policies import generator
 from starjax.rollouts import cores
 from starjax.runtime import files, progress
 from starjax.training.encoder import Encoder
@@ -93,7 +93,7 @@ def _make_see(
     encoder: Encoder, policy_config: config.PolicyConfig
 ) -> Callable[[np.ndarray], jax.Array]:
     """Frames `[BATCH, h, w, 3]` uint8 to features `[BATCH, d_v]`."""
-    vision = diffuser.vision_encoder(policy_config)
+    vision = generator.vision_encoder(policy_config)
 
     @jax.jit
     def see(params: Any, frames: jax.Array) -> Any:

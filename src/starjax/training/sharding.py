@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from starjax.models.kernels import packed_params
-from starjax.policies import policy as policies
+from starjax.policies.base import Params
 from starjax.training import devices
 from starjax.training.state import TrainState
 
-Carried = tuple[TrainState, policies.Params]
+Carried = tuple[TrainState, Params]
 
 LARGE = 1 << 18  # entries of a matrix: smaller ones take longer to send than to update everywhere
 _ROW = 1 << 10  # entries: what a block of a GPU's threads adds up at once
@@ -34,12 +34,12 @@ class Parts(NamedTuple):
 
     Attributes:
       mesh: the batch is split over it.
-      dtype: of the networks' arithmetic.
+      round: parameters with large matrices in the type that is calculated in, `Policy.rounded`.
       like: the whole state's shapes, as a TrainState.
     """
 
     mesh: Mesh
-    dtype: str
+    round: Callable[[Params], Params]
     like: Any
 
     def begin(self, state: TrainState) -> Carried:
@@ -88,7 +88,7 @@ class Parts(NamedTuple):
         narrow = jax.eval_shape(self.rounded, state.params)
         return jax.tree_util.tree_map_with_path(one, (state, narrow))
 
-    def params(self, carried: Carried) -> policies.Params:
+    def params(self, carried: Carried) -> Params:
         """The networks' parameters, matrices in their type; those in parts still are."""
         state, narrow = carried
         if self._joins:
@@ -96,11 +96,11 @@ class Parts(NamedTuple):
             return self._separate(params)
         return _taken(narrow, state.params)
 
-    def rounded(self, params: Any) -> policies.Params:
+    def rounded(self, params: Any) -> Params:
         """The matrices of a carried state's parameters, as they are carried beside it."""
-        return rounded(params.matrices if self._joins else params, self.dtype)
+        return rounded(params.matrices if self._joins else params, self.round)
 
-    def whole(self, params: policies.Params) -> policies.Params:
+    def whole(self, params: Params) -> Params:
         """Parameters put together, within `on_each`; differentiated, sums come back as parts."""
         if self.mesh.size == 1:
             return params
@@ -115,7 +115,7 @@ class Parts(NamedTuple):
         """Of every device's numbers, within `on_each`."""
         return tree if self.mesh.size == 1 else jax.lax.pmean(tree, devices.AXIS)
 
-    def mean_gradient(self, gradients: policies.Params) -> Any:
+    def mean_gradient(self, gradients: Params) -> Any:
         """Each device's gradients of `whole` parameters as the batch's, joined as those are."""
         count, like = self.mesh.size, self._joined(self.like.params)
         summed = self._join(gradients)
@@ -164,9 +164,9 @@ class Parts(NamedTuple):
 
 
 @functools.partial(jax.jit, static_argnums=1)  # outside of any, one program for all of them
-def rounded(params: policies.Params, dtype: str) -> policies.Params:
-    """The matrices that `policy.rounded` changes, as it gives them; None in the others' places."""
-    changed = policies.rounded(params, dtype)
+def rounded(params: Params, change: Callable[[Params], Params]) -> Params:
+    """The matrices that `Policy.rounded` changes, as it gives them; None instead of the others."""
+    changed = change(params)
     return jax.tree.map(lambda old, new: None if new.dtype == old.dtype else new, params, changed)
 
 

@@ -9,7 +9,7 @@ import optax
 
 from starjax import config
 from starjax.data import windows
-from starjax.policies import policy as policies
+from starjax.policies.base import Policy
 from starjax.training import devices
 from starjax.training import state as states
 from starjax.training.sharding import Carried, Parts
@@ -22,7 +22,7 @@ def step_keys(key: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def train_step(
-    policy: policies.Policy,
+    policy: Policy,
     optimizer: optax.GradientTransformation,
     train_config: config.TrainConfig,
     parts: Parts,
@@ -38,7 +38,7 @@ def train_step(
 
 
 def _update(
-    policy: policies.Policy,
+    policy: Policy,
     optimizer: optax.GradientTransformation,
     train_config: config.TrainConfig,
     parts: Parts,
@@ -81,7 +81,7 @@ def _update(
 
 
 def resident_step(
-    policy: policies.Policy,
+    policy: Policy,
     optimizer: optax.GradientTransformation,
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,
@@ -111,7 +111,7 @@ def resident_step(
 
 
 def resident_steps(
-    policy: policies.Policy,
+    policy: Policy,
     optimizer: optax.GradientTransformation,
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,

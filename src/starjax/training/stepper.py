@@ -63,7 +63,7 @@ def resident(it: Training, like: TrainState, ahead: bool) -> Advance:
     beside what the caller does until the first step.
     """
     data = devices.replicate((it.dataset, jnp.asarray(it.frames)), it.mesh, may_alias=None)
-    parts = Parts(it.mesh, it.policy_config.dtype, like)
+    parts = Parts(it.mesh, it.policy.rounded, like)
     settings = (it.policy, it.optimizer, it.policy_config, it.train_config, parts)
     looped = steps.runs_in_a_loop(it.policy_config)
     body = steps.resident_steps if looped else steps.resident_step
@@ -85,7 +85,7 @@ def resident(it: Training, like: TrainState, ahead: bool) -> Advance:
 
 def streamed(it: Training, state: TrainState) -> Advance:
     """Steps on a dataset of the host, whose batches follow this state's."""
-    parts = Parts(it.mesh, it.policy_config.dtype, jax.eval_shape(lambda x: x, state))
+    parts = Parts(it.mesh, it.policy.rounded, jax.eval_shape(lambda x: x, state))
     settings = (it.policy, it.optimizer, it.train_config, parts)
     program = _program(functools.partial(steps.train_step, *settings), parts)
     key = jnp.copy(processes.own(state.key))

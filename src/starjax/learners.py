@@ -1,0 +1,30 @@
+"""The learners by name: how sequences of actions are generated. `--help` reads this: no jax here.
+
+A method (`methods`) says in which action space they are, what is told and whether the roll is left
+to a network of its own; every method works with every learner. Others add theirs by an entry point
+of the group `starjax.learners` that names a `Learner`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from starjax.registry import Registry
+
+
+class Learner(NamedTuple):
+    """One way to learn sequences of actions and to generate them.
+
+    Attributes:
+      settings: frozen dataclass of its own options, all with defaults, none of them called as a
+        field of `config.PolicyConfig` is. They are flags beside those of the policy.
+      check: (options, PolicyConfig) -> None; raises UsageError for options that do not go together
+        or with the policy's. It imports no jax.
+      make: (options, PolicyConfig, policies.sequences.Sizes) -> policies.sequences.SequenceModel.
+    """
+
+    settings: type
+    check: Callable[[Any, Any], None]
+    make: Callable[[Any, Any, Any], Any]
+
+
+LEARNERS = Registry("learner", {"diffusion": "starjax.policies.learners.diffusion:LEARNER"})

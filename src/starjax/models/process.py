@@ -1,0 +1,70 @@
+"""Ways from noise to sequences, which a network learns to go back: what a denoiser is made of."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+
+from starjax.models import diffusion as ddpm
+from starjax.models import schedule
+from starjax.models.kernels import parallel_ddim
+
+
+class Sample(Protocol):
+    """How a sequence is generated."""
+
+    def __call__(
+        self,
+        predict: Callable[[jax.Array, Any], jax.Array],
+        noise: jax.Array,
+        *,
+        prepare: Callable[[jax.Array], Any],
+        reach: Any,
+    ) -> jax.Array:
+        """Sequences of noise `[B, H, D]`, within `reach` `[2, D]`, or if it is None [-1, 1].
+
+        Args:
+          predict: `(x, prepared)`, of `x` `[B, H, D]` at one time, or `[n, B, H, D]` at n times.
+          noise: standard normal, or a share of it.
+          prepare: what `predict` is given, of times `[n]` all at once, a pytree `[n, ...]`.
+          reach: lowest and highest values.
+        """
+        ...
+
+
+class Process(NamedTuple):
+    """What becomes noise, and how it is undone.
+
+    A time is what the network is told of how noisy a sequence is, in the process's own unit.
+
+    Attributes:
+      noised: `(key, x0 [B, H, D]) -> given`, what is learned from clean sequences, about [-1, 1]:
+        a pytree whose leading axis is the batch.
+      loss: `(predict, given) -> scalar`, where `predict(x [B, H, D], time [B])` is the network.
+      sample: see `Sample`.
+    """
+
+    noised: Callable[[jax.Array, jax.Array], Any]
+    loss: Callable[[Callable[[jax.Array, jax.Array], jax.Array], Any], jax.Array]
+    sample: Sample
+
+
+def diffusion(diffusion_steps: int, ddim_steps: int) -> Process:
+    """Denoising diffusion: K steps of a cosine schedule, whose noise is predicted; DDIM back."""
+    tables = schedule.cosine(diffusion_steps)
+
+    def noised(key: jax.Array, x0: jax.Array) -> ddpm.Noised:
+        return ddpm.noised(tables, key, x0)
+
+    def sample(predict, noise, *, prepare, reach=None):
+        side_by_side = parallel_ddim.pays(len(noise), ddim_steps)
+        return (parallel_ddim if side_by_side else ddpm).ddim_sample(
+            predict,
+            noise,
+            diffusion_steps=diffusion_steps,
+            steps=ddim_steps,
+            prepare=prepare,
+            reach=reach,
+        )
+
+    return Process(noised, ddpm.eps_loss, sample)

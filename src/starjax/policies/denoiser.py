@@ -1,0 +1,68 @@
+"""A U-Net that undoes noise, whatever the process: a model of sequences."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from starjax.models import diffusion, unet1d
+from starjax.models.kernels import packed_params, sampling_unet
+from starjax.models.process import Process
+from starjax.policies import sequences
+from starjax.policies.sequences import Condition, Params, SequenceModel
+
+_MATRICES = {"kernel", "film_time", "film_cond"}
+
+
+def make(
+    unet: unet1d.ConditionalUnet1D, process: Process, horizon: int, temperature: float
+) -> SequenceModel:
+    """The model of a network and a process.
+
+    Args:
+      unet: predicts what the process asks for.
+      process: how sequences become noise and are generated.
+      horizon: H.
+      temperature: of a sample's first noise.
+    """
+    apply = packed_params.applied(sampling_unet.applied(unet))
+    shape = (horizon, unet.action_dim)
+
+    def init(key: jax.Array) -> Params:
+        condition = jnp.zeros((1, unet.cond_dim))
+        return {"unet": unet.init(key, jnp.zeros((1, *shape)), jnp.zeros(1, jnp.int32), condition)}
+
+    def loss(params: Params, condition: Condition, given: Any) -> tuple[jax.Array, dict]:
+        joined = sequences.joined(condition)
+        return process.loss(lambda x, time: apply(params["unet"], x, time, joined), given), {}
+
+    def sample(
+        params: Params, keys: jax.Array, condition: Condition, reach: jax.Array | None
+    ) -> jax.Array:
+        film = apply(params["unet"], sequences.joined(condition), method="condition")
+
+        def predict(x: jax.Array, film_of_time: jax.Array) -> jax.Array:
+            """Of `[B, H, D]` at one time, or of `[n, B, H, D]`."""
+            rows = (film + film_of_time[..., None, :]).reshape(-1, film.shape[-1])
+            found = apply(params["unet"], x.reshape(-1, *shape), rows, method="denoise")
+            return found.reshape(x.shape)
+
+        return process.sample(
+            predict,
+            temperature * diffusion.sample_noise(keys, shape),
+            prepare=lambda times: apply(params["unet"], times, method="embed_step"),
+            reach=reach,
+        )
+
+    def rounded(params: Any) -> Any:
+        return sequences.rounded(params, _MATRICES, unet.dtype)
+
+    def for_sampling(params: Params) -> Params:
+        network = params["unet"]
+        if sampling_unet.pays():
+            network = sampling_unet.prepared(network)
+        network = rounded(network)
+        packs = packed_params.pays(jax.default_backend())
+        return {"unet": packed_params.packed(network) if packs else network}
+
+    return SequenceModel(init, process.noised, loss, sample, rounded, for_sampling)

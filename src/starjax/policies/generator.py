@@ -1,0 +1,126 @@
+"""Networks that read observations, and a learner's model of sequences given what they make of them.
+
+Images are read one by one, by one encoder for all moments and cameras.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from starjax import config, methods
+from starjax.learners import LEARNERS
+from starjax.models import encoders
+from starjax.models.kernels import packed_params
+from starjax.policies import features, sequences
+from starjax.policies.base import Params
+from starjax.policies.sequences import Condition, SequenceModel, Sizes
+
+
+class Generator(NamedTuple):
+    """Pure functions of parameters `{"vision", "state", "learner"}`.
+
+    Attributes:
+      init: `key -> params`, those that training changes: without `vision` where no image is read,
+        or its encoder is frozen.
+      observe: `(params, inputs, told [B, E]) -> Condition`.
+      model: of sequences, whose parameters are `params["learner"]`.
+      rounded, for_sampling: as those of `sequences.SequenceModel`, of all of them.
+    """
+
+    init: Callable[[jax.Array], Params]
+    observe: Callable[[Params, features.Inputs, jax.Array], Condition]
+    model: SequenceModel
+    rounded: Callable[[Params], Params]
+    for_sampling: Callable[[Params], Params]
+
+
+def sizes(
+    policy_config: config.PolicyConfig, seen: features.Sensors, action: int, told: int = 0
+) -> Sizes:
+    """Sizes for actions of so many numbers, where so many tell of the trocars."""
+    sees_image = policy_config.observation == "image"
+    return Sizes(
+        horizon=policy_config.horizon,
+        action=action,
+        moments=policy_config.obs_horizon,
+        vision=len(seen.cameras) * policy_config.vision_dim if sees_image else 0,
+        state=policy_config.state_dim,
+        told=told,
+    )
+
+
+def make(
+    method: methods.Method,
+    policy_config: config.PolicyConfig,
+    seen: features.Sensors,
+    action: int,
+) -> Generator:
+    """The networks of the settings.
+
+    Args:
+      method: says whether trocars are told.
+      policy_config: networks, and the learner.
+      seen: what is observed.
+      action: D, numbers of an action, and of the proprioception of a moment.
+    """
+    dtype = jnp.dtype(policy_config.dtype)
+    vision = vision_encoder(policy_config)
+    state = encoders.StateEncoder(features=policy_config.state_dim, dtype=dtype)
+    of_state, of_vision = map(packed_params.applied, (state.apply, vision.apply))
+    learner, size = LEARNERS.get(policy_config.learner), policy_config.image_size
+    dims = sizes(policy_config, seen, action, features.extra_dim(method, seen.task))
+    model = learner.make(policy_config.options, policy_config, dims)
+    learns_vision = policy_config.observation == "image" and not policy_config.freeze_encoder
+    width = features.history_dim(policy_config, seen.task, action)
+
+    def init(key: jax.Array) -> Params:
+        key_vision, key_state, key_learner = jax.random.split(key, 3)
+        history = jnp.zeros((1, policy_config.obs_horizon, width))
+        params = {"state": state.init(key_state, history), "learner": model.init(key_learner)}
+        if learns_vision:
+            params["vision"] = vision.init(key_vision, jnp.zeros((1, size, size, 3)))
+        return params
+
+    def observe(params: Params, inputs: features.Inputs, told: jax.Array) -> Condition:
+        visual = inputs.features
+        if visual is None and inputs.images is not None:
+            batch, moments, offset = *inputs.images.shape[:2], inputs.offset
+            visual = of_vision(
+                params["vision"],
+                inputs.images.reshape(-1, *inputs.images.shape[3:]),
+                None if offset is None else offset.reshape(-1, 2),
+            ).reshape(batch, moments, -1)
+        return Condition(visual, of_state(params["state"], inputs.history), told)
+
+    def rounded(params: Params) -> Params:
+        return {**_rounded_vision(params, dtype), "learner": model.rounded(params["learner"])}
+
+    def for_sampling(params: Params) -> Params:
+        found = _rounded_vision(params, dtype)
+        if packed_params.pays(jax.default_backend()):
+            # A decision for one robot begins the later, the more arrays it is handed.
+            readers = found.keys() - {"learner"}
+            found = {**found, **{name: packed_params.packed(found[name]) for name in readers}}
+        return {**found, "learner": model.for_sampling(params["learner"])}
+
+    return Generator(init, observe, model, rounded, for_sampling)
+
+
+def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:
+    """The network that reads images, whose parameters are `params["vision"]`."""
+    return encoders.ImageEncoder(
+        trunk=policy_config.encoder,
+        features=policy_config.vision_dim,
+        dtype=jnp.dtype(policy_config.dtype),
+    )
+
+
+def _rounded_vision(params: Params, dtype: jnp.dtype) -> Params:
+    """The trunk's kernels rounded; other parameters as they are."""
+    if "vision" not in params:
+        return params
+    inner = params["vision"]["params"]
+    trunk = sequences.rounded(inner["trunk"], {"kernel"}, dtype)
+    return {**params, "vision": {"params": {**inner, "trunk": trunk}}}

@@ -1,0 +1,1 @@
+"""One module a learner: its options, their check, and what makes its model."""

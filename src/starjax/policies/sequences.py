@@ -1,0 +1,105 @@
+"""What a policy knows of a learner: sequences of normalised actions, given what was observed."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+Params = dict[str, Any]
+
+
+class Sizes(NamedTuple):
+    """Of a model's arrays.
+
+    Attributes:
+      horizon: H, actions of a sequence.
+      action: D, numbers of an action.
+      moments: O, that are observed.
+      vision: V, numbers that one moment's images become; 0 without images.
+      state: d_s, numbers that the low-dimensional history becomes.
+      told: E, numbers that tell of the trocars; may be 0.
+    """
+
+    horizon: int
+    action: int
+    moments: int
+    vision: int
+    state: int
+    told: int
+
+    @property
+    def observed(self) -> int:
+        """N, numbers of `observed`."""
+        return self.moments * self.vision + self.state
+
+    @property
+    def condition(self) -> int:
+        """Numbers of `joined`."""
+        return self.observed + self.told
+
+
+class Condition(NamedTuple):
+    """What sequences are generated for.
+
+    Attributes:
+      vision: `[B, O, V]`, or None without images.
+      state: `[B, d_s]` of the low-dimensional history.
+      told: `[B, E]` features of the trocars.
+    """
+
+    vision: jax.Array | None
+    state: jax.Array
+    told: jax.Array
+
+
+class SequenceModel(NamedTuple):
+    """Pure functions of one model of sequences `[B, H, D]`, about [-1, 1].
+
+    Attributes:
+      init: `key -> params`.
+      prepare: `(key, x0 [B, H, D]) -> given`, what is learned from demonstrated sequences, with
+        everything random drawn: a pytree whose leading axis is the batch.
+      loss: `(params, Condition, given) -> (scalar, {name: scalar})`, the names being `metrics`.
+      sample: `(params, keys [B], Condition, reach) -> [B, H, D]` within `reach` `[2, D]`, lowest
+        and highest, or if it is None within [-1, 1]. Sample i depends on `keys[i]` alone.
+      rounded: `params -> params` whose large matrices are in the type that is calculated in.
+      for_sampling: `params -> params` as `sample` uses them fastest here.
+      metrics: names of what `loss` tells beside its value.
+    """
+
+    init: Callable[[jax.Array], Params]
+    prepare: Callable[[jax.Array, jax.Array], Any]
+    loss: Callable[[Params, Condition, Any], tuple[jax.Array, dict[str, jax.Array]]]
+    sample: Callable[[Params, jax.Array, Condition, jax.Array | None], jax.Array]
+    rounded: Callable[[Params], Params] = lambda params: params
+    for_sampling: Callable[[Params], Params] = lambda params: params
+    metrics: tuple[str, ...] = ()
+
+
+def observed(condition: Condition) -> jax.Array:
+    """`[B, N]`, all that was observed."""
+    if condition.vision is None:
+        return condition.state
+    flat = condition.vision.reshape(len(condition.vision), -1)
+    return jnp.concatenate([flat, condition.state], axis=-1)
+
+
+def joined(condition: Condition) -> jax.Array:
+    """`[B, N + E]`, what was observed and what is told."""
+    seen = observed(condition)
+    # XLA of jax 0.11 crashes on an empty array that is concatenated under `shard_map`
+    return jnp.concatenate([seen, condition.told], axis=-1) if condition.told.shape[-1] else seen
+
+
+def rounded(params: Any, names: set[str], dtype: Any) -> Any:
+    """Parameters with the leaves of these names in another type.
+
+    Networks round them so anyway, to the same numbers, wherever they use them. Done before, they
+    are not read in float32 and rounded again at each of many evaluations.
+    """
+
+    def one(path: tuple[Any, ...], leaf: Any) -> Any:
+        return leaf.astype(dtype) if getattr(path[-1], "key", None) in names else leaf
+
+    return jax.tree_util.tree_map_with_path(one, params)
