@@ -81,8 +81,8 @@ def _quadratic_policy():
     from starjax.types import Command
 
     def say(params, observation):
-        p = observation.pose.p[:, -1:]
-        return jnp.concatenate([p, p * p], -1) @ params["a"] + params["b"]
+        p, weights = observation.pose.p[:, -1:], params["learner"]
+        return jnp.concatenate([p, p * p], -1) @ weights["a"] + weights["b"]
 
     def prepare(stats, key, batch):
         noise = 0.001 * jax.random.normal(key, batch.command.pose.p.shape)
@@ -98,7 +98,7 @@ def _quadratic_policy():
         return Command(pose._replace(p=p), observation.gripper[:, -1:])
 
     def init(key):
-        return {"a": jax.random.normal(key, (6, 3)), "b": jnp.zeros(3)}
+        return {"learner": {"a": jax.random.normal(key, (6, 3)), "b": jnp.zeros(3)}}
 
     return Policy(init, prepare, loss, sample)
 
