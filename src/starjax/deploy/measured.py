@@ -74,7 +74,7 @@ def given(asks: Asks, observation: Any, trocar: Any) -> tuple[types.Observation,
     if not isinstance(trocar, rcm.Trocar):
         raise UsageError("trocar", "an rcm.Trocar", type(trocar).__name__)
     trocar = rcm.check_trocar(trocar)
-    farthest = 0.0 if _is_traced(trocar.radius) else np.asarray(trocar.radius).max(initial=0.0)
+    farthest = 0.0 if is_traced(trocar.radius) else np.asarray(trocar.radius).max(initial=0.0)
     if farthest > FARTHEST:
         raise UsageError("trocar.radius", f"at most {FARTHEST} m", f"{farthest:g}")
     trocar = rcm.Trocar(*map(jnp.asarray, trocar))  # within a program a traced one
@@ -148,7 +148,7 @@ def _check_values(asks: Asks, seen: types.Observation, trocar: rcm.Trocar, leadi
     known = {
         name: np.asarray(value, np.float64)  # numpy's functions refuse or wrap some types
         for name, value in {**found, "state": seen.state}.items()
-        if value is not None and not _is_traced(value)
+        if value is not None and not is_traced(value)
     }
     for name, value in known.items():
         if not np.isfinite(value).all():
@@ -166,23 +166,31 @@ def _check_values(asks: Asks, seen: types.Observation, trocar: rcm.Trocar, leadi
         worst = gripper.flat[np.abs(gripper).argmax()]
         expected = "numbers from -1 (closed) to 1 (open)"
         raise UsageError("observation.gripper", expected, f"{worst:.3g}")
-    if asks.keeps_to_manifold and not any(map(_is_traced, (*seen.pose, *trocar))):
-        off = float(_largest_miss(seen.pose, trocar, asks.p_world_ref, leading))
+    if asks.keeps_to_manifold and not any(map(is_traced, (*seen.pose, *trocar))):
+        off, depth = map(float, _through(seen.pose, trocar, asks.p_world_ref, leading))
         if off > FARTHEST_OFF:
             got = f"an axis that misses it by {1e3 * off:.0f} mm"
             raise UsageError("observation.pose", "tools through the trocar", got)
+        if depth <= 0.0:
+            expected = "tips beyond the trocar along the tool's axis, which points out of the jaws"
+            hint = "a quaternion w x y z read as x y z w turns a tool round"
+            got = f"one {-1e3 * depth:.0f} mm before it"
+            raise UsageError("observation.pose", expected, got, hint)
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def _largest_miss(pose: Pose, trocar: rcm.Trocar, p_world_ref: Any, leading: int) -> jax.Array:
-    """m, of trocars `[*robots, *arms]` from the axes of tools `[*robots, O, *arms]`."""
+def _through(
+    pose: Pose, trocar: rcm.Trocar, p_world_ref: Any, leading: int
+) -> tuple[jax.Array, jax.Array]:
+    """m, the largest distance of trocars `[*robots, *arms]` from the axes of tools `[*robots, O,
+    *arms]`, and the least depth of a tip."""
     through = jnp.expand_dims(rcm.trocar_position(trocar, p_world_ref), leading)
-    return jnp.max(rcm.rcm_error(pose, through))
+    return jnp.max(rcm.rcm_error(pose, through)), jnp.min(rcm.insertion_depth(pose, through))
 
 
 def _array(value: Any) -> Any:
     return value if value is None or isinstance(value, jax.Array) else np.asarray(value)
 
 
-def _is_traced(value: Any) -> bool:
+def is_traced(value: Any) -> bool:
     return isinstance(value, core.Tracer)

@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import config, errors, limits, methods, rcm, types
-from starjax.deploy import measured
+from starjax.deploy import measured, start
 from starjax.deploy.measured import Observation
 from starjax.learners import LEARNERS
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
+from starjax.runtime import files
 from starjax.sim import registry
 from starjax.sim.names import SceneNames
 from starjax.types import Command, Pose
@@ -37,14 +38,21 @@ class Deployed:
       scene: names of the task, arms, tools and cameras that it was trained with.
       p_world_ref: `[3]` m, the nominal trocar, which a trocar is described from; `[A, 3]` of A
         arms.
+      max_first_move: m, how far from the measured tip a plan may begin.
+      max_first_turn: rad, how far from the measured rotation.
+
+    It pickles as the arguments that it was loaded with: another process loads the same file.
     """
 
     method: str
     settings: config.PolicyConfig
     scene: SceneNames
     p_world_ref: np.ndarray
+    max_first_move: float
+    max_first_turn: float
+    _source: tuple[Any, ...] = dataclasses.field(repr=False)
     _asks: measured.Asks = dataclasses.field(repr=False)
-    _sample: Callable[..., Command] = dataclasses.field(repr=False)
+    _decide: Callable[..., tuple[Command, start.First]] = dataclasses.field(repr=False)
     _weights: tuple[Any, Any] = dataclasses.field(repr=False)
 
     @arrays.broadcasting
@@ -64,6 +72,11 @@ class Deployed:
         Jaws are the same after half a turn, so a tool that is turned by more than a quarter (of
         `rcm.roll_of`), which no demonstration shows, is read and commanded as half a turn back.
 
+        A tool that has just been passed through the trocar is shallower than any demonstrated one.
+        Where a plan begins deeper and farther from it than the bounds, the commands are instead a
+        slow way there (`start.LEAD_MOVE`, `start.LEAD_TURN` a control step), which the next
+        decisions continue.
+
         Returns:
           Command `[H]` or `[B, H]`: tip poses in the world frame, all of them on the RCM manifold
           (but for `dp_ee`), and the gripper's openings.
@@ -72,18 +85,38 @@ class Deployed:
           UsageError: an array is missing or has another shape or type than expected, a number is
             not finite or none that is measured so, a rotation is none, the trocar is none, tip or
             trocar are farther than `FARTHEST` from the nominal trocar, or, of a policy that keeps
-            to the RCM manifold, the tool's axis is farther than `FARTHEST_OFF` from the trocar.
-            Values that jax traces are not looked at, nor, within a program, whether the tool
-            passes through the trocar.
+            to the RCM manifold, the tool's axis is farther than `FARTHEST_OFF` from the trocar or
+            the tip not beyond it. Also where a plan begins farther than `max_first_move` or
+            `max_first_turn` from the measured pose.
+            Values that jax traces are not looked at: within a program none of the last three is.
         """
         _check_key(key)
         seen, trocar = measured.given(self._asks, observation, trocar)
         robots = np.shape(trocar.radius)[: np.ndim(trocar.radius) - len(self._asks.arms)]
-        if robots:
-            return self._sample(*self._weights, jax.random.split(key, robots[0]), seen, trocar)
-        one = jax.tree.map(lambda x: jnp.asarray(x)[None], (seen, trocar))
-        command = self._sample(*self._weights, key[None], *one)
-        return jax.tree.map(lambda x: x[0], command)
+        bounds = start.bounds(self.max_first_move, self.max_first_turn)
+        keys = jax.random.split(key, robots[0]) if robots else key[None]
+        if not robots:
+            seen, trocar = jax.tree.map(lambda x: jnp.asarray(x)[None], (seen, trocar))
+        command, found = self._decide(*self._weights, keys, seen, trocar, bounds)
+        self._check_first(found)
+        return command if robots else jax.tree.map(lambda x: x[0], command)
+
+    def __reduce__(self) -> tuple[Callable[..., "Deployed"], tuple[Any, ...]]:
+        path, digest, settings = self._source
+        bounds = {"max_first_move": self.max_first_move, "max_first_turn": self.max_first_turn}
+        return _load_again, (path, digest, {**settings, **bounds})
+
+    def _check_first(self, found: start.First) -> None:
+        if measured.is_traced(found.move):
+            return
+        move, turn = (np.max(x) for x in jax.device_get(found))
+        hint = "compare the frames of pose and trocar with the policy's, or load it with more"
+        if not move <= self.max_first_move:  # NaN too
+            expected = f"a plan that begins within {1e3 * self.max_first_move:g} mm of the tip"
+            raise errors.UsageError("max_first_move", expected, f"{1e3 * move:.0f} mm", hint)
+        if not turn <= self.max_first_turn:
+            expected = f"a plan that begins within {self.max_first_turn:g} rad of the tool"
+            raise errors.UsageError("max_first_turn", expected, f"{turn:.2g} rad", hint)
 
 
 def _check_key(key: Any) -> None:
@@ -104,22 +137,39 @@ def _is_key(array: jax.Array | np.ndarray) -> bool:
     return (array.dtype, array.shape) == (old.dtype, old.shape)
 
 
-def load(policy: str | Path, method: str | None = None, **options: Any) -> Deployed:
-    """A policy from its file.
+@arrays.broadcasting
+def load(
+    policy: str | Path,
+    method: str | None = None,
+    *,
+    max_first_move: float = start.MAX_FIRST_MOVE,
+    max_first_turn: float = start.MAX_FIRST_TURN,
+    **options: Any,
+) -> Deployed:
+    """Loads a policy from its file.
+
+    jax's settings stay as they are. Where a program has set others of random numbers
+    (`jax_threefry_partitionable`, `jax_random_seed_offset`), its keys draw other noise.
 
     Args:
       policy: a policy.safetensors, or the name of one that ships with starjax, such as "compact".
       method: of several with the same weights the one to run: `dp_ee_proj` runs those of `dp_ee`.
         By default the one that trained them.
+      max_first_move: m, how far from the measured tip a plan may begin; for the owner of a robot
+        to choose. Infinity: as far as it likes.
+      max_first_turn: rad, how far from the measured rotation.
       options: of the policy's learner that decisions are made with, those of its training unless
         given. Of diffusion: `ddim_steps`, denoising steps of a decision, of which fewer are faster,
         and `temperature`.
 
     Raises:
-      ValueError: there is no such file, it is damaged or of another version, an option is unknown
-        or out of range, `method` has other weights, or its task, a tool or its learner is not
-        installed.
+      ValueError: there is no such file, it is damaged or of another version, an option is unknown,
+        it or a bound is out of range, `method` has other weights, or its task, a tool or its
+        learner is not installed.
     """
+    for name, bound in (("max_first_move", max_first_move), ("max_first_turn", max_first_turn)):
+        if not bound > 0:
+            raise errors.UsageError(name, "more than 0", bound)
     path = packaged.find("policy", str(policy))
     trained = policy_file.load(path)
     if trained.p_world_ref is None:
@@ -144,9 +194,31 @@ def load(policy: str | Path, method: str | None = None, **options: Any) -> Deplo
         cameras=trained.scene.cameras if settings.observation == "image" else (),
         state_size=task.state_size,
     )
-    decide = jax.jit(_decider(made.sample, trained, not arms))
+    leads = row.action_space if asks.keeps_to_manifold else None
+    decide = jax.jit(_decider(made.sample, trained, not arms, leads))
     weights = jax.device_put((params, trained.normalizer))
-    return Deployed(method, settings, trained.scene, asks.p_world_ref, asks, decide, weights)
+    bounds = {"max_first_move": float(max_first_move), "max_first_turn": float(max_first_turn)}
+    again = {"method": method, **options}
+    source = (str(path.absolute()), files.sha256(path), again)
+    return Deployed(
+        method=method,
+        settings=settings,
+        scene=trained.scene,
+        p_world_ref=asks.p_world_ref,
+        **bounds,
+        _source=source,
+        _asks=asks,
+        _decide=decide,
+        _weights=weights,
+    )
+
+
+def _load_again(path: str, digest: str, settings: dict[str, Any]) -> Deployed:
+    """`load` in another process, of the same file."""
+    loaded = load(path, **settings)
+    if loaded._source[1] != digest:
+        raise errors.UsageError("policy", "the file as it was when the policy was pickled", path)
+    return loaded
 
 
 def _with_options(settings: config.PolicyConfig, options: dict[str, Any]) -> config.PolicyConfig:
@@ -163,16 +235,23 @@ def _with_options(settings: config.PolicyConfig, options: dict[str, Any]) -> con
 
 
 def _decider(
-    sample: Callable[..., Command], trained: policy_file.Trained, is_one_arm: bool
-) -> Callable[..., Command]:
+    sample: Callable[..., Command],
+    trained: policy_file.Trained,
+    is_one_arm: bool,
+    leads: str | None,
+) -> Callable[..., tuple[Command, start.First]]:
     """`sample` of trocars, and of one arm's arrays without an arm axis; tools that look the same
-    after half a turn are turned back by it where they are turned by more than a quarter."""
+    after half a turn are turned back by it where they are turned by more than a quarter.
+
+    `leads` is the action space of a policy that keeps to the manifold, whose plans `start.led`
+    leads from shallow tools; None for others.
+    """
     p_world_ref = np.asarray(trained.p_world_ref, np.float32)
     roll_zero = np.asarray(trained.roll_zero, np.float32)
     tools = [registry.tools.get(name) for name in trained.scene.tools]
     is_symmetric = np.array([tool.is_symmetric for tool in tools])
 
-    def decide(params, stats, keys, seen: types.Observation, trocar: rcm.Trocar) -> Command:
+    def decide(params, stats, keys, seen: types.Observation, trocar: rcm.Trocar, bounds):
         if is_one_arm:
             pose = Pose(seen.pose.R[..., None, :, :], seen.pose.p[..., None, :])
             seen = seen._replace(pose=pose, gripper=seen.gripper[..., None])
@@ -183,9 +262,13 @@ def _decider(
         seen = seen._replace(pose=seen.pose._replace(R=seen.pose.R * half))
         told = rcm.trocar_frame(trocar, p_world_ref, roll_zero)
         command = sample(params, stats, keys, seen, told)
+        now = Pose(*(x[:, -1].astype(jnp.float32) for x in seen.pose))
+        if leads:
+            command = start.led(leads, stats, now, command, told, bounds)
+        found = start.first(now, Pose(*(x[:, 0] for x in command.pose)))
         R, p, gripper = command.pose.R * half, command.pose.p, command.gripper
         if is_one_arm:
             R, p, gripper = R[..., 0, :, :], p[..., 0, :], gripper[..., 0]
-        return Command(Pose(R, p), gripper)
+        return Command(Pose(R, p), gripper), found
 
     return decide
