@@ -18,7 +18,7 @@ from starjax.policies import policy as policies
 from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.sim import registry
 from starjax.training import devices, state, step
-from starjax.training.sharding import Carried, Parts
+from starjax.training.sharding import Carry, Layout
 from starjax.types import Command, Observation, Pose
 
 TASK = registry.tasks.get("peg_transfer")
@@ -59,10 +59,10 @@ class Job(NamedTuple):
     Attributes:
       policy: being trained.
       params: shapes of its parameters, as the networks take them.
-      carried: its TrainState and its rounded matrices, what goes from call to call, on all devices.
+      carry: what goes from call to call, on all devices.
       dataset: made-up frames on all devices.
       example: a batch.
-      steps: (carried, dataset, count) -> carried after `per_call` steps.
+      steps: (carry, dataset, count) -> carry after `per_call` steps.
       per_call: steps in one call; `count` must be given as this.
       options: of `jax.jit` for `steps`, as training has them.
       calls: made before the last one's result is waited for, as training does.
@@ -70,10 +70,10 @@ class Job(NamedTuple):
 
     policy: policies.Policy
     params: policies.Params
-    carried: Carried
+    carry: Carry
     dataset: windows.Dataset
     example: windows.Batch
-    steps: Callable[..., Carried]
+    steps: Callable[..., Carry]
     per_call: int
     options: dict[str, Any]
     calls: int
@@ -114,25 +114,28 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     batch = case.train.batch_size
     frame = jnp.arange(batch) % count
     example = windows.gather(dataset, frame, case.policy.obs_horizon, case.policy.horizon)
-    stats = statistics(case.policy)
-    first = state.create(policy, optimizer, drawn(policy, seed), stats, seed)
+    stats, key = statistics(case.policy), state.streams(seed).steps
+    first = state.create(policy, optimizer, drawn(policy, seed), stats, key)
     mesh = devices.make_mesh(batch, on)
-    like = jax.eval_shape(lambda x: x, first)
-    parts = Parts(mesh, policy.rounded, like)
-    settings = (policy, optimizer, case.policy, case.train, parts)
+    shapes = jax.eval_shape(lambda x: x, first)
+    layout = Layout(mesh, policy.rounded, shapes)
+    setup = step.Setup(policy, optimizer, case.policy, case.train, layout)
     looped = step.runs_in_a_loop(case.policy)
 
-    def steps(carried, dataset, count):
+    def steps(carry, dataset, count):
         drawn = jnp.arange(len(dataset.episode))
         if looped:
-            return step.resident_steps(*settings, carried, dataset, drawn, count)
-        return step.resident_step(*settings, carried, dataset, drawn)
+            return step.resident_steps(setup, carry, dataset, drawn, count)
+        return step.resident_step(setup, carry, dataset, drawn)
 
     first, dataset = devices.replicate((first, dataset), mesh)
-    carried = jax.jit(parts.begin, out_shardings=parts.placed())(first)
-    options = {"out_shardings": parts.placed(), "compiler_options": devices.compiler_options(mesh)}
+    carry = jax.jit(layout.to_carry, out_shardings=layout.shardings())(first)
+    options = {
+        "out_shardings": layout.shardings(),
+        "compiler_options": devices.compiler_options(mesh),
+    }
     per_call, calls = (10, 1) if looped else (1, 50 if on[0].platform == "gpu" else 1)
-    return Job(policy, like.params, carried, dataset, example, steps, per_call, options, calls)
+    return Job(policy, shapes.params, carry, dataset, example, steps, per_call, options, calls)
 
 
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:
@@ -144,7 +147,7 @@ def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:
 
 def drawn(policy: policies.Policy, seed: int = 0) -> policies.Params:
     """A policy's first parameters, on the device."""
-    return state.on_device(state.init(policy, seed).drawn())
+    return state.on_device(state.init(policy, state.streams(seed).params).drawn())
 
 
 def statistics(policy_config: PolicyConfig) -> normalizer.Normalizer:

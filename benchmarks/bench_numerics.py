@@ -70,17 +70,16 @@ def losses(case: _setup.Case, seed: int, steps: int) -> np.ndarray:
     """`[steps]` losses, one a step."""
     job = _setup.job(case, seed=seed, frames=256)
 
-    def step(carried, dataset):
-        state, narrow = carried
-        cleared = jax.tree.map(jnp.zeros_like, state.sums)
-        return job.steps((state.replace(sums=cleared), narrow), dataset, jnp.int32(1))
+    def step(carry, dataset):
+        cleared = carry.state.replace(sums=jax.tree.map(jnp.zeros_like, carry.state.sums))
+        return job.steps(carry._replace(state=cleared), dataset, jnp.int32(1))
 
     one = jax.jit(step, donate_argnums=0)
-    carried, found = job.carried, []
+    carry, found = job.carry, []
     for _ in range(steps):
-        carried = one(carried, job.dataset)
+        carry = one(carry, job.dataset)
         # Copied, as the next step takes the state's memory; not waited for.
-        found.append(jnp.copy(carried[0].sums["loss"]))
+        found.append(jnp.copy(carry.state.sums["loss"]))
     return np.array(jax.device_get(found))
 
 

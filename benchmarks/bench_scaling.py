@@ -80,7 +80,7 @@ def train(count: int, tiny: bool) -> dict:
     job = _setup.job(case, jax.devices()[:count])
     steps = np.int32(job.per_call)
     timing, _ = _timing.time_carried(
-        job.steps, job.carried, job.dataset, steps, calls=job.calls, **job.options
+        job.steps, job.carry, job.dataset, steps, calls=job.calls, **job.options
     )
     seconds = timing.median_s / (job.calls * job.per_call)
     return {"seconds": seconds, "batch": case.train.batch_size, "compile_s": timing.compile_s}

@@ -74,17 +74,16 @@ def main() -> None:
 def measure(case: _setup.Case, rates: _machine.Rates) -> dict:
     """One method (stardiff), dataset resident on the device."""
     job = _setup.job(case)
-    state, _ = job.carried
     parameters = sum(leaf.size for leaf in jax.tree.leaves(job.params))
     gradient = jax.grad(job.policy.loss, has_aux=True)
-    given = job.policy.prepare(state.normalizer, jax.random.key(0), job.example)
+    given = job.policy.prepare(job.carry.state.normalizer, jax.random.key(0), job.example)
     work = _arithmetic.operations(gradient, job.params, given)
     # Forward, and the gradients of inputs and of weights.
     work -= 3 * case.train.batch_size * _arithmetic.of_padding(case.policy)
     arithmetic_s = work / rates.flops
     floor = arithmetic_s + STATE_PASSES * 4 * parameters / rates.bandwidth
     count = np.int32(job.per_call)
-    inputs = (job.carried, job.dataset, count)
+    inputs = (job.carry, job.dataset, count)
     timing, _ = _timing.time_carried(job.steps, *inputs, calls=job.calls, **job.options)
     timed = job.calls * job.per_call
     seconds = timing.median_s / timed

@@ -111,15 +111,16 @@ def devices_main(count: int, out: str, observation: str, dtype: str) -> None:
 
     from starjax.data import windows
     from starjax.models.kernels import packed_params
-    from starjax.training import sharding, step
+    from starjax.training import sharding
+    from starjax.training.state import step_keys
 
     assert len(jax.devices()) == count
     # so that this small policy has some, as on GPUs
     sharding.LARGE, packed_params.PLATFORMS = 256, {"cpu"}
     settings = dataclasses.replace(SETTINGS, holdout_demos=0)
     state = train(Path(out), settings, observation=observation, dtype=dtype).state
-    key_frames, _ = step.step_keys(state.key, 5)
-    frames = windows.sample_frames(key_frames, jnp.arange(100), settings.batch_size)
+    key = step_keys(state.key, 5).batch
+    frames = windows.sample_frames(key, jnp.arange(100), settings.batch_size)
     arrays = {str(i): np.asarray(x) for i, x in enumerate(jax.tree.leaves(state.params))}
     sizes = {len(x.sharding.device_set) for x in jax.tree.leaves(state.params)}
     assert sizes == {count}

@@ -15,7 +15,7 @@ from starjax.methods import METHODS
 from starjax.policies import generator, policy_file
 from starjax.policies import policy as policies
 from starjax.rollouts import sharing
-from starjax.training import checkpoint, encoder, frozen, loop, state
+from starjax.training import checkpoint, encoder, frozen, log, loop, state
 
 TRAIN = config.TrainConfig(
     steps=6,
@@ -178,10 +178,10 @@ def test_the_encoder_has_no_optimiser_and_no_average(source, whole):
 def test_the_rest_learns(source, whole):
     policy = policies.make(METHODS["stardiff"], source[0], fakes.TASK, TRAIN)
     assert "vision" not in jax.eval_shape(policy.init, jax.random.key(0))
-    lines = loop.metrics.read(whole.parent / "metrics.jsonl")
+    lines = log.read(whole.parent / "metrics.jsonl")
     assert {"train", "holdout"} == {line["kind"] for line in lines}
     kernel = policy_file.load(whole).params["learner"]["unet"]
-    begun = state.init(policy, 0).drawn()["learner"]["unet"]
+    begun = state.init(policy, state.streams(0).params).drawn()["learner"]["unet"]
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), kernel, begun)
     assert max(jax.tree.leaves(moved)) > 1e-3
 

@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import types
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,7 @@ from starjax.data import windows
 from starjax.methods import METHODS
 from starjax.models.kernels import packed_params
 from starjax.runtime import files, signals
-from starjax.training import checkpoint, loop, state, step, stepper
-from starjax.training import log as metrics
+from starjax.training import checkpoint, log, loop, state, step, stepper
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
@@ -71,7 +69,7 @@ def test_a_thread_trains_the_same_weights(tmp_path, monkeypatch):
 
 def test_a_run_leaves_its_log_and_checkpoints(whole):
     directory, result = whole
-    lines = metrics.read(directory / "metrics.jsonl")
+    lines = log.read(directory / "metrics.jsonl")
     train = [line["step"] for line in lines if line["kind"] == "train"]
     held = [line for line in lines if line["kind"] == "holdout"]
     assert train == list(range(3, 13, 3))
@@ -107,7 +105,7 @@ def test_demonstrations_kept_out_are_neither_trained_on_nor_fitted(quick, monkey
     fitted, drawn, fit, resident = [], [], loop.normalizer.fit, stepper.resident
     monkeypatch.setattr(loop.normalizer, "fit", lambda *a: fitted.append(a[3]) or fit(*a))
     monkeypatch.setattr(
-        stepper, "resident", lambda it, *a, **k: drawn.append(it.frames) or resident(it, *a, **k)
+        stepper, "resident", lambda *a, **k: drawn.append(a[2]) or resident(*a, **k)
     )
     jobs.train(tmp_path, dataclasses.replace(jobs.SETTINGS, steps=1))
     dataset = fakes.dataset(seed=0)
@@ -126,26 +124,9 @@ def test_losses_that_are_all_broken_end_the_training(quick, monkeypatch, tmp_pat
         jobs.train(tmp_path)
 
 
-def test_a_single_step_that_is_broken_does_not_end_the_training(tmp_path):
-    def log(step, skipped, of_all):
-        sums = {"loss": 0.0, "taken": 0, "skipped": skipped}
-        state = types.SimpleNamespace(
-            sums=jax.tree.map(jnp.float32, sums), skipped=of_all, replace=lambda **made: made
-        )
-        settings = dataclasses.replace(jobs.SETTINGS, log_every=3)
-        return loop._log(tmp_path / "log", step, (state, None), settings)[1]
-
-    assert log(13, 1, 1) == "no finite loss, 1 steps skipped"  # the end cut the stretch short
-    (line,) = metrics.read(tmp_path / "log")
-    assert line["skipped"] == 1 and "loss" not in line
-    for hopeless in ((12, 3, 3), (2, 1, 2)):
-        with mistakes.of("train.learning_rate"):
-            log(*hopeless)
-
-
 def test_a_full_disk_at_a_line_of_the_log_is_told(tmp_path):
     with pytest.raises(files.StorageError, match=r"cannot write .*log: .*last checkpoint"):
-        metrics.append(tmp_path / "missing" / "log", 3, "train", {})
+        log.append(tmp_path / "missing" / "log", 3, "train", {})
 
 
 def test_a_skipped_step_does_not_move_the_learning_rate(quick, monkeypatch, tmp_path):
@@ -157,7 +138,7 @@ def test_a_skipped_step_does_not_move_the_learning_rate(quick, monkeypatch, tmp_
     monkeypatch.setattr(loop.policies, "make", lambda *_: broken)
     result = jobs.train(tmp_path)
     used = int(result.state.opt_state[0].count)
-    lines = [x for x in metrics.read(tmp_path / "metrics.jsonl") if x["kind"] == "train"]
+    lines = [x for x in log.read(tmp_path / "metrics.jsonl") if x["kind"] == "train"]
     skipped = np.cumsum([line["skipped"] for line in lines])
     assert 0 < skipped[-2] < skipped[-1] == result.skipped == 12 - used
     rate = state.learning_rate(jobs.SETTINGS)
@@ -188,8 +169,8 @@ def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
     again = jobs.train(tmp_path)
     assert_same_bytes(again.state, result.state)
     assert again.holdout == result.holdout
-    log = (tmp_path / "metrics.jsonl").read_bytes()
-    assert log == (directory / "metrics.jsonl").read_bytes()
+    written = (tmp_path / "metrics.jsonl").read_bytes()
+    assert written == (directory / "metrics.jsonl").read_bytes()
 
 
 def test_only_the_state_is_held_while_steps_are_taken(whole, tmp_path):
@@ -267,9 +248,9 @@ def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
     hosted = jobs.train(tmp_path, host=True)
     for x, y in zip(leaves(hosted.state), leaves(result.state), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
-    ours, theirs = (metrics.read(d / "metrics.jsonl") for d in (tmp_path, directory))
+    ours, theirs = (log.read(d / "metrics.jsonl") for d in (tmp_path, directory))
     assert [line["step"] for line in ours] == [line["step"] for line in theirs]
-    losses = [[line["loss"] for line in log if "loss" in line] for log in (ours, theirs)]
+    losses = [[line["loss"] for line in lines if "loss" in line] for lines in (ours, theirs)]
     np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
 
 
@@ -282,7 +263,7 @@ def test_packed_parameters_give_the_same_run_and_resume(whole, tmp_path, monkeyp
     again = jobs.train(tmp_path)
     for x, y in zip(leaves(again.state), leaves(result.state), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
-    ours, theirs = (metrics.read(d / "metrics.jsonl") for d in (tmp_path, directory))
+    ours, theirs = (log.read(d / "metrics.jsonl") for d in (tmp_path, directory))
     for a, b in zip(ours, theirs, strict=True):
         assert a.pop("kind") == b.pop("kind")
         assert a == pytest.approx(b, rel=1e-4)
@@ -310,7 +291,7 @@ def test_training_learns(tmp_path):
         jobs.SETTINGS, steps=300, log_every=50, checkpoint_every=300, steps_per_call=50
     )
     result = jobs.train(tmp_path, settings)
-    losses = [x["loss"] for x in metrics.read(tmp_path / "metrics.jsonl") if x["kind"] == "train"]
+    losses = [x["loss"] for x in log.read(tmp_path / "metrics.jsonl") if x["kind"] == "train"]
     assert losses[-1] < 0.6 * losses[0]
     assert result.samples_per_second > 0
 
@@ -348,13 +329,12 @@ def test_many_devices_give_the_numbers_of_one(tmp_path, count, observation, dtyp
         env=environment,
         check=True,
     )
-    one, many = (list(metrics.read(tmp_path / name / "metrics.jsonl")) for name in "1n")
+    one, many = (list(log.read(tmp_path / name / "metrics.jsonl")) for name in "1n")
     for a, b in zip(one, many, strict=True):
         assert a.pop("kind") == b.pop("kind")
         assert a == pytest.approx(b, rel=tolerance)
     with np.load(tmp_path / "n/found.npz", allow_pickle=False) as found:
-        key_frames, _ = step.step_keys(last.key, 5)
-        drawn = jax.random.randint(key_frames, (16,), 0, 100)
+        drawn = jax.random.randint(state.step_keys(last.key, 5).batch, (16,), 0, 100)
         np.testing.assert_array_equal(found["frames"], drawn)
         for i, x in enumerate(leaves(last.params)):
             assert np.abs(found[str(i)] - x).mean() < tolerance * settings.learning_rate * 12
@@ -373,27 +353,19 @@ def test_learning_rate_and_average():
 
 
 def test_a_half_written_line_is_dropped_and_the_rest_goes_on(tmp_path):
-    log = tmp_path / "log"
-    log.write_bytes(b'{"step": 3, "kind": "train"}\n{"step": 4, "kind": "holdout"}')
-    metrics.resume(log, 4)
-    metrics.append(log, 4, "holdout", {})
-    assert [line["step"] for line in metrics.read(log)] == [3, 4]
+    path = tmp_path / "log"
+    path.write_bytes(b'{"step": 3, "kind": "train"}\n{"step": 4, "kind": "holdout"}')
+    log.resume(path, 4)
+    log.append(path, 4, "holdout", {})
+    assert [line["step"] for line in log.read(path)] == [3, 4]
 
 
 def test_throughput_is_without_the_call_that_compiles():
-    rate = loop._Rate(batch_size=16)
+    rate = loop._Pace(batch_size=16)
     assert rate.next_call(1, 100.0, 50) == 1
     assert rate.next_call(1, 0.5, 50) == 2 and rate.next_call(10, 0.5, 50) == 20
     assert rate.next_call(20, 0.1, 50) == 50
     assert rate.samples_per_second == pytest.approx(16 * 31 / 1.1)
-
-
-def test_the_logged_loss_is_of_the_steps_that_were_taken(tmp_path):
-    sums = jax.tree.map(jnp.float32, {"loss": 6.0, "taken": 2, "skipped": 1})
-    it: Any = types.SimpleNamespace(sums=sums, skipped=1, replace=lambda **made: made)
-    assert loop._log(tmp_path / "log", 3, (it, None), jobs.SETTINGS)[1].startswith("loss 3.0000")
-    (line,) = metrics.read(tmp_path / "log")
-    assert (line["loss"], line["skipped"]) == (3.0, 1)
 
 
 def test_a_millimetre_is_another_dataset_and_a_last_bit_is_not():

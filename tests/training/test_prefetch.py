@@ -1,6 +1,7 @@
 """Batches that a thread gathers on the host."""
 
 import time
+from typing import Any
 
 import fakes
 import jax
@@ -10,17 +11,27 @@ import pytest
 
 from starjax import config
 from starjax.data import windows
-from starjax.training import devices, prefetch, step
+from starjax.training import devices, prefetch, state
+from starjax.training.sharding import Layout
+from starjax.training.step import Setup
+
+NOTHING: Any = None
+SETUP = Setup(
+    policy=NOTHING,
+    optimizer=NOTHING,
+    policy_config=fakes.TINY,
+    train_config=config.TrainConfig(batch_size=16),
+    layout=Layout(devices.make_mesh(16), lambda params: params, NOTHING),
+)
 
 
 def test_frames_follow_the_step_from_wherever_it_begins(monkeypatch):
     monkeypatch.setattr(prefetch, "_CHUNK", 4)  # several of them in ten steps
     dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
     frames, key, first = np.arange(40), jax.random.key(3), 3
-    settings, mesh = config.TrainConfig(batch_size=16), devices.make_mesh(16)
-    stream = prefetch.batches(dataset, frames, fakes.TINY, settings, mesh, key, first)
+    stream = prefetch.batches(SETUP, dataset, frames, key, first)
     for number in range(first, first + 10):
-        drawn = windows.sample_frames(step.step_keys(key, number)[0], jnp.asarray(frames), 16)
+        drawn = windows.sample_frames(state.step_keys(key, number).batch, jnp.asarray(frames), 16)
         wanted = windows.gather(
             dataset, np.asarray(drawn), fakes.TINY.obs_horizon, fakes.TINY.horizon
         )
@@ -34,10 +45,7 @@ def test_a_closed_feed_gathers_nothing_more(monkeypatch):
     monkeypatch.setattr(
         windows, "gather", lambda *given: gathered.append(time.sleep(0.02)) or gather(*given)
     )
-    settings, mesh = config.TrainConfig(batch_size=16), devices.make_mesh(16)
-    stream = prefetch.batches(
-        dataset, np.arange(40), fakes.TINY, settings, mesh, jax.random.key(3), 0
-    )
+    stream = prefetch.batches(SETUP, dataset, np.arange(40), jax.random.key(3), 0)
     next(stream)
     stream.close()
     assert len(gathered) < prefetch._CHUNK // 2
@@ -49,9 +57,6 @@ def test_a_fault_of_the_thread_is_raised_where_the_batch_is_asked_for(monkeypatc
 
     monkeypatch.setattr(windows, "gather", fail)
     dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
-    settings, mesh = config.TrainConfig(batch_size=16), devices.make_mesh(16)
-    stream = prefetch.batches(
-        dataset, np.arange(40), fakes.TINY, settings, mesh, jax.random.key(3), 0
-    )
+    stream = prefetch.batches(SETUP, dataset, np.arange(40), jax.random.key(3), 0)
     with pytest.raises(OSError, match="disk"):
         next(stream)

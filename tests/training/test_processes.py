@@ -18,8 +18,7 @@ from starjax.data import store
 from starjax.evaluation import result
 from starjax.experiments import pipeline
 from starjax.runtime import processes
-from starjax.training import checkpoint, loop
-from starjax.training import log as metrics
+from starjax.training import checkpoint, log, loop
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
@@ -51,8 +50,8 @@ def test_two_processes_are_one_run(tmp_path, monkeypatch):
         np.testing.assert_allclose(first[name], alone, rtol=1e-5, atol=1e-6)
     written = {path.name for path in (tmp_path / "run").iterdir()}
     assert written == {"checkpoints", "metrics.jsonl"}
-    logs = [metrics.read(tmp_path / name / "metrics.jsonl") for name in ("run", "alone")]
-    ours, theirs = ([(line["step"], line["kind"]) for line in log] for log in logs)
+    logs = [log.read(tmp_path / name / "metrics.jsonl") for name in ("run", "alone")]
+    ours, theirs = ([(line["step"], line["kind"]) for line in lines] for lines in logs)
     assert ours == theirs  # the log of the first process alone
 
 
@@ -96,9 +95,9 @@ def stop_two(
     ("number", "told"), [(signal.SIGINT, (1, 0)), (signal.SIGTERM, (1,)), (signal.SIGTERM, (0,))]
 )
 def test_a_stop_while_all_train_saves(tmp_path, number, told):
-    log = tmp_path / "stardiff/metrics.jsonl"
+    path = tmp_path / "stardiff/metrics.jsonl"
     started = start_two("trains", str(tmp_path))
-    said = stop_two(started, lambda: log.exists() and log.read_text() != "", number, told)
+    said = stop_two(started, lambda: path.exists() and path.read_text() != "", number, told)
     assert all("same command goes on from there" in error for error in said)
     assert len(checkpoint.steps(tmp_path / "stardiff/checkpoints")) == 1
 

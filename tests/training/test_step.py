@@ -18,8 +18,13 @@ from starjax.policies import policy as policies
 from starjax.policies.base import Policy
 from starjax.runtime import xla
 from starjax.training import devices, state, step
-from starjax.training.sharding import Parts
+from starjax.training.sharding import Layout
+from starjax.training.step import Setup
 
+STRICT = {
+    "promotion of types": lambda: jax.numpy_dtype_promotion("strict"),
+    "promotion of ranks": lambda: jax.numpy_rank_promotion("raise"),
+}
 SETTINGS = config.TrainConfig(
     steps=300, batch_size=8, learning_rate=0.1, warmup_steps=0, weight_decay=0.0
 )
@@ -44,24 +49,31 @@ def dataset():
     return fakes.dataset(seed=0, demos=4, length=20)
 
 
+def begun(policy, optimizer, stats):
+    """The state before the first step."""
+    streams = state.streams(0)
+    drawn = state.init(policy, streams.params).drawn()
+    return state.create(policy, optimizer, drawn, stats, streams.steps)
+
+
 @pytest.fixture
 def start():
     policy, optimizer = regression(), state.make_optimizer(SETTINGS)
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
     stats = normalizer.Normalizer(box, None)
-    first = state.create(policy, optimizer, state.init(policy, 0).drawn(), stats, seed=0)
+    first = begun(policy, optimizer, stats)
     return policy, optimizer, devices.replicate(first, devices.make_mesh(SETTINGS.batch_size))
 
 
-def parts(like, policy=None):
-    return Parts(devices.make_mesh(SETTINGS.batch_size), (policy or regression()).rounded, like)
+def layout(shapes, policy=None):
+    return Layout(devices.make_mesh(SETTINGS.batch_size), (policy or regression()).rounded, shapes)
 
 
 def program(policy, optimizer):
     def run(state, dataset, frames, count):
-        it = parts(state)
-        settings = (policy, optimizer, fakes.TINY, SETTINGS, it)
-        return it.end(step.resident_steps(*settings, it.begin(state), dataset, frames, count))
+        it = layout(state)
+        setup = Setup(policy, optimizer, fakes.TINY, SETTINGS, it)
+        return it.to_state(step.resident_steps(setup, it.to_carry(state), dataset, frames, count))
 
     return run
 
@@ -102,18 +114,21 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
     policy = policies.make(METHODS["stardiff"], small, fakes.TASK, settings)
     optimizer = state.make_optimizer(settings)
     stats = normalizer.fit(METHODS["stardiff"], fakes.TASK, dataset, np.arange(80))
-    first = state.create(policy, optimizer, state.init(policy, 0).drawn(), stats, seed=0)
-    it = parts(first, policy)
-    given = (policy, optimizer, small, settings, it)
+    first = begun(policy, optimizer, stats)
+    it = layout(first, policy)
+    setup = Setup(policy, optimizer, small, settings, it)
     frames, nothing = jnp.arange(80), jax.tree.map(lambda _: None, first.params)
-    unrounded = jax.jit(
-        lambda c: (step.resident_step(*given, (c[0], nothing), dataset, frames)[0], nothing)
-    )
-    many = jax.jit(lambda c, n: step.resident_steps(*given, c, dataset, frames, n))
-    called = it.begin(first)
+
+    @jax.jit
+    def unrounded(carry):
+        after = step.resident_step(setup, carry._replace(rounded=nothing), dataset, frames)
+        return after._replace(rounded=nothing)
+
+    many = jax.jit(lambda c, n: step.resident_steps(setup, c, dataset, frames, n))
+    called = it.to_carry(first)
     for _ in range(3):
         called = unrounded(called)
-    looped, called = it.end(many(it.begin(first), 3)), it.end(called)
+    looped, called = it.to_state(many(it.to_carry(first), 3)), it.to_state(called)
     chex.assert_trees_all_close((looped.params, looped.sums), (called.params, called.sums))
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), looped.params, first.params)
     assert min(jax.tree.leaves(moved)) > 5e-4  # of three steps of the learning rate
@@ -121,9 +136,9 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
 
 def test_a_broken_loss_is_left_out_and_counted(start, dataset):
     policy, optimizer, first = start
-    it = parts(first)
-    given = (policy, optimizer, SETTINGS, it)
-    once = jax.jit(lambda s, b: it.end(step.train_step(*given, it.begin(s), b)))
+    it = layout(first)
+    setup = Setup(policy, optimizer, fakes.TINY, SETTINGS, it)
+    once = jax.jit(lambda s, b: it.to_state(step.train_step(setup, it.to_carry(s), b)))
     good = windows.gather(dataset, jnp.arange(8), 2, 16)
     bad = good.replace(observation=good.observation._replace(gripper=jnp.full((8, 2), 2.0)))
     before = once(first, good)
@@ -155,7 +170,7 @@ def test_norm_is_of_every_entry():
     random = np.random.default_rng(0)
     gradients = {name: random.normal(size=shape) for name, shape in shapes.items()}
     wanted = np.linalg.norm(np.concatenate([g.ravel() for g in gradients.values()]))
-    found = parts(None).norm(jax.tree.map(jnp.asarray, gradients))
+    found = layout(None).norm(jax.tree.map(jnp.asarray, gradients))
     np.testing.assert_allclose(found, wanted, rtol=1e-5)
 
 
@@ -193,5 +208,29 @@ def test_a_gradient_that_is_not_finite_is_left_out_too(start, dataset):
 
 
 def test_every_step_has_keys_of_its_own():
-    keys = jax.vmap(lambda s: jnp.stack(step.step_keys(jax.random.key(0), s)))(jnp.arange(50))
+    keys = jax.vmap(lambda s: jnp.stack(state.step_keys(jax.random.key(0), s)))(jnp.arange(50))
     assert len({bytes(x) for x in np.asarray(jax.random.key_data(keys)).reshape(100, -1)}) == 100
+
+
+@pytest.mark.parametrize("observation", ["state", "image"])
+@pytest.mark.parametrize("mode", STRICT)
+def test_a_step_is_traced_in_every_strict_mode(observation, mode):
+    settings = dataclasses.replace(fakes.TINY, observation=observation)
+    size = settings.image_size if observation == "image" else 0
+    data = fakes.dataset(seed=0, demos=2, length=20, image_size=size)
+    policy = policies.make(METHODS["stardiff"], settings, fakes.TASK, SETTINGS)
+    optimizer = state.make_optimizer(SETTINGS)
+    stats = normalizer.fit(METHODS["stardiff"], fakes.TASK, data, np.arange(40))
+
+    def run():
+        streams = state.streams(0)
+        params = policy.init(streams.params)
+        first = state.create(policy, optimizer, params, stats, streams.steps)
+        it = layout(first)
+        setup = Setup(policy, optimizer, settings, SETTINGS, it)
+        frames, count = jnp.arange(40, dtype=jnp.int32), jnp.int32(3)
+        return it.to_state(step.resident_steps(setup, it.to_carry(first), data, frames, count))
+
+    wanted = jax.eval_shape(run)
+    with STRICT[mode]():
+        chex.assert_trees_all_equal(jax.eval_shape(run), wanted)

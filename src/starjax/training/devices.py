@@ -1,4 +1,4 @@
-"""One mesh of devices: the batch is split over it, between calls all else is on all of them."""
+"""The mesh of devices that the batch is split over; all else has a copy on each device."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,10 +21,10 @@ _OVERLAP: dict[str, Any] = {
 
 
 def make_mesh(batch_size: int, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """A mesh of the given devices (all of them by default), or of as many as divide the batch.
+    """Makes a mesh of the given devices (default: all), or of as many as divide the batch.
 
     Raises:
-      UsageError: several processes, whose devices do not divide the batch: none may be left out.
+      UsageError: there are several processes, and all of their devices do not divide the batch.
     """
     devices = list(jax.devices() if devices is None else devices)
     count = max(n for n in range(1, len(devices) + 1) if batch_size % n == 0)

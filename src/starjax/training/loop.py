@@ -3,7 +3,7 @@
 import pathlib
 import time
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,18 @@ from starjax import config, errors, methods
 from starjax.data import normalizer, windows
 from starjax.policies import features
 from starjax.policies import policy as policies
+from starjax.rcm import arrays
 from starjax.runtime import background, processes, progress
 from starjax.sim.tasks.base import Task
-from starjax.training import checkpoint, devices, encoder, holdout
-from starjax.training import log as metrics
+from starjax.training import checkpoint, devices, encoder, holdout, log, metrics, stepper
 from starjax.training import state as states
-from starjax.training import stepper as advancing
-from starjax.training.sharding import Carried
+from starjax.training.sharding import Carry, Layout
+from starjax.training.step import Setup
+from starjax.training.stepper import Stepper
 
 _CALL_SECONDS = 1.0  # aim of one compiled call: how long Ctrl-C waits, how often the bar moves
+
+Judge = Callable[[states.TrainState], dict[str, float]]
 
 
 class Interrupted(KeyboardInterrupt):
@@ -44,6 +47,7 @@ class Result(NamedTuple):
     holdout: dict[str, float]
 
 
+@arrays.broadcasting
 def run(
     method: methods.Method,
     policy_config: config.PolicyConfig,
@@ -84,88 +88,103 @@ def run(
         settings are these is for the caller to see to, as `experiments.folders.claim` does.
     """
     directory = pathlib.Path(directory)
-    log = directory / "metrics.jsonl"
     mesh = devices.make_mesh(train_config.batch_size, mesh_devices)
     dataset = _observed(dataset, policy_config, features.sensors(task, cameras))
-    policy = policies.make(method, policy_config, task, train_config, cameras)
-    optimizer = states.make_optimizer(train_config)
-    train, held_out = windows.split_holdout(
+    frames, held_out = windows.split_holdout(
         dataset.start, dataset.length, dataset.trocar, train_config.holdout_demos
     )
-    row = policies.ablated(method, policy_config)
-    stats = normalizer.fit(row, task, dataset, train)
+    stats = normalizer.fit(policies.ablated(method, policy_config), task, dataset, frames)
+    policy = policies.make(method, policy_config, task, train_config, cameras)
+    optimizer = states.make_optimizer(train_config)
+    streams = states.streams(seed)
 
-    def around(params):
-        return states.create(policy, optimizer, params, stats, seed)
+    def first_state(params: policies.Params) -> states.TrainState:
+        return states.create(policy, optimizer, params, stats, streams.steps)
 
-    checkpoints = directory / "checkpoints"
-    begun = states.init(policy, seed)
-    new = not checkpoint.steps(checkpoints)  # a restored training may be finished
-    drawn = background.run_in_background(begun.drawn) if new else begun.drawn
-    like = _like(around, begun, mesh)
-    it = advancing.Training(policy, optimizer, policy_config, train_config, mesh, dataset, train)
-    advance = advancing.resident(it, like, ahead=new) if windows.on_device(dataset) else None
-    state = _restored(checkpoints, like)
+    # A new training's parameters are drawn, and its steps compiled, while the rest is done here; a
+    # restored one may be finished, and then needs neither.
+    is_new = not checkpoint.steps(directory / "checkpoints")
+    init = states.init(policy, streams.params)
+    drawn = background.run_in_background(init.drawn) if is_new else init.drawn
+    shapes = _shapes(first_state, init, mesh)
+    layout = Layout(mesh, policy.rounded, shapes)
+    setup = Setup(policy, optimizer, policy_config, train_config, layout)
+    resident = windows.on_device(dataset)
+    steps = stepper.resident(setup, dataset, frames, ahead=is_new) if resident else None
+
+    state = _restored(directory / "checkpoints", shapes)
     if state is None:
-        state = states.run_once(around, _begun(drawn(), policy_config))
+        state = states.run_once(first_state, _first_params(drawn(), policy_config))
         state = devices.replicate(state, mesh)
     else:
-        _check_same(directory, state, states.keys(seed)[1], stats, train_config.steps)
+        _check_same(directory, state, streams.steps, stats, train_config.steps)
     del drawn  # it holds what was drawn
-    step = saved = int(state.step)
+
     judge = None
     if processes.is_first():
-        metrics.resume(log, step)
+        log.resume(directory / "metrics.jsonl", int(state.step))
         judge = holdout.make(policy, policy_config, dataset, held_out)
-    if step == train_config.steps:
-        errors = judge(processes.own(state)) if judge else {}
-        return Result(state, 0.0, int(state.skipped), errors)
-    if advance is None:
-        advance = advancing.streamed(it, state)
-    carried = advance.begin(state)
+    if int(state.step) == train_config.steps:
+        found = judge(processes.own(state)) if judge else {}
+        return Result(state, 0.0, int(state.skipped), found)
+    if steps is None:
+        steps = stepper.streamed(setup, dataset, frames, state)
+    step, carry = int(state.step), steps.begin(state)
     del state  # on several devices, memory that the steps may need
-    errors: dict[str, float] = {}
-    rate = _Rate(train_config.batch_size)
-    with progress.track(description, train_config.steps, unit="steps", done=step) as show:
+    return _train(steps, carry, step, train_config, directory, judge, should_stop, description)
+
+
+def _train(
+    stepper: Stepper,
+    carry: Carry,
+    step: int,
+    train_config: config.TrainConfig,
+    directory: pathlib.Path,
+    judge: Judge | None,
+    should_stop: Callable[[], bool],
+    description: str,
+) -> Result:
+    """Takes the steps that are left, with a line of the log and a checkpoint every so many."""
+    last, saved, found = train_config.steps, step, {}
+    pace = _Pace(train_config.batch_size)
+    with progress.track(description, last, unit="steps", done=step) as show:
         note, call = "", 1
-        while step < train_config.steps:
+        while step < last:
             # Processes of one run stop together, and after the same steps.
             stop, calls = processes.gathered(should_stop(), call)
-            call = calls[0]
             if any(stop):
                 if step > saved:
-                    _save(directory, advance.end(carried), train_config)
+                    _save(directory, stepper.end(carry), train_config)
                 raise Interrupted(
-                    f"stopped after step {step} of {train_config.steps}; what is done is in "
-                    f"{directory}, the same command goes on from there"
+                    f"stopped after step {step} of {last}; what is done is in {directory}, the "
+                    "same command goes on from there"
                 )
-            count = min(call, *(_until(step, n) for n in _stops(train_config)))
-            count = min(count, train_config.steps - step)
+            stops = _next(step, train_config.log_every), _next(step, train_config.checkpoint_every)
+            count = min(step + calls[0], *stops, last) - step
             start = time.monotonic()
-            carried = advance.several(carried, count)
-            jax.block_until_ready(carried[0].step)
-            call = rate.next_call(count, time.monotonic() - start, train_config.steps_per_call)
+            carry = stepper.run(carry, count)
+            jax.block_until_ready(carry.state.step)
+            call = pace.next_call(count, time.monotonic() - start, train_config.steps_per_call)
             step += count
-            last = step == train_config.steps
-            if step % train_config.log_every == 0 or last:
-                carried, note = _log(log, step, carried, train_config)
-            if step % train_config.checkpoint_every == 0 or last:
-                state = advance.end(carried)  # by all processes together
+            if step in (stops[0], last):
+                carry, note = _log(directory / "metrics.jsonl", step, carry, train_config)
+            if step in (stops[1], last):
+                state = stepper.end(carry)  # by all processes together
                 if judge:
-                    errors = judge(processes.own(state))
-                    metrics.append(log, step, "holdout", errors)
+                    found = judge(processes.own(state))
+                    log.append(directory / "metrics.jsonl", step, "holdout", found)
                 _save(directory, state, train_config)
                 saved = step
                 del state
             show(count, note=note)
-    state = advance.end(carried)
-    return Result(state, rate.samples_per_second, int(state.skipped), errors)
+    state = stepper.end(carry)
+    return Result(state, pace.samples_per_second, int(state.skipped), found)
 
 
 def _observed(
     dataset: windows.Dataset, policy_config: config.PolicyConfig, seen: features.Sensors
 ) -> windows.Dataset:
-    """The dataset without what the policy does not look at, so that nobody gathers it."""
+    """Leaves out what the policy does not look at, so that nobody gathers it."""
     given = dataset.observation
     kept = "images" if policy_config.observation == "image" else "state"
     kept = "features" if policy_config.freeze_encoder else kept
@@ -174,17 +193,18 @@ def _observed(
     return dataset.replace(observation=given._replace(**{"images": images, **unseen}))
 
 
-def _like(around, begun, mesh) -> states.TrainState:
-    """Shapes and places of the state, without the state."""
+def _shapes(first_state: Callable[..., Any], init: states.Init, mesh: jax.sharding.Mesh) -> Any:
+    """Shapes and shardings of the state, without the state."""
     placed = devices.replicated(mesh)
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
-        jax.eval_shape(around, begun.traced.out_info),
+        jax.eval_shape(first_state, init.traced.out_info),
     )
 
 
-def _restored(checkpoints, like) -> states.TrainState | None:
-    restored = checkpoint.restore(checkpoints, like) if checkpoint.steps(checkpoints) else None
+def _restored(checkpoints: pathlib.Path, shapes: Any) -> states.TrainState | None:
+    """The state of the newest sound checkpoint, None where there is none."""
+    restored = checkpoint.restore(checkpoints, shapes) if checkpoint.steps(checkpoints) else None
     step = -1 if restored is None else restored[0]
     if processes.agree(step) != (step,):
         raise errors.UsageError(
@@ -193,7 +213,13 @@ def _restored(checkpoints, like) -> states.TrainState | None:
     return None if restored is None else restored[1]
 
 
-def _check_same(directory, state, key, stats, steps) -> None:
+def _check_same(
+    directory: pathlib.Path,
+    state: states.TrainState,
+    key: jax.Array,
+    stats: normalizer.Normalizer,
+    steps: int,
+) -> None:
     """Raises UsageError for a state of another training."""
     if not np.array_equal(jax.random.key_data(state.key), jax.random.key_data(key)):
         raise errors.UsageError("seed", f"that of the training in {directory}", "another")
@@ -206,63 +232,52 @@ def _check_same(directory, state, key, stats, steps) -> None:
         raise errors.UsageError("train.steps", done, steps)
 
 
-def _alike(one, other) -> bool:
-    """Whether two statistics are of the same data: another processor has other last bits."""
+def _alike(one: Any, other: Any) -> bool:
+    """Tells whether two statistics are of the same data: another processor has other last bits."""
     return np.shape(one) == np.shape(other) and np.allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
-def _begun(drawn, policy_config) -> policies.Params:
-    """Parameters of a new training, of drawn ones."""
+def _first_params(drawn: policies.Params, policy_config: config.PolicyConfig) -> policies.Params:
+    """The parameters of a new training, with the encoder's weights that the settings name."""
     params = states.on_device(drawn)
-    begins = policy_config.observation == "image" and not policy_config.freeze_encoder
-    if begins and policy_config.encoder_weights:
+    learns_to_see = policy_config.observation == "image" and not policy_config.freeze_encoder
+    if learns_to_see and policy_config.encoder_weights:
         params = encoder.start(params, policy_config)
     return params
 
 
-def _log(log, step, carried, train_config) -> tuple[Carried, str]:
-    """Writes the means since the last line and starts the sums afresh."""
-    state, narrow = carried
-    sums = {name: float(value) for name, value in state.sums.items()}
-    taken, skipped = int(sums.pop("taken")), int(sums.pop("skipped"))
-    # A single step says nothing, as where the training's end cuts a stretch short.
-    if taken == 0 and (skipped >= max(train_config.log_every, 2) or 1 < step == int(state.skipped)):
-        raise errors.UsageError(
-            "train.learning_rate",
-            "one at which losses stay finite",
-            f"{train_config.learning_rate:g}, none finite in {skipped} steps before step {step}",
-            "lower it, or use policy.dtype float32",
-        )
-    values = {name: value / taken for name, value in sums.items()} if taken else {}
-    last = step - 1 - int(state.skipped)  # as the optimiser counts, which sees no skipped step
-    values["learning_rate"] = float(jnp.asarray(states.learning_rate(train_config)(last)))
-    values["skipped"] = skipped
+def _log(
+    path: pathlib.Path, step: int, carry: Carry, train_config: config.TrainConfig
+) -> tuple[Carry, str]:
+    """Writes the means since the last line and restarts the sums; returns a note for the bar."""
+    state, skipped = carry.state, int(carry.state.skipped)
+    values = metrics.means(state.sums, step, skipped, train_config)
+    here = values.pop("skipped")
+    # The optimiser counts from 0 and sees no skipped step.
+    rate = states.learning_rate(train_config)(step - 1 - skipped)
+    values |= {"learning_rate": float(jnp.asarray(rate)), "skipped": here}
     if processes.is_first():
-        metrics.append(log, step, "train", values)
-    note = f"loss {values['loss']:.4f}" if taken else "no finite loss"
-    note += f", {skipped} steps skipped" if skipped else ""
-    # placed as they were: another placement would be another program
-    fresh = jax.tree.map(lambda x: jax.device_put(jnp.zeros_like(x), x.sharding), state.sums)
-    return (state.replace(sums=fresh), narrow), note
+        log.append(path, step, "train", values)
+    note = f"loss {values['loss']:.4f}" if "loss" in values else "no finite loss"
+    note += f", {here} steps skipped" if here else ""
+    return carry._replace(state=state.replace(sums=metrics.restarted(state.sums))), note
 
 
-def _save(directory, state, train_config) -> None:
+def _save(
+    directory: pathlib.Path, state: states.TrainState, train_config: config.TrainConfig
+) -> None:
     checkpoint.save(
         directory / "checkpoints", int(state.step), state, keep=train_config.keep_checkpoints
     )
 
 
-def _stops(train_config: config.TrainConfig) -> tuple[int, int]:
-    return train_config.log_every, train_config.checkpoint_every
+def _next(step: int, every: int) -> int:
+    """The next multiple of `every` after a step."""
+    return step + every - step % every
 
 
-def _until(step: int, every: int) -> int:
-    """Steps from `step` to the next multiple of `every`."""
-    return every - step % every
-
-
-class _Rate:
-    """Throughput without the first call (which compiles), and how long the next call should be."""
+class _Pace:
+    """Throughput without the first call, which compiles, and how long the next call should be."""
 
     def __init__(self, batch_size: int):
         self._batch_size, self._steps, self._seconds, self._calls = batch_size, 0, 0.0, 0

@@ -1,4 +1,4 @@
-"""Batches of a dataset that is not on the device: gathered by a thread, ahead of the steps."""
+"""Batches of a dataset of the host, gathered by a thread ahead of the steps."""
 
 import queue
 import threading
@@ -7,30 +7,32 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
-from starjax import config
 from starjax.data import windows
+from starjax.rcm import arrays
 from starjax.training import devices
-from starjax.training import step as steps
+from starjax.training import state as states
+from starjax.training.step import Setup
 
-_AHEAD = 2
-_CHUNK = 64
+_AHEAD = 2  # batches that wait for their steps
+_CHUNK = 64  # steps whose frames are drawn at once
 
 
 def batches(
-    dataset: windows.Dataset,
-    frames: np.ndarray,
-    policy_config: config.PolicyConfig,
-    train_config: config.TrainConfig,
-    mesh: Mesh,
-    key: jax.Array,
-    first: int,
+    setup: Setup, dataset: windows.Dataset, frames: np.ndarray, key: jax.Array, first: int
 ) -> Iterator[windows.Batch]:
-    """Batches of steps `first`, `first + 1`, ..: the ones that `resident_steps` would gather.
+    """Yields the batches of steps `first`, `first + 1`, .. that `step.resident_step` would gather.
 
     Close the iterator (or let it go) to end its thread.
+
+    Args:
+      setup: of the training.
+      dataset: on the host.
+      frames: `[n]` frame numbers to draw from.
+      key: `Streams.steps`.
+      first: number of the first step.
     """
+    policy_config, mesh = setup.policy_config, setup.layout.mesh
     on_device = jnp.asarray(frames)
     waiting: queue.Queue = queue.Queue(maxsize=_AHEAD)
     closed = threading.Event()
@@ -38,11 +40,12 @@ def batches(
     @jax.jit
     def chosen(first_step):
         def of(step):
-            key_frames, _ = steps.step_keys(key, step)
-            return windows.sample_frames(key_frames, on_device, train_config.batch_size)
+            key_batch = states.step_keys(key, step).batch
+            return windows.sample_frames(key_batch, on_device, setup.train_config.batch_size)
 
         return jax.vmap(of)(first_step + jnp.arange(_CHUNK))
 
+    @arrays.broadcasting
     def produce() -> None:
         try:
             step = first
@@ -55,7 +58,7 @@ def batches(
                     )
                     _put(waiting, devices.shard_batch(batch, mesh), closed)
                 step += _CHUNK
-        except BaseException as error:  # raised where the batch is asked for
+        except BaseException as error:  # raised where the next batch is asked for
             _put(waiting, error, closed)
 
     thread = threading.Thread(target=produce, daemon=True, name="starjax-feed")

@@ -1,8 +1,8 @@
-"""Several devices: each keeps, and updates, its own part of every large matrix (ZeRO, stage 2).
+"""Several devices: each keeps, and updates, its own share of every large matrix (ZeRO, stage 2).
 
-Rajbhandari et al., arXiv:1910.02054. A step puts the matrices together where the networks use them,
-in the networks' type, and of the gradients' sum each device gets its part alone. On one device all
-of this does nothing.
+Rajbhandari et al., arXiv:1910.02054. A step gathers the matrices where the networks use them, in
+the networks' type, and of the gradients' sum each device gets its own share alone. Reference: one
+device, where nothing here does anything but keep the rounded matrices.
 """
 
 import functools
@@ -18,174 +18,185 @@ from starjax.policies.base import Params
 from starjax.training import devices
 from starjax.training.state import TrainState
 
-Carried = tuple[TrainState, Params]
-
 LARGE = 1 << 18  # entries of a matrix: smaller ones take longer to send than to update everywhere
-_ROW = 1 << 10  # entries: what a block of a GPU's threads adds up at once
-_SMALL = 1 << 16  # entries: a leaf below takes a GPU longer to start on than to read
+_ROW = 1 << 10  # entries that a block of a GPU's threads adds up at once
+_SMALL = 1 << 16  # entries: starting on a smaller leaf takes a GPU longer than reading it
 
 
-class Parts(NamedTuple):
-    """How a state lies on the devices from step to step.
+class Carry(NamedTuple):
+    """What one step hands to the next.
 
-    What is carried is the state and its `rounded` matrices: the optimiser writes both, so that the
-    float32 ones are not read again to round them. Matrices in parts are flat there, and on a GPU
-    vectors are joined.
+    Attributes:
+      state: of the training, as `Layout` lays it out.
+      rounded: its matrices in the networks' type, None for other leaves. The optimiser writes both,
+        so that the float32 ones are not read again to round them.
+    """
+
+    state: TrainState
+    rounded: Params
+
+
+class Layout(NamedTuple):
+    """How a training's state lies on the devices from step to step.
+
+    Large matrices are flat and shared out over the devices; on a GPU vectors are packed.
 
     Attributes:
       mesh: the batch is split over it.
       round: parameters with large matrices in the type that is calculated in, `Policy.rounded`.
-      like: the whole state's shapes, as a TrainState.
+      whole: shapes of the whole state, as a TrainState.
     """
 
     mesh: Mesh
     round: Callable[[Params], Params]
-    like: Any
+    whole: Any
 
-    def begin(self, state: TrainState) -> Carried:
-        """What is carried, of a whole state."""
-        state = self._join(state)
+    def to_carry(self, state: TrainState) -> Carry:
+        """Lays out a whole state."""
+        state = self._packed(state)
+        carry = Carry(state, self.rounded(state.params))
         return jax.tree_util.tree_map_with_path(
-            lambda path, x: x.reshape(-1) if self._is_split(path, x) else x,
-            (state, self.rounded(state.params)),
+            lambda path, x: x.reshape(-1) if self._is_shared_out(path, x) else x, carry
         )
 
-    def end(self, carried: Carried) -> TrainState:
-        """The whole state of what is carried."""
+    def to_state(self, carry: Carry) -> TrainState:
+        """Returns the whole state."""
+        shapes = self._packed_shapes(self.whole)
         state = jax.tree.map(
             lambda x, like: x if x.shape == like.shape else x.reshape(like.shape),
-            carried[0],
-            self._joined(self.like),
+            carry.state,
+            shapes,
         )
-        return self._separate(state)
+        return self._unpacked(state)
 
-    def on_each(self, update: Callable[[Carried, Any], Carried]) -> Callable[..., Carried]:
-        """`update(carried, batch)` on every device, of its parts and its share of the batch."""
-        if self.mesh.size == 1:
-            return update
-        spec = jax.tree.map(lambda placed: placed.spec, self.placed())
-        share = devices.batch_sharding(self.mesh).spec
-        return jax.shard_map(
-            update, mesh=self.mesh, in_specs=(spec, share), out_specs=spec, check_vma=False
-        )
-
-    def placed(self) -> Any:
-        """Shardings of what is carried."""
-        if self.mesh.size == 1:
-            return devices.replicated(self.mesh)
-        return jax.tree.map(lambda x: x.sharding, self.carried())
-
-    def carried(self) -> Any:
-        """Shapes and places of what is carried."""
-        placed = {True: devices.batch_sharding(self.mesh), False: devices.replicated(self.mesh)}
+    def shapes(self) -> Carry:
+        """Shapes and shardings of a carry."""
+        shardings = {True: devices.batch_sharding(self.mesh), False: devices.replicated(self.mesh)}
 
         def one(path: tuple[Any, ...], x: Any) -> jax.ShapeDtypeStruct:
-            split = self._is_split(path, x)
-            shape = (x.size,) if split else x.shape
-            return jax.ShapeDtypeStruct(shape, x.dtype, sharding=placed[split])
+            shared_out = self._is_shared_out(path, x)
+            shape = (x.size,) if shared_out else x.shape
+            return jax.ShapeDtypeStruct(shape, x.dtype, sharding=shardings[shared_out])
 
-        state = self._joined(self.like)
-        narrow = jax.eval_shape(self.rounded, state.params)
-        return jax.tree_util.tree_map_with_path(one, (state, narrow))
+        state = self._packed_shapes(self.whole)
+        carry = Carry(state, jax.eval_shape(self.rounded, state.params))
+        return jax.tree_util.tree_map_with_path(one, carry)
 
-    def params(self, carried: Carried) -> Params:
-        """The networks' parameters, matrices in their type; those in parts still are."""
-        state, narrow = carried
-        if self._joins:
-            params = state.params._replace(matrices=_taken(narrow, state.params.matrices))
-            return self._separate(params)
-        return _taken(narrow, state.params)
+    def shardings(self) -> Any:
+        """Shardings of a carry, for `jax.jit`."""
+        if self.mesh.size == 1:
+            return devices.replicated(self.mesh)
+        return jax.tree.map(lambda x: x.sharding, self.shapes())
+
+    def on_each_device(self, update: Callable[[Carry, Any], Carry]) -> Callable[..., Carry]:
+        """Runs `update(carry, batch)` on every device, of its shares of the two."""
+        if self.mesh.size == 1:
+            return update
+        spec = jax.tree.map(lambda placed: placed.spec, self.shardings())
+        batch = devices.batch_sharding(self.mesh).spec
+        return jax.shard_map(
+            update, mesh=self.mesh, in_specs=(spec, batch), out_specs=spec, check_vma=False
+        )
+
+    def params(self, carry: Carry) -> Params:
+        """The networks' parameters, with the rounded matrices; shared out where the carry is."""
+        params = carry.state.params
+        if self._packs:
+            matrices = _replaced(params.matrices, carry.rounded)
+            return self._unpacked(params._replace(matrices=matrices))
+        return _replaced(params, carry.rounded)
 
     def rounded(self, params: Any) -> Params:
-        """The matrices of a carried state's parameters, as they are carried beside it."""
-        return rounded(params.matrices if self._joins else params, self.round)
+        """The matrices of a carry's parameters in the networks' type, None for other leaves."""
+        return _rounded(params.matrices if self._packs else params, self.round)
 
-    def whole(self, params: Params) -> Params:
-        """Parameters put together, within `on_each`; differentiated, sums come back as parts."""
+    # Within `on_each_device`:
+
+    def gathered(self, params: Params) -> Params:
+        """Parameters put together; of their gradient each device gets the sum of its share."""
         if self.mesh.size == 1:
             return params
         gather = functools.partial(jax.lax.all_gather, axis_name=devices.AXIS, tiled=True)
         return jax.tree.map(
             lambda x, like: x if x.shape == like.shape else gather(x).reshape(like.shape),
             params,
-            self.like.params,
+            self.whole.params,
         )
 
     def mean(self, tree: Any) -> Any:
-        """Of every device's numbers, within `on_each`."""
+        """The mean of every device's numbers."""
         return tree if self.mesh.size == 1 else jax.lax.pmean(tree, devices.AXIS)
 
-    def mean_gradient(self, gradients: Params) -> Any:
-        """Each device's gradients of `whole` parameters as the batch's, joined as those are."""
-        count, like = self.mesh.size, self._joined(self.like.params)
-        summed = self._join(gradients)
-        if self._joins:
-            summed = jax.tree.map(_as_it_lies, summed)
-        if count > 1:
-            summed = jax.tree.map(
+    def mean_gradients(self, gradients: Params) -> Any:
+        """The batch's gradients from each device's, laid out as a carry's parameters."""
+        count, shapes = self.mesh.size, self._packed_shapes(self.whole.params)
+        found = self._packed(gradients)
+        if self._packs:
+            found = jax.tree.map(_row_major, found)
+        if count > 1:  # those of gathered matrices are summed already
+            found = jax.tree.map(
                 lambda g, like: jax.lax.psum(g, devices.AXIS) if g.shape == like.shape else g,
-                summed,
-                like,
+                found,
+                shapes,
             )
-        summed = jax.tree.map(lambda g, like: g.astype(like.dtype), summed, like)
-        return jax.tree.map(lambda g: g / count, summed) if count > 1 else summed
+        found = jax.tree.map(lambda g, like: g.astype(like.dtype), found, shapes)
+        return jax.tree.map(lambda g: g / count, found) if count > 1 else found
 
     def norm(self, gradients: Any) -> jax.Array:
-        """Euclidean norm of all of them, within `on_each`."""
+        """Euclidean norm of all gradients."""
         leaves = jax.tree.leaves(gradients)
         if self.mesh.size == 1:
             return jnp.sqrt(_squares(leaves))
-        of: dict[bool, list[jax.Array]] = {True: [], False: []}
-        for leaf, like in zip(leaves, jax.tree.leaves(self._joined(self.like.params)), strict=True):
-            of[leaf.shape == like.shape].append(leaf)
-        return jnp.sqrt(_squares(of[True]) + jax.lax.psum(_squares(of[False]), devices.AXIS))
-
-    def _joined(self, like: Any) -> Any:
-        """Shapes of the state, or of its parameters, as they are carried but for the parts."""
-        return jax.eval_shape(self._join, like)
-
-    def _join(self, tree: Any) -> Any:
-        return packed_params.pack_all(tree, self.like.params) if self._joins else tree
-
-    def _separate(self, tree: Any) -> Any:
-        return packed_params.unpack_all(tree, self.like.params) if self._joins else tree
+        shapes = jax.tree.leaves(self._packed_shapes(self.whole.params))
+        everywhere, shared_out = [], []
+        for leaf, like in zip(leaves, shapes, strict=True):
+            (everywhere if leaf.shape == like.shape else shared_out).append(leaf)
+        return jnp.sqrt(_squares(everywhere) + jax.lax.psum(_squares(shared_out), devices.AXIS))
 
     @property
-    def _joins(self) -> bool:
+    def _packs(self) -> bool:
         return packed_params.pays(self.mesh.devices.flat[0].platform)
 
-    def _is_split(self, path: tuple[Any, ...], x: Any) -> bool:
-        """Whether a leaf of what is carried lies in parts: not the vision encoder's, which is the
-        first to be used and the last whose gradient is known, so that nothing could run beside."""
+    def _packed(self, tree: Any) -> Any:
+        return packed_params.pack_all(tree, self.whole.params) if self._packs else tree
+
+    def _unpacked(self, tree: Any) -> Any:
+        return packed_params.unpack_all(tree, self.whole.params) if self._packs else tree
+
+    def _packed_shapes(self, shapes: Any) -> Any:
+        """Shapes of the state, or of its parameters, packed but not shared out."""
+        return jax.eval_shape(self._packed, shapes)
+
+    def _is_shared_out(self, path: tuple[Any, ...], x: Any) -> bool:
+        """Whether a leaf of a carry is shared out: a large matrix, but not the vision encoder's.
+
+        The encoder is used first, and its gradient known last: nothing could run meanwhile.
+        """
         count = self.mesh.size
         names = {getattr(key, "key", None) for key in path}
         large = x.ndim > 1 and x.size >= LARGE and x.size % count == 0
         return count > 1 and large and "vision" not in names
 
 
-@functools.partial(jax.jit, static_argnums=1)  # outside of any, one program for all of them
-def rounded(params: Params, change: Callable[[Params], Params]) -> Params:
-    """The matrices that `Policy.rounded` changes, as it gives them; None instead of the others."""
+@functools.partial(jax.jit, static_argnums=1)  # called outside of any, one program for all of them
+def _rounded(params: Params, change: Callable[[Params], Params]) -> Params:
+    """The matrices that `Policy.rounded` changes, as it gives them; None for the others."""
     changed = change(params)
     return jax.tree.map(lambda old, new: None if new.dtype == old.dtype else new, params, changed)
 
 
-def _taken(some: Any, tree: Any) -> Any:
-    """`tree` with those of its leaves replaced that are not None in `some`."""
+def _replaced(tree: Any, some: Any) -> Any:
+    """`tree` with the leaves of `some` that are not None."""
     return jax.tree.map(
-        lambda one, leaf: leaf if one is None else one, some, tree, is_leaf=_is_none
+        lambda one, leaf: leaf if one is None else one, some, tree, is_leaf=lambda x: x is None
     )
 
 
-def _is_none(x: Any) -> bool:
-    return x is None
+def _row_major(gradient: jax.Array) -> jax.Array:
+    """Forces a convolution kernel's gradient into the order of its axes.
 
-
-def _as_it_lies(gradient: jax.Array) -> jax.Array:
-    """A gradient; of a convolution's kernel one that is written in the order of its axes.
-
-    Over 3x3 pixels XLA has it from a forward convolution, whose result lies otherwise, and would
-    turn each of the optimiser's arrays instead, in five kernels. What is flat has one order only.
+    XLA computes a 3x3 kernel's gradient as a forward convolution with another layout, and would
+    transpose all of the optimiser's arrays to it, in five kernels. What is flat has one order only.
     """
     if gradient.ndim < 4:
         return gradient
@@ -193,15 +204,18 @@ def _as_it_lies(gradient: jax.Array) -> jax.Array:
 
 
 def _squares(leaves: list[jax.Array]) -> jax.Array:
-    """Sum of all squares. A GPU needs two kernels for the sum of a large array, and starting them
-    takes longer than most of them run: the second is shared, and so are both of small ones."""
+    """Sum of all squares.
+
+    A GPU needs two kernels for the sum of a large array, and starting them takes longer than most
+    of them run: the second is shared, and so are both of small arrays.
+    """
     found = [jnp.square(leaf).ravel() if leaf.size < _SMALL else _by_rows(leaf) for leaf in leaves]
-    # without the barrier XLA takes apart again what is put together
+    # Without the barrier XLA takes the concatenation apart again.
     return jax.lax.optimization_barrier(jnp.concatenate([*found, jnp.zeros(1)])).sum()
 
 
 def _by_rows(leaf: jax.Array) -> jax.Array:
-    """Its squares summed along the last axis, or `_ROW` at a time: one kernel."""
+    """Squares summed along the last axis, of a vector `_ROW` at a time: one kernel."""
     if leaf.ndim == 1:
         leaf = jnp.pad(leaf, (0, -leaf.size % _ROW)).reshape(-1, _ROW)
     return jnp.square(leaf).sum(-1).ravel()

@@ -1,4 +1,4 @@
-"""Everything that training carries from step to step, and so everything that a checkpoint holds."""
+"""The state of a training: what goes from step to step, and what a checkpoint holds."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,6 +12,41 @@ from starjax import config
 from starjax.data import normalizer
 from starjax.policies.base import Params, Policy
 from starjax.runtime import garbage
+from starjax.training import metrics
+
+
+class Streams(NamedTuple):
+    """Typed keys of a training, all from its seed.
+
+    Attributes:
+      params: of the first parameters.
+      steps: of the steps; see `step_keys`.
+    """
+
+    params: jax.Array
+    steps: jax.Array
+
+
+class StepKeys(NamedTuple):
+    """Typed keys of one step.
+
+    Attributes:
+      batch: which frames it sees.
+      loss: augmentation, noise and diffusion steps.
+    """
+
+    batch: jax.Array
+    loss: jax.Array
+
+
+def streams(seed: int) -> Streams:
+    """Splits a seed into the streams of a training."""
+    return Streams(*jax.random.split(jax.random.key(seed)))
+
+
+def step_keys(key: jax.Array, step: jax.Array) -> StepKeys:
+    """Derives the keys of a step from those of all steps."""
+    return StepKeys(*jax.random.split(jax.random.fold_in(key, step)))
 
 
 @flax.struct.dataclass
@@ -21,12 +56,12 @@ class TrainState:
     Attributes:
       step: int32 `[]`, steps taken.
       params: of the policy.
-      ema_params: their exponential moving average, what is evaluated.
+      ema_params: their exponential moving average, which is evaluated.
       opt_state: of the optimiser.
-      normalizer: fitted once; on resume it is what the checkpoint holds.
-      key: typed key; step s uses `fold_in(key, s)` and nothing else.
+      normalizer: fitted once; on resume it is the checkpoint's.
+      key: `Streams.steps`.
       skipped: int32 `[]`, steps whose loss or gradient was not finite.
-      sums: named float32 scalars, added up since the last line of the log.
+      sums: of `metrics`, since the last line of the log.
     """
 
     step: Any
@@ -51,7 +86,7 @@ def learning_rate(train_config: config.TrainConfig) -> optax.Schedule:
 
 
 def make_optimizer(train_config: config.TrainConfig) -> optax.GradientTransformation:
-    """AdamW with Diffusion Policy's betas; kernels of the roll network may decay faster."""
+    """Returns AdamW with Diffusion Policy's betas; the roll network's kernels may decay faster."""
     parts = [
         optax.scale_by_adam(b1=0.95, b2=0.999),
         optax.add_decayed_weights(train_config.weight_decay),
@@ -62,7 +97,7 @@ def make_optimizer(train_config: config.TrainConfig) -> optax.GradientTransforma
 
 
 def _are_of_roll(params: Any) -> Any:
-    """Which leaves are kernels of the roll network, packed or not."""
+    """Tells which leaves are kernels of the roll network, packed or not."""
 
     def is_one(path: tuple[Any, ...], _: Any) -> bool:
         names = [getattr(entry, "key", None) for entry in path]
@@ -72,40 +107,42 @@ def _are_of_roll(params: Any) -> Any:
 
 
 class Init(NamedTuple):
-    """A policy's parameters before the first step, traced but not yet drawn.
+    """A policy's first parameters, traced but not yet drawn.
 
     Attributes:
-      traced: the program, whose `out_info` are the shapes.
-      key: what it is to be called with.
+      traced: the program; its `out_info` has the shapes.
+      key: its argument.
     """
 
     traced: jax.stages.Traced
     key: jax.Array
 
     def drawn(self) -> Params:
-        """The parameters, where they were drawn."""
+        """Draws the parameters; they stay on the device of the key."""
         return jax.block_until_ready(self.traced.lower().compile()(self.key))
 
 
 def on_device(params: Params) -> Params:
-    """`Init.drawn`, on jax's first device."""
+    """Copies drawn parameters to jax's first device."""
     return jax.device_put(jax.device_get(params))
 
 
-def init(policy: Policy, seed: int) -> Init:
-    """Traces the policy's parameters, for the host if it can: a GPU's compiler takes 14 s for so
-    many small draws."""
+def init(policy: Policy, key: jax.Array) -> Init:
+    """Traces a policy's first parameters, drawn with `Streams.params`.
+
+    For the host where jax has one: a GPU's compiler takes 14 s for so many small draws.
+    """
     try:
         place = jax.local_devices(backend="cpu")[0]
     except RuntimeError:  # JAX_PLATFORMS leaves it out
         place = jax.local_devices()[0]
-    key = jax.device_put(keys(seed)[0], place)
+    key = jax.device_put(key, place)
     with garbage.gc_paused():
         return Init(_quick(policy.init).trace(key), key)
 
 
 def run_once(fn: Callable[..., Any], *args: Any) -> Any:
-    """`fn(*args)` as one program, not optimised: it takes less time than that would.
+    """Calls `fn(*args)` as one program that is not optimised, which would take longer.
 
     Called as it is, `fn` would compile a program for each of its hundred small arrays.
     """
@@ -121,19 +158,17 @@ def create(
     optimizer: optax.GradientTransformation,
     params: Params,
     stats: normalizer.Normalizer,
-    seed: int,
+    key: jax.Array,
 ) -> TrainState:
-    """The state before the first step.
+    """Makes the state before the first step.
 
     Args:
       policy: to be trained.
       optimizer: from `make_optimizer`.
       params: from `Init.drawn`.
       stats: fitted to the training frames.
-      seed: of everything random.
+      key: `Streams.steps`.
     """
-    _, key = keys(seed)
-    names = ["loss", "gradient_norm", "taken", "skipped", *policy.metrics]
     return TrainState(
         step=jnp.int32(0),
         params=params,
@@ -142,15 +177,10 @@ def create(
         normalizer=stats,
         key=key,
         skipped=jnp.int32(0),
-        sums={name: jnp.float32(0.0) for name in names},
+        sums=metrics.zeros(policy.metrics),
     )
 
 
 def ema_decay(step: jax.Array, ema_max: float) -> jax.Array:
-    """1 - (1 + s)^-0.75, at most `ema_max`: young averages forget fast."""
+    """Returns 1 - (1 + s)^-0.75, at most `ema_max`: young averages forget fast."""
     return jnp.minimum(1.0 - (1.0 + step) ** -0.75, ema_max)
-
-
-def keys(seed: int) -> jax.Array:
-    """Keys of the parameters and of the steps."""
-    return jax.random.split(jax.random.key(seed))
