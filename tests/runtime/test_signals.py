@@ -131,8 +131,8 @@ def test_training_saves_after_its_terminal_was_closed(tmp_path):
 
         def command(argv):
             with signals.stop_signals() as should_stop:
+                print("step", flush=True)
                 while not should_stop():
-                    print("step", flush=True)
                     time.sleep(0.01)
             print("one more", flush=True)
             pathlib.Path({str(saved)!r}).touch()

@@ -269,10 +269,9 @@ def test_packed_parameters_give_the_same_run_and_resume(whole, tmp_path, monkeyp
         assert a == pytest.approx(b, rel=1e-4)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_pictures_train_too_and_resume(tmp_path, dtype, monkeypatch):
+def test_pictures_train_too_and_resume(tmp_path, monkeypatch):
     settings = dataclasses.replace(jobs.SETTINGS, steps=2, holdout_demos=0)
-    seen = {"observation": "image", "dtype": dtype}
+    seen = {"observation": "image", "dtype": "bfloat16"}
     whole = jobs.train(tmp_path / "a", settings, **seen)
     asked = iter(range(100))
     with pytest.raises(loop.Interrupted):
