@@ -2,15 +2,22 @@
 
 import functools
 
+import numpy as np
 import pytest
 
 from starjax.sim import mounts, registry
+from starjax.sim.arms.base import opposite
 
 MOUNTS = [
     (arm, tool, workspace)
     for arm in registry.arms.names()
     for tool, workspace in registry.arms.get(arm).mounts
 ]
+
+
+def worst(arm, mount, workspace, tool="grasper"):
+    at = mounts.bench(registry.arms.get(arm), registry.tools.get(tool))
+    return mounts.worst(mounts.fit(at, mount, targets(workspace)))
 
 
 @functools.cache
@@ -20,11 +27,44 @@ def targets(workspace):
 
 @pytest.mark.parametrize(("arm", "tool", "workspace"), MOUNTS)
 def test_a_mount_reaches_its_workspace_with_room_to_spare(arm, tool, workspace):
-    record = registry.arms.get(arm)
-    at = mounts.bench(record, registry.tools.get(tool))
-    fit = mounts.fit(at, record.mounts[tool, workspace], targets(workspace))
-    worst = mounts.worst(fit)
-    assert worst.residual < mounts.REACHED
-    assert worst.margin >= mounts.MIN_MARGIN
-    assert worst.singular >= mounts.MIN_SINGULAR
-    assert worst.height > 0 and mounts.is_good(worst)
+    found = worst(arm, registry.arms.get(arm).mounts[tool, workspace], workspace, tool)
+    assert found.residual < mounts.REACHED
+    assert found.margin >= mounts.MIN_MARGIN
+    assert found.singular >= mounts.MIN_SINGULAR
+    assert found.height > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"position": (-0.9, 0.0, 0.2)}, "residual"),
+        ({"turn": 1.2}, "margin"),
+        ({"position": (-0.58, 0.0, -0.1)}, "height"),
+    ],
+)
+def test_a_worse_mount_is_none(change, field):
+    good = registry.arms.get("fr5").mounts["grasper", "board"]
+    before, after = (worst("fr5", mount, "board") for mount in (good, good._replace(**change)))
+    assert mounts.is_good(before) and not mounts.is_good(after)
+    assert abs(getattr(after, field) - getattr(before, field)) > 0.1 * abs(getattr(before, field))
+
+
+def test_a_mount_is_as_good_on_the_other_side():
+    left = registry.arms.get("ur5e").mounts["grasper", "left"]
+    here, there = worst("ur5e", left, "left"), worst("ur5e", opposite(left), "right")
+    np.testing.assert_allclose(here, there, atol=1e-4)
+
+
+def test_the_trocars_of_every_task_lie_in_its_workspaces():
+    for name in registry.tasks.built_in:
+        task = registry.tasks.get(name)
+        for a, slot in enumerate(task.slots):
+            workspace = registry.workspaces.get(slot.workspace)
+            assert workspace.p_world_ref == slot.p_world_ref
+            assert np.isclose(workspace.roll_zero, slot.roll_zero)
+            for field in ("radius", "polar", "azimuth"):
+                values = np.asarray(getattr(task.trocars, field))[:, a]
+                low, high = getattr(workspace, field)
+                if field == "azimuth":
+                    values = low + (values - low + 1e-6) % (2 * np.pi) - 1e-6
+                assert (values > low - 1e-6).all() and (values < high + 1e-6).all(), (name, field)

@@ -43,27 +43,25 @@ def main(argv: Sequence[str]) -> int:
 
     from starjax.sim import mounts, place, registry
 
-    arm, tool = registry.arms.get(chosen.arm), registry.tools.get(chosen.tool)
-    is_good = True
+    at = mounts.bench(registry.arms.get(chosen.arm), registry.tools.get(chosen.tool))
+    found = []
     for name, workspace in _workspaces(chosen.workspace).items():
-        at = mounts.bench(arm, tool)
         print(f"{chosen.arm} with {chosen.tool} in {name}", flush=True)
-        mount, least = place.search(
-            at,
-            workspace,
-            chosen.seed,
-            chosen.tilts,
-            lambda fit: print(f"  {_figures(fit)}", flush=True),
-        )
+        mount, least = place.search(at, workspace, chosen.seed, chosen.tilts, _tell)
         print(f"\n{_record(chosen.tool, name, mount, least)}\n")
-        is_good = is_good and mounts.is_good(least)
-        if not mounts.is_good(least):
-            print(
-                f"This is no mount to use: {mounts.MIN_MARGIN:g} rad and a singular value of "
-                f"{mounts.MIN_SINGULAR:g} m are asked for, every pose reached, above the table. "
-                "Another --seed, or --tilts, may find one.\n"
-            )
-    return 0 if is_good else 1
+        found.append(mounts.is_good(least))
+    if all(found):
+        return 0
+    print(
+        f"Not every mount may be used. It needs at least {mounts.MIN_MARGIN:g} rad to the limits, "
+        f"a singular value of {mounts.MIN_SINGULAR:g} m, every pose reached and no link in the "
+        "table. Another --seed, or --tilts, may find one."
+    )
+    return 1
+
+
+def _tell(fit: "Fit") -> None:
+    print(f"  {_figures(fit)}", flush=True)
 
 
 def _workspaces(name: str) -> "dict[str, Workspace]":
@@ -72,7 +70,8 @@ def _workspaces(name: str) -> "dict[str, Workspace]":
 
     if name in registry.workspaces.names():
         return {name: registry.workspaces.get(name)}
-    errors.choice("WORKSPACE", name, [*registry.workspaces.names(), *registry.tasks.names()])
+    known = [*registry.workspaces.names(), *registry.tasks.names()]
+    errors.choice("WORKSPACE", name, known)
     return {
         slot.workspace: registry.workspaces.get(slot.workspace)._replace(
             p_world_ref=slot.p_world_ref, roll_zero=slot.roll_zero

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from starjax.sim import solver
 from starjax.sim.engine import mjx
@@ -86,6 +87,7 @@ def advance(
       period: s.
     """
     substeps = round(period / scene.mj_model.opt.timestep)
+    mjx_model = _model(scene, p_world_trocar)
     mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
     turn = [period * v - d for v, d in zip(velocity, dq, strict=True)]
 
@@ -114,7 +116,7 @@ def advance(
             ctrl=target(i),
             mocap_pos=mocap_pos,
         )
-        data, error = solver.step(scene.mjx_model, data)
+        data, error = solver.step(mjx_model, data)
         found = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
         error = jnp.maximum(passed.solver_error, error)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
@@ -150,7 +152,7 @@ def kinematics(scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array) -> mjx.
     """Poses of all bodies and geoms, the trocars' markers at `p_world_trocar` `[A, 3]` m."""
     mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
     data = scene.mjx_data.replace(qpos=qpos, mocap_pos=mocap_pos)
-    return mjx.kinematics(scene.mjx_model, data)
+    return mjx.kinematics(_model(scene, p_world_trocar), data)
 
 
 def geom_poses(
@@ -170,6 +172,18 @@ def touching(scene: Scene, contacts: Contacts) -> jax.Array:
         for bound in scene.arms
     ]
     return jnp.stack(touched)
+
+
+def _model(scene: Scene, p_world_trocar: jax.Array) -> mjx.Model:
+    """The model; for arms that stand at a trocar with the trocars at `p_world_trocar` `[A, 3]` m.
+
+    In MJX bodies do not follow the mocap body that they are fixed to, but its `body_pos`.
+    """
+    if not any(bound.arm.remote_centre for bound in scene.arms):
+        return scene.mjx_model
+    bodies = np.array([scene.mj_model.body(f"trocar{i}").id for i in range(len(scene.arms))])
+    body_pos = jnp.asarray(scene.mjx_model.body_pos).at[bodies].set(p_world_trocar)
+    return scene.mjx_model.replace(body_pos=body_pos)
 
 
 def _jaw_target(bound: BoundArm, gripper: jax.Array) -> jax.Array:

@@ -9,9 +9,7 @@ import math
 from starjax.sim.arms.base import Arm, Mount, opposite
 
 # Yaw turns about the world's y axis, where the shaft leans furthest.
-_BOARD = Mount(
-    position=(0.0, 0.0, 0.0), yaw=-math.pi / 2, turn=-math.pi / 2, home=(0.0, 0.0, 0.11, 0.0)
-)
+_BOARD = Mount(position=(0.0, 0.0, 0.0), yaw=-math.pi / 2, turn=0.0, home=(0.0, 0.0, 0.11, 0.0))
 _LEFT = Mount(position=(0.0, 0.0, 0.0), yaw=-1.522, turn=0.044, home=(0.432, 0.02, 0.122, 0.0))
 
 ARM = Arm(
