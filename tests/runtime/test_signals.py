@@ -125,14 +125,16 @@ def test_training_saves_after_its_terminal_was_closed(tmp_path):
     """Lines into a terminal that is gone would be errors."""
     saved = tmp_path / "saved"
     code = f"""
-        import pathlib, time
+        import pathlib, signal, time
         from starjax import cli
         from starjax.runtime import signals
 
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored where the tests began under nohup
+
         def command(argv):
             with signals.stop_signals() as should_stop:
-                print("step", flush=True)
                 while not should_stop():
+                    print("step", flush=True)
                     time.sleep(0.01)
             print("one more", flush=True)
             pathlib.Path({str(saved)!r}).touch()

@@ -269,6 +269,7 @@ def test_packed_parameters_give_the_same_run_and_resume(whole, tmp_path, monkeyp
         assert a == pytest.approx(b, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_pictures_train_too_and_resume(tmp_path, monkeypatch):
     settings = dataclasses.replace(jobs.SETTINGS, steps=2, holdout_demos=0)
     seen = {"observation": "image", "dtype": "bfloat16"}
@@ -306,6 +307,7 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
 
 # Adam turns the rounding of a gradient near zero into a whole step of the learning rate: wide for
 # bfloat16, whose parameters are compared on average.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "observation", "dtype", "tolerance"),
     [(8, "state", "float32", 1e-4), (2, "image", "bfloat16", 5e-2)],

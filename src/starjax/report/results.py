@@ -147,7 +147,7 @@ def latencies(run: Run) -> list[tuple[int, dict[str, float]]]:
     about = run.result.about
     rows = (run.bench or about).get("inference_ms_by_ddim_steps") or {}
     found = {int(n): ms for n, ms in rows.items()}
-    steps = run.result.config["policy"].get("ddim_steps")
+    steps = run.result.config.get("policy", {}).get("ddim_steps")
     if steps and about.get("inference_ms"):
         found.setdefault(int(steps), about["inference_ms"])
     return sorted(found.items())
