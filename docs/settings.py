@@ -15,7 +15,8 @@ _TRAILING = re.compile(r"^\s+(\w+): .*?#\s*(.*)$")
 def comments(settings: type) -> dict[str, str]:
     """Field -> its comment: what stands after it, else the lines above it."""
     found, above = {}, []
-    for line in inspect.getsource(settings).splitlines():
+    kinds = filter(dataclasses.is_dataclass, reversed(settings.__mro__))
+    for line in "".join(map(inspect.getsource, kinds)).splitlines():
         text = line.strip()
         if text.startswith("#"):
             above.append(text.lstrip("# "))

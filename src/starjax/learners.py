@@ -27,4 +27,10 @@ class Learner(NamedTuple):
     make: Callable[[Any, Any, Any], Any]
 
 
-LEARNERS = Registry("learner", {"diffusion": "starjax.policies.learners.diffusion:LEARNER"})
+LEARNERS = Registry(
+    "learner",
+    {
+        "diffusion": "starjax.policies.learners.diffusion:LEARNER",
+        "flow": "starjax.policies.learners.flow:LEARNER",
+    },
+)

@@ -8,9 +8,9 @@ class Method(NamedTuple):
 
     Attributes:
       action_space: key of `starjax.rcm.ACTION_SPACES`.
-      sees_trocar: whether the diffusion model is conditioned on the trocar.
+      sees_trocar: whether the learner is told the trocar.
       projects: whether poses are projected onto the RCM manifold at execution.
-      hierarchical: diffusion for (position, gripper) and a network for the roll, else one model.
+      hierarchical: the learner for (position, gripper) and a network for the roll, else one model.
       weights_of: the method whose weights it shares (its own name if it trains its own).
       label: name in tables.
       group: group in Tables II and III.

@@ -1,10 +1,12 @@
 """`starjax list`: everything that flags can name, a line each."""
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from starjax import errors, methods
 from starjax.experiments import presets
+from starjax.learners import LEARNERS
 from starjax.policies import packaged
 from starjax.runtime import files
 from starjax.sim import registry
@@ -13,7 +15,9 @@ from starjax.sim.registry import Registry
 from starjax.sim.tasks.base import Task
 from starjax.sim.tools.base import Tool
 
-DESCRIPTION = """Lists what flags can name: tasks, arms, tools, methods, presets, policies."""
+DESCRIPTION = (
+    """Lists what flags can name: tasks, arms, tools, methods, learners, presets, policies."""
+)
 
 Row = tuple[str, str]  # name, what it is
 
@@ -30,6 +34,7 @@ def main(argv: Sequence[str]) -> int:
         "arms (--arm)": _parts(registry.arms, _arm),
         "tools (--tool)": _parts(registry.tools, _tool),
         "methods (--method)": _methods(),
+        "learners (--policy.learner)": _learners(),
         "presets (--preset)": _presets(),
         "policies (--policy, --policy.encoder-weights)": _policies(),
     }
@@ -66,10 +71,19 @@ def _tool(tool: Tool) -> str:
 
 def _methods() -> Iterator[Row]:
     for name, row in methods.METHODS.items():
-        learner = "diffusion, and a network for the roll" if row.hierarchical else "diffusion"
+        rolls = "; a network for the roll" * row.hierarchical
         told = "; told the trocar" * row.sees_trocar + "; projected" * row.projects
-        yield name, f"{row.label}: actions {row.action_space}; {learner}{told}"
+        yield name, f"{row.label}: actions {row.action_space}{rolls}{told}"
     yield "all", "every one of them"
+
+
+def _learners() -> Iterator[Row]:
+    for name in LEARNERS.names():
+        try:
+            kind = LEARNERS.get(name).settings
+            yield name, ", ".join(field.name for field in dataclasses.fields(kind))
+        except errors.UsageError as error:  # of a package that cannot be imported
+            yield name, f"cannot be used: {error.got}"
 
 
 def _presets() -> Iterator[Row]:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 
 from starjax.models import diffusion as ddpm
+from starjax.models import flow as flow_matching
 from starjax.models import schedule
 from starjax.models.kernels import parallel_ddim
 
@@ -68,3 +69,12 @@ def diffusion(diffusion_steps: int, ddim_steps: int) -> Process:
         )
 
     return Process(noised, ddpm.eps_loss, sample)
+
+
+def flow(steps: int) -> Process:
+    """Flow matching on straight ways, whose velocity is predicted; Euler steps back."""
+
+    def sample(predict, noise, *, prepare, reach=None):
+        return flow_matching.sample(predict, noise, steps=steps, prepare=prepare, reach=reach)
+
+    return Process(flow_matching.noised, flow_matching.velocity_loss, sample)

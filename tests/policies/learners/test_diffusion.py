@@ -6,28 +6,13 @@ import fakes
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
+import repeats
 
 from starjax import config, errors
-from starjax.learners import LEARNERS
 from starjax.models import diffusion, schedule
 from starjax.models.kernels import parallel_ddim
-from starjax.policies import sequences
 from starjax.policies.learners import diffusion as learner
-
-ACTION = 2
-STEPS = 400
-PRESENT = jnp.array([[0.7, -0.6], [-0.5, 0.8]])  # of two samples
-
-
-def made(settings):
-    sizes = sequences.Sizes(settings.horizon, ACTION, 2, 0, ACTION, 0)
-    return LEARNERS.get("diffusion").make(settings.options, settings, sizes)
-
-
-def condition(state):
-    return sequences.Condition(None, state, jnp.zeros((len(state), 0)))
 
 
 def tiny(**changed):
@@ -36,80 +21,51 @@ def tiny(**changed):
 
 @pytest.fixture(scope="module")
 def learned():
-    """Settings, the parameters of a model that repeats two sequences, and the sequences."""
-    settings = fakes.TINY
-    model = made(settings)
-    ramp = jnp.linspace(0.0, 0.2, settings.horizon)[:, None]
-    wanted = PRESENT[:, None] + ramp * jnp.array([1.0, -1.0])
-    optimizer = optax.adam(optax.cosine_decay_schedule(1e-2, STEPS))
-
-    def repeated(x):
-        return jnp.repeat(x, 16, axis=0)
-
-    def loss(params, given):
-        return model.loss(params, condition(repeated(PRESENT)), given)[0]
-
-    def step(i, carry):
-        params, state = carry
-        given = model.prepare(jax.random.fold_in(jax.random.key(1), i), repeated(wanted))
-        gradient = jax.grad(loss)(params, given)
-        updates, state = optimizer.update(gradient, state, params)
-        return optax.apply_updates(params, updates), state
-
-    @jax.jit
-    def train(key):
-        params = model.init(key)
-        return jax.lax.fori_loop(0, STEPS, step, (params, optimizer.init(params)))[0]
-
-    return settings, train(jax.random.key(0)), wanted
-
-
-def sampled(settings, params, seed=2):
-    keys = jax.random.split(jax.random.key(seed), len(PRESENT))
-    sample = jax.jit(made(settings).sample)
-    return np.asarray(sample(params, keys, condition(PRESENT), None))
+    return repeats.learned(fakes.TINY)
 
 
 def test_samples_are_what_was_learned(learned):
-    _, params, wanted = learned
-    found = sampled(tiny(ddim_steps=10), params)
+    params, wanted = learned
+    found = repeats.sampled(tiny(ddim_steps=10), params)
     assert np.abs(found - wanted).mean() < 0.05
 
 
 def test_samples_are_the_same_where_steps_are_side_by_side(learned, monkeypatch):
-    _, params, _ = learned
+    params, _ = learned
     ten = tiny(ddim_steps=10)
-    wanted, calls = sampled(ten, params), []
+    wanted, calls = repeats.sampled(ten, params), []
     one_by_one = diffusion.ddim_sample
     monkeypatch.setattr(diffusion, "ddim_sample", lambda *a, **k: calls.append(a))
     monkeypatch.setattr(parallel_ddim, "pays", lambda batch, steps: (batch, steps) == (2, 10))
-    found = sampled(ten, params)
+    found = repeats.sampled(ten, params)
     np.testing.assert_allclose(found, wanted, atol=0.01)
     assert np.abs(found - wanted).max() > 0 and calls == []
     monkeypatch.setattr(diffusion, "ddim_sample", one_by_one)
     five = tiny(ddim_steps=5)
     monkeypatch.setattr(parallel_ddim, "ddim_sample", lambda *a, **k: calls.append(a))
-    sampled(five, params)
+    repeats.sampled(five, params)
     assert calls == []
 
 
 def test_at_temperature_zero_no_sample_depends_on_its_key(learned):
-    _, params, _ = learned
+    params, _ = learned
     cold, warm = (tiny(ddim_steps=10, temperature=share) for share in (0.0, 1.0))
-    np.testing.assert_array_equal(sampled(cold, params, 2), sampled(cold, params, 3))
-    assert np.abs(sampled(warm, params, 2) - sampled(warm, params, 3)).max() > 1e-4
+    np.testing.assert_array_equal(
+        repeats.sampled(cold, params, 2), repeats.sampled(cold, params, 3)
+    )
+    assert np.abs(repeats.sampled(warm, params, 2) - repeats.sampled(warm, params, 3)).max() > 1e-4
 
 
 def test_a_sample_starts_as_the_settings_say():
     """A network that predicts no noise leaves what a sample starts from, scaled."""
     settings = tiny(diffusion_steps=50, ddim_steps=5, temperature=0.25)
-    model = made(settings)
+    model = repeats.model(settings)
     shapes = jax.eval_shape(model.init, jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), shapes)
     keys = jax.random.split(jax.random.key(2), 2)
     reach = 1e9 * jnp.array([[-1.0], [1.0]])
-    found = jax.jit(model.sample)(params, keys, condition(PRESENT), reach)
-    start = 0.25 * diffusion.sample_noise(keys, (settings.horizon, ACTION))
+    found = jax.jit(model.sample)(params, keys, repeats.condition(repeats.PRESENT), reach)
+    start = 0.25 * diffusion.sample_noise(keys, (settings.horizon, repeats.ACTION))
     first = schedule.ddim_table(50, 5).sqrt_alpha_bar[0]
     np.testing.assert_allclose(found, start / first, rtol=1e-4)
     k = model.prepare(jax.random.key(3), jnp.zeros((1024, 1))).k
@@ -118,7 +74,7 @@ def test_a_sample_starts_as_the_settings_say():
 
 def test_networks_are_as_the_options_say():
     def shapes(**changed):
-        return jax.eval_shape(made(tiny(**changed)).init, jax.random.key(0))
+        return jax.eval_shape(repeats.model(tiny(**changed)).init, jax.random.key(0))
 
     block = shapes(kernel_size=3)["unet"]["params"]["down_0_0"]["ConvBlock_0"]["Conv1d_0"]
     assert block["kernel"].shape[0] == 3

@@ -1,0 +1,82 @@
+"""Flow matching: straight ways from noise to action sequences, and the steps along them.
+
+Lipman et al., "Flow Matching for Generative Modeling", and Liu et al., "Flow Straight and Fast"
+(both ICLR 2023). At time t a sequence is `(1 - t) x0 + t noise`: clean at 0, noise at 1. A network
+learns the mean of its velocity, `noise - x0`. All arithmetic is float32.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.models.diffusion import within
+
+# Networks are told times in this unit: their embedding is made for steps from 0 to about 100.
+TIME_UNIT = 0.01
+
+
+class Noised(NamedTuple):
+    """Sequences to learn from.
+
+    Attributes:
+      x: `[B, ...]`, with noise.
+      time: `[B]`, in TIME_UNIT.
+      velocity: `[B, ...]`, what is to be predicted.
+    """
+
+    x: jax.Array
+    time: jax.Array
+    velocity: jax.Array
+
+
+def noised(key: jax.Array, x0: jax.Array) -> Noised:
+    """Clean sequences `[B, ...]`, about [-1, 1], each at a random time.
+
+    `key` is one typed key for the whole batch.
+    """
+    key_time, key_noise = jax.random.split(key)
+    time = jax.random.uniform(key_time, x0.shape[:1])
+    noise = jax.random.normal(key_noise, x0.shape, x0.dtype)
+    share = time.reshape(-1, *[1] * (x0.ndim - 1))
+    return Noised(x0 + share * (noise - x0), time / TIME_UNIT, noise - x0)
+
+
+def velocity_loss(predict: Callable[[jax.Array, jax.Array], jax.Array], given: Noised) -> jax.Array:
+    """Mean squared error of the velocity that `predict(x, time)` `[B, ...]` predicts."""
+    return jnp.mean((predict(given.x, given.time) - given.velocity) ** 2)
+
+
+def sample(
+    predict: Callable[[jax.Array, Any], jax.Array],
+    noise: jax.Array,
+    *,
+    steps: int,
+    prepare: Callable[[jax.Array], Any] = lambda time: time,
+    reach: Any = None,
+) -> jax.Array:
+    """Euler steps of one length from `noise` `[B, ...]` to a clean sequence.
+
+    At each step the way ends in a clean sequence, which is clipped to `reach`: lowest and highest
+    value, None for -1 and 1.
+
+    Args:
+      predict: `(x [B, ...], prepared) -> velocity [B, ...]`.
+      noise: the start, standard normal.
+      steps: how many network evaluations.
+      prepare: maps the times `[n]` in TIME_UNIT to a pytree with leading axis n, once, before the
+        loop; `predict` gets its slice.
+      reach: what broadcasts against `[B, ...]` each.
+    """
+    time = np.arange(steps, 0, -1, dtype=np.float32) / steps
+
+    def step(x: jax.Array, inputs: Any) -> tuple[jax.Array, None]:
+        time, left, prepared = inputs
+        clean = within(x - time * predict(x, prepared), reach)
+        return clean + left * (x - clean), None
+
+    left = 1.0 - 1.0 / (steps * time)  # share of the way that is left after the step
+    rows = (jnp.asarray(time), jnp.asarray(left), prepare(jnp.asarray(time / TIME_UNIT)))
+    return jax.lax.scan(step, noise, rows)[0]
