@@ -16,7 +16,7 @@ import jax  # noqa: E402
 HERE = pathlib.Path(__file__).parent
 # Where numbers are compared to the last bit, or settings of jax are recorded. Elsewhere most
 # programs run once, and compiling them takes longer than running them.
-OPTIMIZED = {"data", "evaluation", "report", "runtime"}
+OPTIMIZED = {"data", "evaluation", "report", "rollouts", "runtime"}
 
 
 @pytest.hookimpl(tryfirst=True)
