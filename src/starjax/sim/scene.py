@@ -140,8 +140,9 @@ def load(names: SceneNames) -> Scene:
     task: Task = registry.tasks.get(names.task)
     m = compose(names)
     # XLA's MJX implementation everywhere: the warp one needs CUDA.
-    mjx_model = mjx.put_model(m, impl="jax")
-    mjx_data = mjx.make_data(m, impl="jax")
+    device = jax.local_devices()[0]  # MJX alone takes the first of all, another process's
+    mjx_model = mjx.put_model(m, device=device, impl="jax")
+    mjx_data = mjx.make_data(m, device=device, impl="jax")
     solver.check(mjx_model, mjx_data)
     mounted = _mounted(task, names)
     return Scene(
