@@ -323,3 +323,14 @@ def test_distances_of_a_sweep_are_to_the_trocars_of_the_weights(file):
     training = rcm.Trocar(*(field[:4, None] for field in rcm.TROCARS))
     far = sweeping.distance_to_nearest(ports, training, np.zeros((1, 3)))
     assert [t["distance_m"] for t in trials] == pytest.approx(far, abs=1e-6)
+
+
+def test_another_arm_is_another_evaluation(file, monkeypatch):
+    asked, made = [], policy_under_test.sim_env.make
+    monkeypatch.setattr(
+        policy_under_test.sim_env, "make", lambda *a, **k: asked.append(a[1]) or made(*a, **k)
+    )
+    assert score() == 0 and score("--arm", "ur5e") == 0
+    assert asked == [("fr5",), ("ur5e",)]
+    folders = {path.name for path in (file.parent / "runs" / "evaluate").iterdir()}
+    assert len(folders) == 2 and len([name for name in folders if "-ur5e-seed0" in name]) == 1

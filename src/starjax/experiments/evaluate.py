@@ -27,6 +27,7 @@ class Options:
     run: options.RunOrNone = ""  # a method's folder, such as runs/cpu/stardiff
     # a policy.safetensors, or the name of a policy that ships with starjax, instead of RUN
     policy: str = ""
+    arm: tuple[str, ...] = ()  # robots to score it with; left out: those it was trained with
     seed: config_lib.Seed = 0  # of the trials
     # folder of the result; auto: one in RUN or in runs/evaluate
     out: str = options.AUTO
@@ -49,12 +50,17 @@ def main(argv: Sequence[str]) -> int:
     from starjax.rollouts import sharing
 
     method, config = (run.name, folders.read_config(run)) if run else (None, None)
-    who = policy_under_test.load(method, file) if method else policy_under_test.from_file(file)
+    if method:
+        who = policy_under_test.load(method, file, arms=chosen.arm)
+    else:
+        who = policy_under_test.from_file(file, chosen.arm)
     config = policy_under_test.settings(who, config) if config else _config(who.trained)
-    config = dataclasses.replace(config, method=who.method, out=str(folder), eval=chosen.eval)
+    scene = scenes.settings(who.env.names)
+    changed = {"method": who.method, "out": str(folder), "scene": scene, "eval": chosen.eval}
+    config = dataclasses.replace(config, **changed)
     about = messages.about(config, chosen.policy or chosen.run, chosen.seed)
     with sharing.shared(folder) as share, messages.heard(share.is_first):
-        same = share.first("same", lambda: _goes_on(folder, who.weights, chosen))
+        same = share.first("same", lambda: _goes_on(folder, who.weights, chosen, scene))
         print(f"{about}, into {folder}\n", flush=True)
         with stage_times.timed(folder, "evaluate", same or folders.is_under_way(folder)):
             table = policy_under_test.rollouts(
@@ -76,12 +82,13 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _goes_on(folder: Path, weights: str, chosen: Options) -> bool:
+def _goes_on(folder: Path, weights: str, chosen: Options, scene: config_lib.SceneConfig) -> bool:
     """Whether the folder's result is of these weights and trials; refuses what it must not hold."""
     before = _before(folder)
     if chosen.out != options.AUTO:
         _refuse_foreign(folder, before.get("weights", weights) == weights)
-    return _identity(before) == (weights, chosen.seed, dataclasses.asdict(chosen.eval))
+    arms = list(scene.arm)
+    return _identity(before) == (weights, chosen.seed, arms, dataclasses.asdict(chosen.eval))
 
 
 def _asked(argv: Sequence[str], has_gpu: bool) -> tuple[Options, Path, Path | None, Path]:
@@ -115,7 +122,8 @@ def _default(has_gpu: bool) -> Options:
 
 def _trials(chosen: Options) -> str:
     """A name for an evaluation's trials, so that others do not replace them."""
-    return f"seed{chosen.seed}-{chosen.eval.trials}x{chosen.eval.time_limit_s:g}s"
+    trials = f"seed{chosen.seed}-{chosen.eval.trials}x{chosen.eval.time_limit_s:g}s"
+    return "-".join([*chosen.arm, trials])
 
 
 def _label(file: Path) -> str:
@@ -135,10 +143,11 @@ def _before(folder: Path) -> dict[str, Any]:
         return {}
 
 
-def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any]:
+def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any, Any]:
     """Whose trials a result has, and which."""
     config = result.get("config") or {}
-    return result.get("weights"), result.get("seed"), config.get("eval")
+    arms = (config.get("scene") or {}).get("arm")
+    return result.get("weights"), result.get("seed"), arms, config.get("eval")
 
 
 def _refuse_foreign(folder: Path, is_ours: bool) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,13 +39,16 @@ class Subject(NamedTuple):
     weights: str
 
 
-def load(method: str, weights: Path, env: sim_env.Env | None = None) -> Subject:
+def load(
+    method: str, weights: Path, env: sim_env.Env | None = None, arms: Sequence[str] = ()
+) -> Subject:
     """Loads a method's weights.
 
     Args:
       method: a row of Table II.
       weights: policy.safetensors.
       env: built from what the weights were trained on unless given.
+      arms: robots of that env in the place of those that they were trained with.
 
     Raises:
       errors.UsageError: the file is missing or damaged.
@@ -57,11 +61,11 @@ def load(method: str, weights: Path, env: sim_env.Env | None = None) -> Subject:
     except ValueError as error:
         hint = f"remove it, and {again} trains it again"
         raise errors.UsageError(str(weights), "a policy of starjax", error, hint) from error
-    return _load(method, trained, weights, env)
+    return _load(method, trained, weights, env, arms)
 
 
-def from_file(path: Path) -> Subject:
-    """Loads a policy that says itself which method it is.
+def from_file(path: Path, arms: Sequence[str] = ()) -> Subject:
+    """Loads a policy that says itself which method it is; `arms` as in `load`.
 
     Raises:
       errors.UsageError: the file is damaged, or not a policy of this version.
@@ -71,16 +75,20 @@ def from_file(path: Path) -> Subject:
     except ValueError as error:
         raise errors.UsageError("--policy", "a policy of starjax", error) from error
     errors.choice(f"method of {path}", trained.method, methods.METHODS)
-    return _load(trained.method, trained, path, None)
+    return _load(trained.method, trained, path, None, arms)
 
 
 def _load(
-    method: str, trained: policy_file.Trained, file: Path, env: sim_env.Env | None
+    method: str,
+    trained: policy_file.Trained,
+    file: Path,
+    env: sim_env.Env | None,
+    arms: Sequence[str],
 ) -> Subject:
     scene = trained.scene
     env = env or sim_env.make(
         scene.task,
-        scene.arms,
+        arms or scene.arms,
         scene.tools,
         observation=trained.policy.observation,
         image_size=trained.policy.image_size,
