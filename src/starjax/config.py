@@ -5,11 +5,11 @@ A field's comment is its help, its type has its range (`limits`).
 
 import dataclasses
 import json
-import types
 import typing
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
+from starjax import json_types
 from starjax.learners import LEARNERS
 from starjax.limits import INLINE, Count, CountOrZero, NotNegative, Positive, Range
 
@@ -237,12 +237,11 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
             fields[name] = value
         elif dataclasses.is_dataclass(hints[name]):
             fields[name] = from_dict(hints[name], value)
-        elif _fits(value, hints[name]):
+        elif json_types.fits(value, hints[name]):
             fields[name] = tuple(value) if isinstance(value, list) else value
         else:
-            raise ValueError(
-                f"{settings.__name__}.{name}: expected {_kind(hints[name])}, got {value!r}"
-            )
+            expected = json_types.kind(hints[name])
+            raise ValueError(f"{settings.__name__}.{name}: expected {expected}, got {value!r}")
     return settings(**fields)
 
 
@@ -278,24 +277,3 @@ def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
         rest.setdefault("expert", "one_wall" if demos["one_wall"] else "")
         found = {**found, "demos": rest} if "demos" in found else rest
     return found
-
-
-def _kind(hint: Any) -> str:
-    """A field's type, for people."""
-    if typing.get_origin(hint) is Literal:
-        return f"one of {', '.join(map(str, typing.get_args(hint)))}"
-    return getattr(hint, "__name__", str(hint))
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value from JSON is of a field's type."""
-    origin, kinds = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        return value in kinds
-    if origin is tuple:
-        return isinstance(value, list | tuple) and all(_fits(part, kinds[0]) for part in value)
-    if isinstance(hint, types.UnionType):
-        return any(_fits(value, kind) for kind in kinds)
-    if isinstance(value, bool):
-        return hint is bool
-    return isinstance(value, int | float if hint is float else hint)
