@@ -4,7 +4,7 @@ Sources, and what differs from them: `models.transformer`.
 """
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from starjax import config, errors
 from starjax.learners import Learner
@@ -76,7 +76,7 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
         params: Params, condition: Condition, given: tuple[jax.Array, jax.Array]
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         x0, noise = given
-        style: transformer.Style = styles.apply(params["style"], x0, condition.state)
+        style: Any = styles.apply(params["style"], x0, condition.state)
         said = decode(params["decoder"], transformer.drawn(style, noise), *condition)
         off, divergence = jnp.mean(jnp.abs(said - x0)), transformer.divergence(style)
         return off + options.kl_weight * divergence, {"l1": off, "divergence": divergence}

@@ -53,24 +53,25 @@ def make(options: BcConfig, policy_config: config.PolicyConfig, sizes: "Sizes") 
     apply = packed_params.applied(network.apply)
 
     def init(key: jax.Array) -> Params:
-        return network.init(key, jnp.zeros((1, sizes.condition)))
+        return {"mixture": network.init(key, jnp.zeros((1, sizes.condition)))}
 
     def loss(params: Params, condition: Condition, x0: jax.Array) -> tuple[jax.Array, dict]:
-        said = apply(params, sequences.joined(condition))
+        said = apply(params["mixture"], sequences.joined(condition))
         return regression.loss(said, x0, options.component_spread), {}
 
     def sample(
         params: Params, keys: jax.Array, condition: Condition, reach: jax.Array | None
     ) -> jax.Array:
-        said = apply(params, sequences.joined(condition))
+        said = apply(params["mixture"], sequences.joined(condition))
         return diffusion.within(regression.draw(said, keys), reach)
 
     def rounded(params: Params) -> Params:
         return sequences.rounded(params, {"kernel"}, dtype)
 
     def for_sampling(params: Params) -> Params:
+        network = rounded(params["mixture"])
         packs = packed_params.pays(jax.default_backend())
-        return packed_params.packed(rounded(params)) if packs else rounded(params)
+        return {"mixture": packed_params.packed(network) if packs else network}
 
     return sequences.SequenceModel(init, lambda key, x0: x0, loss, sample, rounded, for_sampling)
 
