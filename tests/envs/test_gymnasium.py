@@ -74,6 +74,7 @@ def test_lanes_are_what_gymnasium_makes_of_single_environments(lanes, mode):
     assert ended >= 4
 
 
+@pytest.mark.slow
 def test_only_masked_lanes_begin_anew_and_others_stay(lanes):
     ours, _ = lanes("Disabled")
     first, _ = ours.reset(seed=[7, 8])
@@ -139,6 +140,7 @@ def test_a_mistake_names_its_argument(wrong, argument):
     assert raised.value.argument == argument
 
 
+@pytest.mark.slow
 def test_wrong_calls_are_one_line(lanes):
     ours, _ = lanes("NextStep")
     with pytest.raises(gymnasium.error.ResetNeeded):

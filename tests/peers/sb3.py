@@ -114,7 +114,9 @@ def main() -> None:
     given = parser.parse_args()
     task = {"trocar": "all", "action_space": given.action_space, "max_episode_steps": 150}
     env, judge = (
-        gymnasium.make_vec("starjax/Reach-v0", given.lanes, autoreset_mode=mode, **task)
+        gymnasium.make_vec(
+            "starjax.envs:starjax/Reach-v0", given.lanes, autoreset_mode=mode, **task
+        )
         for mode in ("SameStep", "Disabled")
     )
     make, settings = LEARNERS[given.learner]
