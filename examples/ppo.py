@@ -143,7 +143,8 @@ def make(env, envs):
 
         state = jax.lax.while_loop(going, act, reset(jax.random.split(key, envs)))
         success = state.metrics["is_success"]
-        return success.mean(), jnp.sum(success * state.data.step) * env.dt / success.sum()
+        seconds = jnp.sum(success * state.data.step) * env.dt
+        return success.mean(), seconds / jnp.maximum(success.sum(), 1)
 
     return first, iterate, evaluate
 
