@@ -1,7 +1,7 @@
 """Learns a task by proximal policy optimisation; an iteration is one compiled program.
 
     python examples/ppo.py --envs 4096 --iterations 100      # a GPU
-    python examples/ppo.py                                   # two CPU cores, some minutes
+    python examples/ppo.py                                   # a CPU
 
 Needs optax and flax beside jax and mujoco-mjx. Prints one JSON object a line: the curve, and at
 last how often the mean action succeeds. Noise is drawn with memory, as tools are moved, not shaken,
