@@ -15,6 +15,7 @@ from starjax.deploy import wire
 from starjax.errors import UsageError
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.05, 1.0  # between two tries to connect
+_LOOK_S = 0.05  # between two looks whether an idle connection is still there
 _MOST_ANSWER = 1 << 24  # bytes of a frame that a server may send
 _SILENT = logging.getLogger("starjax.link")
 _SILENT.addHandler(logging.NullHandler())
@@ -125,7 +126,7 @@ class Link:
 
     def _talk(self, connection: Any) -> None:
         """Answers requests until the connection breaks, which loses the one under way."""
-        while (frame := self._asked.get()) is not None:
+        while (frame := self._wanted(connection)) is not None:
             try:
                 connection.send(frame)
                 answer = connection.recv(self._timeout_s)
@@ -134,6 +135,16 @@ class Link:
                 self._heard.put(Heard(None, str(error) or "no answer in time", is_lost=True))
                 raise
             self._heard.put(_read(answer))
+
+
+    def _wanted(self, connection: Any) -> bytes | None:
+        """The next request, None at the end; raises where the connection breaks before it."""
+        while True:
+            try:
+                return self._asked.get(timeout=_LOOK_S)
+            except queue.Empty:
+                if connection.protocol.state is not websockets.State.OPEN:
+                    raise ConnectionError("the server has closed the connection") from None
 
 
 def _read(frame: Any) -> Heard:
