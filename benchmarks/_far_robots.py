@@ -11,7 +11,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -24,7 +23,6 @@ from starjax.rollouts import episodes
 from starjax.sim import env as envs
 from starjax.types import Command, Pose
 
-_SOON_S = 5e-4  # between two looks for an answer
 _SETTLED_S = 120.0  # for a server to start
 
 
@@ -100,8 +98,7 @@ class BadLink(Link):
     def poll(self) -> Heard | None:
         if self._due is None or self._clock.now < self._due - 1e-6:
             return None
-        while (heard := super().poll()) is None:
-            time.sleep(_SOON_S)
+        heard = self.wait(_SETTLED_S)
         self._due = None
         return Heard(None, "dropped", is_lost=True) if self._is_dropped else heard
 

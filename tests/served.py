@@ -11,7 +11,7 @@ import numpy as np
 
 from starjax import deploy, rcm
 from starjax.data import normalizer
-from starjax.deploy import server
+from starjax.deploy import server, wire
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
@@ -68,3 +68,24 @@ def running(batches, port=0, key=KEY, clients=8):
         finally:
             stop.set()
             work.join()
+
+
+def bad_frame(rng, good):
+    """A frame that is no request, or hardly one: cut, flipped, random, or another map."""
+    kind = rng.integers(5)
+    if kind == 0:
+        return good[: rng.integers(len(good))]
+    if kind == 1:
+        flipped = bytearray(good)
+        for at in rng.integers(len(good), size=rng.integers(1, 9)):
+            flipped[at] ^= 1 << rng.integers(8)
+        return bytes(flipped)
+    if kind == 2:
+        return rng.bytes(rng.integers(200))
+    if kind == 3:
+        return "text" * rng.integers(9)
+    odd = [None, -1, 2.5, "x", [], {}, {b"__ndarray__": True}, np.zeros((2, 3)), 10**18, np.nan]
+    value = wire.unpack(good)
+    names = [*value, b"p", 7, "more"]
+    value[names[rng.integers(len(names))]] = odd[rng.integers(len(odd))]
+    return wire.pack(value)

@@ -149,34 +149,13 @@ def test_more_clients_than_it_may_have_are_sent_away(batches):
         assert caught.value.response.status_code == 503
 
 
-def bad_frame(rng, good):
-    """A frame that is no request, or hardly one: cut, flipped, random, or another map."""
-    kind = rng.integers(5)
-    if kind == 0:
-        return good[: rng.integers(len(good))]
-    if kind == 1:
-        flipped = bytearray(good)
-        for at in rng.integers(len(good), size=rng.integers(1, 9)):
-            flipped[at] ^= 1 << rng.integers(8)
-        return bytes(flipped)
-    if kind == 2:
-        return rng.bytes(rng.integers(200))
-    if kind == 3:
-        return "text" * rng.integers(9)
-    odd = [None, -1, 2.5, "x", [], {}, {b"__ndarray__": True}, np.zeros((2, 3)), 10**18, np.nan]
-    value = wire.unpack(good)
-    names = [*value, b"p", 7, "more"]
-    value[names[rng.integers(len(names))]] = odd[rng.integers(len(odd))]
-    return wire.pack(value)
-
-
 def test_no_frame_ends_it(batches, up):
     where, counts = up
     rng, good = np.random.default_rng(0), wire.pack(asked(batches))
     answers, connection = [], connect(where)
     connection.recv()
     for _ in range(FRAMES):
-        connection.send(bad_frame(rng, good))
+        connection.send(served.bad_frame(rng, good))
         answers.append(connection.recv(timeout=60))
     refused = sum(isinstance(answer, str) for answer in answers)
     assert refused > 0.8 * FRAMES and all("Traceback" not in str(answer) for answer in answers)

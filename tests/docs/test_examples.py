@@ -4,7 +4,7 @@ import runpy
 
 import pytest
 
-SLOW = {"closed_loop"}  # compiles the simulation
+SLOW = {"closed_loop", "far_robot"}  # compile the simulation, a server
 
 
 def pytest_generate_tests(metafunc):

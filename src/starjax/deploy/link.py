@@ -82,6 +82,13 @@ class Link:
         except queue.Empty:
             return None
 
+    def wait(self, seconds: float) -> Heard | None:
+        """As `poll`, but waits for it so long."""
+        try:
+            return self._heard.get(timeout=seconds)
+        except queue.Empty:
+            return None
+
     def close(self) -> None:
         """Ends the connection and the thread."""
         self._closing.set()
@@ -135,7 +142,6 @@ class Link:
                 self._heard.put(Heard(None, str(error) or "no answer in time", is_lost=True))
                 raise
             self._heard.put(_read(answer))
-
 
     def _wanted(self, connection: Any) -> bytes | None:
         """The next request, None at the end; raises where the connection breaks before it."""
