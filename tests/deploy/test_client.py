@@ -132,6 +132,27 @@ def test_commands_keep_to_the_manifold_and_do_not_jump(seed):
     assert all(-1.0 <= c.gripper <= 1.0 for c in commands)
 
 
+@pytest.mark.parametrize("spoil", ["off", "above", "stretched", "mirrored"])
+def test_a_plan_that_misses_the_trocar_is_not_followed(spoil):
+    follower = follow.Follower(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
+    follower.begin(poses(0.0, 0.1), 1.0)
+    good = plan(0)
+    R, p = np.array(good.pose.R), np.array(good.pose.p)
+    p[5, 0] += 2e-4 * (spoil == "off")
+    p[5, 2] += 0.2 * (spoil == "above")
+    R[5] *= 1.01 if spoil == "stretched" else 1.0
+    R[5, :, 0] *= -1.0 if spoil == "mirrored" else 1.0
+    follower.asked()
+    follower.answered(good._replace(pose=Pose(R, p)))
+    assert follower.report.refused == 1 and follower.report.latencies == []
+    follower.step()
+    assert follower.report.held == 1 and follower.is_due  # it asks again
+    follower.asked()
+    follower.answered(good)
+    follower.step()
+    assert follower.report.refused == 1 and follower.report.plans == 1
+
+
 def test_a_tool_that_does_not_go_through_the_trocar_is_not_moved():
     follower = follow.Follower(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
     pose = poses(0.0, 0.1)
@@ -217,20 +238,25 @@ def test_a_loop_over_the_socket_is_the_loop_in_the_process(batches):
         np.testing.assert_allclose(got.gripper, wanted.gripper, atol=1e-3)
 
 
+def driven_until(holds, client, robot, seconds=60.0):
+    """Whether it holds in time, however busy the machine is."""
+    deadline = time.monotonic() + seconds
+    while not holds() and time.monotonic() < deadline:
+        client.run(robot, 0.1)
+    return holds()
+
+
 def test_a_server_that_goes_and_comes_back_is_found_again(batches):
     robot = Robot()
     with served.running(batches) as (where, _):
-        client = client_of(where, timeout_s=0.5)
-        assert client.run(robot, 1.0).plans > 0
+        client = client_of(where)
+        assert driven_until(lambda: client.report.plans > 0, client, robot)
     plans = client.report.plans
     client.run(robot, 1.0)  # nobody is there: it holds
-    held = client.report.held
-    assert client.report.plans <= plans + 1 and held > 5
+    assert client.report.plans <= plans + 1 and client.report.held > 5
     with served.running(batches, port=where[1]):
-        deadline = time.monotonic() + 20.0
-        while client.report.plans <= plans + 1 and time.monotonic() < deadline:
-            client.run(robot, 0.2)
-        assert client.reconnected == 1 and client.report.plans > plans + 1
+        assert driven_until(lambda: client.report.plans > plans + 1, client, robot)
+        assert client.reconnected >= 1
         client.close()
     steps = np.diff([c.pose.p for c in robot.commands], axis=0)
     assert np.linalg.norm(steps, axis=-1).max() <= deploy.Limits().move * (1 + 1e-4)
@@ -241,7 +267,7 @@ def test_another_policy_at_the_address_is_not_asked(batches, monkeypatch):
         client = client_of(where, timeout_s=0.5)
     monkeypatch.setattr(type(batches.policy), "digest", "another")
     with served.running(batches, port=where[1]):
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 60.0
         while "another" not in client._link.fault and time.monotonic() < deadline:
             time.sleep(0.05)
         assert "another" in client._link.fault and not client._link.is_up
@@ -279,8 +305,8 @@ def test_answers_that_are_none_are_refused_and_it_holds(batches):
 
     robot = Robot()
     with served.running(batches) as (where, _), client_of(where, connect=Liar) as client:
-        client.run(robot, 1.0)
-        assert client.report.plans == 0 and client.report.refused >= 2
+        assert driven_until(lambda: client.report.refused >= 5, client, robot)
+        assert client.report.plans == 0
         assert client.report.held == client.report.steps
     assert len({c.pose.p.tobytes() for c in robot.commands}) == 1
 

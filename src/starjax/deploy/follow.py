@@ -241,6 +241,8 @@ def _through(pose: Pose, p_world_trocar: jax.Array) -> Pose:
 def _worst(pose: Pose, p_world_trocar: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Of poses `[H, *arms]`: m, the farthest axis from the trocar and the least depth; how far the
     worst matrix is from a rotation."""
-    skew = jnp.abs(arrays.matmul(pose.R.mT, pose.R) - jnp.eye(3)).max()
+    x, y, z = (pose.R[..., :, i] for i in range(3))
+    mirrored = jnp.abs(jnp.cross(x, y) - z).max()
+    skew = jnp.maximum(jnp.abs(arrays.matmul(pose.R.mT, pose.R) - jnp.eye(3)).max(), mirrored)
     off = rcm.rcm_error(pose, p_world_trocar).max()
     return off, rcm.insertion_depth(pose, p_world_trocar).min(), skew
