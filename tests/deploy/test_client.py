@@ -94,10 +94,10 @@ def test_a_late_plan_stretches_the_old_one_and_then_the_robot_holds():
 
 def test_of_a_plan_that_comes_very_late_only_the_rest_is_followed():
     given, report = followed(lambda n: 0 if n == 1 else 16, 60, ahead=8)
-    assert given[:16] == [(1, t) for t in range(16)]
-    # Of the second one all but the last is over when it comes; the third is asked for at rest.
-    assert given[16:34] == [None, (2, 15)] + [None] * 16
-    assert given[34:50] == [(3, t) for t in range(16)]
+    # The robot waits where the late one still has as many commands as a plan should have.
+    assert given[:17] == [(1, t) for t in range(9)] + [None] * 8
+    assert given[17:25] == [(2, t) for t in range(8, 16)]
+    assert given[25:35] == [None] * 9 + [(3, 7)] and report.missed == 4
     assert report.lost == report.refused == 0
 
 

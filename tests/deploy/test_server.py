@@ -1,6 +1,7 @@
 """A policy behind a socket: the same plans, and nothing that a client sends ends it."""
 
 import threading
+import time
 
 import fakes
 import jax
@@ -180,6 +181,26 @@ def test_a_fault_of_the_device_is_told_and_passes(batches, up, monkeypatch):
         assert "out of memory" in infer(connection, asked(batches))
         patch.undo()
         assert isinstance(infer(connection, asked(batches)), dict)
+
+
+def test_it_ends_while_it_decides(batches, monkeypatch):
+    begun, decide = threading.Event(), batches.decide
+
+    def slowly(requests):
+        begun.set()
+        time.sleep(0.5)
+        return decide(requests)
+
+    monkeypatch.setattr(batches, "decide", slowly)
+    with served.running(batches) as (where, counts):
+        connections = [connect(where) for _ in range(4)]  # one more than a call takes
+        for connection in connections:
+            connection.recv()
+            connection.send(wire.pack(asked(batches)))
+        assert begun.wait(60)
+    assert counts.answered >= 1
+    for connection in connections:
+        connection.close()
 
 
 def test_a_port_that_is_taken_is_one_line(batches, up):

@@ -2,11 +2,13 @@
 
 Pure arithmetic of control steps, no clock and no network: `Client` gives it both.
 
-    asked      |<-- ahead -->| the new plan's first commands pass while the old one is carried out
-    old plan   0 . . . . . . . execute | . . . . horizon     beyond `execute` only if the answer
-    new plan           0 . . . . . . . . | . . .             is late; then the robot holds
+    old plan   0 . . . . . . . execute . . . . horizon
+    new plan           0 . . . . . . . . execute . . . horizon
+                   asked |<ahead>| due
 
-While the robot holds, plans do not age: nothing moves that they would have to foresee.
+The first commands of the new plan pass while those of the old one are carried out. Where it is
+late, more of the old one are, as long as the new one would have `execute` left; then the robot
+holds. While it holds, plans do not age: nothing moves that they would have to foresee.
 """
 
 import collections
@@ -136,6 +138,12 @@ class Follower:
         is_near = self._plan is None or self._until - self._index <= self.ahead
         return is_near and self._next is None and not self._is_asked
 
+    @property
+    def _is_far_enough(self) -> bool:
+        """Whether of the plan that is late, no more than `execute` commands would be left."""
+        is_beyond = self._index >= self._until
+        return is_beyond and self._moved >= self.horizon - self.execute
+
     def asked(self) -> None:
         """A plan has been asked for."""
         self._is_asked, self._moved, self._waited = True, 0, 0
@@ -187,7 +195,7 @@ class Follower:
             self.report.missed += 1
         self.report.steps += 1
         self._waited += 1
-        if self._plan is None or self._index >= self.horizon:
+        if self._plan is None or self._index >= self.horizon or self._is_far_enough:
             self.report.held += 1
             return self.last
         wanted = jax.tree.map(lambda x: x[self._index], self._plan)

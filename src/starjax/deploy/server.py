@@ -161,11 +161,11 @@ class _Served:
             max_queue=2,
             logger=_SILENT,
         )
-        async with server:
+        # It decides until the last connection is closed, as that waits for its answer.
+        async with self._deciding() as deciding, server:
             listening(*server.sockets[0].getsockname()[:2])
-            async with self._deciding() as deciding:
-                while not (should_stop() or deciding.done()):
-                    await asyncio.wait([deciding], timeout=_ASK_S)
+            while not (should_stop() or deciding.done()):
+                await asyncio.wait([deciding], timeout=_ASK_S)
 
     @contextlib.asynccontextmanager
     async def _deciding(self) -> AsyncIterator[asyncio.Task]:
