@@ -40,8 +40,8 @@ class Client:
     """A robot's control loop, with plans from a server.
 
     `step` takes what is measured and gives the next command; it never waits. The next plan is asked
-    for ahead, so that it is there when the one before has been carried out. Where it is late the
-    rest of the old plan is carried out, and then the last command again: a pose on the RCM
+    for ahead, so that it is there when the one before has been carried out. Where it is late more
+    of the old plan is carried out, and then the last command again: a pose on the RCM
     manifold, with the jaws as they were. That is also given before the first plan, for the tool as
     it was measured. A server that is gone is looked for until it is there again.
 
