@@ -37,6 +37,11 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         _LEARNING,
     ),
     "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)", _LEARNING),
+    "serve": (
+        "starjax.experiments.serve",
+        "a trained policy for robots elsewhere, over websockets",
+        ("sim", "serve"),
+    ),
     "pack": ("starjax.experiments.pack", "a policy in a file of half the size", _LEARNING),
     "report": (
         "starjax.experiments.report_command",

@@ -4,8 +4,8 @@ import runpy
 
 import pytest
 
-SLOW = {"closed_loop", "ppo"}  # these compile the simulation
 SHORT = {"ppo": ["--envs", "4", "--iterations", "2"]}
+SLOW = {"closed_loop", "far_robot", "ppo"}  # compile the simulation, a server
 
 
 def pytest_generate_tests(metafunc):
