@@ -49,6 +49,11 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "a dataset from LeRobot, robomimic or zarr, to train on",
         _EXCHANGE,
     ),
+    "inspect": (
+        "starjax.experiments.inspect_command",
+        "what is in a dataset, policy or result, and what is odd about it",
+        _EXCHANGE,
+    ),
     "report": (
         "starjax.experiments.report_command",
         "tables, figures, video, page from results",

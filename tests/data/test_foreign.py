@@ -204,7 +204,7 @@ def test_uneven_times_with_small_gaps_are_filled_in_and_said(tmp_path):
     _, p, _ = moved(times[0] + np.arange(length) / 30, TROCARS[0], 0)
     np.testing.assert_allclose(dataset.observation.pose.p[:length, 0], p, atol=2e-4)
     assert len(found.notes) == 3 and all("gap" in note for note in found.notes)
-    assert json.loads((tmp_path / "d" / foreign.ABOUT).read_text())["notes"] == found.notes
+    assert json.loads((tmp_path / "d" / schema.IMPORTED).read_text())["notes"] == found.notes
 
 
 def test_long_gaps_leave_the_episode_out():

@@ -63,6 +63,7 @@ def _bring_back(source: Any, path: Path, out: Path) -> int:
 
 
 def _mapped(source: Any, map_path: Path, out: Path) -> int:
+    from starjax.data import schema
     from starjax.data.formats import foreign, mapping
 
     given = mapping.load(map_path)
@@ -71,7 +72,7 @@ def _mapped(source: Any, map_path: Path, out: Path) -> int:
     for line in found.notes[:_SHOWN]:
         messages.indented(line)
     if len(found.notes) > _SHOWN:
-        messages.indented(f"and {len(found.notes) - _SHOWN} more, see {out / foreign.ABOUT}")
+        messages.indented(f"and {len(found.notes) - _SHOWN} more, see {out / schema.IMPORTED}")
     worst = f"{found.residual_mm.max():.2g} mm or less (root mean square)"
     print(
         f"{out}: {found.episodes} demonstrations, {found.frames} frames, {found.left_out} left out"

@@ -150,13 +150,14 @@ def _remove(path: Path) -> None:
 
 
 def _records(root: Path, sealed: dict[str, Any]) -> dict[str, store.Record]:
-    found = store.verify_all(root, sealed["episodes"])
-    for key, record in found.items():
+    found = {}
+    for key, record in store.verify_all(root, sealed["episodes"]).items():
         if isinstance(record, store.DamagedEpisode):
             raise record
         if record["digest"] != sealed["episodes"][key]:
             raise store.DamagedEpisode(f"{root}: {key} is not the episode that SEALED.json lists")
-    return found  # type: ignore[return-value]
+        found[key] = record
+    return found
 
 
 def _today(description: dict[str, Any]) -> dict[str, Any]:

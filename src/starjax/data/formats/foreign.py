@@ -23,8 +23,6 @@ from starjax.rollouts import episodes
 from starjax.runtime import files, xla
 from starjax.sim import registry
 
-ABOUT = "imported.json"  # beside dataset.json: what was odd
-
 
 class Imported(NamedTuple):
     """What became of the files.
@@ -150,7 +148,7 @@ def _describe(
         "scene": {
             "task": mapping.task,
             "arms": unknown,
-            "tools": unknown,
+            "tools": ["unknown"] * len(unknown),
             "cameras": list(mapping.cameras),
         },
         "trocars": np.stack([np.asarray(f, np.float64) for f in trocars], -1).tolist(),
@@ -237,7 +235,7 @@ def _written(
                 parts = {name: [arrays[name]] for name in sorted(arrays)}
                 records[key] = store.commit(root, key, outcome, parts)
             note(1)
-        files.write_json(root / ABOUT, about)
+        files.write_json(root / schema.IMPORTED, about)
         return store.seal(root, records)
 
 

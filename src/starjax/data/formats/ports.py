@@ -2,32 +2,24 @@
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from starjax import rcm
+from starjax.data import shafts
 from starjax.data.formats.mapping import Map
 from starjax.data.formats.motion import Motion
 
 SAME = 1e-3  # m; trocars that lie closer are one
 MISSED = 5e-3  # m; shafts that pass the trocar so far (root mean square) have another axis or frame
-_ROWS = 1024  # poses that an estimate is made of, so that one program serves all episodes
 _SIZE = 64  # episodes of which the trocar of a whole dataset is estimated
-
-_estimate = jax.jit(rcm.trocar_from_poses)
 
 Tips = tuple[np.ndarray, np.ndarray, np.ndarray]  # see `thinned`
 
 
 def thinned(found: Motion) -> Tips:
-    """Of an episode, what tells its trocar: `[_ROWS, A, ...]` poses, NaN after the last, and the
-    `[A, 3]` that the files say."""
-    length = len(found.pose.p)
-    chosen = np.linspace(0, length - 1, min(length, _ROWS)).astype(int)
-    R, p = (np.full((_ROWS, *x.shape[1:]), np.nan, np.float32) for x in found.pose)
-    R[: len(chosen)], p[: len(chosen)] = found.pose.R[chosen], found.pose.p[chosen]
-    return R, p, np.median(found.p_world_trocar, axis=0)
+    """Of an episode, what tells its trocars: some poses `[T, A, ...]`, and the `[A, 3]` that the
+    files say, NaN where they do not."""
+    said = np.median(found.p_world_trocar, axis=0)
+    return shafts.thinned(found.pose.R), shafts.thinned(found.pose.p), said
 
 
 def found(
@@ -42,12 +34,11 @@ def found(
     if mapping.trocars == "dataset":
         few = [tips[i] for i in np.linspace(0, len(tips) - 1, min(len(tips), _SIZE)).astype(int)]
         whole = [np.concatenate(field) for field in zip(*((R, p) for R, p, _ in few))]
-        place, sure = _estimated(*whole)
-        is_sure = np.tile(sure, (len(tips), 1))
-        places = np.tile(place, (len(tips), 1, 1))
+        each = [shafts.estimate(*whole)] * len(tips)
     else:
-        each = [_estimated(R, p) for R, p, _ in tips]
-        places, is_sure = (np.array([one[i] for one in each]) for i in range(2))
+        each = [shafts.estimate(R, p) for R, p, _ in tips]
+    places = np.array([one.p_world_trocar for one in each], np.float64)
+    is_sure = np.array([one.is_determined for one in each])
     is_said: Any = np.isfinite(said).all(-1)
     places = np.where(is_said[..., None], said, places)
     known: Any = is_said | is_sure
@@ -57,12 +48,6 @@ def found(
             why = f"the motion of arm {arm} does not determine its trocar"
             notes.append(f"episode {number}: {why}; left out")
     return list(places), list(known.all(-1))
-
-
-def _estimated(R: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Trocars `[A, 3]` of poses `[T, A]`, and `[A]` whether they are determined."""
-    found = _estimate(rcm.Pose(jnp.asarray(R.swapaxes(0, 1)), jnp.asarray(p.swapaxes(0, 1))))
-    return np.asarray(found.p_world_trocar, np.float64), np.asarray(found.is_determined)
 
 
 def grouped(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -84,7 +69,7 @@ def residual(
     found = []
     for (R, p, _), place, number in zip(tips, places, numbers):
         off = np.linalg.norm(np.cross(p - place, R[..., 2]), axis=-1)
-        rms = np.sqrt(np.nanmean(off**2, axis=0))
+        rms = np.sqrt(np.mean(off**2, axis=0))
         for arm in np.flatnonzero(rms > MISSED).tolist():
             notes.append(
                 f"episode {number}: the shaft of arm {arm} passes its trocar at "

@@ -50,7 +50,7 @@ def _open(path: Path) -> Iterator[Source]:
         found = {int(match[1]): name for name in data if (match := _DEMO.fullmatch(name))}
         demos = [data[found[number]] for number in sorted(found)]
         base.require(bool(demos), "groups data/demo_<i>", sorted(data)[:5])
-        first, odd = _datasets(demos[0]), _datasets(file) if base.OURS in file else {}
+        first, ours = _datasets(demos[0]), file.get(base.OURS)
         lengths = [_length(demo) for demo in demos]
         columns = {
             name: Column(dataset.shape[1:], dataset.dtype.name)
@@ -66,7 +66,7 @@ def _open(path: Path) -> Iterator[Source]:
                 arrays[name] = dataset[()]
             return arrays
 
-        origin = json.loads(odd[base.OURS].asstr()[()]) if base.OURS in odd else None
+        origin = json.loads(bytes(ours[()])) if _is_bytes(ours) else None
         about = _attribute(data, "env_args")
         hz = float((origin or {}).get("description", {}).get("control_hz", 0.0) or _hz(about))
         yield Source(hz, lengths, columns, read, origin, task=str(about.get("env_name", "")))
@@ -94,8 +94,9 @@ def _write(path: Path, source: Source, video: bool) -> None:
         data.attrs["env_args"] = json.dumps(about | {"control_freq": source.hz})
         file.create_dataset("mask/train", data=np.array(names, h5py.string_dtype()))
         if source.origin:
-            # A dataset, as attributes hold 64 kB.
-            file.create_dataset(base.OURS, data=json.dumps(source.origin))
+            # Bytes of a dataset: attributes hold 64 kB, and a damaged string hangs HDF5.
+            said = json.dumps(source.origin).encode()
+            file.create_dataset(base.OURS, data=np.frombuffer(said, np.uint8))
 
 
 def _plain(array: np.ndarray) -> np.ndarray:
@@ -129,6 +130,10 @@ def _datasets(group: Any) -> dict[str, Any]:
     found = {}
     group.visititems(lambda name, item: found.update({name: item} if _is_data(item) else {}))
     return found
+
+
+def _is_bytes(item: Any) -> bool:
+    return _is_data(item) and item.dtype == np.uint8 and item.ndim == 1
 
 
 def _is_data(item: Any) -> bool:

@@ -5,7 +5,8 @@ meta/episode_ends   [E] int64, first frame after each episode
 """
 
 import contextlib
-from collections.abc import Collection, Iterator
+import math
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from starjax.data.formats import base
 from starjax.data.formats.base import Column, Source
 
 _CHUNK_BYTES = 2_000_000  # as Diffusion Policy has them
+_MOST_CHUNKS = 1_000_000  # of a column of an episode
 
 
 def named(column: str) -> str:
@@ -45,8 +47,7 @@ def _open(path: Path) -> Iterator[Source]:
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
         first, last = int(starts[episode]), int(ends[episode])
         for name in names:
-            base.require_fits(name, (last - first, *columns[name].shape), columns[name].dtype)
-            base.require_fits(f"{name}'s chunks", arrays[name].chunks, columns[name].dtype)
+            _require_readable(name, arrays[name], (last - first, *columns[name].shape))
         return {name: np.asarray(arrays[name][first:last]) for name in names}
 
     said = root.attrs.asdict()
@@ -113,7 +114,17 @@ class _Buffer:
 def _array(root: Any, name: str) -> Any:
     found = root[name]
     base.require(isinstance(found, zarr.Array), f"an array {name}", type(found).__name__)
+    _require_readable(name, found, found.shape)
     return found
+
+
+def _require_readable(name: str, array: Any, shape: Sequence[int]) -> None:
+    """Raises Damaged for sizes that a damaged header claims, in numbers or in chunks."""
+    base.require(min(array.chunks, default=1) > 0, f"chunks of {name}", list(array.chunks))
+    base.require_fits(name, shape, array.dtype)
+    base.require_fits(f"{name}'s chunks", array.chunks, array.dtype)
+    count = math.prod(-(-size // chunk) for size, chunk in zip(shape, array.chunks))
+    base.require(count <= _MOST_CHUNKS, f"{_MOST_CHUNKS} chunks of {name} at most", count)
 
 
 def _recognises(path: Path) -> bool:
