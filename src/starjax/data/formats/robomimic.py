@@ -50,7 +50,8 @@ def _open(path: Path) -> Iterator[Source]:
         found = {int(match[1]): name for name in data if (match := _DEMO.fullmatch(name))}
         demos = [data[found[number]] for number in sorted(found)]
         base.require(bool(demos), "groups data/demo_<i>", sorted(data)[:5])
-        first, ours = _datasets(demos[0]), file.get(base.OURS)
+        first: dict[str, Any] = _datasets(demos[0])
+        ours: Any = file.get(base.OURS)
         lengths = [_length(demo) for demo in demos]
         columns = {
             name: Column(dataset.shape[1:], dataset.dtype.name)
