@@ -2,7 +2,7 @@
 
 It reads where the tip is off the page, presses the page's hotkeys until the tip is at the mark,
 waits for the strict success and saves. The episode must then load as a dataset that one can train
-on. Needs `playwright` and a Chromium (named by CHROMIUM, else `chromium`): neither is in the extras.
+on. Needs `playwright` and a Chromium (named by CHROMIUM, else `chromium`); no extra brings them.
 Run as a script, or by pytest, which skips it where something is missing.
 """
 

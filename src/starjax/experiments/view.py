@@ -1,7 +1,7 @@
 """`starjax view`: a page in the browser with a policy, an expert or recorded episodes at work."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +18,7 @@ The scene in 3D, the camera's picture, RCM error and plan. Drag a trocar by its 
 policy goes on through it. Ctrl-C closes the page."""
 
 Port = Annotated[int, Range(0, 65_535)]
+Show = Callable[[Any, Callable[[], bool]], str]  # (server, should_stop) -> a last line
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,17 +51,27 @@ def main(argv: Sequence[str]) -> int:
     xla.require_devices("starjax.viewer.view")
 
     from starjax.viewer import server as pages
-    from starjax.viewer import view
 
-    asked = _asked(chosen)
+    show = _dataset(chosen.dataset) if chosen.dataset else _live(chosen)
     with signals.stop_signals() as should_stop, pages.opened(chosen.port) as server:
         print(f"open {pages.address(server)} in a browser; Ctrl-C closes it", flush=True)
-        print(view.run(server, asked, should_stop))
+        print(show(server, should_stop))
     return 0
 
 
-def _asked(chosen: Options) -> Any:
-    """Who is shown, where."""
+def _dataset(folder: str) -> Show:
+    """What shows recorded episodes."""
+    from starjax.viewer import browse, recorded
+
+    try:
+        found = recorded.opened(Path(folder))
+    except ValueError as error:  # of a damaged file, which it names
+        raise errors.UsageError("--dataset", "a folder of demonstrations", error) from error
+    return lambda server, should_stop: browse.run(server, found, should_stop)
+
+
+def _live(chosen: Options) -> Show:
+    """What shows somebody at work."""
     from starjax.sim import registry
     from starjax.viewer import actors, view
 
@@ -75,7 +86,8 @@ def _asked(chosen: Options) -> Any:
     count = len(registry.tasks.get(who[0].task).is_seen)
     if chosen.trocar >= count:
         raise errors.UsageError("--trocar", f"0 to {count - 1}", chosen.trocar)
-    return view.Asked(tuple(who), chosen.arm or view.THEIRS, chosen.trocar, chosen.seed)
+    asked = view.Asked(tuple(who), chosen.arm or view.THEIRS, chosen.trocar, chosen.seed)
+    return lambda server, should_stop: view.run(server, asked, should_stop)
 
 
 def _actor(policy: str, run: str, task: str) -> Any:

@@ -12,8 +12,8 @@ from starjax.viewer.handles import TrocarHandles
 from starjax.viewer.plots import Plots
 from starjax.viewer.simulation import Simulation
 from starjax.viewer.stage import Stage
+from starjax.viewer.words import Status
 
-_MEASURED = 300  # pixels, width of the panel of plots and pictures
 _APART = 0.75  # m between two of them
 _SELDOM = 3  # control steps between two pictures and plots
 _REST_S = 1.5  # after an episode, until the next trial
@@ -27,7 +27,7 @@ class Rollouts:
       hz: control steps a second. trial: number of the present one.
     """
 
-    def __init__(self, server: Any, simulations: Sequence[Simulation], status: Any):
+    def __init__(self, server: Any, simulations: Sequence[Simulation], status: Status):
         self._server, self._simulations, self._status = server, simulations, status
         env, gui = simulations[0].env, server.gui
         self.hz, self._limit = env.control_hz, round(env.task.time_limit_s * env.control_hz)
@@ -39,10 +39,8 @@ class Rollouts:
             for i, simulation in enumerate(simulations)
         ]
         self._handles = TrocarHandles(server.scene, env.task)
-        self._measured = gui.add_panel()
-        self._measured.dock_left()
-        self._measured.set_width(_MEASURED)
-        with self._measured.add_tab("Measured"):
+        self._measured, tab = panel.beside(gui, "Measured")
+        with tab:
             self._plots = Plots(gui, labels, self.hz)
             self._pictures = panel.Pictures(gui, labels)
         self._tally = np.zeros((len(simulations), 2), int)  # succeeded, ended
@@ -98,15 +96,15 @@ class Rollouts:
             self._plots.draw()
             looks = [one.look(c) for one, c in zip(self._simulations, self._carries)]
             self._pictures.show([np.asarray(next(iter(look.values()))) for look in looks])
-            self._status.content = "\n\n".join(map(self._line, range(len(self._stages))))
+            self._status.say("\n\n".join(map(self._line, range(len(self._stages)))))
 
     def _line(self, i: int) -> str:
-        """Status of a rollout, as Markdown."""
+        """Status of a rollout."""
         frame, (won, ended) = self._frames[i], self._tally[i]
         now = self._ends[i] or self._simulations[i].env.task.stages[int(frame.stage)]
         error = 1e3 * float(np.max(frame.rcm_error))
         return (
-            f"**{self._simulations[i].label}**, trial {self.trial}: "
-            f"{frame.step / self.hz:.1f} s, *{now}*  \n"
+            f"{self._simulations[i].label}, trial {self.trial}: "
+            f"{frame.step / self.hz:.1f} s, {now}\n"
             f"RCM error {error:.2f} mm; success so far: {won} of {ended}"
         )

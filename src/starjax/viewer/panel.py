@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 NOBODY = "nobody"
+_WIDTH = 300  # pixels, of the panel of plots and pictures
 
 
 @dataclasses.dataclass
@@ -83,6 +84,14 @@ class Choices:
             dropdown.options = tuple(names)
         if dropdown.value != value:
             dropdown.value = value
+
+
+def beside(gui: Any, label: str) -> tuple[Any, Any]:
+    """A panel at the left: it, which can be removed, and its tab, to be filled in a `with`."""
+    panel = gui.add_panel()
+    panel.dock_left()
+    panel.set_width(_WIDTH)
+    return panel, panel.add_tab(label)
 
 
 class Pictures:

@@ -51,7 +51,7 @@ def light(server: Any) -> None:
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map("studio", environment_intensity=0.18)
     scene.add_light_directional(
-        "/sun", color=_WARM, intensity=1.1, cast_shadow=True, position=(0.3, -0.25, 0.6)
+        "/sun", color=_WARM, intensity=1.1, cast_shadow=False, position=(0.3, -0.25, 0.6)
     )
     server.initial_camera.position = (0.34, -0.27, 0.27)
     server.initial_camera.look_at = (0.0, 0.0, 0.08)

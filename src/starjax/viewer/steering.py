@@ -41,16 +41,18 @@ class Steering(NamedTuple):
         evaluation.
       step: (EnvState `[1]`, actions `[A, 4]`, openings `[A]`) -> (EnvState `[1]`, Moment).
       look: EnvState `[1]` -> camera's name -> `[h, w, 3]` uint8.
+      compile: () -> None, all of these; else their first calls do.
     """
 
     env: sim_env.Env
     start: Callable[[int, int, int], tuple[Any, Frame, np.ndarray, np.ndarray]]
     step: Callable[[Any, np.ndarray, np.ndarray], tuple[Any, Moment]]
     look: Callable[[Any], dict[str, jax.Array]]
+    compile: Callable[[], None]
 
 
 def make(env: sim_env.Env) -> Steering:
-    """Compiles nothing yet: the first call of each function does."""
+    """Makes the functions of an environment."""
     space = rcm.ACTION_SPACES["rcm4"]
 
     @jax.jit
@@ -86,7 +88,11 @@ def make(env: sim_env.Env) -> Steering:
         state, moment = step(state, np.float32(action), np.float32(opening))
         return state, jax.device_get(moment)
 
-    return Steering(env, begin, advance, look)
+    def compile_all() -> None:
+        state, _, actions, openings = begin(0, 0, 0)
+        look(advance(state, actions, openings)[0])
+
+    return Steering(env, begin, advance, look, compile_all)
 
 
 def _frame(env: sim_env.Env, state: Any) -> Frame:

@@ -16,6 +16,7 @@ from starjax.viewer.pilot import Pilot
 from starjax.viewer.recorder import Recorder
 from starjax.viewer.stage import Stage
 from starjax.viewer.steering import Steering
+from starjax.viewer.words import Status, notify
 
 _SELDOM = 3  # control steps between two pictures
 
@@ -87,7 +88,7 @@ def run(
 ) -> str:
     """Lets a person demonstrate until `should_stop()`; returns a line about what was kept."""
     env, gui, wishes = steering.env, server.gui, Wishes()
-    status = gui.add_markdown("Compiling: about a minute the first time, seconds later.")
+    status = Status(gui, "Compiling\nAbout a minute the first time, seconds later.")
     gui.add_markdown(f"Strict success: {env.task.words.strict}.")
     buttons = gui.add_button_group("", ("Save", "Discard"), hint="Enter, Backspace")
     buttons.on_click(lambda event: setattr(wishes, event.target.value.lower(), True))
@@ -99,6 +100,7 @@ def run(
     chosen = gui.add_dropdown("Trocar", names, initial_value=names[trocar])
     chosen.on_update(lambda _: setattr(wishes, "other", True))
     pilot = Pilot(server, env.task.arms, _axes(env), device)
+    steering.compile()  # not while a hand waits for the first motion
     episode = Episode(server, steering, pilot, seed)
 
     def begin() -> None:
@@ -120,7 +122,7 @@ def run(
         clock.wait()
         episode.advance(recorder)
         if clock.steps % _SELDOM == 0:
-            status.content = _said(env, episode, recorder, clock)
+            status.say(_said(env, episode, recorder, clock))
     return f"{recorder.kept} episodes kept; {clock.missed} of {clock.steps} control steps late"
 
 
@@ -129,24 +131,24 @@ def _saved(server: Any, recorder: Recorder, episode: Episode) -> bool:
     try:
         folder = recorder.save(episode.configuration, episode.trial)
     except files.StorageError as error:
-        server.gui.add_notification("Not saved", str(error), color="red")
+        notify(server, "Not saved", str(error), is_bad=True)
         return False
     kind = "" if episode.frame.success else ", which training leaves out"
-    server.gui.add_notification("Saved", f"{folder}{kind}", auto_close_seconds=4.0)
+    notify(server, "Saved", f"{folder}{kind}")
     return True
 
 
 def _said(env: Any, episode: Episode, recorder: Recorder, clock: Clock) -> str:
-    """What goes on, as Markdown."""
+    """What goes on."""
     frame: Frame = episode.frame
     tips = "; ".join(" ".join(f"{1e3 * x:.1f}" for x in p) for p in frame.p_world_tip)
     now = episode.end or env.task.stages[int(frame.stage)]
     if not recorder.length:
         now = "waits for your hand"
     return (
-        f"**{now}**, {recorder.length / env.control_hz:.1f} s recorded  \n"
-        f"tip {tips} mm, RCM error {1e3 * float(np.max(frame.rcm_error)):.2f} mm  \n"
-        f"{recorder.kept} successful episodes kept; {clock.missed} of {clock.steps} steps late"
+        f"{now}, {recorder.length / env.control_hz:.1f} s recorded\n"
+        f"tip {tips} mm, RCM error {1e3 * float(np.max(frame.rcm_error)):.2f} mm\n"
+        f"{recorder.kept} successful episodes kept; {clock.missed} steps late"
     )
 
 

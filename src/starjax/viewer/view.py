@@ -9,6 +9,7 @@ from starjax.viewer import actors, panel
 from starjax.viewer.actors import Actor
 from starjax.viewer.beside import Rollouts
 from starjax.viewer.clock import Clock
+from starjax.viewer.words import Status, notify
 
 THEIRS = "their own"  # of arms
 
@@ -31,7 +32,7 @@ class Asked(NamedTuple):
 def run(server: Any, asked: Asked, should_stop: Callable[[], bool]) -> str:
     """Shows rollouts until `should_stop()`; returns a line about what was shown."""
     wishes = panel.Wishes()
-    status = server.gui.add_markdown("")
+    status = Status(server.gui)
     player = panel.Player(server.gui, wishes)
     cast = Cast(server.gui, wishes, asked)
     rollouts = _built(server, cast, status)
@@ -117,15 +118,15 @@ class Cast:
         return list(self._known(task))
 
 
-def _built(server: Any, cast: Cast, status: Any) -> Rollouts:
+def _built(server: Any, cast: Cast, status: Status) -> Rollouts:
     """Compiles what was chosen, or the same without the arm that cannot do it."""
     who = cast.actors()
     labels = " and ".join(actor.label for actor in who)
-    status.content = f"Compiling **{labels}**: about a minute the first time, seconds later."
+    status.say(f"Compiling {labels}\nAbout a minute the first time, seconds later.")
     try:
         found = [actors.simulate(actor, cast.arms) for actor in who]
     except errors.UsageError as error:  # an arm without a mount for this task
-        server.gui.add_notification("Not possible", str(error), auto_close_seconds=10.0)
+        notify(server, "Not possible", str(error), is_bad=True)
         found = [actors.simulate(actor) for actor in who]
     return Rollouts(server, found, status)
 
