@@ -10,6 +10,7 @@ from starjax.sim.camera import geometry
 from starjax.viewer import shapes
 
 _CELL, _SECTION = 0.01, 0.05  # m, squares of a grid
+_DIM = 0.45  # of colours: the page's lights are brighter than the simulator's
 _ABOVE = 2e-4  # m, of a grid over its plane
 
 # (qpos `[Q]`, p_world_trocar `[A, 3]` m, rgb `[G, 3]` in [0, 1], or None for the last ones)
@@ -106,4 +107,4 @@ def _places(part: shapes.Instances, poses: Poses) -> np.ndarray:
 
 
 def _bytes(rgb: np.ndarray) -> np.ndarray:
-    return np.clip(255.0 * rgb + 0.5, 0, 255).astype(np.uint8)
+    return np.clip(255.0 * _DIM * rgb + 0.5, 0, 255).astype(np.uint8)

@@ -11,7 +11,6 @@ HOST = "127.0.0.1"
 PORT = 8080
 ANY = 0  # a port that the system chooses
 _TEAL = (0, 84, 74)
-_WARM = (255, 244, 229)
 
 
 @contextlib.contextmanager
@@ -33,7 +32,10 @@ def opened(port: int = PORT, label: str = "starjax", host: str = HOST) -> Iterat
         server.gui.configure_theme(
             brand_color=_TEAL, show_logo=False, show_share_button=False, control_width="medium"
         )
-        light(server)
+        # The lights stay viser's own: others flicker whenever an embedded playback begins again.
+        server.initial_camera.position = (0.28, -0.22, 0.24)
+        server.initial_camera.look_at = (0.0, 0.0, 0.07)
+        server.initial_camera.near = 0.005
         yield server
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
@@ -43,16 +45,3 @@ def opened(port: int = PORT, label: str = "starjax", host: str = HOST) -> Iterat
 def address(server: Any) -> str:
     """What to open in a browser."""
     return f"http://{server.get_host()}:{server.get_port()}"
-
-
-def light(server: Any) -> None:
-    """Lights the scene, and looks at it from where the trocar and the table are seen well."""
-    scene = server.scene
-    scene.configure_default_lights(enabled=False)
-    scene.configure_environment_map("studio", environment_intensity=0.18)
-    scene.add_light_directional(
-        "/sun", color=_WARM, intensity=1.1, cast_shadow=False, position=(0.3, -0.25, 0.6)
-    )
-    server.initial_camera.position = (0.34, -0.27, 0.27)
-    server.initial_camera.look_at = (0.0, 0.0, 0.08)
-    server.initial_camera.near = 0.005
