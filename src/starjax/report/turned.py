@@ -39,7 +39,7 @@ def record(runs: Sequence[results.Run]) -> Turned | None:
     model = scene.compose(names)
     rollouts = [
         recorded.frames(
-            one.rollout.qpos,
+            np.asarray(one.rollout.qpos),
             np.asarray(one.rollout.p_world_trocar),
             one.rollout.p_world_tip,
             None,

@@ -11,10 +11,9 @@ from starjax.viewer.frame import outcome
 from starjax.viewer.handles import TrocarHandles
 from starjax.viewer.plots import Plots
 from starjax.viewer.simulation import Simulation
-from starjax.viewer.stage import Stage
+from starjax.viewer.stage import Stage, aim
 from starjax.viewer.words import Status
 
-_APART = 0.75  # m between two of them
 _SELDOM = 3  # control steps between two pictures and plots
 _REST_S = 1.5  # after an episode, until the next trial
 _PAUSED_S = 0.02  # between two looks at the page
@@ -33,11 +32,10 @@ class Rollouts:
         self.hz, self._limit = env.control_hz, round(env.task.time_limit_s * env.control_hz)
         labels = [simulation.label for simulation in simulations]
         self._stages = [
-            Stage(
-                server.scene, simulation.env.scene.mj_model, f"/rollout{i}", (0.0, _APART * i, 0.0)
-            )
+            Stage(server.scene, simulation.env.scene.mj_model, i)
             for i, simulation in enumerate(simulations)
         ]
+        aim(server, len(simulations))
         self._handles = TrocarHandles(server.scene, env.task)
         self._measured, tab = panel.beside(gui, "Measured")
         with tab:

@@ -8,7 +8,7 @@ from starjax.data import store
 from starjax.viewer import panel, recorded
 from starjax.viewer.clock import Clock
 from starjax.viewer.plots import Plots
-from starjax.viewer.stage import Stage
+from starjax.viewer.stage import Stage, aim
 from starjax.viewer.words import Status, notify
 
 _SELDOM = 3  # control steps between two pictures and plots
@@ -26,7 +26,8 @@ class Episode:
         self._server, self._dataset = server, dataset
         self.hz = float(dataset.description["control_hz"])
         self._status = Status(server.gui)
-        self._stage = Stage(server.scene, dataset.model, "/rollout", (0.0, 0.0, 0.0))
+        self._stage = Stage(server.scene, dataset.model)
+        aim(server, 1)
         _, tab = panel.beside(server.gui, "Recorded")
         with tab:
             self._plots = Plots(server.gui, ["recorded"], self.hz)

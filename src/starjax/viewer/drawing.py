@@ -10,7 +10,9 @@ from starjax.sim.camera import geometry
 from starjax.viewer import shapes
 
 _CELL, _SECTION = 0.01, 0.05  # m, squares of a grid
-_DIM = 0.45  # of colours: the page's lights are brighter than the simulator's
+# Of colours: viser's own lights are brighter than the simulator's. Others would flicker whenever an
+# embedded playback begins again.
+_DIM = 0.45
 _ABOVE = 2e-4  # m, of a grid over its plane
 
 # (qpos `[Q]`, p_world_trocar `[A, 3]` m, rgb `[G, 3]` in [0, 1], or None for the last ones)

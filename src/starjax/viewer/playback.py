@@ -7,9 +7,8 @@ import numpy as np
 
 from starjax.viewer import server as pages
 from starjax.viewer.frame import Frame
-from starjax.viewer.stage import Stage
+from starjax.viewer.stage import Stage, aim
 
-_APART = 0.75  # m between two rollouts
 _REST_S = 1.0  # that the last moment stays
 _EVERY = 2  # control steps between two moments: 15 a second play smoothly
 
@@ -26,10 +25,8 @@ def html(
     """
     shown = [list(frames[: round(longest_s * hz)]) for frames in rollouts]
     with pages.opened(pages.ANY) as server:
-        stages = [
-            Stage(server.scene, model, f"/rollout{i}", (0.0, _APART * i, 0.0))
-            for i in range(len(shown))
-        ]
+        stages = [Stage(server.scene, model, i) for i in range(len(shown))]
+        aim(server, len(shown))
         for stage, frames in zip(stages, shown):
             stage.show(frames[0])
         recording = server.get_scene_serializer()

@@ -32,10 +32,6 @@ def opened(port: int = PORT, label: str = "starjax", host: str = HOST) -> Iterat
         server.gui.configure_theme(
             brand_color=_TEAL, show_logo=False, show_share_button=False, control_width="medium"
         )
-        # The lights stay viser's own: others flicker whenever an embedded playback begins again.
-        server.initial_camera.position = (0.28, -0.22, 0.24)
-        server.initial_camera.look_at = (0.0, 0.0, 0.07)
-        server.initial_camera.near = 0.005
         yield server
     finally:
         with contextlib.redirect_stdout(io.StringIO()):

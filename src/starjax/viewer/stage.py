@@ -9,18 +9,18 @@ import numpy as np
 from starjax.viewer import drawing
 from starjax.viewer.frame import Frame
 
+_APART = 0.6  # m between two rollouts
 _TRAIL = 90  # moments that the tip's path stays
 _WIDTH = 0.0008  # m
 _TRAIL_RGB, _PLAN_RGB = (96, 125, 139), (0, 150, 136)
 
 
 class Stage:
-    """Draws frames of one rollout below the node `root`, `offset` m from the world's origin."""
+    """Draws frames of rollout number `i`, beside those before it."""
 
-    def __init__(
-        self, scene: Any, model: mujoco.MjModel, root: str, offset: tuple[float, float, float]
-    ):
-        self._root = scene.add_frame(root, show_axes=False, position=offset)
+    def __init__(self, scene: Any, model: mujoco.MjModel, i: int = 0):
+        root = f"/rollout{i}"
+        self._root = scene.add_frame(root, show_axes=False, position=(0.0, _APART * i, 0.0))
         self._show = drawing.add(scene, model, f"{root}/geoms")
         self._tips = collections.deque[np.ndarray](maxlen=_TRAIL)
         blank = np.zeros((1, 2, 3), np.float32)
@@ -42,6 +42,15 @@ class Stage:
     def remove(self) -> None:
         """Takes all of it off the page."""
         self._root.remove()
+
+
+def aim(server: Any, rollouts: int) -> None:
+    """Points a new page's camera so that it sees all rollouts."""
+    back = 1.0 + 0.9 * (rollouts - 1)
+    middle = 0.5 * _APART * (rollouts - 1)
+    server.initial_camera.position = (0.28 * back, middle - 0.22, 0.07 + 0.17 * back)
+    server.initial_camera.look_at = (0.0, middle, 0.07)
+    server.initial_camera.near = 0.005
 
 
 def _segments(p: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from starjax.viewer.devices import Device
 from starjax.viewer.frame import Frame, outcome
 from starjax.viewer.pilot import Pilot
 from starjax.viewer.recorder import Recorder
-from starjax.viewer.stage import Stage
+from starjax.viewer.stage import Stage, aim
 from starjax.viewer.steering import Steering
 from starjax.viewer.words import Status, notify
 
@@ -43,7 +43,8 @@ class Episode:
         self._steering, self._pilot, self._seed = steering, pilot, seed
         env = steering.env
         self.limit = round(env.task.time_limit_s * env.control_hz)
-        self._stage = Stage(server.scene, env.scene.mj_model, "/rollout", (0.0, 0.0, 0.0))
+        self._stage = Stage(server.scene, env.scene.mj_model)
+        aim(server, 1)
         self._picture = server.gui.add_image(np.zeros((2, 2, 3), np.uint8), label="Camera")
 
     def begin(self, configuration: int, trial: int) -> None:
