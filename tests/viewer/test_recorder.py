@@ -53,16 +53,24 @@ def test_episodes_load_as_demonstrations(root, steered):
 
 def test_more_can_be_added_and_numbers_go_on(root, steered):
     with recorder.opened(root, steered.env, SEED) as kept:
-        assert (kept.kept, kept.next_trial(2), kept.next_trial(9), kept.next_trial(0)) == (3, 3, 1, 0)
+        assert (kept.kept, kept.next_trial(2), kept.next_trial(9), kept.next_trial(0)) == (
+            3,
+            3,
+            1,
+            0,
+        )
         kept.add(None)
         kept.discard()
         assert kept.length == 0
 
 
 def test_a_folder_is_one_process_at_a_time_and_one_dataset(root, steered):
-    with recorder.opened(root, steered.env, SEED):
-        with pytest.raises(files.StorageError), recorder.opened(root, steered.env, SEED):
-            pass
+    with (
+        recorder.opened(root, steered.env, SEED),
+        pytest.raises(files.StorageError),
+        recorder.opened(root, steered.env, SEED),
+    ):
+        pass
     with pytest.raises(files.StorageError), recorder.opened(root, steered.env, SEED + 1):
         pass
 

@@ -32,9 +32,7 @@ def test_undisturbed_it_is_the_episode_of_an_evaluation(who):
     }
     batch, params = acting[who]
     trocars = env.task.trocars
-    run = engine.make(
-        env, batch, trocars, engine.Settings(seed, None, 60, lanes=1), episodes.SCORE
-    )
+    run = engine.make(env, batch, trocars, engine.Settings(seed, None, 60, lanes=1), episodes.SCORE)
     (progress,) = [p for p in run(params, [trial]) if p.ended]
     expected = progress.ended[0].joined("reached_p")
     live = simulation.make(who, env, batch, params)
@@ -60,7 +58,9 @@ def test_a_plan_is_shown_from_its_next_command_on():
 
 def test_what_stays_keeps_its_bits_and_what_moves_is_told(env):
     state = jax.eval_shape(
-        lambda: env.reset(jax.random.key(0), simulation.sim_env.EnvParams(rcm.Trocar(*[[0.02]] * 3)))
+        lambda: env.reset(
+            jax.random.key(0), simulation.sim_env.EnvParams(rcm.Trocar(*[[0.02]] * 3))
+        )
     )
     frame = rcm.trocar_frame(
         rcm.Trocar(*np.float32([[0.04], [1.4], [0.3]])), env.p_world_ref, np.zeros(1)

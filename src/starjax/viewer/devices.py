@@ -23,11 +23,15 @@ class Reading(NamedTuple):
     buttons: tuple[bool, bool]
 
 
+class Gone(OSError):
+    """A device that can no longer be read."""
+
+
 class Device(NamedTuple):
     """A device that is open.
 
     Attributes:
-      read: () -> Reading, at once.
+      read: () -> Reading, at once; raises `Gone`.
       close: ends it.
     """
 
@@ -43,11 +47,16 @@ def _spacemouse() -> Device:
         hint = "on Linux the user needs the right to read it: a udev rule for vendor 256f"
         raise errors.UsageError("--device", "a SpaceMouse", error, hint) from error
 
+    unplugged = _library("easyhid", "spacemouse").HIDException
+
     def read() -> Reading:
         before = None
-        state = mouse.read()
-        while state.t != before:  # all that it has sent since
-            before, state = state.t, mouse.read()
+        try:
+            state = mouse.read()
+            while state.t != before:  # all that it has sent since
+                before, state = state.t, mouse.read()
+        except unplugged as error:
+            raise Gone(str(error)) from error
         pressed = [*map(bool, state.buttons), False, False]
         found = np.array([state.yaw, state.x, state.y, state.z])
         return Reading(np.clip(found, -1.0, 1.0), (pressed[0], pressed[1]))
@@ -66,6 +75,8 @@ def _gamepad() -> Device:
 
     def read() -> Reading:
         library.event.pump()
+        if not library.joystick.get_count():
+            raise Gone("it was unplugged")
         # left stick: right and away; right stick: roll and up
         sticks = np.array([pad.get_axis(i) for i in range(4)])
         sticks = np.where(np.abs(sticks) < _DEAD, 0.0, sticks)

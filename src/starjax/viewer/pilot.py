@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from starjax.viewer import hand as hands
-from starjax.viewer.devices import Device
+from starjax.viewer.devices import Device, Gone, Reading
+from starjax.viewer.words import notify
 
 KEY_STEP = 0.0015  # m a stroke, with a scale of 1; holding a key repeats it
 KEY_TURN = 0.05  # rad
@@ -39,7 +40,7 @@ class Pilot:
     """
 
     def __init__(self, server: Any, arms: int, axes: np.ndarray, device: Device | None):
-        self._axes, self._device = axes, device
+        self._server, self._axes, self._device = server, axes, device
         self._buttons = (False, False)
         self._strokes: queue.SimpleQueue[tuple[np.ndarray, bool]] = queue.SimpleQueue()
         gui = server.gui
@@ -96,8 +97,8 @@ class Pilot:
             stroke, turns = self._strokes.get()
             by += steps * np.array([stroke[0], *(self._axes @ stroke[1:])])
             squeezes ^= turns
-        if self._device:
-            reading, before = self._device.read(), self._buttons
+        if reading := self._reading():
+            before = self._buttons
             by += hands.increment(reading.deflection, self._axes, scale, period)
             self._buttons = reading.buttons
             pressed = [now and not once for now, once in zip(reading.buttons, before)]
@@ -105,6 +106,15 @@ class Pilot:
             if pressed[1]:
                 self._toggle_clutch()
         return by, squeezes
+
+    def _reading(self) -> Reading | None:
+        """A look at the device; after it has gone, none: the page's own hands go on."""
+        try:
+            return self._device.read() if self._device else None
+        except Gone as error:
+            self._device = None
+            notify(self._server, "The device has gone", str(error), is_bad=True)
+            return None
 
     def _settle(self) -> None:
         """The handle returns to the tip that is asked for."""
