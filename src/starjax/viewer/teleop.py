@@ -100,7 +100,7 @@ def run(
     names = view.trocar_names(env.task.name)
     chosen = gui.add_dropdown("Trocar", names, initial_value=names[trocar])
     chosen.on_update(lambda _: setattr(wishes, "other", True))
-    pilot = Pilot(server, env.task.arms, _axes(env), device)
+    pilot = Pilot(server, env.task.arms, axes_of(env), device)
     steering.compile()  # not while a hand waits for the first motion
     episode = Episode(server, steering, pilot, seed)
 
@@ -153,7 +153,7 @@ def _said(env: Any, episode: Episode, recorder: Recorder, clock: Clock) -> str:
     )
 
 
-def _axes(env: Any) -> np.ndarray:
+def axes_of(env: Any) -> np.ndarray:
     """The world's directions as a person sees them who looks at the first camera's picture."""
     import mujoco
 
