@@ -10,6 +10,7 @@ import stubs
 from starjax import rcm
 from starjax.rollouts import agent, engine, episodes
 from starjax.sim import moving
+from starjax.types import Command
 from starjax.viewer import simulation
 from starjax.viewer.frame import outcome
 
@@ -39,7 +40,7 @@ def test_undisturbed_it_is_the_episode_of_an_evaluation(who):
     carry, frame = live.start(seed, *trial)
     for t, p in enumerate(expected):
         carry, frame = live.step(carry, frame.p_world_trocar)
-        np.testing.assert_array_equal(frame.p_world_tip, p)
+        np.testing.assert_allclose(frame.p_world_tip, p, rtol=0, atol=1e-6)
         assert frame.step == t + 1
     assert bool(frame.success) == progress.ended[0].outcome["success"]
 
@@ -75,6 +76,25 @@ def test_what_stays_keeps_its_bits_and_what_moves_is_told(env):
         np.testing.assert_allclose(
             rcm.trocar_position(told.trocar, env.p_world_ref), place, atol=1e-7
         )
+
+
+def test_what_was_planned_is_carried_to_where_the_trocar_is():
+    random = np.random.default_rng(0)
+    before, now = np.float32(0.02 * random.normal(size=(2, 50, 3)) + [0, 0, 0.15])
+    action = np.float32(random.normal(size=(50, 4)) * [1, 0.03, 0.03, 0.02] + [0, 0, 0, 0.03])
+    place = rcm.trocar_from_position(before, [0.0, 0.0, 0.15])
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, place, [0.0, 0.0, 0.15])
+    command = Command(pose, np.ones(50, np.float32))
+    found = moving.carried(command, before, now)
+    assert np.max(rcm.rcm_error(found.pose, now)) < 1e-6
+    np.testing.assert_array_equal(found.pose.p, pose.p)
+    stays = moving.carried(command, before, before)
+    np.testing.assert_array_equal(stays.pose.R, pose.R)
+    missed = command._replace(pose=pose._replace(p=pose.p + np.float32([0.0, 0.001, 0.001])))
+    free = np.asarray(rcm.rcm_error(missed.pose, before)) > moving.HELD
+    left = moving.carried(missed, before, now).pose
+    np.testing.assert_array_equal(left.R[free], missed.pose.R[free])
+    assert free.sum() > 40
 
 
 def test_a_dragged_trocar_is_followed_and_the_task_is_done_through_it(expert):

@@ -6,6 +6,9 @@ import numpy as np
 
 from starjax import rcm
 from starjax.sim.state import Env, EnvState
+from starjax.types import Command, Pose
+
+HELD = 1e-5  # m; a commanded shaft this near to its trocar was meant to pass it
 
 
 def trocars_to(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvState:
@@ -27,6 +30,27 @@ def trocars_to(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvState
         for frame in (state.trocar, state.told)
     )
     return state.replace(trocar=trocar, told=told)
+
+
+def carried(command: Command, p_before: jax.Array, p_now: jax.Array) -> Command:
+    """A command that was planned for trocars elsewhere: a shaft that passed its trocar passes it.
+
+    The tip is kept and the tool turned, see `rcm.project`. A command that missed its trocar, as
+    free poses do, and one whose trocar has not moved are left as they are.
+
+    Args:
+      command: `[..., A]`.
+      p_before, p_now: `[..., A, 3]` m, trocars at the time of the plan and now.
+    """
+    held = rcm.rcm_error(command.pose, p_before) < HELD
+    is_other = (held & jnp.any(p_before != p_now, axis=-1))[..., None]
+    turned = rcm.project(command.pose, p_now)
+    return command._replace(
+        pose=Pose(
+            jnp.where(is_other[..., None], turned.R, command.pose.R),
+            jnp.where(is_other, turned.p, command.pose.p),
+        )
+    )
 
 
 def toward(here: jax.Array, there: jax.Array, most: float) -> jax.Array:

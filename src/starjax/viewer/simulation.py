@@ -1,7 +1,7 @@
 """A closed loop of one episode, compiled: start, step, look. Trocars follow where one drags them.
 
 Undisturbed it is the loop of `rollouts.engine`: a trial's seed, trocar and number give the same
-episode here and in an evaluation, up to the last bits of another batch size.
+episode here and in an evaluation, but for the last bits of another program.
 """
 
 from collections.abc import Callable
@@ -23,11 +23,13 @@ TROCAR_SPEED = 0.03
 
 
 class Carry(NamedTuple):
-    """An episode under way: EnvState and the agent's memory, `[1]` each, control steps taken."""
+    """An episode under way: EnvState and the agent's memory, `[1]` each, control steps taken, and
+    `[1, A, 3]` m, where the trocars were at the last plan."""
 
     env: Any
     memory: Any
     t: jax.Array
+    planned: Any = None
 
 
 class Simulation(NamedTuple):
@@ -52,6 +54,7 @@ class Simulation(NamedTuple):
 def make(label: str, env: sim_env.Env, agent: BatchAgent, params: Any = None) -> Simulation:
     """Compiles nothing yet: the first call of each function does."""
     observe = jax.vmap(env.observe)
+    execute = agent.about.get("execute", 0)
 
     @jax.jit
     def start(params: Any, key: jax.Array, trocar: Trocar) -> tuple[Carry, Frame]:
@@ -59,7 +62,7 @@ def make(label: str, env: sim_env.Env, agent: BatchAgent, params: Any = None) ->
         state = env.reset(key_env, sim_env.EnvParams(trocar))
         state = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
         memory = agent.init(params, key_agent[None], state, lambda: observe(state))
-        carry = Carry(state, memory, jnp.zeros((), jnp.int32))
+        carry = Carry(state, memory, jnp.zeros((), jnp.int32), state.trocar.p_world_trocar)
         return carry, frame(env, carry)
 
     @jax.jit
@@ -73,8 +76,11 @@ def make(label: str, env: sim_env.Env, agent: BatchAgent, params: Any = None) ->
         executed, memory, _ = agent.act(
             params, carry.memory, before, lambda: observe(before), carry.t
         )
-        carry = Carry(jax.vmap(env.step)(before, executed), memory, carry.t + 1)
-        return carry, frame(env, carry, agent.about.get("execute", 0))
+        now = before.trocar.p_world_trocar
+        planned = jnp.where(carry.t % max(execute, 1) == 0, now, carry.planned)
+        executed = moving.carried(executed, planned, now)
+        carry = Carry(jax.vmap(env.step)(before, executed), memory, carry.t + 1, planned)
+        return carry, frame(env, carry, execute)
 
     @jax.jit
     def look(carry: Carry) -> dict[str, jax.Array]:
