@@ -18,7 +18,8 @@ ROWS = (
     ("policies",),
     ("training", "evaluation"),
     ("deploy", "envs"),
-    ("viewer", "report"),
+    ("viewer",),
+    ("report",),
     ("commands",),
 )
 COMMANDS = {"experiments", "doctor", "cli", "__main__"}  # one layer

@@ -64,6 +64,16 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "tables, figures, video, page from results",
         ("sim", "report"),
     ),
+    "view": (
+        "starjax.experiments.view",
+        "a policy, an expert or a dataset at work, live in a browser",
+        (*_LEARNING, "viewer"),
+    ),
+    "teleop": (
+        "starjax.experiments.teleop",
+        "demonstrate by hand in a browser; episodes become a dataset",
+        (*_LEARNING, "viewer"),
+    ),
     "list": ("starjax.experiments.list_command", "what flags can name", ("sim",)),
     "place": (
         "starjax.experiments.place",

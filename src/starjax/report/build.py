@@ -1,11 +1,11 @@
-"""Builds the report of one or many runs: tables.md, figures, rollout.mp4, index.html."""
+"""Builds the report of one or many runs: tables, figures, rollouts filmed and in 3D, the page."""
 
 import functools
 import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from starjax import methods
+from starjax import errors, methods
 from starjax.report import (
     compare,
     figures,
@@ -16,6 +16,7 @@ from starjax.report import (
     style,
     tables,
     trajectories,
+    turned,
     video,
 )
 from starjax.runtime import files
@@ -49,8 +50,10 @@ def build(
         pairs, drawn = _figures(loaded, focus)
         film = _film(loaded, out / _FILM, report) if with_video and recorded else None
         clip = film.read_bytes() if film else None
-        html = page.render(loaded, focus, pairs, clip)
+        solid = _turned(loaded, report) if with_video and recorded else None
+        html = page.render(loaded, focus, pairs, clip, solid)
         made = {"tables.md": text.encode(), **drawn, "index.html": html.encode()}
+        made |= {_SOLID: solid.html.encode()} if solid else {}
         for name, data in made.items():
             files.write_bytes(out / name, data)
         for name in _NAMES.difference(made, [film.name] if film else []):
@@ -60,8 +63,9 @@ def build(
 
 _FIGURES = ("training", "ports", "fig3", "fig4")
 _FILM = "rollout.mp4"
+_SOLID = "rollout.html"
 # Of files that a report may have or not.
-_NAMES = {_FILM, *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf"))}
+_NAMES = {_FILM, _SOLID, *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf"))}
 
 
 def _order(run: results.Run) -> int:
@@ -114,6 +118,15 @@ def _film(
     if film is None:
         report("no video: no trial was recorded with its joint positions")
     return film
+
+
+def _turned(runs: Sequence[results.Run], report: Callable[[str], None]) -> turned.Turned | None:
+    """Rollouts in 3D, or None, after a line where that has a reason."""
+    try:
+        return turned.record(runs)
+    except (OSError, RuntimeError, errors.UsageError) as error:  # no port, or an unknown scene
+        report(f"no rollouts in 3D: {error}")
+        return None
 
 
 def _focus(runs: Sequence[results.Run]) -> results.Run:

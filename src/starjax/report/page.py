@@ -1,9 +1,12 @@
-"""One self-contained HTML page of a report: no scripts, no links to other files."""
+"""One self-contained HTML page of a report, without links to other files.
+
+Its only script is that of the rollouts in 3D, which are a page in a frame.
+"""
 
 import importlib.resources
 from collections.abc import Mapping, Sequence
 
-from starjax.report import captions, compare, markup, results, sections
+from starjax.report import captions, compare, markup, results, sections, turned
 from starjax.sim.tasks.base import Words
 
 # name -> (light PNG, dark PNG)
@@ -35,7 +38,11 @@ CAPTIONS = {
 
 
 def render(
-    runs: Sequence[results.Run], focus: results.Run, figures: Figures, video: bytes | None
+    runs: Sequence[results.Run],
+    focus: results.Run,
+    figures: Figures,
+    video: bytes | None,
+    solid: turned.Turned | None = None,
 ) -> str:
     """The page of `runs`, whose headline numbers are those of `focus`."""
     several = len(runs) > 1
@@ -47,6 +54,7 @@ def render(
         sections.warnings(runs),
         sections.cards(focus),
         _video(video, compare.observed(runs), words),
+        _turned(solid),
         sections.comparison(runs) if several else sections.tests(focus),
         _figure("fig3", figures, words),
         _figure("fig4", figures, words),
@@ -89,4 +97,17 @@ def _video(video: bytes | None, observed: str, words: Words) -> str:
         f'<figure><video controls loop muted autoplay playsinline src="{source}"></video>'
         f"<figcaption>The policy, which sees the {observed}, at work in real time. The disc on the "
         f"shaft is the trocar; {words.goal}.</figcaption></figure>"
+    )
+
+
+def _turned(solid: turned.Turned | None) -> str:
+    """The rollouts in 3D, which a browser sets up when somebody opens them."""
+    if solid is None:
+        return ""
+    said = f"In 3D, to be turned with the mouse: {solid.said}"
+    return (
+        f"<details><summary>{markup.escape(said)}</summary>"
+        f'<iframe title="{markup.escape(said)}" loading="lazy" sandbox="allow-scripts" '
+        f'style="width:100%;height:32rem;border:0" srcdoc="{markup.escape(solid.html)}"></iframe>'
+        "</details>"
     )

@@ -1,6 +1,5 @@
 """The simulated scene of a result, set up again for figures and the video."""
 
-import types
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -77,7 +76,7 @@ def camera(names: SceneNames, size: int) -> Draw:
 
     @jax.jit
     def batch(qpos: jax.Array, p_world_trocar: jax.Array, labels: dict[str, Any]) -> jax.Array:
-        rgb = _marked(made, labels, jnp.asarray(made.geom_rgb))
+        rgb = scene.marked(made.task, made.bound, labels, jnp.asarray(made.geom_rgb))
         return jax.lax.map(lambda q: one(q, p_world_trocar, rgb), qpos)
 
     def draw(
@@ -90,11 +89,3 @@ def camera(names: SceneNames, size: int) -> Draw:
             return np.asarray(found)
 
     return draw
-
-
-def _marked(made: Any, labels: dict[str, Any], rgb: Any) -> Any:
-    """Colours with the goal marked, as far as the labels of an episode tell it."""
-    try:
-        return made.task.colours(made.bound, types.SimpleNamespace(**labels), rgb)
-    except AttributeError:  # the task's colours ask for more of the layout than was recorded
-        return rgb

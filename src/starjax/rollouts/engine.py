@@ -221,7 +221,7 @@ def _advancer(
             return t + 1, carry, jax.tree.map(put, records, fields)
 
         _, carry, records = jax.lax.while_loop(is_running, body, (first, carry, blank))
-        return carry, records, _status(env, carry)
+        return carry, records, status(env, carry)
 
     return advance
 
@@ -246,9 +246,10 @@ def frame(env: Any, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
     return jax.eval_shape(one, jax.random.key(0))
 
 
-def _status(env: Any, carry: Carry) -> dict[str, Any]:
+def status(env: Any, carry: Carry) -> dict[str, Any]:
+    """How N episodes stand: `over`, `length`, `episodes.FLAGS`, `stage`, `labels`, `[N]` each."""
     state = carry.env
-    status = {
+    found = {
         "over": state.done,
         "length": carry.length,
         "success": state.success & ~state.invalid,
@@ -260,4 +261,4 @@ def _status(env: Any, carry: Carry) -> dict[str, Any]:
         "labels": jax.vmap(env.labels)(state),
     }
     # Copied, as the next segment is given the carry's memory before the host has read this.
-    return jax.tree.map(jnp.copy, status)
+    return jax.tree.map(jnp.copy, found)

@@ -4,7 +4,8 @@ Names of arm i begin with `arm<i>/` in the composed model, those of its tool wit
 `mjcf/README.md` says what a part must offer.
 """
 
-from collections.abc import Sequence
+import types
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -166,6 +167,14 @@ def chain_at(bound: BoundArm, p_world_trocar: jax.Array) -> ik.Chain:
     if not bound.arm.remote_centre:
         return bound.chain
     return bound.chain.replace(p_base=p_world_trocar + bound.base_offset)
+
+
+def marked(task: Task, bound: Any, labels: Mapping[str, Any], rgb: Any) -> Any:
+    """Colours `[G, 3]` with the goal marked, as far as the labels of an episode tell it."""
+    try:
+        return task.colours(bound, types.SimpleNamespace(**labels), rgb)
+    except AttributeError:  # the task's colours ask for more of the layout than was recorded
+        return rgb
 
 
 def tcp(i: int, tool: Tool) -> str:

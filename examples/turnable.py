@@ -1,0 +1,38 @@
+"""Writes a page in which a scene moves and can be turned with the mouse, without a server.
+
+Needs the extra `viewer`. Here joints sway about their home: put coordinates that you recorded in
+their place, such as `qpos.npy` of an episode.
+"""
+
+import pathlib
+
+import numpy as np
+
+from starjax.sim import scene
+from starjax.viewer import playback, recorded
+
+HZ, SECONDS = 30.0, 3.0
+
+
+def main() -> None:
+    names = scene.name("reach", arms=["panda"])
+    loaded = scene.load(names)
+    (arm,) = loaded.arms
+    phase = np.linspace(0.0, 2.0 * np.pi, round(HZ * SECONDS))
+    qpos = np.tile(loaded.mj_model.qpos0, (len(phase), 1))
+    qpos[:, arm.q] = arm.home + 0.1 * np.sin(phase)[:, None]
+    frames = recorded.frames(
+        qpos,
+        p_world_trocar=loaded.p_world_ref,
+        p_world_tip=np.zeros((len(phase), 1, 3)),
+        rcm_error=None,
+        rgb=loaded.geom_rgb,
+    )
+    page = playback.html(loaded.mj_model, [frames], HZ, longest_s=SECONDS)
+    path = pathlib.Path("turnable.html")
+    path.write_text(page)
+    print(f"open {path} in a browser: {len(page) / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()

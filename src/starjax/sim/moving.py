@@ -1,0 +1,60 @@
+"""Trocars that move during an episode, as those of a patient who is turned or breathes do."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import rcm
+from starjax.sim.state import Env, EnvState
+from starjax.types import Command, Pose
+
+HELD = 1e-5  # m; a commanded shaft this near to its trocar was meant to pass it
+
+
+def trocars_to(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvState:
+    """The state with its trocars elsewhere, of which agents are told; what stays keeps its bits.
+
+    The arms have not moved: until they do, their tools miss the trocars. The next steps bring them
+    back at the controller's own pace (`sim.control`).
+
+    Args:
+      p_world_trocar: `[A, 3]` m.
+    """
+    is_moved = jnp.any(p_world_trocar != state.trocar.p_world_trocar)
+    roll_zero = np.array([slot.roll_zero for slot in env.task.slots], np.float32)
+    moved = rcm.trocar_frame(
+        rcm.trocar_from_position(p_world_trocar, env.p_world_ref), env.p_world_ref, roll_zero
+    )
+    trocar, told = (
+        jax.tree.map(lambda new, old: jnp.where(is_moved, new, old), moved, frame)
+        for frame in (state.trocar, state.told)
+    )
+    return state.replace(trocar=trocar, told=told)
+
+
+def carried(command: Command, p_before: jax.Array, p_now: jax.Array) -> Command:
+    """A command that was planned for trocars elsewhere: a shaft that passed its trocar passes it.
+
+    The tip is kept and the tool turned, see `rcm.project`. A command that missed its trocar, as
+    free poses do, and one whose trocar has not moved are left as they are.
+
+    Args:
+      command: `[..., A]`.
+      p_before, p_now: `[..., A, 3]` m, trocars at the time of the plan and now.
+    """
+    held = rcm.rcm_error(command.pose, p_before) < HELD
+    is_other = (held & jnp.any(p_before != p_now, axis=-1))[..., None]
+    turned = rcm.project(command.pose, p_now)
+    return command._replace(
+        pose=Pose(
+            jnp.where(is_other[..., None], turned.R, command.pose.R),
+            jnp.where(is_other, turned.p, command.pose.p),
+        )
+    )
+
+
+def toward(here: jax.Array, there: jax.Array, most: float) -> jax.Array:
+    """`[..., 3]` m: from `here` to `there`, `most` m at most."""
+    way = there - here
+    length = jnp.linalg.norm(way, axis=-1, keepdims=True)
+    return jnp.where(length > most, here + way * (most / jnp.maximum(length, 1e-9)), there)

@@ -1,0 +1,25 @@
+"""Environments that the viewer's tests share: the real simulator, `reach`, states instead of
+pictures."""
+
+import pytest
+
+from starjax.rollouts import agent
+from starjax.sim import env as sim_env
+from starjax.viewer import simulation, steering
+
+
+@pytest.fixture(scope="session")
+def env():
+    return sim_env.make("reach", observation="state", image_size=32)
+
+
+@pytest.fixture(scope="session")
+def expert(env):
+    """The closed loop of the scripted expert."""
+    return simulation.make("expert", env, agent.from_single(env.task.experts["default"]()))
+
+
+@pytest.fixture(scope="session")
+def steered(env):
+    """The same in a person's hands."""
+    return steering.make(env)

@@ -1,0 +1,54 @@
+"""Devices by their libraries, which are stood for here; `tests/peers` has a real one of them."""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+
+from starjax import errors
+from starjax.viewer import devices
+
+
+def test_a_device_without_its_library_is_a_mistake(monkeypatch):
+    for name, package in (("spacemouse", "pyspacemouse"), ("gamepad", "pygame")):
+        monkeypatch.setitem(sys.modules, package, None)
+        with pytest.raises(errors.UsageError) as raised:
+            devices.opened(name)
+        assert package in raised.value.hint
+
+
+def pygame(count=1):
+    pad = types.SimpleNamespace(axes=[0.0] * 4, pressed=set())
+    pad.get_axis, pad.get_button = lambda i: pad.axes[i], lambda i: i in pad.pressed
+    stick = types.SimpleNamespace(
+        init=lambda: None, get_count=lambda: count, Joystick=lambda i: pad
+    )
+    library = types.SimpleNamespace(
+        display=types.SimpleNamespace(init=lambda: None),
+        event=types.SimpleNamespace(pump=lambda: None),
+        joystick=stick,
+        quit=lambda: None,
+    )
+    return library, pad, stick
+
+
+def test_a_gamepad(monkeypatch):
+    library, pad, stick = pygame()
+    monkeypatch.setitem(sys.modules, "pygame", library)
+    device = devices.opened("gamepad")
+    pad.axes = [0.05, 0.02, -0.03, 0.0]  # as sticks rest
+    np.testing.assert_array_equal(device.read().deflection, 0.0)
+    pad.axes, pad.pressed = [1.0, -0.5, 0.25, -1.0], {1}  # right, away, roll, up
+    reading = device.read()
+    np.testing.assert_allclose(reading.deflection, [-0.25, 1.0, 0.5, 1.0])
+    assert reading.buttons == (False, True)
+    stick.get_count = lambda: 0
+    with pytest.raises(devices.Gone):
+        device.read()
+
+
+def test_no_gamepad_is_a_mistake(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", pygame(count=0)[0])
+    with pytest.raises(errors.UsageError):
+        devices.opened("gamepad")

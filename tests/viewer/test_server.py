@@ -1,0 +1,65 @@
+"""The page's server and what one drags on it; nobody is connected."""
+
+import socket
+
+import numpy as np
+import pytest
+
+from starjax import errors
+from starjax.sim import registry
+from starjax.viewer import handles
+from starjax.viewer import server as pages
+
+
+@pytest.fixture(scope="module")
+def page():
+    with pages.opened(pages.ANY) as server:
+        yield server
+
+
+def test_only_this_machine_is_served(page):
+    assert page.get_host() == "127.0.0.1" and pages.address(page).startswith("http://127.0.0.1:")
+    with socket.create_connection(("127.0.0.1", page.get_port()), timeout=5):
+        pass
+
+
+def test_a_second_viewer_on_the_port_is_a_mistake_and_leaves_the_first(page):
+    with pytest.raises(errors.UsageError) as raised, pages.opened(page.get_port()):
+        pass
+    assert raised.value.argument == "port" and raised.value.got == page.get_port()
+    with socket.create_connection(("127.0.0.1", page.get_port()), timeout=5):
+        pass
+
+
+def test_a_closed_page_gives_its_port_back():
+    with pages.opened(pages.ANY) as server:
+        port = server.get_port()
+    with pages.opened(port) as server:
+        assert server.get_port() == port
+
+
+def test_a_dragged_trocar_stays_where_the_arms_reach(page):
+    task = registry.tasks.get("peg_transfer")
+    found = handles.TrocarHandles(page.scene, task)
+    found.place(np.array([[0.02, 0.0, 0.15]]))
+    (handle,) = found._handles
+    handle.position = (0.3, 0.0, 0.15)  # as the page's message does
+    np.testing.assert_allclose(found.wanted(), [[0.05, 0.0, 0.15]], atol=1e-6)
+    handle.position = (0.01, 0.02, 0.152)
+    np.testing.assert_allclose(found.wanted(), [[0.01, 0.02, 0.152]], atol=1e-6)
+    found.remove()
+
+
+@pytest.mark.parametrize("name", ["peg_transfer", "peg_transfer_bimanual"])
+def test_within_is_a_projection_onto_the_workspace(name):
+    random = np.random.default_rng(0)
+    for slot in registry.tasks.get(name).slots:
+        space = registry.workspaces.get(slot.workspace)
+        for p in random.normal(scale=0.1, size=(20, 3)) + slot.p_world_ref:
+            found = handles.within(slot, p)
+            offset = found - np.array(slot.p_world_ref)
+            radius = np.linalg.norm(offset)
+            assert space.radius[0] - 1e-6 <= radius <= space.radius[1] + 1e-6
+            polar = np.arccos(offset[2] / max(radius, 1e-9))
+            assert radius < 1e-6 or space.polar[0] - 1e-3 <= polar <= space.polar[1] + 1e-3
+            np.testing.assert_allclose(handles.within(slot, found), found, atol=1e-6)

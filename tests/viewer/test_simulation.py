@@ -1,0 +1,112 @@
+"""The live loop: an evaluation's episodes while nobody disturbs it, and trocars that move."""
+
+import types
+
+import jax
+import numpy as np
+import pytest
+import stubs
+
+from starjax import rcm
+from starjax.rollouts import agent, engine, episodes
+from starjax.sim import moving
+from starjax.types import Command
+from starjax.viewer import simulation
+from starjax.viewer.frame import outcome
+
+
+def stubbed():
+    """The point masses, with what the page shows of a scene."""
+    env = stubs.make_env(unlucky=0.0)
+    nothing = types.SimpleNamespace(bound=None, geom_rgb=np.zeros((1, 3)))
+    task = env.task._replace(colours=lambda bound, layout, rgb: rgb)
+    return env._replace(scene=nothing, task=task)
+
+
+@pytest.mark.parametrize("who", ["expert", "policy"])
+def test_undisturbed_it_is_the_episode_of_an_evaluation(who):
+    env, seed, trial = stubbed(), 5, (3, 2)
+    sample, params = stubs.make_policy()
+    acting = {
+        "expert": (agent.from_single(stubs.EXPERT), None),
+        "policy": (agent.from_policy(sample, 2, 4), (params, 1.0)),
+    }
+    batch, params = acting[who]
+    trocars = env.task.trocars
+    run = engine.make(env, batch, trocars, engine.Settings(seed, None, 60, lanes=1), episodes.SCORE)
+    (progress,) = [p for p in run(params, [trial]) if p.ended]
+    expected = progress.ended[0].joined("reached_p")
+    live = simulation.make(who, env, batch, params)
+    carry, frame = live.start(seed, *trial)
+    for t, p in enumerate(expected):
+        carry, frame = live.step(carry, frame.p_world_trocar)
+        np.testing.assert_allclose(frame.p_world_tip, p, rtol=0, atol=1e-6)
+        assert frame.step == t + 1
+    assert bool(frame.success) == progress.ended[0].outcome["success"]
+
+
+def test_a_plan_is_shown_from_its_next_command_on():
+    env = stubbed()
+    sample, params = stubs.make_policy(horizon=6)
+    live = simulation.make("policy", env, agent.from_policy(sample, 2, 4), (params, 0.0))
+    carry, frame = live.start(0, 0, 0)
+    for _ in range(6):
+        carry, frame = live.step(carry, frame.p_world_trocar)
+        ahead = carry.memory.command.pose.p[0, (int(frame.step) - 1) % 4 + 1]
+        np.testing.assert_array_equal(frame.plan[0], ahead)
+        assert frame.plan.shape == (6, 1, 3)
+
+
+def test_what_stays_keeps_its_bits_and_what_moves_is_told(env):
+    state = jax.eval_shape(
+        lambda: env.reset(
+            jax.random.key(0), simulation.sim_env.EnvParams(rcm.Trocar(*[[0.02]] * 3))
+        )
+    )
+    frame = rcm.trocar_frame(
+        rcm.Trocar(*np.float32([[0.04], [1.4], [0.3]])), env.p_world_ref, np.zeros(1)
+    )
+    state = state.replace(trocar=frame, told=frame)
+    same = moving.trocars_to(env, state, frame.p_world_trocar)
+    jax.tree.map(np.testing.assert_array_equal, same.trocar, frame)
+    place = np.float32([[0.01, -0.02, 0.152]])
+    other = moving.trocars_to(env, state, place)
+    for told in (other.trocar, other.told):
+        np.testing.assert_allclose(told.p_world_trocar, place, atol=1e-7)
+        np.testing.assert_allclose(
+            rcm.trocar_position(told.trocar, env.p_world_ref), place, atol=1e-7
+        )
+
+
+def test_what_was_planned_is_carried_to_where_the_trocar_is():
+    random = np.random.default_rng(0)
+    before, now = np.float32(0.02 * random.normal(size=(2, 50, 3)) + [0, 0, 0.15])
+    action = np.float32(random.normal(size=(50, 4)) * [1, 0.03, 0.03, 0.02] + [0, 0, 0, 0.03])
+    place = rcm.trocar_from_position(before, [0.0, 0.0, 0.15])
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, place, [0.0, 0.0, 0.15])
+    command = Command(pose, np.ones(50, np.float32))
+    found = moving.carried(command, before, now)
+    assert np.max(rcm.rcm_error(found.pose, now)) < 1e-6
+    np.testing.assert_array_equal(found.pose.p, pose.p)
+    stays = moving.carried(command, before, before)
+    np.testing.assert_array_equal(stays.pose.R, pose.R)
+    missed = command._replace(pose=pose._replace(p=pose.p + np.float32([0.0, 0.001, 0.001])))
+    free = np.asarray(rcm.rcm_error(missed.pose, before)) > moving.HELD
+    left = moving.carried(missed, before, now).pose
+    np.testing.assert_array_equal(left.R[free], missed.pose.R[free])
+    assert free.sum() > 40
+
+
+def test_a_dragged_trocar_is_followed_and_the_task_is_done_through_it(expert):
+    carry, frame = expert.start(0, 0, 0)
+    wanted = frame.p_world_trocar + np.float32([[-0.03, 0.02, 0.0]])
+    errors, speed = [], []
+    while not outcome(frame) and frame.step < 300:
+        before = frame.p_world_trocar
+        carry, frame = expert.step(carry, wanted)
+        errors.append(float(frame.rcm_error[0]))
+        speed.append(float(np.linalg.norm(frame.p_world_trocar - before)) * 30)
+    assert outcome(frame) == "success" and not frame.collided
+    np.testing.assert_allclose(frame.p_world_trocar, wanted, atol=1e-6)
+    assert max(speed) < 1.001 * simulation.TROCAR_SPEED
+    assert max(errors) < 5e-3 and errors[-1] < 1e-4  # it lags behind the hand, and arrives
