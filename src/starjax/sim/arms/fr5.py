@@ -4,6 +4,13 @@ import math
 
 from starjax.sim.arms.base import Arm, Mount
 
+_OVERHEAD = Mount(
+    position=(-0.456, 0.237, -0.04),
+    yaw=-2.238,
+    turn=-1.587,
+    home=(-1.55, -1.491, 1.572, -1.582, -1.624, -0.628),
+)
+
 ARM = Arm(
     name="fr5",
     mjcf="arms/fr5/fr5.xml",
@@ -31,5 +38,6 @@ ARM = Arm(
             turn=-1.75,
             home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
         ),
+        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
     },
 )

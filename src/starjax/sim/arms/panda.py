@@ -9,6 +9,13 @@ _LEFT = Mount(
     home=(-0.276, -0.869, 0.005, -2.188, -0.003, 1.752, 1.073),
 )
 
+_OVERHEAD = Mount(
+    position=(-0.312, 0.191, -0.291),
+    yaw=0.432,
+    turn=-1.199,
+    home=(-0.812, -0.446, -0.089, -1.841, -0.08, 1.319, 0.723),
+)
+
 ARM = Arm(
     name="panda",
     mjcf="arms/panda/panda.xml",
@@ -25,6 +32,7 @@ ARM = Arm(
         ),
         ("grasper", "left"): _LEFT,
         ("grasper", "right"): opposite(_LEFT),
+        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
     },
     rest_gain=0.1,
     link_radius=0.055,

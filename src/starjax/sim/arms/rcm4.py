@@ -12,6 +12,13 @@ from starjax.sim.arms.base import Arm, Mount, opposite
 _BOARD = Mount(position=(0.0, 0.0, 0.0), yaw=-math.pi / 2, turn=0.0, home=(0.0, 0.0, 0.11, 0.0))
 _LEFT = Mount(position=(0.0, 0.0, 0.0), yaw=-1.522, turn=0.044, home=(0.432, 0.02, 0.122, 0.0))
 
+_OVERHEAD = Mount(
+    position=(0.0, 0.0, 0.0),
+    yaw=-1.571,
+    turn=2.534,
+    home=(-0.088, 0.0, 0.087, -2.534),
+)
+
 ARM = Arm(
     name="rcm4",
     mjcf="arms/rcm4/rcm4.xml",
@@ -23,6 +30,7 @@ ARM = Arm(
         ("grasper", "board"): _BOARD,
         ("grasper", "left"): _LEFT,
         ("grasper", "right"): opposite(_LEFT),
+        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
     },
     link_radius=0.02,
     remote_centre=True,
