@@ -65,3 +65,10 @@ OVERHEAD = BOARD._replace(
     high=(0.032, 0.028, 0.094),
     rolls=(-0.3, 0.3),
 )
+
+# Where a tool holds a ring on a wire along y by its tab.
+WIRE = BOARD._replace(
+    low=(-0.012, -0.045, 0.026),
+    high=(0.012, 0.045, 0.066),
+    rolls=(-1.0, 1.0),
+)

@@ -4,6 +4,12 @@ import math
 
 from starjax.sim.arms.base import Arm, Mount
 
+_BOARD = Mount(
+    position=(-0.58, 0.0, 0.20),
+    yaw=math.pi,
+    turn=-1.75,  # j6 stays far from its limits over all trocars
+    home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
+)
 _OVERHEAD = Mount(
     position=(-0.456, 0.237, -0.04),
     yaw=-2.238,
@@ -19,12 +25,8 @@ ARM = Arm(
     max_speed=(3.15,) * 6,  # the slower joints of the data sheet
     servo_frequency=100.0,
     mounts={
-        ("grasper", "board"): Mount(
-            position=(-0.58, 0.0, 0.20),
-            yaw=math.pi,
-            turn=-1.75,  # j6 stays far from its limits over all trocars
-            home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
-        ),
+        ("grasper", "board"): _BOARD,
+        ("grasper_wide", "wire"): _BOARD,
         # Two arms at either side of the board.
         ("grasper", "left"): Mount(
             position=(-0.58, 0.0, 0.20),

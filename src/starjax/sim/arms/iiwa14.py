@@ -31,6 +31,7 @@ ARM = Arm(
     servo_frequency=100.0,
     mounts={
         ("grasper", "board"): _MOUNT,
+        ("grasper_wide", "wire"): _MOUNT,
         ("grasper", "left"): _MOUNT,
         ("grasper", "right"): opposite(_MOUNT),
         **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
