@@ -25,7 +25,7 @@ DISTANCE = 0.06  # of the target from the lens
 CENTRE = (0.0, 0.0, 0.022)
 REACH = (0.032, 0.024, 0.012)
 SHARES = (0.7, 0.3)
-RATES = ((0.35, 0.6), (0.8, 1.2))  # rad/s, ranges: 13 mm/s on the whole, 30 at most
+RATES = ((0.35, 0.6), (0.8, 1.2))  # rad/s, ranges
 
 # Where an episode begins.
 TIP_HOME = (0.0, 0.0, 0.085)

@@ -1,9 +1,9 @@
 """Scripted expert of needle hand-over: pick up, meet in the air, take over, hold.
 
-The tools hold the wire two segments apart, the one that takes over nearer to its own side. Which
-pair of segments is drawn among those across which both jaws open without much of a turn; wanted
-positions never look at a trocar. It tries again where a tool has missed the wire; a needle that is
-dropped is a failure.
+The tools hold the wire two to four segments apart, the one that takes over nearer to its own side.
+Which pair is drawn among those across which both jaws open without much of a turn; wanted positions
+never look at a trocar. It tries again where a tool has missed the wire; a needle that is dropped is
+a failure.
 """
 
 import flax.struct
@@ -15,8 +15,8 @@ from starjax import rcm
 from starjax.sim.state import EnvState
 from starjax.sim.tasks import scripting
 from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.tasks.needle_handover.task import PARK
 from starjax.sim.tasks.needle_pick import task as single
-from starjax.sim.tasks.peg_transfer_bimanual.task import PARK
 from starjax.types import Agent, Command
 
 PHASES = (
@@ -47,7 +47,8 @@ ASIDE = 150.0  # 1/m, what it is worth that the taker's segment lies on its own 
 DEVIATION = (0.001, 0.001, 0.001, 0.04)  # m and rad, of the disturbance of each arm
 CORRELATION, SMOOTHING = 0.4, 0.15  # s
 MIDDLES, TANGENTS = single.segments()
-PAIRS = np.array([(1, 3), (2, 4), (3, 5), (3, 1), (4, 2), (5, 3)])  # giver's and taker's segment
+INNER = range(1, single.SEGMENTS - 1)
+PAIRS = np.array([(a, b) for a in INNER for b in INNER if abs(a - b) > 1])  # giver's, taker's
 
 
 @flax.struct.dataclass

@@ -14,10 +14,11 @@ from starjax.sim import bodies
 from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
 from starjax.sim.tasks.needle_handover import words
 from starjax.sim.tasks.needle_pick import task as single
-from starjax.sim.tasks.peg_transfer_bimanual.task import PARK, SPREAD
-from starjax.sim.tasks.peg_transfer_bimanual.task import TASK as OTHER
 from starjax.types import Agent, Pose
 
+# Where the tips start, and an idle one waits: so near the middle that the shafts lean apart.
+PARK = ((-0.012, 0.0, 0.065), (0.012, 0.0, 0.065))
+SPREAD = 0.005  # each axis, at most
 # Where the needle lies: on the side of the tool that picks it up.
 PLACE = (-0.024, 0.0)
 PLACE_SPREAD = (0.012, 0.02)  # either way
@@ -122,6 +123,27 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 
 
+def _trocars() -> rcm.Trocar:
+    """Twelve pairs of trocars, each on its arm's side, 10 to 16 cm apart; the last four unseen."""
+    turn = (-24.0, -8.0, 8.0, 24.0)
+    pairs = [
+        (
+            (0.07 - 0.015 * (k % 2), 85.0 + 10.0 * (k // 2 % 2), 180.0 + turn[k % 4]),
+            (0.055 + 0.015 * (k % 2), 95.0 - 10.0 * (k // 4), turn[(3 * k + 1) % 4]),
+        )
+        for k in range(8)
+    ]
+    pairs += [
+        ((0.08, 80.0, 151.0), (0.08, 100.0, 29.0)),
+        ((0.08, 100.0, 209.0), (0.08, 80.0, -29.0)),
+        ((0.05, 90.0, 180.0), (0.05, 90.0, 0.0)),
+        ((0.08, 90.0, 180.0), (0.08, 90.0, 0.0)),
+    ]
+    radius, polar, azimuth = np.moveaxis(np.array(pairs), -1, 0)
+    fields = (radius, np.deg2rad(polar), np.deg2rad(azimuth))
+    return rcm.Trocar(*(field.astype(np.float32) for field in fields))
+
+
 def _nothing(bound: single.Bound, layout: Layout, facts: Facts) -> Capsules:
     """The needle is no obstacle: it gives way."""
     return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
@@ -163,5 +185,5 @@ TASK = Task(
     floor=single.FLOOR,
     is_sound=single.is_sound,
     outline=words.outline,
-    trocars=OTHER.trocars,
+    trocars=_trocars(),
 )
