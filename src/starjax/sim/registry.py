@@ -37,7 +37,7 @@ workspaces = Registry(
     "workspace",
     {
         name: f"starjax.sim.workspaces:{name.upper()}"
-        for name in ("board", "left", "right", "overhead", "wire")
+        for name in ("board", "left", "right", "tissue", "wire")
     },
 )
 

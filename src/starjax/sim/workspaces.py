@@ -59,7 +59,7 @@ RIGHT = LEFT._replace(
 )
 
 # Where the lens of an endoscope is that looks down on a target from 6 cm; its trocar lies higher.
-OVERHEAD = BOARD._replace(
+TISSUE = BOARD._replace(
     p_world_ref=(0.0, 0.0, 0.18),
     low=(-0.05, -0.028, 0.062),
     high=(0.032, 0.028, 0.094),

@@ -10,7 +10,7 @@ _BOARD = Mount(
     turn=-1.75,  # j6 stays far from its limits over all trocars
     home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
 )
-_OVERHEAD = Mount(
+_TISSUE = Mount(
     position=(-0.456, 0.237, -0.04),
     yaw=-2.238,
     turn=-1.587,
@@ -40,6 +40,6 @@ ARM = Arm(
             turn=-1.75,
             home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
         ),
-        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
+        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
     },
 )

@@ -14,7 +14,7 @@ _MOUNT = Mount(
     tilt=2.171,
 )
 
-_OVERHEAD = Mount(
+_TISSUE = Mount(
     position=(-0.216, 0.101, 1.196),
     yaw=2.361,
     turn=-1.137,
@@ -34,7 +34,7 @@ ARM = Arm(
         ("grasper_wide", "wire"): _MOUNT,
         ("grasper", "left"): _MOUNT,
         ("grasper", "right"): opposite(_MOUNT),
-        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
+        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
     },
     rest_gain=0.1,
     link_radius=0.06,

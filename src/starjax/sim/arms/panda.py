@@ -15,7 +15,7 @@ _WIRE = Mount(
     turn=0.145,
     home=(-0.654, -0.539, 0.013, -2.062, 0.006, 1.523, -0.156),
 )
-_OVERHEAD = Mount(
+_TISSUE = Mount(
     position=(-0.312, 0.191, -0.291),
     yaw=0.432,
     turn=-1.199,
@@ -39,7 +39,7 @@ ARM = Arm(
         ("grasper_wide", "wire"): _WIRE,
         ("grasper", "left"): _LEFT,
         ("grasper", "right"): opposite(_LEFT),
-        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
+        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
     },
     rest_gain=0.1,
     link_radius=0.055,

@@ -18,7 +18,7 @@ _WIRE = Mount(
     turn=2.297,
     home=(0.0, 0.0, 0.089, 2.253),
 )
-_OVERHEAD = Mount(
+_TISSUE = Mount(
     position=(0.0, 0.0, 0.0),
     yaw=-1.571,
     turn=2.534,
@@ -37,7 +37,7 @@ ARM = Arm(
         ("grasper_wide", "wire"): _WIRE,
         ("grasper", "left"): _LEFT,
         ("grasper", "right"): opposite(_LEFT),
-        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
+        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
     },
     link_radius=0.02,
     remote_centre=True,

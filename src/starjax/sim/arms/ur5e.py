@@ -11,7 +11,7 @@ _MOUNT = Mount(
     home=(-0.722, 1.972, 1.911, -2.312, 1.571, 1.653),
 )
 
-_OVERHEAD = Mount(
+_TISSUE = Mount(
     position=(-0.476, 0.231, 0.447),
     yaw=0.819,
     turn=-1.711,
@@ -30,6 +30,6 @@ ARM = Arm(
         ("grasper_wide", "wire"): _MOUNT,
         ("grasper", "left"): _MOUNT,
         ("grasper", "right"): opposite(_MOUNT),
-        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
+        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
     },
 )

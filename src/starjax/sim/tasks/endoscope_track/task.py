@@ -227,7 +227,7 @@ def _expert() -> Agent:
 TASK = Task(
     name="endoscope_track",
     mjcf="tasks/endoscope_track/endoscope_track.xml",
-    slots=(Slot(workspace="overhead", p_world_ref=(0.0, 0.0, 0.18), tool="endoscope"),),
+    slots=(Slot(workspace="tissue", p_world_ref=(0.0, 0.0, 0.18), tool="endoscope"),),
     cameras=(CAMERA, "camera"),
     time_limit_s=30.0,
     settle_steps=1,
