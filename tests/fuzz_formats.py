@@ -20,7 +20,7 @@ from starjax import errors
 from starjax.data.formats import base, exchange
 from starjax.runtime import files
 
-BATCH = 2000  # damages a process
+BATCH = 1000  # damages a process
 JSON_VALUES = (
     None,
     -1,

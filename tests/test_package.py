@@ -38,6 +38,7 @@ HOSTS = {
     "www.w3.org",
 }
 COMMANDS = ["run", "collect", "train", "evaluate", "sweep", "bench", "pack", "report"]
+COMMANDS += ["export", "import", "inspect"]
 HEAVY = ("jax", "mujoco", "flax", "scipy", "matplotlib")
 
 

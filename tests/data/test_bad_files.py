@@ -202,7 +202,7 @@ def test_columns_that_are_not_there_are_named(sound):
         source.read(0, ["actoin"])
 
 
-@pytest.mark.parametrize("name", ["lerobot", "robomimic"])
+@pytest.mark.parametrize("name", NAMES)
 def test_accidents_end_in_arrays_or_in_a_line(tmp_path, name):
     found = fuzz_formats.run(fuzz_formats.prepared(tmp_path, name), name, 120, seed=0)
     assert set(found) == {"read", "refused"}, found

@@ -13,6 +13,8 @@ from starjax import cli, config
 from starjax.experiments import (
     bench,
     evaluate,
+    export_command,
+    import_command,
     options,
     pack,
     presets,
@@ -26,6 +28,7 @@ OPTIONS = {
     **dict.fromkeys(("run", "collect", "train"), config.RunConfig),
     **{"evaluate": evaluate.Options, "sweep": sweep.Options, "bench": bench.Options},
     **{"pack": pack.Options, "report": report_command.Options},
+    **{"export": export_command.Options, "import": import_command.Options},
 }
 
 

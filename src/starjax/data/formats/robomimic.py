@@ -92,7 +92,7 @@ def _write(path: Path, source: Source, video: bool) -> None:
                 demo.create_dataset(name, data=_plain(array), **packed, **chunks)
         data.attrs["total"] = sum(source.lengths)
         about = {"env_name": source.task, "env_type": 2, "env_kwargs": {"robot": source.robot}}
-        data.attrs["env_args"] = json.dumps(about | {"control_freq": source.hz})
+        data.attrs["env_args"] = np.bytes_(json.dumps(about | {"control_freq": source.hz}))
         file.create_dataset("mask/train", data=np.array(names, h5py.string_dtype()))
         if source.origin:
             # Bytes of a dataset: attributes hold 64 kB, and a damaged string hangs HDF5.
@@ -151,6 +151,9 @@ def _length(demo: Any) -> int:
 
 
 def _attribute(data: Any, name: str) -> dict[str, Any]:
+    # HDF5 may hang over a damaged string of any length, so only those of a fixed one are read.
+    if name not in data.attrs or data.attrs.get_id(name).dtype.kind != "S":
+        return {}
     try:
         found = json.loads(data.attrs[name])
     except (KeyError, TypeError, ValueError):
