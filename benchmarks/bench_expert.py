@@ -1,7 +1,7 @@
 """Success of the scripted expert: the task's trocars, and others drawn from Eq. 19.
 
     python benchmarks/bench_expert.py [--per-trocar 100] [--sampled 500] [--seed 2026] \\
-        [--task peg_transfer] [--arm fr5] [--expert default]
+        [--task peg_transfer] [--arm fr5] [--expert default] [--seconds 20]
 
 Demonstrations are worth as much as their expert: this is printed before any figure of a policy.
 """
@@ -18,9 +18,9 @@ import numpy as np
 from starjax import errors, rcm, runtime
 from starjax.evaluation import statistics
 from starjax.sim import env as envs
+from starjax.sim import registry
 from starjax.types import Agent
 
-STEPS = 600  # control steps, 20 s; the limit of a policy's trial is 60 s
 CHUNK = {"cpu": 16}  # episodes at once
 CHUNK_GPU = 600
 
@@ -32,6 +32,7 @@ def main() -> None:
     parser.add_argument("--sampled", type=int, default=500)
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--expert", default="", help="by default the task's first one")
+    parser.add_argument("--seconds", type=float, default=20.0, help="that an episode may take")
     _scene.add_flags(parser)
     arguments = parser.parse_args()
     environment = _scene.make(arguments, observation="state")
@@ -41,27 +42,52 @@ def main() -> None:
     agent, listed = experts[expert](), environment.task.trocars
     key = jax.random.key(arguments.seed)
     twelve = rcm.Trocar(*(jnp.repeat(jnp.asarray(f), arguments.per_trocar, axis=0) for f in listed))
-    shape = (arguments.sampled, environment.task.arms)
-    drawn = rcm.sample_trocar(jax.random.fold_in(key, 1), shape)
+    drawn = _drawn(environment, jax.random.fold_in(key, 1), arguments.sampled)
+    steps = round(arguments.seconds * environment.control_hz)
     results = {
         "seed": arguments.seed,
         "scene": environment.names._asdict(),
         "expert": expert,
-        "twelve": _score(environment, agent, twelve, jax.random.fold_in(key, 2), "the task's"),
-        "eq19": _score(environment, agent, drawn, jax.random.fold_in(key, 3), "from Eq. 19"),
+        "seconds": arguments.seconds,
+        "twelve": _score(
+            environment, agent, twelve, jax.random.fold_in(key, 2), steps, "the task's"
+        ),
+        "eq19": _score(environment, agent, drawn, jax.random.fold_in(key, 3), steps, "from Eq. 19"),
     }
     name = _scene.result_name("expert", environment.names)
     print("written to", _timing.write(name, results))
 
 
+def _drawn(environment: envs.Env, key: jax.Array, count: int) -> rcm.Trocar:
+    """Trocars `[N, A]` drawn from the region of each arm (Eq. 19 with its ranges)."""
+    arms = []
+    for a, slot in enumerate(environment.task.slots):
+        region = registry.workspaces.get(slot.workspace)
+        arms.append(
+            rcm.sample_trocar(
+                jax.random.fold_in(key, a) if a else key,
+                (count,),
+                radius_range=region.radius,
+                polar_range=region.polar,
+                azimuth_range=region.azimuth,
+            )
+        )
+    return jax.tree.map(lambda *fields: jnp.stack(fields, axis=-1), *arms)
+
+
 def _score(
-    environment: envs.Env, agent: Agent, trocars: rcm.Trocar, key: jax.Array, name: str
+    environment: envs.Env,
+    agent: Agent,
+    trocars: rcm.Trocar,
+    key: jax.Array,
+    steps: int,
+    name: str,
 ) -> dict:
     """Outcome of one expert episode at each configuration of trocars `[N, A]`."""
     count = len(trocars.radius)
     chunk = min(count, CHUNK.get(jax.default_backend(), CHUNK_GPU))
     keys = jax.random.split(key, count)
-    run = jax.jit(jax.vmap(lambda key, trocar: _episode(environment, agent, key, trocar)))
+    run = jax.jit(jax.vmap(lambda key, trocar: _episode(environment, agent, key, trocar, steps)))
     start, parts = time.perf_counter(), []
     for first in range(0, count, chunk):
         # The last chunk is filled up with its first lanes, which are not counted.
@@ -69,7 +95,7 @@ def _score(
         part = run(keys[index], jax.tree.map(lambda leaf, i=index: leaf[i], trocars))
         parts.append(jax.tree.map(lambda leaf, f=first: np.asarray(leaf)[: count - f], part))
     outcome = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    success, steps, distances, live = (outcome[k] for k in ("success", "step", "errors", "live"))
+    success, taken, distances, live = (outcome[k] for k in ("success", "step", "errors", "live"))
     low, high = statistics.wilson(int(success.sum()), count)
     executed = distances[live] * 1e3  # of the arm that is farthest off
     summary = {
@@ -79,7 +105,7 @@ def _score(
         "ci95": [low, high],
         "collided": int(outcome["collided"].sum()),
         "invalid": int(outcome["invalid"].sum()),
-        "median_transfer_s": float(np.median(steps[success])) / environment.control_hz,
+        "median_transfer_s": float(np.median(taken[success])) / environment.control_hz,
         "rcm_error_mm": {
             "mean": float(executed.mean()),
             "p99": float(np.quantile(executed, 0.99)),
@@ -92,7 +118,7 @@ def _score(
 
 
 def _episode(
-    environment: envs.Env, agent: Agent, key: jax.Array, trocar: rcm.Trocar
+    environment: envs.Env, agent: Agent, key: jax.Array, trocar: rcm.Trocar, steps: int
 ) -> dict[str, jax.Array]:
     key_reset, key_expert = jax.random.split(key)
     state = environment.reset(key_reset, envs.EnvParams(trocar))
@@ -103,10 +129,10 @@ def _episode(
         after = environment.step(state, command)
         return after, memory, largest.at[state.step].set(jnp.max(after.rcm_error))
 
-    start = (state, agent.init(key_expert, state), jnp.zeros(STEPS))
-    state, _, largest = jax.lax.while_loop(lambda c: ~c[0].done & (c[0].step < STEPS), step, start)
+    start = (state, agent.init(key_expert, state), jnp.zeros(steps))
+    state, _, largest = jax.lax.while_loop(lambda c: ~c[0].done & (c[0].step < steps), step, start)
     names = ("success", "step", "collided", "invalid")
-    live = jnp.arange(STEPS) < state.step
+    live = jnp.arange(steps) < state.step
     return {"errors": largest, "live": live, **{name: getattr(state, name) for name in names}}
 
 

@@ -110,6 +110,24 @@ def _swept(scored: Scored) -> results.Run:
     return scored.swept
 
 
+def _median(scored: Scored) -> str:
+    steps = scored.run.result.figures["steps"]["median"]
+    return "–" if steps is None else f"{steps / scored.run.result.control_hz:.1f}"
+
+
+def _served(scored: Scored, draw: Callable[[dict[str, Any]], str]) -> str:
+    """Of what the clients of a server reported; nothing of trials without one."""
+    said = scored.run.result.about.get("served")
+    return draw(said) if said else "–"
+
+
+def _share(part: str, whole: str) -> Callable[[Scored], str]:
+    def draw(said: dict[str, Any]) -> str:
+        return f"{said[part]} of {said[whole]}: {100 * said[part] / max(said[whole], 1):.1f}%"
+
+    return lambda scored: _served(scored, draw)
+
+
 COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "seen": ("seen", lambda x: rate(_seen(x))),
     "unseen": ("unseen", lambda x: rate(_unseen(x))),
@@ -130,6 +148,19 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "roll": ("held-out roll (deg)", lambda x: _held_out(x, "roll_error_deg")),
     "decision": ("a decision (ms)", lambda x: f"{x.run.result.about['inference_ms']['p50']:.1f}"),
     "time": ("all stages", _time),
+    "late": ("plans late", _share("missed", "plans")),
+    "held": ("steps held", _share("held", "steps")),
+    "limited": ("steps limited", _share("limited", "steps")),
+    "lost": ("questions lost", lambda x: _served(x, lambda said: str(said["lost"]))),
+    "step": (
+        "largest step (mm, rad)",
+        lambda x: _served(x, lambda said: f"{said['move_mm']:.2f}, {said['turn_rad']:.3f}"),
+    ),
+    "off": (
+        "commanded off the trocar, most (mm)",
+        lambda x: _served(x, lambda said: f"{said['rcm_commanded_mm']:.0e}"),
+    ),
+    "median": ("median success (s)", _median),
 }
 
 PARTS: dict[str, Callable[[Scored], Any]] = {

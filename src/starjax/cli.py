@@ -13,6 +13,7 @@ from starjax.runtime import signals
 
 _LEARNING = ("sim", "train")
 _ALL = (*_LEARNING, "report")
+_EXCHANGE = (*_LEARNING, "formats")
 # Subcommand -> (module with `main(argv) -> exit code`, one line of help, extras that it needs).
 COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "run": (
@@ -37,7 +38,27 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         _LEARNING,
     ),
     "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)", _LEARNING),
+    "serve": (
+        "starjax.experiments.serve",
+        "a trained policy for robots elsewhere, over websockets",
+        ("sim", "serve"),
+    ),
     "pack": ("starjax.experiments.pack", "a policy in a file of half the size", _LEARNING),
+    "export": (
+        "starjax.experiments.export_command",
+        "demonstrations as a LeRobot, robomimic or zarr dataset",
+        _EXCHANGE,
+    ),
+    "import": (
+        "starjax.experiments.import_command",
+        "a dataset from LeRobot, robomimic or zarr, to train on",
+        _EXCHANGE,
+    ),
+    "inspect": (
+        "starjax.experiments.inspect_command",
+        "what is in a dataset, policy or result, and what is odd about it",
+        _EXCHANGE,
+    ),
     "report": (
         "starjax.experiments.report_command",
         "tables, figures, video, page from results",

@@ -37,6 +37,8 @@ class SceneConfig:
 class DemosConfig:
     """Demonstrations: how many, and what is recorded."""
 
+    # folder of a dataset to learn from, such as starjax import writes; left out: the expert's
+    from_: str = ""
     per_trocar: Count = 30  # successful demonstrations at each seen trocar (V-A3)
     seen_trocars: Count = 8  # of the task's, to train with, from the first on
     keep_failures: bool = False  # store failed episodes too; training leaves them out

@@ -32,5 +32,8 @@ LEARNERS = Registry(
     {
         "diffusion": "starjax.policies.learners.diffusion:LEARNER",
         "flow": "starjax.policies.learners.flow:LEARNER",
+        "onestep": "starjax.policies.learners.onestep:LEARNER",
+        "act": "starjax.policies.learners.act:LEARNER",
+        "bc": "starjax.policies.learners.bc:LEARNER",
     },
 )

@@ -4,7 +4,8 @@ import runpy
 
 import pytest
 
-SLOW = {"closed_loop"}  # compiles the simulation
+SHORT = {"ppo": ["--envs", "4", "--iterations", "2"]}
+SLOW = {"closed_loop", "far_robot", "ppo"}  # compile the simulation, a server
 
 
 def pytest_generate_tests(metafunc):
@@ -17,5 +18,6 @@ def pytest_generate_tests(metafunc):
 
 def test_example_runs(file, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", [str(file), *SHORT.get(file.stem, [])])
     runpy.run_path(str(file), run_name="__main__")
     assert capsys.readouterr().out.strip()

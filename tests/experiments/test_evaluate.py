@@ -15,7 +15,7 @@ import stubs
 from starjax import config, rcm
 from starjax.data import normalizer
 from starjax.evaluation import sweep as sweeping
-from starjax.experiments import evaluate, folders, policy_under_test, presets, sweep
+from starjax.experiments import evaluate, folders, policy_under_test, presets, subjects, sweep
 from starjax.policies import packaged, policy_file
 from starjax.report import video
 from starjax.runtime import files, gpu
@@ -221,12 +221,12 @@ def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
         path = tmp_path / "stardiff" / "policy.safetensors"
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(content)
-        names.append(evaluate._label(path))
+        names.append(subjects.label(path))
     assert names[0] == names[2] != names[1] and all(n.startswith("stardiff-") for n in names)
     other = tmp_path / "compact.safetensors"
     other.write_bytes(b"c")
-    assert evaluate._label(other).startswith("compact-")
-    assert evaluate._label(packaged.FOLDER / "compact.safetensors") == "compact"
+    assert subjects.label(other).startswith("compact-")
+    assert subjects.label(packaged.FOLDER / "compact.safetensors") == "compact"
 
 
 def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):
@@ -334,3 +334,8 @@ def test_another_arm_is_another_evaluation(file, monkeypatch):
     assert asked == [("fr5",), ("ur5e",)]
     folders = {path.name for path in (file.parent / "runs" / "evaluate").iterdir()}
     assert len(folders) == 2 and len([name for name in folders if "-ur5e-seed0" in name]) == 1
+    swept = ["--policy", str(file), "--trocars", "2", "--eval.time-limit-s", "1"]
+    assert sweep.main(swept) == sweep.main([*swept, "--arm", "ur5e"]) == 0
+    assert asked[2:] == [("fr5",), ("ur5e",)]
+    found = [path.parent.name for path in file.parent.rglob("sweep.json")]
+    assert len(set(found)) == 2 and len([name for name in found if name.endswith("-ur5e")]) == 1

@@ -56,7 +56,7 @@ def settings(typed: str) -> config.RunConfig:
         ("evaluate", "x y", "FLAG", "y"),
         ("evaluate", "x --video=False", "FLAG", "False"),
         ("evaluate", "x --eval.time-limit-s 0", "eval.time_limit_s", 0),
-        ("sweep", "--trocars 1", "RUN", "none"),
+        ("sweep", "--trocars 1", "RUN or --policy", "none"),
         ("sweep", "x --eval.time-limit-s soon", "--eval.time-limit-s", "'soon'"),
         ("report", "--out x", "RUN", "none"),
         ("pack", "a b c", "FLAG", "c"),
@@ -187,7 +187,7 @@ def test_help_says_of_every_flag_something_of_its_own(command, capsys):
 def test_help_shows_ranges_and_defaults(capsys, monkeypatch):
     said = helped("run", capsys)[1]
     assert said["--policy.kernel-size"].endswith("(1, 3, ... 4095; default: 5)")
-    assert helped("sweep", capsys)[1]["--eval.time-limit-s"].endswith("RUN's (in [0.1, 86400])")
+    assert helped("sweep", capsys)[1]["--eval.time-limit-s"].endswith("(in [0.1, 86400])")
     for likely, trials, limit in ((False, 4, 30.0), (True, 30, 60.0)):
         monkeypatch.setattr(gpu, "is_likely", lambda likely=likely: likely)
         said = helped("evaluate", capsys)[1]

@@ -6,7 +6,7 @@ import mistakes
 import numpy as np
 import pytest
 
-from starjax.experiments import bench, sweep
+from starjax.experiments import bench, subjects, sweep
 
 
 @pytest.mark.parametrize(
@@ -44,5 +44,16 @@ def test_sweeps_of_other_trials_lie_apart(tmp_path):
     one = sweep.Options("run")
     other = dataclasses.replace(one, eval=dataclasses.replace(one.eval, trials=2))
     same = dataclasses.replace(one, eval=dataclasses.replace(one.eval, chunk=2))
-    assert sweep._folder(tmp_path, one) == sweep._folder(tmp_path, same)
-    assert sweep._folder(tmp_path, one) != sweep._folder(tmp_path, other)
+    assert sweep._trials(tmp_path, one) == sweep._trials(tmp_path, same)
+    assert sweep._trials(tmp_path, one) != sweep._trials(tmp_path, other)
+
+
+def test_sweeps_of_other_arms_and_of_files_lie_apart(tmp_path):
+    file = tmp_path / "mine.safetensors"
+    file.write_bytes(b"m")
+    folders = [
+        sweep._folder(subjects.Named(file, run), sweep.Options(arm=arms))
+        for run in (None, tmp_path / "stardiff")
+        for arms in ((), ("ur5e",), ("ur5e", "panda"))
+    ]
+    assert len(set(folders)) == 6 and folders[3] == tmp_path / "stardiff"

@@ -25,6 +25,11 @@ ROTATION = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 POSE = rcm.Pose(ROTATION, drawn(N, 3))
 TROCAR = rcm.Trocar(np.full(N, 2.0), np.ones(N), np.full(N, 3.0))
 POINT = drawn(3)
+# Axes in every direction, of which bfloat16 has the entries; their lines meet.
+AXES = np.array(
+    [[0.0, 0.5, -1.0], [0.5, 0.25, -1.0], [-0.5, 0.0, -1.0], [0.25, -0.5, -1.0], [1, 1, 1]]
+)
+MOVING = rcm.Pose(ROTATION + AXES[..., None] * np.array([0.0, 0.0, 1.0]), POINT / 32 + AXES / 64)
 # Of each public function numbers that it takes; every axis and type that jax may refuse to mix.
 GIVEN = {
     "check_trocar": (TROCAR,),
@@ -40,6 +45,7 @@ GIVEN = {
     "rotation_from_axis_roll": (drawn(N, 3), drawn(2, N)),
     "rotation_z": (drawn(N),),
     "trocar_frame": (TROCAR, POINT),
+    "trocar_from_poses": (MOVING,),
     "trocar_from_position": (drawn(N, 3), POINT),
     "trocar_position": (TROCAR, POINT),
     "trocar_rotation": (TROCAR,),
@@ -59,7 +65,10 @@ def as_type(given, dtype):
 
 def test_all_public_functions_are_here():
     public = {name for name in rcm.__all__ if callable(getattr(rcm, name))}
-    assert public - {"ActionSpace", "Pose", "Trocar", "TrocarFrame"} == {*GIVEN, "sample_trocar"}
+    assert public - {"ActionSpace", "Pose", "Trocar", "TrocarEstimate", "TrocarFrame"} == {
+        *GIVEN,
+        "sample_trocar",
+    }
 
 
 @pytest.mark.parametrize("dtype", TYPES)

@@ -17,6 +17,7 @@ from starjax.runtime import jax_settings, xla
 from starjax.sim import names
 
 SCHEMA = 2
+IMPORTED = "imported.json"  # beside dataset.json: what was odd about the files of others
 # Demonstrations never start from the states that an evaluation with the same seed draws.
 STREAM = 0x64656D6F
 

@@ -38,6 +38,11 @@ def key(trocar: int, trial: int, seed: int) -> str:
     return f"{trocar:04d}-{trial:04d}-{seed}"
 
 
+def is_key(name: object) -> bool:
+    """Whether a name is one that `key` gives, and so of no other folder."""
+    return isinstance(name, str) and bool(_KEY.fullmatch(name))
+
+
 def digest(description: Mapping[str, Any]) -> str:
     """Twelve hexadecimal digits that name a dataset by what it is, versions of software aside."""
     return _hash({k: v for k, v in description.items() if k != "versions"})[:12]
@@ -160,7 +165,7 @@ def keys(root: Path) -> list[str]:
     """Committed episodes, in order of trocar, trial and seed."""
     folder = root / "episodes"
     # others are not ours: file systems and desktops leave files there, and folders (`@eaDir`)
-    return sorted(path.name for path in folder.glob("*/") if _KEY.fullmatch(path.name))
+    return sorted(path.name for path in folder.glob("*/") if is_key(path.name))
 
 
 def clean(root: Path) -> None:

@@ -40,6 +40,7 @@ class Deployed:
         arms.
       max_first_move: m, how far from the measured tip a plan may begin.
       max_first_turn: rad, how far from the measured rotation.
+      asks: shapes of what it must be told.
 
     It pickles as the arguments that it was loaded with: another process loads the same file.
     """
@@ -50,10 +51,15 @@ class Deployed:
     p_world_ref: np.ndarray
     max_first_move: float
     max_first_turn: float
+    asks: measured.Asks = dataclasses.field(repr=False)
     _source: tuple[Any, ...] = dataclasses.field(repr=False)
-    _asks: measured.Asks = dataclasses.field(repr=False)
     _decide: Callable[..., tuple[Command, start.First]] = dataclasses.field(repr=False)
     _weights: tuple[Any, Any] = dataclasses.field(repr=False)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its file."""
+        return self._source[1]
 
     @arrays.broadcasting
     def __call__(self, key: jax.Array, observation: Observation, trocar: rcm.Trocar) -> Command:
@@ -91,22 +97,38 @@ class Deployed:
             Values that jax traces are not looked at: within a program none of the last three is.
         """
         _check_key(key)
-        seen, trocar = measured.given(self._asks, observation, trocar)
-        robots = np.shape(trocar.radius)[: np.ndim(trocar.radius) - len(self._asks.arms)]
-        bounds = start.bounds(self.max_first_move, self.max_first_turn)
+        seen, trocar = measured.given(self.asks, observation, trocar)
+        robots = np.shape(trocar.radius)[: np.ndim(trocar.radius) - len(self.asks.arms)]
         keys = jax.random.split(key, robots[0]) if robots else key[None]
         if not robots:
             seen, trocar = jax.tree.map(lambda x: jnp.asarray(x)[None], (seen, trocar))
-        command, found = self._decide(*self._weights, keys, seen, trocar, bounds)
-        self._check_first(found)
+        command, found = self.plan(keys, seen, trocar)
+        self.check_first(found)
         return command if robots else jax.tree.map(lambda x: x[0], command)
+
+    def plan(
+        self, keys: jax.Array, seen: types.Observation, trocar: rcm.Trocar
+    ) -> tuple[Command, start.First]:
+        """Plans for B robots, each with its own key, of arrays that `measured.given` has checked.
+
+        Args:
+          keys: `[B]`.
+          seen: `[B, O, *arms]`.
+          trocar: `[B, *arms]`.
+
+        Returns:
+          Command `[B, H, *arms]`; how far their first ones are, `[B, *arms]`, for `check_first`.
+        """
+        bounds = start.bounds(self.max_first_move, self.max_first_turn)
+        return self._decide(*self._weights, keys, seen, trocar, bounds)
 
     def __reduce__(self) -> tuple[Callable[..., "Deployed"], tuple[Any, ...]]:
         path, digest, settings = self._source
         bounds = {"max_first_move": self.max_first_move, "max_first_turn": self.max_first_turn}
         return _load_again, (path, digest, {**settings, **bounds})
 
-    def _check_first(self, found: start.First) -> None:
+    def check_first(self, found: start.First) -> None:
+        """Raises UsageError where a plan begins farther than the bounds from the measured pose."""
         if measured.is_traced(found.move):
             return
         move, turn = (np.max(x) for x in jax.device_get(found))
@@ -206,8 +228,8 @@ def load(
         scene=trained.scene,
         p_world_ref=asks.p_world_ref,
         **bounds,
+        asks=asks,
         _source=source,
-        _asks=asks,
         _decide=decide,
         _weights=weights,
     )

@@ -13,12 +13,17 @@ from starjax import config as config_lib
 from starjax import errors
 from starjax.experiments import messages, stage_times
 
+_FROM = "demos.from_"
+
 
 def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Callable[[], None]]:
     """The folder of a run's demonstrations, and a function that collects what it lacks.
 
     `share` is the run's: all processes collect together.
     """
+    if config.demos.from_:
+        root = given(config, env)
+        return root, lambda: messages.stage("collect", f"nothing, from {root}")
     from starjax.data import demos, schema, store
     from starjax.rollouts import agent, placement, trocars, waves
 
@@ -74,6 +79,44 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
     return root, collect
 
 
+def given(config: config_lib.RunConfig, env: Any) -> Path:
+    """The folder of somebody's dataset, once it is known to be one that this run can learn from.
+
+    Raises:
+      errors.UsageError: it is none, or of another task, or lacks what the policy observes.
+    """
+    import numpy as np
+
+    from starjax.data import schema, store
+    from starjax.rollouts import episodes
+
+    root = Path(config.demos.from_)
+    try:
+        about = schema.upgraded(store.read_description(root))
+        store.read_seal(root)
+        task, features = about["scene"]["task"], about["features"]
+        reference = np.array(about["p_world_ref"], np.float32)
+    except (KeyError, TypeError, ValueError) as error:
+        hint = "starjax import makes one of LeRobot, robomimic and zarr datasets"
+        raise errors.UsageError(_FROM, "a dataset that is complete", error, hint) from error
+    policy, task_hint = config.policy, f"--task {task} trains on it"
+    if task != env.task.name:
+        raise errors.UsageError(_FROM, f"demonstrations of {env.task.name}", task, task_hint)
+    if not np.array_equal(reference, np.asarray(env.p_world_ref, np.float32)):
+        expected = f"nominal trocars at {env.p_world_ref.tolist()}"
+        raise errors.UsageError(_FROM, expected, reference.tolist())
+    size = [policy.image_size, policy.image_size, 3]
+    wanted = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
+    if policy.observation == "state":
+        wanted = {"state": [sum(field.size for field in env.task.fields)]}
+    for name, shape in wanted.items():
+        found = features.get(name, {}).get("shape")
+        if found != shape:
+            got = "none" if found is None else f"one of {found}"
+            raise errors.UsageError(_FROM, f"a field {name} of {shape}", f"{got} in {root}")
+    return root
+
+
 def load(
     config: config_lib.RunConfig, root: Path, collect: Callable[[], None], encoder: Any, share: Any
 ) -> Any:
@@ -85,6 +128,8 @@ def load(
         try:
             loading.verify(root)
         except store.DamagedEpisode as error:
+            if config.demos.from_:
+                raise errors.UsageError(_FROM, "demonstrations that are whole", error) from error
             messages.indented(f"damaged, collected again: {error}")
             (root / "SEALED.json").unlink()
             return False
@@ -117,7 +162,7 @@ def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder
                 functools.partial(_frames, root, camera),
                 messages.indented,
             )
-            for camera in demos.description["scene"]["cameras"]
+            for camera in config.scene.camera
         ]
     found = np.concatenate(parts, axis=-1)
     features = jax.device_put(found) if windows.on_device(dataset) else found

@@ -79,6 +79,8 @@ def seconds(config: config_lib.RunConfig, stages: Sequence[str], trocars: int) -
     usual, timed = presets.PRESETS.get(config.preset), TIMED.get(config.preset)
     if usual is None or timed is None or config.scene.task != usual.scene.task:
         return None
+    if config.demos.from_:  # nobody has said how many
+        return None
     networks = [(each.policy, each.train.batch_size) for each in (config, usual)]
     if {"train", "evaluate"} & {*stages} and networks[0] != networks[1]:
         return None

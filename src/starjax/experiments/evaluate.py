@@ -8,8 +8,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.experiments import checks, folders, messages, options, scenes, stage_times
-from starjax.policies import packaged
+from starjax.experiments import checks, folders, messages, options, scenes, stage_times, subjects
 from starjax.runtime import files, gpu, xla
 
 DESCRIPTION = """Scores a trained policy on its task's trocars, and films it.
@@ -44,17 +43,12 @@ def main(argv: Sequence[str]) -> int:
 
     processes.join()
     xla.require_devices("starjax.experiments.policy_under_test")
-    chosen, file, run, folder = asked if gpu.is_used() == guess else _asked(argv, not guess)
+    chosen, named, folder = asked if gpu.is_used() == guess else _asked(argv, not guess)
 
     from starjax.experiments import policy_under_test
     from starjax.rollouts import sharing
 
-    method, config = (run.name, folders.read_config(run)) if run else (None, None)
-    if method:
-        who = policy_under_test.load(method, file, arms=chosen.arm)
-    else:
-        who = policy_under_test.from_file(file, chosen.arm)
-    config = policy_under_test.settings(who, config) if config else _config(who.trained)
+    who, config = subjects.load(named, chosen.arm)
     scene = scenes.settings(who.env.names)
     changed = {"method": who.method, "out": str(folder), "scene": scene, "eval": chosen.eval}
     config = dataclasses.replace(config, **changed)
@@ -91,26 +85,19 @@ def _goes_on(folder: Path, weights: str, chosen: Options, scene: config_lib.Scen
     return _identity(before) == (weights, chosen.seed, arms, dataclasses.asdict(chosen.eval))
 
 
-def _asked(argv: Sequence[str], has_gpu: bool) -> tuple[Options, Path, Path | None, Path]:
-    """What the command line asks for: its flags, the weights, RUN if given, the result's folder."""
+def _asked(argv: Sequence[str], has_gpu: bool) -> tuple[Options, subjects.Named, Path]:
+    """What the command line asks for: its flags, the policy, the result's folder."""
     chosen = options.parse(
         Options, argv, prog="starjax evaluate", description=DESCRIPTION, default=_default(has_gpu)
     )
-    if bool(chosen.run) == bool(chosen.policy):
-        got = "both" if chosen.run else "none"
-        raise errors.UsageError("RUN or --policy", "one of the two", got)
-    run = None
-    if chosen.policy:
-        file = packaged.find("--policy", chosen.policy)
-        default = Path("runs/evaluate") / f"{_label(file)}-{_trials(chosen)}"
-    else:
-        run = folders.existing(chosen.run)
-        folders.read_config(run)
-        file = folders.weights(run.parent, run.name)
+    named = subjects.find(chosen.run, chosen.policy)
+    if named.run:
         default = Path(chosen.run) / f"evaluate-{_trials(chosen)}"
+    else:
+        default = Path("runs/evaluate") / f"{subjects.label(named.file)}-{_trials(chosen)}"
     folder = default if chosen.out == options.AUTO else chosen.out
     checks.expect_folder("--out", folder)
-    return chosen, file, run, Path(folder)
+    return chosen, named, Path(folder)
 
 
 def _default(has_gpu: bool) -> Options:
@@ -124,15 +111,6 @@ def _trials(chosen: Options) -> str:
     """A name for an evaluation's trials, so that others do not replace them."""
     trials = f"seed{chosen.seed}-{chosen.eval.trials}x{chosen.eval.time_limit_s:g}s"
     return "-".join([*chosen.arm, trials])
-
-
-def _label(file: Path) -> str:
-    """A name for a file of weights: its own, or its folder's where that says nothing, and what is
-    in it, as files of other weights are called so too."""
-    if file.parent == packaged.FOLDER:
-        return file.stem
-    name = file.stem if file.stem != "policy" else file.resolve().parent.name
-    return f"{name}-{files.sha256(file)[:8]}"
 
 
 def _before(folder: Path) -> dict[str, Any]:
@@ -162,20 +140,6 @@ def _refuse_foreign(folder: Path, is_ours: bool) -> None:
             folder,
             "choose another, or remove that one",
         )
-
-
-def _config(trained: Any) -> config_lib.RunConfig:
-    """Settings of the run that a policy comes from, as far as its file knows them."""
-    known = {
-        "method": trained.method,
-        "preset": trained.preset or "auto",
-        "policy": config_lib.as_json(trained.policy),
-        "train": config_lib.as_json(trained.train),
-        "demos": config_lib.as_json(trained.demos or config_lib.DemosConfig()),
-        "scene": config_lib.as_json(scenes.settings(trained.scene)),
-    }
-    unknown = {"seed": None}  # no file of weights says it
-    return dataclasses.replace(config_lib.from_dict(config_lib.RunConfig, known), **unknown)
 
 
 def _times(result: Any) -> str:

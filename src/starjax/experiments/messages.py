@@ -63,6 +63,8 @@ def _task(config: config_lib.RunConfig) -> Any:
 
 
 def _learning_from(demos: config_lib.DemosConfig) -> str:
+    if demos.from_:
+        return f"  demonstrations  those in {demos.from_}"
     count = demos.per_trocar * demos.seen_trocars
     return f"  demonstrations  {count} ({demos.per_trocar} x {demos.seen_trocars} seen trocars)"
 

@@ -80,8 +80,9 @@ def flags(settings: Any) -> list[str]:
 
 
 def flag(field: str) -> str:
-    """How a field is typed: `train.steps` as `--train.steps`, `scene.task` as `--task`."""
-    return f"--{field.removeprefix(f'{_UNNAMED}.').replace('_', '-')}"
+    """How a field is typed: `train.steps` as `--train.steps`, `scene.task` as `--task`, `from_` as
+    `--from`."""
+    return f"--{field.removeprefix(f'{_UNNAMED}.').rstrip('_').replace('_', '-')}"
 
 
 def spelled(error: errors.UsageError) -> str:
@@ -153,7 +154,8 @@ def _with_ranges(
             inline = Annotated[type(field.default), tyro.conf.arg(name="")]
             fields.append(dataclasses.replace(field, type=inline))
             continue
-        name = "" if field.name == _UNNAMED else None
+        plain = field.name.rstrip("_")  # a word of Python's, such as `from`, ends in one
+        name = "" if field.name == _UNNAMED else plain if plain != field.name else None
         range_and_default = functools.partial(_hint, limits.within(field.type))
         hint = tyro.conf.arg(name=name, help_behavior_hint=range_and_default)
         # What stands on the field itself comes later, and wins.

@@ -52,10 +52,12 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
         print(messages.plan(config, stages), flush=True)
         env = _environment(config)
         root, collect = demonstrations.plan(config, env, share)
+        digest = folders.demos_digest(root) if config.demos.from_ else None
+        dataset = f"{root.name}-{digest[:12]}" if digest else root.name
 
         def claim() -> None:
             for name in dict.fromkeys([*trained, *names]):
-                folders.claim(out / name, config, root.name, encoder and encoder.fingerprint)
+                folders.claim(out / name, config, dataset, encoder and encoder.fingerprint)
 
         # Loaded once, and only if something is still to be trained with them.
         demos = functools.cache(lambda: demonstrations.load(config, root, collect, encoder, share))
@@ -67,7 +69,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
                 _train(config, name, demos, env, encoder, share)
         if "evaluate" in stages:
             for name in names:
-                _evaluate(config, name, env, root.name, command, share)
+                _evaluate(config, name, env, root, command, share)
         if "report" in stages:
             share.first("reported", lambda: _report(out, names))
 
@@ -148,7 +150,7 @@ def _train(
 
 
 def _evaluate(
-    config: config_lib.RunConfig, name: str, env: Any, demos: str, command: str, share: Any
+    config: config_lib.RunConfig, name: str, env: Any, demos: Path, command: str, share: Any
 ) -> None:
     """Closed-loop trials of one method; `result.json` is its last file."""
     from starjax.experiments import policy_under_test
@@ -167,8 +169,8 @@ def _evaluate(
         )
 
     def write() -> None:
-        timings = _timings(out, name, demos)
-        digest = folders.demos_digest(out / demos)
+        timings = _timings(out, name, demos.name)
+        digest = folders.demos_digest(demos)
         policy_under_test.write_result(
             folder, who, table, config, config.seed, command, timings, dataset_digest=digest
         )

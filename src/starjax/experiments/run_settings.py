@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 from starjax import config as config_lib
 from starjax import errors
@@ -79,14 +80,15 @@ def _default(argv: Sequence[str], has_gpu: bool) -> config_lib.RunConfig:
 def _folder(config: config_lib.RunConfig) -> str:
     """Folder of a run that names none.
 
-    Other scenes, learners, observations, encoders frozen or not, and seeds have one each; trainings
-    of one method that differ in anything else meet in it, and are refused.
+    Other scenes, datasets, learners, observations, encoders frozen or not, and seeds have one each;
+    trainings of one method that differ in anything else meet in it, and are refused.
     """
     policy, usual = config.policy, presets.PRESETS[config.preset]
     scene = config.scene
     parts = [usual.preset]
     parts += [scene.task] if scene.task != usual.scene.task else []
     parts += [*scene.arm, *scene.tool, *scene.camera]
+    parts += [f"from-{Path(config.demos.from_).name}"] if config.demos.from_ else []
     parts += [policy.learner] if policy.learner != usual.policy.learner else []
     parts += [policy.observation] if policy.observation != usual.policy.observation else []
     sees, freezes = policy.observation == "image", policy.freeze_encoder

@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from starjax import config as config_lib
-from starjax.experiments import checks, folders, messages, options
+from starjax.experiments import checks, folders, messages, options, subjects
 from starjax.limits import CountOrZero, Range
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Scores a trained policy on a random sample (Eq. 19) or a grid of trocars.
 
-RUN is a method's folder, such as runs/cpu/stardiff; RUN/sweep.json, of the last sweep, is what the
-report draws as the success map and as Fig. 4. Trials of every sweep stay in RUN/sweep: the same
-command again only puts its figures together."""
+RUN is a method's folder, such as runs/cpu/stardiff; or --policy names a policy.safetensors, from
+anywhere, or a policy that ships with starjax. sweep.json, of the last sweep, is in RUN, and with
+--arm or --policy in a folder of its own, which the command says. In RUN it is what the report draws
+as the success map and as Fig. 4. Trials of every sweep stay beside it, in sweep: the same command
+again only puts its figures together."""
 
 # More is a slip of the hand.
 MOST_TROCARS = 1_000_000
@@ -29,7 +31,7 @@ class Trials:
     """Closed-loop trials."""
 
     trials: Several = 1  # trials at each trocar
-    # s of simulated time that a trial may take; left out: RUN's
+    # s of simulated time that a trial may take; left out: RUN's, of a file the usual one
     time_limit_s: Annotated[options.FloatOrNone, config_lib.TIME_LIMIT] = None
     chunk: CountOrZero = 0  # trials between two savings, at most; 0: as many as a program runs
     video_trials: CountOrZero = 0  # trials whose joint positions are recorded
@@ -39,7 +41,10 @@ class Trials:
 class Options:
     """Flags of the command."""
 
-    run: options.Run  # a method's folder, such as runs/cpu/stardiff
+    run: options.RunOrNone = ""  # a method's folder, such as runs/cpu/stardiff
+    # a policy.safetensors, or the name of a policy that ships with starjax, instead of RUN
+    policy: str = ""
+    arm: tuple[str, ...] = ()  # robots to score it with; left out: those it was trained with
     trocars: Several = 200  # how many to draw; not used with a grid
     # distances of a grid from the nominal trocar in cm, 0 is one point; left out: no grid
     radii_cm: Annotated[tuple[float, ...], Range(0.0, 10.0)] = ()
@@ -55,31 +60,30 @@ def main(argv: Sequence[str]) -> int:
     chosen = _parse(argv)
     # A mistake should not wait for jax.
     _check(chosen)
-    run = folders.existing(chosen.run)
-    config = folders.read_config(run)
+    named = subjects.find(chosen.run, chosen.policy)
     if chosen.eval.time_limit_s is None:
-        like_run = dataclasses.replace(chosen.eval, time_limit_s=_time_limit_s(run, config))
-        chosen = dataclasses.replace(chosen, eval=like_run)
+        limit = dataclasses.replace(chosen.eval, time_limit_s=_time_limit_s(named.run))
+        chosen = dataclasses.replace(chosen, eval=limit)
+    folder = _folder(named, chosen)
     xla.prepare_xla()
     from starjax.runtime import processes
 
     processes.join()
     xla.require_devices("starjax.experiments.policy_under_test")
-    files.require_writable(run)
+    files.require_writable(folder)
 
     from starjax.evaluation import result, sweep
     from starjax.experiments import policy_under_test
     from starjax.rollouts import trocars
 
-    who = policy_under_test.load(run.name, folders.weights(run.parent, run.name))
+    who, config = subjects.load(named, chosen.arm)
     task = who.env.task
     drawn = _trocars(chosen, task.arms)
     trials = config_lib.EvalConfig(**vars(chosen.eval))
-    table = policy_under_test.rollouts(_folder(run, chosen), who, drawn, trials, chosen.seed)
+    table = policy_under_test.rollouts(_trials(folder, chosen), who, drawn, trials, chosen.seed)
     if not processes.is_first():
         return 0
-    demos = policy_under_test.settings(who, config).demos
-    seen = trocars.select(task.trocars, slice(demos.seen_trocars))
+    seen = trocars.select(task.trocars, slice(config.demos.seen_trocars))
     figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)
     about = {
         "method": who.method,
@@ -90,19 +94,22 @@ def main(argv: Sequence[str]) -> int:
         "seed": chosen.seed,
         "time_limit_s": chosen.eval.time_limit_s,
     }
-    result.write(run / "sweep.json", who.env.names, figures, about)
+    result.write(folder / "sweep.json", who.env.names, figures, about)
     print(_outcome(figures))
-    print(f"\nresult: {run / 'sweep.json'}; {messages.hint(run, who.weights, 'draws')}")
+    then = f"; {messages.hint(folder, who.weights, 'draws')}" if folder == named.run else ""
+    print(f"\nresult: {folder / 'sweep.json'}{then}")
     return 0
 
 
-def _time_limit_s(run: Path, config: config_lib.RunConfig) -> float:
+def _time_limit_s(run: Path | None) -> float:
     """That of the run's result, which later commands do not change; until there is one, what was
-    typed last."""
+    typed last; without a run the usual one."""
+    if run is None:
+        return config_lib.EvalConfig.time_limit_s
     try:
         return float(files.read_json(run / "result.json")["config"]["eval"]["time_limit_s"])
     except (FileNotFoundError, KeyError, TypeError, ValueError):
-        return config.eval.time_limit_s
+        return folders.read_config(run).eval.time_limit_s
 
 
 def _parse(argv: Sequence[str]) -> Options:
@@ -114,19 +121,26 @@ def _check(chosen: Options) -> None:
     count = len(chosen.radii_cm) * len(chosen.polars_deg) * chosen.azimuths
     most = f"at most {MOST_TROCARS} trocars of its grid"
     checks.expect(count <= MOST_TROCARS, "azimuths", most, count)
-    is_grid, default = bool(chosen.radii_cm), Options(chosen.run)
+    is_grid, default = bool(chosen.radii_cm), Options()
     for field in ("trocars",) if is_grid else ("polars_deg", "azimuths"):
         value = getattr(chosen, field)
         what = "nothing with --radii-cm" if is_grid else "--radii-cm beside it"
         checks.expect(value == getattr(default, field), field, what, value)
 
 
-def _folder(run: Path, chosen: Options) -> Path:
+def _folder(named: subjects.Named, chosen: Options) -> Path:
+    """Where sweep.json is written."""
+    if named.run:
+        return named.run / "-".join(["sweep", *chosen.arm]) if chosen.arm else named.run
+    return Path("runs/sweep") / "-".join([subjects.label(named.file), *chosen.arm])
+
+
+def _trials(folder: Path, chosen: Options) -> Path:
     """Where a sweep's trials are kept, one folder for each so that none replaces another's."""
     what = dataclasses.asdict(chosen)
-    del what["run"], what["eval"]["chunk"]
+    del what["run"], what["policy"], what["arm"], what["eval"]["chunk"]
     digest = hashlib.sha256(json.dumps(what).encode()).hexdigest()
-    return run / "sweep" / f"seed{chosen.seed}-{digest[:8]}"
+    return folder / "sweep" / f"seed{chosen.seed}-{digest[:8]}"
 
 
 def _trocars(chosen: Options, arms: int) -> Any:

@@ -83,6 +83,31 @@ class Dense(nn.Module):
         return y + spread(bias.astype(x.dtype), y.shape)
 
 
+def xavier_init(key: jax.Array, shape: tuple[int, int], dtype: Any = None) -> jax.Array:
+    """Uniform within +-sqrt(6 / (inputs + outputs)), hashed as in `uniform_init`: of attention."""
+    return math.sqrt(6.0 / sum(shape)) * _hashed(key, tuple(shape))
+
+
+def residual_mlp(x: jax.Array, width: int, blocks: int, dtype: Any) -> jax.Array:
+    """Runs a residual MLP on `[..., C]`, in the scope of the module that calls it.
+
+    Args:
+      x: in `dtype`.
+      width: of all layers.
+      blocks: of LayerNorm, Linear, GELU, Linear.
+      dtype: of the arithmetic; LayerNorm's is float32.
+
+    Returns:
+      `[..., width]`, in `dtype`.
+    """
+    x = Dense(width, name="project")(x)
+    for _ in range(blocks):
+        h = nn.LayerNorm()(x.astype(jnp.float32)).astype(dtype)
+        h = nn.gelu(Dense(width)(h))
+        x = x + Dense(width)(h)
+    return x
+
+
 class Conv1d(nn.Module):
     """1-D convolution over `[B, L, C]` as one matrix product of the shifted inputs.
 

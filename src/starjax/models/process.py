@@ -8,6 +8,7 @@ import jax
 from starjax.models import diffusion as ddpm
 from starjax.models import flow as flow_matching
 from starjax.models import schedule
+from starjax.models import shortcut as shortcuts
 from starjax.models.kernels import parallel_ddim
 
 
@@ -41,12 +42,13 @@ class Process(NamedTuple):
     Attributes:
       noised: `(key, x0 [B, H, D]) -> given`, what is learned from clean sequences, about [-1, 1]:
         a pytree whose leading axis is the batch.
-      loss: `(predict, given) -> scalar`, where `predict(x [B, H, D], time [B])` is the network.
+      loss: `(predict, given) -> scalar`, where `predict(x [B, H, D], time [B])` is the network;
+        of some rows of the batch alone `predict(x [n, H, D], time [n], rows [n])`.
       sample: see `Sample`.
     """
 
     noised: Callable[[jax.Array, jax.Array], Any]
-    loss: Callable[[Callable[[jax.Array, jax.Array], jax.Array], Any], jax.Array]
+    loss: Callable[[Callable[..., jax.Array], Any], jax.Array]
     sample: Sample
 
 
@@ -78,3 +80,12 @@ def flow(steps: int) -> Process:
         return flow_matching.sample(predict, noise, steps=steps, prepare=prepare, reach=reach)
 
     return Process(flow_matching.noised, flow_matching.velocity_loss, sample)
+
+
+def shortcut(steps: int) -> Process:
+    """Flow matching whose network is told how far it steps, so that few steps are enough."""
+
+    def sample(predict, noise, *, prepare, reach=None):
+        return shortcuts.sample(predict, noise, steps=steps, prepare=prepare, reach=reach)
+
+    return Process(shortcuts.noised, shortcuts.loss, sample)

@@ -54,9 +54,5 @@ class RollNet(nn.Module):
         if observed is not None:
             inputs.append(observed)
         x = jnp.concatenate([part.astype(self.dtype) for part in inputs], -1)
-        x = layers.Dense(self.width, name="project")(x)
-        for _ in range(self.blocks):
-            h = nn.LayerNorm()(x.astype(jnp.float32)).astype(self.dtype)
-            h = nn.gelu(layers.Dense(self.width)(h))
-            x = x + layers.Dense(self.width)(h)
+        x = layers.residual_mlp(x, self.width, self.blocks, self.dtype)
         return layers.Dense(horizon, zero=True, name="out")(x).astype(jnp.float32)

@@ -34,7 +34,11 @@ def make(
 
     def loss(params: Params, condition: Condition, given: Any) -> tuple[jax.Array, dict]:
         joined = sequences.joined(condition)
-        return process.loss(lambda x, time: apply(params["unet"], x, time, joined), given), {}
+
+        def predict(x: jax.Array, time: jax.Array, rows: Any = slice(None)) -> jax.Array:
+            return apply(params["unet"], x, time, joined[rows])
+
+        return process.loss(predict, given), {}
 
     def sample(
         params: Params, keys: jax.Array, condition: Condition, reach: jax.Array | None

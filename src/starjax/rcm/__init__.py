@@ -5,6 +5,7 @@
 """
 
 from starjax.rcm.actions import ACTION_SPACES, MAX_REACH, ActionSpace
+from starjax.rcm.estimate import MIN_SPREAD, TrocarEstimate, trocar_from_poses
 from starjax.rcm.manifold import (
     HOLD_DEPTH,
     MAX_DEPTH,
@@ -49,6 +50,7 @@ __all__ = [
     "MAX_DEPTH",
     "MAX_REACH",
     "MIN_DEPTH",
+    "MIN_SPREAD",
     "POLAR_RANGE",
     "POLAR_RANGE_WIDE",
     "RADIUS_RANGE",
@@ -56,6 +58,7 @@ __all__ = [
     "ActionSpace",
     "Pose",
     "Trocar",
+    "TrocarEstimate",
     "TrocarFrame",
     "check_trocar",
     "insertion_depth",
@@ -71,6 +74,7 @@ __all__ = [
     "rotation_z",
     "sample_trocar",
     "trocar_frame",
+    "trocar_from_poses",
     "trocar_from_position",
     "trocar_position",
     "trocar_rotation",

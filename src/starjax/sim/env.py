@@ -164,6 +164,8 @@ def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
         jnp.stack(gripper),
         p_world_trocar,
         period,
+        state.layout,
+        state.step * period,
     )
     moved = state.replace(
         physics=after,

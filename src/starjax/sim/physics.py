@@ -74,6 +74,8 @@ def advance(
     gripper: jax.Array,
     p_world_trocar: jax.Array,
     period: float,
+    layout: object,
+    time: jax.Array,
 ) -> tuple[PhysicsState, Passed]:
     """One control period: the joint targets move smoothly from `q` to `q + dq`.
 
@@ -85,6 +87,7 @@ def advance(
       gripper: `[A]` in [-1, 1].
       p_world_trocar: `[A, 3]` m.
       period: s.
+      layout: of the episode, for what the task itself drives. time: s since reset.
     """
     substeps = round(period / scene.mj_model.opt.timestep)
     mjx_model = _model(scene, p_world_trocar)
@@ -104,7 +107,7 @@ def advance(
             ctrl = ctrl.at[bound.ctrl].set(x + 2.0 / w * v + acceleration / w**2)
             if bound.jaw_ctrl is not None:
                 ctrl = ctrl.at[bound.jaw_ctrl].set(_jaw_target(bound, gripper[a]))
-        return ctrl
+        return scene.task.drive(scene.bound, layout, ctrl, time + s * period)
 
     def substep(i, carry):
         state, passed = carry
@@ -116,7 +119,7 @@ def advance(
             ctrl=target(i),
             mocap_pos=mocap_pos,
         )
-        data, error = solver.step(mjx_model, data)
+        data, error = solver.step(mjx_model, data, scene.solver_turns)
         found = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
         error = jnp.maximum(passed.solver_error, error)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)

@@ -17,16 +17,28 @@ tasks = Registry(
         "needle_pick": "starjax.sim.tasks.needle_pick.task:TASK",
         "peg_transfer_bimanual": "starjax.sim.tasks.peg_transfer_bimanual.task:TASK",
         "reach": "starjax.sim.tasks.reach.task:TASK",
+        "needle_handover": "starjax.sim.tasks.needle_handover.task:TASK",
+        "ring_on_wire": "starjax.sim.tasks.ring_on_wire.task:TASK",
+        "endoscope_track": "starjax.sim.tasks.endoscope_track.task:TASK",
     },
 )
 arms = Registry(
     "arm",
     {name: f"starjax.sim.arms.{name}:ARM" for name in ("fr5", "ur5e", "panda", "iiwa14", "rcm4")},
 )
-tools = Registry("tool", {"grasper": "starjax.sim.tools.grasper:TOOL"})
+tools = Registry(
+    "tool",
+    {
+        name: f"starjax.sim.tools.{name}:TOOL"
+        for name in ("grasper", "grasper_wide", "endoscope", "endoscope30")
+    },
+)
 workspaces = Registry(
     "workspace",
-    {name: f"starjax.sim.workspaces:{name.upper()}" for name in ("board", "left", "right")},
+    {
+        name: f"starjax.sim.workspaces:{name.upper()}"
+        for name in ("board", "left", "right", "overhead", "wire")
+    },
 )
 
 

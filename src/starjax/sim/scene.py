@@ -23,6 +23,8 @@ from starjax.sim.tools.base import Tool
 
 # Sizes that MJX compiles in. Each part says what it adds; the scene has the sum.
 CONTACT_LIMITS = ("max_geom_pairs", "max_contact_points")
+# Of a task's MJCF: turns of the contact solver, where light bodies need more than usual.
+SOLVER_TURNS = "solver_turns"
 
 
 class BoundArm(NamedTuple):
@@ -66,6 +68,7 @@ class Scene(NamedTuple):
       p_world_ref: `[A, 3]` m, nominal trocars. roll_zero: `[A]` rad, see `rcm.TrocarFrame`.
       trocar_mocap: `[A]` mocap bodies that mark the trocars.
       graspable: geom ids. geom_rgb: `[G, 3]` colours.
+      solver_turns: most turns of the contact solver, None for the usual number.
     """
 
     names: SceneNames
@@ -80,6 +83,7 @@ class Scene(NamedTuple):
     trocar_mocap: np.ndarray
     graspable: np.ndarray
     geom_rgb: np.ndarray
+    solver_turns: int | None
 
 
 def name(
@@ -115,7 +119,8 @@ def compose(names: SceneNames) -> mujoco.MjModel:
     """The C model of a scene.
 
     Raises:
-      errors.UsageError: no mount of an arm with its tool is known for the task's workspace.
+      errors.UsageError: no mount of an arm with its tool is known for the task's workspace, or no
+        part has a camera that is observed.
     """
     task: Task = registry.tasks.get(names.task)
     world = _spec(task.mjcf)
@@ -131,6 +136,10 @@ def compose(names: SceneNames) -> mujoco.MjModel:
             name=f"base{i}", pos=mount.position, quat=mount.wxyz_base, group=3, size=[0.003] * 3
         )
         world.attach(robot, site=base, prefix=f"arm{i}/")
+        _call_by_name(world, f"arm{i}/tool/")
+    known = [camera.name for camera in world.cameras]
+    for camera in names.cameras:
+        errors.choice("camera", camera, known)
     for limit, size in zip(CONTACT_LIMITS, limits):
         world.add_numeric(name=limit, data=[float(size)], size=1)
     return world.compile()
@@ -159,6 +168,7 @@ def load(names: SceneNames) -> Scene:
         trocar_mocap=np.array([m.body(f"trocar{i}").mocapid[0] for i in range(task.arms)]),
         graspable=np.array([m.geom(geom).id for geom in task.graspable], int),
         geom_rgb=geometry.geom_rgb(m),
+        solver_turns=_solver_turns(m),
     )
 
 
@@ -235,6 +245,20 @@ def _taken(part: mujoco.MjSpec) -> np.ndarray:
             sizes[CONTACT_LIMITS.index(numeric.name)] += numeric.data[0]
             part.delete(numeric)
     return sizes
+
+
+def _call_by_name(world: mujoco.MjSpec, prefix: str) -> None:
+    """A tool's camera is called by its own name, as those of the world, where that is free."""
+    taken = {camera.name for camera in world.cameras}
+    for camera in list(world.cameras):
+        own = camera.name.removeprefix(prefix)
+        if own not in taken:
+            camera.name = own
+
+
+def _solver_turns(m: mujoco.MjModel) -> int | None:
+    row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_NUMERIC, SOLVER_TURNS)
+    return None if row < 0 else int(m.numeric(row).data[0])
 
 
 def _about_z(angle: float) -> list[float]:

@@ -62,10 +62,13 @@ class Iterate(NamedTuple):
     gradient: jax.Array
 
 
-def step(m: mjx.Model, d: mjx.Data) -> tuple[mjx.Data, jax.Array]:
+def step(m: mjx.Model, d: mjx.Data, turns: int | None = None) -> tuple[mjx.Data, jax.Array]:
     """`mjx.step`: kinematics, contacts, forces, and the implicit integrator.
 
     For models that pass `check`, and no forces from outside (`qfrc_applied`, `xfrc_applied`).
+
+    Args:
+      turns: of Newton's method, at most; `MAX_ITERATIONS` if not given.
 
     Returns:
       the state after; J `[]`, the energy that the error left in the solution may hold.
@@ -74,7 +77,7 @@ def step(m: mjx.Model, d: mjx.Data) -> tuple[mjx.Data, jax.Array]:
     d = mjx.fwd_velocity(m, d)
     d = mjx.fwd_actuation(m, d)
     d = d.replace(qfrc_smooth=d.qfrc_passive - d.qfrc_bias + d.qfrc_actuator)
-    x, force, error = solve(problem(m, d), d.qacc_warmstart, m.opt.timestep)
+    x, force, error = solve(problem(m, d), d.qacc_warmstart, m.opt.timestep, turns)
     # As `mjx.implicit`: servos and dampers at the velocity after the step. `mjx.euler` then only
     # integrates, since the model lets it do nothing about damping (flag eulerdamp).
     by_velocity = mjx.deriv_smooth_vel(m, d)
@@ -115,7 +118,7 @@ def check(m: mjx.Model, d: mjx.Data) -> None:
 
 
 def solve(
-    problem: Problem, x: jax.Array, timestep: float | jax.Array
+    problem: Problem, x: jax.Array, timestep: float | jax.Array, turns: int | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The minimum by Newton's method from `x` `[V]`, single-sample.
 
@@ -129,6 +132,7 @@ def solve(
     # An error e in x has e M e <= gradient M^-1 gradient, for the Hessian is at least M. Of M the
     # diagonal will do: the motors' armature prevails.
     limit = 2.0 * MAX_ERROR_ENERGY / timestep**2
+    turns = MAX_ITERATIONS if turns is None else turns
     weights = 1.0 / jnp.diagonal(M)
 
     def at(x: jax.Array, Mx: jax.Array, r: jax.Array) -> Iterate:
@@ -136,7 +140,7 @@ def solve(
 
     def is_coarse(loop: tuple[jax.Array, Iterate]) -> jax.Array:
         count, now = loop
-        return (count < MAX_ITERATIONS) & (jnp.sum(now.gradient**2 * weights) > limit)
+        return (count < turns) & (jnp.sum(now.gradient**2 * weights) > limit)
 
     def improve(loop: tuple[jax.Array, Iterate]) -> tuple[jax.Array, Iterate]:
         count, now = loop

@@ -57,3 +57,18 @@ RIGHT = LEFT._replace(
     base_low=(0.2, -0.3, -0.4),
     base_high=(0.8, 0.3, 1.2),
 )
+
+# Where the lens of an endoscope is that looks down on a target from 6 cm; its trocar lies higher.
+OVERHEAD = BOARD._replace(
+    p_world_ref=(0.0, 0.0, 0.18),
+    low=(-0.05, -0.028, 0.062),
+    high=(0.032, 0.028, 0.094),
+    rolls=(-0.3, 0.3),
+)
+
+# Where a tool holds a ring on a wire along y by its tab.
+WIRE = BOARD._replace(
+    low=(-0.012, -0.045, 0.026),
+    high=(0.012, 0.045, 0.066),
+    rolls=(-1.0, 1.0),
+)

@@ -13,7 +13,14 @@ from starjax.sim.tasks.needle_pick import task as needle
 
 LANES = 4
 # Peg transfer's own tests run its expert through every trocar.
-EXPERTS = {"reach": 120, "needle_pick": 240, "peg_transfer_bimanual": 460}  # control steps
+EXPERTS = {  # control steps
+    "reach": 120,
+    "needle_pick": 240,
+    "peg_transfer_bimanual": 460,
+    "endoscope_track": 880,
+    "needle_handover": 460,
+    "ring_on_wire": 460,
+}
 # The script with two arms has no second try, and drops about one block in ten.
 DROPS = {"peg_transfer_bimanual": 1}
 

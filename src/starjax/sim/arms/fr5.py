@@ -4,6 +4,19 @@ import math
 
 from starjax.sim.arms.base import Arm, Mount
 
+_BOARD = Mount(
+    position=(-0.58, 0.0, 0.20),
+    yaw=math.pi,
+    turn=-1.75,  # j6 stays far from its limits over all trocars
+    home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
+)
+_OVERHEAD = Mount(
+    position=(-0.456, 0.237, -0.04),
+    yaw=-2.238,
+    turn=-1.587,
+    home=(-1.55, -1.491, 1.572, -1.582, -1.624, -0.628),
+)
+
 ARM = Arm(
     name="fr5",
     mjcf="arms/fr5/fr5.xml",
@@ -12,12 +25,8 @@ ARM = Arm(
     max_speed=(3.15,) * 6,  # the slower joints of the data sheet
     servo_frequency=100.0,
     mounts={
-        ("grasper", "board"): Mount(
-            position=(-0.58, 0.0, 0.20),
-            yaw=math.pi,
-            turn=-1.75,  # j6 stays far from its limits over all trocars
-            home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
-        ),
+        ("grasper", "board"): _BOARD,
+        ("grasper_wide", "wire"): _BOARD,
         # Two arms at either side of the board.
         ("grasper", "left"): Mount(
             position=(-0.58, 0.0, 0.20),
@@ -31,5 +40,6 @@ ARM = Arm(
             turn=-1.75,
             home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
         ),
+        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
     },
 )

@@ -14,6 +14,14 @@ _MOUNT = Mount(
     tilt=2.171,
 )
 
+_OVERHEAD = Mount(
+    position=(-0.216, 0.101, 1.196),
+    yaw=2.361,
+    turn=-1.137,
+    home=(-0.72, -1.197, 1.746, 1.795, -0.049, 1.197, -1.085),
+    tilt=-2.083,
+)
+
 ARM = Arm(
     name="iiwa14",
     mjcf="arms/iiwa14/iiwa14.xml",
@@ -23,8 +31,10 @@ ARM = Arm(
     servo_frequency=100.0,
     mounts={
         ("grasper", "board"): _MOUNT,
+        ("grasper_wide", "wire"): _MOUNT,
         ("grasper", "left"): _MOUNT,
         ("grasper", "right"): opposite(_MOUNT),
+        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
     },
     rest_gain=0.1,
     link_radius=0.06,

@@ -9,6 +9,19 @@ _LEFT = Mount(
     home=(-0.276, -0.869, 0.005, -2.188, -0.003, 1.752, 1.073),
 )
 
+_WIRE = Mount(
+    position=(-0.376, 0.002, -0.274),
+    yaw=0.631,
+    turn=0.145,
+    home=(-0.654, -0.539, 0.013, -2.062, 0.006, 1.523, -0.156),
+)
+_OVERHEAD = Mount(
+    position=(-0.312, 0.191, -0.291),
+    yaw=0.432,
+    turn=-1.199,
+    home=(-0.812, -0.446, -0.089, -1.841, -0.08, 1.319, 0.723),
+)
+
 ARM = Arm(
     name="panda",
     mjcf="arms/panda/panda.xml",
@@ -23,8 +36,10 @@ ARM = Arm(
             turn=-0.221,
             home=(0.499, -0.513, 0.005, -1.939, 0.002, 1.426, 0.448),
         ),
+        ("grasper_wide", "wire"): _WIRE,
         ("grasper", "left"): _LEFT,
         ("grasper", "right"): opposite(_LEFT),
+        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
     },
     rest_gain=0.1,
     link_radius=0.055,

@@ -12,6 +12,19 @@ from starjax.sim.arms.base import Arm, Mount, opposite
 _BOARD = Mount(position=(0.0, 0.0, 0.0), yaw=-math.pi / 2, turn=0.0, home=(0.0, 0.0, 0.11, 0.0))
 _LEFT = Mount(position=(0.0, 0.0, 0.0), yaw=-1.522, turn=0.044, home=(0.432, 0.02, 0.122, 0.0))
 
+_WIRE = Mount(
+    position=(0.0, 0.0, 0.0),
+    yaw=2.979,
+    turn=2.297,
+    home=(0.0, 0.0, 0.089, 2.253),
+)
+_OVERHEAD = Mount(
+    position=(0.0, 0.0, 0.0),
+    yaw=-1.571,
+    turn=2.534,
+    home=(-0.088, 0.0, 0.087, -2.534),
+)
+
 ARM = Arm(
     name="rcm4",
     mjcf="arms/rcm4/rcm4.xml",
@@ -21,8 +34,10 @@ ARM = Arm(
     servo_frequency=100.0,
     mounts={
         ("grasper", "board"): _BOARD,
+        ("grasper_wide", "wire"): _WIRE,
         ("grasper", "left"): _LEFT,
         ("grasper", "right"): opposite(_LEFT),
+        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
     },
     link_radius=0.02,
     remote_centre=True,

@@ -11,6 +11,13 @@ _MOUNT = Mount(
     home=(-0.722, 1.972, 1.911, -2.312, 1.571, 1.653),
 )
 
+_OVERHEAD = Mount(
+    position=(-0.476, 0.231, 0.447),
+    yaw=0.819,
+    turn=-1.711,
+    home=(-1.006, 1.98, 1.975, -2.471, 1.554, -0.046),
+)
+
 ARM = Arm(
     name="ur5e",
     mjcf="arms/ur5e/ur5e.xml",
@@ -20,7 +27,9 @@ ARM = Arm(
     servo_frequency=100.0,
     mounts={
         ("grasper", "board"): _MOUNT,
+        ("grasper_wide", "wire"): _MOUNT,
         ("grasper", "left"): _MOUNT,
         ("grasper", "right"): opposite(_MOUNT),
+        **dict.fromkeys([("endoscope", "overhead"), ("endoscope30", "overhead")], _OVERHEAD),
     },
 )

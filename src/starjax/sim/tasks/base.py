@@ -149,6 +149,10 @@ class Views(NamedTuple):
     contacts: Contacts
 
 
+def _undriven(bound: Any, layout: Any, ctrl: jax.Array, time: jax.Array) -> jax.Array:
+    return ctrl
+
+
 class Task(NamedTuple):
     """One task, a row of the registry.
 
@@ -156,7 +160,8 @@ class Task(NamedTuple):
       name: key in the registry.
       mjcf: the world: a part below `mjcf/`, or the path of a file.
       slots: one for each arm.
-      cameras: of the MJCF, that policies may see; the first one is used unless others are chosen.
+      cameras: of the MJCF or of a tool, that policies may see; the first one is used unless others
+        are chosen.
       time_limit_s: s of simulated time that a trial may take.
       settle_steps: control steps in a row that a strict success must hold.
       fields: parts of the `state` observation, in order.
@@ -184,6 +189,8 @@ class Task(NamedTuple):
       trocars: configurations of trocars to train and to be scored on, fields `[C, A]`; the seen
         ones, of which the first may be chosen for training, come first.
       is_seen: `[C]` bool.
+      drive: (Bound, Layout, ctrl `[nu]`, s since reset) -> ctrl with what actuators of the task's
+        own MJCF are to do, for things that move by themselves.
     """
 
     name: str
@@ -214,6 +221,7 @@ class Task(NamedTuple):
     outline: Callable[..., Outline]
     trocars: rcm.Trocar = rcm.Trocar(*(field[:, None] for field in rcm.TROCARS))
     is_seen: np.ndarray = rcm.IS_SEEN
+    drive: Callable[..., jax.Array] = _undriven
 
     @property
     def arms(self) -> int:

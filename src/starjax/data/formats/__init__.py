@@ -1,0 +1,1 @@
+"""Other people's dataset formats: rows of `base.FORMATS`, read and written as one struct."""

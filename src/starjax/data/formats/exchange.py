@@ -1,0 +1,275 @@
+"""Our datasets as other formats, and back: exports carry enough to come back as they were.
+
+An export has the columns that its peers expect (state, action, trocar, images) and every field of
+ours as it is, under `starjax.<field>`. Images are there once.
+"""
+
+import contextlib
+import json
+import shutil
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import transform
+
+from starjax import errors, rcm
+from starjax.data import schema, store
+from starjax.data.formats import base
+from starjax.data.formats.base import Column, Source
+from starjax.rollouts import episodes
+from starjax.runtime import files, provenance
+
+_AXES = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
+
+
+def source(root: Path, form: base.Format) -> Source:
+    """A sealed dataset of ours as what a format writes.
+
+    Raises:
+      ValueError: it is not complete, or damaged.
+    """
+    description = schema.upgraded(store.read_description(root))
+    sealed = store.read_seal(root)
+    records = list(_records(root, sealed).values())
+    kept = [record for record in records if record["files"]]
+    if not kept:
+        raise errors.UsageError("DATASET", "episodes", f"{root}: none was kept")
+    fields = {
+        name: Column(tuple(feature["shape"]), np.dtype(feature["dtype"]).name)
+        for name, feature in description["features"].items()
+    }
+    named = {name: form.named(_column(name)) for name in fields}
+    scene = description["scene"]
+
+    def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
+        arrays = _arrays(root, description, kept[episode])
+        found = {named[name]: array for name, array in arrays.items()}
+        made = _derived(arrays, kept[episode], description)
+        found |= {form.named(name): array for name, array in made.items()}
+        return {name: found[name] for name in names}
+
+    columns = {form.named(name): column for name, column in _extra(description).items()}
+    columns |= {named[name]: column for name, column in fields.items()}
+    return Source(
+        hz=description["control_hz"],
+        lengths=[record["length"] for record in kept],
+        columns=columns,
+        read=read,
+        origin={
+            "schema": 1,
+            **provenance.code()._asdict(),
+            "description": _today(description),
+            "records": [_outcome(record) for record in records],
+            "stored": [bool(record["files"]) for record in records],
+            "columns": named,
+            "digest": sealed["digest"],
+        },
+        task=scene["task"].replace("_", " "),
+        robot="_".join(scene["arms"]),
+    )
+
+
+def export(
+    found: Source,
+    out: Path,
+    form: base.Format,
+    video: bool = True,
+    note: Callable[[int], None] = lambda count: None,
+) -> None:
+    """Writes what `source` found; `out` appears once all of it is there.
+
+    Args:
+      note: hears of every episode that is written.
+    """
+
+    def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
+        note(1)
+        return found.read(episode, names)
+
+    with _staged(out) as staged:
+        form.write(staged, found._replace(read=read), video)
+
+
+def bring_back(
+    found: Source, root: Path, note: Callable[[int], None] = lambda count: None
+) -> dict[str, Any]:
+    """Writes an export of ours, which has an origin, as the dataset that it was.
+
+    Args:
+      note: hears of every episode that is written.
+
+    Returns:
+      {"digest", "episodes", "same"}: `same` is whether every byte is as it was.
+
+    Raises:
+      errors.UsageError: what the origin says is not what a dataset has.
+    """
+    assert found.origin is not None
+    origin = _checked(found.origin, found)
+    description, stored = origin["description"], iter(range(len(found.lengths)))
+    with files.lock(root):
+        store.create(root, description)
+        store.clean(root)
+        known, records = set(store.keys(root)), {}
+        for outcome, is_stored in zip(origin["records"], origin["stored"], strict=True):
+            episode = next(stored) if is_stored else None
+            key = outcome["key"]
+            if key in known:  # of a run that was killed
+                records[key] = store.verify(root, key)
+                continue
+            arrays = {} if episode is None else _ours(found, origin, episode)
+            records[key] = store.commit(root, key, outcome, arrays)
+            note(1)
+        digest = store.seal(root, records)
+    count = sum(map(bool, origin["stored"]))
+    return {"digest": digest, "episodes": count, "same": digest == origin["digest"]}
+
+
+@contextlib.contextmanager
+def _staged(out: Path) -> Iterator[Path]:
+    """Where to write what then becomes `out` at once."""
+    staged = out.with_name(f".{out.name}.tmp")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    _remove(staged)
+    try:
+        yield staged
+        staged.rename(out)
+    except BaseException:
+        _remove(staged)
+        raise
+    files.sync_directory(out.parent)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _records(root: Path, sealed: dict[str, Any]) -> dict[str, store.Record]:
+    found = {}
+    for key, record in store.verify_all(root, sealed["episodes"]).items():
+        if isinstance(record, store.DamagedEpisode):
+            raise record
+        if record["digest"] != sealed["episodes"][key]:
+            raise store.DamagedEpisode(f"{root}: {key} is not the episode that SEALED.json lists")
+        found[key] = record
+    return found
+
+
+def _today(description: dict[str, Any]) -> dict[str, Any]:
+    return description | {"schema": schema.SCHEMA}
+
+
+def _outcome(record: store.Record) -> dict[str, Any]:
+    """A record as schema 2 has it, without what `store.commit` adds."""
+    found = {name: value for name, value in record.items() if name not in ("files", "digest")}
+    place = zip(rcm.Trocar._fields, schema.trocars_of([record]))
+    per_arm = {name: np.asarray(record[name]).reshape(-1).tolist() for name, _ in place}
+    return found | per_arm
+
+
+def _column(field: str) -> str:
+    return field if field.startswith(episodes.IMAGE) else f"{base.OURS}.{field}"
+
+
+def _arrays(root: Path, about: dict[str, Any], record: store.Record) -> dict[str, np.ndarray]:
+    """Fields of an episode as schema 2 has them."""
+    folder = root / "episodes" / record["key"]
+    found = {}
+    for name in about["features"]:
+        array = np.load(folder / schema.file_name(about["schema"], name), allow_pickle=False)
+        found[name] = schema.with_arms(about["schema"], name, array)
+    return found
+
+
+def _extra(description: dict[str, Any]) -> dict[str, Column]:
+    """Columns that peers expect, made of ours."""
+    arms = len(description["p_world_ref"])
+    names = [f"arm{i}_{axis}" if arms > 1 else axis for i in range(arms) for axis in _AXES]
+    places = [
+        name.replace("gripper", "") for name in names if name[-1] in "xyz" and "q" not in name
+    ]
+    found = {
+        "state": Column((8 * arms,), "float32", tuple(names)),
+        "action": Column((8 * arms,), "float32", tuple(names)),
+        "trocar": Column((3 * arms,), "float32", tuple(places)),
+        "reward": Column((), "float32"),
+        "done": Column((), "bool"),
+    }
+    if "state" in description["features"]:
+        count = description["features"]["state"]["shape"]
+        said = description.get("task", {}).get("fields", [])  # schema 1 does not say them
+        labels = tuple(f"{name}.{i}" for name, size, *_ in said for i in range(size))
+        found["environment_state"] = Column(tuple(count), "float32", labels)
+    return found
+
+
+def _derived(
+    arrays: dict[str, np.ndarray], record: store.Record, description: dict[str, Any]
+) -> dict[str, np.ndarray]:
+    length, places = record["length"], schema.trocars_of([record])
+    reference = np.asarray(description["p_world_ref"], np.float32)
+    trocar = np.asarray(rcm.trocar_position(places, reference)).reshape(1, -1)
+    last = np.arange(length) == length - 1
+    found = {
+        "state": _poses(arrays["p"], arrays["R"], arrays["gripper"]),
+        "action": _poses(arrays["command_p"], arrays["command_R"], arrays["command_gripper"]),
+        "trocar": np.repeat(trocar, length, axis=0).astype(np.float32),
+        "reward": (last & record["success"]).astype(np.float32),
+        "done": last,
+    }
+    return found | ({"environment_state": arrays["state"]} if "state" in arrays else {})
+
+
+def _poses(p: np.ndarray, R: np.ndarray, gripper: np.ndarray) -> np.ndarray:
+    """Positions, quaternions xyzw without jumps, jaws: `[T, 8 A]`."""
+    turned = transform.Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
+    turned = turned.reshape(*R.shape[:2], 4)
+    # A quaternion and its opposite are one rotation: that nearer to the last one.
+    ahead = np.where(np.sum(turned[1:] * turned[:-1], -1, keepdims=True) < 0, -1.0, 1.0)
+    turned[1:] *= np.cumprod(ahead, axis=0)
+    rows = np.concatenate([p, turned, gripper[..., None]], -1)
+    return rows.reshape(len(p), -1).astype(np.float32)
+
+
+def _checked(origin: dict[str, Any], found: Source) -> dict[str, Any]:
+    """An origin whose parts are there and fit the files; it may have been edited by anybody."""
+    try:
+        description, records = origin["description"], origin["records"]
+        counts = len(records), len(origin["stored"])
+        base.require(counts[0] == counts[1], f"{counts[0]} episodes", counts[1])
+        stored = [r for r, kept in zip(records, origin["stored"]) if kept]
+        lengths = [record["length"] for record in stored]
+        base.require(lengths == list(found.lengths), f"lengths {lengths}", list(found.lengths))
+        for record in records:
+            base.require(store.is_key(record["key"]), "an episode's key", record["key"])
+        for field, feature in description["features"].items():
+            base.require(field.replace("_", "").isalnum(), "a field's name", field)
+            column = found.columns[origin["columns"][field]]
+            same = np.prod(column.shape) == np.prod(feature["shape"])
+            base.require(bool(same), f"{field} of shape {feature['shape']}", column.shape)
+        json.dumps(description)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        said = f"{type(error).__name__}: {error}"
+        raise errors.UsageError(
+            "PATH", "what an export of starjax says of itself", said, "a --map reads it as others'"
+        ) from error
+    return origin
+
+
+def _ours(found: Source, origin: dict[str, Any], episode: int) -> dict[str, list[np.ndarray]]:
+    """Fields of an episode in the order in which `rollouts.episodes.assemble` has them."""
+    names, features = origin["columns"], origin["description"]["features"]
+    arrays = found.read(episode, [names[field] for field in features])
+    return {
+        field: [
+            arrays[names[field]]
+            .reshape(found.lengths[episode], *features[field]["shape"])
+            .astype(np.dtype(features[field]["dtype"]), copy=False)
+        ]
+        for field in sorted(features)
+    }

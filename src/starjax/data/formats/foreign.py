@@ -1,0 +1,289 @@
+"""Somebody's demonstrations as a dataset of ours, by a mapping: two readings of the files.
+
+The first reads numbers alone: what is odd, and where the trocars are. The second writes episodes,
+with images, as `data.demos` would have.
+"""
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from starjax import errors, rcm
+from starjax.data import schema, store
+from starjax.data.formats import mapping as maps
+from starjax.data.formats import motion, ports
+from starjax.data.formats.base import Source
+from starjax.data.formats.mapping import Camera, Map
+from starjax.data.formats.motion import HZ, Motion
+from starjax.rollouts import episodes
+from starjax.runtime import files, xla
+from starjax.sim import registry
+
+
+class Imported(NamedTuple):
+    """What became of the files.
+
+    Attributes:
+      digest: of the dataset.
+      episodes: kept. left_out: not kept. frames: of those that are kept.
+      p_world_trocar: `[E, A, 3]` m of the kept episodes.
+      residual_mm: `[E, A]` root mean square of the shafts' distances from it.
+      notes: what is odd, a line each.
+    """
+
+    digest: str
+    episodes: int
+    left_out: int
+    frames: int
+    p_world_trocar: np.ndarray
+    residual_mm: np.ndarray
+    notes: list[str]
+
+
+class _Kept(NamedTuple):
+    episode: int
+    length: int
+    trocar: int
+    success: bool
+
+
+def bring(
+    source: Source,
+    mapping: Map,
+    root: Path,
+    folder: Path,
+    note: Callable[[int], None] = lambda count: None,
+) -> Imported:
+    """Writes a sealed dataset at `root`; of a killed run what is there is kept.
+
+    Args:
+      folder: of the mapping file, where robots' models lie.
+      note: hears of every episode that is read.
+
+    Raises:
+      errors.UsageError: the mapping does not fit the files or the task, or no episode is left.
+      StorageError: `root` cannot be written, or holds another dataset.
+    """
+    task = registry.tasks.get(mapping.task)
+    _fits(source, mapping, task)
+    hz = mapping.hz or source.hz
+    if not hz and not mapping.time:
+        raise errors.UsageError("--map: hz", "steps a second, which the files do not say", "none")
+
+    def moved(arrays: dict[str, np.ndarray]) -> Motion:
+        return motion.read(arrays, mapping, hz, folder)
+
+    kept, tips, notes = [], [], list(source.notes)
+    for episode in range(len(source.lengths)):
+        arrays = source.read(episode, maps.names(mapping))
+        try:
+            found = moved(arrays)
+            is_good = _succeeded(arrays, mapping)
+        except motion.Gap as gap:
+            notes.append(f"episode {episode}: {gap}; left out")
+        except errors.UsageError as error:
+            line = f"{error.got} in episode {episode}"
+            raise errors.UsageError(error.argument, error.expected, line) from error
+        else:
+            notes += [f"episode {episode}: {line}" for line in found.notes]
+            tips.append(ports.thinned(found))
+            kept.append(_Kept(episode, len(found.pose.p), -1, is_good))
+        note(1)
+    places, is_known = ports.found(tips, mapping, [k.episode for k in kept], notes)
+    kept, places = (list(itertools.compress(items, is_known)) for items in (kept, places))
+    tips = list(itertools.compress(tips, is_known))
+    if not kept:
+        said = notes[-1] if notes else "no episode"
+        raise errors.UsageError("PATH", "demonstrations to keep", said)
+    groups, centres = ports.grouped(np.array(places))
+    kept = [k._replace(trocar=int(group)) for k, group in zip(kept, groups)]
+    residual = ports.residual(tips, centres[groups], [k.episode for k in kept], notes)
+    description = _describe(source, mapping, task, kept, centres, hz)
+    about = {"notes": notes, "residual_mm": np.round(residual, 4).tolist()}
+    digest = _written(root, description, about, source, mapping, kept, centres, task, moved, note)
+    return Imported(
+        digest,
+        len(kept),
+        len(source.lengths) - len(kept),
+        sum(k.length for k in kept),
+        centres[groups],
+        residual,
+        notes,
+    )
+
+
+def _fits(source: Source, mapping: Map, task: Any) -> None:
+    maps.check(mapping, source)
+    arms, wanted = len(mapping.arms), len(task.slots)
+    if arms != wanted:
+        raise errors.UsageError("--map: arms", f"{wanted}, as task {mapping.task} has", arms)
+    for name in mapping.cameras:
+        errors.choice("--map: cameras", name, task.cameras)
+    if not mapping.cameras and not mapping.state:
+        raise errors.UsageError("--map", "cameras or a state, to learn from", "neither")
+
+
+def _succeeded(arrays: dict[str, np.ndarray], mapping: Map) -> bool:
+    return not mapping.success or bool(maps.pick(arrays, mapping.success, 1)[-1, 0] > 0.5)
+
+
+def _describe(
+    source: Source, mapping: Map, task: Any, kept: list[_Kept], centres: np.ndarray, hz: float
+) -> dict[str, Any]:
+    reference = np.array([slot.p_world_ref for slot in task.slots])
+    trocars = rcm.trocar_from_position(centres.astype(np.float32), reference.astype(np.float32))
+    shapes = _shapes(source, mapping, len(task.slots))
+    unknown = [source.robot or "unknown"] * len(task.slots)
+    return {
+        "schema": schema.SCHEMA,
+        "per_trocar": int(np.bincount([k.trocar for k in kept]).max()),
+        "seed": 0,
+        "max_steps": max(k.length for k in kept),
+        "keep_failures": True,
+        "expert": "imported",
+        "scene": {
+            "task": mapping.task,
+            "arms": unknown,
+            "tools": ["unknown"] * len(unknown),
+            "cameras": list(mapping.cameras),
+        },
+        "trocars": np.stack([np.asarray(f, np.float64) for f in trocars], -1).tolist(),
+        "p_world_ref": reference.tolist(),
+        "roll_zero": [float(slot.roll_zero) for slot in task.slots],
+        "control_hz": HZ,
+        "task": {
+            "fields": [list(field) for field in task.fields],
+            "labels": list(task.labels),
+            "stages": list(task.stages),
+        },
+        "features": {
+            name: {"shape": list(shape), "dtype": dtype, "what": episodes.what(name)}
+            for name, (shape, dtype) in sorted(shapes.items())
+        },
+        "imported": {"mapping": maps.as_json(mapping), "hz": hz, "task": source.task},
+        "versions": xla.versions(),
+    }
+
+
+def _shapes(source: Source, mapping: Map, arms: int) -> dict[str, tuple[tuple[int, ...], str]]:
+    real = np.dtype(np.float32).str
+    found: dict[str, tuple[tuple[int, ...], str]] = {
+        f"{before}{name}": ((arms, *shape), real)
+        for before in ("", "command_")
+        for name, shape in (("p", (3,)), ("R", (3, 3)), ("gripper", ()))
+    }
+    found["rcm_error"] = ((arms,), real)
+    if mapping.state:
+        some = maps.pick(source.read(0, maps.names(mapping)), mapping.state)
+        found["state"] = (some.shape[1:], real)
+    for name, camera in mapping.cameras.items():
+        shape = source.columns[camera.column].shape
+        blank = pictures(np.zeros((1, *shape), np.uint8), camera)
+        found[f"{episodes.IMAGE}{name}"] = (blank.shape[1:], np.dtype(np.uint8).str)
+    return found
+
+
+def _written(
+    root: Path,
+    description: dict[str, Any],
+    about: dict[str, Any],
+    source: Source,
+    mapping: Map,
+    kept: list[_Kept],
+    centres: np.ndarray,
+    task: Any,
+    moved: Callable[[dict[str, np.ndarray]], Motion],
+    note: Callable[[int], None],
+) -> str:
+    """Commits the episodes; returns the digest."""
+    labels = dict.fromkeys(task.labels, 0)
+    trials = np.zeros(len(centres), int)
+    frame_bytes = sum(
+        int(np.prod(f["shape"])) * np.dtype(f["dtype"]).itemsize
+        for f in description["features"].values()
+    )
+    with files.lock(root):
+        store.create(root, description)
+        store.clean(root)
+        files.require_writable(root, frame_bytes * sum(k.length for k in kept))
+        known, records = set(store.keys(root)), {}
+        for k in kept:
+            key = store.key(k.trocar, int(trials[k.trocar]), 0)
+            outcome = {
+                "trocar": k.trocar,
+                **_place(description["trocars"][k.trocar]),
+                "trial": int(trials[k.trocar]),
+                "seed": 0,
+                "length": k.length,
+                **dict.fromkeys(episodes.FLAGS, False),
+                "success": k.success,
+                "loose": k.success,
+                "stage": 0,
+                "labels": labels,
+                "episode": k.episode,
+            }
+            trials[k.trocar] += 1
+            if key in known:  # of a run that was killed
+                records[key] = store.verify(root, key)
+            else:
+                raw = source.read(k.episode, maps.names(mapping))
+                arrays = _fields(source, mapping, k, raw, moved(raw), centres[k.trocar])
+                parts = {name: [arrays[name]] for name in sorted(arrays)}
+                records[key] = store.commit(root, key, outcome, parts)
+            note(1)
+        files.write_json(root / schema.IMPORTED, about)
+        return store.seal(root, records)
+
+
+def _place(trocar: list[list[float]]) -> dict[str, list[float]]:
+    return {name: [arm[i] for arm in trocar] for i, name in enumerate(rcm.Trocar._fields)}
+
+
+def _fields(
+    source: Source,
+    mapping: Map,
+    kept: _Kept,
+    raw: dict[str, np.ndarray],
+    found: Motion,
+    place: np.ndarray,
+) -> dict[str, np.ndarray]:
+    off = np.cross(found.pose.p - place, found.pose.R[..., 2])
+    arrays = {
+        "p": found.pose.p,
+        "R": found.pose.R,
+        "gripper": found.gripper,
+        "command_p": found.command.p,
+        "command_R": found.command.R,
+        "command_gripper": found.command_gripper,
+        "rcm_error": np.linalg.norm(off, axis=-1),
+    }
+    if mapping.state:
+        arrays["state"] = maps.pick(raw, mapping.state)[found.nearest]
+    arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
+    columns = [camera.column for camera in mapping.cameras.values()]
+    images = source.read(kept.episode, columns) if columns else {}
+    for name, camera in mapping.cameras.items():
+        shown = images[camera.column][found.nearest]
+        arrays[f"{episodes.IMAGE}{name}"] = pictures(shown, camera)
+    return arrays
+
+
+def pictures(images: np.ndarray, camera: Camera) -> np.ndarray:
+    """Images `[T, h, w, 3]` cropped, with red first, at the size that is asked for."""
+    if camera.crop:
+        top, left, height, width = camera.crop
+        cut = images[:, top : top + height, left : left + width]
+        if cut.shape[1:3] != (height, width) or not cut.size:
+            got = f"{list(camera.crop)} of {list(images.shape[1:3])}"
+            raise errors.UsageError("--map: crop", "a part of the image", got)
+        images = cut
+    images = images[..., ::-1] if camera.bgr else images
+    if camera.size and images.shape[1:3] != (camera.size, camera.size):
+        sides = (camera.size, camera.size)
+        resized = (Image.fromarray(np.ascontiguousarray(x)).resize(sides) for x in images)
+        images = np.stack([np.asarray(image) for image in resized])
+    return np.ascontiguousarray(images)

@@ -1,0 +1,212 @@
+"""LeRobotDataset: written as v3.0, read as v3.0 and v2.1. Nothing of lerobot is needed.
+
+v3.0 has episodes one after another in files of about 100 MB, v2.1 a file an episode:
+
+    meta/info.json                     fps, features
+    meta/episodes/*/*.parquet          lengths, and where each lies (v2.1: meta/episodes.jsonl)
+    data/chunk-000/file-000.parquet    numbers, and images as PNG (v2.1: episode_000000.parquet)
+    videos/<camera>/chunk-000/...      images as video (v2.1: videos/chunk-000/<camera>/...)
+    meta/starjax.json                  of our exports: what they need to come back whole
+
+Where files lie is not taken from templates in info.json, which anybody may have written.
+"""
+
+import contextlib
+import io
+import json
+import re
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as datasets
+import pyarrow.parquet as parquet
+from PIL import Image
+
+from starjax.data.formats import base, lerobot_write, video
+from starjax.data.formats.base import Column, Source
+from starjax.rollouts import episodes
+from starjax.runtime import files
+
+_NAMES = {
+    "state": "observation.state",
+    "trocar": "observation.trocar",
+    "environment_state": "observation.environment_state",
+    "reward": "next.reward",
+    "done": "next.done",
+}
+_FEATURE = re.compile(r"[\w.][\w.\- ]*")  # a feature's name, which is also a folder's
+_CHUNK = 1000  # files a folder, where v2.1 does not say
+
+
+def named(column: str) -> str:
+    """LeRobot's name of a column of ours."""
+    if column.startswith(episodes.IMAGE):
+        return f"observation.images.{column.removeprefix(episodes.IMAGE)}"
+    return _NAMES.get(column, column)
+
+
+class _Place(NamedTuple):
+    """Where an episode lies: its number, its file of numbers, of each camera video and start."""
+
+    number: int
+    length: int
+    table: Path
+    videos: dict[str, tuple[Path, float]]
+
+
+@contextlib.contextmanager
+def _open(path: Path) -> Iterator[Source]:
+    info = files.read_json(path / "meta/info.json")
+    version = str(info["codebase_version"])
+    base.require(version[:3] in _READERS, "version v3.0 or v2.1", version)
+    hz = float(info["fps"])
+    base.require(0.0 < hz < 1e5, "fps above 0", hz)
+    columns, kinds = {}, {}
+    for name, feature in info["features"].items():
+        base.require(bool(_FEATURE.fullmatch(name)) and ".." not in name, "a name", name)
+        if (column := _column(feature)) is not None:
+            columns[name], kinds[name] = column, feature["dtype"]
+    cameras = [name for name, kind in kinds.items() if kind == "video"]
+    places = list(_READERS[version[:3]](path, info, cameras))
+
+    def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
+        place = places[episode]
+        low = [name for name in names if kinds[name] != "video"]
+        table = _rows(path, place, low)
+        found = {
+            name: _array(name, table[name], columns[name], kinds[name], place.length)
+            for name in low
+        }
+        for name in names:
+            if kinds[name] == "video":
+                file, first = place.videos[name]
+                base.require_inside(path, file)
+                found[name] = video.read(file, first, place.length, hz, columns[name].shape)
+        return found
+
+    ours = path / "meta" / f"{base.OURS}.json"
+    origin = files.read_json(ours) if ours.exists() else None
+    robot = str(info.get("robot_type") or "")
+    yield Source(hz, [p.length for p in places], columns, read, origin, _task(path), robot)
+
+
+def _column(feature: dict[str, Any]) -> Column | None:
+    """A feature as a column; None of one that has no numbers."""
+    kind, shape = feature["dtype"], tuple(int(n) for n in feature["shape"])
+    base.require(all(n > 0 for n in shape), "sizes above 0", list(shape))
+    if kind in ("image", "video"):
+        base.require(len(shape) == 3, "[h, w, 3]", list(shape))
+        first = shape[0] == 3 and shape[2] != 3
+        return Column((*shape[1:], 3) if first else shape, "uint8")
+    if kind == "string":
+        return None
+    names = feature.get("names")
+    names = next(iter(names.values())) if isinstance(names, dict) and names else names
+    named = tuple(map(str, names)) if isinstance(names, list) else ()
+    return Column(() if shape == (1,) else shape, np.dtype(kind).name, named)
+
+
+def _places_v3(root: Path, info: dict[str, Any], cameras: list[str]) -> Iterator[_Place]:
+    found = sorted((root / "meta/episodes").glob("*/*.parquet"))
+    base.require(bool(found), "meta/episodes/*/*.parquet", "none")
+    for path in found:
+        table = parquet.read_table(base.require_inside(root, path))
+        wanted = [name for name in table.column_names if not name.startswith("stats/")]
+        for row in table.select(wanted).to_pylist():
+            videos = {
+                name: (
+                    root / "videos" / name / _file(row, f"videos/{name}", "mp4"),
+                    float(row[f"videos/{name}/from_timestamp"]),
+                )
+                for name in cameras
+            }
+            number = int(row["episode_index"])
+            length = _length(row["length"])
+            yield _Place(number, length, root / "data" / _file(row, "data", "parquet"), videos)
+
+
+def _file(row: dict[str, Any], kind: str, ending: str) -> str:
+    chunk, file = int(row[f"{kind}/chunk_index"]), int(row[f"{kind}/file_index"])
+    return f"chunk-{chunk:03d}/file-{file:03d}.{ending}"
+
+
+def _places_v2(root: Path, info: dict[str, Any], cameras: list[str]) -> Iterator[_Place]:
+    size = int(info.get("chunks_size") or _CHUNK)
+    with open(root / "meta/episodes.jsonl") as lines:
+        rows = [json.loads(line) for line in lines if line.strip()]
+    for row in rows:
+        number = int(row["episode_index"])
+        base.require(number >= 0, "an episode's number", number)
+        chunk, name = f"chunk-{number // size:03d}", f"episode_{number:06d}"
+        videos = {
+            camera: (root / "videos" / chunk / camera / f"{name}.mp4", 0.0) for camera in cameras
+        }
+        table = root / "data" / chunk / f"{name}.parquet"
+        yield _Place(number, _length(row["length"]), table, videos)
+
+
+_READERS: dict[str, Callable[[Path, dict[str, Any], list[str]], Iterator[_Place]]] = {
+    "v3.": _places_v3,
+    "v2.": _places_v2,
+}
+
+
+def _length(value: Any) -> int:
+    base.require(0 < int(value) < 10**8, "control steps", value)
+    return int(value)
+
+
+def _rows(root: Path, place: _Place, names: list[str]) -> Any:
+    """The rows of an episode; row groups of others are skipped by their statistics."""
+    if not names:
+        return {}
+    base.require(place.table.is_file(), "a file of numbers", f"none at {place.table}")
+    lies = datasets.dataset(base.require_inside(root, place.table), format="parquet")
+    is_its = datasets.field("episode_index") == place.number
+    order = "frame_index" if "frame_index" in lies.schema.names else "episode_index"
+    wanted = dict.fromkeys([*names, order])
+    return lies.to_table(columns=list(wanted), filter=is_its).sort_by(order)
+
+
+def _array(name: str, cells: Any, column: Column, kind: str, length: int) -> np.ndarray:
+    base.require(len(cells) == length, f"{length} rows of {name}", len(cells))
+    base.require(cells.null_count == 0, f"no empty cells in {name}", cells.null_count)
+    if kind == "image":
+        base.require_fits(name, (length, *column.shape), np.uint8)
+        return np.stack([_picture(cell, column.shape) for cell in cells.to_pylist()])
+    flat = cells.combine_chunks()
+    while pa.types.is_nested(flat.type):
+        flat = flat.flatten()
+    base.require(flat.null_count == 0, f"no empty cells in {name}", flat.null_count)
+    array = flat.to_numpy(zero_copy_only=False).reshape(length, *column.shape)
+    return array.astype(column.dtype, casting="same_kind", copy=False)
+
+
+def _picture(cell: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
+    base.require(bool(cell.get("bytes")), "an image in the file", cell.get("path"))
+    with Image.open(io.BytesIO(cell["bytes"]), formats=("PNG", "JPEG")) as image:
+        base.require((image.height, image.width) == shape[:2], f"{list(shape)}", image.size)
+        return np.asarray(image.convert("RGB"))
+
+
+def _task(path: Path) -> str:
+    """The only task, in words; empty where there are several, or none is said."""
+    modern, old = path / "meta/tasks.parquet", path / "meta/tasks.jsonl"
+    said = []
+    if modern.exists():
+        table = parquet.read_table(modern)
+        texts = [name for name in table.column_names if pa.types.is_string(table[name].type)]
+        said = table[texts[0]].to_pylist() if texts else []
+    elif old.exists():
+        said = [json.loads(line)["task"] for line in old.read_text().splitlines() if line.strip()]
+    return str(said[0]) if len(said) == 1 else ""
+
+
+def _recognises(path: Path) -> bool:
+    return (path / "meta/info.json").is_file()
+
+
+FORMAT = base.Format("LeRobotDataset v3.0", named, _recognises, _open, lerobot_write.write)

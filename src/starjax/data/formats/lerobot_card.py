@@ -1,0 +1,68 @@
+"""The README of an exported dataset, as hubs show it: what it holds, and where it comes from."""
+
+from typing import Any
+
+from starjax.data.formats.base import Source
+
+_HEADER = """---
+license: unknown
+task_categories:
+- robotics
+tags:
+- LeRobot
+- surgical-robotics
+- starjax
+configs:
+- config_name: default
+  data_files: data/*/*.parquet
+---
+"""
+
+
+def card(info: dict[str, Any], source: Source) -> str:
+    """Text of the card.
+
+    Args:
+      info: content of meta/info.json.
+      source: what was written.
+    """
+    origin = source.origin or {}
+    about = origin.get("description", {})
+    rows = [
+        ("task", source.task),
+        ("robot", info["robot_type"]),
+        ("episodes", info["total_episodes"]),
+        ("frames", f"{info['total_frames']} at {info['fps']} Hz"),
+        ("trocars", len(about.get("trocars", [])) or "not said"),
+        (
+            "code",
+            f"starjax {origin.get('version', '')}, commit {origin.get('commit') or 'unknown'}",
+        ),
+        ("dataset", f"`{origin['digest']}`" if origin else "not said"),
+    ]
+    features = [
+        f"| `{name}` | {feature['dtype']} | {feature['shape']} | {_names(feature)} |"
+        for name, feature in info["features"].items()
+        if not name.startswith("starjax.")
+    ]
+    return "\n".join(
+        [
+            _HEADER,
+            f"# {source.task}\n",
+            "Demonstrations of a laparoscopic tool that moves through a trocar. Lengths are in m, "
+            "the world's frame has z up, quaternions are xyzw; z of the tip's frame is the shaft, "
+            "away from the robot. The gripper is -1 closed to +1 open.\n",
+            "| | |\n|---|---|",
+            *(f"| {name} | {text} |" for name, text in rows),
+            "\n## Features\n\n| name | type | shape | numbers |\n|---|---|---|---|",
+            *features,
+            "\n`observation.trocar` is where the shaft passes through the wall: a remote centre of "
+            "motion, fixed within an episode. Columns `starjax.*` and `meta/starjax.json` bring "
+            "the dataset back as it was: `starjax import`.\n",
+        ]
+    )
+
+
+def _names(feature: dict[str, Any]) -> str:
+    names = feature.get("names") or []
+    return ", ".join(map(str, names)) if len(names) < 30 else f"{names[0]} ... {names[-1]}"

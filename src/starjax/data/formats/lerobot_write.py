@@ -1,0 +1,291 @@
+"""Writes a LeRobotDataset v3.0: parquet, videos or PNG, statistics, and its card for a hub."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as parquet
+from PIL import Image
+
+from starjax import errors
+from starjax.data.formats import base, lerobot_card, video
+from starjax.data.formats.base import Column, Source
+from starjax.runtime import files
+
+DATA_MB, VIDEO_MB, CHUNK = 100, 200, 1000  # sizes of files, files a folder, as LeRobot has them
+_COUNTED = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_LOOKED_AT = 20  # images of an episode whose statistics are taken
+_EVERY = 4  # pixels of them
+
+
+def write(path: Path, source: Source, with_video: bool) -> None:
+    """Writes the folder; `with_video` is whether images go into videos, else into PNG."""
+    hz = round(source.hz)
+    if hz != source.hz or hz < 1:
+        raise errors.UsageError("DATASET", "a whole number of steps a second", source.hz)
+    features = _features(source, hz, with_video)
+    moving = {name: column for name, column in source.columns.items() if column.is_image}
+    moving = moving if with_video else {}
+    table, films = _Table(path, features), {name: _Films(path, name, hz) for name in moving}
+    rows, seen, first = [], {}, 0
+    for episode, length in enumerate(source.lengths):
+        arrays = source.read(episode, source.columns)
+        arrays |= _counted(episode, length, first, hz)
+        row = {"episode_index": episode, "tasks": [source.task], "length": length}
+        row |= {"dataset_from_index": first, "dataset_to_index": first + length}
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        for name, film in films.items():
+            row |= film.append(arrays.pop(name))
+        row |= table.append(arrays)
+        for name, figures in _looked_at(source, arrays, films).items():
+            row |= {f"stats/{name}/{key}": value for key, value in _stats(figures).items()}
+            seen.setdefault(name, []).append(figures)
+        rows.append(row)
+        first += length
+    table.close()
+    for film in films.values():
+        film.close()
+    _meta(path, source, features, rows, seen, hz)
+
+
+class _Numbered:
+    """Files of about a size, numbered as LeRobot does."""
+
+    def __init__(self, root: Path, kind: str, ending: str):
+        self._root, self._kind, self._ending, self.count = root, kind, ending, -1
+
+    def next(self) -> Path:
+        """The path of another one."""
+        self.count += 1
+        chunk, file = divmod(self.count, CHUNK)
+        path = self._root / self._kind / f"chunk-{chunk:03d}/file-{file:03d}.{self._ending}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def place(self) -> dict[str, int]:
+        """Columns that say which one it is."""
+        chunk, file = divmod(self.count, CHUNK)
+        return {f"{self._kind}/chunk_index": chunk, f"{self._kind}/file_index": file}
+
+
+class _Table:
+    """data/*: an episode a row group."""
+
+    def __init__(self, root: Path, features: dict[str, Any]):
+        self._files, self._writer, self._features = (
+            _Numbered(root, "data", "parquet"),
+            None,
+            features,
+        )
+        self._path = root
+
+    def append(self, arrays: dict[str, np.ndarray]) -> dict[str, int]:
+        """Writes an episode; returns where it is."""
+        names = [name for name, feature in self._features.items() if feature["dtype"] != "video"]
+        table = pa.table({name: _cells(arrays[name], self._features[name]) for name in names})
+        described = {name: _described(self._features[name]) for name in names}
+        said = json.dumps({"info": {"features": described}})
+        table = table.replace_schema_metadata({"huggingface": said})
+        if self._writer and self._path.stat().st_size > DATA_MB * 1e6:
+            self.close()
+        if self._writer is None:
+            self._path = self._files.next()
+            self._writer = parquet.ParquetWriter(self._path, table.schema)
+        self._writer.write_table(table)
+        return self._files.place()
+
+    def close(self) -> None:
+        """Ends the file."""
+        assert self._writer is not None
+        self._writer.close()
+        self._writer = None
+
+
+class _Films:
+    """videos/<camera>/*: episodes one after another."""
+
+    def __init__(self, root: Path, name: str, hz: int):
+        self._files, self._hz, self._name = _Numbered(root, f"videos/{name}", "mp4"), hz, name
+        self._film: video.Writer | None = None
+        self.sampled = np.zeros(0)
+
+    def append(self, images: np.ndarray) -> dict[str, Any]:
+        """Writes an episode; returns where it is."""
+        self.sampled = _sampled(images)
+        if self._film and self._film.bytes > VIDEO_MB * 1e6:
+            self.close()
+        if self._film is None:
+            self._film = video.Writer(self._files.next(), images.shape[1:], self._hz)
+        begins = self._film.seconds
+        self._film.append(images)
+        times = {"from_timestamp": begins, "to_timestamp": self._film.seconds}
+        return self._files.place() | {f"videos/{self._name}/{k}": v for k, v in times.items()}
+
+    def close(self) -> None:
+        """Ends the file."""
+        assert self._film is not None
+        self._film.close()
+        self._film = None
+
+
+def _features(source: Source, hz: int, with_video: bool) -> dict[str, Any]:
+    found = {
+        name: _picture(column, hz, with_video) if column.is_image else _feature(column)
+        for name, column in source.columns.items()
+    }
+    counted = {
+        name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _COUNTED.items()
+    }
+    return found | counted
+
+
+def _feature(column: Column) -> dict[str, Any]:
+    """Numbers of a step, in a row: peers read rows only."""
+    count = int(np.prod(column.shape))
+    return {"dtype": column.dtype, "shape": [count], "names": list(column.names) or None}
+
+
+def _picture(column: Column, hz: int, with_video: bool) -> dict[str, Any]:
+    shape = list(column.shape)
+    found = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+    if not with_video:
+        return found
+    about = {
+        "video.height": shape[0],
+        "video.width": shape[1],
+        "video.codec": video.CODEC,
+        "video.pix_fmt": video.pixels(column.shape),
+        "video.is_depth_map": False,
+        "video.fps": hz,
+        "video.channels": 3,
+        "has_audio": False,
+    }
+    return found | {"dtype": "video", "info": about}
+
+
+def _counted(episode: int, length: int, first: int, hz: int) -> dict[str, np.ndarray]:
+    steps = np.arange(length)
+    found = {
+        "timestamp": steps / hz,
+        "frame_index": steps,
+        "episode_index": np.full(length, episode),
+        "index": first + steps,
+        "task_index": np.zeros(length),
+    }
+    return {name: array.astype(_COUNTED[name]) for name, array in found.items()}
+
+
+def _cells(array: np.ndarray, feature: dict[str, Any]) -> pa.Array:
+    if feature["dtype"] == "image":
+        kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+        names = (f"frame-{i:06d}.png" for i in range(len(array)))
+        return pa.array([{"bytes": _png(x), "path": name} for x, name in zip(array, names)], kind)
+    flat = pa.array(np.ascontiguousarray(array).reshape(-1))
+    count = feature["shape"][0]
+    return flat if count == 1 else pa.FixedSizeListArray.from_arrays(flat, count)
+
+
+def _png(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", compress_level=1)
+    return buffer.getvalue()
+
+
+def _described(feature: dict[str, Any]) -> dict[str, Any]:
+    """A feature as the package datasets says it."""
+    if feature["dtype"] == "image":
+        return {"_type": "Image"}
+    value = {"dtype": feature["dtype"], "_type": "Value"}
+    count = feature["shape"][0]
+    return value if count == 1 else {"feature": value, "length": count, "_type": "List"}
+
+
+def _sampled(images: np.ndarray) -> np.ndarray:
+    chosen = np.linspace(0, len(images) - 1, min(len(images), _LOOKED_AT)).astype(int)
+    return images[chosen][:, ::_EVERY, ::_EVERY]
+
+
+def _looked_at(
+    source: Source, arrays: dict[str, np.ndarray], films: dict[str, _Films]
+) -> dict[str, np.ndarray]:
+    images = {name: film.sampled for name, film in films.items()}
+    rest = {
+        name: _sampled(array) if name in source.columns and source.columns[name].is_image else array
+        for name, array in arrays.items()
+    }
+    return images | rest
+
+
+def _stats(array: np.ndarray) -> dict[str, list]:
+    is_image = array.ndim == 4 and array.dtype == np.uint8
+    rows = array.reshape(-1, 3) / 255.0 if is_image else array.reshape(len(array), -1)
+    rows = np.where(np.isfinite(rows), rows, 0.0)  # JSON has no other numbers
+    found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+    found |= dict(zip(_QUANTILES, np.quantile(rows, list(_QUANTILES.values()), axis=0)))
+    shape = (3, 1, 1) if is_image else (-1,)
+    return {n: x.reshape(shape).tolist() for n, x in found.items()} | {"count": [len(array)]}
+
+
+def _meta(
+    path: Path,
+    source: Source,
+    features: dict[str, Any],
+    rows: list[dict[str, Any]],
+    seen: dict[str, list[np.ndarray]],
+    hz: int,
+) -> None:
+    placed = path / "meta/episodes/chunk-000/file-000.parquet"
+    placed.parent.mkdir(parents=True)
+    parquet.write_table(pa.Table.from_pylist(rows), placed)
+    parquet.write_table(_tasks(source.task), path / "meta/tasks.parquet")
+    stats = {name: _stats(np.concatenate(parts)) for name, parts in seen.items()}
+    files.write_json(path / "meta/stats.json", stats)
+    has_video = any(feature["dtype"] == "video" for feature in features.values())
+    place = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+    about = {
+        "codebase_version": "v3.0",
+        "robot_type": source.robot,
+        "total_episodes": len(rows),
+        "total_frames": sum(source.lengths),
+        "total_tasks": 1,
+        "chunks_size": CHUNK,
+        "data_files_size_in_mb": DATA_MB,
+        "video_files_size_in_mb": VIDEO_MB,
+        "fps": hz,
+        "splits": {"train": f"0:{len(rows)}"},
+        "data_path": f"data/{place}.parquet",
+        "video_path": f"videos/{{video_key}}/{place}.mp4" if has_video else None,
+        "features": features,
+    }
+    files.write_json(path / "meta/info.json", about)
+    if source.origin:
+        files.write_json(path / "meta" / f"{base.OURS}.json", source.origin)
+    (path / "README.md").write_text(lerobot_card.card(about, source))
+
+
+def _tasks(task: str) -> pa.Table:
+    """Tasks as pandas writes them: their words are the index."""
+    table = pa.table({"task_index": pa.array([0]), "task": pa.array([task])})
+    number = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+    words = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    said = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", **number},
+            {"name": "task", "field_name": "task", **words},
+        ],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.2.0",
+    }
+    return table.replace_schema_metadata({"pandas": json.dumps(said)})

@@ -1,0 +1,292 @@
+"""What arms did in an episode of somebody's dataset: poses in the task's world, at our rate."""
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial import transform
+
+from starjax import errors
+from starjax.data.formats import mapping as maps
+from starjax.data.formats.mapping import Arm, Map
+
+HZ = 30.0  # of every dataset
+FAST = 1.0  # m/s, faster tips are jumps
+SPINNING = 15.0  # rad/s, faster turns are jumps
+_FARTHEST = 5.0  # m; tips farther from the origin are in other units
+_EVEN = 0.02  # of a period, by which even steps may be off
+_UNIT = 0.1  # by which a quaternion's length may be off
+
+
+class Poses(NamedTuple):
+    """Tip poses on the host: rotations `[..., 3, 3]`, positions `[..., 3]` m."""
+
+    R: np.ndarray
+    p: np.ndarray
+
+
+class Motion(NamedTuple):
+    """An episode of A arms at T even control steps, in double precision.
+
+    Attributes:
+      pose, command: `[T, A]`, world frame.
+      gripper, command_gripper: `[T, A]` in [-1, 1].
+      p_world_trocar: `[T, A, 3]` m, NaN where it is to be estimated.
+      nearest: `[T]` step of the files whose images are shown.
+      notes: what is odd, a line each.
+    """
+
+    pose: Poses
+    command: Poses
+    gripper: np.ndarray
+    command_gripper: np.ndarray
+    p_world_trocar: np.ndarray
+    nearest: np.ndarray
+    notes: list[str]
+
+
+class Gap(ValueError):
+    """An episode that leaves too long a time unsaid."""
+
+
+def read(arrays: Mapping[str, np.ndarray], mapping: Map, hz: float, folder: Path) -> Motion:
+    """Makes an episode's columns a motion.
+
+    Args:
+      hz: of the files.
+      folder: of the mapping file, where robots' models lie.
+
+    Raises:
+      Gap: it has a gap longer than `max_gap_s`.
+      errors.UsageError: a column is not what the mapping says.
+    """
+    length = len(next(iter(arrays.values())))
+    times = maps.pick(arrays, mapping.time, 1)[:, 0] if mapping.time else np.arange(length) / hz
+    notes = _looked_at(times, hz, mapping)
+    arms = [_arm(arrays, arm, mapping, folder) for arm in mapping.arms]
+    for i, arm in enumerate(arms):
+        notes += _jumps(times, arm.pose, f"arm {i}: " if len(arms) > 1 else "")
+    wanted, nearest = _even(times)
+    sampled = [_sampled(arm, times, wanted) for arm in arms]
+    return Motion(
+        pose=_together([arm.pose for arm in sampled]),
+        command=_together([arm.command for arm in sampled]),
+        gripper=np.stack([arm.gripper for arm in sampled], 1),
+        command_gripper=np.stack([arm.command_gripper for arm in sampled], 1),
+        p_world_trocar=np.stack([arm.p_world_trocar for arm in sampled], 1),
+        nearest=nearest,
+        notes=notes,
+    )
+
+
+def _together(arms: list[Poses]) -> Poses:
+    return Poses(np.stack([arm.R for arm in arms], 1), np.stack([arm.p for arm in arms], 1))
+
+
+class _Arm(NamedTuple):
+    """One arm; None of a command that the files lack."""
+
+    pose: Poses
+    command: Any
+    gripper: np.ndarray
+    command_gripper: Any
+    p_world_trocar: np.ndarray
+
+
+def _arm(arrays: Mapping[str, np.ndarray], arm: Arm, mapping: Map, folder: Path) -> _Arm:
+    scale = 1e-3 if mapping.units == "mm" else 1.0
+    turn, origin = _quaternion(mapping.turn, "turn"), np.array(mapping.origin)
+
+    def placed(p: np.ndarray) -> np.ndarray:
+        return origin + scale * p @ turn.T
+
+    def tip(position: maps.Columns, rotation: maps.Columns) -> Poses:
+        R = turn @ rotations(maps.pick(arrays, rotation, maps.NUMBERS[arm.rotation_as]), arm)
+        return Poses(
+            R @ _quaternion(arm.tip_turn, "tip_turn"),
+            placed(maps.pick(arrays, position, 3)) + R @ np.array(arm.tip),
+        )
+
+    def jaws(columns: maps.Columns) -> np.ndarray:
+        raw = maps.pick(arrays, columns, 1)[:, 0]
+        share = (raw - arm.gripper_closed) / (arm.gripper_open - arm.gripper_closed)
+        return np.clip(2.0 * share - 1.0, -1.0, 1.0)
+
+    if arm.joints:
+        R, p = _kinematics(maps.pick(arrays, arm.joints), arm, folder / arm.model)
+        R = turn @ R
+        # A model is in m whatever the columns are.
+        p = origin + p @ turn.T + R @ np.array(arm.tip)
+        pose = Poses(R @ _quaternion(arm.tip_turn, "tip_turn"), p)
+    else:
+        pose = tip(arm.position, arm.rotation)
+    farthest = float(np.abs(pose.p).max())
+    if farthest > _FARTHEST:
+        raise errors.UsageError("position", f"tips within {_FARTHEST:g} m", f"{farthest:.3g} m")
+    asked = arm.command_position and arm.command_rotation
+    unknown = np.full_like(pose.p, np.nan)
+    return _Arm(
+        pose,
+        tip(arm.command_position, arm.command_rotation) if asked else None,
+        jaws(arm.gripper) if arm.gripper else np.ones(len(pose.p)),
+        jaws(arm.command_gripper) if arm.command_gripper else None,
+        placed(maps.pick(arrays, arm.trocar, 3)) if arm.trocar else unknown,
+    )
+
+
+def rotations(numbers: np.ndarray, arm: Arm) -> np.ndarray:
+    """Matrices `[T, 3, 3]` of rotations as somebody wrote them."""
+    kind = arm.rotation_as
+    if kind.startswith("quat"):
+        length = np.linalg.norm(numbers, axis=-1)
+        off = np.abs(length - 1.0) > _UNIT
+        if off.any():
+            got = f"one of length {length[off][0]:.3g} at step {int(np.argmax(off))}"
+            raise errors.UsageError("rotation", "unit quaternions", got)
+        xyzw = numbers if kind == "quat_xyzw" else numbers[:, [1, 2, 3, 0]]
+        return transform.Rotation.from_quat(xyzw).as_matrix()
+    if kind == "rotvec":
+        return transform.Rotation.from_rotvec(numbers).as_matrix()
+    if kind == "euler_xyz":
+        return transform.Rotation.from_euler("xyz", numbers).as_matrix()
+    columns = numbers[:, [0, 3, 6, 1, 4, 7]] if kind == "matrix" else numbers
+    x, y = columns[:, :3], columns[:, 3:]
+    off = np.abs([np.sum(x * x, -1) - 1.0, np.sum(y * y, -1) - 1.0, np.sum(x * y, -1)]).max(0)
+    if (off > _UNIT).any():
+        got = f"columns off by {off.max():.3g} at step {int(np.argmax(off))}"
+        raise errors.UsageError("rotation", "orthonormal columns", got)
+    whole = np.stack([x, y, np.cross(x, y)], -1)
+    if kind == "matrix" and np.abs(whole[:, :, 2] - numbers[:, [2, 5, 8]]).max() > _UNIT:
+        raise errors.UsageError("rotation", "matrices of rotations", "a mirrored one")
+    return transform.Rotation.from_matrix(whole).as_matrix()
+
+
+def _quaternion(wxyz: tuple[float, ...], name: str) -> np.ndarray:
+    length = float(np.linalg.norm(wxyz))
+    if not abs(length - 1.0) <= _UNIT:
+        raise errors.UsageError(name, "a unit quaternion, wxyz", list(wxyz))
+    w, x, y, z = wxyz
+    return transform.Rotation.from_quat([x, y, z, w]).as_matrix()
+
+
+def _kinematics(joints: np.ndarray, arm: Arm, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of the tip in the model's world: `[T, 3, 3]`, `[T, 3]`."""
+    import mujoco
+
+    model, places, site, body = _model(path, arm.joint_names, arm.body, joints.shape[1])
+    data = mujoco.MjData(model)
+    R, p = np.zeros((len(joints), 3, 3)), np.zeros((len(joints), 3))
+    for t, row in enumerate(joints):
+        data.qpos[places] = row
+        mujoco.mj_kinematics(model, data)
+        frame = data.site(site) if site >= 0 else data.body(body)
+        R[t], p[t] = frame.xmat.reshape(3, 3), frame.xpos
+    return R, p
+
+
+@functools.cache
+def _model(path: Path, joints: tuple[str, ...], tip: str, count: int) -> tuple:
+    """A robot's model, addresses of its joints, and the number of the site or body of its tip."""
+    import mujoco
+
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise errors.UsageError("model", "an MJCF or URDF", f"{path}: {error}") from error
+    known = [model.joint(i).name for i in range(model.njnt)]
+    for name in joints:
+        errors.choice("joint_names", name, known)
+    chosen = joints or tuple(known[:count])
+    if len(chosen) != count:
+        raise errors.UsageError("joints", f"{len(chosen)} as in the model", count)
+    find = functools.partial(mujoco.mj_name2id, model)
+    site, body = (find(kind, tip) for kind in (mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY))
+    if max(site, body) < 0:
+        bodies = [model.body(i).name for i in range(model.nbody)]
+        errors.choice("body", tip, bodies + [model.site(i).name for i in range(model.nsite)])
+    places = [model.jnt_qposadr[known.index(name)] for name in chosen]
+    return model, np.array(places), site, body
+
+
+def _looked_at(times: np.ndarray, hz: float, mapping: Map) -> list[str]:
+    """What is odd about the times."""
+    steps = np.diff(times)
+    if (steps <= 0.0).any():
+        at = int(np.argmax(steps <= 0.0)) + 1
+        raise errors.UsageError("time", "times that rise", f"{times[at]:.4f} s at step {at}")
+    if not len(steps):
+        return []
+    usual, most = float(np.median(steps)), int(np.argmax(steps))
+    if steps[most] > mapping.max_gap_s:
+        raise Gap(f"a gap of {steps[most]:.2f} s at {times[most] - times[0]:.2f} s")
+    notes = []
+    if hz and abs(usual * hz - 1.0) > 0.05:
+        notes.append(f"its times show {1.0 / usual:.3g} Hz where {hz:g} is said")
+    count = int((steps > 1.5 * usual).sum())
+    if count:
+        notes.append(f"{count} gaps, the longest of {steps[most]:.2f} s; filled in")
+    return notes
+
+
+def _jumps(times: np.ndarray, pose: Poses, whose: str) -> list[str]:
+    steps = np.maximum(np.diff(times), 1e-9)
+    if not len(steps):
+        return []
+    speed = np.linalg.norm(np.diff(pose.p, axis=0), axis=-1) / steps
+    turned = transform.Rotation.from_matrix(pose.R[1:] @ pose.R[:-1].swapaxes(-1, -2))
+    spin = turned.magnitude() / steps
+    odd = (speed > FAST) | (spin > SPINNING)
+    if not odd.any():
+        return []
+    at = int(np.argmax(odd))
+    return [
+        f"{whose}{int(odd.sum())} jumps, the first at {times[at] - times[0]:.2f} s "
+        f"({speed[at]:.2g} m/s, {spin[at]:.2g} rad/s)"
+    ]
+
+
+def _even(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Even times at our rate, and of each the nearest step of the files."""
+    if len(times) == 1 or np.abs(np.diff(times) * HZ - 1.0).max() < _EVEN:
+        return times, np.arange(len(times))
+    count = int(np.floor((times[-1] - times[0]) * HZ + 1e-6)) + 1
+    wanted = times[0] + np.arange(count) / HZ
+    middles = 0.5 * (times[1:] + times[:-1])
+    return wanted, np.searchsorted(middles, wanted)
+
+
+def _sampled(arm: _Arm, times: np.ndarray, wanted: np.ndarray) -> _Arm:
+    """An arm at other times; what was not asked for is the next of its steps."""
+    if wanted is not times:
+
+        def along(x: np.ndarray) -> np.ndarray:
+            rows = x.reshape(len(x), -1)
+            return np.stack([np.interp(wanted, times, row) for row in rows.T], -1).reshape(
+                len(wanted), *x.shape[1:]
+            )
+
+        def moved(pose: Poses) -> Poses:
+            # The shorter way between two rotations: neither signs of quaternions nor angles beyond
+            # a whole turn matter.
+            turning = transform.Slerp(times, transform.Rotation.from_matrix(pose.R))
+            within = np.clip(wanted, times[0], times[-1])
+            return Poses(turning(within).as_matrix(), along(pose.p))
+
+        arm = _Arm(
+            moved(arm.pose),
+            arm.command and moved(arm.command),
+            along(arm.gripper),
+            arm.command_gripper if arm.command_gripper is None else along(arm.command_gripper),
+            along(arm.p_world_trocar),
+        )
+    command = arm.command or Poses(_following(arm.pose.R), _following(arm.pose.p))
+    gripper = arm.command_gripper
+    return arm._replace(
+        command=command, command_gripper=_following(arm.gripper) if gripper is None else gripper
+    )
+
+
+def _following(x: np.ndarray) -> np.ndarray:
+    return np.concatenate([x[1:], x[-1:]])

@@ -1,0 +1,79 @@
+"""Where the trocars of imported episodes are: said by a column, or estimated from the motion."""
+
+from typing import Any
+
+import numpy as np
+
+from starjax.data import shafts
+from starjax.data.formats.mapping import Map
+from starjax.data.formats.motion import Motion
+
+SAME = 1e-3  # m; trocars that lie closer are one
+MISSED = 5e-3  # m; shafts that pass the trocar so far (root mean square) have another axis or frame
+_SIZE = 64  # episodes of which the trocar of a whole dataset is estimated
+
+Tips = tuple[np.ndarray, np.ndarray, np.ndarray]  # see `thinned`
+
+
+def thinned(found: Motion) -> Tips:
+    """Of an episode, what tells its trocars: some poses `[T, A, ...]`, and the `[A, 3]` that the
+    files say, NaN where they do not."""
+    said = np.median(found.p_world_trocar, axis=0)
+    return shafts.thinned(found.pose.R), shafts.thinned(found.pose.p), said
+
+
+def found(
+    tips: list[Tips], mapping: Map, numbers: list[int], notes: list[str]
+) -> tuple[list[np.ndarray], list[bool]]:
+    """Of every episode the trocars `[A, 3]`, and whether they are known."""
+    if not tips:
+        return [], []
+    said = np.array([trocar for *_, trocar in tips])
+    if np.isfinite(said).all():
+        return list(said), [True] * len(tips)
+    if mapping.trocars == "dataset":
+        few = [tips[i] for i in np.linspace(0, len(tips) - 1, min(len(tips), _SIZE)).astype(int)]
+        whole = [np.concatenate(field) for field in zip(*((R, p) for R, p, _ in few))]
+        each = [shafts.estimate(*whole)] * len(tips)
+    else:
+        each = [shafts.estimate(R, p) for R, p, _ in tips]
+    places = np.array([one.p_world_trocar for one in each], np.float64)
+    is_sure = np.array([one.is_determined for one in each])
+    is_said: Any = np.isfinite(said).all(-1)
+    places = np.where(is_said[..., None], said, places)
+    known: Any = is_said | is_sure
+    for number, sure in zip(numbers, known):
+        if not sure.all():
+            arm = int(np.argmin(sure))
+            why = f"the motion of arm {arm} does not determine its trocar"
+            notes.append(f"episode {number}: {why}; left out")
+    return list(places), list(known.all(-1))
+
+
+def grouped(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Episodes `[E, A, 3]` by trocars: `[E]` which group, `[C, A, 3]` its mean."""
+    firsts, groups = [], []
+    for place in places:
+        near = [i for i, first in enumerate(firsts) if np.abs(first - place).max() < SAME]
+        if not near:
+            firsts.append(place)
+        groups.append(near[0] if near else len(firsts) - 1)
+    groups = np.array(groups)
+    return groups, np.stack([places[groups == i].mean(0) for i in range(len(firsts))])
+
+
+def residual(
+    tips: list[Tips], places: np.ndarray, numbers: list[int], notes: list[str]
+) -> np.ndarray:
+    """`[E, A]` mm; notes where shafts miss their trocar by much."""
+    found = []
+    for (R, p, _), place, number in zip(tips, places, numbers):
+        off = np.linalg.norm(np.cross(p - place, R[..., 2]), axis=-1)
+        rms = np.sqrt(np.mean(off**2, axis=0))
+        for arm in np.flatnonzero(rms > MISSED).tolist():
+            notes.append(
+                f"episode {number}: the shaft of arm {arm} passes its trocar at "
+                f"{1e3 * rms[arm]:.0f} mm; is z of tip_turn its axis, and the frame right?"
+            )
+        found.append(1e3 * rms)
+    return np.array(found)

@@ -1,0 +1,166 @@
+"""robomimic's HDF5: one file, a group an episode; any HDF5 of such groups is read.
+
+    data            attributes total, env_args
+    data/demo_<i>   attribute num_samples; actions [T, n] in [-1, 1], rewards, dones, obs/<name>
+    mask/<name>     episodes of a subset
+
+There is no next_obs: it would hold every image twice, and no imitation learner reads it.
+"""
+
+import contextlib
+import json
+import re
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from starjax.data.formats import base
+from starjax.data.formats.base import Column, Source
+from starjax.rollouts import episodes
+
+SUFFIXES = (".hdf5", ".h5")
+_NAMES = {
+    "state": "obs/state",
+    "action": "actions",
+    "trocar": "obs/trocar",
+    "environment_state": "obs/environment_state",
+    "reward": "rewards",
+    "done": "dones",
+}
+_DEMO = re.compile(r"(?:demo|episode|traj)_?(\d+)")
+_MOST_DEEP = 6  # groups within groups
+
+
+def named(column: str) -> str:
+    """robomimic's name of a column of ours."""
+    if column.startswith(episodes.IMAGE):
+        return f"obs/{column.removeprefix(episodes.IMAGE)}_image"
+    return _NAMES.get(column, column.replace(".", "/", 1))
+
+
+@contextlib.contextmanager
+def _open(path: Path) -> Iterator[Source]:
+    with h5py.File(path, "r") as file:
+        _refuse_links(file)
+        data: Any = file.get("data", file)
+        base.require(isinstance(data, h5py.Group), "a group of episodes", data)
+        found = {int(match[1]): name for name in data if (match := _DEMO.fullmatch(name))}
+        demos = [data[found[number]] for number in sorted(found)]
+        base.require(bool(demos), "groups data/demo_<i>", sorted(data)[:5])
+        first: dict[str, Any] = _datasets(demos[0])
+        ours: Any = file.get(base.OURS)
+        lengths = [_length(demo) for demo in demos]
+        columns = {
+            name: Column(dataset.shape[1:], dataset.dtype.name)
+            for name, dataset in first.items()
+            if dataset.shape[:1] == (lengths[0],) and dataset.dtype.kind in "biuf"
+        }
+
+        def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
+            arrays = {}
+            for name in names:
+                dataset = demos[episode][name]
+                base.require_fits(name, dataset.shape, dataset.dtype)
+                arrays[name] = dataset[()]
+            return arrays
+
+        origin = json.loads(bytes(ours[()])) if _is_bytes(ours) else None
+        about = _attribute(data, "env_args")
+        hz = float((origin or {}).get("description", {}).get("control_hz", 0.0) or _hz(about))
+        yield Source(hz, lengths, columns, read, origin, task=str(about.get("env_name", "")))
+
+
+def _write(path: Path, source: Source, video: bool) -> None:
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        names = []
+        for episode, length in enumerate(source.lengths):
+            names.append(f"demo_{episode}")
+            demo = data.create_group(names[-1])
+            demo.attrs["num_samples"] = length
+            for name, array in source.read(episode, source.columns).items():
+                if name == "actions":
+                    most = float(np.abs(array).max())
+                    base.require(most <= 1.0, "actions in [-1, 1] (m from the origin)", most)
+                is_image = source.columns[name].is_image
+                packed = {"compression": "gzip", "compression_opts": 1} if is_image else {}
+                # A frame a chunk: learners read them in any order.
+                chunks = {"chunks": (1, *array.shape[1:])} if is_image else {}
+                demo.create_dataset(name, data=_plain(array), **packed, **chunks)
+        data.attrs["total"] = sum(source.lengths)
+        about = {"env_name": source.task, "env_type": 2, "env_kwargs": {"robot": source.robot}}
+        data.attrs["env_args"] = json.dumps(about | {"control_freq": source.hz})
+        file.create_dataset("mask/train", data=np.array(names, h5py.string_dtype()))
+        if source.origin:
+            # Bytes of a dataset: attributes hold 64 kB, and a damaged string hangs HDF5.
+            said = json.dumps(source.origin).encode()
+            file.create_dataset(base.OURS, data=np.frombuffer(said, np.uint8))
+
+
+def _plain(array: np.ndarray) -> np.ndarray:
+    return array.astype(np.uint8) if array.dtype == bool else array
+
+
+def _recognises(path: Path) -> bool:
+    return path.is_file() and path.suffix in SUFFIXES
+
+
+def _refuse_links(file: h5py.File) -> None:
+    """Refuses files that lead out of themselves, or in circles."""
+
+    def look(group: Any, depth: int) -> None:
+        base.require(depth <= _MOST_DEEP, f"at most {_MOST_DEEP} groups deep", group.name)
+        for name in group:
+            link = group.get(name, getlink=True)
+            plain = isinstance(link, h5py.HardLink)
+            base.require(plain, "no links", f"{type(link).__name__} {group.name}/{name}")
+            child = group[name]
+            if isinstance(child, h5py.Group):
+                look(child, depth + 1)
+            elif isinstance(child, h5py.Dataset):
+                outside = child.is_virtual or bool(child.external)
+                base.require(not outside, "data inside the file", f"{child.name} elsewhere")
+
+    look(file, 0)
+
+
+def _datasets(group: Any) -> dict[str, Any]:
+    found = {}
+    group.visititems(lambda name, item: found.update({name: item} if _is_data(item) else {}))
+    return found
+
+
+def _is_bytes(item: Any) -> bool:
+    return _is_data(item) and item.dtype == np.uint8 and item.ndim == 1
+
+
+def _is_data(item: Any) -> bool:
+    return isinstance(item, h5py.Dataset)
+
+
+def _length(demo: Any) -> int:
+    """Control steps of an episode: of its actions, or what most of its datasets have."""
+    if "actions" in demo:
+        return int(demo["actions"].shape[0])
+    counts = [dataset.shape[0] for dataset in _datasets(demo).values() if dataset.shape]
+    base.require(bool(counts), "datasets of control steps", f"none in {demo.name}")
+    return int(max(set(counts), key=counts.count))
+
+
+def _attribute(data: Any, name: str) -> dict[str, Any]:
+    try:
+        found = json.loads(data.attrs[name])
+    except (KeyError, TypeError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _hz(about: dict[str, Any]) -> float:
+    kwargs = about.get("env_kwargs")
+    return about.get("control_freq") or (kwargs or {}).get("control_freq") or 0.0
+
+
+FORMAT = base.Format("HDF5 of robomimic", named, _recognises, _open, _write)

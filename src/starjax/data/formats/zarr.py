@@ -1,0 +1,135 @@
+"""Diffusion Policy's replay buffer: a zarr folder (version 2) of all episodes one after another.
+
+data/<name>         [F, ...], chunked along time
+meta/episode_ends   [E] int64, first frame after each episode
+"""
+
+import contextlib
+import math
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numcodecs
+import numpy as np
+import zarr
+
+from starjax.data.formats import base
+from starjax.data.formats.base import Column, Source
+from starjax.runtime import files
+
+_CHUNK_BYTES = 2_000_000  # as Diffusion Policy has them
+_MOST_CHUNKS = 1_000_000  # of a column of an episode
+
+
+def named(column: str) -> str:
+    """Diffusion Policy's name of a column of ours: the same."""
+    return column
+
+
+@contextlib.contextmanager
+def _open(path: Path) -> Iterator[Source]:
+    for inside in path.rglob("*"):
+        base.require(not inside.is_symlink(), "no links", inside)
+    # One array at a time: a group of which one is damaged may leave zarr's own loop waiting.
+    whole = _array(path / "meta/episode_ends")
+    _require_readable("episode_ends", whole, whole.shape)
+    ends = np.asarray(whole[:], np.int64)
+    rises = ends.ndim == 1 and len(ends) > 0 and bool((np.diff(ends, prepend=0) > 0).all())
+    base.require(rises, "episode_ends that rise", ends.tolist()[:5])
+    starts = np.concatenate([[0], ends[:-1]])
+    found = {place.name: _array(place) for place in sorted((path / "data").glob("*/"))}
+    arrays = {name: array for name, array in found.items() if array.dtype.kind in "biuf"}
+    for name, array in arrays.items():
+        whole = array.ndim > 0 and array.shape[0] == ends[-1]
+        base.require(whole, f"{ends[-1]} frames of {name}", list(array.shape))
+    columns = {
+        name: Column(tuple(array.shape[1:]), array.dtype.name) for name, array in arrays.items()
+    }
+
+    def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
+        first, last = int(starts[episode]), int(ends[episode])
+        for name in names:
+            _require_readable(name, arrays[name], (last - first, *columns[name].shape))
+        return {name: np.asarray(arrays[name][first:last]) for name in names}
+
+    attributes = path / ".zattrs"
+    said = files.read_json(attributes) if attributes.exists() else {}
+    origin = said.get(base.OURS)
+    hz = float((origin or {}).get("description", {}).get("control_hz", 0.0) or said.get("hz", 0.0))
+    lengths = (ends - starts).tolist()
+    yield Source(hz, lengths, columns, read, origin, str(said.get("task", "")))
+
+
+def _write(path: Path, source: Source, video: bool) -> None:
+    root: Any = zarr.open_group(str(path), mode="w", zarr_format=2)
+    frames = sum(source.lengths)
+    data, meta = root.create_group("data"), root.create_group("meta")
+    packed = numcodecs.Blosc(cname="zstd", clevel=5, shuffle=numcodecs.Blosc.BITSHUFFLE)
+    arrays = {}
+    for name, column in source.columns.items():
+        step = int(np.prod(column.shape)) * np.dtype(column.dtype).itemsize
+        rows = 1 if column.is_image else max(1, min(frames, _CHUNK_BYTES // step))
+        arrays[name] = data.create_array(
+            name,
+            shape=(frames, *column.shape),
+            chunks=(rows, *column.shape),
+            dtype=column.dtype,
+            compressors=packed,
+        )
+    written = {name: _Buffer(array) for name, array in arrays.items()}
+    for episode in range(len(source.lengths)):
+        for name, array in source.read(episode, source.columns).items():
+            written[name].append(array)
+    for buffer in written.values():
+        buffer.flush()
+    ends = np.cumsum(source.lengths, dtype=np.int64)
+    meta.create_array("episode_ends", shape=ends.shape, dtype=ends.dtype, compressors=None)[:] = (
+        ends
+    )
+    root.attrs.update({"hz": source.hz, "task": source.task, base.OURS: source.origin})
+
+
+class _Buffer:
+    """Appends to an array in whole chunks, so that none is read again to be filled up."""
+
+    def __init__(self, array: Any):
+        self._array, self._parts, self._held, self._at = array, [], 0, 0
+
+    def append(self, part: np.ndarray) -> None:
+        """Takes rows that follow the last ones."""
+        self._parts.append(part)
+        self._held += len(part)
+        rows = self._array.chunks[0]
+        if self._held >= rows:
+            self._store(self._held - self._held % rows)
+
+    def flush(self) -> None:
+        """Stores the rest."""
+        if self._held:
+            self._store(self._held)
+
+    def _store(self, count: int) -> None:
+        whole = np.concatenate(self._parts)
+        self._array[self._at : self._at + count] = whole[:count]
+        self._parts, self._held, self._at = [whole[count:]], self._held - count, self._at + count
+
+
+def _array(path: Path) -> Any:
+    return zarr.open_array(str(path), mode="r")
+
+
+def _require_readable(name: str, array: Any, shape: Sequence[int]) -> None:
+    """Raises Damaged for sizes that a damaged header claims, in numbers or in chunks."""
+    base.require(min(array.chunks, default=1) > 0, f"chunks of {name}", list(array.chunks))
+    base.require_fits(name, shape, array.dtype)
+    base.require_fits(f"{name}'s chunks", array.chunks, array.dtype)
+    count = math.prod(-(-size // chunk) for size, chunk in zip(shape, array.chunks))
+    base.require(count <= _MOST_CHUNKS, f"{_MOST_CHUNKS} chunks of {name} at most", count)
+
+
+def _recognises(path: Path) -> bool:
+    return (path / ".zgroup").is_file() or (path / "zarr.json").is_file()
+
+
+FORMAT = base.Format("zarr of Diffusion Policy", named, _recognises, _open, _write)

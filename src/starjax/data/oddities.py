@@ -1,0 +1,97 @@
+"""What is odd about demonstrations: a look at every number, before anybody learns from them."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starjax import rcm
+from starjax.data import schema, shafts, store
+from starjax.rollouts import episodes
+from starjax.runtime import files
+
+FAST = 1.0  # m/s; faster tips are jumps
+MISSED = 1e-3  # m; a shaft that passes the trocar so far is not on its manifold
+MOVED = 2e-3  # m; between the trocar that is told and the one that the motion shows
+SURE = 5e-4  # m; a standard deviation above this says nothing against what is told
+SHORT = 16  # control steps; shorter episodes are less than a plan
+
+
+def of_dataset(root: Path) -> Iterator[str]:
+    """Lines on what is odd about a dataset of ours, damage first; one for each kind.
+
+    Raises:
+      ValueError: it is none.
+    """
+    about = schema.upgraded(store.read_description(root))
+    try:
+        store.read_seal(root)
+    except ValueError as error:
+        yield str(error)
+    found: dict[str, list[str]] = {}
+    for key, record in store.verify_all(root, store.keys(root)).items():
+        if isinstance(record, store.DamagedEpisode):
+            yield str(record)
+        elif record["files"]:
+            for kind, detail in _of_episode(root, about, record):
+                found.setdefault(kind, []).append(f"{key}{f' ({detail})' if detail else ''}")
+    for kind, where in found.items():
+        more = f" and {len(where) - 1} more" if len(where) > 1 else ""
+        yield f"{kind}: {where[0]}{more}"
+    yield from imported(root)
+
+
+def imported(root: Path) -> list[str]:
+    """What `starjax import` found odd about the files that it read."""
+    path = root / schema.IMPORTED
+    return files.read_json(path).get("notes", []) if path.exists() else []
+
+
+def _of_episode(
+    root: Path, about: Mapping[str, Any], record: Mapping[str, Any]
+) -> Iterator[tuple[str, str]]:
+    """(kind, detail) of each oddity."""
+    if record["length"] < SHORT:
+        yield f"shorter than {SHORT} control steps", str(record["length"])
+    arrays = {
+        name: schema.with_arms(about["schema"], name, _mapped(root, about, record, name))
+        for name in about["features"]
+        if schema.file_name(about["schema"], name) in record["files"]
+    }
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            yield f"{name} is not finite", ""
+            if name in ("p", "R"):
+                return
+        if name.startswith(episodes.IMAGE) and array.size and array.min() == array.max():
+            yield f"{name} is of one colour", ""
+    R: Any = arrays["R"]
+    p: Any = arrays["p"]
+    pose = rcm.Pose(R, p)
+    speed = np.linalg.norm(np.diff(arrays["p"], axis=0), axis=-1) * about["control_hz"]
+    if speed.size and speed.max() > FAST:
+        yield f"tips faster than {FAST:g} m/s", f"{speed.max():.2g} m/s"
+    told = rcm.trocar_position(
+        schema.trocars_of([record]), np.array(about["p_world_ref"], np.float32)
+    )[0]
+    missed = float(np.max(rcm.rcm_error(pose, told)))
+    if missed > MISSED:
+        yield f"shafts pass the trocar at more than {1e3 * MISSED:g} mm", f"{1e3 * missed:.2g} mm"
+    seen = shafts.estimate(pose.R, pose.p)
+    deviation = np.sqrt(np.linalg.eigvalsh(np.asarray(seen.covariance))[:, -1])
+    is_sure = np.asarray(seen.is_determined) & (deviation < SURE)
+    away = np.linalg.norm(np.asarray(seen.p_world_trocar) - np.asarray(told), axis=-1)
+    if (is_sure & (away > MOVED)).any():
+        yield "the motion shows another trocar than is told", f"{1e3 * away[is_sure].max():.2g} mm"
+    rolls = np.asarray(rcm.roll_of(pose.R)) - np.array(about["roll_zero"])
+    turned = np.abs(np.diff(np.mod(rolls + np.pi, 2 * np.pi), axis=0))
+    if turned.size and turned.max() > np.pi:
+        yield "rolls pass half a turn, where an action's roll wraps", ""
+
+
+def _mapped(
+    root: Path, about: Mapping[str, Any], record: Mapping[str, Any], name: str
+) -> np.ndarray:
+    path = root / "episodes" / record["key"] / schema.file_name(about["schema"], name)
+    return np.load(path, mmap_mode="r", allow_pickle=False)

@@ -1,0 +1,61 @@
+"""What an agent sees: numbers of order one, and pictures if it is to see those.
+
+`tool`, of each arm after the others' where there are several, is what a robot measures and is told:
+
+- its pose in the action space, in [-1, 1] within `ranges.actions`, and its jaws' opening;
+- velocity of the tip (3) and of the roll (1) that the controller was at, in shares of the fastest;
+- 7 numbers that say where its trocar is (`policies.features.trocar_features`).
+
+Seen as `state`, the task's fields follow, points scaled by the tip's box, and `Task.relative`. Seen
+as `image`, there are the cameras' images beside `tool`.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.envs import ranges
+from starjax.policies import features
+from starjax.sim import control
+from starjax.sim.tasks.base import Task
+
+LARGEST = 10.0  # numbers are clipped here
+_FASTEST = np.array([control.MAX_SPEED] * 3 + [control.MAX_SPIN], np.float32)
+
+
+def make(env: Any, scaled: Callable[[Any], jax.Array]) -> Callable[[Any], Any]:
+    """EnvState -> `[O]` float32, or `{camera's name: [h, w, 3] uint8, "tool": [O] float32}`.
+
+    Args:
+      env: `sim.env.Env`.
+      scaled: EnvState -> measured poses, scaled, and openings.
+    """
+    task: Task = env.task
+    low, high = (end[0] for end in ranges.tips(task))
+
+    def tool(state: Any) -> jax.Array:
+        speed = state.velocity[:, :4] / _FASTEST
+        trocar = features.trocar_features(state.told.trocar)
+        parts = [scaled(state), speed.ravel(), trocar.ravel()]
+        return jnp.concatenate(parts)
+
+    def observe(state: Any) -> Any:
+        seen = env.observe(state)
+        if seen.images is not None:
+            return {**seen.images, "tool": _clipped(tool(state))}
+        parts, at = [tool(state)], 0
+        for field in task.fields:
+            part = seen.state[at : at + field.size]
+            at += field.size
+            parts.append((2 * part - high - low) / (high - low) if field.kind == "point" else part)
+        parts.append(task.relative(seen.state, state.pose.p))
+        return _clipped(jnp.concatenate(parts))
+
+    return observe
+
+
+def _clipped(x: jax.Array) -> jax.Array:
+    return jnp.clip(x, -LARGEST, LARGEST).astype(jnp.float32)

@@ -1,0 +1,48 @@
+"""What an action in [-1, 1] spans: where tools can be in a task, as an action space writes it."""
+
+import jax
+import numpy as np
+
+from starjax import rcm
+from starjax.sim import registry
+from starjax.sim.tasks.base import Task
+
+# Beyond the workspace's box of the tip, m, and its rolls, rad: an action at a bound is still sound,
+# and a command past the goal hurries the tool.
+MARGIN = np.array([0.005, 0.005, 0.015])
+ROLL_MARGIN = 0.2
+AZIMUTHS, ROLLS, TIPS = 16, 9, 3  # of the grid, a side
+
+
+def tips(task: Task) -> tuple[np.ndarray, np.ndarray]:
+    """The boxes of the tips, low and high `[A, 3]` m in the world: the workspaces' and MARGIN, but
+    no lower."""
+    spaces = [registry.workspaces.get(slot.workspace) for slot in task.slots]
+    low, high = (np.array([getattr(space, end) for space in spaces]) for end in ("low", "high"))
+    return low - MARGIN * [1, 1, 0], high + MARGIN
+
+
+def actions(task: Task, action_space: str) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest encoding `[A, dim]` of poses whose tip lies in its box.
+
+    All poses are on the RCM manifold, through trocars at the edge of the workspace's ranges, with
+    rolls of the workspace and ROLL_MARGIN. So positions, depths and rolls are bounded by what the
+    task asks for, and the middle of the box is near a tool that points down.
+    """
+    space = rcm.ACTION_SPACES[action_space]
+    encode = jax.jit(space.encode)
+    found = []
+    for slot, low, high in zip(task.slots, *tips(task), strict=True):
+        work = registry.workspaces.get(slot.workspace)
+        turn = np.linspace(*work.azimuth, num=AZIMUTHS)
+        edge = np.meshgrid(work.radius, [*work.polar, np.mean(work.polar)], turn)
+        trocar = rcm.Trocar(*(x.ravel()[:, None] for x in edge))
+        frame = rcm.trocar_frame(trocar, np.array(slot.p_world_ref), slot.roll_zero)
+        rolls = np.linspace(work.rolls[0] - ROLL_MARGIN, work.rolls[1] + ROLL_MARGIN, ROLLS)
+        axes = [rolls, *np.linspace(low, high, TIPS).T]
+        poses = np.stack([x.ravel() for x in np.meshgrid(*axes)], axis=-1)
+        pose, _ = rcm.ACTION_SPACES["rcm4"].decode(poses[None], frame)
+        encoded = np.asarray(encode(pose, frame)).reshape(-1, space.dim)
+        found.append((encoded.min(axis=0), encoded.max(axis=0)))
+    low, high = (np.stack(ends).astype(np.float32) for ends in zip(*found, strict=True))
+    return low, high

@@ -1,0 +1,33 @@
+"""Every task as an environment of Gymnasium, by name. Imports neither jax nor mjx."""
+
+import re
+
+from starjax import extras
+from starjax.sim import registry
+
+VERSION = 0
+
+
+def name(task: str) -> str:
+    """Gymnasium's name of a task: `starjax/PegTransfer-v0` of `peg_transfer`."""
+    words = re.split(r"[_\W]+", task)
+    return f"starjax/{''.join(word[:1].upper() + word[1:] for word in words)}-v{VERSION}"
+
+
+def register() -> None:
+    """Registers all tasks, those of other packages too, unless they are.
+
+    Raises:
+      errors.UsageError: Gymnasium is not installed.
+    """
+    extras.require("starjax.envs", "gym")
+    import gymnasium
+
+    for task in registry.tasks.names():
+        if name(task) not in gymnasium.registry:
+            gymnasium.register(
+                name(task),
+                entry_point="starjax.envs.single:TaskEnv",
+                vector_entry_point="starjax.envs.vector:TaskVectorEnv",
+                kwargs={"task": task},
+            )

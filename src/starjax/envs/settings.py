@@ -1,0 +1,91 @@
+"""What an environment for reinforcement learning is made with."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from starjax import errors, rcm
+
+CONTROLS = ("relative", "absolute")
+REWARDS = ("dense", "sparse")
+OBSERVATIONS = ("state", "image")
+TROCARS = ("seen", "unseen", "all", "random")
+Row = tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of an environment, the keyword arguments of `gymnasium.make`.
+
+    Attributes:
+      task: key of `registry.tasks`.
+      arms, tools: keys of `registry.arms` and `registry.tools`, one for each slot of the task, one
+        for all, or none for the task's own.
+      trocar: where the trocars are. `seen`, `unseen`, `all`: every episode draws one of the task's
+        configurations; `random`: uniformly in the workspace's ranges (Eq. 19); a whole number:
+        that configuration of the task; a `rcm.Trocar` or (radius m, polar rad, azimuth rad),
+        fields `[]` or `[A]`: this one.
+      action_space: key of `rcm.ACTION_SPACES`.
+      control: whether an action is `relative` to where the tool is, or `absolute`, see `episodes`.
+      reward: `dense` or `sparse`, see `episodes`.
+      observation: `state` (numbers) or `image` (pixels, and numbers of the tool).
+      image_size: pixels a side of the cameras' square images, rendered ones too.
+      cameras: of the task; none for its first one.
+      max_episode_steps: control steps after which an episode is truncated, if fewer than the task's
+        time limit has.
+    """
+
+    task: str = "peg_transfer"
+    arms: tuple[str, ...] = ()
+    tools: tuple[str, ...] = ()
+    trocar: str | int | tuple[Row, Row, Row] = "seen"
+    action_space: str = "rcm4"
+    control: str = "relative"
+    reward: str = "dense"
+    observation: str = "state"
+    image_size: int = 96
+    cameras: tuple[str, ...] = ()
+    max_episode_steps: int | None = None
+
+
+def make(**given: Any) -> Settings:
+    """Settings of what a user gave.
+
+    Raises:
+      errors.UsageError: an unknown name, or a value out of range.
+    """
+    known = [field.name for field in dataclasses.fields(Settings)]
+    for name in given:
+        errors.choice("environment's argument", name, known)
+    for name in ("arms", "tools", "cameras"):
+        if name in given:
+            parts = given[name]
+            given[name] = (parts,) if isinstance(parts, str) else tuple(parts)
+    if "trocar" in given:
+        given["trocar"] = _trocar(given["trocar"])
+    settings = Settings(**given)
+    errors.choice("action_space", settings.action_space, rcm.ACTION_SPACES)
+    errors.choice("control", settings.control, CONTROLS)
+    errors.choice("reward", settings.reward, REWARDS)
+    errors.choice("observation", settings.observation, OBSERVATIONS)
+    steps = settings.max_episode_steps
+    if steps is not None and steps < 1:
+        raise errors.UsageError("max_episode_steps", "1 or more", steps)
+    return settings
+
+
+def _trocar(given: Any) -> str | int | tuple[Row, Row, Row]:
+    if isinstance(given, str):
+        errors.choice("trocar", given, TROCARS)
+        return given
+    if isinstance(given, int | np.integer):
+        return int(given)
+    try:
+        fields = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in given))
+        radius, polar, azimuth = (tuple(field.tolist()) for field in fields)
+        rcm.check_trocar(rcm.Trocar(radius, polar, azimuth))
+    except (TypeError, ValueError) as error:
+        expected = f"{', '.join(TROCARS)}, a number, or (radius m, polar rad, azimuth rad)"
+        raise errors.UsageError("trocar", expected, repr(given), str(error)) from error
+    return radius, polar, azimuth

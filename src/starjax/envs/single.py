@@ -1,0 +1,70 @@
+"""One environment of Gymnasium: a batch of one."""
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from starjax.envs import vector
+
+
+class TaskEnv(gymnasium.Env):
+    """One episode of a task at a time.
+
+    Attributes:
+      episodes: its pure functions, see `episodes.Episodes`.
+    """
+
+    metadata = vector.METADATA
+
+    def __init__(self, *, render_mode: str | None = None, **given: Any) -> None:
+        """Makes the environment; the first reset compiles its program.
+
+        Args:
+          render_mode: `rgb_array` or None.
+          given: see `settings.Settings`.
+
+        Raises:
+          errors.UsageError: an argument is unknown or out of range.
+        """
+        self._lanes = vector.TaskVectorEnv(
+            1, autoreset_mode=AutoresetMode.DISABLED, render_mode=render_mode, **given
+        )
+        self.render_mode = render_mode
+        self.episodes = self._lanes.episodes
+        self.action_space = self._lanes.single_action_space
+        self.observation_space = self._lanes.single_observation_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode: the first one of `seed`, or without it the next."""
+        super().reset(seed=seed)
+        observed, info = self._lanes.reset(seed=seed)
+        return _only(observed), _numbers(info)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One control step (1/30 s) towards `action` `[D]` in [-1, 1]."""
+        observed, reward, terminated, truncated, info = self._lanes.step(np.asarray(action)[None])
+        return (
+            _only(observed),
+            float(reward[0]),
+            bool(terminated[0]),
+            bool(truncated[0]),
+            _numbers(info),
+        )
+
+    def render(self) -> np.ndarray | None:
+        """What the first camera sees, `[h, w, 3]` uint8."""
+        frames = self._lanes.render()
+        return None if frames is None else frames[0]
+
+
+def _only(observed: Any) -> Any:
+    return jax.tree.map(lambda x: x[0], observed)
+
+
+def _numbers(info: dict[str, np.ndarray]) -> dict[str, Any]:
+    return {name: x[0].item() for name, x in info.items() if not name.startswith("_")}

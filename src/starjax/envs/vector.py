@@ -1,0 +1,186 @@
+"""A batch of environments of Gymnasium, simulated by one compiled program."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from starjax import errors
+from starjax.envs import batch, observing, settings
+
+METADATA = {"render_modes": ["rgb_array"], "render_fps": 30}
+
+
+class TaskVectorEnv(gymnasium.vector.VectorEnv):
+    """N episodes of a task side by side.
+
+    Lane i of `reset(seed=s)` goes through the same episodes as one environment of seed s + i.
+
+    Attributes:
+      episodes: the pure functions of one episode, see `episodes.Episodes`.
+      settings: what they were made with.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **given: Any,
+    ) -> None:
+        """Makes the environments; the first reset compiles their program.
+
+        Args:
+          num_envs: N.
+          autoreset_mode: what happens to a lane whose episode is over. NEXT_STEP: the next step
+            begins another, whatever the action. SAME_STEP: the same step does, and
+            `info["final_obs"]` and `info["final_info"]` are of the one that ended. DISABLED: it
+            stays as it is until `reset(options={"reset_mask": mask})`.
+          render_mode: `rgb_array` or None.
+          given: see `settings.Settings`.
+
+        Raises:
+          errors.UsageError: an argument is unknown or out of range.
+        """
+        if num_envs < 1:
+            raise errors.UsageError("num_envs", "1 or more", num_envs)
+        errors.choice("render_mode", str(render_mode), ["None", *METADATA["render_modes"]])
+        self.settings = settings.make(**given)
+        self.render_mode = render_mode
+        self._mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**METADATA, "autoreset_mode": self._mode}
+        self._batch = batch.make(self.settings, num_envs)
+        self.episodes = self._batch.episodes
+        self.num_envs = num_envs
+        self.single_action_space = spaces.Box(-1.0, 1.0, (self.episodes.action_size,), np.float32)
+        self.single_observation_space = _space(self._batch.observed)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._shape = (num_envs, self.episodes.action_size)
+        self._lanes: batch.Lanes | None = None
+        self._over = np.zeros(num_envs, bool)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins episodes.
+
+        Args:
+          seed: of lane 0, lane i having seed + i; or one for each lane; or None, and every lane
+            goes on with its next episode.
+          options: `reset_mask`, `[N]` bool: the lanes to reset, all where it is missing.
+
+        Raises:
+          errors.UsageError: seeds or mask are not of N lanes, or a mask comes before all lanes
+            have begun.
+        """
+        super().reset(seed=seed if isinstance(seed, int | None) else None)
+        which = np.ones(self.num_envs, bool)
+        if options and "reset_mask" in options:
+            which = self._mask(options["reset_mask"])
+        seeds = self._seeds(seed)
+        if self._lanes is None:
+            drawn = self.np_random.integers(2**31, size=self.num_envs)
+            self._lanes = batch.seeded(self._batch.empty(), _uint32(drawn), which)
+        is_new = np.array([each is not None for each in seeds]) & which
+        if is_new.any():
+            numbers = _uint32([each or 0 for each in seeds])
+            self._lanes = batch.seeded(self._lanes, numbers, is_new)
+        idle = np.zeros(self._shape, np.float32)
+        self._lanes, found = self._batch.advance(self._lanes, idle, batch.Do(which, False, False))
+        self._over = self._over & ~which
+        observed, measured = _fetched(found.now)
+        return observed, _said(measured, which)
+
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One control step (1/30 s) of every lane.
+
+        Args:
+          actions: `[N, D]` in [-1, 1], clipped.
+
+        Raises:
+          errors.UsageError: actions of another shape, or not finite.
+          gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self._lanes is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        actions = np.asarray(actions, np.float32)
+        if actions.shape != self._shape:
+            raise errors.UsageError("actions", str(list(self._shape)), list(actions.shape))
+        if not np.isfinite(actions).all():
+            raise errors.UsageError("actions", "finite numbers", "NaN or infinity")
+        is_next_step = self._mode == AutoresetMode.NEXT_STEP
+        restart = self._over if is_next_step else np.zeros(self.num_envs, bool)
+        anew = self._mode == AutoresetMode.SAME_STEP
+        do = batch.Do(restart, True, anew)
+        self._lanes, found = self._batch.advance(self._lanes, actions, do)
+        now, (reward, terminated, truncated) = _fetched((found.now, found.outcome))
+        observed, measured = now
+        self._over = terminated | truncated
+        info = _said(measured, np.ones(self.num_envs, bool))
+        if anew and self._over.any():
+            info |= self._final(_fetched(found.last), self._over)
+        return observed, reward.astype(np.float64), terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """What the first camera sees in every lane, `[h, w, 3]` uint8 each."""
+        if self.render_mode is None or self._lanes is None:
+            return None
+        return tuple(np.array(self._batch.camera(self._lanes.state)))
+
+    def _seeds(self, seed: Any) -> list[int | None]:
+        if seed is None or isinstance(seed, int | np.integer):
+            return [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise errors.UsageError("seed", f"one or {self.num_envs} of them", len(seed))
+        return list(seed)
+
+    def _mask(self, mask: Any) -> np.ndarray:
+        mask = np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            expected = f"[{self.num_envs}] bool, some of them true"
+            raise errors.UsageError("reset_mask", expected, f"{mask.dtype}{list(mask.shape)}")
+        if self._lanes is None and not mask.all():
+            raise errors.UsageError("reset_mask", "all lanes at the first reset", "some")
+        return mask
+
+    def _final(self, last: tuple[Any, dict], over: np.ndarray) -> dict[str, Any]:
+        """What Gymnasium's own vector environments say of episodes that ended in this step."""
+        observed, measured = last
+        rows = np.full(self.num_envs, None, object)
+        for lane in np.flatnonzero(over):
+            rows[lane] = jax.tree.map(lambda x, i=lane: x[i].copy(), observed)
+        final = {"final_obs": rows, "final_info": _said(measured, over)}
+        return final | {f"_{name}": over.copy() for name in final}
+
+
+def _space(observed: Any) -> spaces.Space:
+    if isinstance(observed, dict):
+        return spaces.Dict({name: _space(x) for name, x in observed.items()})
+    if observed.dtype == np.uint8:
+        return spaces.Box(0, 255, observed.shape, np.uint8)
+    return spaces.Box(-observing.LARGEST, observing.LARGEST, observed.shape, np.float32)
+
+
+def _said(measured: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:
+    """Gymnasium's info of some lanes: zeros for the others, and which they are."""
+    masks = {f"_{name}": which.copy() for name in measured}
+    return {name: np.where(which, x, np.zeros_like(x)) for name, x in measured.items()} | masks
+
+
+def _fetched(tree: Any) -> Any:
+    """On the host, in arrays that are the user's own."""
+    return jax.tree.map(np.array, jax.device_get(tree))
+
+
+def _uint32(seeds: Any) -> np.ndarray:
+    return np.array([int(seed) % 2**32 for seed in seeds], np.uint32)

@@ -1,0 +1,79 @@
+"""Behaviour cloning: an MLP says the whole sequence at once. The floor that others must beat.
+
+Not in the paper. Sources: `models.regression`.
+"""
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from starjax import config
+from starjax.learners import Learner
+from starjax.limits import Count, Positive
+
+if TYPE_CHECKING:  # it imports jax, which `--help` does without
+    from starjax.policies.sequences import SequenceModel, Sizes
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BcConfig:
+    """Options of the learner `bc`."""
+
+    mlp_width: Count = 1024  # of the MLP's hidden layers
+    mlp_blocks: Count = 3  # residual blocks of two layers
+    # sequences that it says, of which one is drawn; 1: plain regression
+    components: Count = 1
+    # standard deviation of actions in a component, normalised units; without effect on one
+    component_spread: Positive = 0.1
+
+
+def check(options: BcConfig, policy_config: config.PolicyConfig) -> None:
+    """All options go together."""
+
+
+def make(options: BcConfig, policy_config: config.PolicyConfig, sizes: "Sizes") -> "SequenceModel":
+    """The model of these options."""
+    import jax
+    import jax.numpy as jnp
+
+    from starjax.models import diffusion, regression
+    from starjax.models.kernels import packed_params
+    from starjax.policies import sequences
+    from starjax.policies.sequences import Condition, Params
+
+    dtype = jnp.dtype(policy_config.dtype)
+    network = regression.MixtureNet(
+        horizon=sizes.horizon,
+        action_dim=sizes.action,
+        components=options.components,
+        width=options.mlp_width,
+        blocks=options.mlp_blocks,
+        dtype=dtype,
+    )
+
+    apply = packed_params.applied(network.apply)
+
+    def init(key: jax.Array) -> Params:
+        return {"mixture": network.init(key, jnp.zeros((1, sizes.condition)))}
+
+    def loss(params: Params, condition: Condition, x0: jax.Array) -> tuple[jax.Array, dict]:
+        said = apply(params["mixture"], sequences.joined(condition))
+        return regression.loss(said, x0, options.component_spread), {}
+
+    def sample(
+        params: Params, keys: jax.Array, condition: Condition, reach: jax.Array | None
+    ) -> jax.Array:
+        said = apply(params["mixture"], sequences.joined(condition))
+        return diffusion.within(regression.draw(said, keys), reach)
+
+    def rounded(params: Params) -> Params:
+        return sequences.rounded(params, {"kernel"}, dtype)
+
+    def for_sampling(params: Params) -> Params:
+        network = rounded(params["mixture"])
+        packs = packed_params.pays(jax.default_backend())
+        return {"mixture": packed_params.packed(network) if packs else network}
+
+    return sequences.SequenceModel(init, lambda key, x0: x0, loss, sample, rounded, for_sampling)
+
+
+LEARNER = Learner(BcConfig, check, make)

@@ -1,0 +1,146 @@
+"""Where the trocar must have been, from how a tool moved: the point that its lines share."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import types
+from starjax.rcm import arrays
+
+# rad; axes that lie closer about one direction (root mean square) do not fix the depth of a point
+MIN_SPREAD = float(np.deg2rad(2.0))
+MIN_LINES = 3.0  # that agree on the point
+_FARTHEST = 1e3  # m; tips beyond count as not measured, like those that are not finite
+_FINEST = 1e-5  # m; no line is an outlier for missing the point by less
+_DAMPING = 1e-5  # well below the least eigenvalue that `MIN_SPREAD` asks for
+_COARSE, _FINE = 40, 10  # steps of the two minimisations
+_CUT = 4.685  # deviations beyond which a line counts nothing (Tukey's, for 95% efficiency)
+_RAYLEIGH = 1.1774  # median distance from a point, of lines with unit deviation each way
+
+
+class TrocarEstimate(NamedTuple):
+    """A trocar as the motion of one tool shows it.
+
+    Attributes:
+      p_world_trocar: `[..., 3]` m; where `is_determined` is false, the median of the tips.
+      residual: `[...]` m, root mean square of the lines' distances from the point (Eq. 3), those
+        weighed that count.
+      covariance: `[..., 3, 3]` m^2 of the point, as if lines had independent errors; where
+        `is_determined` is false, that of a point that may be anywhere.
+      weight: `[..., T]` in [0, 1], what each line counts: 0 for an outlier.
+      is_determined: `[...]`, whether the axes spread by `MIN_SPREAD` and `MIN_LINES` count.
+    """
+
+    p_world_trocar: jax.Array
+    residual: jax.Array
+    covariance: jax.Array
+    weight: jax.Array
+    is_determined: jax.Array
+
+
+@arrays.broadcasting
+def trocar_from_poses(pose: types.Pose) -> TrocarEstimate:
+    """Estimates the trocar from a moving tool: the point nearest to the lines of its shaft.
+
+    The sum of distances, which is convex and which a third of wrong poses hardly moves, gives the
+    start; weighed squares (Tukey's, by the median distance) give the point. Turning about the shaft
+    and sliding along it say nothing of where on it the trocar is: see `is_determined`.
+
+    Args:
+      pose: pose_world_tip `[..., T]`; those that are none, as of NaN, are left out.
+    """
+    R, p = arrays.checked(**{"pose.R": (pose.R, (3, 3)), "pose.p": (pose.p, (3,))})
+    if R.ndim < 3 or R.shape[:-2] != p.shape[:-1]:
+        raise ValueError(
+            f"pose: expected R [..., T, 3, 3] and p [..., T, 3], got {list(R.shape)}, "
+            f"{list(p.shape)}"
+        )
+    axis = R[..., :, 2]
+    is_known = jnp.isfinite(axis).all(-1) & (jnp.abs(p) <= _FARTHEST).all(-1)
+    axis, length = arrays.direction(arrays.bounded(axis), np.array([0.0, 0.0, -1.0], np.float32))
+    known = (is_known & (length > 0.5) & (length < 2.0)).astype(p.dtype)
+    centre = _median(p, known)
+    # Where the lines are is counted from the centre: float32 has more digits there.
+    p = jnp.where(known[..., None] > 0.0, p - centre[..., None, :], 0.0)
+
+    def nearer(_: int, point: jax.Array) -> jax.Array:
+        return _step(point, axis, p, known / jnp.maximum(_distance(point, axis, p), _FINEST))
+
+    def better(_: int, point: jax.Array) -> jax.Array:
+        return _step(point, axis, p, _weight(_distance(point, axis, p), known))
+
+    point = jax.lax.fori_loop(0, _COARSE, nearer, jnp.zeros_like(centre))
+    point = jax.lax.fori_loop(0, _FINE, better, point)
+    distance = _distance(point, axis, p)
+    weight = _weight(distance, known)
+    count = jnp.sum(weight, -1)
+    normal = _normal(axis, weight)
+    # The least eigenvalue is the mean square of sin(angle to the axes' common direction).
+    spread = jnp.linalg.eigvalsh(jax.lax.stop_gradient(normal))[..., 0]
+    is_determined = (spread >= np.sin(MIN_SPREAD) ** 2) & (count >= MIN_LINES)
+    total = jnp.sum(weight * distance**2, -1)
+    variance = total / jnp.maximum(2.0 * count - 3.0, 1.0)  # a line fixes two coordinates
+    eye = jnp.eye(3, dtype=p.dtype)
+    safe = jnp.where(is_determined[..., None, None], normal, eye)
+    covariance = (variance / jnp.maximum(count, 1.0))[..., None, None] * _inverse(safe)
+    return TrocarEstimate(
+        p_world_trocar=centre + jnp.where(is_determined[..., None], point, 0.0),
+        residual=jnp.sqrt(jnp.maximum(total / jnp.maximum(count, 1.0), 1e-30)),
+        covariance=jnp.where(is_determined[..., None, None], covariance, _FARTHEST**2 * eye),
+        weight=weight,
+        is_determined=is_determined,
+    )
+
+
+def _step(point: jax.Array, axis: jax.Array, p: jax.Array, weight: jax.Array) -> jax.Array:
+    """The point that minimises weighed squares, by a step from one nearby."""
+    off = _off(point, axis, p)
+    scale = jnp.maximum(jnp.sum(weight, -1), 1e-30)[..., None]
+    towards = jnp.sum(weight[..., None] * off, -2) / scale
+    # Where lines are parallel all points along them are as good: it stays.
+    damped = _normal(axis, weight) + _DAMPING * jnp.eye(3, dtype=p.dtype)
+    return jnp.clip(point + arrays.matvec(_inverse(damped), towards), -1e4, 1e4)
+
+
+def _inverse(symmetric: jax.Array) -> jax.Array:
+    """Of a positive `[..., 3, 3]`, written out: jax's own does not go with its error checks."""
+    x, y, z = (symmetric[..., i] for i in range(3))
+    adjugate = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)], axis=-2)
+    return adjugate / arrays.dot(x, adjugate[..., 0, :])[..., None]
+
+
+def _normal(axis: jax.Array, weight: jax.Array) -> jax.Array:
+    """Weighed mean of `I - a a'`, `[..., 3, 3]`."""
+    scale = jnp.maximum(jnp.sum(weight, -1), 1e-30)[..., None, None]
+    outer = axis[..., :, None] * axis[..., None, :]
+    spanned = jnp.sum(weight[..., None, None] * outer, -3) / scale
+    return jnp.eye(3, dtype=axis.dtype) - spanned
+
+
+def _off(point: jax.Array, axis: jax.Array, p: jax.Array) -> jax.Array:
+    """From the point to the nearest place on each line, `[..., T, 3]` m."""
+    away = p - point[..., None, :]
+    return away - arrays.dot(away, axis) * axis
+
+
+def _distance(point: jax.Array, axis: jax.Array, p: jax.Array) -> jax.Array:
+    return arrays.norm(_off(point, axis, p))
+
+
+def _weight(distance: jax.Array, known: jax.Array) -> jax.Array:
+    """Tukey's weights, their deviation from the median distance of known lines."""
+    middle = _median(distance[..., None], known)
+    deviation = jax.lax.stop_gradient(jnp.maximum(middle / _RAYLEIGH, _FINEST))
+    inside = jnp.maximum(1.0 - (distance / (_CUT * deviation)) ** 2, 0.0)
+    return known * inside**2
+
+
+def _median(x: jax.Array, known: jax.Array) -> jax.Array:
+    """Lower median over the last axis but one of the known rows; zero where none is."""
+    large = jnp.finfo(x.dtype).max
+    ordered = jnp.sort(jnp.where(known[..., None] > 0.0, x, large), axis=-2)
+    middle = jnp.maximum((jnp.sum(known, -1) - 1.0) // 2.0, 0.0).astype(jnp.int32)
+    found = jnp.take_along_axis(ordered, middle[..., None, None], axis=-2)[..., 0, :]
+    return jnp.where(jnp.sum(known, -1)[..., None] > 0.0, found, 0.0)

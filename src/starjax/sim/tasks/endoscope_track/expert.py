@@ -1,0 +1,116 @@
+"""Scripted expert of endoscope tracking: to the target along an arc, then with it.
+
+Centring, distance and level leave one pose of the scope, in closed form. It aims where the target
+will be at the end of the control step. Side of the arc, pace and distance are drawn, never by the
+trocar; it is disturbed on purpose and comes back.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from starjax import rcm
+from starjax.sim.state import EnvState
+from starjax.sim.tasks import scripting
+from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.tasks.endoscope_track.task import DISTANCE, UP
+from starjax.types import Agent, Command, Pose
+
+FIND_TIME = (1.0, 1.6)  # s, range of the way to the target
+NEARER = (0.9, 1.1)  # of DISTANCE, range of an episode's own
+BULGE = 0.008  # m, how far the arc leaves the straight way
+DEVIATION = (0.0008, 0.0008, 0.0008, 0.012)  # m and rad, of the disturbance
+CORRELATION, SMOOTHING = 0.4, 0.15  # s
+DISTURBANCE = 0.7  # how much of it acts once the target is found
+
+
+@flax.struct.dataclass
+class Script:
+    """One episode's script.
+
+    Attributes:
+      key: of everything random. start: `[4]` roll (rad) and position (m).
+      side: `[3]` m, how far the arc leaves the line. distance: m, kept to the target.
+      duration, elapsed: s. noise: `[2, 4]`, disturbance of position and roll, rough and smooth.
+    """
+
+    key: jax.Array
+    start: jax.Array
+    side: jax.Array
+    distance: jax.Array
+    duration: jax.Array
+    elapsed: jax.Array
+    noise: jax.Array
+
+
+def init(key: jax.Array, state: EnvState) -> Script:
+    """Draws side, pace and distance."""
+    key, key_side, key_time, key_distance = jax.random.split(key, 4)
+    sign = jax.random.rademacher(key_side, (), jnp.float32)
+    return Script(
+        key=key,
+        start=jnp.append(0.0, state.pose.p[0]),
+        side=sign * BULGE * jnp.array([0.0, 1.0, 0.0]),
+        distance=DISTANCE * jax.random.uniform(key_distance, minval=NEARER[0], maxval=NEARER[1]),
+        duration=jax.random.uniform(key_time, minval=FIND_TIME[0], maxval=FIND_TIME[1]),
+        elapsed=jnp.zeros(()),
+        noise=jnp.zeros((2, 4)),
+    )
+
+
+def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+    """The disturbed command to execute, the script, and the undisturbed one to record."""
+    dt, facts = 1.0 / CONTROL_HZ, state.facts
+    elapsed = script.elapsed + dt
+    s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
+    share = scripting.minimum_jerk(s)
+    aim = facts.target + dt * facts.velocity
+    R_tip_camera = state.pose.R[0].T @ facts.camera.R
+    p_trocar = state.told.p_world_trocar[0]
+    pose = looking_at(aim, p_trocar, script.distance, R_tip_camera)
+    wanted = jnp.append(rcm.roll_of(pose.R) - state.told.roll_zero[0], pose.p)
+    way = script.start + share * (wanted - script.start)
+    way = way.at[1:].add(4.0 * share * (1.0 - share) * script.side)
+    noise = scripting.disturb(
+        script.key,
+        script.noise,
+        state.step,
+        deviation=jnp.array(DEVIATION),
+        correlation=CORRELATION,
+        smoothing=SMOOTHING,
+        dt=dt,
+    )
+    weight = 1.0 - (1.0 - DISTURBANCE) * s
+    script = script.replace(elapsed=elapsed, noise=noise)
+    return _command(way + weight * jnp.roll(noise[1], 1), state), script, _command(way, state)
+
+
+def looking_at(
+    target: jax.Array, p_trocar: jax.Array, distance: jax.Array, R_tip_camera: jax.Array
+) -> Pose:
+    """The tip's one pose with the target in the middle of a level picture at `distance` m.
+
+    The view may lean from the shaft in the plane of the picture's vertical, as with oblique optics.
+    """
+    length = jnp.linalg.norm(target - p_trocar)
+    straight = (target - p_trocar) / length
+    up = jnp.array(UP)
+    up = up - (up @ straight) * straight
+    up = up / jnp.maximum(jnp.linalg.norm(up), 1e-6)
+    sine, cosine = R_tip_camera[2, 1], -R_tip_camera[2, 2]  # of the lean towards the lower edge
+    sine_e = distance * sine / length
+    cosine_e = jnp.sqrt(1.0 - sine_e**2)
+    axis = cosine_e * straight + sine_e * up
+    p = p_trocar + (length * cosine_e - distance * cosine) * axis
+    back = (p - target) / distance
+    right = jnp.cross(straight, up)
+    R_world_camera = jnp.stack([right, jnp.cross(back, right), back], axis=-1)
+    return Pose(R_world_camera @ R_tip_camera.T, p)
+
+
+def _command(way: jax.Array, state: EnvState) -> Command:
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(way[None], state.told)
+    return Command(pose, jnp.ones(1))
+
+
+AGENT = Agent(init, act)

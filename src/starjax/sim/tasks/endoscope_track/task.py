@@ -1,0 +1,255 @@
+"""Endoscope tracking: a camera on a straight scope keeps a moving tip in view. Lengths in m.
+
+The scope looks down through its trocar, so gravity is no horizon: where the tip passes below the
+trocar the picture would have to spin. What is up in the picture is a horizontal direction, `UP`.
+"""
+
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from starjax import errors
+from starjax.sim.tasks.base import CONTROL_HZ, Capsules, Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks.endoscope_track import words
+from starjax.types import Agent, Pose
+
+CAMERA = "endoscope"
+UP = (-1.0, 0.0, 0.0)
+DISTANCE = 0.06  # of the target from the lens
+
+# The target's path: two oscillations a coordinate, about a centre.
+CENTRE = (0.0, 0.0, 0.022)
+REACH = (0.032, 0.024, 0.012)
+SHARES = (0.7, 0.3)
+RATES = ((0.35, 0.6), (0.8, 1.2))  # rad/s, ranges
+
+# Where an episode begins.
+TIP_HOME = (0.0, 0.0, 0.085)
+TIP_SPREAD = 0.012  # each axis, at most
+
+# Strict success: on target for SHARE of the control steps from FIRST to LAST.
+OFF_CENTRE = 0.05  # of the picture's side
+TILT = float(np.deg2rad(3.0))
+FAR = 0.2  # of DISTANCE, either way
+FIRST, LAST = round(2 * CONTROL_HZ), round(29 * CONTROL_HZ)
+SHARE = 0.9
+MAY_MISS = round((1.0 - SHARE) * (LAST - FIRST))
+
+STAGES = ("out of the picture", "in the picture", "on target", "done")
+MAX_AWAY = 0.3  # beyond it the simulation has diverged
+
+
+@flax.struct.dataclass
+class Layout:
+    """What is drawn at reset.
+
+    Attributes:
+      rate: `[2, 3]` rad/s and phase: `[2, 3]` rad of the target's oscillations.
+      tip: `[3]` m, where the lens starts.
+    """
+
+    rate: jax.Array
+    phase: jax.Array
+    tip: jax.Array
+
+
+@flax.struct.dataclass
+class Facts:
+    """What is measured, and how it went so far.
+
+    Attributes:
+      target: `[3]` m. velocity: `[3]` m/s of it.
+      camera: pose_world_camera: x to the right, y up, it looks along -z.
+      off: how far the target is from the picture's middle, in sides of the picture; 9 behind it.
+      tilt: rad, of the picture from level. distance: m, of the target from the lens.
+      on_target: all three are within the limits.
+      step: int32, control steps since reset. missed: int32, those that count without `on_target`.
+      unseen: the target has left the picture.
+    """
+
+    target: jax.Array
+    velocity: jax.Array
+    camera: Pose
+    off: jax.Array
+    tilt: jax.Array
+    distance: jax.Array
+    on_target: jax.Array
+    step: jax.Array
+    missed: jax.Array
+    unseen: jax.Array
+
+
+class Bound(NamedTuple):
+    """Ids and shapes in the compiled model.
+
+    Attributes:
+      target, dof, ctrl: `[3]` where the target's coordinates are in qpos, qvel and ctrl.
+      R_tip_camera, p_tip_camera: the camera in the tip's frame.
+      half: tangent of half the field of view.
+      rod: `[2, 3]` m, ends of the instrument's rod, from the target. radius: m, of the rod.
+    """
+
+    target: np.ndarray
+    dof: np.ndarray
+    ctrl: np.ndarray
+    R_tip_camera: np.ndarray
+    p_tip_camera: np.ndarray
+    half: float
+    rod: np.ndarray
+    radius: float
+
+
+def bind(m: mujoco.MjModel) -> Bound:
+    """Resolves the ids of the target, and the camera's pose on the tool.
+
+    Raises:
+      errors.UsageError: the tool has no camera.
+    """
+    if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_CAMERA, CAMERA) < 0:
+        raise errors.UsageError("tool", f"one with a camera {CAMERA}", "one without")
+    camera, names = m.camera(CAMERA), [f"target_{axis}" for axis in "xyz"]
+    tip = m.site(int(np.flatnonzero(m.site_bodyid == camera.bodyid[0])[0]))
+    rod = m.geom("rod")
+    R_tip, R_camera, R_rod = (_matrix(part.quat) for part in (tip, camera, rod))
+    ends = rod.pos + np.array([[-1.0], [1.0]]) * rod.size[1] * R_rod[:, 2]
+    return Bound(
+        target=np.array([m.joint(name).qposadr[0] for name in names]),
+        dof=np.array([m.joint(name).dofadr[0] for name in names]),
+        ctrl=np.array([m.actuator(name).id for name in names]),
+        R_tip_camera=np.array(R_tip.T @ R_camera, np.float32),
+        p_tip_camera=np.array(R_tip.T @ (camera.pos - tip.pos), np.float32),
+        half=float(np.tan(np.deg2rad(camera.fovy[0]) / 2)),
+        rod=np.array(ends, np.float32),
+        radius=float(rod.size[0]),
+    )
+
+
+def sample(bound: Bound, key: jax.Array) -> Layout:
+    """Draws the target's path and the lens's start."""
+    key_rate, key_phase, key_tip = jax.random.split(key, 3)
+    low, high = jnp.array(RATES).T
+    rate = low[:, None] + (high - low)[:, None] * jax.random.uniform(key_rate, (2, 3))
+    phase = jax.random.uniform(key_phase, (2, 3), maxval=2 * jnp.pi)
+    spread = jax.random.uniform(key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD)
+    return Layout(rate, phase, jnp.array(TIP_HOME) + spread)
+
+
+def path(layout: Layout, time: jax.Array) -> jax.Array:
+    """Where the target is to be `time` s after reset, `[3]` m."""
+    waves = jnp.array(SHARES) @ jnp.sin(layout.rate * time + layout.phase)
+    return jnp.array(CENTRE) + jnp.array(REACH) * waves
+
+
+def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
+    """Puts the target at the beginning of its path."""
+    return qpos.at[bound.target].set(path(layout, jnp.zeros(())))
+
+
+def drive(bound: Bound, layout: Layout, ctrl: jax.Array, time: jax.Array) -> jax.Array:
+    """Moves the target along its path."""
+    return ctrl.at[bound.ctrl].set(path(layout, time))
+
+
+def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+    """Where the target is in the picture, and for how long it was not where it belongs."""
+    target, tip = views.qpos[bound.target], jax.tree.map(lambda leaf: leaf[0], views.pose)
+    camera = Pose(tip.R @ bound.R_tip_camera, tip.p + tip.R @ bound.p_tip_camera)
+    x, y, z = camera.R.T @ (target - camera.p)
+    depth = jnp.maximum(-z, 1e-6)
+    aside = jnp.stack([x, y]) / (2.0 * bound.half * depth)
+    off = jnp.where(z < 0, jnp.linalg.norm(aside), 9.0)
+    is_seen = (z < 0) & (jnp.max(jnp.abs(aside)) < 0.5)
+    across, along = jnp.array(UP) @ camera.R[:, 0], jnp.array(UP) @ camera.R[:, 1]
+    tilt = jnp.abs(jnp.arctan2(across, along))
+    distance = jnp.linalg.norm(target - camera.p)
+    is_near = jnp.abs(distance - DISTANCE) < FAR * DISTANCE
+    on_target = (off < OFF_CENTRE) & (tilt < TILT) & is_near
+    step, missed, unseen = jnp.array(-1, jnp.int32), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    if before is not None:  # at reset once for the start, so that the count begins at 0
+        step = before.step + 1
+        counts = step > FIRST
+        missed, unseen = before.missed + (counts & ~on_target), before.unseen | (counts & ~is_seen)
+    return Facts(
+        target=target,
+        velocity=views.qvel[bound.dof],
+        camera=camera,
+        off=off,
+        tilt=tilt,
+        distance=distance,
+        on_target=on_target,
+        step=step,
+        missed=missed,
+        unseen=unseen,
+    )
+
+
+def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+    """Strict: on target for long enough. Loose: never out of the picture."""
+    is_over = facts.step >= LAST
+    may_succeed = facts.missed <= MAY_MISS
+    good = is_over & may_succeed
+    stage = (facts.off < 0.5).astype(jnp.int32) + facts.on_target
+    stage = jnp.where(good, 3, stage).astype(jnp.int32)
+    kept = (facts.step - facts.missed) / LAST
+    share = jnp.where(facts.on_target, jnp.clip(kept, 0.0, 1.0), jnp.exp(-facts.off / OFF_CENTRE))
+    reward = jnp.where(good, 1.0, (stage + share) / len(STAGES))
+    lost = facts.unseen & ~may_succeed
+    return Verdict(good, is_over & ~facts.unseen, lost, stage, reward)
+
+
+def obstacles(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+    """The instrument."""
+    start, end = facts.target + jnp.asarray(bound.rod)
+    return Capsules(start[None], end[None], jnp.array([bound.radius]))
+
+
+def is_sound(bound: Bound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+    """Whether the target is near its path."""
+    return jnp.max(jnp.abs(qpos[bound.target])) < MAX_AWAY
+
+
+def _matrix(wxyz: np.ndarray) -> np.ndarray:
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, wxyz)
+    return R.reshape(3, 3)
+
+
+def _expert() -> Agent:
+    from starjax.sim.tasks.endoscope_track import expert
+
+    return expert.AGENT
+
+
+TASK = Task(
+    name="endoscope_track",
+    mjcf="tasks/endoscope_track/endoscope_track.xml",
+    slots=(Slot(workspace="overhead", p_world_ref=(0.0, 0.0, 0.18), tool="endoscope"),),
+    cameras=(CAMERA, "camera"),
+    time_limit_s=30.0,
+    settle_steps=1,
+    fields=(Field("target.p", 3, "point"),),
+    labels=(),
+    stages=STAGES,
+    words=words.WORDS,
+    experts={"default": _expert},
+    graspable=(),
+    bind=bind,
+    sample=sample,
+    tips=lambda bound, layout: layout.tip[None],
+    place=place,
+    measure=measure,
+    judge=judge,
+    state=lambda bound, layout, facts: facts.target,
+    relative=lambda state, tips: (state - tips[..., 0, :]) / DISTANCE,
+    label=lambda layout: {},
+    colours=lambda bound, layout, rgb: rgb,
+    obstacles=obstacles,
+    floor=0.0,
+    is_sound=is_sound,
+    outline=words.outline,
+    drive=drive,
+)

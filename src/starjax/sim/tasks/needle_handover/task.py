@@ -1,0 +1,189 @@
+"""Needle hand-over: one tool (arm 0) picks a suture needle up, the other (arm 1) takes it over.
+
+A drop is a failure. Needle and foam are those of needle pick. Lengths in m.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from starjax import rcm
+from starjax.sim import bodies
+from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks.needle_handover import words
+from starjax.sim.tasks.needle_pick import task as single
+from starjax.types import Agent, Pose
+
+# Where the tips start, and an idle one waits: so near the middle that the shafts lean apart.
+PARK = ((-0.012, 0.0, 0.065), (0.012, 0.0, 0.065))
+SPREAD = 0.005  # each axis, at most
+# Where the needle lies: on the side of the tool that picks it up.
+PLACE = (-0.024, 0.0)
+PLACE_SPREAD = (0.012, 0.02)  # either way
+
+DROPPED_STEPS = 15  # control steps without a tool after which a needle that was lifted is dropped
+STAGES = ("approach", "grasped", "lifted", "taken over", "held", "done")
+
+
+@flax.struct.dataclass
+class Layout:
+    """What is drawn at reset: pose_world_needle; tips `[2, 3]` m."""
+
+    needle: Pose
+    tips: jax.Array
+
+
+@flax.struct.dataclass
+class Facts:
+    """What is measured, and what has happened.
+
+    Attributes:
+      needle: pose_world_needle. tips: `[2, 3]` m.
+      touch: `[2]` bool, whose jaws hold some of the wire.
+      lifted: by arm 0 alone, at some time. passed: held by arm 1 alone in the air, after that.
+      grip: `[3]` m, tip 1 in the needle's frame when its present hold, alone, began.
+      slip: m, how far it has moved along the wire, or off it, since.
+      untouched: int32, control steps in a row without a tool at the needle.
+    """
+
+    needle: Pose
+    tips: jax.Array
+    touch: jax.Array
+    lifted: jax.Array
+    passed: jax.Array
+    grip: jax.Array
+    slip: jax.Array
+    untouched: jax.Array
+
+
+def bind(m: mujoco.MjModel) -> single.Bound:
+    """As in `needle_pick`."""
+    return single.bind(m)
+
+
+def sample(bound: single.Bound, key: jax.Array) -> Layout:
+    """Draws the needle's place and yaw, and the tips' starts."""
+    key_place, key_yaw, key_tips = jax.random.split(key, 3)
+    aside = jax.random.uniform(key_place, (2,), minval=-1.0) * jnp.array(PLACE_SPREAD)
+    yaw = jax.random.uniform(key_yaw, minval=-jnp.pi, maxval=jnp.pi)
+    needle = Pose(rcm.rotation_z(yaw), jnp.append(jnp.array(PLACE) + aside, bound.height))
+    spread = jax.random.uniform(key_tips, (2, 3), minval=-SPREAD, maxval=SPREAD)
+    return Layout(needle, jnp.array(PARK) + spread)
+
+
+def measure(bound: single.Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+    """The needle, who has held it, and how it lies in the jaws that took it over."""
+    needle, touch = bodies.free_pose(views.qpos, bound.needle), views.touch
+    is_up = needle.p[2] > bound.height + single.LIFT
+    lifted, passed = is_up & touch[0] & ~touch[1], jnp.zeros((), bool)
+    here = needle.R.T @ (views.pose.p[1] - needle.p)
+    grip, untouched = here, jnp.zeros((), jnp.int32)
+    if before is not None:
+        is_alone = touch[1] & ~touch[0]
+        lifted = before.lifted | lifted
+        passed = before.passed | (before.lifted & is_up & is_alone)
+        was_alone = before.touch[1] & ~before.touch[0]
+        # A hold begins anew once the needle has slipped too far.
+        goes_on = is_alone & was_alone & (before.slip < single.SLIP)
+        grip = jnp.where(goes_on, before.grip, here)
+        untouched = jnp.where(touch.any(), 0, before.untouched + 1)
+    return Facts(
+        needle=needle,
+        tips=views.pose.p,
+        touch=touch,
+        lifted=lifted,
+        passed=passed,
+        grip=grip,
+        slip=jnp.linalg.norm(here - grip),
+        untouched=untouched,
+    )
+
+
+def judge(bound: single.Bound, layout: Layout, facts: Facts) -> Verdict:
+    """Strict: taken over, held by the other tool alone without slip. Loose: taken over."""
+    is_up = facts.needle.p[2] > bound.height + single.LIFT
+    is_alone = facts.touch[1] & ~facts.touch[0]
+    good = facts.passed & is_up & is_alone & (facts.slip < single.SLIP)
+    lost = facts.lifted & (facts.untouched > DROPPED_STEPS)
+    stage = jnp.where(facts.touch[0], 1, 0)
+    stage = jnp.where(facts.lifted, 2, stage)
+    stage = jnp.where(facts.passed, 3, stage)
+    stage = jnp.where(good, 4, stage).astype(jnp.int32)
+    to_giver, to_taker = jnp.linalg.norm(facts.needle.p - facts.tips, axis=-1)
+    left = jnp.stack([to_giver, to_giver, to_taker, to_taker, to_taker])[stage]
+    reward = (stage + jnp.exp(-left / single.NEAR)) / len(STAGES)
+    return Verdict(good, facts.passed, lost, stage, jnp.where(good, 1.0, reward))
+
+
+def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
+    """As in `needle_pick`, from each tip, and from tip to tip: `[..., 15]`."""
+    parts = [single.relative(state, tips[..., a : a + 1, :]) for a in range(2)]
+    return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
+
+
+def _trocars() -> rcm.Trocar:
+    """Twelve pairs of trocars, each on its arm's side, 10 to 16 cm apart; the last four unseen."""
+    turn = (-24.0, -8.0, 8.0, 24.0)
+    pairs = [
+        (
+            (0.07 - 0.015 * (k % 2), 85.0 + 10.0 * (k // 2 % 2), 180.0 + turn[k % 4]),
+            (0.055 + 0.015 * (k % 2), 95.0 - 10.0 * (k // 4), turn[(3 * k + 1) % 4]),
+        )
+        for k in range(8)
+    ]
+    pairs += [
+        ((0.08, 80.0, 151.0), (0.08, 100.0, 29.0)),
+        ((0.08, 100.0, 209.0), (0.08, 80.0, -29.0)),
+        ((0.05, 90.0, 180.0), (0.05, 90.0, 0.0)),
+        ((0.08, 90.0, 180.0), (0.08, 90.0, 0.0)),
+    ]
+    radius, polar, azimuth = np.moveaxis(np.array(pairs), -1, 0)
+    fields = (radius, np.deg2rad(polar), np.deg2rad(azimuth))
+    return rcm.Trocar(*(field.astype(np.float32) for field in fields))
+
+
+def _nothing(bound: single.Bound, layout: Layout, facts: Facts) -> Capsules:
+    """The needle is no obstacle: it gives way."""
+    return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
+
+
+def _expert() -> Agent:
+    from starjax.sim.tasks.needle_handover import expert
+
+    return expert.AGENT
+
+
+TASK = Task(
+    name="needle_handover",
+    mjcf="tasks/needle_handover/needle_handover.xml",
+    slots=(
+        Slot(workspace="left", p_world_ref=(0.0, 0.0, 0.15)),
+        Slot(workspace="right", p_world_ref=(0.0, 0.0, 0.15), roll_zero=float(np.pi)),
+    ),
+    cameras=("camera",),
+    time_limit_s=60.0,
+    settle_steps=single.SETTLE_STEPS,
+    fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
+    labels=(),
+    stages=STAGES,
+    words=words.WORDS,
+    experts={"default": _expert},
+    graspable=single.TASK.graspable,
+    bind=bind,
+    sample=sample,
+    tips=lambda bound, layout: layout.tips,
+    place=single.place,
+    measure=measure,
+    judge=judge,
+    state=single.state,
+    relative=relative,
+    label=lambda layout: {},
+    colours=lambda bound, layout, rgb: rgb,
+    obstacles=_nothing,
+    floor=single.FLOOR,
+    is_sound=single.is_sound,
+    outline=words.outline,
+    trocars=_trocars(),
+)

@@ -1,0 +1,16 @@
+"""What reports say of needle hand-over."""
+
+from starjax.sim.tasks.needle_pick import words
+
+WORDS = words.WORDS._replace(
+    title="needle hand-over",
+    done="handed the needle over in the air",
+    strict="lifted by one tool, taken over in the air, and held for 2 s by the other alone without "
+    "slipping by more than 0.5 mm, in time",
+    loose="the other tool alone held the needle in the air, slipping or not",
+    nearly="needle taken over, but it slipped or was not held for 2 s",
+    collided="pressed jaws or shaft into the foam, or shafts or arms touched",
+    goal="the needle is to be handed over",
+    lost="the needle was dropped",
+)
+outline = words.outline

@@ -1,0 +1,230 @@
+"""Scripted expert of ring on wire: take the tab, lift the ring free, carry it along, let it hang.
+
+It goes from bend to bend and stops at each. The tip's place for a ring's place follows from how the
+ring is held and how the tool leans there, so from the trocar: a straight tool cannot do otherwise.
+Pace, the place on the tab and the side from which it comes are drawn, never by the trocar. It is
+disturbed on purpose, and starts over when it does not hold the tab.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from starjax import rcm
+from starjax.sim.state import EnvState
+from starjax.sim.tasks import scripting
+from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.tasks.ring_on_wire import task
+from starjax.types import Agent, Command, Pose
+
+RAISE, APPROACH, DESCEND, CLOSE, LIFT, CARRY, LOWER, OPEN, LEAVE, WAIT = range(10)
+# Least duration (s) and mean speed (m/s) of each phase, and jaws: +1 open, -1 closed at its end.
+DURATION = (0.5, 1.2, 0.9, 0.6, 1.2, 0.4, 0.8, 0.5, 0.7, 0.8)
+SPEED = (0.04, 0.04, 0.024, 1.0, 0.02, 0.015, 0.02, 1.0, 0.03, 1.0)
+JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
+# How much of the disturbance acts at the end of each phase.
+DISTURBANCE = (1.0, 1.0, 0.0, 0.0, 0.1, 0.15, 0.0, 0.0, 0.3, 0.1)
+
+TEMPO = (0.85, 1.15)  # range of an episode's pace
+JAW_TIME = 0.25  # s to close or open
+ALIGNED = 0.6  # share of a descent after which it goes straight along the shaft
+HOVER = 0.02  # m along the shaft before the tab
+HOVER_ASIDE = 0.006  # m along the wire, either way
+GRASP_SPREAD = 0.0008  # m along the tab, either way
+RELEASE = 0.55  # share of the way down to where the ring hangs at which it is let go
+SMOOTHED = 0.003  # m to either side over which the wire's direction is taken
+DEVIATION = (0.0012, 0.0012, 0.0012, 0.05)  # m and rad, of the disturbance
+CORRELATION, SMOOTHING = 0.4, 0.15  # s
+STOPS = (*task.BENDS[1:-1], task.START)  # m along the way
+AHEAD = 0.001  # m, the least way to the next stop
+TURNS = 4  # of finding a pose whose roll and position depend on each other
+
+
+@flax.struct.dataclass
+class Script:
+    """Where the script stands; single episode.
+
+    Attributes:
+      key: folded with the attempt or the step for everything random.
+      phase, attempt: int32. elapsed, duration: s. tempo: pace.
+      side: 1 or -1, from where it comes. grasp: m, where the tab is held.
+      start, goal: `[4]` roll (rad) and position (m), undisturbed, at the phase's ends. way: the
+        present one.
+      stop: `[]` m along the way, where the present carry ends.
+      jaws_from, jaws: openings.
+      noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
+    """
+
+    key: jax.Array
+    phase: jax.Array
+    attempt: jax.Array
+    elapsed: jax.Array
+    duration: jax.Array
+    tempo: jax.Array
+    side: jax.Array
+    grasp: jax.Array
+    start: jax.Array
+    goal: jax.Array
+    way: jax.Array
+    stop: jax.Array
+    jaws_from: jax.Array
+    jaws: jax.Array
+    noise: jax.Array
+
+
+def init(key: jax.Array, state: EnvState) -> Script:
+    """The script at the start of an episode."""
+    key_tempo, key = jax.random.split(key)
+    zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
+    tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
+    way = jnp.append(0.0, state.pose.p[0])
+    script = Script(
+        key, none, none, zero, zero, tempo, jnp.ones(()), zero, way, way, way, zero, jnp.ones(()),
+        jnp.ones(()), jnp.zeros((2, 4)),
+    )  # fmt: skip
+    return _enter(script, jnp.asarray(APPROACH, jnp.int32), state)
+
+
+def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+    """The disturbed command to execute, the script, and the undisturbed one to record."""
+    dt = 1.0 / CONTROL_HZ
+    is_over = script.elapsed >= script.duration - 1e-6
+    after = _enter(script, _following(script, state), state)
+    script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
+    elapsed = script.elapsed + dt
+    s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
+    share = scripting.minimum_jerk(s)
+    way = script.start + share * (script.goal - script.start)
+    # On the way down the tool has turned, and goes along its shaft, by the time it can touch.
+    early = scripting.minimum_jerk(jnp.minimum(s / ALIGNED, 1.0))
+    back = HOVER * (1.0 - share) * _shaft(script.goal[1:], state)
+    aside = (1.0 - early) * (script.start + _lifted(script, state) - script.goal)
+    way = jnp.where(script.phase == DESCEND, (script.goal + aside).at[1:].add(-back), way)
+    wanted = jnp.asarray(JAWS)[script.phase]
+    jaws = script.jaws_from + jnp.clip(elapsed / JAW_TIME, 0.0, 1.0) * (wanted - script.jaws_from)
+    noise = scripting.disturb(
+        script.key,
+        script.noise,
+        state.step,
+        deviation=jnp.array(DEVIATION),
+        correlation=CORRELATION,
+        smoothing=SMOOTHING,
+        dt=dt,
+    )
+    weights = jnp.asarray(DISTURBANCE)
+    before, weight = weights[jnp.maximum(script.phase - 1, 0)], weights[script.phase]
+    moved = (before + share * (weight - before)) * jnp.roll(noise[1], 1)
+    script = script.replace(elapsed=elapsed, way=way, jaws=jaws, noise=noise)
+    return _command(way + moved, jaws, state), script, _command(way, jaws, state)
+
+
+def _lifted(script: Script, state: EnvState) -> jax.Array:
+    """`[4]`: from where a descent begins to as far down the shaft as it goes."""
+    return jnp.append(0.0, HOVER * _shaft(script.goal[1:], state))
+
+
+def _following(script: Script, state: EnvState) -> jax.Array:
+    """The phase after the present one: the next carry, or again from the start without the tab."""
+    is_carry, is_there = script.phase == CARRY, script.stop >= STOPS[-1] - 1e-6
+    following = jnp.where(is_carry & ~is_there, CARRY, script.phase + 1)
+    is_held = (script.phase >= LIFT) & (script.phase <= CARRY)
+    following = jnp.where(is_held & ~state.facts.touch, RAISE, following)
+    is_away = state.layout.way * state.facts.ring.p[1] < task.END
+    at_last = jnp.where(is_away, RAISE, WAIT)
+    return jnp.where(script.phase == WAIT, at_last, following).astype(jnp.int32)
+
+
+def _enter(script: Script, phase: jax.Array, state: EnvState) -> Script:
+    """Begins `phase` with a goal from what is seen now."""
+    ring, here = state.facts.ring, script.way
+    is_approach = phase == APPROACH
+    attempt = script.attempt + is_approach
+    key_side, key_grasp = jax.random.split(jax.random.fold_in(script.key, attempt))
+    side = jax.random.rademacher(key_side, (), jnp.float32)
+    side = jnp.where(is_approach, side, script.side)
+    spread = jax.random.uniform(key_grasp, minval=-GRASP_SPREAD, maxval=GRASP_SPREAD)
+    grasp = jnp.where(is_approach, task.TAB + spread, script.grasp)
+    at_tab = ring.p + grasp * ring.R[:, 2]
+    shaft = _shaft(at_tab, state)
+    normal = ring.R[:, 1] * jnp.where(ring.R[1, 1] > 0, -1.0, 1.0)
+    above = at_tab - HOVER * shaft + jnp.array([0.0, HOVER_ASIDE, 0.0]) * side
+    progress = state.layout.way * ring.p[1]
+    stops = jnp.array(STOPS)
+    following = jnp.min(jnp.where(stops > progress + AHEAD, stops, STOPS[-1]))
+    stop = jnp.where(phase == LIFT, progress, jnp.where(phase == CARRY, following, script.stop))
+    on_wire = _carrying(state.layout.way * stop, jnp.zeros(()), here[0], state)
+    hung = _carrying(state.layout.way * stop, jnp.array(RELEASE), here[0], state)
+    leaving = here.at[1:].add(-HOVER * _shaft(here[1:], state))
+    goals = jnp.stack(
+        [
+            here.at[3].set(jnp.maximum(here[3], task.TIP_HOME[2])),
+            _turned(above, normal, here[0], state),
+            _turned(at_tab, normal, here[0], state),
+            here,
+            on_wire,
+            on_wire,
+            hung,
+            here,
+            leaving,
+            here,
+        ]
+    )
+    goal = goals[phase]
+    length = jnp.linalg.norm(goal[1:] - here[1:])
+    least = jnp.maximum(jnp.asarray(DURATION)[phase], length / jnp.asarray(SPEED)[phase])
+    return script.replace(
+        phase=phase,
+        attempt=attempt,
+        elapsed=jnp.zeros(()),
+        duration=least / script.tempo,
+        side=side,
+        grasp=grasp,
+        start=here,
+        goal=goal,
+        stop=stop,
+        jaws_from=script.jaws,
+    )
+
+
+def _carrying(y: jax.Array, lowered: jax.Array, roll: jax.Array, state: EnvState) -> jax.Array:
+    """Roll and position `[4]` with the ring, as it is held now, about the wire at `y` m.
+
+    Args:
+      lowered: share of the way down to where the ring hangs.
+      roll: rad, the present one.
+    """
+    point = jnp.stack([jnp.zeros(()), y, task.height(y) - lowered * task.HANG])
+    rise = task.height(y + SMOOTHED) - task.height(y - SMOOTHED)
+    normal = -jnp.stack([jnp.zeros(()), jnp.array(2.0 * SMOOTHED), rise])
+    held: Pose = jax.tree.map(lambda leaf: leaf[0], state.pose)
+    in_tool = held.R.T @ (state.facts.ring.p - held.p)
+    way = jnp.append(roll, held.p)
+    for _ in range(TURNS):
+        way = _turned(way[1:], normal, roll, state)
+        R = _command(way, jnp.zeros(()), state).pose.R[0]
+        way = way.at[1:].set(point - R @ in_tool)
+    return way
+
+
+def _turned(p: jax.Array, normal: jax.Array, roll: jax.Array, state: EnvState) -> jax.Array:
+    """Roll and position `[4]` at `p`, the jaws opening along `normal`, as near `roll` as may be.
+
+    Jaws are the same after half a turn.
+    """
+    R = _command(jnp.append(0.0, p), jnp.zeros(()), state).pose.R[0]
+    turned = jnp.arctan2(-normal @ R[:, 0], normal @ R[:, 1])
+    return jnp.append(roll + (turned - roll + jnp.pi / 2) % jnp.pi - jnp.pi / 2, p)
+
+
+def _shaft(p: jax.Array, state: EnvState) -> jax.Array:
+    """The direction `[3]` of a shaft with its tip at `p`."""
+    away = p - state.told.p_world_trocar[0]
+    return away / jnp.linalg.norm(away)
+
+
+def _command(way: jax.Array, jaws: jax.Array, state: EnvState) -> Command:
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(way[None], state.told)
+    return Command(pose, jaws[None])
+
+
+AGENT = Agent(init, act)

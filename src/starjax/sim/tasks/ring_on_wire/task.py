@@ -1,0 +1,270 @@
+"""Ring on wire: a ring that hangs on a bent wire is carried along without touching it.
+
+Lengths in m. Ring frame: origin at its centre, y along its normal, z towards its tab. The wire lies
+in the plane x = 0; it is the same from either end, and an episode begins at one of them.
+"""
+
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from starjax import rcm
+from starjax.sim import bodies
+from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks.peg_transfer.task import is_at_rest
+from starjax.sim.tasks.ring_on_wire import words
+from starjax.types import Agent, Pose
+
+# As in ring_on_wire.xml (a test holds these to the compiled model).
+BENDS = (
+    -0.045981,
+    -0.025981,
+    -0.01299,
+    0.0,
+    0.01299,
+    0.025981,
+    0.045981,
+)  # y of the wire's corners
+HEIGHTS = (0.022, 0.022, 0.0295, 0.022, 0.0295, 0.022, 0.022)  # z of them
+TAB = 0.0110  # from the ring's centre to where its tab is held
+HANG = 0.00414  # of the ring's centre below the wire's axis, where it hangs
+
+# Where an episode begins.
+START = 0.037  # from the wire's middle
+START_SPREAD = 0.0035
+YAW = 0.25  # rad, either way
+TIP_HOME = (0.0, 0.0, 0.056)
+TIP_SPREAD = 0.008  # each axis, at most
+
+# Strict success: beyond the bent part, hanging, released, at rest for SETTLE_STEPS control steps.
+END = 0.029
+HANG_TOLERANCE = 0.003
+MAY_TOUCH = 9  # control steps over the bent part: 0.3 s
+SETTLE_STEPS = 10
+
+STAGES = ("approach", "grasped", "lifted", "on the way", "at the end", "done")
+LIFTED = 0.002  # above where it hangs
+NEAR = 0.03  # the scale of distances that decide
+GOAL_RGB = (0.98, 0.62, 0.1)
+# Beyond these the simulation has diverged.
+MAX_SPEED = 5.0  # m/s
+MAX_DISTANCE = 0.3
+
+
+@flax.struct.dataclass
+class Layout:
+    """What is drawn at reset.
+
+    Attributes:
+      start: int32, the end at which the ring hangs: 0 at y < 0, 1 at y > 0.
+      way: `[]`, 1 or -1: along y, to the other end.
+      ring: pose_world_ring. tip: `[3]` m, where the tool's tip starts.
+    """
+
+    start: jax.Array
+    way: jax.Array
+    ring: Pose
+    tip: jax.Array
+
+
+@flax.struct.dataclass
+class Facts:
+    """What is measured, and how it went so far.
+
+    Attributes:
+      ring: pose_world_ring. velocity: `[6]` of it, m/s and rad/s.
+      tip: `[3]` m. touch: the jaws touch the tab.
+      rubs: the ring touches the wire. rubbed: int32, control steps in which it did so over the bent
+        part.
+    """
+
+    ring: Pose
+    velocity: jax.Array
+    tip: jax.Array
+    touch: jax.Array
+    rubs: jax.Array
+    rubbed: jax.Array
+
+
+class Bound(NamedTuple):
+    """Ids and shapes in the compiled model.
+
+    Attributes:
+      ring, dof: where the ring's coordinates begin in qpos and qvel.
+      tube, wire: geom ids of the ring's tube, and of the wire with its posts.
+      ends: `[2, 2]` geom ids, the last piece and the post of either end.
+      pieces: `[K, 2, 3]` m, axes of wire and posts. radius: m, of them.
+    """
+
+    ring: int
+    dof: int
+    tube: np.ndarray
+    wire: np.ndarray
+    ends: np.ndarray
+    pieces: np.ndarray
+    radius: float
+
+
+def bind(m: mujoco.MjModel) -> Bound:
+    """Resolves the ids of ring and wire."""
+    names = [m.geom(g).name for g in range(m.ngeom)]
+    wire = [g for g, name in enumerate(names) if name.startswith(("wire", "post"))]
+    last = len(BENDS) - 2
+    ends = [[f"wire{last}", "post1"], ["wire0", "post0"]]  # by the episode's start
+    pieces = np.array([words.capsule_ends(m.geom(g)) for g in wire], np.float32)
+    return Bound(
+        ring=int(m.joint("ring").qposadr[0]),
+        dof=int(m.joint("ring").dofadr[0]),
+        tube=np.array([g for g, name in enumerate(names) if name.startswith("ring")]),
+        wire=np.array(wire),
+        ends=np.array([[m.geom(name).id for name in pair] for pair in ends]),
+        pieces=pieces,
+        radius=float(m.geom(wire[0]).size[0]),
+    )
+
+
+def height(y: jax.Array) -> jax.Array:
+    """Of the wire's axis at `y` `[...]` m."""
+    return jnp.interp(y, jnp.array(BENDS), jnp.array(HEIGHTS))
+
+
+def sample(bound: Bound, key: jax.Array) -> Layout:
+    """Draws the end, the ring's place on it and yaw, and the tip's start."""
+    key_start, key_place, key_yaw, key_tip = jax.random.split(key, 4)
+    start = jax.random.randint(key_start, (), 0, 2)
+    way = 1.0 - 2.0 * start
+    aside = jax.random.uniform(key_place, minval=-START_SPREAD, maxval=START_SPREAD)
+    y = -way * START + aside
+    yaw = jax.random.uniform(key_yaw, minval=-YAW, maxval=YAW)
+    p = jnp.stack([jnp.zeros(()), y, height(y) - HANG])
+    tip = jnp.array(TIP_HOME) + jax.random.uniform(
+        key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD
+    )
+    return Layout(start, way, Pose(rcm.rotation_z(yaw), p), tip)
+
+
+def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
+    """Hangs the ring where it was drawn."""
+    R = layout.ring.R
+    half, zero = 0.5 * jnp.arctan2(R[1, 0], R[0, 0]), jnp.zeros(())
+    coords = jnp.concatenate([layout.ring.p, jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])])
+    return qpos.at[bound.ring : bound.ring + 7].set(coords)
+
+
+def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+    """The ring, and how often it has touched the wire."""
+    ring = bodies.free_pose(views.qpos, bound.ring)
+    geom, close = views.contacts.geom, views.contacts.dist < 0
+    of_tube, of_wire = (
+        jnp.any(geom[..., None] == jnp.asarray(ids), axis=(-2, -1))
+        for ids in (bound.tube, bound.wire)
+    )
+    rubs = jnp.any(close & of_tube & of_wire)
+    rubbed = jnp.zeros((), jnp.int32)
+    if before is not None:
+        rubbed = before.rubbed + (rubs & (jnp.abs(ring.p[1]) < -BENDS[1]))
+    return Facts(
+        ring=ring,
+        velocity=views.qvel[bound.dof : bound.dof + 6],
+        tip=views.pose.p[0],
+        touch=views.touch[0],
+        rubs=rubs,
+        rubbed=rubbed,
+    )
+
+
+def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+    """Strict: carried to the end with little touching, released, at rest. Loose: at the end."""
+    p, way = facts.ring.p, layout.way * facts.ring.p[1]
+    raised = p[2] - (height(p[1]) - HANG)
+    at_end = (way > END) & (way < -BENDS[0])
+    hangs = at_end & (jnp.abs(raised) < HANG_TOLERANCE)
+    may = facts.rubbed <= MAY_TOUCH
+    good = hangs & may & ~facts.touch & is_at_rest(facts.velocity)
+    stage = jnp.where(facts.touch, 1, 0)
+    stage = jnp.where(facts.touch & (raised > LIFTED), 2, stage)
+    stage = jnp.where((stage == 2) & (way > BENDS[1]), 3, stage)
+    stage = jnp.where(at_end, 4, stage)
+    stage = jnp.where(good, 5, stage).astype(jnp.int32)
+    to_tab = jnp.linalg.norm(p + TAB * facts.ring.R[:, 2] - facts.tip)
+    left = jnp.where(stage == 0, to_tab, jnp.maximum(END - way, 0.0))
+    reward = jnp.where(good, 1.0, (stage + jnp.exp(-left / NEAR)) / len(STAGES))
+    return Verdict(good, at_end, ~may, stage, reward)
+
+
+def state(bound: Bound, layout: Layout, facts: Facts) -> jax.Array:
+    """`[12]`: the ring's position and rotation, the place where it is to hang."""
+    goal = jnp.stack([jnp.zeros(()), layout.way * START, jnp.array(HEIGHTS[-1] - HANG)])
+    return jnp.concatenate([facts.ring.p, rcm.rot6d_encode(facts.ring.R), goal])
+
+
+def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
+    """Tip to tab, in the world's frame and in the ring's; the ring above the wire, its normal from
+    the wire's plane, and to the goal: `[..., 11]`."""
+    p, R, goal = state[..., :3], rcm.rot6d_decode(state[..., 3:9]), state[..., 9:12]
+    off = p + TAB * R[..., 2] - tips[..., 0, :]
+    turned = jnp.einsum("...ji,...j->...i", R, off, precision="highest")
+    above = (p[..., 2] - height(p[..., 1]))[..., None] / HANG
+    return jnp.concatenate([off / NEAR, turned / NEAR, above, R[..., :1, 1], (goal - p) / NEAR], -1)
+
+
+def colours(bound: Bound, layout: Layout, rgb: jax.Array) -> jax.Array:
+    """Marks the end to which the ring belongs."""
+    return rgb.at[jnp.asarray(bound.ends)[layout.start]].set(jnp.array(GOAL_RGB))
+
+
+def obstacles(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+    """Wire and posts."""
+    start, end = jnp.moveaxis(jnp.asarray(bound.pieces), 1, 0)
+    return Capsules(start, end, jnp.full(len(bound.pieces), bound.radius))
+
+
+def is_sound(bound: Bound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+    """Whether the ring is slower, and nearer, than anything physical."""
+    speed = jnp.max(jnp.abs(qvel[bound.dof : bound.dof + 3]))
+    away = jnp.max(jnp.abs(qpos[bound.ring : bound.ring + 3]))
+    return (speed < MAX_SPEED) & (away < MAX_DISTANCE)
+
+
+def _expert() -> Agent:
+    from starjax.sim.tasks.ring_on_wire import expert
+
+    return expert.AGENT
+
+
+TASK = Task(
+    name="ring_on_wire",
+    mjcf="tasks/ring_on_wire/ring_on_wire.xml",
+    slots=(Slot(workspace="wire", p_world_ref=(0.0, 0.0, 0.15), tool="grasper_wide"),),
+    cameras=("camera",),
+    time_limit_s=60.0,
+    settle_steps=SETTLE_STEPS,
+    fields=(
+        Field("ring.p", 3, "point"),
+        Field("ring.R", 6, "rot6d"),
+        Field("goal.p", 3, "point"),
+    ),
+    labels=("start",),
+    stages=STAGES,
+    words=words.WORDS,
+    experts={"default": _expert},
+    graspable=("tab0", "tab1"),
+    bind=bind,
+    sample=sample,
+    tips=lambda bound, layout: layout.tip[None],
+    place=place,
+    measure=measure,
+    judge=judge,
+    state=state,
+    relative=relative,
+    label=lambda layout: {"start": layout.start},
+    colours=colours,
+    obstacles=obstacles,
+    floor=0.0,
+    is_sound=is_sound,
+    outline=words.outline,
+)

@@ -1,0 +1,329 @@
+"""Exports and imports: back as they were, with the columns that peers expect, whatever happens."""
+
+import json
+import shutil
+
+import h5py
+import kill
+import mistakes
+import numpy as np
+import pyarrow.parquet
+import pytest
+import recorded
+import zarr
+from scipy.spatial import transform
+
+from starjax import errors
+from starjax.data import load, schema, store
+from starjax.data.formats import base, exchange
+from starjax.rollouts import episodes
+
+KINDS = {"state": {}, "images": {"size": 32, "cameras": 2}, "two_arms": {"arms": 2, "demos": 2}}
+EXACT = {"robomimic": True, "zarr": True, "lerobot": False}  # and whether images go into videos
+SUFFIX = {"robomimic": ".hdf5"}
+
+
+@pytest.fixture(scope="module")
+def roots(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sealed")
+    for name, given in KINDS.items():
+        recorded.write(folder / name, **given)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(roots, tmp_path_factory):
+    """(kind, format, video) -> path of the export, made once."""
+    made = {}
+
+    def find(kind, name, video=False):
+        at = (kind, name, video)
+        if at not in made:
+            form = base.FORMATS.get(name)
+            made[at] = tmp_path_factory.mktemp("out") / f"{kind}{SUFFIX.get(name, '')}"
+            exchange.export(exchange.source(roots / kind, form), made[at], form, video)
+        return made[at]
+
+    return find
+
+
+def bring_back(path, root, **given):
+    with base.opened(path, base.recognised(path)) as source:
+        return exchange.bring_back(source, root, **given)
+
+
+@pytest.mark.parametrize("name", base.FORMATS.names())
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_export_comes_back_to_the_last_byte(roots, exported, tmp_path, kind, name):
+    found = bring_back(exported(kind, name), tmp_path / "back")
+    assert found["same"] and found["digest"] == store.read_seal(roots / kind)["digest"]
+    assert kill.tree(tmp_path / "back") == kill.tree(roots / kind)
+
+
+def test_videos_lose_little_and_nothing_else(roots, exported, tmp_path):
+    found = bring_back(exported("images", "lerobot", True), tmp_path / "back")
+    assert not found["same"]
+    before, after = kill.tree(roots / "images"), kill.tree(tmp_path / "back")
+    assert before.keys() == after.keys()
+    differing = {name for name in before if before[name] != after[name]}
+    assert {name.rpartition("/")[2].partition("_")[0] for name in differing} == {
+        "image",
+        "episode.json",
+        "SEALED.json",
+    }
+    for camera in recorded.CAMERAS:
+        one, other = (
+            load.frames(root)[camera].read().astype(float)
+            for root in (roots / "images", tmp_path / "back")
+        )
+        assert 10 * np.log10(255**2 / np.mean((one - other) ** 2)) >= 35.0
+
+
+@pytest.mark.parametrize("observation", ["state", "image"])
+@pytest.mark.parametrize("name", base.FORMATS.names())
+def test_a_dataset_of_schema_1_comes_back_as_one_of_today(tmp_path, request, observation, name):
+    root = request.config.rootpath / f"tests/golden/demonstrations/schema_1_{observation}"
+    form, out = base.FORMATS.get(name), tmp_path / f"out{SUFFIX.get(name, '')}"
+    exchange.export(exchange.source(root, form), out, form, False)
+    bring_back(out, tmp_path / "back")
+    assert store.read_description(tmp_path / "back")["schema"] == schema.SCHEMA
+    before, after = (
+        load.load(path, report=lambda _: None).dataset for path in (root, tmp_path / "back")
+    )
+    import jax
+
+    jax.tree.map(np.testing.assert_array_equal, before, after)
+
+
+@pytest.mark.parametrize("kind", ["state", "two_arms"])
+def test_peers_columns_say_what_ours_say(roots, kind):
+    form = base.FORMATS.get("zarr")
+    source = exchange.source(roots / kind, form)
+    names = ["state", "action", "trocar", "reward", "done", "environment_state"]
+    key = store.keys(roots / kind)[1]
+    record = store.verify(roots / kind, key)
+    ours = {name: np.load(roots / kind / "episodes" / key / name) for name in record["files"]}
+    found = source.read(1, names)
+    arms = len(record["radius"])
+    for column, before in (("state", ""), ("action", "command_")):
+        rows = found[column].reshape(-1, arms, 8)
+        np.testing.assert_array_equal(rows[..., :3], ours[f"{before}p.npy"])
+        R = transform.Rotation.from_quat(rows[..., 3:7].reshape(-1, 4)).as_matrix()
+        np.testing.assert_allclose(R, ours[f"{before}R.npy"].reshape(-1, 3, 3), atol=1e-6)
+        assert (np.sum(rows[1:, :, 3:7] * rows[:-1, :, 3:7], -1) > 0).all()  # no jumps
+        np.testing.assert_array_equal(rows[..., 7], ours[f"{before}gripper.npy"])
+        assert len(source.columns[column].names) == 8 * arms
+    description = store.read_description(roots / kind)
+    offset = found["trocar"].reshape(-1, arms, 3) - np.float32(description["p_world_ref"])
+    np.testing.assert_allclose(np.linalg.norm(offset, axis=-1)[0], record["radius"], atol=1e-6)
+    np.testing.assert_array_equal(found["environment_state"], ours["state.npy"])
+    last = np.arange(record["length"]) == record["length"] - 1
+    np.testing.assert_array_equal(found["done"], last)
+    np.testing.assert_array_equal(found["reward"], last)
+
+
+def test_robomimic_has_its_groups(exported):
+    with h5py.File(exported("images", "robomimic")) as file:
+        assert json.loads(file["data"].attrs["env_args"]).keys() >= {"env_name", "env_kwargs"}
+        assert file["data"].attrs["total"] == 120 and len(file["data"]) == 4
+        demo = file["data/demo_3"]
+        assert demo.attrs["num_samples"] == 30 and np.abs(demo["actions"]).max() <= 1.0
+        assert demo["obs/wrist_image"].shape == (30, 32, 32, 3)
+        assert demo["obs/wrist_image"].chunks == (1, 32, 32, 3)
+        assert file["mask/train"].asstr()[3] == "demo_3"
+
+
+def test_robomimic_refuses_actions_that_its_learners_would_clip(roots, tmp_path):
+    form = base.FORMATS.get("robomimic")
+    source = exchange.source(roots / "state", form)
+
+    def far(episode, names):
+        return {name: 20.0 * array for name, array in source.read(episode, names).items()}
+
+    with pytest.raises(base.Damaged):
+        exchange.export(source._replace(read=far), tmp_path / "out.hdf5", form)
+    assert not list(tmp_path.iterdir())
+
+
+def test_zarr_is_of_version_2(exported):
+    path = exported("images", "zarr")
+    assert (path / ".zgroup").exists() and not list(path.rglob("zarr.json"))
+    root = zarr.open_group(str(path), mode="r", zarr_format=2)
+    assert root["meta/episode_ends"][:].tolist() == [30, 60, 90, 120]
+    assert json.loads((path / "meta/episode_ends/.zarray").read_text())["compressor"] is None
+    assert root["data/image_wrist"].shape == (120, 32, 32, 3)
+    assert root["data/image_wrist"].chunks == (1, 32, 32, 3)
+
+
+@pytest.mark.parametrize("video", [False, True])
+def test_lerobot_has_its_tables(exported, video):
+    path = exported("images", "lerobot", video)
+    info = json.loads((path / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 30
+    assert (info["total_episodes"], info["total_frames"]) == (4, 120)
+    image = "observation.images.wrist"
+    assert info["features"][image]["dtype"] == ("video" if video else "image")
+    table = pyarrow.parquet.ParquetFile(path / "data/chunk-000/file-000.parquet")
+    assert table.num_row_groups == 4 and (image in table.schema_arrow.names) != video
+    described = json.loads(table.schema_arrow.metadata[b"huggingface"])["info"]["features"]
+    assert described.keys() == set(table.schema_arrow.names)
+    rows = pyarrow.parquet.read_table(path / "meta/episodes/chunk-000/file-000.parquet")
+    assert rows["dataset_to_index"].to_pylist() == [30, 60, 90, 120]
+    stats = json.loads((path / "meta/stats.json").read_text())
+    assert np.shape(stats[image]["q99"]) == (3, 1, 1) and 0 <= stats[image]["min"][0][0][0] <= 1
+    state = np.stack(pyarrow.parquet.read_table(path / "data")["observation.state"].to_pylist())
+    np.testing.assert_allclose(stats["observation.state"]["q10"], np.quantile(state, 0.1, axis=0))
+    if video:
+        begins = rows[f"videos/{image}/from_timestamp"].to_pylist()
+        assert begins == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_the_card_has_a_header_and_every_feature(exported):
+    path = exported("images", "lerobot", True)
+    _, header, text = (path / "README.md").read_text().split("---\n", 2)
+    assert "- LeRobot" in header and "data_files: data/*/*.parquet" in header
+    info = json.loads((path / "meta/info.json").read_text())
+    shown = [name for name in info["features"] if not name.startswith(base.OURS)]
+    assert all(f"`{name}`" in text for name in shown)
+
+
+def test_files_of_lerobot_are_split_by_size(roots, tmp_path, monkeypatch):
+    from starjax.data.formats import lerobot_write
+
+    monkeypatch.setattr(lerobot_write, "DATA_MB", 0)
+    monkeypatch.setattr(lerobot_write, "VIDEO_MB", 0)
+    monkeypatch.setattr(lerobot_write, "CHUNK", 3)
+    form = base.FORMATS.get("lerobot")
+    exchange.export(exchange.source(roots / "images", form), tmp_path / "out", form, True)
+    assert (tmp_path / "out/data/chunk-001/file-000.parquet").exists()
+    assert (tmp_path / "out/videos/observation.images.wrist/chunk-001/file-000.mp4").exists()
+    bring_back(tmp_path / "out", tmp_path / "back")
+    before, after = kill.tree(roots / "images"), kill.tree(tmp_path / "back")
+    assert {n for n in before if "p.npy" in n and before[n] != after[n]} == set()
+
+
+def as_v21(path, out):
+    """The dataset as LeRobot's version 2.1 lays it out."""
+    info = json.loads((path / "meta/info.json").read_text())
+    table = pyarrow.parquet.read_table(path / "data")
+    (out / "meta").mkdir(parents=True)
+    (out / "data/chunk-000").mkdir(parents=True)
+    lines = []
+    for episode in range(info["total_episodes"]):
+        mine = table.filter(pyarrow.compute.equal(table["episode_index"], episode))
+        pyarrow.parquet.write_table(mine, out / f"data/chunk-000/episode_{episode:06d}.parquet")
+        lines.append({"episode_index": episode, "tasks": ["t"], "length": len(mine)})
+    (out / "meta/episodes.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n")
+    (out / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "move it"}\n')
+    info |= {"codebase_version": "v2.1"}
+    (out / "meta/info.json").write_text(json.dumps(info))
+    return out
+
+
+def test_version_2_1_of_lerobot_is_read(exported, tmp_path):
+    path = exported("images", "lerobot")
+    with (
+        base.opened(path, "lerobot") as modern,
+        base.opened(as_v21(path, tmp_path / "old"), "lerobot") as old,
+    ):
+        assert list(old.lengths) == list(modern.lengths) and old.columns == modern.columns
+        assert old.task == "move it" and old.origin is None
+        for episode in (0, 3):
+            found = (source.read(episode, source.columns) for source in (old, modern))
+            for one, other in zip(*(arrays.values() for arrays in found), strict=True):
+                np.testing.assert_array_equal(one, other)
+
+
+def test_a_stopped_import_goes_on(exported, roots, tmp_path):
+    counts = []
+
+    def stop(count):
+        counts.append(count)
+        if len(counts) == 3:
+            raise KeyboardInterrupt
+
+    path = exported("state", "zarr")
+    with pytest.raises(KeyboardInterrupt):
+        bring_back(path, tmp_path / "back", note=stop)
+    assert not store.is_sealed(tmp_path / "back") and len(store.keys(tmp_path / "back")) == 3
+    bring_back(path, tmp_path / "back", note=counts.append)
+    assert len(counts) == 5  # three before, two now: none twice
+    assert kill.tree(tmp_path / "back") == kill.tree(roots / "state")
+
+
+@pytest.mark.parametrize("name", base.FORMATS.names())
+def test_a_stopped_export_leaves_nothing(roots, tmp_path, name):
+    form = base.FORMATS.get(name)
+    done = []
+
+    def stop(count):
+        done.append(count)
+        if len(done) == 3:
+            raise KeyboardInterrupt
+
+    source = exchange.source(roots / "images", form)
+    with pytest.raises(KeyboardInterrupt):
+        exchange.export(source, tmp_path / "out", form, True, stop)
+    assert not list(tmp_path.iterdir())
+
+
+def _key(origin):
+    origin["records"][0]["key"] = "../../escaped"
+
+
+def _field(origin):
+    about = origin["description"]["features"]
+    about["../p"] = about.pop("p")
+    origin["columns"]["../p"] = origin["columns"].pop("p")
+
+
+CHANGES = {
+    "key": _key,
+    "field": _field,
+    "length": lambda origin: origin["records"][0].update(length=7),
+    "records": lambda origin: origin["records"].pop(),
+    "columns": lambda origin: origin["columns"].update(p="starjax.R"),
+    "features": lambda origin: origin["description"].pop("features"),
+    "description": lambda origin: origin.update(description=[]),
+    "stored": lambda origin: origin.update(stored=None),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_an_export_says_of_itself_is_not_trusted(exported, tmp_path, change):
+    path = shutil.copytree(exported("state", "lerobot"), tmp_path / "in")
+    ours = path / "meta/starjax.json"
+    origin = json.loads(ours.read_text())
+    CHANGES[change](origin)
+    ours.write_text(json.dumps(origin))
+    with pytest.raises(errors.UsageError):
+        bring_back(path, tmp_path / "deep/er/back")
+    assert {p.name for p in tmp_path.iterdir()} <= {"in", "deep"}
+    assert not list((tmp_path / "deep").rglob("*.npy"))
+
+
+def test_what_is_no_dataset_is_named(roots, tmp_path):
+    for path in (tmp_path / "nowhere", tmp_path):
+        with mistakes.of("PATH", path):
+            base.recognised(path)
+    form = base.FORMATS.get("zarr")
+    shutil.copytree(roots / "state", tmp_path / "d")
+    (tmp_path / "d/SEALED.json").unlink()
+    with pytest.raises(ValueError, match="complete"):
+        exchange.source(tmp_path / "d", form)
+
+
+def test_a_damaged_dataset_is_not_exported(roots, tmp_path):
+    root = shutil.copytree(roots / "state", tmp_path / "d")
+    file = root / "episodes" / store.keys(root)[0] / "p.npy"
+    file.write_bytes(file.read_bytes()[:-4])
+    with pytest.raises(store.DamagedEpisode, match=r"p\.npy"):
+        exchange.source(root, base.FORMATS.get("zarr"))
+
+
+def test_every_field_of_a_demonstration_has_a_column(roots):
+    source = exchange.source(roots / "images", base.FORMATS.get("robomimic"))
+    assert source.origin is not None
+    named = source.origin["columns"]
+    assert named.keys() >= {"p", "R", "qpos", f"{episodes.IMAGE}wrist"}
+    assert set(named.values()) <= set(source.columns)

@@ -1,0 +1,325 @@
+"""A robot's loop whatever the network does: which command is next, and none is a jump."""
+
+import collections
+import threading
+import time
+
+import jax
+import numpy as np
+import pytest
+import served
+
+from starjax import deploy, rcm
+from starjax.deploy import batching, follow, wire
+from starjax.deploy.link import Heard, Link
+from starjax.errors import UsageError
+from starjax.sim import registry
+from starjax.types import Command, Pose
+
+HORIZON, EXECUTE = 16, 8
+WHERE = np.asarray(rcm.trocar_position(served.PORT, np.float32([0.0, 0.0, 0.15])))
+
+
+def poses(roll, depth):
+    """Tools straight down through the trocar, `[T]`."""
+    pose = rcm.pose_on_manifold(np.float32([0.0, 0.0, -1.0]), np.float32(roll), depth, WHERE)
+    return Pose(*(np.asarray(x) for x in pose))
+
+
+def plan(number):
+    """Command t of plan `number` turns the tool by 0.1 number + 0.001 t, so that it is known."""
+    roll = 0.1 * number + 1e-3 * np.arange(HORIZON)
+    return Command(poses(roll, np.full(HORIZON, 0.1)), np.zeros(HORIZON, np.float32))
+
+
+def which(command):
+    """(number, t) of a command."""
+    roll = float(rcm.roll_of(command.pose.R))
+    number = int((roll + 1e-4) / 0.1)
+    return number, round(1e3 * (roll - 0.1 * number))
+
+
+def followed(latency, steps, ahead=None):
+    """Plans that take `latency(n)` control steps each; (plan, command) of every step, the report.
+
+    Held steps are None.
+    """
+    follower = follow.Follower(WHERE, HORIZON, EXECUTE, ahead, deploy.Limits(1.0, 3.0))
+    follower.begin(poses(0.0, 0.1), 1.0)
+    given, number, due = [], 0, None
+    for t in range(steps):
+        for _ in range(2):
+            if due is not None and t >= due:
+                follower.answered(plan(number))
+                due = None
+            if follower.is_due:
+                number += 1
+                follower.asked()
+                due = t + latency(number)
+        held = follower.report.held
+        command = follower.step()
+        given.append(None if follower.report.held > held else which(command))
+    return given, follower.report
+
+
+def test_without_delay_plans_are_carried_out_as_by_an_evaluation():
+    given, report = followed(lambda n: 0, 32, ahead=0)
+    assert given == [(n, t) for n in range(1, 5) for t in range(8)]
+    assert (report.missed, report.held, report.stretched, report.limited) == (0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("latency", [1, 3, 7])
+def test_it_asks_ahead_so_that_no_command_is_missed(latency):
+    given, report = followed(lambda n: latency, 100)
+    assert given[:latency] == [None] * latency and report.held == latency
+    assert report.missed == 0 and report.stretched == 0
+    # From question to answer the robot moves on: the new plan begins where it then is.
+    first = 0
+    wanted = []
+    while len(wanted) < 100 - latency:
+        number = len(wanted) // EXECUTE + 1
+        wanted += [(number, t) for t in range(first, first + EXECUTE)]
+        first = min(latency + 1, EXECUTE - 1)  # asked for as soon as the one before began
+    assert given[latency:] == wanted[: 100 - latency]
+
+
+def test_a_late_plan_stretches_the_old_one_and_then_the_robot_holds():
+    given, report = followed(lambda n: 0 if n == 1 else 30, 60, ahead=0)
+    assert given[:16] == [(1, t) for t in range(16)]
+    assert given[16:38] == [None] * 22
+    # Eight commands passed since the question, the others were held: plans do not age meanwhile.
+    assert given[38:46] == [(2, t) for t in range(8, 16)]
+    assert report.missed == 1 + 1 and report.held >= 22 and report.stretched == 8
+
+
+def test_of_a_plan_that_comes_very_late_only_the_rest_is_followed():
+    given, report = followed(lambda n: 0 if n == 1 else 16, 60, ahead=8)
+    # The robot waits where the late one still has as many commands as a plan should have.
+    assert given[:17] == [(1, t) for t in range(9)] + [None] * 8
+    assert given[17:25] == [(2, t) for t in range(8, 16)]
+    assert given[25:35] == [None] * 9 + [(3, 7)] and report.missed == 4
+    assert report.lost == report.refused == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_commands_keep_to_the_manifold_and_do_not_jump(seed):
+    """Whatever the plans are: far apart, off the manifold, not rotations."""
+    rng, limits = np.random.default_rng(seed), deploy.Limits()
+    follower = follow.Follower(WHERE, HORIZON, EXECUTE, None, limits)
+    follower.begin(poses(0.0, 0.1), 0.3)
+    commands = [follower.last]
+    for _ in range(150):
+        if follower.is_due:
+            follower.asked()
+        if rng.random() < 0.3 and follower._is_asked:
+            axis = rng.normal(size=(HORIZON, 3)) * [0.5, 0.5, 0.1] - [0.0, 0.0, 1.0]
+            roll, depth = rng.uniform(-3.0, 3.0, HORIZON), rng.uniform(0.02, 0.2, HORIZON)
+            pose = rcm.pose_on_manifold(np.float32(axis), roll, depth, WHERE)
+            R, p = (np.array(x) for x in pose)
+            spoilt = rng.integers(6)
+            p += 1e-3 * (spoilt == 1)
+            R *= 1.0 + 0.1 * (spoilt == 2)
+            p[3] = np.where(spoilt == 3, np.nan, p[3])
+            follower.answered(Command(Pose(R, p), rng.normal(size=HORIZON)))
+        commands.append(follower.step())
+    assert follower.report.refused > 0 and follower.report.limited > 0
+    R, p = (np.stack([c.pose[n] for c in commands]).astype(np.float64) for n in (0, 1))
+    off = np.linalg.norm(np.cross(p - WHERE, R[:, :, 2]), axis=-1)
+    assert off.max() < 1e-6 and ((p - WHERE) * R[:, :, 2]).sum(-1).min() > 0.0
+    assert np.linalg.norm(np.diff(p, axis=0), axis=-1).max() <= limits.move * (1 + 1e-4)
+    cos = (np.einsum("tij,tij->t", R[1:], R[:-1]) - 1.0) / 2.0
+    assert np.arccos(np.clip(cos, -1.0, 1.0)).max() <= limits.turn * (1 + 1e-2)
+    assert all(-1.0 <= c.gripper <= 1.0 for c in commands)
+
+
+@pytest.mark.parametrize("spoil", ["off", "above", "stretched", "mirrored"])
+def test_a_plan_that_misses_the_trocar_is_not_followed(spoil):
+    follower = follow.Follower(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
+    follower.begin(poses(0.0, 0.1), 1.0)
+    good = plan(0)
+    R, p = np.array(good.pose.R), np.array(good.pose.p)
+    p[5, 0] += 2e-4 * (spoil == "off")
+    p[5, 2] += 0.2 * (spoil == "above")
+    R[5] *= 1.01 if spoil == "stretched" else 1.0
+    R[5, :, 0] *= -1.0 if spoil == "mirrored" else 1.0
+    follower.asked()
+    follower.answered(good._replace(pose=Pose(R, p)))
+    assert follower.report.refused == 1 and follower.report.latencies == []
+    follower.step()
+    assert follower.report.held == 1 and follower.is_due  # it asks again
+    follower.asked()
+    follower.answered(good)
+    follower.step()
+    assert follower.report.refused == 1 and follower.report.plans == 1
+
+
+def test_a_tool_that_does_not_go_through_the_trocar_is_not_moved():
+    follower = follow.Follower(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
+    pose = poses(0.0, 0.1)
+    follower.begin(pose._replace(p=pose.p + np.float32([0.002, 0.0, 0.0])), 1.0)
+    held = follower.step()
+    assert float(rcm.rcm_error(held.pose, WHERE)) < 1e-6
+    assert np.linalg.norm(held.pose.p - pose.p) < 0.005
+    with pytest.raises(UsageError) as caught:
+        follower.begin(pose._replace(p=pose.p + np.float32([0.03, 0.0, 0.0])), 1.0)
+    assert caught.value.argument == "observation.pose"
+
+
+@pytest.mark.parametrize(("ahead", "limits"), [(9, (0.1, 0.1)), (-1, (0.1, 0.1)), (0, (0.0, 0.1))])
+def test_settings_that_cannot_be_are_named(ahead, limits):
+    with pytest.raises(UsageError):
+        follow.Follower(WHERE, HORIZON, EXECUTE, ahead, deploy.Limits(*limits))
+
+
+@pytest.fixture(scope="module")
+def batches(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "tasks", registry.Registry("task", {"fake": "fakes:TASK"}))
+        made = batching.Batches(served.policy(tmp_path_factory.mktemp("client")), most=1)
+        made.warm_up()
+        yield made
+
+
+class Robot:
+    """It is where it was last sent."""
+
+    def __init__(self):
+        self.seen, self.commands = served.moment(), collections.deque()
+
+    def measure(self):
+        return self.seen
+
+    def send(self, command):
+        self.commands.append(command)
+        self.seen = self.seen.replace(pose=command.pose, gripper=command.gripper)
+
+
+def client_of(where, **options):
+    options = {"api_key": served.KEY, "key": jax.random.key(0), **options}
+    return deploy.Client(f"{where[0]}:{where[1]}", served.PORT, **options)
+
+
+class AtOnce(Link):
+    """Waits for every answer, as if it came within no time."""
+
+    def poll(self):
+        heard = super().poll()
+        while heard is None and self.waits:
+            heard = super().poll()
+        self.waits = False
+        return heard
+
+    waits = False
+
+    def ask(self, value):
+        self.waits = True
+        super().ask(value)
+
+
+def test_a_loop_over_the_socket_is_the_loop_in_the_process(batches):
+    policy, key, robot = batches.policy, jax.random.key(0), Robot()
+    execute = policy.settings.execute
+    options = {"ahead": 0, "connect": AtOnce, "limits": deploy.Limits(1.0, 3.1)}
+    with served.running(batches) as (where, _), client_of(where, **options) as client:
+        for _ in range(3 * execute):
+            robot.send(client.step(robot.measure()))
+        assert client.report.missed == client.report.held == 0
+    here = Robot()
+    history = [here.measure()] * 2
+    for decision in range(3):
+        seen = jax.tree.map(lambda *x: np.stack(x), *history[-2:])
+        made = policy(jax.random.fold_in(key, decision), seen, rcm.Trocar(*served.PORT))
+        made = jax.tree.map(np.asarray, made)
+        for t in range(execute):
+            here.send(jax.tree.map(lambda x: x[t], made))  # noqa: B023
+            history.append(here.measure())
+    for got, wanted in zip(robot.commands, here.commands, strict=True):
+        np.testing.assert_allclose(got.pose.p, wanted.pose.p, atol=1e-4)
+        np.testing.assert_allclose(got.gripper, wanted.gripper, atol=1e-3)
+
+
+def driven_until(holds, client, robot, seconds=60.0):
+    """Whether it holds in time, however busy the machine is."""
+    deadline = time.monotonic() + seconds
+    while not holds() and time.monotonic() < deadline:
+        client.run(robot, 0.1)
+    return holds()
+
+
+def test_a_server_that_goes_and_comes_back_is_found_again(batches):
+    robot = Robot()
+    with served.running(batches) as (where, _):
+        client = client_of(where)
+        assert driven_until(lambda: client.report.plans > 0, client, robot)
+    plans = client.report.plans
+    client.run(robot, 1.0)  # nobody is there: it holds
+    assert client.report.plans <= plans + 1 and client.report.held > 5
+    with served.running(batches, port=where[1]):
+        assert driven_until(lambda: client.report.plans > plans + 1, client, robot)
+        assert client.reconnected >= 1
+        client.close()
+    steps = np.diff([c.pose.p for c in robot.commands], axis=0)
+    assert np.linalg.norm(steps, axis=-1).max() <= deploy.Limits().move * (1 + 1e-4)
+
+
+def test_another_policy_at_the_address_is_not_asked(batches, monkeypatch):
+    with served.running(batches) as (where, _):
+        client = client_of(where, timeout_s=0.5)
+    monkeypatch.setattr(type(batches.policy), "digest", "another")
+    with served.running(batches, port=where[1]):
+        deadline = time.monotonic() + 60.0
+        while "another" not in client._link.fault and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert "another" in client._link.fault and not client._link.is_up
+        client.close()
+
+
+@pytest.mark.parametrize(
+    ("about", "argument"),
+    [
+        ({"api_key": "wrong"}, "address"),
+        ({"trocar": rcm.Trocar(0.01, 80.0, 0.0)}, None),
+        ({"trocar": (0.0, 0.0, 0.15)}, "trocar"),
+    ],
+)
+def test_what_cannot_be_served_is_said_at_the_start(batches, about, argument):
+    trocar = about.pop("trocar", served.PORT)
+    threads = threading.active_count()
+    with served.running(batches) as (where, _):
+        given = {"api_key": served.KEY, "wait_s": 1.0, **about}
+        with pytest.raises(ValueError) as caught:
+            deploy.Client(f"{where[0]}:{where[1]}", trocar, **given)
+        assert argument is None or caught.value.argument == argument
+    assert threading.active_count() <= threads
+
+
+def test_answers_that_are_none_are_refused_and_it_holds(batches):
+    """Of a server that sends anything but a plan of this policy."""
+
+    class Liar(Link):
+        lies = iter([{}, {"R": 1}, None, "text", wire.unpack(wire.pack({"p": np.zeros(3)}))])
+
+        def poll(self):
+            heard = super().poll()
+            return None if heard is None else Heard(next(self.lies, {}))
+
+    robot = Robot()
+    with served.running(batches) as (where, _), client_of(where, connect=Liar) as client:
+        assert driven_until(lambda: client.report.refused >= 5, client, robot)
+        assert client.report.plans == 0
+        assert client.report.held == client.report.steps
+    assert len({c.pose.p.tobytes() for c in robot.commands}) == 1
+
+
+def test_periods_that_take_too_long_are_counted(batches):
+    robot = Robot()
+
+    def slow():
+        time.sleep(0.05)
+        return robot.seen
+
+    with served.running(batches) as (where, _), client_of(where) as client:
+        robot.measure = slow
+        assert client.run(robot, 0.3).overran == client.report.steps == 9
+        stopped = client.run(robot, 5.0, should_stop=lambda: client.report.steps >= 12)
+        assert stopped.steps == 12

@@ -1,0 +1,97 @@
+"""Actions, rewards and observations of one episode, without simulating much."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import rcm
+from starjax.envs import episodes, playground, ranges, settings
+from starjax.sim import registry
+from starjax.types import Command, Pose
+
+STEPS = 40
+
+
+@pytest.fixture(scope="module")
+def env():
+    return playground.make("reach", trocar="unseen", max_episode_steps=STEPS)
+
+
+@pytest.fixture(scope="module")
+def start(env):
+    return jax.jit(env.reset)(jax.random.key(1))
+
+
+def frame(task):
+    places = np.array([slot.p_world_ref for slot in task.slots], np.float32)
+    zeros = np.array([slot.roll_zero for slot in task.slots], np.float32)
+    first = rcm.Trocar(*(field[-1] for field in task.trocars))
+    return rcm.trocar_frame(first, places, zeros)
+
+
+@pytest.mark.parametrize("task", ["peg_transfer", "peg_transfer_bimanual"])
+@pytest.mark.parametrize("space", rcm.ACTION_SPACES)
+def test_the_workspace_lies_within_the_bounds_of_actions(task, space):
+    """Poses whose tip and roll are the workspace's, seen through a trocar that nobody tried."""
+    task = registry.tasks.get(task)
+    low, high = ranges.actions(task, space)
+    assert low.shape == high.shape == (task.arms, rcm.ACTION_SPACES[space].dim)
+    assert (high - low > 0.05).all() and np.isfinite(high - low).all()
+    work = registry.workspaces.get(task.slots[0].workspace)
+    drawn = np.random.default_rng(0).uniform(size=(200, task.arms, 4))
+    bottom, top = (np.array([r, *x]) for r, x in zip(work.rolls, (work.low, work.high)))
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(bottom + (top - bottom) * drawn, frame(task))
+    action = rcm.ACTION_SPACES[space].encode(pose, frame(task))
+    within = (action > low - 0.01 * (high - low)) & (action < high + 0.01 * (high - low))
+    assert within.all()
+
+
+@pytest.mark.parametrize("space", ["se3", "rcm1", "rcm2", "rcm3", "rcm4"])
+@pytest.mark.parametrize("control", settings.CONTROLS)
+def test_an_action_says_the_pose_that_it_is_made_from(env, start, space, control):
+    made = episodes.make(settings.make(task="reach", action_space=space, control=control))
+    near = start.data.pose.p + jnp.array([0.002, -0.001, -0.014])
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(
+        jnp.concatenate([jnp.array([[0.1]]), near], -1), start.data.told
+    )
+    command = Command(pose, jnp.array([0.5]))
+    data = start.data.replace(pose=Pose(pose.R, near + 0.001))
+    again = made.decode(data, made.encode(data, command))
+    np.testing.assert_allclose(again.pose.R, pose.R, atol=2e-4)
+    np.testing.assert_allclose(again.pose.p, pose.p, atol=2e-6)
+    np.testing.assert_allclose(again.gripper, 0.5, atol=1e-6)
+
+
+@pytest.mark.parametrize("space", ["rcm1", "rcm4"])
+def test_whatever_the_action_the_shaft_goes_through_the_trocar(start, space):
+    made = episodes.make(settings.make(task="reach", action_space=space))
+    actions = jax.random.uniform(jax.random.key(2), (500, made.action_size), minval=-3, maxval=3)
+    command = jax.vmap(made.decode, (None, 0))(start.data, actions)
+    error = rcm.rcm_error(command.pose, start.data.trocar.p_world_trocar)
+    assert float(error.max()) < 1e-6
+
+
+def outcome(start, reward="dense", **changed):
+    given = settings.make(task="reach", reward=reward, max_episode_steps=STEPS)
+    after = start.data.replace(step=start.data.step + 1, **changed)
+    return episodes.make(given).judge(start.data, after)
+
+
+def test_rewards(start):
+    yes = jnp.ones((), bool)
+    data = start.data.replace(reward=jnp.float32(0.25))
+    begun = start.replace(data=data)
+    assert float(outcome(begun).reward) == -0.75
+    won = begun.replace(data=data.replace(reward=jnp.float32(1.0)))
+    found = outcome(won, success=yes)
+    assert float(found.reward) == 0.0 and found.terminated and not found.truncated
+    lost = outcome(begun, lost=yes)
+    assert float(lost.reward) == -0.75 - (STEPS - 1) and lost.terminated
+    assert outcome(begun, invalid=yes).terminated
+    late = begun.replace(data=data.replace(step=jnp.int32(STEPS - 1)))
+    assert outcome(late).truncated and not outcome(late).terminated
+    assert float(outcome(begun, "sparse").reward) == 0.0
+    assert float(outcome(begun, "sparse", success=yes).reward) == 1.0
+    over = begun.replace(data=data.replace(step=jnp.int32(STEPS)))
+    assert float(outcome(over).reward) == 0.0

@@ -1,0 +1,104 @@
+"""The endoscope: where its camera is, what is on target, and when a trial is over."""
+
+import jax
+import jax.numpy as jnp
+import mistakes
+import mujoco
+import numpy as np
+import pytest
+
+from starjax import rcm
+from starjax.sim import ik, scene
+from starjax.sim.tasks.base import Contacts, Views
+from starjax.sim.tasks.endoscope_track import expert, task
+from starjax.types import Pose
+
+NO_CONTACTS = Contacts(jnp.zeros((0, 2), jnp.int32), jnp.zeros(0))
+TARGET = jnp.array([0.02, -0.015, 0.03])
+
+
+def model(tool):
+    return scene.compose(scene.name("endoscope_track", tools=(tool,)))
+
+
+def measured(m, pose, before=None):
+    """Facts of a tip at `pose`, the target at TARGET."""
+    bound = task.bind(m)
+    qpos = jnp.zeros(m.nq).at[bound.target].set(TARGET)
+    one = jax.tree.map(lambda leaf: leaf[None], pose)
+    nothing = jnp.zeros(1)
+    views = Views(qpos, jnp.zeros(m.nv), one, nothing, nothing, nothing, NO_CONTACTS)
+    return task.measure(bound, None, views, before)
+
+
+def looking(m, trocar, turn=0.0, distance=task.DISTANCE):
+    """The expert's pose at a trocar, turned about the shaft by `turn` rad."""
+    frame = rcm.trocar_frame(trocar, np.array(task.TASK.slots[0].p_world_ref))
+    pose = expert.looking_at(
+        TARGET, frame.p_world_trocar, jnp.array(distance), task.bind(m).R_tip_camera
+    )
+    assert rcm.rcm_error(pose, frame.p_world_trocar) < 1e-6
+    return Pose(pose.R @ rcm.rotation_z(turn), pose.p)
+
+
+@pytest.mark.parametrize("tool", ["endoscope", "endoscope30"])
+def test_the_camera_is_judged_where_mujoco_has_it(tool):
+    m = model(tool)
+    data = mujoco.MjData(m)
+    data.qpos[:6] = [0.1, -1.2, 1.4, -1.0, -1.5, 0.3]
+    mujoco.mj_kinematics(m, data)
+    mujoco.mj_camlight(m, data)
+    chain = ik.chain_of(m, "arm0/shoulder", "arm0/tool/tcp")
+    order = [m.joint(f"arm0/j{i + 1}").qposadr[0] for i in range(6)]
+    pose, _, _ = ik.forward(chain, jnp.asarray(data.qpos[order], jnp.float32))
+    camera, at = measured(m, pose).camera, m.camera(task.CAMERA).id
+    np.testing.assert_allclose(camera.R, data.cam_xmat[at].reshape(3, 3), atol=1e-5)
+    np.testing.assert_allclose(camera.p, data.cam_xpos[at], atol=1e-5)
+
+
+@pytest.mark.parametrize("tool", ["endoscope", "endoscope30"])
+@pytest.mark.parametrize("row", [0, 8, 11])
+def test_one_pose_of_a_trocar_has_the_target_where_it_belongs(tool, row):
+    m, trocar = model(tool), rcm.Trocar(*(field[row] for field in rcm.TROCARS))
+    facts = measured(m, looking(m, trocar))
+    assert facts.off < 1e-4 and facts.tilt < 1e-4 and facts.on_target
+    assert abs(facts.distance - task.DISTANCE) < 1e-5
+    turned = measured(m, looking(m, trocar, turn=1.5 * task.TILT))
+    assert not turned.on_target
+    assert not measured(m, looking(m, trocar, distance=1.25 * task.DISTANCE)).on_target
+    assert measured(m, looking(m, trocar, distance=1.15 * task.DISTANCE)).on_target
+
+
+@pytest.mark.parametrize(
+    ("missed", "unseen", "good", "loose", "lost"),
+    [
+        (0, False, True, True, False),
+        (task.MAY_MISS, True, True, False, False),
+        (task.MAY_MISS + 1, False, False, True, False),
+        (task.MAY_MISS + 1, True, False, False, True),
+    ],
+)
+def test_a_trial_is_judged_by_the_time_on_target(missed, unseen, good, loose, lost):
+    m = model("endoscope")
+    facts = measured(m, looking(m, rcm.Trocar(0.0, 1.5, 0.0)))
+    facts = facts.replace(missed=jnp.int32(missed), unseen=jnp.array(unseen))
+    for step, is_over in ((task.LAST - 1, False), (task.LAST, True)):
+        found = task.judge(None, None, facts.replace(step=jnp.int32(step)))
+        assert bool(found.good) == (good and is_over) and bool(found.loose) == (loose and is_over)
+        assert bool(found.lost) == lost and (float(found.reward) == 1.0) == bool(found.good)
+
+
+def test_time_off_target_counts_after_the_first_seconds():
+    m = model("endoscope")
+    pose = looking(m, rcm.Trocar(0.0, 1.5, 0.0), turn=2 * task.TILT)
+    before = measured(m, pose)
+    early, late = (
+        measured(m, pose, before.replace(step=jnp.int32(step)))
+        for step in (task.FIRST - 1, task.FIRST)
+    )
+    assert int(early.missed) == 0 and int(late.missed) == 1 and not late.unseen
+
+
+def test_a_tool_without_the_camera_is_a_mistake():
+    with mistakes.of("camera", "endoscope"):
+        scene.compose(scene.name("peg_transfer")._replace(cameras=("endoscope",)))

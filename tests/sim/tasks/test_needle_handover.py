@@ -1,0 +1,83 @@
+"""Needle hand-over: who has held the needle, slip, drops, and what they make of a trial."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from starjax.sim import scene
+from starjax.sim.tasks.base import Contacts, Views
+from starjax.sim.tasks.needle_handover import task
+from starjax.sim.tasks.needle_pick import task as single
+from starjax.types import Pose
+
+NO_CONTACTS = Contacts(jnp.zeros((0, 2), jnp.int32), jnp.zeros(0))
+GIVER, BOTH, TAKER, NOBODY = (True, False), (True, True), (False, True), (False, False)
+
+
+@pytest.fixture(scope="module")
+def play():
+    """`steps -> (Facts, Verdict)` after (who touches, height in m, taker's tip aside in m)."""
+    m = scene.compose(scene.name("needle_handover"))
+    bound = task.bind(m)
+    layout = task.sample(bound, jax.random.key(0))
+
+    @jax.jit
+    def one(before, touch, height, aside):
+        needle = layout.needle._replace(p=layout.needle.p.at[2].add(height))
+        qpos = single.place(bound, jnp.zeros(m.nq), layout.replace(needle=needle))
+        tips = jnp.stack([needle.p, needle.p + jnp.stack([aside, 0 * aside, 0 * aside])])
+        R, still = jnp.stack([jnp.eye(3)] * 2), jnp.zeros((2, 3))
+        opening = jnp.zeros(2)
+        views = Views(qpos, jnp.zeros(m.nv), Pose(R, tips), still, opening, touch, NO_CONTACTS)
+        facts = task.measure(bound, layout, views, before)
+        return facts, task.judge(bound, layout, facts)
+
+    def play(*steps):
+        facts, verdict = None, None
+        for touch, height, *aside in steps:
+            given = jnp.array(touch), jnp.array(height), jnp.array(aside[0] if aside else 0.0)
+            facts, verdict = one(facts, *given)
+        return facts, verdict
+
+    return play
+
+
+def test_the_needle_goes_from_one_to_the_other(play):
+    lifted, both = (GIVER, 0.03), (BOTH, 0.03)
+    stages = [
+        int(play(*steps)[1].stage)
+        for steps in (
+            [(NOBODY, 0.0)],
+            [(GIVER, 0.0)],
+            [lifted],
+            [lifted, both],
+            [lifted, both, (TAKER, 0.03)],
+        )
+    ]
+    assert stages == [0, 1, 2, 2, 4]
+    _, verdict = play(lifted, both, (TAKER, 0.03))
+    assert verdict.good and verdict.loose and float(verdict.reward) == 1.0
+
+
+def test_the_other_tool_alone_does_not_count(play):
+    for steps in ([(TAKER, 0.03)], [(TAKER, 0.0), (TAKER, 0.03)], [(GIVER, 0.0), (TAKER, 0.03)]):
+        _, verdict = play(*steps)
+        assert not verdict.good and not verdict.loose
+
+
+def test_slip_begins_a_hold_anew(play):
+    start = [(GIVER, 0.03), (BOTH, 0.03), (TAKER, 0.03)]
+    slipped = (TAKER, 0.03, 1.2 * single.SLIP)
+    facts, verdict = play(*start, slipped)
+    assert not verdict.good and verdict.loose
+    assert float(facts.slip) > single.SLIP
+    facts, verdict = play(*start, slipped, slipped)
+    assert verdict.good and float(facts.slip) == 0.0
+    assert play(*start, (TAKER, 0.03, 0.8 * single.SLIP))[1].good
+
+
+def test_a_drop_is_a_failure(play):
+    dropped = [(NOBODY, 0.0)] * (task.DROPPED_STEPS + 1)
+    assert not play((GIVER, 0.0), *dropped)[1].lost  # never lifted
+    assert not play((GIVER, 0.03), *dropped[1:])[1].lost
+    assert play((GIVER, 0.03), *dropped)[1].lost
