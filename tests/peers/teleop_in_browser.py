@@ -1,8 +1,8 @@
 """A scripted browser steers an episode of `reach` through the page of `starjax teleop`.
 
 It reads where the tip is off the page, presses the page's hotkeys until the tip is at the mark,
-waits for the strict success and saves. The episode must then load as a dataset that one can train
-on. Needs `playwright` and a Chromium (named by CHROMIUM, else `chromium`); no extra brings them.
+waits for the strict success and saves. The episode must then load as a dataset, be exported, and
+train. Needs `playwright` and a Chromium (named by CHROMIUM, else `chromium`); no extra brings them.
 Run as a script, or by pytest, which skips it where something is missing.
 """
 
@@ -137,6 +137,16 @@ def main(out):
     assert list(demos.dataset.length) == [frames] and demos.description["expert"] == "operator"
     print(f"{strokes} strokes, {frames} control steps ({frames / 30:.1f} s), strict success")
     print(said)
+    exported, run = out.parent / "lerobot", out.parent / "run"
+    train = "train --preset smoke --task reach --policy.observation state"
+    for words in (
+        ["export", str(out), str(exported), "--format", "lerobot"],
+        [*train.split(), "--demos.from", str(out), "--out", str(run)],
+    ):
+        done = subprocess.run([sys.executable, "-m", "starjax", *words], check=True)
+        print(f"starjax {words[0]}: exit code {done.returncode}")
+    assert (exported / "meta" / "info.json").is_file()
+    assert (run / "stardiff" / "policy.safetensors").is_file()
 
 
 def test_a_browser_demonstrates_reach(tmp_path):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from starjax.report import encode, stage, video
+from starjax.sim import scene
 
 
 def with_qpos(run):
@@ -76,8 +77,6 @@ def test_a_clip_that_ends_early_stays_as_it_ended(one):
 
 
 def test_the_camera_draws_the_recorded_configuration(one):
-    from starjax.sim import scene
-
     model = scene.compose(one.result.scene)
     qpos, port = np.tile(model.qpos0, (3, 1)), np.array([[0.0, 0.0, 0.15]])
     draw = stage.camera(one.result.scene, 64)
@@ -90,8 +89,7 @@ def test_the_camera_draws_the_recorded_configuration(one):
 
 def test_a_goal_that_labels_do_not_tell_is_left_unmarked():
     task = types.SimpleNamespace(colours=lambda bound, layout, rgb: rgb + layout.target)
-    scene = types.SimpleNamespace(task=task, bound=None)
-    assert stage._marked(scene, {"target": 2}, 1) == 3 and stage._marked(scene, {}, 1) == 1
+    assert scene.marked(task, None, {"target": 2}, 1) == 3 and scene.marked(task, None, {}, 1) == 1
 
 
 @pytest.mark.parametrize("folder", ["a:1", "-x"])

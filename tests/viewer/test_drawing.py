@@ -31,7 +31,9 @@ def test_geoms_are_as_large_as_their_bounding_spheres(model):
     for g in range(model.ngeom):
         if mujoco.mjtGeom(model.geom_type[g]).name not in ROUND or model.geom_group[g] >= 3:
             continue
-        radius = np.linalg.norm(drawn(parts, g), axis=1).max()
+        points = drawn(parts, g)
+        radius = np.linalg.norm(points, axis=1).max()
+        np.testing.assert_allclose(points.max(0), -points.min(0), atol=0.01 * radius)
         assert radius == pytest.approx(model.geom_rbound[g], rel=1e-4), model.geom(g).name
         seen += 1
     assert seen > 40

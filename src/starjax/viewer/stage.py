@@ -46,9 +46,9 @@ class Stage:
 
 def aim(server: Any, rollouts: int) -> None:
     """Points a new page's camera so that it sees all rollouts."""
-    back = 1.0 + 0.9 * (rollouts - 1)
-    middle = 0.5 * _APART * (rollouts - 1)
-    server.initial_camera.position = (0.28 * back, middle - 0.22, 0.07 + 0.17 * back)
+    others = rollouts - 1
+    middle = 0.5 * _APART * others
+    server.initial_camera.position = (0.28 + 0.4 * others, middle - 0.22, 0.24 + 0.18 * others)
     server.initial_camera.look_at = (0.0, middle, 0.07)
     server.initial_camera.near = 0.005
 

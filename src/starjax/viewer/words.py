@@ -4,7 +4,7 @@ import html
 from typing import Any
 
 _NOTE_S = 5.0  # that a note stays
-_STYLE = "font-size:0.85em;line-height:1.5;padding:0 0.5em"
+_STYLE = "font-size:0.85em;line-height:1.5;padding:0 0.9em 0.4em"
 
 
 class Status:
