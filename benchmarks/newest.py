@@ -1,4 +1,4 @@
-"""The newest figure of every benchmark as one table: the rows of newest.toml, from results/."""
+"""Tables of benchmarks, from results/: the newest figure of each, the learners, the experts."""
 
 import json
 import re
@@ -13,17 +13,28 @@ _VALUE = re.compile(r"\{([^:{}]+):?([^{}]*)\}")
 
 
 def table() -> str:
-    """The table as markdown.
+    """The table of speed as markdown.
 
     Raises:
       KeyError: a row names a value that its results do not have.
     """
     rows = [["Work", "Here", "Peer, same run", "Floor", "On"]]
     for said in tomllib.loads((HERE / "newest.toml").read_text())["rows"]:
-        found = json.loads((HERE / "results" / f"{said['file']}.json").read_text())
+        found = _results(said["file"])
         cells = [_filled(said.get(cell, ""), found) for cell in ("here", "peer", "floor")]
         rows.append([said["work"], *cells, formats.machine(found["hardware"])])
     return formats.render(rows, names=len(rows[0]))
+
+
+def other(name: str) -> str:
+    """The table of `<name>.toml`, with a header and cells of its own; KeyError as `table`."""
+    said = tomllib.loads((HERE / f"{name}.toml").read_text())
+    rows = [[_filled(cell, _results(row["file"])) for cell in row["cells"]] for row in said["rows"]]
+    return formats.render([said["header"], *rows], names=1)
+
+
+def _results(file: str) -> dict[str, Any]:
+    return json.loads((HERE / "results" / f"{file}.json").read_text())
 
 
 def _filled(text: str, results: dict[str, Any]) -> str:

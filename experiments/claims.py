@@ -5,6 +5,7 @@ claim.toml holds what cannot be drawn from results:
     title, claim, date    what was found, in words without figures, and when
     code                  what is known of the code, where results do not name a commit
     commands              that made the results
+    rows_are              what a row of the tables is, "Method" where left out
     notes                 what a reader must know, one a line
     [runs]                name in the tables -> result file in this folder or another claim's
     [[tables]]            name, title, columns (of `columns.COLUMNS`), rows (all where left out)
@@ -57,14 +58,15 @@ def table(claim: Claim, name: str) -> str:
     for said in claim.said.get("tables", []):
         if said["name"] == name:
             rows = [claim.runs[row] for row in said.get("rows", claim.runs)]
-            header = ["Method", *(columns.COLUMNS[column][0] for column in said["columns"])]
+            header = [_rows_are(claim), *(columns.COLUMNS[column][0] for column in said["columns"])]
             draws = [columns.COLUMNS[column][1] for column in said["columns"]]
             body = [[run.run.label, *(draw(run) for draw in draws)] for run in rows]
-            return formats.render([header, *body])
+            return formats.render([header, *body], names=1)
     for said in claim.said.get("pairs", []):
         if said["name"] == name:
             pairs = [[claim.runs[one] for one in row] for row in said["rows"]]
-            return formats.render(columns.paired(pairs, said.get("part", "twelve")))
+            drawn = columns.paired(pairs, said.get("part", "twelve"))
+            return formats.render([[_rows_are(claim), *drawn[0][1:]], *drawn[1:]], names=2)
     raise KeyError(f"{claim.name}: no table {name}")
 
 
@@ -102,6 +104,10 @@ def index(claims: list[Claim]) -> str:
         for claim in claims
     ]
     return formats.render([["Claim", "What was found"], *rows], 2)
+
+
+def _rows_are(claim: Claim) -> str:
+    return claim.said.get("rows_are", "Method")
 
 
 def _date(folder: Path) -> str:
