@@ -48,6 +48,7 @@ class State:
     rcm_error_within: jax.Array
     pose: Pose
     gripper: jax.Array
+    cameras: Any = None
 
 
 class Layout(NamedTuple):

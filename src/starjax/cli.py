@@ -37,6 +37,11 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "score a trained policy on a grid or sample of trocars",
         _LEARNING,
     ),
+    "stress": (
+        "starjax.experiments.stress",
+        "score a trained policy while something is wrong",
+        _LEARNING,
+    ),
     "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)", _LEARNING),
     "serve": (
         "starjax.experiments.serve",

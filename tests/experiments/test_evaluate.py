@@ -1,4 +1,4 @@
-"""`starjax evaluate` and `starjax sweep` of trained weights. The simulator is a stub."""
+"""`starjax evaluate`, `sweep` and `stress` of trained weights. The simulator is a stub."""
 
 import dataclasses
 import json
@@ -15,7 +15,15 @@ import stubs
 from starjax import config, rcm
 from starjax.data import normalizer
 from starjax.evaluation import sweep as sweeping
-from starjax.experiments import evaluate, folders, policy_under_test, presets, subjects, sweep
+from starjax.experiments import (
+    evaluate,
+    folders,
+    policy_under_test,
+    presets,
+    stress,
+    subjects,
+    sweep,
+)
 from starjax.policies import packaged, policy_file
 from starjax.report import video
 from starjax.runtime import files, gpu
@@ -339,3 +347,28 @@ def test_another_arm_is_another_evaluation(file, monkeypatch):
     assert asked[2:] == [("fr5",), ("ur5e",)]
     found = [path.parent.name for path in file.parent.rglob("sweep.json")]
     assert len(set(found)) == 2 and len([name for name in found if name.endswith("-ur5e")]) == 1
+
+
+def stressed(*more):
+    trials = ["--eval.trials", "1", "--eval.time-limit-s", "1"]
+    return stress.main(["--policy", "mine.safetensors", *trials, *more])
+
+
+def test_a_policy_is_scored_at_every_level(file, capsys):
+    assert stressed("--disturbance", "trocar_told", "--levels", "0", "5") == 0
+    (result,) = file.parent.rglob("stress.json")
+    found = json.loads(result.read_text())
+    levels = found["disturbances"]["trocar_told"]["levels"]
+    assert list(levels) == ["0", "5"] and found["method"] == "dp_rcm2"
+    assert all(level["strict"]["trials"] == 12 for level in levels.values())
+    chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
+    assert stressed("--disturbance", "trocar_told", "--levels", "0", "5") == 0 and chunks
+    assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
+    assert capsys.readouterr().out.count("/12 = ") == 4
+
+
+def test_a_policy_of_states_meets_no_disturbance_of_images(file):
+    with mistakes.of("disturbance", "smoke"):
+        stressed("--disturbance", "smoke")
+    with mistakes.of("disturbance", "rain"):
+        stressed("--disturbance", "rain")

@@ -20,6 +20,7 @@ from starjax.experiments import (
     presets,
     report_command,
     run_settings,
+    stress,
     sweep,
 )
 from starjax.runtime import gpu
@@ -27,7 +28,7 @@ from starjax.runtime import gpu
 OPTIONS = {
     **dict.fromkeys(("run", "collect", "train"), config.RunConfig),
     **{"evaluate": evaluate.Options, "sweep": sweep.Options, "bench": bench.Options},
-    **{"pack": pack.Options, "report": report_command.Options},
+    **{"stress": stress.Options, "pack": pack.Options, "report": report_command.Options},
     **{"export": export_command.Options, "import": import_command.Options},
 }
 
@@ -61,6 +62,8 @@ def settings(typed: str) -> config.RunConfig:
         ("evaluate", "x --eval.time-limit-s 0", "eval.time_limit_s", 0),
         ("sweep", "--trocars 1", "RUN or --policy", "none"),
         ("sweep", "x --eval.time-limit-s soon", "--eval.time-limit-s", "'soon'"),
+        ("stress", "", "RUN or --policy", "none"),
+        ("stress", "--policy compact --levels 1", "levels", "none or several"),
         ("report", "--out x", "RUN", "none"),
         ("pack", "a b c", "FLAG", "c"),
         ("bench", "x --calls 0", "calls", 0),

@@ -1,0 +1,164 @@
+"""`starjax stress`: what breaks a trained policy, one disturbance at a time."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from starjax import config as config_lib
+from starjax import errors
+from starjax.experiments import checks, options, subjects
+from starjax.limits import Count, CountOrZero, NotNegative
+from starjax.runtime import files, xla
+
+DESCRIPTION = """Scores a trained policy on its task's trocars while something is wrong.
+
+RUN is a method's folder, such as runs/cpu/stardiff; or --policy names a policy.safetensors, or a
+policy that ships with starjax. Nothing is trained again. Each disturbance has levels, the first
+of which is none, and every level runs the same trials. The same command again goes on from the
+trials that are done."""
+
+
+# The fields of `config.EvalConfig`, with other defaults.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trials:
+    """Closed-loop trials of a level."""
+
+    trials: Count = 4  # trials at each trocar
+    # s of simulated time that a trial may take
+    time_limit_s: Annotated[float, config_lib.TIME_LIMIT] = 30.0
+    chunk: CountOrZero = 0  # trials between two savings, at most; 0: as many as a program runs
+    video_trials: CountOrZero = 0  # trials whose joint positions are recorded
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    run: options.RunOrNone = ""  # a method's folder, such as runs/cpu/stardiff
+    # a policy.safetensors, or the name of a policy that ships with starjax, instead of RUN
+    policy: str = ""
+    arm: tuple[str, ...] = ()  # robots to score it with; left out: those it was trained with
+    disturbance: tuple[str, ...] = ()  # which ones; left out: all that this policy can meet
+    # of one disturbance, in its unit; left out: its usual ones
+    levels: tuple[NotNegative, ...] = ()
+    seed: config_lib.Seed = 0  # of the trials
+    # folder of the result; auto: RUN/stress or one in runs/stress
+    out: str = options.AUTO
+    eval: Trials = dataclasses.field(default_factory=Trials)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs the trials that are missing; writes stress.json."""
+    chosen = options.parse(Options, argv, prog="starjax stress", description=DESCRIPTION)
+    named = subjects.find(chosen.run, chosen.policy)
+    folder = _folder(named, chosen)
+    if chosen.levels and len(chosen.disturbance) != 1:
+        raise errors.UsageError("levels", "one --disturbance beside it", "none or several")
+    xla.prepare_xla()
+    xla.require_devices("starjax.experiments.policy_under_test")
+    files.require_writable(folder)
+    who, _ = subjects.load(named, chosen.arm)
+
+    from starjax.evaluation import disturbances
+
+    names = _names(chosen, who.trained.policy.observation)
+    found: dict[str, Any] = {}
+    for name in names:
+        kind = disturbances.DISTURBANCES[name]
+        print(f"{name}: {kind.what}", flush=True)
+        rows = found[name] = {"what": kind.what, "unit": kind.unit, "levels": {}}
+        for level in chosen.levels or kind.levels:
+            score = _score(folder, who, chosen, name, level)
+            rows["levels"][f"{level:g}"] = score
+            print(_line(f"{level:g} {kind.unit}", score), flush=True)
+            files.write_json(folder / "stress.json", _content(who, chosen, argv, found))
+    print(f"\nresult: {folder / 'stress.json'}")
+    return 0
+
+
+def _folder(named: subjects.Named, chosen: Options) -> Path:
+    parts = [*chosen.arm, f"seed{chosen.seed}"]
+    if named.run:
+        default = named.run / "-".join(["stress", *parts])
+    else:
+        default = Path("runs/stress") / "-".join([subjects.label(named.file), *parts])
+    folder = default if chosen.out == options.AUTO else chosen.out
+    checks.expect_folder("--out", folder)
+    return Path(folder)
+
+
+def _names(chosen: Options, observation: str) -> list[str]:
+    """The disturbances that are asked for.
+
+    Raises:
+      errors.UsageError: one is unknown, or the policy sees no images for it to change.
+    """
+    from starjax.evaluation.disturbances import DISTURBANCES
+
+    for name in chosen.disturbance:
+        errors.choice("disturbance", name, DISTURBANCES)
+        if DISTURBANCES[name].of_images and observation != "image":
+            raise errors.UsageError("disturbance", "one that a policy of states meets", name)
+    meets = [n for n, kind in DISTURBANCES.items() if observation == "image" or not kind.of_images]
+    return list(chosen.disturbance) or meets
+
+
+def _score(folder: Path, who: Any, chosen: Options, name: str, level: float) -> dict[str, Any]:
+    """Success and RCM error of all trials of a level."""
+    from starjax.evaluation import disturbances, statistics
+    from starjax.experiments import policy_under_test
+    from starjax.sim import env as sim_env
+
+    kind, env = disturbances.DISTURBANCES[name], who.env
+    if kind.moves_cameras:
+        env = sim_env.make(
+            env.names.task,
+            env.names.arms,
+            env.names.tools,
+            observation=who.trained.policy.observation,
+            image_size=who.trained.policy.image_size,
+            cameras=env.names.cameras,
+            moving_cameras=True,
+        )
+    trials = config_lib.EvalConfig(**vars(chosen.eval))
+    subject = who._replace(env=disturbances.disturbed(env, name, level))
+    place = (
+        folder / f"{name}-{level:g}" if level else folder / ("moving" * kind.moves_cameras + "0")
+    )
+    table = policy_under_test.rollouts(place, subject, env.task.trocars, trials, chosen.seed)
+    return {
+        "strict": statistics.rate(table.success),
+        "safe": statistics.rate(table.safe),
+        "invalid": int(table.invalid.sum()),
+        "rcm_error_mm": statistics.rcm_error_mm(table),
+    }
+
+
+def _line(level: str, score: dict[str, Any]) -> str:
+    won, errors_mm = score["strict"], score["rcm_error_mm"]["executed"]
+    rate = f"{won['successes']}/{won['trials']} = {100 * won['rate']:.0f}%"
+    return (
+        f"  {level:10} {rate:16} RCM error {errors_mm['mean']:.3f} mm, p99 {errors_mm['p99']:.2f}"
+    )
+
+
+def _content(
+    who: Any, chosen: Options, argv: Sequence[str], found: dict[str, Any]
+) -> dict[str, Any]:
+    from starjax.runtime import jax_settings, provenance
+
+    return {
+        "scene": who.env.names._asdict(),
+        "method": who.method,
+        "weights": who.weights,
+        "seed": chosen.seed,
+        "trials_at_each_trocar": chosen.eval.trials,
+        "time_limit_s": chosen.eval.time_limit_s,
+        "command": options.typed("stress", argv),
+        "disturbances": found,
+        **provenance.code()._asdict(),
+        "versions": xla.versions(),
+        "hardware": xla.hardware(),
+        **jax_settings.record(),
+    }
