@@ -129,8 +129,12 @@ def over(low: Array, high: Array, c: Array, R: Array, axes: Array, rounding: Arr
     flat = jnp.hypot(u[:, 0], u[:, 1])[:, None]
     normal = jnp.stack([-u[:, 1], u[:, 0]], -1) / jnp.maximum(flat, _SLACK)
     reach = jnp.einsum("gi,gij->gj", normal, R[:, :2], precision="highest")
-    limit = _reach(reach, axes) + rounding + jnp.sum(jnp.abs(normal) * half[..., :2], -1)
-    aside = jnp.abs(jnp.sum(normal * (c[:, :2] - middle[..., :2]), -1))
+    # Both axes written out: XLA 0.10 for CPU adds up other numbers where a large array's last axis
+    # of two is sliced, broadcast and summed, and whole shadows were missing.
+    i, j = normal[:, 0], normal[:, 1]
+    beside = jnp.abs(i) * half[..., 0] + jnp.abs(j) * half[..., 1]
+    limit = _reach(reach, axes) + rounding + beside
+    aside = jnp.abs(i * (c[:, 0] - middle[..., 0]) + j * (c[:, 1] - middle[..., 1]))
     return near & (aside <= limit)
 
 
