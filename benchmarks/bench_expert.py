@@ -1,7 +1,7 @@
 """Success of the scripted expert: the task's trocars, and others drawn from Eq. 19.
 
     python benchmarks/bench_expert.py [--per-trocar 100] [--sampled 500] [--seed 2026] \\
-        [--task peg_transfer] [--arm fr5] [--expert default] [--seconds 20]
+        [--task peg_transfer] [--arm fr5] [--expert default] [--seconds 0]
 
 Demonstrations are worth as much as their expert: this is printed before any figure of a policy.
 """
@@ -21,6 +21,7 @@ from starjax.sim import env as envs
 from starjax.sim import registry
 from starjax.types import Agent
 
+STEPS = 600  # control steps, 20 s, that demonstrations may take too
 CHUNK = {"cpu": 16}  # episodes at once
 CHUNK_GPU = 600
 
@@ -32,7 +33,7 @@ def main() -> None:
     parser.add_argument("--sampled", type=int, default=500)
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--expert", default="", help="by default the task's first one")
-    parser.add_argument("--seconds", type=float, default=20.0, help="that an episode may take")
+    parser.add_argument("--seconds", type=float, default=0.0, help="of an episode; 0: enough")
     _scene.add_flags(parser)
     arguments = parser.parse_args()
     environment = _scene.make(arguments, observation="state")
@@ -43,12 +44,13 @@ def main() -> None:
     key = jax.random.key(arguments.seed)
     twelve = rcm.Trocar(*(jnp.repeat(jnp.asarray(f), arguments.per_trocar, axis=0) for f in listed))
     drawn = _drawn(environment, jax.random.fold_in(key, 1), arguments.sampled)
-    steps = round(arguments.seconds * environment.control_hz)
+    enough = max(STEPS, environment.task.least_steps)
+    steps = round(arguments.seconds * environment.control_hz) or enough
     results = {
         "seed": arguments.seed,
         "scene": environment.names._asdict(),
         "expert": expert,
-        "seconds": arguments.seconds,
+        "seconds": steps / environment.control_hz,
         "twelve": _score(
             environment, agent, twelve, jax.random.fold_in(key, 2), steps, "the task's"
         ),

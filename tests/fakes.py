@@ -52,6 +52,7 @@ def task(arms: int = 1, **changed: Any) -> base.Task:
         "name": "peg_transfer",
         "trocars": rcm.Trocar(*(field[:, None] for field in rcm.TROCARS)),
         "is_seen": rcm.IS_SEEN,
+        "least_steps": 0,
         "slots": slots[:arms],
         "cameras": ("camera", "wrist"),
         "fields": (

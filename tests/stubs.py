@@ -93,6 +93,7 @@ def make_task(arms: int = 1) -> base.Task:
         "relative": lambda state, tips: state[..., None, :3] - tips,
         "trocars": trocars(*range(12), arms=arms),
         "is_seen": rcm.IS_SEEN,
+        "least_steps": 0,
     }
     return base.Task(**{**dict.fromkeys(base.Task._fields), **given})
 

@@ -30,8 +30,8 @@ def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
     assert "0 of 10" in caught.value.hint
 
 
-@pytest.mark.parametrize(("seen", "expert"), [(1, "one_wall"), (8, "")])
-def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, seen, expert):
+@pytest.mark.parametrize(("seen", "expert", "least"), [(1, "one_wall", 0), (8, "", 6), (2, "", 9)])
+def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, seen, expert, least):
     from starjax import rcm
     from starjax.data import demos
 
@@ -40,10 +40,13 @@ def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, see
     monkeypatch.setattr(demos, "collect", lambda *a, **_: given.append(a) or found)
     asked = config.DemosConfig(per_trocar=3, seen_trocars=seen, max_steps=7, expert=expert)
     chosen = dataclasses.replace(SMOKE, demos=asked, seed=5, out=str(tmp_path))
-    demonstrations.plan(chosen, stubs.make_env(), sharing.ALONE)[1]()
+    env = stubs.make_env()
+    env = env._replace(task=env.task._replace(least_steps=least))
+    demonstrations.plan(chosen, env, sharing.ALONE)[1]()
     ((_, _, _, trocars, settings),) = given
     np.testing.assert_array_equal(trocars, [field[:seen, None] for field in rcm.TROCARS])
-    wanted = {"per_trocar": 3, "seed": 5, "max_steps": 7, "expert": expert or "default"}
+    wanted = {"per_trocar": 3, "seed": 5, "max_steps": max(7, least)}
+    wanted["expert"] = expert or "default"
     assert {name: settings._asdict()[name] for name in wanted} == wanted
 
 

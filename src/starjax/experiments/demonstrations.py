@@ -33,7 +33,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
     settings = schema.Settings(
         per_trocar=config.demos.per_trocar,
         seed=config.seed,
-        max_steps=config.demos.max_steps,
+        max_steps=max(config.demos.max_steps, task.least_steps),
         keep_failures=config.demos.keep_failures,
         expert=name,
     )
@@ -69,7 +69,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
             raise errors.UsageError(
                 "demos.max_steps",
                 "enough control steps for the expert",
-                config.demos.max_steps,
+                settings.max_steps,
                 str(error),
             ) from error
         messages.indented(

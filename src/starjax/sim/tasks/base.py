@@ -191,6 +191,8 @@ class Task(NamedTuple):
       is_seen: `[C]` bool.
       drive: (Bound, Layout, ctrl `[nu]`, s since reset) -> ctrl with what actuators of the task's
         own MJCF are to do, for things that move by themselves.
+      least_steps: control steps that any success takes; demonstrations may take so many whatever
+        the usual limit is.
     """
 
     name: str
@@ -222,6 +224,7 @@ class Task(NamedTuple):
     trocars: rcm.Trocar = rcm.Trocar(*(field[:, None] for field in rcm.TROCARS))
     is_seen: np.ndarray = rcm.IS_SEEN
     drive: Callable[..., jax.Array] = _undriven
+    least_steps: int = 0
 
     @property
     def arms(self) -> int:

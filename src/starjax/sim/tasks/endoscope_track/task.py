@@ -252,4 +252,5 @@ TASK = Task(
     is_sound=is_sound,
     outline=words.outline,
     drive=drive,
+    least_steps=LAST,
 )
