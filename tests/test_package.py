@@ -25,20 +25,24 @@ TEXT += [
     if path.suffix in {".md", ".toml", ".yaml", ".yml", ".txt", ".cff"}
 ]
 TEXT.append(ROOT / ".ci" / "run")
-# Whose documents a page may link to. Package registries, hubs and trackers are none of them.
+# This machine, and whose documents a page may link to: package registries, hubs and trackers are
+# none of them.
 HOSTS = {
+    "127.0.0.1",
     "arxiv.org",
     "doi.org",
     "docs.jax.dev",
     "docs.python.org",
     "flax.readthedocs.io",
+    "gymnasium.farama.org",
+    "localhost",
     "mujoco.readthedocs.io",
     "slurm.schedmd.com",
     "www.apache.org",
     "www.w3.org",
 }
 COMMANDS = ["run", "collect", "train", "evaluate", "sweep", "bench", "pack", "report"]
-COMMANDS += ["export", "import", "inspect"]
+COMMANDS += ["export", "import", "inspect", "serve", "stress", "view", "teleop"]
 HEAVY = ("jax", "mujoco", "flax", "scipy", "matplotlib")
 
 

@@ -214,7 +214,9 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
         policy_under_test, "rollouts", lambda at, *_: found.extend(at.glob("*.npz"))
     )
     monkeypatch.setattr(policy_under_test, "write_result", lambda *_, **__: None)
-    pipeline._evaluate(preset, "stardiff_single", stubs.make_env(), "demos-a", "", sharing.ALONE)
+    pipeline._evaluate(
+        preset, "stardiff_single", stubs.make_env(), tmp_path / "demos-a", "", sharing.ALONE
+    )
     assert found == [tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz"]
 
 

@@ -106,7 +106,7 @@ def demonstrate(out):
     command = [sys.executable, "-u", "-m", "starjax", "teleop", *flags.split()]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
-        address = re.search(r"http://127\.0\.0\.1:\d+", process.stdout.readline())[0]
+        address = re.search(r"http://[\d.]+:\d+", process.stdout.readline())[0]
         with sync_playwright() as p, tempfile.TemporaryDirectory() as profile:
             browser = p.chromium.launch_persistent_context(
                 profile, executable_path=CHROMIUM, headless=True, args=ARGS, viewport=VIEW

@@ -37,6 +37,7 @@ MIXED = {
     "rotation_z": (drawn(N),),
     "sample_trocar": (jax.random.key(0), (N,)),
     "trocar_frame": (TROCAR, POINT),
+    "trocar_from_poses": (rcm.Pose(R=ROTATION, p=drawn(N, 3)),),
     "trocar_from_position": (drawn(N, 3), POINT),
     "trocar_position": (TROCAR, POINT),
     "trocar_rotation": (TROCAR,),

@@ -140,7 +140,9 @@ def test_another_encoder_crop_or_dataset_has_features_of_its_own(source, dataset
 
 
 def run_config(settings, out):
-    return dataclasses.replace(presets.PRESETS["smoke"], out=str(out), policy=settings, train=TRAIN)
+    scene = config.SceneConfig(camera=("camera",))
+    changed = {"out": str(out), "scene": scene, "policy": settings, "train": TRAIN}
+    return dataclasses.replace(presets.PRESETS["smoke"], **changed)
 
 
 def train(source, seen, out, name):
