@@ -4,7 +4,8 @@
     python experiments/tables.py --check    fails if one of them is not what would be written
 
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
-claim.toml, `claims` (the list of claims), or of benchmarks/results: `speed`, `learners`, `experts`.
+claim.toml, `claims` (the list of claims), or of benchmarks/results: `speed`, `learners`, `experts`,
+`stress`.
 """
 
 import re
@@ -33,7 +34,7 @@ def table(name: str) -> str:
         return claims.index([claims.load(folder) for folder in claims.folders()])
     if name == "speed":
         return newest.table()
-    if name in ("learners", "experts"):
+    if name in ("learners", "experts", "stress"):
         return newest.other(name)
     folder, _, which = name.partition("/")
     return claims.table(claims.load(HERE / folder), which)
