@@ -63,6 +63,7 @@ class Lanes(VecEnv):
     def get_attr(self, name: str, indices: Any = None) -> list[Any]:
         return [getattr(self.env, name)] * self.num_envs
 
+    # Asked for by the base class; no learner here calls them.
     def set_attr(self, name: str, value: Any, indices: Any = None) -> None:
         raise NotImplementedError(name)
 
