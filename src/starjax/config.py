@@ -80,7 +80,8 @@ class PolicyConfig:
     # trocar's azimuth, or an ablation
     trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
     roll_loss_weight: NotNegative = 0.1  # lambda of Eq. 15
-    dtype: Literal["float32", "bfloat16"] = "float32"  # of the networks' arithmetic
+    # of the networks' arithmetic in training; a trained policy decides in float32
+    dtype: Literal["float32", "bfloat16"] = "float32"
     # Of the learner, see `learners.Learner`; None: its defaults. In JSON, and as flags, they stand
     # among the others.
     options: Any = dataclasses.field(default=None, metadata=INLINE)

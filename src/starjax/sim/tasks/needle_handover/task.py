@@ -162,7 +162,7 @@ TASK = Task(
         Slot(workspace="left", p_world_ref=(0.0, 0.0, 0.15)),
         Slot(workspace="right", p_world_ref=(0.0, 0.0, 0.15), roll_zero=float(np.pi)),
     ),
-    cameras=("camera",),
+    cameras=("passing", "camera"),
     time_limit_s=60.0,
     settle_steps=single.SETTLE_STEPS,
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
