@@ -74,7 +74,7 @@ class PolicyConfig:
     roll_history: bool = True  # the roll network reads the measured rolls
     roll_trocar: bool = True  # the roll network reads the trocar
     roll_observation: bool = False  # the roll network reads the image or the task state too
-    # whether the learner's model is given the trocar: as Table II says, or an ablation
+    # whether the learner's model is given the trocar: as the method says, or an ablation
     sees_trocar: Literal["method", "always", "never"] = "method"
     # which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
     # trocar's azimuth, or an ablation
@@ -135,7 +135,7 @@ class EvalConfig:
 class RunConfig:
     """One run of `python -m starjax.experiments.run`."""
 
-    method: str = "stardiff"  # a row of Table II, or all
+    method: str = "stardiff"  # of starjax list; all: the eight of Table II
     # starting values of the rest; auto: gpu where jax can use one, else cpu
     preset: Preset = "auto"
     seed: Seed = 0  # of everything random
