@@ -3,16 +3,18 @@
 import itertools
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 
 from starjax import rcm
 from starjax.envs import trocars
 from starjax.evaluation import sweep
-from starjax.sim import registry
+from starjax.sim import registry, scene
 from starjax.sim.tasks import two_arms
 
 DRAWN = 10_000
+COLLISION = 0.0005  # m, overlap that is called one
 REGION = 0.055  # m, across: each trocar varies within 3 to 5 cm
 
 
@@ -54,6 +56,26 @@ def test_a_pair_is_100_to_170_mm_and_37_to_60_degrees_apart(source):
         assert np.ptp(p[:, arm], axis=0).max() < REGION
     if source != "twelve":
         assert (np.ptp(p, axis=0)[:, :2] > 0.028).all()
+
+
+def test_six_blocks_stand_side_by_side_at_any_yaw():
+    m = scene.compose(scene.name("peg_transfer_bimanual"))
+    pegs = registry.tasks.get("peg_transfer_bimanual").bind(m).pegs
+    apart = np.linalg.norm(pegs[:, None] - pegs, axis=-1)[~np.eye(len(pegs), dtype=bool)]
+    parts = [g for g in range(m.ngeom) if m.geom(g).name.startswith(("wall", "corner", "leg"))]
+    ends = [  # capsules: their axes, and how thick they are
+        np.linalg.norm((m.geom_pos[g] + s * m.geom_size[g, 1] * axis(m.geom_quat[g]))[:2])
+        + m.geom_size[g, 0]
+        for g in parts
+        for s in (-1, 1)
+    ]
+    assert apart.min() > 2 * max(ends) - COLLISION
+
+
+def axis(quat):
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, quat)
+    return R.reshape(3, 3)[:, 2]
 
 
 def test_unseen_pairs_are_at_the_edge_and_in_the_middle():
