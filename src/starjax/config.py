@@ -24,7 +24,7 @@ TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneConfig:
-    """What is simulated, by the names that `starjax list` shows."""
+    """Names the parts of a scene, as `starjax list` shows them."""
 
     task: str = "peg_transfer"  # what is to be done; starjax list shows what there is
     # robots, one for each that the task asks for, or one for all; left out: the task's
@@ -48,7 +48,7 @@ class DemosConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PolicyConfig:
-    """What policies of all learners share (IV-G); the learner's own options follow."""
+    """Settings that policies of all learners share (IV-G); the learner's own options follow."""
 
     learner: str = "diffusion"  # how sequences of actions are generated
 

@@ -146,7 +146,7 @@ def memory() -> list[Finding]:
 
 
 def devices() -> list[Finding]:
-    """What jax runs on, whether it can compile and run a program there, and a GPU left unused."""
+    """Finds jax's devices, whether a program compiles and runs there, and a GPU left unused."""
     try:
         import jax
         import jax.numpy as jnp

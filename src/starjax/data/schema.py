@@ -1,4 +1,4 @@
-"""What dataset.json says of demonstrations, and how schema 1 says it.
+"""Schema of dataset.json, and how schema 1 becomes it.
 
 Schema 1 is of one arm: episodes have fields without the axis A, one camera's `image`, numbers for
 radius, polar and azimuth; trocars are `[C][3]`, `scene` is the hash that is now `model`.
@@ -44,7 +44,7 @@ class Settings(NamedTuple):
 
 
 def describe(env: Any, trocars: Trocar, settings: Settings) -> dict[str, Any]:
-    """What a dataset is: the content of dataset.json, and by `store.digest` its name.
+    """Describes a dataset: the content of dataset.json, and by `store.digest` its name.
 
     Args:
       env: `sim.env.Env`.

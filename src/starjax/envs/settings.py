@@ -1,4 +1,4 @@
-"""What an environment for reinforcement learning is made with."""
+"""Settings of an environment for reinforcement learning."""
 
 import dataclasses
 from typing import Any

@@ -1,4 +1,4 @@
-"""What was measured, as a typed result: the schema of result.json and sweep.json.
+"""Typed results: the schema of result.json and sweep.json.
 
 Written and read here alone. Schema 2 says in which scene, with which code and on which
 demonstrations; a trial's radius, polar and azimuth are lists `[A]`, its labels an object. Files of

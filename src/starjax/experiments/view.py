@@ -60,7 +60,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _dataset(folder: str) -> Show:
-    """What shows recorded episodes."""
+    """Makes the viewer of recorded episodes."""
     from starjax.viewer import browse, recorded
 
     try:
@@ -71,7 +71,7 @@ def _dataset(folder: str) -> Show:
 
 
 def _live(chosen: Options) -> Show:
-    """What shows somebody at work."""
+    """Makes the viewer of somebody at work."""
     from starjax.sim import registry
     from starjax.viewer import actors, view
 

@@ -58,7 +58,7 @@ class BoundArm(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What never varies in an environment.
+    """A compiled scene: all that never varies in an environment.
 
     Attributes:
       names: of the parts.
