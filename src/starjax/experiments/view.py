@@ -32,7 +32,7 @@ class Options:
     dataset: str = ""  # a folder of demonstrations: its episodes
     # a second one at the same trial: expert, or a policy as above
     beside: str = ""
-    task: str = "peg_transfer"  # of the expert
+    task: str = config_lib.DEFAULT_TASK  # of the expert
     arm: str = ""  # robot in the place of their own
     trocar: Annotated[int, Range(0, 999)] = 8  # number of the task's configuration of trocars
     seed: config_lib.Seed = 0  # of the trials
