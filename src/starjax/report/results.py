@@ -1,4 +1,4 @@
-"""What a finished run left on disk, read for the report: results, rollouts, loss curves, sweep."""
+"""Reads finished runs for the report: results, rollouts, loss curves, sweep."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path

@@ -32,7 +32,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Result(NamedTuple):
-    """What training leaves.
+    """A finished training.
 
     Attributes:
       state: after the last step.

@@ -29,7 +29,7 @@ STAGES = ("approach", "grasped", "lifted", "taken over", "held", "done")
 
 @flax.struct.dataclass
 class Layout:
-    """What is drawn at reset: pose_world_needle; tips `[2, 3]` m."""
+    """Drawn at reset: pose_world_needle; tips `[2, 3]` m."""
 
     needle: Pose
     tips: jax.Array
@@ -37,7 +37,7 @@ class Layout:
 
 @flax.struct.dataclass
 class Facts:
-    """What is measured, and what has happened.
+    """Measurements of one moment, and what has happened.
 
     Attributes:
       needle: pose_world_needle. tips: `[2, 3]` m.
