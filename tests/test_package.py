@@ -10,6 +10,7 @@ import sys
 import pytest
 
 import starjax
+from starjax import cli
 
 ROOT = pathlib.Path(__file__).parents[1]
 PYTHON = sorted((ROOT / "src").rglob("*.py"))
@@ -41,8 +42,6 @@ HOSTS = {
     "www.apache.org",
     "www.w3.org",
 }
-COMMANDS = ["run", "collect", "train", "evaluate", "sweep", "bench", "pack", "report"]
-COMMANDS += ["export", "import", "inspect", "serve", "stress", "view", "teleop"]
 HEAVY = ("jax", "mujoco", "flax", "scipy", "matplotlib")
 
 
@@ -71,7 +70,7 @@ def test_no_hosts_and_no_paths_of_one_machine(path):
     assert not hosts and not paths
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)], ids=str)
+@pytest.mark.parametrize("command", [[], *([name] for name in cli.COMMANDS)], ids=str)
 def test_help_is_quick_and_imports_nothing_heavy(command):
     program = (
         "import sys\n"

@@ -195,7 +195,7 @@ def _without_interrupts(ignored: Any) -> None:
 
 
 def _warning(message: Warning | str, kind: type[Warning], place: str, *rest: Any) -> str:
-    """What is printed: of our own warnings a line, of others also where they come from.
+    """Formats a warning: ours as one line, those of others with their place.
 
     jax warns of every program, hundreds of them, that its cache cannot keep or read: one line says
     so, once.

@@ -9,7 +9,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
-from starjax import json_types
+from starjax import json_types, schema_1
 from starjax.learners import LEARNERS
 from starjax.limits import INLINE, Count, CountOrZero, NotNegative, Positive, Range
 
@@ -20,13 +20,14 @@ SettingsT = TypeVar("SettingsT")
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 Preset = Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"]
 TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
+DEFAULT_TASK = "peg_transfer"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneConfig:
-    """What is simulated, by the names that `starjax list` shows."""
+    """Names the parts of a scene, as `starjax list` shows them."""
 
-    task: str = "peg_transfer"  # what is to be done; starjax list shows what there is
+    task: str = DEFAULT_TASK  # what is to be done; starjax list shows what there is
     # robots, one for each that the task asks for, or one for all; left out: the task's
     arm: tuple[str, ...] = ()
     tool: tuple[str, ...] = ()  # instruments that the arms hold; left out: the task's
@@ -48,7 +49,7 @@ class DemosConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PolicyConfig:
-    """What policies of all learners share (IV-G); the learner's own options follow."""
+    """Settings that policies of all learners share (IV-G); the learner's own options follow."""
 
     learner: str = "diffusion"  # how sequences of actions are generated
 
@@ -74,13 +75,14 @@ class PolicyConfig:
     roll_history: bool = True  # the roll network reads the measured rolls
     roll_trocar: bool = True  # the roll network reads the trocar
     roll_observation: bool = False  # the roll network reads the image or the task state too
-    # whether the learner's model is given the trocar: as Table II says, or an ablation
+    # whether the learner's model is given the trocar: as the method says, or an ablation
     sees_trocar: Literal["method", "always", "never"] = "method"
     # which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
     # trocar's azimuth, or an ablation
     trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
     roll_loss_weight: NotNegative = 0.1  # lambda of Eq. 15
-    dtype: Literal["float32", "bfloat16"] = "float32"  # of the networks' arithmetic
+    # of the networks' arithmetic in training; a trained policy decides in float32
+    dtype: Literal["float32", "bfloat16"] = "float32"
     # Of the learner, see `learners.Learner`; None: its defaults. In JSON, and as flags, they stand
     # among the others.
     options: Any = dataclasses.field(default=None, metadata=INLINE)
@@ -134,7 +136,7 @@ class EvalConfig:
 class RunConfig:
     """One run of `python -m starjax.experiments.run`."""
 
-    method: str = "stardiff"  # a row of Table II, or all
+    method: str = "stardiff"  # of starjax list; all: the eight of Table II
     # starting values of the rest; auto: gpu where jax can use one, else cpu
     preset: Preset = "auto"
     seed: Seed = 0  # of everything random
@@ -259,23 +261,20 @@ def _nested(policy: Mapping[str, Any]) -> dict[str, Any]:
     return {**rest, "options": from_dict(settings, options)}
 
 
-# What runs were in before scenes had names, `sim.names.FIRST`.
-_FIRST_SCENE = SceneConfig(arm=("fr5",), tool=("grasper",), camera=("camera",))
-
-
 def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of a run from JSON, or parts of them, with those of earlier versions as today's."""
     found = dict(values)
     train, policy = found.get("train"), found.get("policy")
     if train is not None:  # a whole run's
-        found.setdefault("scene", as_json(_FIRST_SCENE))
+        task, arm, tool, camera = schema_1.SCENE
+        scene = SceneConfig(task=task, arm=arm, tool=tool, camera=camera)
+        found.setdefault("scene", as_json(scene))
     if isinstance(train, Mapping) and isinstance(policy, Mapping) and "crop_fraction" in train:
         rest = dict(train)
         found["policy"] = {**policy, "crop_fraction": rest.pop("crop_fraction")}
         found["train"] = rest
     demos = found.get("demos", found)
-    if isinstance(demos, Mapping) and "one_wall" in demos:
-        rest = {name: value for name, value in demos.items() if name != "one_wall"}
-        rest.setdefault("expert", "one_wall" if demos["one_wall"] else "")
+    if isinstance(demos, Mapping) and schema_1.has_switch(demos):
+        rest = schema_1.with_expert(demos, usual="")
         found = {**found, "demos": rest} if "demos" in found else rest
     return found

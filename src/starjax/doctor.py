@@ -8,10 +8,14 @@ import tempfile
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from starjax import cli, errors
-from starjax.experiments import presets
+from starjax import cli
+from starjax.experiments import options, presets
 from starjax.runtime import files, gpu, locks, xla
 
+DESCRIPTION = """Looks at what of this machine and installation works; one remedy for each fault.
+
+The exit code is 1 if there is a fault.
+"""
 NEEDED_MEMORY = 4e9  # bytes free for the preset `cpu`
 NEEDED_DISK = 2e9
 
@@ -32,11 +36,7 @@ class Finding(NamedTuple):
 
 def main(argv: Sequence[str]) -> int:
     """Prints every finding; returns 1 if there is a fault."""
-    if set(argv) & {"-h", "--help"}:
-        print(f"usage: starjax doctor\n\n{__doc__}\nThe exit code is 1 if there is a fault.")
-        return 0
-    if argv:
-        raise errors.UsageError("starjax doctor", "no argument", argv[0])
+    options.parse(options.NoFlags, argv, prog="starjax doctor", description=DESCRIPTION)
     # The order matters: a wrong XLA flag ends the process as soon as jax starts.
     checks: list[Callable[[], list[Finding]]] = [packages, xla_flags, storage, folder_locks, memory]
     findings = [finding for check in checks for finding in _shown(check)]
@@ -146,7 +146,7 @@ def memory() -> list[Finding]:
 
 
 def devices() -> list[Finding]:
-    """What jax runs on, whether it can compile and run a program there, and a GPU left unused."""
+    """Finds jax's devices, whether a program compiles and runs there, and a GPU left unused."""
     try:
         import jax
         import jax.numpy as jnp

@@ -19,7 +19,7 @@ _OPEN = (MOST, math.inf)  # bounds that need not be said
 
 
 class Range(NamedTuple):
-    """What a number may be; of a tuple, each number. Written on a field as `Annotated[int, Range]`.
+    """Range of a number, of a tuple each number. Stands on a field: `Annotated[int, Range(0, 8)]`.
 
     Attributes:
       low, high: bounds.
@@ -101,7 +101,7 @@ def check(settings: Any) -> None:
 
 
 def _expected(limit: Range, number: float) -> str:
-    """What a number that is out of range should have been."""
+    """Describes what a number out of range should have been."""
     if isinstance(number, float) and not math.isfinite(number):
         return "a finite number"
     return f"at most {MOST}" if number > limit.high == MOST else str(limit)

@@ -24,7 +24,7 @@ class Pose(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What the environment is asked to reach by the end of one control step.
+    """Target of the environment for the end of one control step.
 
     Attributes:
       pose: tip poses in the world frame, `[..., A]`.

@@ -1,5 +1,6 @@
 """The environment under the expert: success on every trocar, and trouble that stays where it is."""
 
+import contacts
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,16 +19,17 @@ def episodes(reset, begin, drive):
     """Final states of twelve expert episodes; executed RCM errors and labels' rolls on the way."""
     state = reset(7)
     script = begin(state, 8)
-    found, labels, running = [], [], []
+    found, labels, running, looks = [], [], [], []
     for _ in range(STEPS):
         running.append(np.asarray(~state.done))
         state, script = drive(state, script)
         found.append(np.stack([state.rcm_error[:, 0], state.rcm_error_within[:, 0]]))
         labels.append(jax.tree.map(np.asarray, script.label))
+        looks.append(np.asarray(state.physics.qpos))
         if bool(state.done.all()):
             break
     rolls = [rcm.roll_of(jnp.asarray(label.pose.R)) for label in labels]
-    return state, np.array(found), np.array(rolls), np.array(running), labels
+    return state, np.array(found), np.array(rolls), np.array(running), labels, looks
 
 
 def test_the_expert_succeeds_on_every_trocar(episodes):
@@ -39,7 +41,7 @@ def test_the_expert_succeeds_on_every_trocar(episodes):
 
 
 def test_executed_rcm_error_is_small(episodes):
-    _, errors, _, running, _ = episodes
+    _, errors, _, running, *_ = episodes
     live, within = errors[:, 0][running], errors[:, 1][running]
     assert live.max() > 0
     assert np.quantile(live, 0.99) < 0.07e-3
@@ -47,7 +49,7 @@ def test_executed_rcm_error_is_small(episodes):
 
 
 def test_the_error_within_a_control_step_is_the_largest_of_its_physics_steps(episodes):
-    _, errors, _, running, _ = episodes
+    _, errors, _, running, *_ = episodes
     at_end, within = errors[:, 0], errors[:, 1]
     both = running[1:] & running[:-1]  # a step begins where the one before it ended
     assert (within[running] >= at_end[running]).all()
@@ -56,13 +58,19 @@ def test_the_error_within_a_control_step_is_the_largest_of_its_physics_steps(epi
 
 
 def test_labels_are_on_the_manifold_and_their_roll_never_wraps(episodes):
-    state, _, rolls, running, labels = episodes
+    state, _, rolls, running, labels, _ = episodes
     port = state.trocar.p_world_trocar[:, 0]
     worst = max(float(rcm.rcm_error(label.pose, port).max()) for label in labels)
     assert worst < 1e-6
     assert np.abs(rolls[running]).max() < np.pi / 2
     steps = np.abs(np.diff(rolls, axis=0))[running[1:]]
     assert steps.max() < 0.2, "the roll stays on one branch"
+
+
+def test_no_contact_is_left_out(episodes, sim):
+    state, *_, looks = episodes
+    asked = contacts.asked(sim, looks[::10], state.trocar.p_world_trocar)
+    assert min(asked) > 0 and (np.less_equal(asked, contacts.held(sim))).all(), asked
 
 
 def test_a_released_block_is_threaded_and_at_rest(episodes, sim):

@@ -94,7 +94,7 @@ def collect(
             advance(int(record["success"]))
 
         def news() -> dict[episodes.Trial, bool]:
-            """What other processes have written."""
+            """Reads episodes that other processes have written."""
             if share.count == 1:
                 return {}
             found = _records(root, set(store.keys(root)) - records.keys() - written)

@@ -1,4 +1,4 @@
-"""What is odd about demonstrations: a look at every number, before anybody learns from them."""
+"""Looks at every number of demonstrations for what is odd, before anybody learns from them."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -43,7 +43,7 @@ def of_dataset(root: Path) -> Iterator[str]:
 
 
 def imported(root: Path) -> list[str]:
-    """What `starjax import` found odd about the files that it read."""
+    """Notes of `starjax import` on the files that it read."""
     path = root / schema.IMPORTED
     return files.read_json(path).get("notes", []) if path.exists() else []
 

@@ -1,4 +1,4 @@
-"""What dataset.json says of demonstrations, and how schema 1 says it.
+"""Schema of dataset.json, and how schema 1 becomes it.
 
 Schema 1 is of one arm: episodes have fields without the axis A, one camera's `image`, numbers for
 radius, polar and azimuth; trocars are `[C][3]`, `scene` is the hash that is now `model`.
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import errors
+from starjax import errors, schema_1
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import engine, episodes
 from starjax.runtime import jax_settings, xla
@@ -44,7 +44,7 @@ class Settings(NamedTuple):
 
 
 def describe(env: Any, trocars: Trocar, settings: Settings) -> dict[str, Any]:
-    """What a dataset is: the content of dataset.json, and by `store.digest` its name.
+    """Describes a dataset: the content of dataset.json, and by `store.digest` its name.
 
     Args:
       env: `sim.env.Env`.
@@ -93,10 +93,9 @@ def upgraded(description: Mapping[str, Any]) -> dict[str, Any]:
     """A description of any schema as schema 2 says it; `schema` stays that of the files."""
     if description["schema"] == SCHEMA:
         return dict(description)
-    found = {name: value for name, value in description.items() if name != "one_wall"}
+    found = schema_1.with_expert(description, usual="default")
     camera = episodes.IMAGE + names.FIRST.cameras[0]
     return found | {
-        "expert": "one_wall" if description.get("one_wall") else "default",
         "scene": names.FIRST._asdict(),
         "model": description["scene"],
         "trocars": [[trocar] for trocar in description["trocars"]],

@@ -17,7 +17,7 @@ def thinned(x: Any) -> np.ndarray:
 
 
 def estimate(R: Any, p: Any) -> rcm.TrocarEstimate:
-    """What the motion of A arms shows of their trocars.
+    """Trocars as the motion of A arms shows them.
 
     Args:
       R: `[T, A, 3, 3]` R_world_tip.

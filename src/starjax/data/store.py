@@ -227,7 +227,7 @@ def _hash(value: Any) -> str:
 
 
 def _read(path: Path, read: Callable[[Path], Any]) -> Any:
-    """What `read` makes of an episode's file; a disk that fails is no damage to it."""
+    """Reads an episode's file with `read`; a disk that fails is no damage to it."""
     try:
         return read(path)
     except FileNotFoundError as error:

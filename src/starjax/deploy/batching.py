@@ -39,7 +39,7 @@ class Batches:
 
     @arrays.broadcasting
     def decide(self, requests: Sequence[wire.Request]) -> list[dict[str, Any] | UsageError]:
-        """What each of at most `most` requests is answered: as `wire.answer`, or its mistake."""
+        """Answers at most `most` requests: each with its `wire.answer`, or its mistake."""
         begun, asks = time.perf_counter(), self.policy.asks
         answers: list[Any] = [None] * len(requests)
         good, rows = [], []

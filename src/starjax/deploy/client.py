@@ -25,7 +25,7 @@ WAIT_S = 10.0  # for the first one
 
 
 class Robot(Protocol):
-    """What `Client.run` needs of a robot."""
+    """A robot, as `Client.run` drives it."""
 
     def measure(self) -> Observation:
         """This moment: pose `[*arms]`, gripper `[*arms]`, image `[h, w, 3]`, images or state."""
@@ -104,7 +104,7 @@ class Client:
 
     @property
     def report(self) -> Report:
-        """What happened so far."""
+        """Counts of what happened so far."""
         return self._follower.report
 
     @property

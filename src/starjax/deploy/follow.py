@@ -48,7 +48,7 @@ LIMITS = Limits()
 
 @dataclasses.dataclass
 class Report:
-    """What happened, in control steps unless said otherwise.
+    """Counts of what happened, in control steps unless said otherwise.
 
     Attributes:
       steps: commands given.

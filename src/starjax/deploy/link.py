@@ -23,7 +23,7 @@ _SILENT.propagate = False
 
 
 class Heard(NamedTuple):
-    """What became of a request.
+    """Outcome of a request.
 
     Attributes:
       answer: the frame's value; None where there is none.
@@ -76,7 +76,7 @@ class Link:
         self._asked.put(wire.pack(value))
 
     def poll(self) -> Heard | None:
-        """What became of the request, or None as long as that is not known."""
+        """Outcome of the request, None as long as it is not known."""
         try:
             return self._heard.get_nowait()
         except queue.Empty:

@@ -1,4 +1,4 @@
-"""What a robot measures, as a deployed policy takes it; mistakes are named, not planned on.
+"""Checks what a robot measured: mistakes are named, not planned on.
 
 One arm's arrays have no arm axis. Those of A arms have it last: `[O, A]`, or `[B, O, A]` of B
 robots.
@@ -26,7 +26,7 @@ _SKEW = 0.05  # of R'R from the identity: what rounding and calibration leave is
 
 @flax.struct.dataclass
 class Observation:
-    """What one robot measured in the last O moments, oldest first; B robots' fields begin with B.
+    """Measurements of one robot at the last O moments, oldest first; B robots' fields begin with B.
 
     Attributes:
       pose: of the tip in the world frame, `[O]`.
@@ -44,7 +44,7 @@ class Observation:
 
 
 class Asks(NamedTuple):
-    """What a policy must be told.
+    """Inputs that a policy asks for.
 
     Attributes:
       moments: O.
@@ -66,7 +66,7 @@ class Asks(NamedTuple):
 
 
 def given(asks: Asks, observation: Any, trocar: Any) -> tuple[types.Observation, rcm.Trocar]:
-    """What the policy looks at, as arrays, and the trocars `[*robots, *arms]`.
+    """Checked inputs as arrays, and the trocars `[*robots, *arms]`.
 
     Raises:
       UsageError: see `Deployed.__call__`.

@@ -50,7 +50,7 @@ class Settings(NamedTuple):
 
 @dataclasses.dataclass
 class Counts:
-    """What a server has done."""
+    """Counts of a server's work."""
 
     clients: int = 0  # that have connected
     answered: int = 0  # requests
@@ -92,7 +92,7 @@ def run(
 
 
 def metadata(policy: Deployed, name: str = "") -> dict[str, Any]:
-    """What a client is told when it connects."""
+    """Greeting of a client that connects."""
     settings, asks = policy.settings, policy.asks
     described = {
         field: {**said._asdict(), "shape": list(said.shape)}

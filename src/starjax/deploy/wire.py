@@ -1,4 +1,4 @@
-"""What goes over the socket: openpi's protocol, msgpack with numpy arrays as maps of four entries.
+"""Frames of the socket: openpi's protocol, msgpack with numpy arrays as maps of four entries.
 
 The server sends what it serves when a client connects. Then each binary frame of the client is a
 request, and is answered by a binary frame, or by a text that says what is wrong with it. Nothing
@@ -47,7 +47,7 @@ class Input(NamedTuple):
 
 
 class Request(NamedTuple):
-    """What one robot asks.
+    """Request of one robot.
 
     Attributes:
       observation: of the last O moments, numbers in float32.
@@ -119,7 +119,7 @@ def unpack(frame: Any) -> Any:
 def request(
     asks: Asks, observation: Observation, trocar: rcm.Trocar, key: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """What a client packs: the arrays of `inputs`."""
+    """Arrays of `inputs`, as a client packs them."""
     found: dict[str, Any] = {
         "R": np.asarray(observation.pose.R, np.float32),
         "p": np.asarray(observation.pose.p, np.float32),
@@ -136,7 +136,7 @@ def request(
 
 
 def read_request(asks: Asks, value: Any, key_size: int = 2) -> Request:
-    """What a frame asks, with every array of its shape and type.
+    """Parses a request, every array of its shape and type.
 
     Raises:
       UsageError: an array is missing, unknown, or has another shape or type.
@@ -161,7 +161,7 @@ def read_request(asks: Asks, value: Any, key_size: int = 2) -> Request:
 
 
 def answer(command: Command, decided_ms: float) -> dict[str, Any]:
-    """What a client is answered, of a command `[H, *arms]` on the host.
+    """Answer to a client, of a command `[H, *arms]` on the host.
 
     Every array begins with H. `actions` `[H, A * 8]` has, of each arm, what `ACTION` names.
     """

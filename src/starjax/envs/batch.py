@@ -25,7 +25,7 @@ class Lanes(NamedTuple):
 
 
 class Do(NamedTuple):
-    """What a call does.
+    """Functions of a batch of episodes.
 
     Attributes:
       restart: `[N]` bool; these lanes begin an episode and take no action.
@@ -39,7 +39,7 @@ class Do(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What a call gives of N episodes.
+    """Result of a call for N episodes.
 
     Attributes:
       now: observation and info of the states now, leaves `[N, ...]`.

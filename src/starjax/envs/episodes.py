@@ -32,7 +32,7 @@ SHARE = 0.1  # of half an action's range, in a control step: of a tip 0.15 m/s, 
 
 
 class Outcome(NamedTuple):
-    """What a control step gave: reward float32, terminated and truncated bool."""
+    """Outcome of a control step: reward float32, terminated and truncated bool."""
 
     reward: jax.Array
     terminated: jax.Array
@@ -154,7 +154,7 @@ def is_terminated(state: Any) -> jax.Array:
 
 
 def measure(state: Any) -> dict[str, jax.Array]:
-    """What `info` says of a state; `rcm_error` in m is the largest of the arms', executed."""
+    """Content of `info`; `rcm_error` in m is the largest of the arms', executed."""
     return {
         "is_success": state.success,
         "loose": state.loose,

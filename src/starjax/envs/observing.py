@@ -1,4 +1,4 @@
-"""What an agent sees: numbers of order one, and pictures if it is to see those.
+"""Observations of an agent: numbers of order one, and images if it is to see them.
 
 `tool`, of each arm after the others' where there are several, is what a robot measures and is told:
 

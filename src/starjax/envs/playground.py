@@ -40,7 +40,7 @@ class State:
 
 
 class Environment(NamedTuple):
-    """What Playground's learners ask of an environment.
+    """An environment as Playground's learners call it.
 
     Attributes:
       reset: key -> State.

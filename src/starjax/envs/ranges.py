@@ -1,4 +1,4 @@
-"""What an action in [-1, 1] spans: where tools can be in a task, as an action space writes it."""
+"""Ranges that actions in [-1, 1] span: where tools can be in a task, in its action space."""
 
 import jax
 import numpy as np

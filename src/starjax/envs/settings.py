@@ -1,4 +1,4 @@
-"""What an environment for reinforcement learning is made with."""
+"""Settings of an environment for reinforcement learning."""
 
 import dataclasses
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from starjax import errors, rcm
+from starjax.config import DEFAULT_TASK
 
 CONTROLS = ("relative", "absolute")
 REWARDS = ("dense", "sparse")
@@ -36,7 +37,7 @@ class Settings:
         time limit has.
     """
 
-    task: str = "peg_transfer"
+    task: str = DEFAULT_TASK
     arms: tuple[str, ...] = ()
     tools: tuple[str, ...] = ()
     trocar: str | int | tuple[Row, Row, Row] = "seen"

@@ -57,7 +57,7 @@ class TaskEnv(gymnasium.Env):
         )
 
     def render(self) -> np.ndarray | None:
-        """What the first camera sees, `[h, w, 3]` uint8."""
+        """Renders the first camera, `[h, w, 3]` uint8."""
         frames = self._lanes.render()
         return None if frames is None else frames[0]
 

@@ -132,7 +132,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         return observed, reward.astype(np.float64), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """What the first camera sees in every lane, `[h, w, 3]` uint8 each."""
+        """Renders the first camera of every lane, `[h, w, 3]` uint8 each."""
         if self.render_mode is None or self._lanes is None:
             return None
         return tuple(np.array(self._batch.camera(self._lanes.state)))
@@ -154,7 +154,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         return mask
 
     def _final(self, last: tuple[Any, dict], over: np.ndarray) -> dict[str, Any]:
-        """What Gymnasium's own vector environments say of episodes that ended in this step."""
+        """Entries of `info` for episodes that ended in this step, as Gymnasium's own have them."""
         observed, measured = last
         rows = np.full(self.num_envs, None, object)
         for lane in np.flatnonzero(over):

@@ -1,4 +1,4 @@
-"""What is wrong in a theatre: environments that differ from the usual one by one disturbance.
+"""Disturbances of a theatre: environments that differ from the usual one by one thing.
 
 A disturbance wraps the functions of an environment; starts, keys and judging stay, and the executed
 RCM error is measured against the true trocar. What it draws depends on the episode's key alone.

@@ -1,4 +1,4 @@
-"""What stands in result.json and sweep.json, as kinds that `structure.check` holds files to."""
+"""Kinds of all fields of result.json and sweep.json, for `structure.check`."""
 
 from typing import Any
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import rcm
+from starjax import rcm, schema_1
 from starjax.rollouts.episodes import Episode
 from starjax.runtime import files
 
@@ -14,7 +14,6 @@ from starjax.runtime import files
 FIGURE_TROCARS = 16
 
 _LABEL = "labels."
-_PEGS = ("source", "target")  # labels that files of before the axis of arms have as `<name>_peg`
 _BY_STEP = ("p_world_tip", "rcm_error", "qpos")
 _COLUMNS = ("trocar", "trial", "length", "p_world_trocar", *_BY_STEP)
 
@@ -112,7 +111,8 @@ def read(file: Path) -> list[Trajectory]:
         for name in ("p_world_tip", "p_world_trocar", "rcm_error"):
             if name in found:
                 found[name] = np.expand_dims(found[name], 1 if name == "p_world_trocar" else 2)
-        found |= {f"{_LABEL}{n}": found[f"{n}_peg"] for n in _PEGS if f"{n}_peg" in found}
+        labels = schema_1.labels(found, "_peg")
+        found |= {f"{_LABEL}{name}": array for name, array in labels.items()}
     return [_row(found, row, int(length)) for row, length in enumerate(found["length"])]
 
 

@@ -1,4 +1,4 @@
-"""What was measured, as a typed result: the schema of result.json and sweep.json.
+"""Typed results: the schema of result.json and sweep.json.
 
 Written and read here alone. Schema 2 says in which scene, with which code and on which
 demonstrations; a trial's radius, polar and azimuth are lists `[A]`, its labels an object. Files of
@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from starjax import schema_1
 from starjax.evaluation import kinds, structure, trial_file
 from starjax.runtime import files, jax_settings, provenance, xla
 from starjax.sim import names
@@ -65,7 +66,7 @@ class Result(NamedTuple):
     Attributes:
       schema: of the file.
       scene: the task, its arms, tools and cameras.
-      method: a row of Table II. observation: `image` or `state`.
+      method: a row of `methods.METHODS`. observation: `image` or `state`.
       seed: of the trials.
       time_limit_s: of a trial, simulated, 0 where the file does not say it.
       control_hz: control steps a second.
@@ -191,8 +192,9 @@ def _upgraded(found: dict[str, Any]) -> dict[str, Any]:
 
     def labelled(row: dict[str, Any]) -> dict[str, Any]:
         row = placed(row) | {"lost": False}
-        pegs = [name for name in ("source", "target") if name in row]
-        return row | {"labels": {name: row.pop(name) for name in pegs}}
+        labels = schema_1.labels(row)
+        rest = {name: value for name, value in row.items() if name not in labels}
+        return rest | {"labels": labels}
 
     return found | {
         "scene": names.FIRST._asdict(),

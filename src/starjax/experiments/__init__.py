@@ -1,1 +1,1 @@
-"""What a person runs: the methods, the presets, the commands and the report."""
+"""The commands, and the presets that they begin with."""

@@ -1,4 +1,4 @@
-"""What one field alone cannot say of a run's settings, checked before anything heavy is imported.
+"""Checks settings against each other, before anything heavy is imported.
 
 The range of each is on the field (`limits`).
 """

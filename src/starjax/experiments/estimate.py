@@ -97,7 +97,7 @@ def seconds(config: config_lib.RunConfig, stages: Sequence[str], trocars: int) -
 
 
 def line(config: config_lib.RunConfig, stages: Sequence[str], trocars: int, backend: str) -> str:
-    """What the plan says of it."""
+    """Estimated time, as the plan says it."""
     timed, spent = TIMED.get(config.preset), seconds(config, stages, trocars)
     if timed is None or spent is None or timed.backend != backend:
         return "not known for these settings; each stage's bar says it after some steps"

@@ -86,7 +86,7 @@ def _goes_on(folder: Path, weights: str, chosen: Options, scene: config_lib.Scen
 
 
 def _asked(argv: Sequence[str], has_gpu: bool) -> tuple[Options, subjects.Named, Path]:
-    """What the command line asks for: its flags, the policy, the result's folder."""
+    """Parses the command line: its flags, the policy, the result's folder."""
     chosen = options.parse(
         Options, argv, prog="starjax evaluate", description=DESCRIPTION, default=_default(has_gpu)
     )

@@ -1,4 +1,4 @@
-"""What lies where in a run's folder, and whose settings it was made with.
+"""Layout of a run's folder, and whose settings it was made with.
 
 <out>/demos-<digest>/      demonstrations, shared by all methods
 <out>/timings.json         seconds a stage, summed over every start
@@ -71,7 +71,7 @@ def adopt_twin(out: Path, method: str) -> None:
 
 def selected(config: config_lib.RunConfig) -> list[str]:
     """The methods of a run, in the order of Table II."""
-    return list(methods.METHODS) if config.method == "all" else [config.method]
+    return list(methods.TABLE_II) if config.method == "all" else [config.method]
 
 
 def is_under_way(folder: Path) -> bool:
@@ -141,7 +141,7 @@ def _recorded(folder: Path) -> dict[str, Any]:
 
 
 def _remedy(folder: Path) -> str:
-    """What to do about a method's folder whose settings are lost, or others."""
+    """Advice on a method's folder whose settings are lost, or others."""
     weights = folder / "policy.safetensors"
     scores = f"; starjax evaluate --policy {shlex.quote(str(weights))} scores its weights"
     return "train in another folder by --out, or remove this one" + scores * weights.is_file()

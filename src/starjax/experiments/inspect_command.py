@@ -28,7 +28,7 @@ class Options:
 
 
 class Found(NamedTuple):
-    """What is printed: rows of names and texts, and oddities, a line each."""
+    """A printed report: rows of names and texts, and oddities, a line each."""
 
     rows: list[tuple[str, str]]
     odd: list[str]

@@ -2,33 +2,29 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starjax import errors, methods
-from starjax.experiments import presets
+from starjax.experiments import options, presets
 from starjax.learners import LEARNERS
 from starjax.policies import packaged
 from starjax.runtime import files
-from starjax.sim import registry
+from starjax.sim import names, registry
 from starjax.sim.arms.base import Arm
 from starjax.sim.registry import Registry
-from starjax.sim.tasks.base import Task
 from starjax.sim.tools.base import Tool
 
-DESCRIPTION = (
-    """Lists what flags can name: tasks, arms, tools, methods, learners, presets, policies."""
-)
+if TYPE_CHECKING:  # it imports jax, which `--help` does without
+    from starjax.sim.tasks.base import Task
+
+DESCRIPTION = "Lists what flags can name: tasks, arms, tools, methods, learners, presets, policies."
 
 Row = tuple[str, str]  # name, what it is
 
 
 def main(argv: Sequence[str]) -> int:
     """Prints the tables."""
-    if set(argv) & {"-h", "--help"}:
-        print(f"usage: starjax list\n\n{DESCRIPTION}")
-        return 0
-    if argv:
-        raise errors.UsageError("starjax list", "no argument", argv[0])
+    options.parse(options.NoFlags, argv, prog="starjax list", description=DESCRIPTION)
     tables = {
         "tasks (--task, --camera, --demos.expert)": _parts(registry.tasks, _task),
         "arms (--arm)": _parts(registry.arms, _arm),
@@ -53,7 +49,7 @@ def _parts(registry: Registry, described: Callable[[Any], str]) -> Iterator[Row]
             yield name, f"cannot be used: {error.got}"
 
 
-def _task(task: Task) -> str:
+def _task(task: "Task") -> str:
     arms = f"{task.arms} arm{'s' if task.arms > 1 else ''}"
     sees, shows = ", ".join(task.cameras), ", ".join(task.experts)
     return f"{task.words.title}: {arms}; cameras {sees}; experts {shows}"
@@ -74,7 +70,7 @@ def _methods() -> Iterator[Row]:
         rolls = "; a network for the roll" * row.hierarchical
         told = "; told the trocar" * row.sees_trocar + "; projected" * row.projects
         yield name, f"{row.label}: actions {row.action_space}{rolls}{told}"
-    yield "all", "every one of them"
+    yield "all", f"the {len(methods.TABLE_II)} of the paper's Table II"
 
 
 def _learners() -> Iterator[Row]:
@@ -103,5 +99,5 @@ def _policies() -> Iterator[Row]:
             f"{part} {about[part]['successes']}/{about[part]['trials']}"
             for part in ("seen", "unseen")
         )
-        task = about.get("scene", {}).get("task", "peg_transfer")
+        task = about.get("scene", {}).get("task", names.FIRST.task)
         yield name, f"{label} for {task}; successes at trocars: {scores}"

@@ -1,4 +1,4 @@
-"""What a run tells its user: the plan, the stages, the outcome."""
+"""Texts of a run for its user: the plan, the stages, the outcome."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ STAGES = ("collect", "train", "evaluate", "report")
 
 
 def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
-    """What is going to happen, for the start of a run."""
+    """Describes what is going to happen, for the start of a run."""
     lines = [
         f"starjax {starjax.__version__}: method {config.method}, preset {config.preset}, "
         f"seed {config.seed}, folder {config.out}",
@@ -30,7 +30,7 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
 
 
 def about(config: config_lib.RunConfig, name: str, seed: int) -> str:
-    """What is going to be scored: the policy `name`, how it was made, the trials and their seed."""
+    """Describes what is scored: the policy `name`, how it was made, the trials and their seed."""
     lines = [
         f"starjax {starjax.__version__}: {methods.METHODS[config.method].label} of {name}",
         *_setting(config),
@@ -142,8 +142,8 @@ def _task_of(encoder_weights: str) -> str:
 
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
-    """Active ablations: settings that deviate from the method's row of Table II."""
-    rows = methods.METHODS.values() if method == "all" else [methods.METHODS[method]]
+    """Active ablations: settings that deviate from the method's row."""
+    rows = [methods.METHODS[name] for name in (methods.TABLE_II if method == "all" else [method])]
     sees, yaw = policy.sees_trocar, policy.trocar_yaw
     given = "given" if sees == "always" else "not given"
     told = sees != "method" and any(row.sees_trocar != (sees == "always") for row in rows)
@@ -166,7 +166,7 @@ def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
 
 
 def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[str]:
-    """What a reader of the result, whose method `figures` names, must know, one sentence each."""
+    """Warnings for readers of the result whose method `figures` names, a sentence each."""
     found = []
     if config.policy.observation == "state":
         found.append(

@@ -32,6 +32,12 @@ Runs = Annotated[
 ]
 FloatOrNone = Annotated[float | None, tyro.conf.arg(metavar="FLOAT")]
 
+
+@dataclasses.dataclass(frozen=True)
+class NoFlags:
+    """Flags of a command that has none."""
+
+
 _UNNAMED = "scene"  # the part of settings whose flags do not name it
 _registry = tyro.constructors.ConstructorRegistry()
 _FIELD = re.compile(r"[a-z][a-z0-9_.]*")

@@ -18,7 +18,7 @@ class _Learning:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _First:
-    """What other flags and their defaults depend on."""
+    """Flags that other flags and their defaults depend on."""
 
     preset: config_lib.Preset = "auto"
     policy: _Learning = _Learning()

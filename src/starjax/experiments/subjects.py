@@ -12,7 +12,7 @@ from starjax.runtime import files
 
 
 class Named(NamedTuple):
-    """What a command line names.
+    """Files of the policy that a command line names.
 
     Attributes:
       file: of the weights.

@@ -24,7 +24,7 @@ class Options:
     """Flags of the command."""
 
     out: str = options.AUTO  # folder of the dataset; auto: runs/teleop-TASK
-    task: str = "peg_transfer"  # what is to be done
+    task: str = config_lib.DEFAULT_TASK  # what is to be done
     arm: tuple[str, ...] = ()  # robots; left out: the task's
     # pixels, or what the task says of its state: what is recorded, and policies can learn from
     observation: Literal["image", "state"] = "image"

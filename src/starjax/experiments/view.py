@@ -32,7 +32,7 @@ class Options:
     dataset: str = ""  # a folder of demonstrations: its episodes
     # a second one at the same trial: expert, or a policy as above
     beside: str = ""
-    task: str = "peg_transfer"  # of the expert
+    task: str = config_lib.DEFAULT_TASK  # of the expert
     arm: str = ""  # robot in the place of their own
     trocar: Annotated[int, Range(0, 999)] = 8  # number of the task's configuration of trocars
     seed: config_lib.Seed = 0  # of the trials
@@ -60,7 +60,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _dataset(folder: str) -> Show:
-    """What shows recorded episodes."""
+    """Makes the viewer of recorded episodes."""
     from starjax.viewer import browse, recorded
 
     try:
@@ -71,7 +71,7 @@ def _dataset(folder: str) -> Show:
 
 
 def _live(chosen: Options) -> Show:
-    """What shows somebody at work."""
+    """Makes the viewer of somebody at work."""
     from starjax.sim import registry
     from starjax.viewer import actors, view
 

@@ -71,7 +71,7 @@ def _name(names: tuple[str, ...]) -> str:
 
 
 def _prefix(found: Collection[str], wanted: Collection[str], path: str | pathlib.Path) -> str:
-    """What stands before the names of the one ResNet-18 that is found."""
+    """Prefix of the names of the one ResNet-18 that is found."""
     first = "conv1.weight"
     prefixes = [
         name.removesuffix(first) for name in found if re.search(r"(^|\.)conv1\.weight$", name)

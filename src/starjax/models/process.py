@@ -35,7 +35,7 @@ class Sample(Protocol):
 
 
 class Process(NamedTuple):
-    """What becomes noise, and how it is undone.
+    """A generative process: from data to noise and back.
 
     A time is what the network is told of how noisy a sequence is, in the process's own unit.
 

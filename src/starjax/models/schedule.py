@@ -37,7 +37,7 @@ class Schedule(NamedTuple):
 
 
 class DdimTable(NamedTuple):
-    """What each of the n DDIM steps needs, in the order in which they run, `[n]` each.
+    """Coefficients of the n DDIM steps, in the order in which they run, `[n]` each.
 
     Attributes:
       k: int32 diffusion step whose noise is predicted, descending.

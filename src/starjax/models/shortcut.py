@@ -43,7 +43,7 @@ class Noised(NamedTuple):
 
 
 def told(time: Any, level: Any) -> Any:
-    """What the network is told of a time in [0, 1] and a step's level."""
+    """One number for a time in [0, 1] and a step's level, as the network is told them."""
     return time / flow.TIME_UNIT + LEVEL_UNIT * level
 
 
@@ -75,7 +75,7 @@ def loss(predict: Callable[..., jax.Array], given: Noised) -> jax.Array:
 
 
 def targets(predict: Callable[..., jax.Array], given: Noised) -> jax.Array:
-    """What is to be predicted `[B, ...]`: where the step has a length, the mean of two of half."""
+    """Target of the prediction `[B, ...]`: for a step with a length, the mean of two of half."""
     count = len(given.x)
     most = -(-count // EVERY)
     (rows,) = jnp.nonzero(given.level < LEVELS, size=most, fill_value=count)

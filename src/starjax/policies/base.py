@@ -1,4 +1,4 @@
-"""What training and evaluation know of a policy: a tuple of pure functions."""
+"""A policy, as training and evaluation know it: a tuple of pure functions."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ __all__ = ["Params", "Policy"]
 
 
 class Policy(NamedTuple):
-    """What training and evaluation know of a policy.
+    """A policy's pure functions.
 
     The loss of a batch is `loss(params, prepare(stats, key, batch))`.
 

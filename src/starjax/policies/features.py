@@ -1,4 +1,4 @@
-"""What the networks are fed: trocar features, and observations with and without augmentation."""
+"""Inputs of the networks: trocar features, and observations with and without augmentation."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,7 +17,7 @@ _LENGTH = 0.05  # m, the largest displacement of a trocar in Eq. 19: features ar
 
 
 class Sensors(NamedTuple):
-    """What can be observed.
+    """Observations that a policy is given.
 
     Attributes:
       task: says what the state is made of.
@@ -75,7 +75,7 @@ def extra_dim(method: methods.Method, task: Task) -> int:
 
 
 def extra(method: methods.Method, told: rcm.TrocarFrame) -> jax.Array:
-    """What conditions a model beside the observation: all trocars' features `[B, E]`, or none."""
+    """Condition of a model beside the observation: all trocars' features `[B, E]`, or none."""
     found = trocar_features(told.trocar)
     return found.reshape(len(found), -1) if method.sees_trocar else jnp.zeros((len(found), 0))
 

@@ -26,10 +26,10 @@ _SEPARATOR = "/"
 
 
 class Trained(NamedTuple):
-    """What inference needs.
+    """A trained policy.
 
     Attributes:
-      method: its name, a row of Table II.
+      method: its name, a key of `methods.METHODS`.
       policy: networks and diffusion.
       train: how it was trained, for the record.
       params: the averaged (EMA) parameters.
@@ -141,7 +141,7 @@ def fingerprint(params: Params) -> str:
 
 
 def _of_first_scene(about: dict[str, Any]) -> dict[str, Any]:
-    """What a file of schema 1 says, as one of today would."""
+    """Upgrades what a file of schema 1 says."""
     one = about["p_world_ref"]
     return {
         **config.upgraded(about),
@@ -152,7 +152,7 @@ def _of_first_scene(about: dict[str, Any]) -> dict[str, Any]:
 
 
 def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
-    """What `save` was given; raises KeyError, TypeError or ValueError for what it never wrote."""
+    """Parses what `save` wrote; raises KeyError, TypeError or ValueError for anything else."""
     stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
     places, demos, scene = about["p_world_ref"], about.get("demos"), about["scene"]
     return Trained(

@@ -1,4 +1,4 @@
-"""What a policy knows of a learner: sequences of normalised actions, given what was observed."""
+"""A learner, as policies know it: sequences of normalised actions, given what was observed."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -40,7 +40,7 @@ class Sizes(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """What sequences are generated for.
+    """Condition of generated sequences.
 
     Attributes:
       vision: `[B, O, V]`, or None without images.

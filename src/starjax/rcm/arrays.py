@@ -1,4 +1,4 @@
-"""What every RCM map needs of its inputs: one float type, checked shapes, safe directions."""
+"""Inputs of RCM maps: one float type, checked shapes, safe directions."""
 
 import functools
 from collections.abc import Callable, Iterable

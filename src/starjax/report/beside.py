@@ -1,4 +1,4 @@
-"""What lies beside a result.json: the sweep, the bench, and the log of the training."""
+"""Reads what lies beside a result.json: the sweep, the bench, and the log of the training."""
 
 import json
 from pathlib import Path
@@ -68,7 +68,7 @@ def _is_of(folder: Path, scored: result.Result) -> bool:
 
 
 def _lines(file: Path) -> Lines:
-    """What is whole of a log: a kill may have cut its last line short."""
+    """Whole lines of a log: a kill may have cut its last one short."""
     lines = file.read_bytes().splitlines(keepends=True) if file.is_file() else []
     try:
         found = [json.loads(line) for line in lines if line.endswith(b"\n")]

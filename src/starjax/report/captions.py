@@ -1,4 +1,4 @@
-"""What the numbers say, in plain words."""
+"""Sentences about the numbers, in plain words."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What runs have in common: the task, the trials that they met, how they were trained."""
+"""Common ground of runs: the task, the trials that they met, how they were trained."""
 
 import collections
 from collections.abc import Iterable, Sequence
@@ -27,17 +27,17 @@ def task(runs: Sequence[Run]) -> Task:
 
 
 def words(runs: Sequence[Run]) -> Words:
-    """What is said of the task of all runs; raises as `task`."""
+    """Words for the task of all runs; raises as `task`."""
     return task(runs).words
 
 
 def observed(runs: Sequence[Run]) -> str:
-    """What the policies see, `state` or `image`, for every output's title."""
+    """Observation of the policies, `state` or `image`, for every output's title."""
     return " and ".join(sorted({run.result.observation for run in runs}))
 
 
 def identity(trial: Trial) -> tuple[int, int, int]:
-    """What two runs have in common where they met the same trial: trocar, number, seed."""
+    """Pairs the trials that two runs both met: the same trocar, number and seed."""
     return trial.trocar, trial.trial, trial.seed
 
 

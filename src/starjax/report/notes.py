@@ -36,7 +36,7 @@ INFERENCE = (
 
 
 def tests(words: Words) -> dict[str, str]:
-    """What each test of success asks for, in the task's words."""
+    """Tests of success, in the task's words."""
     return {
         "strict": words.strict,
         "loose": words.loose,

@@ -1,4 +1,4 @@
-"""What demonstrations through more ports buy: success at ports that no run was trained at."""
+"""Success at trocars that no run was trained at, by the number of training trocars."""
 
 from collections.abc import Sequence
 from typing import Any

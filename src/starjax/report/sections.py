@@ -27,7 +27,7 @@ _SCORES = (Cell("Seen", span=2), Cell("Unseen", span=2))
 
 
 def facts(runs: Sequence[results.Run]) -> str:
-    """What was run, on what: of several runs all that there is, each once."""
+    """Settings and machines of the runs, each once."""
     items = {
         "Observation": [compare.observed(runs)],
         "Trials" if len(runs) == 1 else "Trials a run": [_trials(run) for run in runs],

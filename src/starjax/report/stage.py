@@ -12,7 +12,7 @@ BATCH = 16  # images drawn in one call
 
 
 class Stage(NamedTuple):
-    """What figures need of a scene.
+    """A scene, as figures draw it.
 
     Attributes:
       outline: of the task.

@@ -153,8 +153,10 @@ def _bin(trial: Trial) -> int:
 
 
 def _comparison(a: results.Run, b: results.Run, test: stats.Paired) -> tuple[object, ...]:
-    """What two comparisons have in common that are one: the policies, by their weights or, where a
-    result does not say whose it is, by their folders, and the trials' outcomes."""
+    """Identity of a comparison: the two policies and their trials' outcomes.
+
+    A policy is known by its weights, or by its folder where a result does not name them.
+    """
     method = b.result.method
     place = b.path.parent if b.path.name == method else b.path
     return a.path, b.result.weights or place, methods.behaviour(method), test

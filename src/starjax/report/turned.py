@@ -12,7 +12,7 @@ _LONGEST_S = 12.0  # shown of a rollout
 
 
 class Turned(NamedTuple):
-    """What is shown.
+    """A drawn rollout.
 
     Attributes:
       html: a page of its own.

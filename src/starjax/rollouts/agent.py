@@ -57,7 +57,7 @@ def replay(command: Command) -> Agent:
 
 
 class Plan(NamedTuple):
-    """What a policy remembers of N episodes.
+    """Memory of a policy in N episodes.
 
     Attributes:
       key: `[N]` keys of its noise.

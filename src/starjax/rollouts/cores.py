@@ -34,7 +34,7 @@ def run(
     at_once: int,
     is_wanted: Callable[[Job], bool] = lambda job: True,
 ) -> Iterator[Found]:
-    """What the jobs' generators yield, as it comes, of all that are at work.
+    """Yields what the jobs' generators yield, as it comes.
 
     Args:
       jobs: taken in this order.

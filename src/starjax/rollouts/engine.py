@@ -227,7 +227,7 @@ def _advancer(
 
 
 def _fields(env: Any, record: episodes.Record, state: Any) -> dict[str, jax.Array]:
-    """What would be recorded of N episodes that stand still: for its shapes."""
+    """Records N episodes that stand still, for the shapes."""
     observed = jax.vmap(env.observe)(state) if record.observes else None
     command = Command(state.pose, state.gripper)
     return record.fields(episodes.Step(observed, command, command, state, state))

@@ -1,4 +1,4 @@
-"""What an episode is once it is over: which trial it was, how it ended, what was recorded of it.
+"""Finished episodes: which trial it was, how it ended, what was recorded of it.
 
 The fields that are recorded of each control step are chosen by whoever receives the episodes.
 """
@@ -73,7 +73,7 @@ class Step(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What is recorded of every control step.
+    """Fields that are recorded of every control step.
 
     Attributes:
       fields: (Step) -> name -> `[N, ...]`.
@@ -123,7 +123,7 @@ SCORE = Record(_scored, observes=False, frames=200)
 
 
 def what(field: str) -> str:
-    """What a field of `DEMONSTRATION` is."""
+    """Describes a field of `DEMONSTRATION`."""
     return FIELDS[IMAGE if field.startswith(IMAGE) else field]
 
 

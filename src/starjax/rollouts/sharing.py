@@ -31,7 +31,7 @@ class ProcessFailed(files.StorageError):
 
 
 class Share(NamedTuple):
-    """What this process has to do with a piece of work.
+    """One process's part in a piece of work.
 
     Attributes:
       folder: of the work.
@@ -54,7 +54,7 @@ class Share(NamedTuple):
         return list(parts[self.index :: self.count])
 
     def first(self, what: str, act: Callable[[], Any]) -> Any:
-        """What `act()` gives in the first process, a JSON value, in all of them; others wait."""
+        """Runs `act` in the first process and returns its JSON value in all; the others wait."""
         if self.is_first:
             value = act()
             self._sign(what, value)

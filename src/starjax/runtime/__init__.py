@@ -1,4 +1,4 @@
-"""What all the rest stands on: safe files, progress, signals, settings of jax and XLA, a hash.
+"""Ground of all the rest: safe files, progress, signals, settings of jax and XLA, a hash.
 
 Only `jax_settings` imports jax.
 """

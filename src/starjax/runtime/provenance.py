@@ -44,7 +44,7 @@ def of_version(version: str) -> tuple[str, bool] | None:
 
 
 def _of_checkout(package: Path) -> tuple[str, bool] | None:
-    """What git says, if it tracks the package: it may also lie in somebody's repository."""
+    """Asks git, if it tracks the package: it may also lie in somebody's repository."""
 
     def git(*words: str) -> str:
         command = ["git", "-C", str(package), *words]

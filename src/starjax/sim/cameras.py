@@ -64,7 +64,7 @@ def nominal(cameras: Sequence[Camera]) -> Pose:
 def images(
     cameras: Sequence[Camera], poses: Pose, data: mjx.Data, rgb: jax.Array
 ) -> dict[str, render.Frame]:
-    """What every camera sees.
+    """Renders every camera.
 
     Args:
       cameras: C of them.

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import errors, rcm
+from starjax.config import DEFAULT_TASK
 from starjax.sim import cameras as views
 from starjax.sim import collision, ik, motion, physics, render
 from starjax.sim import scene as scenes
@@ -29,7 +30,7 @@ SMALLEST_IMAGE = 16  # pixels a side
 
 
 def make(
-    task: str = "peg_transfer",
+    task: str = DEFAULT_TASK,
     arms: Sequence[str] = (),
     tools: Sequence[str] = (),
     *,

@@ -1,4 +1,4 @@
-"""What one arm does in a control period: from a commanded pose to a step of its joints."""
+"""Moves one arm for a control period: from a commanded pose to a step of its joints."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ MAX_SKEW = 0.01
 
 
 def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
-    """What arm a does in a control period: dq, velocity, correction, gripper, residual."""
+    """Motion of arm a in a control period: dq, velocity, correction, gripper, residual."""
     bound, p_trocar = scene.arms[a], state.trocar.p_world_trocar[a]
     q_target, given = state.q_target[a], state.correction[a]
     chain = scenes.chain_at(bound, p_trocar)

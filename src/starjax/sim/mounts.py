@@ -27,7 +27,7 @@ ITERATIONS = 40  # of inverse kinematics from home
 
 
 class Settings(NamedTuple):
-    """What of an arm's record the compiled programs are made for, see `Arm`."""
+    """Part of an arm's record that the compiled programs are made for, see `Arm`."""
 
     rest_gain: float
     remote_centre: bool

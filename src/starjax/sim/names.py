@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+from starjax import schema_1
+
 
 class SceneNames(NamedTuple):
     """A scene by its parts' names in the registries.
@@ -19,4 +21,4 @@ class SceneNames(NamedTuple):
 
 
 # The scene of everything that was stored before scenes had names (schema 1).
-FIRST = SceneNames("peg_transfer", ("fr5",), ("grasper",), ("camera",))
+FIRST = SceneNames(*schema_1.SCENE)

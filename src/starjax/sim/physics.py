@@ -32,7 +32,7 @@ class PhysicsState:
 
 
 class Passed(NamedTuple):
-    """What a control period leaves behind.
+    """Outcome of a control period.
 
     Attributes:
       touch: `[A]` bool, whether a pad touches something graspable in the last substep.

@@ -84,7 +84,7 @@ def search(
 
 
 def _score(least: Fit) -> float:
-    """What is sought for: rad, of the worst pose."""
+    """Objective of the search: rad, of the worst pose."""
     if least.residual > mounts.REACHED:
         return -float(least.residual)
     ease = min(least.margin, SINGULAR_WORTH * least.singular)

@@ -1,4 +1,4 @@
-"""What exists by name: tasks, arms, tools, workspaces. Others add theirs by entry points.
+"""Registries of tasks, arms, tools and workspaces. Others add theirs by entry points.
 
 A row of `starjax.tasks`, `starjax.arms`, `starjax.tools` or `starjax.workspaces` in somebody's
 `[project.entry-points]` names an object that is a `Task`, an `Arm`, a `Tool` or a `Workspace`; a

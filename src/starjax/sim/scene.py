@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from starjax import errors
+from starjax.config import DEFAULT_TASK
 from starjax.sim import assets, ik, registry, solver
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
@@ -58,7 +59,7 @@ class BoundArm(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What never varies in an environment.
+    """A compiled scene: all that never varies in an environment.
 
     Attributes:
       names: of the parts.
@@ -89,7 +90,7 @@ class Scene(NamedTuple):
 
 
 def name(
-    task: str = "peg_transfer",
+    task: str = DEFAULT_TASK,
     arms: Sequence[str] = (),
     tools: Sequence[str] = (),
     cameras: Sequence[str] = (),

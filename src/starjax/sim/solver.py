@@ -36,7 +36,7 @@ SECOND_SHARES = 16  # tried between the two that enclose the minimum
 
 
 class Problem(NamedTuple):
-    """What is minimised. V velocities, E rows, the last 3 C of them those of C contacts.
+    """The minimised function. V velocities, E rows, the last 3 C of them those of C contacts.
 
     Attributes:
       M: `[V, V]` inertia; f: `[V]` force of all but the constraints.

@@ -1,4 +1,4 @@
-"""What an environment is made of: its functions, its parameters and its state."""
+"""Parts of an environment: its functions, its parameters and its state."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from starjax.types import Command, Observation, Pose
 
 
 class EnvParams(NamedTuple):
-    """What the caller chooses for an episode.
+    """Parameters of an episode, the caller's choice.
 
     Attributes:
       trocar: where the trocars are, fields `[A]`.

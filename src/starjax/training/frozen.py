@@ -1,4 +1,4 @@
-"""What a frozen vision encoder sees in every demonstrated frame, computed once and kept on disk.
+"""Features of a frozen vision encoder, computed once for every frame and kept on disk.
 
     <root>/features/<key>/part_<n>.npz    `[PART, d_v]` float32, of consecutive frames
 

@@ -24,7 +24,7 @@ _SMALL = 1 << 16  # entries: starting on a smaller leaf takes a GPU longer than 
 
 
 class Carry(NamedTuple):
-    """What one step hands to the next.
+    """State between two steps.
 
     Attributes:
       state: of the training, as `Layout` lays it out.

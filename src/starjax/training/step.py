@@ -17,7 +17,7 @@ from starjax.training.sharding import Carry, Layout
 
 
 class Setup(NamedTuple):
-    """What every step of a training needs besides its carry and its batch.
+    """Constants of a training, used by every step.
 
     Attributes:
       policy: to be trained.
@@ -73,7 +73,7 @@ def train_step(setup: Setup, carry: Carry, batch: windows.Batch) -> Carry:
 
 
 def _update(setup: Setup, carry: Carry, prepared: Any) -> Carry:
-    """What each device does with its share of a prepared batch."""
+    """Takes one step on a device's share of a prepared batch."""
     layout, state = setup.layout, carry.state
     (loss, metrics), gradients = jax.value_and_grad(
         lambda params: setup.policy.loss(layout.gathered(params), prepared), has_aux=True

@@ -1,4 +1,4 @@
-"""What a hand asks of a tool, as pure functions: a point of the RCM manifold, moved by increments.
+"""A tool steered by hand, as pure functions: a point of the RCM manifold, moved by increments.
 
 A hand moves roll and tip, the coordinates of action space `rcm4`; the shaft follows from them, so
 it passes the trocar whatever the hand does. Nothing here is compiled: a few numbers, 30 times a
@@ -40,7 +40,7 @@ class Bounds(NamedTuple):
 
 
 def bounds(slot: Slot, tip: np.ndarray) -> Bounds:
-    """What an arm of this slot reaches, the tip `[3]` m where it starts included."""
+    """Range that an arm of this slot reaches, the tip `[3]` m where it starts included."""
     space = registry.workspaces.get(slot.workspace)
     low, high = np.minimum(space.low, tip) - ROOM, np.maximum(space.high, tip) + ROOM
     low[2] = min(space.low[2], tip[2])  # no room below: there is the table
@@ -69,7 +69,7 @@ def smoothed(hand: Hand, period: float) -> Hand:
 
 
 def increment(deflection: np.ndarray, axes: np.ndarray, scale: float, period: float) -> np.ndarray:
-    """What a device that is held at a deflection adds in a period.
+    """Increment of a period from a device that is held at a deflection.
 
     Args:
       deflection: `[4]` in [-1, 1]: roll, right, away, up.

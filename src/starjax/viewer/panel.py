@@ -12,7 +12,7 @@ _WIDTH = 300  # pixels, of the panel of plots and pictures
 
 @dataclasses.dataclass
 class Wishes:
-    """What somebody has asked for since the loop looked last. Buttons only ever set a field."""
+    """Requests since the loop looked last. Buttons only ever set a field."""
 
     step: bool = False
     again: bool = False
@@ -95,7 +95,7 @@ def beside(gui: Any, label: str) -> tuple[Any, Any]:
 
 
 class Pictures:
-    """What cameras see, one picture a rollout."""
+    """Images of the cameras, one a rollout."""
 
     def __init__(self, gui: Any, labels: Sequence[str]):
         blank = np.zeros((2, 2, 3), np.uint8)

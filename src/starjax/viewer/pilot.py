@@ -70,7 +70,7 @@ class Pilot:
         self._settle()
 
     def read(self, period: float) -> tuple[np.ndarray, np.ndarray]:
-        """What is commanded now: actions `[A, 4]` and openings `[A]`; one period (s) passes."""
+        """Advances by one period (s); returns actions `[A, 4]` and openings `[A]`."""
         arm = int(self._arm.value)
         by, squeezes = self._asked(period)
         if self._clutch.value and by.any():

@@ -39,5 +39,5 @@ def opened(port: int = PORT, label: str = "starjax", host: str = HOST) -> Iterat
 
 
 def address(server: Any) -> str:
-    """What to open in a browser."""
+    """Address to open in a browser."""
     return f"http://{server.get_host()}:{server.get_port()}"

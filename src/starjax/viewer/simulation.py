@@ -110,7 +110,7 @@ def trial_key(seed: int, configuration: int, trial: int, stream: int | None = No
 
 
 def frame(env: sim_env.Env, carry: Carry, execute: int = 0) -> Frame:
-    """What the page shows of a moment."""
+    """A moment as the page shows it."""
     state = jax.tree.map(lambda x: x[0], carry.env)
     plan = jnp.zeros((0, *state.pose.p.shape))
     if execute and isinstance(carry.memory, Plan):

@@ -23,7 +23,7 @@ _SELDOM = 3  # control steps between two pictures
 
 @dataclasses.dataclass
 class Wishes:
-    """What was pressed since the loop looked last."""
+    """Buttons pressed since the loop looked last."""
 
     save: bool = False
     discard: bool = False
@@ -140,7 +140,7 @@ def _saved(server: Any, recorder: Recorder, episode: Episode) -> bool:
 
 
 def _said(env: Any, episode: Episode, recorder: Recorder, clock: Clock) -> str:
-    """What goes on."""
+    """Status text of the page."""
     frame: Frame = episode.frame
     tips = "; ".join(" ".join(f"{1e3 * x:.1f}" for x in p) for p in frame.p_world_tip)
     now = episode.end or env.task.stages[int(frame.stage)]

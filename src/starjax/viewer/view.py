@@ -15,7 +15,7 @@ THEIRS = "their own"  # of arms
 
 
 class Asked(NamedTuple):
-    """What is shown at first.
+    """Choices that the page begins with.
 
     Attributes:
       who: one actor, or two of one task for side by side.

@@ -1,4 +1,4 @@
-"""What formats have in common: datasets as named columns of episodes, records of functions."""
+"""Common ground of all formats: datasets as named columns of episodes, records of functions."""
 
 import contextlib
 import math
@@ -126,7 +126,7 @@ def opened(path: Path, name: str) -> Iterator[Source]:
 
 
 class Damaged(ValueError):
-    """What a format's reader finds wrong; becomes the line of `opened`."""
+    """Raised by a format's reader where a file is wrong; becomes the line of `opened`."""
 
 
 def require(holds: bool, what: str, got: Any) -> None:

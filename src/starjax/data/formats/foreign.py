@@ -25,7 +25,7 @@ from starjax.sim import registry
 
 
 class Imported(NamedTuple):
-    """What became of the files.
+    """A finished import.
 
     Attributes:
       digest: of the dataset.

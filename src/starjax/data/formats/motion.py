@@ -1,4 +1,4 @@
-"""What arms did in an episode of somebody's dataset: poses in the task's world, at our rate."""
+"""Turns an episode of somebody's dataset into poses in the task's world, at our rate."""
 
 import functools
 from collections.abc import Mapping
@@ -211,7 +211,7 @@ def _model(path: Path, joints: tuple[str, ...], tip: str, count: int) -> tuple:
 
 
 def _looked_at(times: np.ndarray, hz: float, mapping: Map) -> list[str]:
-    """What is odd about the times."""
+    """Checks the times; returns notes on what is odd, raises for times that do not rise."""
     steps = np.diff(times)
     if (steps <= 0.0).any():
         at = int(np.argmax(steps <= 0.0)) + 1

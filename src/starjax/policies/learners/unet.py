@@ -1,4 +1,4 @@
-"""What learners with a U-Net share: its options, their check, and the model around a process."""
+"""Common parts of learners with a U-Net: options, their check, the model around a process."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Annotated

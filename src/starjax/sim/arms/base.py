@@ -1,4 +1,4 @@
-"""What an arm is, and where it stands: what its MJCF does not say. Data only."""
+"""Arms, and where they stand: what the MJCF does not say. Data only."""
 
 import math
 from collections.abc import Mapping

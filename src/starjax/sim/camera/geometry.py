@@ -1,4 +1,4 @@
-"""What never changes between two pictures, read once from the MuJoCo model on the host (numpy)."""
+"""Geometry that never changes between two images, read once from the MuJoCo model (numpy)."""
 
 from typing import NamedTuple
 

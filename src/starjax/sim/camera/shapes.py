@@ -21,7 +21,7 @@ Array = jax.Array
 
 
 def features(kind: int, c: Array, R: Array, size: Array) -> Array:
-    """What `view` and `shadow` need of geoms of one kind: `[N, 16]`.
+    """Numbers of geoms of one kind for `view` and `shadow`: `[N, 16]`.
 
     Args:
       c: `[N, 3]` centres in m.

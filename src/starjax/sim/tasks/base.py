@@ -1,4 +1,4 @@
-"""What a task is: a record of data and of pure, single-sample functions. Needs no simulator.
+"""Tasks: records of data and of pure, single-sample functions. Needs no simulator.
 
 Shape letter A: the arms of the task. `Layout` and `Facts` are the task's own pytrees.
 """
@@ -47,7 +47,7 @@ class Slot(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What a task says of one moment.
+    """A task's judgement of one moment.
 
     Attributes:
       good: the strict conditions hold now; success is `settle_steps` such steps in a row.
@@ -65,7 +65,7 @@ class Verdict(NamedTuple):
 
 
 class Words(NamedTuple):
-    """What reports say of a task, in plain English: phrases without a capital or a full stop.
+    """Phrases for reports of a task, in plain English, without a capital or a full stop.
 
     Attributes:
       title: e.g. `peg transfer`.
@@ -91,7 +91,7 @@ class Words(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """What stands still in a task, for line drawings. Points are m in the world frame.
+    """Fixed parts of a task, for line drawings. Points are m in the world frame.
 
     Attributes:
       areas: closed polygons `[K, 3]`, filled; a drawing shows all of them.
@@ -130,7 +130,7 @@ class Capsules(NamedTuple):
 
 
 class Views(NamedTuple):
-    """What a task may look at, of one moment.
+    """Measurements of one moment that a task may use.
 
     Attributes:
       qpos, qvel: generalised coordinates of the whole model.

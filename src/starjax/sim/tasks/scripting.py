@@ -1,4 +1,4 @@
-"""What scripted experts share: smooth motion, and a disturbance that they correct."""
+"""Common parts of scripted experts: smooth motion, and a disturbance that they correct."""
 
 import jax
 import jax.numpy as jnp

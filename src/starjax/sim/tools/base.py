@@ -1,4 +1,4 @@
-"""What a tool is: what its MJCF does not say. Data only."""
+"""Tools: what the MJCF does not say. Data only."""
 
 from typing import NamedTuple
 

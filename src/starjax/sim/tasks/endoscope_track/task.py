@@ -45,7 +45,7 @@ MAX_AWAY = 0.3  # beyond it the simulation has diverged
 
 @flax.struct.dataclass
 class Layout:
-    """What is drawn at reset.
+    """Drawn at reset.
 
     Attributes:
       rate: `[2, 3]` rad/s and phase: `[2, 3]` rad of the target's oscillations.
@@ -59,7 +59,7 @@ class Layout:
 
 @flax.struct.dataclass
 class Facts:
-    """What is measured, and how it went so far.
+    """Measurements of one moment, and how it went so far.
 
     Attributes:
       target: `[3]` m. velocity: `[3]` m/s of it.

@@ -1,4 +1,4 @@
-"""What reports say of endoscope tracking, and how they draw it."""
+"""Phrases and drawing of endoscope tracking, for reports."""
 
 from typing import Any
 

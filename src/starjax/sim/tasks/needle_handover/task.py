@@ -29,7 +29,7 @@ STAGES = ("approach", "grasped", "lifted", "taken over", "held", "done")
 
 @flax.struct.dataclass
 class Layout:
-    """What is drawn at reset: pose_world_needle; tips `[2, 3]` m."""
+    """Drawn at reset: pose_world_needle; tips `[2, 3]` m."""
 
     needle: Pose
     tips: jax.Array
@@ -37,7 +37,7 @@ class Layout:
 
 @flax.struct.dataclass
 class Facts:
-    """What is measured, and what has happened.
+    """Measurements of one moment, and what has happened.
 
     Attributes:
       needle: pose_world_needle. tips: `[2, 3]` m.
@@ -138,7 +138,7 @@ TASK = Task(
     name="needle_handover",
     mjcf="tasks/needle_handover/needle_handover.xml",
     slots=two_arms.SLOTS,
-    cameras=("camera",),
+    cameras=("passing", "camera"),
     time_limit_s=60.0,
     settle_steps=single.SETTLE_STEPS,
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),

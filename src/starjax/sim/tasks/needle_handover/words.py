@@ -1,4 +1,4 @@
-"""What reports say of needle hand-over."""
+"""Phrases of needle hand-over, for reports."""
 
 from starjax.sim.tasks.needle_pick import words
 

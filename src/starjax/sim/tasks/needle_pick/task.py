@@ -42,7 +42,7 @@ MAX_DISTANCE = 2.0
 
 @flax.struct.dataclass
 class Layout:
-    """What is drawn at reset: pose_world_needle, and `[3]` m, where the tool's tip starts."""
+    """Drawn at reset: pose_world_needle, and `[3]` m, where the tool's tip starts."""
 
     needle: Pose
     tip: jax.Array
@@ -50,7 +50,7 @@ class Layout:
 
 @flax.struct.dataclass
 class Facts:
-    """What is measured.
+    """Measurements of one moment.
 
     Attributes:
       needle: pose_world_needle.

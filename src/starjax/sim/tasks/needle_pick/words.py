@@ -1,4 +1,4 @@
-"""What reports say of needle pick, and how they draw it."""
+"""Phrases and drawing of needle pick, for reports."""
 
 from typing import Any
 

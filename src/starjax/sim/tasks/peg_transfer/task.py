@@ -55,7 +55,7 @@ TARGET_RGB = (0.98, 0.62, 0.1)
 
 @flax.struct.dataclass
 class Layout:
-    """What is drawn at reset.
+    """Drawn at reset.
 
     Attributes:
       source, target: `[]` int32 peg indices, 0-5 and 6-11.
@@ -73,7 +73,7 @@ class Layout:
 
 @flax.struct.dataclass
 class Facts:
-    """What is measured.
+    """Measurements of one moment.
 
     Attributes:
       block: pose_world_block.

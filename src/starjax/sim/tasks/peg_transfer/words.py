@@ -1,4 +1,4 @@
-"""What reports say of peg transfer, and how they draw it."""
+"""Phrases and drawing of peg transfer, for reports."""
 
 from typing import Any
 

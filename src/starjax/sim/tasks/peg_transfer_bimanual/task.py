@@ -26,7 +26,7 @@ STAGES = ("approach", "grasped", "lifted", "passed", "at the target", "threaded"
 
 @flax.struct.dataclass
 class Layout:
-    """What is drawn at reset: see `peg_transfer`; tips `[2, 3]` m."""
+    """Drawn at reset: see `peg_transfer`; tips `[2, 3]` m."""
 
     source: jax.Array
     target: jax.Array
@@ -37,7 +37,7 @@ class Layout:
 
 @flax.struct.dataclass
 class Facts:
-    """What is measured, and what has happened.
+    """Measurements of one moment, and what has happened.
 
     Attributes:
       block: pose_world_block. velocity: `[6]` of it, m/s and rad/s.

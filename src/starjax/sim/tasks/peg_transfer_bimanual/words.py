@@ -1,4 +1,4 @@
-"""What reports say of peg transfer with two arms."""
+"""Phrases of peg transfer with two arms, for reports."""
 
 from starjax.sim.tasks.peg_transfer import words
 

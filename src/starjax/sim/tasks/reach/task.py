@@ -29,7 +29,7 @@ MARK_RGB = (0.98, 0.62, 0.1)
 
 @flax.struct.dataclass
 class Layout:
-    """What is drawn at reset.
+    """Drawn at reset.
 
     Attributes:
       goal: `[]` int32, number of the mark. p: `[3]` m, where it is.
@@ -43,7 +43,7 @@ class Layout:
 
 @flax.struct.dataclass
 class Facts:
-    """What is measured: the tip `[3]` m, and its speed in m/s."""
+    """Measurements of one moment: the tip `[3]` m, and its speed in m/s."""
 
     tip: jax.Array
     speed: jax.Array

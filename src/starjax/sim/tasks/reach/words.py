@@ -1,4 +1,4 @@
-"""What reports say of reach, and how they draw it."""
+"""Phrases and drawing of reach, for reports."""
 
 from typing import Any
 

@@ -57,7 +57,7 @@ MAX_DISTANCE = 0.3
 
 @flax.struct.dataclass
 class Layout:
-    """What is drawn at reset.
+    """Drawn at reset.
 
     Attributes:
       start: int32, the end at which the ring hangs: 0 at y < 0, 1 at y > 0.
@@ -73,7 +73,7 @@ class Layout:
 
 @flax.struct.dataclass
 class Facts:
-    """What is measured, and how it went so far.
+    """Measurements of one moment, and how it went so far.
 
     Attributes:
       ring: pose_world_ring. velocity: `[6]` of it, m/s and rad/s.

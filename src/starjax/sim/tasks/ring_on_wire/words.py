@@ -1,4 +1,4 @@
-"""What reports say of ring on wire, and how they draw it."""
+"""Phrases and drawing of ring on wire, for reports."""
 
 from typing import Any
 

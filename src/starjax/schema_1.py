@@ -1,0 +1,28 @@
+"""Names that files of schema 1 take for granted. Standard library only.
+
+They were written when there was one scene with one arm, whose task had two labels and its expert
+one switch.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+SCENE = ("peg_transfer", ("fr5",), ("grasper",), ("camera",))  # task, arms, tools, cameras
+_LABELS = ("source", "target")  # fields of a trial; among recorded arrays `source_peg` and so on
+_SWITCH = "one_wall"  # of the expert, today a variant of this name
+
+
+def labels(fields: Mapping[str, Any], ending: str = "") -> dict[str, Any]:
+    """The task's labels among the fields of a trial, or with `_peg` among recorded arrays."""
+    return {name: fields[f"{name}{ending}"] for name in _LABELS if f"{name}{ending}" in fields}
+
+
+def has_switch(demos: Mapping[str, Any]) -> bool:
+    """Whether settings of demonstrations say in schema 1's way which expert it was."""
+    return _SWITCH in demos
+
+
+def with_expert(demos: Mapping[str, Any], usual: str) -> dict[str, Any]:
+    """Settings of demonstrations that name the expert, `usual` where the switch was off."""
+    rest = {name: value for name, value in demos.items() if name != _SWITCH}
+    return {"expert": _SWITCH if demos.get(_SWITCH) else usual} | rest
