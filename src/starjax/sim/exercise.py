@@ -21,7 +21,7 @@ from starjax.types import Agent, Command, Pose
 
 # Control steps of the script: the tips rise, then go to their start.
 RISE, WITHDRAWN = 18, 45
-HEIGHT = 0.045  # m to which they rise: above a block in the jaws of none
+HEIGHT = 0.045  # m to which they rise: over blocks that stand
 
 
 def make(
@@ -33,28 +33,36 @@ def make(
     cameras: Sequence[str] = (),
 ) -> Env:
     """Builds the exercise, see `sim.env.make`. Its label `moved` is how many blocks are over."""
-    env = envs.make(
-        six.TASK.name,
-        arms,
-        tools,
-        observation=observation,
-        image_size=image_size,
-        cameras=cameras,
-        variant=six.TASK,
+    return of(
+        envs.make(
+            six.TASK.name,
+            arms,
+            tools,
+            observation=observation,
+            image_size=image_size,
+            cameras=cameras,
+            variant=six.TASK,
+        )
     )
 
+
+def of(env: Env) -> Env:
+    """The exercise in an environment of `six.TASK`."""
+
     def step(state: EnvState, command: Command) -> EnvState:
-        own = _withdrawing(state)
         between = _is_between(state)
-        command = jax.tree.map(lambda x, y: jnp.where(between, x, y), own, command)
+        command = jax.tree.map(
+            lambda own, given: jnp.where(between, own, given), _withdrawing(state), command
+        )
         after = env.step(state, command)
         goes_on = after.success & ~state.done & (state.layout.turn < six.BLOCKS - 1)
         begun = _next(env.scene, after)
         return jax.tree.map(lambda x, y: jnp.where(goes_on, x, y), begun, after)
 
-    return env._replace(
-        step=step, labels=lambda state: {"moved": state.layout.turn + state.success}
-    )
+    def labels(state: EnvState) -> dict[str, jax.Array]:
+        return {"moved": state.layout.turn + state.success}
+
+    return env._replace(step=step, labels=labels)
 
 
 def anew(agent: Agent) -> Agent:
