@@ -63,10 +63,11 @@ def played():
 
 
 def test_every_block_has_its_turn(played):
-    _, states, _, last, labels = played
+    env, states, _, last, labels = played
     turns = np.asarray(states.layout.turn)
     begins = np.flatnonzero(np.diff(turns)) + 1
     assert turns.max() == 5 and len(begins) == 5 and labels["moved"] == 6
+    assert set(labels) == set(env.task.labels)
     assert last.success and last.done and not states.done.any()
     sources, targets = (
         np.asarray(x)[[0, *begins]] for x in (states.layout.source, states.layout.target)

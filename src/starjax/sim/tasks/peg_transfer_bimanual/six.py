@@ -105,7 +105,9 @@ def _obstacles(bound: single.Bound, layout: Layout, facts: task.Facts) -> Capsul
 TASK = task.TASK._replace(
     mjcf="tasks/peg_transfer_bimanual/six_blocks.xml",
     time_limit_s=LIMIT_S,
+    labels=("moved",),
     sample=sample,
+    label=lambda layout: {"moved": layout.turn},
     obstacles=_obstacles,
     still=still,
 )
