@@ -13,6 +13,7 @@ from starjax import cli, config
 from starjax.experiments import (
     bench,
     evaluate,
+    exercise,
     export_command,
     import_command,
     options,
@@ -29,6 +30,7 @@ OPTIONS = {
     **dict.fromkeys(("run", "collect", "train"), config.RunConfig),
     **{"evaluate": evaluate.Options, "sweep": sweep.Options, "bench": bench.Options},
     **{"stress": stress.Options, "pack": pack.Options, "report": report_command.Options},
+    **{"exercise": exercise.Options},
     **{"export": export_command.Options, "import": import_command.Options},
 }
 
@@ -64,6 +66,7 @@ def settings(typed: str) -> config.RunConfig:
         ("sweep", "x --eval.time-limit-s soon", "--eval.time-limit-s", "'soon'"),
         ("stress", "", "RUN or --policy", "none"),
         ("stress", "--policy compact --levels 1", "levels", "none or several"),
+        ("exercise", "x --policy y", "RUN or --policy", "both"),
         ("report", "--out x", "RUN", "none"),
         ("pack", "a b c", "FLAG", "c"),
         ("bench", "x --calls 0", "calls", 0),

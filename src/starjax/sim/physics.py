@@ -7,6 +7,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 
 from starjax.sim import solver
 from starjax.sim.engine import mjx
@@ -151,10 +152,20 @@ def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
     return jnp.clip(jnp.stack(found), -1.0, 1.0)
 
 
-def kinematics(scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array) -> mjx.Data:
-    """Poses of all bodies and geoms, the trocars' markers at `p_world_trocar` `[A, 3]` m."""
+def kinematics(
+    scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array, layout: object = None
+) -> mjx.Data:
+    """Poses of all bodies and geoms, the trocars' markers at `p_world_trocar` `[A, 3]` m; with a
+    layout also those of what stands still in it."""
     mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
     data = scene.mjx_data.replace(qpos=qpos, mocap_pos=mocap_pos)
+    if scene.task.still is not None and layout is not None:
+        still = scene.task.still(layout)
+        turn = jnp.roll(Rotation.from_matrix(still.R).as_quat(), 1, axis=-1)  # w first
+        data = data.replace(
+            mocap_pos=mocap_pos.at[scene.still_mocap].set(still.p),
+            mocap_quat=data.mocap_quat.at[scene.still_mocap].set(turn),
+        )
     return mjx.kinematics(_model(scene, p_world_trocar), data)
 
 
