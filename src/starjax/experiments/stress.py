@@ -1,6 +1,7 @@
 """`starjax stress`: what breaks a trained policy, one disturbance at a time."""
 
 import dataclasses
+import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -50,7 +51,7 @@ class Options:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the trials that are missing; writes stress.json."""
+    """Runs the trials that are missing; writes stress.json, its table and its figure."""
     chosen = options.parse(Options, argv, prog="starjax stress", description=DESCRIPTION)
     named = subjects.find(chosen.run, chosen.policy)
     folder = _folder(named, chosen)
@@ -74,8 +75,19 @@ def main(argv: Sequence[str]) -> int:
             rows["levels"][f"{level:g}"] = score
             print(_line(f"{level:g} {kind.unit}", score), flush=True)
             files.write_json(folder / "stress.json", _content(who, chosen, argv, found))
+    _draw(folder, _content(who, chosen, argv, found))
     print(f"\nresult: {folder / 'stress.json'}")
     return 0
+
+
+def _draw(folder: Path, content: dict[str, Any]) -> None:
+    """Writes the table and the figure, where what draws is installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        return
+    from starjax.report import stress
+
+    for name, data in stress.files(content).items():
+        files.write_bytes(folder / name, data)
 
 
 def _folder(named: subjects.Named, chosen: Options) -> Path:
