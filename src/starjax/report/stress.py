@@ -52,7 +52,7 @@ def draw(found: Found, dark: bool = False) -> Any:
     count = max(len(kind["levels"]) for kind in kinds.values())
     is_undisturbed = all(float(next(iter(kind["levels"]))) == 0 for kind in kinds.values())
     with style.use(dark):
-        figure = style.figure(9.4, 5.3)
+        figure = style.figure(9.4, 5.0)
         success, error = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
         for rank in range(count):
             scores = [_at(kind["levels"], rank) for kind in kinds.values()]
