@@ -170,6 +170,7 @@ def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
         period,
         state.layout,
         state.step * period,
+        state.model,
     )
     moved = state.replace(
         physics=after,
