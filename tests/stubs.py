@@ -49,6 +49,7 @@ class State:
     pose: Pose
     gripper: jax.Array
     cameras: Any = None
+    endoscope: Any = None
 
 
 class Layout(NamedTuple):

@@ -33,6 +33,8 @@ def check(config: config_lib.RunConfig) -> None:
     for name in ("encoder_weights", "freeze_encoder"):
         sees = policy.observation == "image" or not getattr(policy, name)
         expect(sees, f"policy.{name}", "policy.observation image", policy.observation)
+    turns = policy.frame == "world" or policy.trocar_yaw == "azimuth"
+    expect(turns, "policy.trocar_yaw", "azimuth with policy.frame camera", policy.trocar_yaw)
     trained = bool(policy.encoder_weights) or not policy.freeze_encoder
     expect(trained, "policy.freeze_encoder", "policy.encoder_weights of a trained policy", "none")
 

@@ -60,6 +60,8 @@ class EnvState:
       solver_error: J, see `physics.Passed`, of the last control step.
       touch: `[A]` bool, the jaws touch something that they can grasp.
       pose: `[A]` measured tips in the world. gripper: `[A]` measured openings, [-1, 1].
+      endoscope: pose_world_camera that agents are told of the endoscope, see `sim.endoscope`; None
+        where the scene is not seen through one.
     """
 
     physics: physics.PhysicsState
@@ -90,6 +92,7 @@ class EnvState:
     touch: jax.Array
     pose: Pose
     gripper: jax.Array
+    endoscope: Pose | None = None
 
 
 class Env(NamedTuple):

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from starjax import rcm
+from starjax.sim.endoscope import Endoscope
 from starjax.types import Agent, Pose
 
 CONTROL_HZ = 30.0  # commands a second
@@ -193,6 +194,8 @@ class Task(NamedTuple):
         own MJCF are to do, for things that move by themselves.
       least_steps: control steps that any success takes; demonstrations may take so many whatever
         the usual limit is.
+      endoscope: of the camera `endoscope`, where the task can be seen through one that is held in a
+        trocar of its own; None where no such camera is among `cameras`, or a tool carries it.
     """
 
     name: str
@@ -225,6 +228,7 @@ class Task(NamedTuple):
     is_seen: np.ndarray = rcm.IS_SEEN
     drive: Callable[..., jax.Array] = _undriven
     least_steps: int = 0
+    endoscope: Endoscope | None = None
 
     @property
     def arms(self) -> int:
