@@ -82,7 +82,7 @@ def camera(names: SceneNames, size: int) -> Draw:
         qpos: jax.Array, held: Any, p_world_trocar: jax.Array, labels: dict[str, Any]
     ) -> jax.Array:
         rgb = scene.marked(made.task, made.bound, labels, jnp.asarray(made.geom_rgb))
-        return jax.lax.map(lambda step: one(*step, p_world_trocar, rgb), (qpos, held))
+        return jax.lax.map(lambda step: one(step[0], step[1], p_world_trocar, rgb), (qpos, held))
 
     def draw(
         qpos: np.ndarray,
