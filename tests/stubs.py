@@ -51,6 +51,7 @@ class State:
     cameras: Any = None
     model: Any = flax.struct.field(default_factory=dict)
     beside: Any = flax.struct.field(default_factory=dict)
+    endoscope: Any = None
 
 
 class Layout(NamedTuple):

@@ -31,7 +31,9 @@ class SceneConfig:
     # robots, one for each that the task asks for, or one for all; left out: the task's
     arm: tuple[str, ...] = ()
     tool: tuple[str, ...] = ()  # instruments that the arms hold; left out: the task's
-    camera: tuple[str, ...] = ()  # cameras that the policy sees; left out: the task's first
+    # cameras that the policy sees; left out, or fixed: the task's first. endoscope: one in a trocar
+    # of its own, elsewhere in every episode
+    camera: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,6 +85,9 @@ class PolicyConfig:
     # which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
     # trocar's azimuth, or an ablation
     trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
+    # where what is observed and predicted counts from: the world, or the endoscope that it is seen
+    # through, an ablation
+    frame: Literal["world", "camera"] = "world"
     roll_loss_weight: NotNegative = 0.1  # lambda of Eq. 15
     # of the networks' arithmetic in training; a trained policy decides in float32
     dtype: Literal["float32", "bfloat16"] = "float32"

@@ -125,6 +125,12 @@ def test_flags_override_the_preset_and_nothing_else():
         ("--preset cpu", "runs/cpu"),
         ("--preset cpu --seed=3", "runs/cpu-seed3"),
         ("--preset cpu --task reach --arm fr5 --camera side", "runs/cpu-reach-fr5-side"),
+        ("--preset gpu --cameras endoscope", "runs/gpu-endoscope"),
+        ("--preset gpu --cameras fixed", "runs/gpu"),
+        (
+            "--preset gpu --camera endoscope --policy.frame camera",
+            "runs/gpu-endoscope-camera-frame",
+        ),
         ("--preset cpu --policy.observation state --seed 3", "runs/cpu-state-seed3"),
         ("--preset cpu --policy.observation state --seed 3 --out runs/cpu", "runs/cpu"),
         ("--preset cpu --policy.no-freeze-encoder", "runs/cpu-unfrozen"),
@@ -180,7 +186,8 @@ def helped(command, capsys):
     usage, *lines = capsys.readouterr().out.replace("│", " ").splitlines()
     found, entry = {}, []
     for line in lines:
-        if flag := re.match(r"  (--?\w[^ ,]*)", line):
+        # Another name of a flag stands before it, with what it takes.
+        if flag := re.match(r"  (?:--\w+ \[.*\]\]?, )?(--?\w[^ ,]*)", line):
             entry = found[flag[1]] = re.split(r"\s{2,}", line.strip(), maxsplit=1)[1:]
         elif line.startswith(" " * 6):
             entry.append(line.strip())

@@ -64,6 +64,8 @@ class EnvState:
       pose: `[A]` measured tips in the world. gripper: `[A]` measured openings, [-1, 1].
       model: fields of the MJX model that are this episode's own, by name.
       beside: what wrappers of the environment carry, by name.
+      endoscope: pose_world_camera that agents are told of the endoscope, see `sim.endoscope`; None
+        where the scene is not seen through one.
     """
 
     physics: physics.PhysicsState
@@ -96,6 +98,7 @@ class EnvState:
     gripper: jax.Array
     model: dict[str, jax.Array] = flax.struct.field(default_factory=dict)
     beside: dict[str, Any] = flax.struct.field(default_factory=dict)
+    endoscope: Pose | None = None
 
 
 class Env(NamedTuple):

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from starjax import rcm
+from starjax.sim.endoscope import Endoscope
 from starjax.types import Agent, Pose
 
 CONTROL_HZ = 30.0  # commands a second
@@ -195,6 +196,8 @@ class Task(NamedTuple):
         touch nothing; None if there are none.
       least_steps: control steps that any success takes; demonstrations may take so many whatever
         the usual limit is.
+      endoscope: of the camera `endoscope`, where the task can be seen through one that is held in a
+        trocar of its own; None where no such camera is among `cameras`, or a tool carries it.
     """
 
     name: str
@@ -228,6 +231,7 @@ class Task(NamedTuple):
     drive: Callable[..., jax.Array] = _undriven
     still: Callable[..., Pose] | None = None
     least_steps: int = 0
+    endoscope: Endoscope | None = None
 
     @property
     def arms(self) -> int:
