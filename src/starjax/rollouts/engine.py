@@ -101,14 +101,8 @@ def make(
       run(params, group), which simulates at most `lanes` trials and yields Progress after every
       segment. A caller that needs no more may stop.
     """
-    key = jax.random.key(settings.seed)
-    if settings.stream is not None:
-        key = jax.random.fold_in(key, settings.stream)
-    shared, lane = placement.SHARED, placement.LANE
-    start = placement.split(_starter(env, agent), devices, (shared, shared, lane), lane)
-    advance = placement.split(
-        _advancer(env, agent, settings, record), devices, (shared, lane, shared), lane, donate=(1,)
-    )
+    key = _key(settings)
+    start, advance = _programs(env, agent, settings, record, devices)
 
     def run(params: Any, group: Sequence[episodes.Trial]) -> Generator[Progress]:
         carry = start(key, params, _filled(trocars, group, settings.lanes))
@@ -158,6 +152,45 @@ def make(
                     return
 
     return run
+
+
+def compile_ahead(
+    env: Any,
+    agent: BatchAgent,
+    params: Any,
+    trocars: Trocar,
+    settings: Settings,
+    record: episodes.Record,
+) -> None:
+    """Compiles what `make` makes for one device, so that jax's cache on disk has it.
+
+    The arguments are `make`'s, but for `params`: arrays like those to come, or their shapes.
+    """
+    start, advance = _programs(env, agent, settings, record, None)
+    begun = start.lower(_key(settings), params, _filled(trocars, [(0, 0)], settings.lanes))
+    advance.lower(params, begun.out_info, np.int32(0)).compile()
+    begun.compile()
+
+
+def _key(settings: Settings) -> jax.Array:
+    key = jax.random.key(settings.seed)
+    return key if settings.stream is None else jax.random.fold_in(key, settings.stream)
+
+
+def _programs(
+    env: Any,
+    agent: BatchAgent,
+    settings: Settings,
+    record: episodes.Record,
+    devices: Sequence[jax.Device] | None,
+) -> tuple[Any, Any]:
+    """What begins a batch of trials, and what runs a segment of it."""
+    shared, lane = placement.SHARED, placement.LANE
+    start = placement.split(_starter(env, agent), devices, (shared, shared, lane), lane)
+    advance = placement.split(
+        _advancer(env, agent, settings, record), devices, (shared, lane, shared), lane, donate=(1,)
+    )
+    return start, advance
 
 
 def _filled(trocars: Trocar, group: Sequence[episodes.Trial], lanes: int) -> Trials:
