@@ -124,6 +124,15 @@ def fit(
     return Normalizer(action=action, state=state)
 
 
+def shapes(method: methods.Method, task: Task, state: bool) -> Normalizer:
+    """What `fit` returns, without the numbers; of a dataset with or without the task state."""
+    size = task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
+    ends = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (size, task.state_size)]
+    reach = jax.ShapeDtypeStruct((2, size), jnp.float32)
+    action = MinMax(ends[0], ends[0], None if method.action_space in _ABSOLUTE else reach)
+    return Normalizer(action, MinMax(ends[1], ends[1]) if state else None)
+
+
 def _reach(
     box: MinMax, space: rcm.ActionSpace, task: Task, dataset: windows.Dataset, frames: np.ndarray
 ) -> jax.Array:

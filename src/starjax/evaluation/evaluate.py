@@ -88,7 +88,7 @@ def evaluate(
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     count = len(trocars.radius)
     group = [(i, trial) for i in range(count) for trial in range(settings.trials)]
-    max_steps = math.ceil(settings.time_limit_s * env.control_hz - 1e-6)
+    max_steps = _max_steps(env, settings)
     chosen = recorded.choose(count, settings.trials, settings.video_trials)
     several = len(place.devices or [0])
     device = (place.devices or jax.local_devices())[0]
@@ -124,6 +124,20 @@ def evaluate(
     return tables.join([*map(tables.from_columns, made)])
 
 
+def compile_ahead(
+    env: Any, agent: BatchAgent, params: Any, trocars: Trocar, settings: Settings
+) -> None:
+    """Compiles what `evaluate` will run on one device, so that jax's cache on disk has it.
+
+    The arguments are `evaluate`'s, but for `params`: arrays like those to come, or their shapes.
+    """
+    trocars = configurations.listed(trocars, len(env.p_world_ref))
+    trials = len(trocars.radius) * settings.trials
+    lanes = lanes_per_device(jax.local_devices()[0], trials)
+    rules = engine.Settings(settings.seed, None, _max_steps(env, settings), lanes)
+    engine.compile_ahead(env, agent, params, trocars, rules, episodes.SCORE)
+
+
 def lanes_per_device(device: jax.Device, trials: int) -> int:
     """Trials that a device of this kind runs together, where its share of them are `trials`.
 
@@ -152,6 +166,10 @@ def fingerprint(tree: Any) -> str:
         digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+def _max_steps(env: Any, settings: Settings) -> int:
+    return math.ceil(settings.time_limit_s * env.control_hz - 1e-6)
 
 
 def _check(settings: Settings, place: Place) -> None:

@@ -11,7 +11,7 @@ import starjax
 from starjax import config as config_lib
 from starjax import methods
 from starjax.experiments import estimate
-from starjax.runtime import files, xla
+from starjax.runtime import files, speed, xla
 
 STAGES = ("collect", "train", "evaluate", "report")
 
@@ -100,7 +100,7 @@ def _time(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
     import jax
 
     trocars, backend = len(_task(config).is_seen), jax.default_backend()
-    return f"  time            {estimate.line(config, stages, trocars, backend)}"
+    return f"  time            {estimate.line(config, stages, trocars, backend, speed.pace)}"
 
 
 def _seeing(config: config_lib.RunConfig) -> list[str]:

@@ -103,14 +103,8 @@ def make(
       run(params, group), which simulates at most `lanes` trials and yields Progress after every
       segment. A caller that needs no more may stop.
     """
-    key = jax.random.key(settings.seed)
-    if settings.stream is not None:
-        key = jax.random.fold_in(key, settings.stream)
-    world = _World(env.reset, env.step, env.observe, env.labels)
-    mind = _Mind(agent.init, agent.act)
-    start, advance = _programs(
-        world, mind, settings.max_steps, record, None if devices is None else tuple(devices)
-    )
+    key = _key(settings)
+    start, advance = _made(env, agent, settings, record, devices)
     given = {name: np.float32(level) for name, level in (levels or {}).items()}
 
     def run(params: Any, group: Sequence[episodes.Trial]) -> Generator[Progress]:
@@ -161,6 +155,44 @@ def make(
                     return
 
     return run
+
+
+def compile_ahead(
+    env: Any,
+    agent: BatchAgent,
+    params: Any,
+    trocars: Trocar,
+    settings: Settings,
+    record: episodes.Record,
+) -> None:
+    """Compiles what `make` makes for one device, so that jax's cache on disk has it.
+
+    The arguments are `make`'s, but for `params`: arrays like those to come, or their shapes.
+    """
+    start, advance = _made(env, agent, settings, record, None)
+    begun = start.lower(_key(settings), params, _filled(trocars, [(0, 0)], settings.lanes), {})
+    advance.lower(params, begun.out_info, np.int32(0)).compile()
+    begun.compile()
+
+
+def _key(settings: Settings) -> jax.Array:
+    key = jax.random.key(settings.seed)
+    return key if settings.stream is None else jax.random.fold_in(key, settings.stream)
+
+
+def _made(
+    env: Any,
+    agent: BatchAgent,
+    settings: Settings,
+    record: episodes.Record,
+    devices: Sequence[jax.Device] | None,
+) -> tuple[Callable[..., Carry], Callable[..., Any]]:
+    """What begins a batch of trials, and what runs a segment of it."""
+    world = _World(env.reset, env.step, env.observe, env.labels)
+    mind = _Mind(agent.init, agent.act)
+    return _programs(
+        world, mind, settings.max_steps, record, None if devices is None else tuple(devices)
+    )
 
 
 def _filled(trocars: Trocar, group: Sequence[episodes.Trial], lanes: int) -> Trials:
