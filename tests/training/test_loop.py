@@ -280,8 +280,8 @@ def test_training_learns(tmp_path):
 
 
 def test_killed_again_and_again_ends_the_same(tmp_path):
-    found = kill.survive(jobs.__file__, "train_and_export", tmp_path, kills=10)
-    assert found.kills >= 10
+    found = kill.survive(jobs.__file__, "train_and_export", tmp_path, kills=7)
+    assert found.kills == 7
     for name in ("policy.safetensors", "metrics.jsonl"):
         assert found.killed[name] == found.whole[name]
     last = {name.split("/")[1] for name in found.killed if name.startswith("checkpoints/step")}
@@ -293,7 +293,7 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "observation", "dtype", "tolerance"),
-    [(8, "state", "float32", 1e-4), (2, "image", "bfloat16", 5e-2)],
+    [(4, "state", "float32", 1e-4), (2, "image", "bfloat16", 5e-2)],
 )
 def test_many_devices_give_the_numbers_of_one(tmp_path, count, observation, dtype, tolerance):
     settings = dataclasses.replace(jobs.SETTINGS, holdout_demos=0)
