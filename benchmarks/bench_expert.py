@@ -17,8 +17,8 @@ import numpy as np
 
 from starjax import errors, rcm, runtime
 from starjax.evaluation import statistics
+from starjax.sim import drawn as sampling
 from starjax.sim import env as envs
-from starjax.sim import registry
 from starjax.types import Agent
 
 STEPS = 600  # control steps, 20 s, that demonstrations may take too
@@ -43,7 +43,7 @@ def main() -> None:
     agent, listed = experts[expert](), environment.task.trocars
     key = jax.random.key(arguments.seed)
     twelve = rcm.Trocar(*(jnp.repeat(jnp.asarray(f), arguments.per_trocar, axis=0) for f in listed))
-    drawn = _drawn(environment, jax.random.fold_in(key, 1), arguments.sampled)
+    drawn = sampling.trocars(jax.random.fold_in(key, 1), environment.task, (arguments.sampled,))
     enough = max(STEPS, environment.task.least_steps)
     steps = round(arguments.seconds * environment.control_hz) or enough
     results = {
@@ -58,23 +58,6 @@ def main() -> None:
     }
     name = _scene.result_name("expert", environment.names)
     print("written to", _timing.write(name, results))
-
-
-def _drawn(environment: envs.Env, key: jax.Array, count: int) -> rcm.Trocar:
-    """Trocars `[N, A]` drawn from the region of each arm (Eq. 19 with its ranges)."""
-    arms = []
-    for a, slot in enumerate(environment.task.slots):
-        region = registry.workspaces.get(slot.workspace)
-        arms.append(
-            rcm.sample_trocar(
-                jax.random.fold_in(key, a) if a else key,
-                (count,),
-                radius_range=region.radius,
-                polar_range=region.polar,
-                azimuth_range=region.azimuth,
-            )
-        )
-    return jax.tree.map(lambda *fields: jnp.stack(fields, axis=-1), *arms)
 
 
 def _score(

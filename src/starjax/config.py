@@ -75,13 +75,14 @@ class PolicyConfig:
     roll_history: bool = True  # the roll network reads the measured rolls
     roll_trocar: bool = True  # the roll network reads the trocar
     roll_observation: bool = False  # the roll network reads the image or the task state too
-    # whether the learner's model is given the trocar: as Table II says, or an ablation
+    # whether the learner's model is given the trocar: as the method says, or an ablation
     sees_trocar: Literal["method", "always", "never"] = "method"
     # which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
     # trocar's azimuth, or an ablation
     trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
     roll_loss_weight: NotNegative = 0.1  # lambda of Eq. 15
-    dtype: Literal["float32", "bfloat16"] = "float32"  # of the networks' arithmetic
+    # of the networks' arithmetic in training; a trained policy decides in float32
+    dtype: Literal["float32", "bfloat16"] = "float32"
     # Of the learner, see `learners.Learner`; None: its defaults. In JSON, and as flags, they stand
     # among the others.
     options: Any = dataclasses.field(default=None, metadata=INLINE)
@@ -135,7 +136,7 @@ class EvalConfig:
 class RunConfig:
     """One run of `python -m starjax.experiments.run`."""
 
-    method: str = "stardiff"  # a row of Table II, or all
+    method: str = "stardiff"  # of starjax list; all: the eight of Table II
     # starting values of the rest; auto: gpu where jax can use one, else cpu
     preset: Preset = "auto"
     seed: Seed = 0  # of everything random

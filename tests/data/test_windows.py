@@ -125,12 +125,22 @@ def test_non_finite_demonstrations_are_refused(dataset):
 
 
 def test_methods_are_table_two():
-    assert len(METHODS) == 8
+    assert len(methods.TABLE_II) == 8 and set(METHODS) - set(methods.TABLE_II) == {"stardiff_told"}
     assert all(isinstance(method, methods.Method) for method in METHODS.values())
     assert {name for name, method in METHODS.items() if method.projects} == {"dp_ee_proj"}
-    assert {name for name, method in METHODS.items() if method.hierarchical} == {"stardiff"}
+    assert {name for name, method in METHODS.items() if method.hierarchical} == {
+        "stardiff",
+        "stardiff_told",
+    }
     borrowed = {n: m.weights_of for n, m in METHODS.items() if m.weights_of != n}
     assert borrowed == {"dp_ee_proj": "dp_ee", "stardiff_single": "dp_rcm4"}
+
+
+def test_the_hierarchy_that_is_told_the_trocar_is_no_other():
+    told = methods.behaviour("stardiff_told")
+    assert told.sees_trocar and told._replace(sees_trocar=False, weights_of="stardiff") == (
+        methods.behaviour("stardiff")
+    )
 
 
 def test_only_the_given_frames_states_are_fitted(dataset):

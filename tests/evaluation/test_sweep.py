@@ -3,6 +3,7 @@
 import collections
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,18 +13,23 @@ import synthetic
 from starjax import rcm
 from starjax.evaluation import evaluate, sweep
 from starjax.rollouts import agent
+from starjax.sim import registry
 
 TRAINING = stubs.trocars(*range(8))
 P_REF = stubs.P_WORLD_REF[:1]
 
 
 def test_samples_stay_in_their_ranges_and_repeat():
-    drawn = sweep.sample(3, 500)
+    task, two = (registry.tasks.get(name) for name in ("peg_transfer", "needle_handover"))
+    drawn = sweep.sample(3, 500, task)
     assert (drawn.radius <= 0.05).all() and (np.abs(np.rad2deg(drawn.polar) - 90) <= 20).all()
-    np.testing.assert_array_equal(drawn.radius, sweep.sample(3, 500).radius)
-    assert drawn.radius.shape == (500, 1) and sweep.sample(3, 5, arms=2).radius.shape == (5, 2)
+    np.testing.assert_array_equal(drawn.radius, sweep.sample(3, 500, task).radius)
+    assert drawn.radius.shape == (500, 1) and sweep.sample(3, 5, two).radius.shape == (5, 2)
+    np.testing.assert_array_equal(  # as ever since 0.1
+        drawn.azimuth, rcm.sample_trocar(jax.random.key(3), (500, 1)).azimuth
+    )
     with pytest.raises(ValueError, match="count"):
-        sweep.sample(0, 0)
+        sweep.sample(0, 0, task)
 
 
 @pytest.mark.parametrize(("polars", "places"), [([70, 90, 110], 73), ([0, 90, 180], 29)])
@@ -62,7 +68,7 @@ def test_seen_are_the_training_trocars_and_none_beside_them():
 
 def test_a_sweep_of_a_policy(tmp_path):
     sample, params = stubs.make_policy(width=32)
-    drawn = sweep.sample(0, 12)
+    drawn = sweep.sample(0, 12, registry.tasks.get("peg_transfer"))
     found = evaluate.evaluate(
         tmp_path,
         stubs.make_env(),

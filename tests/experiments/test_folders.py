@@ -200,8 +200,8 @@ def test_a_damaged_record_of_times_starts_afresh_and_a_full_disk_hides_nothing(
 
 
 def test_eight_methods_have_six_sets_of_weights(tmp_path):
-    files = {folders.weights(tmp_path, name) for name in methods.METHODS}
-    assert len(methods.METHODS) == 8 and len(files) == 6
+    files = {folders.weights(tmp_path, name) for name in methods.TABLE_II}
+    assert len(methods.TABLE_II) == 8 and len(files) == 6
 
 
 def test_stardiff_single_is_dp_rcm4_and_nothing_else_is_a_twin():

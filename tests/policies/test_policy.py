@@ -141,8 +141,9 @@ def test_hierarchical_positions_do_not_know_the_trocar(made):
     assert np.abs(here.pose.R - there.pose.R).max() > 1e-3
 
 
-def test_trocar_conditioned_positions_do_know_it(made):
-    it = made("dp_rcm4")
+@pytest.mark.parametrize("name", ["dp_rcm4", "stardiff_told"])
+def test_trocar_conditioned_positions_do_know_it(made, name):
+    it = made(name)
     other = jax.tree.map(lambda x: jnp.roll(x, 1), it.batch.trocar)
     assert np.abs(it.commands().pose.p - it.commands(trocar=other).pose.p).max() > 1e-5
 
@@ -171,7 +172,12 @@ def test_a_missing_observation_is_named(made, dataset):
 
 @pytest.mark.parametrize(
     ("name", "sees", "wider"),
-    [("dp_ee", "always", 1), ("dp_rcm4", "never", -1), ("stardiff", "always", 1)],
+    [
+        ("dp_ee", "always", 1),
+        ("dp_rcm4", "never", -1),
+        ("stardiff", "always", 1),
+        ("stardiff_told", "never", -1),
+    ],
 )
 def test_a_method_may_be_given_the_trocar_or_not(made, dataset, name, sees, wider):
     changed = Made(name, dataset, sees_trocar=sees)

@@ -6,6 +6,9 @@ import sys
 
 import pytest
 
+from starjax import methods
+from starjax.report import style
+
 # Draws a figure of every kind of element, light and dark, and prints the digest of its files.
 DRAW = """
 import hashlib
@@ -72,3 +75,7 @@ def test_what_a_program_has_set_changes_nothing_and_stays(usual):
     setup = "import matplotlib\nmatplotlib.rcParams.update({'font.size': 30, 'lines.marker': 'o'})"
     after = "print(matplotlib.rcParams['font.size'] == 30)"
     assert drawn(f"{setup}\n{DRAW}\n{after}\n") == [*usual, "True", *usual]
+
+
+def test_every_method_has_a_look_of_its_own():
+    assert len({style.method(name) for name in methods.METHODS}) == len(methods.METHODS)

@@ -31,7 +31,7 @@ class Deployed:
     """A policy that is ready to decide; calling it runs one compiled program.
 
     Attributes:
-      method: its row of Table II, by name.
+      method: its row of `methods.METHODS`, by name.
       settings: what it was trained with. It asks for the last `obs_horizon` moments, in images of
         `image_size` pixels a side if `observation` is "image", and plans `horizon` control steps
         of 1/30 s, of which `execute` are carried out before it is asked again.

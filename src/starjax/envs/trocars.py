@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import errors, rcm
-from starjax.sim import registry
+from starjax.sim import drawn
 from starjax.sim.tasks.base import Task
 
 Draw = Callable[[jax.Array], rcm.Trocar]
@@ -20,7 +20,7 @@ def make(task: Task, trocar: str | int | tuple) -> Draw:
       errors.UsageError: the task has no configuration of that number, or not so many arms.
     """
     if trocar == "random":
-        return lambda key: _random(task, key)
+        return lambda key: drawn.trocars(key, task)
     if isinstance(trocar, tuple):
         fields = [np.asarray(field, np.float32) for field in trocar]
         if fields[0].shape not in ((1,), (task.arms,)):
@@ -43,12 +43,3 @@ def _listed(task: Task, rows: np.ndarray) -> Draw:
         return rcm.Trocar(*(jnp.asarray(field)[row] for field in chosen))
 
     return draw
-
-
-def _random(task: Task, key: jax.Array) -> rcm.Trocar:
-    drawn = []
-    for slot, key_slot in zip(task.slots, jax.random.split(key, task.arms), strict=True):
-        work = registry.workspaces.get(slot.workspace)
-        bounds = {"radius_range": work.radius, "polar_range": work.polar}
-        drawn.append(rcm.sample_trocar(key_slot, azimuth_range=work.azimuth, **bounds))
-    return rcm.Trocar(*(jnp.stack(field) for field in zip(*drawn, strict=True)))

@@ -66,7 +66,7 @@ class Result(NamedTuple):
     Attributes:
       schema: of the file.
       scene: the task, its arms, tools and cameras.
-      method: a row of Table II. observation: `image` or `state`.
+      method: a row of `methods.METHODS`. observation: `image` or `state`.
       seed: of the trials.
       time_limit_s: of a trial, simulated, 0 where the file does not say it.
       control_hz: control steps a second.

@@ -10,16 +10,20 @@ from starjax import errors, rcm
 from starjax.evaluation import statistics
 from starjax.evaluation import trials as tables
 from starjax.rcm.trocar import Trocar
+from starjax.sim import drawn
+from starjax.sim.tasks.base import Task
 
 BIN_WIDTH = 0.01  # m, of the distance to the nearest training trocar
 
 
-def sample(seed: int, count: int, arms: int = 1) -> Trocar:
-    """Draws configurations as in Eq. 19, in section V-A2's ranges: fields `[count, arms]`."""
+def sample(seed: int, count: int, task: Task) -> Trocar:
+    """Draws configurations as in Eq. 19, each arm in its workspace's ranges: fields `[count, A]`.
+
+    Those of peg transfer are section V-A2's.
+    """
     if count < 1:
         raise errors.UsageError("count", "1 or more", count)
-    drawn = rcm.sample_trocar(jax.random.key(seed), (count, arms))
-    return Trocar(*(np.asarray(field) for field in drawn))
+    return Trocar(*map(np.asarray, drawn.trocars(jax.random.key(seed), task, (count,))))
 
 
 def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray, arms: int = 1) -> Trocar:

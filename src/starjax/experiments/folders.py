@@ -71,7 +71,7 @@ def adopt_twin(out: Path, method: str) -> None:
 
 def selected(config: config_lib.RunConfig) -> list[str]:
     """The methods of a run, in the order of Table II."""
-    return list(methods.METHODS) if config.method == "all" else [config.method]
+    return list(methods.TABLE_II) if config.method == "all" else [config.method]
 
 
 def is_under_way(folder: Path) -> bool:

@@ -142,8 +142,8 @@ def _task_of(encoder_weights: str) -> str:
 
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
-    """Active ablations: settings that deviate from the method's row of Table II."""
-    rows = methods.METHODS.values() if method == "all" else [methods.METHODS[method]]
+    """Active ablations: settings that deviate from the method's row."""
+    rows = [methods.METHODS[name] for name in (methods.TABLE_II if method == "all" else [method])]
     sees, yaw = policy.sees_trocar, policy.trocar_yaw
     given = "given" if sees == "always" else "not given"
     told = sees != "method" and any(row.sees_trocar != (sees == "always") for row in rows)

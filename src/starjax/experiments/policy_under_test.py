@@ -45,7 +45,7 @@ def load(
     """Loads a method's weights.
 
     Args:
-      method: a row of Table II.
+      method: a row of `methods.METHODS`.
       weights: policy.safetensors.
       env: built from what the weights were trained on unless given.
       arms: robots of that env in the place of those that they were trained with.

@@ -78,7 +78,7 @@ def main(argv: Sequence[str]) -> int:
 
     who, config = subjects.load(named, chosen.arm)
     task = who.env.task
-    drawn = _trocars(chosen, task.arms)
+    drawn = _trocars(chosen, task)
     trials = config_lib.EvalConfig(**vars(chosen.eval))
     table = policy_under_test.rollouts(_trials(folder, chosen), who, drawn, trials, chosen.seed)
     if not processes.is_first():
@@ -143,17 +143,17 @@ def _trials(folder: Path, chosen: Options) -> Path:
     return folder / "sweep" / f"seed{chosen.seed}-{digest[:8]}"
 
 
-def _trocars(chosen: Options, arms: int) -> Any:
+def _trocars(chosen: Options, task: Any) -> Any:
     """The trocars that the flags describe."""
     import numpy as np
 
     from starjax.evaluation import sweep
 
     if not chosen.radii_cm:
-        return sweep.sample(chosen.seed, chosen.trocars, arms)
+        return sweep.sample(chosen.seed, chosen.trocars, task)
     azimuths = 2 * np.pi * np.arange(chosen.azimuths) / chosen.azimuths
     radii = np.array(chosen.radii_cm) / 100
-    return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths, arms)
+    return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths, task.arms)
 
 
 def _outcome(figures: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""The policy of a method: what its row of Table II says, learned as the settings say."""
+"""The policy of a method: what its row says, learned as the settings say."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ __all__ = ["Params", "Policy", "ablated", "make"]
 
 
 def ablated(method: methods.Method, policy_config: config.PolicyConfig) -> methods.Method:
-    """The row of Table II as settings change it: what it sees and how its poses are written."""
+    """The row as settings change it: what it sees and how its poses are written."""
     if policy_config.sees_trocar != "method":
         method = method._replace(sees_trocar=policy_config.sees_trocar == "always")
     fixed = f"{method.action_space}_fixed_yaw"
@@ -30,7 +30,7 @@ def make(
     """The policy of a method.
 
     Args:
-      method: a row of Table II.
+      method: a row of `methods.METHODS`.
       policy_config: networks, and the learner.
       task: gives the number of arms, and what a state observation is made of.
       train_config: augmentation, which inference does not need.

@@ -29,7 +29,7 @@ class Trained(NamedTuple):
     """A trained policy.
 
     Attributes:
-      method: its name, a row of Table II.
+      method: its name, a key of `methods.METHODS`.
       policy: networks and diffusion.
       train: how it was trained, for the record.
       params: the averaged (EMA) parameters.

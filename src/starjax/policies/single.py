@@ -1,4 +1,4 @@
-"""One model for the whole action: every row of Table II but the hierarchical one."""
+"""One model for the whole action: every method but the hierarchical ones."""
 
 from typing import Any, NamedTuple
 

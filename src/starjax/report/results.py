@@ -84,7 +84,7 @@ def load(path: Path) -> Run:
         raise errors.UsageError("path", "a run directory with a result.json", path)
     result = read(file)
     if result.method not in methods.METHODS:
-        raise errors.UsageError(f"{file}: method", "a method of Table II", repr(result.method))
+        raise errors.UsageError(f"{file}: method", "one of starjax list", repr(result.method))
     method = methods.METHODS[result.method]
     swept, bench = beside.sweep(path), beside.bench(path)
     log, curves = beside.curves(path, result)

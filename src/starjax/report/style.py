@@ -18,8 +18,11 @@ from starjax.report import stats
 
 SUCCESS, FAILURE = "#2083C5", "#D55E00"
 # In the order of the methods' table, so that a method keeps its colour in every figure.
-_METHODS = ("#D55E00", "#E69F00", "#CC79A7", "#8C6D4F", "#7F7F7F", "#56B4E9", "#009E73", "#2083C5")
-_MARKERS = "sD^v<>Po"
+_METHODS = (
+    *("#D55E00", "#E69F00", "#CC79A7", "#8C6D4F", "#7F7F7F", "#56B4E9", "#009E73", "#2083C5"),
+    "#7A5FB5",
+)
+_MARKERS = "sD^v<>PoX"
 _STROKES = ("-", "--", ":", "-.")
 _LINE, _HANDLE = 110, 8  # characters in a line of a legend, and what a handle takes of them
 MAP = "cividis"  # perceptually even, the same to every kind of colour vision

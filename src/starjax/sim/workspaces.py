@@ -45,14 +45,15 @@ BOARD = Workspace(
 )
 
 
-# Two arms at either side, their trocars apart and their rolls' zeros half a turn apart.
+# Two arms at either side, their rolls' zeros half a turn apart. Each trocar varies by 3 cm to and
+# fro and 4.3 cm along the board; for what that leaves a pair of them see `sim.tasks.two_arms`.
 LEFT = BOARD._replace(
-    radius=(0.03, 0.085),
-    polar=(math.radians(80), math.radians(100)),
-    azimuth=(math.radians(151), math.radians(209)),
+    radius=(0.054, 0.084),
+    polar=(math.radians(87), math.radians(93)),
+    azimuth=(math.radians(165), math.radians(195)),
 )
 RIGHT = LEFT._replace(
-    azimuth=(math.radians(-29), math.radians(29)),
+    azimuth=(math.radians(-15), math.radians(15)),
     roll_zero=math.pi,
     base_low=(0.2, -0.3, -0.4),
     base_high=(0.8, 0.3, 1.2),

@@ -67,7 +67,7 @@ def run(
     Interrupted and resumed, or run through: the result is the same to the last bit.
 
     Args:
-      method: row of Table II, whose own weights are trained.
+      method: row of `methods.METHODS`, whose own weights are trained.
       policy_config: networks and diffusion.
       train_config: optimisation.
       dataset: on the device (jax arrays) or on the host, see `windows.Dataset`; with features

@@ -7,11 +7,11 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from starjax import rcm
 from starjax.sim import bodies
-from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks import two_arms
+from starjax.sim.tasks.base import Capsules, Field, Task, Verdict, Views
 from starjax.sim.tasks.needle_handover import words
 from starjax.sim.tasks.needle_pick import task as single
 from starjax.types import Agent, Pose
@@ -123,27 +123,6 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 
 
-def _trocars() -> rcm.Trocar:
-    """Twelve pairs of trocars, each on its arm's side, 10 to 16 cm apart; the last four unseen."""
-    turn = (-24.0, -8.0, 8.0, 24.0)
-    pairs = [
-        (
-            (0.07 - 0.015 * (k % 2), 85.0 + 10.0 * (k // 2 % 2), 180.0 + turn[k % 4]),
-            (0.055 + 0.015 * (k % 2), 95.0 - 10.0 * (k // 4), turn[(3 * k + 1) % 4]),
-        )
-        for k in range(8)
-    ]
-    pairs += [
-        ((0.08, 80.0, 151.0), (0.08, 100.0, 29.0)),
-        ((0.08, 100.0, 209.0), (0.08, 80.0, -29.0)),
-        ((0.05, 90.0, 180.0), (0.05, 90.0, 0.0)),
-        ((0.08, 90.0, 180.0), (0.08, 90.0, 0.0)),
-    ]
-    radius, polar, azimuth = np.moveaxis(np.array(pairs), -1, 0)
-    fields = (radius, np.deg2rad(polar), np.deg2rad(azimuth))
-    return rcm.Trocar(*(field.astype(np.float32) for field in fields))
-
-
 def _nothing(bound: single.Bound, layout: Layout, facts: Facts) -> Capsules:
     """The needle is no obstacle: it gives way."""
     return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
@@ -158,11 +137,8 @@ def _expert() -> Agent:
 TASK = Task(
     name="needle_handover",
     mjcf="tasks/needle_handover/needle_handover.xml",
-    slots=(
-        Slot(workspace="left", p_world_ref=(0.0, 0.0, 0.15)),
-        Slot(workspace="right", p_world_ref=(0.0, 0.0, 0.15), roll_zero=float(np.pi)),
-    ),
-    cameras=("camera",),
+    slots=two_arms.SLOTS,
+    cameras=("side",),
     time_limit_s=60.0,
     settle_steps=single.SETTLE_STEPS,
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
@@ -185,5 +161,5 @@ TASK = Task(
     floor=single.FLOOR,
     is_sound=single.is_sound,
     outline=words.outline,
-    trocars=_trocars(),
+    trocars=two_arms.TROCARS,
 )

@@ -18,7 +18,7 @@ from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
 from starjax.sim.tasks.peg_transfer import words
 from starjax.types import Agent, Pose
 
-# The block, as in peg_transfer.xml (a test holds these to the compiled model).
+# The block, as in world.xml (a test holds these to the compiled model).
 RIM_RADIUS = 0.007  # from the axis to a wall's centre line
 WALL_RADIUS = 0.0015  # of the capsules
 RIM_HEIGHT = 0.009  # above the board when it stands

@@ -8,11 +8,11 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 
 from starjax import rcm
 from starjax.sim import bodies
-from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
+from starjax.sim.tasks import two_arms
+from starjax.sim.tasks.base import Capsules, Field, Task, Verdict, Views
 from starjax.sim.tasks.peg_transfer import task as single
 from starjax.sim.tasks.peg_transfer_bimanual import words
 from starjax.types import Agent, Pose
@@ -118,27 +118,6 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 
 
-def _trocars() -> rcm.Trocar:
-    """Twelve pairs of trocars, each on its arm's side, 6 to 10 cm apart; the last four unseen."""
-    turn = (-24.0, -8.0, 8.0, 24.0)
-    pairs = [
-        (
-            (0.04 - 0.01 * (k % 2), 85.0 + 10.0 * (k // 2 % 2), 180.0 + turn[k % 4]),
-            (0.03 + 0.01 * (k % 2), 95.0 - 10.0 * (k // 4), turn[(3 * k + 1) % 4]),
-        )
-        for k in range(8)
-    ]
-    pairs += [
-        ((0.05, 80.0, 151.0), (0.05, 100.0, 29.0)),
-        ((0.05, 100.0, 209.0), (0.05, 80.0, -29.0)),
-        ((0.03, 90.0, 180.0), (0.03, 90.0, 0.0)),
-        ((0.05, 90.0, 180.0), (0.05, 90.0, 0.0)),
-    ]
-    radius, polar, azimuth = np.moveaxis(np.array(pairs), -1, 0)
-    fields = (radius, np.deg2rad(polar), np.deg2rad(azimuth))
-    return rcm.Trocar(*(field.astype(np.float32) for field in fields))
-
-
 def _expert() -> Agent:
     from starjax.sim.tasks.peg_transfer_bimanual import expert
 
@@ -157,11 +136,8 @@ def bind(m: mujoco.MjModel) -> single.Bound:
 TASK = Task(
     name="peg_transfer_bimanual",
     mjcf="tasks/peg_transfer_bimanual/peg_transfer_bimanual.xml",
-    slots=(
-        Slot(workspace="left", p_world_ref=(0.0, 0.0, 0.15)),
-        Slot(workspace="right", p_world_ref=(0.0, 0.0, 0.15), roll_zero=float(np.pi)),
-    ),
-    cameras=("camera",),
+    slots=two_arms.SLOTS,
+    cameras=("side",),
     time_limit_s=60.0,
     settle_steps=single.SETTLE_STEPS,
     fields=(
@@ -188,5 +164,5 @@ TASK = Task(
     floor=0.0,
     is_sound=single.is_sound,
     outline=words.outline,
-    trocars=_trocars(),
+    trocars=two_arms.TROCARS,
 )

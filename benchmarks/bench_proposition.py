@@ -1,0 +1,208 @@
+"""Where Proposition 1 holds: the share of the expert's wanted tip position that the trocar decides.
+
+    python benchmarks/bench_proposition.py --task needle_pick [--scenes 16] [--seed 2026]
+
+The proposition says that the wanted position does not depend on the trocar. So each of some scenes
+is played at every trocar of the task, with the same objects, the same choices of the expert and the
+same disturbance: what then differs between the trocars of a scene is the trocar's doing. Positions
+are the undisturbed ones that demonstrations record. They are compared at the same progress within
+the same phase of the expert's first attempt: progress is the share of the phase's own duration, as
+paths through other trocars may take longer, and s in a phase without an end.
+
+With y the position at scene s, trocar c and progress g, of one arm and phase,
+
+    trocar = mean over s, c, g of |y - mean_c y|^2      scene = mean over g of var_s (mean_c y)
+    share  = trocar / (trocar + scene)
+
+and beside the share, which a phase with nearly one place for all scenes makes large, the root of
+`trocar` in mm: how far a trocar moves the wanted tip. `common` is the part of it that is the same
+in all scenes. A task's own figures average the variances over its phases, weighted by their time.
+Of two arms each is looked at alone, and their trocars change together. Intervals draw scenes anew.
+
+What is given is the start of a scene. A policy that sees how an object lies in its jaws by now
+knows more, so the share bounds from above what is lost by not telling it the trocar.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import _decomposition
+import _scene
+import _timing
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import rcm, runtime
+from starjax.runtime import provenance
+from starjax.sim import env as envs
+from starjax.types import Agent
+
+# Names of the phases of scripts that only number them, in order.
+PHASES = {
+    "peg_transfer": "raise approach descend close lift carry lower open retreat wait",
+    "needle_pick": "raise approach descend close lift hold",
+    "ring_on_wire": "raise approach descend close lift carry lower open leave wait",
+    "reach": "move rest",
+    "endoscope_track": "find follow",
+}
+
+
+def main() -> None:
+    runtime.prepare_xla()
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=16)
+    parser.add_argument("--seed", type=int, default=2026)
+    _scene.add_flags(parser)
+    arguments = parser.parse_args()
+    environment = _scene.make(arguments, observation="state")
+    task = environment.task
+    agent = next(iter(task.experts.values()))()
+    start = time.perf_counter()
+    trials, successes = play(environment, agent, arguments.scenes, arguments.seed)
+    found = {
+        "commit": provenance.code().commit,
+        "dirty": provenance.code().dirty,
+        "scene": environment.names._asdict(),
+        "seed": arguments.seed,
+        "scenes": arguments.scenes,
+        "trocars": len(trials[0]),
+        "episodes": sum(map(len, trials)),
+        "successes": successes,
+        **decomposed(trials, names(task.name, agent), task.arms),
+        "wall_s": time.perf_counter() - start,
+    }
+    for name, arm in found["arms"].items():
+        print(f"{task.name}, {name}: {summary(arm)}")
+        for phase, row in arm["phases"].items():
+            print(f"  {phase:9} {summary(row)}, {row['scenes']} scenes")
+    print("written to", _timing.write("proposition", {"results": {task.name: found}}))
+
+
+def names(task: str, agent: Agent) -> list[str]:
+    """Names of the expert's phases."""
+    known = getattr(sys.modules[agent.act.__module__], "PHASES", PHASES.get(task, "").split())
+    return list(known)
+
+
+def play(
+    environment: envs.Env, agent: Agent, scenes: int, seed: int
+) -> tuple[list[list[list[_decomposition.Segment]]], int]:
+    """Segments `[S][C]` of all trials, and how many of them succeed."""
+    listed = environment.task.trocars
+    steps = max(600, environment.task.least_steps)
+    run = jax.jit(jax.vmap(_episode(environment, agent, steps), in_axes=(0, None)))
+    keys = jax.random.split(jax.random.key(seed), scenes)
+    trials: list[list[list[_decomposition.Segment]]] = [[] for _ in range(scenes)]
+    successes = 0
+    for c in range(len(listed.radius)):
+        trocar = rcm.Trocar(*(jnp.asarray(field[c]) for field in listed))
+        live, success, *series = jax.device_get(run(keys, trocar))
+        successes += int(success.sum())
+        for s, length in enumerate(live.sum(1)):
+            trials[s].append(_decomposition.first_attempt(*(x[s, :length] for x in series)))
+    return trials, successes
+
+
+def _episode(environment: envs.Env, agent: Agent, steps: int) -> Callable[..., Any]:
+    """(key, trocar) -> whether it ran `[T]`, success, and what `first_attempt` reads."""
+
+    def run(key: jax.Array, trocar: rcm.Trocar) -> tuple[jax.Array, ...]:
+        key_reset, key_expert = jax.random.split(key)
+        state = environment.reset(key_reset, envs.EnvParams(trocar))
+        carry = (state, agent.init(key_expert, state))
+        blank = jax.tree.map(lambda s: jnp.zeros((steps, *s.shape), s.dtype), _shapes(agent, carry))
+
+        def step(loop):
+            (state, memory), rows = loop
+            command, memory, label = agent.act(memory, state)
+            row = (jnp.ones((), bool), *where(agent, memory), label.pose.p)
+            rows = jax.tree.map(lambda all_, one: all_.at[state.step].set(one), rows, row)
+            return (environment.step(state, command), memory), rows
+
+        def is_on(loop):
+            return ~loop[0][0].done & (loop[0][0].step < steps)
+
+        (state, _), rows = jax.lax.while_loop(is_on, step, (carry, blank))
+        return rows[0], state.success, *rows[1:]
+
+    return run
+
+
+def _shapes(agent: Agent, carry: Any) -> Any:
+    def row(state, memory):
+        _, memory, label = agent.act(memory, state)
+        return (jnp.ones((), bool), *where(agent, memory), label.pose.p)
+
+    return jax.eval_shape(row, *carry)
+
+
+def where(agent: Agent, memory: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Phase, s in it, and progress of a script.
+
+    One without phases is on its way for its duration, and at its goal afterwards.
+    """
+    if hasattr(memory, "phase"):
+        known = sys.modules[agent.act.__module__]
+        duration = (
+            memory.duration
+            if hasattr(memory, "duration")
+            else jnp.asarray(known.DURATION)[memory.phase] / memory.tempo
+        )
+        return memory.phase, memory.elapsed, jnp.minimum(memory.elapsed / duration, 1.0)
+    after = memory.elapsed - memory.duration
+    is_there = after > 0
+    progress = jnp.where(is_there, after, memory.elapsed / memory.duration)
+    return is_there.astype(jnp.int32), memory.elapsed, progress
+
+
+def decomposed(
+    trials: list[list[list[_decomposition.Segment]]], phases: list[str], arms: int
+) -> dict[str, Any]:
+    """`arms`: name -> figures of the task and of its `phases`."""
+    crossed = _decomposition.crossed(trials)
+    spent = {
+        phase: np.mean([sum(len(s.p) for s in x if s.phase == phase) for y in trials for x in y])
+        for phase in crossed
+    }
+    found: dict[str, Any] = {}
+    for arm in range(arms):
+        rows: dict[str, Any] = {}
+        every: list[np.ndarray] = []
+        weights: list[float] = []
+        for phase, visits in crossed.items():
+            mine = [visit[:, :, :, arm] for visit in visits]
+            even = [1.0] * len(mine)
+            name = phases[phase] if phase < len(phases) else str(phase)
+            rows[name] = _figures(mine, even) | {"scenes": max(map(len, mine))}
+            every += mine
+            weights += [float(spent[phase]) / len(mine)] * len(mine)
+        most = max(rows, key=lambda name: rows[name]["trocar_mm"])
+        found[f"arm{arm}"] = {
+            **_figures(every, weights),
+            "most": {"phase": most, **rows[most]},
+            "phases": rows,
+        }
+    return {"arms": found}
+
+
+def _figures(p: list[np.ndarray], weights: list[float]) -> dict[str, Any]:
+    parts = _decomposition.together([_decomposition.parts(x) for x in p], weights)
+    rms = {name: 1e3 * value**0.5 for name, value in parts._asdict().items()}
+    low, high = _decomposition.interval(p, weights)
+    return {"share": parts.share, "low": low, "high": high} | {
+        f"{name}_mm": value for name, value in rms.items()
+    }
+
+
+def summary(row: dict[str, Any]) -> str:
+    """A row in words."""
+    share = f"{100 * row['share']:.1f}% ({100 * row['low']:.1f}-{100 * row['high']:.1f})"
+    return f"{share}; the trocar moves it {row['trocar_mm']:.2f} mm, scenes {row['scene_mm']:.2f}"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,25 @@
+"""Trocars drawn for a task: those of each arm from its own workspace."""
+
+import jax
+import jax.numpy as jnp
+
+from starjax import rcm
+from starjax.sim import registry
+from starjax.sim.tasks.base import Task
+
+
+def trocars(key: jax.Array, task: Task, shape: tuple[int, ...] = ()) -> rcm.Trocar:
+    """Draws configurations, fields `[*shape, A]`: Eq. 19 with the ranges of each workspace."""
+    arms = []
+    for a, slot in enumerate(task.slots):
+        work = registry.workspaces.get(slot.workspace)
+        arms.append(
+            rcm.sample_trocar(
+                jax.random.fold_in(key, a) if a else key,
+                shape,
+                radius_range=work.radius,
+                polar_range=work.polar,
+                azimuth_range=work.azimuth,
+            )
+        )
+    return jax.tree.map(lambda *fields: jnp.stack(fields, axis=-1), *arms)

@@ -1,0 +1,86 @@
+"""Pairs of trocars: as far apart as surgeons place them, wherever they are drawn."""
+
+import itertools
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from starjax import rcm
+from starjax.envs import trocars
+from starjax.evaluation import sweep
+from starjax.sim import registry, scene
+from starjax.sim.tasks import two_arms
+
+DRAWN = 10_000
+COLLISION = 0.0005  # m, overlap that is called one
+REGION = 0.055  # m, across: each trocar varies within 3 to 5 cm
+
+
+def ports(pairs):
+    places = np.array([slot.p_world_ref for slot in two_arms.SLOTS], np.float32)
+    return np.asarray(rcm.trocar_position(pairs, places), np.float64)
+
+
+def corners():
+    """Every corner of both workspaces, `[4096, 2]`; the middle of their ranges too."""
+    ends = []
+    for slot in two_arms.SLOTS:
+        work = registry.workspaces.get(slot.workspace)
+        ranges = [np.linspace(*r, 4) for r in (work.radius, work.polar, work.azimuth)]
+        ends.append(np.array(list(itertools.product(*ranges)), np.float32))
+    left, right = (x.reshape(-1, 3) for x in np.broadcast_arrays(ends[0][:, None], ends[1]))
+    return rcm.Trocar(*np.stack([left, right], axis=1).transpose(2, 0, 1))
+
+
+PAIRS = {
+    "twelve": lambda: two_arms.TROCARS,
+    "corners": corners,
+    "swept": lambda: sweep.sample(0, DRAWN, registry.tasks.get("peg_transfer_bimanual")),
+    "played": lambda: jax.vmap(trocars.make(registry.tasks.get("needle_handover"), "random"))(
+        jax.random.split(jax.random.key(1), DRAWN)
+    ),
+}
+
+
+@pytest.mark.parametrize("source", PAIRS)
+def test_a_pair_is_100_to_170_mm_and_37_to_60_degrees_apart(source):
+    p = ports(PAIRS[source]())
+    apart = np.linalg.norm(p[:, 0] - p[:, 1], axis=-1)
+    shafts = p / np.linalg.norm(p, axis=-1, keepdims=True)  # to the middle of the board
+    angle = np.rad2deg(np.arccos((shafts[:, 0] * shafts[:, 1]).sum(-1)))
+    assert apart.min() >= 0.1 and apart.max() <= 0.17
+    assert angle.min() >= 37 and angle.max() <= 60
+    for arm in range(2):
+        assert np.ptp(p[:, arm], axis=0).max() < REGION
+    if source != "twelve":
+        assert (np.ptp(p, axis=0)[:, :2] > 0.028).all()
+
+
+def test_six_blocks_stand_side_by_side_at_any_yaw():
+    m = scene.compose(scene.name("peg_transfer_bimanual"))
+    pegs = registry.tasks.get("peg_transfer_bimanual").bind(m).pegs
+    apart = np.linalg.norm(pegs[:, None] - pegs, axis=-1)[~np.eye(len(pegs), dtype=bool)]
+    parts = [g for g in range(m.ngeom) if m.geom(g).name.startswith(("wall", "corner", "leg"))]
+    ends = [  # capsules: their axes, and how thick they are
+        np.linalg.norm((m.geom_pos[g] + s * m.geom_size[g, 1] * axis(m.geom_quat[g]))[:2])
+        + m.geom_size[g, 0]
+        for g in parts
+        for s in (-1, 1)
+    ]
+    assert apart.min() > 2 * max(ends) - COLLISION
+
+
+def axis(quat):
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, quat)
+    return R.reshape(3, 3)[:, 2]
+
+
+def test_unseen_pairs_are_at_the_edge_and_in_the_middle():
+    task = registry.tasks.get("peg_transfer_bimanual")
+    p = ports(task.trocars)
+    apart = np.linalg.norm(p[:, 0] - p[:, 1], axis=-1)
+    assert set(np.argsort(apart)[[0, -1]]) <= set(np.flatnonzero(~task.is_seen))
+    assert task.trocars is registry.tasks.get("needle_handover").trocars
