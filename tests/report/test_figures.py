@@ -41,7 +41,7 @@ def test_success_is_pooled_by_distance_and_drawn_with_its_interval(one):
     assert both == 2 * alone
 
 
-def test_ports_from_above_are_at_their_places_and_unseen_ones_orange(one):
+def test_trocars_from_above_are_at_their_places_and_unseen_ones_orange(one):
     shown = figures.distance([one], one).axes[1].collections[0]
     groups = [group[0] for group in outcomes.by_trocar(one.trials)]
     wanted = [
@@ -53,7 +53,7 @@ def test_ports_from_above_are_at_their_places_and_unseen_ones_orange(one):
     assert orange == [not trial.seen for trial in groups]
 
 
-def test_the_map_weighs_ports_by_their_trials_and_ends_far_from_all():
+def test_the_map_weighs_trocars_by_their_trials_and_ends_far_from_all():
     axis, at = Figure().subplots(), np.array([[-5.0, 0.0], [5.0, 0.0]])
     shown = figures._heat(axis, at, np.array([1.0, 0.0]), np.array([3, 1]))
     assert shown.get_array()[80, 80] == pytest.approx(0.75)

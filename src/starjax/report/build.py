@@ -124,7 +124,7 @@ def _turned(runs: Sequence[results.Run], report: Callable[[str], None]) -> turne
     """Rollouts in 3D, or None, after a line where that has a reason."""
     try:
         return turned.record(runs)
-    except (OSError, RuntimeError, errors.UsageError) as error:  # no port, or an unknown scene
+    except (OSError, RuntimeError, errors.UsageError) as error:  # no trocar, or an unknown scene
         report(f"no rollouts in 3D: {error}")
         return None
 
