@@ -243,6 +243,7 @@ def test_damaged_checkpoint_costs_only_its_steps(whole, tmp_path):
     assert_same_bytes(again.state, result.state)
 
 
+@pytest.mark.slow
 def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
     directory, result = whole
     hosted = jobs.train(tmp_path, host=True)
@@ -269,6 +270,7 @@ def test_images_train_too_and_packed_parameters_give_the_same_run_and_resume(tmp
         np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_training_learns(tmp_path):
     settings = dataclasses.replace(
         jobs.SETTINGS, steps=300, log_every=50, checkpoint_every=300, steps_per_call=50
@@ -279,6 +281,7 @@ def test_training_learns(tmp_path):
     assert result.samples_per_second > 0
 
 
+@pytest.mark.slow
 def test_killed_again_and_again_ends_the_same(tmp_path):
     found = kill.survive(jobs.__file__, "train_and_export", tmp_path, kills=7)
     assert found.kills == 7
