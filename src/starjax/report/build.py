@@ -10,11 +10,11 @@ from starjax.report import (
     compare,
     figures,
     page,
-    ports,
     results,
     stage,
     style,
     tables,
+    training_trocars,
     trajectories,
     turned,
     video,
@@ -79,10 +79,10 @@ def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
 
 def _name(run: results.Run, runs: Sequence[results.Run]) -> str:
     alike = [other for other in runs if other.label == run.label]
-    trocars = [ports.trained_at(other) for other in alike]
-    counts = {ports.trained_at(other) for other in runs if other.trials}
+    trocars = [training_trocars.trained_at(other) for other in alike]
+    counts = {training_trocars.trained_at(other) for other in runs if other.trials}
     if run.trials and len(counts) > 1 and len(set(trocars)) == len(trocars):
-        count = ports.trained_at(run)
+        count = training_trocars.trained_at(run)
         return f"{run.label} ({count} trocar{'s' if count > 1 else ''})"
     if len(alike) == 1:
         return run.label
@@ -143,7 +143,7 @@ def _figures(
     }
     evaluated = [run for run in runs if run.trials]
     if evaluated and focus.trials:
-        drawings["ports"] = lambda dark: ports.draw(evaluated, dark)
+        drawings["ports"] = lambda dark: training_trocars.draw(evaluated, dark)
         drawings["fig4"] = lambda dark: figures.distance(evaluated, focus, dark)
     if any(run.rollouts for run in runs):
         shown = compare.representatives(runs)

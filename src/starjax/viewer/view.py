@@ -7,9 +7,9 @@ from starjax import errors
 from starjax.sim import registry
 from starjax.viewer import actors, panel
 from starjax.viewer.actors import Actor
-from starjax.viewer.beside import Rollouts
 from starjax.viewer.clock import Clock
-from starjax.viewer.words import Status, notify
+from starjax.viewer.side_by_side import Rollouts
+from starjax.viewer.status import Status, notify
 
 THEIRS = "their own"  # of arms
 
