@@ -98,7 +98,7 @@ def _all_apart(seeds: Sequence[int | None]) -> bool:
 
 
 def _place(run: results.Run, others: Sequence[results.Run]) -> str:
-    """As much of a run's path, from its end, as sets it apart."""
+    """The end of a run's path, as long as it takes to set it apart."""
     parts = [other.path.absolute().parts for other in others]
     for count in range(2, max(map(len, parts))):
         if len({path[-count:] for path in parts}) == len(parts):

@@ -19,7 +19,7 @@ class Asked(NamedTuple):
 
     Attributes:
       who: one actor, or two of one task for side by side.
-      arm: robot in the place of theirs, or `THEIRS`.
+      arm: robot instead of theirs, or `THEIRS`.
       trocar: number of the task's configuration. seed: of the trials.
     """
 
@@ -87,7 +87,7 @@ class Cast:
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Robots in the place of the actors' own."""
+        """Robots instead of the actors' own."""
         return () if self._choices["arm"] == THEIRS else (self._choices["arm"],)
 
     def actors(self) -> list[Actor]:
