@@ -49,6 +49,8 @@ class State:
     pose: Pose
     gripper: jax.Array
     cameras: Any = None
+    model: Any = flax.struct.field(default_factory=dict)
+    beside: Any = flax.struct.field(default_factory=dict)
 
 
 class Layout(NamedTuple):

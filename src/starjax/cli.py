@@ -42,6 +42,11 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "score a trained policy while something is wrong",
         _LEARNING,
     ),
+    "exercise": (
+        "starjax.experiments.exercise",
+        "six blocks one after another with two arms, beside people's times",
+        _LEARNING,
+    ),
     "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)", _LEARNING),
     "serve": (
         "starjax.experiments.serve",

@@ -45,6 +45,9 @@ class DemosConfig:
     keep_failures: bool = False  # store failed episodes too; training leaves them out
     expert: str = ""  # which of the task's scripted demonstrators; left out, its first
     max_steps: Count = 600  # control steps, at 30 Hz, that the expert may take
+    # what is wrong while they are recorded, each NAME=LEVEL with the names of starjax stress: at
+    # levels that are drawn for every episode, up to these
+    randomise: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

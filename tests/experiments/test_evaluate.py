@@ -17,6 +17,7 @@ from starjax.data import normalizer
 from starjax.evaluation import sweep as sweeping
 from starjax.experiments import (
     evaluate,
+    exercise,
     folders,
     policy_under_test,
     presets,
@@ -27,6 +28,8 @@ from starjax.experiments import (
 from starjax.policies import packaged, policy_file
 from starjax.report import video
 from starjax.runtime import files, gpu
+from starjax.sim import exercise as exercising
+from starjax.sim.tasks.peg_transfer_bimanual import six
 
 POLICY = dataclasses.replace(fakes.TINY, execute=4)
 
@@ -361,6 +364,11 @@ def test_a_policy_is_scored_at_every_level(file, capsys):
     levels = found["disturbances"]["trocar_told"]["levels"]
     assert list(levels) == ["0", "5"] and found["method"] == "dp_rcm2"
     assert all(level["strict"]["trials"] == 12 for level in levels.values())
+    force = [level["wall_force_N"] for level in levels.values()]
+    assert all(0 < level["mean"] <= level["p99"] <= level["max"] for level in force)
+    assert {"stress.md", "stress.png", "stress.pdf"} < {
+        path.name for path in result.parent.iterdir()
+    }
     chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
     assert stressed("--disturbance", "trocar_told", "--levels", "0", "5") == 0 and chunks
     assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
@@ -370,5 +378,31 @@ def test_a_policy_is_scored_at_every_level(file, capsys):
 def test_a_policy_of_states_meets_no_disturbance_of_images(file):
     with mistakes.of("disturbance", "smoke"):
         stressed("--disturbance", "smoke")
-    with mistakes.of("disturbance", "rain"):
-        stressed("--disturbance", "rain")
+    with mistakes.of("levels", 5.0):
+        stressed("--disturbance", "late_view", "--levels", "0", "5")
+
+
+def test_the_exercise_is_for_policies_of_its_task(file):
+    with mistakes.of("RUN or --policy", "of reach"):
+        exercise.main(["--policy", "mine.safetensors"])
+
+
+def test_the_expert_at_the_exercise(file, monkeypatch, capsys):
+    env, task = stubs.make_env(), stubs.make_task()._replace(labels=("moved",))
+    env = env._replace(
+        task=task, labels=lambda state: {"moved": 5 + state.success.astype(jnp.int32)}
+    )
+    monkeypatch.setattr(exercising, "make", lambda *_, **__: env)
+    monkeypatch.setattr(exercising, "anew", lambda agent: agent)
+    monkeypatch.setattr(six, "TASK", task)
+    assert exercise.main(["--trials", "2"]) == 0
+    (result,) = file.parent.rglob("exercise.json")
+    found = json.loads(result.read_text())
+    assert found["expert"] == "default" and found["complete"]["trials"] == 24
+    won = found["complete"]["successes"]
+    assert won and found["moved"]["counts"] == [0, 0, 0, 0, 0, 24 - won, won]
+    assert 0 < found["seconds"]["median"] <= found["seconds"]["p90"] < found["people"]["limit_s"]
+    chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
+    assert exercise.main(["--trials", "2"]) == 0 and chunks
+    assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
+    assert f"in {won} of 24 trials" in capsys.readouterr().out

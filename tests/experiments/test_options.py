@@ -13,6 +13,7 @@ from starjax import cli, config
 from starjax.experiments import (
     bench,
     evaluate,
+    exercise,
     export_command,
     import_command,
     options,
@@ -29,6 +30,7 @@ OPTIONS = {
     **dict.fromkeys(("run", "collect", "train"), config.RunConfig),
     **{"evaluate": evaluate.Options, "sweep": sweep.Options, "bench": bench.Options},
     **{"stress": stress.Options, "pack": pack.Options, "report": report_command.Options},
+    **{"exercise": exercise.Options},
     **{"export": export_command.Options, "import": import_command.Options},
 }
 
@@ -64,6 +66,11 @@ def settings(typed: str) -> config.RunConfig:
         ("sweep", "x --eval.time-limit-s soon", "--eval.time-limit-s", "'soon'"),
         ("stress", "", "RUN or --policy", "none"),
         ("stress", "--policy compact --levels 1", "levels", "none or several"),
+        ("exercise", "x --policy y", "RUN or --policy", "both"),
+        ("stress", "--policy compact --disturbance rain", "disturbance", "'rain'"),
+        ("run", "--demos.randomise rain=1", "demos.randomise", "'rain'"),
+        ("run", "--demos.randomise smoke", "demos.randomise", "smoke"),
+        ("run", "--demos.randomise smoke=1 --demos.from x", "demos.randomise", "x"),
         ("report", "--out x", "RUN", "none"),
         ("pack", "a b c", "FLAG", "c"),
         ("bench", "x --calls 0", "calls", 0),
@@ -86,6 +93,8 @@ def test_the_nearest_flag_is_suggested():
         ("run --train.stepps 3", {"jax", "mujoco", "numpy"}),
         ("run --seed -1", {"jax", "mujoco", "numpy"}),
         ("sweep x --trocars 0", {"jax", "mujoco"}),
+        ("stress --policy compact --disturbance rain", {"jax", "mujoco"}),
+        ("run --demos.randomise rain=1", {"jax", "mujoco", "numpy"}),
     ],
 )
 def test_mistakes_are_one_line_and_come_before_jax(typed, heavy):

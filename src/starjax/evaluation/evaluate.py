@@ -64,6 +64,7 @@ def evaluate(
     *,
     place: Place = ANYWHERE,
     identity: Mapping[str, Any] | None = None,
+    levels: Mapping[str, float] | None = None,
     report: Callable[[str], None] = print,
 ) -> tables.Table:
     """Runs what is missing of an evaluation and returns all of it.
@@ -75,6 +76,7 @@ def evaluate(
       trocars: fields `[C, A]`.
       place: where the lanes are 0, `lanes_per_device`, and so few that all devices have a share.
       identity: JSON values that tell this agent from others with the same params.
+      levels: of what disturbs the environment.
       report: gets lines for the user.
 
     Raises:
@@ -99,6 +101,7 @@ def evaluate(
             "weights": fingerprint(params),
             "agent": agent.about,
             "identity": dict(identity or {}),
+            **({"levels": dict(levels)} if levels else {}),
             "scene": env.names._asdict(),
             "model": schema.model_hash(env.scene),
             "platform": device.platform,
@@ -111,7 +114,7 @@ def evaluate(
         found = share.first("sizes", lambda: _resume(directory, plan, sizes, most, several, report))
         lanes, chunk = found
         rules = engine.Settings(settings.seed, None, max_steps, lanes * several)
-        run = engine.make(env, agent, trocars, rules, episodes.SCORE, place.devices)
+        run = engine.make(env, agent, trocars, rules, episodes.SCORE, place.devices, levels)
         spans = [slice(first, first + chunk) for first in range(0, len(group), chunk)]
         parts = _parts(directory, env, lambda trials: run(params, trials), group, spans, chosen)
         made = chunks.complete(share, parts, "Evaluation", "trials", report)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -101,9 +101,14 @@ def _load(
 
 
 def rollouts(
-    directory: Path, who: Subject, trocars: rcm.Trocar, settings: config_lib.EvalConfig, seed: int
+    directory: Path,
+    who: Subject,
+    trocars: rcm.Trocar,
+    settings: config_lib.EvalConfig,
+    seed: int,
+    levels: Mapping[str, float] | None = None,
 ) -> table.Table:
-    """Runs what is missing of an evaluation."""
+    """Runs what is missing of an evaluation; `levels` are of what disturbs its environment."""
     trained = who.trained
     planner = agent.from_policy(
         who.policy.sample, trained.policy.obs_horizon, trained.policy.execute
@@ -126,6 +131,7 @@ def rollouts(
             **methods.behaviour(who.method)._asdict(),
             "policy": config_lib.as_json(trained.policy),
         },
+        levels=levels,
         report=messages.indented,
     )
 

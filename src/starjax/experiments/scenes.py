@@ -1,6 +1,8 @@
 """The scene of a run: names that are left out become the task's own."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors
@@ -11,6 +13,24 @@ def settings(names: SceneNames) -> config_lib.SceneConfig:
     """The settings that name a scene in full."""
     return config_lib.SceneConfig(
         task=names.task, arm=names.arms, tool=names.tools, camera=names.cameras
+    )
+
+
+def disturbable(env: Any, names: Sequence[str], policy: config_lib.PolicyConfig) -> Any:
+    """The environment, with cameras that may move if one of these disturbances moves them."""
+    from starjax.evaluation.disturbances import DISTURBANCES
+    from starjax.sim import env as sim_env
+
+    if not any(DISTURBANCES.get(name).moves_cameras for name in names):
+        return env
+    return sim_env.make(
+        env.names.task,
+        env.names.arms,
+        env.names.tools,
+        observation=policy.observation,
+        image_size=policy.image_size,
+        cameras=env.names.cameras,
+        moving_cameras=True,
     )
 
 

@@ -12,6 +12,7 @@ from starjax.report import (
     page,
     results,
     stage,
+    stress,
     style,
     tables,
     training_trocars,
@@ -61,7 +62,7 @@ def build(
     return out / "index.html"
 
 
-_FIGURES = ("training", "ports", "fig3", "fig4")
+_FIGURES = ("training", "ports", "fig3", "fig4", "stress")
 _FILM = "rollout.mp4"
 _SOLID = "rollout.html"
 # Of files that a report may have or not.
@@ -145,6 +146,8 @@ def _figures(
     if evaluated and focus.trials:
         drawings["ports"] = lambda dark: training_trocars.draw(evaluated, dark)
         drawings["fig4"] = lambda dark: figures.distance(evaluated, focus, dark)
+    if focus.stress:
+        drawings["stress"] = lambda dark: stress.draw(focus.stress, dark)
     if any(run.rollouts for run in runs):
         shown = compare.representatives(runs)
         drawings["fig3"] = lambda dark: trajectories.draw(shown, _stage, dark)

@@ -29,6 +29,11 @@ CAPTIONS = {
         "Success and the number of training trocars",
         "Trials at the trocars that none of these runs was trained at, with 95% Wilson intervals.",
     ),
+    "stress": (
+        "What breaks it",
+        "Success and executed RCM error while one thing is wrong, around the circle; lines join "
+        "levels of one rank, not one trial.",
+    ),
     "training": (
         "Training",
         "Loss on the training batches, and the error of predicted commands on demonstrations kept "
@@ -60,6 +65,8 @@ def render(
         _figure("fig4", figures, words),
         sections.swept(runs),
         _figure("ports", figures, words),
+        _figure("stress", figures, words),
+        sections.stressed(focus),
         sections.matrix(runs) if several else sections.per_trocar(focus),
         sections.failures(runs),
         sections.measurements(runs),

@@ -42,6 +42,7 @@ class Run(NamedTuple):
       log: the metrics.jsonl of the training of its weights, None if there is none.
       curves: its lines.
       sweep: trials through other trocars, None if no sweep was made of these weights.
+      stress: stress.json, empty if there is none of these weights.
       bench: bench.json, empty if there is none of these weights.
       others: names of what lies beside result.json and is of other weights.
     """
@@ -54,6 +55,7 @@ class Run(NamedTuple):
     log: Path | None
     curves: list[dict[str, Any]]
     sweep: Result | None
+    stress: dict[str, Any]
     bench: dict[str, Any]
     others: tuple[str, ...]
 
@@ -99,6 +101,7 @@ def load(path: Path) -> Run:
         log=log,
         curves=curves,
         sweep=None if "sweep.json" in others else swept,
+        stress=beside.stress(path, result.weights),
         bench={} if "bench.json" in others else bench,
         others=(*others, log.name) if log and not curves else tuple(others),
     )

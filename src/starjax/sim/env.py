@@ -17,7 +17,7 @@ from starjax.sim import cameras as views
 from starjax.sim import collision, ik, motion, physics, render
 from starjax.sim import scene as scenes
 from starjax.sim.state import Env, EnvParams, EnvState
-from starjax.sim.tasks.base import CONTROL_HZ, Views
+from starjax.sim.tasks.base import CONTROL_HZ, Task, Views
 from starjax.types import Command, Observation, Pose
 
 __all__ = ["CONTROL_HZ", "Env", "EnvParams", "EnvState", "make"]
@@ -39,6 +39,7 @@ def make(
     cameras: Sequence[str] = (),
     shadow: bool = True,
     moving_cameras: bool = False,
+    variant: Task | None = None,
 ) -> Env:
     """Builds an environment.
 
@@ -52,6 +53,7 @@ def make(
       shadow: whether the sun throws shadows.
       moving_cameras: whether `EnvParams.cameras` may move the cameras of an episode; else those
         that are fixed in the world are drawn faster, and to the same bytes as ever.
+      variant: of the task, see `scene.load`.
 
     Raises:
       errors.UsageError: an unknown name, an unusable size, or jax in double precision.
@@ -62,7 +64,7 @@ def make(
     if not isinstance(image_size, numbers.Integral) or image_size < SMALLEST_IMAGE:
         expected = f"a whole number of pixels, {SMALLEST_IMAGE} or more"
         raise errors.UsageError("image_size", expected, repr(image_size))
-    scene = scenes.load(scenes.name(task, arms, tools, cameras))
+    scene = scenes.load(scenes.name(task, arms, tools, cameras), variant)
     seen = views.make(scene.mj_model, scene.names.cameras, image_size, shadow, moving_cameras)
 
     def start(key: jax.Array, params: EnvParams) -> EnvState:
@@ -70,7 +72,8 @@ def make(
         return reset(scene, key, params, poses)
 
     def camera(state: EnvState) -> dict[str, render.Frame]:
-        data = physics.kinematics(scene, state.physics.qpos, state.trocar.p_world_trocar)
+        p_world_trocar = state.trocar.p_world_trocar
+        data = physics.kinematics(scene, state.physics.qpos, p_world_trocar, state.layout)
         rgb = scene.task.colours(scene.bound, state.layout, jnp.asarray(scene.geom_rgb))
         return views.images(seen, state.cameras, data, rgb)
 
@@ -167,6 +170,7 @@ def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
         period,
         state.layout,
         state.step * period,
+        state.model,
     )
     moved = state.replace(
         physics=after,

@@ -1,12 +1,14 @@
 """MJX under the environment: what is carried between steps, and one control period of it."""
 
-from collections.abc import Sequence
+import types
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 
 from starjax.sim import solver
 from starjax.sim.engine import mjx
@@ -76,6 +78,7 @@ def advance(
     period: float,
     layout: object,
     time: jax.Array,
+    own: Mapping[str, jax.Array] = types.MappingProxyType({}),
 ) -> tuple[PhysicsState, Passed]:
     """One control period: the joint targets move smoothly from `q` to `q + dq`.
 
@@ -88,9 +91,10 @@ def advance(
       p_world_trocar: `[A, 3]` m.
       period: s.
       layout: of the episode, for what the task itself drives. time: s since reset.
+      own: fields of the MJX model that are the episode's own.
     """
     substeps = round(period / scene.mj_model.opt.timestep)
-    mjx_model = _model(scene, p_world_trocar)
+    mjx_model = _model(scene, p_world_trocar).replace(**own)
     mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
     turn = [period * v - d for v, d in zip(velocity, dq, strict=True)]
 
@@ -151,10 +155,20 @@ def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
     return jnp.clip(jnp.stack(found), -1.0, 1.0)
 
 
-def kinematics(scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array) -> mjx.Data:
-    """Poses of all bodies and geoms, the trocars' markers at `p_world_trocar` `[A, 3]` m."""
+def kinematics(
+    scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array, layout: object = None
+) -> mjx.Data:
+    """Poses of all bodies and geoms, the trocars' markers at `p_world_trocar` `[A, 3]` m; with a
+    layout also those of what stands still in it."""
     mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
     data = scene.mjx_data.replace(qpos=qpos, mocap_pos=mocap_pos)
+    if scene.task.still is not None and layout is not None:
+        still = scene.task.still(layout)
+        turn = jnp.roll(Rotation.from_matrix(still.R).as_quat(), 1, axis=-1)  # w first
+        data = data.replace(
+            mocap_pos=mocap_pos.at[scene.still_mocap].set(still.p),
+            mocap_quat=data.mocap_quat.at[scene.still_mocap].set(turn),
+        )
     return mjx.kinematics(_model(scene, p_world_trocar), data)
 
 

@@ -68,6 +68,7 @@ class Scene(NamedTuple):
       arms: one for each slot of the task.
       p_world_ref: `[A, 3]` m, nominal trocars. roll_zero: `[A]` rad, see `rcm.TrocarFrame`.
       trocar_mocap: `[A]` mocap bodies that mark the trocars.
+      still_mocap: `[K]` mocap bodies of `Task.still`.
       graspable: geom ids. geom_rgb: `[G, 3]` colours.
       solver_turns: most turns of the contact solver, None for the usual number.
     """
@@ -82,6 +83,7 @@ class Scene(NamedTuple):
     p_world_ref: np.ndarray
     roll_zero: np.ndarray
     trocar_mocap: np.ndarray
+    still_mocap: np.ndarray
     graspable: np.ndarray
     geom_rgb: np.ndarray
     solver_turns: int | None
@@ -116,14 +118,14 @@ def name(
     return SceneNames(task, chosen["arm"], chosen["tool"], cameras)
 
 
-def compose(names: SceneNames) -> mujoco.MjModel:
-    """The C model of a scene.
+def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
+    """The C model of a scene; `variant` as in `load`.
 
     Raises:
       errors.UsageError: no mount of an arm with its tool is known for the task's workspace, or no
         part has a camera that is observed.
     """
-    task: Task = registry.tasks.get(names.task)
+    task: Task = variant or registry.tasks.get(names.task)
     world = _spec(task.mjcf)
     limits = _taken(world)
     for i, (arm, tool, mount) in enumerate(_mounted(task, names)):
@@ -146,10 +148,14 @@ def compose(names: SceneNames) -> mujoco.MjModel:
     return world.compile()
 
 
-def load(names: SceneNames) -> Scene:
-    """The scene of these names, copied to MJX, ids resolved."""
-    task: Task = registry.tasks.get(names.task)
-    m = compose(names)
+def load(names: SceneNames, variant: Task | None = None) -> Scene:
+    """The scene of these names, copied to MJX, ids resolved.
+
+    Args:
+      variant: of the task, with the same slots, in its place.
+    """
+    task: Task = variant or registry.tasks.get(names.task)
+    m = compose(names, task)
     # XLA's MJX implementation everywhere: the warp one needs CUDA.
     device = jax.local_devices()[0]  # MJX alone takes the first of all, another process's
     mjx_model = mjx.put_model(m, device=device, impl="jax")
@@ -167,6 +173,7 @@ def load(names: SceneNames) -> Scene:
         p_world_ref=np.array([slot.p_world_ref for slot in task.slots], np.float32),
         roll_zero=np.array([slot.roll_zero for slot in task.slots], np.float32),
         trocar_mocap=np.array([m.body(f"trocar{i}").mocapid[0] for i in range(task.arms)]),
+        still_mocap=np.array([m.body(f"still{i}").mocapid[0] for i in range(_still(m))], int),
         graspable=np.array([m.geom(geom).id for geom in task.graspable], int),
         geom_rgb=geometry.geom_rgb(m),
         solver_turns=_solver_turns(m),
@@ -260,6 +267,10 @@ def _call_by_name(world: mujoco.MjSpec, prefix: str) -> None:
 def _solver_turns(m: mujoco.MjModel) -> int | None:
     row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_NUMERIC, SOLVER_TURNS)
     return None if row < 0 else int(m.numeric(row).data[0])
+
+
+def _still(m: mujoco.MjModel) -> int:
+    return sum(m.body(b).name.startswith("still") for b in range(m.nbody))
 
 
 def _about_z(angle: float) -> list[float]:

@@ -191,6 +191,8 @@ class Task(NamedTuple):
       is_seen: `[C]` bool.
       drive: (Bound, Layout, ctrl `[nu]`, s since reset) -> ctrl with what actuators of the task's
         own MJCF are to do, for things that move by themselves.
+      still: (Layout) -> Pose `[K]` of the mocap bodies `still0`, .. of the MJCF, which are seen and
+        touch nothing; None if there are none.
       least_steps: control steps that any success takes; demonstrations may take so many whatever
         the usual limit is.
     """
@@ -224,6 +226,7 @@ class Task(NamedTuple):
     trocars: rcm.Trocar = rcm.Trocar(*(field[:, None] for field in rcm.TROCARS))
     is_seen: np.ndarray = rcm.IS_SEEN
     drive: Callable[..., jax.Array] = _undriven
+    still: Callable[..., Pose] | None = None
     least_steps: int = 0
 
     @property

@@ -1,0 +1,129 @@
+"""Six blocks in one episode: the environment of one block's transfer, begun anew with each.
+
+A block that is threaded, let go and at rest is left where it stands, and the next one's turn comes.
+Before it a script withdraws the tools to where an episode begins; its time counts. Everything else
+is the task's: the same physics, the same test, and an agent that knows one block's transfer.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+
+from starjax import rcm
+from starjax.sim import env as envs
+from starjax.sim import physics
+from starjax.sim.scene import Scene
+from starjax.sim.state import Env, EnvState
+from starjax.sim.tasks.base import Views
+from starjax.sim.tasks.peg_transfer_bimanual import six, task
+from starjax.types import Agent, Command, Pose
+
+# Control steps of the script: the tips rise, then go to their start.
+RISE, WITHDRAWN = 18, 45
+HEIGHT = 0.045  # m to which they rise: over blocks that stand
+
+
+def make(
+    arms: Sequence[str] = (),
+    tools: Sequence[str] = (),
+    *,
+    observation: str = "image",
+    image_size: int = 256,
+    cameras: Sequence[str] = (),
+) -> Env:
+    """Builds the exercise, see `sim.env.make`. Its label `moved` is how many blocks are over."""
+    return of(
+        envs.make(
+            six.TASK.name,
+            arms,
+            tools,
+            observation=observation,
+            image_size=image_size,
+            cameras=cameras,
+            variant=six.TASK,
+        )
+    )
+
+
+def of(env: Env) -> Env:
+    """The exercise in an environment of `six.TASK`."""
+
+    def step(state: EnvState, command: Command) -> EnvState:
+        between = _is_between(state)
+        command = jax.tree.map(
+            lambda own, given: jnp.where(between, own, given), _withdrawing(state), command
+        )
+        after = env.step(state, command)
+        goes_on = after.success & ~state.done & (state.layout.turn < six.BLOCKS - 1)
+        begun = _next(env.scene, after)
+        return jax.tree.map(lambda x, y: jnp.where(goes_on, x, y), begun, after)
+
+    def labels(state: EnvState) -> dict[str, jax.Array]:
+        return {"moved": state.layout.turn + state.success}
+
+    return env._replace(step=step, labels=labels)
+
+
+def anew(agent: Agent) -> Agent:
+    """An agent with a memory of one block's transfer, which begins again with every block."""
+
+    def init(key: jax.Array, state: EnvState) -> tuple:
+        return key, agent.init(key, state)
+
+    def act(memory: tuple, state: EnvState) -> tuple[Command, tuple, Command]:
+        key, inner = memory
+        turn, since = state.layout.turn, state.layout.since
+        fresh = agent.init(jax.random.fold_in(key, turn), state)
+        begins = (turn > 0) & (state.step == since + WITHDRAWN)
+        inner = jax.tree.map(lambda x, y: jnp.where(begins, x, y), fresh, inner)
+        command, inner, label = agent.act(inner, state)
+        return command, (key, inner), label
+
+    return Agent(init, act)
+
+
+def _is_between(state: EnvState) -> jax.Array:
+    return (state.layout.turn > 0) & (state.step < state.layout.since + WITHDRAWN)
+
+
+def _withdrawing(state: EnvState) -> Command:
+    """Jaws open, tips straight up from where they were, then to their start, with no roll."""
+    rises = state.step < state.layout.since + RISE
+    left = state.layout.tips
+    up = left.at[:, 2].set(jnp.maximum(left[:, 2], HEIGHT))
+    p = jnp.where(rises, up, jnp.array(task.PARK))
+    with jax.default_matmul_precision("highest"):
+        roll = rcm.ACTION_SPACES["rcm4"].encode(state.pose, state.told)[:, :1]
+        pose, _ = rcm.ACTION_SPACES["rcm4"].decode(
+            jnp.concatenate([jnp.where(rises, roll, 0.0), p], axis=-1), state.told
+        )
+    return Command(pose, jnp.ones(len(p)))
+
+
+def _next(scene: Scene, state: EnvState) -> EnvState:
+    """The block at hand stays where it is, the next one is at hand; the arms go on as they do."""
+    bound = scene.bound
+    layout = six.put(state.layout, Pose(state.facts.block.R, state.facts.block.p))
+    turn = jnp.minimum(layout.turn + 1, six.BLOCKS - 1)
+    layout = six.begin(bound, layout, turn, state.pose.p, state.step)
+    own = slice(bound.block_dof, bound.block_dof + 6)
+    after = physics.PhysicsState(
+        qpos=scene.task.place(bound, state.physics.qpos, layout),
+        qvel=state.physics.qvel.at[own].set(0.0),
+        qacc_warmstart=state.physics.qacc_warmstart.at[own].set(0.0),
+    )
+    touch, still = jnp.zeros_like(state.touch), jnp.zeros_like(state.pose.p)
+    contacts = physics.no_contacts(scene)
+    views = Views(after.qpos, after.qvel, state.pose, still, state.gripper, touch, contacts)
+    no = jnp.zeros((), bool)
+    return state.replace(
+        physics=after,
+        layout=layout,
+        facts=scene.task.measure(bound, layout, views, None),
+        settled=jnp.zeros((), jnp.int32),
+        stage=jnp.zeros((), jnp.int32),
+        touch=touch,
+        done=no,
+        success=no,
+    )

@@ -1,0 +1,113 @@
+"""Six blocks one after another, the exercise of FLS one way: a variant of the task.
+
+Blocks are alike, so one body is whichever block is to be moved, and the other five stand where they
+are: seen, and watched for shafts that enter them, but without contacts. Lengths in m.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from starjax.sim.tasks.base import Capsules
+from starjax.sim.tasks.peg_transfer import task as single
+from starjax.sim.tasks.peg_transfer_bimanual import task
+from starjax.types import Pose
+
+BLOCKS = 6
+LIMIT_S = 300.0  # of FLS
+
+
+@flax.struct.dataclass
+class Layout:
+    """The block at hand as in the task, and the whole exercise.
+
+    Attributes:
+      source, target, target_peg, block: of the block at hand, see `peg_transfer`.
+      tips: `[2, 3]`, where the tools' tips were when its turn came.
+      sources, targets: `[6]` int32 pegs, in order. blocks: Pose `[6]`, where each stands.
+      turn: int32, how many are over. since: int32, the control step at which this turn began.
+    """
+
+    source: jax.Array
+    target: jax.Array
+    target_peg: jax.Array
+    block: Pose
+    tips: jax.Array
+    sources: jax.Array
+    targets: jax.Array
+    blocks: Pose
+    turn: jax.Array
+    since: jax.Array
+
+
+def sample(bound: single.Bound, key: jax.Array) -> Layout:
+    """Draws the order, every block's offset and yaw, and the tips' starts; each as in the task."""
+    key_order, key_blocks = jax.random.split(key)
+    keys = jax.random.split(key_blocks, BLOCKS)
+    drawn = jax.vmap(lambda key: task.sample(bound, key))(keys)
+    order = jax.vmap(jax.random.permutation, (0, None))(jax.random.split(key_order), BLOCKS)
+    sources, targets = order[0], BLOCKS + order[1]
+    pegs = jnp.asarray(bound.pegs)
+    offset = drawn.block.p[:, :2] - pegs[drawn.source]
+    p = drawn.block.p.at[:, :2].set(pegs[sources] + offset)
+    zero, no = jnp.zeros((), jnp.int32), jnp.zeros((3,))
+    layout = Layout(
+        source=zero,
+        target=zero,
+        target_peg=no[:2],
+        block=Pose(jnp.eye(3), no),
+        tips=drawn.tips[0],
+        sources=sources.astype(jnp.int32),
+        targets=targets.astype(jnp.int32),
+        blocks=Pose(drawn.block.R, p),
+        turn=zero,
+        since=zero,
+    )
+    return begin(bound, layout, zero, layout.tips, zero)
+
+
+def begin(
+    bound: single.Bound, layout: Layout, turn: jax.Array, tips: jax.Array, step: jax.Array
+) -> Layout:
+    """The layout with another block's turn, from where the tips are at a control step."""
+    target = layout.targets[turn]
+    return layout.replace(
+        source=layout.sources[turn],
+        target=target,
+        target_peg=jnp.asarray(bound.pegs)[target],
+        block=jax.tree.map(lambda x: x[turn], layout.blocks),
+        tips=tips,
+        turn=turn,
+        since=step,
+    )
+
+
+def put(layout: Layout, block: Pose) -> Layout:
+    """The layout with the block at hand left at a pose."""
+    blocks = jax.tree.map(lambda x, at: x.at[layout.turn].set(at), layout.blocks, block)
+    return layout.replace(blocks=blocks)
+
+
+def still(layout: Layout) -> Pose:
+    """Where the five others stand, Pose `[5]`."""
+    others = (layout.turn + 1 + jnp.arange(BLOCKS - 1)) % BLOCKS
+    return jax.tree.map(lambda x: x[others], layout.blocks)
+
+
+def _obstacles(bound: single.Bound, layout: Layout, facts: task.Facts) -> Capsules:
+    """Pegs, and the walls of all blocks."""
+    own = single.around(bound, facts.block)
+    others = jax.vmap(lambda block: single.around(bound, block))(still(layout))
+    walls = (x[:, -single.WALLS :].reshape(-1, *x.shape[2:]) for x in others)
+    return Capsules(*(jnp.concatenate(parts) for parts in zip(own, walls, strict=True)))
+
+
+TASK = task.TASK._replace(
+    mjcf="tasks/peg_transfer_bimanual/six_blocks.xml",
+    time_limit_s=LIMIT_S,
+    labels=("moved",),
+    sample=sample,
+    label=lambda layout: {"moved": layout.turn},
+    obstacles=_obstacles,
+    still=still,
+)
