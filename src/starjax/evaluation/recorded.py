@@ -120,7 +120,7 @@ def read(file: Path) -> list[Trajectory]:
         for name in ("p_world_tip", "p_world_trocar", "rcm_error"):
             if name in found:
                 found[name] = np.expand_dims(found[name], 1 if name == "p_world_trocar" else 2)
-        labels = schema_1.labels(found, "_peg")
+        labels = schema_1.recorded_labels(found)
         found |= {f"{_LABEL}{name}": array for name, array in labels.items()}
     return [_row(found, row, int(length)) for row, length in enumerate(found["length"])]
 

@@ -50,7 +50,7 @@ def load(
       method: a row of `methods.METHODS`.
       weights: policy.safetensors.
       env: built from what the weights were trained on unless given.
-      arms: robots of that env in the place of those that they were trained with.
+      arms: robots of that env instead of those that they were trained with.
 
     Raises:
       errors.UsageError: the file is missing or damaged.

@@ -22,8 +22,8 @@ CAPTIONS = {
     "fig4": (
         "Success and distance from the training trocars",
         "Left: trials pooled by distance of their trocar to the nearest one in the demonstrations, "
-        "with 95% Wilson intervals. Right: ports from above; where a sweep filled the disc, its "
-        "mean over 8 mm, its ports as dots.",
+        "with 95% Wilson intervals. Right: trocars from above; where a sweep filled the disc, its "
+        "mean over 8 mm, its trocars as dots.",
     ),
     "ports": (
         "Success and the number of training trocars",

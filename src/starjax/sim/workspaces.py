@@ -31,7 +31,7 @@ class Workspace(NamedTuple):
     base_high: tuple[float, float, float]
 
 
-# Both boards of pegs, from a grasp to the start; the camera looks on from x > 0.
+# A board, from a grasp on it to the start above it; the camera looks on from x > 0.
 BOARD = Workspace(
     p_world_ref=(0.0, 0.0, 0.15),
     radius=trocar.RADIUS_RANGE,

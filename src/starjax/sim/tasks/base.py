@@ -20,7 +20,7 @@ class Field(NamedTuple):
     """A part of the `state` observation.
 
     Attributes:
-      name: what it is, e.g. `block.p`.
+      name: what it is, e.g. `needle.p`.
       size: how many numbers.
       kind: `point` m in the world frame, scaled for networks; `rot6d`, `unit`: within [-1, 1].
     """
@@ -69,14 +69,14 @@ class Words(NamedTuple):
     """Phrases for reports of a task, in plain English, without a capital or a full stop.
 
     Attributes:
-      title: e.g. `peg transfer`.
-      done: completes "the policy ...", e.g. `moved the block to its peg`.
+      title: e.g. `needle pick`.
+      done: completes "the policy ...", e.g. `lifted the needle`.
       strict: when a trial is a strict success.
       loose: when it passes the loose test.
       nearly: a failed trial that passed the loose test.
       collided: what a collision is here.
       ground: what the tool works over, e.g. `the boards`.
-      goal: how a picture shows what is asked for, e.g. `the block belongs on the marked peg`.
+      goal: how a picture shows what is asked for, e.g. `the tip belongs at the coloured mark`.
       lost: what makes a trial hopeless before its time is up; empty where nothing does.
     """
 
