@@ -1,7 +1,6 @@
 """The stages of a run, one after another, each skipped when its result is there."""
 
 import contextlib
-import dataclasses
 import functools
 import shlex
 from collections.abc import Callable, Sequence
@@ -157,8 +156,7 @@ def _train(
     params = state.ema_params
     made = policy_file.Trained(
         method=name,
-        # Decided in bfloat16, a tool at rest would tremble by 0.1 mm a step, which is 4 mm/s.
-        policy=dataclasses.replace(config.policy, dtype="float32"),
+        policy=config_lib.deciding(config.policy),
         train=config.train,
         params={**params, "vision": encoder.params} if encoder else params,
         normalizer=state.normalizer,

@@ -140,8 +140,8 @@ def compile_ahead(
       env: with the observation that it is trained on.
       vision: parameters of its frozen encoder, None where it has none.
     """
-    row = methods.METHODS[name]
-    policy = policies.make(row, config.policy, env.task, cameras=env.names.cameras)
+    row, deciding = methods.METHODS[name], config_lib.deciding(config.policy)
+    policy = policies.make(row, deciding, env.task, cameras=env.names.cameras)
     params = jax.eval_shape(policy.init, jax.random.key(0))
     if vision is not None:
         params = {**params, "vision": vision}
