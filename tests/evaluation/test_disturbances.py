@@ -89,6 +89,25 @@ def test_several_are_wrong_at_once_each_at_its_level_and_one_program_has_all_lev
     assert start._cache_size() == step._cache_size() == 1
 
 
+def test_with_all_of_them_only_what_has_a_level_is_wrong(env):
+    together = disturbed(env, OTHERS)
+    start, step_all = jax.jit(together.reset), jax.jit(together.step)
+    for only in ([], ["breathing"], ["breathing_late"]):
+        wrong = dict.fromkeys(only, 5.0)
+        alone = disturbed(env, only)
+        one = alone.reset(KEY, at(**wrong))
+        all_of_them = start(KEY, at(**(dict.fromkeys(OTHERS, 0.0) | wrong)))
+        for _ in range(6):
+            to = Command(Pose(one.pose.R, one.pose.p + 0.01), one.gripper)
+            one, all_of_them = alone.step(one, to), step_all(all_of_them, to)
+        for name in ("pose", "gripper", "step", "trocar", "told", "cameras"):
+            pairs = zip(*(jax.tree.leaves(getattr(s, name)) for s in (one, all_of_them)))
+            for x, y in pairs:
+                np.testing.assert_allclose(x, y, atol=1e-6)
+        assert same(together.observe(all_of_them), alone.observe(one))
+    assert step_all._cache_size() == 1
+
+
 @pytest.mark.parametrize("level", [1.0, 10.0])
 def test_trocars_are_told_so_far_from_the_truth(env, level):
     wrong = disturbed(env, ["trocar_told"])

@@ -1,8 +1,8 @@
 """Environments in which something is wrong, by as much as a level says, which is data.
 
 Starts, keys and judging are those of the usual environment, and the executed RCM error is measured
-against the true trocar. What a disturbance draws depends on the episode's key alone. All levels of
-one share a program.
+against the true trocar. What a disturbance draws depends on the episode's key alone. One program
+has all levels of all of them: at level 0 each leaves everything as it was.
 """
 
 import math
