@@ -20,6 +20,7 @@ PARAMS = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4, arms=2)))
 CAMERAS = Pose(jnp.stack([jnp.eye(3)] * 2), jnp.array([[0.1, 0.2, 0.3], [0.0, -0.1, 0.4]]))
 KINDS = {name: DISTURBANCES.get(name) for name in DISTURBANCES.built_in}
 PHYSICAL = ("servos", "friction", "mass")  # they need a model
+NAMES = ("late_view", "dropped", *PHYSICAL)  # states that are kept have a model of their own too
 OTHERS = [name for name in KINDS if name not in PHYSICAL]
 
 
@@ -269,7 +270,7 @@ def reach():
 @pytest.fixture(scope="module")
 def moved(reach):
     """`levels -> state after a motion of 8 control steps`; one program."""
-    wrong = disturbed(reach, PHYSICAL)
+    wrong = disturbed(reach, NAMES)
     params = EnvParams(jax.tree.map(lambda x: jnp.asarray(x)[0], reach.task.trocars))
 
     @jax.jit
@@ -278,7 +279,7 @@ def moved(reach):
         to = Command(Pose(first.pose.R, first.pose.p + 0.02), first.gripper)
         return jax.lax.fori_loop(0, 8, lambda _, state: wrong.step(state, to), first)
 
-    return lambda **levels: run({**dict.fromkeys(PHYSICAL, 0.0), **levels})
+    return lambda **levels: run({**dict.fromkeys(NAMES, 0.0), **levels})
 
 
 def test_servos_of_arms_are_weaker_by_a_share_and_move_otherwise(reach, moved):

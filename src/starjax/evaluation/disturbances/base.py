@@ -45,6 +45,7 @@ class Disturbance(NamedTuple):
       begin: (Env, Now, EnvState) -> EnvState and memory, after it.
       step: (Env, Now, EnvState, Command) -> EnvState and memory.
       observe: (Env, Now, EnvState) -> Observation.
+      keeps_states: whether its memory holds states, which others must have changed before.
       moves_cameras: whether it needs an environment whose cameras may move.
       of_images: whether policies that see no images are spared.
       of_demos: whether demonstrations that are recorded with it teach anything of it.
@@ -65,6 +66,7 @@ class Disturbance(NamedTuple):
     observe: Callable[[Env, Now, EnvState], Observation] = lambda env, now, state: env.observe(
         state
     )
+    keeps_states: bool = False
     moves_cameras: bool = False
     of_images: bool = False
     of_demos: bool = True
@@ -72,8 +74,9 @@ class Disturbance(NamedTuple):
 
 def disturbed(env: Env, names: Sequence[str]) -> Env:
     """The environment in which all of these are wrong, at `EnvParams.levels`."""
-    for name in names:
-        env = _with(env, name, DISTURBANCES.get(name))
+    kinds: dict[str, Disturbance] = {name: DISTURBANCES.get(name) for name in names}
+    for name in sorted(kinds, key=lambda name: kinds[name].keeps_states):
+        env = _with(env, name, kinds[name])
     return env
 
 
