@@ -105,7 +105,7 @@ def test_with_all_of_them_only_what_has_a_level_is_wrong(env):
             pairs = zip(*(jax.tree.leaves(getattr(s, name)) for s in (one, all_of_them)))
             for x, y in pairs:
                 np.testing.assert_allclose(x, y, atol=1e-6)
-        assert same(together.observe(all_of_them), alone.observe(one))
+        assert same(together.observe(all_of_them).images, alone.observe(one).images)
     assert step_all._cache_size() == 1
 
 
