@@ -60,6 +60,7 @@ LATE_VIEW = Disturbance(
     begin=lambda env, now, state: (state, _always(state)),
     step=_keep_states,
     observe=_see_past,
+    keeps_states=True,
 )
 LATE_COMMANDS = Disturbance(
     what="commands are executed so many control steps late",
@@ -77,4 +78,5 @@ DROPPED = Disturbance(
     begin=lambda env, now, state: (state, state),
     step=_lose,
     observe=lambda env, now, state: env.observe(now.memory),
+    keeps_states=True,
 )
