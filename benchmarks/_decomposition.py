@@ -11,6 +11,7 @@ import numpy as np
 
 POINTS = 20  # of progress at which a phase is looked at
 LEAST = 0.5  # of a phase, or s of one without an end, that a trial must have come through
+STILL = 1e-5  # m of root mean square below which a position stands still: rounding
 RESAMPLES = 1000  # of the scenes, for the interval
 
 
@@ -51,7 +52,7 @@ def first_attempt(
 
 def crossed(trials: Sequence[Sequence[list[Segment]]]) -> dict[int, list[np.ndarray]]:
     """Phase -> for each of its visits `[S', C, G, A, 3]`, of the scenes whose trials all came
-    through it; phases and visits that fewer than two scenes came through are left out.
+    through it; phases and visits that fewer than half of the scenes came through are left out.
 
     Args:
       trials: segments `[S][C]`.
@@ -63,7 +64,7 @@ def crossed(trials: Sequence[Sequence[list[Segment]]]) -> dict[int, list[np.ndar
             [one[label] for one in scene] for scene in by_label if all(label in x for x in scene)
         ]
         scenes = [x for x in scenes if min(segment.progress[-1] for segment in x) >= LEAST]
-        if len(scenes) < 2:
+        if len(scenes) < max(2, len(trials) / 2):
             continue
         ends = [segment.progress[[0, -1]] for scene in scenes for segment in scene]
         first, last = np.max(ends, axis=0)[0], np.min(ends, axis=0)[1]
@@ -93,9 +94,9 @@ class Parts(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Of the whole variance, what the trocar explains."""
+        """Of the whole variance, what the trocar explains; 0 of what stands still."""
         whole = self.trocar + self.scene
-        return self.trocar / whole if whole > 0 else 0.0
+        return self.trocar / whole if whole > STILL**2 else 0.0
 
 
 def parts(p: np.ndarray) -> Parts:

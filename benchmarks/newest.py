@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax.report import formats
+from starjax.report import stress as broken
 
 HERE = Path(__file__).parent
 _VALUE = re.compile(r"\{([^:{}]+):?([^{}]*)\}")
@@ -31,6 +32,13 @@ def other(name: str) -> str:
     said = tomllib.loads((HERE / f"{name}.toml").read_text())
     rows = [[_filled(cell, _results(row["file"])) for cell in row["cells"]] for row in said["rows"]]
     return formats.render([said["header"], *rows], names=1)
+
+
+def stress() -> str:
+    """What breaks the packaged policy: of a GPU, which runs more trials, where it was run there."""
+    files = [f"stress_compact_{backend}" for backend in ("gpu", "cpu")]
+    file = next(name for name in files if (HERE / "results" / f"{name}.json").exists())
+    return formats.render(broken.table(_results(file)), names=2)
 
 
 def _results(file: str) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def _gap(scored: Scored) -> str:
     return f"{middle:.1f} ({low:.1f} to {high:.1f})"
 
 
-def _ports(scored: Scored, low: float = 0.0, high: float = 1.0) -> str:
+def _others(scored: Scored, low: float = 0.0, high: float = 1.0) -> str:
     trials = scored.swept.trials if scored.swept else []
     return rate([trial for trial in trials if low <= (trial.distance_m or 0.0) < high])
 
@@ -134,11 +134,11 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "all": ("all", lambda x: rate(x.run.trials)),
     "safe": ("successes within 2 mm all along", _safe),
     "gap": ("gap, points", _gap),
-    "highest": ("highest port", lambda x: rate([t for t in _unseen(x) if t.trocar == HIGHEST])),
-    "ports": ("other ports", _ports),
-    "near": ("within 10 mm", lambda x: _ports(x, 0.0, 0.01)),
-    "middle": ("10 to 20 mm", lambda x: _ports(x, 0.01, 0.02)),
-    "far": ("farther", lambda x: _ports(x, 0.02)),
+    "highest": ("highest trocar", lambda x: rate([t for t in _unseen(x) if t.trocar == HIGHEST])),
+    "trocars": ("other trocars", _others),
+    "near": ("within 10 mm", lambda x: _others(x, 0.0, 0.01)),
+    "middle": ("10 to 20 mm", lambda x: _others(x, 0.01, 0.02)),
+    "far": ("farther", lambda x: _others(x, 0.02)),
     "rcm_mean": ("RCM error, mean (mm)", lambda x: _rcm(x, "executed", "mean")),
     "rcm": ("RCM error, p99 (mm)", lambda x: _rcm(x, "executed", "p99")),
     "rcm_won": ("of successes", lambda x: _rcm(x, "executed", "p99_of_successes")),
@@ -167,7 +167,7 @@ PARTS: dict[str, Callable[[Scored], Any]] = {
     "twelve": lambda x: x.run,
     "seen": lambda x: results.with_trials(x.run, _seen(x)),
     "unseen": lambda x: results.with_trials(x.run, _unseen(x)),
-    "ports": _swept,
+    "trocars": _swept,
     "far": lambda x: results.with_trials(
         _swept(x), [t for t in _swept(x).trials if t.distance_m >= 0.02]
     ),

@@ -34,8 +34,10 @@ def table(name: str) -> str:
         return claims.index([claims.load(folder) for folder in claims.folders()])
     if name == "speed":
         return newest.table()
-    if name in ("learners", "experts", "stress"):
+    if name in ("learners", "experts"):
         return newest.other(name)
+    if name == "stress":
+        return newest.stress()
     folder, _, which = name.partition("/")
     return claims.table(claims.load(HERE / folder), which)
 

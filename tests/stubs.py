@@ -49,6 +49,9 @@ class State:
     pose: Pose
     gripper: jax.Array
     cameras: Any = None
+    model: Any = flax.struct.field(default_factory=dict)
+    beside: Any = flax.struct.field(default_factory=dict)
+    endoscope: Any = None
 
 
 class Layout(NamedTuple):

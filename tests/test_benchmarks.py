@@ -2,6 +2,8 @@
 
 import sys
 
+import pytest
+
 from starjax import rcm
 from starjax.models.kernels import packed_params
 
@@ -28,3 +30,13 @@ def test_the_peers_of_all_action_spaces_compute_the_same(monkeypatch, capsys, py
     rows = [line.split() for line in capsys.readouterr().out.splitlines() if "code " in line]
     assert {row[0] for row in rows} == set(rcm.ACTION_SPACES) and len(rows) == 14
     assert max(float(row[-1]) for row in rows) < 1e-6
+
+
+@pytest.mark.parametrize("arm", ["panda", "iiwa14"])
+def test_seven_joints_do_not_drift_from_lap_to_lap(arm, monkeypatch, pytestconfig):
+    monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
+    import bench_nullspace
+
+    gain = bench_nullspace.registry.arms.get(arm).rest_gain
+    drift, residual = bench_nullspace.laps(arm, gain)
+    assert drift <= 1e-6 and residual < 1e-5

@@ -51,8 +51,8 @@ def test_the_interval_holds_the_share(decomposition, monkeypatch):
 
 
 def test_what_moves_with_no_trocar_has_a_share_of_nothing(decomposition):
-    still = np.zeros((3, TROCARS, POINTS, 3))
-    assert decomposition.parts(still).share == 0.0
+    still = 1e-7 * positions(0, 1, 1, scenes=3)  # m
+    assert decomposition.parts(still).share == 0.0 < decomposition.parts(1e3 * still).share
 
 
 def trial(*passages, scale=1.0):

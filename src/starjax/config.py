@@ -31,7 +31,9 @@ class SceneConfig:
     # robots, one for each that the task asks for, or one for all; left out: the task's
     arm: tuple[str, ...] = ()
     tool: tuple[str, ...] = ()  # instruments that the arms hold; left out: the task's
-    camera: tuple[str, ...] = ()  # cameras that the policy sees; left out: the task's first
+    # cameras that the policy sees; left out, or fixed: the task's first. endoscope: one in a trocar
+    # of its own, elsewhere in every episode
+    camera: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,6 +47,9 @@ class DemosConfig:
     keep_failures: bool = False  # store failed episodes too; training leaves them out
     expert: str = ""  # which of the task's scripted demonstrators; left out, its first
     max_steps: Count = 600  # control steps, at 30 Hz, that the expert may take
+    # what is wrong while they are recorded, each NAME=LEVEL with the names of starjax stress: at
+    # levels that are drawn for every episode, up to these
+    randomise: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -80,6 +85,9 @@ class PolicyConfig:
     # which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
     # trocar's azimuth, or an ablation
     trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
+    # where what is observed and predicted counts from: the world, or the endoscope that it is seen
+    # through, an ablation
+    frame: Literal["world", "camera"] = "world"
     roll_loss_weight: NotNegative = 0.1  # lambda of Eq. 15
     # of the networks' arithmetic in training; a trained policy decides in float32
     dtype: Literal["float32", "bfloat16"] = "float32"
@@ -186,6 +194,14 @@ def with_learner(policy: PolicyConfig, learner: str) -> PolicyConfig:
     )
     kept = {name: getattr(policy.options, name) for name in ours & theirs}
     return dataclasses.replace(policy, learner=learner, options=settings(**kept))
+
+
+def deciding(policy: PolicyConfig) -> PolicyConfig:
+    """Settings of a policy once it is trained: it decides in float32.
+
+    In bfloat16 a tool at rest would tremble by 0.1 mm a control step, which is 4 mm/s.
+    """
+    return dataclasses.replace(policy, dtype="float32")
 
 
 def with_options(policy: PolicyConfig, **changed: Any) -> PolicyConfig:

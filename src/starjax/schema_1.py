@@ -8,13 +8,20 @@ from collections.abc import Mapping
 from typing import Any
 
 SCENE = ("peg_transfer", ("fr5",), ("grasper",), ("camera",))  # task, arms, tools, cameras
-_LABELS = ("source", "target")  # fields of a trial; among recorded arrays `source_peg` and so on
+_LABELS = ("source", "target")  # fields of a trial
+_RECORDED_LABEL = "{}_peg"  # an array of recorded trials
 _SWITCH = "one_wall"  # of the expert, today a variant of this name
 
 
-def labels(fields: Mapping[str, Any], ending: str = "") -> dict[str, Any]:
-    """The task's labels among the fields of a trial, or with `_peg` among recorded arrays."""
-    return {name: fields[f"{name}{ending}"] for name in _LABELS if f"{name}{ending}" in fields}
+def labels(trial: Mapping[str, Any]) -> dict[str, Any]:
+    """The task's labels among the fields of a trial."""
+    return {name: trial[name] for name in _LABELS if name in trial}
+
+
+def recorded_labels(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """The task's labels among the arrays of recorded trials."""
+    found = {name: arrays.get(_RECORDED_LABEL.format(name)) for name in _LABELS}
+    return {name: array for name, array in found.items() if array is not None}
 
 
 def has_switch(demos: Mapping[str, Any]) -> bool:

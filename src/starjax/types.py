@@ -45,6 +45,8 @@ class Observation(NamedTuple):
       state: the task's fields instead of pixels, `[..., S]`, or None.
       features: what a frozen vision encoder makes of the images, `[..., d_v]` float32, instead of
         them; only in the data that such a policy is trained on.
+      endoscope: pose_world_camera `[...]` of an endoscope that is elsewhere in every episode, x to
+        the right, y up, looking along -z; None where the scene is not seen through one.
     """
 
     pose: Pose
@@ -52,6 +54,7 @@ class Observation(NamedTuple):
     images: dict[str, jax.Array] | None = None
     state: jax.Array | None = None
     features: jax.Array | None = None
+    endoscope: Pose | None = None
 
 
 class Agent(NamedTuple):

@@ -13,7 +13,7 @@ from scipy.spatial import transform
 
 from starjax import errors, rcm
 from starjax.data import load, schema, store
-from starjax.data.formats import base, exchange, foreign, mapping, motion, ports
+from starjax.data.formats import base, exchange, foreign, mapping, motion, trocars
 from starjax.data.formats.base import Column, Source
 from starjax.data.formats.mapping import Arm, Camera, Map
 
@@ -254,7 +254,7 @@ def test_a_column_may_say_the_trocar(tmp_path):
     made = dataclasses.replace(MAP, arms=(dataclasses.replace(ARM, trocar="trocar"),))
     found = bring(tmp_path, source(change=change), made)
     np.testing.assert_allclose(found.p_world_trocar, np.tile([0.01, 0.02, 0.14], (3, 1, 1)))
-    assert len(found.notes) == 3 and found.residual_mm.min() > 1e3 * ports.MISSED  # a false one
+    assert len(found.notes) == 3 and found.residual_mm.min() > 1e3 * trocars.MISSED  # a false one
 
 
 def test_a_motion_that_tells_no_trocar_is_left_out_or_shares_one(tmp_path):

@@ -6,13 +6,18 @@ import io
 import itertools
 import re
 import shlex
+import tomllib
 
 import pytest
 
 from starjax import cli, errors
+from starjax.data.formats import base, mapping
+from starjax.learners import LEARNERS
+from starjax.sim import registry
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 HEADER = re.compile(r"\A---\n(.*?)\n---\n", re.DOTALL)
+SNIPPET = re.compile(r'^--8<-- "([^":]+)"$', re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
 
 
@@ -38,7 +43,11 @@ def pytest_generate_tests(metafunc):
 
 def wanted(function, page):
     languages = {language for language, _ in FENCE.findall(page.read_text())}
-    needed = {test_programs_run: "python", test_commands_parse: "bash"}.get(function)
+    needed = {
+        test_programs_run: "python",
+        test_commands_parse: "bash",
+        test_configurations_are_read: "toml",
+    }.get(function)
     return needed is None or needed in languages
 
 
@@ -64,11 +73,29 @@ def test_programs_run(page, tmp_path, monkeypatch):
             exec(compile("\n" * line + block[2], str(page), "exec"), names)
 
 
-def commands(page):
+def test_configurations_are_read(page, root, tmp_path):
+    """Entry points are of groups that are looked at; anything else is a mapping of a dataset."""
+    kinds = (registry.tasks, registry.arms, registry.tools, registry.workspaces, LEARNERS)
+    groups = {f"starjax.{one.kind}s" for one in (*kinds, base.FORMATS)}
+    for block in blocks(page, root, "toml"):
+        found = tomllib.loads(block)
+        if "project" in found:
+            assert found["project"]["entry-points"].keys() <= groups
+        else:
+            (tmp_path / "map.toml").write_text(block)
+            assert mapping.load(tmp_path / "map.toml").task in registry.tasks.names()
+
+
+def blocks(page, root, language):
+    """Blocks of a page in a language, the files that they include in them."""
+    for found, block in FENCE.findall(page.read_text()):
+        if found == language:
+            yield SNIPPET.sub(lambda said: (root / said[1]).read_text(), block)
+
+
+def commands(page, root):
     """(command, flags and their values) of all `starjax` lines of a page's shell blocks."""
-    for language, block in FENCE.findall(page.read_text()):
-        if language != "bash":
-            continue
+    for block in blocks(page, root, "bash"):
         for line in block.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
             for i, word in enumerate(words):
@@ -90,8 +117,8 @@ def flags():
     return found
 
 
-def test_commands_parse(page, flags):
-    for name, *words in commands(page):
+def test_commands_parse(page, root, flags):
+    for name, *words in commands(page, root):
         if name in ("--help", "--version"):
             continue
         errors.choice("COMMAND", name, cli.COMMANDS)

@@ -2,19 +2,25 @@
 
 import jax
 import jax.numpy as jnp
+import mistakes
+import mujoco
 import numpy as np
 import pytest
 import stubs
 
-from starjax import rcm
 from starjax.evaluation import disturbances
-from starjax.evaluation.disturbances import DISTURBANCES, disturbed
+from starjax.evaluation.disturbances import DISTURBANCES, base, images, timing, trocars
+from starjax.evaluation.disturbances.base import disturbed, varied
+from starjax.sim import env as envs
 from starjax.sim.state import EnvParams
 from starjax.types import Command, Pose
 
 KEY = jax.random.key(3)
 PARAMS = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4, arms=2)))
 CAMERAS = Pose(jnp.stack([jnp.eye(3)] * 2), jnp.array([[0.1, 0.2, 0.3], [0.0, -0.1, 0.4]]))
+KINDS = {name: DISTURBANCES.get(name) for name in DISTURBANCES.built_in}
+PHYSICAL = ("servos", "friction", "mass")  # they need a model
+OTHERS = [name for name in KINDS if name not in PHYSICAL]
 
 
 @pytest.fixture
@@ -27,6 +33,10 @@ def env():
     return made._replace(reset=reset)
 
 
+def at(**levels):
+    return PARAMS._replace(levels=levels)
+
+
 def held(state):
     return Command(state.pose, state.gripper)
 
@@ -35,52 +45,93 @@ def same(a, b):
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b)))
 
 
-@pytest.mark.parametrize("name", DISTURBANCES)
-def test_without_a_level_nothing_is_wrong(env, name):
-    kind = DISTURBANCES[name]
-    assert disturbed(env, name, 0.0) is env and kind.levels[0] == 0.0
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+def test_levels_begin_with_none_and_rise_as_far_as_there_are_any(kind):
+    assert kind.levels[0] == 0.0 and kind.levels[-1] <= kind.most
     assert list(kind.levels) == sorted(set(kind.levels))
 
 
-@pytest.mark.parametrize("name", DISTURBANCES)
+@pytest.mark.parametrize("name", OTHERS)
 def test_episodes_begin_as_without_it_and_are_their_key_s(env, name):
-    wrong = disturbed(env, name, DISTURBANCES[name].levels[-1])
-    usual, first, again = (e.reset(KEY, PARAMS) for e in (env, wrong, wrong))
-    assert same(first, again) and same(first.layout, usual.layout)
+    wrong, highest = disturbed(env, [name]), at(**{name: KINDS[name].levels[-1]})
+    usual, first, again = env.reset(KEY, PARAMS), *(wrong.reset(KEY, highest) for _ in range(2))
+    assert same(first.layout, usual.layout)
     assert same(first.trocar, usual.trocar) and same(first.pose, usual.pose)
     assert same(wrong.observe(first), wrong.observe(again))
 
 
+@pytest.mark.parametrize("name", OTHERS)
+def test_at_level_0_and_once_it_is_over_nothing_is_wrong(env, name):
+    wrong = disturbed(env, [name])
+    usual, state = env.reset(KEY, PARAMS), wrong.reset(KEY, at(**{name: 0.0}))
+    to = Command(Pose(usual.pose.R, usual.pose.p + 0.01), usual.gripper)
+    for _ in range(3):
+        usual, state = env.step(usual, to), wrong.step(state, to)
+        np.testing.assert_allclose(state.pose.p, usual.pose.p)
+        assert same(wrong.observe(state), env.observe(usual))
+    over = state.replace(done=jnp.ones((), bool))
+    after = wrong.step(over, held(over))
+    assert same(after.pose, over.pose) and same(after.trocar, over.trocar)
+
+
+def test_several_are_wrong_at_once_each_at_its_level_and_one_program_has_all_levels(env):
+    wrong = disturbed(env, ["late_view", "darkness", "late_commands", "dropped"])
+    start, step = jax.jit(wrong.reset), jax.jit(wrong.step)
+    for steps in (1, 4):
+        state = start(KEY, at(late_view=0.0, darkness=0.5, late_commands=steps, dropped=0.0))
+        first, to = state.pose.p, Command(Pose(state.pose.R, state.pose.p + 0.1), state.gripper)
+        for _ in range(steps):
+            state = step(state, to)
+            np.testing.assert_array_equal(state.pose.p, first)
+        assert np.all(step(state, to).pose.p > first)
+        bright = env.observe(state).images["camera"].astype(float)
+        np.testing.assert_allclose(wrong.observe(state).images["camera"], bright / 2, atol=0.51)
+    assert start._cache_size() == step._cache_size() == 1
+
+
 @pytest.mark.parametrize("level", [1.0, 10.0])
 def test_trocars_are_told_so_far_from_the_truth(env, level):
-    states = [disturbed(env, "trocar_told", level).reset(jax.random.key(k), PARAMS) for k in (0, 1)]
+    wrong = disturbed(env, ["trocar_told"])
+    states = [wrong.reset(jax.random.key(k), at(trocar_told=level)) for k in (0, 1)]
     for state in states:
         apart = state.told.p_world_trocar - state.trocar.p_world_trocar
         np.testing.assert_allclose(jnp.linalg.norm(apart, axis=-1), 1e-3 * level, rtol=1e-2)
     assert not same(states[0].told, states[1].told)
 
 
-def test_trocars_rise_and_fall_with_the_breath_and_nobody_is_told(env):
-    wrong = disturbed(env, "breathing", 5.0)
-    state = first = wrong.reset(KEY, PARAMS)
-    rises = []
-    for _ in range(round(env.control_hz / disturbances.BREATH_HZ)):
-        state = jax.jit(wrong.step)(state, held(state))
+@pytest.mark.parametrize("name", ["breathing", "breathing_late"])
+def test_trocars_rise_and_fall_with_the_breath(env, name):
+    wrong = disturbed(env, [name])
+    state = first = wrong.reset(KEY, at(**{name: 5.0}))
+    step, rises, said = jax.jit(wrong.step), [], []
+    for _ in range(round(env.control_hz / trocars.BREATH_HZ)):
+        state = step(state, held(state))
         apart = state.trocar.p_world_trocar - first.trocar.p_world_trocar
         np.testing.assert_allclose(apart[:, :2], 0.0, atol=1e-6)
         rises.append(float(apart[0, 2]))
-        np.testing.assert_allclose(state.told.p_world_trocar, first.told.p_world_trocar, atol=1e-6)
+        said.append(float((state.told.p_world_trocar - first.told.p_world_trocar)[0, 2]))
     np.testing.assert_allclose([max(rises), rises[-1]], [5e-3, 0.0], atol=1e-5)
-    over = state.replace(done=jnp.ones((), bool))
-    assert same(wrong.step(over, held(over)), over)
+    late = round(trocars.LATE_S * env.control_hz)
+    expected = np.zeros(late).tolist() + rises[:-late] if name == "breathing_late" else 0.0
+    np.testing.assert_allclose(said, expected, atol=1e-6)
 
 
 def test_cameras_are_moved_and_turned(env):
-    state = disturbed(env, "camera", 4.0).reset(KEY, PARAMS)
+    state = disturbed(env, ["camera"]).reset(KEY, at(camera=4.0))
     apart = jnp.linalg.norm(state.cameras.p - CAMERAS.p, axis=-1)
     np.testing.assert_allclose(apart, 4e-3, rtol=1e-3)
     cos = (jnp.trace(state.cameras.R, axis1=1, axis2=2) - 1) / 2
     np.testing.assert_allclose(np.rad2deg(np.arccos(cos)), 2.0, rtol=1e-2)
+
+
+def looked(env, name, level, image, key=KEY, step=0):
+    """What is seen of `image` `[h, w, 3]`."""
+    plain = env._replace(
+        observe=lambda state: env.observe(state)._replace(images={"camera": jnp.asarray(image)})
+    )
+    wrong = disturbed(plain, [name])
+    state = wrong.reset(key, at(**{name: level}))
+    return np.array(wrong.observe(state.replace(step=state.step + step)).images["camera"], float)
 
 
 @pytest.mark.parametrize(
@@ -92,40 +143,159 @@ def test_cameras_are_moved_and_turned(env):
 )
 def test_images_are_changed_as_is_said(env, name, level, wanted):
     image = np.random.default_rng(0).integers(0, 256, (6, 6, 3)).astype(np.uint8)
-    plain = env._replace(observe=lambda state: _seeing(env, state, image))
-    found = disturbed(plain, name, level).observe(env.reset(KEY, PARAMS)).images["camera"]
-    np.testing.assert_allclose(found, wanted(image.astype(float)), atol=0.51)
+    np.testing.assert_allclose(
+        looked(env, name, level, image), wanted(image.astype(float)), atol=0.51
+    )
+
+
+def test_a_lens_colours_every_pixel_alike_and_each_episode_otherwise(env):
+    grey = np.full((6, 6, 3), 100, np.uint8)
+    found = [looked(env, "tint", 0.2, grey, jax.random.key(k)) for k in range(4)]
+    for seen in found:
+        assert np.ptp(seen, axis=(0, 1)).max() == 0
+        np.testing.assert_allclose(np.abs(seen[0, 0] / 100 - 1).max(), 0.2, atol=0.005)
+    assert len({tuple(seen[0, 0]) for seen in found}) == 4
+
+
+@pytest.mark.parametrize("level", [0.05, 0.2])
+def test_blood_hides_so_much_of_the_picture_and_leaves_the_rest(env, level):
+    green = np.full((64, 64, 3), (0, 200, 0), np.uint8)
+    found = np.stack([looked(env, "blood", level, green, jax.random.key(k)) for k in range(30)])
+    is_hidden = (found != green).any(-1)
+    np.testing.assert_allclose(is_hidden.mean(), level, rtol=0.1)
+    colours = np.unique(np.round(found[is_hidden]), axis=0)
+    wanted = np.round(255 * np.array([images.BLOOD_RGB, images.SHINE_RGB]))
+    np.testing.assert_array_equal(colours, wanted)
 
 
 def test_blurred_pixels_are_means_of_those_around_that_there_are(env):
     image = np.random.default_rng(0).integers(0, 256, (6, 6, 3)).astype(np.uint8)
-    plain = env._replace(observe=lambda state: _seeing(env, state, image))
-    found = disturbed(plain, "blur", 1.0).observe(env.reset(KEY, PARAMS)).images["camera"]
-    for at, around in (((1, 1), np.s_[:3, :3]), ((0, 0), np.s_[:2, :2]), ((5, 3), np.s_[4:, 2:5])):
-        np.testing.assert_allclose(found[at], image[around].mean((0, 1)), atol=0.51)
+    found = looked(env, "blur", 1.0, image)
+    for where, near in (((1, 1), np.s_[:3, :3]), ((0, 0), np.s_[:2, :2]), ((5, 3), np.s_[4:, 2:5])):
+        np.testing.assert_allclose(found[where], image[near].mean((0, 1)), atol=0.51)
 
 
 def test_noise_is_as_strong_as_said_and_new_at_every_step(env):
     grey = np.full((100, 100, 3), 128, np.uint8)
-    noisy = disturbed(env._replace(observe=lambda s: _seeing(env, s, grey)), "noise", 0.05)
-    state = env.reset(KEY, PARAMS)
-    now, later, other = (
-        noisy.observe(s).images["camera"].astype(float)
-        for s in (state, state.replace(step=state.step + 1), env.reset(jax.random.key(9), PARAMS))
-    )
+    now, later = (looked(env, "noise", 0.05, grey, step=step) for step in (0, 1))
+    other = looked(env, "noise", 0.05, grey, jax.random.key(9))
     np.testing.assert_allclose(now.std() / 255, 0.05, rtol=0.05)
     for image in (later, other):
         assert abs(np.corrcoef(now.ravel(), image.ravel())[0, 1]) < 0.05
 
 
-def _seeing(env, state, image):
-    return env.observe(state)._replace(images={"camera": jnp.asarray(image)})
+def went(env, name, level, steps=40):
+    """Tips that are seen and tips that are, of an episode in which arms move: `[steps, 3]` m."""
+    wrong = disturbed(env, [name])
+    step, state = jax.jit(wrong.step), wrong.reset(KEY, at(**{name: level}))
+    seen, true = [], []
+    for _ in range(steps):
+        seen.append(wrong.observe(state).pose.p[0])
+        true.append(state.pose.p[0])
+        state = step(state, Command(Pose(state.pose.R, state.pose.p + 0.001), state.gripper))
+    return np.array(seen), np.array(true)
 
 
-def test_policies_of_states_see_what_they_saw():
+@pytest.mark.parametrize("steps", range(1, timing.MOST_DELAY + 1))
+def test_what_is_seen_is_so_many_steps_old(env, steps):
+    seen, true = went(env, "late_view", float(steps), steps=8)
+    np.testing.assert_array_equal(seen[steps:], true[:-steps])
+    np.testing.assert_array_equal(seen[:steps], np.tile(true[0], (steps, 1)))
+
+
+def test_lost_observations_are_replaced_by_the_last_one_that_came(env):
+    seen, true = went(env, "dropped", 0.3, steps=200)
+    is_new = np.all(seen == true, -1)
+    np.testing.assert_allclose(1 - is_new[1:].mean(), 0.3, atol=0.08)
+    for t in np.flatnonzero(~is_new):
+        np.testing.assert_array_equal(seen[t], seen[t - 1])
+
+
+def test_policies_of_states_meet_what_is_no_image_s():
     env = stubs.make_env("state")
-    params = EnvParams(rcm.Trocar(*(x[0] for x in stubs.trocars(4))))
-    state = env.reset(KEY, params)
-    for name, kind in DISTURBANCES.items():
-        if kind.of_images and not kind.moves_cameras:
-            assert same(disturbed(env, name, kind.levels[-1]).observe(state), env.observe(state))
+    params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)), levels={"smoke": 0.5})
+    wrong = disturbed(env, ["smoke"])
+    state = wrong.reset(KEY, params)
+    assert same(wrong.observe(state), env.observe(state))
+
+
+def test_demonstrations_meet_levels_up_to_the_highest(env):
+    most = {"smoke": 0.4, "tint": 0.2}
+    wrong = varied(env, most)
+    drawn = [
+        [float(now.level) for now in wrong.reset(jax.random.key(k), PARAMS).beside.values()]
+        for k in range(60)
+    ]
+    high, low = np.max(drawn, 0), np.min(drawn, 0)
+    for i, level in enumerate(most.values()):
+        assert 0 <= low[i] < 0.1 * level and 0.9 * level < high[i] <= level
+    assert abs(np.corrcoef(np.array(drawn).T)[0, 1]) < 0.3
+
+
+@pytest.mark.parametrize(
+    "written", ["rain=1", "smoke", "smoke=much", "smoke=0", "smoke=nan", "smoke=1 smoke=2"]
+)
+def test_levels_that_are_none_are_refused(written):
+    with mistakes.of("demos.randomise"):
+        disturbances.levels_of("demos.randomise", written.split())
+    with mistakes.of("levels", 5.0):
+        base.check_levels("levels", "late_view", [1.0, 5.0])
+
+
+@pytest.fixture(scope="module")
+def reach():
+    return envs.make("reach", observation="state")
+
+
+@pytest.fixture(scope="module")
+def moved(reach):
+    """`levels -> state after a motion of 8 control steps`; one program."""
+    wrong = disturbed(reach, PHYSICAL)
+    params = EnvParams(jax.tree.map(lambda x: jnp.asarray(x)[0], reach.task.trocars))
+
+    @jax.jit
+    def run(levels):
+        first = wrong.reset(KEY, params._replace(levels=levels))
+        to = Command(Pose(first.pose.R, first.pose.p + 0.02), first.gripper)
+        return jax.lax.fori_loop(0, 8, lambda _, state: wrong.step(state, to), first)
+
+    return lambda **levels: run({**dict.fromkeys(PHYSICAL, 0.0), **levels})
+
+
+def test_servos_of_arms_are_weaker_by_a_share_and_move_otherwise(reach, moved):
+    usual, weak, weakest = (moved(servos=level) for level in (0.0, 0.5, 0.9))
+    m, of_arms = reach.scene.mj_model, reach.scene.arms[0].ctrl
+    for name in ("actuator_gainprm", "actuator_biasprm"):
+        wanted = getattr(m, name).copy()
+        wanted[of_arms] *= 0.5
+        np.testing.assert_allclose(weak.model[name], wanted, rtol=1e-6)
+    q = [state.physics.qpos[reach.scene.arms[0].q] for state in (usual, weak, weakest)]
+    apart = [float(jnp.max(jnp.abs(other - q[0]))) for other in q[1:]]
+    assert 1e-5 < 2 * apart[0] < apart[1]
+
+
+def test_friction_of_all_geoms_is_less_by_a_share(reach, moved):
+    usual = reach.scene.mj_model.geom_friction
+    np.testing.assert_allclose(moved(friction=0.25).model["geom_friction"], 0.75 * usual, rtol=1e-6)
+
+
+def test_objects_weigh_more_or_less_as_mujoco_itself_would_have_them():
+    scene = envs.scenes.load(envs.scenes.name("needle_pick"))
+    env = stubs.make_env()._replace(scene=scene)
+    wrong = disturbed(env, ["mass"])
+    params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)), levels={"mass": 0.5})
+    found = {}
+    for k in range(4):
+        model = wrong.reset(jax.random.key(k), params).model
+        m = scene.mj_model.__copy__()
+        objects = np.unique(m.geom_bodyid[scene.graspable])
+        times = float(model["body_mass"][objects[0]] / m.body_mass[objects[0]])
+        m.body_mass[objects] *= times
+        m.body_inertia[objects] *= times
+        mujoco.mj_setConst(m, mujoco.MjData(m))
+        for name in ("body_mass", "body_inertia"):
+            np.testing.assert_allclose(model[name], getattr(m, name), rtol=1e-5)
+        ours, theirs = model["body_invweight0"][objects, 0], m.body_invweight0[objects, 0]
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3)
+        found[round(times, 3)] = True
+    assert sorted(found) == [0.5, 1.5]

@@ -140,6 +140,7 @@ def _first_trials(found):
     return tables.select(found, found.trial == 0)
 
 
+@pytest.mark.slow
 def test_kills_leave_no_trace(tmp_path):
     survived = kill.survive(__file__, "job", tmp_path, kills=10)
     assert survived.kills == 10

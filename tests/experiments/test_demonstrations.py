@@ -56,3 +56,45 @@ def test_an_expert_that_the_task_lacks_is_a_mistake(tmp_path):
         demonstrations.plan(
             dataclasses.replace(SMOKE, demos=asked), stubs.make_env(), sharing.ALONE
         )
+
+
+def test_demonstrations_are_recorded_with_what_is_wrong(tmp_path, monkeypatch):
+    import jax
+
+    from starjax.data import demos, schema
+    from starjax.sim.state import EnvParams
+
+    given = []
+    found = {"episodes": 0, "trials": 0, "frames": 0}
+    monkeypatch.setattr(demos, "collect", lambda *a, **_: given.append(a) or found)
+    seen = dataclasses.replace(SMOKE.policy, observation="image")
+    env, roots = stubs.make_env("image"), []
+    for wrong in ((), ("smoke=0.5", "dropped=0.3"), ("smoke=0.4",)):
+        asked = dataclasses.replace(SMOKE.demos, randomise=wrong)
+        chosen = dataclasses.replace(SMOKE, demos=asked, policy=seen, out=str(tmp_path))
+        root, collect = demonstrations.plan(chosen, env, sharing.ALONE)
+        collect()
+        roots.append(root)
+    assert len(set(roots)) == 3 and given[0][1] is env
+    assert "randomise" not in schema.describe(env, *given[0][3:])
+    assert schema.describe(env, *given[1][3:])["randomise"] == {"smoke": 0.5, "dropped": 0.3}
+    params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)))
+    state = given[1][1].reset(jax.random.key(0), params)
+    assert set(state.beside) == {"smoke", "dropped"}
+
+
+@pytest.mark.parametrize(
+    ("observation", "wrong", "got"),
+    [
+        ("image", "trocar_told=2", "trocar_told"),
+        ("image", "breathing=2", "breathing"),
+        ("image", "late_view=5", 5),
+        ("state", "smoke=0.5", "smoke"),
+    ],
+)
+def test_what_demonstrations_cannot_show_is_refused(tmp_path, observation, wrong, got):
+    asked = dataclasses.replace(SMOKE.demos, randomise=(wrong,))
+    seen = dataclasses.replace(SMOKE.policy, observation=observation)
+    chosen = dataclasses.replace(SMOKE, demos=asked, policy=seen, out=str(tmp_path))
+    with mistakes.of("demos.randomise", got):
+        demonstrations.plan(chosen, stubs.make_env(observation), sharing.ALONE)

@@ -7,6 +7,7 @@ import pathlib
 import pytest
 
 from starjax.experiments import estimate, presets
+from starjax.runtime import speed, xla
 
 RESULTS = pathlib.Path(__file__).parents[2] / "experiments"
 STAGES = ("collect", "train", "evaluate", "report")
@@ -62,5 +63,23 @@ def test_more_of_anything_takes_longer_and_compiles_once():
 )
 def test_what_was_not_timed_is_not_known(parts):
     assert estimate.seconds(changed(**parts), STAGES, 12) is None
-    assert "not known" in estimate.line(changed(**parts), STAGES, 12, "cpu")
-    assert "not known" in estimate.line(presets.PRESETS["cpu"], STAGES, 12, "gpu")
+    assert "not known" in estimate.line(changed(**parts), STAGES, 12, "cpu", lambda: 1.0)
+    assert "not known" in estimate.line(presets.PRESETS["cpu"], STAGES, 12, "gpu", lambda: 1.0)
+
+
+def test_a_slower_machine_takes_longer():
+    cpu = presets.PRESETS["cpu"]
+    minutes = estimate.seconds(cpu, STAGES, 12) / 60
+    for pace in (1.0, 3.0):
+        said = estimate.line(cpu, STAGES, 12, "cpu", lambda pace=pace: pace)
+        assert f"about {round(pace * minutes)} min here" in said and f"{round(minutes)} min" in said
+
+
+def test_a_machine_is_as_fast_as_its_cores(monkeypatch):
+    monkeypatch.setattr(xla, "cores", lambda: 2)
+    here = speed.pace()
+    assert 0.1 < here < 10
+    monkeypatch.setattr(xla, "cores", lambda: 8)
+    assert speed.pace() < 1.5 * here
+    monkeypatch.setattr(xla, "cores", lambda: 1)
+    assert 1.3 * here < speed.pace() < 3 * here

@@ -364,6 +364,11 @@ def test_a_policy_is_scored_at_every_level(file, capsys):
     levels = found["disturbances"]["trocar_told"]["levels"]
     assert list(levels) == ["0", "5"] and found["method"] == "dp_rcm2"
     assert all(level["strict"]["trials"] == 12 for level in levels.values())
+    force = [level["wall_force_N"] for level in levels.values()]
+    assert all(0 < level["mean"] <= level["p99"] <= level["max"] for level in force)
+    assert {"stress.md", "stress.png", "stress.pdf"} < {
+        path.name for path in result.parent.iterdir()
+    }
     chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
     assert stressed("--disturbance", "trocar_told", "--levels", "0", "5") == 0 and chunks
     assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
@@ -373,8 +378,8 @@ def test_a_policy_is_scored_at_every_level(file, capsys):
 def test_a_policy_of_states_meets_no_disturbance_of_images(file):
     with mistakes.of("disturbance", "smoke"):
         stressed("--disturbance", "smoke")
-    with mistakes.of("disturbance", "rain"):
-        stressed("--disturbance", "rain")
+    with mistakes.of("levels", 5.0):
+        stressed("--disturbance", "late_view", "--levels", "0", "5")
 
 
 def test_the_exercise_is_for_policies_of_its_task(file):

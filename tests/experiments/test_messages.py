@@ -51,6 +51,12 @@ def test_an_encoder_says_where_it_began_and_for_which_task(tmp_path, monkeypatch
     assert "this task" in messages.encoder(settings)
     elsewhere = dataclasses.replace(settings, scene=config.SceneConfig(task="reach"))
     assert "peg_transfer" in messages.encoder(elsewhere)
+    seen = config.SceneConfig(camera=("endoscope",))
+    through = [
+        messages.encoder(dataclasses.replace(settings, scene=scene))
+        for scene in (seen, config.SceneConfig(camera=("camera",)))
+    ]
+    assert ["through camera" in text for text in through] == [True, False]
 
 
 def test_warnings_name_what_a_reader_must_know():

@@ -67,6 +67,10 @@ def settings(typed: str) -> config.RunConfig:
         ("stress", "", "RUN or --policy", "none"),
         ("stress", "--policy compact --levels 1", "levels", "none or several"),
         ("exercise", "x --policy y", "RUN or --policy", "both"),
+        ("stress", "--policy compact --disturbance rain", "disturbance", "'rain'"),
+        ("run", "--demos.randomise rain=1", "demos.randomise", "'rain'"),
+        ("run", "--demos.randomise smoke", "demos.randomise", "smoke"),
+        ("run", "--demos.randomise smoke=1 --demos.from x", "demos.randomise", "x"),
         ("report", "--out x", "RUN", "none"),
         ("pack", "a b c", "FLAG", "c"),
         ("bench", "x --calls 0", "calls", 0),
@@ -89,6 +93,8 @@ def test_the_nearest_flag_is_suggested():
         ("run --train.stepps 3", {"jax", "mujoco", "numpy"}),
         ("run --seed -1", {"jax", "mujoco", "numpy"}),
         ("sweep x --trocars 0", {"jax", "mujoco"}),
+        ("stress --policy compact --disturbance rain", {"jax", "mujoco"}),
+        ("run --demos.randomise rain=1", {"jax", "mujoco", "numpy"}),
     ],
 )
 def test_mistakes_are_one_line_and_come_before_jax(typed, heavy):
@@ -119,6 +125,12 @@ def test_flags_override_the_preset_and_nothing_else():
         ("--preset cpu", "runs/cpu"),
         ("--preset cpu --seed=3", "runs/cpu-seed3"),
         ("--preset cpu --task reach --arm fr5 --camera side", "runs/cpu-reach-fr5-side"),
+        ("--preset gpu --cameras endoscope", "runs/gpu-endoscope"),
+        ("--preset gpu --cameras fixed", "runs/gpu"),
+        (
+            "--preset gpu --camera endoscope --policy.frame camera",
+            "runs/gpu-endoscope-camera-frame",
+        ),
         ("--preset cpu --policy.observation state --seed 3", "runs/cpu-state-seed3"),
         ("--preset cpu --policy.observation state --seed 3 --out runs/cpu", "runs/cpu"),
         ("--preset cpu --policy.no-freeze-encoder", "runs/cpu-unfrozen"),
@@ -174,7 +186,8 @@ def helped(command, capsys):
     usage, *lines = capsys.readouterr().out.replace("│", " ").splitlines()
     found, entry = {}, []
     for line in lines:
-        if flag := re.match(r"  (--?\w[^ ,]*)", line):
+        # Another name of a flag stands before it, with what it takes.
+        if flag := re.match(r"  (?:--\w+ \[.*\]\]?, )?(--?\w[^ ,]*)", line):
             entry = found[flag[1]] = re.split(r"\s{2,}", line.strip(), maxsplit=1)[1:]
         elif line.startswith(" " * 6):
             entry.append(line.strip())

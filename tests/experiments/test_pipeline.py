@@ -42,6 +42,7 @@ def done(monkeypatch):
         calls.append(f"train {name}")
 
     monkeypatch.setattr(pipeline, "_environment", lambda settings: None)
+    monkeypatch.setattr(pipeline, "_compiling_ahead", lambda *_: None)
     monkeypatch.setattr(demonstrations, "plan", plan)
     monkeypatch.setattr(demonstrations, "load", lambda _, root, collect, encoder, share: collect())
     monkeypatch.setattr(pipeline, "_train", train)

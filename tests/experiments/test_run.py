@@ -1,7 +1,11 @@
-"""The whole command at its smallest, as a user types it, and what it leaves behind."""
+"""The whole command at its smallest, as a user types it, and what it leaves behind.
+
+The task is of another package, `tests/extension/site`: from its expert to its report.
+"""
 
 import json
 import os
+import pathlib
 import re
 import subprocess
 import sys
@@ -9,21 +13,25 @@ import sys
 import numpy as np
 import pytest
 
+from starjax.data import load
 from starjax.policies import policy_file
 
 pytestmark = pytest.mark.slow
-TINY = ["--demos.seen-trocars", "4", "--train.steps", "20", "--eval.time-limit-s", "2"]
+SITE = pathlib.Path(__file__).parents[1] / "extension" / "site"
+TINY = ["--task", "touch", "--preset", "smoke", "--demos.seen-trocars", "4"]
+TINY += ["--train.steps", "20", "--eval.time-limit-s", "2"]
 
 
 def starjax(*words: str) -> subprocess.CompletedProcess:
     # A real terminal's environment: nothing that the tests have set up but the device.
     kept = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    path = os.pathsep.join([str(SITE), *filter(None, sys.path)])
     return subprocess.run(
         [sys.executable, "-m", "starjax", *words],
         capture_output=True,
         text=True,
         timeout=1500,
-        env={**kept, "JAX_PLATFORMS": "cpu"},
+        env={**kept, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path},
     )
 
 
@@ -34,7 +42,7 @@ def out(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def said(out):
-    command = ["run", "--preset", "smoke", "--method", "stardiff", "--out", str(out), *TINY]
+    command = ["run", "--method", "stardiff", "--out", str(out), *TINY]
     first = starjax(*command)
     assert first.returncode == 0, first.stderr
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.npz")}
@@ -61,6 +69,7 @@ def test_the_same_command_again_does_nothing_twice(said):
 def test_result_holds_what_is_documented(said, out):
     result = json.loads((out / "stardiff" / "result.json").read_text())
     assert result["method"] == "stardiff" and result["observation"] == "state"
+    assert result["scene"]["task"] == "touch"
     assert (result["seen"]["trials"], result["unseen"]["trials"]) == (4, 8)
     for part in (result["seen"], result["unseen"], result["safe"]["all"]):
         assert part["ci95"][0] <= part["rate"] <= part["ci95"][1]
@@ -74,23 +83,25 @@ def test_result_holds_what_is_documented(said, out):
     assert len(result["trials"]) == 12 and len(result["per_trocar"]) == 12
     assert result["config"]["train"]["steps"] == 20 and result["config"]["preset"] == "smoke"
     assert {"collect", "train", "evaluate", "train: compile"} <= result["timings_s"].keys()
-    assert result["command"].startswith("starjax run --preset smoke")
+    assert result["command"].startswith("starjax run --method stardiff")
     assert any("not pixels" in text for text in result["warnings"])
     assert result["versions"]["jax"] and result["hardware"]["cores"] >= 1
 
 
 def test_report_and_weights_are_there(said, out):
     page = (out / "report" / "index.html").read_text()
-    assert "STAR-Diff" in page and "state" in page
+    assert "STAR-Diff" in page and "state" in page and "touched the mark" in page
     assert (out / "report" / "tables.md").read_text().count("|") > 20
+    (demos,) = out.glob("demos-*")
+    assert load.load(demos).description["scene"]["task"] == "touch"
     trained = policy_file.load(out / "stardiff" / "policy.safetensors")
-    assert trained.policy.observation == "state"
+    assert trained.policy.observation == "state" and trained.scene.task == "touch"
     lines = (out / "stardiff" / "metrics.jsonl").read_text().splitlines()
     assert all(np.isfinite(json.loads(line).get("loss", 0.0)) for line in lines)
 
 
 def test_another_setting_in_the_same_folder_is_refused(said, out):
-    changed = ["run", "--preset", "smoke", "--out", str(out), *TINY, "--train.batch-size", "8"]
+    changed = ["run", "--out", str(out), *TINY, "--train.batch-size", "8"]
     done = starjax(*changed)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "--train.batch-size" in done.stderr and "--out" in done.stderr

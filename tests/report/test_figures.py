@@ -7,7 +7,7 @@ from matplotlib import colors
 from matplotlib.figure import Figure
 from report.conftest import edited
 
-from starjax.report import figures, outcomes, ports, results, stage, style, trajectories
+from starjax.report import figures, outcomes, results, stage, style, training_trocars, trajectories
 from starjax.sim.tasks.base import Outline
 
 BOARD = np.array([[-0.05, -0.04, 0], [0.05, -0.04, 0], [0.05, 0.04, 0], [-0.05, 0.04, 0]])
@@ -41,7 +41,7 @@ def test_success_is_pooled_by_distance_and_drawn_with_its_interval(one):
     assert both == 2 * alone
 
 
-def test_ports_from_above_are_at_their_places_and_unseen_ones_orange(one):
+def test_trocars_from_above_are_at_their_places_and_unseen_ones_orange(one):
     shown = figures.distance([one], one).axes[1].collections[0]
     groups = [group[0] for group in outcomes.by_trocar(one.trials)]
     wanted = [
@@ -53,7 +53,7 @@ def test_ports_from_above_are_at_their_places_and_unseen_ones_orange(one):
     assert orange == [not trial.seen for trial in groups]
 
 
-def test_the_map_weighs_ports_by_their_trials_and_ends_far_from_all():
+def test_the_map_weighs_trocars_by_their_trials_and_ends_far_from_all():
     axis, at = Figure().subplots(), np.array([[-5.0, 0.0], [5.0, 0.0]])
     shown = figures._heat(axis, at, np.array([1.0, 0.0]), np.array([3, 1]))
     assert shown.get_array()[80, 80] == pytest.approx(0.75)
@@ -87,11 +87,14 @@ def test_success_against_the_number_of_training_trocars(one):
     runs = [
         edited(one, [t._replace(seen=t.trocar < count) for t in one.trials]) for count in (1, 2, 8)
     ]
-    assert ports.never_seen(runs) == {8, 9, 10, 11}
-    assert [ports.trained_at(run) for run in runs] == [1, 2, 8]
+    assert training_trocars.never_seen(runs) == {8, 9, 10, 11}
+    assert [training_trocars.trained_at(run) for run in runs] == [1, 2, 8]
     expected = outcomes.tally(t for t in one.trials if t.trocar >= 8).rate
-    np.testing.assert_allclose(ports.draw(runs).axes[0].lines[0].get_ydata(), expected)
-    assert ports.draw(runs[1:2]) is None and ports.draw([runs[2], runs[2]]) is None
+    np.testing.assert_allclose(training_trocars.draw(runs).axes[0].lines[0].get_ydata(), expected)
+    assert (
+        training_trocars.draw(runs[1:2]) is None
+        and training_trocars.draw([runs[2], runs[2]]) is None
+    )
 
 
 def test_paths_are_over_the_outline_seen_trocars_above_unseen_ones(one):

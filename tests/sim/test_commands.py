@@ -49,6 +49,7 @@ def through(*tip):
     return pose
 
 
+@pytest.mark.slow
 def test_what_is_asked_of_the_arm_is_approached_and_not_leapt_at(follow):
     tilts = [2, 3, 5, 10, 20, -5]
     # tools that lie at 45 degrees, near the port and far from it

@@ -8,6 +8,7 @@ import pytest
 
 from starjax import errors, rcm
 from starjax.sim import env as envs
+from starjax.sim import physics
 from starjax.sim.tasks.peg_transfer import expert, task
 from starjax.types import Command, Pose
 
@@ -304,17 +305,31 @@ def test_the_expert_is_disturbed_by_a_millimetre_and_a_few_degrees(reset, begin)
 
 
 def test_the_contact_solver_converges_and_a_step_where_it_does_not_is_invalid(
-    reset, begin, drive, monkeypatch
+    sim, reset, begin, drive, monkeypatch
 ):
     state = reset(3)
     after, _ = drive(state, begin(state, 4))
     assert float(after.solver_error.max()) < envs.MAX_SOLVER_ERROR and not after.invalid.any()
-    monkeypatch.setattr(envs, "MAX_SOLVER_ERROR", 0.0)
-    environment = envs.make(observation="state")
-    command = Command(state.pose, state.gripper)
-    stopped = jax.jit(jax.vmap(environment.step))(state, command)
-    assert stopped.invalid.all() and stopped.done.all()
-    np.testing.assert_array_equal(stopped.physics.qpos, state.physics.qpos)
+    state = jax.tree.map(lambda leaf: leaf[0], state)
+    moved = state.physics.replace(qpos=state.physics.qpos + 1e-3)
+    passed = physics.Passed(
+        state.touch,
+        physics.no_contacts(sim),
+        jnp.tile(state.physics.qpos, (8, 1)),
+        jnp.zeros(()),
+    )
+
+    @jax.jit
+    def step(error):
+        left = passed._replace(solver_error=error)
+        monkeypatch.setattr(physics, "advance", lambda *_: (moved, left))
+        return envs.step(sim, state, Command(state.pose, state.gripper))
+
+    for share in (0.9, 1.1):
+        after, stopped = step(share * envs.MAX_SOLVER_ERROR), share > 1.0
+        assert bool(after.invalid) == bool(after.done) == stopped
+        kept = state if stopped else after.replace(physics=moved)
+        np.testing.assert_array_equal(after.physics.qpos, kept.physics.qpos)
 
 
 def test_experts_act_on_the_trocar_that_they_are_told_and_errors_count_from_the_true_one(

@@ -243,6 +243,7 @@ def test_damaged_checkpoint_costs_only_its_steps(whole, tmp_path):
     assert_same_bytes(again.state, result.state)
 
 
+@pytest.mark.slow
 def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
     directory, result = whole
     hosted = jobs.train(tmp_path, host=True)
@@ -254,38 +255,22 @@ def test_data_on_the_host_gives_the_same_run(whole, tmp_path):
     np.testing.assert_allclose(losses[0], losses[1], rtol=1e-5)
 
 
-def test_packed_parameters_give_the_same_run_and_resume(whole, tmp_path, monkeypatch):
-    monkeypatch.setattr(packed_params, "PLATFORMS", {"cpu"})
-    asked = itertools.count(1)
-    with pytest.raises(loop.Interrupted):
-        jobs.train(tmp_path, should_stop=lambda: next(asked) == 3)
-    directory, result = whole
-    again = jobs.train(tmp_path)
-    for x, y in zip(leaves(again.state), leaves(result.state), strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6)
-    ours, theirs = (log.read(d / "metrics.jsonl") for d in (tmp_path, directory))
-    for a, b in zip(ours, theirs, strict=True):
-        assert a.pop("kind") == b.pop("kind")
-        assert a == pytest.approx(b, rel=1e-4)
-
-
 @pytest.mark.slow
-def test_pictures_train_too_and_resume(tmp_path, monkeypatch):
+def test_images_train_too_and_packed_parameters_give_the_same_run_and_resume(tmp_path, monkeypatch):
     settings = dataclasses.replace(jobs.SETTINGS, steps=2, holdout_demos=0)
     seen = {"observation": "image", "dtype": "bfloat16"}
     whole = jobs.train(tmp_path / "a", settings, **seen)
-    asked = iter(range(100))
-    with pytest.raises(loop.Interrupted):
-        jobs.train(tmp_path / "b", settings, **seen, should_stop=lambda: next(asked) == 1)
-    again = jobs.train(tmp_path / "b", settings, **seen)
-    assert_same_bytes(again.state, whole.state)
-
     monkeypatch.setattr(packed_params, "PLATFORMS", {"cpu"})  # and kernels turned
-    packed = jobs.train(tmp_path / "c", settings, **seen)
+    asked = itertools.count(1)
+    with pytest.raises(loop.Interrupted):
+        jobs.train(tmp_path / "b", settings, **seen, should_stop=lambda: next(asked) == 2)
+    assert checkpoint.steps(tmp_path / "b/checkpoints") == [1]
+    packed = jobs.train(tmp_path / "b", settings, **seen)
     for x, y in zip(leaves(packed.state), leaves(whole.state), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_training_learns(tmp_path):
     settings = dataclasses.replace(
         jobs.SETTINGS, steps=300, log_every=50, checkpoint_every=300, steps_per_call=50
@@ -296,9 +281,10 @@ def test_training_learns(tmp_path):
     assert result.samples_per_second > 0
 
 
+@pytest.mark.slow
 def test_killed_again_and_again_ends_the_same(tmp_path):
-    found = kill.survive(jobs.__file__, "train_and_export", tmp_path, kills=10)
-    assert found.kills >= 10
+    found = kill.survive(jobs.__file__, "train_and_export", tmp_path, kills=7)
+    assert found.kills == 7
     for name in ("policy.safetensors", "metrics.jsonl"):
         assert found.killed[name] == found.whole[name]
     last = {name.split("/")[1] for name in found.killed if name.startswith("checkpoints/step")}
@@ -310,7 +296,7 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "observation", "dtype", "tolerance"),
-    [(8, "state", "float32", 1e-4), (2, "image", "bfloat16", 5e-2)],
+    [(4, "state", "float32", 1e-4), (2, "image", "bfloat16", 5e-2)],
 )
 def test_many_devices_give_the_numbers_of_one(tmp_path, count, observation, dtype, tolerance):
     settings = dataclasses.replace(jobs.SETTINGS, holdout_demos=0)

@@ -221,7 +221,7 @@ def _writer(
 
 
 def _frame_bytes(description: dict[str, Any]) -> int:
-    """Of one recorded control step."""
+    """Size of one recorded control step."""
     features = description["features"].values()
     return sum(math.prod(x["shape"]) * np.dtype(x["dtype"]).itemsize for x in features)
 

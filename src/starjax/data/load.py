@@ -188,6 +188,7 @@ def _dataset(
             gripper=fields["gripper"],
             images=images or None,
             state=fields.get("state"),
+            endoscope=_endoscope(fields),
         ),
         command=Command(
             pose=Pose(fields["command_R"], fields["command_p"]), gripper=fields["command_gripper"]
@@ -198,6 +199,11 @@ def _dataset(
         length=length,
     )
     return jax.device_put(dataset) if place == "device" else dataset
+
+
+def _endoscope(fields: dict[str, Any]) -> Pose | None:
+    known = [fields[name] for name in episodes.ENDOSCOPE if name in fields]
+    return Pose(*known) if known else None
 
 
 class Frames:

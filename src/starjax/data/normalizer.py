@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import methods, rcm
+from starjax.data import frames as camera_frames
 from starjax.data import windows
 from starjax.sim.tasks.base import Field, Task
 
@@ -76,7 +77,11 @@ def encode(action_space: str, pose: Any, gripper: Any, told: rcm.TrocarFrame) ->
 
 
 def fit(
-    method: methods.Method, task: Task, dataset: windows.Dataset, frames: np.ndarray
+    method: methods.Method,
+    task: Task,
+    dataset: windows.Dataset,
+    frames: np.ndarray,
+    frame: str = "world",
 ) -> Normalizer:
     """Statistics of the commands (and the task state) at the given frames of a dataset.
 
@@ -85,12 +90,21 @@ def fit(
       task: whose state's points are scaled, and whose arms' trocars may be drawn elsewhere.
       dataset: the demonstrations, wherever they are.
       frames: `[n]` frame numbers, those trained on.
+      frame: of the policy, "world" or "camera", see `data.frames`.
     """
-    encode_commands = jax.jit(
-        lambda command, told: encode(method.action_space, command.pose, command.gripper, told)
-    )
+
+    @jax.jit
+    def encode_commands(camera, command, told):
+        if camera is not None:
+            command = camera_frames.command(camera, command)
+            told = camera_frames.trocar(task, camera, told)
+        return encode(method.action_space, command.pose, command.gripper, told)
+
+    def camera_of(observation):
+        return None if frame == "world" else camera_frames.of(observation)
+
     actions = windows.over_frames(
-        dataset, frames, lambda _, command, told: encode_commands(command, told)
+        dataset, frames, lambda seen, *rest: encode_commands(camera_of(seen), *rest)
     )
     space = rcm.ACTION_SPACES[method.action_space]
     action = _min_max(actions, _entries_but(space, task.arms, "R"))
@@ -98,9 +112,25 @@ def fit(
         action = action.replace(reach=_reach(action, space, task, dataset, frames))
     state = None
     if dataset.observation.state is not None:
-        states = windows.over_frames(dataset, frames, lambda observation, *_: observation.state)
+
+        def seen_state(observation: Any, *_: Any) -> Any:
+            camera = camera_of(observation)
+            if camera is None:
+                return observation.state
+            return camera_frames.observation(task, camera, observation).state
+
+        states = windows.over_frames(dataset, frames, seen_state)
         state = _min_max(states, _points(task.fields))
     return Normalizer(action=action, state=state)
+
+
+def shapes(method: methods.Method, task: Task, state: bool) -> Normalizer:
+    """What `fit` returns, without the numbers; of a dataset with or without the task state."""
+    size = task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
+    ends = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (size, task.state_size)]
+    reach = jax.ShapeDtypeStruct((2, size), jnp.float32)
+    action = MinMax(ends[0], ends[0], None if method.action_space in _ABSOLUTE else reach)
+    return Normalizer(action, MinMax(ends[1], ends[1]) if state else None)
 
 
 def _reach(

@@ -5,6 +5,7 @@ radius, polar and azimuth; trocars are `[C][3]`, `scene` is the hash that is now
 """
 
 import hashlib
+import types
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -34,6 +35,7 @@ class Settings(NamedTuple):
       max_steps: control steps after which an episode has failed.
       keep_failures: whether failed episodes are stored too.
       expert: which of the task's; empty for its first one.
+      randomise: what is wrong with their environment: highest levels by name.
     """
 
     per_trocar: int
@@ -41,6 +43,7 @@ class Settings(NamedTuple):
     max_steps: int
     keep_failures: bool = False
     expert: str = ""
+    randomise: Mapping[str, float] = types.MappingProxyType({})
 
 
 def describe(env: Any, trocars: Trocar, settings: Settings) -> dict[str, Any]:
@@ -62,7 +65,9 @@ def describe(env: Any, trocars: Trocar, settings: Settings) -> dict[str, Any]:
     rule = f"fold_in(fold_in(fold_in(key(seed), {STREAM}), trocar), trial)"
     return {
         "schema": SCHEMA,
-        **settings._asdict(),
+        **{name: x for name, x in settings._asdict().items() if name != "randomise"},
+        # Where nothing is wrong, datasets are called as they were before anything could be.
+        **({"randomise": dict(settings.randomise)} if settings.randomise else {}),
         "expert": expert_name(env.task, settings),
         "scene": env.names._asdict(),
         "trocars": np.stack([np.asarray(f, np.float64) for f in trocars], -1).tolist(),

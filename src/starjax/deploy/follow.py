@@ -247,8 +247,12 @@ def _through(pose: Pose, p_world_trocar: jax.Array) -> Pose:
 @jax.jit
 @arrays.broadcasting
 def _worst(pose: Pose, p_world_trocar: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of poses `[H, *arms]`: m, the farthest axis from the trocar and the least depth; how far the
-    worst matrix is from a rotation."""
+    """Measures how bad the worst of the poses `[H, *arms]` is.
+
+    Returns:
+      m, the farthest axis from the trocar; m, the least depth; how far the worst matrix is from a
+      rotation.
+    """
     x, y, z = (pose.R[..., :, i] for i in range(3))
     mirrored = jnp.abs(jnp.cross(x, y) - z).max()
     skew = jnp.maximum(jnp.abs(arrays.matmul(pose.R.mT, pose.R) - jnp.eye(3)).max(), mirrored)

@@ -83,7 +83,7 @@ class Link:
             return None
 
     def wait(self, seconds: float) -> Heard | None:
-        """As `poll`, but waits for it so long."""
+        """Waits at most `seconds` for what `poll` returns."""
         try:
             return self._heard.get(timeout=seconds)
         except queue.Empty:

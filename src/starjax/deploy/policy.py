@@ -88,13 +88,12 @@ class Deployed:
           (but for `dp_ee`), and the gripper's openings.
 
         Raises:
-          UsageError: an array is missing or has another shape or type than expected, a number is
-            not finite or none that is measured so, a rotation is none, the trocar is none, tip or
-            trocar are farther than `FARTHEST` from the nominal trocar, or, of a policy that keeps
-            to the RCM manifold, the tool's axis is farther than `FARTHEST_OFF` from the trocar or
-            the tip not beyond it. Also where a plan begins farther than `max_first_move` or
-            `max_first_turn` from the measured pose.
-            Values that jax traces are not looked at: within a program none of the last three is.
+          UsageError: an input is missing, has the wrong shape or type, is not finite or cannot have
+            been measured: `R` is no rotation, or tip or trocar are farther than `FARTHEST` from
+            the nominal trocar. For a policy on the RCM manifold also if the tool's axis passes the
+            trocar by more than `FARTHEST_OFF`, or the tip is not beyond it. Also if the plan begins
+            farther than `max_first_move` or `max_first_turn` from the measured pose.
+            Values that jax traces are not checked: inside `jit` only shapes and types are.
         """
         _check_key(key)
         seen, trocar = measured.given(self.asks, observation, trocar)
@@ -196,6 +195,9 @@ def load(
     trained = policy_file.load(path)
     if trained.p_world_ref is None:
         raise errors.UsageError("policy", "one that says its nominal trocar", path)
+    if trained.policy.frame != "world":
+        expected = "one that plans in the world's frame"
+        raise errors.UsageError("policy", expected, path, "train it with --policy.frame world")
     settings = _with_options(trained.policy, options)
     errors.choice(f"{path}: method", trained.method, methods.METHODS)
     method = method or trained.method

@@ -220,7 +220,7 @@ class _Served:
         return wire.pack(answer)
 
     def _admit(self, connection: sockets.ServerConnection, request: Any) -> Any:
-        """None for a client that may connect, else what it is told."""
+        """Admits a client: None if it may connect, else the answer that refuses it."""
         if request.path == "/healthz":
             return connection.respond(http.HTTPStatus.OK, "OK\n")
         given = request.headers.get_all("Authorization")

@@ -28,6 +28,7 @@ from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import ANYWHERE, Place
 from starjax.runtime import files, jax_settings, xla
+from starjax.sim import endoscope
 
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
 GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
@@ -64,6 +65,7 @@ def evaluate(
     *,
     place: Place = ANYWHERE,
     identity: Mapping[str, Any] | None = None,
+    levels: Mapping[str, float] | None = None,
     report: Callable[[str], None] = print,
 ) -> tables.Table:
     """Runs what is missing of an evaluation and returns all of it.
@@ -75,6 +77,7 @@ def evaluate(
       trocars: fields `[C, A]`.
       place: where the lanes are 0, `lanes_per_device`, and so few that all devices have a share.
       identity: JSON values that tell this agent from others with the same params.
+      levels: of what disturbs the environment.
       report: gets lines for the user.
 
     Raises:
@@ -85,7 +88,7 @@ def evaluate(
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     count = len(trocars.radius)
     group = [(i, trial) for i in range(count) for trial in range(settings.trials)]
-    max_steps = math.ceil(settings.time_limit_s * env.control_hz - 1e-6)
+    max_steps = _max_steps(env, settings)
     chosen = recorded.choose(count, settings.trials, settings.video_trials)
     several = len(place.devices or [0])
     device = (place.devices or jax.local_devices())[0]
@@ -99,6 +102,7 @@ def evaluate(
             "weights": fingerprint(params),
             "agent": agent.about,
             "identity": dict(identity or {}),
+            **({"levels": dict(levels)} if levels else {}),
             "scene": env.names._asdict(),
             "model": schema.model_hash(env.scene),
             "platform": device.platform,
@@ -111,13 +115,27 @@ def evaluate(
         found = share.first("sizes", lambda: _resume(directory, plan, sizes, most, several, report))
         lanes, chunk = found
         rules = engine.Settings(settings.seed, None, max_steps, lanes * several)
-        run = engine.make(env, agent, trocars, rules, episodes.SCORE, place.devices)
+        run = engine.make(env, agent, trocars, rules, episodes.SCORE, place.devices, levels)
         spans = [slice(first, first + chunk) for first in range(0, len(group), chunk)]
         parts = _parts(directory, env, lambda trials: run(params, trials), group, spans, chosen)
         made = chunks.complete(share, parts, "Evaluation", "trials", report)
         if share.is_first and chosen.any():
             files.write_npz(directory / "recorded.npz", recorded.join([*map(_recorded, made)]))
     return tables.join([*map(tables.from_columns, made)])
+
+
+def compile_ahead(
+    env: Any, agent: BatchAgent, params: Any, trocars: Trocar, settings: Settings
+) -> None:
+    """Compiles what `evaluate` will run on one device, so that jax's cache on disk has it.
+
+    The arguments are `evaluate`'s, but for `params`: arrays like those to come, or their shapes.
+    """
+    trocars = configurations.listed(trocars, len(env.p_world_ref))
+    trials = len(trocars.radius) * settings.trials
+    lanes = lanes_per_device(jax.local_devices()[0], trials)
+    rules = engine.Settings(settings.seed, None, _max_steps(env, settings), lanes)
+    engine.compile_ahead(env, agent, params, trocars, rules, episodes.SCORE)
 
 
 def lanes_per_device(device: jax.Device, trials: int) -> int:
@@ -148,6 +166,10 @@ def fingerprint(tree: Any) -> str:
         digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+def _max_steps(env: Any, settings: Settings) -> int:
+    return math.ceil(settings.time_limit_s * env.control_hz - 1e-6)
 
 
 def _check(settings: Settings, place: Place) -> None:
@@ -209,7 +231,8 @@ def _parts(
 ) -> chunks.Parts:
     """Chunks of trials: their table, and of those that are `chosen` `[M]` the trajectories."""
     labels = env.task.labels
-    beside = {f"{_RECORDED}{name}" for name in recorded.names(labels)}
+    has_endoscope = endoscope.of(env.task, env.names.cameras) is not None
+    beside = {f"{_RECORDED}{name}" for name in recorded.names(labels, has_endoscope)}
 
     def check(number: int, arrays: chunks.Arrays) -> None:
         rows = spans[number]

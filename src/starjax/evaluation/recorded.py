@@ -7,15 +7,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from starjax import rcm, schema_1
-from starjax.rollouts.episodes import Episode
+from starjax.rollouts.episodes import ENDOSCOPE, Episode
 from starjax.runtime import files
+from starjax.types import Pose
 
 # One trajectory a configuration is recorded for figures, unless there are more than this.
 FIGURE_TROCARS = 16
 
 _LABEL = "labels."
-_BY_STEP = ("p_world_tip", "rcm_error", "qpos")
-_COLUMNS = ("trocar", "trial", "length", "p_world_trocar", *_BY_STEP)
+_BY_STEP = ("p_world_tip", "rcm_error", "qpos", *ENDOSCOPE)
+_COLUMNS = ("trocar", "trial", "length", "p_world_trocar", "p_world_tip", "rcm_error", "qpos")
 
 
 class Trajectory(NamedTuple):
@@ -28,6 +29,7 @@ class Trajectory(NamedTuple):
       rcm_error: `[T, A]` m, executed, or None where the file does not have it.
       qpos: `[T, Q]` generalised coordinates, or None.
       labels: the task's, e.g. source and target.
+      endoscope: pose_world_camera `[T]`, or None where the scene was not seen through one.
     """
 
     trocar: int
@@ -37,6 +39,7 @@ class Trajectory(NamedTuple):
     rcm_error: np.ndarray | None
     qpos: np.ndarray | None
     labels: dict[str, int]
+    endoscope: Pose | None = None
 
 
 def choose(count: int, trials: int, video_trials: int) -> np.ndarray:
@@ -54,9 +57,10 @@ def choose(count: int, trials: int, video_trials: int) -> np.ndarray:
     return mask.reshape(-1)
 
 
-def names(labels: Sequence[str]) -> list[str]:
+def names(labels: Sequence[str], has_endoscope: bool = False) -> list[str]:
     """Names of what `take` gives of trials with these labels."""
-    return [*_COLUMNS, *(f"{_LABEL}{name}" for name in labels)]
+    more = ENDOSCOPE if has_endoscope else ()
+    return [*_COLUMNS, *more, *(f"{_LABEL}{name}" for name in labels)]
 
 
 def take(episodes: Sequence[Episode], p_world_ref: np.ndarray) -> dict[str, np.ndarray]:
@@ -80,6 +84,11 @@ def take(episodes: Sequence[Episode], p_world_ref: np.ndarray) -> dict[str, np.n
         "rcm_error": _padded([episode.joined("rcm_error") for episode in episodes]),
         "qpos": _padded([episode.joined("reached_qpos") for episode in episodes]),
         "p_world_trocar": np.asarray(rcm.trocar_position(trocar, p_world_ref)),
+        **{
+            name: _padded([episode.joined(name) for episode in episodes])
+            for name in ENDOSCOPE
+            if name in episodes[0].arrays
+        },
         **{
             f"{_LABEL}{name}": np.array([o["labels"][name] for o in outcomes], np.int32)
             for name in outcomes[0]["labels"]
@@ -111,7 +120,7 @@ def read(file: Path) -> list[Trajectory]:
         for name in ("p_world_tip", "p_world_trocar", "rcm_error"):
             if name in found:
                 found[name] = np.expand_dims(found[name], 1 if name == "p_world_trocar" else 2)
-        labels = schema_1.labels(found, "_peg")
+        labels = schema_1.recorded_labels(found)
         found |= {f"{_LABEL}{name}": array for name, array in labels.items()}
     return [_row(found, row, int(length)) for row, length in enumerate(found["length"])]
 
@@ -129,6 +138,7 @@ def _row(found: dict[str, np.ndarray], row: int, length: int) -> Trajectory:
         rcm_error=steps("rcm_error"),
         qpos=steps("qpos"),
         labels={name.removeprefix(_LABEL): value for name, value in labels.items()},
+        endoscope=Pose(*map(steps, ENDOSCOPE)) if ENDOSCOPE[0] in found else None,
     )
 
 

@@ -2,7 +2,7 @@
 
 Written and read here alone. Schema 2 says in which scene, with which code and on which
 demonstrations; a trial's radius, polar and azimuth are lists `[A]`, its labels an object. Files of
-schema 1, which does not say it, are peg transfer with one arm, their numbers become lists of one.
+schema 1, which does not say it, are of the first scene, with one arm: numbers become lists of one.
 """
 
 import json

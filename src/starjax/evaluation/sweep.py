@@ -19,7 +19,7 @@ BIN_WIDTH = 0.01  # m, of the distance to the nearest training trocar
 def sample(seed: int, count: int, task: Task) -> Trocar:
     """Draws configurations as in Eq. 19, each arm in its workspace's ranges: fields `[count, A]`.
 
-    Those of peg transfer are section V-A2's.
+    The ranges of the workspace `board` are section V-A2's.
     """
     if count < 1:
         raise errors.UsageError("count", "1 or more", count)

@@ -9,6 +9,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
+from starjax.evaluation import disturbances
 from starjax.learners import LEARNERS
 
 _CELL = {"resnet18": 32, "small": 8}  # pixels that an encoder makes one of its maps' cells
@@ -33,6 +34,11 @@ def check(config: config_lib.RunConfig) -> None:
     for name in ("encoder_weights", "freeze_encoder"):
         sees = policy.observation == "image" or not getattr(policy, name)
         expect(sees, f"policy.{name}", "policy.observation image", policy.observation)
+    wrong = disturbances.levels_of("demos.randomise", config.demos.randomise)
+    ours = not (wrong and config.demos.from_)
+    expect(ours, "demos.randomise", "the expert's demonstrations", config.demos.from_)
+    turns = policy.frame == "world" or policy.trocar_yaw == "azimuth"
+    expect(turns, "policy.trocar_yaw", "azimuth with policy.frame camera", policy.trocar_yaw)
     trained = bool(policy.encoder_weights) or not policy.freeze_encoder
     expect(trained, "policy.freeze_encoder", "policy.encoder_weights of a trained policy", "none")
 

@@ -11,9 +11,9 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.experiments import messages, stage_times
+from starjax.experiments import messages, scenes, stage_times
 
-_FROM = "demos.from_"
+_FROM, _RANDOMISE = "demos.from_", "demos.randomise"
 
 
 def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Callable[[], None]]:
@@ -27,6 +27,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
     from starjax.data import demos, schema, store
     from starjax.rollouts import agent, placement, trocars, waves
 
+    env, most = randomised(config, env)
     task, name = env.task, config.demos.expert or next(iter(env.task.experts))
     errors.choice("demos.expert", name, task.experts)
     chosen = trocars.select(task.trocars, slice(config.demos.seen_trocars))
@@ -36,6 +37,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
         max_steps=max(config.demos.max_steps, task.least_steps),
         keep_failures=config.demos.keep_failures,
         expert=name,
+        randomise=most,
     )
     expert = agent.from_single(task.experts[name]())
     out = Path(config.out)
@@ -79,6 +81,27 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
     return root, collect
 
 
+def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, float]]:
+    """The environment that demonstrations are recorded in, and the highest levels of what is wrong
+    with it.
+
+    Raises:
+      errors.UsageError: something that these demonstrations would not show, or no such level.
+    """
+    from starjax.evaluation.disturbances import DISTURBANCES, base, levels_of
+
+    most = levels_of(_RANDOMISE, config.demos.randomise)
+    for name, level in most.items():
+        kind: base.Disturbance = DISTURBANCES.get(name)
+        sees = config.policy.observation == "image" or not kind.of_images
+        if not (kind.of_demos and sees):
+            raise errors.UsageError(_RANDOMISE, "what demonstrations can show", name)
+        base.check_levels(_RANDOMISE, name, [level])
+    if not most:
+        return env, most
+    return base.varied(scenes.disturbable(env, list(most), config.policy), most), most
+
+
 def given(config: config_lib.RunConfig, env: Any) -> Path:
     """The folder of somebody's dataset, once it is known to be one that this run can learn from.
 
@@ -109,6 +132,8 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
     wanted = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
     if policy.observation == "state":
         wanted = {"state": [sum(field.size for field in env.task.fields)]}
+    if policy.frame == "camera":
+        wanted |= dict(zip(episodes.ENDOSCOPE, ([3, 3], [3]), strict=True))
     for name, shape in wanted.items():
         found = features.get(name, {}).get("shape")
         if found != shape:

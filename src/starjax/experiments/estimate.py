@@ -1,6 +1,6 @@
 """About how long a run takes, from runs that were timed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from starjax import config as config_lib
@@ -96,10 +96,20 @@ def seconds(config: config_lib.RunConfig, stages: Sequence[str], trocars: int) -
     return spent
 
 
-def line(config: config_lib.RunConfig, stages: Sequence[str], trocars: int, backend: str) -> str:
-    """Estimated time, as the plan says it."""
+def line(
+    config: config_lib.RunConfig,
+    stages: Sequence[str],
+    trocars: int,
+    backend: str,
+    pace: Callable[[], float],
+) -> str:
+    """Estimated time, as the plan says it; on a CPU the time is this machine's, by its `pace`."""
     timed, spent = TIMED.get(config.preset), seconds(config, stages, trocars)
     if timed is None or spent is None or timed.backend != backend:
         return "not known for these settings; each stage's bar says it after some steps"
-    minutes = max(1, round(spent / 60))
-    return f"about {minutes} min from the start on {timed.machine}"
+    there = f"about {_minutes(spent)} from the start on {timed.machine}"
+    return there if backend != "cpu" else f"about {_minutes(spent * pace())} here; {there}"
+
+
+def _minutes(spent: float) -> str:
+    return f"{max(1, round(spent / 60))} min"

@@ -122,7 +122,7 @@ def _before(folder: Path) -> dict[str, Any]:
 
 
 def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any, Any]:
-    """Whose trials a result has, and which."""
+    """Identifies the trials of a result: whose they are, and which."""
     config = result.get("config") or {}
     arms = (config.get("scene") or {}).get("arm")
     return result.get("weights"), result.get("seed"), arms, config.get("eval")

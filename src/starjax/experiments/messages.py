@@ -11,7 +11,7 @@ import starjax
 from starjax import config as config_lib
 from starjax import methods
 from starjax.experiments import estimate
-from starjax.runtime import files, xla
+from starjax.runtime import files, speed, xla
 
 STAGES = ("collect", "train", "evaluate", "report")
 
@@ -100,7 +100,7 @@ def _time(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
     import jax
 
     trocars, backend = len(_task(config).is_seen), jax.default_backend()
-    return f"  time            {estimate.line(config, stages, trocars, backend)}"
+    return f"  time            {estimate.line(config, stages, trocars, backend, speed.pace)}"
 
 
 def _seeing(config: config_lib.RunConfig) -> list[str]:
@@ -126,19 +126,23 @@ def encoder(config: config_lib.RunConfig) -> str:
     policy, name = config.policy, config.policy.encoder_weights
     if not name:
         return "trained from scratch"
-    task = _task_of(name)
-    known = f" (pretrained on {'this task' if task == config.scene.task else task})" if task else ""
+    trained_in, scene, known = _scene_of(name), config.scene, ""
+    if trained_in:
+        task, cameras = trained_in.task, trained_in.cameras
+        other = f" through {', '.join(cameras)}" if {*scene.camera} - {*cameras} else ""
+        known = f" (pretrained on {'this task' if task == scene.task else task}{other})"
     return f"{'frozen' if policy.freeze_encoder else 'trained further'}, from {name}{known}"
 
 
-def _task_of(encoder_weights: str) -> str:
-    """The task that an encoder's policy was trained on; empty of a file that is none, or gone."""
+def _scene_of(encoder_weights: str) -> Any:
+    """Names of the scene that an encoder's policy was trained in; None of a file that is none, or
+    gone."""
     from starjax.policies import packaged, policy_file
 
     try:
-        return policy_file.load(packaged.locate(encoder_weights)).scene.task
+        return policy_file.load(packaged.locate(encoder_weights)).scene
     except (OSError, ValueError):
-        return ""
+        return None
 
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
@@ -150,6 +154,7 @@ def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
     turned = yaw == "fixed" and any(row.action_space in ("rcm1", "rcm2") for row in rows)
     rolls = any(row.hierarchical for row in rows)
     found = {
+        "positions count from the endoscope (--policy.frame camera)": policy.frame == "camera",
         f"the learner's model is {given} the trocar (--policy.sees-trocar {sees})": told,
         "the frame {T} does not turn with the trocar's azimuth (--policy.trocar-yaw fixed)": turned,
         "the roll network does not read the measured rolls (--policy.no-roll-history)": (

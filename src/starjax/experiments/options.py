@@ -32,6 +32,8 @@ Runs = Annotated[
 ]
 FloatOrNone = Annotated[float | None, tyro.conf.arg(metavar="FLOAT")]
 
+_ALIASES = {(config_lib.SceneConfig, "camera"): ("--cameras",)}
+
 
 @dataclasses.dataclass(frozen=True)
 class NoFlags:
@@ -163,7 +165,8 @@ def _with_ranges(
         plain = field.name.rstrip("_")  # a word of Python's, such as `from`, ends in one
         name = "" if field.name == _UNNAMED else plain if plain != field.name else None
         range_and_default = functools.partial(_hint, limits.within(field.type))
-        hint = tyro.conf.arg(name=name, help_behavior_hint=range_and_default)
+        aliases = _ALIASES.get((info.type, plain))
+        hint = tyro.conf.arg(name=name, aliases=aliases, help_behavior_hint=range_and_default)
         # What stands on the field itself comes later, and wins.
         kind, *rest = typing.get_args(field.type) if _is_annotated(field.type) else [field.type]
         fields.append(dataclasses.replace(field, type=Annotated[(kind, hint, *rest)]))

@@ -1,6 +1,6 @@
 """The stages of a run, one after another, each skipped when its result is there."""
 
-import dataclasses
+import contextlib
 import functools
 import shlex
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from typing import Any
 from starjax import config as config_lib
 from starjax import errors, methods
 from starjax.experiments import demonstrations, folders, messages, scenes, stage_times
-from starjax.runtime import files, xla
+from starjax.runtime import background, files, xla
 from starjax.runtime.signals import stop_signals
 
 STAGES = messages.STAGES
@@ -60,6 +60,9 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
             for name in dict.fromkeys([*trained, *names]):
                 folders.claim(out / name, config, dataset, encoder and encoder.fingerprint)
 
+        ahead = None
+        if untrained and {"train", "evaluate"} <= {*stages}:
+            ahead = _compiling_ahead(config, names[0], env, encoder)
         # Loaded once, and only if something is still to be trained with them.
         demos = functools.cache(lambda: demonstrations.load(config, root, collect, encoder, share))
         if "train" not in stages:
@@ -69,6 +72,9 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
             for name in trained:
                 _train(config, name, demos, env, encoder, share)
         if "evaluate" in stages:
+            if ahead:
+                with contextlib.suppress(Exception):  # it shows again where the program is run
+                    ahead()
             for name in names:
                 _evaluate(config, name, env, root, command, share)
         if "report" in stages:
@@ -87,6 +93,28 @@ def _environment(config: config_lib.RunConfig) -> Any:
         image_size=config.policy.image_size,
         cameras=config.scene.camera,
     )
+
+
+def _compiling_ahead(
+    config: config_lib.RunConfig, name: str, env: Any, encoder: Any
+) -> Callable[[], None] | None:
+    """Begins to compile the evaluation of a method that is not trained yet, beside other stages.
+
+    A compiler keeps one core busy. Returns what waits for it; None where it would be in vain.
+    """
+    import jax
+
+    from starjax.experiments import policy_under_test
+
+    if len(jax.devices()) > 1 or not jax.config.jax_compilation_cache_dir:
+        return None
+    vision = encoder.params if encoder else None
+
+    def work() -> None:
+        with stage_times.apart():
+            policy_under_test.compile_ahead(name, config, env, vision)
+
+    return background.run_in_background(work)
 
 
 def _train(
@@ -128,8 +156,7 @@ def _train(
     params = state.ema_params
     made = policy_file.Trained(
         method=name,
-        # Decided in bfloat16, a tool at rest would tremble by 0.1 mm a step, which is 4 mm/s.
-        policy=dataclasses.replace(config.policy, dtype="float32"),
+        policy=config_lib.deciding(config.policy),
         train=config.train,
         params={**params, "vision": encoder.params} if encoder else params,
         normalizer=state.normalizer,

@@ -2,14 +2,16 @@
 
 import dataclasses
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from starjax import config as config_lib
 from starjax import errors, methods, rcm
+from starjax.data import normalizer
 from starjax.evaluation import evaluate, latency, statistics
 from starjax.evaluation import result as results
 from starjax.evaluation import trials as table
@@ -48,7 +50,7 @@ def load(
       method: a row of `methods.METHODS`.
       weights: policy.safetensors.
       env: built from what the weights were trained on unless given.
-      arms: robots of that env in the place of those that they were trained with.
+      arms: robots of that env instead of those that they were trained with.
 
     Raises:
       errors.UsageError: the file is missing or damaged.
@@ -101,32 +103,71 @@ def _load(
 
 
 def rollouts(
-    directory: Path, who: Subject, trocars: rcm.Trocar, settings: config_lib.EvalConfig, seed: int
+    directory: Path,
+    who: Subject,
+    trocars: rcm.Trocar,
+    settings: config_lib.EvalConfig,
+    seed: int,
+    levels: Mapping[str, float] | None = None,
 ) -> table.Table:
-    """Runs what is missing of an evaluation."""
+    """Runs what is missing of an evaluation; `levels` are of what disturbs its environment."""
     trained = who.trained
-    planner = agent.from_policy(
-        who.policy.sample, trained.policy.obs_horizon, trained.policy.execute
-    )
     return evaluate.evaluate(
         directory,
         who.env,
-        planner,
+        _planner(who.policy, trained.policy),
         (trained.params, trained.normalizer),
         trocars,
-        evaluate.Settings(
-            trials=settings.trials,
-            seed=seed,
-            time_limit_s=settings.time_limit_s,
-            video_trials=settings.video_trials,
-            chunk=settings.chunk,
-        ),
+        _settings(settings, seed),
         place=placement.Place(devices=placement.devices()),
         identity={
             **methods.behaviour(who.method)._asdict(),
             "policy": config_lib.as_json(trained.policy),
         },
+        levels=levels,
         report=messages.indented,
+    )
+
+
+def compile_ahead(
+    name: str, config: config_lib.RunConfig, env: sim_env.Env, vision: policies.Params | None
+) -> None:
+    """Compiles what `rollouts` will run of a method that is not trained yet.
+
+    Args:
+      name: of the method.
+      config: of the run.
+      env: with the observation that it is trained on.
+      vision: parameters of its frozen encoder, None where it has none.
+    """
+    row, deciding = methods.METHODS[name], config_lib.deciding(config.policy)
+    policy = policies.make(row, deciding, env.task, cameras=env.names.cameras)
+    params = jax.eval_shape(policy.init, jax.random.key(0))
+    if vision is not None:
+        params = {**params, "vision": vision}
+    params = jax.eval_shape(policy.for_sampling, params)
+    told = policies.ablated(row, config.policy)
+    stats = normalizer.shapes(told, env.task, config.policy.observation == "state")
+    evaluate.compile_ahead(
+        env,
+        _planner(policy, config.policy),
+        (params, stats),
+        env.task.trocars,
+        _settings(config.eval, config.seed),
+    )
+
+
+def _planner(policy: policies.Policy, policy_config: config_lib.PolicyConfig) -> agent.BatchAgent:
+    return agent.from_policy(policy.sample, policy_config.obs_horizon, policy_config.execute)
+
+
+def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.Settings:
+    return evaluate.Settings(
+        trials=settings.trials,
+        seed=seed,
+        time_limit_s=settings.time_limit_s,
+        video_trials=settings.video_trials,
+        chunk=settings.chunk,
     )
 
 

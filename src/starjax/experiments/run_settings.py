@@ -87,10 +87,11 @@ def _folder(config: config_lib.RunConfig) -> str:
     scene = config.scene
     parts = [usual.preset]
     parts += [scene.task] if scene.task != usual.scene.task else []
-    parts += [*scene.arm, *scene.tool, *scene.camera]
+    parts += [*scene.arm, *scene.tool, *(name for name in scene.camera if name != "fixed")]
     parts += [f"from-{Path(config.demos.from_).name}"] if config.demos.from_ else []
     parts += [policy.learner] if policy.learner != usual.policy.learner else []
     parts += [policy.observation] if policy.observation != usual.policy.observation else []
+    parts += ["camera-frame"] if policy.frame != usual.policy.frame else []
     sees, freezes = policy.observation == "image", policy.freeze_encoder
     if sees and freezes != usual.policy.freeze_encoder:
         parts.append("frozen" if freezes else "unfrozen")

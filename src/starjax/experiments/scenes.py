@@ -1,6 +1,8 @@
 """The scene of a run: names that are left out become the task's own."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors
@@ -14,6 +16,24 @@ def settings(names: SceneNames) -> config_lib.SceneConfig:
     )
 
 
+def disturbable(env: Any, names: Sequence[str], policy: config_lib.PolicyConfig) -> Any:
+    """The environment, with cameras that may move if one of these disturbances moves them."""
+    from starjax.evaluation.disturbances import DISTURBANCES
+    from starjax.sim import env as sim_env
+
+    if not any(DISTURBANCES.get(name).moves_cameras for name in names):
+        return env
+    return sim_env.make(
+        env.names.task,
+        env.names.arms,
+        env.names.tools,
+        observation=policy.observation,
+        image_size=policy.image_size,
+        cameras=env.names.cameras,
+        moving_cameras=True,
+    )
+
+
 def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
     """Settings that name their scene in full, and train with trocars that its task has.
 
@@ -21,11 +41,15 @@ def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
       errors.UsageError: a name is unknown, or the task has fewer seen trocars than were asked for.
     """
     # Imported here, as it imports jax and MuJoCo.
-    from starjax.sim import registry, scene
+    from starjax.sim import endoscope, registry, scene
 
     asked, demos = config.scene, config.demos
     names = scene.name(asked.task, asked.arm, asked.tool, asked.camera)
-    most = int(registry.tasks.get(names.task).is_seen.sum())
+    task = registry.tasks.get(names.task)
+    if config.policy.frame == "camera" and endoscope.of(task, names.cameras) is None:
+        hint = f"--camera {endoscope.NAME}" if task.endoscope else "other tasks have one"
+        raise errors.UsageError("policy.frame", "world, without an endoscope", "camera", hint)
+    most = int(task.is_seen.sum())
     is_default = demos.seen_trocars == config_lib.DemosConfig().seen_trocars
     if demos.seen_trocars > most and not is_default:  # the default is all of them
         raise errors.UsageError("demos.seen_trocars", f"1 to {most}", demos.seen_trocars)

@@ -1,6 +1,7 @@
 """How long each stage took, compilation apart, summed over every start of the same run."""
 
 import contextlib
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +13,18 @@ _COMPILE_EVENTS = (
     "/jax/core/compile/backend_compile_duration",
     "/jax/core/compile/jaxpr_to_mlir_module_duration",
 )
+
+_here = threading.local()
+
+
+@contextlib.contextmanager
+def apart() -> Iterator[None]:
+    """Lets what this thread compiles inside count for no stage: it is done beside them."""
+    _here.is_apart = True
+    try:
+        yield
+    finally:
+        _here.is_apart = False
 
 
 @contextlib.contextmanager
@@ -64,7 +77,7 @@ class _CompileSeconds:
         self.seconds = 0.0
 
     def _add(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event in _COMPILE_EVENTS:
+        if event in _COMPILE_EVENTS and not getattr(_here, "is_apart", False):
             self.seconds += duration_secs
 
     def __enter__(self) -> None:

@@ -1,13 +1,15 @@
 """`starjax stress`: what breaks a trained policy, one disturbance at a time."""
 
 import dataclasses
+import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.experiments import checks, options, subjects
+from starjax.evaluation import disturbances
+from starjax.experiments import checks, options, scenes, subjects
 from starjax.limits import Count, CountOrZero, NotNegative
 from starjax.runtime import files, xla
 
@@ -49,32 +51,43 @@ class Options:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the trials that are missing; writes stress.json."""
+    """Runs the trials that are missing; writes stress.json, its table and its figure."""
     chosen = options.parse(Options, argv, prog="starjax stress", description=DESCRIPTION)
     named = subjects.find(chosen.run, chosen.policy)
     folder = _folder(named, chosen)
     if chosen.levels and len(chosen.disturbance) != 1:
         raise errors.UsageError("levels", "one --disturbance beside it", "none or several")
+    disturbances.check("disturbance", chosen.disturbance)
     xla.prepare_xla()
     xla.require_devices("starjax.experiments.policy_under_test")
     files.require_writable(folder)
     who, _ = subjects.load(named, chosen.arm)
-
-    from starjax.evaluation import disturbances
-
-    names = _names(chosen, who.trained.policy.observation)
+    kinds = _kinds(chosen, who.trained.policy.observation)
     found: dict[str, Any] = {}
-    for name in names:
-        kind = disturbances.DISTURBANCES[name]
+    for name, kind in kinds.items():
         print(f"{name}: {kind.what}", flush=True)
         rows = found[name] = {"what": kind.what, "unit": kind.unit, "levels": {}}
+        usual, wrong = _subjects(who, name)
         for level in chosen.levels or kind.levels:
-            score = _score(folder, who, chosen, name, level)
+            place = folder / (f"{name}-{level:g}" if level else "moving" * kind.moves_cameras + "0")
+            at = (wrong, {name: level}) if level else (usual, None)
+            score = _score(place, *at, chosen)
             rows["levels"][f"{level:g}"] = score
             print(_line(f"{level:g} {kind.unit}", score), flush=True)
             files.write_json(folder / "stress.json", _content(who, chosen, argv, found))
+    _draw(folder, _content(who, chosen, argv, found))
     print(f"\nresult: {folder / 'stress.json'}")
     return 0
+
+
+def _draw(folder: Path, content: dict[str, Any]) -> None:
+    """Writes the table and the figure, where what draws is installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        return
+    from starjax.report import stress
+
+    for name, data in stress.files(content).items():
+        files.write_bytes(folder / name, data)
 
 
 def _folder(named: subjects.Named, chosen: Options) -> Path:
@@ -88,59 +101,56 @@ def _folder(named: subjects.Named, chosen: Options) -> Path:
     return Path(folder)
 
 
-def _names(chosen: Options, observation: str) -> list[str]:
-    """The disturbances that are asked for.
+def _kinds(chosen: Options, observation: str) -> dict[str, Any]:
+    """The disturbances that are asked for, or all that a policy with this observation can meet.
 
     Raises:
-      errors.UsageError: one is unknown, or the policy sees no images for it to change.
+      errors.UsageError: the policy sees no images for one to change, or one has no such level.
     """
-    from starjax.evaluation.disturbances import DISTURBANCES
+    from starjax.evaluation.disturbances import base
 
+    known = disturbances.DISTURBANCES
+    kinds = {name: known.get(name) for name in chosen.disturbance or known.names()}
+    meets = {n: kind for n, kind in kinds.items() if observation == "image" or not kind.of_images}
     for name in chosen.disturbance:
-        errors.choice("disturbance", name, DISTURBANCES)
-        if DISTURBANCES[name].of_images and observation != "image":
+        if name not in meets:
             raise errors.UsageError("disturbance", "one that a policy of states meets", name)
-    meets = [n for n, kind in DISTURBANCES.items() if observation == "image" or not kind.of_images]
-    return list(chosen.disturbance) or meets
+        base.check_levels("levels", name, chosen.levels)
+    return meets
 
 
-def _score(folder: Path, who: Any, chosen: Options, name: str, level: float) -> dict[str, Any]:
-    """Success and RCM error of all trials of a level."""
-    from starjax.evaluation import disturbances, statistics
+def _subjects(who: Any, name: str) -> tuple[Any, Any]:
+    """The policy without and with a disturbance, whose levels share one program."""
+    from starjax.evaluation.disturbances import base
+
+    who = who._replace(env=scenes.disturbable(who.env, [name], who.trained.policy))
+    return who, who._replace(env=base.disturbed(who.env, [name]))
+
+
+def _score(
+    place: Path, who: Any, levels: dict[str, float] | None, chosen: Options
+) -> dict[str, Any]:
+    """Success, RCM error and the force on the abdominal wall in all trials of a level."""
+    from starjax.evaluation import statistics, wall
     from starjax.experiments import policy_under_test
-    from starjax.sim import env as sim_env
 
-    kind, env = disturbances.DISTURBANCES[name], who.env
-    if kind.moves_cameras:
-        env = sim_env.make(
-            env.names.task,
-            env.names.arms,
-            env.names.tools,
-            observation=who.trained.policy.observation,
-            image_size=who.trained.policy.image_size,
-            cameras=env.names.cameras,
-            moving_cameras=True,
-        )
     trials = config_lib.EvalConfig(**vars(chosen.eval))
-    subject = who._replace(env=disturbances.disturbed(env, name, level))
-    place = (
-        folder / f"{name}-{level:g}" if level else folder / ("moving" * kind.moves_cameras + "0")
-    )
-    table = policy_under_test.rollouts(place, subject, env.task.trocars, trials, chosen.seed)
+    trocars = who.env.task.trocars
+    table = policy_under_test.rollouts(place, who, trocars, trials, chosen.seed, levels)
     return {
         "strict": statistics.rate(table.success),
         "safe": statistics.rate(table.safe),
         "invalid": int(table.invalid.sum()),
         "rcm_error_mm": statistics.rcm_error_mm(table),
+        "wall_force_N": wall.force(table, who.env.control_hz),
     }
 
 
 def _line(level: str, score: dict[str, Any]) -> str:
     won, errors_mm = score["strict"], score["rcm_error_mm"]["executed"]
     rate = f"{won['successes']}/{won['trials']} = {100 * won['rate']:.0f}%"
-    return (
-        f"  {level:10} {rate:16} RCM error {errors_mm['mean']:.3f} mm, p99 {errors_mm['p99']:.2f}"
-    )
+    error = f"RCM error {errors_mm['mean']:.3f} mm, p99 {errors_mm['p99']:.2f}"
+    return f"  {level:10} {rate:16} {error}; wall {score['wall_force_N']['p99']:.2f} N"
 
 
 def _content(

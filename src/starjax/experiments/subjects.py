@@ -57,7 +57,7 @@ def load(named: Named, arms: tuple[str, ...]) -> tuple[Any, config_lib.RunConfig
 
     Args:
       named: what.
-      arms: robots in the place of those that it was trained with.
+      arms: robots instead of those that it was trained with.
 
     Returns:
       `policy_under_test.Subject`, and the settings of the run that it comes from, as far as they

@@ -102,8 +102,11 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _time_limit_s(run: Path | None) -> float:
-    """That of the run's result, which later commands do not change; until there is one, what was
-    typed last; without a run the usual one."""
+    """Time limit of the trials.
+
+    That of the run's result, which later commands do not change; before there is one, what was
+    typed last; without a run the default.
+    """
     if run is None:
         return config_lib.EvalConfig.time_limit_s
     try:

@@ -33,7 +33,7 @@ class Options:
     # a second one at the same trial: expert, or a policy as above
     beside: str = ""
     task: str = config_lib.DEFAULT_TASK  # of the expert
-    arm: str = ""  # robot in the place of their own
+    arm: str = ""  # robot instead of their own
     trocar: Annotated[int, Range(0, 999)] = 8  # number of the task's configuration of trocars
     seed: config_lib.Seed = 0  # of the trials
     port: Port = 8080  # of the page, on this machine only; 0 takes a free one

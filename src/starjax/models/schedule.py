@@ -77,7 +77,7 @@ def ddim_table(diffusion_steps: int, steps: int) -> DdimTable:
     """`steps` DDIM steps, spread evenly over a `cosine(diffusion_steps)` schedule.
 
     With 100 and 10 they are k = 90, 80, .., 0, the 'leading' spacing, which starts in the middle
-    of the schedule where `steps` is no divisor: k = 50, .. for 51 of 100 in the place of 98, .. .
+    of the schedule where `steps` is no divisor: k = 50, .. for 51 of 100 instead of 98, .. .
     One step alone is k = 0, where the input counts as nearly clean: what comes out is the noise
     that went in, good for measuring time only.
     """

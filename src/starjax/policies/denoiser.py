@@ -46,7 +46,7 @@ def make(
         film = apply(params["unet"], sequences.joined(condition), method="condition")
 
         def predict(x: jax.Array, film_of_time: jax.Array) -> jax.Array:
-            """Of `[B, H, D]` at one time, or of `[n, B, H, D]`."""
+            """Predicts for `x` `[B, H, D]` at one time, or `[n, B, H, D]` at n times."""
             rows = (film + film_of_time[..., None, :]).reshape(-1, film.shape[-1])
             found = apply(params["unet"], x.reshape(-1, *shape), rows, method="denoise")
             return found.reshape(x.shape)

@@ -10,7 +10,7 @@ Params = dict[str, Any]
 
 
 class Sizes(NamedTuple):
-    """Of a model's arrays.
+    """Sizes of a model's arrays.
 
     Attributes:
       horizon: H, actions of a sequence.

@@ -105,7 +105,7 @@ def _step(point: jax.Array, axis: jax.Array, p: jax.Array, weight: jax.Array) ->
 
 
 def _inverse(symmetric: jax.Array) -> jax.Array:
-    """Of a positive `[..., 3, 3]`, written out: jax's own does not go with its error checks."""
+    """Inverts a positive `[..., 3, 3]`. Written out, as jax's own fails under its error checks."""
     x, y, z = (symmetric[..., i] for i in range(3))
     adjugate = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)], axis=-2)
     return adjugate / arrays.dot(x, adjugate[..., 0, :])[..., None]
@@ -120,7 +120,7 @@ def _normal(axis: jax.Array, weight: jax.Array) -> jax.Array:
 
 
 def _off(point: jax.Array, axis: jax.Array, p: jax.Array) -> jax.Array:
-    """From the point to the nearest place on each line, `[..., T, 3]` m."""
+    """Vectors from the point to the nearest place on each line, `[..., T, 3]` m."""
     away = p - point[..., None, :]
     return away - arrays.dot(away, axis) * axis
 

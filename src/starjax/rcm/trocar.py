@@ -19,10 +19,10 @@ AZIMUTH_RANGE: Range = (0.0, 2.0 * np.pi)  # rad
 
 
 class Trocar(NamedTuple):
-    """Trocar parameters lambda = (r, theta, phi) about the nominal port (Eq. 1).
+    """Trocar parameters lambda = (r, theta, phi) about the nominal trocar (Eq. 1).
 
     Attributes:
-      radius: `[...]` m, distance from the nominal port.
+      radius: `[...]` m, distance from the nominal trocar.
       polar: `[...]` rad, from the world's z axis (up).
       azimuth: `[...]` rad, about the world's z axis.
     """
@@ -87,7 +87,7 @@ def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
 
     Args:
       trocar: fields `[...]`.
-      p_world_ref: `[..., 3]` m, the nominal port o_ref.
+      p_world_ref: `[..., 3]` m, the nominal trocar o_ref.
 
     Returns:
       `[..., 3]` m, p_world_trocar.
@@ -112,12 +112,12 @@ def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
 def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> Trocar:
     """Parameters of a trocar that was measured in the world frame: Eq. 2 solved for lambda.
 
-    Where a position says nothing of an angle it is as in `TROCARS`: at the nominal port the polar
+    Where a position says nothing of an angle it is as in `TROCARS`: at the nominal trocar the polar
     angle is pi/2, and there, above and below it the azimuth is 0. That azimuth turns {T}.
 
     Args:
       p_world_trocar: `[..., 3]` m.
-      p_world_ref: `[..., 3]` m, the nominal port o_ref.
+      p_world_ref: `[..., 3]` m, the nominal trocar o_ref.
 
     Returns:
       Fields `[...]`, the azimuth in [0, 2 pi]; NaN where a position is not finite.
@@ -154,7 +154,7 @@ def trocar_frame(trocar: Trocar, p_world_ref: ArrayLike, roll_zero: ArrayLike = 
 
     Args:
       trocar: fields `[...]`.
-      p_world_ref: `[..., 3]` m, the nominal port o_ref.
+      p_world_ref: `[..., 3]` m, the nominal trocar o_ref.
       roll_zero: `[...]` rad, see `TrocarFrame`.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Reads what lies beside a result.json: the sweep, the bench, and the log of the training."""
+"""Reads what lies beside a result.json: sweep, stress, bench, and the log of the training."""
 
 import json
 from pathlib import Path
@@ -15,6 +15,13 @@ _BENCH = {
     "inference_ms_by_ddim_steps": {"*": _MS},
     "roll_network_ms?": _MS,
     "hardware?": {"devices?": [str], "memory_gb?": NUMBER},
+}
+_RATE = {"successes": int, "trials": int, "rate": NUMBER}
+_ERROR = {"executed": {"mean": NUMBER, "p99?": NUMBER}}
+_LEVEL = {"strict": _RATE, "rcm_error_mm": _ERROR, "wall_force_N?": {"p99?": NUMBER}}
+_STRESS = {
+    "weights": str,
+    "disturbances": {"*": {"unit": str, "levels": {"*": _LEVEL}}},
 }
 _LINE = {"step": int, "loss?": NUMBER, "position_error_mm?": NUMBER, "roll_error_deg?": NUMBER}
 
@@ -39,6 +46,21 @@ def bench(folder: Path) -> dict[str, Any]:
     found = files.read_json(file)
     structure.check(file, found, _BENCH)
     return found
+
+
+def stress(folder: Path, weights: str | None) -> dict[str, Any]:
+    """The newest stress.json of a run that is of these weights, empty if there is none.
+
+    Raises:
+      ValueError: it is damaged; the message names it.
+    """
+    found = sorted(folder.glob("stress-seed*/stress.json"), key=lambda path: path.stat().st_mtime)
+    for file in reversed(found):
+        content = files.read_json(file)
+        structure.check(file, content, _STRESS)
+        if weights is None or content["weights"] == weights:
+            return content
+    return {}
 
 
 def curves(folder: Path, scored: result.Result) -> tuple[Path | None, Lines]:

@@ -10,11 +10,12 @@ from starjax.report import (
     compare,
     figures,
     page,
-    ports,
     results,
     stage,
+    stress,
     style,
     tables,
+    training_trocars,
     trajectories,
     turned,
     video,
@@ -61,7 +62,7 @@ def build(
     return out / "index.html"
 
 
-_FIGURES = ("training", "ports", "fig3", "fig4")
+_FIGURES = ("training", "ports", "fig3", "fig4", "stress")
 _FILM = "rollout.mp4"
 _SOLID = "rollout.html"
 # Of files that a report may have or not.
@@ -79,10 +80,10 @@ def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
 
 def _name(run: results.Run, runs: Sequence[results.Run]) -> str:
     alike = [other for other in runs if other.label == run.label]
-    trocars = [ports.trained_at(other) for other in alike]
-    counts = {ports.trained_at(other) for other in runs if other.trials}
+    trocars = [training_trocars.trained_at(other) for other in alike]
+    counts = {training_trocars.trained_at(other) for other in runs if other.trials}
     if run.trials and len(counts) > 1 and len(set(trocars)) == len(trocars):
-        count = ports.trained_at(run)
+        count = training_trocars.trained_at(run)
         return f"{run.label} ({count} trocar{'s' if count > 1 else ''})"
     if len(alike) == 1:
         return run.label
@@ -98,7 +99,7 @@ def _all_apart(seeds: Sequence[int | None]) -> bool:
 
 
 def _place(run: results.Run, others: Sequence[results.Run]) -> str:
-    """As much of a run's path, from its end, as sets it apart."""
+    """The end of a run's path, as long as it takes to set it apart."""
     parts = [other.path.absolute().parts for other in others]
     for count in range(2, max(map(len, parts))):
         if len({path[-count:] for path in parts}) == len(parts):
@@ -124,7 +125,7 @@ def _turned(runs: Sequence[results.Run], report: Callable[[str], None]) -> turne
     """Rollouts in 3D, or None, after a line where that has a reason."""
     try:
         return turned.record(runs)
-    except (OSError, RuntimeError, errors.UsageError) as error:  # no port, or an unknown scene
+    except (OSError, RuntimeError, errors.UsageError) as error:  # no trocar, or an unknown scene
         report(f"no rollouts in 3D: {error}")
         return None
 
@@ -143,8 +144,10 @@ def _figures(
     }
     evaluated = [run for run in runs if run.trials]
     if evaluated and focus.trials:
-        drawings["ports"] = lambda dark: ports.draw(evaluated, dark)
+        drawings["ports"] = lambda dark: training_trocars.draw(evaluated, dark)
         drawings["fig4"] = lambda dark: figures.distance(evaluated, focus, dark)
+    if focus.stress:
+        drawings["stress"] = lambda dark: stress.draw(focus.stress, dark)
     if any(run.rollouts for run in runs):
         shown = compare.representatives(runs)
         drawings["fig3"] = lambda dark: trajectories.draw(shown, _stage, dark)

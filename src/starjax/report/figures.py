@@ -10,7 +10,7 @@ from starjax.report import captions, compare, outcomes, results, stats, style
 
 _BIN = 0.005  # m of distance pooled in one point
 _SMOOTH = 0.008  # m, width of the kernel behind the heat map
-_FAR = 2.0  # kernel widths from the nearest port: farther off the map shows nothing
+_FAR = 2.0  # kernel widths from the nearest trocar: farther off the map shows nothing
 _DISC = 0.05  # m, radius of Eq. 19's disc
 _FEWEST = 2  # panels of a page's width, or a single one would be as large as the page
 
@@ -154,7 +154,7 @@ def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> N
     axis.plot(1e3 * _DISC * np.cos(turn), 1e3 * _DISC * np.sin(turn), color=shades["muted"], lw=0.8)
     axis.set_aspect("equal")
     axis.grid(False)
-    axis.set_title(f"by port, from above (mm)\n{run.label}", fontsize=8)
+    axis.set_title(f"by trocar, from above (mm)\n{run.label}", fontsize=8)
     bar = figure.colorbar(shown, ax=axis, shrink=0.8, ticks=[0, 0.5, 1])
     bar.ax.set_yticklabels(["0", "50", "100%"])
     bar.outline.set_visible(False)

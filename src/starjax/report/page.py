@@ -22,12 +22,17 @@ CAPTIONS = {
     "fig4": (
         "Success and distance from the training trocars",
         "Left: trials pooled by distance of their trocar to the nearest one in the demonstrations, "
-        "with 95% Wilson intervals. Right: ports from above; where a sweep filled the disc, its "
-        "mean over 8 mm, its ports as dots.",
+        "with 95% Wilson intervals. Right: trocars from above; where a sweep filled the disc, its "
+        "mean over 8 mm, its trocars as dots.",
     ),
     "ports": (
         "Success and the number of training trocars",
         "Trials at the trocars that none of these runs was trained at, with 95% Wilson intervals.",
+    ),
+    "stress": (
+        "What breaks it",
+        "Success and executed RCM error while one thing is wrong, around the circle; lines join "
+        "levels of one rank, not one trial.",
     ),
     "training": (
         "Training",
@@ -60,6 +65,8 @@ def render(
         _figure("fig4", figures, words),
         sections.swept(runs),
         _figure("ports", figures, words),
+        _figure("stress", figures, words),
+        sections.stressed(focus),
         sections.matrix(runs) if several else sections.per_trocar(focus),
         sections.failures(runs),
         sections.measurements(runs),

@@ -10,6 +10,7 @@ from starjax import errors, methods
 from starjax.evaluation import recorded
 from starjax.evaluation.result import Result, Trial, read
 from starjax.report import beside, outcomes
+from starjax.types import Pose
 
 
 class Rollout(NamedTuple):
@@ -21,6 +22,7 @@ class Rollout(NamedTuple):
       p_world_trocar: `[A, 3]` m.
       qpos: `[T, Q]` generalised coordinates, or None where only the tips were kept.
       labels: the task's, that tell how the goal is marked.
+      endoscope: pose_world_camera `[T]`, or None where the scene was not seen through one.
     """
 
     trial: Trial
@@ -28,6 +30,7 @@ class Rollout(NamedTuple):
     p_world_trocar: np.ndarray
     qpos: np.ndarray | None
     labels: dict[str, int]
+    endoscope: Pose | None = None
 
 
 class Run(NamedTuple):
@@ -42,6 +45,7 @@ class Run(NamedTuple):
       log: the metrics.jsonl of the training of its weights, None if there is none.
       curves: its lines.
       sweep: trials through other trocars, None if no sweep was made of these weights.
+      stress: stress.json, empty if there is none of these weights.
       bench: bench.json, empty if there is none of these weights.
       others: names of what lies beside result.json and is of other weights.
     """
@@ -54,6 +58,7 @@ class Run(NamedTuple):
     log: Path | None
     curves: list[dict[str, Any]]
     sweep: Result | None
+    stress: dict[str, Any]
     bench: dict[str, Any]
     others: tuple[str, ...]
 
@@ -99,6 +104,7 @@ def load(path: Path) -> Run:
         log=log,
         curves=curves,
         sweep=None if "sweep.json" in others else swept,
+        stress=beside.stress(path, result.weights),
         bench={} if "bench.json" in others else bench,
         others=(*others, log.name) if log and not curves else tuple(others),
     )
@@ -171,7 +177,7 @@ def _rollouts(path: Path, trials: Sequence[Trial]) -> list[Rollout]:
         ) from error
     known = {(trial.trocar, trial.trial): trial for trial in trials}
     return [
-        Rollout(trial, track.p_world_tip, track.p_world_trocar, track.qpos, track.labels)
+        Rollout(trial, *(getattr(track, name) for name in Rollout._fields[1:]))
         for track in kept
         if (trial := known.get((track.trocar, track.trial))) and _is_recorded(trial, track)
     ]

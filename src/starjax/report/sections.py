@@ -14,6 +14,7 @@ from starjax.report import (
     outcomes,
     results,
     stats,
+    stress,
     tables,
 )
 from starjax.report.markup import Cell
@@ -152,6 +153,15 @@ def swept(runs: Sequence[results.Run]) -> str:
         (tables.SWEPT_PAIRED, tables.paired(results.swept(runs)), notes.PAIRED),
     )
     return _titled(parts)
+
+
+def stressed(run: results.Run) -> str:
+    """A row for each level of each disturbance."""
+    if not run.stress:
+        return ""
+    rows = stress.table(run.stress)
+    cells = [[Cell(markup.escape(t)) for t in r[:2]] + [*map(markup.number, r[2:])] for r in rows]
+    return markup.table(cells[0], cells[1:]) + markup.small(stress.NOTE)
 
 
 def per_trocar(run: results.Run) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from starjax.sim.names import SceneNames
 from starjax.sim.tasks.base import Outline
+from starjax.types import Pose
 
 BATCH = 16  # images drawn in one call
 
@@ -50,9 +51,9 @@ def load(names: SceneNames) -> Stage:
     return Stage(registry.tasks.get(names.task).outline(model), tips)
 
 
-# (qpos `[T, Q]`, p_world_trocar `[A, 3]` m, labels, first) -> `[BATCH, size, size, 3]` uint8 of
-# the steps from `first` on, the last one repeated.
-Draw = Callable[[np.ndarray, np.ndarray, dict[str, int], int], np.ndarray]
+# (qpos `[T, Q]`, p_world_trocar `[A, 3]` m, labels, first, endoscope's Pose `[T]` or None) ->
+# `[BATCH, size, size, 3]` uint8 of the steps from `first` on, the last one repeated.
+Draw = Callable[..., np.ndarray]
 
 
 def camera(names: SceneNames, size: int) -> Draw:
@@ -60,32 +61,41 @@ def camera(names: SceneNames, size: int) -> Draw:
     import jax
     import jax.numpy as jnp
 
-    from starjax.sim import cameras, physics, render, scene
+    from starjax.sim import cameras, endoscope, physics, render, scene
 
     # Smooth outlines cost four times as much: a matter of seconds on a GPU, of minutes on a CPU.
     samples = 1 if jax.default_backend() == "cpu" else 2
     made = scene.load(names)
-    (shown,) = cameras.make(made.mj_model, names.cameras[:1], size)
+    scope = endoscope.of(made.task, names.cameras[:1])
+    (shown,) = cameras.make(made.mj_model, names.cameras[:1], size, scope=scope)
     smooth = {"samples": samples, "moves": shown.moves}
     shown = shown._replace(draw=render.make(made.mj_model, shown.name, size, size, **smooth))
-    poses = cameras.nominal([shown])
+    still = cameras.nominal([shown])
 
-    def one(qpos: jax.Array, p_world_trocar: jax.Array, rgb: jax.Array) -> jax.Array:
+    def one(qpos: jax.Array, held: Any, p_world_trocar: jax.Array, rgb: jax.Array) -> jax.Array:
         data = physics.kinematics(made, qpos, p_world_trocar)
+        poses = still if held is None else jax.tree.map(lambda leaf: leaf[None], held)
         return cameras.images([shown], poses, data, rgb)[shown.name].rgb
 
     @jax.jit
-    def batch(qpos: jax.Array, p_world_trocar: jax.Array, labels: dict[str, Any]) -> jax.Array:
+    def batch(
+        qpos: jax.Array, held: Any, p_world_trocar: jax.Array, labels: dict[str, Any]
+    ) -> jax.Array:
         rgb = scene.marked(made.task, made.bound, labels, jnp.asarray(made.geom_rgb))
-        return jax.lax.map(lambda q: one(q, p_world_trocar, rgb), qpos)
+        return jax.lax.map(lambda step: one(step[0], step[1], p_world_trocar, rgb), (qpos, held))
 
     def draw(
-        qpos: np.ndarray, p_world_trocar: np.ndarray, labels: dict[str, int], first: int
+        qpos: np.ndarray,
+        p_world_trocar: np.ndarray,
+        labels: dict[str, int],
+        first: int,
+        held: Pose | None = None,
     ) -> np.ndarray:
         rows = np.minimum(np.arange(first, first + BATCH), len(qpos) - 1)
-        shown = {name: np.int32(value) for name, value in labels.items()}
+        marked = {name: np.int32(value) for name, value in labels.items()}
+        held = held if scope else None
+        qpos, held = jax.tree.map(lambda leaf: leaf[rows].astype(np.float32), (qpos, held))
         with jax.default_matmul_precision("highest"):  # poses to float32, as the environment's
-            found = batch(qpos[rows].astype(np.float32), p_world_trocar.astype(np.float32), shown)
-            return np.asarray(found)
+            return np.asarray(batch(qpos, held, p_world_trocar.astype(np.float32), marked))
 
     return draw

@@ -121,7 +121,7 @@ def _clip(draw: stage.Draw, shown: Shown, note: str) -> Iterator[np.ndarray]:
     told = f"{kind} trocar {rollout.trial.trocar}" + (f", {note}" if note else "")
     about = (told, _MUTED), (cut, _MUTED)
     for first in range(0, steps, stage.BATCH):
-        drawn = draw(rollout.qpos, rollout.p_world_trocar, rollout.labels, first)
+        drawn = draw(rollout.qpos, rollout.p_world_trocar, rollout.labels, first, rollout.endoscope)
         for step, image in enumerate(drawn[: steps - first], start=first):
             now = outcome if step == steps - 1 else (f"{step / hz:.0f} s", _MUTED)
             bar = caption([[(shown.label, "#e6e9ec"), now], about], image.shape[1])

@@ -4,6 +4,7 @@ A policy plans anew every `execute` control steps, for all episodes at once, and
 moments that its next plan needs, so that pictures are drawn for these alone.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -70,8 +71,10 @@ class Plan(NamedTuple):
     command: Command
 
 
+@functools.lru_cache(maxsize=4)
 def from_policy(sample: Callable[..., Command], obs_horizon: int, execute: int) -> BatchAgent:
-    """Makes a batch of a policy; `params` are (weights, statistics).
+    """Makes a batch of a policy, the same one for the same policy; `params` are (weights,
+    statistics).
 
     The noise of plan r of an episode is drawn with `fold_in(key, r)`.
 

@@ -11,7 +11,7 @@ are over. While the device runs a segment, the host fetches what the one before 
 """
 
 import functools
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -89,29 +89,26 @@ def make(
     settings: Settings,
     record: episodes.Record,
     devices: Sequence[jax.Device] | None = None,
+    levels: Mapping[str, float] | None = None,
 ) -> Run:
-    """Builds the programs.
+    """Builds the programs, which are compiled once for the same functions.
 
     Args:
       env: `sim.env.Env`.
       trocars: fields `[C, A]`, on the host.
       devices: that lanes are split over; their number must divide that of the lanes.
+      levels: of what disturbs the environment, see `EnvParams`; data, not part of a program.
 
     Returns:
       run(params, group), which simulates at most `lanes` trials and yields Progress after every
       segment. A caller that needs no more may stop.
     """
-    key = jax.random.key(settings.seed)
-    if settings.stream is not None:
-        key = jax.random.fold_in(key, settings.stream)
-    shared, lane = placement.SHARED, placement.LANE
-    start = placement.split(_starter(env, agent), devices, (shared, shared, lane), lane)
-    advance = placement.split(
-        _advancer(env, agent, settings, record), devices, (shared, lane, shared), lane, donate=(1,)
-    )
+    key = _key(settings)
+    start, advance = _made(env, agent, settings, record, devices)
+    given = {name: np.float32(level) for name, level in (levels or {}).items()}
 
     def run(params: Any, group: Sequence[episodes.Trial]) -> Generator[Progress]:
-        carry = start(key, params, _filled(trocars, group, settings.lanes))
+        carry = start(key, params, _filled(trocars, group, settings.lanes), given)
         running = list(range(len(group)))
         images: dict[int, dict[str, list[np.ndarray]]] = {lane: {} for lane in running}
         others: list[dict[str, np.ndarray]] = []
@@ -160,6 +157,44 @@ def make(
     return run
 
 
+def compile_ahead(
+    env: Any,
+    agent: BatchAgent,
+    params: Any,
+    trocars: Trocar,
+    settings: Settings,
+    record: episodes.Record,
+) -> None:
+    """Compiles what `make` makes for one device, so that jax's cache on disk has it.
+
+    The arguments are `make`'s, but for `params`: arrays like those to come, or their shapes.
+    """
+    start, advance = _made(env, agent, settings, record, None)
+    begun = start.lower(_key(settings), params, _filled(trocars, [(0, 0)], settings.lanes), {})
+    advance.lower(params, begun.out_info, np.int32(0)).compile()
+    begun.compile()
+
+
+def _key(settings: Settings) -> jax.Array:
+    key = jax.random.key(settings.seed)
+    return key if settings.stream is None else jax.random.fold_in(key, settings.stream)
+
+
+def _made(
+    env: Any,
+    agent: BatchAgent,
+    settings: Settings,
+    record: episodes.Record,
+    devices: Sequence[jax.Device] | None,
+) -> tuple[Callable[..., Carry], Callable[..., Any]]:
+    """What begins a batch of trials, and what runs a segment of it."""
+    world = _World(env.reset, env.step, env.observe, env.labels)
+    mind = _Mind(agent.init, agent.act)
+    return _programs(
+        world, mind, settings.max_steps, record, None if devices is None else tuple(devices)
+    )
+
+
 def _filled(trocars: Trocar, group: Sequence[episodes.Trial], lanes: int) -> Trials:
     """A full batch: the first trial repeats, unwanted, where there are too few."""
     index, trial = np.array([*group, *[group[0]] * (lanes - len(group))], np.int32).T
@@ -167,17 +202,50 @@ def _filled(trocars: Trocar, group: Sequence[episodes.Trial], lanes: int) -> Tri
     return Trials(Trocar(*(field[index] for field in trocars)), index, trial, wanted)
 
 
-def _starter(env: Any, agent: BatchAgent) -> Callable[..., Carry]:
+class _World(NamedTuple):
+    """The functions of an `Env` that programs call: what they are known by."""
+
+    reset: Callable[..., Any]
+    step: Callable[..., Any]
+    observe: Callable[..., Any]
+    labels: Callable[..., Any]
+
+
+class _Mind(NamedTuple):
+    """The same of a `BatchAgent`."""
+
+    init: Callable[..., Any]
+    act: Callable[..., Any]
+
+
+@functools.lru_cache(maxsize=4)
+def _programs(
+    env: _World,
+    agent: _Mind,
+    max_steps: int,
+    record: episodes.Record,
+    devices: Sequence[jax.Device] | None,
+) -> tuple[Callable[..., Carry], Callable[..., Any]]:
+    """Programs that start trials and advance them."""
+    shared, lane = placement.SHARED, placement.LANE
+    start = placement.split(_starter(env, agent), devices, (shared, shared, lane, shared), lane)
+    advance = placement.split(
+        _advancer(env, agent, max_steps, record), devices, (shared, lane, shared), lane, donate=(1,)
+    )
+    return start, advance
+
+
+def _starter(env: _World, agent: _Mind) -> Callable[..., Carry]:
     # Imported here, as only programs need it: reading a dataset does not load the simulator.
     from starjax.sim import env as sim_env
 
-    def start_one(key: jax.Array, trials: Trials) -> tuple[Any, jax.Array]:
+    def start_one(key: jax.Array, trials: Trials, levels: Any) -> tuple[Any, jax.Array]:
         key = jax.random.fold_in(jax.random.fold_in(key, trials.index), trials.trial)
         key_env, key_agent = jax.random.split(key)
-        return env.reset(key_env, sim_env.EnvParams(trials.trocar)), key_agent
+        return env.reset(key_env, sim_env.EnvParams(trials.trocar, levels=levels)), key_agent
 
-    def start(key: jax.Array, params: Any, trials: Trials) -> Carry:
-        state, keys = jax.vmap(start_one, in_axes=(None, 0))(key, trials)
+    def start(key: jax.Array, params: Any, trials: Trials, levels: Any) -> Carry:
+        state, keys = jax.vmap(start_one, in_axes=(None, 0, None))(key, trials, levels)
         memory = agent.init(params, keys, state, lambda: jax.vmap(env.observe)(state))
         return Carry(state, memory, jnp.zeros(trials.wanted.shape, jnp.int32), trials.wanted)
 
@@ -185,7 +253,7 @@ def _starter(env: Any, agent: BatchAgent) -> Callable[..., Carry]:
 
 
 def _advancer(
-    env: Any, agent: BatchAgent, settings: Settings, record: episodes.Record
+    env: _World, agent: _Mind, max_steps: int, record: episodes.Record
 ) -> Callable[..., Any]:
     observe, step_all = jax.vmap(env.observe), jax.vmap(env.step)
 
@@ -207,7 +275,7 @@ def _advancer(
         blank = jax.tree.map(
             lambda s: jnp.zeros((s.shape[0], record.frames, *s.shape[1:]), s.dtype), shapes
         )
-        last = jnp.minimum(first + record.frames, settings.max_steps)
+        last = jnp.minimum(first + record.frames, max_steps)
 
         def is_running(loop):
             t, carry, _ = loop

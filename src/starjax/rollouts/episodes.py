@@ -11,11 +11,12 @@ import numpy as np
 
 from starjax import rcm
 from starjax.rcm.trocar import Trocar
-from starjax.types import Command, Observation
+from starjax.types import Command, Observation, Pose
 
 Trial = tuple[int, int]  # index of the trocars' configuration, number there
 
 IMAGE = "image_"  # before a camera's name
+ENDOSCOPE = ("endoscope_R", "endoscope_p")  # parts of the endoscope's pose
 
 # How an episode ended: fields of EnvState.
 FLAGS = ("collided", "invalid", "loose", "lost", "success")
@@ -27,6 +28,8 @@ FIELDS = {
     "gripper": "measured openings, -1 closed to +1 open",
     IMAGE: "uint8 RGB",
     "state": "fields of the task, one after another",
+    "endoscope_R": "R_world_camera of the endoscope: x to the right, y up, it looks along -z",
+    "endoscope_p": "m, position of the endoscope's lens, world frame",
     "command_p": "m, commanded tip positions, world frame",
     "command_R": "commanded R_world_tip",
     "command_gripper": "-1 squeeze to +1 open",
@@ -96,6 +99,7 @@ def _demonstrated(step: Step) -> dict[str, jax.Array]:
         "gripper": seen.gripper,
         **{f"{IMAGE}{camera}": image for camera, image in (seen.images or {}).items()},
         "state": seen.state,
+        **_of_endoscope(seen.endoscope),
         "command_p": label.pose.p,
         "command_R": label.pose.R,
         "command_gripper": label.gripper,
@@ -114,7 +118,12 @@ def _scored(step: Step) -> dict[str, jax.Array]:
         "rcm_error_commanded": commanded,
         "reached_p": after.pose.p,
         "reached_qpos": after.physics.qpos,
+        **_of_endoscope(after.endoscope),
     }
+
+
+def _of_endoscope(pose: Pose | None) -> dict[str, jax.Array]:
+    return {} if pose is None else dict(zip(ENDOSCOPE, pose, strict=True))
 
 
 DEMONSTRATION = Record(_demonstrated, observes=True, frames=16)

@@ -112,7 +112,7 @@ def _wave(known: Known, drawn: list[int], per_trocar: int, chunk: int) -> list[T
 
 
 def _is_needed(trial: Trial, known: Known, per_trocar: int) -> bool:
-    """Whether it is, also if all before it that are not over succeed."""
+    """Whether the trial is needed even if every unfinished one before it succeeds."""
     return sum(known.get((trial[0], i), True) for i in range(trial[1])) < per_trocar
 
 

@@ -86,7 +86,7 @@ def agree(*values: int) -> tuple[int, ...]:
 
 
 def gathered(*values: int) -> list[list[int]]:
-    """Of each value what all processes have, in their order; each waits here for the others."""
+    """Gathers each value from all processes, in their order; each waits here for the others."""
     if is_alone():
         return [[value] for value in values]
     said = multihost_utils.process_allgather(np.array(values, np.int32))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax.sim import render
+from starjax.sim import endoscope, render
 from starjax.sim.engine import mjx
 from starjax.types import Pose
 
@@ -42,15 +42,19 @@ def make(
     image_size: int,
     shadow: bool = True,
     moving: bool = False,
+    scope: endoscope.Endoscope | None = None,
 ) -> tuple[Camera, ...]:
-    """The cameras of these names, for square images; with `moving` all of them may move."""
+    """The cameras of these names, for square images; with `moving` all of them may move.
+
+    `scope` is where the endoscope may be, if a trocar of its own holds it.
+    """
     found = []
     for name in names:
         camera = mj_model.camera(name)
         body, R = int(camera.bodyid[0]), np.zeros(9)
         mujoco.mju_quat2Mat(R, camera.quat)
         R, p = R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32)
-        moves = moving or body != 0
+        moves = moving or body != 0 or (scope is not None and name == endoscope.NAME)
         draw = render.make(mj_model, name, image_size, image_size, shadow=shadow, moves=moves)
         found.append(Camera(name, body, R, p, moves, draw))
     return tuple(found)
@@ -59,6 +63,19 @@ def make(
 def nominal(cameras: Sequence[Camera]) -> Pose:
     """Poses `[C]` of the cameras in their bodies' frames, as the MJCF has them."""
     return Pose(jnp.stack([c.R for c in cameras]), jnp.stack([c.p for c in cameras]))
+
+
+def at_reset(cameras: Sequence[Camera], scope: endoscope.Endoscope | None, key: jax.Array) -> Pose:
+    """Poses `[C]` as `nominal`, but for the endoscope's, which is drawn."""
+    poses = nominal(cameras)
+    if scope is None:
+        return poses
+    is_drawn = jnp.array([camera.name == endoscope.NAME for camera in cameras])
+    drawn = endoscope.draw(scope, key)
+    return Pose(
+        jnp.where(is_drawn[:, None, None], drawn.R, poses.R),
+        jnp.where(is_drawn[:, None], drawn.p, poses.p),
+    )
 
 
 def images(

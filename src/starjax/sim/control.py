@@ -15,11 +15,11 @@ import jax.numpy as jnp
 from starjax import rcm
 from starjax.types import Pose
 
-# Of the tip (m/s, m/s^2) and of the roll about the axis (rad/s, rad/s^2): what the FR5's joints
-# follow with the torque they have, and the tip no faster than half of that (the joint that turns
-# the roll then still has its own limit, 3.15 rad/s). A policy that is lost
-# jumps from plan to plan, and the joints' servos do not answer a jerk alike: with 1.8 m/s^2 the
-# axis missed the trocar by 0.14 mm then (99th percentile of five such trials), with 0.9 by 0.08.
+# Of the tip (m/s, m/s^2) and of the roll about the axis (rad/s, rad/s^2). The same for every arm,
+# so that a policy moves alike with each; `Arm.max_speed` bounds the joints besides. Found with the
+# first arm: its torque can follow them, and twice such a tip. A policy that is lost jumps from plan
+# to plan, and servos do not answer a jerk alike: with 1.8 m/s^2 the axis missed the trocar by
+# 0.14 mm then (99th percentile of five such trials), with 0.9 by 0.08.
 MAX_SPEED = 0.2
 MAX_ACCELERATION = 0.9
 MAX_SPIN = 4.0

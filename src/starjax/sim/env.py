@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from starjax import errors, rcm
 from starjax.config import DEFAULT_TASK
 from starjax.sim import cameras as views
-from starjax.sim import collision, ik, motion, physics, render
+from starjax.sim import collision, endoscope, ik, motion, physics, render
 from starjax.sim import scene as scenes
 from starjax.sim.state import Env, EnvParams, EnvState
 from starjax.sim.tasks.base import CONTROL_HZ, Task, Views
@@ -65,11 +65,16 @@ def make(
         expected = f"a whole number of pixels, {SMALLEST_IMAGE} or more"
         raise errors.UsageError("image_size", expected, repr(image_size))
     scene = scenes.load(scenes.name(task, arms, tools, cameras), variant)
-    seen = views.make(scene.mj_model, scene.names.cameras, image_size, shadow, moving_cameras)
+    names, scope = scene.names.cameras, endoscope.of(scene.task, scene.names.cameras)
+    seen = views.make(scene.mj_model, names, image_size, shadow, moving_cameras, scope)
 
     def start(key: jax.Array, params: EnvParams) -> EnvState:
-        poses = views.nominal(seen) if params.cameras is None else params.cameras
-        return reset(scene, key, params, poses)
+        poses = views.at_reset(seen, scope, key) if params.cameras is None else params.cameras
+        state = reset(scene, key, params, poses)
+        if scope is None:
+            return state
+        here = names.index(endoscope.NAME)
+        return state.replace(endoscope=jax.tree.map(lambda leaf: leaf[here], poses))
 
     def camera(state: EnvState) -> dict[str, render.Frame]:
         p_world_trocar = state.trocar.p_world_trocar
@@ -83,7 +88,7 @@ def make(
             images = {name: frame.rgb for name, frame in camera(state).items()}
         else:
             fields = scene.task.state(scene.bound, state.layout, state.facts)
-        return Observation(state.pose, state.gripper, images, fields)
+        return Observation(state.pose, state.gripper, images, fields, endoscope=state.endoscope)
 
     return Env(
         reset=_precisely(start),
@@ -170,6 +175,7 @@ def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
         period,
         state.layout,
         state.step * period,
+        state.model,
     )
     moved = state.replace(
         physics=after,

@@ -21,15 +21,19 @@ def trocars_to(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvState
       p_world_trocar: `[A, 3]` m.
     """
     is_moved = jnp.any(p_world_trocar != state.trocar.p_world_trocar)
-    roll_zero = np.array([slot.roll_zero for slot in env.task.slots], np.float32)
-    moved = rcm.trocar_frame(
-        rcm.trocar_from_position(p_world_trocar, env.p_world_ref), env.p_world_ref, roll_zero
-    )
+    moved = frame_at(env, p_world_trocar)
     trocar, told = (
         jax.tree.map(lambda new, old: jnp.where(is_moved, new, old), moved, frame)
         for frame in (state.trocar, state.told)
     )
     return state.replace(trocar=trocar, told=told)
+
+
+def frame_at(env: Env, p_world_trocar: jax.Array) -> rcm.TrocarFrame:
+    """The frames of trocars at `p_world_trocar` `[A, 3]` m."""
+    roll_zero = np.array([slot.roll_zero for slot in env.task.slots], np.float32)
+    parameters = rcm.trocar_from_position(p_world_trocar, env.p_world_ref)
+    return rcm.trocar_frame(parameters, env.p_world_ref, roll_zero)
 
 
 def carried(command: Command, p_before: jax.Array, p_now: jax.Array) -> Command:

@@ -1,6 +1,7 @@
 """MJX under the environment: what is carried between steps, and one control period of it."""
 
-from collections.abc import Sequence
+import types
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import flax.struct
@@ -77,6 +78,7 @@ def advance(
     period: float,
     layout: object,
     time: jax.Array,
+    own: Mapping[str, jax.Array] = types.MappingProxyType({}),
 ) -> tuple[PhysicsState, Passed]:
     """One control period: the joint targets move smoothly from `q` to `q + dq`.
 
@@ -89,9 +91,10 @@ def advance(
       p_world_trocar: `[A, 3]` m.
       period: s.
       layout: of the episode, for what the task itself drives. time: s since reset.
+      own: fields of the MJX model that are the episode's own.
     """
     substeps = round(period / scene.mj_model.opt.timestep)
-    mjx_model = _model(scene, p_world_trocar)
+    mjx_model = _model(scene, p_world_trocar).replace(**own)
     mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
     turn = [period * v - d for v, d in zip(velocity, dq, strict=True)]
 

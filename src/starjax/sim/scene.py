@@ -14,7 +14,7 @@ import numpy as np
 
 from starjax import errors
 from starjax.config import DEFAULT_TASK
-from starjax.sim import assets, ik, registry, solver
+from starjax.sim import assets, endoscope, ik, registry, solver
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
 from starjax.sim.engine import mjx
@@ -24,6 +24,7 @@ from starjax.sim.tools.base import Tool
 
 # Sizes that MJX compiles in. Each part says what it adds; the scene has the sum.
 CONTACT_LIMITS = ("max_geom_pairs", "max_contact_points")
+FIXED = "fixed"  # among cameras: the task's first one that is no endoscope
 # Of a task's MJCF: turns of the contact solver, where light bodies need more than usual.
 SOLVER_TURNS = "solver_turns"
 
@@ -95,7 +96,7 @@ def name(
     tools: Sequence[str] = (),
     cameras: Sequence[str] = (),
 ) -> SceneNames:
-    """The names of a scene: those of the task where none are given.
+    """The names of a scene: those of the task where none are given; cameras may be `FIXED`.
 
     Raises:
       errors.UsageError: a name is unknown, or there are not as many as the task has slots.
@@ -112,7 +113,8 @@ def name(
         for one in names:
             errors.choice(kind, one, known.names())
         chosen[kind] = names
-    cameras = tuple(cameras) or record.cameras[:1]
+    still = next((one for one in record.cameras if one != endoscope.NAME), FIXED)
+    cameras = tuple(still if one == FIXED else one for one in cameras) or record.cameras[:1]
     for one in cameras:
         errors.choice("camera", one, record.cameras)
     return SceneNames(task, chosen["arm"], chosen["tool"], cameras)
@@ -140,6 +142,8 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
         )
         world.attach(robot, site=base, prefix=f"arm{i}/")
         _call_by_name(world, f"arm{i}/tool/")
+    if scope := endoscope.of(task, names.cameras):
+        _add_endoscope(world, scope)
     known = [camera.name for camera in world.cameras]
     for camera in names.cameras:
         errors.choice("camera", camera, known)
@@ -262,6 +266,13 @@ def _call_by_name(world: mujoco.MjSpec, prefix: str) -> None:
         own = camera.name.removeprefix(prefix)
         if own not in taken:
             camera.name = own
+
+
+def _add_endoscope(world: mujoco.MjSpec, scope: endoscope.Endoscope) -> None:
+    pose, wxyz = endoscope.nominal(scope), np.zeros(4)
+    mujoco.mju_mat2Quat(wxyz, np.asarray(pose.R, float).ravel())
+    p = np.asarray(pose.p, float)
+    world.worldbody.add_camera(name=endoscope.NAME, pos=p, quat=wxyz, fovy=scope.fovy)
 
 
 def _solver_turns(m: mujoco.MjModel) -> int | None:

@@ -24,8 +24,8 @@ from starjax.sim import linear
 from starjax.sim.engine import mjx
 
 MAX_ITERATIONS = 10
-# The error left may move the scene with no more than this kinetic energy (J): the 3 g block at
-# 0.08 mm/s, the first joint at 2 urad/s.
+# The error left may move the scene with no more than this kinetic energy (J): a thing of 3 g at
+# 0.08 mm/s, an arm's first joint at 2 urad/s.
 MAX_ERROR_ENERGY = 1e-11
 # Shares of the Newton step that the line search tries first: it is mostly right, or far too long.
 FIRST_SHARES = (

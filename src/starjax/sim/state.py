@@ -1,6 +1,6 @@
 """Parts of an environment: its functions, its parameters and its state."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -23,11 +23,13 @@ class EnvParams(NamedTuple):
       told: what agents are told of them, fields `[A]`, or None for the truth.
       cameras: poses `[C]` of the observed cameras in their bodies' frames, or None for those of the
         MJCF; only an environment with moving cameras looks at those that are fixed in the world.
+      levels: how much of each thing is wrong, by name, for an environment that is disturbed.
     """
 
     trocar: rcm.Trocar
     told: rcm.Trocar | None = None
     cameras: Pose | None = None
+    levels: Mapping[str, jax.typing.ArrayLike] | None = None
 
 
 @flax.struct.dataclass
@@ -60,6 +62,10 @@ class EnvState:
       solver_error: J, see `physics.Passed`, of the last control step.
       touch: `[A]` bool, the jaws touch something that they can grasp.
       pose: `[A]` measured tips in the world. gripper: `[A]` measured openings, [-1, 1].
+      model: fields of the MJX model that are this episode's own, by name.
+      beside: what wrappers of the environment carry, by name.
+      endoscope: pose_world_camera that agents are told of the endoscope, see `sim.endoscope`; None
+        where the scene is not seen through one.
     """
 
     physics: physics.PhysicsState
@@ -90,6 +96,9 @@ class EnvState:
     touch: jax.Array
     pose: Pose
     gripper: jax.Array
+    model: dict[str, jax.Array] = flax.struct.field(default_factory=dict)
+    beside: dict[str, Any] = flax.struct.field(default_factory=dict)
+    endoscope: Pose | None = None
 
 
 class Env(NamedTuple):

@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 from starjax.rcm import trocar
+from starjax.sim import endoscope
 
 
 class Workspace(NamedTuple):
@@ -30,7 +31,7 @@ class Workspace(NamedTuple):
     base_high: tuple[float, float, float]
 
 
-# Both boards of pegs, from a grasp to the start; the camera looks on from x > 0.
+# A board, from a grasp on it to the start above it; the camera looks on from x > 0.
 BOARD = Workspace(
     p_world_ref=(0.0, 0.0, 0.15),
     radius=trocar.RADIUS_RANGE,
@@ -42,6 +43,20 @@ BOARD = Workspace(
     roll_zero=0.0,
     base_low=(-0.8, -0.3, -0.4),
     base_high=(-0.2, 0.3, 1.2),
+)
+
+
+# The endoscope over the boards, opposite the arm. Nearer than 8 cm, pegs are out of the picture.
+BOARD_ENDOSCOPE = endoscope.Endoscope(
+    p_world_ref=(0.15, 0.0, 0.15),
+    radius=(0.0, 0.03),
+    polar=trocar.POLAR_RANGE,
+    azimuth=trocar.AZIMUTH_RANGE,
+    work=(0.0, 0.0, 0.008),
+    spread=(0.006, 0.006, 0.003),
+    distance=(0.08, 0.11),
+    up=(-1.0, 0.0, 0.0),
+    fovy=70.0,
 )
 
 

@@ -93,7 +93,8 @@ def run(
     frames, held_out = windows.split_holdout(
         dataset.start, dataset.length, dataset.trocar, train_config.holdout_demos
     )
-    stats = normalizer.fit(policies.ablated(method, policy_config), task, dataset, frames)
+    row = policies.ablated(method, policy_config)
+    stats = normalizer.fit(row, task, dataset, frames, policy_config.frame)
     policy = policies.make(method, policy_config, task, train_config, cameras)
     optimizer = states.make_optimizer(train_config)
     streams = states.streams(seed)
@@ -190,6 +191,8 @@ def _observed(
     kept = "features" if policy_config.freeze_encoder else kept
     images = {name: (given.images or {}).get(name) for name in seen.cameras}
     unseen = {name: None for name in ("images", "state", "features") if name != kept}
+    if policy_config.frame == "world":
+        unseen["endoscope"] = None
     return dataset.replace(observation=given._replace(**{"images": images, **unseen}))
 
 

@@ -9,7 +9,7 @@ from starjax.viewer import panel, recorded
 from starjax.viewer.clock import Clock
 from starjax.viewer.plots import Plots
 from starjax.viewer.stage import Stage, aim
-from starjax.viewer.words import Status, notify
+from starjax.viewer.status import Status, notify
 
 _SELDOM = 3  # control steps between two pictures and plots
 _PAUSED_S = 0.02  # between two looks at the page

@@ -20,7 +20,7 @@ Show = Callable[[np.ndarray, np.ndarray, np.ndarray | None], None]
 
 
 class Poses(NamedTuple):
-    """Of all geoms G: `p` `[G, 3]` m, `R` `[G, 3, 3]` and `wxyz` `[G, 4]`, in the world frame."""
+    """World poses of all geoms G: `p` `[G, 3]` m, `R` `[G, 3, 3]`, `wxyz` `[G, 4]`."""
 
     p: np.ndarray
     R: np.ndarray

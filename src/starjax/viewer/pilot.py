@@ -8,7 +8,7 @@ import numpy as np
 
 from starjax.viewer import hand as hands
 from starjax.viewer.devices import Device, Gone, Reading
-from starjax.viewer.words import notify
+from starjax.viewer.status import notify
 
 KEY_STEP = 0.0015  # m a stroke, with a scale of 1; holding a key repeats it
 KEY_TURN = 0.05  # rad

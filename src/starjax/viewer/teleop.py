@@ -15,8 +15,8 @@ from starjax.viewer.frame import Frame, outcome
 from starjax.viewer.pilot import Pilot
 from starjax.viewer.recorder import Recorder
 from starjax.viewer.stage import Stage, aim
+from starjax.viewer.status import Status, notify
 from starjax.viewer.steering import Steering
-from starjax.viewer.words import Status, notify
 
 _SELDOM = 3  # control steps between two pictures
 

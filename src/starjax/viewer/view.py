@@ -7,9 +7,9 @@ from starjax import errors
 from starjax.sim import registry
 from starjax.viewer import actors, panel
 from starjax.viewer.actors import Actor
-from starjax.viewer.beside import Rollouts
 from starjax.viewer.clock import Clock
-from starjax.viewer.words import Status, notify
+from starjax.viewer.side_by_side import Rollouts
+from starjax.viewer.status import Status, notify
 
 THEIRS = "their own"  # of arms
 
@@ -19,7 +19,7 @@ class Asked(NamedTuple):
 
     Attributes:
       who: one actor, or two of one task for side by side.
-      arm: robot in the place of theirs, or `THEIRS`.
+      arm: robot instead of theirs, or `THEIRS`.
       trocar: number of the task's configuration. seed: of the trials.
     """
 
@@ -87,7 +87,7 @@ class Cast:
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Robots in the place of the actors' own."""
+        """Robots instead of the actors' own."""
         return () if self._choices["arm"] == THEIRS else (self._choices["arm"],)
 
     def actors(self) -> list[Actor]:

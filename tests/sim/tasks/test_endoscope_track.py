@@ -101,4 +101,4 @@ def test_time_off_target_counts_after_the_first_seconds():
 
 def test_a_tool_without_the_camera_is_a_mistake():
     with mistakes.of("camera", "endoscope"):
-        scene.compose(scene.name("peg_transfer")._replace(cameras=("endoscope",)))
+        scene.compose(scene.name("ring_on_wire")._replace(cameras=("endoscope",)))

@@ -15,7 +15,7 @@ from PIL import Image
 from starjax import errors, rcm
 from starjax.data import schema, store
 from starjax.data.formats import mapping as maps
-from starjax.data.formats import motion, ports
+from starjax.data.formats import motion, trocars
 from starjax.data.formats.base import Source
 from starjax.data.formats.mapping import Camera, Map
 from starjax.data.formats.motion import HZ, Motion
@@ -90,18 +90,18 @@ def bring(
             raise errors.UsageError(error.argument, error.expected, line) from error
         else:
             notes += [f"episode {episode}: {line}" for line in found.notes]
-            tips.append(ports.thinned(found))
+            tips.append(trocars.thinned(found))
             kept.append(_Kept(episode, len(found.pose.p), -1, is_good))
         note(1)
-    places, is_known = ports.found(tips, mapping, [k.episode for k in kept], notes)
+    places, is_known = trocars.found(tips, mapping, [k.episode for k in kept], notes)
     kept, places = (list(itertools.compress(items, is_known)) for items in (kept, places))
     tips = list(itertools.compress(tips, is_known))
     if not kept:
         said = notes[-1] if notes else "no episode"
         raise errors.UsageError("PATH", "demonstrations to keep", said)
-    groups, centres = ports.grouped(np.array(places))
+    groups, centres = trocars.grouped(np.array(places))
     kept = [k._replace(trocar=int(group)) for k, group in zip(kept, groups)]
-    residual = ports.residual(tips, centres[groups], [k.episode for k in kept], notes)
+    residual = trocars.residual(tips, centres[groups], [k.episode for k in kept], notes)
     description = _describe(source, mapping, task, kept, centres, hz)
     about = {"notes": notes, "residual_mm": np.round(residual, 4).tolist()}
     digest = _written(root, description, about, source, mapping, kept, centres, task, moved, note)
@@ -135,7 +135,7 @@ def _describe(
     source: Source, mapping: Map, task: Any, kept: list[_Kept], centres: np.ndarray, hz: float
 ) -> dict[str, Any]:
     reference = np.array([slot.p_world_ref for slot in task.slots])
-    trocars = rcm.trocar_from_position(centres.astype(np.float32), reference.astype(np.float32))
+    parameters = rcm.trocar_from_position(centres.astype(np.float32), reference.astype(np.float32))
     shapes = _shapes(source, mapping, len(task.slots))
     unknown = [source.robot or "unknown"] * len(task.slots)
     return {
@@ -151,7 +151,7 @@ def _describe(
             "tools": ["unknown"] * len(unknown),
             "cameras": list(mapping.cameras),
         },
-        "trocars": np.stack([np.asarray(f, np.float64) for f in trocars], -1).tolist(),
+        "trocars": np.stack([np.asarray(f, np.float64) for f in parameters], -1).tolist(),
         "p_world_ref": reference.tolist(),
         "roll_zero": [float(slot.roll_zero) for slot in task.slots],
         "control_hz": HZ,

@@ -60,7 +60,7 @@ def grid(scene: scenes.Scene, height: int, width: int) -> Grid:
 
 
 def picture(grid: Grid, tiled: Array) -> Array:
-    """From `[T, n * n]`, n a divisor of the side, to `[h, w]`, the overhang cut off."""
+    """Puts tiles `[T, n * n]`, n a divisor of the side, together to `[h, w]`; cuts the overhang."""
     rows, cols, n = len(grid.edges_y) - 1, len(grid.edges_x) - 1, math.isqrt(tiled.shape[1])
     whole = tiled.reshape(rows, cols, n, n).swapaxes(1, 2).reshape(rows * n, cols * n)
     return whole[: grid.height * n // grid.side, : grid.width * n // grid.side]

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from starjax import rcm
+from starjax.sim.endoscope import Endoscope
 from starjax.types import Agent, Pose
 
 CONTROL_HZ = 30.0  # commands a second
@@ -19,7 +20,7 @@ class Field(NamedTuple):
     """A part of the `state` observation.
 
     Attributes:
-      name: what it is, e.g. `block.p`.
+      name: what it is, e.g. `needle.p`.
       size: how many numbers.
       kind: `point` m in the world frame, scaled for networks; `rot6d`, `unit`: within [-1, 1].
     """
@@ -68,14 +69,14 @@ class Words(NamedTuple):
     """Phrases for reports of a task, in plain English, without a capital or a full stop.
 
     Attributes:
-      title: e.g. `peg transfer`.
-      done: completes "the policy ...", e.g. `moved the block to its peg`.
+      title: e.g. `needle pick`.
+      done: completes "the policy ...", e.g. `lifted the needle`.
       strict: when a trial is a strict success.
       loose: when it passes the loose test.
       nearly: a failed trial that passed the loose test.
       collided: what a collision is here.
       ground: what the tool works over, e.g. `the boards`.
-      goal: how a picture shows what is asked for, e.g. `the block belongs on the marked peg`.
+      goal: how a picture shows what is asked for, e.g. `the tip belongs at the coloured mark`.
       lost: what makes a trial hopeless before its time is up; empty where nothing does.
     """
 
@@ -195,6 +196,8 @@ class Task(NamedTuple):
         touch nothing; None if there are none.
       least_steps: control steps that any success takes; demonstrations may take so many whatever
         the usual limit is.
+      endoscope: of the camera `endoscope`, where the task can be seen through one that is held in a
+        trocar of its own; None where no such camera is among `cameras`, or a tool carries it.
     """
 
     name: str
@@ -228,6 +231,7 @@ class Task(NamedTuple):
     drive: Callable[..., jax.Array] = _undriven
     still: Callable[..., Pose] | None = None
     least_steps: int = 0
+    endoscope: Endoscope | None = None
 
     @property
     def arms(self) -> int:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
+from starjax.sim import endoscope
 from starjax.sim.state import EnvState
 from starjax.sim.tasks import scripting
 from starjax.sim.tasks.base import CONTROL_HZ
@@ -83,20 +84,9 @@ def looking_at(
 
     The view may lean from the shaft in the plane of the picture's vertical, as with oblique optics.
     """
-    length = jnp.linalg.norm(target - p_trocar)
-    straight = (target - p_trocar) / length
-    up = jnp.array(UP)
-    up = up - (up @ straight) * straight
-    up = up / jnp.maximum(jnp.linalg.norm(up), 1e-6)
-    sine, cosine = R_tip_camera[2, 1], -R_tip_camera[2, 2]  # of the lean towards the lower edge
-    sine_e = distance * sine / length
-    cosine_e = jnp.sqrt(1.0 - sine_e**2)
-    axis = cosine_e * straight + sine_e * up
-    p = p_trocar + (length * cosine_e - distance * cosine) * axis
-    back = (p - target) / distance
-    right = jnp.cross(straight, up)
-    R_world_camera = jnp.stack([right, jnp.cross(back, right), back], axis=-1)
-    return Pose(R_world_camera @ R_tip_camera.T, p)
+    lean = R_tip_camera[2, 1], -R_tip_camera[2, 2]
+    camera = endoscope.looking_at(target, p_trocar, distance, UP, lean)
+    return Pose(camera.R @ R_tip_camera.T, camera.p)
 
 
 def _command(way: jax.Array, state: EnvState) -> Command:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import bodies
+from starjax.sim import bodies, endoscope, workspaces
 from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
 from starjax.sim.tasks.needle_pick import words
 from starjax.types import Agent, Pose
@@ -204,7 +204,7 @@ TASK = Task(
     name="needle_pick",
     mjcf="tasks/needle_pick/needle_pick.xml",
     slots=(Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15)),),
-    cameras=("camera",),
+    cameras=("camera", endoscope.NAME),
     time_limit_s=30.0,
     settle_steps=SETTLE_STEPS,
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
@@ -227,4 +227,5 @@ TASK = Task(
     floor=FLOOR,
     is_sound=is_sound,
     outline=words.outline,
+    endoscope=workspaces.BOARD_ENDOSCOPE,
 )

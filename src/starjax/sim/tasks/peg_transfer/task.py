@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import bodies
+from starjax.sim import bodies, endoscope, workspaces
 from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
 from starjax.sim.tasks.peg_transfer import words
 from starjax.types import Agent, Pose
@@ -269,7 +269,7 @@ TASK = Task(
     name="peg_transfer",
     mjcf="tasks/peg_transfer/peg_transfer.xml",
     slots=(Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15)),),
-    cameras=("camera",),
+    cameras=("camera", endoscope.NAME),
     time_limit_s=60.0,
     settle_steps=SETTLE_STEPS,
     fields=(
@@ -296,4 +296,5 @@ TASK = Task(
     floor=0.0,
     is_sound=is_sound,
     outline=words.outline,
+    endoscope=workspaces.BOARD_ENDOSCOPE,
 )

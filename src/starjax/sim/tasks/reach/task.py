@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from starjax.sim import endoscope, workspaces
 from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
 from starjax.sim.tasks.reach import words
 from starjax.types import Agent
@@ -114,7 +115,7 @@ TASK = Task(
     name="reach",
     mjcf="tasks/reach/reach.xml",
     slots=(Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15)),),
-    cameras=("camera",),
+    cameras=("camera", endoscope.NAME),
     time_limit_s=15.0,
     settle_steps=SETTLE_STEPS,
     fields=(Field("goal.p", 3, "point"),),
@@ -137,4 +138,5 @@ TASK = Task(
     floor=0.0,
     is_sound=lambda bound, qpos, qvel: jnp.ones((), bool),
     outline=words.outline,
+    endoscope=workspaces.BOARD_ENDOSCOPE,
 )

@@ -128,7 +128,7 @@ def bind(m: mujoco.MjModel) -> Bound:
 
 
 def height(y: jax.Array) -> jax.Array:
-    """Of the wire's axis at `y` `[...]` m."""
+    """Height of the wire's axis at `y` `[...]` m."""
     return jnp.interp(y, jnp.array(BENDS), jnp.array(HEIGHTS))
 
 

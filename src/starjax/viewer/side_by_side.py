@@ -12,7 +12,7 @@ from starjax.viewer.handles import TrocarHandles
 from starjax.viewer.plots import Plots
 from starjax.viewer.simulation import Simulation
 from starjax.viewer.stage import Stage, aim
-from starjax.viewer.words import Status
+from starjax.viewer.status import Status
 
 _SELDOM = 3  # control steps between two pictures and plots
 _REST_S = 1.5  # after an episode, until the next trial

@@ -16,8 +16,10 @@ Tips = tuple[np.ndarray, np.ndarray, np.ndarray]  # see `thinned`
 
 
 def thinned(found: Motion) -> Tips:
-    """Of an episode, what tells its trocars: some poses `[T, A, ...]`, and the `[A, 3]` that the
-    files say, NaN where they do not."""
+    """Keeps of an episode what tells its trocars.
+
+    Some poses `[T, A, ...]`, and the trocars `[A, 3]` that the files say, NaN where they do not.
+    """
     said = np.median(found.p_world_trocar, axis=0)
     return shafts.thinned(found.pose.R), shafts.thinned(found.pose.p), said
 
@@ -25,7 +27,7 @@ def thinned(found: Motion) -> Tips:
 def found(
     tips: list[Tips], mapping: Map, numbers: list[int], notes: list[str]
 ) -> tuple[list[np.ndarray], list[bool]]:
-    """Of every episode the trocars `[A, 3]`, and whether they are known."""
+    """Finds every episode's trocars `[A, 3]`, and whether they are known."""
     if not tips:
         return [], []
     said = np.array([trocar for *_, trocar in tips])

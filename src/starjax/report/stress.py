@@ -1,0 +1,125 @@
+"""What breaks a policy, from a stress.json: a table, and success and RCM error around a circle."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from starjax.report import formats, stats, style
+
+NOTE = (
+    "Each row is one disturbance alone, at the trials of the undisturbed policy. Success with its "
+    "95% Wilson interval; executed RCM error at the true trocar; force of a spring of 1 N/mm with "
+    "a damper at the port."
+)
+_LEAST_MM = 1e-2  # in the middle of the circle of RCM errors
+# From no disturbance to the strongest.
+_SHADES = ("#2083C5", "#009E73", "#E69F00", "#D55E00", "#7A1F5C")
+
+Found = Mapping[str, Any]  # the content of a stress.json
+
+
+def table(found: Found) -> formats.Table:
+    """A row for each level of each disturbance."""
+    header = [
+        "Disturbance",
+        "Level",
+        "Success (%)",
+        "RCM mean (mm)",
+        "RCM p99 (mm)",
+        "Wall p99 (N)",
+    ]
+    rows = [header]
+    for name, kind in found["disturbances"].items():
+        for level, score in kind["levels"].items():
+            error, wall = score["rcm_error_mm"]["executed"], score.get("wall_force_N") or {}
+            values = (error["mean"], error["p99"], wall.get("p99"))
+            cells = ["\u2013" if value is None else f"{value:.2f}" for value in values]
+            rows.append([name, f"{level} {kind['unit']}".strip(), _rate(score), *cells])
+    return rows
+
+
+def markdown(found: Found) -> str:
+    """The table with a heading."""
+    return f"# What breaks {found['method']}\n\n{formats.render(table(found), 2)}\n\n{NOTE}\n"
+
+
+def draw(found: Found, dark: bool = False) -> Any:
+    """Success, and RCM error, of every disturbance from its lowest to its highest level."""
+    kinds = found["disturbances"]
+    angles = np.linspace(0.0, 2.0 * np.pi, len(kinds), endpoint=False)
+    names = [f"{name}\n{_span(kind)}" for name, kind in kinds.items()]
+    count = max(len(kind["levels"]) for kind in kinds.values())
+    is_undisturbed = all(float(next(iter(kind["levels"]))) == 0 for kind in kinds.values())
+    with style.use(dark):
+        figure = style.figure(9.4, 5.0)
+        success, error = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
+        for rank in range(count):
+            scores = [_at(kind["levels"], rank) for kind in kinds.values()]
+            line = {
+                "color": _SHADES[round(rank / max(count - 1, 1) * (len(_SHADES) - 1))],
+                "linewidth": 1.4,
+            }
+            line |= {"marker": "o", "markersize": 3, "label": _label(rank, count, is_undisturbed)}
+            _around(success, angles, [score["strict"]["rate"] for score in scores], line)
+            _around(error, angles, [_logarithm(score) for score in scores], line)
+        success.set_title("Success", pad=14, loc="center")
+        success.set_ylim(0, 1)
+        success.set_yticks([0.25, 0.5, 0.75, 1], ["25", "50", "75", "100%"])
+        error.set_title("RCM error, 99th percentile", pad=14, loc="center")
+        error.set_ylim(0, 3)
+        error.set_yticks([0, 1, 2, 3], ["0.01", "0.1", "1", "10 mm"])
+        for axis in (success, error):
+            axis.set_theta_zero_location("N")
+            axis.set_theta_direction(-1)
+            axis.set_xticks(angles, names, fontsize=6)
+            for label, angle in zip(axis.get_xticklabels(), angles):
+                side = round(float(np.sin(angle)), 6)
+                label.set_ha("left" if side > 0 else "right" if side else "center")
+            axis.tick_params(axis="x", pad=3)
+            axis.tick_params(axis="y", labelsize=6)
+            axis.set_rlabel_position(np.rad2deg(angles[1]) / 2 if len(kinds) > 1 else 90)
+        style.legend(figure, *success.get_legend_handles_labels(), most=count)
+    return figure
+
+
+def files(found: Found) -> dict[str, bytes]:
+    """The table and the figure by their files' names."""
+    figure = draw(found)
+    return {
+        "stress.md": markdown(found).encode(),
+        "stress.png": style.save(figure, "png"),
+        "stress.pdf": style.save(figure, "pdf"),
+    }
+
+
+def _rate(score: Found) -> str:
+    strict = score["strict"]
+    return formats.rate(stats.rate(strict["successes"], strict["trials"]))
+
+
+def _span(kind: Found) -> str:
+    levels = [level for level in kind["levels"] if float(level)]
+    ends = dict.fromkeys([levels[0], levels[-1]]) if levels else {}
+    return f"{' to '.join(ends)} {kind['unit']}".strip()
+
+
+def _at(levels: Mapping[str, Any], rank: int) -> Any:
+    """The score of the level of this rank, or of the highest one."""
+    return list(levels.values())[min(rank, len(levels) - 1)]
+
+
+def _label(rank: int, count: int, is_undisturbed: bool) -> str:
+    if rank == 0:
+        return "undisturbed" if is_undisturbed else "lowest level"
+    return "highest level" if rank == count - 1 else f"level {rank if is_undisturbed else rank + 1}"
+
+
+def _logarithm(score: Found) -> float:
+    error = score["rcm_error_mm"]["executed"]["p99"]
+    return float(np.clip(np.log10(max(error or 0.0, _LEAST_MM) / _LEAST_MM), 0.0, 3.0))
+
+
+def _around(axis: Any, angles: np.ndarray, values: list[float], line: dict[str, Any]) -> None:
+    closed = [*range(len(angles)), 0]
+    axis.plot(angles[closed], np.array(values)[closed], **line)

@@ -1,0 +1,103 @@
+"""The endoscope through which a task may be seen: it stands in a trocar of its own, other in every
+episode, and is held still and level.
+
+It is a camera, not a body: it neither touches anything nor casts a shadow.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.rcm import trocar as trocars
+from starjax.types import Pose
+
+NAME = "endoscope"  # of the camera
+STREAM = 0x73636F70  # folded into an episode's key: objects and tips are drawn as without it
+
+
+class Endoscope(NamedTuple):
+    """Where a task's endoscope may be, and what its lens sees.
+
+    Attributes:
+      p_world_ref: `(3,)` m, its nominal trocar.
+      radius, polar, azimuth: ranges of its trocar about that one (Eq. 19), m and rad.
+      work: `(3,)` m, what it looks at. spread: `(3,)` m, how far from there, either way.
+      distance: range, m from the lens to what it looks at.
+      up: `(3,)`, the direction that is up in the picture as far as the line of sight lets it.
+      fovy: degrees from the picture's lower edge to its upper one.
+    """
+
+    p_world_ref: tuple[float, float, float]
+    radius: trocars.Range
+    polar: trocars.Range
+    azimuth: trocars.Range
+    work: tuple[float, float, float]
+    spread: tuple[float, float, float]
+    distance: trocars.Range
+    up: tuple[float, float, float]
+    fovy: float
+
+
+def of(task: Any, cameras: Sequence[str]) -> Endoscope | None:
+    """The task's endoscope, if it is one of the observed cameras."""
+    return task.endoscope if NAME in cameras else None
+
+
+def draw(endoscope: Endoscope, key: jax.Array) -> Pose:
+    """The camera's pose in one episode, which `key` is of."""
+    key_trocar, key_work, key_distance = jax.random.split(jax.random.fold_in(key, STREAM), 3)
+    where = trocars.sample_trocar(
+        key_trocar,
+        radius_range=endoscope.radius,
+        polar_range=endoscope.polar,
+        azimuth_range=endoscope.azimuth,
+    )
+    aside = jax.random.uniform(key_work, (3,), minval=-1.0)
+    low, high = endoscope.distance
+    return looking_at(
+        jnp.array(endoscope.work) + jnp.array(endoscope.spread) * aside,
+        trocars.trocar_position(where, jnp.array(endoscope.p_world_ref)),
+        jax.random.uniform(key_distance, minval=low, maxval=high),
+        endoscope.up,
+    )
+
+
+def nominal(endoscope: Endoscope) -> Pose:
+    """The camera's pose in the middle of all that may be drawn; a constant in programs."""
+    work, p_trocar = np.array(endoscope.work), np.array(endoscope.p_world_ref)
+    with jax.ensure_compile_time_eval(), jax.default_matmul_precision("highest"):
+        return looking_at(work, p_trocar, np.mean(endoscope.distance), endoscope.up)
+
+
+def looking_at(
+    target: Any, p_trocar: Any, distance: Any, up: Any, lean: tuple[Any, Any] = (0.0, 1.0)
+) -> Pose:
+    """The one pose of a scope's camera with the target in the middle of a level picture.
+
+    Args:
+      target: `[3]` m.
+      p_trocar: `[3]` m, the scope's trocar.
+      distance: m, from the lens to the target.
+      up: `[3]`, up in the picture; not along the line of sight.
+      lean: sine and cosine of the angle by which the lens looks from the shaft towards the
+        picture's lower edge, as oblique optics do.
+
+    Returns:
+      pose_world_camera: x to the right, y up, it looks along -z.
+    """
+    length = jnp.linalg.norm(target - p_trocar)
+    straight = (target - p_trocar) / length
+    up = jnp.array(up)
+    up = up - (up @ straight) * straight
+    up = up / jnp.maximum(jnp.linalg.norm(up), 1e-6)
+    sine, cosine = lean
+    sine_e = distance * sine / length
+    cosine_e = jnp.sqrt(1.0 - sine_e**2)
+    axis = cosine_e * straight + sine_e * up
+    p = p_trocar + (length * cosine_e - distance * cosine) * axis
+    back = (p - target) / distance
+    right = jnp.cross(straight, up)
+    return Pose(jnp.stack([right, jnp.cross(back, right), back], axis=-1), p)
