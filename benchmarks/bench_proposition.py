@@ -24,7 +24,7 @@ knows more, so the share bounds from above what is lost by not telling it the tr
 """
 
 import argparse
-import sys
+import importlib
 import time
 from collections.abc import Callable
 from typing import Any
@@ -72,7 +72,7 @@ def main() -> None:
         "trocars": len(trials[0]),
         "episodes": sum(map(len, trials)),
         "successes": successes,
-        **decomposed(trials, names(task.name, agent), task.arms),
+        **decomposed(trials, names(task.name), task.arms),
         "wall_s": time.perf_counter() - start,
     }
     for name, arm in found["arms"].items():
@@ -82,10 +82,10 @@ def main() -> None:
     print("written to", _timing.write("proposition", {"results": {task.name: found}}))
 
 
-def names(task: str, agent: Agent) -> list[str]:
+def names(task: str) -> list[str]:
     """Names of the expert's phases."""
-    known = getattr(sys.modules[agent.act.__module__], "PHASES", PHASES.get(task, "").split())
-    return list(known)
+    known = importlib.import_module(f"starjax.sim.tasks.{task}.expert")
+    return list(getattr(known, "PHASES", PHASES.get(task, "").split()))
 
 
 def play(
@@ -119,7 +119,7 @@ def _episode(environment: envs.Env, agent: Agent, steps: int) -> Callable[..., A
         def step(loop):
             (state, memory), rows = loop
             command, memory, label = agent.act(memory, state)
-            row = (jnp.ones((), bool), *where(agent, memory), label.pose.p)
+            row = (jnp.ones((), bool), *where(memory), label.pose.p)
             rows = jax.tree.map(lambda all_, one: all_.at[state.step].set(one), rows, row)
             return (environment.step(state, command), memory), rows
 
@@ -135,24 +135,19 @@ def _episode(environment: envs.Env, agent: Agent, steps: int) -> Callable[..., A
 def _shapes(agent: Agent, carry: Any) -> Any:
     def row(state, memory):
         _, memory, label = agent.act(memory, state)
-        return (jnp.ones((), bool), *where(agent, memory), label.pose.p)
+        return (jnp.ones((), bool), *where(memory), label.pose.p)
 
     return jax.eval_shape(row, *carry)
 
 
-def where(agent: Agent, memory: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+def where(memory: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Phase, s in it, and progress of a script.
 
     One without phases is on its way for its duration, and at its goal afterwards.
     """
     if hasattr(memory, "phase"):
-        known = sys.modules[agent.act.__module__]
-        duration = (
-            memory.duration
-            if hasattr(memory, "duration")
-            else jnp.asarray(known.DURATION)[memory.phase] / memory.tempo
-        )
-        return memory.phase, memory.elapsed, jnp.minimum(memory.elapsed / duration, 1.0)
+        progress = jnp.minimum(memory.elapsed / memory.duration, 1.0)
+        return memory.phase, memory.elapsed, progress
     after = memory.elapsed - memory.duration
     is_there = after > 0
     progress = jnp.where(is_there, after, memory.elapsed / memory.duration)

@@ -80,7 +80,7 @@ def make_task(arms: int = 1) -> base.Task:
     given = {
         "name": "reach",
         "slots": tuple(
-            base.Slot("air", tuple(ref.tolist()), roll)
+            base.Slot("board", tuple(ref.tolist()), roll)
             for ref, roll in zip(P_WORLD_REF[:arms], ROLL_ZERO)
         ),
         "cameras": (CAMERA,),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from starjax.experiments import bench, subjects, sweep
+from starjax.sim import registry
 
 
 @pytest.mark.parametrize(
@@ -34,10 +35,13 @@ def test_a_renamed_folder_is_explained(command, tmp_path):
 
 def test_a_grid_is_in_centimetres_and_degrees():
     grid = {"radii_cm": (2.0, 5.0), "polars_deg": (70.0,), "azimuths": 4}
-    found = sweep._trocars(sweep.Options(run="x", **grid), 1)
+    one, two = (registry.tasks.get(name) for name in ("peg_transfer", "needle_handover"))
+    found = sweep._trocars(sweep.Options(run="x", **grid), one)
     np.testing.assert_allclose(np.unique(found.radius), [0.02, 0.05], rtol=1e-6)
     np.testing.assert_allclose(np.rad2deg(found.polar), 70, rtol=1e-6)
     np.testing.assert_allclose(np.rad2deg(found.azimuth[:4, 0]), [0, 90, 180, 270], atol=1e-4)
+    with mistakes.of("radii_cm", (2.0, 5.0)):  # both arms in one place
+        sweep._trocars(sweep.Options(run="x", **grid), two)
 
 
 def test_sweeps_of_other_trials_lie_apart(tmp_path):

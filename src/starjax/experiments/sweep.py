@@ -154,6 +154,8 @@ def _trocars(chosen: Options, task: Any) -> Any:
 
     if not chosen.radii_cm:
         return sweep.sample(chosen.seed, chosen.trocars, task)
+    one = "none beside several arms, whose trocars would all be in one place"
+    checks.expect(task.arms == 1, "radii_cm", one, chosen.radii_cm)
     azimuths = 2 * np.pi * np.arange(chosen.azimuths) / chosen.azimuths
     radii = np.array(chosen.radii_cm) / 100
     return sweep.grid(radii, np.deg2rad(chosen.polars_deg), azimuths, task.arms)

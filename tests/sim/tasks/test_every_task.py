@@ -24,7 +24,7 @@ EXPERTS = {  # control steps
     "needle_handover": 460,
     "ring_on_wire": 460,
 }
-# The script with two arms has no second try, and drops about one block in ten.
+# The script with two arms has no second try, and drops a block now and then.
 DROPS = {"peg_transfer_bimanual": 1}
 # A pad that lies across the arc touches more of its segments than are kept, the nearest.
 CROWDED = {"needle_pick", "needle_handover"}

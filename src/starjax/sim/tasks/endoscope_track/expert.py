@@ -21,7 +21,6 @@ FIND_TIME = (1.0, 1.6)  # s, range of the way to the target
 NEARER = (0.9, 1.1)  # of DISTANCE, range of an episode's own
 BULGE = 0.008  # m, how far the arc leaves the straight way
 DEVIATION = (0.0008, 0.0008, 0.0008, 0.012)  # m and rad, of the disturbance
-CORRELATION, SMOOTHING = 0.4, 0.15  # s
 DISTURBANCE = 0.7  # how much of it acts once the target is found
 
 
@@ -72,15 +71,7 @@ def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
     wanted = jnp.append(rcm.roll_of(pose.R) - state.told.roll_zero[0], pose.p)
     way = script.start + share * (wanted - script.start)
     way = way.at[1:].add(4.0 * share * (1.0 - share) * script.side)
-    noise = scripting.disturb(
-        script.key,
-        script.noise,
-        state.step,
-        deviation=jnp.array(DEVIATION),
-        correlation=CORRELATION,
-        smoothing=SMOOTHING,
-        dt=dt,
-    )
+    noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
     weight = 1.0 - (1.0 - DISTURBANCE) * s
     script = script.replace(elapsed=elapsed, noise=noise)
     return _command(way + weight * jnp.roll(noise[1], 1), state), script, _command(way, state)
@@ -99,8 +90,7 @@ def looking_at(
 
 
 def _command(way: jax.Array, state: EnvState) -> Command:
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(way[None], state.told)
-    return Command(pose, jnp.ones(1))
+    return scripting.command(way[:1], way[None, 1:], jnp.ones(1), state)
 
 
 AGENT = Agent(init, act)

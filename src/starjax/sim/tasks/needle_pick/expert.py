@@ -9,7 +9,6 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from starjax import rcm
 from starjax.sim.state import EnvState
 from starjax.sim.tasks import scripting
 from starjax.sim.tasks.base import CONTROL_HZ
@@ -24,7 +23,6 @@ JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0)
 DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.1)  # how much of it acts in each phase
 
 TEMPO = (0.85, 1.2)  # range of an episode's pace
-JAW_TIME = 0.25  # s to close or open
 TURN_LEAD = 0.25  # s before the end of the approach at which the tool begins to turn
 TURN_TIME = 0.80  # s the turn takes
 ALIGNED = 0.6  # share of a descent after which it goes straight down
@@ -34,7 +32,6 @@ GRASP_ABOVE = 0.001  # m of the tip above the wire: the pads' ends lie 1.5 mm be
 LIFT_HEIGHT = 0.027  # m
 SKEW = 0.15  # sine of the angle between jaws and the world's y at which a preference shows
 DEVIATION = (0.0012, 0.0012, 0.0012, 0.05)  # m and rad, of the disturbance
-CORRELATION, SMOOTHING = 0.4, 0.15  # s
 MIDDLES, TANGENTS = task.segments()
 
 
@@ -138,18 +135,10 @@ def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
     share = jnp.stack([aside, aside, scripting.minimum_jerk(s)])
     p = script.start + share * (script.goal - script.start)
     wanted = jnp.asarray(JAWS)[script.phase]
-    jaws = script.jaws_from + jnp.clip(elapsed / JAW_TIME, 0.0, 1.0) * (wanted - script.jaws_from)
+    jaws = scripting.jaws(script.jaws_from, wanted, elapsed)
     script = script.replace(elapsed=elapsed, p=p, jaws=jaws)
     script = script.replace(roll=_roll(script, state))
-    noise = scripting.disturb(
-        script.key,
-        script.noise,
-        state.step,
-        deviation=jnp.array(DEVIATION),
-        correlation=CORRELATION,
-        smoothing=SMOOTHING,
-        dt=dt,
-    )
+    noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
     weight = jnp.asarray(DISTURBANCE)[script.phase]
     moved = weight * noise[1] * jnp.where(script.phase == DESCEND, 1.0 - s, 1.0)
     script = script.replace(noise=noise)
@@ -177,8 +166,7 @@ def _roll(script: Script, state: EnvState) -> jax.Array:
 
 
 def _command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) -> Command:
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(jnp.append(roll, p)[None], state.told)
-    return Command(pose, jaws[None])
+    return scripting.command(roll[None], p[None], jaws[None], state)
 
 
 AGENT = Agent(init, act)

@@ -31,7 +31,6 @@ JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
 DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.6, 0.3, 0.0, 0.3, 0.0)
 
 TEMPO = (0.85, 1.2)  # range of an episode's pace
-JAW_TIME = 0.25  # s to close or open
 TURN_LEAD = 0.25  # s before the end of the approach at which the tool begins to turn
 TURN_TIME = 0.80  # s the turn takes
 
@@ -49,8 +48,6 @@ SKEW = 0.1  # sine of the angle between jaws and the world's y at which a prefer
 
 NOISE_POSITION = 0.0012  # m, standard deviation of the disturbance
 NOISE_ROLL = 0.07  # rad
-NOISE_TIME = 0.4  # s, correlation time
-NOISE_SMOOTHING = 0.15  # s, low-pass: an arm's tool does not jump
 HOVER_OUT = 0.008  # m out from the grasp point along the wall's normal
 HOVER_SPREAD = 0.0015  # m, standard deviation of where it hovers
 
@@ -133,13 +130,12 @@ def act(expert: ExpertState, state: EnvState) -> tuple[Command, ExpertState, Com
     p = expert.start + share * (expert.goal - expert.start)
     expert = expert.replace(label=Command(expert.label.pose._replace(p=p), expert.label.gripper))
     roll = _roll_of(expert, state)
-    jaws = jnp.asarray(JAWS)[expert.phase]
-    gripper = expert.jaws_from + jnp.clip(expert.elapsed / JAW_TIME, 0.0, 1.0) * (
-        jaws - expert.jaws_from
-    )
+    wanted = jnp.asarray(JAWS)[expert.phase]
+    gripper = scripting.jaws(expert.jaws_from, wanted, expert.elapsed)
 
     weight = jnp.asarray(DISTURBANCE)[expert.phase]
-    noise = _disturb(expert, state.step, dt)
+    deviation = jnp.array([NOISE_POSITION] * 3 + [NOISE_ROLL])
+    noise = scripting.disturb(expert.key, expert.noise, state.step, deviation)
     moved = weight * noise[1] * jnp.where(expert.phase == DESCEND, 1.0 - s, 1.0)
     decode = rcm.ACTION_SPACES["rcm4"].decode
     clean, _ = decode(jnp.append(roll, p), _told(state))
@@ -247,18 +243,6 @@ def _roll_of(expert: ExpertState, state: EnvState) -> jax.Array:
     turned = jnp.where(expert.phase > DESCEND, 1.0, jnp.where(expert.phase == RAISE, 0.0, turned))
     weight = 0.5 - 0.5 * jnp.cos(jnp.pi * turned)
     return expert.roll_from + weight * (on_wall - expert.roll_from)
-
-
-def _disturb(expert: ExpertState, step: jax.Array, dt: float) -> jax.Array:
-    return scripting.disturb(
-        expert.key,
-        expert.noise,
-        step,
-        deviation=jnp.array([NOISE_POSITION] * 3 + [NOISE_ROLL]),
-        correlation=NOISE_TIME,
-        smoothing=NOISE_SMOOTHING,
-        dt=dt,
-    )
 
 
 AGENT = Agent(init, act)

@@ -7,7 +7,6 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from starjax import rcm
 from starjax.sim.state import EnvState
 from starjax.sim.tasks import scripting
 from starjax.sim.tasks.base import CONTROL_HZ
@@ -18,8 +17,6 @@ LEAST_TIME = 0.8  # s
 TEMPO = (0.85, 1.2)  # range of an episode's pace
 BULGE = 0.25  # of the straight line's length, how far the arc leaves it
 DEVIATION = 0.0012  # m, of the disturbance
-CORRELATION = 0.4  # s
-SMOOTHING = 0.15  # s
 CALM = 0.8  # share of the way after which the disturbance has faded
 
 
@@ -62,23 +59,14 @@ def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
     share = scripting.minimum_jerk(s)
     p = script.start + share * (state.layout.p - script.start)
     p = p + 4.0 * share * (1.0 - share) * script.side
-    noise = scripting.disturb(
-        script.key,
-        script.noise,
-        state.step,
-        deviation=jnp.full(3, DEVIATION),
-        correlation=CORRELATION,
-        smoothing=SMOOTHING,
-        dt=dt,
-    )
+    noise = scripting.disturb(script.key, script.noise, state.step, jnp.full(3, DEVIATION))
     weight = jnp.clip((CALM - s) / CALM, 0.0, 1.0)
     script = script.replace(elapsed=elapsed, noise=noise)
     return _command(p + weight * noise[1], state), script, _command(p, state)
 
 
 def _command(p: jax.Array, state: EnvState) -> Command:
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(jnp.append(0.0, p)[None], state.told)
-    return Command(pose, -jnp.ones(1))
+    return scripting.command(jnp.zeros(1), p[None], -jnp.ones(1), state)
 
 
 AGENT = Agent(init, act)

@@ -10,7 +10,6 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from starjax import rcm
 from starjax.sim.state import EnvState
 from starjax.sim.tasks import scripting
 from starjax.sim.tasks.base import CONTROL_HZ
@@ -26,7 +25,6 @@ JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
 DISTURBANCE = (1.0, 1.0, 0.0, 0.0, 0.1, 0.15, 0.0, 0.0, 0.3, 0.1)
 
 TEMPO = (0.85, 1.15)  # range of an episode's pace
-JAW_TIME = 0.25  # s to close or open
 ALIGNED = 0.6  # share of a descent after which it goes straight along the shaft
 HOVER = 0.02  # m along the shaft before the tab
 HOVER_ASIDE = 0.006  # m along the wire, either way
@@ -34,7 +32,6 @@ GRASP_SPREAD = 0.0008  # m along the tab, either way
 RELEASE = 0.55  # share of the way down to where the ring hangs at which it is let go
 SMOOTHED = 0.003  # m to either side over which the wire's direction is taken
 DEVIATION = (0.0012, 0.0012, 0.0012, 0.05)  # m and rad, of the disturbance
-CORRELATION, SMOOTHING = 0.4, 0.15  # s
 STOPS = (*task.BENDS[1:-1], task.START)  # m along the way
 AHEAD = 0.001  # m, the least way to the next stop
 TURNS = 4  # of finding a pose whose roll and position depend on each other
@@ -101,16 +98,8 @@ def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
     aside = (1.0 - early) * (script.start + _lifted(script, state) - script.goal)
     way = jnp.where(script.phase == DESCEND, (script.goal + aside).at[1:].add(-back), way)
     wanted = jnp.asarray(JAWS)[script.phase]
-    jaws = script.jaws_from + jnp.clip(elapsed / JAW_TIME, 0.0, 1.0) * (wanted - script.jaws_from)
-    noise = scripting.disturb(
-        script.key,
-        script.noise,
-        state.step,
-        deviation=jnp.array(DEVIATION),
-        correlation=CORRELATION,
-        smoothing=SMOOTHING,
-        dt=dt,
-    )
+    jaws = scripting.jaws(script.jaws_from, wanted, elapsed)
+    noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
     weights = jnp.asarray(DISTURBANCE)
     before, weight = weights[jnp.maximum(script.phase - 1, 0)], weights[script.phase]
     moved = (before + share * (weight - before)) * jnp.roll(noise[1], 1)
@@ -207,13 +196,10 @@ def _carrying(y: jax.Array, lowered: jax.Array, roll: jax.Array, state: EnvState
 
 
 def _turned(p: jax.Array, normal: jax.Array, roll: jax.Array, state: EnvState) -> jax.Array:
-    """Roll and position `[4]` at `p`, the jaws opening along `normal`, as near `roll` as may be.
-
-    Jaws are the same after half a turn.
-    """
+    """Roll and position `[4]` at `p`, the jaws opening along `normal`, as near `roll` as may be."""
     R = _command(jnp.append(0.0, p), jnp.zeros(()), state).pose.R[0]
     turned = jnp.arctan2(-normal @ R[:, 0], normal @ R[:, 1])
-    return jnp.append(roll + (turned - roll + jnp.pi / 2) % jnp.pi - jnp.pi / 2, p)
+    return jnp.append(scripting.nearer_half(turned, roll), p)
 
 
 def _shaft(p: jax.Array, state: EnvState) -> jax.Array:
@@ -223,8 +209,7 @@ def _shaft(p: jax.Array, state: EnvState) -> jax.Array:
 
 
 def _command(way: jax.Array, jaws: jax.Array, state: EnvState) -> Command:
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(way[None], state.told)
-    return Command(pose, jaws[None])
+    return scripting.command(way[:1], way[None, 1:], jaws[None], state)
 
 
 AGENT = Agent(init, act)

@@ -1,0 +1,154 @@
+"""What scripts share that hand a thing from one arm to the other: phases of both arms in step.
+
+A script is a `Play`: how long each phase is, what the jaws do, who turns to what, where to go. It
+comes with a memory, `Script`; what it holds on to beside that is the task's own.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.sim.state import EnvState
+from starjax.sim.tasks import scripting
+from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.types import Agent, Command
+
+DEVIATION = (0.001, 0.001, 0.001, 0.04)  # m and rad, of the disturbance of each arm
+
+
+@flax.struct.dataclass
+class Script:
+    """Where the script stands; single episode. Arrays `[2, ...]` are of both arms.
+
+    Attributes:
+      key: of everything random. phase: int32. elapsed, duration: s, of the phase. tempo: pace.
+      held: the task's own: which part of the thing is held.
+      start, goal, p: `[2, 3]` m, undisturbed positions. normal: `[2, 3]`, what the jaws open along.
+      roll_from, roll_to, roll: `[2]` rad. jaws_from, jaws: `[2]`.
+      noise: `[2, 8]` disturbance of both arms, rough and smooth.
+    """
+
+    key: jax.Array
+    phase: jax.Array
+    elapsed: jax.Array
+    duration: jax.Array
+    tempo: jax.Array
+    held: Any
+    start: jax.Array
+    goal: jax.Array
+    p: jax.Array
+    normal: jax.Array
+    roll_from: jax.Array
+    roll_to: jax.Array
+    roll: jax.Array
+    jaws_from: jax.Array
+    jaws: jax.Array
+    noise: jax.Array
+
+
+class Play(NamedTuple):
+    """What both arms do, phase by phase P.
+
+    Attributes:
+      choose: (key, EnvState) -> (key, tempo, held), what is drawn at the start.
+      duration: `[P]` s at tempo 1.
+      jaws: `[P, 2]`, at the end of each phase.
+      aligned: `[P]`, share of a phase after which a tool goes straight down.
+      looks: `[P, 2]` bool, who turns to what it holds; the others keep their turn.
+      weight: (phase, share of the way) -> how much of the disturbance acts.
+      following: (Script, EnvState) -> int32, the phase after the present one.
+      goals: (Script, EnvState) -> positions `[P, 2, 3]` m, and what the jaws are to open along,
+        `[2, 3]` or for both `[3]`.
+    """
+
+    choose: Callable[..., tuple[jax.Array, jax.Array, Any]]
+    duration: np.ndarray
+    jaws: np.ndarray
+    aligned: np.ndarray
+    looks: np.ndarray
+    weight: Callable[[jax.Array, jax.Array], jax.Array]
+    following: Callable[[Script, EnvState], jax.Array]
+    goals: Callable[[Script, EnvState], tuple[jax.Array, jax.Array]]
+
+
+def agent(play: Play) -> Agent:
+    """The demonstrator of a play."""
+
+    def init(key: jax.Array, state: EnvState) -> Script:
+        key, tempo, held = play.choose(key, state)
+        p, zero, open_ = state.pose.p, jnp.zeros(2), jnp.ones(2)
+        script = Script(
+            key=key,
+            phase=jnp.zeros((), jnp.int32),
+            elapsed=jnp.zeros(()),
+            duration=jnp.zeros(()),
+            tempo=tempo,
+            held=held,
+            start=p,
+            goal=p,
+            p=p,
+            normal=jnp.tile(jnp.array([0.0, -1.0, 0.0]), (2, 1)),
+            roll_from=zero,
+            roll_to=zero,
+            roll=zero,
+            jaws_from=open_,
+            jaws=open_,
+            noise=jnp.zeros((2, 8)),
+        )
+        return _enter(play, script, jnp.zeros((), jnp.int32), state)
+
+    def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+        return _act(play, script, state)
+
+    return Agent(init, act)
+
+
+def _act(play: Play, script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+    """The disturbed commands to execute, the script, and the undisturbed ones to record."""
+    is_over = script.elapsed >= script.duration - 1e-6
+    after = _enter(play, script, play.following(script, state), state)
+    script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
+    elapsed = script.elapsed + 1.0 / CONTROL_HZ
+    usual = jnp.asarray(play.duration, jnp.float32)[script.phase]
+    s = jnp.clip(elapsed * script.tempo / usual, 0.0, 1.0)
+    # On the way down a tool is over its goal by the time anything can touch.
+    aligned = jnp.asarray(play.aligned, jnp.float32)[script.phase]
+    aside = scripting.minimum_jerk(jnp.minimum(s / aligned, 1.0))
+    share = scripting.minimum_jerk(s)
+    deviation = jnp.array(DEVIATION * 2)
+    noise = scripting.disturb(script.key, script.noise, state.step, deviation)
+    wanted = jnp.asarray(play.jaws, jnp.float32)[script.phase]
+    script = script.replace(
+        elapsed=elapsed,
+        p=script.start + jnp.stack([aside, aside, share]) * (script.goal - script.start),
+        roll=script.roll_from + aside * (script.roll_to - script.roll_from),
+        jaws=scripting.jaws(script.jaws_from, wanted, elapsed),
+        noise=noise,
+    )
+    moved = play.weight(script.phase, share) * noise[1].reshape(2, 4)
+    roll, p = script.roll + moved[:, 3], script.p + moved[:, :3]
+    rough = scripting.command(roll, p, script.jaws, state)
+    return rough, script, scripting.command(script.roll, script.p, script.jaws, state)
+
+
+def _enter(play: Play, script: Script, phase: jax.Array, state: EnvState) -> Script:
+    """Begins `phase` with goals from what is seen now."""
+    goals, normal = play.goals(script, state)
+    goal = goals[phase]
+    normals = jnp.where(jnp.asarray(play.looks)[phase][:, None], normal, script.normal)
+    at_zero = scripting.command(jnp.zeros(2), goal, script.jaws, state).pose.R
+    return script.replace(
+        phase=phase,
+        elapsed=jnp.zeros(()),
+        duration=jnp.asarray(play.duration, jnp.float32)[phase] / script.tempo,
+        start=script.p,
+        goal=goal,
+        normal=normals,
+        roll_from=script.roll,
+        roll_to=scripting.nearer_half(scripting.turn_to(normals, at_zero), script.roll),
+        jaws_from=script.jaws,
+    )
