@@ -20,7 +20,7 @@ from starjax.types import Command, Observation
 
 
 class Now(NamedTuple):
-    """What a disturbance knows of an episode.
+    """An episode as a disturbance knows it.
 
     Attributes:
       level: `[]`, how much is wrong.

@@ -1,4 +1,4 @@
-"""What is seen and what is commanded come late, or not at all."""
+"""Disturbances of time: images and commands come late, or not at all."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ MOST_DELAY = 4  # control steps that are remembered
 
 
 def _late(now: Now, present: Any, past: Any) -> Any:
-    """What was `level` steps ago; `past` `[MOST_DELAY, ...]`, the latest first."""
+    """Value of `level` steps ago; `past` `[MOST_DELAY, ...]`, the latest first."""
     steps = jnp.round(now.level).astype(jnp.int32)
     return jax.tree.map(lambda x, old: jnp.where(steps > 0, old[steps - 1], x), present, past)
 
