@@ -22,7 +22,7 @@ from starjax import runtime
 from starjax.sim import cameras, endoscope, render
 from starjax.sim import scene as scenes
 
-TURNS = 9
+TURNS = 41
 
 
 def main() -> None:
