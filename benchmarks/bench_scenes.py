@@ -9,6 +9,7 @@ Programs are compiled side by side.
 
 import argparse
 import functools
+import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -38,7 +39,7 @@ def main() -> None:
     parser.add_argument("--peer", action="store_true", help="time mjx.step too")
     asked = parser.parse_args()
     found = {task: scenes.load(scenes.name(task)) for task in asked.only}
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
         waiting = {
             task: {
                 (kind, batch): pool.submit(compiled, scene, kind, batch)

@@ -12,6 +12,7 @@ import pytest
 
 from starjax import cli, errors
 from starjax.data.formats import base, mapping
+from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.learners import LEARNERS
 from starjax.sim import registry
 
@@ -76,7 +77,7 @@ def test_programs_run(page, tmp_path, monkeypatch):
 def test_configurations_are_read(page, root, tmp_path):
     """Entry points are of groups that are looked at; anything else is a mapping of a dataset."""
     kinds = (registry.tasks, registry.arms, registry.tools, registry.workspaces, LEARNERS)
-    groups = {f"starjax.{one.kind}s" for one in (*kinds, base.FORMATS)}
+    groups = {f"starjax.{one.kind}s" for one in (*kinds, base.FORMATS, DISTURBANCES)}
     for block in blocks(page, root, "toml"):
         found = tomllib.loads(block)
         if "project" in found:

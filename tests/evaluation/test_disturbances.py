@@ -20,6 +20,7 @@ PARAMS = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4, arms=2)))
 CAMERAS = Pose(jnp.stack([jnp.eye(3)] * 2), jnp.array([[0.1, 0.2, 0.3], [0.0, -0.1, 0.4]]))
 KINDS = {name: DISTURBANCES.get(name) for name in DISTURBANCES.built_in}
 PHYSICAL = ("servos", "friction", "mass")  # they need a model
+NAMES = ("late_view", "dropped", *PHYSICAL)  # states that are kept have a model of their own too
 OTHERS = [name for name in KINDS if name not in PHYSICAL]
 
 
@@ -87,6 +88,25 @@ def test_several_are_wrong_at_once_each_at_its_level_and_one_program_has_all_lev
         bright = env.observe(state).images["camera"].astype(float)
         np.testing.assert_allclose(wrong.observe(state).images["camera"], bright / 2, atol=0.51)
     assert start._cache_size() == step._cache_size() == 1
+
+
+def test_with_all_of_them_only_what_has_a_level_is_wrong(env):
+    together = disturbed(env, OTHERS)
+    start, step_all = jax.jit(together.reset), jax.jit(together.step)
+    for only in ([], ["breathing"], ["breathing_late"]):
+        wrong = dict.fromkeys(only, 5.0)
+        alone = disturbed(env, only)
+        one = alone.reset(KEY, at(**wrong))
+        all_of_them = start(KEY, at(**(dict.fromkeys(OTHERS, 0.0) | wrong)))
+        for _ in range(6):
+            to = Command(Pose(one.pose.R, one.pose.p + 0.01), one.gripper)
+            one, all_of_them = alone.step(one, to), step_all(all_of_them, to)
+        for name in ("pose", "gripper", "step", "trocar", "told", "cameras"):
+            pairs = zip(*(jax.tree.leaves(getattr(s, name)) for s in (one, all_of_them)))
+            for x, y in pairs:
+                np.testing.assert_allclose(x, y, atol=1e-6)
+        assert same(together.observe(all_of_them).images, alone.observe(one).images)
+    assert step_all._cache_size() == 1
 
 
 @pytest.mark.parametrize("level", [1.0, 10.0])
@@ -250,7 +270,7 @@ def reach():
 @pytest.fixture(scope="module")
 def moved(reach):
     """`levels -> state after a motion of 8 control steps`; one program."""
-    wrong = disturbed(reach, PHYSICAL)
+    wrong = disturbed(reach, NAMES)
     params = EnvParams(jax.tree.map(lambda x: jnp.asarray(x)[0], reach.task.trocars))
 
     @jax.jit
@@ -259,7 +279,7 @@ def moved(reach):
         to = Command(Pose(first.pose.R, first.pose.p + 0.02), first.gripper)
         return jax.lax.fori_loop(0, 8, lambda _, state: wrong.step(state, to), first)
 
-    return lambda **levels: run({**dict.fromkeys(PHYSICAL, 0.0), **levels})
+    return lambda **levels: run({**dict.fromkeys(NAMES, 0.0), **levels})
 
 
 def test_servos_of_arms_are_weaker_by_a_share_and_move_otherwise(reach, moved):

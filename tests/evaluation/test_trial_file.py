@@ -9,17 +9,18 @@ from starjax.evaluation import trial_file
 from starjax.runtime import files
 
 FIRST = {"trocar": 0, "radius": 0.04, "seen": True, "steps": 244, "rcm_max_mm": 0.0813822}
+UNLABELLED = {"radius": [0.04], "labels": {}, "success": True}
 SECOND = {"radius": [0.04, 0.02], "labels": {"source": 4, "target": 11}, "success": False}
 
 
-@pytest.mark.parametrize("record", [FIRST, SECOND], ids=["schema 1", "arms and labels"])
-def test_records_come_back(tmp_path, record):
+@pytest.mark.parametrize(("schema", "record"), [(1, FIRST), (2, SECOND), (2, UNLABELLED)])
+def test_records_come_back(tmp_path, schema, record):
     changed = {k: not v if isinstance(v, bool) else v for k, v in record.items()}
-    result = {"method": "stardiff", "trials": [record, changed]}
+    result = {"schema": schema, "trials": [record, changed]}
     files.write_json(tmp_path / "result.json", result)
     trial_file.detach(tmp_path / "result.json")
     kept = json.loads((tmp_path / "result.json").read_text())
-    assert kept == {"method": "stardiff", "trials": "result.trials.npz"}
+    assert kept == {"schema": schema, "trials": "result.trials.npz"}
     found = trial_file.read(tmp_path / "result.json")
     for trial, wanted in zip(found["trials"], result["trials"], strict=True):
         assert trial.keys() == wanted.keys()

@@ -63,7 +63,7 @@ def trocar(task: Task, camera: Pose, told: rcm.TrocarFrame) -> rcm.TrocarFrame:
 
 
 def observation(task: Task, camera: Pose, seen: Observation) -> Observation:
-    """What was observed `[..., *]`, in the frame of cameras `[...]`; pictures are as they are."""
+    """Turns observations `[..., *]` into the frame of cameras `[...]`; images stay as they are."""
     state = None if seen.state is None else _state(task.fields, camera, jnp.asarray(seen.state))
     return seen._replace(pose=inward(camera, seen.pose), state=state, endoscope=None)
 

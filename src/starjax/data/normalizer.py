@@ -125,7 +125,7 @@ def fit(
 
 
 def shapes(method: methods.Method, task: Task, state: bool) -> Normalizer:
-    """What `fit` returns, without the numbers; of a dataset with or without the task state."""
+    """Structure of what `fit` returns, for a dataset with or without the task state."""
     size = task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
     ends = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (size, task.state_size)]
     reach = jax.ShapeDtypeStruct((2, size), jnp.float32)

@@ -92,6 +92,7 @@ def evaluate(
     chosen = recorded.choose(count, settings.trials, settings.video_trials)
     several = len(place.devices or [0])
     device = (place.devices or jax.local_devices())[0]
+    wrong = {name: level for name, level in (levels or {}).items() if level}
     with sharing.shared(directory) as share:
         plan = {
             "seed": settings.seed,
@@ -102,7 +103,8 @@ def evaluate(
             "weights": fingerprint(params),
             "agent": agent.about,
             "identity": dict(identity or {}),
-            **({"levels": dict(levels)} if levels else {}),
+            # Not those of 0: trials are the same ones, whatever else might have been wrong.
+            **({"levels": wrong} if wrong else {}),
             "scene": env.names._asdict(),
             "model": schema.model_hash(env.scene),
             "platform": device.platform,

@@ -63,15 +63,14 @@ def main(argv: Sequence[str]) -> int:
     files.require_writable(folder)
     who, _ = subjects.load(named, chosen.arm)
     kinds = _kinds(chosen, who.trained.policy.observation)
+    who = _disturbed(who, list(kinds))
     found: dict[str, Any] = {}
     for name, kind in kinds.items():
         print(f"{name}: {kind.what}", flush=True)
         rows = found[name] = {"what": kind.what, "unit": kind.unit, "levels": {}}
-        usual, wrong = _subjects(who, name)
         for level in chosen.levels or kind.levels:
-            place = folder / (f"{name}-{level:g}" if level else "moving" * kind.moves_cameras + "0")
-            at = (wrong, {name: level}) if level else (usual, None)
-            score = _score(place, *at, chosen)
+            place = folder / (f"{name}-{level:g}" if level else "0")
+            score = _score(place, who, {**dict.fromkeys(kinds, 0.0), name: level}, chosen)
             rows["levels"][f"{level:g}"] = score
             print(_line(f"{level:g} {kind.unit}", score), flush=True)
             files.write_json(folder / "stress.json", _content(who, chosen, argv, found))
@@ -119,17 +118,15 @@ def _kinds(chosen: Options, observation: str) -> dict[str, Any]:
     return meets
 
 
-def _subjects(who: Any, name: str) -> tuple[Any, Any]:
-    """The policy without and with a disturbance, whose levels share one program."""
+def _disturbed(who: Any, names: list[str]) -> Any:
+    """The policy where all of these may be wrong: one program has every level of each."""
     from starjax.evaluation.disturbances import base
 
-    who = who._replace(env=scenes.disturbable(who.env, [name], who.trained.policy))
-    return who, who._replace(env=base.disturbed(who.env, [name]))
+    env = scenes.disturbable(who.env, names, who.trained.policy)
+    return who._replace(env=base.disturbed(env, names))
 
 
-def _score(
-    place: Path, who: Any, levels: dict[str, float] | None, chosen: Options
-) -> dict[str, Any]:
+def _score(place: Path, who: Any, levels: dict[str, float], chosen: Options) -> dict[str, Any]:
     """Success, RCM error and the force on the abdominal wall in all trials of a level."""
     from starjax.evaluation import statistics, wall
     from starjax.experiments import policy_under_test

@@ -1,4 +1,4 @@
-"""What breaks a policy, from a stress.json: a table, and success and RCM error around a circle."""
+"""Draws a stress.json: a table, and success and RCM error around a circle."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -187,7 +187,7 @@ def _made(
     record: episodes.Record,
     devices: Sequence[jax.Device] | None,
 ) -> tuple[Callable[..., Carry], Callable[..., Any]]:
-    """What begins a batch of trials, and what runs a segment of it."""
+    """Programs that begin a batch of trials, and run a segment of it."""
     world = _World(env.reset, env.step, env.observe, env.labels)
     mind = _Mind(agent.init, agent.act)
     return _programs(

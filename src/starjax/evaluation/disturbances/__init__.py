@@ -1,4 +1,4 @@
-"""What is wrong in a theatre, by name. `--help` and mistakes read this: no jax here.
+"""Disturbances of a theatre, by name. `--help` and mistakes read this: no jax here.
 
 Others add theirs by an entry point of the group `starjax.disturbances` that names a
 `base.Disturbance`.

@@ -1,8 +1,8 @@
 """Environments in which something is wrong, by as much as a level says, which is data.
 
 Starts, keys and judging are those of the usual environment, and the executed RCM error is measured
-against the true trocar. What a disturbance draws depends on the episode's key alone. All levels of
-one share a program.
+against the true trocar. What a disturbance draws depends on the episode's key alone. One program
+has all levels of all of them: at level 0 each leaves everything as it was.
 """
 
 import math
@@ -20,7 +20,7 @@ from starjax.types import Command, Observation
 
 
 class Now(NamedTuple):
-    """What a disturbance knows of an episode.
+    """An episode as a disturbance knows it.
 
     Attributes:
       level: `[]`, how much is wrong.
@@ -45,6 +45,7 @@ class Disturbance(NamedTuple):
       begin: (Env, Now, EnvState) -> EnvState and memory, after it.
       step: (Env, Now, EnvState, Command) -> EnvState and memory.
       observe: (Env, Now, EnvState) -> Observation.
+      keeps_states: whether its memory holds states, which others must have changed before.
       moves_cameras: whether it needs an environment whose cameras may move.
       of_images: whether policies that see no images are spared.
       of_demos: whether demonstrations that are recorded with it teach anything of it.
@@ -65,6 +66,7 @@ class Disturbance(NamedTuple):
     observe: Callable[[Env, Now, EnvState], Observation] = lambda env, now, state: env.observe(
         state
     )
+    keeps_states: bool = False
     moves_cameras: bool = False
     of_images: bool = False
     of_demos: bool = True
@@ -72,8 +74,9 @@ class Disturbance(NamedTuple):
 
 def disturbed(env: Env, names: Sequence[str]) -> Env:
     """The environment in which all of these are wrong, at `EnvParams.levels`."""
-    for name in names:
-        env = _with(env, name, DISTURBANCES.get(name))
+    kinds: dict[str, Disturbance] = {name: DISTURBANCES.get(name) for name in names}
+    for name in sorted(kinds, key=lambda name: kinds[name].keeps_states):
+        env = _with(env, name, kinds[name])
     return env
 
 

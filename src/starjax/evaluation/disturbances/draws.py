@@ -1,4 +1,4 @@
-"""What several disturbances draw."""
+"""Random draws of several disturbances."""
 
 import jax
 import jax.numpy as jnp

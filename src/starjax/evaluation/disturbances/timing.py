@@ -1,4 +1,4 @@
-"""What is seen and what is commanded come late, or not at all."""
+"""Disturbances of time: images and commands come late, or not at all."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ MOST_DELAY = 4  # control steps that are remembered
 
 
 def _late(now: Now, present: Any, past: Any) -> Any:
-    """What was `level` steps ago; `past` `[MOST_DELAY, ...]`, the latest first."""
+    """Value of `level` steps ago; `past` `[MOST_DELAY, ...]`, the latest first."""
     steps = jnp.round(now.level).astype(jnp.int32)
     return jax.tree.map(lambda x, old: jnp.where(steps > 0, old[steps - 1], x), present, past)
 
@@ -60,6 +60,7 @@ LATE_VIEW = Disturbance(
     begin=lambda env, now, state: (state, _always(state)),
     step=_keep_states,
     observe=_see_past,
+    keeps_states=True,
 )
 LATE_COMMANDS = Disturbance(
     what="commands are executed so many control steps late",
@@ -77,4 +78,5 @@ DROPPED = Disturbance(
     begin=lambda env, now, state: (state, state),
     step=_lose,
     observe=lambda env, now, state: env.observe(now.memory),
+    keeps_states=True,
 )

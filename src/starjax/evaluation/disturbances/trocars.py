@@ -18,8 +18,9 @@ LATE_S = 0.1  # s that a measured trocar is old
 
 def _tell(env: Env, now: Now, params: EnvParams) -> EnvParams:
     p = rcm.trocar_position(params.trocar, env.p_world_ref)
-    told = p + 1e-3 * now.level * directions(now.key, p)
-    return params._replace(told=rcm.trocar_from_position(told, env.p_world_ref))
+    there = p + 1e-3 * now.level * directions(now.key, p)
+    wrong = rcm.trocar_from_position(there, env.p_world_ref)
+    return params._replace(told=_if_wrong(now, wrong, params.told or params.trocar))
 
 
 def _rest(env: Env, now: Now, state: EnvState) -> tuple[EnvState, Any]:
@@ -40,9 +41,16 @@ def _breathe(
     is_at, said = now.memory
     step, told = state.step + 1, state.told
     if is_told:
-        told = moving.frame_at(env, said + _rise(env, now, step - round(LATE_S * env.control_hz)))
-    moved = moving.trocars_to(env, state, is_at + _rise(env, now, step))
+        late = step - round(LATE_S * env.control_hz)
+        told = _if_wrong(now, moving.frame_at(env, said + _rise(env, now, late)), told)
+    there = _if_wrong(now, is_at + _rise(env, now, step), state.trocar.p_world_trocar)
+    moved = moving.trocars_to(env, state, there)
     return env.step(moved.replace(told=told), command), now.memory
+
+
+def _if_wrong(now: Now, wrong: Any, usual: Any) -> Any:
+    """What another disturbance has left stays where this one has no level."""
+    return jax.tree.map(lambda x, y: jnp.where(now.level > 0, x, y), wrong, usual)
 
 
 TOLD_WRONGLY = Disturbance(

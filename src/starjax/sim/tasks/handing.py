@@ -1,4 +1,4 @@
-"""What scripts share that hand a thing from one arm to the other: phases of both arms in step.
+"""Common parts of scripts that hand a thing from one arm to the other, in phases of both arms.
 
 A script is a `Play`: how long each phase is, what the jaws do, who turns to what, where to go. It
 comes with a memory, `Script`; what it holds on to beside that is the task's own.
@@ -51,7 +51,7 @@ class Script:
 
 
 class Play(NamedTuple):
-    """What both arms do, phase by phase P.
+    """Motions of both arms, phase by phase P.
 
     Attributes:
       choose: (key, EnvState) -> (key, tempo, held), what is drawn at the start.

@@ -1,4 +1,4 @@
-"""What scripted experts share: smooth motion, jaws, turns, a disturbance that they correct."""
+"""Common parts of scripted experts: smooth motion, jaws, turns, a disturbance they correct."""
 
 import jax
 import jax.numpy as jnp
