@@ -25,7 +25,6 @@ knows more, so the share bounds from above what is lost by not telling it the tr
 
 import argparse
 import importlib
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -61,7 +60,6 @@ def main() -> None:
     environment = _scene.make(arguments, observation="state")
     task = environment.task
     agent = next(iter(task.experts.values()))()
-    start = time.perf_counter()
     trials, successes = play(environment, agent, arguments.scenes, arguments.seed)
     found = {
         "commit": provenance.code().commit,
@@ -73,7 +71,6 @@ def main() -> None:
         "episodes": sum(map(len, trials)),
         "successes": successes,
         **decomposed(trials, names(task.name), task.arms),
-        "wall_s": time.perf_counter() - start,
     }
     for name, arm in found["arms"].items():
         print(f"{task.name}, {name}: {summary(arm)}")
