@@ -112,7 +112,7 @@ def settings() -> str:
         "",
         "Flags of `starjax run`, `collect` and `train`; a switch has a twin, `--demos.no-...`.",
         "Columns of presets show what a preset changes; elsewhere the default holds, which is the",
-        "paper's where the paper says it.",
+        "paper's where the paper says it, or – where the preset's learner has no such option.",
     ]
     groups: dict[str, list] = {}
     for row in rows(config.RunConfig, config.RunConfig()):
@@ -126,7 +126,7 @@ def settings() -> str:
         parts += ["", f"## {group}", ""]
         drawn = []
         for flag, kind, value, said in lines:
-            cells = [changed[name][flag] for name in names]
+            cells = [changed[name].get(flag, "–") for name in names]  # its learner has none
             differs = [cell if cell != value and group != "run" else "" for cell in cells]
             drawn.append((f"`{flag}`", value, differs, kind, said))
         used = [i for i in range(len(names)) if any(line[2][i] for line in drawn)]

@@ -198,9 +198,10 @@ def helped(command, capsys):
 def test_help_says_of_every_flag_something_of_its_own(command, capsys):
     _, said = helped(command, capsys)
     texts = [re.sub(r" ?\([^()]*\)$", "", text) for text in said.values()]
-    flags = [
-        flag for flag in options.flags(OPTIONS[command]) if not re.search(r"--(.*\.)?no-", flag)
-    ]
+    # A run's are those of the learner of the preset that `auto` is here.
+    is_run = OPTIONS[command] is config.RunConfig
+    settings = presets.resolve("auto", False) if is_run else OPTIONS[command]
+    flags = [flag for flag in options.flags(settings) if not re.search(r"--(.*\.)?no-", flag)]
     assert {*said} == {*flags, "-h"}
     assert all(texts) and len({*texts}) == len(texts)
     assert not any(re.search(r"default: *(''|None)?[;)]", text) for text in said.values())
@@ -208,7 +209,8 @@ def test_help_says_of_every_flag_something_of_its_own(command, capsys):
 
 def test_help_shows_ranges_and_defaults(capsys, monkeypatch):
     said = helped("run", capsys)[1]
-    assert said["--policy.kernel-size"].endswith("(1, 3, ... 4095; default: 5)")
+    usual = presets.PRESETS["cpu"].policy.options.kernel_size
+    assert said["--policy.kernel-size"].endswith(f"(1, 3, ... 4095; default: {usual})")
     assert helped("sweep", capsys)[1]["--eval.time-limit-s"].endswith("(in [0.1, 86400])")
     for likely, trials, limit in ((False, 4, 30.0), (True, 30, 60.0)):
         monkeypatch.setattr(gpu, "is_likely", lambda likely=likely: likely)
