@@ -1,6 +1,7 @@
 """The whole command at its smallest, as a user types it, and what it leaves behind.
 
-The task is of another package, `tests/extension/site`: from its expert to its report.
+Task and arm are of other packages, `tests/extension/site` and the page on arms: from the expert to
+the report.
 """
 
 import json
@@ -10,6 +11,7 @@ import re
 import subprocess
 import sys
 
+import gantry
 import numpy as np
 import pytest
 
@@ -18,21 +20,29 @@ from starjax.policies import policy_file
 
 pytestmark = pytest.mark.slow
 SITE = pathlib.Path(__file__).parents[1] / "extension" / "site"
-TINY = ["--task", "touch", "--preset", "smoke", "--demos.seen-trocars", "4"]
+TINY = ["--task", "touch", "--arm", "gantry", "--preset", "smoke", "--demos.seen-trocars", "4"]
 TINY += ["--train.steps", "20", "--eval.time-limit-s", "2"]
 
 
-def starjax(*words: str) -> subprocess.CompletedProcess:
+@pytest.fixture(scope="module")
+def starjax(tmp_path_factory):
+    """Runs a command as a user does, with both packages installed."""
+    arms = tmp_path_factory.mktemp("site")
+    gantry.install(arms)
     # A real terminal's environment: nothing that the tests have set up but the device.
     kept = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    path = os.pathsep.join([str(SITE), *filter(None, sys.path)])
-    return subprocess.run(
-        [sys.executable, "-m", "starjax", *words],
-        capture_output=True,
-        text=True,
-        timeout=1500,
-        env={**kept, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path},
-    )
+    path = os.pathsep.join([str(SITE), str(arms), *filter(None, sys.path)])
+
+    def run(*words: str) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            [sys.executable, "-m", "starjax", *words],
+            capture_output=True,
+            text=True,
+            timeout=1500,
+            env={**kept, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path},
+        )
+
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +51,7 @@ def out(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def said(out):
+def said(starjax, out):
     command = ["run", "--method", "stardiff", "--out", str(out), *TINY]
     first = starjax(*command)
     assert first.returncode == 0, first.stderr
@@ -69,7 +79,7 @@ def test_the_same_command_again_does_nothing_twice(said):
 def test_result_holds_what_is_documented(said, out):
     result = json.loads((out / "stardiff" / "result.json").read_text())
     assert result["method"] == "stardiff" and result["observation"] == "state"
-    assert result["scene"]["task"] == "touch"
+    assert result["scene"]["task"] == "touch" and result["scene"]["arms"] == ["gantry"]
     assert (result["seen"]["trials"], result["unseen"]["trials"]) == (4, 8)
     for part in (result["seen"], result["unseen"], result["safe"]["all"]):
         assert part["ci95"][0] <= part["rate"] <= part["ci95"][1]
@@ -100,14 +110,14 @@ def test_report_and_weights_are_there(said, out):
     assert all(np.isfinite(json.loads(line).get("loss", 0.0)) for line in lines)
 
 
-def test_another_setting_in_the_same_folder_is_refused(said, out):
+def test_another_setting_in_the_same_folder_is_refused(starjax, said, out):
     changed = ["run", "--out", str(out), *TINY, "--train.batch-size", "8"]
     done = starjax(*changed)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "--train.batch-size" in done.stderr and "--out" in done.stderr
 
 
-def test_commands_on_a_finished_run(said, out):
+def test_commands_on_a_finished_run(starjax, said, out):
     run = str(out / "stardiff")
     bench = starjax("bench", run, "--ddim-steps", "1", "2", "--calls", "5")
     assert bench.returncode == 0, bench.stderr
@@ -120,6 +130,6 @@ def test_commands_on_a_finished_run(said, out):
 
 
 @pytest.mark.parametrize("command", ["evaluate", "sweep", "bench", "report"])
-def test_a_folder_without_a_run_is_one_line(command, tmp_path):
+def test_a_folder_without_a_run_is_one_line(starjax, command, tmp_path):
     done = starjax(command, str(tmp_path))
     assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1

@@ -1,35 +1,18 @@
-"""An arm from outside of starjax: the one of docs/howto/add-arm.md, built from that page."""
+"""An arm from outside of starjax, in a scene; `tests/experiments/test_run.py` runs it through."""
 
 import importlib
-import re
 
+import gantry
 import mujoco
 import numpy as np
 import pytest
 
 from starjax.sim import mounts, registry, scene
 
-FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-GROUP = re.compile(r'entry-points\."([\w.]+)"\]\n(\w+) = "([\w.]+):(\w+)"')
-
 
 @pytest.fixture
-def package(pytestconfig, tmp_path, monkeypatch):
-    """The page's blocks as an installed package."""
-    page = (pytestconfig.rootpath / "docs" / "howto" / "add-arm.md").read_text()
-    blocks = dict(FENCE.findall(page))
-    found = GROUP.search(blocks["toml"])
-    assert found
-    group, name, module, attribute = found.groups()
-    folder = tmp_path / module.partition(".")[0]
-    folder.mkdir()
-    (folder / "__init__.py").touch()
-    (folder / "gantry.py").write_text(blocks["py"])
-    (folder / "gantry.xml").write_text(blocks["xml"])
-    info = tmp_path / "my_arms-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-arms\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {module}:{attribute}\n")
+def package(tmp_path, monkeypatch):
+    name = gantry.install(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     importlib.invalidate_caches()
     return name
