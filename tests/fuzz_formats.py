@@ -1,18 +1,22 @@
 """Damages exports at random and reads them: each ends in arrays or in one line, never otherwise.
 
 `python tests/fuzz_formats.py FORMAT COUNT [SEED]` does as many in processes of its own, so that a
-crash of a library is counted too.
+crash of a library is counted too. A damage that takes longer than `LIMIT_S` ends its process, too,
+and what it was doing goes to stderr. The damaged files of such an end are kept.
 """
 
 import collections
+import faulthandler
 import json
 import multiprocessing
 import os
 import random
+import resource
 import shutil
 import sys
 import tempfile
 from pathlib import Path
+from typing import IO
 
 import recorded
 
@@ -20,7 +24,8 @@ from starjax import errors
 from starjax.data.formats import base, exchange
 from starjax.runtime import files
 
-BATCH = 1000  # damages a process
+BATCH = 4000  # damages a process
+LIMIT_S = 60.0  # of one damage, which takes milliseconds
 JSON_VALUES = (
     None,
     -1,
@@ -126,8 +131,14 @@ def attempt(path: Path, name: str, root: Path | None = None) -> str:
         return f"{type(error).__name__}: {error}"
 
 
-def run(path: Path, name: str, count: int, seed: int, back: bool = False) -> collections.Counter:
-    """As many accidents, each to one file of a sound export, which is sound again afterwards."""
+def run(
+    path: Path, name: str, count: int, seed: int, back: bool = False, hung: IO[str] | None = None
+) -> collections.Counter:
+    """As many accidents, each to one file of a sound export, which is sound again afterwards.
+
+    Args:
+      hung: where the stack goes, before the process ends, of a read that takes too long.
+    """
     found, draws = collections.Counter(), random.Random(seed)
     among = parts(path)
     sound = {part: part.read_bytes() for part in among}
@@ -136,40 +147,40 @@ def run(path: Path, name: str, count: int, seed: int, back: bool = False) -> col
         is_json = part.suffix == ".json" or part.name in (".zattrs", ".zarray", ".zgroup")
         part.write_bytes(damaged(sound[part], draws, is_json))
         root = path.parent / f"deep/er/back{number}" if back else None
+        if hung:
+            faulthandler.dump_traceback_later(LIMIT_S, exit=True, file=hung)
         said = attempt(path, name, root)
         found[said if said in ("read", "refused") else f"{part.name}: {said}"[:300]] += 1
         part.write_bytes(sound[part])
     return found
 
 
-def _batch(name: str, count: int, seed: int) -> collections.Counter:
-    folder = Path(tempfile.mkdtemp())
-    try:
-        return run(prepared(folder, name), name, count, seed)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _child(queue, name: str, count: int, seed: int) -> None:
+def _child(queue, folder: Path, name: str, count: int, seed: int) -> None:
+    complaints = os.fdopen(os.dup(2), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries in C complain there
-    queue.put(_batch(name, count, seed))
+    queue.put(run(prepared(folder, name), name, count, seed, hung=complaints))
+    faulthandler.cancel_dump_traceback_later()
 
 
 def main(name: str, count: int, seed: int = 0) -> None:
+    """Prints the outcomes so far after every process, and CPU seconds, those of starting too."""
     total, context = collections.Counter(), multiprocessing.get_context("spawn")
     for start in range(0, count, BATCH):
-        queue = context.Queue()
+        queue, folder = context.Queue(), Path(tempfile.mkdtemp())
         size = min(BATCH, count - start)
-        process = context.Process(target=_child, args=(queue, name, size, seed + start))
+        process = context.Process(target=_child, args=(queue, folder, name, size, seed + start))
         process.start()
         while process.is_alive() and queue.empty():
             process.join(0.2)
         if queue.empty() and process.exitcode:
-            total[f"crash {process.exitcode} in batch of seed {seed + start}"] += 1
+            total[f"process ended with {process.exitcode}, see {folder}"] += 1
         else:
             total += queue.get()
-        print(name, sum(total.values()), dict(total), flush=True)
-        process.join()
+            process.join()
+            shutil.rmtree(folder)
+        spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+        cpu_s = spent.ru_utime + spent.ru_stime
+        print(f"{name} {sum(total.values())} {dict(total)} {cpu_s:.0f} CPU s", flush=True)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import zarr
 
 from starjax import errors
 from starjax.data.formats import base
+from starjax.runtime import xla
 
 NAMES = base.FORMATS.names()
 
@@ -131,6 +132,23 @@ def _circle(file):
     file["data/demo_0/again"] = file["data/demo_0"]
 
 
+def _names(file):
+    """A group with two names: sixty a group, six deep, are more paths than can be walked."""
+    inside = file["data/demo_0"].create_group("n")
+    file["data/demo_0/again"] = inside
+
+
+def _together(file):
+    demo, each = file["data/demo_0"], int(base.MEMORY_SHARE * xla.memory_bytes() / 6 * 0.6)
+    demo.create_dataset("some", (6, each), "u1", chunks=(1, 1000))
+    demo.create_dataset("more", (6, each), "u1", chunks=(1, 1000))
+
+
+def _rate(file):
+    del file["starjax"]
+    file["data"].attrs["env_args"] = np.bytes_('{"control_freq": -1e999}')
+
+
 def _huge(file):
     file["data/demo_0"].create_dataset("raw", (6, 10**10), "f4", chunks=(1, 1000))
 
@@ -146,7 +164,10 @@ ROBOMIMIC = {
     "virtual data": _virtual,
     "soft link": lambda file: file.update({"data/demo_0/x": h5py.SoftLink("/data")}),
     "circle": _circle,
+    "names": _names,
     "huge": _huge,
+    "huge together": _together,
+    "rate": _rate,
     "short": _short,
     "missing": lambda file: file["data/demo_1"].pop("rewards"),
     "no demos": lambda file: [file["data"].pop(name) for name in list(file["data"])],

@@ -77,7 +77,7 @@ def given(asks: Asks, observation: Any, trocar: Any) -> tuple[types.Observation,
     farthest = 0.0 if is_traced(trocar.radius) else np.asarray(trocar.radius).max(initial=0.0)
     if farthest > FARTHEST:
         raise UsageError("trocar.radius", f"at most {FARTHEST} m", f"{farthest:g}")
-    trocar = rcm.Trocar(*map(jnp.asarray, trocar))  # within a program a traced one
+    trocar = rcm.Trocar(*map(_array, trocar))  # within a program a traced one
     if not isinstance(observation, Observation):
         raise UsageError("observation", "a deploy.Observation", type(observation).__name__)
     pose = (None, None) if observation.pose is None else observation.pose
@@ -90,7 +90,7 @@ def given(asks: Asks, observation: Any, trocar: Any) -> tuple[types.Observation,
         seen = seen._replace(state=_array(observation.state))
     robots = _robots(asks, seen, trocar)
     _check_shapes(asks, seen, robots)
-    trocar = rcm.Trocar(*(jnp.broadcast_to(field, (*robots, *asks.arms)) for field in trocar))
+    trocar = rcm.Trocar(*(_broadcast(field, (*robots, *asks.arms)) for field in trocar))
     _check_values(asks, seen, trocar, len(robots))
     return seen, trocar
 
@@ -190,6 +190,12 @@ def _through(
 
 def _array(value: Any) -> Any:
     return value if value is None or isinstance(value, jax.Array) else np.asarray(value)
+
+
+def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
+    # On the host where it is there: each operation of jax costs as much as all checks.
+    place = jnp if isinstance(value, jax.Array) else np
+    return place.broadcast_to(value, shape)
 
 
 def is_traced(value: Any) -> bool:

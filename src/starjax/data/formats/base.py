@@ -21,7 +21,8 @@ FORMATS = Registry(
     },
 )
 OURS = "starjax"  # name of what an export adds so that it comes back whole
-MEMORY_SHARE = 0.25  # of the host's, that one column of one episode may take
+MEMORY_SHARE = 0.25  # of the host's, that what is read of one episode may take
+_MOST_HZ = 1e5
 
 
 class Column(NamedTuple):
@@ -112,11 +113,13 @@ def opened(path: Path, name: str) -> Iterator[Source]:
         with explained(path, name):
             source = stack.enter_context(form.open(path))
             require(bool(source.lengths), "episodes", 0)
+            require(0.0 <= source.hz < _MOST_HZ, "steps a second", source.hz)
 
         def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
             for column in names:
                 errors.choice("column", column, source.columns)
             with explained(path, name, episode):
+                _require_all_fit(source, episode, names)
                 found = source.read(episode, names)
                 for column in names:
                     _check(column, found[column], source, episode)
@@ -146,6 +149,13 @@ def require_fits(name: str, shape: Sequence[int], dtype: Any) -> None:
     count = math.prod(shape) * np.dtype(dtype).itemsize
     most = MEMORY_SHARE * xla.memory_bytes()
     require(0 <= count <= most, f"at most {files.size(most)} an episode of {name}", count)
+
+
+def _require_all_fit(source: Source, episode: int, names: Collection[str]) -> None:
+    """Raises Damaged where columns, none of them too large, are so together."""
+    columns = [source.columns[name] for name in names]
+    row = sum(math.prod(c.shape) * np.dtype(c.dtype).itemsize for c in columns)
+    require_fits("all columns", (source.lengths[episode], row), np.uint8)
 
 
 @contextlib.contextmanager

@@ -50,9 +50,9 @@ def _open(path: Path) -> Iterator[Source]:
         found = {int(match[1]): name for name in data if (match := _DEMO.fullmatch(name))}
         demos = [data[found[number]] for number in sorted(found)]
         base.require(bool(demos), "groups data/demo_<i>", sorted(data)[:5])
+        lengths = [_length(demo) for demo in demos]
         first: dict[str, Any] = _datasets(demos[0])
         ours: Any = file.get(base.OURS)
-        lengths = [_length(demo) for demo in demos]
         columns = {
             name: Column(dataset.shape[1:], dataset.dtype.name)
             for name, dataset in first.items()
@@ -67,7 +67,11 @@ def _open(path: Path) -> Iterator[Source]:
                 arrays[name] = dataset[()]
             return arrays
 
-        origin = json.loads(bytes(ours[()])) if _is_bytes(ours) else None
+        origin = None
+        if _is_bytes(ours):
+            base.require_fits(base.OURS, ours.shape, ours.dtype)
+            origin = json.loads(bytes(ours[()]))
+            base.require(isinstance(origin, dict), f"a map in {base.OURS}", type(origin).__name__)
         about = _attribute(data, "env_args")
         hz = float((origin or {}).get("description", {}).get("control_hz", 0.0) or _hz(about))
         yield Source(hz, lengths, columns, read, origin, task=str(about.get("env_name", "")))
@@ -109,10 +113,15 @@ def _recognises(path: Path) -> bool:
 
 
 def _refuse_links(file: h5py.File) -> None:
-    """Refuses files that lead out of themselves, or in circles."""
+    """Refuses files that lead out of themselves, in circles, or many ways to the same place."""
+    met = set()
 
     def look(group: Any, depth: int) -> None:
         base.require(depth <= _MOST_DEEP, f"at most {_MOST_DEEP} groups deep", group.name)
+        address = h5py.h5o.get_info(group.id).addr
+        # With sixty names a group, six deep, a file of 100 kB has more paths than can be walked.
+        base.require(address not in met, "one name a group", f"another: {group.name}")
+        met.add(address)
         for name in group:
             link = group.get(name, getlink=True)
             plain = isinstance(link, h5py.HardLink)
@@ -138,13 +147,17 @@ def _is_bytes(item: Any) -> bool:
 
 
 def _is_data(item: Any) -> bool:
-    return isinstance(item, h5py.Dataset)
+    return isinstance(item, h5py.Dataset) and item.shape is not None
 
 
 def _length(demo: Any) -> int:
     """Control steps of an episode: of its actions, or what most of its datasets have."""
+    base.require(isinstance(demo, h5py.Group), "a group an episode", f"a dataset {demo.name}")
     if "actions" in demo:
-        return int(demo["actions"].shape[0])
+        actions = demo["actions"]
+        is_steps = _is_data(actions) and bool(actions.shape)
+        base.require(is_steps, "a dataset of control steps", actions.name)
+        return int(actions.shape[0])
     counts = [dataset.shape[0] for dataset in _datasets(demo).values() if dataset.shape]
     base.require(bool(counts), "datasets of control steps", f"none in {demo.name}")
     return int(max(set(counts), key=counts.count))
