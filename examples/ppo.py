@@ -1,14 +1,14 @@
 """Learns a task by proximal policy optimisation; an iteration is one compiled program.
 
-    python examples/ppo.py                                                   # a CPU
-    python examples/ppo.py --envs 4096 --iterations 60 --minibatches 32      # a GPU
+    python examples/ppo.py                                               # a CPU
+    python examples/ppo.py --envs 4096 --iterations 60 --minibatches 32   # a GPU
 
 Needs optax and flax beside jax and mujoco-mjx. Prints one JSON object a line: the curve, with how
 often the mean action succeeds.
 
-The noise begins small, and the network says how large it is where. An action of size 1 is a step of
-5 mm, and the controller bounds acceleration: under large noise steps hit that bound whatever the
-mean, a policy that leaps to and fro over the goal loses nothing by it, and never comes to rest.
+The noise is small, and the network says how large it is where. The controller bounds acceleration:
+under large noise steps hit that bound whatever the mean is, so a policy that leaps to and fro over
+the goal loses nothing by it, and does not learn to rest there.
 """
 
 import argparse
@@ -28,8 +28,7 @@ EPOCHS = 4
 LENGTH = 32  # control steps of an iteration
 EPISODE = 150  # control steps at most while it learns
 RATE = 3e-3  # of Adam at first; it falls to nothing
-STD = 0.1  # of the noise at first
-LEAST_STD = 0.003
+STDS = (0.003, 0.1, 0.15)  # of the noise: the least, at first, the most
 LOOKS = 8  # evaluations on the way
 
 
@@ -47,7 +46,8 @@ class ActorCritic(nn.Module):
             return nn.Dense(size, kernel_init=nn.initializers.orthogonal(scale))(h)
 
         mean, wide = jnp.split(mlp(2 * self.actions, 0.01), 2, axis=-1)
-        std = nn.softplus(wide + jnp.log(jnp.expm1(STD))) + LEAST_STD
+        least, first, most = STDS
+        std = least + (most - least) * nn.sigmoid(wide + jnp.log((first - least) / (most - first)))
         return mean, std, mlp(1, 1.0)[..., 0]
 
 
@@ -157,9 +157,9 @@ def main() -> None:
     parser.add_argument("--task", default="reach")
     parser.add_argument("--trocar", default="all")
     parser.add_argument("--action-space", default="rcm4")
-    parser.add_argument("--envs", type=int, default=64)
-    parser.add_argument("--iterations", type=int, default=240)
-    parser.add_argument("--minibatches", type=int, default=4)
+    parser.add_argument("--envs", type=int, default=128)
+    parser.add_argument("--iterations", type=int, default=160)
+    parser.add_argument("--minibatches", type=int, default=8)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     runtime.prepare_xla()  # before the first jax array: physics on a CPU wants it
