@@ -1,7 +1,7 @@
 """Learns reach with PPO or SAC of stable-baselines3, through `gymnasium.make_vec`.
 
     pip install 'starjax[gym]' stable-baselines3
-    python tests/peers/sb3.py > curve.json
+    python tests/peers/sb3.py > benchmarks/results/sb3_cpu.json
 
 Prints the learning curve as JSON: every `--every` control steps the mean return, the strict
 successes and the distance left of episodes with the mean action.
