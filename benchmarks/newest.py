@@ -51,7 +51,7 @@ def _filled(text: str, results: dict[str, Any]) -> str:
     def value(match: re.Match[str]) -> str:
         found: Any = results
         for key in match[1].split("/"):
-            found = found[key]
+            found = found[int(key) if isinstance(found, list) else key]
         return f"{found / 1e6:#.3g}" if match[2] == "M" else format(found, match[2])
 
     return _VALUE.sub(value, text)

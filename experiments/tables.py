@@ -5,7 +5,7 @@
 
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
 claim.toml, `claims` (the list of claims), or of benchmarks/results: `speed`, `learners`, `experts`,
-`six_blocks`, `stress`, `proposition`.
+`six_blocks`, `stress`, `proposition`, `ppo`, `sb3`.
 """
 
 import re
@@ -34,7 +34,7 @@ def table(name: str) -> str:
         return claims.index([claims.load(folder) for folder in claims.folders()])
     if name == "speed":
         return newest.table()
-    if name in ("learners", "experts", "six_blocks", "proposition"):
+    if name in ("learners", "experts", "six_blocks", "proposition", "ppo", "sb3"):
         return newest.other(name)
     if name == "stress":
         return newest.stress()
