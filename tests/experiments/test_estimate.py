@@ -55,7 +55,7 @@ def test_more_of_anything_takes_longer_and_compiles_once():
         assert once < estimate.seconds(changed(**{part: new}), STAGES, 12) < 2 * once
     assert estimate.seconds(changed(**more), STAGES, 12) < 2 * once
     everything = dataclasses.replace(presets.PRESETS["cpu"], method="all")
-    assert estimate.seconds(everything, STAGES, 12) > 4 * once
+    assert 3 * once < estimate.seconds(everything, STAGES, 12) < 8 * once
 
 
 @pytest.mark.parametrize(

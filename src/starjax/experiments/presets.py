@@ -49,7 +49,7 @@ PRESETS: dict[str, RunConfig] = {
             freeze_encoder=True,
             vision_dim=128,
             options=FlowConfig(
-                unet_channels=(32, 64, 96), kernel_size=3, time_dim=64, temperature=0.5
+                unet_channels=(32, 64, 96), kernel_size=3, time_dim=64, temperature=0.1
             ),
         ),
         train=TrainConfig(
