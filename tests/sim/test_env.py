@@ -9,6 +9,7 @@ import pytest
 from starjax import errors, rcm
 from starjax.sim import env as envs
 from starjax.sim import physics
+from starjax.sim.tasks import scripting
 from starjax.sim.tasks.peg_transfer import expert, task
 from starjax.types import Command, Pose
 
@@ -291,10 +292,10 @@ def test_the_expert_starts_over_when_the_block_is_lost_on_the_way(reset, begin):
 def test_the_expert_is_disturbed_by_a_millimetre_and_a_few_degrees(reset, begin):
     script = begin(reset(0), 0)
 
+    deviation = jnp.array([expert.NOISE_POSITION] * 3 + [expert.NOISE_ROLL])
+
     def one(noise, step):
-        noise = jax.vmap(lambda s, n: expert._disturb(s.replace(noise=n), step, 1 / 30))(
-            script, noise
-        )
+        noise = jax.vmap(scripting.disturb, (0, 0, None, None))(script.key, noise, step, deviation)
         return noise, noise
 
     _, noises = jax.lax.scan(one, script.noise, jnp.arange(300))
