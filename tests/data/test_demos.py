@@ -16,7 +16,7 @@ import stubs
 
 from starjax import errors, rcm
 from starjax.data import demos, load, schema, store
-from starjax.rollouts import agent, cores, engine, episodes, fetching, waves
+from starjax.rollouts import agent, cores, engine, episodes, fetching, programs, waves
 from starjax.rollouts.placement import Place
 from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
@@ -142,7 +142,7 @@ def test_free_lanes_take_the_place_of_failures(tmp_path, monkeypatch):
 def test_images_of_all_that_is_simulated_fit_the_memory(
     tmp_path, monkeypatch, chunks, lanes, at_once
 ):
-    frame = engine.frame(stubs.make_env("image", unlucky=0.4), episodes.DEMONSTRATION)
+    frame = programs.frame(stubs.make_env("image", unlucky=0.4), episodes.DEMONSTRATION)
     lane = 2 * demos.FRAME_GUESS * sum(np.dtype(x.dtype).itemsize * x.size for x in frame.values())
     memory = int(chunks * cores.CPU_LANES * lane / demos.MEMORY_SHARE)
     monkeypatch.setattr(xla, "memory_bytes", lambda: memory)

@@ -230,9 +230,12 @@ def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):
     state = types.SimpleNamespace(ema_params={"w": np.ones(3)}, normalizer=stats)
     monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
     settings, env = smoke(tmp_path, "stardiff"), stubs.make_env()
-    pipeline._train(settings, "stardiff", lambda: None, env, None, sharing.ALONE)
+    trained = dataclasses.replace(settings.policy, dtype="bfloat16")
+    trains = dataclasses.replace(settings, policy=trained)
+    pipeline._train(trains, "stardiff", lambda: None, env, None, sharing.ALONE)
     kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
     assert (kept.method, kept.preset, kept.demos) == ("stardiff", "smoke", settings.demos)
+    assert settings.policy.dtype == "float32"  # in which it decides
     assert (kept.policy, kept.train) == (settings.policy, settings.train)
     assert kept.scene == env.names and kept.roll_zero == (0.0,)
     np.testing.assert_array_equal(kept.p_world_ref, env.p_world_ref)

@@ -7,7 +7,7 @@ import pytest
 
 from starjax import rcm
 from starjax.data import schema
-from starjax.rollouts import engine, episodes
+from starjax.rollouts import episodes, programs
 from starjax.sim import endoscope, physics, registry, render, scene
 from starjax.sim import env as envs
 
@@ -86,7 +86,7 @@ def environment():
 
 def test_datasets_and_trajectories_have_its_pose(environment):
     for record in (episodes.DEMONSTRATION, episodes.SCORE):
-        frame = engine.frame(environment, record)
+        frame = programs.frame(environment, record)
         assert frame["endoscope_R"].shape == (3, 3) and frame["endoscope_p"].shape == (3,)
     about = schema.describe(
         environment, rcm.Trocar(*[np.zeros((1, 1))] * 3), schema.Settings(1, 0, 9)

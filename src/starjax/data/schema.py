@@ -13,7 +13,7 @@ import numpy as np
 
 from starjax import errors, schema_1
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import engine, episodes
+from starjax.rollouts import episodes, programs
 from starjax.runtime import jax_settings, xla
 from starjax.sim import names
 
@@ -53,7 +53,7 @@ def describe(env: Any, trocars: Trocar, settings: Settings) -> dict[str, Any]:
       env: `sim.env.Env`.
       trocars: fields `[C, A]`.
     """
-    frame = engine.frame(env, episodes.DEMONSTRATION)
+    frame = programs.frame(env, episodes.DEMONSTRATION)
     features = {
         name: {
             "shape": list(leaf.shape),

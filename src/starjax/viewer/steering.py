@@ -10,7 +10,7 @@ import numpy as np
 from starjax import rcm
 from starjax.data import schema
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import engine, episodes
+from starjax.rollouts import episodes, programs
 from starjax.sim import env as sim_env
 from starjax.types import Command
 from starjax.viewer import simulation
@@ -23,7 +23,7 @@ class Moment(NamedTuple):
     Attributes:
       frame: for the page.
       fields: of `episodes.DEMONSTRATION`, `[1, ...]` each.
-      status: of `engine.status`, `[1]` each.
+      status: of `programs.status`, `[1]` each.
     """
 
     frame: Frame
@@ -70,8 +70,8 @@ def make(env: sim_env.Env) -> Steering:
         after = jax.vmap(env.step)(before, command)
         seen = jax.vmap(env.observe)(before)
         fields = episodes.DEMONSTRATION.fields(episodes.Step(seen, command, command, before, after))
-        carry = engine.Carry(after, (), after.step, jnp.ones(1, bool))
-        return after, Moment(_frame(env, after), fields, engine.status(env, carry))
+        carry = programs.Carry(after, (), after.step, jnp.ones(1, bool))
+        return after, Moment(_frame(env, after), fields, programs.status(env, carry))
 
     @jax.jit
     def look(state: Any) -> dict[str, jax.Array]:

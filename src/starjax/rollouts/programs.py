@@ -1,0 +1,192 @@
+"""Programs of the engine: one starts a batch of trials, one runs a segment of control steps.
+
+They are compiled once for the same functions: what is data, as trials and levels, is an argument.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.rcm.trocar import Trocar
+from starjax.rollouts import episodes, placement
+from starjax.rollouts.agent import BatchAgent
+from starjax.types import Command
+
+
+class Trials(NamedTuple):
+    """N trials.
+
+    Attributes:
+      trocar: fields `[N, A]`.
+      index: `[N]` int32 of the trocars' configuration.
+      trial: `[N]` int32.
+      wanted: `[N]` bool; the others only fill up the batch.
+    """
+
+    trocar: Trocar
+    index: Any
+    trial: Any
+    wanted: Any
+
+
+class Carry(NamedTuple):
+    """N trials under way: EnvState, the agent's memory, `[N]` int32 control steps taken, and
+    whether they are wanted."""
+
+    env: Any
+    memory: Any
+    length: jax.Array
+    wanted: jax.Array
+
+
+def make(
+    env: Any,
+    agent: BatchAgent,
+    max_steps: int,
+    record: episodes.Record,
+    devices: Sequence[jax.Device] | None,
+) -> tuple[Callable[..., Carry], Callable[..., Any]]:
+    """Builds the program that starts a batch of trials, and the one that runs a segment of it.
+
+    Args:
+      env: `sim.env.Env`.
+      max_steps: control steps after which a trial is over.
+      devices: that lanes are split over; None for one that jax chooses.
+    """
+    world = _World(env.reset, env.step, env.observe, env.labels)
+    mind = _Mind(agent.init, agent.act)
+    return _programs(world, mind, max_steps, record, None if devices is None else tuple(devices))
+
+
+class _World(NamedTuple):
+    """The functions of an `Env` that programs call: what they are known by."""
+
+    reset: Callable[..., Any]
+    step: Callable[..., Any]
+    observe: Callable[..., Any]
+    labels: Callable[..., Any]
+
+
+class _Mind(NamedTuple):
+    """The same of a `BatchAgent`."""
+
+    init: Callable[..., Any]
+    act: Callable[..., Any]
+
+
+@functools.lru_cache(maxsize=4)
+def _programs(
+    env: _World,
+    agent: _Mind,
+    max_steps: int,
+    record: episodes.Record,
+    devices: Sequence[jax.Device] | None,
+) -> tuple[Callable[..., Carry], Callable[..., Any]]:
+    """As `make`, by the functions alone: other environments may share them."""
+    shared, lane = placement.SHARED, placement.LANE
+    start = placement.split(_starter(env, agent), devices, (shared, shared, lane, shared), lane)
+    advance = placement.split(
+        _advancer(env, agent, max_steps, record), devices, (shared, lane, shared), lane, donate=(1,)
+    )
+    return start, advance
+
+
+def _starter(env: _World, agent: _Mind) -> Callable[..., Carry]:
+    # Imported here, as only programs need it: reading a dataset does not load the simulator.
+    from starjax.sim import env as sim_env
+
+    def start_one(key: jax.Array, trials: Trials, levels: Any) -> tuple[Any, jax.Array]:
+        key = jax.random.fold_in(jax.random.fold_in(key, trials.index), trials.trial)
+        key_env, key_agent = jax.random.split(key)
+        return env.reset(key_env, sim_env.EnvParams(trials.trocar, levels=levels)), key_agent
+
+    def start(key: jax.Array, params: Any, trials: Trials, levels: Any) -> Carry:
+        state, keys = jax.vmap(start_one, in_axes=(None, 0, None))(key, trials, levels)
+        memory = agent.init(params, keys, state, lambda: jax.vmap(env.observe)(state))
+        return Carry(state, memory, jnp.zeros(trials.wanted.shape, jnp.int32), trials.wanted)
+
+    return start
+
+
+def _advancer(
+    env: _World, agent: _Mind, max_steps: int, record: episodes.Record
+) -> Callable[..., Any]:
+    observe, step_all = jax.vmap(env.observe), jax.vmap(env.step)
+
+    def step(params: Any, carry: Carry, t: jax.Array) -> tuple[Carry, dict[str, jax.Array]]:
+        before = carry.env
+        observed = observe(before) if record.observes else None
+        look = (lambda: observe(before)) if observed is None else lambda: observed
+        executed, memory, label = agent.act(params, carry.memory, before, look, t)
+        after = step_all(before, executed)
+        fields = record.fields(episodes.Step(observed, label, executed, before, after))
+        return Carry(after, memory, carry.length + ~before.done, carry.wanted), fields
+
+    def advance(params: Any, carry: Carry, first: jax.Array) -> Any:
+        """Control steps `first` up to `first + record.frames`, fewer when all episodes are over.
+
+        Returns the carry, records `[N, record.frames]`, and the status `[N]`.
+        """
+        shapes = jax.eval_shape(lambda state: _fields(env, record, state), carry.env)
+        blank = jax.tree.map(
+            lambda s: jnp.zeros((s.shape[0], record.frames, *s.shape[1:]), s.dtype), shapes
+        )
+        last = jnp.minimum(first + record.frames, max_steps)
+
+        def is_running(loop):
+            t, carry, _ = loop
+            return (t < last) & jnp.any(carry.wanted & ~carry.env.done)
+
+        def body(loop):
+            t, carry, records = loop
+            carry, fields = step(params, carry, t)
+            # In place: not `.at[:, i].set`, a scatter, which may move the whole of the images.
+            put = functools.partial(jax.lax.dynamic_update_index_in_dim, index=t - first, axis=1)
+            return t + 1, carry, jax.tree.map(put, records, fields)
+
+        _, carry, records = jax.lax.while_loop(is_running, body, (first, carry, blank))
+        return carry, records, status(env, carry)
+
+    return advance
+
+
+def _fields(env: Any, record: episodes.Record, state: Any) -> dict[str, jax.Array]:
+    """Records N episodes that stand still, for the shapes."""
+    observed = jax.vmap(env.observe)(state) if record.observes else None
+    command = Command(state.pose, state.gripper)
+    return record.fields(episodes.Step(observed, command, command, state, state))
+
+
+def frame(env: Any, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
+    """Shapes of one recorded control step, without computing anything."""
+    from starjax.sim import env as sim_env
+
+    def one(key: jax.Array) -> dict[str, jax.Array]:
+        zeros = jnp.zeros(np.shape(env.p_world_ref)[0])
+        state = env.reset(key, sim_env.EnvParams(Trocar(zeros, zeros, zeros)))
+        batch = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
+        return jax.tree.map(lambda x: x[0], _fields(env, record, batch))
+
+    return jax.eval_shape(one, jax.random.key(0))
+
+
+def status(env: Any, carry: Carry) -> dict[str, Any]:
+    """How N episodes stand: `over`, `length`, `episodes.FLAGS`, `stage`, `labels`, `[N]` each."""
+    state = carry.env
+    found = {
+        "over": state.done,
+        "length": carry.length,
+        "success": state.success & ~state.invalid,
+        "loose": state.loose & ~state.invalid,
+        "invalid": state.invalid,
+        "collided": state.collided,
+        "lost": state.lost,
+        "stage": state.stage,
+        "labels": jax.vmap(env.labels)(state),
+    }
+    # Copied, as the next segment is given the carry's memory before the host has read this.
+    return jax.tree.map(jnp.copy, found)
