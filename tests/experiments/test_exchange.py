@@ -96,7 +96,7 @@ def test_inspect_shows_columns_of_others_and_what_is_not_finite(exported, tmp_pa
 def test_inspect_reads_policies_and_results(request):
     found = inspect_command.inspect("compact")
     assert "stardiff" in found.rows[0][1] and not found.odd
-    file = request.config.rootpath / "experiments/cpu_main_job/result.json"
+    file = request.config.rootpath / "tests/golden/result_schema_1/result.json"
     rows = dict(inspect_command.inspect(str(file)).rows)
     assert rows["trials"] == "72" and rows["seen"].startswith("46/48")
 

@@ -5,6 +5,7 @@ After a change of what they say: STARJAX_GOLDEN=write pytest tests/report/test_p
 
 import json
 import os
+import pathlib
 import re
 
 import pytest
@@ -23,14 +24,16 @@ from starjax.report import (
 )
 from starjax.runtime import files
 
+GOLDEN = pathlib.Path(__file__).parents[1] / "golden"
+
 
 @pytest.fixture(scope="module")
 def kept(pytestconfig):
-    """Results as they were committed: of all methods with their sweeps, and of one alone."""
+    """Results of all methods with their sweeps, and one alone of schema 1, which stays."""
     folder = pytestconfig.rootpath / "experiments"
     paths = {
         "several": [file.parent for file in sorted(folder.glob("all_methods/*/result.json"))],
-        "one": [folder / "cpu_main_job" / "result.json"],
+        "one": [GOLDEN / "result_schema_1" / "result.json"],
     }
     return {
         name: build._named_apart(sorted(map(results.load, found), key=build._order))
@@ -39,11 +42,11 @@ def kept(pytestconfig):
 
 
 @pytest.mark.parametrize("name", ["several", "one"])
-def test_page_and_tables_are_the_golden_ones(kept, pytestconfig, name):
+def test_page_and_tables_are_the_golden_ones(kept, name):
     runs = kept[name]
     drawn = {"md": tables.markdown(runs), "html": page.render(runs, runs[-1], {}, None)}
     for ending, text in drawn.items():
-        golden = pytestconfig.rootpath / "tests" / "golden" / f"report_{name}.{ending}"
+        golden = GOLDEN / f"report_{name}.{ending}"
         if os.environ.get("STARJAX_GOLDEN") == "write":
             golden.write_text(text)
         assert text == golden.read_text(), golden.name
