@@ -2,6 +2,8 @@
 
 A script is a `Play`: how long each phase is, what the jaws do, who turns to what, where to go. It
 comes with a memory, `Script`; what it holds on to beside that is the task's own.
+As with one arm, a roll follows from that arm's coming tip positions and its trocar: a tool turns on
+its way in, which begins `OUT` to one side along what the jaws are to open along.
 """
 
 from collections.abc import Callable
@@ -18,6 +20,7 @@ from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Agent, Command
 
 DEVIATION = (0.001, 0.001, 0.001, 0.04)  # m and rad, of the disturbance of each arm
+OUT = 0.006  # m along the normal, from which a tool comes in to its grasp
 
 
 @flax.struct.dataclass
@@ -58,6 +61,7 @@ class Play(NamedTuple):
       duration: `[P]` s at tempo 1.
       jaws: `[P, 2]`, at the end of each phase.
       aligned: `[P]`, share of a phase after which a tool goes straight down.
+      turned: `[P]`, share of a phase after which a tool has turned.
       looks: `[P, 2]` bool, who turns to what it holds; the others keep their turn.
       weight: (phase, share of the way) -> how much of the disturbance acts.
       following: (Script, EnvState) -> int32, the phase after the present one.
@@ -69,6 +73,7 @@ class Play(NamedTuple):
     duration: np.ndarray
     jaws: np.ndarray
     aligned: np.ndarray
+    turned: np.ndarray
     looks: np.ndarray
     weight: Callable[[jax.Array, jax.Array], jax.Array]
     following: Callable[[Script, EnvState], jax.Array]
@@ -119,13 +124,16 @@ def _act(play: Play, script: Script, state: EnvState) -> tuple[Command, Script, 
     aligned = jnp.asarray(play.aligned, jnp.float32)[script.phase]
     aside = scripting.minimum_jerk(jnp.minimum(s / aligned, 1.0))
     share = scripting.minimum_jerk(s)
+    turned = scripting.minimum_jerk(
+        jnp.minimum(s / jnp.asarray(play.turned, jnp.float32)[script.phase], 1.0)
+    )
     deviation = jnp.array(DEVIATION * 2)
     noise = scripting.disturb(script.key, script.noise, state.step, deviation)
     wanted = jnp.asarray(play.jaws, jnp.float32)[script.phase]
     script = script.replace(
         elapsed=elapsed,
         p=script.start + jnp.stack([aside, aside, share]) * (script.goal - script.start),
-        roll=script.roll_from + aside * (script.roll_to - script.roll_from),
+        roll=script.roll_from + turned * (script.roll_to - script.roll_from),
         jaws=scripting.jaws(script.jaws_from, wanted, elapsed),
         noise=noise,
     )

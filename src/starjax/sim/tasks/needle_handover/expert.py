@@ -25,12 +25,12 @@ GIVER = (1, 1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1)
 TAKER = (1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1)
 # Which arms turn to their segment in which phase; the others keep their turn.
 LOOKS = np.zeros((len(PHASES), 2), bool)
-LOOKS[[0, 1], 0] = LOOKS[[5, 6], 1] = True
+LOOKS[1, 0] = LOOKS[6, 1] = True
 # How much of the disturbance acts at the end of each phase.
 DISTURBANCE = (1, 0, 0, 0.1, 0.3, 0.3, 0, 0, 0, 0, 0.1, 0.1)
 
 TEMPO = (0.9, 1.15)  # range of an episode's pace
-ALIGNED = 0.6  # share of a phase that goes down after which it goes straight down
+ALIGNED = 0.6  # share of the ways in after which a tool has turned, and of "down", is over its goal
 MEET = (0.0, 0.0, 0.04)  # m, of the giver's segment at the hand-over
 HOVER = 0.02  # m above a grasp
 GRASP_ABOVE = 0.001  # m of the tip above the wire: the pads' ends lie 1.5 mm below it
@@ -79,15 +79,16 @@ def _goals(script: handing.Script, state: EnvState) -> tuple[jax.Array, jax.Arra
     normal = across * jnp.where(across[:, 1:2] > 0, -1.0, 1.0)
     wire = needle.p + jnp.asarray(MIDDLES)[script.held] @ needle.R.T
     give, take = wire + jnp.array([0.0, 0.0, GRASP_ABOVE])
+    out = handing.OUT * across
     park, up = jnp.array(PARK), jnp.array([0.0, 0.0, HOVER])
     goals = jnp.stack(
         [
-            jnp.stack([give + up, park[1]]),
+            jnp.stack([give + out[0] + up, park[1]]),
             jnp.stack([give, park[1]]),
             tips,
             tips.at[0].add(up),
             jnp.stack([tips[0] + jnp.array(MEET) - wire[0], park[1]]),
-            jnp.stack([tips[0], take + jnp.array(COME)]),
+            jnp.stack([tips[0], take + out[1] + jnp.array(COME)]),
             jnp.stack([tips[0], take]),
             tips,
             tips,
@@ -105,6 +106,7 @@ AGENT = handing.agent(
         duration=np.array(DURATION),
         jaws=np.stack([GIVER, TAKER], -1),
         aligned=np.where(np.array(PHASES) == "down", ALIGNED, 1.0),
+        turned=np.where(LOOKS.any(-1), ALIGNED, 1.0),
         looks=LOOKS,
         weight=_weight,
         following=_following,

@@ -26,7 +26,7 @@ GIVER = (1, 1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1, 1, 1, 1)
 TAKER = (1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1, 1, 1, 1)
 # Which arms turn to the wall in which phase; the others keep their turn.
 LOOKS = np.zeros((len(PHASES), 2), bool)
-LOOKS[[0, 1], 0] = LOOKS[[5, 6, 10, 11], 1] = True
+LOOKS[1, 0] = LOOKS[[6, 10, 11], 1] = True
 # How much of the disturbance acts.
 DISTURBANCE = (1, 0.4, 0, 0.1, 0.3, 0.3, 0.1, 0, 0, 0, 0.3, 0.1, 0, 0.3, 0)
 
@@ -36,6 +36,7 @@ TEMPO = (0.9, 1.15)  # range of an episode's pace
 RAISED = 5.0
 SIDE = 0.0048  # m along the wall, from its middle to either tool
 PLACE = (0.0, 0.0, 0.045)  # m, of the block at the hand-over
+ALIGNED = 0.6  # share of the ways in after which a tool has turned, and of "down", is over its goal
 HOVER = 0.026  # m above a grasp
 GRASP_DROP = 0.001  # m below the rim's centre line
 OVER = 0.012  # m more above the target: the block hangs below the taker
@@ -77,6 +78,7 @@ def _goals(script: handing.Script, state: EnvState) -> tuple[jax.Array, jax.Arra
     flat = out * jnp.array([1.0, 1.0, 0.0])
     flat = flat / jnp.maximum(jnp.linalg.norm(flat), 1e-6)
     normal = flat * jnp.where(flat[1] > 0, -1.0, 1.0)
+    outside = handing.OUT * flat
     low = jnp.array([0.0, 0.0, -GRASP_DROP])
     give, take = (
         block.p + single.RIM_RADIUS * out + side * SIDE * along + low for side in (-1.0, 1.0)
@@ -91,12 +93,12 @@ def _goals(script: handing.Script, state: EnvState) -> tuple[jax.Array, jax.Arra
     held = tips
     goals = jnp.stack(
         [
-            jnp.stack([give + up, park[1]]),
+            jnp.stack([give + outside + up, park[1]]),
             jnp.stack([give, park[1]]),
             held,
             held.at[0].add(up),
             jnp.stack([carried, park[1]]),
-            jnp.stack([tips[0], take + jnp.array(COME)]),
+            jnp.stack([tips[0], take + outside + jnp.array(COME)]),
             jnp.stack([tips[0], take]),
             held,
             held,
@@ -116,7 +118,8 @@ AGENT = handing.agent(
         choose=_choose,
         duration=np.array(DURATION),
         jaws=np.stack([GIVER, TAKER], -1),
-        aligned=np.ones(len(PHASES)),
+        aligned=np.where(np.array(PHASES) == "down", ALIGNED, 1.0),
+        turned=np.where(np.isin(PHASES, ("down", "meet")), ALIGNED, 1.0),
         looks=LOOKS,
         weight=_weight,
         following=_following,
