@@ -34,11 +34,9 @@ def other(name: str) -> str:
     return formats.render([said["header"], *rows], names=1)
 
 
-def stress() -> str:
-    """What breaks the packaged policy: of a GPU, which runs more trials, where it was run there."""
-    files = [f"stress_compact_{backend}" for backend in ("gpu", "cpu")]
-    file = next(name for name in files if (HERE / "results" / f"{name}.json").exists())
-    return formats.render(broken.table(_results(file)), names=2)
+def stress(name: str) -> str:
+    """What breaks a policy, of results/<name>_gpu.json."""
+    return formats.render(broken.table(_results(f"{name}_gpu")), names=2)
 
 
 def _results(file: str) -> dict[str, Any]:

@@ -5,7 +5,8 @@
 
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
 claim.toml, `claims` (the list of claims), or of benchmarks/results: `speed`, `learners`, `experts`,
-`six_blocks`, `stress`, `proposition`, `ppo`, `sb3`.
+`six_blocks`, `scenes`, `stress_compact`, `stress_randomised`, `proposition`, `ppo`, `ppo_gpu`,
+`sb3`.
 """
 
 import re
@@ -34,10 +35,10 @@ def table(name: str) -> str:
         return claims.index([claims.load(folder) for folder in claims.folders()])
     if name == "speed":
         return newest.table()
-    if name in ("learners", "experts", "six_blocks", "proposition", "ppo", "sb3"):
+    if (HERE.parent / "benchmarks" / f"{name}.toml").exists():
         return newest.other(name)
-    if name == "stress":
-        return newest.stress()
+    if name.startswith("stress"):
+        return newest.stress(name)
     folder, _, which = name.partition("/")
     return claims.table(claims.load(HERE / folder), which)
 
