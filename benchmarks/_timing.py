@@ -27,6 +27,8 @@ class Timing(NamedTuple):
       median_s: of one call, over the repeats; min_s: the fastest.
       temporary_bytes: the compiler's scratch memory, beside inputs and results.
       result_bytes: its results, where they do not reuse an input's memory.
+      cores: CPU time of this process over wall time. A program of several threads is slower where
+        others take the cores: times of different numbers do not compare.
     """
 
     compile_s: float
@@ -34,6 +36,7 @@ class Timing(NamedTuple):
     min_s: float
     temporary_bytes: int = 0
     result_bytes: int = 0
+    cores: float = 0.0
 
 
 def time_jitted(function: Callable, *arguments: Any, repeats: int = 7) -> Timing:
@@ -86,12 +89,13 @@ def _compile(function: Callable, arguments: tuple, **options: Any) -> tuple[Any,
 def time_plain(function: Callable[[], Any], repeats: int = 7) -> Timing:
     """Time calls of a function that returns when it is done, after one that is not counted."""
     function()
-    seconds = []
+    seconds, cpu_start = [], time.process_time()
     for _ in range(repeats):
         start = time.perf_counter()
         function()
         seconds.append(time.perf_counter() - start)
-    return Timing(0.0, statistics.median(seconds), min(seconds))
+    cores = (time.process_time() - cpu_start) / sum(seconds)
+    return Timing(0.0, statistics.median(seconds), min(seconds), cores=cores)
 
 
 def time_once(function: Callable[[], Any]) -> float:

@@ -5,7 +5,8 @@
 
 At rest (arms at home, objects where an episode begins) and at work: states of the scripted expert's
 episodes, with the jaws closing. `--peer` also times `mjx.step`, whose contact solver is MJX's, from
-the same states. A CPU steps a batch 16 at a time.
+the same states. A CPU steps a batch 16 at a time, with threads: what else runs there shows in the
+cores that it got.
 """
 
 import argparse
@@ -57,6 +58,7 @@ def main() -> None:
                 )
                 row[f"{name}steps_per_s_{kind}"] = batch * STEPS / timing.median_s
                 row[f"{name}ms_a_step_{kind}"] = 1e3 * timing.median_s / STEPS
+                row[f"{name}cores_{kind}"] = timing.cores
             memory = run.memory_analysis()
             row[f"{name}temporary_bytes_an_environment"] = memory.temp_size_in_bytes / lanes
         for kind in starts if asked.peer else ():
