@@ -1,8 +1,10 @@
 """Pairs of trocars: as far apart as surgeons place them, wherever they are drawn."""
 
 import itertools
+import types
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -11,7 +13,10 @@ from starjax import rcm
 from starjax.envs import trocars
 from starjax.evaluation import sweep
 from starjax.sim import registry, scene
-from starjax.sim.tasks import two_arms
+from starjax.sim.tasks import handing, two_arms
+from starjax.sim.tasks.needle_handover import expert as handover
+from starjax.sim.tasks.peg_transfer_bimanual import expert as bimanual
+from starjax.types import Pose
 
 DRAWN = 10_000
 COLLISION = 0.0005  # m, overlap that is called one
@@ -70,6 +75,40 @@ def test_six_blocks_stand_side_by_side_at_any_yaw():
         for s in (-1, 1)
     ]
     assert apart.min() > 2 * max(ends) - COLLISION
+
+
+YAWS = np.linspace(-0.5, 0.5, 7)  # rad, of what is handed over
+# What each expert's tools hold: segments of the wire; the wall's normal and its direction.
+HELD = {
+    handover: jnp.array([2, 4]),
+    bimanual: (jnp.array([0.0, 1.0, 0.0]), jnp.array([1.0, 0.0, 0.0])),
+}
+
+
+@pytest.mark.parametrize("expert", HELD, ids=lambda expert: expert.__name__.split(".")[-2])
+def test_a_tool_first_turns_on_a_way_that_says_how(expert):
+    """A roll network sees the coming path of its arm, and not what is to be grasped."""
+    tips = jnp.array(handover.PARK)
+    script = types.SimpleNamespace(p=tips, held=HELD[expert])
+
+    def goals(yaw):
+        there = Pose(rcm.rotation_z(yaw), jnp.array([0.003, 0.002, 0.01]))
+        state = types.SimpleNamespace(
+            facts=types.SimpleNamespace(needle=there, block=there),
+            layout=types.SimpleNamespace(target_peg=jnp.zeros(2)),
+            pose=Pose(jnp.stack([jnp.eye(3)] * 2), tips),
+        )
+        return expert.PLAY.goals(script, state)
+
+    found, normals = jax.vmap(goals)(jnp.array(YAWS))
+    normals = jnp.broadcast_to(normals.reshape(len(YAWS), -1, 3), (len(YAWS), 2, 3))
+    for arm, come in enumerate((jnp.zeros(3), jnp.array(expert.COME))):
+        turns = int(np.argmax(expert.PLAY.looks[:, arm]))
+        way = (found[:, turns - 1, arm] - found[:, turns, arm] - come)[:, :2]
+        along = jnp.sum(way * normals[:, arm, :2], axis=-1)
+        np.testing.assert_allclose(jnp.abs(along), handing.OUT, rtol=1e-4)
+        np.testing.assert_allclose(jnp.linalg.norm(way, axis=-1), handing.OUT, rtol=1e-4)
+        assert expert.PLAY.turned[turns] < 1.0
 
 
 def axis(quat):

@@ -100,16 +100,15 @@ def _goals(script: handing.Script, state: EnvState) -> tuple[jax.Array, jax.Arra
     return goals, normal
 
 
-AGENT = handing.agent(
-    handing.Play(
-        choose=_choose,
-        duration=np.array(DURATION),
-        jaws=np.stack([GIVER, TAKER], -1),
-        aligned=np.where(np.array(PHASES) == "down", ALIGNED, 1.0),
-        turned=np.where(LOOKS.any(-1), ALIGNED, 1.0),
-        looks=LOOKS,
-        weight=_weight,
-        following=_following,
-        goals=_goals,
-    )
+PLAY = handing.Play(
+    choose=_choose,
+    duration=np.array(DURATION),
+    jaws=np.stack([GIVER, TAKER], -1),
+    aligned=np.where(np.array(PHASES) == "down", ALIGNED, 1.0),
+    turned=np.where(LOOKS.any(-1), ALIGNED, 1.0),
+    looks=LOOKS,
+    weight=_weight,
+    following=_following,
+    goals=_goals,
 )
+AGENT = handing.agent(PLAY)
