@@ -82,10 +82,6 @@ def flow(steps: int) -> Process:
     return Process(flow_matching.noised, flow_matching.velocity_loss, sample)
 
 
-def shortcut(steps: int) -> Process:
-    """Flow matching whose network is told how far it steps, so that few steps are enough."""
-
-    def sample(predict, noise, *, prepare, reach=None):
-        return shortcuts.sample(predict, noise, steps=steps, prepare=prepare, reach=reach)
-
-    return Process(shortcuts.noised, shortcuts.loss, sample)
+def shortcut() -> Process:
+    """Flow matching whose network also learns to take the whole way at once."""
+    return Process(shortcuts.noised, shortcuts.loss, shortcuts.sample)

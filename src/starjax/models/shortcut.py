@@ -1,11 +1,13 @@
-"""Shortcut models: flow matching whose network also knows how far it is to step, up to all the way.
+"""Flow matching whose network also knows the whole way: one evaluation from noise to a sequence.
 
-Frans et al., "One Step Diffusion via Shortcut Models" (ICLR 2025). A step of length d from time t
-ends in `x - d v`, and the network learns the mean velocity v over the step: of no length, flow
-matching's (`models.flow`); of length 2 d, what two steps of its own of length d add up to. So one
-training teaches one step and many, without a teacher that must be trained before.
+Two things are learned at once. At any time the network predicts flow matching's velocity
+(`models.flow`). Told that it is to go all the way, it predicts where its own flow ends, so that one
+step does what many do: the distillation of Liu et al., "Flow Straight and Fast" (ICLR 2023), with
+the flow in training as its teacher, and weights in common, as in Frans et al., "One Step Diffusion
+via Shortcut Models" (ICLR 2025).
 
-Other than there, targets come from the weights in training, not from their average.
+Other than in the latter, the whole way is not put together from halves of halves: each of these
+must be learned before the next longer one can be.
 """
 
 from collections.abc import Callable
@@ -18,12 +20,11 @@ import numpy as np
 from starjax.models import flow
 from starjax.models.diffusion import within
 
-# Steps have lengths 1/2, 1/4, ... by level; at the last level the length counts as none.
-LEVELS = 7
-EVERY = 4  # one of so many sequences teaches steps that have a length
-# A time tells the length too: levels are this far apart, in `flow.TIME_UNIT`, of which a time
-# has 100. The network's embedding then tells them apart as it tells times.
-LEVEL_UNIT = 200.0
+EVERY = 4  # one of so many sequences teaches the whole way
+TEACHER_STEPS = 8  # Euler steps of the flow that teaches it
+# The network is told the whole way as a time that no other is, in `flow.TIME_UNIT`: those of the
+# flow end at 100.
+WHOLE_WAY = 300.0
 
 
 class Noised(NamedTuple):
@@ -31,87 +32,76 @@ class Noised(NamedTuple):
 
     Attributes:
       x: `[B, ...]`, with noise.
-      time: `[B]` in [0, 1], 1 is noise.
-      level: int32 `[B]`, LEVELS where the velocity is to be predicted, else the step's.
-      velocity: `[B, ...]`.
+      time: `[B]`, what the network is told.
+      velocity: `[B, ...]`, of the flow; it is not used of those that teach the whole way.
     """
 
     x: jax.Array
     time: jax.Array
-    level: jax.Array
     velocity: jax.Array
 
 
-def told(time: Any, level: Any) -> Any:
-    """One number for a time in [0, 1] and a step's level, as the network is told them."""
-    return time / flow.TIME_UNIT + LEVEL_UNIT * level
-
-
 def noised(key: jax.Array, x0: jax.Array) -> Noised:
-    """Clean sequences `[B, ...]`, about [-1, 1], each at a random time.
+    """Clean sequences `[B, ...]`, about [-1, 1], each at a random time, or a start of a way.
 
-    `key` is one typed key for the whole batch. Steps of level l begin at multiples of their length,
-    2^-l, as those of a sampler do.
+    A way starts from a random share of the noise, as samples of any temperature do. `key` is one
+    typed key for the whole batch.
     """
-    key_time, key_level, key_noise = jax.random.split(key, 3)
-    count = len(x0)
-    steps = jnp.arange(count) % EVERY == 0
-    level = jnp.where(steps, jax.random.randint(key_level, (count,), 0, LEVELS), LEVELS)
-    time = jax.random.uniform(key_time, (count,))
-    pieces = 2.0**level
-    time = jnp.where(steps, (jnp.floor(time * pieces) + 1.0) / pieces, time)
-    noise = jax.random.normal(key_noise, x0.shape, x0.dtype)
-    share = _beside(time, x0)
-    return Noised(x0 + share * (noise - x0), time, level, noise - x0)
+    key_flow, key_noise, key_share = jax.random.split(key, 3)
+    at = flow.noised(key_flow, x0)
+    goes = jnp.arange(len(x0)) % EVERY == 0
+    share = _beside(jax.random.uniform(key_share, x0.shape[:1]), x0)
+    start = share * jax.random.normal(key_noise, x0.shape, x0.dtype)
+    return Noised(
+        jnp.where(_beside(goes, x0) > 0, start, at.x),
+        jnp.where(goes, WHOLE_WAY, at.time),
+        at.velocity,
+    )
 
 
 def loss(predict: Callable[..., jax.Array], given: Noised) -> jax.Array:
-    """Mean squared error of the mean velocity.
+    """Mean squared error of the velocity, or of the mean velocity over the whole way.
 
     It is what `predict(x, told)` `[B, ...]` predicts, of some rows `predict(x, told, rows)`.
     """
     target = jax.lax.stop_gradient(targets(predict, given))
-    return jnp.mean((predict(given.x, told(given.time, given.level)) - target) ** 2)
+    return jnp.mean((predict(given.x, given.time) - target) ** 2)
 
 
 def targets(predict: Callable[..., jax.Array], given: Noised) -> jax.Array:
-    """Target of the prediction `[B, ...]`: for a step with a length, the mean of two of half."""
+    """Target of the prediction `[B, ...]`: for a whole way, the mean velocity of the flow."""
     count = len(given.x)
     most = -(-count // EVERY)
-    (rows,) = jnp.nonzero(given.level < LEVELS, size=most, fill_value=count)
+    (rows,) = jnp.nonzero(given.time == WHOLE_WAY, size=most, fill_value=count)
     there = jnp.minimum(rows, count - 1)  # fewer than `most` in a share of the batch, perhaps
-    x, time, level = given.x[there], given.time[there], given.level[there]
-    half = 2.0 ** -(level + 1.0)
-    first = predict(x, told(time, level + 1), there)
-    second = predict(x - _beside(half, x) * first, told(time - half, level + 1), there)
-    return given.velocity.at[rows].set(0.5 * (first + second), mode="drop")
+    start = given.x[there]
+
+    def step(x: jax.Array, time: jax.Array) -> tuple[jax.Array, None]:
+        told = jnp.full(most, time, start.dtype)
+        return x - predict(x, told, there) / TEACHER_STEPS, None
+
+    times = np.arange(TEACHER_STEPS, 0, -1, dtype=np.float32) / TEACHER_STEPS / flow.TIME_UNIT
+    end, _ = jax.lax.scan(step, start, jnp.asarray(times))
+    return given.velocity.at[rows].set(start - end, mode="drop")
 
 
 def sample(
     predict: Callable[[jax.Array, Any], jax.Array],
     noise: jax.Array,
     *,
-    steps: int,
     prepare: Callable[[jax.Array], Any] = lambda time: time,
     reach: Any = None,
 ) -> jax.Array:
-    """Steps of one length from `noise` `[B, ...]` to a clean sequence, clipped to `reach`.
+    """One step from `noise` `[B, ...]` to a clean sequence, clipped to `reach`.
 
     Args:
       predict: `(x [B, ...], prepared) -> velocity [B, ...]`.
-      noise: the start, standard normal.
-      steps: how many network evaluations, a power of two of at most 2^LEVELS.
-      prepare: maps what is told `[n]` to a pytree with leading axis n, once, before the loop;
-        `predict` gets its slice.
+      noise: the start, standard normal or a share of it.
+      prepare: maps what is told `[1]` to a pytree with leading axis 1; `predict` gets its slice.
       reach: lowest and highest value, what broadcasts against `[B, ...]` each; None: -1 and 1.
     """
-    time = np.arange(steps, 0, -1, dtype=np.float32) / steps
-    level = np.float32(np.log2(steps))
-
-    def step(x: jax.Array, prepared: Any) -> tuple[jax.Array, None]:
-        return x - predict(x, prepared) / steps, None
-
-    return within(jax.lax.scan(step, noise, prepare(jnp.asarray(told(time, level))))[0], reach)
+    prepared = jax.tree.map(lambda leaf: leaf[0], prepare(jnp.array([WHOLE_WAY])))
+    return within(noise - predict(noise, prepared), reach)
 
 
 def _beside(numbers: jax.Array, x: jax.Array) -> jax.Array:

@@ -1,6 +1,4 @@
-"""The learner `onestep`: exact where the mean velocity is known, and what its samples return."""
-
-import dataclasses
+"""The learner `onestep`: its way is the one of its flow, and what its samples return."""
 
 import fakes
 import jax
@@ -9,80 +7,57 @@ import numpy as np
 import pytest
 import repeats
 
-from starjax import config, errors
+from starjax import config
 from starjax.models import flow, shortcut
-from starjax.policies.learners import onestep
 
 MEAN, SPREAD = 0.3, 0.2  # of a normal distribution
 FAR = 1e9 * np.array([-1.0, 1.0])
 
 
-def spread(time):
-    return jnp.sqrt((1 - time) ** 2 * SPREAD**2 + time**2)
-
-
 def velocity(x, told, rows=None):
-    """What a perfect network predicts of that distribution: on the way of a noise, which is known,
-    the mean over the step; at the last level the velocity itself."""
-    level = jnp.floor(told / shortcut.LEVEL_UNIT)
-    time = (told - shortcut.LEVEL_UNIT * level) * flow.TIME_UNIT
-    length = 2.0**-level
-    time, length = (n[..., None] if jnp.ndim(n) else n for n in (time, length))
-    after = time - length
-    standard = (x - (1 - time) * MEAN) / spread(time)
-    there = (1 - after) * MEAN + spread(after) * standard
-    slope = (time - (1 - time) * SPREAD**2) / spread(time)  # of `spread`
-    return jnp.where(length > 2.0**-shortcut.LEVELS, (x - there) / length, slope * standard - MEAN)
+    """What a perfect network predicts of that distribution; on a whole way, where it leads."""
+    told = told[..., None] if jnp.ndim(told) else told
+    t = told * flow.TIME_UNIT
+    variance = (1 - t) ** 2 * SPREAD**2 + t**2
+    flowing = (t - (1 - t) * SPREAD**2) / variance * (x - (1 - t) * MEAN) - MEAN
+    return jnp.where(told == shortcut.WHOLE_WAY, x - (MEAN + SPREAD * x), flowing)
 
 
-@pytest.mark.parametrize("steps", [1, 4, 64])
-def test_any_number_of_steps_ends_where_the_way_does(steps):
+def test_one_step_ends_where_the_way_does():
     noise = jax.random.normal(jax.random.key(0), (64, 2))
-    found = shortcut.sample(velocity, noise, steps=steps, reach=FAR)
-    np.testing.assert_allclose(found, MEAN + SPREAD * noise, atol=1e-5)
+    found = shortcut.sample(velocity, noise, reach=FAR)
+    np.testing.assert_allclose(found, MEAN + SPREAD * noise, atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [400, 401, 3])
-def test_steps_of_a_perfect_network_add_up(count):
-    """Its own targets are what it predicts, but for the last level, whose length is not none."""
+def test_the_flow_teaches_the_whole_way(count):
     x0 = MEAN + SPREAD * jax.random.normal(jax.random.key(1), (count, 1))
     given = shortcut.noised(jax.random.key(2), x0)
     found = shortcut.targets(velocity, given)
-    wanted = velocity(given.x, shortcut.told(given.time, given.level))
-    long = np.asarray(given.level) < shortcut.LEVELS - 1
-    np.testing.assert_allclose(found[long], wanted[long], atol=1e-4)
-    flowing = np.asarray(given.level) == shortcut.LEVELS
-    np.testing.assert_array_equal(found[flowing], given.velocity[flowing])
-    assert flowing.sum() == count - -(-count // shortcut.EVERY)
+    whole = np.asarray(given.time) == shortcut.WHOLE_WAY
+    start = given.x[whole]
+    end = flow.sample(velocity, start, steps=shortcut.TEACHER_STEPS, reach=FAR)
+    np.testing.assert_allclose(found[whole], start - end, atol=1e-5)
+    np.testing.assert_array_equal(found[~whole], given.velocity[~whole])
+    assert whole.sum() == -(-count // shortcut.EVERY)
 
 
-def test_steps_begin_where_a_sampler_begins_them():
-    given = shortcut.noised(jax.random.key(3), jnp.zeros((4000, 1)))
-    steps = np.asarray(given.level) < shortcut.LEVELS
-    time, level = np.asarray(given.time)[steps], np.asarray(given.level)[steps]
-    place = time * 2.0**level
-    np.testing.assert_array_equal(place, np.round(place))
-    assert set(level) == set(range(shortcut.LEVELS)) and time.min() > 0 and time.max() == 1.0
+def test_ways_start_where_samples_of_any_temperature_do():
+    given = shortcut.noised(jax.random.key(3), jnp.full((4000, 8), 0.5))
+    whole = np.asarray(given.time) == shortcut.WHOLE_WAY
+    spread = np.asarray(given.x)[whole].std(axis=1)
+    assert spread.min() < 0.05 and spread.max() > 1.0
+    time = np.asarray(given.time)[~whole]
+    assert time.min() >= 0 and time.max() <= 1 / flow.TIME_UNIT < shortcut.WHOLE_WAY
 
 
 def test_a_sample_is_within_reach():
     noise = jax.random.normal(jax.random.key(0), (64, 2))
-    found = shortcut.sample(lambda x, _: -1e3 * jnp.sign(x), noise, steps=2)
+    found = shortcut.sample(lambda x, _: -1e3 * jnp.sign(x), noise)
     np.testing.assert_array_equal(np.abs(found), 1.0)
 
 
 def test_samples_are_what_was_learned():
     settings = config.with_learner(fakes.TINY, "onestep")
     params, wanted = repeats.learned(settings)
-    for steps in (1, 8):
-        found = repeats.sampled(config.with_options(settings, shortcut_steps=steps), params)
-        assert np.abs(found - wanted).mean() < 0.1
-
-
-def test_options_that_do_not_go_together_are_named():
-    assert onestep.MOST_STEPS == 2**shortcut.LEVELS
-    with pytest.raises(errors.UsageError) as caught:
-        onestep.check(
-            dataclasses.replace(onestep.OnestepConfig(), shortcut_steps=3), config.PolicyConfig()
-        )
-    assert caught.value.argument == "policy.shortcut_steps"
+    assert np.abs(repeats.sampled(settings, params) - wanted).mean() < 0.1
