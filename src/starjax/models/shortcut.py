@@ -53,7 +53,7 @@ def noised(key: jax.Array, x0: jax.Array) -> Noised:
     share = _beside(jax.random.uniform(key_share, x0.shape[:1]), x0)
     start = share * jax.random.normal(key_noise, x0.shape, x0.dtype)
     return Noised(
-        jnp.where(_beside(goes, x0) > 0, start, at.x),
+        jnp.where(_beside(goes, x0), start, at.x),
         jnp.where(goes, WHOLE_WAY, at.time),
         at.velocity,
     )
@@ -106,4 +106,4 @@ def sample(
 
 def _beside(numbers: jax.Array, x: jax.Array) -> jax.Array:
     """`[B]` with the axes that broadcast against `x` `[B, ...]`."""
-    return numbers.reshape(-1, *[1] * (x.ndim - 1)).astype(x.dtype)
+    return numbers.reshape(-1, *[1] * (x.ndim - 1))

@@ -121,12 +121,11 @@ def _act(play: Play, script: Script, state: EnvState) -> tuple[Command, Script, 
     usual = jnp.asarray(play.duration, jnp.float32)[script.phase]
     s = jnp.clip(elapsed * script.tempo / usual, 0.0, 1.0)
     # On the way down a tool is over its goal by the time anything can touch.
-    aligned = jnp.asarray(play.aligned, jnp.float32)[script.phase]
-    aside = scripting.minimum_jerk(jnp.minimum(s / aligned, 1.0))
-    share = scripting.minimum_jerk(s)
-    turned = scripting.minimum_jerk(
-        jnp.minimum(s / jnp.asarray(play.turned, jnp.float32)[script.phase], 1.0)
+    aside, turned = (
+        scripting.minimum_jerk(jnp.minimum(s / jnp.asarray(at, jnp.float32)[script.phase], 1.0))
+        for at in (play.aligned, play.turned)
     )
+    share = scripting.minimum_jerk(s)
     deviation = jnp.array(DEVIATION * 2)
     noise = scripting.disturb(script.key, script.noise, state.step, deviation)
     wanted = jnp.asarray(play.jaws, jnp.float32)[script.phase]
