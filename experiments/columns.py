@@ -132,6 +132,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "seen": ("seen", lambda x: rate(_seen(x))),
     "unseen": ("unseen", lambda x: rate(_unseen(x))),
     "all": ("all", lambda x: rate(x.run.trials)),
+    "loose": ("all, loose", lambda x: rate(x.run.trials, outcomes.loose)),
     "safe": ("successes within 2 mm all along", _safe),
     "gap": ("gap, points", _gap),
     "highest": ("highest trocar", lambda x: rate([t for t in _unseen(x) if t.trocar == HIGHEST])),

@@ -6,7 +6,7 @@
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
 claim.toml, `claims` (the list of claims), or of benchmarks/results: `speed`, `learners`, `experts`,
 `six_blocks`, `scenes`, `stress_compact`, `stress_randomised`, `proposition`, `ppo`, `ppo_gpu`,
-`sb3`.
+`sb3`, `through_lerobot`.
 """
 
 import re

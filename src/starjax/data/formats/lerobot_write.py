@@ -164,7 +164,7 @@ def _picture(column: Column, hz: int, with_video: bool) -> dict[str, Any]:
         "video.height": shape[0],
         "video.width": shape[1],
         "video.codec": video.CODEC,
-        "video.pix_fmt": video.pixels(column.shape),
+        "video.pix_fmt": video.PIXELS,
         "video.is_depth_map": False,
         "video.fps": hz,
         "video.channels": 3,
