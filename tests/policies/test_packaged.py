@@ -15,6 +15,7 @@ from starjax.evaluation import latency
 from starjax.models.kernels import parallel_ddim
 from starjax.policies import features, packaged, policy_file
 from starjax.policies import policy as policies
+from starjax.sim import registry
 
 MOST = 12e6  # bytes of a file
 
@@ -24,10 +25,10 @@ def shapes(params):
     return {jax.tree_util.keystr(path): leaf.shape for path, leaf in leaves}
 
 
-def initial(method, policy_config):
+def initial(method, policy_config, task=fakes.TASK):
     """Shapes of the parameters that the networks have today."""
     whole = dataclasses.replace(policy_config, freeze_encoder=False)
-    policy = policies.make(methods.METHODS[method], whole, fakes.TASK)
+    policy = policies.make(methods.METHODS[method], whole, task)
     return jax.eval_shape(policy.init, jax.random.key(0))
 
 
@@ -39,7 +40,8 @@ def faults(name):
         trained = policy_file.load(path)
     except ValueError as error:
         return [*found, str(error)]
-    if shapes(trained.params) != shapes(initial(trained.method, trained.policy)):
+    task = registry.tasks.get(trained.scene.task)
+    if shapes(trained.params) != shapes(initial(trained.method, trained.policy, task)):
         found.append(f"{name}: of other networks")
     result = path.with_suffix(".json")
     if not result.is_file():
