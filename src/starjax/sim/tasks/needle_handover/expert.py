@@ -16,18 +16,19 @@ from starjax.sim.tasks.needle_handover.task import PARK
 from starjax.sim.tasks.needle_pick import task as single
 
 PHASES = (
-    "above", "down", "close", "lift", "carry", "near", "meet", "take", "open", "away", "raise",
-    "hold",
+    "above", "down", "close", "lift", "carry", "near", "meet", "rest", "take", "open", "away",
+    "raise", "hold",
 )  # fmt: skip
 # s, of each phase at tempo 1; jaws of both arms at its end.
-DURATION = (1.6, 1.1, 0.5, 0.9, 1.2, 1.2, 1.0, 0.5, 0.4, 0.8, 0.8, 1.0)
-GIVER = (1, 1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1)
-TAKER = (1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1)
+DURATION = (1.6, 1.1, 0.5, 0.9, 1.2, 1.2, 1.0, 0.3, 0.5, 0.4, 0.8, 0.8, 1.0)
+GIVER = (1, 1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1)
+TAKER = (1, 1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1)
 # Which arms turn to their segment in which phase; the others keep their turn.
 LOOKS = np.zeros((len(PHASES), 2), bool)
 LOOKS[1, 0] = LOOKS[6, 1] = True
-# How much of the disturbance acts at the end of each phase.
-DISTURBANCE = (1, 0, 0, 0.1, 0.3, 0.3, 0, 0, 0, 0, 0.1, 0.1)
+# How much of the disturbance acts at the end of each phase: also where a tool comes to the wire, so
+# that it is shown what to do a little beside it.
+DISTURBANCE = (1, 0.4, 0, 0.1, 0.3, 0.5, 0.4, 0.2, 0, 0, 0, 0.1, 0.1)
 
 TEMPO = (0.9, 1.15)  # range of an episode's pace
 ALIGNED = 0.6  # share of the ways in after which a tool has turned, and of "down", is over its goal
@@ -90,6 +91,7 @@ def _goals(script: handing.Script, state: EnvState) -> tuple[jax.Array, jax.Arra
             jnp.stack([tips[0] + jnp.array(MEET) - wire[0], park[1]]),
             jnp.stack([tips[0], take + out[1] + jnp.array(COME)]),
             jnp.stack([tips[0], take]),
+            tips,
             tips,
             tips,
             tips.at[0].add(jnp.array(GO)),
