@@ -104,6 +104,13 @@ def _time(scored: Scored) -> str:
     return formats.duration(sum(s for name, s in spent.items() if not name.endswith(": compile")))
 
 
+def _running(scored: Scored) -> str:
+    spent = scored.run.result.about.get("timings_s") or {}
+    if "evaluate: compile" not in spent:
+        return "–"
+    return f"{spent['evaluate'] - spent['evaluate: compile']:.0f}"
+
+
 def _swept(scored: Scored) -> results.Run:
     if scored.swept is None:
         raise ValueError(f"{scored.run.label}: expected a sweep, got none")
@@ -149,6 +156,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "roll": ("held-out roll (deg)", lambda x: _held_out(x, "roll_error_deg")),
     "decision": ("a decision (ms)", lambda x: f"{x.run.result.about['inference_ms']['p50']:.1f}"),
     "time": ("all stages", _time),
+    "running": ("trials, once compiled (s)", _running),
     "late": ("plans late", _share("missed", "plans")),
     "held": ("steps held", _share("held", "steps")),
     "limited": ("steps limited", _share("limited", "steps")),

@@ -5,6 +5,7 @@ import os
 import resource
 import shutil
 import types
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -363,7 +364,8 @@ def test_all_residencies_hold_the_same(images, residency):
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_images_may_stay_on_disk_and_are_found_there(images):
+def test_images_may_stay_on_disk_and_are_found_there(images, monkeypatch):
+    monkeypatch.setattr(load.cores, "count", lambda: 1)
     said = []
     whole = load.load(images, report=said.append)
     without = load.load(images, images=False, report=said.append)
@@ -374,6 +376,15 @@ def test_images_may_stay_on_disk_and_are_found_there(images):
     frames, drawn = load.frames(images)[stubs.CAMERA], whole.dataset.observation.images
     some = np.array([0, 7, frames.shape[0] - 1])
     np.testing.assert_array_equal(frames[some], np.asarray(drawn[stubs.CAMERA])[some])
+    for frame in range(frames.shape[0]):  # in turn, so that what was read does not pile up
+        frames[frame]
+        assert _mapped(images) <= load._OPEN_IN_TURN
+
+
+def _mapped(folder: Path) -> int:
+    """How many of the folder's files this process has mapped into its memory."""
+    lines = Path("/proc/self/maps").read_text().splitlines()
+    return len({line.split()[-1] for line in lines if str(folder) in line})
 
 
 def test_more_episodes_than_a_process_may_open_files(tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 
 from starjax import errors, rcm
 from starjax.data import schema, store, windows
-from starjax.rollouts import episodes
+from starjax.rollouts import cores, episodes
 from starjax.runtime import files, xla
 from starjax.types import Command, Observation, Pose
 
@@ -19,6 +19,9 @@ Residency = Literal["auto", "device", "host", "disk"]
 DEVICE_SHARE = 0.5  # of the device's free memory that demonstrations may take
 HOST_SHARE = 0.6  # of the host's
 _MOST_OPEN = 256  # files of a field at once; systems allow a process about 1,000
+# The same for each core that reads one episode after another: what was read of an open file counts
+# as the process's memory.
+_OPEN_IN_TURN = 2
 
 
 class Demos(NamedTuple):
@@ -83,6 +86,7 @@ def verify(root: Path) -> None:
 def frames(root: Path) -> "dict[str, Frames]":
     """The images of the successful episodes by camera, memory-mapped, in the order of `load`.
 
+    They are for reading in that order: few files stay open.
     Only the episodes' records are checked.
 
     Raises:
@@ -93,8 +97,9 @@ def frames(root: Path) -> "dict[str, Frames]":
     records = _successful(root, store.read_seal(root), verify=False)
     fields = _fields(description, records[0], images=True)
     length, start = _spans(records)
+    few = _OPEN_IN_TURN * cores.count()
     found = {
-        name.removeprefix(episodes.IMAGE): Frames(_paths(root, records, file), start, length)
+        name.removeprefix(episodes.IMAGE): Frames(_paths(root, records, file), start, length, few)
         for name, file in fields.items()
         if name.startswith(episodes.IMAGE)
     }
@@ -209,9 +214,11 @@ def _endoscope(fields: dict[str, Any]) -> Pose | None:
 class Frames:
     """One field of all episodes as if it were one array `[F, ...]`, read from disk when indexed."""
 
-    def __init__(self, paths: list[Path], start: np.ndarray, length: np.ndarray):
+    def __init__(
+        self, paths: list[Path], start: np.ndarray, length: np.ndarray, most_open: int = _MOST_OPEN
+    ):
         self._paths, self._start = paths, start
-        self._mapped = functools.lru_cache(_MOST_OPEN)(_map)
+        self._mapped = functools.lru_cache(most_open)(_map)
         first = self._mapped(paths[0])
         self.shape = (int(length.sum()), *first.shape[1:])
         self.dtype = first.dtype
