@@ -1,0 +1,79 @@
+"""Draws each task as its camera sees it, while its expert is at work.
+
+python benchmarks/task_pictures.py FIGURE.png
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import runtime
+from starjax.report import style
+from starjax.sim import env as envs
+from starjax.sim import registry
+
+PIXELS = 384  # a side of a picture
+COLUMNS = 4
+# Task, control steps of an episode after which there is something to see, and by which camera.
+MOMENTS = {
+    "reach": ("reach", 25, "camera"),
+    "peg_transfer": ("peg_transfer", 110, "camera"),
+    "needle_pick": ("needle_pick", 115, "camera"),
+    "ring_on_wire": ("ring_on_wire", 150, "camera"),
+    "peg_transfer_bimanual": ("peg_transfer_bimanual", 170, "side"),
+    "needle_handover": ("needle_handover", 235, "side"),
+    "endoscope_track": ("endoscope_track", 120, "camera"),
+    "endoscope_track: what it sees": ("endoscope_track", 120, "endoscope"),
+}
+TROCAR = 1  # of the task's twelve
+
+
+def main(file: Path) -> None:
+    runtime.prepare_xla()
+    pictures = {name: picture(*moment) for name, moment in MOMENTS.items()}
+    file.write_bytes(style.save(draw(pictures), "png"))
+
+
+def picture(task: str, steps: int, camera: str) -> np.ndarray:
+    """`[PIXELS, PIXELS, 3]` uint8, after `steps` of the task's first expert."""
+    environment = envs.make(task, image_size=PIXELS, cameras=[camera])
+    expert = next(iter(registry.tasks.get(task).experts.values()))()
+    trocar = jax.tree.map(lambda leaf: jnp.asarray(leaf)[TROCAR], environment.task.trocars)
+
+    @jax.jit
+    def play(key: jax.Array) -> jax.Array:
+        start, choices = jax.random.split(key)
+        state = environment.reset(start, envs.EnvParams(trocar))
+
+        def step(_, carry):
+            state, memory = carry
+            command, memory, _ = expert.act(memory, state)
+            return environment.step(state, command), memory
+
+        carry = (state, expert.init(choices, state))
+        state, _ = jax.lax.fori_loop(0, steps, step, carry)
+        return environment.camera(state)[camera].rgb
+
+    return np.asarray(play(jax.random.key(0)))
+
+
+def draw(pictures: dict[str, np.ndarray]) -> Any:
+    """The pictures side by side, named."""
+    rows = -(-len(pictures) // COLUMNS)
+    with style.use():
+        figure = style.figure(2.4 * COLUMNS, 2.65 * rows)
+        axes = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
+        for axis in axes:
+            axis.set_axis_off()
+        for axis, (name, rgb) in zip(axes, pictures.items(), strict=False):
+            axis.imshow(rgb)
+            axis.set_title(name)
+        return figure
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
