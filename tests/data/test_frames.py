@@ -99,6 +99,7 @@ def test_shafts_pass_their_trocars_in_either_frame(dataset):
     assert jnp.abs(command - world).max() < 1.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "observation"), [("stardiff", "image"), ("stardiff", "state"), ("dp_rcm2", "image")]
 )

@@ -84,6 +84,7 @@ def of_one_arm(observation):
     return Observation(pose, observation.gripper[..., None], images, observation.state)
 
 
+@pytest.mark.slow
 def test_it_decides_as_the_policy_of_an_evaluation_does(made):
     path, trained, policy = made
     deployed, observation = load(path), observed(trained.policy)
@@ -104,6 +105,7 @@ def test_it_decides_as_the_policy_of_an_evaluation_does(made):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[1], atol=1e-5), alone, wanted)
 
 
+@pytest.mark.slow
 def test_it_decides_alike_whatever_a_program_makes_jax_refuse(made):
     path, trained, _ = made
     arguments = jax.random.key(7), observed(trained.policy, ()), PORT

@@ -29,6 +29,7 @@ def test_it_has_what_playgrounds_learners_read(env):
     assert env.mj_model.nq == env.mjx_model.nq and env.episode_length == STEPS
 
 
+@pytest.mark.slow
 def test_a_proportional_controller_reaches_and_rests(env):
     def towards(state):
         goal = state.data.pose._replace(p=state.data.layout.p[None])

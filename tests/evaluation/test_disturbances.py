@@ -282,6 +282,7 @@ def moved(reach):
     return lambda **levels: run({**dict.fromkeys(NAMES, 0.0), **levels})
 
 
+@pytest.mark.slow
 def test_servos_of_arms_are_weaker_by_a_share_and_move_otherwise(reach, moved):
     usual, weak, weakest = (moved(servos=level) for level in (0.0, 0.5, 0.9))
     m, of_arms = reach.scene.mj_model, reach.scene.arms[0].ctrl

@@ -105,6 +105,7 @@ def test_the_same_seed_gives_the_same_trials(whole):
         np.testing.assert_array_equal(mine, before[name], name)
 
 
+@pytest.mark.slow
 def test_the_chunk_does_not_change_a_bit_of_a_network(tmp_path):
     """The same with convolutions and matrix products, whose last bits may depend on the batch."""
     row = METHODS["stardiff"]
@@ -415,6 +416,7 @@ print("same")
 """
 
 
+@pytest.mark.slow
 def test_two_devices_give_the_same_bits(tmp_path):
     here = pathlib.Path(__file__).parent
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"

@@ -119,6 +119,7 @@ def test_each_trocar_of_the_arms_is_told(dataset):
     assert features.extra(METHODS["stardiff"], told).shape == (4, 0)
 
 
+@pytest.mark.slow
 def test_cameras_share_an_encoder_and_keep_their_order():
     settings = dataclasses.replace(fakes.TINY, observation="image")
     images = {

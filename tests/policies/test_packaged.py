@@ -54,6 +54,7 @@ def test_what_is_packaged_is_whole():
     assert [fault for name in packaged.names() for fault in faults(name)] == []
 
 
+@pytest.mark.slow
 def test_five_evaluations_side_by_side_are_enough_for_what_is_packaged(monkeypatch):
     """Pictures of noise; `benchmarks/bench_ddim.py` takes demonstrations."""
     trained = policy_file.load(packaged.find("name", "compact"))

@@ -8,6 +8,7 @@ from starjax.report import build, page, style, video
 from starjax.runtime import files
 
 
+@pytest.mark.slow
 def test_build_writes_every_file_and_the_same_ones_again(tmp_path):
     run, out = synthetic.run(tmp_path / "stardiff", sweep_of=40), tmp_path / "report"
     out.mkdir()

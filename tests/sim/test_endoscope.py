@@ -95,6 +95,7 @@ def test_datasets_and_trajectories_have_its_pose(environment):
     assert {"endoscope_R", "endoscope_p", "image_endoscope"} <= about["features"].keys()
 
 
+@pytest.mark.slow
 def test_every_episode_is_seen_from_its_own_place(environment):
     keys = jax.random.split(jax.random.key(5), 2)
     trocars = jax.tree.map(lambda x: jnp.asarray(x)[:2, None], rcm.TROCARS)

@@ -127,6 +127,7 @@ def test_a_wrong_gravity_would_be_noticed(sim, step):
     assert np.abs(np.asarray(ours) - qvel).max() > 5 * FREE_TOLERANCE
 
 
+@pytest.mark.slow
 def test_a_block_rests_on_its_peg_for_ten_seconds(sim):
     qpos, ctrl, m = settled(sim)
     steps = round(REST_SECONDS / m.opt.timestep)

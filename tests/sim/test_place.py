@@ -12,6 +12,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(place, "GENERATIONS", 6)
 
 
+@pytest.mark.slow
 def test_a_search_finds_a_mount_from_its_seed_alone(quick):
     at = mounts.bench(registry.arms.get("rcm4"), registry.tools.get("grasper"))
     workspace = registry.workspaces.get("board")

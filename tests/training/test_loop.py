@@ -159,6 +159,7 @@ def test_data_on_the_host_goes_on_where_it_was_stopped(quick, tmp_path):
     assert logs[0] == logs[1]
 
 
+@pytest.mark.slow
 def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
     directory, result = whole
     asked = iter(range(100))

@@ -108,6 +108,7 @@ def test_it_learns_the_given_frames_only(start, dataset):
     np.testing.assert_allclose(last.params["w"], wanted, atol=0.05)
 
 
+@pytest.mark.slow
 def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset):
     small = dataclasses.replace(fakes.TINY, dtype="bfloat16")
     settings = dataclasses.replace(SETTINGS, learning_rate=1e-3)

@@ -47,6 +47,7 @@ def hurried(monkeypatch):
         monkeypatch.setattr(module, "Clock", quick)
 
 
+@pytest.mark.slow
 def test_trials_follow_one_another(page, expert, hurried, monkeypatch):
     monkeypatch.setattr(actors, "simulate", lambda who, arms=(): expert)
     asked = view.Asked((actors.expert("reach"),), trocar=2, seed=SEED)
@@ -81,6 +82,7 @@ def directed(steered, trocar):
     )
 
 
+@pytest.mark.slow
 def test_a_person_demonstrates_and_keeps_it(page, steered, hurried, tmp_path):
     trocar, root = 3, tmp_path / "demos"
     with recorder.opened(root, steered.env, SEED) as kept:

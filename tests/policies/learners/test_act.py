@@ -69,6 +69,7 @@ def test_samples_are_what_was_learned():
     np.testing.assert_array_equal(found, repeats.sampled(SMALL, params, seed=9))
 
 
+@pytest.mark.slow
 def test_a_sequence_depends_on_all_that_is_given():
     """Images, state, trocar and style; in training on the demonstrated sequence itself."""
     sizes = sequences.Sizes(horizon=8, action=2, moments=2, vision=6, state=5, told=7)

@@ -57,6 +57,7 @@ def test_a_sample_is_within_reach():
     np.testing.assert_array_equal(np.abs(found), 1.0)
 
 
+@pytest.mark.slow
 def test_samples_are_what_was_learned():
     settings = config.with_learner(fakes.TINY, "onestep")
     params, wanted = repeats.learned(settings)

@@ -103,6 +103,7 @@ def test_the_tools_withdraw_before_the_next_block(played):
     np.testing.assert_array_equal(began, [0, *(begins + exercise.WITHDRAWN)])
 
 
+@pytest.mark.slow
 def test_what_stands_still_is_seen(played):
     env, states, _, _, _ = played
     state = jax.tree.map(lambda x: x[0], states)
