@@ -18,23 +18,25 @@ from starjax.sim import registry
 
 PIXELS = 384  # a side of a picture
 COLUMNS = 4
-# Task, control steps of an episode after which there is something to see, and by which camera.
+# Title, which begins with the task; control steps of an episode after which there is something to see, and by which camera.
 MOMENTS = {
-    "reach": ("reach", 25, "camera"),
-    "peg_transfer": ("peg_transfer", 110, "camera"),
-    "needle_pick": ("needle_pick", 115, "camera"),
-    "ring_on_wire": ("ring_on_wire", 150, "camera"),
-    "peg_transfer_bimanual": ("peg_transfer_bimanual", 170, "side"),
-    "needle_handover": ("needle_handover", 235, "side"),
-    "endoscope_track": ("endoscope_track", 120, "camera"),
-    "endoscope_track: what it sees": ("endoscope_track", 120, "endoscope"),
+    "reach": (25, "camera"),
+    "peg_transfer": (110, "camera"),
+    "needle_pick": (115, "camera"),
+    "ring_on_wire": (150, "camera"),
+    "peg_transfer_bimanual": (170, "side"),
+    "needle_handover": (235, "side"),
+    "endoscope_track": (120, "camera"),
+    "endoscope_track: what it sees": (120, "endoscope"),
 }
 TROCAR = 1  # of the task's twelve
 
 
 def main(file: Path) -> None:
     runtime.prepare_xla()
-    pictures = {name: picture(*moment) for name, moment in MOMENTS.items()}
+    pictures = {
+        title: picture(title.partition(":")[0], *moment) for title, moment in MOMENTS.items()
+    }
     file.write_bytes(style.save(draw(pictures), "png"))
 
 
@@ -62,16 +64,16 @@ def picture(task: str, steps: int, camera: str) -> np.ndarray:
 
 
 def draw(pictures: dict[str, np.ndarray]) -> Any:
-    """The pictures side by side, named."""
+    """The pictures side by side, with their titles."""
     rows = -(-len(pictures) // COLUMNS)
     with style.use():
         figure = style.figure(2.4 * COLUMNS, 2.65 * rows)
         axes = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
         for axis in axes:
             axis.set_axis_off()
-        for axis, (name, rgb) in zip(axes, pictures.items(), strict=False):
+        for axis, (title, rgb) in zip(axes, pictures.items(), strict=False):
             axis.imshow(rgb)
-            axis.set_title(name)
+            axis.set_title(title)
         return figure
 
 
