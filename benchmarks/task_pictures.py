@@ -18,7 +18,8 @@ from starjax.sim import registry
 
 PIXELS = 384  # a side of a picture
 COLUMNS = 4
-# Title, which begins with the task; control steps of an episode after which there is something to see, and by which camera.
+# Title, which begins with the task; control steps of an episode after which there is something to
+# see, and by which camera.
 MOMENTS = {
     "reach": (25, "camera"),
     "peg_transfer": (110, "camera"),
