@@ -7,29 +7,18 @@ import numpy as np
 import pytest
 import stubs
 from fakes import TASK, TINY, dataset, relative, trained
-from jax.experimental.compilation_cache import compilation_cache
 
 from starjax import config
 from starjax.data import normalizer
-from starjax.experiments import pipeline, policy_under_test, presets, stage_times
+from starjax.experiments import ahead, pipeline, policy_under_test, stage_times
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
+from starjax.rollouts import engine
 from starjax.runtime import background
+from starjax.training import ahead as training
 
 EVAL = config.EvalConfig(trials=1, time_limit_s=0.5, video_trials=1)
-
-
-@pytest.fixture
-def cache(tmp_path, monkeypatch):
-    """An empty cache of compiled programs; gives how many of them advance a batch of trials."""
-    before = jax.config.jax_compilation_cache_dir
-    folder = tmp_path / "cache"
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    compilation_cache.reset_cache()
-    yield lambda: len([path for path in folder.glob("jit_advance-*") if path.suffix != ".atime"])
-    jax.config.update("jax_compilation_cache_dir", before)
-    compilation_cache.reset_cache()
 
 
 def environment() -> Any:
@@ -50,7 +39,7 @@ def test_shapes_of_statistics_are_those_of_fitted_ones(name, state):
     )
 
 
-def test_weights_that_come_later_meet_their_program(tmp_path, cache):
+def test_weights_that_come_later_meet_their_program(tmp_path, monkeypatch):
     env, name = environment(), "stardiff"
     row = METHODS[name]
     settings = config.RunConfig(method=name, preset="smoke", policy=TINY, eval=EVAL)
@@ -59,11 +48,31 @@ def test_weights_that_come_later_meet_their_program(tmp_path, cache):
     made = trained(params=params, normalizer=stats, scene=env.names)
     policy_file.save(tmp_path / "policy.safetensors", made)
 
-    policy_under_test.compile_ahead(name, settings, env, None)
-    assert cache() == 1
+    # In a thread, beside another program that is traced: what a run does.
+    compiled = ahead.begin(settings, name, pipeline.STAGES, env, None).evaluation()
     who = policy_under_test.load(name, tmp_path / "policy.safetensors", env)
-    found = policy_under_test.rollouts(tmp_path / "out", who, env.task.trocars, EVAL, settings.seed)
-    assert len(found.steps) == 12 and cache() == 1
+
+    def scored(folder, **given):
+        wanted = (tmp_path / folder, who, env.task.trocars, EVAL, settings.seed)
+        return policy_under_test.rollouts(*wanted, **given)
+
+    usual = scored("usual")
+    monkeypatch.setattr(engine.programs, "make", None)
+    found = scored("ahead", compiled=compiled)
+    assert len(found.steps) == 12
+    jax.tree.map(np.testing.assert_array_equal, found, usual)
+    other = compiled._replace(settings=compiled.settings._replace(lanes=1))
+    with pytest.raises(TypeError, match="not callable"):  # programs of its own are made
+        scored("others", compiled=other)
+
+
+def test_a_mistake_ends_no_run(monkeypatch):
+    monkeypatch.setattr(training, "compile_step", lambda *_: 1 / 0)
+    monkeypatch.setattr(policy_under_test, "compile_ahead", lambda *_: "evaluation")
+    found = ahead.begin(config.RunConfig(), "stardiff", pipeline.STAGES, environment(), None)
+    assert found.step() is None and found.evaluation() == "evaluation"
+    found = ahead.begin(config.RunConfig(), "stardiff", ["collect"], environment(), None)
+    assert found.step() is None and found.evaluation() is None
 
 
 def test_it_counts_for_no_stage(tmp_path):
@@ -74,9 +83,3 @@ def test_it_counts_for_no_stage(tmp_path):
     with stage_times.timed(tmp_path, "collect"):
         background.run_in_background(work)()
     assert stage_times.read(tmp_path)["collect: compile"] == 0.0
-
-
-def test_without_a_cache_nothing_is_compiled_ahead(cache):
-    jax.config.update("jax_compilation_cache_dir", None)
-    smoke = presets.PRESETS["smoke"]
-    assert pipeline._compiling_ahead(smoke, "stardiff", environment(), None) is None

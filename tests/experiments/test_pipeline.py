@@ -37,12 +37,12 @@ def done(monkeypatch):
     def plan(settings, env, share):
         return pipeline.Path(settings.out) / "demos-a", lambda: calls.append("collect")
 
-    def train(settings, name, demos, env, encoder, share):
+    def train(settings, name, demos, env, encoder, share, compiled):
         demos()
         calls.append(f"train {name}")
 
     monkeypatch.setattr(pipeline, "_environment", lambda settings: None)
-    monkeypatch.setattr(pipeline, "_compiling_ahead", lambda *_: None)
+    monkeypatch.setattr(pipeline.ahead, "begin", lambda *_: pipeline.ahead.Ahead())
     monkeypatch.setattr(demonstrations, "plan", plan)
     monkeypatch.setattr(demonstrations, "load", lambda _, root, collect, encoder, share: collect())
     monkeypatch.setattr(pipeline, "_train", train)
@@ -212,7 +212,7 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
     found = []
     monkeypatch.setattr(policy_under_test, "load", lambda *_: None)
     monkeypatch.setattr(
-        policy_under_test, "rollouts", lambda at, *_: found.extend(at.glob("*.npz"))
+        policy_under_test, "rollouts", lambda at, *_, **__: found.extend(at.glob("*.npz"))
     )
     monkeypatch.setattr(policy_under_test, "write_result", lambda *_, **__: None)
     pipeline._evaluate(

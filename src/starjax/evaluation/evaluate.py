@@ -66,6 +66,7 @@ def evaluate(
     place: Place = ANYWHERE,
     identity: Mapping[str, Any] | None = None,
     levels: Mapping[str, float] | None = None,
+    compiled: engine.Compiled | None = None,
     report: Callable[[str], None] = print,
 ) -> tables.Table:
     """Runs what is missing of an evaluation and returns all of it.
@@ -78,6 +79,7 @@ def evaluate(
       place: where the lanes are 0, `lanes_per_device`, and so few that all devices have a share.
       identity: JSON values that tell this agent from others with the same params.
       levels: of what disturbs the environment.
+      compiled: by `compile_ahead`; used where it is for trials like these.
       report: gets lines for the user.
 
     Raises:
@@ -117,7 +119,9 @@ def evaluate(
         found = share.first("sizes", lambda: _resume(directory, plan, sizes, most, several, report))
         lanes, chunk = found
         rules = engine.Settings(settings.seed, None, max_steps, lanes * several)
-        run = engine.make(env, agent, trocars, rules, episodes.SCORE, place.devices, levels)
+        run = engine.make(
+            env, agent, trocars, rules, episodes.SCORE, place.devices, levels, compiled
+        )
         spans = [slice(first, first + chunk) for first in range(0, len(group), chunk)]
         parts = _parts(directory, env, lambda trials: run(params, trials), group, spans, chosen)
         made = chunks.complete(share, parts, "Evaluation", "trials", report)
@@ -128,8 +132,8 @@ def evaluate(
 
 def compile_ahead(
     env: Any, agent: BatchAgent, params: Any, trocars: Trocar, settings: Settings
-) -> None:
-    """Compiles what `evaluate` will run on one device, so that jax's cache on disk has it.
+) -> engine.Compiled:
+    """Compiles what `evaluate` will run on one device.
 
     The arguments are `evaluate`'s, but for `params`: arrays like those to come, or their shapes.
     """
@@ -137,7 +141,7 @@ def compile_ahead(
     trials = len(trocars.radius) * settings.trials
     lanes = lanes_per_device(jax.local_devices()[0], trials)
     rules = engine.Settings(settings.seed, None, _max_steps(env, settings), lanes)
-    engine.compile_ahead(env, agent, params, trocars, rules, episodes.SCORE)
+    return engine.compile_ahead(env, agent, params, trocars, rules, episodes.SCORE)
 
 
 def lanes_per_device(device: jax.Device, trials: int) -> int:

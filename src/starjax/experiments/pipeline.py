@@ -1,6 +1,5 @@
 """The stages of a run, one after another, each skipped when its result is there."""
 
-import contextlib
 import functools
 import shlex
 from collections.abc import Callable, Sequence
@@ -9,8 +8,8 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.experiments import demonstrations, folders, messages, scenes, stage_times
-from starjax.runtime import background, files, xla
+from starjax.experiments import ahead, demonstrations, folders, messages, scenes, stage_times
+from starjax.runtime import files, xla
 from starjax.runtime.signals import stop_signals
 
 STAGES = messages.STAGES
@@ -46,7 +45,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
         devices.make_mesh(config.train.batch_size)  # a mistake is found before demonstrations are
     out, names = Path(config.out), folders.selected(config)
     trained = list(dict.fromkeys(methods.METHODS[name].weights_of for name in names))
-    untrained = any(not folders.weights(out, name).exists() for name in trained)
+    untrained = [name for name in trained if not folders.weights(out, name).exists()]
     encoder = demonstrations.frozen_encoder(config) if "train" in stages and untrained else None
     files.require_writable(out, LEAST_FREE_BYTES)
     with sharing.shared(out) as share, messages.heard(share.is_first):
@@ -60,9 +59,8 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
             for name in dict.fromkeys([*trained, *names]):
                 folders.claim(out / name, config, dataset, encoder and encoder.fingerprint)
 
-        ahead = None
-        if untrained and {"train", "evaluate"} <= {*stages}:
-            ahead = _compiling_ahead(config, names[0], env, encoder)
+        new = next((name for name in names if methods.METHODS[name].weights_of in untrained), None)
+        compiling = ahead.begin(config, new, stages, env, encoder) if new else ahead.Ahead()
         # Loaded once, and only if something is still to be trained with them.
         demos = functools.cache(lambda: demonstrations.load(config, root, collect, encoder, share))
         if "train" not in stages:
@@ -70,13 +68,12 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
         else:
             share.first("claimed", claim)
             for name in trained:
-                _train(config, name, demos, env, encoder, share)
+                ready = compiling.step if [name] == untrained[:1] else None
+                _train(config, name, demos, env, encoder, share, ready)
         if "evaluate" in stages:
-            if ahead:
-                with contextlib.suppress(Exception):  # it shows again where the program is run
-                    ahead()
             for name in names:
-                _evaluate(config, name, env, root, command, share)
+                ready = compiling.evaluation if name == new else None
+                _evaluate(config, name, env, root, command, share, ready)
         if "report" in stages:
             share.first("reported", lambda: _report(out, names))
 
@@ -95,28 +92,6 @@ def _environment(config: config_lib.RunConfig) -> Any:
     )
 
 
-def _compiling_ahead(
-    config: config_lib.RunConfig, name: str, env: Any, encoder: Any
-) -> Callable[[], None] | None:
-    """Begins to compile the evaluation of a method that is not trained yet, beside other stages.
-
-    A compiler keeps one core busy. Returns what waits for it; None where it would be in vain.
-    """
-    import jax
-
-    from starjax.experiments import policy_under_test
-
-    if len(jax.devices()) > 1 or not jax.config.jax_compilation_cache_dir:
-        return None
-    vision = encoder.params if encoder else None
-
-    def work() -> None:
-        with stage_times.apart():
-            policy_under_test.compile_ahead(name, config, env, vision)
-
-    return background.run_in_background(work)
-
-
 def _train(
     config: config_lib.RunConfig,
     name: str,
@@ -124,6 +99,7 @@ def _train(
     env: Any,
     encoder: Any,
     share: Any,
+    compiled: Callable[[], Any] | None = None,
 ) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
     from starjax.policies import policy_file
@@ -151,6 +127,7 @@ def _train(
             cameras=env.names.cameras,
             should_stop=should_stop,
             description=f"Training {name}",
+            compiled=compiled() if compiled else None,
         )
     state = processes.own(result.state)
     params = state.ema_params
@@ -179,7 +156,13 @@ def _train(
 
 
 def _evaluate(
-    config: config_lib.RunConfig, name: str, env: Any, demos: Path, command: str, share: Any
+    config: config_lib.RunConfig,
+    name: str,
+    env: Any,
+    demos: Path,
+    command: str,
+    share: Any,
+    compiled: Callable[[], Any] | None = None,
 ) -> None:
     """Closed-loop trials of one method; `result.json` is its last file."""
     from starjax.experiments import policy_under_test
@@ -194,7 +177,12 @@ def _evaluate(
     with stage_times.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
         who = policy_under_test.load(name, weights, env)
         table = policy_under_test.rollouts(
-            folder / "evaluation", who, env.task.trocars, config.eval, config.seed
+            folder / "evaluation",
+            who,
+            env.task.trocars,
+            config.eval,
+            config.seed,
+            compiled=compiled() if compiled else None,
         )
 
     def write() -> None:

@@ -18,7 +18,7 @@ from starjax.evaluation import trials as table
 from starjax.experiments import messages
 from starjax.policies import features, policy_file
 from starjax.policies import policy as policies
-from starjax.rollouts import agent, placement
+from starjax.rollouts import agent, engine, placement
 from starjax.runtime import files
 from starjax.sim import env as sim_env
 
@@ -109,8 +109,12 @@ def rollouts(
     settings: config_lib.EvalConfig,
     seed: int,
     levels: Mapping[str, float] | None = None,
+    compiled: engine.Compiled | None = None,
 ) -> table.Table:
-    """Runs what is missing of an evaluation; `levels` are of what disturbs its environment."""
+    """Runs what is missing of an evaluation.
+
+    `levels` are of what disturbs its environment; `compiled` comes from `compile_ahead`.
+    """
     trained = who.trained
     return evaluate.evaluate(
         directory,
@@ -125,13 +129,14 @@ def rollouts(
             "policy": config_lib.as_json(trained.policy),
         },
         levels=levels,
+        compiled=compiled,
         report=messages.indented,
     )
 
 
 def compile_ahead(
     name: str, config: config_lib.RunConfig, env: sim_env.Env, vision: policies.Params | None
-) -> None:
+) -> engine.Compiled:
     """Compiles what `rollouts` will run of a method that is not trained yet.
 
     Args:
@@ -148,7 +153,7 @@ def compile_ahead(
     params = jax.eval_shape(policy.for_sampling, params)
     told = policies.ablated(row, config.policy)
     stats = normalizer.shapes(told, env.task, config.policy.observation == "state")
-    evaluate.compile_ahead(
+    return evaluate.compile_ahead(
         env,
         _planner(policy, config.policy),
         (params, stats),

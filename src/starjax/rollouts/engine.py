@@ -38,6 +38,20 @@ class Settings(NamedTuple):
     lanes: int
 
 
+class Compiled(NamedTuple):
+    """Programs of one device, compiled before what they run on was there.
+
+    Attributes:
+      settings: that they are for.
+      start: as `programs.make` has it.
+      advance: the same.
+    """
+
+    settings: Settings
+    start: Callable[..., Any]
+    advance: Callable[..., Any]
+
+
 class Progress(NamedTuple):
     """After a segment.
 
@@ -61,6 +75,7 @@ def make(
     record: episodes.Record,
     devices: Sequence[jax.Device] | None = None,
     levels: Mapping[str, float] | None = None,
+    compiled: Compiled | None = None,
 ) -> Run:
     """Builds the programs, which are compiled once for the same functions.
 
@@ -69,13 +84,18 @@ def make(
       trocars: fields `[C, A]`, on the host.
       devices: that lanes are split over; their number must divide that of the lanes.
       levels: of what disturbs the environment, see `EnvParams`; data, not part of a program.
+      compiled: programs of the same agent and record, used if they are for these settings and for
+        one device.
 
     Returns:
       run(params, group), which simulates at most `lanes` trials and yields Progress after every
       segment. A caller that needs no more may stop.
     """
     key = _key(settings)
-    start, advance = programs.make(env, agent, settings.max_steps, record, devices)
+    if compiled and compiled.settings == settings and devices is None and not levels:
+        start, advance = compiled.start, compiled.advance
+    else:
+        start, advance = programs.make(env, agent, settings.max_steps, record, devices)
     given = {name: np.float32(level) for name, level in (levels or {}).items()}
 
     def run(params: Any, group: Sequence[episodes.Trial]) -> Generator[Progress]:
@@ -135,15 +155,17 @@ def compile_ahead(
     trocars: Trocar,
     settings: Settings,
     record: episodes.Record,
-) -> None:
-    """Compiles what `make` makes for one device, so that jax's cache on disk has it.
+) -> Compiled:
+    """Compiles what `make` makes for one device.
 
     The arguments are `make`'s, but for `params`: arrays like those to come, or their shapes.
+    jax's cache on disk would not do: a program traced beside another, in a thread, may be written
+    down in another order, and is not found there.
     """
     start, advance = programs.make(env, agent, settings.max_steps, record, None)
     begun = start.lower(_key(settings), params, _filled(trocars, [(0, 0)], settings.lanes), {})
-    advance.lower(params, begun.out_info, np.int32(0)).compile()
-    begun.compile()
+    advanced = advance.lower(params, begun.out_info, np.int32(0)).compile()
+    return Compiled(settings, begun.compile(), advanced)
 
 
 def _key(settings: Settings) -> jax.Array:

@@ -61,6 +61,7 @@ def run(
     mesh_devices: Sequence[jax.Device] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     description: str = "train",
+    compiled: stepper.Compiled | None = None,
 ) -> Result:
     """Trains a method, going on from the newest sound checkpoint in the directory.
 
@@ -79,6 +80,7 @@ def run(
       mesh_devices: all of jax's by default.
       should_stop: asked about once a second; True saves and raises Interrupted.
       description: name of the progress bar.
+      compiled: from `ahead.compile_step` with these arguments.
 
     Raises:
       Interrupted: after `should_stop`.
@@ -107,11 +109,15 @@ def run(
     is_new = not checkpoint.steps(directory / "checkpoints")
     init = states.init(policy, streams.params)
     drawn = background.run_in_background(init.drawn) if is_new else init.drawn
-    shapes = _shapes(first_state, init, mesh)
+    shapes = states.shapes(
+        policy, optimizer, init.traced.out_info, stats, streams.steps, devices.replicated(mesh)
+    )
     layout = Layout(mesh, policy.rounded, shapes)
     setup = Setup(policy, optimizer, policy_config, train_config, layout)
     resident = windows.on_device(dataset)
-    steps = stepper.resident(setup, dataset, frames, ahead=is_new) if resident else None
+    steps = None
+    if resident:
+        steps = stepper.resident(setup, dataset, frames, is_new, compiled)
 
     state = _restored(directory / "checkpoints", shapes)
     if state is None:
@@ -194,15 +200,6 @@ def _observed(
     if policy_config.frame == "world":
         unseen["endoscope"] = None
     return dataset.replace(observation=given._replace(**{"images": images, **unseen}))
-
-
-def _shapes(first_state: Callable[..., Any], init: states.Init, mesh: jax.sharding.Mesh) -> Any:
-    """Shapes and shardings of the state, without the state."""
-    placed = devices.replicated(mesh)
-    return jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=placed),
-        jax.eval_shape(first_state, init.traced.out_info),
-    )
 
 
 def _restored(checkpoints: pathlib.Path, shapes: Any) -> states.TrainState | None:

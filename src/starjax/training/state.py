@@ -1,5 +1,6 @@
 """The state of a training: what goes from step to step, and what a checkpoint holds."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -179,6 +180,19 @@ def create(
         skipped=jnp.int32(0),
         sums=metrics.zeros(policy.metrics),
     )
+
+
+def shapes(
+    policy: Policy,
+    optimizer: optax.GradientTransformation,
+    params: Params,
+    stats: normalizer.Normalizer,
+    key: jax.Array,
+    sharding: jax.sharding.Sharding,
+) -> TrainState:
+    """Shapes and sharding of what `create` makes of these, or of their shapes."""
+    state = jax.eval_shape(functools.partial(create, policy, optimizer), params, stats, key)
+    return jax.tree.map(lambda x: x.update(sharding=sharding), state)
 
 
 def ema_decay(step: jax.Array, ema_max: float) -> jax.Array:

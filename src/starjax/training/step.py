@@ -55,12 +55,19 @@ def resident_steps(
 @arrays.broadcasting
 def resident_step(setup: Setup, carry: Carry, dataset: windows.Dataset, frames: jax.Array) -> Carry:
     """Draws a batch and takes one step; see `resident_steps`."""
+    batch = drawn_batch(setup, carry.state.key, carry.state.step, dataset, frames)
+    return train_step(setup, carry, batch)
+
+
+def drawn_batch(
+    setup: Setup, key: jax.Array, step: jax.Array, dataset: windows.Dataset, frames: jax.Array
+) -> windows.Batch:
+    """The batch of a step, split over the devices; `key` and `step` are the state's."""
     policy_config, train_config = setup.policy_config, setup.train_config
-    key = states.step_keys(carry.state.key, carry.state.step).batch
+    key = states.step_keys(key, step).batch
     frame = windows.sample_frames(key, frames, train_config.batch_size)
     frame = jax.lax.with_sharding_constraint(frame, devices.batch_sharding(setup.layout.mesh))
-    batch = windows.gather(dataset, frame, policy_config.obs_horizon, policy_config.horizon)
-    return train_step(setup, carry, batch)
+    return windows.gather(dataset, frame, policy_config.obs_horizon, policy_config.horizon)
 
 
 @arrays.broadcasting  # which optax relies on

@@ -31,7 +31,25 @@ class Stepper(NamedTuple):
     end: Callable[[Carry], TrainState]
 
 
-def resident(setup: Setup, dataset: windows.Dataset, frames: np.ndarray, ahead: bool) -> Stepper:
+class Compiled(NamedTuple):
+    """The step of a batch, compiled before there was one.
+
+    Attributes:
+      batch: its shapes.
+      program: (Carry, Batch) -> Carry.
+    """
+
+    batch: windows.Batch
+    program: Callable[[Carry, windows.Batch], Carry]
+
+
+def resident(
+    setup: Setup,
+    dataset: windows.Dataset,
+    frames: np.ndarray,
+    ahead: bool,
+    compiled: Compiled | None = None,
+) -> Stepper:
     """Makes steps on a dataset that is on the device; every device of the mesh gets a copy.
 
     Args:
@@ -39,32 +57,79 @@ def resident(setup: Setup, dataset: windows.Dataset, frames: np.ndarray, ahead: 
       dataset: leaves are jax arrays.
       frames: `[n]` frame numbers to draw from.
       ahead: the program is traced now, and compiled while the caller goes on until the first step.
+      compiled: the step of a batch, used where batches are such ones and steps are no loop.
     """
     layout = setup.layout
     data = devices.replicate((dataset, jnp.asarray(frames)), layout.mesh, may_alias=None)
-    looped = steps.runs_in_a_loop(setup.policy_config)
-    body = steps.resident_steps if looped else steps.resident_step
-    program = _program(functools.partial(body, setup), layout)
-
-    def counted(count: int) -> tuple[jax.Array, ...]:
-        return (devices.replicate(np.int32(count), layout.mesh),) if looped else ()
-
-    if ahead:
-        program = _compiled_in_background(program, layout.shapes(), *data, *counted(1))
+    if steps.runs_in_a_loop(setup.policy_config):
+        return _looped(setup, data, ahead)
+    # The batch is drawn by a program of its own, so that the large one, which takes most of a
+    # minute to compile for a GPU, is the same for any number of frames.
+    split = devices.batch_sharding(layout.mesh)
+    draw = jax.jit(functools.partial(steps.drawn_batch, setup), out_shardings=split)
+    shapes = jax.eval_shape(draw, *_drawn_by(layout.shapes()), *data)
+    if compiled and _alike(compiled.batch, shapes):
+        program = compiled.program
+    else:
+        program = _step(setup)
+        if ahead:
+            program = _compiled_in_background(program, *_given(setup, shapes))
 
     def run(carry: Carry, count: int) -> Carry:
-        for _ in range(1 if looped else count):
-            carry = program(carry, *data, *counted(count))
+        for _ in range(count):
+            carry = program(carry, draw(*_drawn_by(carry), *data))
         return carry
 
     return _stepper(layout, run)
+
+
+def _looped(setup: Setup, data: tuple[windows.Dataset, jax.Array], ahead: bool) -> Stepper:
+    """Many steps in one program, of whose arguments the dataset is one."""
+    layout = setup.layout
+    program = _program(functools.partial(steps.resident_steps, setup), layout)
+
+    def counted(count: int) -> jax.Array:
+        return devices.replicate(np.int32(count), layout.mesh)
+
+    if ahead:
+        program = _compiled_in_background(program, layout.shapes(), *data, counted(1))
+    return _stepper(layout, lambda carry, count: program(carry, *data, counted(count)))
+
+
+def _alike(one: windows.Batch, other: windows.Batch) -> bool:
+    """Whether two batches have the same fields, shapes and types."""
+    bare = [jax.tree.map(lambda x: (x.shape, x.dtype), shapes) for shapes in (one, other)]
+    return bare[0] == bare[1]
+
+
+def _drawn_by(carry: Carry) -> tuple[Any, Any]:
+    """What a batch is drawn by: the key and the number of the step."""
+    return carry.state.key, carry.state.step
+
+
+def compile_ahead(setup: Setup, batch: windows.Batch) -> Compiled | None:
+    """Compiles the step of a batch of these shapes; None where steps run in a loop."""
+    if steps.runs_in_a_loop(setup.policy_config):
+        return None
+    return Compiled(batch, _step(setup).lower(*_given(setup, batch)).compile())
+
+
+def _step(setup: Setup) -> Any:
+    """The step of a batch."""
+    return _program(functools.partial(steps.train_step, setup), setup.layout)
+
+
+def _given(setup: Setup, batch: windows.Batch) -> tuple[Carry, windows.Batch]:
+    """Shapes and shardings of the step's arguments."""
+    split = devices.batch_sharding(setup.layout.mesh)
+    return setup.layout.shapes(), jax.tree.map(lambda x: x.update(sharding=split), batch)
 
 
 def streamed(
     setup: Setup, dataset: windows.Dataset, frames: np.ndarray, state: TrainState
 ) -> Stepper:
     """Makes steps on a dataset of the host, whose batches follow those before `state`."""
-    program = _program(functools.partial(steps.train_step, setup), setup.layout)
+    program = _step(setup)
     key = jnp.copy(processes.own(state.key))
     batches = prefetch.batches(setup, dataset, frames, key, int(state.step))
 
