@@ -43,6 +43,13 @@ class Compiled(NamedTuple):
     program: Callable[[Carry, windows.Batch], Carry]
 
 
+def compile_ahead(setup: Setup, batch: windows.Batch) -> Compiled | None:
+    """Compiles the step of a batch of these shapes; None where steps run in a loop."""
+    if steps.runs_in_a_loop(setup.policy_config):
+        return None
+    return Compiled(batch, _step(setup).lower(*_given(setup, batch)).compile())
+
+
 def resident(
     setup: Setup,
     dataset: windows.Dataset,
@@ -83,48 +90,6 @@ def resident(
     return _stepper(layout, run)
 
 
-def _looped(setup: Setup, data: tuple[windows.Dataset, jax.Array], ahead: bool) -> Stepper:
-    """Many steps in one program, of whose arguments the dataset is one."""
-    layout = setup.layout
-    program = _program(functools.partial(steps.resident_steps, setup), layout)
-
-    def counted(count: int) -> jax.Array:
-        return devices.replicate(np.int32(count), layout.mesh)
-
-    if ahead:
-        program = _compiled_in_background(program, layout.shapes(), *data, counted(1))
-    return _stepper(layout, lambda carry, count: program(carry, *data, counted(count)))
-
-
-def _alike(one: windows.Batch, other: windows.Batch) -> bool:
-    """Whether two batches have the same fields, shapes and types."""
-    bare = [jax.tree.map(lambda x: (x.shape, x.dtype), shapes) for shapes in (one, other)]
-    return bare[0] == bare[1]
-
-
-def _drawn_by(carry: Carry) -> tuple[Any, Any]:
-    """What a batch is drawn by: the key and the number of the step."""
-    return carry.state.key, carry.state.step
-
-
-def compile_ahead(setup: Setup, batch: windows.Batch) -> Compiled | None:
-    """Compiles the step of a batch of these shapes; None where steps run in a loop."""
-    if steps.runs_in_a_loop(setup.policy_config):
-        return None
-    return Compiled(batch, _step(setup).lower(*_given(setup, batch)).compile())
-
-
-def _step(setup: Setup) -> Any:
-    """The step of a batch."""
-    return _program(functools.partial(steps.train_step, setup), setup.layout)
-
-
-def _given(setup: Setup, batch: windows.Batch) -> tuple[Carry, windows.Batch]:
-    """Shapes and shardings of the step's arguments."""
-    split = devices.batch_sharding(setup.layout.mesh)
-    return setup.layout.shapes(), jax.tree.map(lambda x: x.update(sharding=split), batch)
-
-
 def streamed(
     setup: Setup, dataset: windows.Dataset, frames: np.ndarray, state: TrainState
 ) -> Stepper:
@@ -139,6 +104,41 @@ def streamed(
         return carry
 
     return _stepper(setup.layout, run)
+
+
+def _looped(setup: Setup, data: tuple[windows.Dataset, jax.Array], ahead: bool) -> Stepper:
+    """Many steps in one program, of whose arguments the dataset is one."""
+    layout = setup.layout
+    program = _program(functools.partial(steps.resident_steps, setup), layout)
+
+    def counted(count: int) -> jax.Array:
+        return devices.replicate(np.int32(count), layout.mesh)
+
+    if ahead:
+        program = _compiled_in_background(program, layout.shapes(), *data, counted(1))
+    return _stepper(layout, lambda carry, count: program(carry, *data, counted(count)))
+
+
+def _drawn_by(carry: Carry) -> tuple[Any, Any]:
+    """What a batch is drawn by: the key and the number of the step."""
+    return carry.state.key, carry.state.step
+
+
+def _alike(one: windows.Batch, other: windows.Batch) -> bool:
+    """Whether two batches have the same fields, shapes and types."""
+    bare = [jax.tree.map(lambda x: (x.shape, x.dtype), shapes) for shapes in (one, other)]
+    return bare[0] == bare[1]
+
+
+def _step(setup: Setup) -> Any:
+    """The step of a batch."""
+    return _program(functools.partial(steps.train_step, setup), setup.layout)
+
+
+def _given(setup: Setup, batch: windows.Batch) -> tuple[Carry, windows.Batch]:
+    """Shapes and shardings of the step's arguments."""
+    split = devices.batch_sharding(setup.layout.mesh)
+    return setup.layout.shapes(), jax.tree.map(lambda x: x.update(sharding=split), batch)
 
 
 def _stepper(layout: Layout, run: Callable[[Carry, int], Carry]) -> Stepper:
