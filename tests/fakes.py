@@ -122,13 +122,14 @@ def told(trocar: rcm.Trocar, arms: int = 1) -> rcm.TrocarFrame:
 def dataset(
     seed: int, demos: int = 8, length: int = 30, image_size: int = 0, arms: int = 1
 ) -> windows.Dataset:
-    """See `_dataset`, in one program."""
-    return jax.jit(lambda: _dataset(seed, demos, length, image_size, arms))()
+    """What `drawn` returns but for rounding, in one program."""
+    return jax.jit(lambda: drawn(seed, demos, length, image_size, arms))()
 
 
-def _dataset(seed: int, demos: int, length: int, image_size: int, arms: int) -> windows.Dataset:
+def drawn(seed: int, demos: int, length: int, image_size: int, arms: int) -> windows.Dataset:
     """Each demonstration goes from A to B at constant height; its roll depends on where it is. Two
-    share a trocar. Further arms go other ways through trocars of their own."""
+    share a trocar. Further arms go other ways through trocars of their own. Golden files were made of
+    these, to the last bit."""
     paths = [
         _paths(jax.random.split(jax.random.key(seed + 1000 * arm), 4), demos, length)
         for arm in range(arms)
