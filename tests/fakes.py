@@ -128,8 +128,8 @@ def dataset(
 
 def drawn(seed: int, demos: int, length: int, image_size: int, arms: int) -> windows.Dataset:
     """Each demonstration goes from A to B at constant height; its roll depends on where it is. Two
-    share a trocar. Further arms go other ways through trocars of their own. Golden files were made of
-    these, to the last bit."""
+    share a trocar. Further arms go other ways through trocars of their own. Golden files were
+    made of these, to the last bit."""
     paths = [
         _paths(jax.random.split(jax.random.key(seed + 1000 * arm), 4), demos, length)
         for arm in range(arms)
