@@ -1,5 +1,6 @@
 """Demonstrations without a simulator: tips on random straight paths, poses on the RCM manifold."""
 
+import functools
 import types
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from starjax import config, rcm
 from starjax.data import normalizer, windows
 from starjax.policies import policy_file
+from starjax.policies.base import Params, Policy
 from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.sim import names
 from starjax.sim.tasks import base
@@ -90,6 +92,22 @@ def trained(**changed: Any) -> policy_file.Trained:
     return policy_file.Trained(**{**given, **changed})
 
 
+def params(policy: Policy) -> Params:
+    """Parameters like those that `init` draws, which needs compiling: a roll network says zero."""
+    rng = np.random.default_rng(0)
+
+    def draw(path: Any, leaf: jax.ShapeDtypeStruct) -> jax.Array:
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        if name.endswith("/scale"):
+            return jnp.ones(leaf.shape, leaf.dtype)
+        if name.startswith("roll/params/out/"):
+            return jnp.zeros(leaf.shape, leaf.dtype)
+        most = 0.1 if leaf.ndim == 1 else 1.0 / np.sqrt(np.prod(leaf.shape[:-1]))
+        return jnp.asarray(rng.uniform(-most, most, leaf.shape), leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(draw, jax.eval_shape(policy.init, jax.random.key(0)))
+
+
 def told(trocar: rcm.Trocar, arms: int = 1) -> rcm.TrocarFrame:
     """Frames `[..., A]` of trocars `[...]`, the same parameters for every arm of `task(arms)`."""
     slots = task(arms).slots
@@ -100,11 +118,18 @@ def told(trocar: rcm.Trocar, arms: int = 1) -> rcm.TrocarFrame:
     )
 
 
+@functools.cache
 def dataset(
     seed: int, demos: int = 8, length: int = 30, image_size: int = 0, arms: int = 1
 ) -> windows.Dataset:
+    """What `drawn` returns but for rounding, in one program."""
+    return jax.jit(lambda: drawn(seed, demos, length, image_size, arms))()
+
+
+def drawn(seed: int, demos: int, length: int, image_size: int, arms: int) -> windows.Dataset:
     """Each demonstration goes from A to B at constant height; its roll depends on where it is. Two
-    share a trocar. Further arms go other ways through trocars of their own."""
+    share a trocar. Further arms go other ways through trocars of their own. Golden files were
+    made of these, to the last bit."""
     paths = [
         _paths(jax.random.split(jax.random.key(seed + 1000 * arm), 4), demos, length)
         for arm in range(arms)

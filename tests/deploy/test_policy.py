@@ -1,6 +1,7 @@
 """A policy in someone else's program: the same commands, and mistakes that are named."""
 
 import dataclasses
+import functools
 import pathlib
 import pickle
 
@@ -42,6 +43,15 @@ def registered():
         yield
 
 
+def mostly(kind, other):
+    """One kind of observation, and the other where nobody waits."""
+    kinds = [kind, pytest.param(other, marks=pytest.mark.slow)]
+    return pytest.mark.parametrize("made", kinds, indirect=True)
+
+
+MOSTLY_STATES, MOSTLY_IMAGES = mostly("state", "image"), mostly("image", "state")
+
+
 @pytest.fixture(scope="module", params=["state", "image"])
 def made(request, tmp_path_factory):
     """A file of a policy with random weights; the same policy, loaded."""
@@ -50,13 +60,18 @@ def made(request, tmp_path_factory):
     dataset = fakes.dataset(seed=0, image_size=size)
     policy = policies.make(METHODS["stardiff"], settings, fakes.TASK, TRAIN)
     stats = normalizer.fit(METHODS["stardiff"], fakes.TASK, dataset, np.arange(80))
-    init = jax.jit(policy.init, compiler_options={"xla_backend_optimization_level": 0})
     trained = fakes.trained(
-        policy=settings, params=init(jax.random.key(0)), normalizer=stats, scene=SCENE
+        policy=settings, params=fakes.params(policy), normalizer=stats, scene=SCENE
     )
     path = tmp_path_factory.mktemp("deploy") / "policy.safetensors"
     policy_file.save(path, trained)
     return path, trained, policy
+
+
+@functools.cache
+def shared(path):
+    """The policy of `made`, compiled once for all tests that only ask it."""
+    return load(path)
 
 
 def observed(settings, robots=(ROBOTS,)):
@@ -124,10 +139,11 @@ def test_it_decides_alike_whatever_a_program_makes_jax_refuse(made):
 def test_a_program_keeps_its_settings_of_jax(made):
     path, trained, _ = made
     before = {name: jax.config.values[name] for name in jax.config.values}
-    load(path)(jax.random.key(7), observed(trained.policy, ()), PORT)
+    shared(path)(jax.random.key(7), observed(trained.policy, ()), PORT)
     assert {name: jax.config.values[name] for name in jax.config.values} == before
 
 
+@MOSTLY_STATES
 def test_it_pickles_by_its_file(made):
     path, trained, _ = made
     deployed = dataclasses.replace(load(path, ddim_steps=3), max_first_turn=9.0)
@@ -140,6 +156,7 @@ def test_it_pickles_by_its_file(made):
     jax.tree.map(np.testing.assert_array_equal, again(*arguments), deployed(*arguments))
 
 
+@MOSTLY_STATES
 def test_a_file_that_changed_is_not_the_policy_that_was_pickled(made, tmp_path):
     path, trained, _ = made
     other = tmp_path / "policy.safetensors"
@@ -151,9 +168,10 @@ def test_a_file_that_changed_is_not_the_policy_that_was_pickled(made, tmp_path):
     assert caught.value.argument == "policy" and caught.value.got == str(other)
 
 
+@MOSTLY_STATES
 def test_fields_of_a_trocar_broadcast(made):
     path, trained, _ = made
-    deployed, observation = load(path), observed(trained.policy)
+    deployed, observation = shared(path), observed(trained.policy)
     one = jax.tree.map(lambda x: np.repeat(x[:1], ROBOTS, 0), observation)
     port = jax.tree.map(lambda field: field[:1].repeat(ROBOTS), rcm.TROCARS)
     wanted = deployed(jax.random.key(0), one, port)
@@ -165,7 +183,7 @@ def test_fields_of_a_trocar_broadcast(made):
 
 def test_a_mistake_names_the_array(made):
     path, trained, _ = made
-    deployed, kind = load(path), trained.policy.observation
+    deployed, kind = shared(path), trained.policy.observation
     trocar, good = PORT, observed(trained.policy, ())
     turned = good.replace(pose=good.pose._replace(p=np.zeros(3)))
     mistakes = {
@@ -223,7 +241,7 @@ def test_a_mistake_names_the_array(made):
 
 def test_numbers_that_no_robot_measures_are_refused(made):
     path, trained, _ = made
-    deployed, key = load(path), jax.random.key(0)
+    deployed, key = shared(path), jax.random.key(0)
     good = observed(trained.policy, ())
 
     def refused(message, observation=good, trocar=PORT):
@@ -256,7 +274,7 @@ def test_numbers_that_no_robot_measures_are_refused(made):
 
 def test_what_the_policy_does_not_look_at_is_not_looked_at(made):
     path, trained, _ = made
-    deployed, key, good = load(path), jax.random.key(0), observed(trained.policy, ())
+    deployed, key, good = shared(path), jax.random.key(0), observed(trained.policy, ())
     wanted = deployed(key, good, PORT)
     unused = "state" if trained.policy.observation == "image" else "image"
     more = good.replace(**{unused: np.full((2, 12), np.nan)})
@@ -267,7 +285,7 @@ def test_what_the_policy_does_not_look_at_is_not_looked_at(made):
 
 def test_a_tool_half_a_turn_away_is_the_same_tool(made):
     path, trained, _ = made
-    deployed, key, good = load(path), jax.random.key(0), observed(trained.policy, ())
+    deployed, key, good = shared(path), jax.random.key(0), observed(trained.policy, ())
     half = np.diag([-1.0, -1.0, 1.0]).astype(np.float32)
     turned = good.replace(pose=good.pose._replace(R=good.pose.R @ half))
     wanted, got = deployed(key, good, PORT), deployed(key, turned, PORT)
@@ -275,11 +293,12 @@ def test_a_tool_half_a_turn_away_is_the_same_tool(made):
     np.testing.assert_array_equal(got.pose.R, wanted.pose.R @ half)
 
 
+@MOSTLY_STATES
 def test_methods_that_share_weights_are_each_deployed(made, tmp_path):
     _, trained, _ = made
     stats = normalizer.fit(METHODS["dp_ee"], fakes.TASK, fakes.dataset(0), np.arange(80))
     policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.TASK, TRAIN)
-    params = jax.jit(policy.init)(jax.random.key(0))
+    params = fakes.params(policy)
     file = tmp_path / "policy.safetensors"
     policy_file.save(file, trained._replace(method="dp_ee", params=params, normalizer=stats))
     off = {}
@@ -293,6 +312,7 @@ def test_methods_that_share_weights_are_each_deployed(made, tmp_path):
         load(file, method="stardiff")
 
 
+@MOSTLY_STATES
 def test_a_file_that_will_not_do_is_named(made, tmp_path):
     path, trained, _ = made
     with pytest.raises(ValueError, match=r"^policy: expected a file or one of .*compact.*, got no"):
@@ -311,26 +331,28 @@ def test_a_file_that_will_not_do_is_named(made, tmp_path):
         load(tmp_path / "p")
 
 
+@MOSTLY_STATES
 def test_a_policy_prints_as_its_settings_without_its_weights(made):
     path, trained, _ = made
-    said = repr(load(path))
+    said = repr(shared(path))
     assert repr(trained.policy) in said and "Array" not in said
 
 
 def test_what_sensors_are_off_is_not_refused(made):
     path, trained, _ = made
-    deployed, key = load(path), jax.random.key(0)
+    deployed, key = shared(path), jax.random.key(0)
     good = observed(trained.policy, ())
     deployed(key, good.replace(gripper=1.05 * good.gripper), PORT)
     pose = good.pose._replace(R=1.01 * good.pose.R, p=good.pose.p + 0.01 * good.pose.R[..., 0])
     deployed(key, good.replace(pose=pose), PORT)
 
 
+@MOSTLY_STATES
 def test_a_tool_through_another_port_is_refused_where_the_policy_keeps_to_it(made, tmp_path):
     _, trained, _ = made
     stats = normalizer.fit(METHODS["dp_ee"], fakes.TASK, fakes.dataset(0), np.arange(80))
     policy = policies.make(METHODS["dp_ee"], trained.policy, fakes.TASK, TRAIN)
-    params = jax.jit(policy.init)(jax.random.key(0))
+    params = fakes.params(policy)
     file, other = tmp_path / "policy.safetensors", jax.tree.map(lambda x: x[4], rcm.TROCARS)
     policy_file.save(file, trained._replace(method="dp_ee", params=params, normalizer=stats))
     given = jax.random.key(0), observed(trained.policy, ()), other
@@ -346,13 +368,14 @@ def test_the_newest_moment_says_which_way_a_tool_is_turned(made, rolls):
     good = observed(trained.policy, ())
     R = rcm.rotation_from_axis_roll(good.pose.R[..., 2], np.float32(rolls))
     turned = good.replace(pose=good.pose._replace(R=R))
-    roll = np.abs(rcm.roll_of(load(path)(jax.random.key(0), turned, PORT).pose.R))
+    roll = np.abs(rcm.roll_of(shared(path)(jax.random.key(0), turned, PORT).pose.R))
     assert ((roll > np.pi / 2) == (rolls[1] > np.pi / 2)).all()
 
 
+@MOSTLY_STATES
 def test_it_may_be_part_of_a_program(made):
     path, trained, _ = made
-    deployed, given = load(path), (observed(trained.policy, ()), PORT)
+    deployed, given = shared(path), (observed(trained.policy, ()), PORT)
     wanted = deployed(jax.random.key(0), *given)
     got = jax.jit(deployed)(jax.random.key(0), *jax.tree.map(jnp.asarray, given))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
@@ -361,9 +384,10 @@ def test_it_may_be_part_of_a_program(made):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
 
 
+@MOSTLY_IMAGES
 def test_it_plans_the_same_in_a_program_of_double_precision(made):
     path, trained, _ = made
-    deployed, good, key = load(path), observed(trained.policy), jax.random.key(0)
+    deployed, good, key = shared(path), observed(trained.policy), jax.random.key(0)
     ports = jax.tree.map(lambda field: field[:ROBOTS], rcm.TROCARS)
     wanted = deployed(key, good, ports)
     with jax.enable_x64(True):
@@ -386,7 +410,7 @@ def test_pictures_are_cropped_as_in_its_training(made, tmp_path):
 
 def test_one_number_of_one_robot_is_enough_to_refuse(made):
     path, trained, _ = made
-    deployed, good = load(path), observed(trained.policy)
+    deployed, good = shared(path), observed(trained.policy)
     ports = jax.tree.map(lambda field: field[:ROBOTS].copy(), rcm.TROCARS)
 
     def changed(x, value):
@@ -424,10 +448,9 @@ def two_arms(tmp_path_factory):
     cameras = ("wrist", "camera")
     policy = policies.make(row, settings, fakes.TWO_ARMS, TRAIN, cameras)
     stats = normalizer.fit(row, fakes.TWO_ARMS, dataset, np.arange(80))
-    init = jax.jit(policy.init, compiler_options={"xla_backend_optimization_level": 0})
     trained = fakes.trained(
         policy=settings,
-        params=init(jax.random.key(0)),
+        params=fakes.params(policy),
         normalizer=stats,
         scene=names.SceneNames("fakes", ("fr5", "fr5"), ("grasper", "grasper"), cameras),
         p_world_ref=tuple(slot.p_world_ref for slot in fakes.TWO_ARMS.slots),
@@ -450,7 +473,8 @@ def test_several_arms_have_an_axis_and_several_cameras_names(two_arms):
     through = dataset.trocar.p_world_trocar[0]
     assert np.asarray(rcm.rcm_error(command.pose, through)).max() < 1e-6
     both = jax.tree.map(lambda x: np.stack([x, x]), good)
-    assert deployed(jax.random.key(0), both, trocar).pose.p.shape == (2, 16, 2, 3)
+    traced = jax.eval_shape(deployed, jax.random.key(0), both, trocar)
+    assert traced.pose.p.shape == (2, 16, 2, 3)
     # An untrained policy says a roll of about the zero of each arm, which face each other.
     roll = np.asarray(rcm.roll_of(command.pose.R))
     assert (np.abs(roll[:, 0]) < np.pi / 2).all() and (np.abs(roll[:, 1]) > np.pi / 2).all()
@@ -476,7 +500,8 @@ def test_a_mistake_of_several_arms_or_cameras_is_named(two_arms):
         assert caught.value.argument == argument
 
 
-def test_the_packaged_policy_commands_what_it_did(monkeypatch):
+@pytest.mark.parametrize("prefix", ["", pytest.param("one_", marks=pytest.mark.slow)])
+def test_the_packaged_policy_commands_what_it_did(prefix, monkeypatch):
     tasks = registry.Registry("task", {"peg_transfer": "fakes:TASK"})
     monkeypatch.setattr(registry, "tasks", tasks)
     before, deployed = np.load(GOLDEN / "compact_commands.npz"), load("compact")
@@ -488,14 +513,13 @@ def test_the_packaged_policy_commands_what_it_did(monkeypatch):
         image=np.stack(images).astype(np.uint8).reshape(3, 2, 128, 128, 3),
     )
     trocars = jax.tree.map(lambda field: field[:3], rcm.TROCARS)
-    one = jax.tree.map(lambda x: x[1], (observation, trocars))
-    for prefix, command in (
-        ("", deployed(jax.random.key(7), observation, trocars)),
-        ("one_", deployed(jax.random.key(3), *one)),
-    ):
-        np.testing.assert_allclose(command.pose.p, before[f"{prefix}p"], atol=1e-6)
-        np.testing.assert_allclose(command.pose.R, before[f"{prefix}R"], atol=1e-6)
-        np.testing.assert_allclose(command.gripper, before[f"{prefix}gripper"], atol=1e-6)
+    given = jax.random.key(7), observation, trocars
+    if prefix:
+        given = jax.random.key(3), *jax.tree.map(lambda x: x[1], (observation, trocars))
+    command = deployed(*given)
+    np.testing.assert_allclose(command.pose.p, before[f"{prefix}p"], atol=1e-6)
+    np.testing.assert_allclose(command.pose.R, before[f"{prefix}R"], atol=1e-6)
+    np.testing.assert_allclose(command.gripper, before[f"{prefix}gripper"], atol=1e-6)
 
 
 def test_a_policy_that_counts_from_its_camera_is_refused(made, tmp_path):

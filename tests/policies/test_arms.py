@@ -75,7 +75,7 @@ def test_demonstrated_actions_become_each_arms_commands(dataset, name):
 def test_every_parameter_learns_and_samples_are_on_each_manifold(dataset, name):
     policy = policies.make(METHODS[name], fakes.TINY, fakes.TWO_ARMS, TRAIN)
     stats = normalizer.fit(METHODS[name], fakes.TWO_ARMS, dataset, FRAMES)
-    params = jit(policy.init)(jax.random.key(0))
+    params = fakes.params(policy)
     batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
 
     def loss(params):
@@ -94,7 +94,7 @@ def test_every_parameter_learns_and_samples_are_on_each_manifold(dataset, name):
 def test_one_roll_network_serves_every_arm(dataset):
     policy = policies.make(METHODS["stardiff"], fakes.TINY, fakes.TWO_ARMS, TRAIN)
     stats = normalizer.fit(METHODS["stardiff"], fakes.TWO_ARMS, dataset, FRAMES)
-    params = jax.tree.map(lambda x: x + 0.01, jit(policy.init)(jax.random.key(0)))
+    params = jax.tree.map(lambda x: x + 0.01, fakes.params(policy))
     batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
     given = jit(policy.prepare)(stats, jax.random.key(0), batch)
     swapped = given._replace(

@@ -31,7 +31,7 @@ def test_parameters_losses_and_samples_of_one_arm_are_what_they_were(row):
     settings = dataclasses.replace(fakes.TINY, observation=kind, roll_observation=sees)
     policy = policies.make(METHODS[name], settings, fakes.TASK, config.TrainConfig())
     size = settings.image_size if sees else 0
-    dataset = fakes.dataset(seed=0, demos=4, length=20, image_size=size)
+    dataset = fakes.drawn(seed=0, demos=4, length=20, image_size=size, arms=1)
     stats = normalizer.fit(METHODS[name], fakes.TASK, dataset, np.arange(60))
     np.testing.assert_allclose(stats.action.low, before["low"], atol=1e-6)
     assert (stats.action.reach is None) == (before["reach"] is None)

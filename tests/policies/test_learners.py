@@ -46,12 +46,17 @@ def toy(**changed):
     return dataclasses.replace(config.with_learner(fakes.TINY, "toy"), **changed)
 
 
-@pytest.mark.parametrize("name", METHODS)
+QUICK = {"dp_ee", "stardiff"}  # one of each kind of policy
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in METHODS]
+)
 def test_every_method_works_with_every_learner(name):
     dataset = fakes.dataset(seed=0, demos=4, length=20, arms=2)
     policy = policies.make(METHODS[name], toy(), fakes.TWO_ARMS, TRAIN)
     stats = normalizer.fit(METHODS[name], fakes.TWO_ARMS, dataset, np.arange(60))
-    params = policy.init(jax.random.key(0))
+    params = jax.jit(policy.init)(jax.random.key(0))
     batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
 
     def loss(params):

@@ -71,32 +71,66 @@ def test_all_public_functions_are_here():
     }
 
 
+def assert_same_program(name, arrays, strict, wanted):
+    """Asserts that a strict mode compiles what jax's own settings do: it has the same values."""
+    # Error checks add to a program what they look for; without them it is the same.
+    unchecked = {k: v for k, v in strict.items() if "error_checking" not in k}
+    function = FUNCTIONS[name][0]
+    with mode(strict):
+        placed = jax.device_put(arrays)
+        assert jax.eval_shape(function, *placed) == wanted.out_info
+        if name == "check_trocar":  # it looks at values
+            function(*placed)
+    with mode(unchecked):
+        assert lowered(function, placed).as_text() == wanted.as_text()
+
+
+def lowered(function, arrays):
+    def program(*arrays):
+        return function(*arrays)
+
+    return jax.jit(program).lower(*arrays)
+
+
 @pytest.mark.parametrize("dtype", TYPES)
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.filterwarnings("error")
 def test_values_are_those_of_jaxs_own_settings(name, dtype):
+    """Other types are read as float32, before anything else."""
     function, given = FUNCTIONS[name]
     arguments = as_type(given, TYPES[dtype])
-    wanted = jax.device_get(function(*jax.tree.map(np.float32, arguments)))
-    with mode(STRICT):
-        placed = jax.device_put(arguments)
-        call = function if name == "check_trocar" else jax.jit(function)
-        found = jax.device_get(call(*placed))
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), found, wanted)
+
+    def converted(*arrays):
+        return function(*jax.tree.map(jnp.float32, arrays))
+
+    kind = function if name == "check_trocar" else converted  # it returns what it is given
+    assert_same_program(name, arguments, STRICT, lowered(kind, arguments))
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.filterwarnings("error")
-def test_a_program_in_double_precision_has_the_same_values(name):
-    function, given = FUNCTIONS[name]
-    wanted = jax.device_get(function(*jax.tree.map(np.float32, given)))
-    with mode({**STRICT, "jax_enable_x64": True}):
-        first, *others = jax.device_put(given)
-        arguments = (first, *jax.tree.map(np.float32, others))
-        found = jax.device_get(
-            (function if name == "check_trocar" else jax.jit(function))(*jax.device_put(arguments))
+def test_a_program_in_double_precision_has_the_same_values():
+    usual, double = {}, {}
+    for name, (function, arrays) in FUNCTIONS.items():
+        usual[name] = jax.tree.map(np.float32, arrays)
+        double[name] = (arrays[0], *usual[name][1:])
+        with jax.enable_x64(True):
+            wanted = lowered(function, double[name])
+        assert_same_program(name, double[name], {**STRICT, "jax_enable_x64": True}, wanted)
+    wanted = values(usual)
+    with jax.enable_x64(True):
+        found = values(double)
+    for name in FUNCTIONS:
+        jax.tree.map(
+            lambda a, b, name=name: np.testing.assert_allclose(a, b, atol=2e-6, err_msg=name),
+            found[name],
+            wanted[name],
         )
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), found, wanted)
+
+
+@jax.jit
+def values(given):
+    """What every function says, in one program."""
+    return {name: FUNCTIONS[name][0](*arrays) for name, arrays in given.items()}
 
 
 def test_a_program_that_looks_for_nan_finds_none_where_inputs_are_finite():

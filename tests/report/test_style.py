@@ -60,12 +60,21 @@ def usual():
     return digests
 
 
-@pytest.mark.parametrize("backend", ["module://nonsense", "nonsense", "svg"])
+@pytest.mark.parametrize(
+    "backend",
+    ["module://nonsense", *(pytest.param(x, marks=pytest.mark.slow) for x in ("nonsense", "svg"))],
+)
 def test_the_users_backend_changes_nothing(usual, backend):
     assert drawn(MPLBACKEND=backend) == usual
 
 
-@pytest.mark.parametrize("text", [HOSTILE.encode(), b"\xff\xfe\x00"], ids=["hostile", "no text"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param(HOSTILE.encode(), id="hostile"),
+        pytest.param(b"\xff\xfe\x00", id="no text", marks=pytest.mark.slow),
+    ],
+)
 def test_a_matplotlibrc_changes_nothing(usual, tmp_path, text):
     (tmp_path / "matplotlibrc").write_bytes(text)
     assert drawn(MATPLOTLIBRC=str(tmp_path)) == usual

@@ -205,7 +205,11 @@ def gl_pictures(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("compose", "camera", "height", "width"),
-    [(pile, "camera", 144, 208), (pile, "shifted", 192, 256), (composed, "camera", 256, 256)],
+    [
+        pytest.param(pile, "camera", 144, 208, marks=pytest.mark.slow),
+        (pile, "shifted", 192, 256),
+        pytest.param(composed, "camera", 256, 256, marks=pytest.mark.slow),
+    ],
 )
 def test_agrees_with_the_gl_renderer(gl_pictures, compose, camera, height, width):
     mj_model = compose()
@@ -265,7 +269,7 @@ def test_a_scene_needs_not_have_every_shape():
         </worldbody></mujoco>"""
     )
     xpos, xmat = geoms(mj_model, mj_model.qpos0[None])
-    take = render.make(mj_model, "camera", 16, 16)
+    take = jax.jit(render.make(mj_model, "camera", 16, 16))
     rgb = np.asarray(take(xpos[0], xmat[0], render.geom_rgb(mj_model)).rgb).astype(int)
     assert rgb[8, 8, 0] > rgb[8, 8, 2] and rgb[0, 0, 2] > rgb[0, 0, 0]
 
@@ -341,7 +345,11 @@ def test_wrong_shapes_are_named():
         caster(jnp.zeros((2, 3)), jnp.zeros((2, 3, 3)), jnp.zeros((2, 3)))
 
 
-@pytest.mark.parametrize("compose", [lambda: pile(marks=False), composed])
+@pytest.mark.parametrize(
+    "compose",
+    [lambda: pile(marks=False), pytest.param(composed, marks=pytest.mark.slow)],
+    ids=["pile", "composed"],
+)
 def test_a_moving_camera_sees_what_a_fixed_one_sees_from_there(compose):
     mj_model = compose()
     qpos = poses(mj_model, 2)

@@ -20,7 +20,7 @@ def made(module, *given):
     params = jax.jit(module.init)(jax.random.key(0), *given)["params"]
     leaves, tree = jax.tree.flatten(params)
     params = tree.unflatten([x + 0.3 * inputs(*x.shape, seed=i) for i, x in enumerate(leaves)])
-    return params, module.apply({"params": params}, *given)
+    return params, jax.jit(module.apply)({"params": params}, *given)
 
 
 def sample(module, params, *given):
@@ -30,11 +30,17 @@ def sample(module, params, *given):
         unet1d.ConvBlock: sampling_unet.SamplingConv,
     }[type(module)]
     block = of(module.features, module.kernel_size, module.groups)
-    return block.apply({"params": sampling_unet.prepared(params).params}, *given)
+
+    def apply(params, *given):
+        return block.apply({"params": sampling_unet.prepared(params).params}, *given)
+
+    return jax.jit(apply)(params, *given)
 
 
-@pytest.mark.parametrize("channels", [8, 12])
-@pytest.mark.parametrize(("kernel", "length"), [(5, 16), (5, 3), (5, 2), (5, 1), (3, 2), (1, 4)])
+@pytest.mark.parametrize(
+    ("kernel", "length", "channels"),
+    [*((5, length, 8) for length in (16, 3, 2, 1)), (3, 2, 8), (1, 4, 8), (5, 16, 12), (5, 1, 12)],
+)
 def test_a_block_is_the_same_function(kernel, length, channels):
     """With a convolution beside the first one, from 8 channels to 12, and without."""
     module = unet1d.ResidualBlock(12, kernel, GROUPS)
