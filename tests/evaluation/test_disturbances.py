@@ -295,6 +295,7 @@ def test_servos_of_arms_are_weaker_by_a_share_and_move_otherwise(reach, moved):
     assert 1e-5 < 2 * apart[0] < apart[1]
 
 
+@pytest.mark.slow
 def test_friction_of_all_geoms_is_less_by_a_share(reach, moved):
     usual = reach.scene.mj_model.geom_friction
     np.testing.assert_allclose(moved(friction=0.25).model["geom_friction"], 0.75 * usual, rtol=1e-6)

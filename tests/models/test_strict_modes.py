@@ -10,6 +10,8 @@ import pytest
 from starjax.models import diffusion, encoders, kernels, roll_net, schedule, unet1d
 from starjax.models.kernels import packed_params, parallel_ddim, sampling_unet
 
+pytestmark = pytest.mark.slow
+
 MODES = {
     "promotion of types": lambda: jax.numpy_dtype_promotion("strict"),
     "promotion of ranks": lambda: jax.numpy_rank_promotion("raise"),

@@ -128,6 +128,7 @@ def test_film_split_is_exact(params):
     np.testing.assert_allclose(split(params), expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_sampling_with_the_condition_computed_once(params, apply):
     noise, _, cond = data()
 

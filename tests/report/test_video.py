@@ -76,6 +76,7 @@ def test_a_clip_that_ends_early_stays_as_it_ended(one):
     np.testing.assert_array_equal(pixels[:, 1], np.minimum(np.arange(65), 19))
 
 
+@pytest.mark.slow
 def test_the_camera_draws_the_recorded_configuration(one):
     model = scene.compose(one.result.scene)
     qpos, port = np.tile(model.qpos0, (3, 1)), np.array([[0.0, 0.0, 0.15]])

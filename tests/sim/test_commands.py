@@ -71,6 +71,7 @@ def test_what_is_asked_of_the_arm_is_approached_and_not_leapt_at(follow):
     np.testing.assert_allclose(after.pose.p[-1, -3:, 0, 2], [0.13, 0.15, 0.2], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_tool_near_the_port_comes_to_rest(follow):
     depths = [rcm.MIN_DEPTH, 0.0055, 0.008, 0.012, 0.02, 0.03]
     port = np.array([0.0, 0.0, 0.15], np.float32)

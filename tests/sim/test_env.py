@@ -34,6 +34,7 @@ def episodes(reset, begin, drive):
     return state, np.array(found), np.array(rolls), np.array(running), labels, looks
 
 
+@pytest.mark.slow
 def test_the_expert_succeeds_on_every_trocar(episodes):
     state, *_ = episodes
     assert state.success.sum() >= 11, state.success
@@ -42,6 +43,7 @@ def test_the_expert_succeeds_on_every_trocar(episodes):
     assert float(jnp.median(state.step)) / envs.CONTROL_HZ < 8.1  # s, real dVRK automation
 
 
+@pytest.mark.slow
 def test_executed_rcm_error_is_small(episodes):
     _, errors, _, running, *_ = episodes
     live, within = errors[:, 0][running], errors[:, 1][running]
@@ -50,6 +52,7 @@ def test_executed_rcm_error_is_small(episodes):
     assert within.max() < 1e-3
 
 
+@pytest.mark.slow
 def test_the_error_within_a_control_step_is_the_largest_of_its_physics_steps(episodes):
     _, errors, _, running, *_ = episodes
     at_end, within = errors[:, 0], errors[:, 1]
@@ -59,6 +62,7 @@ def test_the_error_within_a_control_step_is_the_largest_of_its_physics_steps(epi
     assert np.median(within[running] / np.maximum(at_end[running], 1e-9)) > 1.2
 
 
+@pytest.mark.slow
 def test_labels_are_on_the_manifold_and_their_roll_never_wraps(episodes):
     state, _, rolls, running, labels, _ = episodes
     port = state.trocar.p_world_trocar[:, 0]
@@ -69,12 +73,14 @@ def test_labels_are_on_the_manifold_and_their_roll_never_wraps(episodes):
     assert steps.max() < 0.2, "the roll stays on one branch"
 
 
+@pytest.mark.slow
 def test_no_contact_is_left_out(episodes, sim):
     state, *_, looks = episodes
     asked = contacts.asked(sim, looks[::10], state.trocar.p_world_trocar)
     assert min(asked) > 0 and (np.less_equal(asked, contacts.held(sim))).all(), asked
 
 
+@pytest.mark.slow
 def test_a_released_block_is_threaded_and_at_rest(episodes, sim):
     state, *_ = episodes
     for lane in np.flatnonzero(state.success):

@@ -223,6 +223,7 @@ def test_agrees_with_the_gl_renderer(gl_pictures, compose, camera, height, width
     assert np.abs(ours.rgb.astype(float) - theirs["rgb"]).mean() <= 3.0
 
 
+@pytest.mark.slow
 def test_culling_never_changes_a_picture(monkeypatch):
     mj_model = pile(9)  # 36 moving geoms and more than 32 of the round kinds: two words of bits
     qpos = poses(mj_model, 2, seed=2)
@@ -290,6 +291,7 @@ def test_one_picture_is_the_same_alone_as_in_a_batch():
     assert np.mean(difference > 1) < 1e-3  # fused otherwise, an outline may fall otherwise
 
 
+@pytest.mark.slow
 def test_supersampling_smooths_outlines_and_nothing_else():
     mj_model = pile()
     qpos = poses(mj_model, 3)

@@ -17,6 +17,8 @@ from starjax.policies import policy as policies
 from starjax.rollouts import sharing
 from starjax.training import checkpoint, encoder, frozen, log, loop, state
 
+pytestmark = pytest.mark.slow
+
 TRAIN = config.TrainConfig(
     steps=6,
     batch_size=16,

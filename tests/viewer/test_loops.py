@@ -10,6 +10,8 @@ from starjax.rollouts import trocars
 from starjax.viewer import actors, browse, clock, devices, hand, recorded, recorder, teleop, view
 from starjax.viewer import server as pages
 
+pytestmark = pytest.mark.slow
+
 SEED = 7
 
 

@@ -38,6 +38,7 @@ def root(steered, tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_episodes_load_as_demonstrations(root, steered):
     found = load.load(root, report=lambda line: None)
     data = found.dataset

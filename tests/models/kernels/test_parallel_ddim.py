@@ -100,6 +100,7 @@ def test_a_sequence_does_not_depend_on_those_beside_it():
     np.testing.assert_allclose(parallel_ddim.ddim_sample(curved, NOISE)[1:], alone, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("steps", "evaluations"), [(6, 5), (10, 5), (11, 6), (50, 8), (100, 9)])
 def test_more_steps_need_few_more_evaluations(steps, evaluations):
     assert parallel_ddim.evaluations_for(steps) == evaluations

@@ -62,6 +62,7 @@ def test_attention_is_the_softmax_of_products():
     np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_samples_are_what_was_learned():
     params, wanted = repeats.learned(SMALL)
     found = repeats.sampled(SMALL, params)

@@ -24,6 +24,7 @@ def learned():
     return repeats.learned(fakes.TINY)
 
 
+@pytest.mark.slow
 def test_samples_are_what_was_learned(learned):
     params, wanted = learned
     found = repeats.sampled(tiny(ddim_steps=10), params)

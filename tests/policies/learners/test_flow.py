@@ -58,6 +58,7 @@ def test_the_perfect_velocity_has_the_least_loss():
     np.testing.assert_allclose(loss(0.1) + loss(-0.1) - 2 * least, 0.02, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_samples_are_what_was_learned():
     settings = config.with_learner(fakes.TINY, "flow")
     params, wanted = repeats.learned(settings)
