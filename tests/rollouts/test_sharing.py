@@ -76,6 +76,16 @@ def test_an_error_of_one_process_is_a_line_in_all(tmp_path, failing):
     assert f"process {failing} of 2 ended: no space left" in said[1 - failing][-1]
 
 
+def test_processes_that_are_stopped_together_write_no_file_twice(tmp_path):
+    shares = [sharing.Share(tmp_path, index, 2, "work") for index in (0, 1)]
+    for share in shares:
+        with pytest.raises(KeyboardInterrupt), sharing._told(share):
+            raise KeyboardInterrupt("stopped")
+    for share in shares:
+        with pytest.raises(sharing.ProcessFailed, match=f"process {1 - share.index} of 2"):
+            share.pause()
+
+
 def test_one_process_leaves_no_signs(tmp_path):
     with sharing.shared(tmp_path) as share:
         assert share.mine([1, 2, 3]) == [1, 2, 3] and share.first("a", lambda: 7) == 7

@@ -20,7 +20,6 @@ from starjax.runtime import files, processes
 
 POLL_S = 0.2  # between two looks for what another process writes
 _SIGNS = ".shared"
-_FAILED = "failed"
 
 Part = TypeVar("Part")
 _works = itertools.count()
@@ -74,8 +73,10 @@ class Share(NamedTuple):
           ProcessFailed: one of them ended with an error.
         """
         time.sleep(POLL_S)
-        with contextlib.suppress(FileNotFoundError):
-            raise ProcessFailed(files.read_json(self._path(_FAILED))["value"])
+        for other in range(self.count):
+            if other != self.index:
+                with contextlib.suppress(FileNotFoundError):
+                    raise ProcessFailed(files.read_json(self._path(_failed(other)))["value"])
 
     def _path(self, what: str) -> Path:
         return self.folder / _SIGNS / f"{self.name}-{what}.json"
@@ -132,5 +133,11 @@ def _told(share: Share) -> Iterator[None]:
         raise
     except BaseException as error:
         message = f"process {share.index} of {share.count} ended: {error}"
-        share._sign(_FAILED, message)
+        share._sign(_failed(share.index), message)
         raise
+
+
+def _failed(index: int) -> str:
+    """Names what a process writes that ends with an error. Each has its own file: processes that
+    are stopped together write at the same moment."""
+    return f"failed-{index}"
