@@ -28,7 +28,7 @@ class Ahead(NamedTuple):
 def begin(
     config: config_lib.RunConfig, name: str, stages: Sequence[str], env: Any, encoder: Any
 ) -> Ahead:
-    """Begins to compile what a method that is not trained yet will need, in that order.
+    """Begins to compile what a method that is not trained yet will need: its step, then its trials.
 
     Args:
       config: of the run.

@@ -70,8 +70,8 @@ def resident(
     data = devices.replicate((dataset, jnp.asarray(frames)), layout.mesh, may_alias=None)
     if steps.runs_in_a_loop(setup.policy_config):
         return _looped(setup, data, ahead)
-    # The batch is drawn by a program of its own, so that the large one, which takes most of a
-    # minute to compile for a GPU, is the same for any number of frames.
+    # The batch is drawn by a program of its own, so that the large one is the same for any number
+    # of frames, and can be compiled before these are known.
     split = devices.batch_sharding(layout.mesh)
     draw = jax.jit(functools.partial(steps.drawn_batch, setup), out_shardings=split)
     shapes = jax.eval_shape(draw, *_drawn_by(layout.shapes()), *data)
