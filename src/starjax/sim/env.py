@@ -112,7 +112,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
         for given in (params.trocar, params.told or params.trocar)
     )
     count = len(scene.arms)
-    tips = scene.task.tips(scene.bound, layout)
+    tips = scene.task.tips(scene.bound, layout, trocar.p_world_trocar)
     start = jnp.concatenate([jnp.zeros((count, 1)), tips], axis=-1)
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, trocar)
     solved = [

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim import ik, scene
+from starjax.sim import ik, registry, scene
 from starjax.sim.tasks.base import Contacts, Views
-from starjax.sim.tasks.endoscope_track import expert, task
+from starjax.sim.tasks.endoscope_track import task
 from starjax.types import Pose
 
 NO_CONTACTS = Contacts(jnp.zeros((0, 2), jnp.int32), jnp.zeros(0))
@@ -34,7 +34,7 @@ def measured(m, pose, before=None):
 def looking(m, trocar, turn=0.0, distance=task.DISTANCE):
     """The expert's pose at a trocar, turned about the shaft by `turn` rad."""
     frame = rcm.trocar_frame(trocar, np.array(task.TASK.slots[0].p_world_ref))
-    pose = expert.looking_at(
+    pose = task.looking_at(
         TARGET, frame.p_world_trocar, jnp.array(distance), task.bind(m).R_tip_camera
     )
     assert rcm.rcm_error(pose, frame.p_world_trocar) < 1e-6
@@ -67,6 +67,30 @@ def test_one_pose_of_a_trocar_has_the_target_where_it_belongs(tool, row):
     assert not turned.on_target
     assert not measured(m, looking(m, trocar, distance=1.25 * task.DISTANCE)).on_target
     assert measured(m, looking(m, trocar, distance=1.15 * task.DISTANCE)).on_target
+
+
+@pytest.mark.parametrize("tool", ["endoscope", "endoscope30"])
+def test_an_episode_begins_with_its_target_in_the_picture(tool):
+    bound = task.bind(model(tool))
+    work = registry.workspaces.get(task.TASK.slots[0].workspace)
+
+    def furthest_aside(key):
+        key_trocar, key_layout = jax.random.split(key)
+        where = jax.random.uniform(key_trocar, (3, 1))
+        low, high = jnp.array([work.radius, work.polar, work.azimuth]).T[..., None]
+        trocar = rcm.trocar_frame(
+            rcm.Trocar(*(low + (high - low) * where)), np.array(work.p_world_ref)[None]
+        )
+        layout = task.sample(bound, key_layout)
+        tips = task.tips(bound, layout, trocar.p_world_trocar)
+        start = jnp.concatenate([jnp.zeros((1, 1)), tips], axis=-1)
+        pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, trocar)
+        camera_R = pose.R[0] @ bound.R_tip_camera
+        target = camera_R.T @ (task.path(layout, jnp.zeros(())) - pose.p[0])
+        return jnp.max(jnp.abs(target[:2])) / (-2.0 * bound.half * target[2])
+
+    keys = jax.random.split(jax.random.key(0), 20_000)
+    assert float(jnp.max(jax.jit(jax.vmap(furthest_aside))(keys))) < 0.5
 
 
 @pytest.mark.parametrize(

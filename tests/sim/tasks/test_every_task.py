@@ -38,7 +38,7 @@ def test_a_task_is_what_it_says(name):
     m = scene.compose(scene.name(name))
     bound = task.bind(m)
     layout = task.sample(bound, jax.random.key(0))
-    tips = task.tips(bound, layout)
+    tips = task.tips(bound, layout, jnp.array([slot.p_world_ref for slot in task.slots]))
     assert tips.shape == (task.arms, 3) and set(task.label(layout)) == set(task.labels)
     rcm.check_trocar(task.trocars)
     assert task.trocars.radius.shape == (len(task.is_seen), task.arms)

@@ -174,7 +174,7 @@ class Task(NamedTuple):
       graspable: geoms of the MJCF, by name, that jaws can hold.
       bind: (mj_model) -> Bound, ids resolved once.
       sample: (Bound, key) -> Layout, what is drawn at reset.
-      tips: (Bound, Layout) -> `[A, 3]` m, where the tools' tips start.
+      tips: (Bound, Layout, trocars `[A, 3]` m) -> `[A, 3]` m, where the tools' tips start.
       place: (Bound, qpos, Layout) -> qpos with the task's objects in it.
       measure: (Bound, Layout, Views, Facts of the step before or None at reset) -> Facts.
       judge: (Bound, Layout, Facts) -> Verdict.

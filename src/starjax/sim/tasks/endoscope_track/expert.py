@@ -10,12 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
-from starjax.sim import endoscope
 from starjax.sim.state import EnvState
 from starjax.sim.tasks import scripting
 from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.sim.tasks.endoscope_track.task import DISTANCE, UP
-from starjax.types import Agent, Command, Pose
+from starjax.sim.tasks.endoscope_track.task import DISTANCE, looking_at
+from starjax.types import Agent, Command
 
 FIND_TIME = (1.0, 1.6)  # s, range of the way to the target
 NEARER = (0.9, 1.1)  # of DISTANCE, range of an episode's own
@@ -75,18 +74,6 @@ def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
     weight = 1.0 - (1.0 - DISTURBANCE) * s
     script = script.replace(elapsed=elapsed, noise=noise)
     return _command(way + weight * jnp.roll(noise[1], 1), state), script, _command(way, state)
-
-
-def looking_at(
-    target: jax.Array, p_trocar: jax.Array, distance: jax.Array, R_tip_camera: jax.Array
-) -> Pose:
-    """The tip's one pose with the target in the middle of a level picture at `distance` m.
-
-    The view may lean from the shaft in the plane of the picture's vertical, as with oblique optics.
-    """
-    lean = R_tip_camera[2, 1], -R_tip_camera[2, 2]
-    camera = endoscope.looking_at(target, p_trocar, distance, UP, lean)
-    return Pose(camera.R @ R_tip_camera.T, camera.p)
 
 
 def _command(way: jax.Array, state: EnvState) -> Command:

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from starjax import errors
+from starjax.sim import endoscope
 from starjax.sim.tasks.base import CONTROL_HZ, Capsules, Field, Slot, Task, Verdict, Views
 from starjax.sim.tasks.endoscope_track import words
 from starjax.types import Agent, Pose
@@ -27,9 +28,9 @@ REACH = (0.032, 0.024, 0.012)
 SHARES = (0.7, 0.3)
 RATES = ((0.35, 0.6), (0.8, 1.2))  # rad/s, ranges
 
-# Where an episode begins.
-TIP_HOME = (0.0, 0.0, 0.085)
-TIP_SPREAD = 0.012  # each axis, at most
+# Where an episode begins: the lens looks at CENTRE from afar, so that the target is in the picture.
+START = 0.07  # of CENTRE from the lens
+SPREAD = 0.003  # of the lens, each axis, at most
 
 # Strict success: on target for SHARE of the control steps from FIRST to LAST.
 OFF_CENTRE = 0.05  # of the picture's side
@@ -49,12 +50,12 @@ class Layout:
 
     Attributes:
       rate: `[2, 3]` rad/s and phase: `[2, 3]` rad of the target's oscillations.
-      tip: `[3]` m, where the lens starts.
+      spread: `[3]` m, how far from its usual place the lens starts.
     """
 
     rate: jax.Array
     phase: jax.Array
-    tip: jax.Array
+    spread: jax.Array
 
 
 @flax.struct.dataclass
@@ -130,12 +131,30 @@ def bind(m: mujoco.MjModel) -> Bound:
 
 def sample(bound: Bound, key: jax.Array) -> Layout:
     """Draws the target's path and the lens's start."""
-    key_rate, key_phase, key_tip = jax.random.split(key, 3)
+    key_rate, key_phase, key_spread = jax.random.split(key, 3)
     low, high = jnp.array(RATES).T
     rate = low[:, None] + (high - low)[:, None] * jax.random.uniform(key_rate, (2, 3))
     phase = jax.random.uniform(key_phase, (2, 3), maxval=2 * jnp.pi)
-    spread = jax.random.uniform(key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD)
-    return Layout(rate, phase, jnp.array(TIP_HOME) + spread)
+    spread = jax.random.uniform(key_spread, (3,), minval=-SPREAD, maxval=SPREAD)
+    return Layout(rate, phase, spread)
+
+
+def looking_at(
+    target: jax.Array, p_trocar: jax.Array, distance: jax.Array, R_tip_camera: jax.Array
+) -> Pose:
+    """The tip's one pose with the target in the middle of a level picture at `distance` m.
+
+    The view may lean from the shaft in the plane of the picture's vertical, as with oblique optics.
+    """
+    lean = R_tip_camera[2, 1], -R_tip_camera[2, 2]
+    camera = endoscope.looking_at(target, p_trocar, distance, UP, lean)
+    return Pose(camera.R @ R_tip_camera.T, camera.p)
+
+
+def tips(bound: Bound, layout: Layout, p_trocars: jax.Array) -> jax.Array:
+    """Where the lens starts, `[1, 3]` m."""
+    start = looking_at(jnp.array(CENTRE), p_trocars[0], jnp.array(START), bound.R_tip_camera)
+    return start.p[None] + layout.spread
 
 
 def path(layout: Layout, time: jax.Array) -> jax.Array:
@@ -239,7 +258,7 @@ TASK = Task(
     graspable=(),
     bind=bind,
     sample=sample,
-    tips=lambda bound, layout: layout.tip[None],
+    tips=tips,
     place=place,
     measure=measure,
     judge=judge,
