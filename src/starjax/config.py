@@ -138,6 +138,8 @@ class EvalConfig:
     time_limit_s: Annotated[float, TIME_LIMIT] = 60.0  # s of simulated time that a trial may take
     chunk: CountOrZero = 0  # trials between two savings, at most; 0: as many as a program runs
     video_trials: CountOrZero = 4  # trials recorded for the video and the figures
+    # plan at every control step, and execute the mean of all plans for the moment, as ACT does
+    ensemble: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,11 @@ class Method(NamedTuple):
     label: str
     group: str
 
+    @property
+    def keeps_to_manifold(self) -> bool:
+        """Whether what it executes is on the RCM manifold."""
+        return self.projects or self.action_space != "se3"
+
 
 _NAIVE, _RCM, _OURS = "Naive", "RCM action spaces", "Ours"
 _BESIDE = "Ours (ablation)"

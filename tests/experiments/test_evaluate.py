@@ -169,6 +169,25 @@ def test_the_same_command_again_runs_nothing_twice(file):
     assert chunks and all(path.stat().st_mtime_ns == then for path, then in chunks.items())
 
 
+def test_a_result_from_before_a_setting_was_there_is_of_the_same_trials(file):
+    score("--out", "here", "--no-video")
+    path, film = (file.parent / "here" / name for name in ("result.json", "rollout.mp4"))
+    before = json.loads(path.read_text())
+    del before["config"]["eval"]["ensemble"]
+    path.write_text(json.dumps(before))
+    film.write_bytes(b"film")
+    score("--out", "here", "--no-video")
+    assert film.exists()
+
+
+def test_plans_are_averaged_if_asked_for(file):
+    assert score("--eval.ensemble") == 0
+    (folder,) = (file.parent / "runs" / "evaluate").glob("*-ensemble")
+    plan = json.loads((folder / "evaluation" / "plan.json").read_text())
+    assert plan["agent"] == {"obs_horizon": 2, "execute": 1, "ensemble": 0.01}
+    assert json.loads((folder / "result.json").read_text())["config"]["eval"]["ensemble"]
+
+
 def test_the_seed_is_that_of_the_flag(file):
     score("--seed", "5", "--out", "here")
     plan = json.loads((file.parent / "here" / "evaluation" / "plan.json").read_text())

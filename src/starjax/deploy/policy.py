@@ -213,7 +213,7 @@ def load(
         moments=settings.obs_horizon,
         arms=arms,
         p_world_ref=places if arms else places[0],
-        keeps_to_manifold=row.projects or row.action_space != "se3",
+        keeps_to_manifold=row.keeps_to_manifold,
         image_size=settings.image_size,
         cameras=trained.scene.cameras if settings.observation == "image" else (),
         state_size=task.state_size,

@@ -26,6 +26,8 @@ def check(config: config_lib.RunConfig) -> None:
     ):
         value = getattr(policy, name)
         expect(value <= most, f"policy.{name}", f"at most {of} = {most}", value)
+    planned = not config.eval.ensemble or policy.obs_horizon <= 2
+    expect(planned, "policy.obs_horizon", "at most 2 with eval.ensemble", policy.obs_horizon)
     if policy.observation == "image":
         fraction, cell = policy.crop_fraction, _CELL[policy.encoder]
         crop = round(policy.image_size * fraction)

@@ -110,7 +110,7 @@ def _default(has_gpu: bool) -> Options:
 def _trials(chosen: Options) -> str:
     """A name for an evaluation's trials, so that others do not replace them."""
     trials = f"seed{chosen.seed}-{chosen.eval.trials}x{chosen.eval.time_limit_s:g}s"
-    return "-".join([*chosen.arm, trials])
+    return "-".join([*chosen.arm, trials, *["ensemble"] * chosen.eval.ensemble])
 
 
 def _before(folder: Path) -> dict[str, Any]:
@@ -125,7 +125,9 @@ def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any, Any]:
     """Identifies the trials of a result: whose they are, and which."""
     config = result.get("config") or {}
     arms = (config.get("scene") or {}).get("arm")
-    return result.get("weights"), result.get("seed"), arms, config.get("eval")
+    # Older results lack what was added since.
+    trials = dataclasses.asdict(config_lib.EvalConfig()) | (config.get("eval") or {})
+    return result.get("weights"), result.get("seed"), arms, trials
 
 
 def _refuse_foreign(folder: Path, is_ours: bool) -> None:

@@ -18,7 +18,7 @@ from starjax.evaluation import trials as table
 from starjax.experiments import messages
 from starjax.policies import features, policy_file
 from starjax.policies import policy as policies
-from starjax.rollouts import agent, engine, placement
+from starjax.rollouts import agent, engine, ensemble, placement
 from starjax.runtime import files
 from starjax.sim import env as sim_env
 
@@ -119,7 +119,7 @@ def rollouts(
     return evaluate.evaluate(
         directory,
         who.env,
-        _planner(who.policy, trained.policy),
+        _planner(who.method, who.policy, trained.policy, settings.ensemble),
         (trained.params, trained.normalizer),
         trocars,
         _settings(settings, seed),
@@ -155,14 +155,22 @@ def compile_ahead(
     stats = normalizer.shapes(told, env.task, config.policy.observation == "state")
     return evaluate.compile_ahead(
         env,
-        _planner(policy, config.policy),
+        _planner(name, policy, config.policy, config.eval.ensemble),
         (params, stats),
         env.task.trocars,
         _settings(config.eval, config.seed),
     )
 
 
-def _planner(policy: policies.Policy, policy_config: config_lib.PolicyConfig) -> agent.BatchAgent:
+def _planner(
+    method: str,
+    policy: policies.Policy,
+    policy_config: config_lib.PolicyConfig,
+    averages: bool,
+) -> agent.BatchAgent:
+    if averages:
+        keeps = methods.METHODS[method].keeps_to_manifold
+        return ensemble.from_policy(policy.sample, policy_config.obs_horizon, keeps)
     return agent.from_policy(policy.sample, policy_config.obs_horizon, policy_config.execute)
 
 

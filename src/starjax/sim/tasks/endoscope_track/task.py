@@ -153,7 +153,8 @@ def looking_at(
 
 def tips(bound: Bound, layout: Layout, p_trocars: jax.Array) -> jax.Array:
     """Where the lens starts, `[1, 3]` m."""
-    start = looking_at(jnp.array(CENTRE), p_trocars[0], jnp.array(START), bound.R_tip_camera)
+    R_tip_camera = jnp.asarray(bound.R_tip_camera)
+    start = looking_at(jnp.array(CENTRE), p_trocars[0], jnp.array(START), R_tip_camera)
     return start.p[None] + layout.spread
 
 

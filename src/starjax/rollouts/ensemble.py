@@ -1,0 +1,77 @@
+"""Temporal ensembling: a plan at every control step, and the mean of all plans for the moment.
+
+Source: Zhao et al., Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware (ACT),
+section IV-B: the i-th plan for a moment, the oldest first, weighs exp(-DECAY i). Poses are averaged
+entry by entry; the mean becomes a rotation again, and of a method on the RCM manifold a pose there.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from starjax import rcm
+from starjax.rollouts import agent
+from starjax.types import Command, Pose
+
+DECAY = 0.01  # a control step, as in ACT
+
+
+class Memory(NamedTuple):
+    """Of N episodes.
+
+    Attributes:
+      planner: the memory of the policy that plans.
+      total: Command `[N, H, A]`, the weighted sum of the plans for each moment from this one on.
+    """
+
+    planner: agent.Plan
+    total: Command
+
+
+@functools.lru_cache(maxsize=4)
+def from_policy(
+    sample: Callable[..., Command], obs_horizon: int, keeps_to_manifold: bool
+) -> agent.BatchAgent:
+    """Makes a batch of a policy that averages its plans; `params` are (weights, statistics).
+
+    Args:
+      sample: as `Policy.sample`.
+      obs_horizon: O, observations it sees, at most 2, as it plans at every control step.
+      keeps_to_manifold: whether its poses are on the RCM manifold.
+    """
+    planner = agent.from_policy(sample, obs_horizon, 1)
+
+    def init(params: Any, keys: jax.Array, state: Any, observe: agent.Observe) -> Memory:
+        memory = planner.init(params, keys, state, observe)
+        return Memory(memory, jax.tree.map(jnp.zeros_like, memory.command))
+
+    def act(
+        params: Any, memory: Memory, state: Any, observe: agent.Observe, t: jax.Array
+    ) -> tuple[Command, Memory, Command]:
+        _, planned, _ = planner.act(params, memory.planner, state, observe, t)
+        weight, whole = weights(planned.command.gripper.shape[1], t)
+
+        def added(total: jax.Array, plan: jax.Array) -> jax.Array:
+            later = jnp.concatenate([total[:, 1:], jnp.zeros_like(total[:, :1])], 1)
+            return later + weight.reshape(-1, *[1] * (plan.ndim - 2)) * plan
+
+        total = jax.tree.map(added, memory.total, planned.command)
+        mean = jax.tree.map(lambda x: x[:, 0] / whole, total)
+        pose = Pose(rcm.rot6d_decode(rcm.rot6d_encode(mean.pose.R)), mean.pose.p)
+        if keeps_to_manifold:
+            pose = rcm.project(pose, state.told.p_world_trocar)
+        now = Command(pose, mean.gripper)
+        return now, Memory(planned, total), now
+
+    return agent.BatchAgent(init, act, {**planner.about, "ensemble": DECAY})
+
+
+def weights(horizon: int, t: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What the plan of control step `t` weighs at each of its `[H]` moments, and what all plans for
+    the first of them weigh together."""
+    earlier = jnp.minimum(t, horizon - 1 - jnp.arange(horizon))
+    each = jnp.exp(-DECAY * jnp.arange(horizon))
+    return each[earlier], jnp.sum(jnp.where(jnp.arange(horizon) <= earlier[0], each, 0.0))
