@@ -58,12 +58,16 @@ def test_weights_that_come_later_meet_their_program(tmp_path, monkeypatch):
 
     usual = scored("usual")
     monkeypatch.setattr(engine.programs, "make", None)
-    found = scored("ahead", compiled=compiled)
+    found = scored("ahead", compiled=compiled.trials)
     assert len(found.steps) == 12
     jax.tree.map(np.testing.assert_array_equal, found, usual)
-    other = compiled._replace(settings=compiled.settings._replace(lanes=1))
+    other = compiled.trials._replace(settings=compiled.trials.settings._replace(lanes=1))
     with pytest.raises(TypeError, match="not callable"):  # programs of its own are made
         scored("others", compiled=other)
+
+    # Its own program may not be made.
+    monkeypatch.setattr(policy_under_test.latency, "_program", None)
+    assert policy_under_test.decision_ms(who, compiled.decision)["n"] >= 5
 
 
 def test_a_mistake_ends_no_run(monkeypatch):

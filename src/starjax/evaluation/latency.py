@@ -18,6 +18,9 @@ from starjax.types import Observation, Pose
 
 _WARM_UP = 3  # calls before the clock starts
 
+# (params, stats, keys `[B]`, Observation, trocars) -> Command
+Decide = Callable[..., Any]
+
 
 def policy_ms(
     policy: policies.Policy,
@@ -29,6 +32,7 @@ def policy_ms(
     batch: int = 1,
     calls: int = 100,
     seconds: float = 10.0,
+    decide: Decide | None = None,
 ) -> dict[str, float]:
     """Time of one call of a policy, from an observation on the device to finished commands.
 
@@ -41,20 +45,28 @@ def policy_ms(
       batch: robots that are served at once.
       calls: timed calls, fewer if they take longer than `seconds` altogether.
       seconds: see `calls`; at least five calls are made.
+      decide: from `compile_ahead` with the same arguments.
 
     Returns:
       {p50, p95, p99} in ms, and n, the number of calls.
     """
-    observation, trocar = example(policy_config, seen, batch)
-
-    @jax.jit
-    def sample(params, stats, keys, observation, trocar):
-        return policy.sample(params, stats, keys, observation, _told(seen, trocar))
-
-    keys = jax.random.split(jax.random.key(0), batch)
+    asked = _asked(policy_config, seen, batch)
+    call = decide or _program(policy, seen)
     # Weights on the host would be copied again at each call.
     params, stats = jax.device_put((params, stats))
-    return _percentiles(lambda: sample(params, stats, keys, observation, trocar), calls, seconds)
+    return _percentiles(lambda: call(params, stats, *asked), calls, seconds)
+
+
+def compile_ahead(
+    policy: policies.Policy,
+    policy_config: config.PolicyConfig,
+    params: Any,
+    stats: Any,
+    seen: features.Sensors,
+) -> Decide:
+    """Compiles what `policy_ms` times at batch 1; of `params` and `stats` the shapes are enough."""
+    asked = jax.eval_shape(lambda: _asked(policy_config, seen, 1))
+    return _program(policy, seen).lower(params, stats, *asked).compile()
 
 
 def table(
@@ -130,6 +142,20 @@ def example(
         for name, key in zip(seen.cameras, keys, strict=True)
     }
     return observation._replace(images=images), trocar
+
+
+def _program(policy: policies.Policy, seen: features.Sensors) -> Any:
+    @jax.jit
+    def sample(params, stats, keys, observation, trocar):
+        return policy.sample(params, stats, keys, observation, _told(seen, trocar))
+
+    return sample
+
+
+def _asked(policy_config: config.PolicyConfig, seen: features.Sensors, batch: int) -> Any:
+    """What a decision is made from, beside the policy: keys, observation, trocars."""
+    keys = jax.random.split(jax.random.key(0), batch)
+    return keys, *example(policy_config, seen, batch)
 
 
 def _told(seen: features.Sensors, trocar: rcm.Trocar) -> rcm.TrocarFrame:

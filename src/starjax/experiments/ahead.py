@@ -18,7 +18,7 @@ class Ahead(NamedTuple):
 
     Attributes:
       step: `training.stepper.Compiled` of the first training.
-      evaluation: `rollouts.engine.Compiled` of the first method.
+      evaluation: `policy_under_test.Programs` of the first method.
     """
 
     step: Callable[[], Any] = _nothing

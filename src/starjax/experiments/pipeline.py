@@ -176,21 +176,21 @@ def _evaluate(
     share.first(f"{name} has its twin", lambda: folders.adopt_twin(out, name))
     with stage_times.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
         who = policy_under_test.load(name, weights, env)
+        programs = (compiled() if compiled else None) or policy_under_test.Programs()
         table = policy_under_test.rollouts(
             folder / "evaluation",
             who,
             env.task.trocars,
             config.eval,
             config.seed,
-            compiled=compiled() if compiled else None,
+            compiled=programs.trials,
         )
 
     def write() -> None:
         timings = _timings(out, name, demos.name)
         digest = folders.demos_digest(demos)
-        policy_under_test.write_result(
-            folder, who, table, config, config.seed, command, timings, dataset_digest=digest
-        )
+        given = (folder, who, table, config, config.seed, command, timings, digest)
+        policy_under_test.write_result(*given, decide=programs.decision)
 
     share.first(f"{name} is scored", write)
 

@@ -41,6 +41,18 @@ class Subject(NamedTuple):
     weights: str
 
 
+class Programs(NamedTuple):
+    """Programs that were compiled before there were weights.
+
+    Attributes:
+      trials: of `rollouts`.
+      decision: that `write_result` times.
+    """
+
+    trials: engine.Compiled | None = None
+    decision: latency.Decide | None = None
+
+
 def load(
     method: str, weights: Path, env: sim_env.Env | None = None, arms: Sequence[str] = ()
 ) -> Subject:
@@ -136,8 +148,8 @@ def rollouts(
 
 def compile_ahead(
     name: str, config: config_lib.RunConfig, env: sim_env.Env, vision: policies.Params | None
-) -> engine.Compiled:
-    """Compiles what `rollouts` will run of a method that is not trained yet.
+) -> Programs:
+    """Compiles what `rollouts` and `write_result` will run of a method that is not trained yet.
 
     Args:
       name: of the method.
@@ -153,13 +165,15 @@ def compile_ahead(
     params = jax.eval_shape(policy.for_sampling, params)
     told = policies.ablated(row, config.policy)
     stats = normalizer.shapes(told, env.task, config.policy.observation == "state")
-    return evaluate.compile_ahead(
+    trials = evaluate.compile_ahead(
         env,
         _planner(name, policy, config.policy, config.eval.ensemble),
         (params, stats),
         env.task.trocars,
         _settings(config.eval, config.seed),
     )
+    seen = features.sensors(env.task, env.names.cameras)
+    return Programs(trials, latency.compile_ahead(policy, deciding, params, stats, seen))
 
 
 def _planner(
@@ -193,7 +207,7 @@ def settings(who: Subject, config: config_lib.RunConfig) -> config_lib.RunConfig
     )
 
 
-def decision_ms(who: Subject) -> dict[str, float]:
+def decision_ms(who: Subject, decide: latency.Decide | None = None) -> dict[str, float]:
     """Time of one decision at batch 1: observation in, commands out, compilation apart."""
     trained = who.trained
     return latency.policy_ms(
@@ -203,6 +217,7 @@ def decision_ms(who: Subject) -> dict[str, float]:
         trained.normalizer,
         features.sensors(who.env.task, trained.scene.cameras),
         seconds=5.0,
+        decide=decide,
     )
 
 
@@ -215,6 +230,7 @@ def write_result(
     command: str,
     timings_s: dict[str, float] | None = None,
     dataset_digest: str | None = None,
+    decide: latency.Decide | None = None,
 ) -> results.Result:
     """Writes and returns `<folder>/result.json`: `statistics.compose`'s figures and what made them.
 
@@ -227,6 +243,7 @@ def write_result(
       command: what was typed.
       timings_s: seconds by stage.
       dataset_digest: of the demonstrations, if they are there.
+      decide: the program of a decision, if it is compiled.
     """
     task = who.env.task
     is_seen = task.is_seen & (np.arange(len(task.is_seen)) < config.demos.seen_trocars)
@@ -236,7 +253,7 @@ def write_result(
     )
     about = {
         "control_hz": who.env.control_hz,
-        "inference_ms": decision_ms(who),
+        "inference_ms": decision_ms(who, decide),
         "preset": config.preset,
         "seed": seed,
         "weights": who.weights,
