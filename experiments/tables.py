@@ -4,7 +4,7 @@
     python experiments/tables.py --check    fails if one of them is not what would be written
 
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
-claim.toml, `claims` (the list of claims), or of benchmarks/results: `speed`, `learners`, `experts`,
+claim.toml, `claims` (the list of claims), `presets` (from their values), or of benchmarks/results: `speed`, `learners`, `experts`,
 `six_blocks`, `scenes`, `stress_compact`, `stress_randomised`, `proposition`, `ppo`, `ppo_gpu`,
 `sb3`, `through_lerobot`.
 """
@@ -20,6 +20,7 @@ sys.path[:0] = [str(HERE), str(ROOT / "benchmarks")]
 
 import claims  # noqa: E402
 import newest  # noqa: E402
+import preset_table  # noqa: E402
 
 _BLOCK = re.compile(r"(<!-- table:(\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
 
@@ -33,6 +34,8 @@ def table(name: str) -> str:
     """A table by its name in the markers; KeyError where there is none."""
     if name == "claims":
         return claims.index([claims.load(folder) for folder in claims.folders()])
+    if name == "presets":
+        return preset_table.table()
     if name == "speed":
         return newest.table()
     if (HERE.parent / "benchmarks" / f"{name}.toml").exists():

@@ -18,7 +18,7 @@ SettingsT = TypeVar("SettingsT")
 
 # A key of jax takes 32 bits: larger seeds would alias smaller ones.
 Seed = Annotated[int, Range(0, 2**32 - 1)]
-Preset = Literal["auto", "smoke", "cpu", "gpu", "compact", "paper"]
+Preset = Literal["auto", "smoke", "cpu", "gpu", "resnet", "compact", "paper"]
 TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
 DEFAULT_TASK = "peg_transfer"
 

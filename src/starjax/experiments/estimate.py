@@ -54,15 +54,6 @@ TIMED = {
         train=Stage(3_000, 138.58, 23.37),
         evaluate=Stage(72, 39.44, 3.87),
     ),
-    "gpu": Timed(
-        machine="an NVIDIA H200 with 32 cores",
-        backend="gpu",
-        source="gpu_main_job/result.json",
-        collect=Stage(800, 67.79, 34.46),
-        features=Stage(0, 0.0, 0.0),
-        train=Stage(16_000, 212.95, 47.46),
-        evaluate=Stage(360, 67.49, 45.03),
-    ),
 }
 
 
