@@ -4,9 +4,9 @@
     python experiments/tables.py --check    fails if one of them is not what would be written
 
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
-claim.toml, `claims` (the list of claims), `presets` (from their values), or of benchmarks/results: `speed`, `learners`, `experts`,
-`six_blocks`, `scenes`, `stress_compact`, `stress_randomised`, `proposition`, `ppo`, `ppo_gpu`,
-`sb3`, `through_lerobot`.
+claim.toml, `claims` (the list of claims), `presets` (from their values), or of benchmarks/results:
+`speed`, `learners`, `experts`, `six_blocks`, `scenes`, `stress_compact`, `stress_randomised`,
+`proposition`, `ppo`, `ppo_gpu`, `sb3`, `through_lerobot`.
 """
 
 import re

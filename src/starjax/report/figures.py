@@ -55,7 +55,8 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
 
         figure = style.figure(2.6 * max(len(panels), _FEWEST), 2.4)
         strokes = style.strokes([run.result.method for run in runs])
-        grid = figure.subplots(1, max(len(panels), _FEWEST), squeeze=False)[0]
+        shape = (1, max(len(panels), _FEWEST))
+        (grid,) = figure.subplots(*shape, squeeze=False, sharex=True)
         for unused in grid[len(panels) :]:
             unused.set_visible(False)
         for axis, (name, title) in zip(grid, panels):
