@@ -7,7 +7,7 @@ SEEN_TROCARS = 8
 FOR = {
     "smoke": "every stage in minutes; learns nothing",
     "cpu": "a policy that works, on two cores",
-    "gpu": "a policy that works, on one GPU, soon",
+    "gpu": "a policy that works, on one GPU",
     "resnet": "the same with the paper's encoder, from scratch",
     "compact": "tables: the paper's learner, small networks",
     "paper": "the paper's figures",
