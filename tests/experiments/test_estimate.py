@@ -6,6 +6,7 @@ import pathlib
 
 import pytest
 
+from starjax import config
 from starjax.experiments import estimate, presets
 from starjax.runtime import speed, xla
 
@@ -28,7 +29,10 @@ def test_what_was_timed_is_a_committed_result(name):
         figures = tuple(found["timings_s"].get(f"{stage}{part}") for part in ("", ": compile"))
         if figures != (None, None):
             assert getattr(timed, stage) == (count, *figures)
-    assert (found["preset"], found["method"]) == (name, "stardiff")
+    assert found["method"] == "stardiff"
+    run = config.from_dict(config.RunConfig, settings)
+    usual = dataclasses.replace(presets.PRESETS[name], scene=run.scene)
+    assert config.trained_with(run) == config.trained_with(usual) and run.eval == usual.eval
     assert found["hardware"]["backend"] == timed.backend
 
 
@@ -36,7 +40,7 @@ def test_what_was_timed_is_a_committed_result(name):
 def test_a_run_as_long_as_the_timed_one_takes_as_long(name):
     timed = estimate.TIMED[name]
     took = timed.collect.seconds + timed.features.seconds
-    took += timed.train.seconds + timed.evaluate.seconds
+    took += timed.train.seconds + timed.evaluate.seconds + timed.beside
     same = {"train": {"steps": timed.train.count}, "eval": {"trials": timed.evaluate.count // 12}}
     assert estimate.seconds(changed(name, **same), STAGES, 12) == pytest.approx(took)
 
