@@ -93,7 +93,8 @@ def _idle(batch_size: int) -> list[str]:
 def _evaluation(config: config_lib.RunConfig) -> str:
     trocars, trials = len(_task(config).is_seen), config.eval.trials
     limit = f"at most {config.eval.time_limit_s:g} s each"
-    return f"  evaluation      {trocars} trocars x {trials} trials, {limit}"
+    averaged = ", plans averaged" if config.eval.ensemble else ""
+    return f"  evaluation      {trocars} trocars x {trials} trials, {limit}{averaged}"
 
 
 def _time(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
