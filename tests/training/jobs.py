@@ -166,7 +166,7 @@ def run_main(out: str, mode: str) -> None:
     from starjax.runtime import processes
 
     policies.make = lambda *_, **__: _quadratic_policy()
-    policy_under_test.decision_ms = lambda who: {"p50": 1.0, "p95": 1.0, "p99": 1.0}
+    policy_under_test.decision_ms = lambda who, decide: {"p50": 1.0, "p95": 1.0, "p99": 1.0}
     training, stages = SETTINGS, ["collect", "train", "evaluate"]
     if mode == "trains":
         training = dataclasses.replace(SETTINGS, steps=10**6, checkpoint_every=10**6)
