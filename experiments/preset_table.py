@@ -3,7 +3,6 @@
 from starjax.experiments.presets import PRESETS
 from starjax.report import formats
 
-SEEN_TROCARS = 8
 FOR = {
     "smoke": "every stage in minutes; learns nothing",
     "cpu": "a policy that works, on two cores",
@@ -27,7 +26,7 @@ def table() -> str:
         network = f"U-Net {widths}" + (", bfloat16" if policy.dtype == "bfloat16" else "")
         if policy.observation == "image":
             network = f"{encoder}; {network}"
-        count = SEEN_TROCARS * run.demos.per_trocar
+        count = run.demos.seen_trocars * run.demos.per_trocar
         steps = f"{train.steps:,} steps of {train.batch_size}"
         rows.append([f"`{name}`", sees, f"{count:,}", network, policy.learner, steps, FOR[name]])
     return formats.render(rows, names=len(rows[0]))
