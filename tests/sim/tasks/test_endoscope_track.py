@@ -1,5 +1,7 @@
 """The endoscope: where its camera is, what is on target, and when a trial is over."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import mistakes
@@ -10,7 +12,7 @@ import pytest
 from starjax import rcm
 from starjax.sim import ik, registry, scene
 from starjax.sim.tasks.base import Contacts, Views
-from starjax.sim.tasks.endoscope_track import task
+from starjax.sim.tasks.endoscope_track import expert, task
 from starjax.types import Pose
 
 NO_CONTACTS = Contacts(jnp.zeros((0, 2), jnp.int32), jnp.zeros(0))
@@ -91,6 +93,24 @@ def test_an_episode_begins_with_its_target_in_the_picture(tool):
 
     keys = jax.random.split(jax.random.key(0), 20_000)
     assert float(jnp.max(jax.jit(jax.vmap(furthest_aside))(keys))) < 0.5
+
+
+def test_the_expert_records_the_right_distance_from_a_disturbed_one():
+    m, told = model("endoscope"), rcm.Trocar(*(jnp.full(1, angle) for angle in (0.03, 1.5, 0.0)))
+    told = rcm.trocar_frame(told, np.array(task.TASK.slots[0].p_world_ref)[None])
+    facts = measured(m, looking(m, rcm.Trocar(0.03, 1.5, 0.0)))
+    pose = Pose(facts.camera.R[None] @ task.bind(m).R_tip_camera.T, facts.camera.p[None])
+    state = SimpleNamespace(facts=facts, pose=pose, told=told, step=jnp.int32(0))
+
+    def distances(key):
+        script = expert.init(key, state).replace(elapsed=jnp.array(expert.FIND_TIME[1]))
+        executed, _, recorded = expert.act(script, state)
+        tips = jnp.stack([executed.pose.p[0], recorded.pose.p[0]])
+        return jnp.linalg.norm(tips - TARGET, axis=-1)
+
+    executed, recorded = jax.vmap(distances)(jax.random.split(jax.random.key(0), 64)).T
+    np.testing.assert_allclose(recorded, task.DISTANCE, atol=1e-5)
+    assert executed.min() < 0.95 * task.DISTANCE and executed.max() > 1.05 * task.DISTANCE
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,9 @@
 """Scripted expert of endoscope tracking: to the target along an arc, then with it.
 
 Centring, distance and level leave one pose of the scope, in closed form. It aims where the target
-will be at the end of the control step. Side of the arc, pace and distance are drawn, never by the
-trocar; it is disturbed on purpose and comes back.
+will be at the end of the control step. Side of the arc and pace are drawn, never by the trocar. It
+is disturbed on purpose and comes back; an episode's distance is disturbed most, because a policy
+that saw only the right one drifts away from it.
 """
 
 import flax.struct
@@ -17,7 +18,7 @@ from starjax.sim.tasks.endoscope_track.task import DISTANCE, looking_at
 from starjax.types import Agent, Command
 
 FIND_TIME = (1.0, 1.6)  # s, range of the way to the target
-NEARER = (0.9, 1.1)  # of DISTANCE, range of an episode's own
+DISTURBED_DISTANCE = (0.9, 1.1)  # of DISTANCE, range of what an episode executes
 BULGE = 0.008  # m, how far the arc leaves the straight way
 DEVIATION = (0.0008, 0.0008, 0.0008, 0.012)  # m and rad, of the disturbance
 DISTURBANCE = 0.7  # how much of it acts once the target is found
@@ -29,7 +30,8 @@ class Script:
 
     Attributes:
       key: of everything random. start: `[4]` roll (rad) and position (m).
-      side: `[3]` m, how far the arc leaves the line. distance: m, kept to the target.
+      side: `[3]` m, how far the arc leaves the line.
+      distance: m, executed in place of DISTANCE.
       duration, elapsed: s. noise: `[2, 4]`, disturbance of position and roll, rough and smooth.
     """
 
@@ -43,14 +45,14 @@ class Script:
 
 
 def init(key: jax.Array, state: EnvState) -> Script:
-    """Draws side, pace and distance."""
+    """Draws side, pace and disturbed distance."""
     key, key_side, key_time, key_distance = jax.random.split(key, 4)
     sign = jax.random.rademacher(key_side, (), jnp.float32)
     return Script(
         key=key,
         start=jnp.append(0.0, state.pose.p[0]),
         side=sign * BULGE * jnp.array([0.0, 1.0, 0.0]),
-        distance=DISTANCE * jax.random.uniform(key_distance, minval=NEARER[0], maxval=NEARER[1]),
+        distance=DISTANCE * jax.random.uniform(key_distance, (), jnp.float32, *DISTURBED_DISTANCE),
         duration=jax.random.uniform(key_time, minval=FIND_TIME[0], maxval=FIND_TIME[1]),
         elapsed=jnp.zeros(()),
         noise=jnp.zeros((2, 4)),
@@ -59,21 +61,28 @@ def init(key: jax.Array, state: EnvState) -> Script:
 
 def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
     """The disturbed command to execute, the script, and the undisturbed one to record."""
-    dt, facts = 1.0 / CONTROL_HZ, state.facts
-    elapsed = script.elapsed + dt
+    elapsed = script.elapsed + 1.0 / CONTROL_HZ
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
     share = scripting.minimum_jerk(s)
-    aim = facts.target + dt * facts.velocity
-    R_tip_camera = state.pose.R[0].T @ facts.camera.R
-    p_trocar = state.told.p_world_trocar[0]
-    pose = looking_at(aim, p_trocar, script.distance, R_tip_camera)
-    wanted = jnp.append(rcm.roll_of(pose.R) - state.told.roll_zero[0], pose.p)
-    way = script.start + share * (wanted - script.start)
-    way = way.at[1:].add(4.0 * share * (1.0 - share) * script.side)
+
+    def way(distance: jax.Array | float) -> jax.Array:
+        line = script.start + share * (_wanted(distance, state) - script.start)
+        return line.at[1:].add(4.0 * share * (1.0 - share) * script.side)
+
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
     weight = 1.0 - (1.0 - DISTURBANCE) * s
     script = script.replace(elapsed=elapsed, noise=noise)
-    return _command(way + weight * jnp.roll(noise[1], 1), state), script, _command(way, state)
+    disturbed = way(script.distance) + weight * jnp.roll(noise[1], 1)
+    return _command(disturbed, state), script, _command(way(DISTANCE), state)
+
+
+def _wanted(distance: jax.Array | float, state: EnvState) -> jax.Array:
+    """Roll and position, `[4]`, from which the target is centred and level at `distance`."""
+    facts = state.facts
+    aim = facts.target + facts.velocity / CONTROL_HZ
+    R_tip_camera = state.pose.R[0].T @ facts.camera.R
+    pose = looking_at(aim, state.told.p_world_trocar[0], distance, R_tip_camera)
+    return jnp.append(rcm.roll_of(pose.R) - state.told.roll_zero[0], pose.p)
 
 
 def _command(way: jax.Array, state: EnvState) -> Command:

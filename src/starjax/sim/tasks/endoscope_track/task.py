@@ -140,7 +140,7 @@ def sample(bound: Bound, key: jax.Array) -> Layout:
 
 
 def looking_at(
-    target: jax.Array, p_trocar: jax.Array, distance: jax.Array, R_tip_camera: jax.Array
+    target: jax.Array, p_trocar: jax.Array, distance: jax.Array | float, R_tip_camera: jax.Array
 ) -> Pose:
     """The tip's one pose with the target in the middle of a level picture at `distance` m.
 
