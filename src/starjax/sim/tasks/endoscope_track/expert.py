@@ -2,8 +2,8 @@
 
 Centring, distance and level leave one pose of the scope, in closed form. It aims where the target
 will be at the end of the control step. Side of the arc and pace are drawn, never by the trocar. It
-is disturbed on purpose and comes back; an episode's distance is disturbed most, because a policy
-that saw only the right one drifts away from it.
+is disturbed on purpose and comes back. What an episode executes is too near or too far all along,
+so that a policy learns to come back from there.
 """
 
 import flax.struct
