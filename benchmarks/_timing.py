@@ -6,7 +6,9 @@ is timed in the same process, so that a ratio means something on a busy or a slo
 
 import json
 import pathlib
+import shlex
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax.runtime import files, xla
+from starjax.runtime import files, provenance, xla
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 
@@ -115,18 +117,21 @@ def rounded(value: Any) -> Any:
 
 
 def write(name: str, results: dict[str, Any]) -> pathlib.Path:
-    """Write `results/<name>_<backend>.json` with the versions and the hardware beside it.
+    """Write `results/<name>_<backend>.json`: what was found, with what code, command and machine.
 
     Rows (`results["results"]`) measured before with the same versions on the same kind of device,
-    of a CPU the same number of the same cores, stay, so that a benchmark may be run row by row.
+    of a CPU the same number of the same cores, stay, so that a benchmark may be run row by row;
+    `made` has the code and command of each.
     """
     path = RESULTS / f"{name}_{jax.default_backend()}.json"
     path.parent.mkdir(exist_ok=True)
     machine = {"versions": xla.versions(), "hardware": xla.hardware()}
-    new = {"benchmark": name, **rounded(results), **machine}
+    new = {"benchmark": name, **rounded(results), "made": _made_by(), **machine}
     before = json.loads(path.read_text()) if path.exists() else {}
-    if "results" in new and _made_with(before) == _made_with(new):
-        new["results"] = {**before.get("results", {}), **new["results"]}
+    if "results" in new:
+        new["made"] = dict.fromkeys(new["results"], new["made"])
+        if _made_with(before) == _made_with(new):
+            new |= {part: {**before.get(part, {}), **new[part]} for part in ("results", "made")}
     files.write_json(path, new)
     return path
 
@@ -134,6 +139,12 @@ def write(name: str, results: dict[str, Any]) -> pathlib.Path:
 def report(name: str, results: dict[str, Any], tiny: bool) -> None:
     """`write`, unless the sizes were only for a test."""
     print("a test's sizes: nothing is written" if tiny else f"wrote {write(name, results)}")
+
+
+def _made_by() -> dict[str, Any]:
+    code = provenance.code()
+    command = shlex.join(["python", f"benchmarks/{pathlib.Path(sys.argv[0]).name}", *sys.argv[1:]])
+    return {"commit": code.commit, "dirty": code.dirty, "command": command}
 
 
 def _made_with(found: dict[str, Any]) -> Any:

@@ -89,6 +89,7 @@ def _score(
         "rate": float(success.mean()),
         "ci95": [low, high],
         "collided": int(outcome["collided"].sum()),
+        "collided_successes": int((outcome["collided"] & success).sum()),
         "invalid": int(outcome["invalid"].sum()),
         "median_transfer_s": float(np.median(taken[success])) / environment.control_hz,
         "rcm_error_mm": {

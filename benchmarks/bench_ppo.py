@@ -12,8 +12,6 @@ from typing import Any
 
 import _timing
 
-from starjax.runtime import provenance
-
 EXAMPLE = Path(__file__).parents[1] / "examples" / "ppo.py"
 
 
@@ -22,8 +20,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     arguments, flags = parser.parse_known_args()
     curves = {str(seed): learn(seed, flags) for seed in range(arguments.seeds)}
-    code = provenance.code()
-    found = {"commit": code.commit, "dirty": code.dirty, "flags": flags, "curves": curves}
+    found = {"flags": flags, "curves": curves}
     found["mean"] = mean(list(curves.values()))
     print("written to", _timing.write("ppo", {"results": found}))
 

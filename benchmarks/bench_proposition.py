@@ -36,7 +36,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.runtime import provenance
 from starjax.sim import env as envs
 from starjax.types import Agent
 
@@ -62,8 +61,6 @@ def main() -> None:
     agent = next(iter(task.experts.values()))()
     trials, successes = play(environment, agent, arguments.scenes, arguments.seed)
     found = {
-        "commit": provenance.code().commit,
-        "dirty": provenance.code().dirty,
         "scene": environment.names._asdict(),
         "seed": arguments.seed,
         "scenes": arguments.scenes,

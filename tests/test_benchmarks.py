@@ -1,11 +1,13 @@
 """Benchmarks run, one with what a state carries on a GPU, which a run on a CPU would not see."""
 
+import json
 import sys
 
 import pytest
 
 from starjax import rcm
 from starjax.models.kernels import packed_params
+from starjax.runtime import provenance
 
 
 @pytest.mark.slow
@@ -42,3 +44,21 @@ def test_seven_joints_do_not_drift_from_lap_to_lap(arm, monkeypatch, pytestconfi
     gain = bench_nullspace.registry.arms.get(arm).rest_gain
     drift, residual = bench_nullspace.laps(arm, gain)
     assert drift <= 1e-6 and residual < 1e-5
+
+
+def test_a_row_of_a_result_keeps_the_code_and_command_that_made_it(
+    monkeypatch, tmp_path, pytestconfig
+):
+    monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
+    import _timing
+
+    monkeypatch.setattr(_timing, "RESULTS", tmp_path)
+    for commit, row in (("a" * 40, "one"), ("b" * 40, "two"), ("c" * 40, "one")):
+        code = provenance.Code("0", commit, dirty=False)
+        monkeypatch.setattr(_timing.provenance, "code", lambda code=code: code)
+        monkeypatch.setattr(sys, "argv", ["/elsewhere/bench_x.py", "--only", row])
+        path = _timing.write("x", {"results": {row: {"ms": 1.0}}})
+    found = json.loads(path.read_text())
+    assert set(found["results"]) == {"one", "two"}
+    assert [found["made"][row]["commit"][0] for row in ("one", "two")] == ["c", "b"]
+    assert found["made"]["two"]["command"] == "python benchmarks/bench_x.py --only two"
