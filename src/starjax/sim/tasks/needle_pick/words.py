@@ -9,7 +9,8 @@ from starjax.sim.tasks.base import Outline, Words
 WORDS = Words(
     title="needle pick",
     done="picked up the needle",
-    strict="lifted by 20 mm and held for 2 s without slipping by more than 0.5 mm, in time",
+    strict="lifted by 20 mm and held for 2 s without slipping by more than 0.5 mm, its point free, "
+    "in time",
     loose="the needle was lifted by 20 mm, held or thrown",
     nearly="needle lifted, but it slipped or was not held for 2 s",
     collided="pressed jaws or shaft into the foam",
