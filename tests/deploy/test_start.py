@@ -1,5 +1,7 @@
 """Where a plan may begin: refused where it is far from the tool, led to from a shallow one."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,17 @@ P_WORLD_TROCAR = np.array([0.014, 0.014, 0.153], np.float32)
 @pytest.fixture(scope="module")
 def compact():
     return deploy.load("compact", ddim_steps=2)
+
+
+@pytest.fixture(scope="module")
+def unled():
+    """The same, whose plans are its own, however far they begin."""
+    policy = deploy.load("compact", ddim_steps=2, max_first_move=np.inf, max_first_turn=np.inf)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(start, "led", lambda action_space, stats, now, plan, told: plan)
+        pose, trocar = tool(policy, [0.0, 0.0, 0.03])
+        policy(jax.random.key(0), seen(pose), trocar)  # compiles it so
+    return policy
 
 
 def seen(pose, moments=2):
@@ -62,10 +75,9 @@ def test_a_tip_before_the_trocar_is_refused(compact):
     assert found.argument == "observation.pose" and "30 mm" in found.got
 
 
-def test_a_plan_that_begins_near_the_tool_is_the_policys_own(compact):
+def test_a_plan_that_begins_near_the_tool_is_the_policys_own(compact, unled):
     pose, trocar = tool(compact, [0.0, 0.0, 0.03])
-    free = deploy.load("compact", ddim_steps=2, max_first_move=np.inf, max_first_turn=np.inf)
-    plans = [policy(jax.random.key(0), seen(pose), trocar) for policy in (compact, free)]
+    plans = [policy(jax.random.key(0), seen(pose), trocar) for policy in (compact, unled)]
     jax.tree.map(np.testing.assert_array_equal, *plans)
     assert np.linalg.norm(plans[0].pose.p[0] - pose.p) < start.MAX_FIRST_MOVE
 
@@ -83,7 +95,7 @@ def test_a_plan_that_begins_beyond_the_owners_bound_is_refused(bound, limits):
     assert refused(policy, pose, trocar).argument == bound
 
 
-@pytest.mark.parametrize("bound", [0.0, -1.0, np.nan])
+@pytest.mark.parametrize("bound", [0.0, -1.0, np.nan, "far", None])
 def test_a_bound_is_more_than_nothing(bound):
     for name in ("max_first_move", "max_first_turn"):
         with pytest.raises(UsageError) as caught:
@@ -91,20 +103,24 @@ def test_a_bound_is_more_than_nothing(bound):
         assert caught.value.argument == name
 
 
+@pytest.mark.parametrize("limits", [{}, {"max_first_move": np.inf, "max_first_turn": np.inf}])
 @pytest.mark.parametrize("depth", [0.001, 0.02, 0.06])
-def test_from_a_tip_just_within_the_trocar_commands_lead_there_gradually(compact, depth):
+def test_from_a_tip_just_within_the_trocar_commands_lead_there_gradually(
+    compact, unled, depth, limits
+):
     """A robot that is where it was last sent, until the plans are the policy's own."""
+    policy = dataclasses.replace(compact, **limits)
     axis = np.array([0.1, -0.05, -1.0]) / np.linalg.norm([0.1, -0.05, -1.0])
     pose, trocar = tool(compact, P_WORLD_TROCAR + max(depth, rcm.MIN_DEPTH) * axis, 0.8)
     pose = pose._replace(p=np.float32(P_WORLD_TROCAR + depth * axis))
-    free = deploy.load("compact", ddim_steps=2, max_first_move=np.inf, max_first_turn=np.inf)
     for decision in range(100):
         key = jax.random.fold_in(jax.random.key(0), decision)
-        plan = jax.device_get(compact(key, seen(pose), trocar))
-        wanted = jax.device_get(free(key, seen(pose), trocar))
+        plan = jax.device_get(policy(key, seen(pose), trocar))
+        wanted = jax.device_get(unled(key, seen(pose), trocar))
         is_own = np.array_equal(plan.pose.p, wanted.pose.p)
         assert rcm.rcm_error(plan.pose, P_WORLD_TROCAR).max() < 1e-6
         if is_own:
+            assert np.linalg.norm(plan.pose.p[0] - pose.p) <= start.NEAR_MOVE
             break
         positions = np.concatenate([pose.p[None], plan.pose.p])
         moves = np.linalg.norm(np.diff(positions, axis=0), axis=-1)

@@ -5,6 +5,7 @@
 """
 
 import dataclasses
+import numbers
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,9 +80,9 @@ class Deployed:
         `rcm.roll_of`), which no demonstration shows, is read and commanded as half a turn back.
 
         A tool that has just been passed through the trocar is shallower than any demonstrated one.
-        Where a plan begins deeper and farther from it than the bounds, the commands are instead a
-        slow way there (`start.LEAD_MOVE`, `start.LEAD_TURN` a control step), which the next
-        decisions continue.
+        Where a plan begins deeper and more than 3 mm or 0.15 rad from it, the commands are instead
+        a slow way there (`start.LEAD_MOVE`, `start.LEAD_TURN` a control step), which the next
+        decisions continue. A tip above `rcm.MIN_DEPTH`, 5 mm, is sent to it at once.
 
         Returns:
           Command `[H]` or `[B, H]`: tip poses in the world frame, all of them on the RCM manifold
@@ -118,8 +119,7 @@ class Deployed:
         Returns:
           Command `[B, H, *arms]`; how far their first ones are, `[B, *arms]`, for `check_first`.
         """
-        bounds = start.bounds(self.max_first_move, self.max_first_turn)
-        return self._decide(*self._weights, keys, seen, trocar, bounds)
+        return self._decide(*self._weights, keys, seen, trocar)
 
     def __reduce__(self) -> tuple[Callable[..., "Deployed"], tuple[Any, ...]]:
         path, digest, settings = self._source
@@ -189,8 +189,8 @@ def load(
         learner is not installed.
     """
     for name, bound in (("max_first_move", max_first_move), ("max_first_turn", max_first_turn)):
-        if not bound > 0:
-            raise errors.UsageError(name, "more than 0", bound)
+        if not (isinstance(bound, numbers.Real) and bound > 0):
+            raise errors.UsageError(name, "a number above 0", repr(bound))
     path = packaged.find("policy", str(policy))
     trained = policy_file.load(path)
     if trained.p_world_ref is None:
@@ -275,7 +275,7 @@ def _decider(
     tools = [registry.tools.get(name) for name in trained.scene.tools]
     is_symmetric = np.array([tool.is_symmetric for tool in tools])
 
-    def decide(params, stats, keys, seen: types.Observation, trocar: rcm.Trocar, bounds):
+    def decide(params, stats, keys, seen: types.Observation, trocar: rcm.Trocar):
         if is_one_arm:
             pose = Pose(seen.pose.R[..., None, :, :], seen.pose.p[..., None, :])
             seen = seen._replace(pose=pose, gripper=seen.gripper[..., None])
@@ -288,7 +288,7 @@ def _decider(
         command = sample(params, stats, keys, seen, told)
         now = Pose(*(x[:, -1].astype(jnp.float32) for x in seen.pose))
         if leads:
-            command = start.led(leads, stats, now, command, told, bounds)
+            command = start.led(leads, stats, now, command, told)
         found = start.first(now, Pose(*(x[:, 0] for x in command.pose)))
         R, p, gripper = command.pose.R * half, command.pose.p, command.gripper
         if is_one_arm:

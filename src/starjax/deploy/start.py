@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
 from starjax import rcm
@@ -18,7 +17,10 @@ from starjax.rcm import arrays
 from starjax.types import Command, Pose
 
 # The packaged policy's first commands are at most 2.8 mm and 0.14 rad from the measured pose (110
-# decisions of four simulated trials); three and two times that.
+# decisions of four simulated trials). A plan that begins so near needs no way there; the default
+# bounds are three and two times that.
+NEAR_MOVE = 0.003  # m
+NEAR_TURN = 0.15  # rad
 MAX_FIRST_MOVE = 0.01  # m
 MAX_FIRST_TURN = 0.3  # rad
 # Of a control step on the way: 3 cm/s, about as fast as demonstrations are half of the time.
@@ -38,12 +40,6 @@ class First(NamedTuple):
     turn: jax.Array
 
 
-def bounds(move: float, turn: float) -> First:
-    """Bounds on the device; an infinite one as the largest number, which no debugger minds."""
-    largest = np.finfo(np.float32).max
-    return First(*(jnp.asarray(np.float32(min(bound, largest))) for bound in (move, turn)))
-
-
 def first(now: Pose, command: Pose) -> First:
     """Compares a command with the measured pose; both `[...]`."""
     return First(arrays.norm(command.p - now.p), arrays.norm(_turn(now.R, command.R)))
@@ -55,22 +51,22 @@ def led(
     now: Pose,
     plan: Command,
     told: rcm.TrocarFrame,
-    bounds: First,
 ) -> Command:
-    """Replaces plans that begin farther than `bounds` from a shallow tool by a way to their start.
+    """Replaces plans that begin far from a shallow tool by a slow way to their start.
 
-    A tool is shallow if its tip lies outside the demonstrated ones and the plan begins deeper.
+    A tool is shallow if its tip lies outside the demonstrated ones and the plan begins deeper. Far
+    is beyond `NEAR_MOVE` or `NEAR_TURN`. The first command of a tip above `rcm.MIN_DEPTH` goes
+    there at once, as no command is shallower.
 
     Args:
       action_space: key of `rcm.ACTION_SPACES`, of `stats`.
       now: measured, `[B, A]`.
       plan: `[B, H, A]`.
       told: `[B, A]`.
-      bounds: `[]`, in m and rad.
     """
     begin = jax.tree.map(lambda x: x[:, 0], plan)
     found = first(now, begin.pose)
-    is_far = (found.move > bounds.move) | (found.turn > bounds.turn)
+    is_far = (found.move > NEAR_MOVE) | (found.turn > NEAR_TURN)
     depth, wanted = (rcm.insertion_depth(x, told.p_world_trocar) for x in (now, begin.pose))
     is_led = is_far & (wanted > depth) & _is_unknown(action_space, stats, now, told)
     way = Command(_way(now, begin.pose, told.p_world_trocar, plan.gripper.shape[1]), begin.gripper)

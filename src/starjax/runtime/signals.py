@@ -1,4 +1,4 @@
-"""Requests to stop: Ctrl-C, SIGTERM, a closed terminal (SIGHUP), a scheduler's warning (SIGUSR1).
+"""Requests to stop: Ctrl-C, SIGTERM, a closed terminal (SIGHUP), a scheduler's warning.
 
 A command answers them with KeyboardInterrupt, training with a checkpoint. What is ignored, as
 Ctrl-C by a shell's background job and SIGHUP under nohup, stays so.
@@ -14,10 +14,11 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-# Some systems do not have all of them.
+# Slurm and LSF warn by the signal that they are asked for, Grid Engine by SIGUSR1 and SIGUSR2. Some
+# systems do not have all of them.
 STOPS = tuple(
     getattr(signal, name)
-    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2")
     if hasattr(signal, name)
 )
 _AGAIN_S = 0.5  # until a KeyboardInterrupt that was lost is raised again
