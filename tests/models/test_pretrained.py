@@ -1,5 +1,7 @@
 """ImageNet weights for the ResNet-18: every convolution, under whatever prefix a file has."""
 
+import pickle
+
 import jax
 import jax.numpy as jnp
 import mistakes
@@ -127,10 +129,11 @@ def test_other_weights_are_refused_by_what_is_there(trunk, weights, tmp_path):
             pretrained.load_resnet18(trunk, path)
 
 
-@pytest.mark.parametrize("ending", ["pth", "pt", "pth.tar", "bin", "ckpt", "pkl"])
-def test_a_pickle_is_refused_unread_with_the_way_to_convert_it(tmp_path, ending):
+@pytest.mark.parametrize("ending", ["pth.tar", "bin", "PTH", "th", "safetensors"])
+@pytest.mark.parametrize("start", [b"PK\x03\x04", pickle.dumps({})[:2]])
+def test_a_pickle_is_refused_unread_with_the_way_to_convert_it(tmp_path, ending, start):
     path = tmp_path / f"resnet18.{ending}"
-    path.write_bytes(b"not read")
+    path.write_bytes(start + 64 * b"not read")
     with mistakes.of(str(path), path.name) as caught:
         pretrained.read_weights(path)
     assert "save_file" in caught.value.hint

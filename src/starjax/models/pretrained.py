@@ -19,7 +19,7 @@ import safetensors.numpy
 
 from starjax import errors
 
-_PICKLES = (".pth", ".pt", ".pth.tar", ".bin", ".ckpt", ".pkl")
+_PICKLES = (b"PK\x03\x04", b"\x80")  # how torch's files begin: zipped since 1.6, and before
 # Copies beside the encoder in a file of MoCo (its momentum encoder) or DINO (its student).
 _COPIES = ("encoder_k.", "momentum_encoder.", "student.")
 _SHOWN = 4  # names in a message
@@ -50,19 +50,29 @@ def load_resnet18(trunk: dict[str, Any], path: str | pathlib.Path) -> dict[str, 
 def read_weights(path: str | pathlib.Path) -> dict[str, np.ndarray]:
     """Reads all tensors of a `.safetensors` file, by name."""
     path, expected = pathlib.Path(path), "a .safetensors file"
-    if path.name.endswith(_PICKLES):
-        hint = (
-            "convert it where torch is installed: safetensors.torch.save_file of what torch.load "
-            "returns (docs/howto/encoder-weights.md)"
-        )
-        raise errors.UsageError(str(path), expected, f"{path.name}, a pickle of torch's", hint)
     try:
         return safetensors.numpy.load_file(path)
     except (safetensors.SafetensorError, OSError) as error:
-        raise errors.UsageError(str(path), expected, f"{path.name}: {error}") from error
+        got, hint = f"{path.name}: {error}", ""
+        if _is_pickle(path):
+            got = f"{path.name}, a pickle of torch's"
+            hint = (
+                "convert it where torch is installed: safetensors.torch.save_file of what "
+                "torch.load returns (docs/howto/encoder-weights.md)"
+            )
+        raise errors.UsageError(str(path), expected, got, hint) from error
     except (AttributeError, KeyError, TypeError) as error:  # a type that numpy lacks
         got = f"{path.name} with a tensor of type {error}"
         raise errors.UsageError(str(path), f"{expected} of float types", got) from error
+
+
+def _is_pickle(path: pathlib.Path) -> bool:
+    """Whether a file that is no `.safetensors` begins as torch's do, whatever its name."""
+    try:
+        with path.open("rb") as file:
+            return file.read(4).startswith(_PICKLES)
+    except OSError:
+        return False
 
 
 def _name(names: tuple[str, ...]) -> str:
@@ -79,7 +89,8 @@ def _prefix(found: Collection[str], wanted: Collection[str], path: str | pathlib
     complete = [prefix for prefix in prefixes if all(prefix + name in found for name in wanted)]
     encoders = [prefix for prefix in complete if not any(copy in prefix for copy in _COPIES)]
     if len(encoders) > 1:
-        raise errors.UsageError(str(path), "one ResNet-18", f"several: {_listed(encoders)}")
+        got, hint = f"several: {_listed(encoders)}", "write one of them into a file of its own"
+        raise errors.UsageError(str(path), "one ResNet-18", got, hint)
     if not encoders:
         expected = f"a ResNet-18's names ({_listed(wanted)})"
         raise errors.UsageError(str(path), expected, _listed(found) or "none")
