@@ -1,21 +1,34 @@
 """An arm from outside of starjax, in a scene; `tests/experiments/test_run.py` runs it through."""
 
 import importlib
+import sys
 
 import gantry
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from starjax.sim import mounts, registry, scene
+from starjax import errors
+from starjax.sim import ik, mounts, registry, robot, scene
+
+EULER = 'euler="3.141592654 0 0"'  # of the flange
 
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
     name = gantry.install(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    for module in ("my_arms", "my_arms.gantry"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
     importlib.invalidate_caches()
     return name
+
+
+def edit(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
 
 
 def test_an_arm_of_another_package_stands_in_a_scene_and_holds_its_tool(package):
@@ -37,3 +50,38 @@ def test_an_arm_of_another_package_stands_in_a_scene_and_holds_its_tool(package)
     assert np.linalg.norm(before[:2]) < 0.01 and 0 < before[2] < 0.15  # through the trocar
     mujoco.mj_step(m, data, 480)
     np.testing.assert_allclose(data.site("arm0/tool/tcp").xpos, before, atol=1e-4)
+
+
+@pytest.mark.parametrize("flange", [EULER, 'quat="0 1 0 0"', 'zaxis="0 0.6 -0.8"', ""])
+def test_a_scene_turns_the_tool_on_the_flange_as_the_search_did(package, tmp_path, flange):
+    edit(tmp_path / "my_arms" / "gantry.xml", EULER, flange)
+    edit(tmp_path / "my_arms" / "gantry.py", "turn=0.0", "turn=0.7")
+    arm, tool = registry.arms.get(package), registry.tools.get("grasper")
+    mount = arm.mounts["grasper", "board"]
+    place = jnp.array([*mount.position, mount.yaw, mount.turn, mount.tilt])
+    at = mounts.bench(arm, tool)
+    pose, _, _ = ik.forward(mounts.standing(at.flange, at.tip, place), jnp.array(mount.home))
+
+    m = scene.compose(scene.name("peg_transfer", arms=(package,)))
+    data = mujoco.MjData(m)
+    for joint, value in zip(arm.joints, mount.home):
+        data.joint(f"arm0/{joint}").qpos = value
+    mujoco.mj_forward(m, data)
+    tcp = data.site("arm0/tool/tcp")
+    np.testing.assert_allclose(tcp.xpos, pose.p, atol=1e-5)
+    np.testing.assert_allclose(tcp.xmat.reshape(3, 3), pose.R, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "argument"),
+    [
+        ('name="flange"', 'name="attachment_site"', "arm gantry"),
+        ('name="tilt" joint=', 'name="act5" joint=', "arm gantry"),
+        ('range="-2 2"', 'range="-2 2" frictionloss="1"', "arm gantry: joint pitch"),
+    ],
+)
+def test_a_file_that_is_not_ready_is_refused_by_name(package, tmp_path, old, new, argument):
+    edit(tmp_path / "my_arms" / "gantry.xml", old, new)
+    with pytest.raises(errors.UsageError) as caught:
+        robot.read(registry.arms.get(package))
+    assert caught.value.argument == argument

@@ -55,7 +55,8 @@ def main(argv: Sequence[str]) -> int:
     print(
         f"Not every mount may be used. It needs at least {mounts.MIN_MARGIN:g} rad to the limits, "
         f"a singular value of {mounts.MIN_SINGULAR:g} m, every pose reached and no link in the "
-        "table. Another --seed, or --tilts, may find one."
+        "table. Another --seed, or --tilts, may find one. Beside the table an elbow may be lower: "
+        "`watched` in the arm's record is the first joint that may not."
     )
     return 1
 

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import assets, ik
+from starjax.sim import assets, ik, robot
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.tools.base import Tool
 from starjax.sim.workspaces import Workspace
@@ -80,13 +80,14 @@ def bench(arm: Arm, tool: Tool) -> Bench:
     """Reads the arm with the tool off their MJCF.
 
     Raises:
-      errors.UsageError: its joints cannot be read, see `ik.chain_of`.
+      errors.UsageError: its part lacks something, see `robot.read`, or its joints cannot be read,
+        see `ik.chain_of`.
     """
-    robot, held = (mujoco.MjSpec.from_file(str(assets.path(part.mjcf))) for part in (arm, tool))
-    robot.attach(held, site=robot.site("flange"), prefix="tool/")
-    m = robot.compile()
+    whole, held = robot.read(arm), mujoco.MjSpec.from_file(str(assets.path(tool.mjcf)))
+    whole.attach(held, site=whole.site(robot.FLANGE), prefix="tool/")
+    m = whole.compile()
     flange, tip = (
-        ik.chain_of(m, arm.first, site, arm.joints) for site in ("flange", f"tool/{tool.tcp}")
+        ik.chain_of(m, arm.first, site, arm.joints) for site in (robot.FLANGE, f"tool/{tool.tcp}")
     )
     settings = Settings(arm.rest_gain, arm.remote_centre, arm.watched, arm.link_radius)
     return Bench(flange, tip, settings)

@@ -14,7 +14,7 @@ import numpy as np
 
 from starjax import errors
 from starjax.config import DEFAULT_TASK
-from starjax.sim import assets, endoscope, ik, registry, solver
+from starjax.sim import assets, endoscope, ik, registry, robot, solver
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
 from starjax.sim.engine import mjx
@@ -124,23 +124,23 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
     """The C model of a scene; `variant` as in `load`.
 
     Raises:
-      errors.UsageError: no mount of an arm with its tool is known for the task's workspace, or no
-        part has a camera that is observed.
+      errors.UsageError: no mount of an arm with its tool is known for the task's workspace, no part
+        has a camera that is observed, or an arm's part lacks something, see `robot.read`.
     """
     task: Task = variant or registry.tasks.get(names.task)
     world = _spec(task.mjcf)
     limits = _taken(world)
     for i, (arm, tool, mount) in enumerate(_mounted(task, names)):
-        robot, hand = _spec(arm.mjcf), _spec(tool.mjcf)
-        robot.site("flange").quat = _about_z(mount.turn)
-        for part in (robot, hand):
+        whole, hand = robot.read(arm), _spec(tool.mjcf)
+        for part in (whole, hand):
             limits = limits + _taken(part)
-        robot.attach(hand, site=robot.site("flange"), prefix="tool/")
+        held = whole.attach(hand, site=whole.site(robot.FLANGE), prefix="tool/")
+        held.quat = _about_z(mount.turn)  # from the flange on, however its file turns that
         parent = world.body(f"trocar{i}") if arm.remote_centre else world.worldbody
         base = parent.add_site(
             name=f"base{i}", pos=mount.position, quat=mount.wxyz_base, group=3, size=[0.003] * 3
         )
-        world.attach(robot, site=base, prefix=f"arm{i}/")
+        world.attach(whole, site=base, prefix=f"arm{i}/")
         _call_by_name(world, f"arm{i}/tool/")
     if scope := endoscope.of(task, names.cameras):
         _add_endoscope(world, scope)
