@@ -10,6 +10,7 @@ from starjax.data import schema
 from starjax.rollouts import episodes, programs
 from starjax.sim import endoscope, physics, registry, render, scene
 from starjax.sim import env as envs
+from starjax.sim.tasks.needle_handover import task as needle_handover
 
 TASKS = sorted(name for name in registry.tasks.names() if registry.tasks.get(name).endoscope)
 CROP = 0.9  # of the picture's side, that policies see
@@ -27,8 +28,10 @@ def seen(pose, points, scope):
     return x[..., :2] / -x[..., 2:] / np.tan(np.deg2rad(scope.fovy) / 2)
 
 
-def test_the_tool_tasks_have_one():
-    assert {"peg_transfer", "needle_pick", "reach"} <= set(TASKS)
+def test_the_tasks_with_tools_have_one():
+    names = registry.tasks.names()
+    with_jaws = [n for n in names if registry.tasks.get(n).slots[0].tool.startswith("grasper")]
+    assert sorted(with_jaws) == TASKS
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -56,13 +59,19 @@ def work_of(name):
     bound = registry.tasks.get(name).bind(scene.compose(scene.name(name)))
     if name == "reach":
         return bound.marks
-    if name == "peg_transfer":
+    if name.startswith("peg_transfer"):
         return np.concatenate([bound.pegs, np.full((len(bound.pegs), 1), 0.005)], -1)
+    if name == "ring_on_wire":  # the ring where it hangs at either end, and carried at the middle
+        return np.array([[0, -0.041, 0.018], [0, 0.041, 0.018], [0, 0, 0.05]])
+    if name == "needle_handover":  # a needle of 8 mm where it may lie, and where it is passed
+        (x, y), aside = needle_handover.PLACE, np.array(needle_handover.PLACE_SPREAD) + 0.008
+        corners = [[x + i * aside[0], y + j * aside[1], 0] for i in (-1, 1) for j in (-1, 1)]
+        return np.array([*corners, [0, 0, 0.06]])
     x, y = np.meshgrid([-0.035, 0.035], [-0.025, 0.025])  # needle_pick
     return np.stack([x, y, 0 * x], -1).reshape(-1, 3)
 
 
-@pytest.mark.parametrize("name", ["peg_transfer", "needle_pick", "reach"])
+@pytest.mark.parametrize("name", TASKS)
 def test_the_work_is_in_the_picture(name):
     scope = registry.tasks.get(name).endoscope
     inside = np.abs(seen(drawn(scope), work_of(name), scope)).max(-1) < CROP

@@ -58,6 +58,12 @@ BOARD_ENDOSCOPE = endoscope.Endoscope(
     up=(-1.0, 0.0, 0.0),
     fovy=70.0,
 )
+# The wire is longer than the boards, and higher.
+WIRE_ENDOSCOPE = BOARD_ENDOSCOPE._replace(work=(0.0, 0.0, 0.03), distance=(0.09, 0.11))
+# Across two arms, which stand along x; what they pass on is lifted.
+SIDE_ENDOSCOPE = BOARD_ENDOSCOPE._replace(
+    p_world_ref=(0.0, -0.15, 0.15), work=(0.0, 0.0, 0.02), up=(0.0, 1.0, 0.0)
+)
 
 
 # Two arms at either side, their rolls' zeros half a turn apart. Each trocar varies by 3 cm to and

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 
 from starjax import rcm
-from starjax.sim import bodies
+from starjax.sim import bodies, endoscope, workspaces
 from starjax.sim.tasks import two_arms
 from starjax.sim.tasks.base import Capsules, Field, Task, Verdict, Views
 from starjax.sim.tasks.needle_handover import words
@@ -138,7 +138,7 @@ TASK = Task(
     name="needle_handover",
     mjcf="tasks/needle_handover/needle_handover.xml",
     slots=two_arms.SLOTS,
-    cameras=("side",),
+    cameras=("side", endoscope.NAME),
     time_limit_s=60.0,
     settle_steps=single.SETTLE_STEPS,
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
@@ -161,5 +161,7 @@ TASK = Task(
     floor=single.FLOOR,
     is_sound=single.is_sound,
     outline=words.outline,
+    # Between where the needle lies and where it is passed.
+    endoscope=workspaces.SIDE_ENDOSCOPE._replace(work=(-0.012, 0.0, 0.02)),
     trocars=two_arms.TROCARS,
 )

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 
 from starjax import rcm
-from starjax.sim import bodies
+from starjax.sim import bodies, endoscope, workspaces
 from starjax.sim.tasks import two_arms
 from starjax.sim.tasks.base import Capsules, Field, Task, Verdict, Views
 from starjax.sim.tasks.peg_transfer import task as single
@@ -137,7 +137,7 @@ TASK = Task(
     name="peg_transfer_bimanual",
     mjcf="tasks/peg_transfer_bimanual/peg_transfer_bimanual.xml",
     slots=two_arms.SLOTS,
-    cameras=("side",),
+    cameras=("side", endoscope.NAME),
     time_limit_s=60.0,
     settle_steps=single.SETTLE_STEPS,
     fields=(
@@ -164,5 +164,6 @@ TASK = Task(
     floor=0.0,
     is_sound=single.is_sound,
     outline=words.outline,
+    endoscope=workspaces.SIDE_ENDOSCOPE,
     trocars=two_arms.TROCARS,
 )

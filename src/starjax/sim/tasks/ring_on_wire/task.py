@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import bodies
+from starjax.sim import bodies, endoscope, workspaces
 from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
 from starjax.sim.tasks.peg_transfer.task import is_at_rest
 from starjax.sim.tasks.ring_on_wire import words
@@ -240,7 +240,7 @@ TASK = Task(
     name="ring_on_wire",
     mjcf="tasks/ring_on_wire/ring_on_wire.xml",
     slots=(Slot(workspace="wire", p_world_ref=(0.0, 0.0, 0.15), tool="grasper_wide"),),
-    cameras=("camera",),
+    cameras=("camera", endoscope.NAME),
     time_limit_s=60.0,
     settle_steps=SETTLE_STEPS,
     fields=(
@@ -267,4 +267,5 @@ TASK = Task(
     floor=0.0,
     is_sound=is_sound,
     outline=words.outline,
+    endoscope=workspaces.WIRE_ENDOSCOPE,
 )
