@@ -26,6 +26,9 @@ MAX_FIRST_TURN = 0.3  # rad
 # Of a control step on the way: 3 cm/s, about as fast as demonstrations are half of the time.
 LEAD_MOVE = 0.001  # m
 LEAD_TURN = 0.02  # rad
+# Of half the demonstrated range, by which a tip lies outside of it: commands end at its edge, and
+# rounding alone may measure a tip there as outside.
+OUTSIDE = 0.01
 
 
 class First(NamedTuple):
@@ -87,7 +90,7 @@ def _is_unknown(
     encoded = normalizer.encode(action_space, now, jnp.zeros(now.p.shape[:-1]), told)
     scaled = stats.action.normalize(encoded).reshape(*now.p.shape[:-1], space.dim + 1)
     where = space.slices["p"] if "p" in space.slices else space.slices["depth"]
-    return (jnp.abs(scaled[..., where]) > 1.0).any(-1)
+    return (jnp.abs(scaled[..., where]) > 1.0 + OUTSIDE).any(-1)
 
 
 def _way(now: Pose, begin: Pose, p_world_trocar: jax.Array, steps: int) -> Pose:

@@ -143,6 +143,9 @@ def test_time_off_target_counts_after_the_first_seconds():
     assert int(early.missed) == 0 and int(late.missed) == 1 and not late.unseen
 
 
-def test_a_tool_without_the_camera_is_a_mistake():
+def test_a_tool_without_the_camera_is_a_mistake(monkeypatch):
+    names, mounted = scene.name("endoscope_track"), registry.mount
+    as_endoscope = lambda arm, tool, workspace: mounted(arm, "endoscope", workspace)  # noqa: E731
+    monkeypatch.setattr(registry, "mount", as_endoscope)
     with mistakes.of("camera", "endoscope"):
-        scene.compose(scene.name("ring_on_wire")._replace(cameras=("endoscope",)))
+        scene.compose(names._replace(tools=("grasper",)))
