@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from starjax import deploy, rcm
+from starjax.data import normalizer
 from starjax.deploy import start
 from starjax.errors import UsageError
 
@@ -144,6 +145,23 @@ def test_a_tip_aside_of_the_demonstrated_ones_is_not_led(compact):
     """It is as deep as they are: a frame is wrong, or something else is."""
     pose, trocar = tool(compact, [0.0, 0.09, 0.0])
     assert refused(compact, pose, trocar).argument == "max_first_move"
+
+
+@pytest.mark.parametrize(("beyond", "unknown"), [(1e-5, False), (0.05, True)])
+def test_a_tip_at_the_edge_of_the_demonstrated_ones_is_known(beyond, unknown):
+    """Commands end there, so rounding must not decide."""
+    stats = normalizer.Normalizer(normalizer.MinMax(-0.05 * np.ones(5), 0.05 * np.ones(5)), None)
+    p_world_ref = np.float32([0.0, 0.0, 0.15])
+    told = rcm.trocar_frame(rcm.trocar_from_position(P_WORLD_TROCAR, p_world_ref), p_world_ref)
+    tip = np.float32([0.0, 0.0, 0.05 * (1.0 + beyond)])
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(
+        np.append(np.float32(0.0), tip),
+        rcm.trocar_from_position(P_WORLD_TROCAR, p_world_ref),
+        p_world_ref,
+    )
+    now = jax.tree.map(lambda x: jnp.asarray(x)[None, None], pose)
+    told = jax.tree.map(lambda x: jnp.asarray(x)[None, None], told)
+    assert bool(start._is_unknown("rcm4", stats, now, told).all()) is unknown
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 1.0, np.pi - 1e-3, np.pi])

@@ -82,7 +82,7 @@ class Deployed:
         A tool that has just been passed through the trocar is shallower than any demonstrated one.
         Where a plan begins deeper and more than 3 mm or 0.15 rad from it, the commands are instead
         a slow way there (`start.LEAD_MOVE`, `start.LEAD_TURN` a control step), which the next
-        decisions continue. A tip above `rcm.MIN_DEPTH`, 5 mm, is sent to it at once.
+        decisions continue. A tip less deep than `rcm.MIN_DEPTH` (5 mm) is sent there at once.
 
         Returns:
           Command `[H]` or `[B, H]`: tip poses in the world frame, all of them on the RCM manifold

@@ -26,8 +26,8 @@ MAX_FIRST_TURN = 0.3  # rad
 # Of a control step on the way: 3 cm/s, about as fast as demonstrations are half of the time.
 LEAD_MOVE = 0.001  # m
 LEAD_TURN = 0.02  # rad
-# Of half the demonstrated range, by which a tip lies outside of it: commands end at its edge, and
-# rounding alone may measure a tip there as outside.
+# Share of half the demonstrated range, beyond which a tip lies outside: commands end at the range's
+# edge, and rounding may put a tip that is there a little beyond.
 OUTSIDE = 0.01
 
 
@@ -58,8 +58,8 @@ def led(
     """Replaces plans that begin far from a shallow tool by a slow way to their start.
 
     A tool is shallow if its tip lies outside the demonstrated ones and the plan begins deeper. Far
-    is beyond `NEAR_MOVE` or `NEAR_TURN`. The first command of a tip above `rcm.MIN_DEPTH` goes
-    there at once, as no command is shallower.
+    is beyond `NEAR_MOVE` or `NEAR_TURN`. A tip less deep than `rcm.MIN_DEPTH` is sent there at
+    once, as no command is shallower.
 
     Args:
       action_space: key of `rcm.ACTION_SPACES`, of `stats`.

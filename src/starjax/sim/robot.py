@@ -34,7 +34,7 @@ def read(arm: Arm) -> mujoco.MjSpec:
         if joint.frictionloss:
             raise errors.UsageError(
                 f"arm {arm.name}: joint {joint.name}",
-                "no frictionloss, which the contact solver has not",
+                "no frictionloss, which the contact solver does not know",
                 f"{joint.frictionloss:g}",
             )
     return spec

@@ -145,7 +145,8 @@ def test_time_off_target_counts_after_the_first_seconds():
 
 def test_a_tool_without_the_camera_is_a_mistake(monkeypatch):
     names, mounted = scene.name("endoscope_track"), registry.mount
-    as_endoscope = lambda arm, tool, workspace: mounted(arm, "endoscope", workspace)  # noqa: E731
-    monkeypatch.setattr(registry, "mount", as_endoscope)
+    monkeypatch.setattr(
+        registry, "mount", lambda arm, tool, workspace: mounted(arm, "endoscope", workspace)
+    )
     with mistakes.of("camera", "endoscope"):
         scene.compose(names._replace(tools=("grasper",)))
