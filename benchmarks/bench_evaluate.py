@@ -25,8 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
+from starjax.commands import policy_under_test
 from starjax.evaluation import evaluate, latency
-from starjax.experiments import policy_under_test
 from starjax.policies import features, packaged
 from starjax.rollouts import agent, cores, engine, episodes
 from starjax.sim import env as envs

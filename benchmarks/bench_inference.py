@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import config, rcm, runtime
+from starjax.commands import bench
 from starjax.evaluation import latency
-from starjax.experiments import bench
 from starjax.models import roll_net
 from starjax.models.kernels import parallel_ddim
 from starjax.policies import features

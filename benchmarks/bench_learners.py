@@ -14,8 +14,8 @@ import _setup
 import _timing
 
 from starjax import config, runtime
+from starjax.commands import presets
 from starjax.evaluation import latency
-from starjax.experiments import presets
 from starjax.learners import LEARNERS
 from starjax.policies import features
 

@@ -103,8 +103,8 @@ def summed(driven: _far_robots.Driven, network: Network) -> dict:
 def write(asked, env, driven, told: dict, name: str, spent: float) -> dict:
     """Writes a result file; returns its strict successes of all trials."""
     from starjax import deploy
+    from starjax.commands import evaluate
     from starjax.evaluation import result, statistics, trial_file, trials
-    from starjax.experiments import evaluate
     from starjax.policies import packaged, policy_file
     from starjax.runtime import files
 

@@ -7,7 +7,7 @@ import re
 import typing
 
 from starjax import cli, config, limits
-from starjax.experiments import options, presets
+from starjax.commands import options, presets
 
 _TRAILING = re.compile(r"^\s+(\w+): .*?#\s*(.*)$")
 

@@ -4,7 +4,7 @@ import mistakes
 import pytest
 
 from starjax import errors
-from starjax.experiments import options
+from starjax.commands import options
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ ROWS = (
     ("report",),
     ("commands",),
 )
-COMMANDS = {"experiments", "doctor", "cli", "__main__"}  # one layer
+COMMANDS = {"commands", "experiments", "doctor", "cli", "__main__"}  # one layer
 PLACE = {name: row for row, names in enumerate(ROWS) for name in names}
 
 

@@ -8,7 +8,7 @@ import mistakes
 import pytest
 
 from starjax import config, limits
-from starjax.experiments import bench, evaluate, pack, sweep
+from starjax.commands import bench, evaluate, pack, sweep
 
 STARTS = (config.RunConfig(), evaluate.Options(), sweep.Options("x"), bench.Options("x"))
 RANGES = [

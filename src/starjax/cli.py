@@ -17,76 +17,76 @@ _EXCHANGE = (*_LEARNING, "formats")
 # Subcommand -> (module with `main(argv) -> exit code`, one line of help, extras that it needs).
 COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "run": (
-        "starjax.experiments.run",
+        "starjax.commands.run",
         "collect, train, evaluate and report: the whole of it",
         _ALL,
     ),
-    "collect": ("starjax.experiments.collect", "demonstrations only", _LEARNING),
+    "collect": ("starjax.commands.collect", "demonstrations only", _LEARNING),
     "train": (
-        "starjax.experiments.train",
+        "starjax.commands.train",
         "demonstrations and training, no evaluation",
         _LEARNING,
     ),
     "evaluate": (
-        "starjax.experiments.evaluate",
+        "starjax.commands.evaluate",
         "score a trained policy on its task's trocars",
         _ALL,
     ),
     "sweep": (
-        "starjax.experiments.sweep",
+        "starjax.commands.sweep",
         "score a trained policy on a grid or sample of trocars",
         _LEARNING,
     ),
     "stress": (
-        "starjax.experiments.stress",
+        "starjax.commands.stress",
         "score a trained policy while something is wrong",
         _LEARNING,
     ),
     "exercise": (
-        "starjax.experiments.exercise",
+        "starjax.commands.exercise",
         "six blocks one after another with two arms, beside people's times",
         _LEARNING,
     ),
-    "bench": ("starjax.experiments.bench", "inference latency of a policy (Table IV)", _LEARNING),
+    "bench": ("starjax.commands.bench", "inference latency of a policy (Table IV)", _LEARNING),
     "serve": (
-        "starjax.experiments.serve",
+        "starjax.commands.serve",
         "a trained policy for robots elsewhere, over websockets",
         ("sim", "serve"),
     ),
-    "pack": ("starjax.experiments.pack", "a policy in a file of half the size", _LEARNING),
+    "pack": ("starjax.commands.pack", "a policy in a file of half the size", _LEARNING),
     "export": (
-        "starjax.experiments.export_command",
+        "starjax.commands.export_command",
         "demonstrations as a LeRobot, robomimic or zarr dataset",
         _EXCHANGE,
     ),
     "import": (
-        "starjax.experiments.import_command",
+        "starjax.commands.import_command",
         "a dataset from LeRobot, robomimic or zarr, to train on",
         _EXCHANGE,
     ),
     "inspect": (
-        "starjax.experiments.inspect_command",
+        "starjax.commands.inspect_command",
         "what is in a dataset, policy or result, and what is odd about it",
         _EXCHANGE,
     ),
     "report": (
-        "starjax.experiments.report_command",
+        "starjax.commands.report_command",
         "tables, figures, video, page from results",
         ("sim", "report"),
     ),
     "view": (
-        "starjax.experiments.view",
+        "starjax.commands.view",
         "a policy, an expert or a dataset at work, live in a browser",
         (*_LEARNING, "viewer"),
     ),
     "teleop": (
-        "starjax.experiments.teleop",
+        "starjax.commands.teleop",
         "demonstrate by hand in a browser; episodes become a dataset",
         (*_LEARNING, "viewer"),
     ),
-    "list": ("starjax.experiments.list_command", "what flags can name", ("sim",)),
+    "list": ("starjax.commands.list_command", "what flags can name", ("sim",)),
     "place": (
-        "starjax.experiments.place",
+        "starjax.commands.place",
         "search where an arm must stand for a task",
         ("sim", "train"),
     ),
@@ -223,7 +223,7 @@ def _warning(message: Warning | str, kind: type[Warning], place: str, *rest: Any
 def _spelled(error: errors.UsageError) -> str:
     """A mistake's line, with flags instead of fields if tyro is there to read them."""
     try:
-        from starjax.experiments import options  # late: `--version` need not wait for tyro
+        from starjax.commands import options  # late: `--version` need not wait for tyro
     except ModuleNotFoundError:
         return str(error)
     return options.spelled(error)

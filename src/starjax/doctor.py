@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from starjax import cli
-from starjax.experiments import options, presets
+from starjax.commands import options, presets
 from starjax.runtime import files, gpu, locks, xla
 
 DESCRIPTION = """Looks at what of this machine and installation works; one remedy for each fault.

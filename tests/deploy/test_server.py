@@ -12,9 +12,9 @@ import websockets
 from websockets.sync import client as sockets
 
 from starjax import rcm
+from starjax.commands import serve
 from starjax.deploy import batching, server, wire
 from starjax.errors import UsageError
-from starjax.experiments import serve
 from starjax.sim import registry
 
 FRAMES = 300  # bad ones

@@ -7,9 +7,9 @@ import pytest
 import stubs
 
 from starjax import config
+from starjax.commands import demonstrations
 from starjax.data import demos, load, schema
 from starjax.evaluation import evaluate, recorded
-from starjax.experiments import demonstrations
 from starjax.rollouts import agent
 from starjax.rollouts.placement import Place
 from starjax.sim import endoscope, workspaces

@@ -13,8 +13,8 @@ import pytest
 import toy_learner
 
 from starjax import config, deploy, errors, learners, rcm
+from starjax.commands import options, run_settings
 from starjax.data import normalizer, windows
-from starjax.experiments import options, run_settings
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
@@ -150,7 +150,7 @@ def test_settings_import_no_jax():
     program = """
 import sys
 from starjax import config, learners
-from starjax.experiments import run_settings
+from starjax.commands import run_settings
 config.PolicyConfig()
 run_settings._settings(["--preset", "cpu", "--out", "x"], "starjax run", "", has_gpu=False)
 assert not {"jax", "numpy", "mujoco"} & sys.modules.keys()

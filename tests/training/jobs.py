@@ -161,7 +161,7 @@ def run_main(out: str, mode: str) -> None:
     import stubs
 
     from starjax import cli
-    from starjax.experiments import demonstrations, pipeline, policy_under_test
+    from starjax.commands import demonstrations, pipeline, policy_under_test
     from starjax.policies import policy as policies
     from starjax.runtime import processes
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from starjax import config
+from starjax.commands import demonstrations, folders, pipeline, presets
 from starjax.data import load, normalizer, windows
-from starjax.experiments import demonstrations, folders, pipeline, presets
 from starjax.methods import METHODS
 from starjax.policies import generator, policy_file
 from starjax.policies import policy as policies

@@ -14,9 +14,9 @@ import pytest
 import several
 
 from starjax import config
+from starjax.commands import pipeline
 from starjax.data import store
 from starjax.evaluation import result
-from starjax.experiments import pipeline
 from starjax.runtime import processes
 from starjax.training import checkpoint, log, loop
 

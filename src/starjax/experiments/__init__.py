@@ -1,1 +1,1 @@
-"""The commands, and the presets that they begin with."""
+"""Home of `python -m starjax.experiments.run`; the commands live in `starjax.commands`."""

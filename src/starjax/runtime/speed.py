@@ -6,7 +6,7 @@ import numpy as np
 
 from starjax.runtime import xla
 
-CORES = 2  # of the machine that `experiments.estimate` has its figures from
+CORES = 2  # of the machine that `commands.estimate` has its figures from
 _SECONDS = 0.286e-3  # that `_work` takes on one of them, an AMD EPYC's
 _TRIES = 50
 

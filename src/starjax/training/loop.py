@@ -87,7 +87,7 @@ def run(
       StorageError: the disk is full.
       UsageError: the directory holds a training of another seed, of other demonstrations, or of
         more steps; or no loss of a whole stretch of the log was finite. That its method and
-        settings are these is for the caller to see to, as `experiments.folders.claim` does.
+        settings are these is for the caller to see to, as `commands.folders.claim` does.
     """
     directory = pathlib.Path(directory)
     mesh = devices.make_mesh(train_config.batch_size, mesh_devices)

@@ -1,0 +1,210 @@
+"""Demonstrations of a run: where they lie, collecting what is missing, and what training sees.
+
+What brings jax is imported where it is used, after XLA has been prepared.
+"""
+
+import functools
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from starjax import config as config_lib
+from starjax import errors
+from starjax.commands import messages, scenes, stage_times
+
+_FROM, _RANDOMISE = "demos.from_", "demos.randomise"
+
+
+def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Callable[[], None]]:
+    """The folder of a run's demonstrations, and a function that collects what it lacks.
+
+    `share` is the run's: all processes collect together.
+    """
+    if config.demos.from_:
+        root = given(config, env)
+        return root, lambda: messages.stage("collect", f"nothing, from {root}")
+    from starjax.data import demos, schema, store
+    from starjax.rollouts import agent, placement, trocars, waves
+
+    env, most = randomised(config, env)
+    task, name = env.task, config.demos.expert or next(iter(env.task.experts))
+    errors.choice("demos.expert", name, task.experts)
+    chosen = trocars.select(task.trocars, slice(config.demos.seen_trocars))
+    settings = schema.Settings(
+        per_trocar=config.demos.per_trocar,
+        seed=config.seed,
+        max_steps=max(config.demos.max_steps, task.least_steps),
+        keep_failures=config.demos.keep_failures,
+        expert=name,
+        randomise=most,
+    )
+    expert = agent.from_single(task.experts[name]())
+    out = Path(config.out)
+    root = out / f"demos-{store.digest(schema.describe(env, chosen, settings))}"
+
+    def is_there() -> bool:
+        if not store.is_sealed(root):
+            return False
+        try:
+            store.read_seal(root)
+        except ValueError as error:
+            messages.indented(f"damaged, collected again: {error}")
+            (root / "SEALED.json").unlink()
+            return False
+        return True
+
+    asked = itertools.count()
+
+    def collect() -> None:
+        if share.first(f"collected {next(asked)}", is_there):
+            messages.stage("collect", f"done before, {root}")
+            return
+        messages.stage("collect", f"into {root}")
+        place = placement.Place(devices=placement.devices())
+        try:
+            with stage_times.timed(out, f"collect {root.name}"):
+                found = demos.collect(
+                    root, env, expert, chosen, settings, place=place, report=messages.indented
+                )
+        except waves.ExpertFailed as error:
+            raise errors.UsageError(
+                "demos.max_steps",
+                "enough control steps for the expert",
+                settings.max_steps,
+                str(error),
+            ) from error
+        messages.indented(
+            "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
+        )
+
+    return root, collect
+
+
+def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, float]]:
+    """The environment that demonstrations are recorded in, and the highest levels of what is wrong
+    with it.
+
+    Raises:
+      errors.UsageError: something that these demonstrations would not show, or no such level.
+    """
+    from starjax.evaluation.disturbances import DISTURBANCES, base, levels_of
+
+    most = levels_of(_RANDOMISE, config.demos.randomise)
+    for name, level in most.items():
+        kind: base.Disturbance = DISTURBANCES.get(name)
+        sees = config.policy.observation == "image" or not kind.of_images
+        if not (kind.of_demos and sees):
+            raise errors.UsageError(_RANDOMISE, "what demonstrations can show", name)
+        base.check_levels(_RANDOMISE, name, [level])
+    if not most:
+        return env, most
+    return base.varied(scenes.disturbable(env, list(most), config.policy), most), most
+
+
+def given(config: config_lib.RunConfig, env: Any) -> Path:
+    """The folder of somebody's dataset, once it is known to be one that this run can learn from.
+
+    Raises:
+      errors.UsageError: it is none, or of another task, or lacks what the policy observes.
+    """
+    import numpy as np
+
+    from starjax.data import schema, store
+    from starjax.rollouts import episodes
+
+    root = Path(config.demos.from_)
+    try:
+        about = schema.upgraded(store.read_description(root))
+        store.read_seal(root)
+        task, features = about["scene"]["task"], about["features"]
+        reference = np.array(about["p_world_ref"], np.float32)
+    except (KeyError, TypeError, ValueError) as error:
+        hint = "starjax import makes one of LeRobot, robomimic and zarr datasets"
+        raise errors.UsageError(_FROM, "a dataset that is complete", error, hint) from error
+    policy, task_hint = config.policy, f"--task {task} trains on it"
+    if task != env.task.name:
+        raise errors.UsageError(_FROM, f"demonstrations of {env.task.name}", task, task_hint)
+    if not np.array_equal(reference, np.asarray(env.p_world_ref, np.float32)):
+        expected = f"nominal trocars at {env.p_world_ref.tolist()}"
+        raise errors.UsageError(_FROM, expected, reference.tolist())
+    size = [policy.image_size, policy.image_size, 3]
+    wanted = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
+    if policy.observation == "state":
+        wanted = {"state": [sum(field.size for field in env.task.fields)]}
+    if policy.frame == "camera":
+        wanted |= dict(zip(episodes.ENDOSCOPE, ([3, 3], [3]), strict=True))
+    for name, shape in wanted.items():
+        found = features.get(name, {}).get("shape")
+        if found != shape:
+            got = "none" if found is None else f"one of {found}"
+            raise errors.UsageError(_FROM, f"a field {name} of {shape}", f"{got} in {root}")
+    return root
+
+
+def load(
+    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], encoder: Any, share: Any
+) -> Any:
+    """The dataset to train on, with what a frozen encoder sees instead of images."""
+    from starjax.data import load as loading
+    from starjax.data import store
+
+    def is_whole() -> bool:
+        try:
+            loading.verify(root)
+        except store.DamagedEpisode as error:
+            if config.demos.from_:
+                raise errors.UsageError(_FROM, "demonstrations that are whole", error) from error
+            messages.indented(f"damaged, collected again: {error}")
+            (root / "SEALED.json").unlink()
+            return False
+        return True
+
+    collect()
+    if not share.first("whole", is_whole):
+        collect()
+    found = loading.load(root, verify=False, images=encoder is None, report=messages.indented)
+    return found.dataset if encoder is None else _with_features(config, root, found, encoder)
+
+
+def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder: Any) -> Any:
+    import jax
+    import numpy as np
+
+    from starjax.data import windows
+    from starjax.training import frozen
+
+    dataset = demos.dataset
+    with stage_times.timed(Path(config.out), "features"):
+        parts = [
+            frozen.features(
+                encoder,
+                config.policy,
+                root,
+                demos.digest,
+                len(dataset.episode),
+                camera,
+                functools.partial(_frames, root, camera),
+                messages.indented,
+            )
+            for camera in config.scene.camera
+        ]
+    found = np.concatenate(parts, axis=-1)
+    features = jax.device_put(found) if windows.on_device(dataset) else found
+    return dataset.replace(observation=dataset.observation._replace(features=features))
+
+
+def _frames(root: Path, camera: str) -> Any:
+    from starjax.data import load as loading
+
+    return loading.frames(root)[camera]
+
+
+def frozen_encoder(config: config_lib.RunConfig) -> Any:
+    """The vision encoder that stays frozen, None for other runs; mistakes are found here."""
+    if config.policy.observation != "image" or not config.policy.encoder_weights:
+        return None
+    from starjax.training import encoder
+
+    found = encoder.read(config.policy)
+    return found if config.policy.freeze_encoder else None

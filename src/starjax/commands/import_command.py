@@ -1,0 +1,82 @@
+"""`starjax import PATH OUT`: exports of ours as they were, others' demonstrations by a mapping."""
+
+import dataclasses
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from starjax import errors
+from starjax.commands import checks, messages, options
+from starjax.runtime import progress, xla
+
+_SHOWN = 10  # oddities, the others are in a file
+DESCRIPTION = """Makes a dataset of demonstrations in another format, to train on.
+
+PATH is a LeRobot or zarr folder or an HDF5 file, OUT the dataset's folder. An export of starjax
+comes back as it was. Of others' data a mapping file says what the columns are."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]  # what to read
+    out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]  # folder to write
+    map: str = ""  # mapping file, .toml or .json; left out, PATH must be an export of starjax
+    format: str = options.AUTO  # lerobot, robomimic or zarr; auto: as PATH looks
+
+
+def main(argv: Sequence[str]) -> int:
+    """Writes the dataset, says what is odd about it."""
+    chosen = options.parse(Options, argv, prog="starjax import", description=DESCRIPTION)
+    checks.expect_folder("OUT", chosen.out)
+    xla.prepare_xla()
+    from starjax.data import store
+    from starjax.data.formats import base
+
+    path, out = Path(chosen.path), Path(chosen.out)
+    checks.expect(not store.is_sealed(out), "OUT", "a folder without a dataset", out)
+    if chosen.format != options.AUTO:
+        errors.choice("format", chosen.format, base.FORMATS.names())
+    name = base.recognised(path) if chosen.format == options.AUTO else chosen.format
+    with base.opened(path, name) as source:
+        if not chosen.map:
+            return _bring_back(source, path, out)
+        return _mapped(source, Path(chosen.map), out)
+
+
+def _bring_back(source: Any, path: Path, out: Path) -> int:
+    from starjax.data.formats import exchange
+
+    if source.origin is None:
+        raise errors.UsageError(
+            "PATH", "an export of starjax, or a --map", path, "starjax inspect shows its columns"
+        )
+    with progress.track("Import", len(source.lengths), unit="episodes") as advance:
+        found = exchange.bring_back(source, out, advance)
+    same = "every byte as it was" if found["same"] else "images or an earlier schema changed"
+    print(f"{out}: {found['episodes']} demonstrations, {same}; digest {found['digest'][:12]}")
+    return 0
+
+
+def _mapped(source: Any, map_path: Path, out: Path) -> int:
+    from starjax.data import schema
+    from starjax.data.formats import foreign, mapping
+
+    given = mapping.load(map_path)
+    with progress.track("Import", 2 * len(source.lengths), unit="episodes read") as advance:
+        found = foreign.bring(source, given, out, map_path.parent, advance)
+    for line in found.notes[:_SHOWN]:
+        messages.indented(line)
+    if len(found.notes) > _SHOWN:
+        messages.indented(f"and {len(found.notes) - _SHOWN} more, see {out / schema.IMPORTED}")
+    worst = f"{found.residual_mm.max():.2g} mm or less (root mean square)"
+    print(
+        f"{out}: {found.episodes} demonstrations, {found.frames} frames, {found.left_out} left out"
+    )
+    print(f"shafts pass their trocars at {worst}")
+    print(f"starjax train --demos.from {shlex.quote(str(out))} --task {given.task} trains on it")
+    return 0

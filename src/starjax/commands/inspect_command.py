@@ -1,0 +1,211 @@
+"""`starjax inspect PATH`: what is in a dataset, a policy or a result, and what is odd about it."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import tyro
+
+from starjax import errors
+from starjax.commands import options
+from starjax.runtime import files, xla
+
+DESCRIPTION = """Says what is in a dataset, a policy or a result, and what is odd about it.
+
+PATH is a folder of demonstrations, a LeRobot or zarr folder, a robomimic file, a policy.safetensors
+or the name of a policy that ships with starjax, a result.json or a method's folder with one."""
+
+_LOOKED_AT = 50  # episodes of somebody's dataset whose numbers are read
+_SHOWN = 20  # oddities
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+
+
+class Found(NamedTuple):
+    """A printed report: rows of names and texts, and oddities, a line each."""
+
+    rows: list[tuple[str, str]]
+    odd: list[str]
+
+
+def main(argv: Sequence[str]) -> int:
+    """Prints what is there; returns 1 where something is odd."""
+    chosen = options.parse(Options, argv, prog="starjax inspect", description=DESCRIPTION)
+    xla.prepare_xla()
+    found = inspect(chosen.path)
+    width = max(len(name) for name, _ in found.rows)
+    for name, text in found.rows:
+        print(f"{name:{width}}  {text}".rstrip())
+    for line in found.odd[:_SHOWN]:
+        print(f"odd: {line}")
+    if len(found.odd) > _SHOWN:
+        print(f"odd: {len(found.odd) - _SHOWN} more")
+    return int(bool(found.odd))
+
+
+def inspect(name: str) -> Found:
+    """Looks at whatever lies at a path, or is the policy of this name.
+
+    Raises:
+      errors.UsageError: it is nothing that starjax knows, or cannot be read.
+    """
+    from starjax.policies import packaged
+
+    path = Path(name)
+    look: Callable[[Path], Found]
+    if packaged.locate(name).suffix == ".safetensors":
+        path, look = packaged.find("PATH", name), _policy
+    elif (path / "dataset.json").is_file():
+        look = _dataset
+    elif path.suffix == ".json" or (path / "result.json").is_file():
+        look = _result
+    else:
+        look = _others
+    try:
+        return look(path)
+    except (ValueError, KeyError) as error:
+        if isinstance(error, errors.UsageError):
+            raise
+        raise errors.UsageError("PATH", "a dataset, policy or result", error) from error
+
+
+def _dataset(path: Path) -> Found:
+    from starjax.data import oddities, schema, store
+
+    about = schema.upgraded(store.read_description(path))
+    scene, keys = about["scene"], store.keys(path)
+    records = [
+        r for r in store.verify_all(path, keys, arrays=False).values() if isinstance(r, dict)
+    ]
+    kept = [record for record in records if record["files"]]
+    lengths = sorted(record["length"] for record in kept)
+    size = sum(file["bytes"] for record in kept for file in record["files"].values())
+    sealed = files.read_json(path / "SEALED.json")["digest"] if store.is_sealed(path) else "none"
+    rows = [
+        ("dataset", f"of starjax, schema {about['schema']}, digest {sealed[:12]}"),
+        ("scene", _scene(scene)),
+        ("episodes", f"{len(records)}: {sum(bool(r['success']) for r in records)} successful"),
+        ("kept", f"{len(kept)}, {sum(lengths)} frames, {files.size(size)}"),
+        ("lengths", _spread(lengths, " control steps")),
+        ("trocars", str(len(about["trocars"]))),
+        ("from", "import" if "imported" in about else f"expert {about['expert']}"),
+    ]
+    rows += [
+        (f"  {name}", f"{feature['dtype']} {feature['shape']}  {feature.get('what', '')}")
+        for name, feature in about["features"].items()
+    ]
+    return Found(rows, list(oddities.of_dataset(path)))
+
+
+def _policy(path: Path) -> Found:
+    import jax
+    import numpy as np
+
+    from starjax.policies import policy_file
+
+    trained = policy_file.load(path)
+    policy, train, leaves = trained.policy, trained.train, jax.tree.leaves(trained.params)
+    count = sum(leaf.size for leaf in leaves) / 1e6
+    rows = [
+        ("policy", f"{trained.method}, learner {policy.learner}, preset {trained.preset}"),
+        ("scene", _scene(trained.scene._asdict())),
+        ("weights", f"{count:.3g} M, {files.size(path.stat().st_size)}"),
+        ("observes", f"{policy.observation}, {policy.image_size} px, {policy.obs_horizon} steps"),
+        ("plans", f"{policy.horizon} commands, {policy.execute} executed"),
+        ("trained", f"{train.steps} steps of {train.batch_size}"),
+    ]
+    odd = [] if all(np.isfinite(leaf).all() for leaf in leaves) else ["weights are not finite"]
+    for name, box in (("actions", trained.normalizer.action), ("state", trained.normalizer.state)):
+        if box is not None:
+            low, high = np.asarray(box.low), np.asarray(box.high)
+            ranges = (f"{a:.3g} to {b:.3g}" for a, b in zip(low, high))
+            rows.append((name, ", ".join(ranges)))
+            odd += [f"{name}: a range that is empty"] * bool((high <= low).any())
+    return Found(rows, odd)
+
+
+def _result(path: Path) -> Found:
+    from starjax.evaluation import result
+
+    file = path if path.suffix == ".json" else path / "result.json"
+    found = result.read(file)
+    figures = found.figures
+    rows = [
+        ("result", f"{found.method}, observes {found.observation}, schema {found.schema}"),
+        ("scene", _scene(found.scene._asdict())),
+        ("trials", str(len(found.trials))),
+        (
+            "code",
+            f"starjax {found.version}, commit {found.commit}{' (changed)' * bool(found.dirty)}",
+        ),
+        ("weights", str(found.weights)),
+        ("dataset", str(found.dataset_digest)),
+    ]
+    for name in ("seen", "unseen"):
+        if rate := figures.get(name):
+            low, high = (100 * bound for bound in rate["ci95"] or (0.0, 1.0))
+            count = f"{rate['successes']}/{rate['trials']}"
+            rows.append((name, f"{count}, 95% interval [{low:.0f}, {high:.0f}] %"))
+    rows += [("note", line) for line in found.about.get("warnings", [])]
+    odd = ["made with code that was changed"] * bool(found.dirty)
+    odd += [f"{figures['invalid']} trials diverged"] * bool(figures.get("invalid"))
+    return Found(rows, odd)
+
+
+def _others(path: Path) -> Found:
+    from starjax.data.formats import base
+
+    name = base.recognised(path)
+    with base.opened(path, name) as source:
+        lengths = sorted(source.lengths)
+        rate = f"{source.hz:g} Hz" if source.hz else "unknown"
+        comes = "starjax export: starjax import brings it back" if source.origin else "others"
+        rows = [
+            ("dataset", base.FORMATS.get(name).what),
+            ("from", comes),
+            ("task", source.task),
+            ("episodes", f"{len(lengths)}, {sum(lengths)} frames"),
+            ("lengths", _spread(lengths, " steps")),
+            ("rate", rate),
+        ]
+        low = [column for column, about in source.columns.items() if not about.is_image]
+        seen = [source.read(i, low) for i in range(min(len(lengths), _LOOKED_AT))]
+        rows += [(f"  {column}", _said(source, column, seen)) for column in source.columns]
+        return Found(rows, [*source.notes, *_odd(low, seen)])
+
+
+def _said(source: Any, name: str, seen: list[dict[str, Any]]) -> str:
+    import numpy as np
+
+    column = source.columns[name]
+    text = f"{column.dtype} {list(column.shape)}  {', '.join(column.names[:16])}"
+    if column.is_image or (not column.shape and column.dtype == "bool"):
+        return text
+    values = np.concatenate([arrays[name].reshape(-1) for arrays in seen])
+    return f"{text}  {np.nanmin(values):.4g} to {np.nanmax(values):.4g}" if values.size else text
+
+
+def _odd(names: Sequence[str], seen: list[dict[str, Any]]) -> Iterator[str]:
+    import numpy as np
+
+    for name in names:
+        bad = [i for i, arrays in enumerate(seen) if not np.isfinite(arrays[name]).all()]
+        if bad:
+            yield f"{name} is not finite in episode {bad[0]} and {len(bad) - 1} more"
+
+
+def _scene(scene: dict[str, Any]) -> str:
+    robots = ", ".join(f"{arm} with {tool}" for arm, tool in zip(scene["arms"], scene["tools"]))
+    return "; ".join(filter(None, [scene["task"], robots, ", ".join(scene["cameras"])]))
+
+
+def _spread(sizes: Sequence[int], unit: str) -> str:
+    if not sizes:
+        return "none"
+    return f"{sizes[0]} to {sizes[-1]}{unit}, half of them up to {sizes[len(sizes) // 2]}"

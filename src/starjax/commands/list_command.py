@@ -1,0 +1,103 @@
+"""`starjax list`: everything that flags can name, a line each."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from starjax import errors, methods
+from starjax.commands import options, presets
+from starjax.learners import LEARNERS
+from starjax.policies import packaged
+from starjax.runtime import files
+from starjax.sim import names, registry
+from starjax.sim.arms.base import Arm
+from starjax.sim.registry import Registry
+from starjax.sim.tools.base import Tool
+
+if TYPE_CHECKING:  # it imports jax, which `--help` does without
+    from starjax.sim.tasks.base import Task
+
+DESCRIPTION = "Lists what flags can name: tasks, arms, tools, methods, learners, presets, policies."
+
+Row = tuple[str, str]  # name, what it is
+
+
+def main(argv: Sequence[str]) -> int:
+    """Prints the tables."""
+    options.parse(options.NoFlags, argv, prog="starjax list", description=DESCRIPTION)
+    tables = {
+        "tasks (--task, --camera, --demos.expert)": _parts(registry.tasks, _task),
+        "arms (--arm)": _parts(registry.arms, _arm),
+        "tools (--tool)": _parts(registry.tools, _tool),
+        "methods (--method)": _methods(),
+        "learners (--policy.learner)": _learners(),
+        "presets (--preset)": _presets(),
+        "policies (--policy, --policy.encoder-weights)": _policies(),
+    }
+    for title, found in tables.items():
+        rows = list(found)
+        width = max(len(name) for name, _ in rows) if rows else 0
+        print(f"{title}\n" + "\n".join(f"  {name:{width}}  {text}" for name, text in rows) + "\n")
+    return 0
+
+
+def _parts(registry: Registry, described: Callable[[Any], str]) -> Iterator[Row]:
+    for name in registry.names():
+        try:
+            yield name, described(registry.get(name))
+        except errors.UsageError as error:  # of a package that cannot be imported
+            yield name, f"cannot be used: {error.got}"
+
+
+def _task(task: "Task") -> str:
+    arms = f"{task.arms} arm{'s' if task.arms > 1 else ''}"
+    sees, shows = ", ".join(task.cameras), ", ".join(task.experts)
+    return f"{task.words.title}: {arms}; cameras {sees}; experts {shows}"
+
+
+def _arm(arm: Arm) -> str:
+    places = [f"{tool} over the {place}" for tool, place in arm.mounts]
+    return f"{len(arm.joints)} joints; mounted with {', '.join(places) or 'nothing yet'}"
+
+
+def _tool(tool: Tool) -> str:
+    jaws = f"jaws that open {2e3 * (tool.open - tool.closed):.1f} mm" if tool.jaw else "no jaws"
+    return f"{jaws}; shaft of {2e3 * tool.shaft_radius:g} mm"
+
+
+def _methods() -> Iterator[Row]:
+    for name, row in methods.METHODS.items():
+        rolls = "; a network for the roll" * row.hierarchical
+        told = "; told the trocar" * row.sees_trocar + "; projected" * row.projects
+        yield name, f"{row.label}: actions {row.action_space}{rolls}{told}"
+    yield "all", f"the {len(methods.TABLE_II)} of the paper's Table II"
+
+
+def _learners() -> Iterator[Row]:
+    for name in LEARNERS.names():
+        try:
+            kind = LEARNERS.get(name).settings
+            yield name, ", ".join(field.name for field in dataclasses.fields(kind))
+        except errors.UsageError as error:  # of a package that cannot be imported
+            yield name, f"cannot be used: {error.got}"
+
+
+def _presets() -> Iterator[Row]:
+    yield "auto", "gpu where jax runs on one, else cpu"
+    for name, preset in presets.PRESETS.items():
+        policy, train, demos = preset.policy, preset.train, preset.demos
+        seen = f"images of {policy.image_size} px" if policy.observation == "image" else "the state"
+        count = f"{demos.per_trocar * demos.seen_trocars} demonstrations"
+        yield name, f"{count} of {seen}, {train.steps} steps of {train.batch_size}"
+
+
+def _policies() -> Iterator[Row]:
+    for name in packaged.names():
+        about = files.read_json(packaged.FOLDER / f"{name}.json")
+        label = methods.METHODS[about["method"]].label
+        scores = ", ".join(
+            f"{part} {about[part]['successes']}/{about[part]['trials']}"
+            for part in ("seen", "unseen")
+        )
+        task = about.get("scene", {}).get("task", names.FIRST.task)
+        yield name, f"{label} for {task}; successes at trocars: {scores}"

@@ -1,0 +1,251 @@
+"""Texts of a run for its user: the plan, the stages, the outcome."""
+
+import contextlib
+import os
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import starjax
+from starjax import config as config_lib
+from starjax import methods
+from starjax.commands import estimate
+from starjax.runtime import files, speed, xla
+
+STAGES = ("collect", "train", "evaluate", "report")
+
+
+def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
+    """Describes what is going to happen, for the start of a run."""
+    lines = [
+        f"starjax {starjax.__version__}: method {config.method}, preset {config.preset}, "
+        f"seed {config.seed}, folder {config.out}",
+        *_setting(config),
+        _learning_from(config.demos),
+    ]
+    lines += [_training(config), *_idle(config.train.batch_size)] if "train" in stages else []
+    lines += [_evaluation(config)] if "evaluate" in stages else []
+    return "\n".join([*lines, _time(config, stages)])
+
+
+def about(config: config_lib.RunConfig, name: str, seed: int) -> str:
+    """Describes what is scored: the policy `name`, how it was made, the trials and their seed."""
+    lines = [
+        f"starjax {starjax.__version__}: {methods.METHODS[config.method].label} of {name}",
+        *_setting(config),
+        _learning_from(config.demos),
+        _training(config),
+        f"{_evaluation(config)}, seed {seed}",
+    ]
+    return "\n".join(lines)
+
+
+def _setting(config: config_lib.RunConfig) -> list[str]:
+    """Lines that say where it happens, and what the policy sees."""
+    import jax
+
+    devices, scene = jax.devices(), config.scene
+    robots = ", ".join(f"{arm} with {tool}" for arm, tool in zip(scene.arm, scene.tool))
+    parts = [_task(config).words.title, robots, ", ".join(scene.camera)]
+    return [
+        f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores",
+        f"  scene           {'; '.join(filter(None, parts))}",
+        *_seeing(config),
+        *(f"  ablation        {what}" for what in _ablations(config.method, config.policy)),
+    ]
+
+
+def _task(config: config_lib.RunConfig) -> Any:
+    from starjax.sim import registry
+
+    return registry.tasks.get(config.scene.task)
+
+
+def _learning_from(demos: config_lib.DemosConfig) -> str:
+    if demos.from_:
+        return f"  demonstrations  those in {demos.from_}"
+    count = demos.per_trocar * demos.seen_trocars
+    return f"  demonstrations  {count} ({demos.per_trocar} x {demos.seen_trocars} seen trocars)"
+
+
+def _training(config: config_lib.RunConfig) -> str:
+    policy, train = config.policy, config.train
+    channels = "-".join(map(str, getattr(policy.options, "unet_channels", ())))
+    network = f"{policy.learner}, U-Net {channels}" if channels else policy.learner
+    dtype = "" if policy.dtype == "float32" else f", {policy.dtype}"
+    steps = f"{train.steps} steps of {train.batch_size}"
+    return f"  training        {steps}, {network}{dtype}"
+
+
+def _idle(batch_size: int) -> list[str]:
+    """A line if some devices cannot share a batch."""
+    import jax
+
+    from starjax.training import devices
+
+    used, there = devices.make_mesh(batch_size).size, jax.device_count()
+    if used == there:
+        return []
+    return [f"                  on {used} of {there} devices, as the batch must divide by them"]
+
+
+def _evaluation(config: config_lib.RunConfig) -> str:
+    trocars, trials = len(_task(config).is_seen), config.eval.trials
+    limit = f"at most {config.eval.time_limit_s:g} s each"
+    averaged = ", plans averaged" if config.eval.ensemble else ""
+    return f"  evaluation      {trocars} trocars x {trials} trials, {limit}{averaged}"
+
+
+def _time(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
+    import jax
+
+    trocars, backend = len(_task(config).is_seen), jax.default_backend()
+    return f"  time            {estimate.line(config, stages, trocars, backend, speed.pace)}"
+
+
+def _seeing(config: config_lib.RunConfig) -> list[str]:
+    """Lines that say what the policy sees, and with which encoder."""
+    policy = config.policy
+    if policy.observation == "state":
+        return [
+            f"  observation     state instead of pixels: {_fields(config)} "
+            "(--policy.observation image turns the camera on)"
+        ]
+    return [
+        f"  observation     image, {policy.image_size} px",
+        f"  encoder         {encoder(config)}; {policy.encoder}",
+    ]
+
+
+def _fields(config: config_lib.RunConfig) -> str:
+    return ", ".join(field.name for field in _task(config).fields)
+
+
+def encoder(config: config_lib.RunConfig) -> str:
+    """Where the weights of the image encoder come from, and whether they still learn."""
+    policy, name = config.policy, config.policy.encoder_weights
+    if not name:
+        return "trained from scratch"
+    trained_in, scene, known = _scene_of(name), config.scene, ""
+    if trained_in:
+        task, cameras = trained_in.task, trained_in.cameras
+        other = f" through {', '.join(cameras)}" if {*scene.camera} - {*cameras} else ""
+        known = f" (pretrained on {'this task' if task == scene.task else task}{other})"
+    return f"{'frozen' if policy.freeze_encoder else 'trained further'}, from {name}{known}"
+
+
+def _scene_of(encoder_weights: str) -> Any:
+    """Names of the scene that an encoder's policy was trained in; None of a file that is none, or
+    gone."""
+    from starjax.policies import packaged, policy_file
+
+    try:
+        return policy_file.load(packaged.locate(encoder_weights)).scene
+    except (OSError, ValueError):
+        return None
+
+
+def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
+    """Active ablations: settings that deviate from the method's row."""
+    rows = [methods.METHODS[name] for name in (methods.TABLE_II if method == "all" else [method])]
+    sees, yaw = policy.sees_trocar, policy.trocar_yaw
+    given = "given" if sees == "always" else "not given"
+    told = sees != "method" and any(row.sees_trocar != (sees == "always") for row in rows)
+    turned = yaw == "fixed" and any(row.action_space in ("rcm1", "rcm2") for row in rows)
+    rolls = any(row.hierarchical for row in rows)
+    found = {
+        "positions count from the endoscope (--policy.frame camera)": policy.frame == "camera",
+        f"the learner's model is {given} the trocar (--policy.sees-trocar {sees})": told,
+        "the frame {T} does not turn with the trocar's azimuth (--policy.trocar-yaw fixed)": turned,
+        "the roll network does not read the measured rolls (--policy.no-roll-history)": (
+            rolls and not policy.roll_history
+        ),
+        "the roll network does not read the trocar (--policy.no-roll-trocar)": (
+            rolls and not policy.roll_trocar
+        ),
+        "the roll network reads the observation too (--policy.roll-observation)": (
+            rolls and policy.roll_observation
+        ),
+    }
+    return [what for what, holds in found.items() if holds]
+
+
+def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[str]:
+    """Warnings for readers of the result whose method `figures` names, a sentence each."""
+    found = []
+    if config.policy.observation == "state":
+        found.append(
+            f"The policy observes the task's state ({_fields(config)}), not pixels as in the "
+            "paper; --policy.observation image turns the camera on."
+        )
+    else:
+        policy = config.policy
+        found.append(f"Image encoder: {encoder(config)}; {policy.encoder}, {policy.image_size} px.")
+    found += [f"Ablation: {what}." for what in _ablations(figures["method"], config.policy)]
+    if config.preset == "smoke":
+        found.append("Preset smoke is too short to learn anything: its rates mean nothing.")
+    if figures["invalid"]:
+        found.append(f"{figures['invalid']} trial(s) diverged in simulation; they count as failed.")
+    return found
+
+
+def outcome(results: Sequence[Any]) -> str:
+    """Seen against unseen trocars, one line for each `result.Result`, for the end of a run."""
+    rows = [("success [95% interval]", "seen", "unseen", "safe", "RCM executed")]
+    for result in results:
+        figures = result.figures
+        error = figures["rcm_error_mm"]["executed"]
+        # results of earlier versions do not have it
+        within = figures["rcm_error_mm"].get("within_steps", error)
+        rows.append(
+            (
+                methods.METHODS[result.method].label,
+                _rate(figures["seen"]),
+                _rate(figures["unseen"]),
+                _rate(figures["safe"]["all"]),
+                f"{error['mean']:.3f} mm, at most {within['max']:.2f}",
+            )
+        )
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join(
+        "  " + "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths)).rstrip()
+        for row in rows
+    )
+
+
+def hint(run: Path, weights: str, does: str) -> str:
+    """Which command `does` something with figures of these weights that lie in a run's folder."""
+    try:
+        scored = files.read_json(run / "result.json").get("weights", weights)
+    except (FileNotFoundError, ValueError):
+        scored = None
+    typed = f"starjax report {shlex.quote(str(run))} {does} it"
+    return typed if scored == weights else f"{typed} once starjax run has scored these weights"
+
+
+@contextlib.contextmanager
+def heard(is_first: bool) -> Iterator[None]:
+    """Keeps what is printed to the first process of several."""
+    with open(os.devnull, "w") as nowhere, contextlib.ExitStack() as changed:
+        if not is_first:
+            changed.enter_context(contextlib.redirect_stdout(nowhere))
+        yield
+
+
+def stage(name: str, text: str) -> None:
+    """Prints the line that begins a stage."""
+    print(f"\n[{STAGES.index(name) + 1}/{len(STAGES)}] {name}: {text}", flush=True)
+
+
+def indented(text: str) -> None:
+    """Prints a line that belongs to the stage above it."""
+    print(f"      {text}", flush=True)
+
+
+def _rate(rate: Mapping[str, Any]) -> str:
+    if not rate["trials"]:
+        return "-"
+    low, high = (100 * bound for bound in rate["ci95"])
+    count = f"{rate['successes']}/{rate['trials']}"
+    return f"{count} = {100 * rate['rate']:.0f}% [{low:.0f}, {high:.0f}]"

@@ -1,0 +1,67 @@
+"""`starjax pack POLICY OUT`: a trained policy in half the space, to pass on."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from starjax import config, errors
+from starjax.commands import checks, options
+from starjax.limits import Range
+from starjax.policies import packaged
+from starjax.runtime import files, xla
+
+DESCRIPTION = """Writes a policy for inference: weights in float16, arithmetic in float32.
+
+POLICY is a policy.safetensors, OUT the file to write. Weights are rounded to 11 bits, so score OUT
+itself (`starjax evaluate --policy OUT`)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    # a policy.safetensors, or the name of a policy that ships with starjax
+    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    # the file to write
+    out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    # of a sample's first noise; left out: POLICY's
+    temperature: Annotated[options.FloatOrNone, Range(0.0, 1.0)] = None
+
+
+def main(argv: Sequence[str]) -> int:
+    """Writes the file, says how large it is."""
+    chosen = options.parse(Options, argv, prog="starjax pack", description=DESCRIPTION)
+    source, out = packaged.find("POLICY", chosen.policy), Path(chosen.out)
+    checks.expect_folder("folder of OUT", out.parent)
+    if out.exists():
+        raise errors.UsageError("OUT", "a file that is not there yet", chosen.out or "none")
+    xla.prepare_xla()
+    xla.require_devices("starjax.policies.policy_file")
+
+    import jax
+
+    from starjax.policies import policy_file
+
+    try:
+        trained = policy_file.load(source)
+    except ValueError as error:
+        raise errors.UsageError("POLICY", "a policy of starjax", error) from error
+    policy = config.deciding(trained.policy)
+    if chosen.temperature is not None:
+        if not hasattr(policy.options, "temperature"):
+            raise errors.UsageError("POLICY", "one with a temperature", f"one of {policy.learner}")
+        policy = config.with_options(policy, temperature=chosen.temperature)
+    try:
+        policy_file.save(out, trained._replace(policy=policy), half=True)
+    except ValueError as error:
+        raise errors.UsageError("POLICY", "weights that fit float16", error) from error
+    count = sum(leaf.size for leaf in jax.tree.leaves(trained.params)) / 1e6
+    before, after = (files.size(path.stat().st_size) for path in (source, out))
+    print(f"{out}: {count:.3g} M parameters, {after} ({source}: {before})")
+    temperature = getattr(policy.options, "temperature", None)
+    said = [] if temperature is None else [f"temperature {temperature:g}"]
+    print(", ".join([*said, f"arithmetic in {policy.dtype}"]))
+    return 0

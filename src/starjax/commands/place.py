@@ -1,0 +1,97 @@
+"""`starjax place ARM TOOL WORKSPACE`: where an arm must stand, printed as a record to paste."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from starjax import config as config_lib
+from starjax import errors
+from starjax.commands import options
+from starjax.runtime import xla
+
+if TYPE_CHECKING:
+    from starjax.sim.arms.base import Mount
+    from starjax.sim.mounts import Fit
+    from starjax.sim.workspaces import Workspace
+
+DESCRIPTION = """Searches where an arm must stand, how its tool is turned, and its home.
+
+WORKSPACE is a region of trocars and targets; a task stands for the workspaces of its arms. The arm
+must reach every target through every trocar with every roll. What is printed, as a row for the
+arm's record, is the mount with the most room to joint limits and singular configurations."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    arm: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ARM")]  # name of an arm
+    tool: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TOOL")]  # name of a tool
+    # name of a workspace or of a task
+    workspace: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORKSPACE")]
+    seed: config_lib.Seed = 0  # of the search
+    tilts: bool = False  # let the base also lean, or hang
+
+
+def main(argv: Sequence[str]) -> int:
+    """Searches, prints each round's figures and the best mount."""
+    chosen = options.parse(Options, argv, prog="starjax place", description=DESCRIPTION)
+    xla.prepare_xla()
+    xla.require_devices("starjax.sim.place")
+
+    from starjax.sim import mounts, place, registry
+
+    at = mounts.bench(registry.arms.get(chosen.arm), registry.tools.get(chosen.tool))
+    found = []
+    for name, workspace in _workspaces(chosen.workspace).items():
+        print(f"{chosen.arm} with {chosen.tool} in {name}", flush=True)
+        mount, least = place.search(at, workspace, chosen.seed, chosen.tilts, _tell)
+        print(f"\n{_record(chosen.tool, name, mount, least)}\n")
+        found.append(mounts.is_good(least))
+    if all(found):
+        return 0
+    print(
+        f"Not every mount may be used. It needs at least {mounts.MIN_MARGIN:g} rad to the limits, "
+        f"a singular value of {mounts.MIN_SINGULAR:g} m, every pose reached and no link in the "
+        "table. Another --seed, or --tilts, may find one. Beside the table an elbow may be lower: "
+        "`watched` in the arm's record is the first joint that may not."
+    )
+    return 1
+
+
+def _tell(fit: "Fit") -> None:
+    print(f"  {_figures(fit)}", flush=True)
+
+
+def _workspaces(name: str) -> "dict[str, Workspace]":
+    """The workspace of that name, or those of a task's arms, each with its nominal trocar."""
+    from starjax.sim import registry
+
+    if name in registry.workspaces.names():
+        return {name: registry.workspaces.get(name)}
+    known = [*registry.workspaces.names(), *registry.tasks.names()]
+    errors.choice("WORKSPACE", name, known)
+    return {
+        slot.workspace: registry.workspaces.get(slot.workspace)._replace(
+            p_world_ref=slot.p_world_ref, roll_zero=slot.roll_zero
+        )
+        for slot in registry.tasks.get(name).slots
+    }
+
+
+def _figures(fit: "Fit") -> str:
+    reached = f"missed by {1e3 * fit.residual:.2g} mm" if fit.residual > 1e-4 else "all reached"
+    return (
+        f"{reached}, {fit.margin:.3f} rad to the limits, singular value {fit.singular:.3f} m, "
+        f"links {fit.height:.2f} m above the table"
+    )
+
+
+def _record(tool: str, workspace: str, mount: "Mount", fit: "Fit") -> str:
+    """The row of `Arm.mounts`, its figures in a comment."""
+    usual = mount._field_defaults
+    said = {name: value for name, value in mount._asdict().items() if value != usual.get(name)}
+    inside = "".join(f"\n    {name}={value!r}," for name, value in said.items())
+    return f"# {_figures(fit)}\n({tool!r}, {workspace!r}): Mount({inside}\n),".replace("'", '"')

@@ -1,0 +1,266 @@
+"""A trained policy in closed loop: rollouts of a method, and the result.json that they become."""
+
+import dataclasses
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from starjax import config as config_lib
+from starjax import errors, methods, rcm
+from starjax.commands import messages
+from starjax.data import normalizer
+from starjax.evaluation import evaluate, latency, statistics
+from starjax.evaluation import result as results
+from starjax.evaluation import trials as table
+from starjax.policies import features, policy_file
+from starjax.policies import policy as policies
+from starjax.rollouts import agent, engine, ensemble, placement
+from starjax.runtime import files
+from starjax.sim import env as sim_env
+
+
+class Subject(NamedTuple):
+    """A method with its weights, in its environment.
+
+    Attributes:
+      method: its name.
+      env: with the observation that it was trained on.
+      policy: its functions.
+      trained: its weights, rounded as `sample` would, and what they were trained with.
+      weights: SHA-256 of their file.
+    """
+
+    method: str
+    env: sim_env.Env
+    policy: policies.Policy
+    trained: policy_file.Trained
+    weights: str
+
+
+class Programs(NamedTuple):
+    """Programs that were compiled before there were weights.
+
+    Attributes:
+      trials: of `rollouts`.
+      decision: that `write_result` times.
+    """
+
+    trials: engine.Compiled | None = None
+    decision: latency.Decide | None = None
+
+
+def load(
+    method: str, weights: Path, env: sim_env.Env | None = None, arms: Sequence[str] = ()
+) -> Subject:
+    """Loads a method's weights.
+
+    Args:
+      method: a row of `methods.METHODS`.
+      weights: policy.safetensors.
+      env: built from what the weights were trained on unless given.
+      arms: robots of that env instead of those that they were trained with.
+
+    Raises:
+      errors.UsageError: the file is missing or damaged.
+    """
+    again = f"starjax run with its flags and --out {shlex.quote(str(weights.parent.parent))}"
+    if not weights.exists():
+        raise errors.UsageError(str(weights), "trained weights", "none", f"{again} trains them")
+    try:
+        trained = policy_file.load(weights)
+    except ValueError as error:
+        hint = f"remove it, and {again} trains it again"
+        raise errors.UsageError(str(weights), "a policy of starjax", error, hint) from error
+    return _load(method, trained, weights, env, arms)
+
+
+def from_file(path: Path, arms: Sequence[str] = ()) -> Subject:
+    """Loads a policy that says itself which method it is; `arms` as in `load`.
+
+    Raises:
+      errors.UsageError: the file is damaged, or not a policy of this version.
+    """
+    try:
+        trained = policy_file.load(path)
+    except ValueError as error:
+        raise errors.UsageError("--policy", "a policy of starjax", error) from error
+    errors.choice(f"method of {path}", trained.method, methods.METHODS)
+    return _load(trained.method, trained, path, None, arms)
+
+
+def _load(
+    method: str,
+    trained: policy_file.Trained,
+    file: Path,
+    env: sim_env.Env | None,
+    arms: Sequence[str],
+) -> Subject:
+    scene = trained.scene
+    env = env or sim_env.make(
+        scene.task,
+        arms or scene.arms,
+        scene.tools,
+        observation=trained.policy.observation,
+        image_size=trained.policy.image_size,
+        cameras=scene.cameras,
+    )
+    row = methods.METHODS[method]
+    policy = policies.make(row, trained.policy, env.task, cameras=scene.cameras)
+    ready = trained._replace(params=policy.for_sampling(trained.params))
+    return Subject(method, env, policy, ready, files.sha256(file))
+
+
+def rollouts(
+    directory: Path,
+    who: Subject,
+    trocars: rcm.Trocar,
+    settings: config_lib.EvalConfig,
+    seed: int,
+    levels: Mapping[str, float] | None = None,
+    compiled: engine.Compiled | None = None,
+) -> table.Table:
+    """Runs what is missing of an evaluation.
+
+    `levels` are of what disturbs its environment; `compiled` comes from `compile_ahead`.
+    """
+    trained = who.trained
+    return evaluate.evaluate(
+        directory,
+        who.env,
+        _planner(who.method, who.policy, trained.policy, settings.ensemble),
+        (trained.params, trained.normalizer),
+        trocars,
+        _settings(settings, seed),
+        place=placement.Place(devices=placement.devices()),
+        identity={
+            **methods.behaviour(who.method)._asdict(),
+            "policy": config_lib.as_json(trained.policy),
+        },
+        levels=levels,
+        compiled=compiled,
+        report=messages.indented,
+    )
+
+
+def compile_ahead(
+    name: str, config: config_lib.RunConfig, env: sim_env.Env, vision: policies.Params | None
+) -> Programs:
+    """Compiles what `rollouts` and `write_result` will run of a method that is not trained yet.
+
+    Args:
+      name: of the method.
+      config: of the run.
+      env: with the observation that it is trained on.
+      vision: parameters of its frozen encoder, None where it has none.
+    """
+    row, deciding = methods.METHODS[name], config_lib.deciding(config.policy)
+    policy = policies.make(row, deciding, env.task, cameras=env.names.cameras)
+    params = jax.eval_shape(policy.init, jax.random.key(0))
+    if vision is not None:
+        params = {**params, "vision": vision}
+    params = jax.eval_shape(policy.for_sampling, params)
+    told = policies.ablated(row, config.policy)
+    stats = normalizer.shapes(told, env.task, config.policy.observation == "state")
+    trials = evaluate.compile_ahead(
+        env,
+        _planner(name, policy, config.policy, config.eval.ensemble),
+        (params, stats),
+        env.task.trocars,
+        _settings(config.eval, config.seed),
+    )
+    seen = features.sensors(env.task, env.names.cameras)
+    return Programs(trials, latency.compile_ahead(policy, deciding, params, stats, seen))
+
+
+def _planner(
+    method: str,
+    policy: policies.Policy,
+    policy_config: config_lib.PolicyConfig,
+    averages: bool,
+) -> agent.BatchAgent:
+    if averages:
+        keeps = methods.METHODS[method].keeps_to_manifold
+        return ensemble.from_policy(policy.sample, policy_config.obs_horizon, keeps)
+    return agent.from_policy(policy.sample, policy_config.obs_horizon, policy_config.execute)
+
+
+def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.Settings:
+    return evaluate.Settings(
+        trials=settings.trials,
+        seed=seed,
+        time_limit_s=settings.time_limit_s,
+        video_trials=settings.video_trials,
+        chunk=settings.chunk,
+    )
+
+
+def settings(who: Subject, config: config_lib.RunConfig) -> config_lib.RunConfig:
+    """A run's settings, with those that its weights were trained with: another method may have
+    trained them."""
+    trained = who.trained
+    return dataclasses.replace(
+        config, policy=trained.policy, train=trained.train, demos=trained.demos or config.demos
+    )
+
+
+def decision_ms(who: Subject, decide: latency.Decide | None = None) -> dict[str, float]:
+    """Time of one decision at batch 1: observation in, commands out, compilation apart."""
+    trained = who.trained
+    return latency.policy_ms(
+        who.policy,
+        trained.policy,
+        trained.params,
+        trained.normalizer,
+        features.sensors(who.env.task, trained.scene.cameras),
+        seconds=5.0,
+        decide=decide,
+    )
+
+
+def write_result(
+    folder: Path,
+    who: Subject,
+    trials: table.Table,
+    config: config_lib.RunConfig,
+    seed: int,
+    command: str,
+    timings_s: dict[str, float] | None = None,
+    dataset_digest: str | None = None,
+    decide: latency.Decide | None = None,
+) -> results.Result:
+    """Writes and returns `<folder>/result.json`: `statistics.compose`'s figures and what made them.
+
+    Args:
+      folder: of the result.
+      who: was evaluated.
+      trials: of the task's trocars.
+      config: settings of the run and of this evaluation.
+      seed: of the trials; the run's own is in `config`.
+      command: what was typed.
+      timings_s: seconds by stage.
+      dataset_digest: of the demonstrations, if they are there.
+      decide: the program of a decision, if it is compiled.
+    """
+    task = who.env.task
+    is_seen = task.is_seen & (np.arange(len(task.is_seen)) < config.demos.seen_trocars)
+    observation = who.trained.policy.observation
+    figures = statistics.compose(
+        trials, is_seen, method=who.method, observation=observation, seed=seed
+    )
+    about = {
+        "control_hz": who.env.control_hz,
+        "inference_ms": decision_ms(who, decide),
+        "preset": config.preset,
+        "seed": seed,
+        "weights": who.weights,
+        "dataset_digest": dataset_digest,
+        "config": config_lib.as_json(config),
+        "command": command,
+        "timings_s": timings_s or {},
+        "warnings": messages.warnings(config, figures),
+    }
+    return results.write(folder / "result.json", who.env.names, figures, about)

@@ -1,0 +1,58 @@
+"""`starjax report RUN...`: tables, figures, video and page from results that are there."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from starjax import errors, methods
+from starjax.commands import checks, options
+from starjax.runtime import xla
+
+DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
+
+RUN is a method's folder, such as runs/cpu/stardiff, or a folder of them, such as runs/cpu."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    run: options.Runs  # methods' folders, or folders of them
+    # folder of the report; auto: `report` beside a method's folder, or in an evaluation's
+    out: str = options.AUTO
+    video: bool = True  # write rollout.mp4
+
+
+def main(argv: Sequence[str]) -> int:
+    """Builds the report."""
+    chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
+    checks.expect(bool(chosen.run), "RUN", "one folder or more", "none")
+    once: dict[Path, Path] = {}
+    for name in chosen.run:
+        for found in _with_results(name):
+            once.setdefault(found.resolve(), found)
+    runs = list(once.values())
+    first = runs[0].resolve()
+    beside = (first.parent if first.name in methods.METHODS else first) / "report"
+    out = beside if chosen.out == options.AUTO else chosen.out
+    checks.expect_folder("--out", out)
+    xla.prepare_xla()
+    xla.require_devices("starjax.report.build")
+
+    from starjax.report import build
+
+    try:
+        page = build.build(runs, Path(out), with_video=chosen.video)
+    except ValueError as error:  # of a damaged file, which it names
+        raise errors.UsageError("RUN", "results that are whole", error) from error
+    print(f"report: {page}")
+    return 0
+
+
+def _with_results(name: str) -> list[Path]:
+    """A method's folder, or those inside a folder."""
+    path = Path(name)
+    found = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
+    if not (name and found):
+        raise errors.UsageError("RUN", "a folder with a result.json, or of such", name or "none")
+    return [file if file.is_dir() else file.parent for file in found]

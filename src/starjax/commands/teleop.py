@@ -1,0 +1,77 @@
+"""`starjax teleop`: a person demonstrates in the browser; what is kept is an ordinary dataset."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from starjax import config as config_lib
+from starjax import errors
+from starjax.commands import checks, options
+from starjax.commands.view import Port
+from starjax.limits import Range
+from starjax.runtime import signals, xla
+
+DESCRIPTION = """Opens a page on which a person demonstrates a task.
+
+The tool follows a handle in the 3D, the page's hotkeys, a SpaceMouse or a gamepad; its shaft stays
+in the trocar whatever the hand does. An episode is recorded from the hand's first motion on. Enter
+saves it, Backspace discards it. The same command again adds to what is there."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    out: str = options.AUTO  # folder of the dataset; auto: runs/teleop-TASK
+    task: str = config_lib.DEFAULT_TASK  # what is to be done
+    arm: tuple[str, ...] = ()  # robots; left out: the task's
+    # pixels, or what the task says of its state: what is recorded, and policies can learn from
+    observation: Literal["image", "state"] = "image"
+    image_size: Annotated[int, Range(32, 1_024)] = 128  # pixels a side of the pictures
+    trocar: Annotated[int, Range(0, 999)] = 0  # number of the task's configuration of trocars
+    seed: config_lib.Seed = 0  # of what is drawn at the start of an episode
+    # beside handle and hotkeys: a SpaceMouse (needs pyspacemouse) or a gamepad (needs pygame)
+    device: Literal["none", "spacemouse", "gamepad"] = "none"
+    port: Port = 8080  # of the page, on this machine only; 0 takes a free one
+
+
+def main(argv: Sequence[str]) -> int:
+    """Serves the page until a stop."""
+    chosen = options.parse(Options, argv, prog="starjax teleop", description=DESCRIPTION)
+    out = f"runs/teleop-{chosen.task}" if chosen.out == options.AUTO else chosen.out
+    checks.expect_folder("--out", out)
+    xla.prepare_xla()
+    xla.require_devices("starjax.viewer.teleop")
+
+    from starjax.sim import env as sim_env
+    from starjax.viewer import devices, recorder, steering, teleop
+    from starjax.viewer import server as pages
+
+    env = sim_env.make(
+        chosen.task, chosen.arm, observation=chosen.observation, image_size=chosen.image_size
+    )
+    if chosen.trocar >= (count := len(env.task.is_seen)):
+        raise errors.UsageError("--trocar", f"0 to {count - 1}", chosen.trocar)
+    device = None if chosen.device == "none" else devices.opened(chosen.device)
+    try:
+        with (
+            signals.stop_signals() as should_stop,
+            recorder.opened(Path(out), env, chosen.seed) as kept,
+            pages.opened(chosen.port) as server,
+        ):
+            print(f"open {pages.address(server)} in a browser; Ctrl-C closes it", flush=True)
+            said = teleop.run(
+                server,
+                steering.make(env),
+                kept,
+                should_stop,
+                device=device,
+                trocar=chosen.trocar,
+                seed=chosen.seed,
+            )
+    finally:
+        if device:
+            device.close()
+    print(f"{said}; dataset: {out}")
+    return 0

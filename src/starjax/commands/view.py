@@ -1,0 +1,104 @@
+"""`starjax view`: a page in the browser with a policy, an expert or recorded episodes at work."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from starjax import config as config_lib
+from starjax import errors
+from starjax.commands import folders, options
+from starjax.limits import Range
+from starjax.policies import packaged
+from starjax.runtime import signals, xla
+
+DESCRIPTION = """Shows somebody at work on a page in the browser.
+
+The scene in 3D, the camera's picture, RCM error and plan. Drag a trocar by its arrows, and the
+policy goes on through it. Ctrl-C closes the page."""
+
+Port = Annotated[int, Range(0, 65_535)]
+Show = Callable[[Any, Callable[[], bool]], str]  # (server, should_stop) -> a last line
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Flags of the command."""
+
+    # a policy.safetensors, or the name of a policy that ships with starjax
+    policy: str = ""
+    run: str = ""  # a method's folder, such as runs/cpu/stardiff: its policy
+    expert: bool = False  # the task's scripted demonstrator; so it is where nobody is named
+    dataset: str = ""  # a folder of demonstrations: its episodes
+    # a second one at the same trial: expert, or a policy as above
+    beside: str = ""
+    task: str = config_lib.DEFAULT_TASK  # of the expert
+    arm: str = ""  # robot instead of their own
+    trocar: Annotated[int, Range(0, 999)] = 8  # number of the task's configuration of trocars
+    seed: config_lib.Seed = 0  # of the trials
+    port: Port = 8080  # of the page, on this machine only; 0 takes a free one
+
+
+def main(argv: Sequence[str]) -> int:
+    """Serves the page until a stop."""
+    chosen = options.parse(Options, argv, prog="starjax view", description=DESCRIPTION)
+    named = [name for name in ("policy", "run", "dataset") if getattr(chosen, name)]
+    named += ["expert"] if chosen.expert else []
+    if len(named) > 1:
+        got = " and ".join(f"--{name}" for name in named)
+        raise errors.UsageError("--policy, --run, --expert or --dataset", "one of them", got)
+    xla.prepare_xla()
+    xla.require_devices("starjax.viewer.view")
+
+    from starjax.viewer import server as pages
+
+    show = _dataset(chosen.dataset) if chosen.dataset else _live(chosen)
+    with signals.stop_signals() as should_stop, pages.opened(chosen.port) as server:
+        print(f"open {pages.address(server)} in a browser; Ctrl-C closes it", flush=True)
+        print(show(server, should_stop))
+    return 0
+
+
+def _dataset(folder: str) -> Show:
+    """Makes the viewer of recorded episodes."""
+    from starjax.viewer import browse, recorded
+
+    try:
+        found = recorded.opened(Path(folder))
+    except ValueError as error:  # of a damaged file, which it names
+        raise errors.UsageError("--dataset", "a folder of demonstrations", error) from error
+    return lambda server, should_stop: browse.run(server, found, should_stop)
+
+
+def _live(chosen: Options) -> Show:
+    """Makes the viewer of somebody at work."""
+    from starjax.sim import registry
+    from starjax.viewer import actors, view
+
+    who = [_actor(chosen.policy, chosen.run, chosen.task)]
+    if chosen.beside:
+        name = "" if chosen.beside == actors.EXPERT else chosen.beside
+        who.append(_actor(name, "", who[0].task))
+    if who[-1].task != who[0].task:
+        raise errors.UsageError("--beside", f"one that does {who[0].task}", who[-1].task)
+    if chosen.arm:
+        errors.choice("--arm", chosen.arm, registry.arms.names())
+    count = len(registry.tasks.get(who[0].task).is_seen)
+    if chosen.trocar >= count:
+        raise errors.UsageError("--trocar", f"0 to {count - 1}", chosen.trocar)
+    asked = view.Asked(tuple(who), chosen.arm or view.THEIRS, chosen.trocar, chosen.seed)
+    return lambda server, should_stop: view.run(server, asked, should_stop)
+
+
+def _actor(policy: str, run: str, task: str) -> Any:
+    from starjax.viewer import actors
+
+    if run:
+        folder = folders.existing(run)
+        file = folders.weights(folder.parent, folder.name)
+        if not file.is_file():
+            raise errors.UsageError(str(file), "trained weights", "none")
+        return actors.from_file(file, f"{folder.parent.name}/{folder.name}")
+    if policy:
+        return actors.from_file(packaged.find("--policy", policy), Path(policy).stem)
+    return actors.expert(task)

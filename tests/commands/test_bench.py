@@ -1,0 +1,88 @@
+"""`starjax bench`: what it times, and where it writes."""
+
+import dataclasses
+import json
+import types
+
+import fakes
+import mistakes
+import pytest
+
+from starjax import cli, config
+from starjax.commands import bench, folders, presets
+
+SMOKE = presets.PRESETS["smoke"]
+
+
+@pytest.fixture
+def scored(tmp_path):
+    """A method's folder as far as bench asks for it."""
+    folder = tmp_path / "stardiff"
+    folder.mkdir()
+    folders.claim(folder, SMOKE, "demos-a")
+    (folder / "result.json").write_text('{"method": "stardiff"}')
+    return folder
+
+
+def test_bench_writes_beside_the_result_of_the_folder_it_is_in(scored, monkeypatch, capsys):
+    timed = {"weights": "a"}
+    monkeypatch.setattr(bench, "_time", lambda folder, *_: {**timed, "timed": folder.name})
+    monkeypatch.chdir(scored)
+    assert bench.main(["."]) == 0
+    assert capsys.readouterr().out.endswith(f"starjax report {scored} shows it\n")
+    found = json.loads((scored / "bench.json").read_text())
+    assert (found["method"], found["timed"]) == ("stardiff", "stardiff")
+    assert found["hardware"]["cores"] >= 1 and found["versions"]["starjax"]
+    assert json.loads((scored / "result.json").read_text()) == {"method": "stardiff"}
+    (scored / "result.json").write_text('{"method": "stardiff", "weights": "b"}')
+    assert bench.main(["."]) == 0
+    assert "shows it once starjax run has scored these weights" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("flags", "counts"), [([], (1, 2, 5, 10, 20, 50)), (["--ddim-steps", "3", "60"], (3, 60))]
+)
+def test_bench_times_what_table_iv_has_and_the_policy_can(scored, monkeypatch, flags, counts):
+    few = config.with_options(SMOKE.policy, diffusion_steps=60)
+    folders.claim(scored, dataclasses.replace(SMOKE, policy=few), "demos-a")
+    timed = []
+    monkeypatch.setattr(bench, "_time", lambda *given: timed.append(given) or {"weights": "a"})
+    assert bench.main([str(scored), *flags]) == 0
+    assert timed == [(scored, counts, 100)]
+    with mistakes.of("--ddim-steps", 61):
+        bench.main([str(scored), "--ddim-steps", "61"])
+
+
+def test_bench_promises_nothing_after_ctrl_c(scored, monkeypatch, capsys):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench, "_time", stop)
+    assert cli.guard(bench.main, [str(scored)]) == 130
+    said = capsys.readouterr().err
+    assert "bench saves its figures only at its end" in said and "same command" not in said
+    assert not (scored / "bench.json").exists()
+
+
+@pytest.mark.parametrize(("method", "timed"), [("stardiff", True), ("dp_rcm4", False)])
+def test_only_the_hierarchy_has_a_roll_network_to_time(
+    monkeypatch, capsys, tmp_path, method, timed
+):
+    from starjax.commands import policy_under_test
+    from starjax.evaluation import latency
+
+    ms = {"p50": 4.0, "p95": 5.0, "p99": 8.0}
+    trained = fakes.trained()
+    env = fakes.env()
+    who = types.SimpleNamespace(trained=trained, env=env, weights="a")
+    monkeypatch.setattr(policy_under_test, "load", lambda *_: who)
+    monkeypatch.setattr(latency, "table", lambda *_, **__: iter([{"ddim_steps": 2, **ms}]))
+    monkeypatch.setattr(latency, "roll_ms", lambda *_, **__: ms)
+    assert bool(bench._time(tmp_path / method, (2,), 1)["roll_network_ms"]) == timed
+    assert capsys.readouterr().out.splitlines()[1].split() == [
+        "2",
+        "4.000",
+        "5.000",
+        "8.000",
+        "250.0",
+    ]

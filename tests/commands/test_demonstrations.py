@@ -1,0 +1,100 @@
+"""Demonstrations of a run: which are asked for."""
+
+import dataclasses
+
+import mistakes
+import numpy as np
+import pytest
+import stubs
+
+from starjax import config
+from starjax.commands import demonstrations, presets
+from starjax.rollouts import sharing
+
+SMOKE = presets.PRESETS["smoke"]
+
+
+def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
+    from starjax.data import demos
+    from starjax.rollouts import waves
+
+    def collect(*_, **settings):
+        raise waves.ExpertFailed("got 0 of 10 at trocar 0")
+
+    monkeypatch.setattr(demos, "collect", collect)
+    few = dataclasses.replace(SMOKE.demos, max_steps=1)
+    tried = dataclasses.replace(SMOKE, demos=few, out=str(tmp_path))
+    _, missing = demonstrations.plan(tried, stubs.make_env(), sharing.ALONE)
+    with mistakes.of("demos.max_steps", 1) as caught:
+        missing()
+    assert "0 of 10" in caught.value.hint
+
+
+@pytest.mark.parametrize(("seen", "expert", "least"), [(1, "one_wall", 0), (8, "", 6), (2, "", 9)])
+def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, seen, expert, least):
+    from starjax import rcm
+    from starjax.data import demos
+
+    given = []
+    found = {"episodes": 0, "trials": 0, "frames": 0}
+    monkeypatch.setattr(demos, "collect", lambda *a, **_: given.append(a) or found)
+    asked = config.DemosConfig(per_trocar=3, seen_trocars=seen, max_steps=7, expert=expert)
+    chosen = dataclasses.replace(SMOKE, demos=asked, seed=5, out=str(tmp_path))
+    env = stubs.make_env()
+    env = env._replace(task=env.task._replace(least_steps=least))
+    demonstrations.plan(chosen, env, sharing.ALONE)[1]()
+    ((_, _, _, trocars, settings),) = given
+    np.testing.assert_array_equal(trocars, [field[:seen, None] for field in rcm.TROCARS])
+    wanted = {"per_trocar": 3, "seed": 5, "max_steps": max(7, least)}
+    wanted["expert"] = expert or "default"
+    assert {name: settings._asdict()[name] for name in wanted} == wanted
+
+
+def test_an_expert_that_the_task_lacks_is_a_mistake(tmp_path):
+    asked = dataclasses.replace(SMOKE.demos, expert="two_walls")
+    with mistakes.of("demos.expert", "two_walls"):
+        demonstrations.plan(
+            dataclasses.replace(SMOKE, demos=asked), stubs.make_env(), sharing.ALONE
+        )
+
+
+def test_demonstrations_are_recorded_with_what_is_wrong(tmp_path, monkeypatch):
+    import jax
+
+    from starjax.data import demos, schema
+    from starjax.sim.state import EnvParams
+
+    given = []
+    found = {"episodes": 0, "trials": 0, "frames": 0}
+    monkeypatch.setattr(demos, "collect", lambda *a, **_: given.append(a) or found)
+    seen = dataclasses.replace(SMOKE.policy, observation="image")
+    env, roots = stubs.make_env("image"), []
+    for wrong in ((), ("smoke=0.5", "dropped=0.3"), ("smoke=0.4",)):
+        asked = dataclasses.replace(SMOKE.demos, randomise=wrong)
+        chosen = dataclasses.replace(SMOKE, demos=asked, policy=seen, out=str(tmp_path))
+        root, collect = demonstrations.plan(chosen, env, sharing.ALONE)
+        collect()
+        roots.append(root)
+    assert len(set(roots)) == 3 and given[0][1] is env
+    assert "randomise" not in schema.describe(env, *given[0][3:])
+    assert schema.describe(env, *given[1][3:])["randomise"] == {"smoke": 0.5, "dropped": 0.3}
+    params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)))
+    state = given[1][1].reset(jax.random.key(0), params)
+    assert set(state.beside) == {"smoke", "dropped"}
+
+
+@pytest.mark.parametrize(
+    ("observation", "wrong", "got"),
+    [
+        ("image", "trocar_told=2", "trocar_told"),
+        ("image", "breathing=2", "breathing"),
+        ("image", "late_view=5", 5),
+        ("state", "smoke=0.5", "smoke"),
+    ],
+)
+def test_what_demonstrations_cannot_show_is_refused(tmp_path, observation, wrong, got):
+    asked = dataclasses.replace(SMOKE.demos, randomise=(wrong,))
+    seen = dataclasses.replace(SMOKE.policy, observation=observation)
+    chosen = dataclasses.replace(SMOKE, demos=asked, policy=seen, out=str(tmp_path))
+    with mistakes.of("demos.randomise", got):
+        demonstrations.plan(chosen, stubs.make_env(observation), sharing.ALONE)

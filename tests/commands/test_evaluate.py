@@ -1,0 +1,427 @@
+"""`starjax evaluate`, `sweep` and `stress` of trained weights. The simulator is a stub."""
+
+import dataclasses
+import json
+import types
+
+import fakes
+import jax.numpy as jnp
+import mistakes
+import numpy as np
+import pytest
+import safetensors.numpy
+import stubs
+
+from starjax import config, rcm
+from starjax.commands import (
+    evaluate,
+    exercise,
+    folders,
+    policy_under_test,
+    presets,
+    stress,
+    subjects,
+    sweep,
+)
+from starjax.data import normalizer
+from starjax.evaluation import sweep as sweeping
+from starjax.policies import packaged, policy_file
+from starjax.report import video
+from starjax.runtime import files, gpu
+from starjax.sim import exercise as exercising
+from starjax.sim.tasks.peg_transfer_bimanual import six
+
+POLICY = dataclasses.replace(fakes.TINY, execute=4)
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """A policy's file in an empty folder, for the stub of a simulator and of networks."""
+    network, params = stubs.make_policy()
+
+    def sample(_, stats, keys, observation, trocar):
+        return network(params, 1.0, keys, observation, trocar)
+
+    policy = types.SimpleNamespace(sample=sample, for_sampling=lambda params: params)
+
+    monkeypatch.setattr(policy_under_test.sim_env, "make", lambda *_, **__: stubs.make_env())
+    monkeypatch.setattr(policy_under_test.policies, "make", lambda *_, **__: policy)
+    monkeypatch.setattr(video, "record", lambda runs, path: path)
+    monkeypatch.chdir(tmp_path)
+    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
+    made = fakes.trained(
+        method="dp_rcm2",
+        policy=POLICY,
+        train=config.TrainConfig(steps=77),
+        params={"learner": {"unet": {"kernel": jnp.ones(3)}}},
+        normalizer=normalizer.Normalizer(box, None),
+        demos=config.DemosConfig(per_trocar=2, seen_trocars=4),
+        preset="smoke",
+    )
+    policy_file.save(tmp_path / "mine.safetensors", made)
+    return tmp_path / "mine.safetensors"
+
+
+def score(*more):
+    trials = ["--eval.trials", "2", "--eval.time-limit-s", "1"]
+    return evaluate.main(["--policy", "mine.safetensors", *trials, *more])
+
+
+def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
+    assert score() == 0
+    (folder,) = (file.parent / "runs" / "evaluate").glob("mine-*-seed0-2x1s")
+    result = json.loads((folder / "result.json").read_text())
+    assert result["method"] == "dp_rcm2" and len(result["trials"]) == 24
+    assert (result["seen"]["trials"], result["unseen"]["trials"]) == (8, 16)
+    assert result["config"]["train"]["steps"] == 77 and result["preset"] == "smoke"
+    assert result["config"]["policy"] == config.as_json(POLICY)
+    assert result["timings_s"]["evaluate"] > 0
+    assert any("Preset smoke" in text for text in result["warnings"])
+    said = capsys.readouterr().out
+    for words in (
+        "DP-RCM-2 of mine.safetensors",
+        "12 trocars x 2 trials",
+        "8 (2 x 4 seen trocars)",
+    ):
+        assert words in said
+    assert "/8 = " in said and "/16 = " in said and "95% interval" in said
+    assert "rollout.mp4" in said and "result.json" in said
+
+
+def test_a_packaged_policy_is_scored_by_its_name(file, monkeypatch, capsys):
+    monkeypatch.setattr(packaged, "FOLDER", file.parent / "weights")
+    packaged.FOLDER.mkdir()
+    file.rename(packaged.FOLDER / "compact.safetensors")
+    assert evaluate.main(["--policy", "compact", "--eval.trials=1", "--eval.time-limit-s=1"]) == 0
+    said = capsys.readouterr().out
+    assert "DP-RCM-2 of compact\n" in said and "into runs/evaluate/compact-seed0-1x1s\n" in said
+    assert (file.parent / "runs" / "evaluate" / "compact-seed0-1x1s" / "result.json").is_file()
+    assert [path.name for path in packaged.FOLDER.iterdir()] == ["compact.safetensors"]
+
+
+@pytest.mark.parametrize("guess", [False, True])
+@pytest.mark.parametrize(("used", "trials"), [(False, 4), (True, 30)])
+def test_how_many_trials_jax_decides_not_the_system(file, monkeypatch, guess, used, trials):
+    def scored(folder, who, trocars, settings, seed):
+        raise KeyboardInterrupt(f"{settings.trials} in {folder.parent.name}")
+
+    monkeypatch.setattr(gpu, "is_likely", lambda: guess)
+    monkeypatch.setattr(gpu, "is_used", lambda: used)
+    monkeypatch.setattr(policy_under_test, "rollouts", scored)
+    with pytest.raises(KeyboardInterrupt, match=f"^{trials} in mine-.*-{trials}x"):
+        evaluate.main(["--policy", "mine.safetensors"])
+
+
+@pytest.mark.parametrize("change", [{"temperature": 0.25}, {"ddim_steps": 1}])
+def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
+    score("--out", "here")
+    made = policy_file.load(file)
+    policy_file.save(file, made._replace(policy=config.with_options(POLICY, **change)))
+    with mistakes.of("--out", "here"):
+        score("--out", "here")
+    (file.parent / "here" / "result.json").unlink()
+    score("--out", "here")
+    assert "chunks of another evaluation are replaced" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("damaged", ["{", "[]"])
+def test_a_damaged_result_is_put_together_again(file, damaged):
+    score("--out", "here")
+    result = file.parent / "here" / "result.json"
+    made = json.loads(result.read_text())
+    result.write_text(damaged)
+    score("--out", "here")
+    assert json.loads(result.read_text())["trials"] == made["trials"]
+
+
+@pytest.mark.parametrize("held", ["config.json", "demos-abc", "stardiff/config.json"])
+def test_the_folder_of_a_run_is_no_place_for_a_result(file, held):
+    place = file.parent / "here" / held
+    place.parent.mkdir(parents=True)
+    place.write_text("{}")
+    with mistakes.of("--out", "a run's"):
+        score("--out", "here")
+
+
+def test_results_of_two_at_once_are_not_mixed(file):
+    (file.parent / "here").mkdir()
+    with files.lock(file.parent / "here"), pytest.raises(files.StorageError, match="is in use by"):
+        score("--out", "here")
+
+
+def test_a_video_of_other_trials_does_not_stay(file):
+    score("--out", "here", "--no-video")
+    film = file.parent / "here" / "rollout.mp4"
+    film.write_bytes(b"film")
+    score("--out", "here", "--no-video")
+    assert film.exists()
+    score("--out", "here", "--no-video", "--seed", "3")
+    assert not film.exists()
+    film.write_bytes(b"film")
+    score("--out", "here", "--seed", "4", "--eval.video-trials", "0")  # nothing to film
+    assert not film.exists()
+
+
+def test_the_same_command_again_runs_nothing_twice(file):
+    score("--out", "here")
+    chunks = {path: path.stat().st_mtime_ns for path in (file.parent / "here").rglob("chunk*")}
+    score("--out", "here", "--no-video")
+    assert chunks and all(path.stat().st_mtime_ns == then for path, then in chunks.items())
+
+
+def test_a_result_from_before_a_setting_was_there_is_of_the_same_trials(file):
+    score("--out", "here", "--no-video")
+    path, film = (file.parent / "here" / name for name in ("result.json", "rollout.mp4"))
+    before = json.loads(path.read_text())
+    del before["config"]["eval"]["ensemble"]
+    path.write_text(json.dumps(before))
+    film.write_bytes(b"film")
+    score("--out", "here", "--no-video")
+    assert film.exists()
+
+
+def test_plans_are_averaged_if_asked_for(file):
+    assert score("--eval.ensemble") == 0
+    (folder,) = (file.parent / "runs" / "evaluate").glob("*-ensemble")
+    plan = json.loads((folder / "evaluation" / "plan.json").read_text())
+    assert plan["agent"] == {"obs_horizon": 2, "execute": 1, "ensemble": 0.01}
+    assert json.loads((folder / "result.json").read_text())["config"]["eval"]["ensemble"]
+
+
+def test_the_seed_is_that_of_the_flag(file):
+    score("--seed", "5", "--out", "here")
+    plan = json.loads((file.parent / "here" / "evaluation" / "plan.json").read_text())
+    assert plan["seed"] == 5 and plan["max_steps"] == 30
+    result = json.loads((file.parent / "here" / "result.json").read_text())
+    assert {trial["seed"] for trial in result["trials"]} == {5} == {result["seed"]}
+    assert result["config"]["seed"] is None  # of the training, which no file of weights says
+
+
+@pytest.mark.parametrize(("name", "label"), [("dp_ee", "DP-EE"), ("dp_ee_proj", "DP-EE-Proj")])
+@pytest.mark.parametrize("typed", ["all", "dp_ee_proj"])
+def test_a_method_of_a_run_of_several_is_scored_under_its_own_name(
+    file, capsys, name, label, typed
+):
+    run = file.parent / "run"
+    settings = dataclasses.replace(presets.PRESETS["smoke"], method=typed, seed=3)
+    for folder in ("dp_ee", "dp_ee_proj"):
+        folders.claim(run / folder, settings, "demos-a")
+    file.rename(run / "dp_ee" / "policy.safetensors")
+    flags = ["--seed", "7", "--eval.trials", "1", "--eval.time-limit-s", "1"]
+    assert evaluate.main([f"run/{name}", *flags]) == 0
+    said = capsys.readouterr().out
+    assert f": {label} of run/{name}\n" in said and "1 s each, seed 7" in said
+    result = json.loads((run / name / "evaluate-seed7-1x1s" / "result.json").read_text())
+    assert (result["method"], result["config"]["method"]) == (name, name)
+    assert (result["seed"], result["config"]["seed"]) == (7, 3)
+    # what its weights were trained with, whatever the settings beside them say
+    assert (result["config"]["train"]["steps"], result["seen"]["trials"]) == (77, 4)
+
+
+def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
+    said = {}
+    monkeypatch.setattr(
+        policy_under_test.evaluate, "evaluate", lambda *args, **given: said.update(given, args=args)
+    )
+    policy = dataclasses.replace(POLICY, obs_horizon=3, crop_fraction=0.5)
+    trained = types.SimpleNamespace(policy=policy, params=None, normalizer=None)
+    policy = types.SimpleNamespace(sample=None)
+    who = types.SimpleNamespace(method="stardiff", env=None, policy=policy, trained=trained)
+    flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
+    policy_under_test.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
+    _, _, planner, _, _, settings = said["args"]
+    assert settings._asdict() == {**flags, "seed": 9}
+    assert planner.about == {"obs_horizon": 3, "execute": 4}
+    assert said["identity"]["policy"]["crop_fraction"] == 0.5  # of what the encoder sees
+
+
+def test_a_machine_without_a_video_encoder_still_gets_the_result(file, monkeypatch, capsys):
+    def broken(runs, path):
+        raise RuntimeError("no ffmpeg")
+
+    monkeypatch.setattr(video, "record", broken)
+    assert score() == 0
+    assert "no video: no ffmpeg" in capsys.readouterr().out
+
+
+def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
+    """And by what is in it: most runs' folders have the names of their methods."""
+    names = []
+    for content in (b"a", b"b", b"a"):
+        path = tmp_path / "stardiff" / "policy.safetensors"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(content)
+        names.append(subjects.label(path))
+    assert names[0] == names[2] != names[1] and all(n.startswith("stardiff-") for n in names)
+    other = tmp_path / "compact.safetensors"
+    other.write_bytes(b"c")
+    assert subjects.label(other).startswith("compact-")
+    assert subjects.label(packaged.FOLDER / "compact.safetensors") == "compact"
+
+
+def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):
+    run = file.parent / "dp_rcm2"
+    run.mkdir()
+    folders.claim(run, presets.PRESETS["smoke"], "demos-a")
+    file.rename(run / "policy.safetensors")
+
+    def swept(*flags):
+        assert sweep.main([str(run), "--eval.time-limit-s", "1", *flags]) == 0
+        return json.loads((run / "sweep.json").read_text())
+
+    drawn, grid = ["--trocars", "5"], ["--radii-cm", "0", "2", "--azimuths", "3"]
+    first = swept(*drawn)
+    assert first["time_limit_s"] == 1.0 and len(first["weights"]) == 64
+    chunks = {path: path.stat().st_mtime_ns for path in (run / "sweep").rglob("chunk*")}
+    assert first["strict"]["trials"] == len(first["trials"]) == 5 and chunks
+    assert {trial["trial"] for trial in first["trials"]} == {0}
+    assert swept(*drawn, "--seed", "1")["trials"] != first["trials"]
+    radii = [trial["radius"] for trial in swept(*grid)["trials"]]
+    assert radii == [pytest.approx([radius]) for radius in (0, 0.02, 0.02, 0.02)]
+    assert swept(*drawn, "--eval.chunk", "2")["trials"] == first["trials"]
+    assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
+    said = capsys.readouterr().out
+    assert "replaced" not in said and "/1 = " in said.replace("  ", " ")
+
+
+def test_a_sweep_has_the_time_limit_of_its_run(file):
+    run = file.parent / "dp_rcm2"
+    run.mkdir()
+    settings = presets.PRESETS["smoke"]
+    short = dataclasses.replace(settings.eval, time_limit_s=2.0)
+    folders.claim(run, dataclasses.replace(settings, eval=short), "demos-a")
+    file.rename(run / "policy.safetensors")
+    assert sweep.main([str(run), "--trocars", "1"]) == 0
+    found = json.loads((run / "sweep.json").read_text())
+    assert found["time_limit_s"] == 2.0 and found["strict"]["trials"] == 1
+    (run / "result.json").write_text('{"config": {"eval": {"time_limit_s": 1.0}}}')
+    assert sweep.main([str(run), "--trocars", "1"]) == 0
+    assert json.loads((run / "sweep.json").read_text())["time_limit_s"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("argv", "argument", "got"),
+    [
+        ([], "RUN or --policy", "none"),
+        (["runs/x", "--policy", "y"], "RUN or --policy", "both"),
+        (["nowhere"], "RUN", "nowhere"),
+    ],
+)
+def test_a_mistake_names_what_was_wrong(argv, argument, got):
+    with mistakes.of(argument, got):
+        evaluate.main(argv)
+
+
+def test_a_file_that_is_no_policy_leaves_nothing(file):
+    run = file.parent / "dp_rcm2"
+    run.mkdir()
+    folders.claim(run, presets.PRESETS["smoke"], "demos-a")
+    safetensors.numpy.save_file({"w": np.ones(2, np.float32)}, "other.safetensors")
+    (file.parent / "words.safetensors").write_text("words")
+    (file.parent / "damaged.safetensors").write_bytes(file.read_bytes()[:-3] + b"abc")
+    before = sorted(file.parent.rglob("*"))
+    for argument, given in (
+        ("--policy", "--policy nowhere.safetensors"),
+        ("--policy", "--policy words.safetensors"),
+        ("--policy", "--policy damaged.safetensors"),
+        ("--policy", "--policy other.safetensors"),
+        ("--policy", "--policy other.safetensors --out here"),
+        (str(run / "policy.safetensors"), "dp_rcm2"),
+    ):
+        with mistakes.of(argument):
+            evaluate.main(given.split())
+    assert sorted(file.parent.rglob("*")) == before
+
+
+def test_the_times_of_an_evaluation_are_medians_in_seconds():
+    ms = {"p50": 1.0, "p95": 2.0, "p99": 3.0}
+    result = types.SimpleNamespace(
+        figures={"steps": {"median": 60.0}}, about={"inference_ms": ms}, control_hz=30.0
+    )
+    words = evaluate._times(result).split()
+    assert words[2:4] == ["2.0", "s,"] and words[-2:] == ["1.0", "ms"]
+
+
+def test_distances_of_a_sweep_are_to_the_trocars_of_the_weights(file):
+    run = file.parent / "dp_rcm2"
+    run.mkdir()
+    folders.claim(run, presets.PRESETS["smoke"], "demos-a")  # of 8 trocars; the weights saw 4
+    file.rename(run / "policy.safetensors")
+    assert sweep.main([str(run), "--trocars", "9", "--eval.time-limit-s", "1"]) == 0
+    trials = json.loads((run / "sweep.json").read_text())["trials"]
+    ports = rcm.Trocar(*(np.float32([t[name] for t in trials]) for name in rcm.Trocar._fields))
+    training = rcm.Trocar(*(field[:4, None] for field in rcm.TROCARS))
+    far = sweeping.distance_to_nearest(ports, training, np.zeros((1, 3)))
+    assert [t["distance_m"] for t in trials] == pytest.approx(far, abs=1e-6)
+
+
+def test_another_arm_is_another_evaluation(file, monkeypatch):
+    asked, made = [], policy_under_test.sim_env.make
+    monkeypatch.setattr(
+        policy_under_test.sim_env, "make", lambda *a, **k: asked.append(a[1]) or made(*a, **k)
+    )
+    assert score() == 0 and score("--arm", "ur5e") == 0
+    assert asked == [("fr5",), ("ur5e",)]
+    folders = {path.name for path in (file.parent / "runs" / "evaluate").iterdir()}
+    assert len(folders) == 2 and len([name for name in folders if "-ur5e-seed0" in name]) == 1
+    swept = ["--policy", str(file), "--trocars", "2", "--eval.time-limit-s", "1"]
+    assert sweep.main(swept) == sweep.main([*swept, "--arm", "ur5e"]) == 0
+    assert asked[2:] == [("fr5",), ("ur5e",)]
+    found = [path.parent.name for path in file.parent.rglob("sweep.json")]
+    assert len(set(found)) == 2 and len([name for name in found if name.endswith("-ur5e")]) == 1
+
+
+def stressed(*more):
+    trials = ["--eval.trials", "1", "--eval.time-limit-s", "1"]
+    return stress.main(["--policy", "mine.safetensors", *trials, *more])
+
+
+def test_a_policy_is_scored_at_every_level(file, capsys):
+    assert stressed("--disturbance", "trocar_told", "--levels", "0", "5") == 0
+    (result,) = file.parent.rglob("stress.json")
+    found = json.loads(result.read_text())
+    levels = found["disturbances"]["trocar_told"]["levels"]
+    assert list(levels) == ["0", "5"] and found["method"] == "dp_rcm2"
+    assert all(level["strict"]["trials"] == 12 for level in levels.values())
+    force = [level["wall_force_N"] for level in levels.values()]
+    assert all(0 < level["mean"] <= level["p99"] <= level["max"] for level in force)
+    assert {"stress.md", "stress.png", "stress.pdf"} < {
+        path.name for path in result.parent.iterdir()
+    }
+    chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
+    assert stressed("--disturbance", "trocar_told", "--levels", "0", "5") == 0 and chunks
+    assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
+    assert capsys.readouterr().out.count("/12 = ") == 4
+
+
+def test_a_policy_of_states_meets_no_disturbance_of_images(file):
+    with mistakes.of("disturbance", "smoke"):
+        stressed("--disturbance", "smoke")
+    with mistakes.of("levels", 5.0):
+        stressed("--disturbance", "late_view", "--levels", "0", "5")
+
+
+def test_the_exercise_is_for_policies_of_its_task(file):
+    with mistakes.of("RUN or --policy", "of reach"):
+        exercise.main(["--policy", "mine.safetensors"])
+
+
+def test_the_expert_at_the_exercise(file, monkeypatch, capsys):
+    env, task = stubs.make_env(), stubs.make_task()._replace(labels=("moved",))
+    env = env._replace(
+        task=task, labels=lambda state: {"moved": 5 + state.success.astype(jnp.int32)}
+    )
+    monkeypatch.setattr(exercising, "make", lambda *_, **__: env)
+    monkeypatch.setattr(exercising, "anew", lambda agent: agent)
+    monkeypatch.setattr(six, "TASK", task)
+    assert exercise.main(["--trials", "2"]) == 0
+    (result,) = file.parent.rglob("exercise.json")
+    found = json.loads(result.read_text())
+    assert found["expert"] == "default" and found["complete"]["trials"] == 24
+    won = found["complete"]["successes"]
+    assert won and found["moved"]["counts"] == [0, 0, 0, 0, 0, 24 - won, won]
+    assert 0 < found["seconds"]["median"] <= found["seconds"]["p90"] < found["people"]["limit_s"]
+    chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
+    assert exercise.main(["--trials", "2"]) == 0 and chunks
+    assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
+    assert f"in {won} of 24 trials" in capsys.readouterr().out

@@ -1,0 +1,227 @@
+"""Command lines: what is typed becomes settings, or a mistake of the flag that it belongs to."""
+
+import contextlib
+import dataclasses
+import re
+import subprocess
+import sys
+
+import mistakes
+import pytest
+
+from starjax import cli, config
+from starjax.commands import (
+    bench,
+    evaluate,
+    exercise,
+    export_command,
+    import_command,
+    options,
+    pack,
+    presets,
+    report_command,
+    run_settings,
+    stress,
+    sweep,
+)
+from starjax.runtime import gpu
+
+OPTIONS = {
+    **dict.fromkeys(("run", "collect", "train"), config.RunConfig),
+    **{"evaluate": evaluate.Options, "sweep": sweep.Options, "bench": bench.Options},
+    **{"stress": stress.Options, "pack": pack.Options, "report": report_command.Options},
+    **{"exercise": exercise.Options},
+    **{"export": export_command.Options, "import": import_command.Options},
+}
+
+
+def settings(typed: str) -> config.RunConfig:
+    return run_settings.parse(typed.split(), "starjax run", "")
+
+
+@pytest.mark.parametrize(
+    ("command", "typed", "argument", "got"),
+    [
+        ("run", "--trian.steps 3", "FLAG", "--trian.steps"),
+        ("run", "--train.steps x", "--train.steps", "'x'"),
+        ("run", "--train.steps 1e3", "--train.steps", "'1e3'"),
+        ("run", "--train.steps", "--train.steps", "none"),
+        ("run", "--train.steps 3 4", "FLAG", "4"),
+        ("run", "--train.learning-rate fast", "--train.learning-rate", "'fast'"),
+        ("run", "--policy.observation imag", "--policy.observation", "'imag'"),
+        ("run", "--policy.unet-channels 8 x", "--policy.unet-channels", "'x'"),
+        ("run", "--method stardif", "method", "'stardif'"),
+        ("run", "--preset cpi", "--preset", "'cpi'"),
+        ("run", "--preset smoke --preset cpi", "--preset", "'cpi'"),
+        ("run", "--demos.keep-failures yes", "FLAG", "yes"),
+        ("run", "stardiff", "FLAG", "stardiff"),
+        ("run", "-x", "FLAG", "-x"),
+        ("run", "--train.steps 0", "train.steps", 0),
+        ("run", "--seed -1", "seed", -1),
+        ("run", "--train.weight-decay inf", "train.weight_decay", "inf"),
+        ("evaluate", "x y", "FLAG", "y"),
+        ("evaluate", "x --video=False", "FLAG", "False"),
+        ("evaluate", "x --eval.time-limit-s 0", "eval.time_limit_s", 0),
+        ("sweep", "--trocars 1", "RUN or --policy", "none"),
+        ("sweep", "x --eval.time-limit-s soon", "--eval.time-limit-s", "'soon'"),
+        ("stress", "", "RUN or --policy", "none"),
+        ("stress", "--policy compact --levels 1", "levels", "none or several"),
+        ("exercise", "x --policy y", "RUN or --policy", "both"),
+        ("stress", "--policy compact --disturbance rain", "disturbance", "'rain'"),
+        ("run", "--demos.randomise rain=1", "demos.randomise", "'rain'"),
+        ("run", "--demos.randomise smoke", "demos.randomise", "smoke"),
+        ("run", "--demos.randomise smoke=1 --demos.from x", "demos.randomise", "x"),
+        ("report", "--out x", "RUN", "none"),
+        ("pack", "a b c", "FLAG", "c"),
+        ("bench", "x --calls 0", "calls", 0),
+    ],
+)
+def test_a_mistake_names_its_flag_and_what_came(command, typed, argument, got):
+    with mistakes.of(argument, got):
+        cli.dispatch([command, *typed.split()])
+
+
+def test_the_nearest_flag_is_suggested():
+    with mistakes.of("FLAG") as caught:
+        settings("--trian.steps 3")
+    assert caught.value.hint == "did you mean --train.steps?"
+
+
+@pytest.mark.parametrize(
+    ("typed", "heavy"),
+    [
+        ("run --train.stepps 3", {"jax", "mujoco", "numpy"}),
+        ("run --seed -1", {"jax", "mujoco", "numpy"}),
+        ("sweep x --trocars 0", {"jax", "mujoco"}),
+        ("stress --policy compact --disturbance rain", {"jax", "mujoco"}),
+        ("run --demos.randomise rain=1", {"jax", "mujoco", "numpy"}),
+    ],
+)
+def test_mistakes_are_one_line_and_come_before_jax(typed, heavy):
+    program = (
+        "import sys\n"
+        "from starjax import cli\n"
+        "code = cli.guard(cli.dispatch, sys.argv[1:])\n"
+        f"print(code, {heavy} & set(sys.modules))\n"
+    )
+    command = [sys.executable, "-c", program, *typed.split()]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.stdout.strip() == "2 set()", done.stdout
+    assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
+
+
+def test_flags_override_the_preset_and_nothing_else():
+    smoke = presets.PRESETS["smoke"]
+    changed = settings("--preset=smoke --train.steps 7 --policy.unet_channels 32 --out x")
+    train = dataclasses.replace(smoke.train, steps=7)
+    policy = config.with_options(smoke.policy, unet_channels=(32,))
+    assert changed == dataclasses.replace(smoke, train=train, policy=policy, out="x")
+    assert settings("--preset smoke --seed 1 --preset paper").preset == "paper"
+
+
+@pytest.mark.parametrize(
+    ("typed", "folder"),
+    [
+        ("--preset cpu", "runs/cpu"),
+        ("--preset cpu --seed=3", "runs/cpu-seed3"),
+        ("--preset cpu --task reach --arm fr5 --camera side", "runs/cpu-reach-fr5-side"),
+        ("--preset gpu --cameras endoscope", "runs/gpu-endoscope"),
+        ("--preset gpu --cameras fixed", "runs/gpu"),
+        (
+            "--preset gpu --camera endoscope --policy.frame camera",
+            "runs/gpu-endoscope-camera-frame",
+        ),
+        ("--preset cpu --policy.observation state --seed 3", "runs/cpu-state-seed3"),
+        ("--preset cpu --policy.observation state --seed 3 --out runs/cpu", "runs/cpu"),
+        ("--preset cpu --policy.no-freeze-encoder", "runs/cpu-unfrozen"),
+        (
+            "--preset smoke --policy.observation image --policy.freeze-encoder "
+            "--policy.encoder-weights x",
+            "runs/smoke-image-frozen",
+        ),
+    ],
+)
+def test_other_scenes_observations_encoders_and_seeds_have_folders_of_their_own(typed, folder):
+    assert settings(typed).out == folder
+
+
+def test_a_presets_encoder_is_no_part_of_a_run_that_sees_the_state():
+    policy = settings("--preset cpu --policy.observation state").policy
+    assert presets.PRESETS["cpu"].policy.freeze_encoder
+    assert not policy.freeze_encoder and not policy.encoder_weights
+    for name, value in (("freeze_encoder", ""), ("encoder_weights", " compact")):
+        with mistakes.of(f"policy.{name}", "state"):
+            settings(f"--preset cpu --policy.observation state --policy.{name}{value}")
+
+
+def test_a_presets_expert_is_for_its_own_task():
+    assert settings("--preset cpu").demos.expert == "one_wall"
+    assert settings("--preset cpu --task reach").demos.expert == ""
+    assert settings("--preset cpu --task reach --demos.expert slow").demos.expert == "slow"
+
+
+@pytest.mark.parametrize(
+    "typed", ["x/stardiff --trocars 3", "--trocars 3 x/stardiff", "--trocars=3 x/stardiff"]
+)
+def test_words_may_stand_before_and_after_flags(typed):
+    found = sweep._parse(typed.split())
+    assert (found.run, found.trocars) == ("x/stardiff", 3)
+
+
+def test_a_word_that_is_empty_is_a_mistake():
+    for command, argument in (
+        (["run", "--out="], "--out"),
+        (["evaluate", "--policy", "compact", "--out", ""], "--out"),
+        (["report", ""], "RUN"),
+        (["pack", "compact", ""], "OUT"),
+    ):
+        with mistakes.of(argument):
+            cli.dispatch(command)
+
+
+def helped(command, capsys):
+    """What help says: its first line, and of each flag its text."""
+    with contextlib.suppress(SystemExit):
+        cli.dispatch([command, "--help"])
+    usage, *lines = capsys.readouterr().out.replace("│", " ").splitlines()
+    found, entry = {}, []
+    for line in lines:
+        # Another name of a flag stands before it, with what it takes.
+        if flag := re.match(r"  (?:--\w+ \[.*\]\]?, )?(--?\w[^ ,]*)", line):
+            entry = found[flag[1]] = re.split(r"\s{2,}", line.strip(), maxsplit=1)[1:]
+        elif line.startswith(" " * 6):
+            entry.append(line.strip())
+    return usage, {flag: " ".join(" ".join(entry).split()) for flag, entry in found.items()}
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_help_says_of_every_flag_something_of_its_own(command, capsys):
+    _, said = helped(command, capsys)
+    texts = [re.sub(r" ?\([^()]*\)$", "", text) for text in said.values()]
+    # A run's are those of the learner of the preset that `auto` is here.
+    is_run = OPTIONS[command] is config.RunConfig
+    settings = presets.resolve("auto", False) if is_run else OPTIONS[command]
+    flags = [flag for flag in options.flags(settings) if not re.search(r"--(.*\.)?no-", flag)]
+    assert {*said} == {*flags, "-h"}
+    assert all(texts) and len({*texts}) == len(texts)
+    assert not any(re.search(r"default: *(''|None)?[;)]", text) for text in said.values())
+
+
+def test_help_shows_ranges_and_defaults(capsys, monkeypatch):
+    said = helped("run", capsys)[1]
+    usual = presets.PRESETS["cpu"].policy.options.kernel_size
+    assert said["--policy.kernel-size"].endswith(f"(1, 3, ... 4095; default: {usual})")
+    assert helped("sweep", capsys)[1]["--eval.time-limit-s"].endswith("(in [0.1, 86400])")
+    for likely, trials, limit in ((False, 4, 30.0), (True, 30, 60.0)):
+        monkeypatch.setattr(gpu, "is_likely", lambda likely=likely: likely)
+        said = helped("evaluate", capsys)[1]
+        assert f"default: {trials})" in said["--eval.trials"]
+        assert f"default: {limit})" in said["--eval.time-limit-s"]
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [("bench", "RUN"), ("evaluate", "[RUN]"), ("pack", "POLICY OUT"), ("report", "RUN [RUN ...]")],
+)
+def test_help_names_the_words_before_the_flags(command, words, capsys):
+    assert f" {words} " in f"{helped(command, capsys)[0]} "

@@ -1,0 +1,43 @@
+"""Presets: starting values of a run, and which of them `auto` means."""
+
+import dataclasses
+
+import pytest
+
+from starjax import config, errors
+from starjax.commands import presets, run_settings
+from starjax.runtime import gpu
+
+
+@pytest.mark.parametrize("guess", [False, True])
+@pytest.mark.parametrize(("used", "preset"), [(False, "cpu"), (True, "gpu")])
+def test_auto_is_what_jax_says_not_what_the_system_shows(monkeypatch, capsys, guess, used, preset):
+    monkeypatch.setattr(gpu, "is_likely", lambda: guess)
+    monkeypatch.setattr(gpu, "is_used", lambda: used)
+    for argv in ([], ["--preset", "auto"]):
+        found = run_settings.parse([*argv, "--train.steps", "7"], "", "")
+        assert (found.preset, found.out) == (preset, f"runs/{preset}") and found.train.steps == 7
+        assert found.policy == presets.PRESETS[preset].policy
+        said = capsys.readouterr().out
+        assert said.count("\n") == 1 and said.startswith(f"preset auto: {preset}")
+
+
+def test_a_mistake_is_told_before_jax_is_asked(monkeypatch):
+    monkeypatch.setattr(gpu, "is_used", lambda: pytest.fail("jax was asked"))
+    with pytest.raises(errors.UsageError):
+        run_settings.parse(["--train.steps", "0"], "", "")
+    assert run_settings.parse(["--preset", "smoke"], "", "").preset == "smoke"
+
+
+def test_paper_preset_is_the_default_configuration():
+    paper = presets.PRESETS["paper"]
+    assert dataclasses.replace(paper, preset="auto") == config.RunConfig()
+    assert (paper.train.steps, paper.train.batch_size) == (100_000, 256)
+
+
+@pytest.mark.parametrize("name", presets.PRESETS)
+def test_configuration_survives_json(name):
+    values = config.as_json(presets.PRESETS[name])
+    assert config.from_dict(config.RunConfig, values) == presets.PRESETS[name]
+    with pytest.raises(ValueError, match="stepps"):
+        config.from_dict(config.TrainConfig, {"stepps": 1})

@@ -1,0 +1,105 @@
+"""The scene of a run, by name: what is left out is the task's, what is wrong names its flag."""
+
+import dataclasses
+
+import mistakes
+import pytest
+
+from starjax import cli, config
+from starjax.commands import folders, scenes
+from starjax.sim import names
+
+
+def test_names_that_are_left_out_are_the_tasks():
+    found = scenes.resolved(config.RunConfig()).scene
+    assert found == scenes.settings(names.FIRST)
+    assert scenes.resolved(config.RunConfig(scene=found)).scene == found
+    both = config.SceneConfig(task="peg_transfer_bimanual", arm=("fr5",))
+    assert scenes.resolved(config.RunConfig(scene=both)).scene.arm == ("fr5", "fr5")
+
+
+@pytest.mark.parametrize(
+    ("scene", "argument"),
+    [
+        ({"task": "pegtransfer"}, "task"),
+        ({"arm": ("fr6",)}, "arm"),
+        ({"arm": ("fr5", "fr5")}, "arm"),
+        ({"tool": ("hook",)}, "tool"),
+        ({"camera": ("ceiling",)}, "camera"),
+    ],
+)
+def test_an_unknown_name_is_a_mistake_of_its_flag(scene, argument):
+    with mistakes.of(argument):
+        scenes.resolved(config.RunConfig(scene=config.SceneConfig(**scene)))
+
+
+def test_a_task_gives_all_its_seen_trocars_and_no_more():
+    def asked(count):
+        return config.RunConfig(demos=config.DemosConfig(seen_trocars=count))
+
+    assert scenes.resolved(config.RunConfig()).demos.seen_trocars == 8
+    assert scenes.resolved(asked(3)).demos.seen_trocars == 3
+    with mistakes.of("demos.seen_trocars", 9):
+        scenes.resolved(asked(9))
+
+
+def test_only_what_is_seen_through_an_endoscope_may_count_from_it():
+    policy = config.PolicyConfig(frame="camera")
+
+    def asked(**scene):
+        return config.RunConfig(policy=policy, scene=config.SceneConfig(**scene))
+
+    for camera in (("endoscope",), ("camera", "endoscope")):
+        assert scenes.resolved(asked(camera=camera)).scene.camera == camera
+    for scene in ({}, {"camera": ("fixed",)}, {"task": "endoscope_track"}):
+        with mistakes.of("policy.frame", "camera"):
+            scenes.resolved(asked(**scene))
+    tracked = config.SceneConfig(task="endoscope_track", camera=("fixed",))
+    assert scenes.resolved(config.RunConfig(scene=tracked)).scene.camera == ("camera",)
+
+
+def test_settings_without_a_scene_are_of_the_first_one():
+    old = config.as_json(config.RunConfig())
+    del old["scene"]
+    found = config.from_dict(config.RunConfig, old)
+    assert found.scene == scenes.settings(names.FIRST)
+    now = config.as_json(scenes.resolved(config.RunConfig()))
+    assert config.differing([old, now]) == []
+    other = dataclasses.replace(found, scene=config.SceneConfig(task="reach"))
+    assert "scene.task" in config.differing([old, config.as_json(other)])
+
+
+def test_a_folder_of_another_scene_is_refused(tmp_path):
+    first = scenes.resolved(config.RunConfig())
+    folders.claim(tmp_path, first, "demos-a")
+    (tmp_path / "policy.safetensors").touch()
+    other = scenes.resolved(config.RunConfig(scene=config.SceneConfig(task="reach")))
+    with mistakes.of("scene.task", "reach"):
+        folders.claim(tmp_path, other, "demos-a")
+
+
+def test_the_list_names_everything_that_flags_can(capsys):
+    from starjax import methods
+    from starjax.commands import presets
+    from starjax.policies import packaged
+    from starjax.sim import registry
+
+    assert cli.dispatch(["list"]) == 0
+    said = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line[:2] == "  "}
+    for known in (registry.tasks, registry.arms, registry.tools, packaged):
+        assert said >= {*known.names()}
+    assert said >= {*methods.METHODS, *presets.PRESETS}
+
+
+def test_a_package_that_cannot_be_imported_is_a_line_of_the_list(monkeypatch, capsys):
+    import importlib.metadata
+
+    from starjax.sim import registry
+
+    broken = importlib.metadata.EntryPoint("sew", "nowhere_at_all:TASK", "starjax.tasks")
+    monkeypatch.setattr(
+        registry.Registry, "_entries", lambda self: [broken] if self.kind == "task" else []
+    )
+    assert cli.dispatch(["list"]) == 0
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if x.split()[:1] == ["sew"]]
+    assert "cannot be used" in line and "nowhere_at_all" in line
