@@ -42,8 +42,8 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "score a trained policy while something is wrong",
         _LEARNING,
     ),
-    "exercise": (
-        "starjax.commands.exercise",
+    "six-blocks": (
+        "starjax.commands.six_blocks",
         "six blocks one after another with two arms, beside people's times",
         _LEARNING,
     ),
@@ -85,8 +85,8 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
         (*_LEARNING, "viewer"),
     ),
     "list": ("starjax.commands.list_command", "what flags can name", ("sim",)),
-    "place": (
-        "starjax.commands.place",
+    "find-mount": (
+        "starjax.commands.find_mount",
         "search where an arm must stand for a task",
         ("sim", "train"),
     ),
@@ -97,13 +97,14 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
 }
 
-
+# Names of the previous release; dropped in the next.
+_RENAMED = {"exercise": "six-blocks", "place": "find-mount"}
 _WRITING = (errno.ENOSPC, errno.EROFS, errno.EDQUOT)
 _STORAGE = (
     *_WRITING, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG
 )  # fmt: skip
 _STOPPED = 130  # exit code after a stop, see `signals`
-_UNREAD = 141  # exit code where nobody reads the output any more (128 + SIGPIPE), as in `| head`
+_BROKEN_PIPE = 141  # exit code if the output pipe is closed (128 + SIGPIPE), as by `| head`
 _OURS = os.path.join(os.path.dirname(os.path.abspath(__file__)), "")
 _with_its_place = warnings.formatwarning
 _CACHE_ENTRY = "persistent compilation cache entry"  # in jax's warnings
@@ -154,7 +155,7 @@ def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     except BrokenPipeError:
         # What Python still holds for the reader would fail again when the process ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _UNREAD
+        return _BROKEN_PIPE
     except OSError as error:
         # Imported late: it brings numpy, and `--help` need not wait for it.
         from starjax.runtime import files
@@ -187,6 +188,9 @@ def dispatch(argv: Sequence[str]) -> int:
     if name == "--version":
         print(__version__)
         return 0
+    if name in _RENAMED:
+        errors.warn_renamed(name, _RENAMED[name])
+        name = _RENAMED[name]
     errors.choice("COMMAND", name, COMMANDS)
     module, _, needed = COMMANDS[name]
     extras.require(name, *needed)

@@ -159,24 +159,28 @@ class RunConfig:
 
 
 # What decides a policy's weights; the rest may change between two starts of a run.
-_TRAINED_WITH = ("seed", "scene", "demos", "policy", "train")
-_BESIDE = {"train.keep_checkpoints", "train.checkpoint_every", "train.steps_per_call"}  # of those
+_WEIGHT_SECTIONS = ("seed", "scene", "demos", "policy", "train")
+_NOT_OF_WEIGHTS = {
+    "train.keep_checkpoints",
+    "train.checkpoint_every",
+    "train.steps_per_call",
+}  # of those
 
 
-def trained_with(config: RunConfig) -> dict[str, Any]:
+def weight_settings(config: RunConfig) -> dict[str, Any]:
     """The settings that decide a policy's weights, e.g. `train.steps`, as JSON has them."""
     values = as_json(config)
-    flat = _flat({name: values[name] for name in _TRAINED_WITH})
-    return {name: value for name, value in flat.items() if name not in _BESIDE}
+    flat = _flat({name: values[name] for name in _WEIGHT_SECTIONS})
+    return {name: value for name, value in flat.items() if name not in _NOT_OF_WEIGHTS}
 
 
-def differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+def differing_settings(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Settings, but for the seed, that decide weights and that configurations disagree on.
 
     The configurations are from JSON. Settings that one of them lacks have their default there.
     """
     usual = as_json(RunConfig())
-    parts = [part for part in _TRAINED_WITH if part != "seed"]
+    parts = [part for part in _WEIGHT_SECTIONS if part != "seed"]
     filled = [
         {part: usual[part] | old.get(part, {}) for part in parts} for old in map(upgraded, configs)
     ]
@@ -184,7 +188,7 @@ def differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     return [
         name
         for name in dict.fromkeys(name for row in rows for name in row)
-        if name not in _BESIDE and any(row.get(name) != rows[0].get(name) for row in rows)
+        if name not in _NOT_OF_WEIGHTS and any(row.get(name) != rows[0].get(name) for row in rows)
     ]
 
 
@@ -198,7 +202,7 @@ def with_learner(policy: PolicyConfig, learner: str) -> PolicyConfig:
     return dataclasses.replace(policy, learner=learner, options=settings(**kept))
 
 
-def deciding(policy: PolicyConfig) -> PolicyConfig:
+def inference_settings(policy: PolicyConfig) -> PolicyConfig:
     """Settings of a policy once it is trained: it decides in float32.
 
     In bfloat16 a tool at rest would tremble by 0.1 mm a control step, which is 4 mm/s.

@@ -1,6 +1,7 @@
 """A user's mistake: three fields, put into one line in one place. Standard library only."""
 
 import difflib
+import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -32,3 +33,9 @@ def nearest(word: str, known: Iterable[str]) -> str:
     """`did you mean ...?` for the known word that is nearest, empty if none is near."""
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f"did you mean {near[0]}?" if near else ""
+
+
+def warn_renamed(old: str, new: str) -> None:
+    """Warns of a name that the next release drops; the command line shows one line."""
+    # FutureWarning, as Python shows it to users by default; DeprecationWarning it hides.
+    warnings.warn(f"{old} is now {new}; the next release drops {old}", FutureWarning, stacklevel=1)

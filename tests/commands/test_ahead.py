@@ -9,7 +9,7 @@ import stubs
 from fakes import TASK, TINY, dataset, relative, trained
 
 from starjax import config
-from starjax.commands import ahead, pipeline, policy_under_test, stage_times
+from starjax.commands import ahead, pipeline, policy_evaluation, stage_times
 from starjax.data import normalizer
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
@@ -50,11 +50,11 @@ def test_weights_that_come_later_meet_their_program(tmp_path, monkeypatch):
 
     # In a thread, beside another program that is traced: what a run does.
     compiled = ahead.begin(settings, name, pipeline.STAGES, env, None).evaluation()
-    who = policy_under_test.load(name, tmp_path / "policy.safetensors", env)
+    who = policy_evaluation.load(name, tmp_path / "policy.safetensors", env)
 
     def scored(folder, **given):
         wanted = (tmp_path / folder, who, env.task.trocars, EVAL, settings.seed)
-        return policy_under_test.rollouts(*wanted, **given)
+        return policy_evaluation.rollouts(*wanted, **given)
 
     usual = scored("usual")
     monkeypatch.setattr(engine.programs, "make", None)
@@ -66,13 +66,13 @@ def test_weights_that_come_later_meet_their_program(tmp_path, monkeypatch):
         scored("others", compiled=other)
 
     # Its own program may not be made.
-    monkeypatch.setattr(policy_under_test.latency, "_program", None)
-    assert policy_under_test.decision_ms(who, compiled.decision)["n"] >= 5
+    monkeypatch.setattr(policy_evaluation.latency, "_program", None)
+    assert policy_evaluation.inference_ms(who, compiled.decision)["n"] >= 5
 
 
 def test_a_mistake_ends_no_run(monkeypatch):
     monkeypatch.setattr(training, "compile_step", lambda *_: 1 / 0)
-    monkeypatch.setattr(policy_under_test, "compile_ahead", lambda *_: "evaluation")
+    monkeypatch.setattr(policy_evaluation, "compile_ahead", lambda *_: "evaluation")
     found = ahead.begin(config.RunConfig(), "stardiff", pipeline.STAGES, environment(), None)
     assert found.step() is None and found.evaluation() == "evaluation"
     found = ahead.begin(config.RunConfig(), "stardiff", ["collect"], environment(), None)

@@ -68,14 +68,14 @@ def test_bench_promises_nothing_after_ctrl_c(scored, monkeypatch, capsys):
 def test_only_the_hierarchy_has_a_roll_network_to_time(
     monkeypatch, capsys, tmp_path, method, timed
 ):
-    from starjax.commands import policy_under_test
+    from starjax.commands import policy_evaluation
     from starjax.evaluation import latency
 
     ms = {"p50": 4.0, "p95": 5.0, "p99": 8.0}
     trained = fakes.trained()
     env = fakes.env()
     who = types.SimpleNamespace(trained=trained, env=env, weights="a")
-    monkeypatch.setattr(policy_under_test, "load", lambda *_: who)
+    monkeypatch.setattr(policy_evaluation, "load", lambda *_: who)
     monkeypatch.setattr(latency, "table", lambda *_, **__: iter([{"ddim_steps": 2, **ms}]))
     monkeypatch.setattr(latency, "roll_ms", lambda *_, **__: ms)
     assert bool(bench._time(tmp_path / method, (2,), 1)["roll_network_ms"]) == timed

@@ -32,7 +32,7 @@ def test_what_was_timed_is_a_committed_result(name):
     assert found["method"] == "stardiff"
     run = config.from_dict(config.RunConfig, settings)
     usual = dataclasses.replace(presets.PRESETS[name], scene=run.scene)
-    assert config.trained_with(run) == config.trained_with(usual) and run.eval == usual.eval
+    assert config.weight_settings(run) == config.weight_settings(usual) and run.eval == usual.eval
     assert found["hardware"]["backend"] == timed.backend
 
 

@@ -15,12 +15,12 @@ import stubs
 from starjax import config, rcm
 from starjax.commands import (
     evaluate,
-    exercise,
     folders,
-    policy_under_test,
+    policy_args,
+    policy_evaluation,
     presets,
+    six_blocks,
     stress,
-    subjects,
     sweep,
 )
 from starjax.data import normalizer
@@ -44,8 +44,8 @@ def file(tmp_path, monkeypatch):
 
     policy = types.SimpleNamespace(sample=sample, for_sampling=lambda params: params)
 
-    monkeypatch.setattr(policy_under_test.sim_env, "make", lambda *_, **__: stubs.make_env())
-    monkeypatch.setattr(policy_under_test.policies, "make", lambda *_, **__: policy)
+    monkeypatch.setattr(policy_evaluation.sim_env, "make", lambda *_, **__: stubs.make_env())
+    monkeypatch.setattr(policy_evaluation.policies, "make", lambda *_, **__: policy)
     monkeypatch.setattr(video, "record", lambda runs, path: path)
     monkeypatch.chdir(tmp_path)
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
@@ -107,7 +107,7 @@ def test_how_many_trials_jax_decides_not_the_system(file, monkeypatch, guess, us
 
     monkeypatch.setattr(gpu, "is_likely", lambda: guess)
     monkeypatch.setattr(gpu, "is_used", lambda: used)
-    monkeypatch.setattr(policy_under_test, "rollouts", scored)
+    monkeypatch.setattr(policy_evaluation, "rollouts", scored)
     with pytest.raises(KeyboardInterrupt, match=f"^{trials} in mine-.*-{trials}x"):
         evaluate.main(["--policy", "mine.safetensors"])
 
@@ -221,14 +221,14 @@ def test_a_method_of_a_run_of_several_is_scored_under_its_own_name(
 def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
     said = {}
     monkeypatch.setattr(
-        policy_under_test.evaluate, "evaluate", lambda *args, **given: said.update(given, args=args)
+        policy_evaluation.evaluate, "evaluate", lambda *args, **given: said.update(given, args=args)
     )
     policy = dataclasses.replace(POLICY, obs_horizon=3, crop_fraction=0.5)
     trained = types.SimpleNamespace(policy=policy, params=None, normalizer=None)
     policy = types.SimpleNamespace(sample=None)
     who = types.SimpleNamespace(method="stardiff", env=None, policy=policy, trained=trained)
     flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
-    policy_under_test.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
+    policy_evaluation.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
     _, _, planner, _, _, settings = said["args"]
     assert settings._asdict() == {**flags, "seed": 9}
     assert planner.about == {"obs_horizon": 3, "execute": 4}
@@ -251,12 +251,12 @@ def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
         path = tmp_path / "stardiff" / "policy.safetensors"
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(content)
-        names.append(subjects.label(path))
+        names.append(policy_args.label(path))
     assert names[0] == names[2] != names[1] and all(n.startswith("stardiff-") for n in names)
     other = tmp_path / "compact.safetensors"
     other.write_bytes(b"c")
-    assert subjects.label(other).startswith("compact-")
-    assert subjects.label(packaged.FOLDER / "compact.safetensors") == "compact"
+    assert policy_args.label(other).startswith("compact-")
+    assert policy_args.label(packaged.FOLDER / "compact.safetensors") == "compact"
 
 
 def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):
@@ -356,9 +356,9 @@ def test_distances_of_a_sweep_are_to_the_trocars_of_the_weights(file):
 
 
 def test_another_arm_is_another_evaluation(file, monkeypatch):
-    asked, made = [], policy_under_test.sim_env.make
+    asked, made = [], policy_evaluation.sim_env.make
     monkeypatch.setattr(
-        policy_under_test.sim_env, "make", lambda *a, **k: asked.append(a[1]) or made(*a, **k)
+        policy_evaluation.sim_env, "make", lambda *a, **k: asked.append(a[1]) or made(*a, **k)
     )
     assert score() == 0 and score("--arm", "ur5e") == 0
     assert asked == [("fr5",), ("ur5e",)]
@@ -403,7 +403,7 @@ def test_a_policy_of_states_meets_no_disturbance_of_images(file):
 
 def test_the_exercise_is_for_policies_of_its_task(file):
     with mistakes.of("RUN or --policy", "of reach"):
-        exercise.main(["--policy", "mine.safetensors"])
+        six_blocks.main(["--policy", "mine.safetensors"])
 
 
 def test_the_expert_at_the_exercise(file, monkeypatch, capsys):
@@ -414,7 +414,7 @@ def test_the_expert_at_the_exercise(file, monkeypatch, capsys):
     monkeypatch.setattr(exercising, "make", lambda *_, **__: env)
     monkeypatch.setattr(exercising, "anew", lambda agent: agent)
     monkeypatch.setattr(six, "TASK", task)
-    assert exercise.main(["--trials", "2"]) == 0
+    assert six_blocks.main(["--trials", "2"]) == 0
     (result,) = file.parent.rglob("exercise.json")
     found = json.loads(result.read_text())
     assert found["expert"] == "default" and found["complete"]["trials"] == 24
@@ -422,6 +422,6 @@ def test_the_expert_at_the_exercise(file, monkeypatch, capsys):
     assert won and found["moved"]["counts"] == [0, 0, 0, 0, 0, 24 - won, won]
     assert 0 < found["seconds"]["median"] <= found["seconds"]["p90"] < found["people"]["limit_s"]
     chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
-    assert exercise.main(["--trials", "2"]) == 0 and chunks
+    assert six_blocks.main(["--trials", "2"]) == 0 and chunks
     assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
     assert f"in {won} of 24 trials" in capsys.readouterr().out

@@ -161,12 +161,12 @@ def test_settings_that_runs_differ_in_are_named():
     old = values()
     del old["policy"]["trocar_yaw"]
     same = values(seed=5, train={"keep_checkpoints": 9}, eval={"trials": 9})
-    assert config.differing([]) == config.differing([values(), old, same]) == []
+    assert config.differing_settings([]) == config.differing_settings([values(), old, same]) == []
     newer = values(policy={"trocar_yaw": "fixed"}, demos={"per_trocar": 9})
     newer["policy"]["unheard_of"] = 1
-    found = config.differing([old, newer])
+    found = config.differing_settings([old, newer])
     names = ["demos.per_trocar", "policy.trocar_yaw", "policy.unheard_of"]
-    assert found == config.differing([newer, old, newer]) == names
+    assert found == config.differing_settings([newer, old, newer]) == names
 
 
 def test_a_methods_folder_is_found_from_within_and_told_from_others(tmp_path, monkeypatch):
@@ -205,7 +205,11 @@ def test_eight_methods_have_six_sets_of_weights(tmp_path):
 
 
 def test_stardiff_single_is_dp_rcm4_and_nothing_else_is_a_twin():
-    pairs = {name: folders.twins(name) for name in methods.METHODS if folders.twins(name)}
+    pairs = {
+        name: folders.equivalent_methods(name)
+        for name in methods.METHODS
+        if folders.equivalent_methods(name)
+    }
     assert pairs == {"dp_rcm4": ["stardiff_single"], "stardiff_single": ["dp_rcm4"]}
 
 
@@ -213,12 +217,12 @@ def test_a_twin_takes_over_the_evaluation_once(tmp_path):
     chunk = tmp_path / "dp_rcm4" / "evaluation" / "chunk_0000.npz"
     chunk.parent.mkdir(parents=True)
     chunk.write_bytes(b"first")
-    folders.adopt_twin(tmp_path, "stardiff")
-    folders.adopt_twin(tmp_path, "stardiff_single")
+    folders.adopt_equivalent(tmp_path, "stardiff")
+    folders.adopt_equivalent(tmp_path, "stardiff_single")
     taken = tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz"
     assert taken.read_bytes() == b"first" and not (tmp_path / "stardiff").exists()
     chunk.write_bytes(b"second")
-    folders.adopt_twin(tmp_path, "stardiff_single")
+    folders.adopt_equivalent(tmp_path, "stardiff_single")
     assert taken.read_bytes() == b"first"
 
 
@@ -230,9 +234,9 @@ def test_a_twin_whose_trials_cannot_be_copied_is_left_out(tmp_path, monkeypatch)
     (tmp_path / "dp_rcm4" / "evaluation" / "chunk_0000.npz").write_bytes(b"first")
     with monkeypatch.context() as patch, pytest.raises(files.StorageError, match="No space left"):
         patch.setattr(shutil, "copyfile", full)
-        folders.adopt_twin(tmp_path, "stardiff_single")
+        folders.adopt_equivalent(tmp_path, "stardiff_single")
     assert not any((tmp_path / "stardiff_single").iterdir())
-    folders.adopt_twin(tmp_path, "stardiff_single")
+    folders.adopt_equivalent(tmp_path, "stardiff_single")
     assert (tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz").exists()
 
 
@@ -245,7 +249,7 @@ def test_a_linked_method_is_called_as_its_link(tmp_path):
 
 def test_time_of_another_work_does_not_outlive_a_kill(tmp_path):
     (tmp_path / "timings.json").write_text(json.dumps({"x": 1.0, "x: compile": 1.0, "y": 2.0}))
-    with stage_times.timed(tmp_path, "x", goes_on=False):
+    with stage_times.timed(tmp_path, "x", resumes=False):
         assert stage_times.read(tmp_path) == {"y": 2.0}  # a kill -9 here would leave this
 
 
@@ -261,6 +265,6 @@ def test_time_adds_up_over_starts_also_after_an_interruption(tmp_path):
     assert 100.0 < spent["train x"] < 160.0
     # Both are rounded to hundredths of a second.
     assert 0.0 < spent["train x: compile"] <= round(spent["train x"] - 100.0, 2)
-    with stage_times.timed(tmp_path, "train x", goes_on=False):  # nothing of the others is left
+    with stage_times.timed(tmp_path, "train x", resumes=False):  # nothing of the others is left
         pass
     assert stage_times.read(tmp_path)["train x"] < 60.0

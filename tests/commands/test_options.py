@@ -13,7 +13,6 @@ from starjax import cli, config
 from starjax.commands import (
     bench,
     evaluate,
-    exercise,
     export_command,
     import_command,
     options,
@@ -21,6 +20,7 @@ from starjax.commands import (
     presets,
     report_command,
     run_settings,
+    six_blocks,
     stress,
     sweep,
 )
@@ -30,7 +30,7 @@ OPTIONS = {
     **dict.fromkeys(("run", "collect", "train"), config.RunConfig),
     **{"evaluate": evaluate.Options, "sweep": sweep.Options, "bench": bench.Options},
     **{"stress": stress.Options, "pack": pack.Options, "report": report_command.Options},
-    **{"exercise": exercise.Options},
+    **{"six-blocks": six_blocks.Options},
     **{"export": export_command.Options, "import": import_command.Options},
 }
 
@@ -66,7 +66,7 @@ def settings(typed: str) -> config.RunConfig:
         ("sweep", "x --eval.time-limit-s soon", "--eval.time-limit-s", "'soon'"),
         ("stress", "", "RUN or --policy", "none"),
         ("stress", "--policy compact --levels 1", "levels", "none or several"),
-        ("exercise", "x --policy y", "RUN or --policy", "both"),
+        ("six-blocks", "x --policy y", "RUN or --policy", "both"),
         ("stress", "--policy compact --disturbance rain", "disturbance", "'rain'"),
         ("run", "--demos.randomise rain=1", "demos.randomise", "'rain'"),
         ("run", "--demos.randomise smoke", "demos.randomise", "smoke"),

@@ -201,7 +201,7 @@ def test_more_trials_than_asked_for_are_not_thrown_away(tmp_path):
 
 
 def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
-    from starjax.commands import policy_under_test
+    from starjax.commands import policy_evaluation
 
     preset = smoke(tmp_path, "stardiff_single")
     for name in ("dp_rcm4", "stardiff_single"):
@@ -210,11 +210,11 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
     (tmp_path / "dp_rcm4" / "evaluation").mkdir()
     (tmp_path / "dp_rcm4" / "evaluation" / "chunk_0000.npz").write_bytes(b"trials")
     found = []
-    monkeypatch.setattr(policy_under_test, "load", lambda *_: None)
+    monkeypatch.setattr(policy_evaluation, "load", lambda *_: None)
     monkeypatch.setattr(
-        policy_under_test, "rollouts", lambda at, *_, **__: found.extend(at.glob("*.npz"))
+        policy_evaluation, "rollouts", lambda at, *_, **__: found.extend(at.glob("*.npz"))
     )
-    monkeypatch.setattr(policy_under_test, "write_result", lambda *_, **__: None)
+    monkeypatch.setattr(policy_evaluation, "write_result", lambda *_, **__: None)
     pipeline._evaluate(
         preset, "stardiff_single", stubs.make_env(), tmp_path / "demos-a", "", sharing.ALONE
     )

@@ -64,9 +64,9 @@ def test_settings_without_a_scene_are_of_the_first_one():
     found = config.from_dict(config.RunConfig, old)
     assert found.scene == scenes.settings(names.FIRST)
     now = config.as_json(scenes.resolved(config.RunConfig()))
-    assert config.differing([old, now]) == []
+    assert config.differing_settings([old, now]) == []
     other = dataclasses.replace(found, scene=config.SceneConfig(task="reach"))
-    assert "scene.task" in config.differing([old, config.as_json(other)])
+    assert "scene.task" in config.differing_settings([old, config.as_json(other)])
 
 
 def test_a_folder_of_another_scene_is_refused(tmp_path):

@@ -6,7 +6,7 @@ import mistakes
 import numpy as np
 import pytest
 
-from starjax.commands import bench, subjects, sweep
+from starjax.commands import bench, policy_args, sweep
 from starjax.sim import registry
 
 
@@ -56,7 +56,7 @@ def test_sweeps_of_other_arms_and_of_files_lie_apart(tmp_path):
     file = tmp_path / "mine.safetensors"
     file.write_bytes(b"m")
     folders = [
-        sweep._folder(subjects.Named(file, run), sweep.Options(arm=arms))
+        sweep._folder(policy_args.PolicyPath(file, run), sweep.Options(arm=arms))
         for run in (None, tmp_path / "stardiff")
         for arms in ((), ("ur5e",), ("ur5e", "panda"))
     ]

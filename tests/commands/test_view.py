@@ -15,7 +15,7 @@ from starjax import cli
         ("view --dataset nowhere", "--dataset"),
         ("view --run nowhere", "RUN"),
         ("view --task nothing", "task"),
-        ("view --policy compact --beside expert --trocar 99", "--trocar"),
+        ("view --policy compact --compare-with expert --trocar 99", "--trocar"),
         ("view --arm noodle", "--arm"),
         ("view --port 70000", "--port"),
         ("teleop --task nothing", "task"),

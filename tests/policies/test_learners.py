@@ -108,7 +108,7 @@ def test_its_options_are_flags_and_stand_in_the_settings_of_a_run():
     values = config.as_json(found)
     assert values["policy"]["gain"] == 3.0 and values["policy"]["learner"] == "toy"
     assert config.from_dict(config.RunConfig, values) == found
-    assert "policy.gain" in config.trained_with(found)
+    assert "policy.gain" in config.weight_settings(found)
 
 
 @pytest.mark.parametrize(

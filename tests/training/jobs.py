@@ -161,12 +161,12 @@ def run_main(out: str, mode: str) -> None:
     import stubs
 
     from starjax import cli
-    from starjax.commands import demonstrations, pipeline, policy_under_test
+    from starjax.commands import demonstrations, pipeline, policy_evaluation
     from starjax.policies import policy as policies
     from starjax.runtime import processes
 
     policies.make = lambda *_, **__: _quadratic_policy()
-    policy_under_test.decision_ms = lambda who, decide: {"p50": 1.0, "p95": 1.0, "p99": 1.0}
+    policy_evaluation.inference_ms = lambda who, decide: {"p50": 1.0, "p95": 1.0, "p99": 1.0}
     training, stages = SETTINGS, ["collect", "train", "evaluate"]
     if mode == "trains":
         training = dataclasses.replace(SETTINGS, steps=10**6, checkpoint_every=10**6)

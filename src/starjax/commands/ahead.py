@@ -18,7 +18,7 @@ class Ahead(NamedTuple):
 
     Attributes:
       step: `training.stepper.Compiled` of the first training.
-      evaluation: `policy_under_test.Programs` of the first method.
+      evaluation: `policy_evaluation.Programs` of the first method.
     """
 
     step: Callable[[], Any] = _nothing
@@ -39,7 +39,7 @@ def begin(
     """
     import jax
 
-    from starjax.commands import policy_under_test
+    from starjax.commands import policy_evaluation
     from starjax.training import ahead as training
 
     if "train" not in stages or len(jax.devices()) > 1:
@@ -58,7 +58,7 @@ def begin(
             return None
         step()
         vision = encoder.params if encoder else None
-        return policy_under_test.compile_ahead(name, config, env, vision)
+        return policy_evaluation.compile_ahead(name, config, env, vision)
 
     step = background.run_in_background(lambda: _apart(compile_step))
     return Ahead(step, background.run_in_background(lambda: _apart(compile_evaluation)))

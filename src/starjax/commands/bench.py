@@ -58,14 +58,14 @@ def main(argv: Sequence[str]) -> int:
 def _time(run: Path, counts: Sequence[int], calls: int) -> dict[str, Any]:
     """Times and prints; returns the rows of Table IV."""
     xla.prepare_xla()
-    xla.require_devices("starjax.commands.policy_under_test")
+    xla.require_devices("starjax.commands.policy_evaluation")
 
     from starjax import methods
-    from starjax.commands import policy_under_test
+    from starjax.commands import policy_evaluation
     from starjax.evaluation import latency
     from starjax.policies import features
 
-    who = policy_under_test.load(run.name, folders.weights(run.parent, run.name))
+    who = policy_evaluation.load(run.name, folders.weights(run.parent, run.name))
     trained = who.trained
     seen = features.sensors(who.env.task, trained.scene.cameras)
     print("  DDIM steps      p50      p95      p99 ms       Hz")

@@ -8,7 +8,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.commands import checks, folders, messages, options, scenes, stage_times, subjects
+from starjax.commands import checks, folders, messages, options, policy_args, scenes, stage_times
 from starjax.runtime import files, gpu, xla
 
 DESCRIPTION = """Scores a trained policy on its task's trocars, and films it.
@@ -42,27 +42,27 @@ def main(argv: Sequence[str]) -> int:
     from starjax.runtime import processes
 
     processes.join()
-    xla.require_devices("starjax.commands.policy_under_test")
+    xla.require_devices("starjax.commands.policy_evaluation")
     chosen, named, folder = asked if gpu.is_used() == guess else _asked(argv, not guess)
 
-    from starjax.commands import policy_under_test
+    from starjax.commands import policy_evaluation
     from starjax.rollouts import sharing
 
-    who, config = subjects.load(named, chosen.arm)
+    who, config = policy_args.load(named, chosen.arm)
     scene = scenes.settings(who.env.names)
     changed = {"method": who.method, "out": str(folder), "scene": scene, "eval": chosen.eval}
     config = dataclasses.replace(config, **changed)
     about = messages.about(config, chosen.policy or chosen.run, chosen.seed)
-    with sharing.shared(folder) as share, messages.heard(share.is_first):
+    with sharing.shared(folder) as share, messages.first_process_only(share.is_first):
         same = share.first("same", lambda: _goes_on(folder, who.weights, chosen, scene))
         print(f"{about}, into {folder}\n", flush=True)
         with stage_times.timed(folder, "evaluate", same or folders.is_under_way(folder)):
-            table = policy_under_test.rollouts(
+            table = policy_evaluation.rollouts(
                 folder / "evaluation", who, who.env.task.trocars, chosen.eval, chosen.seed
             )
         if share.is_first:
             command = options.typed("evaluate", argv)
-            result = policy_under_test.write_result(
+            result = policy_evaluation.write_result(
                 folder, who, table, config, chosen.seed, command, stage_times.read(folder)
             )
             print(f"\n{messages.outcome([result])}\n{_times(result)}\n")
@@ -85,16 +85,16 @@ def _goes_on(folder: Path, weights: str, chosen: Options, scene: config_lib.Scen
     return _identity(before) == (weights, chosen.seed, arms, dataclasses.asdict(chosen.eval))
 
 
-def _asked(argv: Sequence[str], has_gpu: bool) -> tuple[Options, subjects.Named, Path]:
+def _asked(argv: Sequence[str], has_gpu: bool) -> tuple[Options, policy_args.PolicyPath, Path]:
     """Parses the command line: its flags, the policy, the result's folder."""
     chosen = options.parse(
         Options, argv, prog="starjax evaluate", description=DESCRIPTION, default=_default(has_gpu)
     )
-    named = subjects.find(chosen.run, chosen.policy)
+    named = policy_args.resolve(chosen.run, chosen.policy)
     if named.run:
         default = Path(chosen.run) / f"evaluate-{_trials(chosen)}"
     else:
-        default = Path("runs/evaluate") / f"{subjects.label(named.file)}-{_trials(chosen)}"
+        default = Path("runs/evaluate") / f"{policy_args.label(named.file)}-{_trials(chosen)}"
     folder = default if chosen.out == options.AUTO else chosen.out
     checks.expect_folder("--out", folder)
     return chosen, named, Path(folder)

@@ -45,7 +45,7 @@ def weights(out: Path, method: str) -> Path:
     return out / methods.METHODS[method].weights_of / "policy.safetensors"
 
 
-def twins(method: str) -> list[str]:
+def equivalent_methods(method: str) -> list[str]:
     """Other methods that behave just as `method` does, so that one evaluation serves both."""
     return [
         name
@@ -54,9 +54,9 @@ def twins(method: str) -> list[str]:
     ]
 
 
-def adopt_twin(out: Path, method: str) -> None:
+def adopt_equivalent(out: Path, method: str) -> None:
     """Takes over the evaluation of a twin that was scored before, chunk by chunk."""
-    for name in twins(method):
+    for name in equivalent_methods(method):
         if (out / name / "evaluation").is_dir() and not (out / method / "evaluation").exists():
             staged = out / method / ".evaluation"
             shutil.rmtree(staged, ignore_errors=True)
@@ -105,7 +105,7 @@ def claim(
         expected = "the config.json that its weights were trained with"
         raise errors.UsageError(str(folder), expected, "none", _remedy(folder))
     if started:
-        before, now = map(config_lib.trained_with, (_settings(folder, found), config))
+        before, now = map(config_lib.weight_settings, (_settings(folder, found), config))
         for name, value in now.items():
             _refuse(folder, name, before[name], value)
         settings = (record.get("jax_settings", {}) for record in (found, jax_settings.record()))

@@ -225,7 +225,7 @@ def hint(run: Path, weights: str, does: str) -> str:
 
 
 @contextlib.contextmanager
-def heard(is_first: bool) -> Iterator[None]:
+def first_process_only(is_first: bool) -> Iterator[None]:
     """Keeps what is printed to the first process of several."""
     with open(os.devnull, "w") as nowhere, contextlib.ExitStack() as changed:
         if not is_first:

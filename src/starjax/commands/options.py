@@ -8,7 +8,7 @@ import functools
 import re
 import shlex
 import typing
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
@@ -52,16 +52,20 @@ def parse(
     prog: str,
     description: str,
     default: SettingsT | None = None,
+    renamed: Mapping[str, str] = {},
 ) -> SettingsT:
     """Returns `settings` filled from `argv`; missing fields come from `default`.
+
+    `renamed` maps flags of the previous release to those of this one.
 
     Raises:
       errors.UsageError: a flag is unknown, or its value is not what its type and range ask for.
     """
     start = tyro.MISSING_NONPROP if default is None else default
     about = {"prog": prog, "description": description, "default": start, "registry": _registry}
+    words = [_current(word, renamed) for word in argv]
     with tyro_errors.on_parse_error(functools.partial(_refuse, default or settings)):
-        found = tyro.cli(settings, args=list(argv), **about)
+        found = tyro.cli(settings, args=words, **about)
     limits.check(found)
     return found
 
@@ -107,6 +111,15 @@ def spelled(error: errors.UsageError) -> str:
 def typed(name: str, argv: Sequence[str]) -> str:
     """The command line, for the record in result.json."""
     return shlex.join(["starjax", name, *argv])
+
+
+def _current(word: str, renamed: Mapping[str, str]) -> str:
+    """Returns a word of the command line, with this release's name if it is a renamed flag."""
+    flag_, equals, value = word.partition("=")
+    if flag_ not in renamed:
+        return word
+    errors.warn_renamed(flag_, renamed[flag_])
+    return f"{renamed[flag_]}{equals}{value}"
 
 
 def _refuse(settings: Any, event: Any) -> NoReturn:

@@ -49,7 +49,7 @@ def main(argv: Sequence[str]) -> int:
         trained = policy_file.load(source)
     except ValueError as error:
         raise errors.UsageError("POLICY", "a policy of starjax", error) from error
-    policy = config.deciding(trained.policy)
+    policy = config.inference_settings(trained.policy)
     if chosen.temperature is not None:
         if not hasattr(policy.options, "temperature"):
             raise errors.UsageError("POLICY", "one with a temperature", f"one of {policy.learner}")

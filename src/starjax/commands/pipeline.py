@@ -48,7 +48,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     untrained = [name for name in trained if not folders.weights(out, name).exists()]
     encoder = demonstrations.frozen_encoder(config) if "train" in stages and untrained else None
     files.require_writable(out, LEAST_FREE_BYTES)
-    with sharing.shared(out) as share, messages.heard(share.is_first):
+    with sharing.shared(out) as share, messages.first_process_only(share.is_first):
         print(messages.plan(config, stages), flush=True)
         env = _environment(config)
         root, collect = demonstrations.plan(config, env, share)
@@ -133,7 +133,7 @@ def _train(
     params = state.ema_params
     made = policy_file.Trained(
         method=name,
-        policy=config_lib.deciding(config.policy),
+        policy=config_lib.inference_settings(config.policy),
         train=config.train,
         params={**params, "vision": encoder.params} if encoder else params,
         normalizer=state.normalizer,
@@ -165,7 +165,7 @@ def _evaluate(
     compiled: Callable[[], Any] | None = None,
 ) -> None:
     """Closed-loop trials of one method; `result.json` is its last file."""
-    from starjax.commands import policy_under_test
+    from starjax.commands import policy_evaluation
 
     out = Path(config.out)
     folder, weights = out / name, folders.weights(out, name)
@@ -173,11 +173,11 @@ def _evaluate(
         messages.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
         return
     messages.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
-    share.first(f"{name} has its twin", lambda: folders.adopt_twin(out, name))
+    share.first(f"{name} has an equal evaluation", lambda: folders.adopt_equivalent(out, name))
     with stage_times.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
-        who = policy_under_test.load(name, weights, env)
-        programs = (compiled() if compiled else None) or policy_under_test.Programs()
-        table = policy_under_test.rollouts(
+        who = policy_evaluation.load(name, weights, env)
+        programs = (compiled() if compiled else None) or policy_evaluation.Programs()
+        table = policy_evaluation.rollouts(
             folder / "evaluation",
             who,
             env.task.trocars,
@@ -190,7 +190,7 @@ def _evaluate(
         timings = _timings(out, name, demos.name)
         digest = folders.demos_digest(demos)
         given = (folder, who, table, config, config.seed, command, timings, digest)
-        policy_under_test.write_result(*given, decide=programs.decision)
+        policy_evaluation.write_result(*given, decide=programs.decision)
 
     share.first(f"{name} is scored", write)
 
@@ -233,7 +233,7 @@ def _is_of(found: Any, config: config_lib.RunConfig) -> bool:
         before = config_lib.from_dict(config_lib.RunConfig, found.config)
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
-    alike = config_lib.trained_with(before) == config_lib.trained_with(config)
+    alike = config_lib.weight_settings(before) == config_lib.weight_settings(config)
     return alike and before.eval == config.eval and found.seed in (None, config.seed)
 
 

@@ -28,10 +28,10 @@ def apart() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def timed(out: Path, stage: str, goes_on: bool = True) -> Iterator[None]:
+def timed(out: Path, stage: str, resumes: bool = True) -> Iterator[None]:
     """Adds the seconds spent inside to `<out>/timings.json`, also after Ctrl-C.
 
-    `stage` is all of them, `stage: compile` those in which jax compiled. Unless the work `goes_on`
+    `stage` is all of them, `stage: compile` those in which jax compiled. Unless the work `resumes`
     from an earlier start, what that took does not count. Of several processes, the first one does.
     """
     from starjax.runtime import processes
@@ -42,7 +42,7 @@ def timed(out: Path, stage: str, goes_on: bool = True) -> Iterator[None]:
     start, compiling = time.monotonic(), _CompileSeconds()
     names = (stage, f"{stage}: compile")
     before = read(out)
-    if not goes_on and any(name in before for name in names):  # at once: a kill leaves no chance
+    if not resumes and any(name in before for name in names):  # at once: a kill leaves no chance
         kept = {name: seconds for name, seconds in before.items() if name not in names}
         files.write_json(out / "timings.json", kept)
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import checks, options, scenes, subjects
+from starjax.commands import checks, options, policy_args, scenes
 from starjax.evaluation import disturbances
 from starjax.limits import Count, CountOrZero, NotNegative
 from starjax.runtime import files, xla
@@ -53,15 +53,15 @@ class Options:
 def main(argv: Sequence[str]) -> int:
     """Runs the trials that are missing; writes stress.json, its table and its figure."""
     chosen = options.parse(Options, argv, prog="starjax stress", description=DESCRIPTION)
-    named = subjects.find(chosen.run, chosen.policy)
+    named = policy_args.resolve(chosen.run, chosen.policy)
     folder = _folder(named, chosen)
     if chosen.levels and len(chosen.disturbance) != 1:
         raise errors.UsageError("levels", "one --disturbance beside it", "none or several")
     disturbances.check("disturbance", chosen.disturbance)
     xla.prepare_xla()
-    xla.require_devices("starjax.commands.policy_under_test")
+    xla.require_devices("starjax.commands.policy_evaluation")
     files.require_writable(folder)
-    who, _ = subjects.load(named, chosen.arm)
+    who, _ = policy_args.load(named, chosen.arm)
     kinds = _kinds(chosen, who.trained.policy.observation)
     who = _disturbed(who, list(kinds))
     found: dict[str, Any] = {}
@@ -89,12 +89,12 @@ def _draw(folder: Path, content: dict[str, Any]) -> None:
         files.write_bytes(folder / name, data)
 
 
-def _folder(named: subjects.Named, chosen: Options) -> Path:
+def _folder(named: policy_args.PolicyPath, chosen: Options) -> Path:
     parts = [*chosen.arm, f"seed{chosen.seed}"]
     if named.run:
         default = named.run / "-".join(["stress", *parts])
     else:
-        default = Path("runs/stress") / "-".join([subjects.label(named.file), *parts])
+        default = Path("runs/stress") / "-".join([policy_args.label(named.file), *parts])
     folder = default if chosen.out == options.AUTO else chosen.out
     checks.expect_folder("--out", folder)
     return Path(folder)
@@ -128,12 +128,12 @@ def _disturbed(who: Any, names: list[str]) -> Any:
 
 def _score(place: Path, who: Any, levels: dict[str, float], chosen: Options) -> dict[str, Any]:
     """Success, RCM error and the force on the abdominal wall in all trials of a level."""
-    from starjax.commands import policy_under_test
+    from starjax.commands import policy_evaluation
     from starjax.evaluation import statistics, wall
 
     trials = config_lib.EvalConfig(**vars(chosen.eval))
     trocars = who.env.task.trocars
-    table = policy_under_test.rollouts(place, who, trocars, trials, chosen.seed, levels)
+    table = policy_evaluation.rollouts(place, who, trocars, trials, chosen.seed, levels)
     return {
         "strict": statistics.rate(table.success),
         "safe": statistics.rate(table.safe),

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from starjax import config as config_lib
-from starjax.commands import checks, folders, messages, options, subjects
+from starjax.commands import checks, folders, messages, options, policy_args
 from starjax.limits import CountOrZero, Range
 from starjax.runtime import files, xla
 
@@ -60,7 +60,7 @@ def main(argv: Sequence[str]) -> int:
     chosen = _parse(argv)
     # A mistake should not wait for jax.
     _check(chosen)
-    named = subjects.find(chosen.run, chosen.policy)
+    named = policy_args.resolve(chosen.run, chosen.policy)
     if chosen.eval.time_limit_s is None:
         limit = dataclasses.replace(chosen.eval, time_limit_s=_time_limit_s(named.run))
         chosen = dataclasses.replace(chosen, eval=limit)
@@ -69,18 +69,18 @@ def main(argv: Sequence[str]) -> int:
     from starjax.runtime import processes
 
     processes.join()
-    xla.require_devices("starjax.commands.policy_under_test")
+    xla.require_devices("starjax.commands.policy_evaluation")
     files.require_writable(folder)
 
-    from starjax.commands import policy_under_test
+    from starjax.commands import policy_evaluation
     from starjax.evaluation import result, sweep
     from starjax.rollouts import trocars
 
-    who, config = subjects.load(named, chosen.arm)
+    who, config = policy_args.load(named, chosen.arm)
     task = who.env.task
     drawn = _trocars(chosen, task)
     trials = config_lib.EvalConfig(**vars(chosen.eval))
-    table = policy_under_test.rollouts(_trials(folder, chosen), who, drawn, trials, chosen.seed)
+    table = policy_evaluation.rollouts(_trials(folder, chosen), who, drawn, trials, chosen.seed)
     if not processes.is_first():
         return 0
     seen = trocars.select(task.trocars, slice(config.demos.seen_trocars))
@@ -131,11 +131,11 @@ def _check(chosen: Options) -> None:
         checks.expect(value == getattr(default, field), field, what, value)
 
 
-def _folder(named: subjects.Named, chosen: Options) -> Path:
+def _folder(named: policy_args.PolicyPath, chosen: Options) -> Path:
     """Where sweep.json is written."""
     if named.run:
         return named.run / "-".join(["sweep", *chosen.arm]) if chosen.arm else named.run
-    return Path("runs/sweep") / "-".join([subjects.label(named.file), *chosen.arm])
+    return Path("runs/sweep") / "-".join([policy_args.label(named.file), *chosen.arm])
 
 
 def _trials(folder: Path, chosen: Options) -> Path:

@@ -17,6 +17,7 @@ DESCRIPTION = """Shows somebody at work on a page in the browser.
 The scene in 3D, the camera's picture, RCM error and plan. Drag a trocar by its arrows, and the
 policy goes on through it. Ctrl-C closes the page."""
 
+_RENAMED = {"--beside": "--compare-with"}  # flags of the previous release
 Port = Annotated[int, Range(0, 65_535)]
 Show = Callable[[Any, Callable[[], bool]], str]  # (server, should_stop) -> a last line
 
@@ -31,7 +32,7 @@ class Options:
     expert: bool = False  # the task's scripted demonstrator; so it is where nobody is named
     dataset: str = ""  # a folder of demonstrations: its episodes
     # a second one at the same trial: expert, or a policy as above
-    beside: str = ""
+    compare_with: str = ""
     task: str = config_lib.DEFAULT_TASK  # of the expert
     arm: str = ""  # robot instead of their own
     trocar: Annotated[int, Range(0, 999)] = 8  # number of the task's configuration of trocars
@@ -41,7 +42,9 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Serves the page until a stop."""
-    chosen = options.parse(Options, argv, prog="starjax view", description=DESCRIPTION)
+    chosen = options.parse(
+        Options, argv, prog="starjax view", description=DESCRIPTION, renamed=_RENAMED
+    )
     named = [name for name in ("policy", "run", "dataset") if getattr(chosen, name)]
     named += ["expert"] if chosen.expert else []
     if len(named) > 1:
@@ -76,11 +79,11 @@ def _live(chosen: Options) -> Show:
     from starjax.viewer import actors, view
 
     who = [_actor(chosen.policy, chosen.run, chosen.task)]
-    if chosen.beside:
-        name = "" if chosen.beside == actors.EXPERT else chosen.beside
+    if chosen.compare_with:
+        name = "" if chosen.compare_with == actors.EXPERT else chosen.compare_with
         who.append(_actor(name, "", who[0].task))
     if who[-1].task != who[0].task:
-        raise errors.UsageError("--beside", f"one that does {who[0].task}", who[-1].task)
+        raise errors.UsageError("--compare-with", f"one that does {who[0].task}", who[-1].task)
     if chosen.arm:
         errors.choice("--arm", chosen.arm, registry.arms.names())
     count = len(registry.tasks.get(who[0].task).is_seen)

@@ -84,7 +84,7 @@ def _is_of(folder: Path, scored: result.Result) -> bool:
     try:
         trained = files.read_json(folder / "config.json")
         same_seed = trained["seed"] == scored.config.get("seed", trained["seed"])
-        return same_seed and not config.differing([trained, scored.config])
+        return same_seed and not config.differing_settings([trained, scored.config])
     except (FileNotFoundError, AttributeError, KeyError, TypeError, ValueError):
         return True  # none, damaged, or of another version: not known
 

@@ -50,7 +50,7 @@ def most_shared(trials: Iterable[Trial]) -> tuple[int, int, int]:
 
 def differing(runs: Sequence[Run]) -> list[str]:
     """Settings that decide the weights, but for the seed, that the runs do not agree on."""
-    return config.differing([run.result.config for run in runs if run.result.config])
+    return config.differing_settings([run.result.config for run in runs if run.result.config])
 
 
 def pair(a: Run, b: Run) -> stats.Paired | None:

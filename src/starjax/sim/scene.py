@@ -215,7 +215,7 @@ def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
                 f"arm {arm_name}",
                 f"a mount with the tool {tool_name} in the workspace {slot.workspace}",
                 known or "none",
-                f"starjax place {arm_name} {tool_name} {task.name} searches one",
+                f"starjax find-mount {arm_name} {tool_name} {task.name} searches one",
             )
         found.append((arm, tool, mount))
     return found

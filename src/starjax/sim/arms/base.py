@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Mount(NamedTuple):
-    """An arm with a tool in a workspace; found by `starjax place`, held by a test.
+    """An arm with a tool in a workspace; found by `starjax find-mount`, held by a test.
 
     Attributes:
       position: `(3,)` m, of the arm's base in the world; for a remote centre from the trocar.

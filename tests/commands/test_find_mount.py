@@ -1,10 +1,10 @@
-"""`starjax place`: what it searches for, prints, and refuses."""
+"""`starjax find-mount`: what it searches for, prints, and refuses."""
 
 import mistakes
 import numpy as np
 import pytest
 
-from starjax.commands import place as command
+from starjax.commands import find_mount as command
 from starjax.sim import mounts, place
 from starjax.sim.arms.base import Mount
 

@@ -1,4 +1,4 @@
-"""`starjax place ARM TOOL WORKSPACE`: where an arm must stand, printed as a record to paste."""
+"""`starjax find-mount ARM TOOL WORKSPACE`: a search for the pose of an arm's base."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Searches, prints each round's figures and the best mount."""
-    chosen = options.parse(Options, argv, prog="starjax place", description=DESCRIPTION)
+    chosen = options.parse(Options, argv, prog="starjax find-mount", description=DESCRIPTION)
     xla.prepare_xla()
     xla.require_devices("starjax.sim.place")
 

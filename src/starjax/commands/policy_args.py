@@ -11,7 +11,7 @@ from starjax.policies import packaged
 from starjax.runtime import files
 
 
-class Named(NamedTuple):
+class PolicyPath(NamedTuple):
     """Files of the policy that a command line names.
 
     Attributes:
@@ -23,7 +23,7 @@ class Named(NamedTuple):
     run: Path | None
 
 
-def find(run: str, policy: str) -> Named:
+def resolve(run: str, policy: str) -> PolicyPath:
     """Finds what one of the two names.
 
     Args:
@@ -37,10 +37,10 @@ def find(run: str, policy: str) -> Named:
         got = "both" if run else "none"
         raise errors.UsageError("RUN or --policy", "one of the two", got)
     if policy:
-        return Named(packaged.find("--policy", policy), None)
+        return PolicyPath(packaged.find("--policy", policy), None)
     folder = folders.existing(run)
     folders.read_config(folder)
-    return Named(folders.weights(folder.parent, folder.name), folder)
+    return PolicyPath(folders.weights(folder.parent, folder.name), folder)
 
 
 def label(file: Path) -> str:
@@ -52,7 +52,7 @@ def label(file: Path) -> str:
     return f"{name}-{files.sha256(file)[:8]}"
 
 
-def load(named: Named, arms: tuple[str, ...]) -> tuple[Any, config_lib.RunConfig]:
+def load(named: PolicyPath, arms: tuple[str, ...]) -> tuple[Any, config_lib.RunConfig]:
     """Loads it, in its scene.
 
     Args:
@@ -60,17 +60,16 @@ def load(named: Named, arms: tuple[str, ...]) -> tuple[Any, config_lib.RunConfig
       arms: robots instead of those that it was trained with.
 
     Returns:
-      `policy_under_test.Subject`, and the settings of the run that it comes from, as far as they
-      are known.
+      `policy_evaluation.PolicyInEnv`, and the known settings of the run that it comes from.
     """
-    from starjax.commands import policy_under_test  # it imports jax
+    from starjax.commands import policy_evaluation  # it imports jax
 
     if named.run is None:
-        who = policy_under_test.from_file(named.file, arms)
+        who = policy_evaluation.from_file(named.file, arms)
         return who, _settings(who.trained)
     config = folders.read_config(named.run)
-    who = policy_under_test.load(named.run.name, named.file, arms=arms)
-    return who, policy_under_test.settings(who, config)
+    who = policy_evaluation.load(named.run.name, named.file, arms=arms)
+    return who, policy_evaluation.settings(who, config)
 
 
 def _settings(trained: Any) -> config_lib.RunConfig:

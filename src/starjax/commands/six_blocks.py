@@ -1,4 +1,4 @@
-"""`starjax exercise`: six blocks one after another with two arms, as surgeons are scored."""
+"""`starjax six-blocks`: six blocks one after another with two arms, as surgeons are scored."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import checks, messages, options, subjects
+from starjax.commands import checks, messages, options, policy_args
 from starjax.limits import Count
 from starjax.runtime import files, xla
 
@@ -35,12 +35,12 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Runs the trials that are missing; writes exercise.json."""
-    chosen = options.parse(Options, argv, prog="starjax exercise", description=DESCRIPTION)
+    chosen = options.parse(Options, argv, prog="starjax six-blocks", description=DESCRIPTION)
     is_expert = not (chosen.run or chosen.policy)
-    named = None if is_expert else subjects.find(chosen.run, chosen.policy)
+    named = None if is_expert else policy_args.resolve(chosen.run, chosen.policy)
     folder = _folder(named, chosen)
     xla.prepare_xla()
-    xla.require_devices("starjax.commands.policy_under_test")
+    xla.require_devices("starjax.commands.policy_evaluation")
     files.require_writable(folder)
 
     from starjax.evaluation import exercise
@@ -52,22 +52,24 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _folder(named: subjects.Named | None, chosen: Options) -> Path:
+def _folder(named: policy_args.PolicyPath | None, chosen: Options) -> Path:
     name = "-".join([*chosen.arm, f"seed{chosen.seed}-{chosen.trials}"])
     if named is None:
         default = Path("runs/exercise") / f"expert-{name}"
     elif named.run:
         default = named.run / f"exercise-{name}"
     else:
-        default = Path("runs/exercise") / f"{subjects.label(named.file)}-{name}"
+        default = Path("runs/exercise") / f"{policy_args.label(named.file)}-{name}"
     folder = default if chosen.out == options.AUTO else chosen.out
     checks.expect_folder("--out", folder)
     return Path(folder)
 
 
-def _score(folder: Path, named: subjects.Named | None, chosen: Options) -> tuple[Any, Any, dict]:
+def _score(
+    folder: Path, named: policy_args.PolicyPath | None, chosen: Options
+) -> tuple[Any, Any, dict]:
     """The trials' table, the environment, and who acted."""
-    from starjax.commands import policy_under_test
+    from starjax.commands import policy_evaluation
     from starjax.evaluation import evaluate
     from starjax.rollouts import agent
     from starjax.sim import exercise
@@ -88,7 +90,7 @@ def _score(folder: Path, named: subjects.Named | None, chosen: Options) -> tuple
             report=messages.indented,
         )
         return table, env, {"expert": name}
-    who, _ = subjects.load(named, chosen.arm)
+    who, _ = policy_args.load(named, chosen.arm)
     names = who.env.names
     if names.task != TASK:
         raise errors.UsageError("RUN or --policy", f"one trained for {TASK}", f"of {names.task}")
@@ -101,7 +103,7 @@ def _score(folder: Path, named: subjects.Named | None, chosen: Options) -> tuple
     )
     trials = config_lib.EvalConfig(trials=chosen.trials, time_limit_s=LIMIT_S, video_trials=0)
     subject = who._replace(env=env)
-    table = policy_under_test.rollouts(folder, subject, task.trocars, trials, chosen.seed)
+    table = policy_evaluation.rollouts(folder, subject, task.trocars, trials, chosen.seed)
     return table, env, {"method": who.method, "weights": who.weights}
 
 
@@ -128,7 +130,7 @@ def _content(
         **about,
         "seed": chosen.seed,
         "trials_at_each_trocar": chosen.trials,
-        "command": options.typed("exercise", argv),
+        "command": options.typed("six-blocks", argv),
         **figures,
         **provenance.code()._asdict(),
         "versions": xla.versions(),

@@ -23,7 +23,7 @@ from starjax.runtime import files
 from starjax.sim import env as sim_env
 
 
-class Subject(NamedTuple):
+class PolicyInEnv(NamedTuple):
     """A method with its weights, in its environment.
 
     Attributes:
@@ -55,7 +55,7 @@ class Programs(NamedTuple):
 
 def load(
     method: str, weights: Path, env: sim_env.Env | None = None, arms: Sequence[str] = ()
-) -> Subject:
+) -> PolicyInEnv:
     """Loads a method's weights.
 
     Args:
@@ -78,7 +78,7 @@ def load(
     return _load(method, trained, weights, env, arms)
 
 
-def from_file(path: Path, arms: Sequence[str] = ()) -> Subject:
+def from_file(path: Path, arms: Sequence[str] = ()) -> PolicyInEnv:
     """Loads a policy that says itself which method it is; `arms` as in `load`.
 
     Raises:
@@ -98,7 +98,7 @@ def _load(
     file: Path,
     env: sim_env.Env | None,
     arms: Sequence[str],
-) -> Subject:
+) -> PolicyInEnv:
     scene = trained.scene
     env = env or sim_env.make(
         scene.task,
@@ -111,12 +111,12 @@ def _load(
     row = methods.METHODS[method]
     policy = policies.make(row, trained.policy, env.task, cameras=scene.cameras)
     ready = trained._replace(params=policy.for_sampling(trained.params))
-    return Subject(method, env, policy, ready, files.sha256(file))
+    return PolicyInEnv(method, env, policy, ready, files.sha256(file))
 
 
 def rollouts(
     directory: Path,
-    who: Subject,
+    who: PolicyInEnv,
     trocars: rcm.Trocar,
     settings: config_lib.EvalConfig,
     seed: int,
@@ -157,7 +157,7 @@ def compile_ahead(
       env: with the observation that it is trained on.
       vision: parameters of its frozen encoder, None where it has none.
     """
-    row, deciding = methods.METHODS[name], config_lib.deciding(config.policy)
+    row, deciding = methods.METHODS[name], config_lib.inference_settings(config.policy)
     policy = policies.make(row, deciding, env.task, cameras=env.names.cameras)
     params = jax.eval_shape(policy.init, jax.random.key(0))
     if vision is not None:
@@ -198,7 +198,7 @@ def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.Settings:
     )
 
 
-def settings(who: Subject, config: config_lib.RunConfig) -> config_lib.RunConfig:
+def settings(who: PolicyInEnv, config: config_lib.RunConfig) -> config_lib.RunConfig:
     """A run's settings, with those that its weights were trained with: another method may have
     trained them."""
     trained = who.trained
@@ -207,7 +207,7 @@ def settings(who: Subject, config: config_lib.RunConfig) -> config_lib.RunConfig
     )
 
 
-def decision_ms(who: Subject, decide: latency.Decide | None = None) -> dict[str, float]:
+def inference_ms(who: PolicyInEnv, decide: latency.Decide | None = None) -> dict[str, float]:
     """Time of one decision at batch 1: observation in, commands out, compilation apart."""
     trained = who.trained
     return latency.policy_ms(
@@ -223,7 +223,7 @@ def decision_ms(who: Subject, decide: latency.Decide | None = None) -> dict[str,
 
 def write_result(
     folder: Path,
-    who: Subject,
+    who: PolicyInEnv,
     trials: table.Table,
     config: config_lib.RunConfig,
     seed: int,
@@ -253,7 +253,7 @@ def write_result(
     )
     about = {
         "control_hz": who.env.control_hz,
-        "inference_ms": decision_ms(who, decide),
+        "inference_ms": inference_ms(who, decide),
         "preset": config.preset,
         "seed": seed,
         "weights": who.weights,
