@@ -18,7 +18,7 @@ from starjax.policies import policy as policies
 from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.sim import registry
 from starjax.training import devices, state, step
-from starjax.training.sharding import Carry, Layout
+from starjax.training.sharding import StepCarry, StateLayout
 from starjax.types import Command, Observation, Pose
 
 TASK = registry.tasks.get("peg_transfer")
@@ -70,10 +70,10 @@ class Job(NamedTuple):
 
     policy: policies.Policy
     params: policies.Params
-    carry: Carry
+    carry: StepCarry
     dataset: windows.Dataset
     example: windows.Batch
-    steps: Callable[..., Carry]
+    steps: Callable[..., StepCarry]
     per_call: int
     options: dict[str, Any]
     calls: int
@@ -118,7 +118,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     first = state.create(policy, optimizer, drawn(policy, seed), stats, key)
     mesh = devices.make_mesh(batch, on)
     shapes = jax.eval_shape(lambda x: x, first)
-    layout = Layout(mesh, policy.rounded, shapes)
+    layout = StateLayout(mesh, policy.rounded, shapes)
     setup = step.Setup(policy, optimizer, case.policy, case.train, layout)
     looped = step.runs_in_a_loop(case.policy)
 

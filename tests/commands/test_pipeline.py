@@ -106,7 +106,7 @@ def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
     stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
     raw, average = {"learner": {"w": np.zeros(3)}}, {"learner": {"w": np.ones(3)}}
     state = types.SimpleNamespace(params=raw, ema_params=average, normalizer=stats)
-    monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
+    monkeypatch.setattr(loop, "run", lambda *_, **__: loop.TrainingResult(state, 1.0, 0, {}))
     env = fakes.env()
     pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None, sharing.ALONE)
     kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
@@ -120,7 +120,7 @@ def test_a_stop_during_the_last_steps_ends_the_run_after_the_weights(tmp_path, m
 
     def last_steps(*_, **__):
         os.kill(os.getpid(), number)
-        return loop.Result(state, 1.0, 0, {})
+        return loop.TrainingResult(state, 1.0, 0, {})
 
     before = signal.signal(number, signal.default_int_handler)  # it may be ignored
     monkeypatch.setattr(loop, "run", last_steps)
@@ -228,7 +228,7 @@ def _json(settings):
 def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):
     stats = normalizer.Normalizer(normalizer.MinMax(-np.ones(5), np.ones(5)), None)
     state = types.SimpleNamespace(ema_params={"w": np.ones(3)}, normalizer=stats)
-    monkeypatch.setattr(loop, "run", lambda *_, **__: loop.Result(state, 1.0, 0, {}))
+    monkeypatch.setattr(loop, "run", lambda *_, **__: loop.TrainingResult(state, 1.0, 0, {}))
     settings, env = smoke(tmp_path, "stardiff"), stubs.make_env()
     trained = dataclasses.replace(settings.policy, dtype="bfloat16")
     trains = dataclasses.replace(settings, policy=trained)

@@ -23,14 +23,14 @@ def test_the_average_is_what_is_judged():
     nothing: Any = None
     dataset = fakes.dataset(seed=0, demos=2, length=20)
     policy = Policy(nothing, nothing, nothing, sample)
-    judge = holdout.make(policy, fakes.TINY, dataset, np.arange(20, 40))
-    assert judge
+    holdout_error = holdout.make(policy, fakes.TINY, dataset, np.arange(20, 40))
+    assert holdout_error
 
     def errors(raw, average):
         state: Any = types.SimpleNamespace(
             params=jnp.float32(raw), ema_params=jnp.float32(average), normalizer=None
         )
-        return judge(state)
+        return holdout_error(state)
 
     assert errors(0.0, 1.0) == errors(5.0, 1.0) != errors(1.0, 0.0)
 

@@ -12,7 +12,7 @@ import pytest
 from starjax import config
 from starjax.data import windows
 from starjax.training import devices, prefetch, state
-from starjax.training.sharding import Layout
+from starjax.training.sharding import StateLayout
 from starjax.training.step import Setup
 
 NOTHING: Any = None
@@ -21,7 +21,7 @@ SETUP = Setup(
     optimizer=NOTHING,
     policy_config=fakes.TINY,
     train_config=config.TrainConfig(batch_size=16),
-    layout=Layout(devices.make_mesh(16), lambda params: params, NOTHING),
+    layout=StateLayout(devices.make_mesh(16), lambda params: params, NOTHING),
 )
 
 

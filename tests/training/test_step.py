@@ -18,7 +18,7 @@ from starjax.policies import policy as policies
 from starjax.policies.base import Policy
 from starjax.runtime import xla
 from starjax.training import devices, state, step
-from starjax.training.sharding import Layout
+from starjax.training.sharding import StateLayout
 from starjax.training.step import Setup
 
 STRICT = {
@@ -66,7 +66,9 @@ def start():
 
 
 def layout(shapes, policy=None):
-    return Layout(devices.make_mesh(SETTINGS.batch_size), (policy or regression()).rounded, shapes)
+    return StateLayout(
+        devices.make_mesh(SETTINGS.batch_size), (policy or regression()).rounded, shapes
+    )
 
 
 def program(policy, optimizer):

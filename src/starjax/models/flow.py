@@ -18,7 +18,7 @@ from starjax.models.diffusion import within
 TIME_UNIT = 0.01
 
 
-class Noised(NamedTuple):
+class NoisedFlow(NamedTuple):
     """Sequences to learn from.
 
     Attributes:
@@ -32,7 +32,7 @@ class Noised(NamedTuple):
     velocity: jax.Array
 
 
-def noised(key: jax.Array, x0: jax.Array) -> Noised:
+def noised(key: jax.Array, x0: jax.Array) -> NoisedFlow:
     """Clean sequences `[B, ...]`, about [-1, 1], each at a random time.
 
     `key` is one typed key for the whole batch.
@@ -41,10 +41,12 @@ def noised(key: jax.Array, x0: jax.Array) -> Noised:
     time = jax.random.uniform(key_time, x0.shape[:1])
     noise = jax.random.normal(key_noise, x0.shape, x0.dtype)
     share = time.reshape(-1, *[1] * (x0.ndim - 1))
-    return Noised(x0 + share * (noise - x0), time / TIME_UNIT, noise - x0)
+    return NoisedFlow(x0 + share * (noise - x0), time / TIME_UNIT, noise - x0)
 
 
-def velocity_loss(predict: Callable[[jax.Array, jax.Array], jax.Array], given: Noised) -> jax.Array:
+def velocity_loss(
+    predict: Callable[[jax.Array, jax.Array], jax.Array], given: NoisedFlow
+) -> jax.Array:
     """Mean squared error of the velocity that `predict(x, time)` `[B, ...]` predicts."""
     return jnp.mean((predict(given.x, given.time) - given.velocity) ** 2)
 

@@ -27,7 +27,7 @@ TEACHER_STEPS = 8  # Euler steps of the flow that teaches it
 WHOLE_WAY = 300.0
 
 
-class Noised(NamedTuple):
+class NoisedShortcut(NamedTuple):
     """Sequences to learn from.
 
     Attributes:
@@ -41,7 +41,7 @@ class Noised(NamedTuple):
     velocity: jax.Array
 
 
-def noised(key: jax.Array, x0: jax.Array) -> Noised:
+def noised(key: jax.Array, x0: jax.Array) -> NoisedShortcut:
     """Clean sequences `[B, ...]`, about [-1, 1], each at a random time, or a start of a way.
 
     A way starts from a random share of the noise, as samples of any temperature do. `key` is one
@@ -52,14 +52,14 @@ def noised(key: jax.Array, x0: jax.Array) -> Noised:
     goes = jnp.arange(len(x0)) % EVERY == 0
     share = _beside(jax.random.uniform(key_share, x0.shape[:1]), x0)
     start = share * jax.random.normal(key_noise, x0.shape, x0.dtype)
-    return Noised(
+    return NoisedShortcut(
         jnp.where(_beside(goes, x0), start, at.x),
         jnp.where(goes, WHOLE_WAY, at.time),
         at.velocity,
     )
 
 
-def loss(predict: Callable[..., jax.Array], given: Noised) -> jax.Array:
+def loss(predict: Callable[..., jax.Array], given: NoisedShortcut) -> jax.Array:
     """Mean squared error of the velocity, or of the mean velocity over the whole way.
 
     It is what `predict(x, told)` `[B, ...]` predicts, of some rows `predict(x, told, rows)`.
@@ -68,7 +68,7 @@ def loss(predict: Callable[..., jax.Array], given: Noised) -> jax.Array:
     return jnp.mean((predict(given.x, given.time) - target) ** 2)
 
 
-def targets(predict: Callable[..., jax.Array], given: Noised) -> jax.Array:
+def targets(predict: Callable[..., jax.Array], given: NoisedShortcut) -> jax.Array:
     """Target of the prediction `[B, ...]`: for a whole way, the mean velocity of the flow."""
     count = len(given.x)
     most = -(-count // EVERY)

@@ -14,7 +14,7 @@ from starjax.rcm import arrays
 from starjax.sim.tasks.base import Task
 from starjax.training import devices, stepper
 from starjax.training import state as states
-from starjax.training.sharding import Layout
+from starjax.training.sharding import StateLayout
 from starjax.training.step import Setup
 from starjax.types import Command, Observation, Pose
 
@@ -44,7 +44,7 @@ def compile_step(
         key,
         devices.replicated(mesh),
     )
-    layout = Layout(mesh, policy.rounded, shapes)
+    layout = StateLayout(mesh, policy.rounded, shapes)
     setup = Setup(policy, optimizer, policy_config, train_config, layout)
     seen = features.sensors(task, cameras)
     return stepper.compile_ahead(setup, batch_shapes(policy_config, train_config.batch_size, seen))

@@ -18,20 +18,20 @@ from starjax.runtime import background, processes, progress
 from starjax.sim.tasks.base import Task
 from starjax.training import checkpoint, devices, encoder, holdout, log, metrics, stepper
 from starjax.training import state as states
-from starjax.training.sharding import Carry, Layout
+from starjax.training.sharding import StepCarry, StateLayout
 from starjax.training.step import Setup
 from starjax.training.stepper import Stepper
 
 _CALL_SECONDS = 1.0  # aim of one compiled call: how long Ctrl-C waits, how often the bar moves
 
-Judge = Callable[[states.TrainState], dict[str, float]]
+HoldoutError = Callable[[states.TrainState], dict[str, float]]
 
 
 class Interrupted(KeyboardInterrupt):
     """Training was asked to stop; its checkpoint is written and the same command goes on."""
 
 
-class Result(NamedTuple):
+class TrainingResult(NamedTuple):
     """A finished training.
 
     Attributes:
@@ -62,7 +62,7 @@ def run(
     should_stop: Callable[[], bool] = lambda: False,
     description: str = "train",
     compiled: stepper.Compiled | None = None,
-) -> Result:
+) -> TrainingResult:
     """Trains a method, going on from the newest sound checkpoint in the directory.
 
     Interrupted and resumed, or run through: the result is the same to the last bit.
@@ -112,7 +112,7 @@ def run(
     shapes = states.shapes(
         policy, optimizer, init.traced.out_info, stats, streams.steps, devices.replicated(mesh)
     )
-    layout = Layout(mesh, policy.rounded, shapes)
+    layout = StateLayout(mesh, policy.rounded, shapes)
     setup = Setup(policy, optimizer, policy_config, train_config, layout)
     resident = windows.on_device(dataset)
     steps = None
@@ -127,30 +127,32 @@ def run(
         _check_same(directory, state, streams.steps, stats, train_config.steps)
     del drawn  # it holds what was drawn
 
-    judge = None
+    holdout_error = None
     if processes.is_first():
         log.resume(directory / "metrics.jsonl", int(state.step))
-        judge = holdout.make(policy, policy_config, dataset, held_out)
+        holdout_error = holdout.make(policy, policy_config, dataset, held_out)
     if int(state.step) == train_config.steps:
-        found = judge(processes.own(state)) if judge else {}
-        return Result(state, 0.0, int(state.skipped), found)
+        found = holdout_error(processes.own(state)) if holdout_error else {}
+        return TrainingResult(state, 0.0, int(state.skipped), found)
     if steps is None:
         steps = stepper.streamed(setup, dataset, frames, state)
     step, carry = int(state.step), steps.begin(state)
     del state  # on several devices, memory that the steps may need
-    return _train(steps, carry, step, train_config, directory, judge, should_stop, description)
+    return _train(
+        steps, carry, step, train_config, directory, holdout_error, should_stop, description
+    )
 
 
 def _train(
     stepper: Stepper,
-    carry: Carry,
+    carry: StepCarry,
     step: int,
     train_config: config.TrainConfig,
     directory: pathlib.Path,
-    judge: Judge | None,
+    holdout_error: HoldoutError | None,
     should_stop: Callable[[], bool],
     description: str,
-) -> Result:
+) -> TrainingResult:
     """Takes the steps that are left, with a line of the log and a checkpoint every so many."""
     last, saved, found = train_config.steps, step, {}
     pace = _Pace(train_config.batch_size)
@@ -177,15 +179,15 @@ def _train(
                 carry, note = _log(directory / "metrics.jsonl", step, carry, train_config)
             if step in (stops[1], last):
                 state = stepper.end(carry)  # by all processes together
-                if judge:
-                    found = judge(processes.own(state))
+                if holdout_error:
+                    found = holdout_error(processes.own(state))
                     log.append(directory / "metrics.jsonl", step, "holdout", found)
                 _save(directory, state, train_config)
                 saved = step
                 del state
             show(count, note=note)
     state = stepper.end(carry)
-    return Result(state, pace.samples_per_second, int(state.skipped), found)
+    return TrainingResult(state, pace.samples_per_second, int(state.skipped), found)
 
 
 def _observed(
@@ -247,8 +249,8 @@ def _first_params(drawn: policies.Params, policy_config: config.PolicyConfig) ->
 
 
 def _log(
-    path: pathlib.Path, step: int, carry: Carry, train_config: config.TrainConfig
-) -> tuple[Carry, str]:
+    path: pathlib.Path, step: int, carry: StepCarry, train_config: config.TrainConfig
+) -> tuple[StepCarry, str]:
     """Writes the means since the last line and restarts the sums; returns a note for the bar."""
     state, skipped = carry.state, int(carry.state.skipped)
     values = metrics.means(state.sums, step, skipped, train_config)

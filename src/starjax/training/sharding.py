@@ -23,11 +23,11 @@ _ROW = 1 << 10  # entries that a block of a GPU's threads adds up at once
 _SMALL = 1 << 16  # entries: starting on a smaller leaf takes a GPU longer than reading it
 
 
-class Carry(NamedTuple):
+class StepCarry(NamedTuple):
     """State between two steps.
 
     Attributes:
-      state: of the training, as `Layout` lays it out.
+      state: of the training, as `StateLayout` lays it out.
       rounded: its matrices in the networks' type, None for other leaves. The optimiser writes both,
         so that the float32 ones are not read again to round them.
     """
@@ -36,7 +36,7 @@ class Carry(NamedTuple):
     rounded: Params
 
 
-class Layout(NamedTuple):
+class StateLayout(NamedTuple):
     """How a training's state lies on the devices from step to step.
 
     Large matrices are flat and shared out over the devices; on a GPU vectors are packed.
@@ -51,15 +51,15 @@ class Layout(NamedTuple):
     round: Callable[[Params], Params]
     whole: Any
 
-    def to_carry(self, state: TrainState) -> Carry:
+    def to_carry(self, state: TrainState) -> StepCarry:
         """Lays out a whole state."""
         state = self._packed(state)
-        carry = Carry(state, self.rounded(state.params))
+        carry = StepCarry(state, self.rounded(state.params))
         return jax.tree_util.tree_map_with_path(
             lambda path, x: x.reshape(-1) if self._is_shared_out(path, x) else x, carry
         )
 
-    def to_state(self, carry: Carry) -> TrainState:
+    def to_state(self, carry: StepCarry) -> TrainState:
         """Returns the whole state."""
         shapes = self._packed_shapes(self.whole)
         state = jax.tree.map(
@@ -69,7 +69,7 @@ class Layout(NamedTuple):
         )
         return self._unpacked(state)
 
-    def shapes(self) -> Carry:
+    def shapes(self) -> StepCarry:
         """Shapes and shardings of a carry."""
         shardings = {True: devices.batch_sharding(self.mesh), False: devices.replicated(self.mesh)}
 
@@ -79,7 +79,7 @@ class Layout(NamedTuple):
             return jax.ShapeDtypeStruct(shape, x.dtype, sharding=shardings[shared_out])
 
         state = self._packed_shapes(self.whole)
-        carry = Carry(state, jax.eval_shape(self.rounded, state.params))
+        carry = StepCarry(state, jax.eval_shape(self.rounded, state.params))
         return jax.tree_util.tree_map_with_path(one, carry)
 
     def shardings(self) -> Any:
@@ -88,7 +88,9 @@ class Layout(NamedTuple):
             return devices.replicated(self.mesh)
         return jax.tree.map(lambda x: x.sharding, self.shapes())
 
-    def on_each_device(self, update: Callable[[Carry, Any], Carry]) -> Callable[..., Carry]:
+    def on_each_device(
+        self, update: Callable[[StepCarry, Any], StepCarry]
+    ) -> Callable[..., StepCarry]:
         """Runs `update(carry, batch)` on every device, of its shares of the two."""
         if self.mesh.size == 1:
             return update
@@ -98,7 +100,7 @@ class Layout(NamedTuple):
             update, mesh=self.mesh, in_specs=(spec, batch), out_specs=spec, check_vma=False
         )
 
-    def params(self, carry: Carry) -> Params:
+    def params(self, carry: StepCarry) -> Params:
         """The networks' parameters, with the rounded matrices; shared out where the carry is."""
         params = carry.state.params
         if self._packs:
@@ -112,7 +114,7 @@ class Layout(NamedTuple):
 
     # Within `on_each_device`:
 
-    def gathered(self, params: Params) -> Params:
+    def gather_params(self, params: Params) -> Params:
         """Parameters put together; of their gradient each device gets the sum of its share."""
         if self.mesh.size == 1:
             return params

@@ -13,7 +13,7 @@ from starjax.policies.base import Policy
 from starjax.rcm import arrays
 from starjax.training import devices
 from starjax.training import state as states
-from starjax.training.sharding import Carry, Layout
+from starjax.training.sharding import StepCarry, StateLayout
 
 
 class Setup(NamedTuple):
@@ -31,17 +31,17 @@ class Setup(NamedTuple):
     optimizer: optax.GradientTransformation
     policy_config: config.PolicyConfig
     train_config: config.TrainConfig
-    layout: Layout
+    layout: StateLayout
 
 
 def resident_steps(
-    setup: Setup, carry: Carry, dataset: windows.Dataset, frames: jax.Array, count: jax.Array
-) -> Carry:
+    setup: Setup, carry: StepCarry, dataset: windows.Dataset, frames: jax.Array, count: jax.Array
+) -> StepCarry:
     """Takes `count` steps on a dataset that is on the device, in one program for any count.
 
     Args:
       setup: of the training.
-      carry: from `Layout.to_carry` or the step before; donated by the caller.
+      carry: from `StateLayout.to_carry` or the step before; donated by the caller.
       dataset: leaves are jax arrays, on every device of the mesh.
       frames: `[n]` int32 frames to draw from.
       count: int32 `[]`, traced, so that logging and checkpoints may stop anywhere without another
@@ -53,7 +53,9 @@ def resident_steps(
 
 
 @arrays.broadcasting
-def resident_step(setup: Setup, carry: Carry, dataset: windows.Dataset, frames: jax.Array) -> Carry:
+def resident_step(
+    setup: Setup, carry: StepCarry, dataset: windows.Dataset, frames: jax.Array
+) -> StepCarry:
     """Draws a batch and takes one step; see `resident_steps`."""
     batch = drawn_batch(setup, carry.state.key, carry.state.step, dataset, frames)
     return train_step(setup, carry, batch)
@@ -71,7 +73,7 @@ def drawn_batch(
 
 
 @arrays.broadcasting  # which optax relies on
-def train_step(setup: Setup, carry: Carry, batch: windows.Batch) -> Carry:
+def train_step(setup: Setup, carry: StepCarry, batch: windows.Batch) -> StepCarry:
     """Takes one step of AdamW and of the average; leaves it out, and counts it, if not finite."""
     key = states.step_keys(carry.state.key, carry.state.step).loss
     prepared = setup.policy.prepare(carry.state.normalizer, key, batch)
@@ -79,11 +81,11 @@ def train_step(setup: Setup, carry: Carry, batch: windows.Batch) -> Carry:
     return setup.layout.on_each_device(update)(carry, prepared)
 
 
-def _update(setup: Setup, carry: Carry, prepared: Any) -> Carry:
+def _update(setup: Setup, carry: StepCarry, prepared: Any) -> StepCarry:
     """Takes one step on a device's share of a prepared batch."""
     layout, state = setup.layout, carry.state
     (loss, metrics), gradients = jax.value_and_grad(
-        lambda params: setup.policy.loss(layout.gathered(params), prepared), has_aux=True
+        lambda params: setup.policy.loss(layout.gather_params(params), prepared), has_aux=True
     )(layout.params(carry))
     metrics = layout.mean({"loss": loss, **metrics})
     gradients = layout.mean_gradients(gradients)
@@ -112,7 +114,7 @@ def _update(setup: Setup, carry: Carry, prepared: Any) -> Carry:
         skipped=state.skipped + jnp.where(finite, 0, 1),
         sums=sums,
     )
-    return Carry(state, layout.rounded(state.params))
+    return StepCarry(state, layout.rounded(state.params))
 
 
 def runs_in_a_loop(policy_config: config.PolicyConfig) -> bool:

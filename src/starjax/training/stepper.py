@@ -12,7 +12,7 @@ from starjax.data import windows
 from starjax.runtime import background, garbage, processes
 from starjax.training import devices, prefetch
 from starjax.training import step as steps
-from starjax.training.sharding import Carry, Layout
+from starjax.training.sharding import StepCarry, StateLayout
 from starjax.training.state import TrainState
 from starjax.training.step import Setup
 
@@ -21,14 +21,14 @@ class Stepper(NamedTuple):
     """Compiled training steps.
 
     Attributes:
-      begin: TrainState -> Carry; the steps may reuse the state's memory.
-      run: (Carry, n) -> Carry after n steps, in the given one's memory.
-      end: Carry -> TrainState; further steps may reuse the state's memory.
+      begin: TrainState -> StepCarry; the steps may reuse the state's memory.
+      run: (StepCarry, n) -> StepCarry after n steps, in the given one's memory.
+      end: StepCarry -> TrainState; further steps may reuse the state's memory.
     """
 
-    begin: Callable[[TrainState], Carry]
-    run: Callable[[Carry, int], Carry]
-    end: Callable[[Carry], TrainState]
+    begin: Callable[[TrainState], StepCarry]
+    run: Callable[[StepCarry, int], StepCarry]
+    end: Callable[[StepCarry], TrainState]
 
 
 class Compiled(NamedTuple):
@@ -36,11 +36,11 @@ class Compiled(NamedTuple):
 
     Attributes:
       batch: its shapes.
-      program: (Carry, Batch) -> Carry.
+      program: (StepCarry, Batch) -> StepCarry.
     """
 
     batch: windows.Batch
-    program: Callable[[Carry, windows.Batch], Carry]
+    program: Callable[[StepCarry, windows.Batch], StepCarry]
 
 
 def compile_ahead(setup: Setup, batch: windows.Batch) -> Compiled | None:
@@ -82,7 +82,7 @@ def resident(
         if ahead:
             program = _compiled_in_background(program, *_given(setup, shapes))
 
-    def run(carry: Carry, count: int) -> Carry:
+    def run(carry: StepCarry, count: int) -> StepCarry:
         for _ in range(count):
             carry = program(carry, draw(*_drawn_by(carry), *data))
         return carry
@@ -98,7 +98,7 @@ def streamed(
     key = jnp.copy(processes.own(state.key))
     batches = prefetch.batches(setup, dataset, frames, key, int(state.step))
 
-    def run(carry: Carry, count: int) -> Carry:
+    def run(carry: StepCarry, count: int) -> StepCarry:
         for _ in range(count):
             carry = program(carry, next(batches))
         return carry
@@ -119,7 +119,7 @@ def _looped(setup: Setup, data: tuple[windows.Dataset, jax.Array], ahead: bool) 
     return _stepper(layout, lambda carry, count: program(carry, *data, counted(count)))
 
 
-def _drawn_by(carry: Carry) -> tuple[Any, Any]:
+def _drawn_by(carry: StepCarry) -> tuple[Any, Any]:
     """What a batch is drawn by: the key and the number of the step."""
     return carry.state.key, carry.state.step
 
@@ -135,13 +135,13 @@ def _step(setup: Setup) -> Any:
     return _program(functools.partial(steps.train_step, setup), setup.layout)
 
 
-def _given(setup: Setup, batch: windows.Batch) -> tuple[Carry, windows.Batch]:
+def _given(setup: Setup, batch: windows.Batch) -> tuple[StepCarry, windows.Batch]:
     """Shapes and shardings of the step's arguments."""
     split = devices.batch_sharding(setup.layout.mesh)
     return setup.layout.shapes(), jax.tree.map(lambda x: x.update(sharding=split), batch)
 
 
-def _stepper(layout: Layout, run: Callable[[Carry, int], Carry]) -> Stepper:
+def _stepper(layout: StateLayout, run: Callable[[StepCarry, int], StepCarry]) -> Stepper:
     if layout.mesh.size == 1:  # matrices stay where they are
         return Stepper(layout.to_carry, run, layout.to_state)
     begin = jax.jit(layout.to_carry, out_shardings=layout.shardings())
@@ -149,14 +149,14 @@ def _stepper(layout: Layout, run: Callable[[Carry, int], Carry]) -> Stepper:
     return Stepper(begin, run, end)
 
 
-def _program(body: Callable[..., Carry], layout: Layout) -> Any:
+def _program(body: Callable[..., StepCarry], layout: StateLayout) -> Any:
     options = devices.compiler_options(layout.mesh)
     return jax.jit(
         body, donate_argnums=0, out_shardings=layout.shardings(), compiler_options=options
     )
 
 
-def _compiled_in_background(program: Any, *shapes: Any) -> Callable[..., Carry]:
+def _compiled_in_background(program: Any, *shapes: Any) -> Callable[..., StepCarry]:
     """Compiles the program in a thread for arguments of these shapes; its first call waits."""
     # Traced here: in a thread it would take turns with what the caller does, both in Python.
     with garbage.gc_paused():

@@ -21,7 +21,7 @@ from starjax.models.unet1d import ConditionalUnet1D
 Params = Mapping[str, Any]
 
 
-class Prepared(struct.PyTreeNode):
+class PreparedUnet(struct.PyTreeNode):
     """A U-Net's parameters as the blocks below take them."""
 
     params: Any
@@ -32,17 +32,17 @@ def pays() -> bool:
     return kernels.on_gpu()
 
 
-def prepared(params: Params) -> Prepared:
+def prepared(params: Params) -> PreparedUnet:
     """Rewrites the parameters of a `ConditionalUnet1D`."""
-    return Prepared(_prepared(params))
+    return PreparedUnet(_prepared(params))
 
 
 def applied(unet: ConditionalUnet1D) -> Callable[..., Any]:
-    """Returns `unet.apply` that also takes `Prepared` parameters."""
+    """Returns `unet.apply` that also takes `PreparedUnet` parameters."""
     sampling = unet.clone(residual_block=SamplingBlock, conv_block=SamplingConv)
 
     def apply(params: Any, *given: Any, **options: Any) -> Any:
-        if isinstance(params, Prepared):
+        if isinstance(params, PreparedUnet):
             return sampling.apply(params.params, *given, **options)
         return unet.apply(params, *given, **options)
 
