@@ -18,14 +18,14 @@ TEXT = [
     path
     for folder in ("src", "tests", "mjcf", "benchmarks", "experiments", "docs", "examples")
     for path in (ROOT / folder).rglob("*")
-    if path.suffix in {".py", ".md", ".xml", ".txt", ".toml", ".json", ".css"}
+    if path.suffix in {".py", ".md", ".xml", ".txt", ".toml", ".json", ".css", ".ipynb"}
 ]
 TEXT += [
     path
     for path in ROOT.iterdir()
     if path.suffix in {".md", ".toml", ".yaml", ".yml", ".txt", ".cff"}
 ]
-TEXT.append(ROOT / ".ci" / "run")
+TEXT += [ROOT / ".ci" / "run", ROOT / "Makefile"]
 # This machine, and whose documents a page may link to: package registries, hubs and trackers are
 # none of them.
 HOSTS = {
