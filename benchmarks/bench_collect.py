@@ -24,7 +24,7 @@ import numpy as np
 
 from starjax import rcm, runtime
 from starjax.data import demos, schema, store
-from starjax.rollouts import agent, cores, engine, episodes, fetching, placement, trocars
+from starjax.rollouts import agent, engine, episodes, fetching, placement, trocars, workers
 from starjax.sim import env as envs
 
 SEEN = 8
@@ -37,7 +37,9 @@ def main() -> None:
     small = _peer.platform() == "cpu"
     parser.add_argument("--image", type=int, default=64 if small else 256)
     parser.add_argument("--per-trocar", type=int, default=2 if small else 30)
-    parser.add_argument("--chunk", type=int, default=cores.CPU_LANES if small else demos.GPU_LANES)
+    parser.add_argument(
+        "--chunk", type=int, default=workers.CPU_LANES if small else demos.GPU_LANES
+    )
     parser.add_argument("--folder", help="where a temporary folder is made; default: the system's")
     parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
     asked = parser.parse_args()
@@ -120,14 +122,14 @@ def collect(
         return fetched
 
     settings = schema.Settings(asked.per_trocar, seed=0, max_steps=MAX_STEPS)
-    place = placement.Place(asked.chunk)
+    layout = placement.DeviceLayout(asked.chunk)
     with (
         mock.patch.object(engine, "make", begin),
         mock.patch.object(fetching, "fetch", timed_fetch),
     ):
-        demos.collect(root, env, expert, seen(env), settings, place=place)
+        demos.collect(root, env, expert, seen(env), settings, layout=layout)
     run_s = time.perf_counter() - begun[0]
-    simulated, copied = (sum(spent) / cores.count() for spent in (segments, fetches))
+    simulated, copied = (sum(spent) / workers.worker_count() for spent in (segments, fetches))
     return {
         "chunks": chunks,
         "run_s": run_s,

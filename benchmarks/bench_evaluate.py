@@ -28,7 +28,7 @@ from starjax import rcm, runtime
 from starjax.commands import policy_evaluation
 from starjax.evaluation import evaluate, latency
 from starjax.policies import features, packaged
-from starjax.rollouts import agent, cores, engine, episodes
+from starjax.rollouts import agent, engine, episodes, workers
 from starjax.sim import env as envs
 from starjax.types import Command
 
@@ -62,7 +62,9 @@ def main() -> None:
 
     compile_s = _timing.time_once(lambda: list(run((params, stats), over_at_once(env))))
     start = time.perf_counter()
-    lengths = [found for found in cores.run(chunks, simulate, cores.count()) if len(found)]
+    lengths = [
+        found for found in workers.run(chunks, simulate, workers.worker_count()) if len(found)
+    ]
     run_s = time.perf_counter() - start
 
     control_steps = int(sum(found.sum() for found in lengths))

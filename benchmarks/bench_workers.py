@@ -13,7 +13,7 @@ import _visited
 
 from starjax import runtime
 from starjax.data import schema
-from starjax.rollouts import agent, cores, engine, episodes
+from starjax.rollouts import agent, engine, episodes, workers
 from starjax.sim import env as envs
 
 SEGMENTS = 8  # of a measurement: 4 s simulated, in which no episode ends
@@ -28,17 +28,17 @@ def main() -> None:
     side, segments = (16, 1) if asked.tiny else (asked.image, SEGMENTS)
     env = envs.make(image_size=side)
     rows = {}
-    for name, lanes, at_once in (
+    for name, lanes, max_workers in (
         ("one program", _visited.CPU_LANES, 1),
-        ("one program, fewer lanes", cores.CPU_LANES, 1),
-        ("one for each core", cores.CPU_LANES, cores.count()),
+        ("one program, fewer lanes", workers.CPU_LANES, 1),
+        ("one for each core", workers.CPU_LANES, workers.worker_count()),
     ):
-        rows[name] = measure(env, lanes, at_once, segments)
+        rows[name] = measure(env, lanes, max_workers, segments)
         rows[name]["times_one_program"] = (
             rows[name]["control_steps_per_s"] / rows["one program"]["control_steps_per_s"]
         )
         print(
-            f"{name:24} {at_once} x {lanes:2} lanes: "
+            f"{name:24} {max_workers} x {lanes:2} lanes: "
             f"{rows[name]['control_steps_per_s']:.0f} control steps/s, "
             f"{rows[name]['times_one_program']:.2f} times one program's",
             flush=True,
@@ -46,8 +46,8 @@ def main() -> None:
     _timing.report("workers", {"results": {f"{side} px": rows}}, asked.tiny)
 
 
-def measure(env: envs.Env, lanes: int, at_once: int, segments: int) -> dict:
-    """Rate of `at_once` simulations of `lanes` episodes each."""
+def measure(env: envs.Env, lanes: int, max_workers: int, segments: int) -> dict:
+    """Rate of `max_workers` simulations of `lanes` episodes each."""
     trocars, record = env.task.trocars, episodes.DEMONSTRATION
     steps, configurations = segments * record.frames, len(trocars.radius)
     rules = engine.Settings(0, schema.STREAM, steps, lanes)
@@ -60,13 +60,13 @@ def measure(env: envs.Env, lanes: int, at_once: int, segments: int) -> dict:
             yield len(segment.ended)
 
     def run() -> None:
-        sum(cores.run(range(at_once), simulate, at_once))
+        sum(workers.run(range(max_workers), simulate, max_workers))
 
     timing = _timing.time_plain(run, repeats=3)
     return {
         "lanes": lanes,
-        "at_once": at_once,
-        "control_steps_per_s": at_once * lanes * steps / timing.median_s,
+        "at_once": max_workers,
+        "control_steps_per_s": max_workers * lanes * steps / timing.median_s,
     }
 
 

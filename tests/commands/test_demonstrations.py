@@ -16,10 +16,10 @@ SMOKE = presets.PRESETS["smoke"]
 
 def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
     from starjax.data import demos
-    from starjax.rollouts import waves
+    from starjax.rollouts import success_quota
 
     def collect(*_, **settings):
-        raise waves.ExpertFailed("got 0 of 10 at trocar 0")
+        raise success_quota.ExpertFailed("got 0 of 10 at trocar 0")
 
     monkeypatch.setattr(demos, "collect", collect)
     few = dataclasses.replace(SMOKE.demos, max_steps=1)

@@ -17,8 +17,8 @@ import stubs
 
 from starjax import errors, rcm
 from starjax.data import demos, load, schema, store
-from starjax.rollouts import agent, cores, engine, episodes, fetching, programs, waves
-from starjax.rollouts.placement import Place
+from starjax.rollouts import agent, engine, episodes, fetching, programs, success_quota, workers
+from starjax.rollouts.placement import DeviceLayout
 from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
 from starjax.types import Agent
@@ -32,7 +32,7 @@ def collect(root, observation="state", chunk=5, trocars=TROCARS, report=print, e
     env = env or stubs.make_env(observation, unlucky=0.4)
     settings = SETTINGS._replace(**changed)
     return demos.collect(
-        root, env, EXPERT, trocars, settings, place=Place(lanes=chunk), report=report
+        root, env, EXPERT, trocars, settings, layout=DeviceLayout(lanes=chunk), report=report
     )
 
 
@@ -145,11 +145,11 @@ def test_images_of_all_that_is_simulated_fit_the_memory(
 ):
     frame = programs.frame(stubs.make_env("image", unlucky=0.4), episodes.DEMONSTRATION)
     lane = 2 * demos.FRAME_GUESS * sum(np.dtype(x.dtype).itemsize * x.size for x in frame.values())
-    memory = int(chunks * cores.CPU_LANES * lane / demos.MEMORY_SHARE)
+    memory = int(chunks * workers.CPU_LANES * lane / demos.MEMORY_SHARE)
     monkeypatch.setattr(xla, "memory_bytes", lambda: memory)
-    monkeypatch.setattr(cores, "count", lambda: 4)
+    monkeypatch.setattr(workers, "worker_count", lambda: 4)
     asked = []
-    monkeypatch.setattr(waves, "run", lambda *args: asked.append(args[4:6]) or [])
+    monkeypatch.setattr(success_quota, "run", lambda *args: asked.append(args[4:6]) or [])
     collect(tmp_path / "d", "image", chunk=0)
     assert asked == [(lanes, at_once)]
 
@@ -321,7 +321,7 @@ def test_every_key_is_found_again(tmp_path):
 
 def test_a_hopeless_expert_is_an_error(tmp_path):
     env = stubs.make_env(unlucky=1.0)
-    with pytest.raises(waves.ExpertFailed, match="expert: expected a success rate above 50%"):
+    with pytest.raises(success_quota.ExpertFailed, match="above 50%"):
         collect(tmp_path, env=env, chunk=8, max_steps=9)
 
 
@@ -365,7 +365,7 @@ def test_all_residencies_hold_the_same(images, residency):
 
 
 def test_images_may_stay_on_disk_and_are_found_there(images, monkeypatch):
-    monkeypatch.setattr(load.cores, "count", lambda: 1)
+    monkeypatch.setattr(load.workers, "worker_count", lambda: 1)
     said = []
     whole = load.load(images, report=said.append)
     without = load.load(images, images=False, report=said.append)
@@ -468,7 +468,7 @@ def test_the_label_of_a_disturbed_command_is_what_is_recorded(tmp_path):
 
     disturbed = agent.from_single(Agent(stubs.EXPERT.init, act))
     env, settings = stubs.make_env(unlucky=0.0), SETTINGS._replace(per_trocar=1)
-    demos.collect(tmp_path, env, disturbed, TROCARS, settings, place=Place(lanes=2))
+    demos.collect(tmp_path, env, disturbed, TROCARS, settings, layout=DeviceLayout(lanes=2))
     dataset = load.load(tmp_path, report=lambda _: None).dataset
     np.testing.assert_array_equal(dataset.command.gripper, -1.0)
     np.testing.assert_array_equal(dataset.observation.gripper, 1.0)

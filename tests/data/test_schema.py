@@ -11,7 +11,7 @@ import stubs
 from starjax import rcm
 from starjax.data import demos, load, schema, store
 from starjax.rollouts import agent
-from starjax.rollouts.placement import Place
+from starjax.rollouts.placement import DeviceLayout
 from starjax.sim import names
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden" / "demonstrations"
@@ -64,7 +64,7 @@ def test_schema_1_is_described_as_schema_2_is():
 def test_the_same_seed_gives_the_same_episodes(tmp_path, observation):
     settings = schema.Settings(1, 0, 100, keep_failures=observation == "image")
     env, expert = stubs.make_env(observation, unlucky=0.4), agent.from_single(stubs.EXPERT)
-    demos.collect(tmp_path, env, expert, TROCARS, settings, place=Place(lanes=5))
+    demos.collect(tmp_path, env, expert, TROCARS, settings, layout=DeviceLayout(lanes=5))
     ours, theirs = quiet(tmp_path), quiet(GOLDEN / f"schema_1_{observation}")
     jax.tree.map(np.testing.assert_array_equal, ours.dataset, theirs.dataset)
     for record in (store.verify(tmp_path, key) for key in store.keys(tmp_path)):

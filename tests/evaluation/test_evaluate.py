@@ -24,7 +24,7 @@ from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.rollouts import agent, chunks, engine, placement
 from starjax.rollouts.episodes import Episode
-from starjax.rollouts.placement import Place
+from starjax.rollouts.placement import DeviceLayout
 from starjax.runtime import files
 
 TROCARS = stubs.trocars(0, 4, 8)
@@ -54,7 +54,7 @@ def run(
         (weights if params is None else params, jnp.float32(stats)),
         trocars,
         SETTINGS._replace(**changed),
-        place=Place(lanes, devices),
+        layout=DeviceLayout(lanes, devices),
         report=report,
     )
 
@@ -121,7 +121,7 @@ def test_the_chunk_does_not_change_a_bit_of_a_network(tmp_path):
             (params, stats),
             TROCARS,
             SETTINGS._replace(chunk=chunk, video_trials=6),
-            place=Place(6),
+            layout=DeviceLayout(6),
         )
         for chunk in (2, 3, 6)
     ]
@@ -410,7 +410,7 @@ for count in (1, 2):
     demos.collect(
         out / f"demos{count}", stubs.make_env(), agent.from_single(stubs.EXPERT),
         test_evaluate.TROCARS, schema.Settings(per_trocar=2, seed=0, max_steps=100),
-        place=placement.Place(4, jax.devices()[:count]))
+        layout=placement.DeviceLayout(4, jax.devices()[:count]))
 assert kill.tree(out / "demos1") == kill.tree(out / "demos2")
 print("same")
 """

@@ -11,7 +11,7 @@ from starjax.commands import demonstrations
 from starjax.data import demos, load, schema
 from starjax.evaluation import evaluate, recorded
 from starjax.rollouts import agent
-from starjax.rollouts.placement import Place
+from starjax.rollouts.placement import DeviceLayout
 from starjax.sim import endoscope, workspaces
 
 SCOPE = workspaces.BOARD_ENDOSCOPE
@@ -33,8 +33,8 @@ def make_env():
 
 def collected(root, env):
     settings = schema.Settings(per_trocar=2, seed=0, max_steps=100)
-    expert, place = agent.from_single(stubs.EXPERT), Place(lanes=4)
-    demos.collect(root, env, expert, stubs.trocars(0, 8), settings, place=place)
+    expert, layout = agent.from_single(stubs.EXPERT), DeviceLayout(lanes=4)
+    demos.collect(root, env, expert, stubs.trocars(0, 8), settings, layout=layout)
     return root
 
 
@@ -70,7 +70,7 @@ def test_trajectories_have_it(tmp_path):
     env, expert = make_env(), agent.from_single(stubs.EXPERT)
     settings = evaluate.Settings(trials=2, seed=0, time_limit_s=2.0, video_trials=2)
     run = lambda: evaluate.evaluate(  # noqa: E731
-        tmp_path, env, expert, (), stubs.trocars(0, 8), settings, place=Place(lanes=4)
+        tmp_path, env, expert, (), stubs.trocars(0, 8), settings, layout=DeviceLayout(lanes=4)
     )
     run()
     kept = recorded.read(tmp_path / "recorded.npz")

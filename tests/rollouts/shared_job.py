@@ -16,12 +16,12 @@ def run(out: Path) -> None:
     from starjax.evaluation import evaluate
     from starjax.evaluation import trials as tables
     from starjax.rollouts import agent
-    from starjax.rollouts.placement import Place
+    from starjax.rollouts.placement import DeviceLayout
 
-    env, trocars, place = stubs.make_env(), stubs.trocars(0, 4, 8), Place(lanes=2)
+    env, trocars, layout = stubs.make_env(), stubs.trocars(0, 4, 8), DeviceLayout(lanes=2)
     expert = agent.from_single(stubs.EXPERT)
     settings = schema.Settings(per_trocar=3, seed=0, max_steps=100)
-    demos.collect(out / "demos", env, expert, trocars, settings, place=place)
+    demos.collect(out / "demos", env, expert, trocars, settings, layout=layout)
     sample, params = stubs.make_policy(width=32)
     found = evaluate.evaluate(
         out / "trials",
@@ -30,7 +30,7 @@ def run(out: Path) -> None:
         (params, jnp.float32(1.0)),
         trocars,
         evaluate.Settings(trials=4, seed=0, time_limit_s=1.0, video_trials=3),
-        place=place,
+        layout=layout,
     )
     np.savez(out / f"table-{jax.process_index()}.npz", **tables.columns(found))
 

@@ -25,7 +25,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
         root = given(config, env)
         return root, lambda: messages.stage("collect", f"nothing, from {root}")
     from starjax.data import demos, schema, store
-    from starjax.rollouts import agent, placement, trocars, waves
+    from starjax.rollouts import agent, placement, success_quota, trocars
 
     env, most = randomised(config, env)
     task, name = env.task, config.demos.expert or next(iter(env.task.experts))
@@ -61,13 +61,13 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
             messages.stage("collect", f"done before, {root}")
             return
         messages.stage("collect", f"into {root}")
-        place = placement.Place(devices=placement.devices())
+        layout = placement.DeviceLayout(devices=placement.devices())
         try:
             with stage_times.timed(out, f"collect {root.name}"):
                 found = demos.collect(
-                    root, env, expert, chosen, settings, place=place, report=messages.indented
+                    root, env, expert, chosen, settings, layout=layout, report=messages.indented
                 )
-        except waves.ExpertFailed as error:
+        except success_quota.ExpertFailed as error:
             raise errors.UsageError(
                 "demos.max_steps",
                 "enough control steps for the expert",

@@ -135,7 +135,7 @@ def rollouts(
         (trained.params, trained.normalizer),
         trocars,
         _settings(settings, seed),
-        place=placement.Place(devices=placement.devices()),
+        layout=placement.DeviceLayout(devices=placement.devices()),
         identity={
             **methods.behaviour(who.method)._asdict(),
             "policy": config_lib.as_json(trained.policy),

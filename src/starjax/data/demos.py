@@ -26,10 +26,10 @@ from starjax import errors
 from starjax.data import schema, store
 from starjax.data.schema import Settings
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import cores, engine, episodes, sharing, waves
+from starjax.rollouts import engine, episodes, sharing, success_quota, workers
 from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
-from starjax.rollouts.placement import ANYWHERE, Place
+from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.runtime import files, progress, xla
 
 COMMITS = 16  # episodes written at once; most of it is waiting for the disk
@@ -46,7 +46,7 @@ def collect(
     settings: Settings,
     *,
     params: Any = None,
-    place: Place = ANYWHERE,
+    layout: DeviceLayout = DEFAULT_LAYOUT,
     report: Callable[[str], None] = print,
 ) -> dict[str, Any]:
     """Collects what is missing of a dataset, and seals it.
@@ -68,8 +68,8 @@ def collect(
         too small.
       ValueError: an argument out of range, a trocar that is none, an agent that fails too often.
     """
-    if settings.per_trocar < 1 or settings.max_steps < 1 or place.lanes < 0:
-        got = (settings.per_trocar, settings.max_steps, place.lanes)
+    if settings.per_trocar < 1 or settings.max_steps < 1 or layout.lanes < 0:
+        got = (settings.per_trocar, settings.max_steps, layout.lanes)
         raise errors.UsageError("per_trocar, max_steps, lanes", "1, 1 and 0 or more", got)
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     total = settings.per_trocar * len(trocars.radius)
@@ -78,9 +78,9 @@ def collect(
         share.first("sound", lambda: _prepare(root, description, settings, total, report))
         records = _records(root, store.keys(root))
         frame_bytes = _frame_bytes(description)
-        lanes = share.first("lanes", lambda: _lanes(place, total, frame_bytes, share.count))
-        at_once = max(1, min(cores.count(), _fitting(frame_bytes) // lanes))
-        simulate = _simulator(env, agent, params, trocars, settings, place._replace(lanes=lanes))
+        lanes = share.first("lanes", lambda: _lanes(layout, total, frame_bytes, share.count))
+        max_workers = max(1, min(workers.worker_count(), _fitting(frame_bytes) // lanes))
+        simulate = _simulator(env, agent, params, trocars, settings, layout._replace(lanes=lanes))
         known = {(r["trocar"], r["trial"]): r["success"] for r in records.values()}
 
         def commit(episode: episodes.Episode) -> store.Record:
@@ -103,8 +103,15 @@ def collect(
             return {(r["trocar"], r["trial"]): r["success"] for r in found.values()}
 
         written: set[str] = set()  # by this process, but for those that `records` has
-        needed = waves.run(
-            simulate, known, len(trocars.radius), settings.per_trocar, lanes, at_once, share, news
+        needed = success_quota.run(
+            simulate,
+            known,
+            len(trocars.radius),
+            settings.per_trocar,
+            lanes,
+            max_workers,
+            share,
+            news,
         )
         with _shown(share, total, records) as advance, _writer(commit, note, lanes) as write:
             for episode in needed:
@@ -157,10 +164,10 @@ def _simulator(
     params: Any,
     trocars: Trocar,
     settings: Settings,
-    place: Place,
+    layout: DeviceLayout,
 ) -> Callable[[list[episodes.Trial]], Generator[list[episodes.Episode]]]:
-    rules = engine.Settings(settings.seed, schema.STREAM, settings.max_steps, place.lanes)
-    run = engine.make(env, agent, trocars, rules, episodes.DEMONSTRATION, place.devices)
+    rules = engine.Settings(settings.seed, schema.STREAM, settings.max_steps, layout.lanes)
+    run = engine.make(env, agent, trocars, rules, episodes.DEMONSTRATION, layout.devices)
 
     def simulate(group: list[episodes.Trial]) -> Generator[list[episodes.Episode]]:
         for segment in run(params, group):
@@ -231,11 +238,11 @@ def _fitting(frame_bytes: int) -> int:
     return int(MEMORY_SHARE * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
 
 
-def _lanes(place: Place, total: int, frame_bytes: int, processes: int) -> int:
+def _lanes(layout: DeviceLayout, total: int, frame_bytes: int, processes: int) -> int:
     """Lanes of a chunk."""
-    fast = _fast(place.devices, total, processes)
-    lanes = place.lanes or max(1, min(fast, _fitting(frame_bytes)))
-    several = len(place.devices or [0])
+    fast = _fast(layout.devices, total, processes)
+    lanes = layout.lanes or max(1, min(fast, _fitting(frame_bytes)))
+    several = len(layout.devices or [0])
     return -(-lanes // several) * several
 
 
@@ -244,6 +251,6 @@ def _fast(devices: Sequence[jax.Device] | None, total: int, processes: int) -> i
     one would do alone. Not of what is there already, as the size of a batch may change last bits.
     """
     if jax.default_backend() == "cpu":
-        return cores.CPU_LANES
+        return workers.CPU_LANES
     count = len(devices or [0]) * processes
     return -(-GPU_LANES * min(count, -(-total // GPU_LANES)) // processes)

@@ -10,7 +10,7 @@ import numpy as np
 
 from starjax import errors, rcm
 from starjax.data import schema, store, windows
-from starjax.rollouts import cores, episodes
+from starjax.rollouts import episodes, workers
 from starjax.runtime import files, xla
 from starjax.types import Command, Observation, Pose
 
@@ -97,7 +97,7 @@ def frames(root: Path) -> "dict[str, Frames]":
     records = _successful(root, store.read_seal(root), verify=False)
     fields = _fields(description, records[0], images=True)
     length, start = _spans(records)
-    few = _OPEN_IN_TURN * cores.count()
+    few = _OPEN_IN_TURN * workers.worker_count()
     found = {
         name.removeprefix(episodes.IMAGE): Frames(_paths(root, records, file), start, length, few)
         for name, file in fields.items()

@@ -23,10 +23,10 @@ from starjax.data import schema
 from starjax.evaluation import recorded
 from starjax.evaluation import trials as tables
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import chunks, cores, engine, episodes, sharing
+from starjax.rollouts import chunks, engine, episodes, sharing, workers
 from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
-from starjax.rollouts.placement import ANYWHERE, Place
+from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.runtime import files, jax_settings, xla
 from starjax.sim import endoscope
 
@@ -63,7 +63,7 @@ def evaluate(
     trocars: Trocar,
     settings: Settings,
     *,
-    place: Place = ANYWHERE,
+    layout: DeviceLayout = DEFAULT_LAYOUT,
     identity: Mapping[str, Any] | None = None,
     levels: Mapping[str, float] | None = None,
     compiled: engine.Compiled | None = None,
@@ -76,7 +76,7 @@ def evaluate(
       env: `sim.env.Env`, with the observation that the agent knows.
       params: of the agent: a policy's (weights, statistics).
       trocars: fields `[C, A]`.
-      place: where the lanes are 0, `lanes_per_device`, and so few that all devices have a share.
+      layout: where the lanes are 0, `lanes_per_device`, and so few that all devices have a share.
       identity: JSON values that tell this agent from others with the same params.
       levels: of what disturbs the environment.
       compiled: by `compile_ahead`; used where it is for trials like these.
@@ -86,14 +86,14 @@ def evaluate(
       StorageError: the folder cannot be written or is in use.
       ValueError: an argument out of range, a trocar that is none.
     """
-    _check(settings, place)
+    _check(settings, layout)
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     count = len(trocars.radius)
     group = [(i, trial) for i in range(count) for trial in range(settings.trials)]
     max_steps = _max_steps(env, settings)
     chosen = recorded.choose(count, settings.trials, settings.video_trials)
-    several = len(place.devices or [0])
-    device = (place.devices or jax.local_devices())[0]
+    several = len(layout.devices or [0])
+    device = (layout.devices or jax.local_devices())[0]
     wrong = {name: level for name, level in (levels or {}).items() if level}
     with sharing.shared(directory) as share:
         plan = {
@@ -114,13 +114,13 @@ def evaluate(
             **jax_settings.record(),
         }
         each = -(-len(group) // (several * share.count))
-        sizes = _Sizes(place.lanes or lanes_per_device(device, each), settings.chunk)
-        most = place.lanes or most_lanes(device)
+        sizes = _Sizes(layout.lanes or lanes_per_device(device, each), settings.chunk)
+        most = layout.lanes or most_lanes(device)
         found = share.first("sizes", lambda: _resume(directory, plan, sizes, most, several, report))
         lanes, chunk = found
         rules = engine.Settings(settings.seed, None, max_steps, lanes * several)
         run = engine.make(
-            env, agent, trocars, rules, episodes.SCORE, place.devices, levels, compiled
+            env, agent, trocars, rules, episodes.SCORE, layout.devices, levels, compiled
         )
         spans = [slice(first, first + chunk) for first in range(0, len(group), chunk)]
         parts = _parts(directory, env, lambda trials: run(params, trials), group, spans, chosen)
@@ -159,7 +159,7 @@ def lanes_per_device(device: jax.Device, trials: int) -> int:
 def most_lanes(device: jax.Device) -> int:
     """Trials that a device of this kind can run together."""
     if device.platform == "cpu":
-        return cores.CPU_LANES
+        return workers.CPU_LANES
     limit = (device.memory_stats() or {}).get("bytes_limit", 0)
     return GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
 
@@ -178,11 +178,11 @@ def _max_steps(env: Any, settings: Settings) -> int:
     return math.ceil(settings.time_limit_s * env.control_hz - 1e-6)
 
 
-def _check(settings: Settings, place: Place) -> None:
+def _check(settings: Settings, layout: DeviceLayout) -> None:
     for name, value in (("trials", settings.trials), ("time_limit_s", settings.time_limit_s)):
         if value <= 0:
             raise errors.UsageError(name, "more than 0", value)
-    counts = {"video_trials": settings.video_trials, "chunk": settings.chunk, "lanes": place.lanes}
+    counts = {"video_trials": settings.video_trials, "chunk": settings.chunk, "lanes": layout.lanes}
     for name, value in counts.items():
         if value < 0:
             raise errors.UsageError(name, "0 or more", value)

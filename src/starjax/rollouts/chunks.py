@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax.rollouts import cores
+from starjax.rollouts import workers
 from starjax.rollouts.sharing import Share
 from starjax.runtime import files, progress
 
@@ -59,7 +59,7 @@ def complete(
         found[number] = arrays
 
     with _shown(share, parts, mine, missing, title, unit) as advance:
-        for passed in cores.run(missing, work, cores.count()):
+        for passed in workers.run(missing, work, workers.worker_count()):
             advance(passed)
     share.meet("made")
     return [found.get(number) or _checked(parts, number) for number in numbers]

@@ -174,7 +174,7 @@ def _key(settings: Settings) -> jax.Array:
 
 
 def _filled(trocars: Trocar, group: Sequence[episodes.Trial], lanes: int) -> programs.Trials:
-    """A full batch: the first trial repeats, unwanted, where there are too few."""
+    """A full batch: the first trial repeats, inactive, where there are too few."""
     index, trial = np.array([*group, *[group[0]] * (lanes - len(group))], np.int32).T
-    wanted = np.arange(lanes) < len(group)
-    return programs.Trials(Trocar(*(field[index] for field in trocars)), index, trial, wanted)
+    active = np.arange(lanes) < len(group)
+    return programs.Trials(Trocar(*(field[index] for field in trocars)), index, trial, active)

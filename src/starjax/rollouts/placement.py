@@ -12,7 +12,7 @@ SHARED = PartitionSpec()
 LANE = PartitionSpec("lane")
 
 
-class Place(NamedTuple):
+class DeviceLayout(NamedTuple):
     """Where a batch runs.
 
     Attributes:
@@ -25,7 +25,7 @@ class Place(NamedTuple):
     devices: Sequence[jax.Device] | None = None
 
 
-ANYWHERE = Place()
+DEFAULT_LAYOUT = DeviceLayout()
 
 
 def devices() -> list[jax.Device] | None:

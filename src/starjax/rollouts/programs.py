@@ -24,23 +24,29 @@ class Trials(NamedTuple):
       trocar: fields `[N, A]`.
       index: `[N]` int32 of the trocars' configuration.
       trial: `[N]` int32.
-      wanted: `[N]` bool; the others only fill up the batch.
+      active: `[N]` bool; the others only fill up the batch.
     """
 
     trocar: Trocar
     index: Any
     trial: Any
-    wanted: Any
+    active: Any
 
 
-class Carry(NamedTuple):
-    """N trials under way: EnvState, the agent's memory, `[N]` int32 control steps taken, and
-    whether they are wanted."""
+class RolloutState(NamedTuple):
+    """N unfinished trials.
+
+    Attributes:
+      env: EnvState.
+      memory: the agent's.
+      length: `[N]` int32, control steps taken.
+      active: `[N]` bool, see `Trials`.
+    """
 
     env: Any
     memory: Any
     length: jax.Array
-    wanted: jax.Array
+    active: jax.Array
 
 
 def make(
@@ -49,7 +55,7 @@ def make(
     max_steps: int,
     record: episodes.Record,
     devices: Sequence[jax.Device] | None,
-) -> tuple[Callable[..., Carry], Callable[..., Any]]:
+) -> tuple[Callable[..., RolloutState], Callable[..., Any]]:
     """Builds the program that starts a batch of trials, and the one that runs a segment of it.
 
     Args:
@@ -57,12 +63,12 @@ def make(
       max_steps: control steps after which a trial is over.
       devices: that lanes are split over; None for one that jax chooses.
     """
-    world = _World(env.reset, env.step, env.observe, env.labels)
-    mind = _Mind(agent.init, agent.act)
+    world = _EnvFns(env.reset, env.step, env.observe, env.labels)
+    mind = _AgentFns(agent.init, agent.act)
     return _programs(world, mind, max_steps, record, None if devices is None else tuple(devices))
 
 
-class _World(NamedTuple):
+class _EnvFns(NamedTuple):
     """The functions of an `Env` that programs call: what they are known by."""
 
     reset: Callable[..., Any]
@@ -71,7 +77,7 @@ class _World(NamedTuple):
     labels: Callable[..., Any]
 
 
-class _Mind(NamedTuple):
+class _AgentFns(NamedTuple):
     """The same of a `BatchAgent`."""
 
     init: Callable[..., Any]
@@ -80,12 +86,12 @@ class _Mind(NamedTuple):
 
 @functools.lru_cache(maxsize=4)
 def _programs(
-    env: _World,
-    agent: _Mind,
+    env: _EnvFns,
+    agent: _AgentFns,
     max_steps: int,
     record: episodes.Record,
     devices: Sequence[jax.Device] | None,
-) -> tuple[Callable[..., Carry], Callable[..., Any]]:
+) -> tuple[Callable[..., RolloutState], Callable[..., Any]]:
     """As `make`, by the functions alone: other environments may share them."""
     shared, lane = placement.SHARED, placement.LANE
     start = placement.split(_starter(env, agent), devices, (shared, shared, lane, shared), lane)
@@ -95,7 +101,7 @@ def _programs(
     return start, advance
 
 
-def _starter(env: _World, agent: _Mind) -> Callable[..., Carry]:
+def _starter(env: _EnvFns, agent: _AgentFns) -> Callable[..., RolloutState]:
     # Imported here, as only programs need it: reading a dataset does not load the simulator.
     from starjax.sim import env as sim_env
 
@@ -104,29 +110,31 @@ def _starter(env: _World, agent: _Mind) -> Callable[..., Carry]:
         key_env, key_agent = jax.random.split(key)
         return env.reset(key_env, sim_env.EnvParams(trials.trocar, levels=levels)), key_agent
 
-    def start(key: jax.Array, params: Any, trials: Trials, levels: Any) -> Carry:
+    def start(key: jax.Array, params: Any, trials: Trials, levels: Any) -> RolloutState:
         state, keys = jax.vmap(start_one, in_axes=(None, 0, None))(key, trials, levels)
         memory = agent.init(params, keys, state, lambda: jax.vmap(env.observe)(state))
-        return Carry(state, memory, jnp.zeros(trials.wanted.shape, jnp.int32), trials.wanted)
+        return RolloutState(state, memory, jnp.zeros(trials.active.shape, jnp.int32), trials.active)
 
     return start
 
 
 def _advancer(
-    env: _World, agent: _Mind, max_steps: int, record: episodes.Record
+    env: _EnvFns, agent: _AgentFns, max_steps: int, record: episodes.Record
 ) -> Callable[..., Any]:
     observe, step_all = jax.vmap(env.observe), jax.vmap(env.step)
 
-    def step(params: Any, carry: Carry, t: jax.Array) -> tuple[Carry, dict[str, jax.Array]]:
+    def step(
+        params: Any, carry: RolloutState, t: jax.Array
+    ) -> tuple[RolloutState, dict[str, jax.Array]]:
         before = carry.env
         observed = observe(before) if record.observes else None
         look = (lambda: observe(before)) if observed is None else lambda: observed
         executed, memory, label = agent.act(params, carry.memory, before, look, t)
         after = step_all(before, executed)
         fields = record.fields(episodes.Step(observed, label, executed, before, after))
-        return Carry(after, memory, carry.length + ~before.done, carry.wanted), fields
+        return RolloutState(after, memory, carry.length + ~before.done, carry.active), fields
 
-    def advance(params: Any, carry: Carry, first: jax.Array) -> Any:
+    def advance(params: Any, carry: RolloutState, first: jax.Array) -> Any:
         """Control steps `first` up to `first + record.frames`, fewer when all episodes are over.
 
         Returns the carry, records `[N, record.frames]`, and the status `[N]`.
@@ -139,7 +147,7 @@ def _advancer(
 
         def is_running(loop):
             t, carry, _ = loop
-            return (t < last) & jnp.any(carry.wanted & ~carry.env.done)
+            return (t < last) & jnp.any(carry.active & ~carry.env.done)
 
         def body(loop):
             t, carry, records = loop
@@ -174,7 +182,7 @@ def frame(env: Any, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
     return jax.eval_shape(one, jax.random.key(0))
 
 
-def status(env: Any, carry: Carry) -> dict[str, Any]:
+def status(env: Any, carry: RolloutState) -> dict[str, Any]:
     """How N episodes stand: `over`, `length`, `episodes.FLAGS`, `stage`, `labels`, `[N]` each."""
     state = carry.env
     found = {

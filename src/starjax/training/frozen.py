@@ -18,7 +18,7 @@ import numpy as np
 from starjax import config
 from starjax.policies import features as inputs
 from starjax.policies import generator
-from starjax.rollouts import cores
+from starjax.rollouts import workers
 from starjax.runtime import files, progress
 from starjax.training.encoder import Encoder
 
@@ -81,7 +81,7 @@ def features(
 
         done = sum(map(len, parts.values()))
         with progress.track("Features", count, unit="frames", done=done) as advance:
-            for seen in cores.run(missing, make, cores.count()):
+            for seen in workers.run(missing, make, workers.worker_count()):
                 advance(seen)
     joined = np.concatenate([parts[path] for path in paths])
     said = "in" if missing else "done before,"

@@ -70,7 +70,7 @@ def make(env: sim_env.Env) -> Steering:
         after = jax.vmap(env.step)(before, command)
         seen = jax.vmap(env.observe)(before)
         fields = episodes.DEMONSTRATION.fields(episodes.Step(seen, command, command, before, after))
-        carry = programs.Carry(after, (), after.step, jnp.ones(1, bool))
+        carry = programs.RolloutState(after, (), after.step, jnp.ones(1, bool))
         return after, Moment(_frame(env, after), fields, programs.status(env, carry))
 
     @jax.jit

@@ -5,7 +5,7 @@ import threading
 import jax
 import pytest
 
-from starjax.rollouts import cores
+from starjax.rollouts import workers
 from starjax.runtime import xla
 
 
@@ -16,10 +16,10 @@ def counting(numbers):
     return start
 
 
-@pytest.mark.parametrize("at_once", [1, 2, 5])
-def test_all_that_jobs_yield_comes_each_jobs_in_its_order(at_once):
+@pytest.mark.parametrize("max_workers", [1, 2, 5])
+def test_all_that_jobs_yield_comes_each_jobs_in_its_order(max_workers):
     numbers = {0: 3, 1: 0, 2: 5, 3: 1}
-    found = list(cores.run(numbers, counting(numbers), at_once))
+    found = list(workers.run(numbers, counting(numbers), max_workers))
     assert sorted(found) == [(job, i) for job, n in numbers.items() for i in range(n)]
     for job, n in numbers.items():
         assert [i for j, i in found if j == job] == list(range(n))
@@ -39,7 +39,7 @@ def test_as_many_are_at_work_together_as_asked_and_no_more():
             at_work -= 1
         yield job
 
-    assert sorted(cores.run(range(9), start, 3)) == list(range(9))
+    assert sorted(workers.run(range(9), start, 3)) == list(range(9))
     assert most == 3
 
 
@@ -51,7 +51,7 @@ def test_a_job_begins_when_one_before_it_has_ended():
         yield from range(5)
         ended.add(job)
 
-    open_jobs = [len(begun - ended) for _ in cores.run(range(6), start, 2)]
+    open_jobs = [len(begun - ended) for _ in workers.run(range(6), start, 2)]
     assert begun == ended == set(range(6))
     assert max(open_jobs) == 2
 
@@ -67,7 +67,7 @@ def test_a_job_ends_where_it_is_no_longer_wanted():
         finally:
             ended.append(job)
 
-    for job, i in cores.run(range(5), start, 2, lambda job: job not in unwanted):
+    for job, i in workers.run(range(5), start, 2, lambda job: job not in unwanted):
         if i == job:
             unwanted.add(job)
     assert sorted(begun) == sorted(ended) == [0, 1, 2, 3]
@@ -85,13 +85,13 @@ def test_a_failed_job_is_its_callers_error_and_others_go_no_further():
             yield i
 
     with pytest.raises(ValueError, match="no lanes"):
-        list(cores.run(range(2), start, 2))
+        list(workers.run(range(2), start, 2))
     assert len(asked) < 1000
 
 
 def test_a_caller_that_leaves_leaves_nobody_at_work():
     before = threading.active_count()
-    found = cores.run(range(4), counting(dict.fromkeys(range(4), 100)), 2)
+    found = workers.run(range(4), counting(dict.fromkeys(range(4), 100)), 2)
     next(found)
     found.close()
     assert threading.active_count() == before
@@ -104,4 +104,4 @@ def test_each_core_of_a_cpu_has_one(monkeypatch, backend, devices, expected):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(jax, "local_devices", lambda: [None] * devices)
     monkeypatch.setattr(xla, "cores", lambda: 6)
-    assert cores.count() == expected
+    assert workers.worker_count() == expected

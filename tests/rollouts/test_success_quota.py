@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from starjax.rollouts import episodes, sharing, waves
+from starjax.rollouts import episodes, sharing, success_quota
 
 
 class World:
@@ -34,11 +34,13 @@ class World:
                 if self.fate(t)[1] == segment
             ]
 
-    def collected(self, known, per_trocar, chunk, at_once=1):
+    def collected(self, known, per_trocar, chunk, max_workers=1):
         """The trials that are yielded, once each."""
         self.groups = []
-        given = waves.run(self.simulate, dict(known), self.trocars, per_trocar, chunk, at_once)
-        found = [(e.outcome["trocar"], e.outcome["trial"]) for e in given]
+        given = success_quota.run(
+            self.simulate, dict(known), self.trocars, per_trocar, chunk, max_workers
+        )
+        found = [episode.trial for episode in given]
         assert len(set(found)) == len(found)
         return set(found)
 
@@ -61,7 +63,7 @@ def test_what_is_collected_is_what_is_needed(seed):
     wanted = needed(world, 5)
     for chunk in (1, 2, 4, 7, 16, 64):
         assert world.collected({}, 5, chunk) == wanted
-        assert world.collected({}, 5, chunk, at_once=3) == wanted
+        assert world.collected({}, 5, chunk, max_workers=3) == wanted
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -98,8 +100,10 @@ def collected_by(world, disk, count, chunk):
 
     def process(index):
         share = sharing.Share(pathlib.Path(), index, count, "")
-        simulate, news = world.simulate_quietly, lambda: dict(disk)
-        for episode in waves.run(simulate, dict(known), 3, 5, chunk, 1, share, news):
+        simulate, poll_results = world.simulate_quietly, lambda: dict(disk)
+        for episode in success_quota.run(
+            simulate, dict(known), 3, 5, chunk, 1, share, poll_results
+        ):
             written.append(episode.trial)
             disk[episode.trial] = episode.outcome["success"]
 
@@ -111,7 +115,7 @@ def collected_by(world, disk, count, chunk):
 @pytest.mark.parametrize("seed", range(10))
 def test_processes_that_share_collect_what_one_collects(seed, monkeypatch):
     """Each knows of the others only what they have written."""
-    monkeypatch.setattr(waves.sharing, "POLL_S", 0.001)
+    monkeypatch.setattr(success_quota.sharing, "POLL_S", 0.001)
     for count, chunk in ((2, 4), (3, 2), (2, 64)):
         world = World(seed)
         wanted = needed(world, 5)
@@ -123,7 +127,7 @@ def test_processes_that_share_collect_what_one_collects(seed, monkeypatch):
         assert sorted(written) == sorted(wanted - there)
 
 
-def test_a_failure_costs_no_second_wave_where_lanes_are_free():
+def test_a_failure_costs_no_second_round_where_lanes_are_free():
     world = World(0)
     world.fates = {(i, j): (j != 2, 1) for i in range(3) for j in range(20)}
     world.collected({}, 5, 18)
