@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from starjax import deploy, rcm
-from starjax.deploy.link import Heard, Link
+from starjax.deploy.connection import Connection, Reply
 from starjax.rollouts import episodes
 from starjax.sim import env as envs
 from starjax.types import Command, Pose
@@ -78,7 +78,7 @@ class Server:
         self._process.wait()
 
 
-class BadLink(Link):
+class BadConnection(Connection):
     """A connection whose answers come when the simulated clock says, or never."""
 
     def __init__(self, clock: Clock, network: Network, rng: np.random.Generator, *given: Any):
@@ -87,20 +87,20 @@ class BadLink(Link):
         address, api_key, _, _ = given
         super().__init__(address, api_key, _SETTLED_S, _SETTLED_S)
 
-    def ask(self, value: dict[str, Any]) -> None:
+    def send(self, value: dict[str, Any]) -> None:
         network, rng = self._network, self._rng
         self._is_dropped = rng.random() < network.drop
         late = rng.exponential(network.jitter_s) if network.jitter_s else 0.0
         wait = network.timeout_s if self._is_dropped else network.delay_s + late
         self._due = self._clock.now + wait
-        super().ask(value)
+        super().send(value)
 
-    def poll(self) -> Heard | None:
+    def poll(self) -> Reply | None:
         if self._due is None or self._clock.now < self._due - 1e-6:
             return None
-        heard = self.wait(_SETTLED_S)
+        reply = self.wait(_SETTLED_S)
         self._due = None
-        return Heard(None, "dropped", is_lost=True) if self._is_dropped else heard
+        return Reply(None, "dropped", is_lost=True) if self._is_dropped else reply
 
 
 class Driven:
@@ -151,8 +151,8 @@ def drive(
         port = rcm.Trocar(*(float(field[i, 0]) for field in ports))
         rng = np.random.default_rng([seed, *group[i]])
 
-        def connect(*given: Any, rng: np.random.Generator = rng) -> BadLink:
-            return BadLink(clock, network, rng, *given)
+        def connect(*given: Any, rng: np.random.Generator = rng) -> BadConnection:
+            return BadConnection(clock, network, rng, *given)
 
         given = {"key": key_agent, "ahead": network.ahead, "connect": connect}
         clients.append(deploy.Client(server.address, port, **given))

@@ -17,7 +17,7 @@ import numpy as np
 
 from starjax import deploy, rcm, runtime
 from starjax.deploy import batching, wire
-from starjax.deploy.link import Link
+from starjax.deploy.connection import Connection
 
 LOOP_S = 10.0  # of the robot
 
@@ -53,16 +53,16 @@ def decisions(policy: deploy.Deployed, address: str, calls: int) -> dict:
     """Percentiles of a call here, over the socket, and of what the socket adds to it, ms."""
     request = batching.example(policy)
     seen, trocar = request.observation, request.trocar
-    link = Link(address, "", 60.0, 60.0)
+    connection = Connection(address, "", 60.0, 60.0)
 
     def here(number: int) -> None:
         jax.device_get(policy(jax.random.key(number), seen, trocar))
 
     def socket(number: int) -> None:
         key = np.asarray(jax.random.key_data(jax.random.key(number)))
-        link.ask(wire.request(policy.asks, seen, trocar, key))
-        heard = link.wait(60.0)
-        wire.read_answer(policy.asks, policy.settings.horizon, heard.answer)
+        connection.send(wire.encode_request(policy.input_spec, seen, trocar, key))
+        reply = connection.wait(60.0)
+        wire.decode_reply(policy.input_spec, policy.settings.horizon, reply.value)
 
     times = {"here": [], "socket": []}
     for number in range(-3, calls):
@@ -70,7 +70,7 @@ def decisions(policy: deploy.Deployed, address: str, calls: int) -> dict:
             spent = 1e3 * _timing.time_once(lambda call=call: call(number))  # noqa: B023
             if number >= 0:
                 times[name].append(spent)
-    link.close()
+    connection.close()
     row = {name: percentiles(found) for name, found in times.items()}
     row["difference"] = {name: row["socket"][name] - row["here"][name] for name in row["here"]}
     return {"calls": calls, **row}

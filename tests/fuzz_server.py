@@ -29,7 +29,7 @@ def main(frames, seed):
     policy = deploy.load("compact")
     asked = batching.example(policy)
     key = np.asarray(jax.random.key_data(jax.random.key(0)))
-    good = wire.pack(wire.request(policy.asks, asked.observation, asked.trocar, key))
+    good = wire.pack(wire.encode_request(policy.input_spec, asked.observation, asked.trocar, key))
     command = [sys.executable, "-m", "starjax", "serve", "--port", "0", "--batch", "1"]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:

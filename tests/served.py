@@ -52,7 +52,7 @@ def observation(height=0.03):
 @contextlib.contextmanager
 def running(batches, port=0, key=KEY, clients=8):
     """A server of compiled `batches`; yields (host, port), its counts."""
-    settings = server.Settings(port=port, batch=batches.most, clients=clients)
+    settings = server.ServerSettings(port=port, batch=batches.most, clients=clients)
     stop, heard = threading.Event(), queue.Queue()
     with server._bound(settings) as address:
         about = server.metadata(batches.policy, "tiny")

@@ -10,8 +10,8 @@ import pytest
 import served
 
 from starjax import deploy, rcm
-from starjax.deploy import batching, follow, wire
-from starjax.deploy.link import Heard, Link
+from starjax.deploy import batching, plan_executor, wire
+from starjax.deploy.connection import Connection, Reply
 from starjax.errors import UsageError
 from starjax.sim import registry
 from starjax.types import Command, Pose
@@ -44,22 +44,22 @@ def followed(latency, steps, ahead=None):
 
     Held steps are None.
     """
-    follower = follow.Follower(WHERE, HORIZON, EXECUTE, ahead, deploy.Limits(1.0, 3.0))
-    follower.begin(poses(0.0, 0.1), 1.0)
+    executor = plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, ahead, deploy.Limits(1.0, 3.0))
+    executor.begin(poses(0.0, 0.1), 1.0)
     given, number, due = [], 0, None
     for t in range(steps):
         for _ in range(2):
             if due is not None and t >= due:
-                follower.answered(plan(number))
+                executor.on_plan(plan(number))
                 due = None
-            if follower.is_due:
+            if executor.needs_plan:
                 number += 1
-                follower.asked()
+                executor.on_request()
                 due = t + latency(number)
-        held = follower.report.held
-        command = follower.step()
-        given.append(None if follower.report.held > held else which(command))
-    return given, follower.report
+        held = executor.report.held
+        command = executor.step()
+        given.append(None if executor.report.held > held else which(command))
+    return given, executor.report
 
 
 def test_without_delay_plans_are_carried_out_as_by_an_evaluation():
@@ -105,13 +105,13 @@ def test_of_a_plan_that_comes_very_late_only_the_rest_is_followed():
 def test_commands_keep_to_the_manifold_and_do_not_jump(seed):
     """Whatever the plans are: far apart, off the manifold, not rotations."""
     rng, limits = np.random.default_rng(seed), deploy.Limits()
-    follower = follow.Follower(WHERE, HORIZON, EXECUTE, None, limits)
-    follower.begin(poses(0.0, 0.1), 0.3)
-    commands = [follower.last]
+    executor = plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, None, limits)
+    executor.begin(poses(0.0, 0.1), 0.3)
+    commands = [executor.last]
     for _ in range(150):
-        if follower.is_due:
-            follower.asked()
-        if rng.random() < 0.3 and follower._is_asked:
+        if executor.needs_plan:
+            executor.on_request()
+        if rng.random() < 0.3 and executor._is_asked:
             axis = rng.normal(size=(HORIZON, 3)) * [0.5, 0.5, 0.1] - [0.0, 0.0, 1.0]
             roll, depth = rng.uniform(-3.0, 3.0, HORIZON), rng.uniform(0.02, 0.2, HORIZON)
             pose = rcm.pose_on_manifold(np.float32(axis), roll, depth, WHERE)
@@ -120,9 +120,9 @@ def test_commands_keep_to_the_manifold_and_do_not_jump(seed):
             p += 1e-3 * (spoilt == 1)
             R *= 1.0 + 0.1 * (spoilt == 2)
             p[3] = np.where(spoilt == 3, np.nan, p[3])
-            follower.answered(Command(Pose(R, p), rng.normal(size=HORIZON)))
-        commands.append(follower.step())
-    assert follower.report.refused > 0 and follower.report.limited > 0
+            executor.on_plan(Command(Pose(R, p), rng.normal(size=HORIZON)))
+        commands.append(executor.step())
+    assert executor.report.refused > 0 and executor.report.limited > 0
     R, p = (np.stack([c.pose[n] for c in commands]).astype(np.float64) for n in (0, 1))
     off = np.linalg.norm(np.cross(p - WHERE, R[:, :, 2]), axis=-1)
     assert off.max() < 1e-6 and ((p - WHERE) * R[:, :, 2]).sum(-1).min() > 0.0
@@ -134,41 +134,41 @@ def test_commands_keep_to_the_manifold_and_do_not_jump(seed):
 
 @pytest.mark.parametrize("spoil", ["off", "above", "stretched", "mirrored"])
 def test_a_plan_that_misses_the_trocar_is_not_followed(spoil):
-    follower = follow.Follower(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
-    follower.begin(poses(0.0, 0.1), 1.0)
+    executor = plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
+    executor.begin(poses(0.0, 0.1), 1.0)
     good = plan(0)
     R, p = np.array(good.pose.R), np.array(good.pose.p)
     p[5, 0] += 2e-4 * (spoil == "off")
     p[5, 2] += 0.2 * (spoil == "above")
     R[5] *= 1.01 if spoil == "stretched" else 1.0
     R[5, :, 0] *= -1.0 if spoil == "mirrored" else 1.0
-    follower.asked()
-    follower.answered(good._replace(pose=Pose(R, p)))
-    assert follower.report.refused == 1 and follower.report.latencies == []
-    follower.step()
-    assert follower.report.held == 1 and follower.is_due  # it asks again
-    follower.asked()
-    follower.answered(good)
-    follower.step()
-    assert follower.report.refused == 1 and follower.report.plans == 1
+    executor.on_request()
+    executor.on_plan(good._replace(pose=Pose(R, p)))
+    assert executor.report.refused == 1 and executor.report.latencies == []
+    executor.step()
+    assert executor.report.held == 1 and executor.needs_plan  # it asks again
+    executor.on_request()
+    executor.on_plan(good)
+    executor.step()
+    assert executor.report.refused == 1 and executor.report.plans == 1
 
 
 def test_a_tool_that_does_not_go_through_the_trocar_is_not_moved():
-    follower = follow.Follower(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
+    executor = plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
     pose = poses(0.0, 0.1)
-    follower.begin(pose._replace(p=pose.p + np.float32([0.002, 0.0, 0.0])), 1.0)
-    held = follower.step()
+    executor.begin(pose._replace(p=pose.p + np.float32([0.002, 0.0, 0.0])), 1.0)
+    held = executor.step()
     assert float(rcm.rcm_error(held.pose, WHERE)) < 1e-6
     assert np.linalg.norm(held.pose.p - pose.p) < 0.005
     with pytest.raises(UsageError) as caught:
-        follower.begin(pose._replace(p=pose.p + np.float32([0.03, 0.0, 0.0])), 1.0)
+        executor.begin(pose._replace(p=pose.p + np.float32([0.03, 0.0, 0.0])), 1.0)
     assert caught.value.argument == "observation.pose"
 
 
 @pytest.mark.parametrize(("ahead", "limits"), [(9, (0.1, 0.1)), (-1, (0.1, 0.1)), (0, (0.0, 0.1))])
 def test_settings_that_cannot_be_are_named(ahead, limits):
     with pytest.raises(UsageError):
-        follow.Follower(WHERE, HORIZON, EXECUTE, ahead, deploy.Limits(*limits))
+        plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, ahead, deploy.Limits(*limits))
 
 
 @pytest.fixture(scope="module")
@@ -199,21 +199,21 @@ def client_of(where, **options):
     return deploy.Client(f"{where[0]}:{where[1]}", served.PORT, **options)
 
 
-class AtOnce(Link):
+class AtOnce(Connection):
     """Waits for every answer, as if it came within no time."""
 
     def poll(self):
-        heard = super().poll()
-        while heard is None and self.waits:
-            heard = super().poll()
+        reply = super().poll()
+        while reply is None and self.waits:
+            reply = super().poll()
         self.waits = False
-        return heard
+        return reply
 
     waits = False
 
-    def ask(self, value):
+    def send(self, value):
         self.waits = True
-        super().ask(value)
+        super().send(value)
 
 
 def test_a_loop_over_the_socket_is_the_loop_in_the_process(batches):
@@ -268,9 +268,9 @@ def test_another_policy_at_the_address_is_not_asked(batches, monkeypatch):
     monkeypatch.setattr(type(batches.policy), "digest", "another")
     with served.running(batches, port=where[1]):
         deadline = time.monotonic() + 60.0
-        while "another" not in client._link.fault and time.monotonic() < deadline:
+        while "another" not in client._connection.fault and time.monotonic() < deadline:
             time.sleep(0.05)
-        assert "another" in client._link.fault and not client._link.is_up
+        assert "another" in client._connection.fault and not client._connection.is_up
         client.close()
 
 
@@ -296,12 +296,12 @@ def test_what_cannot_be_served_is_said_at_the_start(batches, about, argument):
 def test_answers_that_are_none_are_refused_and_it_holds(batches):
     """Of a server that sends anything but a plan of this policy."""
 
-    class Liar(Link):
+    class Liar(Connection):
         lies = iter([{}, {"R": 1}, None, "text", wire.unpack(wire.pack({"p": np.zeros(3)}))])
 
         def poll(self):
-            heard = super().poll()
-            return None if heard is None else Heard(next(self.lies, {}))
+            reply = super().poll()
+            return None if reply is None else Reply(next(self.lies, {}))
 
     robot = Robot()
     with served.running(batches) as (where, _), client_of(where, connect=Liar) as client:

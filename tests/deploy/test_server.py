@@ -49,7 +49,7 @@ def connect(where, key=served.KEY, **options):
 def asked(batches, seed=0, height=0.03):
     key = np.asarray(jax.random.key_data(jax.random.key(seed)))
     seen = served.observation(height)
-    return wire.request(batches.policy.asks, seen, served.PORT, key)
+    return wire.encode_request(batches.policy.input_spec, seen, served.PORT, key)
 
 
 def infer(connection, value):
@@ -77,7 +77,7 @@ def test_it_answers_what_the_policy_plans(batches, up):
 
 def test_clients_that_share_a_call_get_their_own_plans_and_mistakes(batches):
     requests = [
-        wire.read_request(batches.policy.asks, asked(batches, seed, 0.02 + 0.01 * seed))
+        wire.decode_request(batches.policy.input_spec, asked(batches, seed, 0.02 + 0.01 * seed))
         for seed in range(3)
     ]
     alone = [batches.decide([request])[0] for request in requests]
@@ -122,7 +122,7 @@ def test_several_clients_at_once(batches, up):
     for thread in threads:
         thread.join()
     for seed in range(6):
-        request = wire.read_request(batches.policy.asks, asked(batches, seed))
+        request = wire.decode_request(batches.policy.input_spec, asked(batches, seed))
         wanted = batches.decide([request])[0]["p"]
         for plan in plans[seed]:
             np.testing.assert_allclose(plan, wanted, atol=1e-5)
@@ -162,7 +162,7 @@ def test_no_frame_ends_it(batches, up):
     assert refused > 0.8 * FRAMES and all("Traceback" not in str(answer) for answer in answers)
     assert isinstance(infer(connection, asked(batches)), dict)  # on the same connection
     with pytest.raises(websockets.ConnectionClosed):
-        connection.send(bytes(wire.most_bytes(batches.policy.asks) + 1))
+        connection.send(bytes(wire.max_request_bytes(batches.policy.input_spec) + 1))
         connection.recv(timeout=60)
     with connect(where) as other:
         other.recv()
@@ -205,7 +205,7 @@ def test_it_ends_while_it_decides(batches, monkeypatch):
 
 def test_a_port_that_is_taken_is_one_line(batches, up):
     with pytest.raises(UsageError) as caught:
-        server.run(batches.policy, server.Settings(port=up[0][1]))
+        server.run(batches.policy, server.ServerSettings(port=up[0][1]))
     assert caught.value.argument == "--port"
 
 
@@ -231,7 +231,7 @@ def test_its_own_machine_needs_no_key():
 
 def test_the_largest_frame_holds_every_request():
     asks = fakes_asks()
-    request = wire.request(
+    request = wire.encode_request(
         asks,
         served.observation().replace(images={n: np.zeros((2, 48, 48, 3), np.uint8) for n in "ab"}),
         served.PORT,
@@ -240,10 +240,10 @@ def test_the_largest_frame_holds_every_request():
     doubled = {k: v if v.dtype == np.uint8 else v.astype(np.float64) for k, v in request.items()}
     doubled["key"] = request["key"]
     frame = wire.pack(doubled)
-    assert len(frame) <= wire.most_bytes(asks) < 2 * len(frame)
-    again = wire.read_request(asks, wire.unpack(frame))
+    assert len(frame) <= wire.max_request_bytes(asks) < 2 * len(frame)
+    again = wire.decode_request(asks, wire.unpack(frame))
     assert set(again.observation.images) == {"a", "b"} and again.observation.state is None
 
 
 def fakes_asks():
-    return server.wire.Asks(2, (), fakes.P_WORLD_REF[0], True, 48, ("a", "b"), 12)
+    return server.wire.InputSpec(2, (), fakes.P_WORLD_REF[0], True, 48, ("a", "b"), 12)

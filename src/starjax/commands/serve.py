@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     from starjax.deploy import server
 
     policy = deploy.load(path)
-    settings = server.Settings(chosen.host, chosen.port, chosen.batch, chosen.clients)
+    settings = server.ServerSettings(chosen.host, chosen.port, chosen.batch, chosen.clients)
     print(f"{chosen.policy}: compiling for batches of up to {chosen.batch}", flush=True)
 
     def listening(host: str, port: int) -> None:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, types
-from starjax.deploy import measured, wire
+from starjax.deploy import inputs, wire
 from starjax.deploy.policy import Deployed
 from starjax.errors import UsageError
 from starjax.rcm import arrays
@@ -39,13 +39,13 @@ class Batches:
 
     @arrays.broadcasting
     def decide(self, requests: Sequence[wire.Request]) -> list[dict[str, Any] | UsageError]:
-        """Answers at most `most` requests: each with its `wire.answer`, or its mistake."""
-        begun, asks = time.perf_counter(), self.policy.asks
+        """Answers at most `most` requests: each with its `wire.encode_reply`, or its mistake."""
+        begun, spec = time.perf_counter(), self.policy.input_spec
         answers: list[Any] = [None] * len(requests)
         good, rows = [], []
         for i, asked in enumerate(requests):
             try:
-                rows.append(measured.given(asks, asked.observation, asked.trocar))
+                rows.append(inputs.validate(spec, asked.observation, asked.trocar))
                 good.append(i)
             except UsageError as error:
                 answers[i] = error
@@ -65,7 +65,7 @@ class Batches:
             one, first = (jax.tree.map(lambda x: x[row], part) for part in (command, found))  # noqa: B023
             try:
                 self.policy.check_first(first)
-                answers[i] = wire.answer(one, decided_ms)
+                answers[i] = wire.encode_reply(one, decided_ms)
             except UsageError as error:
                 answers[i] = error
         return answers
@@ -78,17 +78,17 @@ class Batches:
 
 def example(policy: Deployed) -> wire.Request:
     """A request of tools at rest in the nominal trocars, straight down."""
-    asks = policy.asks
-    trocar = rcm.Trocar(*(np.full(asks.arms, x, np.float32) for x in (0.0, np.pi / 2, 0.0)))
-    pose = rcm.pose_on_manifold(_DOWN, 0.0, _DEEP, asks.p_world_ref)
-    moments = (asks.moments, *asks.arms)
-    repeated: list[Any] = [np.broadcast_to(x, (asks.moments, *np.shape(x))) for x in pose]
-    side = (asks.moments, asks.image_size, asks.image_size, 3)
-    images = {name: np.zeros(side, np.uint8) for name in asks.cameras}
-    observation = measured.Observation(
+    spec = policy.input_spec
+    trocar = rcm.Trocar(*(np.full(spec.arms, x, np.float32) for x in (0.0, np.pi / 2, 0.0)))
+    pose = rcm.pose_on_manifold(_DOWN, 0.0, _DEEP, spec.p_world_ref)
+    moments = (spec.moments, *spec.arms)
+    repeated: list[Any] = [np.broadcast_to(x, (spec.moments, *np.shape(x))) for x in pose]
+    side = (spec.moments, spec.image_size, spec.image_size, 3)
+    images = {name: np.zeros(side, np.uint8) for name in spec.cameras}
+    observation = inputs.RobotObservation(
         pose=types.Pose(*repeated),
         gripper=np.ones(moments, np.float32),
         images=images or None,
-        state=None if images else np.zeros((asks.moments, asks.state_size), np.float32),
+        state=None if images else np.zeros((spec.moments, spec.state_size), np.float32),
     )
     return wire.Request(observation, trocar, None)

@@ -14,9 +14,9 @@ import numpy as np
 
 from starjax import rcm
 from starjax.deploy import wire
-from starjax.deploy.follow import LIMITS, Follower, Limits, Report
-from starjax.deploy.link import Link
-from starjax.deploy.measured import Asks, Observation
+from starjax.deploy.connection import Connection
+from starjax.deploy.inputs import InputSpec, RobotObservation
+from starjax.deploy.plan_executor import LIMITS, Limits, PlanExecutor, Report
 from starjax.errors import UsageError
 from starjax.types import Command
 
@@ -27,7 +27,7 @@ WAIT_S = 10.0  # for the first one
 class Robot(Protocol):
     """A robot, as `Client.run` drives it."""
 
-    def measure(self) -> Observation:
+    def measure(self) -> RobotObservation:
         """This moment: pose `[*arms]`, gripper `[*arms]`, image `[h, w, 3]`, images or state."""
         ...
 
@@ -49,7 +49,7 @@ class Client:
     than `limits`, whatever the server answers.
 
     Attributes:
-      about: what the server says of itself, see `server.metadata`.
+      metadata: what the server says of itself, see `server.metadata`.
       control_hz: commands a second.
       p_world_trocar: `[*arms, 3]` m.
     """
@@ -65,7 +65,7 @@ class Client:
         limits: Limits = LIMITS,
         timeout_s: float = TIMEOUT_S,
         wait_s: float = WAIT_S,
-        connect: Callable[..., Any] = Link,
+        connect: Callable[..., Any] = Connection,
     ) -> None:
         """Connects and compiles what a step needs.
 
@@ -85,34 +85,36 @@ class Client:
           UsageError: there is no server, it refuses the key, its policy does not keep to the RCM
             manifold, or the trocar is none.
         """
-        self._link = connect(address, api_key, timeout_s, wait_s)
+        self._connection = connect(address, api_key, timeout_s, wait_s)
         try:
-            self.about = self._link.about
-            self._asks = _asks(self.about)
-            self.control_hz = float(self.about["control_hz"])
-            self._trocar = _trocar(trocar, self._asks.arms)
-            where = rcm.trocar_position(self._trocar, self._asks.p_world_ref)
+            self.metadata = self._connection.metadata
+            self._input_spec = _read_spec(self.metadata)
+            self.control_hz = float(self.metadata["control_hz"])
+            self._trocar = _trocar(trocar, self._input_spec.arms)
+            where = rcm.trocar_position(self._trocar, self._input_spec.p_world_ref)
             self.p_world_trocar = np.asarray(where, np.float32)
-            horizon, execute = int(self.about["horizon"]), int(self.about["execute"])
-            self._follower = Follower(self.p_world_trocar, horizon, execute, ahead, limits)
+            horizon, execute = int(self.metadata["horizon"]), int(self.metadata["execute"])
+            self._executor = PlanExecutor(self.p_world_trocar, horizon, execute, ahead, limits)
         except BaseException:
-            self._link.close()
+            self._connection.close()
             raise
         self._key, self._asked = key, 0
         self._next_key()
-        self._seen: collections.deque[Observation] = collections.deque(maxlen=self._asks.moments)
+        self._seen: collections.deque[RobotObservation] = collections.deque(
+            maxlen=self._input_spec.moments
+        )
 
     @property
     def report(self) -> Report:
         """Counts of what happened so far."""
-        return self._follower.report
+        return self._executor.report
 
     @property
     def reconnected(self) -> int:
         """How often the connection was made again."""
-        return self._link.connections - 1
+        return self._connection.connections - 1
 
-    def step(self, moment: Observation) -> Command:
+    def step(self, moment: RobotObservation) -> Command:
         """The next command `[*arms]`, of what is measured now.
 
         Args:
@@ -121,18 +123,18 @@ class Client:
         Raises:
           UsageError: the first moment's tool does not go through the trocar.
         """
-        follower = self._follower
-        if follower.last is None:
-            follower.begin(moment.pose, moment.gripper)
-            self._seen.extend([moment] * self._asks.moments)
+        executor = self._executor
+        if executor.last is None:
+            executor.begin(moment.pose, moment.gripper)
+            self._seen.extend([moment] * self._input_spec.moments)
         else:
             self._seen.append(moment)
         self._listen()
-        if follower.is_due and self._link.is_up:
-            self._link.ask(self._request())
-            follower.asked()
+        if executor.needs_plan and self._connection.is_up:
+            self._connection.send(self._request())
+            executor.on_request()
             self._listen()
-        return follower.step()
+        return executor.step()
 
     def run(
         self, robot: Robot, seconds: float, should_stop: Callable[[], bool] = lambda: False
@@ -153,7 +155,7 @@ class Client:
 
     def close(self) -> None:
         """Ends the connection."""
-        self._link.close()
+        self._connection.close()
 
     def __enter__(self) -> "Client":
         return self
@@ -162,22 +164,22 @@ class Client:
         self.close()
 
     def _listen(self) -> None:
-        heard = self._link.poll()
-        if heard is None:
+        reply = self._connection.poll()
+        if reply is None:
             return
-        if heard.answer is None:
-            return self._follower.refused(heard.fault, heard.is_lost)
+        if reply.value is None:
+            return self._executor.on_failure(reply.fault, reply.is_lost)
         try:
-            plan = wire.read_answer(self._asks, self._follower.horizon, heard.answer)
+            plan = wire.decode_reply(self._input_spec, self._executor.horizon, reply.value)
         except UsageError as error:
-            return self._follower.refused(str(error))
-        self._follower.answered(plan)
+            return self._executor.on_failure(str(error))
+        self._executor.on_plan(plan)
 
     def _request(self) -> dict[str, Any]:
         key = self._next_key()
         self._asked += 1
         seen = jax.tree.map(lambda *moments: np.stack(moments), *self._seen)
-        return wire.request(self._asks, seen, self._trocar, key)
+        return wire.encode_request(self._input_spec, seen, self._trocar, key)
 
     def _next_key(self) -> np.ndarray | None:
         if self._key is None:
@@ -185,18 +187,18 @@ class Client:
         return np.asarray(jax.random.key_data(jax.random.fold_in(self._key, self._asked)))
 
 
-def _asks(about: dict[str, Any]) -> Asks:
+def _read_spec(metadata: dict[str, Any]) -> InputSpec:
     try:
         said: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in about["asks"].items()
+            k: tuple(v) if isinstance(v, list) else v for k, v in metadata["asks"].items()
         }
-        asks = Asks(**said)
+        spec = InputSpec(**said)
     except (KeyError, TypeError, AttributeError) as error:
         raise UsageError("address", "a server of starjax", f"another one: {error!r}") from None
-    if not asks.keeps_to_manifold:
+    if not spec.keeps_to_manifold:
         expected = "a policy that keeps to the RCM manifold"
-        raise UsageError("address", expected, f"one of method {about.get('method')}")
-    return asks
+        raise UsageError("address", expected, f"one of method {metadata.get('method')}")
+    return spec
 
 
 def _trocar(trocar: rcm.Trocar, arms: tuple[int, ...]) -> rcm.Trocar:

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import config, errors, limits, methods, rcm, types
-from starjax.deploy import measured, start
-from starjax.deploy.measured import Observation
+from starjax.deploy import approach, inputs
+from starjax.deploy.inputs import RobotObservation
 from starjax.learners import LEARNERS
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
@@ -33,7 +33,7 @@ class Deployed:
 
     Attributes:
       method: its row of `methods.METHODS`, by name.
-      settings: what it was trained with. It asks for the last `obs_horizon` moments, in images of
+      settings: what it was trained with. It reads the last `obs_horizon` moments, in images of
         `image_size` pixels a side if `observation` is "image", and plans `horizon` control steps
         of 1/30 s, of which `execute` are carried out before it is asked again.
       scene: names of the task, arms, tools and cameras that it was trained with.
@@ -41,7 +41,7 @@ class Deployed:
         arms.
       max_first_move: m, how far from the measured tip a plan may begin.
       max_first_turn: rad, how far from the measured rotation.
-      asks: shapes of what it must be told.
+      input_spec: shapes of its inputs.
 
     It pickles as the arguments that it was loaded with: another process loads the same file.
     """
@@ -52,9 +52,9 @@ class Deployed:
     p_world_ref: np.ndarray
     max_first_move: float
     max_first_turn: float
-    asks: measured.Asks = dataclasses.field(repr=False)
+    input_spec: inputs.InputSpec = dataclasses.field(repr=False)
     _source: tuple[Any, ...] = dataclasses.field(repr=False)
-    _decide: Callable[..., tuple[Command, start.First]] = dataclasses.field(repr=False)
+    _decide: Callable[..., tuple[Command, approach.StartOffset]] = dataclasses.field(repr=False)
     _weights: tuple[Any, Any] = dataclasses.field(repr=False)
 
     @property
@@ -63,7 +63,9 @@ class Deployed:
         return self._source[1]
 
     @arrays.broadcasting
-    def __call__(self, key: jax.Array, observation: Observation, trocar: rcm.Trocar) -> Command:
+    def __call__(
+        self, key: jax.Array, observation: RobotObservation, trocar: rcm.Trocar
+    ) -> Command:
         """Plans the next commands of one robot, or of B at once.
 
         The first call for a number of robots compiles the program. Arrays of a policy of several
@@ -81,7 +83,7 @@ class Deployed:
 
         A tool that has just been passed through the trocar is shallower than any demonstrated one.
         Where a plan begins deeper and more than 3 mm or 0.15 rad from it, the commands are instead
-        a slow way there (`start.LEAD_MOVE`, `start.LEAD_TURN` a control step), which the next
+        a slow approach (`approach.APPROACH_MOVE`, `APPROACH_TURN` per control step), which the next
         decisions continue. A tip less deep than `rcm.MIN_DEPTH` (5 mm) is sent there at once.
 
         Returns:
@@ -97,8 +99,8 @@ class Deployed:
             Values that jax traces are not checked: inside `jit` only shapes and types are.
         """
         _check_key(key)
-        seen, trocar = measured.given(self.asks, observation, trocar)
-        robots = np.shape(trocar.radius)[: np.ndim(trocar.radius) - len(self.asks.arms)]
+        seen, trocar = inputs.validate(self.input_spec, observation, trocar)
+        robots = np.shape(trocar.radius)[: np.ndim(trocar.radius) - len(self.input_spec.arms)]
         keys = jax.random.split(key, robots[0]) if robots else key[None]
         if not robots:
             seen, trocar = jax.tree.map(lambda x: jnp.asarray(x)[None], (seen, trocar))
@@ -108,8 +110,8 @@ class Deployed:
 
     def plan(
         self, keys: jax.Array, seen: types.Observation, trocar: rcm.Trocar
-    ) -> tuple[Command, start.First]:
-        """Plans for B robots, each with its own key, of arrays that `measured.given` has checked.
+    ) -> tuple[Command, approach.StartOffset]:
+        """Plans for B robots, each with its own key, of arrays that `inputs.validate` has checked.
 
         Args:
           keys: `[B]`.
@@ -126,9 +128,9 @@ class Deployed:
         bounds = {"max_first_move": self.max_first_move, "max_first_turn": self.max_first_turn}
         return _load_again, (path, digest, {**settings, **bounds})
 
-    def check_first(self, found: start.First) -> None:
+    def check_first(self, found: approach.StartOffset) -> None:
         """Raises UsageError where a plan begins farther than the bounds from the measured pose."""
-        if measured.is_traced(found.move):
+        if inputs.is_traced(found.move):
             return
         move, turn = (np.max(x) for x in jax.device_get(found))
         hint = "compare the frames of pose and trocar with the policy's, or load it with more"
@@ -163,8 +165,8 @@ def load(
     policy: str | Path,
     method: str | None = None,
     *,
-    max_first_move: float = start.MAX_FIRST_MOVE,
-    max_first_turn: float = start.MAX_FIRST_TURN,
+    max_first_move: float = approach.MAX_FIRST_MOVE,
+    max_first_turn: float = approach.MAX_FIRST_TURN,
     **options: Any,
 ) -> Deployed:
     """Loads a policy from its file.
@@ -209,7 +211,7 @@ def load(
     params = made.for_sampling(trained.params)
     places = np.asarray(trained.p_world_ref, np.float32)
     arms = () if len(places) == 1 else (len(places),)
-    asks = measured.Asks(
+    input_spec = inputs.InputSpec(
         moments=settings.obs_horizon,
         arms=arms,
         p_world_ref=places if arms else places[0],
@@ -218,7 +220,7 @@ def load(
         cameras=trained.scene.cameras if settings.observation == "image" else (),
         state_size=task.state_size,
     )
-    leads = row.action_space if asks.keeps_to_manifold else None
+    leads = row.action_space if input_spec.keeps_to_manifold else None
     decide = jax.jit(_decider(made.sample, trained, not arms, leads))
     weights = jax.device_put((params, trained.normalizer))
     bounds = {"max_first_move": float(max_first_move), "max_first_turn": float(max_first_turn)}
@@ -228,9 +230,9 @@ def load(
         method=method,
         settings=settings,
         scene=trained.scene,
-        p_world_ref=asks.p_world_ref,
+        p_world_ref=input_spec.p_world_ref,
         **bounds,
-        asks=asks,
+        input_spec=input_spec,
         _source=source,
         _decide=decide,
         _weights=weights,
@@ -263,12 +265,12 @@ def _decider(
     trained: policy_file.Trained,
     is_one_arm: bool,
     leads: str | None,
-) -> Callable[..., tuple[Command, start.First]]:
+) -> Callable[..., tuple[Command, approach.StartOffset]]:
     """`sample` of trocars, and of one arm's arrays without an arm axis; tools that look the same
     after half a turn are turned back by it where they are turned by more than a quarter.
 
-    `leads` is the action space of a policy that keeps to the manifold, whose plans `start.led`
-    leads from shallow tools; None for others.
+    `leads` is the action space of a policy that keeps to the manifold, whose plans
+    `approach.with_approach` begins at shallow tools; None for others.
     """
     p_world_ref = np.asarray(trained.p_world_ref, np.float32)
     roll_zero = np.asarray(trained.roll_zero, np.float32)
@@ -288,8 +290,8 @@ def _decider(
         command = sample(params, stats, keys, seen, told)
         now = Pose(*(x[:, -1].astype(jnp.float32) for x in seen.pose))
         if leads:
-            command = start.led(leads, stats, now, command, told)
-        found = start.first(now, Pose(*(x[:, 0] for x in command.pose)))
+            command = approach.with_approach(leads, stats, now, command, told)
+        found = approach.start_offset(now, Pose(*(x[:, 0] for x in command.pose)))
         R, p, gripper = command.pose.R * half, command.pose.p, command.gripper
         if is_one_arm:
             R, p, gripper = R[..., 0, :, :], p[..., 0, :], gripper[..., 0]

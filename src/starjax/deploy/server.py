@@ -32,7 +32,7 @@ _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
 
 
-class Settings(NamedTuple):
+class ServerSettings(NamedTuple):
     """How a server listens.
 
     Attributes:
@@ -65,7 +65,7 @@ class _Job(NamedTuple):
 
 def run(
     policy: Deployed,
-    settings: Settings,
+    settings: ServerSettings,
     *,
     name: str = "",
     api_key: str = "",
@@ -93,10 +93,10 @@ def run(
 
 def metadata(policy: Deployed, name: str = "") -> dict[str, Any]:
     """Greeting of a client that connects."""
-    settings, asks = policy.settings, policy.asks
+    settings, spec = policy.settings, policy.input_spec
     described = {
         field: {**said._asdict(), "shape": list(said.shape)}
-        for field, said in wire.inputs(asks).items()
+        for field, said in wire.request_arrays(spec).items()
     }
     return {
         "protocol": wire.PROTOCOL,
@@ -111,15 +111,15 @@ def metadata(policy: Deployed, name: str = "") -> dict[str, Any]:
         "horizon": settings.horizon,
         "execute": settings.execute,
         "asks": {
-            **{k: list(v) if isinstance(v, tuple) else v for k, v in asks._asdict().items()},
-            "p_world_ref": asks.p_world_ref,
+            **{k: list(v) if isinstance(v, tuple) else v for k, v in spec._asdict().items()},
+            "p_world_ref": spec.p_world_ref,
         },
         "inputs": described,
         "actions": list(wire.ACTION),  # of each arm
     }
 
 
-def _bound(settings: Settings) -> socket.socket:
+def _bound(settings: ServerSettings) -> socket.socket:
     """A socket at the address, before anything is compiled; nobody is listened to yet."""
     host, port = settings.host, settings.port
     bound = None
@@ -138,7 +138,11 @@ def _bound(settings: Settings) -> socket.socket:
 
 class _Served:
     def __init__(
-        self, batches: batching.Batches, settings: Settings, about: dict[str, Any], api_key: str
+        self,
+        batches: batching.Batches,
+        settings: ServerSettings,
+        about: dict[str, Any],
+        api_key: str,
     ) -> None:
         self.batches, self.settings, self.counts = batches, settings, Counts()
         self.about, self.api_key = wire.pack(about), api_key
@@ -157,7 +161,7 @@ class _Served:
             process_request=self._admit,
             origins=[None],  # pages in a browser have one, and could reach this machine's ports
             compression=None,
-            max_size=wire.most_bytes(self.batches.policy.asks),
+            max_size=wire.max_request_bytes(self.batches.policy.input_spec),
             max_queue=2,
             logger=_SILENT,
         )
@@ -205,9 +209,9 @@ class _Served:
             self.open -= 1
 
     async def _answer(self, frame: str | bytes) -> str | bytes:
-        asks, key_size = self.batches.policy.asks, self.batches.key_size
+        spec, key_size = self.batches.policy.input_spec, self.batches.key_size
         try:
-            request = wire.read_request(asks, wire.unpack(frame), key_size)
+            request = wire.decode_request(spec, wire.unpack(frame), key_size)
             job = _Job(request, asyncio.get_running_loop().create_future())
             self.jobs.put_nowait(job)
             answer = await job.answer

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starjax import rcm
-from starjax.deploy.measured import Asks, Observation
+from starjax.deploy.inputs import InputSpec, RobotObservation
 from starjax.errors import UsageError
 from starjax.types import Command, Pose
 
@@ -30,7 +30,7 @@ _OVERHEAD = 1 << 14
 ACTION = ("p.x m", "p.y m", "p.z m", "q.w", "q.x", "q.y", "q.z", "gripper")
 
 
-class Input(NamedTuple):
+class ArraySpec(NamedTuple):
     """One array of a request.
 
     Attributes:
@@ -55,40 +55,40 @@ class Request(NamedTuple):
       key: random key's data, or None for one of the server's.
     """
 
-    observation: Observation
+    observation: RobotObservation
     trocar: rcm.Trocar
     key: np.ndarray | None
 
 
-def inputs(asks: Asks, key_size: int = 2) -> dict[str, Input]:
+def request_arrays(spec: InputSpec, key_size: int = 2) -> dict[str, ArraySpec]:
     """Arrays of a request by name."""
-    moments = (asks.moments, *asks.arms)
+    moments = (spec.moments, *spec.arms)
     found = {
-        "R": Input((*moments, 3, 3), "float32", "measured rotations R_world_tip"),
-        "p": Input((*moments, 3), "float32", "measured tips in the world, m"),
-        "gripper": Input(moments, "float32", "openings of the jaws, -1 closed to 1 open"),
-        "trocar": Input((*asks.arms, 3), "float32", "radius m, polar rad, azimuth rad"),
-        "key": Input((key_size,), "uint32", "of the decision's noise", is_optional=True),
+        "R": ArraySpec((*moments, 3, 3), "float32", "measured rotations R_world_tip"),
+        "p": ArraySpec((*moments, 3), "float32", "measured tips in the world, m"),
+        "gripper": ArraySpec(moments, "float32", "openings of the jaws, -1 closed to 1 open"),
+        "trocar": ArraySpec((*spec.arms, 3), "float32", "radius m, polar rad, azimuth rad"),
+        "key": ArraySpec((key_size,), "uint32", "of the decision's noise", is_optional=True),
     }
-    side = asks.image_size
-    for name in asks.cameras:
-        shape = (asks.moments, side, side, 3)
-        found[image_field(asks, name)] = Input(shape, "uint8", f"RGB of {name}")
-    if not asks.cameras:
-        found["state"] = Input((asks.moments, asks.state_size), "float32", "the task's fields")
+    side = spec.image_size
+    for name in spec.cameras:
+        shape = (spec.moments, side, side, 3)
+        found[image_field(spec, name)] = ArraySpec(shape, "uint8", f"RGB of {name}")
+    if not spec.cameras:
+        found["state"] = ArraySpec((spec.moments, spec.state_size), "float32", "the task's fields")
     return found
 
 
-def image_field(asks: Asks, camera: str) -> str:
+def image_field(spec: InputSpec, camera: str) -> str:
     """Name of a camera's images in a request."""
-    return "image" if len(asks.cameras) == 1 else f"image/{camera}"
+    return "image" if len(spec.cameras) == 1 else f"image/{camera}"
 
 
-def most_bytes(asks: Asks) -> int:
+def max_request_bytes(spec: InputSpec) -> int:
     """The largest frame that can be a request: all numbers as float64."""
     sizes = (
         math.prod(x.shape) * (1 if x.dtype == "uint8" else 8) + len(name)
-        for name, x in inputs(asks).items()
+        for name, x in request_arrays(spec).items()
     )
     return sum(sizes) + _OVERHEAD
 
@@ -116,10 +116,13 @@ def unpack(frame: Any) -> Any:
         raise UsageError("frame", "msgpack as openpi's client writes it", got) from None
 
 
-def request(
-    asks: Asks, observation: Observation, trocar: rcm.Trocar, key: np.ndarray | None = None
+def encode_request(
+    spec: InputSpec,
+    observation: RobotObservation,
+    trocar: rcm.Trocar,
+    key: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """Arrays of `inputs`, as a client packs them."""
+    """Arrays of `request_arrays`, as a client packs them."""
     found: dict[str, Any] = {
         "R": np.asarray(observation.pose.R, np.float32),
         "p": np.asarray(observation.pose.p, np.float32),
@@ -127,15 +130,15 @@ def request(
         "trocar": np.stack([np.asarray(field, np.float32) for field in trocar], -1),
     }
     images = observation.images or {}
-    for name in asks.cameras:
+    for name in spec.cameras:
         image = images.get(name) if observation.image is None else observation.image
-        found[image_field(asks, name)] = np.asarray(image)
-    if not asks.cameras:
+        found[image_field(spec, name)] = np.asarray(image)
+    if not spec.cameras:
         found["state"] = np.asarray(observation.state, np.float32)
     return found if key is None else {**found, "key": np.asarray(key, np.uint32)}
 
 
-def read_request(asks: Asks, value: Any, key_size: int = 2) -> Request:
+def decode_request(spec: InputSpec, value: Any, key_size: int = 2) -> Request:
     """Parses a request, every array of its shape and type.
 
     Raises:
@@ -143,13 +146,13 @@ def read_request(asks: Asks, value: Any, key_size: int = 2) -> Request:
     """
     if not isinstance(value, dict):
         raise UsageError("frame", "a map of arrays", type(value).__name__)
-    wanted = inputs(asks, key_size)
+    wanted = request_arrays(spec, key_size)
     for name in value:
         if name not in wanted:
             raise UsageError("frame", f"only {', '.join(wanted)}", repr(name)[:80])
     found = {name: _array(name, said, value.get(name)) for name, said in wanted.items()}
-    names = {name: found.get(image_field(asks, name)) for name in asks.cameras}
-    observation = Observation(
+    names = {name: found.get(image_field(spec, name)) for name in spec.cameras}
+    observation = RobotObservation(
         pose=Pose(found["R"], found["p"]),
         gripper=found["gripper"],
         image=None if len(names) != 1 else found["image"],
@@ -160,7 +163,7 @@ def read_request(asks: Asks, value: Any, key_size: int = 2) -> Request:
     return Request(observation, trocar, found["key"])
 
 
-def answer(command: Command, decided_ms: float) -> dict[str, Any]:
+def encode_reply(command: Command, decided_ms: float) -> dict[str, Any]:
     """Answer to a client, of a command `[H, *arms]` on the host.
 
     Every array begins with H. `actions` `[H, A * 8]` has, of each arm, what `ACTION` names.
@@ -173,7 +176,7 @@ def answer(command: Command, decided_ms: float) -> dict[str, Any]:
     return {**told, "server_timing": {"infer_ms": decided_ms}}
 
 
-def read_answer(asks: Asks, horizon: int, value: Any) -> Command:
+def decode_reply(spec: InputSpec, horizon: int, value: Any) -> Command:
     """The command `[H, *arms]` in an answer.
 
     Raises:
@@ -181,10 +184,10 @@ def read_answer(asks: Asks, horizon: int, value: Any) -> Command:
     """
     if not isinstance(value, Mapping):
         raise UsageError("answer", "a map of arrays", type(value).__name__)
-    steps = (horizon, *asks.arms)
+    steps = (horizon, *spec.arms)
     shapes = {"R": (*steps, 3, 3), "p": (*steps, 3), "gripper": steps}
     found = {
-        name: _array(name, Input(shape, "float32", ""), value.get(name))
+        name: _array(name, ArraySpec(shape, "float32", ""), value.get(name))
         for name, shape in shapes.items()
     }
     for name, array in found.items():
@@ -193,7 +196,7 @@ def read_answer(asks: Asks, horizon: int, value: Any) -> Command:
     return Command(Pose(found["R"], found["p"]), found["gripper"])
 
 
-def _array(name: str, said: Input, value: Any) -> Any:
+def _array(name: str, said: ArraySpec, value: Any) -> Any:
     if value is None and said.is_optional:
         return None
     if not isinstance(value, np.ndarray):

@@ -24,14 +24,14 @@ NEAR_TURN = 0.15  # rad
 MAX_FIRST_MOVE = 0.01  # m
 MAX_FIRST_TURN = 0.3  # rad
 # Of a control step on the way: 3 cm/s, about as fast as demonstrations are half of the time.
-LEAD_MOVE = 0.001  # m
-LEAD_TURN = 0.02  # rad
+APPROACH_MOVE = 0.001  # m
+APPROACH_TURN = 0.02  # rad
 # Share of half the demonstrated range, beyond which a tip lies outside: commands end at the range's
 # edge, and rounding may put a tip that is there a little beyond.
 OUTSIDE = 0.01
 
 
-class First(NamedTuple):
+class StartOffset(NamedTuple):
     """How far a first command is from the measured pose.
 
     Attributes:
@@ -43,12 +43,12 @@ class First(NamedTuple):
     turn: jax.Array
 
 
-def first(now: Pose, command: Pose) -> First:
+def start_offset(now: Pose, command: Pose) -> StartOffset:
     """Compares a command with the measured pose; both `[...]`."""
-    return First(arrays.norm(command.p - now.p), arrays.norm(_turn(now.R, command.R)))
+    return StartOffset(arrays.norm(command.p - now.p), arrays.norm(_turn(now.R, command.R)))
 
 
-def led(
+def with_approach(
     action_space: str,
     stats: normalizer.Normalizer,
     now: Pose,
@@ -68,7 +68,7 @@ def led(
       told: `[B, A]`.
     """
     begin = jax.tree.map(lambda x: x[:, 0], plan)
-    found = first(now, begin.pose)
+    found = start_offset(now, begin.pose)
     is_far = (found.move > NEAR_MOVE) | (found.turn > NEAR_TURN)
     depth, wanted = (rcm.insertion_depth(x, told.p_world_trocar) for x in (now, begin.pose))
     is_led = is_far & (wanted > depth) & _is_unknown(action_space, stats, now, told)
@@ -103,7 +103,7 @@ def _way(now: Pose, begin: Pose, p_world_trocar: jax.Array, steps: int) -> Pose:
     angle = arrays.norm(turn)
     depth, wanted = (rcm.insertion_depth(x, p_world_trocar) for x in (now, begin))
     swing = angle * jnp.maximum(depth, wanted)  # m, at most, of a tip at this depth
-    count = jnp.maximum(angle / LEAD_TURN, (jnp.abs(wanted - depth) + swing) / LEAD_MOVE)
+    count = jnp.maximum(angle / APPROACH_TURN, (jnp.abs(wanted - depth) + swing) / APPROACH_MOVE)
     share = jnp.arange(1, steps + 1, dtype=count.dtype)[:, None] / jnp.maximum(count, 1.0)[:, None]
     share = jnp.minimum(share, 1.0)
     turned = arrays.matmul(R[:, None], _rotation(share[..., None] * turn[:, None]))

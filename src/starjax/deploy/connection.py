@@ -22,26 +22,26 @@ _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
 
 
-class Heard(NamedTuple):
+class Reply(NamedTuple):
     """Outcome of a request.
 
     Attributes:
-      answer: the frame's value; None where there is none.
+      value: the frame's value; None where there is none.
       fault: why there is none, else empty.
       is_lost: whether it was the connection, or time, and not the server that refused it.
     """
 
-    answer: Any
+    value: Any
     fault: str = ""
     is_lost: bool = False
 
 
-class Link:
+class Connection:
     """A connection that is there again and again; one request at a time.
 
     Attributes:
       address: `ws://HOST:PORT`.
-      about: what the server said of itself; one that says something else later is not asked.
+      metadata: what the server said of itself; one that says something else later is not asked.
       fault: why there is no connection now, else empty.
       connections: how often it was made.
     """
@@ -53,12 +53,12 @@ class Link:
           UsageError: there is no such server within `wait_s`, or it refuses the key.
         """
         self.address = address if "://" in address else f"ws://{address}"
-        self.about: dict[str, Any] = {}
+        self.metadata: dict[str, Any] = {}
         self.fault, self.connections = "no server there", 0
         self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else {}
         self._timeout_s = timeout_s
-        self._asked: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self._heard: queue.SimpleQueue[Heard] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
         self._up, self._closing = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, name="starjax-link", daemon=True)
         self._thread.start()
@@ -71,28 +71,28 @@ class Link:
         """Whether a request can be sent now."""
         return self._up.is_set()
 
-    def ask(self, value: dict[str, Any]) -> None:
+    def send(self, value: dict[str, Any]) -> None:
         """Sends a request, where none is under way."""
-        self._asked.put(wire.pack(value))
+        self._requests.put(wire.pack(value))
 
-    def poll(self) -> Heard | None:
+    def poll(self) -> Reply | None:
         """Outcome of the request, None as long as it is not known."""
         try:
-            return self._heard.get_nowait()
+            return self._replies.get_nowait()
         except queue.Empty:
             return None
 
-    def wait(self, seconds: float) -> Heard | None:
+    def wait(self, seconds: float) -> Reply | None:
         """Waits at most `seconds` for what `poll` returns."""
         try:
-            return self._heard.get(timeout=seconds)
+            return self._replies.get(timeout=seconds)
         except queue.Empty:
             return None
 
     def close(self) -> None:
         """Ends the connection and the thread."""
         self._closing.set()
-        self._asked.put(None)
+        self._requests.put(None)
         self._thread.join()
 
     def _work(self) -> None:
@@ -122,41 +122,41 @@ class Link:
         )
 
     def _greeted(self, frame: Any) -> None:
-        about = wire.unpack(frame)
-        if not isinstance(about, dict) or about.get("protocol") != wire.PROTOCOL:
+        metadata = wire.unpack(frame)
+        if not isinstance(metadata, dict) or metadata.get("protocol") != wire.PROTOCOL:
             raise UsageError("address", f"a server of protocol {wire.PROTOCOL}", self.address)
-        if self.about and about.get("digest") != self.about.get("digest"):
+        if self.metadata and metadata.get("digest") != self.metadata.get("digest"):
             raise UsageError("address", "the policy that was there before", "another one")
-        self.about, self.fault = about, ""
+        self.metadata, self.fault = metadata, ""
         self.connections += 1
         self._up.set()
 
     def _talk(self, connection: Any) -> None:
         """Answers requests until the connection breaks, which loses the one under way."""
-        while (frame := self._wanted(connection)) is not None:
+        while (frame := self._next_request(connection)) is not None:
             try:
                 connection.send(frame)
                 answer = connection.recv(self._timeout_s)
             except (OSError, websockets.WebSocketException) as error:
                 self._up.clear()  # before the loss is known: nobody asks a connection that is gone
-                self._heard.put(Heard(None, str(error) or "no answer in time", is_lost=True))
+                self._replies.put(Reply(None, str(error) or "no answer in time", is_lost=True))
                 raise
-            self._heard.put(_read(answer))
+            self._replies.put(_read(answer))
 
-    def _wanted(self, connection: Any) -> bytes | None:
+    def _next_request(self, connection: Any) -> bytes | None:
         """The next request, None at the end; raises where the connection breaks before it."""
         while True:
             try:
-                return self._asked.get(timeout=_LOOK_S)
+                return self._requests.get(timeout=_LOOK_S)
             except queue.Empty:
                 if connection.protocol.state is not websockets.State.OPEN:
                     raise ConnectionError("the server has closed the connection") from None
 
 
-def _read(frame: Any) -> Heard:
+def _read(frame: Any) -> Reply:
     if isinstance(frame, str):
-        return Heard(None, frame)
+        return Reply(None, frame)
     try:
-        return Heard(wire.unpack(frame))
+        return Reply(wire.unpack(frame))
     except UsageError as error:
-        return Heard(None, str(error))
+        return Reply(None, str(error))

@@ -25,7 +25,7 @@ _SKEW = 0.05  # of R'R from the identity: what rounding and calibration leave is
 
 
 @flax.struct.dataclass
-class Observation:
+class RobotObservation:
     """Measurements of one robot at the last O moments, oldest first; B robots' fields begin with B.
 
     Attributes:
@@ -43,8 +43,8 @@ class Observation:
     state: Any = None
 
 
-class Asks(NamedTuple):
-    """Inputs that a policy asks for.
+class InputSpec(NamedTuple):
+    """Shapes of the inputs of a policy.
 
     Attributes:
       moments: O.
@@ -65,7 +65,9 @@ class Asks(NamedTuple):
     state_size: int
 
 
-def given(asks: Asks, observation: Any, trocar: Any) -> tuple[types.Observation, rcm.Trocar]:
+def validate(
+    spec: InputSpec, observation: Any, trocar: Any
+) -> tuple[types.Observation, rcm.Trocar]:
     """Checked inputs as arrays, and the trocars `[*robots, *arms]`.
 
     Raises:
@@ -78,57 +80,57 @@ def given(asks: Asks, observation: Any, trocar: Any) -> tuple[types.Observation,
     if farthest > FARTHEST:
         raise UsageError("trocar.radius", f"at most {FARTHEST} m", f"{farthest:g}")
     trocar = rcm.Trocar(*map(_array, trocar))  # within a program a traced one
-    if not isinstance(observation, Observation):
+    if not isinstance(observation, RobotObservation):
         raise UsageError("observation", "a deploy.Observation", type(observation).__name__)
     pose = (None, None) if observation.pose is None else observation.pose
     if not (isinstance(pose, tuple | list) and len(pose) == 2):
         raise UsageError("observation.pose", "a deploy.Pose", type(pose).__name__)
     seen = types.Observation(Pose(*map(_array, pose)), _array(observation.gripper))
-    if asks.cameras:
-        seen = seen._replace(images={name: _image(observation, name) for name in asks.cameras})
+    if spec.cameras:
+        seen = seen._replace(images={name: _image(observation, name) for name in spec.cameras})
     else:
         seen = seen._replace(state=_array(observation.state))
-    robots = _robots(asks, seen, trocar)
-    _check_shapes(asks, seen, robots)
-    trocar = rcm.Trocar(*(_broadcast(field, (*robots, *asks.arms)) for field in trocar))
-    _check_values(asks, seen, trocar, len(robots))
+    robots = _robots(spec, seen, trocar)
+    _check_shapes(spec, seen, robots)
+    trocar = rcm.Trocar(*(_broadcast(field, (*robots, *spec.arms)) for field in trocar))
+    _check_values(spec, seen, trocar, len(robots))
     return seen, trocar
 
 
-def _image(observation: Observation, camera: str) -> Any:
+def _image(observation: RobotObservation, camera: str) -> Any:
     images = observation.images if observation.image is None else {camera: observation.image}
     return _array((images or {}).get(camera))
 
 
-def _robots(asks: Asks, seen: types.Observation, trocar: rcm.Trocar) -> tuple[int, ...]:
+def _robots(spec: InputSpec, seen: types.Observation, trocar: rcm.Trocar) -> tuple[int, ...]:
     """`()` of one robot, `(B,)` of several."""
     shape = jnp.broadcast_shapes(*map(np.shape, trocar))
-    one = list(asks.arms)
+    one = list(spec.arms)
     try:
-        whole = jnp.broadcast_shapes(shape, asks.arms)
+        whole = jnp.broadcast_shapes(shape, spec.arms)
     except ValueError:
         whole = None
-    robots = None if whole is None else whole[: len(whole) - len(asks.arms)]
+    robots = None if whole is None else whole[: len(whole) - len(spec.arms)]
     if robots is None or len(robots) > 1 or robots == (0,):
         several = f"[{', '.join(['B', *map(str, one)])}]"
         raise UsageError("trocar", f"fields of shape {one} or {several}", list(shape))
-    several = np.shape(seen.pose.p)[: -2 - len(asks.arms)]
+    several = np.shape(seen.pose.p)[: -2 - len(spec.arms)]
     return robots or (several if len(several) == 1 else ())
 
 
-def _check_shapes(asks: Asks, seen: types.Observation, robots: tuple[int, ...]) -> None:
-    moments = (*robots, asks.moments)
-    of_arms = (*moments, *asks.arms)
+def _check_shapes(spec: InputSpec, seen: types.Observation, robots: tuple[int, ...]) -> None:
+    moments = (*robots, spec.moments)
+    of_arms = (*moments, *spec.arms)
     expected: dict[str, tuple[Any, tuple[int, ...]]] = {
         "pose.R": (seen.pose.R, (*of_arms, 3, 3)),
         "pose.p": (seen.pose.p, (*of_arms, 3)),
         "gripper": (seen.gripper, of_arms),
     }
-    images = {_image_field(asks, name): image for name, image in (seen.images or {}).items()}
-    size = (*moments, asks.image_size, asks.image_size, 3)
+    images = {_image_field(spec, name): image for name, image in (seen.images or {}).items()}
+    size = (*moments, spec.image_size, spec.image_size, 3)
     expected |= {name: (image, size) for name, image in images.items()}
-    if not asks.cameras:
-        expected["state"] = (seen.state, (*moments, asks.state_size))
+    if not spec.cameras:
+        expected["state"] = (seen.state, (*moments, spec.state_size))
     for name, (value, shape) in expected.items():
         if value is None or np.shape(value) != shape:
             got = "none" if value is None else list(np.shape(value))
@@ -138,11 +140,13 @@ def _check_shapes(asks: Asks, seen: types.Observation, robots: tuple[int, ...]) 
             raise UsageError(f"observation.{name}", wanted, value.dtype)
 
 
-def _image_field(asks: Asks, camera: str) -> str:
-    return "image" if len(asks.cameras) == 1 else f"images[{camera!r}]"
+def _image_field(spec: InputSpec, camera: str) -> str:
+    return "image" if len(spec.cameras) == 1 else f"images[{camera!r}]"
 
 
-def _check_values(asks: Asks, seen: types.Observation, trocar: rcm.Trocar, leading: int) -> None:
+def _check_values(
+    spec: InputSpec, seen: types.Observation, trocar: rcm.Trocar, leading: int
+) -> None:
     """Raises UsageError for what no robot measures: a policy would plan on from there."""
     found = {"pose.R": seen.pose.R, "pose.p": seen.pose.p, "gripper": seen.gripper}
     known = {
@@ -158,16 +162,16 @@ def _check_values(asks: Asks, seen: types.Observation, trocar: rcm.Trocar, leadi
         if off > _SKEW or (np.linalg.det(R) < 0).any():
             raise UsageError("observation.pose.R", "rotations", f"one off by {off:.2g}")
     if (p := known.get("pose.p")) is not None:
-        far = np.linalg.norm(p - asks.p_world_ref, axis=-1).max()
+        far = np.linalg.norm(p - spec.p_world_ref, axis=-1).max()
         if far > FARTHEST:
-            expected = f"tips within {FARTHEST} m of the nominal trocar {asks.p_world_ref.tolist()}"
+            expected = f"tips within {FARTHEST} m of the nominal trocar {spec.p_world_ref.tolist()}"
             raise UsageError("observation.pose.p", expected, f"one {far:.3g} m away")
     if (gripper := known.get("gripper")) is not None and np.abs(gripper).max() > _WIDEST:
         worst = gripper.flat[np.abs(gripper).argmax()]
         expected = "numbers from -1 (closed) to 1 (open)"
         raise UsageError("observation.gripper", expected, f"{worst:.3g}")
-    if asks.keeps_to_manifold and not any(map(is_traced, (*seen.pose, *trocar))):
-        off, depth = map(float, _through(seen.pose, trocar, asks.p_world_ref, leading))
+    if spec.keeps_to_manifold and not any(map(is_traced, (*seen.pose, *trocar))):
+        off, depth = map(float, _through(seen.pose, trocar, spec.p_world_ref, leading))
         if off > FARTHEST_OFF:
             got = f"an axis that misses it by {1e3 * off:.0f} mm"
             raise UsageError("observation.pose", "tools through the trocar", got)

@@ -76,7 +76,7 @@ class Report:
     latencies: list[int] = dataclasses.field(default_factory=list)
 
 
-class Follower:
+class PlanExecutor:
     """One robot's plan, and where it is in it.
 
     Attributes:
@@ -133,7 +133,7 @@ class Follower:
         return min(most, max(self._latencies, default=most) + _SPARE)
 
     @property
-    def is_due(self) -> bool:
+    def needs_plan(self) -> bool:
         """Whether a plan should be asked for now."""
         is_near = self._plan is None or self._until - self._index <= self.ahead
         return is_near and self._next is None and not self._is_asked
@@ -144,23 +144,23 @@ class Follower:
         is_beyond = self._index >= self._until
         return is_beyond and self._moved >= self.horizon - self.execute
 
-    def asked(self) -> None:
+    def on_request(self) -> None:
         """A plan has been asked for."""
         self._is_asked, self._moved, self._waited = True, 0, 0
 
-    def refused(self, fault: str, is_lost: bool = False) -> None:
+    def on_failure(self, fault: str, is_lost: bool = False) -> None:
         """There will be no answer."""
         self._is_asked = False
         self.report.fault = fault
         self.report.lost += is_lost
         self.report.refused += not is_lost
 
-    def answered(self, plan: Command) -> None:
+    def on_plan(self, plan: Command) -> None:
         """The plan that was asked for, `[H, *arms]`; what is off the RCM manifold is refused."""
         off, depth, skew = map(float, _worst(plan.pose, self._p_world_trocar))
         if not (off <= MAX_OFF and depth > 0.0 and skew <= 1e-3):
             said = f"{1e3 * off:.3g} mm from the trocar, {1e3 * depth:.3g} mm beyond it"
-            return self.refused(f"plan: expected one on the RCM manifold, got axes {said}")
+            return self.on_failure(f"plan: expected one on the RCM manifold, got axes {said}")
         self._is_asked, self._next = False, plan
         self._latencies.append(self._waited)
         self.report.latencies.append(self._waited)

@@ -9,7 +9,7 @@ import pytest
 
 from starjax import deploy, rcm
 from starjax.data import normalizer
-from starjax.deploy import start
+from starjax.deploy import approach
 from starjax.errors import UsageError
 
 RNG = np.random.default_rng(0)
@@ -26,7 +26,9 @@ def unled():
     """The same, whose plans are its own, however far they begin."""
     policy = deploy.load("compact", ddim_steps=2, max_first_move=np.inf, max_first_turn=np.inf)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(start, "led", lambda action_space, stats, now, plan, told: plan)
+        patched.setattr(
+            approach, "with_approach", lambda action_space, stats, now, plan, told: plan
+        )
         pose, trocar = tool(policy, [0.0, 0.0, 0.03])
         policy(jax.random.key(0), seen(pose), trocar)  # compiles it so
     return policy
@@ -80,7 +82,7 @@ def test_a_plan_that_begins_near_the_tool_is_the_policys_own(compact, unled):
     pose, trocar = tool(compact, [0.0, 0.0, 0.03])
     plans = [policy(jax.random.key(0), seen(pose), trocar) for policy in (compact, unled)]
     jax.tree.map(np.testing.assert_array_equal, *plans)
-    assert np.linalg.norm(plans[0].pose.p[0] - pose.p) < start.MAX_FIRST_MOVE
+    assert np.linalg.norm(plans[0].pose.p[0] - pose.p) < approach.MAX_FIRST_MOVE
 
 
 @pytest.mark.parametrize(
@@ -121,14 +123,14 @@ def test_from_a_tip_just_within_the_trocar_commands_lead_there_gradually(
         is_own = np.array_equal(plan.pose.p, wanted.pose.p)
         assert rcm.rcm_error(plan.pose, P_WORLD_TROCAR).max() < 1e-6
         if is_own:
-            assert np.linalg.norm(plan.pose.p[0] - pose.p) <= start.NEAR_MOVE
+            assert np.linalg.norm(plan.pose.p[0] - pose.p) <= approach.NEAR_MOVE
             break
         positions = np.concatenate([pose.p[None], plan.pose.p])
         moves = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
         rotations = np.concatenate([pose.R[None], plan.pose.R])
         shallow = decision == 0 and depth < rcm.MIN_DEPTH  # no command is shallower
-        assert moves.max() <= (rcm.MIN_DEPTH if shallow else start.LEAD_MOVE + 1e-6)
-        assert turns(rotations[:-1], rotations[1:]).max() <= start.LEAD_TURN + 1e-4
+        assert moves.max() <= (rcm.MIN_DEPTH if shallow else approach.APPROACH_MOVE + 1e-6)
+        assert turns(rotations[:-1], rotations[1:]).max() <= approach.APPROACH_TURN + 1e-4
         pose = jax.tree.map(lambda x: x[compact.settings.execute - 1], plan.pose)
     assert is_own and decision > 2
 
@@ -138,7 +140,7 @@ def test_within_a_program_it_leads_too(compact):
     wanted = compact(jax.random.key(0), seen(pose), trocar)
     got = jax.jit(compact)(jax.random.key(0), *jax.tree.map(jnp.asarray, (seen(pose), trocar)))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), got, wanted)
-    assert np.linalg.norm(got.pose.p[0] - pose.p) <= start.LEAD_MOVE + 1e-6
+    assert np.linalg.norm(got.pose.p[0] - pose.p) <= approach.APPROACH_MOVE + 1e-6
 
 
 def test_a_tip_aside_of_the_demonstrated_ones_is_not_led(compact):
@@ -161,7 +163,7 @@ def test_a_tip_at_the_edge_of_the_demonstrated_ones_is_known(beyond, unknown):
     )
     now = jax.tree.map(lambda x: jnp.asarray(x)[None, None], pose)
     told = jax.tree.map(lambda x: jnp.asarray(x)[None, None], told)
-    assert bool(start._is_unknown("rcm4", stats, now, told).all()) is unknown
+    assert bool(approach._is_unknown("rcm4", stats, now, told).all()) is unknown
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 1.0, np.pi - 1e-3, np.pi])
@@ -173,11 +175,11 @@ def test_a_way_is_straight_and_ends_at_the_command(angle):
     R = np.asarray(rcm.rot6d_decode(RNG.normal(size=(1, 1, 6))))
     p = np.zeros((1, 1, 3), np.float32)
     now, begin = (rcm.pose_at_depth(np.float32(x), d, p) for x, d in ((R, 0.01), (R @ turn, 0.1)))
-    way = start._way(now, begin, p, 2000)
+    way = approach._way(now, begin, p, 2000)
     assert np.abs(way.p[:, -1] - begin.p).max() < 1e-5
     if angle < np.pi:  # there two ways are as short
         assert turns(way.R[:, -1], begin.R).max() < 2e-3
     steps = np.diff(np.concatenate([now.p[:, None], way.p], axis=1), axis=1)
-    assert np.linalg.norm(steps, axis=-1).max() <= start.LEAD_MOVE + 1e-6
-    assert turns(way.R[:, :-1], way.R[:, 1:]).max() <= start.LEAD_TURN + 1e-4
+    assert np.linalg.norm(steps, axis=-1).max() <= approach.APPROACH_MOVE + 1e-6
+    assert turns(way.R[:, :-1], way.R[:, 1:]).max() <= approach.APPROACH_TURN + 1e-4
     assert rcm.rcm_error(way, p[:, None]).max() < 1e-6
