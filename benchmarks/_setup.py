@@ -18,7 +18,7 @@ from starjax.policies import policy as policies
 from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.sim import registry
 from starjax.training import devices, state, step
-from starjax.training.sharding import StepCarry, StateLayout
+from starjax.training.sharding import StateLayout, StepCarry
 from starjax.types import Command, Observation, Pose
 
 TASK = registry.tasks.get("peg_transfer")

@@ -18,7 +18,7 @@ from starjax.runtime import background, processes, progress
 from starjax.sim.tasks.base import Task
 from starjax.training import checkpoint, devices, encoder, holdout, log, metrics, stepper
 from starjax.training import state as states
-from starjax.training.sharding import StepCarry, StateLayout
+from starjax.training.sharding import StateLayout, StepCarry
 from starjax.training.step import Setup
 from starjax.training.stepper import Stepper
 

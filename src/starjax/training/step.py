@@ -13,7 +13,7 @@ from starjax.policies.base import Policy
 from starjax.rcm import arrays
 from starjax.training import devices
 from starjax.training import state as states
-from starjax.training.sharding import StepCarry, StateLayout
+from starjax.training.sharding import StateLayout, StepCarry
 
 
 class Setup(NamedTuple):

@@ -12,7 +12,7 @@ from starjax.data import windows
 from starjax.runtime import background, garbage, processes
 from starjax.training import devices, prefetch
 from starjax.training import step as steps
-from starjax.training.sharding import StepCarry, StateLayout
+from starjax.training.sharding import StateLayout, StepCarry
 from starjax.training.state import TrainState
 from starjax.training.step import Setup
 
