@@ -25,9 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.commands import policy_evaluation
 from starjax.evaluation import evaluate, latency
-from starjax.policies import features, packaged
+from starjax.policies import features, in_env, packaged
 from starjax.rollouts import agent, engine, episodes, workers
 from starjax.sim import env as envs
 from starjax.types import Command
@@ -112,7 +111,8 @@ def subject(asked: argparse.Namespace):
     """Environment, policy, parameters, statistics and settings: of a trained policy, or of a new
     one of the right size."""
     if asked.policy:
-        who = policy_evaluation.from_file(packaged.find("--policy", asked.policy))
+        file = packaged.find("--policy", asked.policy)
+        who = in_env.load(file, in_env.read(file))
         trained = jax.device_put((who.trained.params, who.trained.normalizer))
         return who.env, who.policy, *trained, who.trained.policy
     case = _setup.paper(224) if _peer.platform() == "gpu" else _setup.small(1, asked.image)

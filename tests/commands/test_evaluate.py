@@ -25,7 +25,7 @@ from starjax.commands import (
 )
 from starjax.data import normalizer
 from starjax.evaluation import sweep as sweeping
-from starjax.policies import packaged, policy_file
+from starjax.policies import in_env, packaged, policy_file
 from starjax.report import video
 from starjax.runtime import files, gpu
 from starjax.sim import exercise as exercising
@@ -44,8 +44,8 @@ def file(tmp_path, monkeypatch):
 
     policy = types.SimpleNamespace(sample=sample, for_sampling=lambda params: params)
 
-    monkeypatch.setattr(policy_evaluation.sim_env, "make", lambda *_, **__: stubs.make_env())
-    monkeypatch.setattr(policy_evaluation.policies, "make", lambda *_, **__: policy)
+    monkeypatch.setattr(in_env.sim_env, "make", lambda *_, **__: stubs.make_env())
+    monkeypatch.setattr(in_env.policies, "make", lambda *_, **__: policy)
     monkeypatch.setattr(video, "record", lambda runs, path: path)
     monkeypatch.chdir(tmp_path)
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
@@ -224,9 +224,9 @@ def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
         policy_evaluation.evaluate, "evaluate", lambda *args, **given: said.update(given, args=args)
     )
     policy = dataclasses.replace(POLICY, obs_horizon=3, crop_fraction=0.5)
-    trained = types.SimpleNamespace(policy=policy, params=None, normalizer=None)
+    trained = fakes.trained(method="stardiff", policy=policy, params=None, normalizer=None)
     policy = types.SimpleNamespace(sample=None)
-    who = types.SimpleNamespace(method="stardiff", env=None, policy=policy, trained=trained)
+    who = in_env.PolicyInEnv(trained, policy, None, "")
     flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
     policy_evaluation.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
     _, _, planner, _, _, settings = said["args"]
@@ -356,9 +356,9 @@ def test_distances_of_a_sweep_are_to_the_trocars_of_the_weights(file):
 
 
 def test_another_arm_is_another_evaluation(file, monkeypatch):
-    asked, made = [], policy_evaluation.sim_env.make
+    asked, made = [], in_env.sim_env.make
     monkeypatch.setattr(
-        policy_evaluation.sim_env, "make", lambda *a, **k: asked.append(a[1]) or made(*a, **k)
+        in_env.sim_env, "make", lambda *a, **k: asked.append(tuple(a[1])) or made(*a, **k)
     )
     assert score() == 0 and score("--arm", "ur5e") == 0
     assert asked == [("fr5",), ("ur5e",)]

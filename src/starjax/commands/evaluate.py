@@ -50,7 +50,12 @@ def main(argv: Sequence[str]) -> int:
 
     who, config = policy_args.load(named, chosen.arm)
     scene = scenes.settings(who.env.names)
-    changed = {"method": who.method, "out": str(folder), "scene": scene, "eval": chosen.eval}
+    changed = {
+        "method": who.trained.method,
+        "out": str(folder),
+        "scene": scene,
+        "eval": chosen.eval,
+    }
     config = dataclasses.replace(config, **changed)
     about = messages.about(config, chosen.policy or chosen.run, chosen.seed)
     with sharing.shared(folder) as share, messages.first_process_only(share.is_first):
@@ -159,5 +164,5 @@ def _film(folder: Path, who: Any) -> str:
         path = video.record([results.load(folder)], folder / "rollout.mp4")
     except (OSError, RuntimeError) as error:  # the encoder is a program of its own
         return f"no video: {error}"
-    method = methods.METHODS[who.method].label
+    method = methods.METHODS[who.trained.method].label
     return f"video: {path}" if path else f"no video: no trial of {method} was recorded"

@@ -82,14 +82,7 @@ def _environment(config: config_lib.RunConfig) -> Any:
     # Here and below, what brings jax is imported where it is used, after XLA has been prepared.
     from starjax.sim import env
 
-    return env.make(
-        config.scene.task,
-        config.scene.arm,
-        config.scene.tool,
-        observation=config.policy.observation,
-        image_size=config.policy.image_size,
-        cameras=config.scene.camera,
-    )
+    return env.for_policy(scenes.names(config.scene), config.policy)
 
 
 def _train(

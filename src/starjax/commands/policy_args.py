@@ -60,12 +60,13 @@ def load(named: PolicyPath, arms: tuple[str, ...]) -> tuple[Any, config_lib.RunC
       arms: robots instead of those that it was trained with.
 
     Returns:
-      `policy_evaluation.PolicyInEnv`, and the known settings of the run that it comes from.
+      `in_env.PolicyInEnv`, and the known settings of the run that it comes from.
     """
     from starjax.commands import policy_evaluation  # it imports jax
+    from starjax.policies import in_env
 
     if named.run is None:
-        who = policy_evaluation.from_file(named.file, arms)
+        who = in_env.load(named.file, in_env.read(named.file), arms=arms)
         return who, _settings(who.trained)
     config = folders.read_config(named.run)
     who = policy_evaluation.load(named.run.name, named.file, arms=arms)

@@ -16,29 +16,11 @@ from starjax.data import normalizer
 from starjax.evaluation import evaluate, latency, statistics
 from starjax.evaluation import result as results
 from starjax.evaluation import trials as table
-from starjax.policies import features, policy_file
+from starjax.policies import features, in_env
 from starjax.policies import policy as policies
-from starjax.rollouts import agent, engine, ensemble, placement
-from starjax.runtime import files
-from starjax.sim import env as sim_env
-
-
-class PolicyInEnv(NamedTuple):
-    """A method with its weights, in its environment.
-
-    Attributes:
-      method: its name.
-      env: with the observation that it was trained on.
-      policy: its functions.
-      trained: its weights, rounded as `sample` would, and what they were trained with.
-      weights: SHA-256 of their file.
-    """
-
-    method: str
-    env: sim_env.Env
-    policy: policies.Policy
-    trained: policy_file.Trained
-    weights: str
+from starjax.policies.in_env import PolicyInEnv
+from starjax.rollouts import engine, placement
+from starjax.sim.state import Env
 
 
 class Programs(NamedTuple):
@@ -54,15 +36,15 @@ class Programs(NamedTuple):
 
 
 def load(
-    method: str, weights: Path, env: sim_env.Env | None = None, arms: Sequence[str] = ()
+    method: str, weights: Path, env: Env | None = None, arms: Sequence[str] = ()
 ) -> PolicyInEnv:
-    """Loads a method's weights.
+    """Loads a method's weights from the directory of its run.
 
     Args:
       method: a row of `methods.METHODS`.
       weights: policy.safetensors.
-      env: built from what the weights were trained on unless given.
-      arms: robots of that env instead of those that they were trained with.
+      env: the environment, if it is built already.
+      arms: robots instead of those of the training.
 
     Raises:
       errors.UsageError: the file is missing or damaged.
@@ -70,48 +52,8 @@ def load(
     again = f"starjax run with its flags and --out {shlex.quote(str(weights.parent.parent))}"
     if not weights.exists():
         raise errors.UsageError(str(weights), "trained weights", "none", f"{again} trains them")
-    try:
-        trained = policy_file.load(weights)
-    except ValueError as error:
-        hint = f"remove it, and {again} trains it again"
-        raise errors.UsageError(str(weights), "a policy of starjax", error, hint) from error
-    return _load(method, trained, weights, env, arms)
-
-
-def from_file(path: Path, arms: Sequence[str] = ()) -> PolicyInEnv:
-    """Loads a policy that says itself which method it is; `arms` as in `load`.
-
-    Raises:
-      errors.UsageError: the file is damaged, or not a policy of this version.
-    """
-    try:
-        trained = policy_file.load(path)
-    except ValueError as error:
-        raise errors.UsageError("--policy", "a policy of starjax", error) from error
-    errors.choice(f"method of {path}", trained.method, methods.METHODS)
-    return _load(trained.method, trained, path, None, arms)
-
-
-def _load(
-    method: str,
-    trained: policy_file.Trained,
-    file: Path,
-    env: sim_env.Env | None,
-    arms: Sequence[str],
-) -> PolicyInEnv:
-    scene = trained.scene
-    env = env or sim_env.make(
-        scene.task,
-        arms or scene.arms,
-        scene.tools,
-        observation=trained.policy.observation,
-        image_size=trained.policy.image_size,
-        cameras=scene.cameras,
-    )
-    row = methods.METHODS[method]
-    policy = policies.make(row, trained.policy, env.task, cameras=scene.cameras)
-    ready = trained._replace(params=policy.for_sampling(trained.params))
-    return PolicyInEnv(method, env, policy, ready, files.sha256(file))
+    trained = in_env.read(weights, str(weights), f"remove it, and {again} trains it again")
+    return in_env.load(weights, trained, method=method, arms=arms, env=env)
 
 
 def rollouts(
@@ -131,13 +73,13 @@ def rollouts(
     return evaluate.evaluate(
         directory,
         who.env,
-        _planner(who.method, who.policy, trained.policy, settings.ensemble),
+        who.agent(settings.ensemble),
         (trained.params, trained.normalizer),
         trocars,
         _settings(settings, seed),
         layout=placement.DeviceLayout(devices=placement.devices()),
         identity={
-            **methods.behaviour(who.method)._asdict(),
+            **methods.behaviour(who.trained.method)._asdict(),
             "policy": config_lib.as_json(trained.policy),
         },
         levels=levels,
@@ -147,7 +89,7 @@ def rollouts(
 
 
 def compile_ahead(
-    name: str, config: config_lib.RunConfig, env: sim_env.Env, vision: policies.Params | None
+    name: str, config: config_lib.RunConfig, env: Env, vision: policies.Params | None
 ) -> Programs:
     """Compiles what `rollouts` and `write_result` will run of a method that is not trained yet.
 
@@ -167,25 +109,13 @@ def compile_ahead(
     stats = normalizer.shapes(told, env.task, config.policy.observation == "state")
     trials = evaluate.compile_ahead(
         env,
-        _planner(name, policy, config.policy, config.eval.ensemble),
+        in_env.batch_agent(name, policy, config.policy, config.eval.ensemble),
         (params, stats),
         env.task.trocars,
         _settings(config.eval, config.seed),
     )
     seen = features.sensors(env.task, env.names.cameras)
     return Programs(trials, latency.compile_ahead(policy, deciding, params, stats, seen))
-
-
-def _planner(
-    method: str,
-    policy: policies.Policy,
-    policy_config: config_lib.PolicyConfig,
-    averages: bool,
-) -> agent.BatchAgent:
-    if averages:
-        keeps = methods.METHODS[method].keeps_to_manifold
-        return ensemble.from_policy(policy.sample, policy_config.obs_horizon, keeps)
-    return agent.from_policy(policy.sample, policy_config.obs_horizon, policy_config.execute)
 
 
 def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.Settings:
@@ -249,7 +179,7 @@ def write_result(
     is_seen = task.is_seen & (np.arange(len(task.is_seen)) < config.demos.seen_trocars)
     observation = who.trained.policy.observation
     figures = statistics.compose(
-        trials, is_seen, method=who.method, observation=observation, seed=seed
+        trials, is_seen, method=who.trained.method, observation=observation, seed=seed
     )
     about = {
         "control_hz": who.env.control_hz,

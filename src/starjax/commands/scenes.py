@@ -16,22 +16,19 @@ def settings(names: SceneNames) -> config_lib.SceneConfig:
     )
 
 
-def disturbable(env: Any, names: Sequence[str], policy: config_lib.PolicyConfig) -> Any:
+def names(scene: config_lib.SceneConfig) -> SceneNames:
+    """Returns the names of a scene whose settings are complete, see `resolved`."""
+    return SceneNames(scene.task, scene.arm, scene.tool, scene.camera)
+
+
+def disturbable(env: Any, disturbances: Sequence[str], policy: config_lib.PolicyConfig) -> Any:
     """The environment, with cameras that may move if one of these disturbances moves them."""
     from starjax.evaluation.disturbances import DISTURBANCES
     from starjax.sim import env as sim_env
 
-    if not any(DISTURBANCES.get(name).moves_cameras for name in names):
+    if not any(DISTURBANCES.get(name).moves_cameras for name in disturbances):
         return env
-    return sim_env.make(
-        env.names.task,
-        env.names.arms,
-        env.names.tools,
-        observation=policy.observation,
-        image_size=policy.image_size,
-        cameras=env.names.cameras,
-        moving_cameras=True,
-    )
+    return sim_env.for_policy(env.names, policy, moving_cameras=True)
 
 
 def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
@@ -44,9 +41,9 @@ def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
     from starjax.sim import endoscope, registry, scene
 
     asked, demos = config.scene, config.demos
-    names = scene.name(asked.task, asked.arm, asked.tool, asked.camera)
-    task = registry.tasks.get(names.task)
-    if config.policy.frame == "camera" and endoscope.of(task, names.cameras) is None:
+    full = scene.name(asked.task, asked.arm, asked.tool, asked.camera)
+    task = registry.tasks.get(full.task)
+    if config.policy.frame == "camera" and endoscope.of(task, full.cameras) is None:
         hint = f"--camera {endoscope.NAME}" if task.endoscope else "other tasks have one"
         raise errors.UsageError("policy.frame", "world, without an endoscope", "camera", hint)
     most = int(task.is_seen.sum())
@@ -55,5 +52,5 @@ def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
         raise errors.UsageError("demos.seen_trocars", f"1 to {most}", demos.seen_trocars)
     seen = min(demos.seen_trocars, most)
     return dataclasses.replace(
-        config, scene=settings(names), demos=dataclasses.replace(demos, seen_trocars=seen)
+        config, scene=settings(full), demos=dataclasses.replace(demos, seen_trocars=seen)
     )

@@ -72,6 +72,7 @@ def _score(
     from starjax.commands import policy_evaluation
     from starjax.evaluation import evaluate
     from starjax.rollouts import agent
+    from starjax.sim import env as sim_env
     from starjax.sim import exercise
     from starjax.sim.tasks.peg_transfer_bimanual.six import LIMIT_S
     from starjax.sim.tasks.peg_transfer_bimanual.six import TASK as task
@@ -94,17 +95,11 @@ def _score(
     names = who.env.names
     if names.task != TASK:
         raise errors.UsageError("RUN or --policy", f"one trained for {TASK}", f"of {names.task}")
-    env = exercise.make(
-        names.arms,
-        names.tools,
-        observation=who.trained.policy.observation,
-        image_size=who.trained.policy.image_size,
-        cameras=names.cameras,
-    )
+    env = exercise.of(sim_env.for_policy(names, who.trained.policy, variant=task))
     trials = config_lib.EvalConfig(trials=chosen.trials, time_limit_s=LIMIT_S, video_trials=0)
     subject = who._replace(env=env)
     table = policy_evaluation.rollouts(folder, subject, task.trocars, trials, chosen.seed)
-    return table, env, {"method": who.method, "weights": who.weights}
+    return table, env, {"method": who.trained.method, "weights": who.weights}
 
 
 def _outcome(figures: dict[str, Any]) -> str:

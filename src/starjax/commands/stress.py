@@ -157,7 +157,7 @@ def _content(
 
     return {
         "scene": who.env.names._asdict(),
-        "method": who.method,
+        "method": who.trained.method,
         "weights": who.weights,
         "seed": chosen.seed,
         "trials_at_each_trocar": chosen.eval.trials,

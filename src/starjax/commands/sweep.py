@@ -86,7 +86,7 @@ def main(argv: Sequence[str]) -> int:
     seen = trocars.select(task.trocars, slice(config.demos.seen_trocars))
     figures = sweep.compose(table, seen, who.env.p_world_ref, seed=chosen.seed)
     about = {
-        "method": who.method,
+        "method": who.trained.method,
         "observation": who.trained.policy.observation,
         "command": options.typed("sweep", argv),
         "weights": who.weights,

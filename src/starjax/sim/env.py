@@ -7,20 +7,22 @@ It takes poses and knows no method, no task and no robot by name. What varies pe
 import functools
 import numbers
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from starjax import errors, rcm
-from starjax.config import DEFAULT_TASK
+from starjax.config import DEFAULT_TASK, PolicyConfig
 from starjax.sim import cameras as views
 from starjax.sim import collision, endoscope, ik, motion, physics, render
 from starjax.sim import scene as scenes
+from starjax.sim.names import SceneNames
 from starjax.sim.state import Env, EnvParams, EnvState
 from starjax.sim.tasks.base import CONTROL_HZ, Task, Views
 from starjax.types import Command, Observation, Pose
 
-__all__ = ["CONTROL_HZ", "Env", "EnvParams", "EnvState", "make"]
+__all__ = ["CONTROL_HZ", "Env", "EnvParams", "EnvState", "for_policy", "make"]
 
 RESET_IK_ITERATIONS = 40
 # Energy (J) of the contact solver's error beyond which a step counts as diverged: it moves an arm's
@@ -101,6 +103,28 @@ def make(
         names=scene.names,
         p_world_ref=scene.p_world_ref,
         control_hz=CONTROL_HZ,
+    )
+
+
+def for_policy(
+    scene: SceneNames, policy: PolicyConfig, arms: Sequence[str] = (), **options: Any
+) -> Env:
+    """Builds the environment of a scene with the observation of a policy.
+
+    Args:
+      scene: names of the task, arms, tools and cameras.
+      policy: settings of the observation: its kind and image size.
+      arms: robots instead of the scene's, unless empty.
+      options: further arguments of `make`.
+    """
+    return make(
+        scene.task,
+        arms or scene.arms,
+        scene.tools,
+        observation=policy.observation,
+        image_size=policy.image_size,
+        cameras=scene.cameras,
+        **options,
     )
 
 

@@ -1,11 +1,10 @@
 """Who acts in the view: a scripted expert or a trained policy, by name."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from starjax import errors, methods
-from starjax.policies import packaged, policy_file
-from starjax.policies import policy as policies
+from starjax import methods
+from starjax.policies import in_env, packaged
 from starjax.rollouts import agent
 from starjax.sim import env as sim_env
 from starjax.sim import registry
@@ -43,7 +42,7 @@ def from_file(file: Path, name: str = "") -> Actor:
     Raises:
       errors.UsageError: the file is damaged, or not a policy of this version.
     """
-    trained = _read(file)
+    trained = in_env.read(file)
     label = methods.METHODS[trained.method].label
     return Actor(
         f"{label} ({name or file.parent.name})", trained.scene.task, file, trained.scene.arms
@@ -62,27 +61,6 @@ def simulate(who: Actor, arms: tuple[str, ...] = ()) -> simulation.Simulation:
         env = sim_env.make(who.task, arms, observation="state", image_size=IMAGE_SIZE)
         scripted = next(iter(env.task.experts.values()))()
         return simulation.make(who.label, env, agent.from_single(scripted))
-    trained = _read(who.file)
-    settings, scene = trained.policy, trained.scene
-    env = sim_env.make(
-        scene.task,
-        arms or scene.arms,
-        scene.tools,
-        observation=settings.observation,
-        image_size=settings.image_size,
-        cameras=scene.cameras,
-    )
-    row = methods.METHODS[trained.method]
-    policy = policies.make(row, settings, env.task, cameras=scene.cameras)
-    planner = agent.from_policy(policy.sample, settings.obs_horizon, settings.execute)
-    params = (policy.for_sampling(trained.params), trained.normalizer)
-    return simulation.make(who.label, env, planner, params)
-
-
-def _read(file: Path) -> Any:
-    try:
-        trained = policy_file.load(file)
-    except ValueError as error:
-        raise errors.UsageError("--policy", "a policy of starjax", error) from error
-    errors.choice(f"method of {file}", trained.method, methods.METHODS)
-    return trained
+    played = in_env.load(who.file, in_env.read(who.file), arms=arms)
+    params = (played.trained.params, played.trained.normalizer)
+    return simulation.make(who.label, played.env, played.agent(), params)

@@ -1,0 +1,101 @@
+"""A trained policy in the environment that it acts in: a file of weights to a batch agent."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from starjax import config, errors, methods
+from starjax.policies import policy as policies
+from starjax.policies import policy_file
+from starjax.rollouts import agent, ensemble
+from starjax.runtime import files
+from starjax.sim import env as sim_env
+
+
+class PolicyInEnv(NamedTuple):
+    """A trained policy in its environment.
+
+    Apart from `policy_file.Trained`, the content of a file, because most users of a file (inspect,
+    pack, deployment) build no simulator.
+
+    Attributes:
+      trained: settings, normaliser, and parameters as `policy.sample` takes them; `trained.method`
+        is the method that runs, which may share the weights of another.
+      policy: pure functions of the networks.
+      env: environment with the observation of the training.
+      weights: SHA-256 of the file.
+    """
+
+    trained: policy_file.Trained
+    policy: policies.Policy
+    env: sim_env.Env
+    weights: str
+
+    def agent(self, average_plans: bool = False) -> agent.BatchAgent:
+        """Returns the agent of a batch of episodes; see `batch_agent`."""
+        trained = self.trained
+        return batch_agent(trained.method, self.policy, trained.policy, average_plans)
+
+
+def batch_agent(
+    method: str,
+    policy: policies.Policy,
+    settings: config.PolicyConfig,
+    average_plans: bool = False,
+) -> agent.BatchAgent:
+    """Returns the agent of a batch of episodes, whose parameters are (weights, normaliser).
+
+    Args:
+      method: key of `methods.METHODS`.
+      policy: its functions.
+      settings: its observation horizon and number of executed commands.
+      average_plans: plan at every control step and execute the mean of all plans, as ACT does.
+    """
+    if average_plans:
+        keeps = methods.METHODS[method].keeps_to_manifold
+        return ensemble.from_policy(policy.sample, settings.obs_horizon, keeps)
+    return agent.from_policy(policy.sample, settings.obs_horizon, settings.execute)
+
+
+def read(file: Path, argument: str = "--policy", hint: str = "") -> policy_file.Trained:
+    """Reads a policy file that a user named.
+
+    Args:
+      file: a policy.safetensors.
+      argument: name of the flag or file for errors.
+      hint: advice if the file is damaged.
+
+    Raises:
+      errors.UsageError: the file is damaged, of another version or of an unknown method.
+    """
+    try:
+        trained = policy_file.load(file)
+    except ValueError as error:
+        raise errors.UsageError(argument, "a policy of starjax", error, hint) from error
+    errors.choice(f"method of {file}", trained.method, methods.METHODS)
+    return trained
+
+
+def load(
+    file: Path,
+    trained: policy_file.Trained,
+    *,
+    method: str = "",
+    arms: Sequence[str] = (),
+    env: sim_env.Env | None = None,
+) -> PolicyInEnv:
+    """Builds the networks and the environment of a policy file.
+
+    Args:
+      file: the policy file.
+      trained: its content.
+      method: a method that shares the weights; by default the one that trained them.
+      arms: robots instead of those of the training.
+      env: the environment, if it is built already.
+    """
+    trained = trained._replace(method=method or trained.method)
+    env = env or sim_env.for_policy(trained.scene, trained.policy, arms)
+    row = methods.METHODS[trained.method]
+    policy = policies.make(row, trained.policy, env.task, cameras=trained.scene.cameras)
+    ready = trained._replace(params=policy.for_sampling(trained.params))
+    return PolicyInEnv(ready, policy, env, files.sha256(file))
