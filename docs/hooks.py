@@ -23,8 +23,9 @@ _LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s]+)(#[^)]*)?\)")
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Lists the claims of `experiments/` in the navigation."""
-    pages = [{title(folder): f"results/{folder.name}.md"} for folder in claims()]
+    """Lists the pages of results in the navigation: those of `docs/results/`, then the claims."""
+    pages = [f"results/{page.name}" for page in sorted((ROOT / "docs" / "results").glob("*.md"))]
+    pages += [{title(folder): f"results/{folder.name}.md"} for folder in claims()]
     config.nav.append({"Results": ["results/index.md", *pages]})
     config.nav.append({"Project": ["contributing.md", "changelog.md"]})
     return config
@@ -50,17 +51,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def claims() -> list[Path]:
-    """Folders of results that have a page."""
+    """Returns the folders of results that have a page."""
     return sorted(page.parent for page in RESULTS.glob("*/README.md"))
 
 
 def title(folder: Path) -> str:
-    """The heading of a claim's page."""
+    """Returns the heading of a claim's page."""
     return (folder / "README.md").read_text().splitlines()[0].removeprefix("# ")
 
 
 def relinked(source: Path, page: str) -> str:
-    """A text of the repository with links that hold in the site; those to other files are undone.
+    """Returns a text of the repository with links that hold in the site, and none to other files.
 
     Args:
       source: the text.

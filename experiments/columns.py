@@ -1,4 +1,4 @@
-"""What a table may say of a result: columns, and paired tests."""
+"""Columns of the tables of results, and paired tests."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 from starjax.evaluation.result import Trial, read_sweep
 from starjax.report import compare, formats, outcomes, results, stats
 
-HIGHEST = 8  # index of the unseen trocar that is above all seen ones
+HIGHEST = 8  # index of the unseen trocar above all seen ones
 
 
 class Scored(NamedTuple):
-    """A result with what lies beside it.
+    """A result with its sweep and held-out errors.
 
     Attributes:
       run: the result.
-      swept: the same policy through other trocars, None if it was not swept.
-      held_out: its last error on demonstrations kept out of training, empty if not kept.
+      swept: sweep of the same policy over other trocars, None without one.
+      held_out: last errors on held-out demonstrations, empty without any.
     """
 
     run: results.Run
@@ -26,7 +26,7 @@ class Scored(NamedTuple):
 
 
 def read(file: Path, label: str) -> Scored:
-    """Reads `file`, `sweep.json` beside a `result.json`, and its `.holdout.jsonl`."""
+    """Reads a result, its `.holdout.jsonl`, and the `sweep.json` next to a `result.json`."""
     run = results.load(file)._replace(label=label)
     swept, sweep = None, file.with_name("sweep.json")
     if file.name == "result.json" and sweep.is_file():
@@ -37,7 +37,7 @@ def read(file: Path, label: str) -> Scored:
 
 
 def paired(pairs: Sequence[Sequence[Scored]], part: str) -> formats.Table:
-    """McNemar's test of pairs of results on the same trials.
+    """Draws McNemar's test of pairs of results on the same trials.
 
     Raises:
       ValueError: two results share no trials.
@@ -54,7 +54,7 @@ def paired(pairs: Sequence[Sequence[Scored]], part: str) -> formats.Table:
 
 
 def rate(trials: Sequence[Trial], test: Callable[..., bool] = outcomes.strict) -> str:
-    """E.g. `784/800: 98.0% (96.8-98.8)`."""
+    """Returns successes, trials and interval, such as `784/800: 98.0% (96.8-98.8)`."""
     if not trials:
         return "–"
     score = outcomes.tally(trials, test)
@@ -85,8 +85,8 @@ def _beyond(run: results.Run, distance_m: float) -> list[Trial]:
     return [trial for trial in run.trials if (trial.distance_m or 0.0) >= distance_m]
 
 
-def _rcm(scored: Scored, kind: str, what: str) -> str:
-    value = (scored.run.rcm_error_mm.get(kind) or {}).get(what)
+def _rcm(scored: Scored, kind: str, statistic: str) -> str:
+    value = (scored.run.rcm_error_mm.get(kind) or {}).get(statistic)
     return "–" if value is None else f"{value:.1f}" if value >= 1 else formats.millimetres(value)
 
 
@@ -123,14 +123,15 @@ def _median(scored: Scored) -> str:
 
 
 def _served(scored: Scored, draw: Callable[[dict[str, Any]], str]) -> str:
-    """Of what the clients of a server reported; nothing of trials without one."""
-    said = scored.run.result.about.get("served")
-    return draw(said) if said else "–"
+    """Draws a value of the clients' report, a dash for trials without a server."""
+    report = scored.run.result.about.get("served")
+    return draw(report) if report else "–"
 
 
-def _share(part: str, whole: str) -> Callable[[Scored], str]:
-    def draw(said: dict[str, Any]) -> str:
-        return f"{said[part]} of {said[whole]}: {100 * said[part] / max(said[whole], 1):.1f}%"
+def _fraction(part: str, whole: str) -> Callable[[Scored], str]:
+    def draw(report: dict[str, Any]) -> str:
+        percent = 100 * report[part] / max(report[whole], 1)
+        return f"{report[part]} of {report[whole]}: {percent:.1f}%"
 
     return lambda scored: _served(scored, draw)
 
@@ -140,7 +141,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "unseen": ("unseen", lambda x: rate(_unseen(x))),
     "all": ("all", lambda x: rate(x.run.trials)),
     "loose": ("all, loose", lambda x: rate(x.run.trials, outcomes.loose)),
-    "safe": ("successes within 2 mm all along", _safe),
+    "safe": ("successes always within 2 mm", _safe),
     "gap": ("gap, points", _gap),
     "highest": ("highest trocar", lambda x: rate([t for t in _unseen(x) if t.trocar == HIGHEST])),
     "trocars": ("other trocars", _others),
@@ -151,23 +152,23 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "rcm": ("RCM error, p99 (mm)", lambda x: _rcm(x, "executed", "p99")),
     "rcm_won": ("of successes", lambda x: _rcm(x, "executed", "p99_of_successes")),
     "rcm_within": ("within steps", lambda x: _rcm(x, "within_steps", "p99")),
-    "rcm_commanded": ("commanded, most", lambda x: _rcm(x, "commanded", "max")),
+    "rcm_commanded": ("commanded, maximum", lambda x: _rcm(x, "commanded", "max")),
     "tip": ("held-out tip (mm)", lambda x: _held_out(x, "position_error_mm")),
     "roll": ("held-out roll (deg)", lambda x: _held_out(x, "roll_error_deg")),
-    "decision": ("a decision (ms)", lambda x: f"{x.run.result.about['inference_ms']['p50']:.1f}"),
+    "decision": ("inference (ms)", lambda x: f"{x.run.result.about['inference_ms']['p50']:.1f}"),
     "time": ("all stages", _time),
-    "running": ("trials, once compiled (s)", _running),
-    "late": ("plans late", _share("missed", "plans")),
-    "held": ("steps held", _share("held", "steps")),
-    "limited": ("steps limited", _share("limited", "steps")),
-    "lost": ("questions lost", lambda x: _served(x, lambda said: str(said["lost"]))),
+    "running": ("trials, after compiling (s)", _running),
+    "late": ("plans late", _fraction("missed", "plans")),
+    "held": ("steps held", _fraction("held", "steps")),
+    "limited": ("steps limited", _fraction("limited", "steps")),
+    "lost": ("requests lost", lambda x: _served(x, lambda report: str(report["lost"]))),
     "step": (
         "largest step (mm, rad)",
-        lambda x: _served(x, lambda said: f"{said['move_mm']:.2f}, {said['turn_rad']:.3f}"),
+        lambda x: _served(x, lambda report: f"{report['move_mm']:.2f}, {report['turn_rad']:.3f}"),
     ),
     "off": (
-        "commanded off the trocar, most (mm)",
-        lambda x: _served(x, lambda said: f"{said['rcm_commanded_mm']:.0e}"),
+        "commanded RCM error, maximum (mm)",
+        lambda x: _served(x, lambda report: f"{report['rcm_commanded_mm']:.0e}"),
     ),
     "median": ("median success (s)", _median),
 }

@@ -1,4 +1,4 @@
-"""Moves the trials of results into compressed files beside them, as they are kept here.
+"""Moves the trials of results into compressed files next to them, the form kept here.
 
 python experiments/compact.py RESULT.json...
 """

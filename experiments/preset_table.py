@@ -14,11 +14,11 @@ FOR = {
 
 
 def table() -> str:
-    """What each preset sees, learns with and takes, as markdown."""
+    """Returns observations, networks, learner and training of each preset as markdown."""
     rows = [["preset", "observes", "demonstrations", "networks", "learner", "training", "for"]]
     for name, run in PRESETS.items():
         policy, train = run.policy, run.train
-        sees = "state" if policy.observation == "state" else f"images, {policy.image_size} px"
+        observes = "state" if policy.observation == "state" else f"images, {policy.image_size} px"
         encoder = {"small": "small encoder", "resnet18": "ResNet-18"}[policy.encoder]
         if policy.freeze_encoder:
             encoder = f"encoder of `{policy.encoder_weights}`, frozen"
@@ -28,5 +28,7 @@ def table() -> str:
             network = f"{encoder}; {network}"
         count = run.demos.seen_trocars * run.demos.per_trocar
         steps = f"{train.steps:,} steps of {train.batch_size}"
-        rows.append([f"`{name}`", sees, f"{count:,}", network, policy.learner, steps, FOR[name]])
+        rows.append(
+            [f"`{name}`", observes, f"{count:,}", network, policy.learner, steps, FOR[name]]
+        )
     return formats.render(rows, names=len(rows[0]))

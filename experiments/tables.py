@@ -1,12 +1,13 @@
 """Draws the tables of README.md, docs/ and benchmarks/ and the pages of claims, from results.
 
     python experiments/tables.py            writes them
-    python experiments/tables.py --check    fails if one of them is not what would be written
+    python experiments/tables.py --check    fails if a page differs from the one drawn
 
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
-claim.toml, `claims` (the list of claims), `presets` (from their values), or of benchmarks/results:
-`speed`, `learners`, `experts`, `six_blocks`, `scenes`, `stress_compact`, `stress_randomised`,
-`proposition`, `ppo`, `ppo_gpu`, `sb3`, `through_lerobot`.
+claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list of claims);
+`presets` (from their values); or of benchmarks/results: `speed`, `learners`, `experts`,
+`six_blocks`, `scenes`, `stress_compact`, `stress_randomised`, `proposition`, `ppo`, `ppo_gpu`,
+`sb3`, `through_lerobot`.
 """
 
 import re
@@ -26,12 +27,12 @@ _BLOCK = re.compile(r"(<!-- table:(\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
 
 
 def redraw(text: str, draw: Callable[[str], str]) -> str:
-    """`text` with every marked table drawn anew."""
-    return _BLOCK.sub(lambda found: f"{found[1]}{draw(found[2])}\n{found[3]}", text)
+    """Redraws every marked table of `text`."""
+    return _BLOCK.sub(lambda match: f"{match[1]}{draw(match[2])}\n{match[3]}", text)
 
 
 def table(name: str) -> str:
-    """A table by its name in the markers; KeyError where there is none."""
+    """Returns the table of a marker's name; KeyError if there is none."""
     if name == "claims":
         return claims.index([claims.load(folder) for folder in claims.folders()])
     if name == "presets":
@@ -42,12 +43,13 @@ def table(name: str) -> str:
         return newest.other(name)
     if name.startswith("stress"):
         return newest.stress(name)
-    folder, _, which = name.partition("/")
-    return claims.table(claims.load(HERE / folder), which)
+    folder, _, rest = name.partition("/")
+    name, _, rows = rest.partition(":")
+    return claims.table(claims.load(HERE / folder), name, rows.split(",") if rows else None)
 
 
 def pages() -> Iterator[tuple[Path, str]]:
-    """Every page with something drawn in it, and what it must hold."""
+    """Yields every page with drawn tables, and the text that it must hold."""
     for folder in claims.folders():
         yield folder / "README.md", claims.readme(claims.load(folder))
     marked = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", HERE / "README.md"]
@@ -56,7 +58,7 @@ def pages() -> Iterator[tuple[Path, str]]:
 
 
 def main() -> int:
-    """Writes the pages, or with --check names those that differ."""
+    """Writes the pages that differ, or with --check names them."""
     stale = [
         (page, text) for page, text in pages() if not page.exists() or page.read_text() != text
     ]

@@ -1,7 +1,9 @@
-"""Every example runs as it stands."""
+"""Every example runs, programs as scripts and the notebook cell by cell."""
 
+import json
 import runpy
 
+import matplotlib.pyplot as plt
 import pytest
 
 SHORT = {"ppo": ["--envs", "4", "--iterations", "2"]}
@@ -9,6 +11,8 @@ SLOW = {"closed_loop", "far_robot", "ppo"}  # compile the simulation, a server
 
 
 def pytest_generate_tests(metafunc):
+    if "file" not in metafunc.fixturenames:
+        return
     files = sorted(metafunc.config.rootpath.glob("examples/*.py"))
     marks = {name: [pytest.mark.slow] for name in SLOW}
     metafunc.parametrize(
@@ -21,3 +25,18 @@ def test_example_runs(file, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", [str(file), *SHORT.get(file.stem, [])])
     runpy.run_path(str(file), run_name="__main__")
     assert capsys.readouterr().out.strip()
+
+
+@pytest.mark.slow
+def test_notebook_runs(pytestconfig, tmp_path, monkeypatch):
+    """In this process instead of a kernel, which would start jax and its programs anew."""
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((pytestconfig.rootpath / "examples" / "quickstart.ipynb").read_text())
+    names = {"__name__": "__main__"}
+    for cell in notebook["cells"]:
+        assert cell["cell_type"] == "markdown" or not cell["outputs"], "outputs are not kept"
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
+    assert len(names["figure"].axes) == 3 and max(names["errors_mm"]) < 1
+    assert bool(names["state"].success)
+    plt.close("all")
