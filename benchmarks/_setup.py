@@ -118,7 +118,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     first = state.create(policy, optimizer, drawn(policy, seed), stats, key)
     mesh = devices.make_mesh(batch, on)
     shapes = jax.eval_shape(lambda x: x, first)
-    layout = StateLayout(mesh, policy.rounded, shapes)
+    layout = StateLayout(mesh, policy.cast_params, shapes)
     setup = step.Setup(policy, optimizer, case.policy, case.train, layout)
     looped = step.runs_in_a_loop(case.policy)
 
@@ -141,7 +141,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
 def untrained(case: Case) -> tuple[policies.Policy, Any, normalizer.Normalizer]:
     """A policy, its first parameters as an evaluation holds them, and its statistics."""
     policy = policies.make(METHOD, case.policy, TASK, case.train)
-    params = policy.for_sampling(drawn(policy))
+    params = policy.prepare_for_inference(drawn(policy))
     return policy, params, statistics(case.policy)
 
 

@@ -121,7 +121,7 @@ def collect(
         fetches.append(time.perf_counter() - start)
         return fetched
 
-    settings = schema.Settings(asked.per_trocar, seed=0, max_steps=MAX_STEPS)
+    settings = schema.DemoSettings(asked.per_trocar, seed=0, max_steps=MAX_STEPS)
     layout = placement.DeviceLayout(asked.chunk)
     with (
         mock.patch.object(engine, "make", begin),

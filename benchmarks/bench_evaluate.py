@@ -146,7 +146,7 @@ def runner(env, policy, settings, max_steps: int, lanes: int, devices=None) -> e
 def parts(env, policy, params, stats, settings, lanes: int) -> dict[str, float]:
     """ms: one policy call, one control step and one look, each of all lanes."""
     observation, trocar = latency.example(
-        settings, features.sensors(env.task, env.names.cameras), lanes
+        settings, features.select_sensors(env.task, env.names.cameras), lanes
     )
     told = rcm.trocar_frame(trocar, env.p_world_ref, env.scene.roll_zero)
     keys = jax.random.split(jax.random.key(0), lanes)

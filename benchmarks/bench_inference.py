@@ -29,7 +29,7 @@ from starjax.policies import features
 from starjax.policies import policy as policies
 
 CHAIN = 100  # roll networks in one program, each fed by the one before
-SEEN = features.sensors(_setup.TASK)
+SEEN = features.select_sensors(_setup.TASK)
 
 # name: case, batch, DDIM steps
 CASES = {

@@ -19,7 +19,7 @@ from starjax.evaluation import latency
 from starjax.learners import LEARNERS
 from starjax.policies import features
 
-SEEN = features.sensors(_setup.TASK)
+SEEN = features.select_sensors(_setup.TASK)
 BATCHES = {"gpu": (1, 360), "cpu": (1,), "tiny": (1,)}
 PEER = "diffusion"
 

@@ -51,10 +51,10 @@ def main() -> None:
     exchange.export(exchange.source(asked.dataset, form), folder, form)
     strip(folder)
     (asked.out / "map.toml").write_text(MAP)
-    with base.opened(folder, "lerobot") as source:
+    with base.open_dataset(folder, "lerobot") as source:
         assert source.origin is None and not any(map(is_ours, source.columns))
         given = mapping.load(asked.out / "map.toml")
-        found = foreign.bring(source, given, asked.out / "imported", asked.out)
+        found = foreign.import_mapped(source, given, asked.out / "imported", asked.out)
     row = {
         "digest": store.read_seal(asked.dataset)["digest"],
         "imported": found.digest,

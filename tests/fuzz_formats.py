@@ -117,11 +117,11 @@ def attempt(path: Path, name: str, root: Path | None = None) -> str:
       root: where an export is brought back to, too.
     """
     try:
-        with base.opened(path, name) as source:
+        with base.open_dataset(path, name) as source:
             for episode in range(min(len(source.lengths), 3)):
                 source.read(episode, source.columns)
             if root and source.origin is not None:
-                exchange.bring_back(source, root)
+                exchange.restore_export(source, root)
         return "read"
     except errors.UsageError as error:
         return "refused" if "\n" not in str(error) else f"several lines: {error}"

@@ -26,7 +26,7 @@ def datasets() -> dict[str, str]:
     digests = {}
     for name in registry.tasks.names():
         made = env.make(name)
-        settings = schema.Settings(per_trocar=1, seed=0, max_steps=10)
+        settings = schema.DemoSettings(per_trocar=1, seed=0, max_steps=10)
         described = schema.describe(made, made.task.trocars, settings)
         digests[name] = store.digest({part: described[part] for part in PARTS})
     return digests

@@ -32,7 +32,7 @@ def make(options, policy_config, sizes):
     shape = (sizes.horizon, sizes.action)
 
     def said(params, condition):
-        flat = options.gain * sequences.joined(condition) @ params["map"] + params["bias"]
+        flat = options.gain * sequences.condition_vector(condition) @ params["map"] + params["bias"]
         return flat.reshape(-1, *shape)
 
     def init(key):

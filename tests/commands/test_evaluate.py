@@ -42,7 +42,7 @@ def file(tmp_path, monkeypatch):
     def sample(_, stats, keys, observation, trocar):
         return network(params, 1.0, keys, observation, trocar)
 
-    policy = types.SimpleNamespace(sample=sample, for_sampling=lambda params: params)
+    policy = types.SimpleNamespace(sample=sample, prepare_for_inference=lambda params: params)
 
     monkeypatch.setattr(in_env.sim_env, "make", lambda *_, **__: stubs.make_env())
     monkeypatch.setattr(in_env.policies, "make", lambda *_, **__: policy)

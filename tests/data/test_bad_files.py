@@ -41,7 +41,7 @@ def copy(sound, tmp_path):
 
 def refused(path, name):
     """The line that reading all of it ends in."""
-    with pytest.raises(errors.UsageError) as caught, base.opened(path, name) as source:
+    with pytest.raises(errors.UsageError) as caught, base.open_dataset(path, name) as source:
         for episode in range(len(source.lengths)):
             source.read(episode, source.columns)
     assert str(path) in caught.value.argument and "\n" not in str(caught.value)
@@ -219,7 +219,7 @@ def test_another_formats_reader_refuses_it(sound, name):
 
 
 def test_columns_that_are_not_there_are_named(sound):
-    with base.opened(sound["zarr"], "zarr") as source, mistakes.of("column", "actoin"):
+    with base.open_dataset(sound["zarr"], "zarr") as source, mistakes.of("column", "actoin"):
         source.read(0, ["actoin"])
 
 

@@ -24,7 +24,7 @@ from starjax.sim import env as sim_env
 from starjax.types import Agent
 
 TROCARS = stubs.trocars(0, 8)
-SETTINGS = schema.Settings(per_trocar=4, seed=0, max_steps=100)
+SETTINGS = schema.DemoSettings(per_trocar=4, seed=0, max_steps=100)
 EXPERT = agent.from_single(stubs.EXPERT)
 
 
@@ -353,7 +353,7 @@ def test_all_residencies_hold_the_same(images, residency):
     assert f"{files.size(loaded.bytes)}" in said[0]
     image = loaded.dataset.observation.images[stubs.CAMERA]
     assert isinstance(image, jax.Array) == (residency == "device")
-    assert isinstance(image, load.Frames) == (residency == "disk")
+    assert isinstance(image, load.EpisodeArray) == (residency == "disk")
     order = np.array([7, 0, 3, 3, image.shape[0] - 1])
     whole = reference.dataset.observation.images[stubs.CAMERA]
     np.testing.assert_array_equal(image[order], whole[order])
@@ -396,7 +396,7 @@ def test_more_episodes_than_a_process_may_open_files(tmp_path):
     opened = len(os.listdir("/proc/self/fd"))
     resource.setrlimit(resource.RLIMIT_NOFILE, (opened + count - 50, limits[1]))
     try:
-        frames = load.Frames(paths, 2 * np.arange(count), np.full(count, 2))
+        frames = load.EpisodeArray(paths, 2 * np.arange(count), np.full(count, 2))
         whole, some = frames.read(), frames[np.arange(0, 2 * count, 2)]
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)

@@ -1,4 +1,4 @@
-"""Demonstrations of others: whatever their conventions, the same dataset; oddities are said."""
+"""Demonstrations of others: whatever their conventions, the same dataset; anomalies are said."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ from starjax import errors, rcm
 from starjax.data import load, schema, store
 from starjax.data.formats import base, exchange, foreign, mapping, motion, trocars
 from starjax.data.formats.base import Column, Source
-from starjax.data.formats.mapping import Arm, Camera, Map
+from starjax.data.formats.mapping import ArmColumns, CameraColumn, Map
 
 P_WORLD_REF = np.array([0.0, 0.0, 0.15])
 RNG = np.random.default_rng(0)
@@ -66,12 +66,12 @@ def source(times=None, change=None, hz=30.0, images=False, arms=1):
     return Source(hz, lengths, columns, lambda i, names: {n: found[i][n] for n in names})
 
 
-ARM = Arm(position="p0", rotation="R0", rotation_as="matrix", gripper="jaws0")
+ARM = ArmColumns(position="p0", rotation="R0", rotation_as="matrix", gripper="jaws0")
 MAP = Map(task="peg_transfer", state="state", arms=(ARM,))
 
 
 def bring(tmp_path, given=None, made=MAP, name="d"):
-    return foreign.bring(given or source(), made, tmp_path / name, tmp_path)
+    return foreign.import_mapped(given or source(), made, tmp_path / name, tmp_path)
 
 
 def loaded(root):
@@ -176,7 +176,7 @@ def test_a_robots_joints_give_its_tip(tmp_path):
     )
     joints = RNG.uniform(-1, 1, (40, 2))
     arrays = {"q": joints[:, ::-1], "state": np.zeros((40, 12))}
-    arm = Arm(joints="q", joint_names=("b", "a"), model="robot.xml", body="tip")
+    arm = ArmColumns(joints="q", joint_names=("b", "a"), model="robot.xml", body="tip")
     found = motion.read(arrays, dataclasses.replace(MAP, arms=(arm,)), 30.0, tmp_path)
     first = transform.Rotation.from_euler("z", joints[:, :1])
     second = first * transform.Rotation.from_euler("y", joints[:, 1:])
@@ -291,16 +291,16 @@ def test_two_arms_have_a_trocar_each(tmp_path):
 
 def test_images_are_cut_turned_and_resized(tmp_path):
     given = source(hz=60.0, images=True)
-    cameras = {"camera": Camera(column="image", crop=(2, 3, 8, 8), bgr=True)}
+    cameras = {"camera": CameraColumn(column="image", crop=(2, 3, 8, 8), bgr=True)}
     bring(tmp_path, given, dataclasses.replace(MAP, state=(), cameras=cameras))
     drawn = np.asarray(loaded(tmp_path / "d").observation.images["camera"])
     theirs = given.read(0, ["image"])["image"]
     np.testing.assert_array_equal(drawn[:120], theirs[::2, 2:10, 3:11, ::-1])
-    small = foreign.pictures(theirs, Camera(column="image", size=6))
+    small = foreign.pictures(theirs, CameraColumn(column="image", size=6))
     assert small.shape == (240, 6, 6, 3)
     np.testing.assert_allclose(small.mean((1, 2)), theirs.mean((1, 2)), atol=12)
     with mistakes.of("--map: crop", "[12, 16]"):
-        foreign.pictures(theirs, Camera(column="image", crop=(8, 0, 8, 8)))
+        foreign.pictures(theirs, CameraColumn(column="image", crop=(8, 0, 8, 8)))
     with mistakes.of("--map: cameras", "wrist"):
         bring(tmp_path, given, dataclasses.replace(MAP, cameras={"wrist": cameras["camera"]}))
 
@@ -419,7 +419,8 @@ def test_missing_files_and_columns_are_named(tmp_path):
             tmp_path, made=dataclasses.replace(MAP, arms=(dataclasses.replace(ARM, position="p7"),))
         )
     with mistakes.of("--map: image column", "p0"):
-        bring(tmp_path, made=dataclasses.replace(MAP, cameras={"camera": Camera(column="p0")}))
+        cameras = {"camera": CameraColumn(column="p0")}
+        bring(tmp_path, made=dataclasses.replace(MAP, cameras=cameras))
     with mistakes.of("--map", "neither"):
         bring(tmp_path, made=dataclasses.replace(MAP, state=()))
 
@@ -433,7 +434,7 @@ def test_a_stopped_import_ends_in_the_same_bytes(plain, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        foreign.bring(source(), MAP, tmp_path / "d", tmp_path, stop)
+        foreign.import_mapped(source(), MAP, tmp_path / "d", tmp_path, stop)
     assert len(store.keys(tmp_path / "d")) == 2 and not store.is_sealed(tmp_path / "d")
     bring(tmp_path)
     assert kill.tree(tmp_path / "d") == kill.tree(plain[1])
@@ -460,7 +461,7 @@ def test_an_export_without_its_trocars_comes_back_with_them(tmp_path, name):
     }
     exchange.export(ours._replace(columns=kept, origin=None), out, form)
     state, action, task = MAPPING[name]
-    arm = Arm(
+    arm = ArmColumns(
         position=f"{state}[0:3]",
         rotation=f"{state}[3:7]",
         gripper=f"{state}[7]",
@@ -469,7 +470,7 @@ def test_an_export_without_its_trocars_comes_back_with_them(tmp_path, name):
         command_gripper=f"{action}[7]",
     )
     made = Map(task="peg_transfer", state=task, arms=(arm,), hz=30.0)
-    with base.opened(out, name) as given:
+    with base.open_dataset(out, name) as given:
         assert given.origin is None and set(given.columns) >= set(kept)
         found = bring(tmp_path, given, made)
     before, after = loaded(tmp_path / "ours"), loaded(tmp_path / "d")

@@ -47,21 +47,21 @@ def exported(roots, tmp_path_factory):
     return find
 
 
-def bring_back(path, root, **given):
-    with base.opened(path, base.recognised(path)) as source:
-        return exchange.bring_back(source, root, **given)
+def restore(path, root, **given):
+    with base.open_dataset(path, base.detect(path)) as source:
+        return exchange.restore_export(source, root, **given)
 
 
 @pytest.mark.parametrize("name", base.FORMATS.names())
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_export_comes_back_to_the_last_byte(roots, exported, tmp_path, kind, name):
-    found = bring_back(exported(kind, name), tmp_path / "back")
+    found = restore(exported(kind, name), tmp_path / "back")
     assert found["same"] and found["digest"] == store.read_seal(roots / kind)["digest"]
     assert kill.tree(tmp_path / "back") == kill.tree(roots / kind)
 
 
 def test_videos_lose_little_and_nothing_else(roots, exported, tmp_path):
-    found = bring_back(exported("images", "lerobot", True), tmp_path / "back")
+    found = restore(exported("images", "lerobot", True), tmp_path / "back")
     assert not found["same"]
     before, after = kill.tree(roots / "images"), kill.tree(tmp_path / "back")
     assert before.keys() == after.keys()
@@ -85,7 +85,7 @@ def test_a_dataset_of_schema_1_comes_back_as_one_of_today(tmp_path, request, obs
     root = request.config.rootpath / f"tests/golden/demonstrations/schema_1_{observation}"
     form, out = base.FORMATS.get(name), tmp_path / f"out{SUFFIX.get(name, '')}"
     exchange.export(exchange.source(root, form), out, form, False)
-    bring_back(out, tmp_path / "back")
+    restore(out, tmp_path / "back")
     assert store.read_description(tmp_path / "back")["schema"] == schema.SCHEMA
     before, after = (
         load.load(path, report=lambda _: None).dataset for path in (root, tmp_path / "back")
@@ -197,7 +197,7 @@ def test_files_of_lerobot_are_split_by_size(roots, tmp_path, monkeypatch):
     exchange.export(exchange.source(roots / "images", form), tmp_path / "out", form, True)
     assert (tmp_path / "out/data/chunk-001/file-000.parquet").exists()
     assert (tmp_path / "out/videos/observation.images.wrist/chunk-001/file-000.mp4").exists()
-    bring_back(tmp_path / "out", tmp_path / "back")
+    restore(tmp_path / "out", tmp_path / "back")
     before, after = kill.tree(roots / "images"), kill.tree(tmp_path / "back")
     assert {n for n in before if "p.npy" in n and before[n] != after[n]} == set()
 
@@ -223,8 +223,8 @@ def as_v21(path, out):
 def test_version_2_1_of_lerobot_is_read(exported, tmp_path):
     path = exported("images", "lerobot")
     with (
-        base.opened(path, "lerobot") as modern,
-        base.opened(as_v21(path, tmp_path / "old"), "lerobot") as old,
+        base.open_dataset(path, "lerobot") as modern,
+        base.open_dataset(as_v21(path, tmp_path / "old"), "lerobot") as old,
     ):
         assert list(old.lengths) == list(modern.lengths) and old.columns == modern.columns
         assert old.task == "move it" and old.origin is None
@@ -244,9 +244,9 @@ def test_a_stopped_import_goes_on(exported, roots, tmp_path):
 
     path = exported("state", "zarr")
     with pytest.raises(KeyboardInterrupt):
-        bring_back(path, tmp_path / "back", note=stop)
+        restore(path, tmp_path / "back", note=stop)
     assert not store.is_sealed(tmp_path / "back") and len(store.keys(tmp_path / "back")) == 3
-    bring_back(path, tmp_path / "back", note=counts.append)
+    restore(path, tmp_path / "back", note=counts.append)
     assert len(counts) == 5  # three before, two now: none twice
     assert kill.tree(tmp_path / "back") == kill.tree(roots / "state")
 
@@ -297,7 +297,7 @@ def test_what_an_export_says_of_itself_is_not_trusted(exported, tmp_path, change
     CHANGES[change](origin)
     ours.write_text(json.dumps(origin))
     with pytest.raises(errors.UsageError):
-        bring_back(path, tmp_path / "deep/er/back")
+        restore(path, tmp_path / "deep/er/back")
     assert {p.name for p in tmp_path.iterdir()} <= {"in", "deep"}
     assert not list((tmp_path / "deep").rglob("*.npy"))
 
@@ -305,7 +305,7 @@ def test_what_an_export_says_of_itself_is_not_trusted(exported, tmp_path, change
 def test_what_is_no_dataset_is_named(roots, tmp_path):
     for path in (tmp_path / "nowhere", tmp_path):
         with mistakes.of("PATH", path):
-            base.recognised(path)
+            base.detect(path)
     form = base.FORMATS.get("zarr")
     shutil.copytree(roots / "state", tmp_path / "d")
     (tmp_path / "d/SEALED.json").unlink()

@@ -62,7 +62,7 @@ def test_schema_1_is_described_as_schema_2_is():
 
 @pytest.mark.parametrize("observation", ["image", "state"])
 def test_the_same_seed_gives_the_same_episodes(tmp_path, observation):
-    settings = schema.Settings(1, 0, 100, keep_failures=observation == "image")
+    settings = schema.DemoSettings(1, 0, 100, keep_failures=observation == "image")
     env, expert = stubs.make_env(observation, unlucky=0.4), agent.from_single(stubs.EXPERT)
     demos.collect(tmp_path, env, expert, TROCARS, settings, layout=DeviceLayout(lanes=5))
     ours, theirs = quiet(tmp_path), quiet(GOLDEN / f"schema_1_{observation}")

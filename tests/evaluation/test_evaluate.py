@@ -409,7 +409,7 @@ from starjax.data import demos, schema
 for count in (1, 2):
     demos.collect(
         out / f"demos{count}", stubs.make_env(), agent.from_single(stubs.EXPERT),
-        test_evaluate.TROCARS, schema.Settings(per_trocar=2, seed=0, max_steps=100),
+        test_evaluate.TROCARS, schema.DemoSettings(per_trocar=2, seed=0, max_steps=100),
         layout=placement.DeviceLayout(4, jax.devices()[:count]))
 assert kill.tree(out / "demos1") == kill.tree(out / "demos2")
 print("same")

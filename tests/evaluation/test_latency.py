@@ -10,7 +10,7 @@ from starjax.methods import METHODS
 from starjax.models import roll_net
 from starjax.policies import features
 
-SEEN = features.sensors(fakes.TASK)
+SEEN = features.select_sensors(fakes.TASK)
 
 
 def test_the_roll_network_is_timed_with_what_it_is_told(monkeypatch):

@@ -32,7 +32,7 @@ def make_env():
 
 
 def collected(root, env):
-    settings = schema.Settings(per_trocar=2, seed=0, max_steps=100)
+    settings = schema.DemoSettings(per_trocar=2, seed=0, max_steps=100)
     expert, layout = agent.from_single(stubs.EXPERT), DeviceLayout(lanes=4)
     demos.collect(root, env, expert, stubs.trocars(0, 8), settings, layout=layout)
     return root

@@ -58,7 +58,7 @@ def test_demonstrated_actions_become_each_arms_commands(dataset, name):
     method = METHODS[name]
     stats = normalizer.fit(method, fakes.TWO_ARMS, dataset, FRAMES)
     batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
-    action = features.demonstrated(stats, method.action_space, batch)
+    action = features.encode_commands(stats, method.action_space, batch)
     command = execution.command(method, stats, action, batch.trocar)
     assert command.pose.p.shape == (3, 16, 2, 3)
     np.testing.assert_allclose(command.pose.p, batch.command.pose.p, atol=2e-6)
@@ -113,10 +113,10 @@ def test_one_roll_network_serves_every_arm(dataset):
 
 def test_each_trocar_of_the_arms_is_told(dataset):
     told = dataset.trocar
-    found = features.extra(METHODS["dp_rcm4"], told)
+    found = features.trocar_condition(METHODS["dp_rcm4"], told)
     wanted = [features.trocar_features(of_arm(told.trocar, arm))[:, 0] for arm in (0, 1)]
     np.testing.assert_allclose(found, np.concatenate(wanted, -1), atol=1e-6)
-    assert features.extra(METHODS["stardiff"], told).shape == (4, 0)
+    assert features.trocar_condition(METHODS["stardiff"], told).shape == (4, 0)
 
 
 @pytest.mark.slow
@@ -130,17 +130,17 @@ def test_cameras_share_an_encoder_and_keep_their_order():
     observation = batch.observation._replace(images=images)
     history = jnp.zeros((2, 2, 4))
     stats: normalizer.Normalizer = normalizer.Normalizer(normalizer.MinMax(-1.0, 1.0), None)
-    one = generator.make(METHODS["stardiff"], settings, features.sensors(fakes.TASK), 4)
+    one = generator.make(METHODS["stardiff"], settings, features.select_sensors(fakes.TASK), 4)
     params = jit(one.init)(jax.random.key(0))
 
     def observed(*cameras):
-        seen = features.sensors(fakes.TASK, cameras)
-        inputs = features.for_sampling(settings, seen, stats, observation, history)
+        seen = features.select_sensors(fakes.TASK, cameras)
+        inputs = features.inference_inputs(settings, seen, stats, observation, history)
         return np.asarray(one.observe(params, inputs, jnp.zeros((2, 0))).vision)
 
     pair, camera, wrist = observed("wrist", "camera"), observed("camera"), observed("wrist")
     np.testing.assert_allclose(pair, np.concatenate([wrist, camera], -1), atol=1e-6)
-    seen = features.sensors(fakes.TASK, ("wrist", "camera"))
+    seen = features.select_sensors(fakes.TASK, ("wrist", "camera"))
     assert pair.shape == (2, 2, generator.sizes(settings, seen, 4).vision)
     with pytest.raises(ValueError, match=r"observation.images: expected camera, side"):
         observed("camera", "side")

@@ -65,7 +65,7 @@ def test_every_method_works_with_every_learner(name):
     (value, metrics), gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))(params)
     assert np.isfinite(value) and metrics.keys() == set(policy.metrics) >= {"worst"}
     assert np.abs(gradient["learner"]["map"]).max() > 0
-    ready, keys = policy.for_sampling(params), jax.random.split(jax.random.key(1), 3)
+    ready, keys = policy.prepare_for_inference(params), jax.random.split(jax.random.key(1), 3)
     command = jax.jit(policy.sample)(ready, stats, keys, batch.observation, batch.trocar)
     error = rcm.rcm_error(command.pose, batch.trocar.p_world_trocar[:, None])
     assert (float(error.max()) <= 1e-6) == (name != "dp_ee")

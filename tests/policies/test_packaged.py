@@ -59,7 +59,7 @@ def test_five_evaluations_side_by_side_are_enough_for_what_is_packaged(monkeypat
     """Pictures of noise; `benchmarks/bench_ddim.py` takes demonstrations."""
     trained = policy_file.load(packaged.find("name", "compact"))
     policy = policies.make(methods.METHODS[trained.method], trained.policy, fakes.TASK)
-    observation, trocar = latency.example(trained.policy, features.sensors(fakes.TASK), 4)
+    observation, trocar = latency.example(trained.policy, features.select_sensors(fakes.TASK), 4)
     told = rcm.trocar_frame(trocar, fakes.P_WORLD_REF)
     keys = jax.random.split(jax.random.key(1), 4)
 

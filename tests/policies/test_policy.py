@@ -19,7 +19,7 @@ from starjax.policies import execution, features, generator, hierarchical
 from starjax.policies import policy as policies
 
 TRAIN = config.TrainConfig(state_noise=0.0)
-SEEN = features.sensors(fakes.TASK)
+SEEN = features.select_sensors(fakes.TASK)
 B = 4
 
 
@@ -287,7 +287,7 @@ def test_hierarchy_needs_a_roll():
 @pytest.mark.parametrize("name", METHODS)
 def test_demonstrated_actions_become_the_demonstrated_commands(made, name, dataset):
     it = made(name)
-    action = features.demonstrated(it.stats, it.method.action_space, it.batch)
+    action = features.encode_commands(it.stats, it.method.action_space, it.batch)
     command = execution.command(it.method, it.stats, action, it.batch.trocar)
     np.testing.assert_allclose(command.pose.p, it.batch.command.pose.p, atol=2e-6)
     np.testing.assert_allclose(command.pose.R, it.batch.command.pose.R, atol=2e-5)
@@ -318,8 +318,8 @@ def test_noise_is_in_normalised_units(made):
     clean = jnp.zeros((B, 2, 4))
     seen = (SEEN, it.stats)
     key = jax.random.key(0)
-    drawn = features.for_training(fakes.TINY, noisy, *seen, key, it.batch.observation, clean)
-    exact = features.for_sampling(fakes.TINY, *seen, it.batch.observation, clean)
+    drawn = features.training_inputs(fakes.TINY, noisy, *seen, key, it.batch.observation, clean)
+    exact = features.inference_inputs(fakes.TINY, *seen, it.batch.observation, clean)
     spread = float(jnp.std(drawn.history - exact.history))
     assert 0.4 < spread < 0.6
 
@@ -337,14 +337,16 @@ def test_state_features_tell_block_and_target_from_the_tip(made):
         axis=-1,
     )
     observation = it.batch.observation._replace(state=state)
-    inputs = features.for_sampling(fakes.TINY, SEEN, it.stats, observation, jnp.zeros((B, 2, 4)))
+    inputs = features.inference_inputs(
+        fakes.TINY, SEEN, it.stats, observation, jnp.zeros((B, 2, 4))
+    )
     expected = np.broadcast_to([1, 0, 0, 0, -1, 0, 0, 0, -2], (B, 2, 9))
     np.testing.assert_allclose(inputs.history[..., -9:], expected, atol=1e-5)
 
 
 def test_large_matrices_are_rounded_once_to_what_sample_rounds_them_to(dataset):
     it = Made("stardiff", dataset, "image", dtype="bfloat16")
-    rounded = it.policy.for_sampling(it.params)
+    rounded = it.policy.prepare_for_inference(it.params)
     jax.tree.map(np.testing.assert_array_equal, it.commands(), it.commands(params=rounded))
     kinds = {
         jax.tree_util.keystr(path): leaf.dtype
@@ -360,10 +362,12 @@ def test_large_matrices_are_rounded_once_to_what_sample_rounds_them_to(dataset):
 def test_a_gpu_is_handed_fewer_arrays_that_say_the_same(made, name, monkeypatch):
     it = made(name, "image")
     params, wanted = it.params, it.commands()
-    chex.assert_trees_all_equal(it.policy.for_sampling(params), params)  # as a CPU is handed them
+    chex.assert_trees_all_equal(
+        it.policy.prepare_for_inference(params), params
+    )  # as a CPU is handed them
     monkeypatch.setattr(sampling_unet, "pays", lambda: True)
     monkeypatch.setattr(packed_params, "PLATFORMS", {"cpu"})
-    ready = it.policy.for_sampling(params)
+    ready = it.policy.prepare_for_inference(params)
     assert len(jax.tree.leaves(ready)) < 0.6 * len(jax.tree.leaves(params))
     assert "second" in str(jax.tree.structure(ready))
     chex.assert_trees_all_close(it.commands(params=ready), wanted, atol=2e-5)
@@ -392,8 +396,10 @@ def test_the_losses_are_weighed(made):
 def test_the_roll_network_learns_from_inexact_inputs_what_is_exact(made):
     it = made("stardiff")
     given, batch = prepared(it)
-    exact = jit(lambda x: features.demonstrated(it.stats, "rcm4", x))(batch)
-    seen = jit(lambda x: features.measured(it.stats, "rcm4", x.observation, x.trocar))(batch)
+    exact = jit(lambda x: features.encode_commands(it.stats, "rcm4", x))(batch)
+    seen = jit(lambda x: features.encode_proprioception(it.stats, "rcm4", x.observation, x.trocar))(
+        batch
+    )
     p = np.ravel(given.p[:, :, 0] - exact[..., 1:4])
     roll = np.ravel(given.history - seen[..., :1])
     assert p.std() == pytest.approx(hierarchical.POSITION_NOISE, rel=0.1)
@@ -463,12 +469,12 @@ def test_what_is_measured_is_of_the_scale_of_what_is_learned(made):
     reached = batch.observation._replace(pose=command.pose, gripper=command.gripper)
     where = (it.stats, "rcm4")
     np.testing.assert_allclose(
-        features.measured(*where, reached, batch.trocar),
-        features.demonstrated(*where, batch),
+        features.encode_proprioception(*where, reached, batch.trocar),
+        features.encode_commands(*where, batch),
         atol=1e-6,
     )
     zeros = jnp.zeros((B, 2, 4))
-    inputs = features.for_sampling(fakes.TINY, SEEN, it.stats, batch.observation, zeros)
+    inputs = features.inference_inputs(fakes.TINY, SEEN, it.stats, batch.observation, zeros)
     state = it.stats.state.normalize(batch.observation.state)
     np.testing.assert_array_equal(inputs.history[..., 4:16], state)
 
@@ -504,7 +510,7 @@ def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
     seen, trocar = it.batch.observation, it.batch.trocar
     keys = jax.random.split(jax.random.key(1), B)
     pose = jit(policy.sample)(it.params, it.stats, keys, seen, trocar).pose
-    measured = features.measured(it.stats, "rcm4", seen, trocar)[..., :1]
+    measured = features.encode_proprioception(it.stats, "rcm4", seen, trocar)[..., :1]
     assert np.abs(measured[:, 1] - measured[:, 0]).max() > 1e-2
     low, high = it.stats.action.low, it.stats.action.high
     p = (pose.p[..., 0] - low[1]) * 2.0 / (high - low)[1] - 1.0
@@ -516,9 +522,9 @@ def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
 def test_inference_reads_what_training_read(made):
     it = made("stardiff")
     where = (it.stats, "rcm4", it.batch.observation, it.batch.trocar)
-    given = it.batch.observation, features.measured(*where)
-    exact = features.for_training(fakes.TINY, TRAIN, SEEN, it.stats, jax.random.key(0), *given)
-    again = features.for_sampling(fakes.TINY, SEEN, it.stats, *given)
+    given = it.batch.observation, features.encode_proprioception(*where)
+    exact = features.training_inputs(fakes.TINY, TRAIN, SEEN, it.stats, jax.random.key(0), *given)
+    again = features.inference_inputs(fakes.TINY, SEEN, it.stats, *given)
     assert (exact.history[:, 0] != exact.history[:, 1]).any()
     np.testing.assert_array_equal(exact.history, again.history)
 
@@ -532,7 +538,7 @@ def test_what_is_not_observed_is_named(made, missing):
     blind = it.batch.observation._replace(images=None)
     stats = it.stats.replace(state=None)
     with pytest.raises(ValueError, match=rf"observation\.{missing}: expected .*got None"):
-        features.for_training(
+        features.training_inputs(
             settings, TRAIN, SEEN, stats, jax.random.key(0), blind, jnp.zeros((B, 2, 4))
         )
 

@@ -20,7 +20,7 @@ def run(out: Path) -> None:
 
     env, trocars, layout = stubs.make_env(), stubs.trocars(0, 4, 8), DeviceLayout(lanes=2)
     expert = agent.from_single(stubs.EXPERT)
-    settings = schema.Settings(per_trocar=3, seed=0, max_steps=100)
+    settings = schema.DemoSettings(per_trocar=3, seed=0, max_steps=100)
     demos.collect(out / "demos", env, expert, trocars, settings, layout=layout)
     sample, params = stubs.make_policy(width=32)
     found = evaluate.evaluate(

@@ -177,7 +177,7 @@ def test_a_program_with_other_settings_mixes_no_trials(
 
 def test_demonstrations_of_other_settings_are_another_dataset(changed):
     def named():
-        wanted = schema.Settings(per_trocar=1, seed=0, max_steps=9)
+        wanted = schema.DemoSettings(per_trocar=1, seed=0, max_steps=9)
         return store.digest(schema.describe(stubs.make_env(), stubs.trocars(0, 4), wanted))
 
     usual = named()

@@ -98,7 +98,7 @@ def test_datasets_and_trajectories_have_its_pose(environment):
         frame = programs.frame(environment, record)
         assert frame["endoscope_R"].shape == (3, 3) and frame["endoscope_p"].shape == (3,)
     about = schema.describe(
-        environment, rcm.Trocar(*[np.zeros((1, 1))] * 3), schema.Settings(1, 0, 9)
+        environment, rcm.Trocar(*[np.zeros((1, 1))] * 3), schema.DemoSettings(1, 0, 9)
     )
     assert about["scene"]["cameras"] == ("endoscope",)
     assert {"endoscope_R", "endoscope_p", "image_endoscope"} <= about["features"].keys()

@@ -36,7 +36,7 @@ def test_shapes_of_batches_are_those_of_gathered_ones(arms, settings):
         ),
         dataset,
     )
-    assert stepper._alike(ahead.batch_shapes(settings, 7, features.sensors(task)), gathered)
+    assert stepper._alike(ahead.batch_shapes(settings, 7, features.select_sensors(task)), gathered)
 
 
 def test_a_training_takes_the_step_that_is_ready(tmp_path, monkeypatch):

@@ -67,7 +67,7 @@ def start():
 
 def layout(shapes, policy=None):
     return StateLayout(
-        devices.make_mesh(SETTINGS.batch_size), (policy or regression()).rounded, shapes
+        devices.make_mesh(SETTINGS.batch_size), (policy or regression()).cast_params, shapes
     )
 
 

@@ -67,7 +67,7 @@ def _time(run: Path, counts: Sequence[int], calls: int) -> dict[str, Any]:
 
     who = policy_evaluation.load(run.name, folders.weights(run.parent, run.name))
     trained = who.trained
-    seen = features.sensors(who.env.task, trained.scene.cameras)
+    seen = features.select_sensors(who.env.task, trained.scene.cameras)
     print("  DDIM steps      p50      p95      p99 ms       Hz")
     found = {}
     rows = latency.table(

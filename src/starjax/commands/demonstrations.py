@@ -31,7 +31,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
     task, name = env.task, config.demos.expert or next(iter(env.task.experts))
     errors.choice("demos.expert", name, task.experts)
     chosen = trocars.select(task.trocars, slice(config.demos.seen_trocars))
-    settings = schema.Settings(
+    settings = schema.DemoSettings(
         per_trocar=config.demos.per_trocar,
         seed=config.seed,
         max_steps=max(config.demos.max_steps, task.least_steps),

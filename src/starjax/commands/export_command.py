@@ -46,5 +46,6 @@ def main(argv: Sequence[str]) -> int:
         exchange.export(found, out, form, chosen.video, advance)
     inside = [out] if out.is_file() else [path for path in out.rglob("*") if path.is_file()]
     size = files.size(sum(path.stat().st_size for path in inside))
-    print(f"{out}: {form.what}, {len(found.lengths)} episodes, {sum(found.lengths)} frames, {size}")
+    counts = f"{len(found.lengths)} episodes, {sum(found.lengths)} frames"
+    print(f"{out}: {form.description}, {counts}, {size}")
     return 0

@@ -12,7 +12,7 @@ from starjax import errors
 from starjax.commands import checks, messages, options
 from starjax.runtime import progress, xla
 
-_SHOWN = 10  # oddities, the others are in a file
+_SHOWN = 10  # anomalies, the others are in a file
 DESCRIPTION = """Makes a dataset of demonstrations in another format, to train on.
 
 PATH is a LeRobot or zarr folder or an HDF5 file, OUT the dataset's folder. An export of starjax
@@ -41,8 +41,8 @@ def main(argv: Sequence[str]) -> int:
     checks.expect(not store.is_sealed(out), "OUT", "a folder without a dataset", out)
     if chosen.format != options.AUTO:
         errors.choice("format", chosen.format, base.FORMATS.names())
-    name = base.recognised(path) if chosen.format == options.AUTO else chosen.format
-    with base.opened(path, name) as source:
+    name = base.detect(path) if chosen.format == options.AUTO else chosen.format
+    with base.open_dataset(path, name) as source:
         if not chosen.map:
             return _bring_back(source, path, out)
         return _mapped(source, Path(chosen.map), out)
@@ -56,7 +56,7 @@ def _bring_back(source: Any, path: Path, out: Path) -> int:
             "PATH", "an export of starjax, or a --map", path, "starjax inspect shows its columns"
         )
     with progress.track("Import", len(source.lengths), unit="episodes") as advance:
-        found = exchange.bring_back(source, out, advance)
+        found = exchange.restore_export(source, out, advance)
     same = "every byte as it was" if found["same"] else "images or an earlier schema changed"
     print(f"{out}: {found['episodes']} demonstrations, {same}; digest {found['digest'][:12]}")
     return 0
@@ -68,7 +68,7 @@ def _mapped(source: Any, map_path: Path, out: Path) -> int:
 
     given = mapping.load(map_path)
     with progress.track("Import", 2 * len(source.lengths), unit="episodes read") as advance:
-        found = foreign.bring(source, given, out, map_path.parent, advance)
+        found = foreign.import_mapped(source, given, out, map_path.parent, advance)
     for line in found.notes[:_SHOWN]:
         messages.indented(line)
     if len(found.notes) > _SHOWN:

@@ -17,7 +17,7 @@ PATH is a folder of demonstrations, a LeRobot or zarr folder, a robomimic file, 
 or the name of a policy that ships with starjax, a result.json or a method's folder with one."""
 
 _LOOKED_AT = 50  # episodes of somebody's dataset whose numbers are read
-_SHOWN = 20  # oddities
+_SHOWN = 20  # anomalies
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Options:
 
 
 class Found(NamedTuple):
-    """A printed report: rows of names and texts, and oddities, a line each."""
+    """A printed report: rows of names and texts, and anomalies, a line each."""
 
     rows: list[tuple[str, str]]
     odd: list[str]
@@ -76,7 +76,7 @@ def inspect(name: str) -> Found:
 
 
 def _dataset(path: Path) -> Found:
-    from starjax.data import oddities, schema, store
+    from starjax.data import anomalies, schema, store
 
     about = schema.upgraded(store.read_description(path))
     scene, keys = about["scene"], store.keys(path)
@@ -100,7 +100,7 @@ def _dataset(path: Path) -> Found:
         (f"  {name}", f"{feature['dtype']} {feature['shape']}  {feature.get('what', '')}")
         for name, feature in about["features"].items()
     ]
-    return Found(rows, list(oddities.of_dataset(path)))
+    return Found(rows, list(anomalies.find(path)))
 
 
 def _policy(path: Path) -> Found:
@@ -161,13 +161,13 @@ def _result(path: Path) -> Found:
 def _others(path: Path) -> Found:
     from starjax.data.formats import base
 
-    name = base.recognised(path)
-    with base.opened(path, name) as source:
+    name = base.detect(path)
+    with base.open_dataset(path, name) as source:
         lengths = sorted(source.lengths)
         rate = f"{source.hz:g} Hz" if source.hz else "unknown"
         comes = "starjax export: starjax import brings it back" if source.origin else "others"
         rows = [
-            ("dataset", base.FORMATS.get(name).what),
+            ("dataset", base.FORMATS.get(name).description),
             ("from", comes),
             ("task", source.task),
             ("episodes", f"{len(lengths)}, {sum(lengths)} frames"),

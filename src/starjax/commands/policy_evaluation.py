@@ -104,7 +104,7 @@ def compile_ahead(
     params = jax.eval_shape(policy.init, jax.random.key(0))
     if vision is not None:
         params = {**params, "vision": vision}
-    params = jax.eval_shape(policy.for_sampling, params)
+    params = jax.eval_shape(policy.prepare_for_inference, params)
     told = policies.ablated(row, config.policy)
     stats = normalizer.shapes(told, env.task, config.policy.observation == "state")
     trials = evaluate.compile_ahead(
@@ -114,7 +114,7 @@ def compile_ahead(
         env.task.trocars,
         _settings(config.eval, config.seed),
     )
-    seen = features.sensors(env.task, env.names.cameras)
+    seen = features.select_sensors(env.task, env.names.cameras)
     return Programs(trials, latency.compile_ahead(policy, deciding, params, stats, seen))
 
 
@@ -145,7 +145,7 @@ def inference_ms(who: PolicyInEnv, decide: latency.Decide | None = None) -> dict
         trained.policy,
         trained.params,
         trained.normalizer,
-        features.sensors(who.env.task, trained.scene.cameras),
+        features.select_sensors(who.env.task, trained.scene.cameras),
         seconds=5.0,
         decide=decide,
     )

@@ -24,7 +24,7 @@ import numpy as np
 
 from starjax import errors
 from starjax.data import schema, store
-from starjax.data.schema import Settings
+from starjax.data.schema import DemoSettings
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import engine, episodes, sharing, success_quota, workers
 from starjax.rollouts import trocars as configurations
@@ -43,7 +43,7 @@ def collect(
     env: Any,
     agent: BatchAgent,
     trocars: Trocar,
-    settings: Settings,
+    settings: DemoSettings,
     *,
     params: Any = None,
     layout: DeviceLayout = DEFAULT_LAYOUT,
@@ -131,7 +131,7 @@ def collect(
 def _prepare(
     root: Path,
     description: dict[str, Any],
-    settings: Settings,
+    settings: DemoSettings,
     total: int,
     report: Callable[[str], None],
 ) -> None:
@@ -163,7 +163,7 @@ def _simulator(
     agent: BatchAgent,
     params: Any,
     trocars: Trocar,
-    settings: Settings,
+    settings: DemoSettings,
     layout: DeviceLayout,
 ) -> Callable[[list[episodes.Trial]], Generator[list[episodes.Episode]]]:
     rules = engine.Settings(settings.seed, schema.STREAM, settings.max_steps, layout.lanes)

@@ -83,7 +83,7 @@ def verify(root: Path) -> None:
     _successful(Path(root), store.read_seal(Path(root)), verify=True)
 
 
-def frames(root: Path) -> "dict[str, Frames]":
+def frames(root: Path) -> "dict[str, EpisodeArray]":
     """The images of the successful episodes by camera, memory-mapped, in the order of `load`.
 
     They are for reading in that order: few files stay open.
@@ -99,7 +99,9 @@ def frames(root: Path) -> "dict[str, Frames]":
     length, start = _spans(records)
     few = _OPEN_IN_TURN * workers.worker_count()
     found = {
-        name.removeprefix(episodes.IMAGE): Frames(_paths(root, records, file), start, length, few)
+        name.removeprefix(episodes.IMAGE): EpisodeArray(
+            _paths(root, records, file), start, length, few
+        )
         for name, file in fields.items()
         if name.startswith(episodes.IMAGE)
     }
@@ -159,7 +161,7 @@ def _place(total: int) -> str:
     free = stats.get("bytes_limit", 2 * host) - stats.get("bytes_in_use", 0)
     if device.platform == "cpu":  # jax copies them within the same memory, for each device
         free = HOST_SHARE * host / jax.local_device_count()
-    # Frames pass through host memory on their way to the device.
+    # EpisodeArray pass through host memory on their way to the device.
     if total <= DEVICE_SHARE * free and total <= HOST_SHARE * host:
         return "device"
     return "host" if total <= HOST_SHARE * host else "disk"
@@ -176,7 +178,7 @@ def _dataset(
     fields, images = {}, {}
     for name, file in files_of.items():
         # Only images are large; everything else is read in any case.
-        joined = Frames(_paths(root, records, file), start, length)
+        joined = EpisodeArray(_paths(root, records, file), start, length)
         if name.startswith(episodes.IMAGE):
             camera = name.removeprefix(episodes.IMAGE)
             images[camera] = joined if place == "disk" else joined.read()
@@ -211,7 +213,7 @@ def _endoscope(fields: dict[str, Any]) -> Pose | None:
     return Pose(*known) if known else None
 
 
-class Frames:
+class EpisodeArray:
     """One field of all episodes as if it were one array `[F, ...]`, read from disk when indexed."""
 
     def __init__(
@@ -224,7 +226,7 @@ class Frames:
         self.dtype = first.dtype
 
     def __getitem__(self, index: Any) -> np.ndarray:
-        """Frames at `index`, `[N]` integers, as `[N, ...]` in memory."""
+        """EpisodeArray at `index`, `[N]` integers, as `[N, ...]` in memory."""
         index = np.asarray(index)
         out = np.zeros((*index.shape, *self.shape[1:]), self.dtype)
         episode = np.searchsorted(self._start, index, side="right") - 1

@@ -62,16 +62,16 @@ class Normalizer:
     state: MinMax | None
 
 
-def encode(action_space: str, pose: Any, gripper: Any, told: rcm.TrocarFrame) -> jax.Array:
+def encode(action_space: str, pose: Any, gripper: Any, trocar: rcm.TrocarFrame) -> jax.Array:
     """Poses and grippers `[..., A]` as one vector `[..., A * (dim + 1)]`, not yet scaled.
 
     Args:
       action_space: key of `rcm.ACTION_SPACES`, whose vectors have `dim` entries.
       pose: of the tips, `[..., A]`.
       gripper: `[..., A]`.
-      told: what broadcasts against them.
+      trocar: what broadcasts against them.
     """
-    encoded = rcm.ACTION_SPACES[action_space].encode(pose, told)
+    encoded = rcm.ACTION_SPACES[action_space].encode(pose, trocar)
     vector = jnp.concatenate([encoded, jnp.asarray(gripper)[..., None]], axis=-1)
     return vector.reshape(*vector.shape[:-2], -1)
 
@@ -94,11 +94,11 @@ def fit(
     """
 
     @jax.jit
-    def encode_commands(camera, command, told):
+    def encode_commands(camera, command, trocar):
         if camera is not None:
             command = camera_frames.command(camera, command)
-            told = camera_frames.trocar(task, camera, told)
-        return encode(method.action_space, command.pose, command.gripper, told)
+            trocar = camera_frames.trocar(task, camera, trocar)
+        return encode(method.action_space, command.pose, command.gripper, trocar)
 
     def camera_of(observation):
         return None if frame == "world" else camera_frames.of(observation)

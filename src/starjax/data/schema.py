@@ -26,7 +26,7 @@ _PER_ARM = ("p", "R", "gripper", "command_p", "command_R", "command_gripper", "r
 _PLACE = ("radius", "polar", "azimuth")
 
 
-class Settings(NamedTuple):
+class DemoSettings(NamedTuple):
     """Which demonstrations a dataset has.
 
     Attributes:
@@ -46,7 +46,7 @@ class Settings(NamedTuple):
     randomise: Mapping[str, float] = types.MappingProxyType({})
 
 
-def describe(env: Any, trocars: Trocar, settings: Settings) -> dict[str, Any]:
+def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any]:
     """Describes a dataset: the content of dataset.json, and by `store.digest` its name.
 
     Args:
@@ -87,7 +87,7 @@ def describe(env: Any, trocars: Trocar, settings: Settings) -> dict[str, Any]:
     }
 
 
-def expert_name(task: Any, settings: Settings) -> str:
+def expert_name(task: Any, settings: DemoSettings) -> str:
     """Which of the task's experts the settings mean."""
     name = settings.expert or next(iter(task.experts))
     errors.choice("expert", name, task.experts)

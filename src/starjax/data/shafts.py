@@ -11,7 +11,7 @@ ROWS = 1024  # poses that an estimate is made of, at most
 _estimate = jax.jit(rcm.trocar_from_poses)
 
 
-def thinned(x: Any) -> np.ndarray:
+def subsample(x: Any) -> np.ndarray:
     """At most `ROWS` of `[T, ...]`, evenly spaced."""
     return np.asarray(x)[np.linspace(0, len(x) - 1, min(len(x), ROWS)).astype(int)]
 
@@ -28,7 +28,7 @@ def estimate(R: Any, p: Any) -> rcm.TrocarEstimate:
     """
 
     def rows(x: Any) -> np.ndarray:
-        some = thinned(x)
+        some = subsample(x)
         padded = np.full((ROWS, *some.shape[1:]), np.nan, np.float32)
         padded[: len(some)] = some
         return padded.swapaxes(0, 1)

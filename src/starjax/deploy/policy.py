@@ -208,7 +208,7 @@ def load(
     row = methods.METHODS[method]
     task = registry.tasks.get(trained.scene.task)
     made = policies.make(row, settings, task, cameras=trained.scene.cameras)
-    params = made.for_sampling(trained.params)
+    params = made.prepare_for_inference(trained.params)
     places = np.asarray(trained.p_world_ref, np.float32)
     arms = () if len(places) == 1 else (len(places),)
     input_spec = inputs.InputSpec(

@@ -25,12 +25,12 @@ class Policy(NamedTuple):
         pytree of arrays whose leading axis is the batch.
       loss: `(params, prepared) -> (scalar, {name: scalar})`, the names being `metrics`: means over
         the batch.
-      sample: `(params, stats, keys [B], Observation [B, O, A], told [B, A]) -> Command [B, H, A]`,
-        finite whatever the networks say. What sample i draws depends on `keys[i]` alone.
-      metrics: names of what `loss` tells beside its value.
-      rounded: `params -> params` whose large matrices are in the type that is calculated in.
-      for_sampling: `params -> params` as `sample` uses them fastest here: for evaluation, not for
-        training.
+      sample: `(params, stats, keys [B], Observation [B, O, A], trocar [B, A]) -> Command
+        [B, H, A]`, always finite. Sample i depends on `keys[i]` alone; `trocar` is measured.
+      metrics: names of the metrics that `loss` returns.
+      cast_params: `params -> params` with large matrices in the networks' dtype.
+      prepare_for_inference: `params -> params` in the form that `sample` uses fastest, for
+        inference only.
     """
 
     init: Callable[[jax.Array], Params]
@@ -41,5 +41,5 @@ class Policy(NamedTuple):
         Command,
     ]
     metrics: tuple[str, ...] = ()
-    rounded: Callable[[Params], Params] = lambda params: params
-    for_sampling: Callable[[Params], Params] = lambda params: params
+    cast_params: Callable[[Params], Params] = lambda params: params
+    prepare_for_inference: Callable[[Params], Params] = lambda params: params

@@ -33,7 +33,7 @@ def make(
         return {"unet": unet.init(key, jnp.zeros((1, *shape)), jnp.zeros(1, jnp.int32), condition)}
 
     def loss(params: Params, condition: Condition, given: Any) -> tuple[jax.Array, dict]:
-        joined = sequences.joined(condition)
+        joined = sequences.condition_vector(condition)
 
         def predict(x: jax.Array, time: jax.Array, rows: Any = slice(None)) -> jax.Array:
             return apply(params["unet"], x, time, joined[rows])
@@ -43,7 +43,7 @@ def make(
     def sample(
         params: Params, keys: jax.Array, condition: Condition, reach: jax.Array | None
     ) -> jax.Array:
-        film = apply(params["unet"], sequences.joined(condition), method="condition")
+        film = apply(params["unet"], sequences.condition_vector(condition), method="condition")
 
         def predict(x: jax.Array, film_of_time: jax.Array) -> jax.Array:
             """Predicts for `x` `[B, H, D]` at one time, or `[n, B, H, D]` at n times."""
@@ -58,15 +58,15 @@ def make(
             reach=reach,
         )
 
-    def rounded(params: Any) -> Any:
-        return sequences.rounded(params, _MATRICES, unet.dtype)
+    def cast_params(params: Any) -> Any:
+        return sequences.cast_params(params, _MATRICES, unet.dtype)
 
-    def for_sampling(params: Params) -> Params:
+    def prepare_for_inference(params: Params) -> Params:
         network = params["unet"]
         if sampling_unet.pays():
             network = sampling_unet.prepared(network)
-        network = rounded(network)
+        network = cast_params(network)
         packs = packed_params.pays(jax.default_backend())
         return {"unet": packed_params.packed(network) if packs else network}
 
-    return SequenceModel(init, process.noised, loss, sample, rounded, for_sampling)
+    return SequenceModel(init, process.noised, loss, sample, cast_params, prepare_for_inference)

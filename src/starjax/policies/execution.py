@@ -13,7 +13,7 @@ def command(
     method: methods.Method,
     stats: normalizer.Normalizer,
     action: jax.Array,
-    told: rcm.TrocarFrame,
+    trocar: rcm.TrocarFrame,
 ) -> Command:
     """Commands `[B, H, A]` of normalised actions `[B, H, A * (dim + 1)]`, as `normalizer.encode`.
 
@@ -24,9 +24,9 @@ def command(
       method: gives the action space, and whether poses are projected onto the RCM manifold.
       stats: of the method.
       action: from the networks, any values.
-      told: `[B, A]`.
+      trocar: `[B, A]`.
     """
-    frame = features.per_step(told)
+    frame = features.per_step(trocar)
     space = rcm.ACTION_SPACES[method.action_space]
     vector = stats.action.denormalize(action)
     vector = vector.reshape(*vector.shape[:-1], -1, space.dim + 1)

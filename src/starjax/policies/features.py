@@ -44,14 +44,14 @@ class Inputs(NamedTuple):
     features: jax.Array | None = None
 
 
-def sensors(task: Task, cameras: Sequence[str] = ()) -> Sensors:
+def select_sensors(task: Task, cameras: Sequence[str] = ()) -> Sensors:
     """The given cameras of a task, or its first one."""
     return Sensors(task, tuple(cameras) or task.cameras[:1])
 
 
-def per_step(told: rcm.TrocarFrame) -> rcm.TrocarFrame:
+def per_step(trocar: rcm.TrocarFrame) -> rcm.TrocarFrame:
     """Frames `[B, A]` as `[B, 1, A]`, beside what has a time axis."""
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], told)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], trocar)
 
 
 def trocar_features(trocar: rcm.Trocar) -> jax.Array:
@@ -69,14 +69,14 @@ def trocar_features(trocar: rcm.Trocar) -> jax.Array:
     return jnp.concatenate([scalars, shift / _LENGTH], axis=-1)
 
 
-def extra_dim(method: methods.Method, task: Task) -> int:
-    """Width of `extra`."""
+def trocar_condition_dim(method: methods.Method, task: Task) -> int:
+    """Width of `trocar_condition`."""
     return TROCAR_FEATURES * task.arms if method.sees_trocar else 0
 
 
-def extra(method: methods.Method, told: rcm.TrocarFrame) -> jax.Array:
+def trocar_condition(method: methods.Method, trocar: rcm.TrocarFrame) -> jax.Array:
     """Condition of a model beside the observation: all trocars' features `[B, E]`, or none."""
-    found = trocar_features(told.trocar)
+    found = trocar_features(trocar.trocar)
     return found.reshape(len(found), -1) if method.sees_trocar else jnp.zeros((len(found), 0))
 
 
@@ -89,18 +89,20 @@ def history_dim(policy_config: config.PolicyConfig, task: Task, proprioception: 
     return proprioception + task.state_size + relative.shape[-1]
 
 
-def measured(
+def encode_proprioception(
     stats: normalizer.Normalizer,
     action_space: str,
     observation: Observation,
-    told: rcm.TrocarFrame,
+    trocar: rcm.TrocarFrame,
 ) -> jax.Array:
     """Proprioception `[B, O, D]`: measured poses and grippers as normalised actions."""
-    encoded = normalizer.encode(action_space, observation.pose, observation.gripper, per_step(told))
+    encoded = normalizer.encode(
+        action_space, observation.pose, observation.gripper, per_step(trocar)
+    )
     return stats.action.normalize(encoded)
 
 
-def demonstrated(
+def encode_commands(
     stats: normalizer.Normalizer, action_space: str, batch: windows.Batch
 ) -> jax.Array:
     """Demonstrated commands of a batch as normalised actions `[B, H, D]`."""
@@ -109,26 +111,26 @@ def demonstrated(
     return stats.action.normalize(encoded)
 
 
-def for_sampling(
+def inference_inputs(
     policy_config: config.PolicyConfig,
-    seen: Sensors,
+    sensors: Sensors,
     stats: normalizer.Normalizer,
     observation: Observation,
     proprioception: jax.Array,
 ) -> Inputs:
     """Inputs as they are at inference: centre crops, no noise."""
-    history = _history(policy_config, seen.task, stats, observation, proprioception)
+    history = _history(policy_config, sensors.task, stats, observation, proprioception)
     if policy_config.observation == "state":
         return Inputs(history)
     if observation.features is not None:
         return Inputs(history, features=observation.features)
-    return Inputs(history, centre_crop(policy_config, _images(seen, observation)))
+    return Inputs(history, centre_crop(policy_config, _images(sensors, observation)))
 
 
-def for_training(
+def training_inputs(
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,
-    seen: Sensors,
+    sensors: Sensors,
     stats: normalizer.Normalizer,
     key: jax.Array,
     observation: Observation,
@@ -139,7 +141,7 @@ def for_training(
     What a frozen encoder saw in centre crops stays as it is, so that inference sees the same.
     """
     key_history, key_image = jax.random.split(key)
-    history = _history(policy_config, seen.task, stats, observation, proprioception)
+    history = _history(policy_config, sensors.task, stats, observation, proprioception)
     noise = jax.random.normal(key_history, history.shape, history.dtype)
     history = history + train_config.state_noise * noise
     if policy_config.observation == "state":
@@ -148,7 +150,7 @@ def for_training(
         return Inputs(history, features=_features(observation))
     images, offset = augment.augment(
         key_image,
-        _images(seen, observation),
+        _images(sensors, observation),
         crop=crop_size(policy_config),
         jitter=train_config.jitter,
         noise=train_config.image_noise,
@@ -188,16 +190,16 @@ def _history(
     return jnp.concatenate([proprioception, stats.state.normalize(state), relative], axis=-1)
 
 
-def _images(seen: Sensors, observation: Observation) -> jax.Array:
+def _images(sensors: Sensors, observation: Observation) -> jax.Array:
     """`[B, O, K, h, w, 3]`."""
     given = observation.images or {}
-    missing = [name for name in seen.cameras if name not in given]
+    missing = [name for name in sensors.cameras if name not in given]
     if missing:
         raise ValueError(
-            f"observation.images: expected {', '.join(seen.cameras)} for a policy with "
+            f"observation.images: expected {', '.join(sensors.cameras)} for a policy with "
             f'observation="image", got {", ".join(given) or "None"}'
         )
-    return jnp.stack([given[name] for name in seen.cameras], axis=-4)
+    return jnp.stack([given[name] for name in sensors.cameras], axis=-4)
 
 
 def _features(observation: Observation) -> jax.Array:

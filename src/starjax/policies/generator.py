@@ -24,37 +24,37 @@ class Generator(NamedTuple):
     Attributes:
       init: `key -> params`, those that training changes: without `vision` where no image is read,
         or its encoder is frozen.
-      observe: `(params, inputs, told [B, E]) -> Condition`.
+      observe: `(params, inputs, trocar_condition [B, E]) -> Condition`.
       model: of sequences, whose parameters are `params["learner"]`.
-      rounded, for_sampling: as those of `sequences.SequenceModel`, of all of them.
+      cast_params, prepare_for_inference: as those of `sequences.SequenceModel`, of all of them.
     """
 
     init: Callable[[jax.Array], Params]
     observe: Callable[[Params, features.Inputs, jax.Array], Condition]
     model: SequenceModel
-    rounded: Callable[[Params], Params]
-    for_sampling: Callable[[Params], Params]
+    cast_params: Callable[[Params], Params]
+    prepare_for_inference: Callable[[Params], Params]
 
 
 def sizes(
-    policy_config: config.PolicyConfig, seen: features.Sensors, action: int, told: int = 0
+    policy_config: config.PolicyConfig, sensors: features.Sensors, action: int, trocar: int = 0
 ) -> Sizes:
     """Sizes for actions of so many numbers, where so many tell of the trocars."""
     sees_image = policy_config.observation == "image"
     return Sizes(
         horizon=policy_config.horizon,
         action=action,
-        moments=policy_config.obs_horizon,
-        vision=len(seen.cameras) * policy_config.vision_dim if sees_image else 0,
+        obs_horizon=policy_config.obs_horizon,
+        vision=len(sensors.cameras) * policy_config.vision_dim if sees_image else 0,
         state=policy_config.state_dim,
-        told=told,
+        trocar=trocar,
     )
 
 
 def make(
     method: methods.Method,
     policy_config: config.PolicyConfig,
-    seen: features.Sensors,
+    sensors: features.Sensors,
     action: int,
 ) -> Generator:
     """The networks of the settings.
@@ -62,7 +62,7 @@ def make(
     Args:
       method: says whether trocars are told.
       policy_config: networks, and the learner.
-      seen: what is observed.
+      sensors: what is observed.
       action: D, numbers of an action, and of the proprioception of a moment.
     """
     dtype = jnp.dtype(policy_config.dtype)
@@ -70,10 +70,12 @@ def make(
     state = encoders.StateEncoder(features=policy_config.state_dim, dtype=dtype)
     of_state, of_vision = map(packed_params.applied, (state.apply, vision.apply))
     learner, size = LEARNERS.get(policy_config.learner), policy_config.image_size
-    dims = sizes(policy_config, seen, action, features.extra_dim(method, seen.task))
+    dims = sizes(
+        policy_config, sensors, action, features.trocar_condition_dim(method, sensors.task)
+    )
     model = learner.make(policy_config.options, policy_config, dims)
     learns_vision = policy_config.observation == "image" and not policy_config.freeze_encoder
-    width = features.history_dim(policy_config, seen.task, action)
+    width = features.history_dim(policy_config, sensors.task, action)
 
     def init(key: jax.Array) -> Params:
         key_vision, key_state, key_learner = jax.random.split(key, 3)
@@ -83,7 +85,7 @@ def make(
             params["vision"] = vision.init(key_vision, jnp.zeros((1, size, size, 3)))
         return params
 
-    def observe(params: Params, inputs: features.Inputs, told: jax.Array) -> Condition:
+    def observe(params: Params, inputs: features.Inputs, trocar_condition: jax.Array) -> Condition:
         visual = inputs.features
         if visual is None and inputs.images is not None:
             batch, moments, offset = *inputs.images.shape[:2], inputs.offset
@@ -92,20 +94,20 @@ def make(
                 inputs.images.reshape(-1, *inputs.images.shape[3:]),
                 None if offset is None else offset.reshape(-1, 2),
             ).reshape(batch, moments, -1)
-        return Condition(visual, of_state(params["state"], inputs.history), told)
+        return Condition(visual, of_state(params["state"], inputs.history), trocar_condition)
 
-    def rounded(params: Params) -> Params:
-        return {**_rounded_vision(params, dtype), "learner": model.rounded(params["learner"])}
+    def cast_params(params: Params) -> Params:
+        return {**_cast_vision(params, dtype), "learner": model.cast_params(params["learner"])}
 
-    def for_sampling(params: Params) -> Params:
-        found = _rounded_vision(params, dtype)
+    def prepare_for_inference(params: Params) -> Params:
+        found = _cast_vision(params, dtype)
         if packed_params.pays(jax.default_backend()):
             # A decision for one robot begins the later, the more arrays it is handed.
             readers = found.keys() - {"learner"}
             found = {**found, **{name: packed_params.packed(found[name]) for name in readers}}
-        return {**found, "learner": model.for_sampling(params["learner"])}
+        return {**found, "learner": model.prepare_for_inference(params["learner"])}
 
-    return Generator(init, observe, model, rounded, for_sampling)
+    return Generator(init, observe, model, cast_params, prepare_for_inference)
 
 
 def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:
@@ -117,10 +119,10 @@ def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:
     )
 
 
-def _rounded_vision(params: Params, dtype: jnp.dtype) -> Params:
-    """The trunk's kernels rounded; other parameters as they are."""
+def _cast_vision(params: Params, dtype: jnp.dtype) -> Params:
+    """The trunk's kernels cast_params; other parameters as they are."""
     if "vision" not in params:
         return params
     inner = params["vision"]["params"]
-    trunk = sequences.rounded(inner["trunk"], {"kernel"}, dtype)
+    trunk = sequences.cast_params(inner["trunk"], {"kernel"}, dtype)
     return {**params, "vision": {"params": {**inner, "trunk": trunk}}}

@@ -1,4 +1,4 @@
-"""STAR-Diff: a model of (position, gripper), not told the trocar, and a network for the roll.
+"""STAR-Diff: a model of (position, gripper), not trocar the trocar, and a network for the roll.
 
 Of several arms, positions and grippers are generated together; one roll network serves each arm in
 turn, with that arm's path, trocar and measured rolls.
@@ -24,13 +24,13 @@ POSITION_NOISE = 0.02
 ROLL_NOISE = 0.05
 
 
-class Prepared(NamedTuple):
+class PreparedHierarchy(NamedTuple):
     """A batch as the networks learn from it.
 
     Attributes:
       inputs: what was observed.
-      told: `[B, E]`, what conditions the model of positions beside it.
-      given: what that model learns from.
+      trocar_condition: `[B, E]`, what conditions the model of positions beside it.
+      model_inputs: what that model learns from.
       p: `[B, H, A, 3]` demonstrated positions with noise, for the roll network.
       trocar: `[B, A, 7]` features.
       history: `[B, O, A]` measured rolls with noise.
@@ -38,8 +38,8 @@ class Prepared(NamedTuple):
     """
 
     inputs: features.Inputs
-    told: jax.Array
-    given: Any
+    trocar_condition: jax.Array
+    model_inputs: Any
     p: jax.Array
     trocar: jax.Array
     history: jax.Array
@@ -49,7 +49,7 @@ class Prepared(NamedTuple):
 def make(
     method: methods.Method,
     policy_config: config.PolicyConfig,
-    seen: features.Sensors,
+    sensors: features.Sensors,
     train_config: config.TrainConfig,
 ) -> Policy:
     """The hierarchical policy in an action space of (roll, position)."""
@@ -58,9 +58,9 @@ def make(
         raise ValueError(
             f"method.action_space: expected one of roll and position, got {method.action_space!r}"
         )
-    arms, position, roll = seen.task.arms, space.slices["p"], space.slices["roll"].start
+    arms, position, roll = sensors.task.arms, space.slices["p"], space.slices["roll"].start
     dim = 4 * arms  # of what is generated, see `generated`
-    networks = generator.make(method, policy_config, seen, dim)
+    networks = generator.make(method, policy_config, sensors, dim)
     model = networks.model
     rolls = roll_net.RollNet(
         width=policy_config.roll_width,
@@ -76,7 +76,7 @@ def make(
         p = jnp.zeros((1, policy_config.horizon, 3))
         trocar = jnp.zeros((1, features.TROCAR_FEATURES))
         history = jnp.zeros((1, policy_config.obs_horizon))
-        observed = generator.sizes(policy_config, seen, dim).observed
+        observed = generator.sizes(policy_config, sensors, dim).observed
         more = jnp.zeros((1, observed)) if policy_config.roll_observation else None
         return {
             **networks.init(key_model),
@@ -94,7 +94,7 @@ def make(
         batch, horizon = p.shape[:2]
         more = None
         if policy_config.roll_observation:
-            more = jnp.repeat(sequences.observed(condition), arms, axis=0)
+            more = jnp.repeat(sequences.observation_vector(condition), arms, axis=0)
         found = predict(
             params["roll"],
             p.swapaxes(1, 2).reshape(batch * arms, horizon, 3),
@@ -104,14 +104,16 @@ def make(
         )
         return found.reshape(batch, arms, horizon).swapaxes(1, 2)
 
-    def prepare(stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch) -> Prepared:
+    def prepare(
+        stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
+    ) -> PreparedHierarchy:
         key_inputs, key_model, key_p, key_roll = jax.random.split(key, 4)
-        action = features.demonstrated(stats, method.action_space, batch)
+        action = features.encode_commands(stats, method.action_space, batch)
         measured = _measured(stats, batch.observation, batch.trocar)
-        inputs = features.for_training(
+        inputs = features.training_inputs(
             policy_config,
             train_config,
-            seen,
+            sensors,
             stats,
             key_inputs,
             batch.observation,
@@ -119,20 +121,20 @@ def make(
         )
         wanted = by_arm(action)
         p, history = wanted[..., position], by_arm(measured)[..., roll]
-        return Prepared(
+        return PreparedHierarchy(
             inputs=inputs,
-            told=features.extra(method, batch.trocar),
-            given=model.prepare(key_model, generated(action)),
+            trocar_condition=features.trocar_condition(method, batch.trocar),
+            model_inputs=model.prepare(key_model, generated(action)),
             p=p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
             trocar=features.trocar_features(batch.trocar.trocar),
             history=history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
             roll=wanted[..., roll],
         )
 
-    def loss(params: Params, prepared: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def loss(params: Params, prepared: PreparedHierarchy) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Eq. 15."""
-        condition = networks.observe(params, prepared.inputs, prepared.told)
-        position_loss, metrics = model.loss(params["learner"], condition, prepared.given)
+        condition = networks.observe(params, prepared.inputs, prepared.trocar_condition)
+        position_loss, metrics = model.loss(params["learner"], condition, prepared.model_inputs)
         path = prepared.p, prepared.trocar, prepared.history
         predicted = rolls_along(params, *path, condition)
         roll_loss = jnp.mean((prepared.roll - predicted) ** 2)  # Eq. 14
@@ -144,16 +146,18 @@ def make(
         stats: normalizer.Normalizer,
         keys: jax.Array,
         observation: Observation,
-        told: rcm.TrocarFrame,
+        trocar: rcm.TrocarFrame,
     ) -> Command:
-        measured = _measured(stats, observation, told)
-        inputs = features.for_sampling(policy_config, seen, stats, observation, generated(measured))
-        condition = networks.observe(params, inputs, features.extra(method, told))
+        measured = _measured(stats, observation, trocar)
+        inputs = features.inference_inputs(
+            policy_config, sensors, stats, observation, generated(measured)
+        )
+        condition = networks.observe(params, inputs, features.trocar_condition(method, trocar))
         reach = stats.action.reach
         reach = None if reach is None else generated(reach)
         x0 = model.sample(params["learner"], keys, condition, reach)
         p, gripper = jnp.split(by_arm(x0), [3], axis=-1)
-        about = features.trocar_features(told.trocar)
+        about = features.trocar_features(trocar.trocar)
         gamma = rolls_along(params, p, about, by_arm(measured)[..., roll], condition)
         # within the demonstrated range, as what is generated
         gamma = jnp.clip(gamma, -1.0, 1.0)[..., None]
@@ -161,7 +165,7 @@ def make(
         ordered = sorted(parts, key=lambda name: space.slices[name].start)
         action = jnp.concatenate([*(parts[name] for name in ordered), gripper], axis=-1)
         action = action.reshape(*x0.shape[:-1], -1)
-        return execution.command(method, stats, action, told)
+        return execution.command(method, stats, action, trocar)
 
     def by_arm(vector: jax.Array) -> jax.Array:
         """`[..., A * n]` as `[..., A, n]`."""
@@ -173,13 +177,13 @@ def make(
         kept = jnp.concatenate([parts[..., position], parts[..., -1:]], axis=-1)
         return kept.reshape(*vector.shape[:-1], -1)
 
-    def _measured(stats, observation, told):
-        return features.measured(stats, method.action_space, observation, told)
+    def _measured(stats, observation, trocar):
+        return features.encode_proprioception(stats, method.action_space, observation, trocar)
 
-    def for_sampling(params: Params) -> Params:
-        found, of_rolls = networks.for_sampling(params), params["roll"]
+    def prepare_for_inference(params: Params) -> Params:
+        found, of_rolls = networks.prepare_for_inference(params), params["roll"]
         packs = packed_params.pays(jax.default_backend())
         return {**found, "roll": packed_params.packed(of_rolls) if packs else of_rolls}
 
     metrics = ("position_loss", "roll_loss", *model.metrics)
-    return Policy(init, prepare, loss, sample, metrics, networks.rounded, for_sampling)
+    return Policy(init, prepare, loss, sample, metrics, networks.cast_params, prepare_for_inference)

@@ -33,11 +33,11 @@ def make(policy: Policy, task: Task) -> Policy:
         stats: normalizer.Normalizer,
         keys: jax.Array,
         observation: Observation,
-        told: rcm.TrocarFrame,
+        trocar: rcm.TrocarFrame,
     ) -> Command:
         camera = _now(observation)
         seen = frames.observation(task, camera, observation)
-        planned = policy.sample(params, stats, keys, seen, frames.trocar(task, camera, told))
+        planned = policy.sample(params, stats, keys, seen, frames.trocar(task, camera, trocar))
         return planned._replace(pose=frames.outward(camera, planned.pose))
 
     return policy._replace(prepare=prepare, sample=sample)

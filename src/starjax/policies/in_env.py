@@ -97,5 +97,5 @@ def load(
     env = env or sim_env.for_policy(trained.scene, trained.policy, arms)
     row = methods.METHODS[trained.method]
     policy = policies.make(row, trained.policy, env.task, cameras=trained.scene.cameras)
-    ready = trained._replace(params=policy.for_sampling(trained.params))
+    ready = trained._replace(params=policy.prepare_for_inference(trained.params))
     return PolicyInEnv(ready, policy, env, files.sha256(file))

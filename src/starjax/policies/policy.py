@@ -39,6 +39,6 @@ def make(
     """
     method = ablated(method, policy_config)
     build = hierarchical.make if method.hierarchical else single.make
-    seen = features.sensors(task, cameras)
-    policy = build(method, policy_config, seen, train_config or config.TrainConfig())
+    sensors = features.select_sensors(task, cameras)
+    policy = build(method, policy_config, sensors, train_config or config.TrainConfig())
     return policy if policy_config.frame == "world" else in_camera.make(policy, task)

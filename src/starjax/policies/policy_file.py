@@ -76,7 +76,7 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
         if not np.isfinite(array).all():
             raise ValueError(f"params: expected finite values, got others in {name}")
         if half and name.startswith(f"params{_SEPARATOR}"):
-            arrays[name] = _halved(name, array)
+            arrays[name] = _as_half(name, array)
     about = {
         "schema": SCHEMA,
         "method": trained.method,
@@ -196,7 +196,7 @@ def _flatten(tree: Any, prefix: str = ""):
             yield path, np.ascontiguousarray(value)
 
 
-def _halved(name: str, array: np.ndarray) -> np.ndarray:
+def _as_half(name: str, array: np.ndarray) -> np.ndarray:
     """Floating-point numbers as float16, others as they are."""
     if not np.issubdtype(array.dtype, np.floating):
         return array

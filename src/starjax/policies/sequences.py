@@ -15,28 +15,28 @@ class Sizes(NamedTuple):
     Attributes:
       horizon: H, actions of a sequence.
       action: D, numbers of an action.
-      moments: O, that are observed.
+      obs_horizon: O, that are observed.
       vision: V, numbers that one moment's images become; 0 without images.
       state: d_s, numbers that the low-dimensional history becomes.
-      told: E, numbers that tell of the trocars; may be 0.
+      trocar: E, numbers that tell of the trocars; may be 0.
     """
 
     horizon: int
     action: int
-    moments: int
+    obs_horizon: int
     vision: int
     state: int
-    told: int
+    trocar: int
 
     @property
     def observed(self) -> int:
-        """N, numbers of `observed`."""
-        return self.moments * self.vision + self.state
+        """N, numbers of `observation_vector`."""
+        return self.obs_horizon * self.vision + self.state
 
     @property
     def condition(self) -> int:
-        """Numbers of `joined`."""
-        return self.observed + self.told
+        """Numbers of `condition_vector`."""
+        return self.observed + self.trocar
 
 
 class Condition(NamedTuple):
@@ -45,12 +45,12 @@ class Condition(NamedTuple):
     Attributes:
       vision: `[B, O, V]`, or None without images.
       state: `[B, d_s]` of the low-dimensional history.
-      told: `[B, E]` features of the trocars.
+      trocar: `[B, E]` features of the trocars.
     """
 
     vision: jax.Array | None
     state: jax.Array
-    told: jax.Array
+    trocar: jax.Array
 
 
 class SequenceModel(NamedTuple):
@@ -63,8 +63,8 @@ class SequenceModel(NamedTuple):
       loss: `(params, Condition, given) -> (scalar, {name: scalar})`, the names being `metrics`.
       sample: `(params, keys [B], Condition, reach) -> [B, H, D]` within `reach` `[2, D]`, lowest
         and highest, or if it is None within [-1, 1]. Sample i depends on `keys[i]` alone.
-      rounded: `params -> params` whose large matrices are in the type that is calculated in.
-      for_sampling: `params -> params` as `sample` uses them fastest here.
+      cast_params: `params -> params` whose large matrices are in the type that is calculated in.
+      prepare_for_inference: `params -> params` as `sample` uses them fastest here.
       metrics: names of what `loss` tells beside its value.
     """
 
@@ -72,12 +72,12 @@ class SequenceModel(NamedTuple):
     prepare: Callable[[jax.Array, jax.Array], Any]
     loss: Callable[[Params, Condition, Any], tuple[jax.Array, dict[str, jax.Array]]]
     sample: Callable[[Params, jax.Array, Condition, jax.Array | None], jax.Array]
-    rounded: Callable[[Params], Params] = lambda params: params
-    for_sampling: Callable[[Params], Params] = lambda params: params
+    cast_params: Callable[[Params], Params] = lambda params: params
+    prepare_for_inference: Callable[[Params], Params] = lambda params: params
     metrics: tuple[str, ...] = ()
 
 
-def observed(condition: Condition) -> jax.Array:
+def observation_vector(condition: Condition) -> jax.Array:
     """`[B, N]`, all that was observed."""
     if condition.vision is None:
         return condition.state
@@ -85,18 +85,22 @@ def observed(condition: Condition) -> jax.Array:
     return jnp.concatenate([flat, condition.state], axis=-1)
 
 
-def joined(condition: Condition) -> jax.Array:
-    """`[B, N + E]`, what was observed and what is told."""
-    seen = observed(condition)
+def condition_vector(condition: Condition) -> jax.Array:
+    """`[B, N + E]`, what was observed and what is trocar."""
+    vector = observation_vector(condition)
     # XLA of jax 0.11 crashes on an empty array that is concatenated under `shard_map`
-    return jnp.concatenate([seen, condition.told], axis=-1) if condition.told.shape[-1] else seen
+    return (
+        jnp.concatenate([vector, condition.trocar], axis=-1)
+        if condition.trocar.shape[-1]
+        else vector
+    )
 
 
-def rounded(params: Any, names: set[str], dtype: Any) -> Any:
+def cast_params(params: Any, names: set[str], dtype: Any) -> Any:
     """Parameters with the leaves of these names in another type.
 
     Networks round them so anyway, to the same numbers, wherever they use them. Done before, they
-    are not read in float32 and rounded again at each of many evaluations.
+    are not read in float32 and cast_params again at each of many evaluations.
     """
 
     def one(path: tuple[Any, ...], leaf: Any) -> Any:

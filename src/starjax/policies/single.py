@@ -11,59 +11,63 @@ from starjax.policies.base import Params, Policy
 from starjax.types import Command, Observation
 
 
-class Prepared(NamedTuple):
+class PreparedActions(NamedTuple):
     """A batch as the loss needs it, with everything random drawn."""
 
     inputs: features.Inputs
-    told: jax.Array
-    given: Any
+    trocar_condition: jax.Array
+    model_inputs: Any
 
 
 def make(
     method: methods.Method,
     policy_config: config.PolicyConfig,
-    seen: features.Sensors,
+    sensors: features.Sensors,
     train_config: config.TrainConfig,
 ) -> Policy:
     """The policy that generates (pose in the method's action space, gripper) of all arms."""
-    dim = seen.task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
-    networks = generator.make(method, policy_config, seen, dim)
+    dim = sensors.task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
+    networks = generator.make(method, policy_config, sensors, dim)
     model = networks.model
 
-    def prepare(stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch) -> Prepared:
+    def prepare(
+        stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
+    ) -> PreparedActions:
         key_inputs, key_model = jax.random.split(key)
-        x0 = features.demonstrated(stats, method.action_space, batch)
-        inputs = features.for_training(
+        x0 = features.encode_commands(stats, method.action_space, batch)
+        inputs = features.training_inputs(
             policy_config,
             train_config,
-            seen,
+            sensors,
             stats,
             key_inputs,
             batch.observation,
             _proprioception(stats, batch.observation, batch.trocar),
         )
-        told = features.extra(method, batch.trocar)
-        return Prepared(inputs, told, model.prepare(key_model, x0))
+        trocar_condition = features.trocar_condition(method, batch.trocar)
+        return PreparedActions(inputs, trocar_condition, model.prepare(key_model, x0))
 
-    def loss(params: Params, prepared: Prepared) -> tuple[jax.Array, dict[str, jax.Array]]:
-        condition = networks.observe(params, prepared.inputs, prepared.told)
-        return model.loss(params["learner"], condition, prepared.given)
+    def loss(params: Params, prepared: PreparedActions) -> tuple[jax.Array, dict[str, jax.Array]]:
+        condition = networks.observe(params, prepared.inputs, prepared.trocar_condition)
+        return model.loss(params["learner"], condition, prepared.model_inputs)
 
     def sample(
         params: Params,
         stats: normalizer.Normalizer,
         keys: jax.Array,
         observation: Observation,
-        told: rcm.TrocarFrame,
+        trocar: rcm.TrocarFrame,
     ) -> Command:
-        proprioception = _proprioception(stats, observation, told)
-        inputs = features.for_sampling(policy_config, seen, stats, observation, proprioception)
-        condition = networks.observe(params, inputs, features.extra(method, told))
+        proprioception = _proprioception(stats, observation, trocar)
+        inputs = features.inference_inputs(
+            policy_config, sensors, stats, observation, proprioception
+        )
+        condition = networks.observe(params, inputs, features.trocar_condition(method, trocar))
         action = model.sample(params["learner"], keys, condition, stats.action.reach)
-        return execution.command(method, stats, action, told)
+        return execution.command(method, stats, action, trocar)
 
-    def _proprioception(stats, observation, told):
-        return features.measured(stats, method.action_space, observation, told)
+    def _proprioception(stats, observation, trocar):
+        return features.encode_proprioception(stats, method.action_space, observation, trocar)
 
     return Policy(
         networks.init,
@@ -71,6 +75,6 @@ def make(
         loss,
         sample,
         model.metrics,
-        networks.rounded,
-        networks.for_sampling,
+        networks.cast_params,
+        networks.prepare_for_inference,
     )

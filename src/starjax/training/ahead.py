@@ -44,9 +44,9 @@ def compile_step(
         key,
         devices.replicated(mesh),
     )
-    layout = StateLayout(mesh, policy.rounded, shapes)
+    layout = StateLayout(mesh, policy.cast_params, shapes)
     setup = Setup(policy, optimizer, policy_config, train_config, layout)
-    seen = features.sensors(task, cameras)
+    seen = features.select_sensors(task, cameras)
     return stepper.compile_ahead(setup, batch_shapes(policy_config, train_config.batch_size, seen))
 
 

@@ -91,7 +91,7 @@ def run(
     """
     directory = pathlib.Path(directory)
     mesh = devices.make_mesh(train_config.batch_size, mesh_devices)
-    dataset = _observed(dataset, policy_config, features.sensors(task, cameras))
+    dataset = _observed(dataset, policy_config, features.select_sensors(task, cameras))
     frames, held_out = windows.split_holdout(
         dataset.start, dataset.length, dataset.trocar, train_config.holdout_demos
     )
@@ -112,7 +112,7 @@ def run(
     shapes = states.shapes(
         policy, optimizer, init.traced.out_info, stats, streams.steps, devices.replicated(mesh)
     )
-    layout = StateLayout(mesh, policy.rounded, shapes)
+    layout = StateLayout(mesh, policy.cast_params, shapes)
     setup = Setup(policy, optimizer, policy_config, train_config, layout)
     resident = windows.on_device(dataset)
     steps = None

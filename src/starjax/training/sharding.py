@@ -43,7 +43,7 @@ class StateLayout(NamedTuple):
 
     Attributes:
       mesh: the batch is split over it.
-      round: parameters with large matrices in the type that is calculated in, `Policy.rounded`.
+      round: parameters with large matrices in the type that is calculated in, `Policy.cast_params`.
       whole: shapes of the whole state, as a TrainState.
     """
 
@@ -182,7 +182,7 @@ class StateLayout(NamedTuple):
 
 @functools.partial(jax.jit, static_argnums=1)  # called outside of any, one program for all of them
 def _rounded(params: Params, change: Callable[[Params], Params]) -> Params:
-    """The matrices that `Policy.rounded` changes, as it gives them; None for the others."""
+    """The matrices that `Policy.cast_params` changes, as it gives them; None for the others."""
     changed = change(params)
     return jax.tree.map(lambda old, new: None if new.dtype == old.dtype else new, params, changed)
 

@@ -27,7 +27,7 @@ class Recorder:
         self._root, self._seed = root, seed
         self._trocars = configurations.listed(env.task.trocars, len(env.p_world_ref))
         steps = round(env.task.time_limit_s * env.control_hz)
-        settings = schema.Settings(per_trocar=0, seed=seed, max_steps=steps, keep_failures=True)
+        settings = schema.DemoSettings(per_trocar=0, seed=seed, max_steps=steps, keep_failures=True)
         description = schema.describe(env, self._trocars, settings)
         store.create(root, {**description, "expert": OPERATOR})
         store.clean(root)

@@ -73,7 +73,7 @@ def test_samples_are_what_was_learned():
 @pytest.mark.slow
 def test_a_sequence_depends_on_all_that_is_given():
     """Images, state, trocar and style; in training on the demonstrated sequence itself."""
-    sizes = sequences.Sizes(horizon=8, action=2, moments=2, vision=6, state=5, told=7)
+    sizes = sequences.Sizes(horizon=8, action=2, obs_horizon=2, vision=6, state=5, trocar=7)
     model = act.make(SMALL.options, SMALL, sizes)
     params = model.init(jax.random.key(0))
     given = sequences.Condition(jnp.ones((1, 2, 6)), jnp.ones((1, 5)), jnp.ones((1, 7)))
@@ -88,12 +88,12 @@ def test_a_sequence_depends_on_all_that_is_given():
     value, metrics = model.loss(params, given, x0)
     assert metrics.keys() == set(model.metrics)
     np.testing.assert_allclose(value, metrics["l1"] + 10 * metrics["divergence"], rtol=1e-6)
-    assert set(model.for_sampling(params)) == {"decoder"}
+    assert set(model.prepare_for_inference(params)) == {"decoder"}
 
 
 def test_its_usual_size_is_that_of_act():
     settings = config.with_learner(config.PolicyConfig(), "act")
-    sizes = sequences.Sizes(horizon=16, action=4, moments=2, vision=128, state=256, told=7)
+    sizes = sequences.Sizes(horizon=16, action=4, obs_horizon=2, vision=128, state=256, trocar=7)
     shapes = jax.eval_shape(act.make(settings.options, settings, sizes).init, jax.random.key(0))
     assert 5e6 < sum(leaf.size for leaf in jax.tree.leaves(shapes)) < 10e6
 

@@ -71,22 +71,22 @@ class Format(NamedTuple):
     """A row of `FORMATS`.
 
     Attributes:
-      what: a line for people.
+      description: a line for people.
       named: a column of ours, e.g. `state` or `image_camera` -> as the format's users call it.
       recognises: whether a path holds a dataset of it, by a look at names alone.
-      open: (path) -> context with its `Source`. It may raise anything: `opened` explains it.
+      open: (path) -> context with its `Source`. It may raise anything: `open_dataset` explains it.
       write: (path that is not there, Source, video) writes it; `video` is whether images may lose
         a little, where the format has such.
     """
 
-    what: str
+    description: str
     named: Callable[[str], str]
     recognises: Callable[[Path], bool]
     open: Callable[[Path], contextlib.AbstractContextManager[Source]]
     write: Callable[[Path, Source, bool], None]
 
 
-def recognised(path: Path) -> str:
+def detect(path: Path) -> str:
     """Name of the format of what lies at `path`.
 
     Raises:
@@ -102,7 +102,7 @@ def recognised(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def opened(path: Path, name: str) -> Iterator[Source]:
+def open_dataset(path: Path, name: str) -> Iterator[Source]:
     """The dataset of format `name` at `path`; what is wrong with its files is one line.
 
     Raises:
@@ -129,7 +129,7 @@ def opened(path: Path, name: str) -> Iterator[Source]:
 
 
 class Damaged(ValueError):
-    """Raised by a format's reader where a file is wrong; becomes the line of `opened`."""
+    """Raised by a format's reader where a file is wrong; becomes the line of `open_dataset`."""
 
 
 def require(holds: bool, what: str, got: Any) -> None:

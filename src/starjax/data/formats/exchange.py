@@ -92,7 +92,7 @@ def export(
         form.write(staged, found._replace(read=read), video)
 
 
-def bring_back(
+def restore_export(
     found: Source, root: Path, note: Callable[[int], None] = lambda count: None
 ) -> dict[str, Any]:
     """Writes an export of ours, which has an origin, as the dataset that it was.

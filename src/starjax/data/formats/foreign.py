@@ -17,7 +17,7 @@ from starjax.data import schema, store
 from starjax.data.formats import mapping as maps
 from starjax.data.formats import motion, trocars
 from starjax.data.formats.base import Source
-from starjax.data.formats.mapping import Camera, Map
+from starjax.data.formats.mapping import CameraColumn, Map
 from starjax.data.formats.motion import HZ, Motion
 from starjax.rollouts import episodes
 from starjax.runtime import files, xla
@@ -51,7 +51,7 @@ class _Kept(NamedTuple):
     success: bool
 
 
-def bring(
+def import_mapped(
     source: Source,
     mapping: Map,
     root: Path,
@@ -90,16 +90,16 @@ def bring(
             raise errors.UsageError(error.argument, error.expected, line) from error
         else:
             notes += [f"episode {episode}: {line}" for line in found.notes]
-            tips.append(trocars.thinned(found))
+            tips.append(trocars.subsample(found))
             kept.append(_Kept(episode, len(found.pose.p), -1, is_good))
         note(1)
-    places, is_known = trocars.found(tips, mapping, [k.episode for k in kept], notes)
+    places, is_known = trocars.locate(tips, mapping, [k.episode for k in kept], notes)
     kept, places = (list(itertools.compress(items, is_known)) for items in (kept, places))
     tips = list(itertools.compress(tips, is_known))
     if not kept:
         said = notes[-1] if notes else "no episode"
         raise errors.UsageError("PATH", "demonstrations to keep", said)
-    groups, centres = trocars.grouped(np.array(places))
+    groups, centres = trocars.group(np.array(places))
     kept = [k._replace(trocar=int(group)) for k, group in zip(kept, groups)]
     residual = trocars.residual(tips, centres[groups], [k.episode for k in kept], notes)
     description = _describe(source, mapping, task, kept, centres, hz)
@@ -272,7 +272,7 @@ def _fields(
     return arrays
 
 
-def pictures(images: np.ndarray, camera: Camera) -> np.ndarray:
+def pictures(images: np.ndarray, camera: CameraColumn) -> np.ndarray:
     """Images `[T, h, w, 3]` cropped, with red first, at the size that is asked for."""
     if camera.crop:
         top, left, height, width = camera.crop

@@ -30,7 +30,7 @@ _FILE = "--map"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Arm:
+class ArmColumns:
     """Columns of one arm. Empty ones are not there."""
 
     position: Columns = ()  # of the tip, 3 numbers
@@ -53,7 +53,7 @@ class Arm:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Camera:
+class CameraColumn:
     """A camera of the task, and the column of its images."""
 
     column: str
@@ -144,9 +144,10 @@ def check(mapping: Map, source: Source) -> None:
 
 def _parsed(values: dict[str, Any]) -> Map:
     rest = {name: value for name, value in values.items() if name not in ("arms", "cameras")}
-    arms = tuple(config.from_dict(Arm, arm) for arm in values.get("arms", []))
+    arms = tuple(config.from_dict(ArmColumns, arm) for arm in values.get("arms", []))
     cameras = {
-        name: config.from_dict(Camera, camera) for name, camera in values.get("cameras", {}).items()
+        name: config.from_dict(CameraColumn, camera)
+        for name, camera in values.get("cameras", {}).items()
     }
     found = dataclasses.replace(config.from_dict(Map, rest), arms=arms, cameras=cameras)
     _expect(bool(arms), "one [[arms]] or more", "none")

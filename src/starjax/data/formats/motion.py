@@ -10,7 +10,7 @@ from scipy.spatial import transform
 
 from starjax import errors
 from starjax.data.formats import mapping as maps
-from starjax.data.formats.mapping import Arm, Map
+from starjax.data.formats.mapping import ArmColumns, Map
 
 HZ = 30.0  # of every dataset
 FAST = 1.0  # m/s, faster tips are jumps
@@ -20,7 +20,7 @@ _EVEN = 0.02  # of a period, by which even steps may be off
 _UNIT = 0.1  # by which a quaternion's length may be off
 
 
-class Poses(NamedTuple):
+class TipPoses(NamedTuple):
     """Tip poses on the host: rotations `[..., 3, 3]`, positions `[..., 3]` m."""
 
     R: np.ndarray
@@ -38,8 +38,8 @@ class Motion(NamedTuple):
       notes: what is odd, a line each.
     """
 
-    pose: Poses
-    command: Poses
+    pose: TipPoses
+    command: TipPoses
     gripper: np.ndarray
     command_gripper: np.ndarray
     p_world_trocar: np.ndarray
@@ -81,30 +81,30 @@ def read(arrays: Mapping[str, np.ndarray], mapping: Map, hz: float, folder: Path
     )
 
 
-def _together(arms: list[Poses]) -> Poses:
-    return Poses(np.stack([arm.R for arm in arms], 1), np.stack([arm.p for arm in arms], 1))
+def _together(arms: list[TipPoses]) -> TipPoses:
+    return TipPoses(np.stack([arm.R for arm in arms], 1), np.stack([arm.p for arm in arms], 1))
 
 
 class _Arm(NamedTuple):
     """One arm; None of a command that the files lack."""
 
-    pose: Poses
+    pose: TipPoses
     command: Any
     gripper: np.ndarray
     command_gripper: Any
     p_world_trocar: np.ndarray
 
 
-def _arm(arrays: Mapping[str, np.ndarray], arm: Arm, mapping: Map, folder: Path) -> _Arm:
+def _arm(arrays: Mapping[str, np.ndarray], arm: ArmColumns, mapping: Map, folder: Path) -> _Arm:
     scale = 1e-3 if mapping.units == "mm" else 1.0
     turn, origin = _quaternion(mapping.turn, "turn"), np.array(mapping.origin)
 
     def placed(p: np.ndarray) -> np.ndarray:
         return origin + scale * p @ turn.T
 
-    def tip(position: maps.Columns, rotation: maps.Columns) -> Poses:
+    def tip(position: maps.Columns, rotation: maps.Columns) -> TipPoses:
         R = turn @ rotations(maps.pick(arrays, rotation, maps.NUMBERS[arm.rotation_as]), arm)
-        return Poses(
+        return TipPoses(
             R @ _quaternion(arm.tip_turn, "tip_turn"),
             placed(maps.pick(arrays, position, 3)) + R @ np.array(arm.tip),
         )
@@ -119,7 +119,7 @@ def _arm(arrays: Mapping[str, np.ndarray], arm: Arm, mapping: Map, folder: Path)
         R = turn @ R
         # A model is in m whatever the columns are.
         p = origin + p @ turn.T + R @ np.array(arm.tip)
-        pose = Poses(R @ _quaternion(arm.tip_turn, "tip_turn"), p)
+        pose = TipPoses(R @ _quaternion(arm.tip_turn, "tip_turn"), p)
     else:
         pose = tip(arm.position, arm.rotation)
     farthest = float(np.abs(pose.p).max())
@@ -136,7 +136,7 @@ def _arm(arrays: Mapping[str, np.ndarray], arm: Arm, mapping: Map, folder: Path)
     )
 
 
-def rotations(numbers: np.ndarray, arm: Arm) -> np.ndarray:
+def rotations(numbers: np.ndarray, arm: ArmColumns) -> np.ndarray:
     """Matrices `[T, 3, 3]` of rotations as somebody wrote them."""
     kind = arm.rotation_as
     if kind.startswith("quat"):
@@ -171,8 +171,8 @@ def _quaternion(wxyz: tuple[float, ...], name: str) -> np.ndarray:
     return transform.Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
-def _kinematics(joints: np.ndarray, arm: Arm, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Poses of the tip in the model's world: `[T, 3, 3]`, `[T, 3]`."""
+def _kinematics(joints: np.ndarray, arm: ArmColumns, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """TipPoses of the tip in the model's world: `[T, 3, 3]`, `[T, 3]`."""
     import mujoco
 
     model, places, site, body = _model(path, arm.joint_names, arm.body, joints.shape[1])
@@ -230,7 +230,7 @@ def _looked_at(times: np.ndarray, hz: float, mapping: Map) -> list[str]:
     return notes
 
 
-def _jumps(times: np.ndarray, pose: Poses, whose: str) -> list[str]:
+def _jumps(times: np.ndarray, pose: TipPoses, whose: str) -> list[str]:
     steps = np.maximum(np.diff(times), 1e-9)
     if not len(steps):
         return []
@@ -267,12 +267,12 @@ def _sampled(arm: _Arm, times: np.ndarray, wanted: np.ndarray) -> _Arm:
                 len(wanted), *x.shape[1:]
             )
 
-        def moved(pose: Poses) -> Poses:
+        def moved(pose: TipPoses) -> TipPoses:
             # The shorter way between two rotations: neither signs of quaternions nor angles beyond
             # a whole turn matter.
             turning = transform.Slerp(times, transform.Rotation.from_matrix(pose.R))
             within = np.clip(wanted, times[0], times[-1])
-            return Poses(turning(within).as_matrix(), along(pose.p))
+            return TipPoses(turning(within).as_matrix(), along(pose.p))
 
         arm = _Arm(
             moved(arm.pose),
@@ -281,7 +281,7 @@ def _sampled(arm: _Arm, times: np.ndarray, wanted: np.ndarray) -> _Arm:
             arm.command_gripper if arm.command_gripper is None else along(arm.command_gripper),
             along(arm.p_world_trocar),
         )
-    command = arm.command or Poses(_following(arm.pose.R), _following(arm.pose.p))
+    command = arm.command or TipPoses(_following(arm.pose.R), _following(arm.pose.p))
     gripper = arm.command_gripper
     return arm._replace(
         command=command, command_gripper=_following(arm.gripper) if gripper is None else gripper

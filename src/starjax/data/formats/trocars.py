@@ -12,19 +12,19 @@ SAME = 1e-3  # m; trocars that lie closer are one
 MISSED = 5e-3  # m; shafts that pass the trocar so far (root mean square) have another axis or frame
 _SIZE = 64  # episodes of which the trocar of a whole dataset is estimated
 
-Tips = tuple[np.ndarray, np.ndarray, np.ndarray]  # see `thinned`
+Tips = tuple[np.ndarray, np.ndarray, np.ndarray]  # see `subsample`
 
 
-def thinned(found: Motion) -> Tips:
+def subsample(found: Motion) -> Tips:
     """Keeps of an episode what tells its trocars.
 
     Some poses `[T, A, ...]`, and the trocars `[A, 3]` that the files say, NaN where they do not.
     """
     said = np.median(found.p_world_trocar, axis=0)
-    return shafts.thinned(found.pose.R), shafts.thinned(found.pose.p), said
+    return shafts.subsample(found.pose.R), shafts.subsample(found.pose.p), said
 
 
-def found(
+def locate(
     tips: list[Tips], mapping: Map, numbers: list[int], notes: list[str]
 ) -> tuple[list[np.ndarray], list[bool]]:
     """Finds every episode's trocars `[A, 3]`, and whether they are known."""
@@ -52,7 +52,7 @@ def found(
     return list(places), list(known.all(-1))
 
 
-def grouped(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def group(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Episodes `[E, A, 3]` by trocars: `[E]` which group, `[C, A, 3]` its mean."""
     firsts, groups = [], []
     for place in places:

@@ -62,8 +62,8 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
     def init(key: jax.Array) -> Params:
         key_style, key_decoder = jax.random.split(key)
         x0, state = jnp.zeros((1, sizes.horizon, sizes.action)), jnp.zeros((1, sizes.state))
-        vision = jnp.zeros((1, sizes.moments, sizes.vision)) if sizes.vision else None
-        observed = vision, state, jnp.zeros((1, sizes.told))
+        vision = jnp.zeros((1, sizes.obs_horizon, sizes.vision)) if sizes.vision else None
+        observed = vision, state, jnp.zeros((1, sizes.trocar))
         return {
             "style": styles.init(key_style, x0, state),
             "decoder": decoder.init(key_decoder, jnp.zeros((1, options.style_dim)), *observed),
@@ -87,16 +87,18 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
         z = jnp.zeros((len(keys), options.style_dim))
         return diffusion.within(decode(params["decoder"], z, *condition), reach)
 
-    def rounded(params: Params) -> Params:
-        return sequences.rounded(params, {"kernel"}, dtype)
+    def cast_params(params: Params) -> Params:
+        return sequences.cast_params(params, {"kernel"}, dtype)
 
-    def for_sampling(params: Params) -> Params:
-        network = rounded(params["decoder"])
+    def prepare_for_inference(params: Params) -> Params:
+        network = cast_params(params["decoder"])
         packs = packed_params.pays(jax.default_backend())
         return {"decoder": packed_params.packed(network) if packs else network}
 
     metrics = ("l1", "divergence")
-    return sequences.SequenceModel(init, prepare, loss, sample, rounded, for_sampling, metrics)
+    return sequences.SequenceModel(
+        init, prepare, loss, sample, cast_params, prepare_for_inference, metrics
+    )
 
 
 LEARNER = Learner(ActConfig, check, make)

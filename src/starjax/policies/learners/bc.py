@@ -56,24 +56,26 @@ def make(options: BcConfig, policy_config: config.PolicyConfig, sizes: "Sizes") 
         return {"mixture": network.init(key, jnp.zeros((1, sizes.condition)))}
 
     def loss(params: Params, condition: Condition, x0: jax.Array) -> tuple[jax.Array, dict]:
-        said = apply(params["mixture"], sequences.joined(condition))
+        said = apply(params["mixture"], sequences.condition_vector(condition))
         return regression.loss(said, x0, options.component_spread), {}
 
     def sample(
         params: Params, keys: jax.Array, condition: Condition, reach: jax.Array | None
     ) -> jax.Array:
-        said = apply(params["mixture"], sequences.joined(condition))
+        said = apply(params["mixture"], sequences.condition_vector(condition))
         return diffusion.within(regression.draw(said, keys), reach)
 
-    def rounded(params: Params) -> Params:
-        return sequences.rounded(params, {"kernel"}, dtype)
+    def cast_params(params: Params) -> Params:
+        return sequences.cast_params(params, {"kernel"}, dtype)
 
-    def for_sampling(params: Params) -> Params:
-        network = rounded(params["mixture"])
+    def prepare_for_inference(params: Params) -> Params:
+        network = cast_params(params["mixture"])
         packs = packed_params.pays(jax.default_backend())
         return {"mixture": packed_params.packed(network) if packs else network}
 
-    return sequences.SequenceModel(init, lambda key, x0: x0, loss, sample, rounded, for_sampling)
+    return sequences.SequenceModel(
+        init, lambda key, x0: x0, loss, sample, cast_params, prepare_for_inference
+    )
 
 
 LEARNER = Learner(BcConfig, check, make)

@@ -18,7 +18,7 @@ SURE = 5e-4  # m; a standard deviation above this says nothing against what is t
 SHORT = 16  # control steps; shorter episodes are less than a plan
 
 
-def of_dataset(root: Path) -> Iterator[str]:
+def find(root: Path) -> Iterator[str]:
     """Lines on what is odd about a dataset of ours, damage first; one for each kind.
 
     Raises:
@@ -39,10 +39,10 @@ def of_dataset(root: Path) -> Iterator[str]:
     for kind, where in found.items():
         more = f" and {len(where) - 1} more" if len(where) > 1 else ""
         yield f"{kind}: {where[0]}{more}"
-    yield from imported(root)
+    yield from import_notes(root)
 
 
-def imported(root: Path) -> list[str]:
+def import_notes(root: Path) -> list[str]:
     """Notes of `starjax import` on the files that it read."""
     path = root / schema.IMPORTED
     return files.read_json(path).get("notes", []) if path.exists() else []
@@ -51,7 +51,7 @@ def imported(root: Path) -> list[str]:
 def _of_episode(
     root: Path, about: Mapping[str, Any], record: Mapping[str, Any]
 ) -> Iterator[tuple[str, str]]:
-    """(kind, detail) of each oddity."""
+    """(kind, detail) of each anomaly."""
     if record["length"] < SHORT:
         yield f"shorter than {SHORT} control steps", str(record["length"])
     arrays = {
