@@ -16,12 +16,12 @@ from starjax.methods import METHODS
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.policies.learners.diffusion import DiffusionConfig
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.training import devices, state, step
 from starjax.training.sharding import StateLayout, StepCarry
 from starjax.types import Command, Observation, Pose
 
-TASK = registry.tasks.get("peg_transfer")
+TASK = registries.tasks.get("peg_transfer")
 P_WORLD_REF = np.array([slot.p_world_ref for slot in TASK.slots], np.float32)
 METHOD = METHODS["stardiff"]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from starjax.sim import env as envs
 from starjax.sim import physics, solver
-from starjax.sim.engine import mjx
+from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import Scene
 from starjax.types import Agent
 

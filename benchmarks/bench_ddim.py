@@ -27,7 +27,7 @@ from starjax.models import diffusion
 from starjax.models.kernels import parallel_ddim
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.types import Command
 
 FRAMES = 128
@@ -78,7 +78,7 @@ def planned(
 ) -> Command:
     """Commands `[FRAMES, H, A]` with this way to sample."""
     settings = dataclasses.replace(trained.policy, dtype=dtype)
-    method, task = methods.METHODS[trained.method], registry.tasks.get(trained.scene.task)
+    method, task = methods.METHODS[trained.method], registries.tasks.get(trained.scene.task)
     policy = policies.make(method, settings, task, trained.train, trained.scene.cameras)
     keys = jax.random.split(jax.random.key(1), FRAMES)
     given = (trained.params, trained.normalizer, keys, batch.observation, batch.trocar)

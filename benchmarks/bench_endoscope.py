@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import runtime
-from starjax.sim import cameras, endoscope, render
+from starjax.sim import cameras, endoscope_camera, render
 from starjax.sim import scene as scenes
 
 TURNS = 41
@@ -35,7 +35,7 @@ def main() -> None:
     m, count = scene.mj_model, bench_render.STEPS * asked.batch
     geoms = bench_render.poses(m, bench_render.states(scene, count), asked.batch)
     keys = jax.random.split(jax.random.key(0), asked.batch)
-    drawn = jax.vmap(lambda key: endoscope.draw(scene.task.endoscope, key))(keys)
+    drawn = jax.vmap(lambda key: endoscope_camera.draw(scene.task.endoscope, key))(keys)
     still = cameras.nominal(cameras.make(m, ("camera",), 32))
     held = jax.tree.map(lambda leaf: jnp.repeat(leaf, asked.batch, 0), still)
     rows = {}

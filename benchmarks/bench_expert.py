@@ -17,8 +17,8 @@ import numpy as np
 
 from starjax import errors, rcm, runtime
 from starjax.evaluation import statistics
-from starjax.sim import drawn as sampling
 from starjax.sim import env as envs
+from starjax.sim import sampling
 from starjax.types import Agent
 
 STEPS = 600  # control steps, 20 s, that demonstrations may take too
@@ -43,7 +43,9 @@ def main() -> None:
     agent, listed = experts[expert](), environment.task.trocars
     key = jax.random.key(arguments.seed)
     twelve = rcm.Trocar(*(jnp.repeat(jnp.asarray(f), arguments.per_trocar, axis=0) for f in listed))
-    drawn = sampling.trocars(jax.random.fold_in(key, 1), environment.task, (arguments.sampled,))
+    drawn = sampling.sample_trocars(
+        jax.random.fold_in(key, 1), environment.task, (arguments.sampled,)
+    )
     enough = max(STEPS, environment.task.least_steps)
     steps = round(arguments.seconds * environment.control_hz) or enough
     results = {

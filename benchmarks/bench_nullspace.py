@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
-from starjax.sim import ik, motion, mounts, registry
+from starjax.sim import arm_motion, ik, mounts, registries
 
 LAPS, STEPS = 5, 90  # control steps a lap
 RADIUS, HEIGHT, SWAY = 0.025, 0.025, 0.5  # m, m, rad
@@ -26,7 +26,7 @@ def main() -> None:
     runtime.prepare_xla()
     rows = {}
     for name in ARMS:
-        gain = registry.arms.get(name).rest_gain
+        gain = registries.arms.get(name).rest_gain
         (drift, residual), (without, _) = laps(name, gain), laps(name, 0.0)
         rows[name] = {"gain": gain, "drift_rad": drift, "drift_rad_without": without}
         rows[name]["residual_m"] = residual
@@ -36,8 +36,8 @@ def main() -> None:
 
 def laps(name: str, gain: float) -> tuple[float, float]:
     """Drift (rad) of the arm's joints at the ends of laps, and the largest residual (m)."""
-    arm, workspace = registry.arms.get(name), registry.workspaces.get(WORKSPACE)
-    at, mount = mounts.bench(arm, registry.tools.get(TOOL)), arm.mounts[TOOL, WORKSPACE]
+    arm, workspace = registries.arms.get(name), registries.workspaces.get(WORKSPACE)
+    at, mount = mounts.bench(arm, registries.tools.get(TOOL)), arm.mounts[TOOL, WORKSPACE]
     place = jnp.array([*mount.position, mount.yaw, mount.turn, mount.tilt], jnp.float32)
     chain, home = mounts.standing(at.flange, at.tip, place), jnp.asarray(mount.home, jnp.float32)
     trocars = mounts.frame_of(jax.tree.map(jnp.asarray, rcm.TROCARS), workspace)
@@ -49,7 +49,7 @@ def laps(name: str, gain: float) -> tuple[float, float]:
     def one(trocar: rcm.TrocarFrame) -> tuple[jax.Array, jax.Array]:
         def step(q: jax.Array, action: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
             pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, trocar)
-            q, residual = ik.solve(chain, pose, q, motion.STEP_IK_ITERATIONS, home, gain)
+            q, residual = ik.solve(chain, pose, q, arm_motion.STEP_IK_ITERATIONS, home, gain)
             return q, (q, residual)
 
         pose, _ = rcm.ACTION_SPACES["rcm4"].decode(path[-1], trocar)

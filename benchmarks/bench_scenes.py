@@ -22,9 +22,9 @@ import jax
 import jax.numpy as jnp
 
 from starjax import runtime
-from starjax.sim import registry, solver
+from starjax.sim import registries, solver
 from starjax.sim import scene as scenes
-from starjax.sim.engine import mjx
+from starjax.sim.quiet_mjx import mjx
 
 BATCHES = {"cpu": [1, 16], "gpu": [360, 4096]}
 # A task of two arms, and the same of one.
@@ -35,7 +35,7 @@ def main() -> None:
     runtime.prepare_xla()
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--batches", type=int, nargs="+", default=BATCHES[_peer.platform()])
-    parser.add_argument("--only", nargs="+", default=registry.tasks.names(), help="tasks")
+    parser.add_argument("--only", nargs="+", default=registries.tasks.names(), help="tasks")
     parser.add_argument("--peer", action="store_true", help="time mjx.step too")
     asked = parser.parse_args()
     found = {task: scenes.load(scenes.name(task)) for task in asked.only}
@@ -72,7 +72,7 @@ def main() -> None:
 
 def compiled(scene: scenes.Scene, kind: str, batch: int) -> Any:
     """`bench_sim.program` of this many environments, ahead of time."""
-    ours = functools.partial(_ours, turns=scene.solver_turns)
+    ours = functools.partial(_ours, max_iterations=scene.max_solver_iterations)
     program = bench_sim.program(scene, mjx.step if kind else ours)
     return program.lower(repeated(scene, batch)).compile()
 
@@ -83,8 +83,8 @@ def repeated(scene: scenes.Scene, batch: int) -> _visited.Moment:
     return jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], batch, axis=0), rest)
 
 
-def _ours(model: mjx.Model, data: mjx.Data, turns: int | None) -> mjx.Data:
-    return solver.step(model, data, turns)[0]
+def _ours(model: mjx.Model, data: mjx.Data, max_iterations: int | None) -> mjx.Data:
+    return solver.step(model, data, max_iterations)[0]
 
 
 if __name__ == "__main__":

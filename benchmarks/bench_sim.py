@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import runtime
-from starjax.sim.engine import mjx
+from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import Scene
 
 STEPS = 64  # physics steps a call

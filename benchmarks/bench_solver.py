@@ -16,7 +16,7 @@ import numpy as np
 
 from starjax import runtime
 from starjax.sim import env as envs
-from starjax.sim.engine import mjx
+from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import Scene
 
 # Of MJX's solver: iterations, line-search turns, tolerance.

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from starjax.report import results
-from starjax.sim import registry, scene
+from starjax.sim import registries, scene
 from starjax.sim.tasks.peg_transfer import task
 
 PERIOD_DEG = 60.0  # walls are 120 degrees apart, and jaws look alike after half a turn
@@ -24,7 +24,7 @@ BESIDE = 0.001  # m
 ABOVE = 0.0065  # m over the block's frame: coming down
 AROUND = 0.014  # m from the block's axis
 MIDDLE = 0.012  # m: blocks nearer than this to y = 0 are on the middle row
-TOOL = registry.tools.get("grasper")
+TOOL = registries.tools.get("grasper")
 JAW = f"arm0/tool/{TOOL.jaw}"
 TIP = scene.tcp(0, TOOL)
 

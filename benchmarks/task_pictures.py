@@ -14,7 +14,7 @@ import numpy as np
 from starjax import runtime
 from starjax.report import style
 from starjax.sim import env as envs
-from starjax.sim import registry
+from starjax.sim import registries
 
 PIXELS = 384  # a side of a picture
 COLUMNS = 4
@@ -44,7 +44,7 @@ def main(file: Path) -> None:
 def picture(task: str, steps: int, camera: str) -> np.ndarray:
     """`[PIXELS, PIXELS, 3]` uint8, after `steps` of the task's first expert."""
     environment = envs.make(task, image_size=PIXELS, cameras=[camera])
-    expert = next(iter(registry.tasks.get(task).experts.values()))()
+    expert = next(iter(registries.tasks.get(task).experts.values()))()
     trocar = jax.tree.map(lambda leaf: jnp.asarray(leaf)[TROCAR], environment.task.trocars)
 
     @jax.jit

@@ -2,7 +2,7 @@
 
 import settings
 
-from starjax.sim import registry
+from starjax.sim import registries
 
 
 def page() -> str:
@@ -10,24 +10,24 @@ def page() -> str:
     lines = ["---", "hide: [toc]", "---", "# Tasks, arms, tools", ""]
     lines += ["Names for `--task`, `--arm` and `--tool`.", "", "## Tasks", ""]
     rows = []
-    for name in registry.tasks.built_in:
-        task = registry.tasks.get(name)
+    for name in registries.tasks.built_in:
+        task = registries.tasks.get(name)
         state = ", ".join(f"`{field.name}` {field.size}" for field in task.fields)
         experts = ", ".join(f"`{expert}`" for expert in task.experts)
-        cells = [str(task.arms), task.words.strict, task.words.loose, f"{task.time_limit_s:g} s"]
+        cells = [str(task.arms), task.text.strict, task.words.loose, f"{task.time_limit_s:g} s"]
         rows.append((f"`{name}`", *cells, state, experts))
     head = ["task", "arms", "strict success", "loose", "time", "state, numbers", "experts"]
     lines += [settings.table(head, rows), "", "## Arms", ""]
     rows = []
-    for name in registry.arms.built_in:
-        arm = registry.arms.get(name)
+    for name in registries.arms.built_in:
+        arm = registries.arms.get(name)
         mounts = ", ".join(f"`{tool}` in `{place}`" for tool, place in arm.mounts)
         rows.append((f"`{name}`", str(len(arm.joints)), mounts))
     lines += [settings.table(["arm", "joints", "mounts: tool in workspace"], rows)]
     lines += ["", "## Tools", ""]
     rows = []
-    for name in registry.tools.built_in:
-        tool = registry.tools.get(name)
+    for name in registries.tools.built_in:
+        tool = registries.tools.get(name)
         opening = f"{2e3 * (tool.open - tool.closed):.1f} mm" if tool.jaw else "no jaws"
         rows.append((f"`{name}`", opening, f"{2e3 * tool.shaft_radius:g} mm"))
     lines += [settings.table(["tool", "way of the jaws", "shaft"], rows)]

@@ -32,9 +32,9 @@ class State:
 
     physics: Physics
     trocar: rcm.TrocarFrame
-    told: rcm.TrocarFrame
+    measured_trocar: rcm.TrocarFrame
     layout: Any
-    facts: Any
+    measurements: Any
     step: jax.Array
     done: jax.Array
     success: jax.Array
@@ -50,7 +50,7 @@ class State:
     gripper: jax.Array
     cameras: Any = None
     model: Any = flax.struct.field(default_factory=dict)
-    beside: Any = flax.struct.field(default_factory=dict)
+    wrapper_state: Any = flax.struct.field(default_factory=dict)
     endoscope: Any = None
 
 
@@ -118,13 +118,15 @@ def make_env(
             "target": jax.random.randint(key_peg, (), 6, 12),
         }
         trocar = rcm.trocar_frame(params.trocar, p_world_ref, roll_zero)
-        told = getattr(params, "told", None)
+        measured_trocar = getattr(params, "measured_trocar", None)
         return State(
             physics=Physics(jnp.append(p.reshape(-1), fate)),
             trocar=trocar,
-            told=trocar if told is None else rcm.trocar_frame(told, p_world_ref, roll_zero),
+            measured_trocar=trocar
+            if measured_trocar is None
+            else rcm.trocar_frame(measured_trocar, p_world_ref, roll_zero),
             layout=Layout(goal, labels),
-            facts=(),
+            measurements=(),
             step=jnp.zeros((), jnp.int32),
             done=no,
             success=no,
@@ -216,7 +218,7 @@ def make_policy(horizon: int = 6, width: int = 64) -> tuple[Any, Any]:
         0.0005 * jax.random.normal(keys[1], (width, 3)),
     ]
 
-    def sample(params, stats, keys, observation, told):
+    def sample(params, stats, keys, observation, measured_trocar):
         count, seen = observation.gripper.shape[:2]
         noise = jax.vmap(lambda key: jax.random.normal(key, (2,)))(keys)
         flat = observation.state.reshape(count, 12 * seen)

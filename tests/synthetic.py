@@ -10,7 +10,7 @@ from starjax import config, rcm
 from starjax.evaluation import result, statistics, sweep
 from starjax.evaluation import trials as table
 from starjax.rollouts import trocars
-from starjax.sim import names, registry
+from starjax.sim import names, registries
 
 P_REF = np.array([[0.0, 0.0, 0.15]], np.float32)
 WEIGHTS = "0" * 64
@@ -27,7 +27,7 @@ def run(path: pathlib.Path, method="stardiff", skill=(0.85, 0.7), trials=6, swee
     (path / "metrics.jsonl").write_text("\n".join(json.dumps(line) for line in curves(rng)))
     np.savez(path / "evaluation" / "recorded.npz", **recorded(rng, rows, 3))
     if sweep_of:
-        places = sweep.sample(seed, sweep_of, registry.tasks.get("peg_transfer"))
+        places = sweep.sample(seed, sweep_of, registries.tasks.get("peg_transfer"))
         chance = skill[0] - 6 * np.maximum(0, places.radius[:, 0] - 0.03)
         spread = outcomes(rng, places, np.arange(sweep_of), chance)
         figures = sweep.compose(

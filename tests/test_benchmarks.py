@@ -41,7 +41,7 @@ def test_seven_joints_do_not_drift_from_lap_to_lap(arm, monkeypatch, pytestconfi
     monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
     import bench_nullspace
 
-    gain = bench_nullspace.registry.arms.get(arm).rest_gain
+    gain = bench_nullspace.registries.arms.get(arm).rest_gain
     drift, residual = bench_nullspace.laps(arm, gain)
     assert drift <= 1e-6 and residual < 1e-5
 

@@ -14,7 +14,7 @@ import pytest
 from starjax.data import schema, store
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.policies import packaged, policy_file
-from starjax.sim import env, registry
+from starjax.sim import env, registries
 
 GOLDEN = pathlib.Path(__file__).parent / "golden" / "frozen_names.json"
 # Parts of a dataset's description that no processor, version or setting of jax changes.
@@ -24,7 +24,7 @@ PARTS = ("schema", "per_trocar", "expert", "scene", "task", "features", "seed_ru
 def datasets() -> dict[str, str]:
     """Digests of what a dataset of each task says, numbers aside."""
     digests = {}
-    for name in registry.tasks.names():
+    for name in registries.tasks.names():
         made = env.make(name)
         settings = schema.DemoSettings(per_trocar=1, seed=0, max_steps=10)
         described = schema.describe(made, made.task.trocars, settings)

@@ -80,7 +80,7 @@ def test_demonstrations_are_recorded_with_what_is_wrong(tmp_path, monkeypatch):
     assert schema.describe(env, *given[1][3:])["randomise"] == {"smoke": 0.5, "dropped": 0.3}
     params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)))
     state = given[1][1].reset(jax.random.key(0), params)
-    assert set(state.beside) == {"smoke", "dropped"}
+    assert set(state.wrapper_state) == {"smoke", "dropped"}
 
 
 @pytest.mark.parametrize(

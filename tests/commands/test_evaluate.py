@@ -28,7 +28,7 @@ from starjax.evaluation import sweep as sweeping
 from starjax.policies import in_env, packaged, policy_file
 from starjax.report import video
 from starjax.runtime import files, gpu
-from starjax.sim import exercise as exercising
+from starjax.sim import six_blocks as exercising
 from starjax.sim.tasks.peg_transfer_bimanual import six
 
 POLICY = dataclasses.replace(fakes.TINY, execute=4)
@@ -412,7 +412,7 @@ def test_the_expert_at_the_exercise(file, monkeypatch, capsys):
         task=task, labels=lambda state: {"moved": 5 + state.success.astype(jnp.int32)}
     )
     monkeypatch.setattr(exercising, "make", lambda *_, **__: env)
-    monkeypatch.setattr(exercising, "anew", lambda agent: agent)
+    monkeypatch.setattr(exercising, "reset_each_block", lambda agent: agent)
     monkeypatch.setattr(six, "TASK", task)
     assert six_blocks.main(["--trials", "2"]) == 0
     (result,) = file.parent.rglob("exercise.json")

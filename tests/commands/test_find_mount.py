@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from starjax.commands import find_mount as command
-from starjax.sim import mounts, place
+from starjax.sim import mount_search, mounts
 from starjax.sim.arms.base import Mount
 
 MOUNT = Mount((0.1, 0.2, 0.3), 1.0, 2.0, (0.0, 0.5), tilt=0.5)
@@ -22,7 +22,7 @@ def searched(monkeypatch):
         tell(GOOD)
         return MOUNT, GOOD
 
-    monkeypatch.setattr(place, "search", search)
+    monkeypatch.setattr(mount_search, "search", search)
     return asked
 
 
@@ -44,7 +44,7 @@ def test_a_task_stands_for_the_workspaces_of_its_arms(searched):
 
 def test_a_mount_that_is_none_is_a_failure(monkeypatch):
     bad = GOOD._replace(margin=np.float64(0.05))
-    monkeypatch.setattr(place, "search", lambda *_: (MOUNT, bad))
+    monkeypatch.setattr(mount_search, "search", lambda *_: (MOUNT, bad))
     assert command.main(["fr5", "grasper", "board"]) == 1
 
 

@@ -82,11 +82,11 @@ def test_the_list_names_everything_that_flags_can(capsys):
     from starjax import methods
     from starjax.commands import presets
     from starjax.policies import packaged
-    from starjax.sim import registry
+    from starjax.sim import registries
 
     assert cli.dispatch(["list"]) == 0
     said = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line[:2] == "  "}
-    for known in (registry.tasks, registry.arms, registry.tools, packaged):
+    for known in (registries.tasks, registries.arms, registries.tools, packaged):
         assert said >= {*known.names()}
     assert said >= {*methods.METHODS, *presets.PRESETS}
 
@@ -94,11 +94,11 @@ def test_the_list_names_everything_that_flags_can(capsys):
 def test_a_package_that_cannot_be_imported_is_a_line_of_the_list(monkeypatch, capsys):
     import importlib.metadata
 
-    from starjax.sim import registry
+    from starjax.sim import registries
 
     broken = importlib.metadata.EntryPoint("sew", "nowhere_at_all:TASK", "starjax.tasks")
     monkeypatch.setattr(
-        registry.Registry, "_entries", lambda self: [broken] if self.kind == "task" else []
+        registries.Registry, "_entries", lambda self: [broken] if self.kind == "task" else []
     )
     assert cli.dispatch(["list"]) == 0
     (line,) = [x for x in capsys.readouterr().out.splitlines() if x.split()[:1] == ["sew"]]

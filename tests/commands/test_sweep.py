@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starjax.commands import bench, policy_args, sweep
-from starjax.sim import registry
+from starjax.sim import registries
 
 
 @pytest.mark.parametrize(
@@ -35,7 +35,7 @@ def test_a_renamed_folder_is_explained(command, tmp_path):
 
 def test_a_grid_is_in_centimetres_and_degrees():
     grid = {"radii_cm": (2.0, 5.0), "polars_deg": (70.0,), "azimuths": 4}
-    one, two = (registry.tasks.get(name) for name in ("peg_transfer", "needle_handover"))
+    one, two = (registries.tasks.get(name) for name in ("peg_transfer", "needle_handover"))
     found = sweep._trocars(sweep.Options(run="x", **grid), one)
     np.testing.assert_allclose(np.unique(found.radius), [0.02, 0.05], rtol=1e-6)
     np.testing.assert_allclose(np.rad2deg(found.polar), 70, rtol=1e-6)

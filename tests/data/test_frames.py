@@ -16,12 +16,12 @@ from starjax import config, rcm
 from starjax.data import frames, normalizer, windows
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
-from starjax.sim import endoscope, workspaces
+from starjax.sim import endoscope_camera, workspaces
 from starjax.types import Command, Pose
 
 SCOPE = workspaces.BOARD_ENDOSCOPE
 ARMS = 2
-TASK = fakes.task(ARMS, endoscope=SCOPE, cameras=(endoscope.NAME,))
+TASK = fakes.task(ARMS, endoscope=SCOPE, cameras=(endoscope_camera.NAME,))
 FRAMES = np.arange(80)
 SIZE = fakes.TINY.image_size
 
@@ -36,10 +36,10 @@ def dataset():
     """Demonstrations that see through an endoscope, of which each episode has its own."""
     found = fakes.dataset(seed=0, demos=4, length=20, image_size=SIZE, arms=ARMS)
     keys = jax.random.split(jax.random.key(3), 4)
-    held = jax.vmap(lambda key: endoscope.draw(SCOPE, key))(keys)
+    held = jax.vmap(lambda key: endoscope_camera.draw(SCOPE, key))(keys)
     seen = found.observation
     seen = seen._replace(
-        images={endoscope.NAME: seen.images["camera"]},
+        images={endoscope_camera.NAME: seen.images["camera"]},
         endoscope=jax.tree.map(lambda leaf: leaf[found.episode], held),
     )
     return found.replace(observation=seen)

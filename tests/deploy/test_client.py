@@ -13,7 +13,7 @@ from starjax import deploy, rcm
 from starjax.deploy import batching, plan_executor, wire
 from starjax.deploy.connection import Connection, Reply
 from starjax.errors import UsageError
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.types import Command, Pose
 
 HORIZON, EXECUTE = 16, 8
@@ -174,7 +174,7 @@ def test_settings_that_cannot_be_are_named(ahead, limits):
 @pytest.fixture(scope="module")
 def batches(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(registry, "tasks", registry.Registry("task", {"fake": "fakes:TASK"}))
+        patch.setattr(registries, "tasks", registries.Registry("task", {"fake": "fakes:TASK"}))
         made = batching.Batches(served.policy(tmp_path_factory.mktemp("client")), most=1)
         made.warm_up()
         yield made

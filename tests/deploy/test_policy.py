@@ -18,7 +18,7 @@ from starjax.errors import UsageError
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
-from starjax.sim import names, registry
+from starjax.sim import names, registries
 from starjax.types import Observation
 
 TRAIN = config.TrainConfig()
@@ -38,8 +38,8 @@ def load(path, *args, **kwargs):
 def registered():
     """Policies find the fake tasks by their names."""
     with pytest.MonkeyPatch.context() as patch:
-        tasks = registry.Registry("task", {"fake": "fakes:TASK", "fakes": "fakes:TWO_ARMS"})
-        patch.setattr(registry, "tasks", tasks)
+        tasks = registries.Registry("task", {"fake": "fakes:TASK", "fakes": "fakes:TWO_ARMS"})
+        patch.setattr(registries, "tasks", tasks)
         yield
 
 
@@ -502,8 +502,8 @@ def test_a_mistake_of_several_arms_or_cameras_is_named(two_arms):
 
 @pytest.mark.parametrize("prefix", ["", pytest.param("one_", marks=pytest.mark.slow)])
 def test_the_packaged_policy_commands_what_it_did(prefix, monkeypatch):
-    tasks = registry.Registry("task", {"peg_transfer": "fakes:TASK"})
-    monkeypatch.setattr(registry, "tasks", tasks)
+    tasks = registries.Registry("task", {"peg_transfer": "fakes:TASK"})
+    monkeypatch.setattr(registries, "tasks", tasks)
     before, deployed = np.load(GOLDEN / "compact_commands.npz"), load("compact")
     i, j, c = np.ogrid[:128, :128, :3]
     images = [(37 * i + 91 * j + 17 * c + 53 * o) % 256 for o in range(6)]

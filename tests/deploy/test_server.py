@@ -15,7 +15,7 @@ from starjax import rcm
 from starjax.commands import serve
 from starjax.deploy import batching, server, wire
 from starjax.errors import UsageError
-from starjax.sim import registry
+from starjax.sim import registries
 
 FRAMES = 300  # bad ones
 
@@ -23,7 +23,7 @@ FRAMES = 300  # bad ones
 @pytest.fixture(autouse=True, scope="module")
 def registered():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(registry, "tasks", registry.Registry("task", {"fake": "fakes:TASK"}))
+        patch.setattr(registries, "tasks", registries.Registry("task", {"fake": "fakes:TASK"}))
         yield
 
 

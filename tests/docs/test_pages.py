@@ -14,7 +14,7 @@ from starjax import cli, errors
 from starjax.data.formats import base, mapping
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.learners import LEARNERS
-from starjax.sim import registry
+from starjax.sim import registries
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 HEADER = re.compile(r"\A---\n(.*?)\n---\n", re.DOTALL)
@@ -76,7 +76,7 @@ def test_programs_run(page, tmp_path, monkeypatch):
 
 def test_configurations_are_read(page, root, tmp_path):
     """Entry points are of groups that are looked at; anything else is a mapping of a dataset."""
-    kinds = (registry.tasks, registry.arms, registry.tools, registry.workspaces, LEARNERS)
+    kinds = (registries.tasks, registries.arms, registries.tools, registries.workspaces, LEARNERS)
     groups = {f"starjax.{one.kind}s" for one in (*kinds, base.FORMATS, DISTURBANCES)}
     for block in blocks(page, root, "toml"):
         found = tomllib.loads(block)
@@ -84,7 +84,7 @@ def test_configurations_are_read(page, root, tmp_path):
             assert found["project"]["entry-points"].keys() <= groups
         else:
             (tmp_path / "map.toml").write_text(block)
-            assert mapping.load(tmp_path / "map.toml").task in registry.tasks.names()
+            assert mapping.load(tmp_path / "map.toml").task in registries.tasks.names()
 
 
 def blocks(page, root, language):

@@ -12,7 +12,7 @@ from gymnasium.utils import env_checker
 import starjax.envs
 from starjax import errors, rcm
 from starjax.envs import registration
-from starjax.sim import registry
+from starjax.sim import registries
 
 STEPS = 3  # of an episode, so that some end
 REACH = {"max_episode_steps": STEPS, "trocar": "all"}
@@ -108,7 +108,7 @@ def test_every_task_has_an_environment_also_one_of_another_package(monkeypatch):
     known = dict(gymnasium.registry)
     try:
         registration.register()
-        for task in registry.tasks.names():
+        for task in registries.tasks.names():
             spec = gymnasium.spec(registration.name(task))
             assert spec.kwargs == {"task": task}
         assert "starjax/Touch-v0" in gymnasium.registry

@@ -101,7 +101,7 @@ def test_with_all_of_them_only_what_has_a_level_is_wrong(env):
         for _ in range(6):
             to = Command(Pose(one.pose.R, one.pose.p + 0.01), one.gripper)
             one, all_of_them = alone.step(one, to), step_all(all_of_them, to)
-        for name in ("pose", "gripper", "step", "trocar", "told", "cameras"):
+        for name in ("pose", "gripper", "step", "trocar", "measured_trocar", "cameras"):
             pairs = zip(*(jax.tree.leaves(getattr(s, name)) for s in (one, all_of_them)))
             for x, y in pairs:
                 np.testing.assert_allclose(x, y, atol=1e-6)
@@ -114,9 +114,9 @@ def test_trocars_are_told_so_far_from_the_truth(env, level):
     wrong = disturbed(env, ["trocar_told"])
     states = [wrong.reset(jax.random.key(k), at(trocar_told=level)) for k in (0, 1)]
     for state in states:
-        apart = state.told.p_world_trocar - state.trocar.p_world_trocar
+        apart = state.measured_trocar.p_world_trocar - state.trocar.p_world_trocar
         np.testing.assert_allclose(jnp.linalg.norm(apart, axis=-1), 1e-3 * level, rtol=1e-2)
-    assert not same(states[0].told, states[1].told)
+    assert not same(states[0].measured_trocar, states[1].measured_trocar)
 
 
 @pytest.mark.parametrize("name", ["breathing", "breathing_late"])
@@ -129,7 +129,11 @@ def test_trocars_rise_and_fall_with_the_breath(env, name):
         apart = state.trocar.p_world_trocar - first.trocar.p_world_trocar
         np.testing.assert_allclose(apart[:, :2], 0.0, atol=1e-6)
         rises.append(float(apart[0, 2]))
-        said.append(float((state.told.p_world_trocar - first.told.p_world_trocar)[0, 2]))
+        said.append(
+            float(
+                (state.measured_trocar.p_world_trocar - first.measured_trocar.p_world_trocar)[0, 2]
+            )
+        )
     np.testing.assert_allclose([max(rises), rises[-1]], [5e-3, 0.0], atol=1e-5)
     late = round(trocars.LATE_S * env.control_hz)
     expected = np.zeros(late).tolist() + rises[:-late] if name == "breathing_late" else 0.0
@@ -243,7 +247,7 @@ def test_demonstrations_meet_levels_up_to_the_highest(env):
     most = {"smoke": 0.4, "tint": 0.2}
     wrong = varied(env, most)
     drawn = [
-        [float(now.level) for now in wrong.reset(jax.random.key(k), PARAMS).beside.values()]
+        [float(now.level) for now in wrong.reset(jax.random.key(k), PARAMS).wrapper_state.values()]
         for k in range(60)
     ]
     high, low = np.max(drawn, 0), np.min(drawn, 0)

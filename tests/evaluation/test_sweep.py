@@ -13,14 +13,14 @@ import synthetic
 from starjax import rcm
 from starjax.evaluation import evaluate, sweep
 from starjax.rollouts import agent
-from starjax.sim import registry
+from starjax.sim import registries
 
 TRAINING = stubs.trocars(*range(8))
 P_REF = stubs.P_WORLD_REF[:1]
 
 
 def test_samples_stay_in_their_ranges_and_repeat():
-    task, two = (registry.tasks.get(name) for name in ("peg_transfer", "needle_handover"))
+    task, two = (registries.tasks.get(name) for name in ("peg_transfer", "needle_handover"))
     drawn = sweep.sample(3, 500, task)
     assert (drawn.radius <= 0.05).all() and (np.abs(np.rad2deg(drawn.polar) - 90) <= 20).all()
     np.testing.assert_array_equal(drawn.radius, sweep.sample(3, 500, task).radius)
@@ -68,7 +68,7 @@ def test_seen_are_the_training_trocars_and_none_beside_them():
 
 def test_a_sweep_of_a_policy(tmp_path):
     sample, params = stubs.make_policy(width=32)
-    drawn = sweep.sample(0, 12, registry.tasks.get("peg_transfer"))
+    drawn = sweep.sample(0, 12, registries.tasks.get("peg_transfer"))
     found = evaluate.evaluate(
         tmp_path,
         stubs.make_env(),

@@ -12,22 +12,22 @@ from starjax.data import demos, load, schema
 from starjax.evaluation import evaluate, recorded
 from starjax.rollouts import agent
 from starjax.rollouts.placement import DeviceLayout
-from starjax.sim import endoscope, workspaces
+from starjax.sim import endoscope_camera, workspaces
 
 SCOPE = workspaces.BOARD_ENDOSCOPE
 
 
 def make_env():
     """The stub, seen through an endoscope."""
-    env = stubs.make_env("image", unlucky=0.0, cameras=(endoscope.NAME,))
+    env = stubs.make_env("image", unlucky=0.0, cameras=(endoscope_camera.NAME,))
 
     def reset(key, params):
-        return env.reset(key, params).replace(endoscope=endoscope.draw(SCOPE, key))
+        return env.reset(key, params).replace(endoscope=endoscope_camera.draw(SCOPE, key))
 
     return env._replace(
         reset=reset,
         observe=lambda state: env.observe(state)._replace(endoscope=state.endoscope),
-        task=env.task._replace(endoscope=SCOPE, cameras=(endoscope.NAME,)),
+        task=env.task._replace(endoscope=SCOPE, cameras=(endoscope_camera.NAME,)),
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from starjax import errors
-from starjax.sim import ik, mounts, registry, robot, scene
+from starjax.sim import ik, mounts, registries, robot, scene
 
 EULER = 'euler="3.141592654 0 0"'  # of the flange
 
@@ -32,11 +32,11 @@ def edit(path, old, new):
 
 
 def test_an_arm_of_another_package_stands_in_a_scene_and_holds_its_tool(package):
-    assert package in registry.arms.names() and package not in registry.arms.built_in
-    arm, tool = registry.arms.get(package), registry.tools.get("grasper")
+    assert package in registries.arms.names() and package not in registries.arms.built_in
+    arm, tool = registries.arms.get(package), registries.tools.get("grasper")
     at = mounts.bench(arm, tool)
     assert at.tip.slides == (True, True, True, False, False, False)
-    workspace = registry.workspaces.get("board")
+    workspace = registries.workspaces.get("board")
     fit = mounts.fit(at, arm.mounts["grasper", "board"], mounts.targets(workspace))
     assert mounts.is_good(fit)
 
@@ -56,7 +56,7 @@ def test_an_arm_of_another_package_stands_in_a_scene_and_holds_its_tool(package)
 def test_a_scene_turns_the_tool_on_the_flange_as_the_search_did(package, tmp_path, flange):
     edit(tmp_path / "my_arms" / "gantry.xml", EULER, flange)
     edit(tmp_path / "my_arms" / "gantry.py", "turn=0.0", "turn=0.7")
-    arm, tool = registry.arms.get(package), registry.tools.get("grasper")
+    arm, tool = registries.arms.get(package), registries.tools.get("grasper")
     mount = arm.mounts["grasper", "board"]
     place = jnp.array([*mount.position, mount.yaw, mount.turn, mount.tilt])
     at = mounts.bench(arm, tool)
@@ -83,5 +83,5 @@ def test_a_scene_turns_the_tool_on_the_flange_as_the_search_did(package, tmp_pat
 def test_a_file_that_is_not_ready_is_refused_by_name(package, tmp_path, old, new, argument):
     edit(tmp_path / "my_arms" / "gantry.xml", old, new)
     with pytest.raises(errors.UsageError) as caught:
-        robot.read(registry.arms.get(package))
+        robot.read(registries.arms.get(package))
     assert caught.value.argument == argument

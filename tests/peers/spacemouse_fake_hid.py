@@ -65,7 +65,7 @@ def main():
     fake = Fake()
     sys.modules["easyhid"] = library(fake)  # before pyspacemouse is imported
     from starjax import rcm
-    from starjax.sim import registry
+    from starjax.sim import registries
     from starjax.viewer import devices
     from starjax.viewer import hand as hands
 
@@ -83,7 +83,7 @@ def main():
     fake.push(buttons=2)
     assert device.read().buttons == (False, True)
 
-    slot = registry.tasks.get("reach").slots[0]
+    slot = registries.tasks.get("reach").slots[0]
     tip, axes = np.array([0.0, 0.0, 0.06]), hands.axes_seen(np.eye(3)[:, [1, 0, 2]])
     hand, bounds = hands.resting(np.array([0.0, *tip]), 1.0), hands.bounds(slot, tip)
     frame = rcm.trocar_frame(

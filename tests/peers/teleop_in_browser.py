@@ -41,10 +41,10 @@ def goal_mm():
     import jax
 
     from starjax.data import schema
-    from starjax.sim import registry, scene
+    from starjax.sim import registries, scene
     from starjax.viewer import simulation
 
-    task = registry.tasks.get("reach")
+    task = registries.tasks.get("reach")
     key = jax.random.split(simulation.trial_key(SEED, TROCAR, 0, schema.STREAM))[0]
     bound = task.bind(scene.compose(scene.name("reach")))
     return [1e3 * float(x) for x in task.sample(bound, key).p]

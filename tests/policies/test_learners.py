@@ -18,7 +18,7 @@ from starjax.data import normalizer, windows
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.training import loop
 
 TRAIN = config.TrainConfig(
@@ -37,8 +37,8 @@ def installed():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(importlib.metadata, "entry_points", entry_points)
-        tasks = registry.Registry("task", {"peg_transfer": "fakes:TASK"})
-        patch.setattr(registry, "tasks", tasks)
+        tasks = registries.Registry("task", {"peg_transfer": "fakes:TASK"})
+        patch.setattr(registries, "tasks", tasks)
         yield
 
 

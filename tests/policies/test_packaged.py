@@ -15,7 +15,7 @@ from starjax.evaluation import latency
 from starjax.models.kernels import parallel_ddim
 from starjax.policies import features, packaged, policy_file
 from starjax.policies import policy as policies
-from starjax.sim import registry
+from starjax.sim import registries
 
 MOST = 12e6  # bytes of a file
 
@@ -40,7 +40,7 @@ def faults(name):
         trained = policy_file.load(path)
     except ValueError as error:
         return [*found, str(error)]
-    task = registry.tasks.get(trained.scene.task)
+    task = registries.tasks.get(trained.scene.task)
     if shapes(trained.params) != shapes(initial(trained.method, trained.policy, task)):
         found.append(f"{name}: of other networks")
     result = path.with_suffix(".json")

@@ -155,12 +155,12 @@ def test_each_arm_has_its_path_its_trocar_and_its_port(one):
 
 
 def test_shafts_are_drawn_where_the_joints_had_them(one):
-    from starjax.sim import registry, scene
+    from starjax.sim import registries, scene
 
     names = one.result.scene
     data = mujoco.MjData(scene.compose(names))
     mujoco.mj_kinematics(data.model, data)
-    tcp = data.site(scene.tcp(0, registry.tools.get(names.tools[0])))
+    tcp = data.site(scene.tcp(0, registries.tools.get(names.tools[0])))
     qpos = np.tile(data.qpos, (20, 1))
     rollout = one.rollouts[0]._replace(p_world_tip=one.rollouts[0].p_world_tip[:20], qpos=qpos)
     axis = trajectories.draw([one._replace(rollouts=[rollout])], stage.load).axes[0]

@@ -95,7 +95,7 @@ def test_a_policy_is_told_what_the_environment_tells():
     def reset(key, params):
         state = base.reset(key, params)
         told = rcm.trocar_frame(rcm.Trocar(*np.float32([[0.03], [1.5], [0.2]])), base.p_world_ref)
-        return state.replace(told=told)
+        return state.replace(measured_trocar=told)
 
     expected = rcm.trocar_position(rcm.Trocar(0.03, 1.5, 0.2), base.p_world_ref[0])
     for episode in run(base._replace(reset=reset), agent.from_policy(sample, 1, 4), max_steps=3):

@@ -31,9 +31,10 @@ def reset(environment):
     """`seed -> EnvState` of the twelve trocars, or of others."""
     compiled = jax.jit(jax.vmap(environment.reset))
 
-    def reset(seed, trocars=rcm.TROCARS, told=None):
+    def reset(seed, trocars=rcm.TROCARS, measured_trocar=None):
         given = (
-            jax.tree.map(lambda field: jnp.asarray(field)[:, None], x) for x in (trocars, told)
+            jax.tree.map(lambda field: jnp.asarray(field)[:, None], x)
+            for x in (trocars, measured_trocar)
         )
         return compiled(jax.random.split(jax.random.key(seed), LANES), envs.EnvParams(*given))
 

@@ -21,8 +21,8 @@ def is_hit(sim):
 
     def is_hit(R, p, origins=UP, block=FAR, peg=FAR):
         there = Pose(jnp.eye(3), BLOCK + block)
-        facts = task.Facts(there, jnp.zeros(6), jnp.zeros(3), jnp.zeros((), bool))
-        obstacles = task.obstacles(sim.bound._replace(pegs=PEG + peg), None, facts)
+        measurements = task.PegMeasurements(there, jnp.zeros(6), jnp.zeros(3), jnp.zeros((), bool))
+        obstacles = task.obstacles(sim.bound._replace(pegs=PEG + peg), None, measurements)
         pose = Pose(R[None], jnp.array([p]))
         return bool(collision.detect(sim.arms, pose, [origins], OUTSIDE[None], obstacles, 0.0))
 

@@ -8,17 +8,17 @@ import pytest
 from starjax import rcm
 from starjax.data import schema
 from starjax.rollouts import episodes, programs
-from starjax.sim import endoscope, physics, registry, render, scene
+from starjax.sim import endoscope_camera, physics, registries, render, scene
 from starjax.sim import env as envs
 from starjax.sim.tasks.needle_handover import task as needle_handover
 
-TASKS = sorted(name for name in registry.tasks.names() if registry.tasks.get(name).endoscope)
+TASKS = sorted(name for name in registries.tasks.names() if registries.tasks.get(name).endoscope)
 CROP = 0.9  # of the picture's side, that policies see
 
 
 def drawn(scope, count=400):
     keys = jax.random.split(jax.random.key(0), count)
-    return jax.vmap(lambda key: endoscope.draw(scope, key))(keys)
+    return jax.vmap(lambda key: endoscope_camera.draw(scope, key))(keys)
 
 
 def seen(pose, points, scope):
@@ -29,14 +29,14 @@ def seen(pose, points, scope):
 
 
 def test_the_tasks_with_tools_have_one():
-    names = registry.tasks.names()
-    with_jaws = [n for n in names if registry.tasks.get(n).slots[0].tool.startswith("grasper")]
+    names = registries.tasks.names()
+    with_jaws = [n for n in names if registries.tasks.get(n).slots[0].tool.startswith("grasper")]
     assert sorted(with_jaws) == TASKS
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_it_stands_in_its_trocar_level_and_near_the_work(name):
-    scope = registry.tasks.get(name).endoscope
+    scope = registries.tasks.get(name).endoscope
     pose = drawn(scope)
     work = np.array(scope.work)
     away = np.linalg.norm(pose.p - work, axis=-1)
@@ -56,7 +56,7 @@ def test_it_stands_in_its_trocar_level_and_near_the_work(name):
 
 def work_of(name):
     """Points that an episode may be about."""
-    bound = registry.tasks.get(name).bind(scene.compose(scene.name(name)))
+    bound = registries.tasks.get(name).bind(scene.compose(scene.name(name)))
     if name == "reach":
         return bound.marks
     if name.startswith("peg_transfer"):
@@ -73,7 +73,7 @@ def work_of(name):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_the_work_is_in_the_picture(name):
-    scope = registry.tasks.get(name).endoscope
+    scope = registries.tasks.get(name).endoscope
     inside = np.abs(seen(drawn(scope), work_of(name), scope)).max(-1) < CROP
     assert inside.mean() > 0.995, inside.mean()
     # A lens at 6 cm, the nearest that was asked for, loses some.
@@ -110,7 +110,7 @@ def test_every_episode_is_seen_from_its_own_place(environment):
     trocars = jax.tree.map(lambda x: jnp.asarray(x)[:2, None], rcm.TROCARS)
     state = jax.jit(jax.vmap(environment.reset))(keys, envs.EnvParams(trocars))
     scope, held = environment.task.endoscope, state.endoscope
-    wanted = jax.vmap(lambda key: endoscope.draw(scope, key))(keys)
+    wanted = jax.vmap(lambda key: endoscope_camera.draw(scope, key))(keys)
     np.testing.assert_allclose(held.p, wanted.p, atol=1e-7)
     assert np.linalg.norm(held.p[0] - held.p[1]) > 1e-3
     layout = jax.vmap(lambda key: environment.task.sample(environment.scene.bound, key))(keys)

@@ -84,7 +84,7 @@ def test_no_contact_is_left_out(episodes, sim):
 def test_a_released_block_is_threaded_and_at_rest(episodes, sim):
     state, *_ = episodes
     for lane in np.flatnonzero(state.success):
-        block = jax.tree.map(lambda leaf, i=lane: leaf[i], state.facts.block)
+        block = jax.tree.map(lambda leaf, i=lane: leaf[i], state.measurements.block)
         assert task.is_threaded(block, state.layout.target_peg[lane])
     assert not state.touch[state.success].any()
 
@@ -92,18 +92,18 @@ def test_a_released_block_is_threaded_and_at_rest(episodes, sim):
 def test_success_wants_a_block_let_go_and_at_rest_on_its_peg_five_steps_in_a_row(reset, sim):
     state = jax.tree.map(lambda leaf: leaf[0], reset(0))
     on_target = Pose(jnp.eye(3), jnp.append(state.layout.target_peg, task.RIM_HEIGHT))
-    facts = state.facts.replace(block=on_target)
-    good = state.replace(facts=facts)
-    fast = facts.replace(velocity=facts.velocity.at[0].set(0.02))
-    held = facts.replace(touch=jnp.ones((), bool))
+    measurements = state.measurements.replace(block=on_target)
+    good = state.replace(measurements=measurements)
+    fast = measurements.replace(velocity=measurements.velocity.at[0].set(0.02))
+    held = measurements.replace(touch=jnp.ones((), bool))
     after, successes = good, []
     for _ in range(5):
-        last, after = after, envs.judge(sim, after)
+        last, after = after, envs.with_status(sim, after)
         successes.append(bool(after.success) and bool(after.done))
     assert successes == [False] * 4 + [True]
     assert float(after.reward) == 1.0 and int(after.stage) == len(task.STAGES) - 1
-    for bad in (state, good.replace(facts=fast), good.replace(facts=held)):
-        again = envs.judge(sim, bad.replace(settled=last.settled))
+    for bad in (state, good.replace(measurements=fast), good.replace(measurements=held)):
+        again = envs.with_status(sim, bad.replace(settled=last.settled))
         assert float(again.reward) < 1.0
         assert int(again.settled) == 0 and not again.success and not again.done
 
@@ -142,8 +142,10 @@ def test_observations_hold_what_they_say(environment, reset):
     state = jax.tree.map(lambda leaf: leaf[4], reset(2))
     seen = environment.observe(state)
     assert seen.images is None and seen.state.shape == (environment.task.state_size,) == (12,)
-    np.testing.assert_allclose(seen.state[:3], state.facts.block.p)
-    np.testing.assert_allclose(rcm.rot6d_decode(seen.state[3:9]), state.facts.block.R, atol=1e-6)
+    np.testing.assert_allclose(seen.state[:3], state.measurements.block.p)
+    np.testing.assert_allclose(
+        rcm.rot6d_decode(seen.state[3:9]), state.measurements.block.R, atol=1e-6
+    )
     np.testing.assert_allclose(
         seen.state[9:11], environment.scene.bound.pegs[int(state.layout.target)]
     )
@@ -232,8 +234,8 @@ def test_the_expert_takes_the_inner_wall_and_on_the_middle_row_the_one_of_less_t
     for seed in range(8):
         state = reset(seed)
         walls = np.asarray(begin(state, seed).wall)
-        normals = np.asarray(jax.vmap(task.wall_normals)(state.facts.block))
-        for wall, normal, y in zip(walls, normals, np.asarray(state.facts.block.p[:, 1])):
+        normals = np.asarray(jax.vmap(task.wall_normals)(state.measurements.block))
+        for wall, normal, y in zip(walls, normals, np.asarray(state.measurements.block.p[:, 1])):
             skew = np.abs(normal[:, 0])
             first, second = np.argsort(skew)[:2]
             if abs(y) > 0.015:
@@ -251,8 +253,8 @@ def test_with_one_wall_the_expert_takes_the_same_on_the_middle_row_and_else_as_b
     for seed in range(4):
         state = reset(seed)
         walls = np.asarray(begin(jax.random.split(jax.random.key(seed), 12), state).wall)
-        normals = np.asarray(jax.vmap(task.wall_normals)(state.facts.block))
-        for wall, normal, y in zip(walls, normals, np.asarray(state.facts.block.p[:, 1])):
+        normals = np.asarray(jax.vmap(task.wall_normals)(state.measurements.block))
+        for wall, normal, y in zip(walls, normals, np.asarray(state.measurements.block.p[:, 1])):
             assert (normal[wall, 1] < 0) == (y > expert.BETWEEN_ROWS)
             middle += abs(y) < expert.BETWEEN_ROWS
     assert middle >= 8
@@ -261,9 +263,9 @@ def test_with_one_wall_the_expert_takes_the_same_on_the_middle_row_and_else_as_b
 def test_the_expert_comes_in_from_outside_along_the_wall(reset, begin):
     state = reset(3)
     script = begin(state, 3)
-    normals = np.asarray(jax.vmap(task.wall_normals)(state.facts.block))
+    normals = np.asarray(jax.vmap(task.wall_normals)(state.measurements.block))
     outward = normals[np.arange(len(normals)), np.asarray(script.wall)]
-    away = np.sum(np.asarray(script.goal - state.facts.block.p) * outward, -1)
+    away = np.sum(np.asarray(script.goal - state.measurements.block.p) * outward, -1)
     # HOVER_SPREAD is left out by the mean over the twelve.
     assert away.mean() == pytest.approx(task.RIM_RADIUS + expert.HOVER_OUT, abs=0.0015)
 
@@ -272,7 +274,7 @@ def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
     """What is multimodal never depends on the trocar, or positions would not be invariant."""
     state = reset(5)
     one = jax.tree.map(lambda leaf: jnp.stack([leaf[0]] * 12), state)
-    moved = one.replace(trocar=state.trocar, told=state.told)
+    moved = one.replace(trocar=state.trocar, measured_trocar=state.measured_trocar)
     begin = jax.jit(jax.vmap(expert.init, in_axes=(None, 0)))
     script = begin(jax.random.key(0), moved)
     assert len(np.unique(script.wall)) == 1 and len(np.unique(script.side)) == 1
@@ -282,8 +284,8 @@ def test_the_expert_chooses_alike_for_every_trocar(reset, environment):
 def test_the_expert_starts_over_when_the_block_is_lost_on_the_way(reset, begin):
     state = reset(6)
     state, script = (jax.tree.map(lambda leaf: leaf[0], x) for x in (state, begin(state, 6)))
-    normal = task.wall_normals(state.facts.block)[script.wall]
-    wall = state.facts.block.p + task.RIM_RADIUS * normal
+    normal = task.wall_normals(state.measurements.block)[script.wall]
+    wall = state.measurements.block.p + task.RIM_RADIUS * normal
 
     def after(phase, off):
         there = state.replace(pose=state.pose._replace(p=wall[None] + jnp.array([[0.0, 0.0, off]])))
@@ -319,7 +321,7 @@ def test_the_contact_solver_converges_and_a_step_where_it_does_not_is_invalid(
     assert float(after.solver_error.max()) < envs.MAX_SOLVER_ERROR and not after.invalid.any()
     state = jax.tree.map(lambda leaf: leaf[0], state)
     moved = state.physics.replace(qpos=state.physics.qpos + 1e-3)
-    passed = physics.Passed(
+    passed = physics.StepResult(
         state.touch,
         physics.no_contacts(sim),
         jnp.tile(state.physics.qpos, (8, 1)),
@@ -344,13 +346,15 @@ def test_experts_act_on_the_trocar_that_they_are_told_and_errors_count_from_the_
 ):
     state = reset(3)
     away = jax.tree.map(lambda field: np.roll(field, 1), rcm.TROCARS)
-    told = reset(3, told=away)
-    np.testing.assert_array_equal(told.trocar.p_world_trocar, state.trocar.p_world_trocar)
+    misled = reset(3, measured_trocar=away)
+    np.testing.assert_array_equal(misled.trocar.p_world_trocar, state.trocar.p_world_trocar)
     np.testing.assert_allclose(
-        told.told.p_world_trocar[1:], state.trocar.p_world_trocar[:-1], atol=1e-7
+        misled.measured_trocar.p_world_trocar[1:], state.trocar.p_world_trocar[:-1], atol=1e-7
     )
-    right, wrong = (drive(s, begin(s, 4))[1].label.pose for s in (state, told))
-    p_true, p_told = (frame.p_world_trocar[:, 0] for frame in (told.trocar, told.told))
+    right, wrong = (drive(s, begin(s, 4))[1].label.pose for s in (state, misled))
+    p_true, p_told = (
+        frame.p_world_trocar[:, 0] for frame in (misled.trocar, misled.measured_trocar)
+    )
     assert float(rcm.rcm_error(right, p_true).max()) < 1e-6
     assert float(rcm.rcm_error(wrong, p_told).max()) < 1e-6
     assert float(rcm.rcm_error(wrong, p_true).min()) > 1e-3

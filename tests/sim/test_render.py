@@ -17,7 +17,7 @@ from starjax.sim import render
 from starjax.sim import scene as model
 from starjax.sim.arms import fr5
 from starjax.sim.camera import geometry as scenes
-from starjax.sim.camera import shapes, tiles
+from starjax.sim.camera import tiles
 from starjax.types import Pose
 
 # Every primitive, tilted, in a pile, with what must not be drawn: groups 3 and up, alpha 0, sites.
@@ -110,7 +110,7 @@ def caster(mj_model: mujoco.MjModel, **settings):
     return jax.jit(jax.vmap(render.make(mj_model, **settings), in_axes=(0, 0, None)))
 
 
-def draw(mj_model: mujoco.MjModel, qpos: np.ndarray, **settings) -> render.Frame:
+def draw(mj_model: mujoco.MjModel, qpos: np.ndarray, **settings) -> render.CameraImage:
     """Our pictures of `[n, nq]` configurations."""
     take = caster(mj_model, **settings)
     return jax.tree.map(np.asarray, take(*geoms(mj_model, qpos), render.geom_rgb(mj_model)))
@@ -155,7 +155,7 @@ def test_geom_and_depth_agree_with_mujoco_rays(camera):
         both = (ours == ids) & (ids >= 0)
         error = np.abs(frames.depth[i].ravel() - t)[both]
         assert error.mean() <= 5e-6 and np.percentile(error, 99) <= 5e-5
-        assert (frames.depth[i].ravel()[ours < 0] == shapes.FAR).all()
+        assert (frames.depth[i].ravel()[ours < 0] == rays.FAR).all()
 
 
 def test_shadow_agrees_with_mujoco_rays():

@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 
 from starjax.sim import linear, scene, solver
-from starjax.sim.engine import mjx
+from starjax.sim.quiet_mjx import mjx
 
 VELOCITIES, LIMITS, CONTACTS = 6, 3, 4
 TIMESTEP = 1 / 240

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.viewer import hand as hands
 
-SLOT = registry.tasks.get("reach").slots[0]
+SLOT = registries.tasks.get("reach").slots[0]
 TIP = np.array([0.0, 0.01, 0.07])
 BOUNDS = hands.bounds(SLOT, TIP)
 
@@ -36,7 +36,7 @@ def test_any_motion_stays_within_bounds_and_on_the_manifold(seed):
 
 def test_bounds_hold_the_start_and_end_above_the_table():
     assert (BOUNDS.low[1:] < TIP).all() and (BOUNDS.high[1:] > TIP).all()
-    assert BOUNDS.low[3] >= registry.tasks.get("reach").floor
+    assert BOUNDS.low[3] >= registries.tasks.get("reach").floor
 
 
 def test_a_step_of_a_key_arrives_smoothly_and_whole():

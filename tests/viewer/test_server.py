@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starjax import errors
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.viewer import handles
 from starjax.viewer import server as pages
 
@@ -39,7 +39,7 @@ def test_a_closed_page_gives_its_port_back():
 
 
 def test_a_dragged_trocar_stays_where_the_arms_reach(page):
-    task = registry.tasks.get("peg_transfer")
+    task = registries.tasks.get("peg_transfer")
     found = handles.TrocarHandles(page.scene, task)
     found.place(np.array([[0.02, 0.0, 0.15]]))
     (handle,) = found._handles
@@ -53,8 +53,8 @@ def test_a_dragged_trocar_stays_where_the_arms_reach(page):
 @pytest.mark.parametrize("name", ["peg_transfer", "peg_transfer_bimanual"])
 def test_within_is_a_projection_onto_the_workspace(name):
     random = np.random.default_rng(0)
-    for slot in registry.tasks.get(name).slots:
-        space = registry.workspaces.get(slot.workspace)
+    for slot in registries.tasks.get(name).slots:
+        space = registries.workspaces.get(slot.workspace)
         for p in random.normal(scale=0.1, size=(20, 3)) + slot.p_world_ref:
             found = handles.within(slot, p)
             offset = found - np.array(slot.p_world_ref)

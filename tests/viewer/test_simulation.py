@@ -9,7 +9,7 @@ import stubs
 
 from starjax import rcm
 from starjax.rollouts import agent, engine, episodes
-from starjax.sim import moving
+from starjax.sim import moving_trocars
 from starjax.types import Command
 from starjax.viewer import simulation
 from starjax.viewer.frame import outcome
@@ -66,15 +66,15 @@ def test_what_stays_keeps_its_bits_and_what_moves_is_told(env):
     frame = rcm.trocar_frame(
         rcm.Trocar(*np.float32([[0.04], [1.4], [0.3]])), env.p_world_ref, np.zeros(1)
     )
-    state = state.replace(trocar=frame, told=frame)
-    same = moving.trocars_to(env, state, frame.p_world_trocar)
+    state = state.replace(trocar=frame, measured_trocar=frame)
+    same = moving_trocars.move_trocars(env, state, frame.p_world_trocar)
     jax.tree.map(np.testing.assert_array_equal, same.trocar, frame)
     place = np.float32([[0.01, -0.02, 0.152]])
-    other = moving.trocars_to(env, state, place)
-    for told in (other.trocar, other.told):
-        np.testing.assert_allclose(told.p_world_trocar, place, atol=1e-7)
+    other = moving_trocars.move_trocars(env, state, place)
+    for measured_trocar in (other.trocar, other.measured_trocar):
+        np.testing.assert_allclose(measured_trocar.p_world_trocar, place, atol=1e-7)
         np.testing.assert_allclose(
-            rcm.trocar_position(told.trocar, env.p_world_ref), place, atol=1e-7
+            rcm.trocar_position(measured_trocar.trocar, env.p_world_ref), place, atol=1e-7
         )
 
 
@@ -85,14 +85,14 @@ def test_what_was_planned_is_carried_to_where_the_trocar_is():
     place = rcm.trocar_from_position(before, [0.0, 0.0, 0.15])
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, place, [0.0, 0.0, 0.15])
     command = Command(pose, np.ones(50, np.float32))
-    found = moving.carried(command, before, now)
+    found = moving_trocars.carried(command, before, now)
     assert np.max(rcm.rcm_error(found.pose, now)) < 1e-6
     np.testing.assert_array_equal(found.pose.p, pose.p)
-    stays = moving.carried(command, before, before)
+    stays = moving_trocars.carried(command, before, before)
     np.testing.assert_array_equal(stays.pose.R, pose.R)
     missed = command._replace(pose=pose._replace(p=pose.p + np.float32([0.0, 0.001, 0.001])))
-    free = np.asarray(rcm.rcm_error(missed.pose, before)) > moving.HELD
-    left = moving.carried(missed, before, now).pose
+    free = np.asarray(rcm.rcm_error(missed.pose, before)) > moving_trocars.HELD
+    left = moving_trocars.carried(missed, before, now).pose
     np.testing.assert_array_equal(left.R[free], missed.pose.R[free])
     assert free.sum() > 40
 

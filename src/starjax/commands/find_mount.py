@@ -39,15 +39,15 @@ def main(argv: Sequence[str]) -> int:
     """Searches, prints each round's figures and the best mount."""
     chosen = options.parse(Options, argv, prog="starjax find-mount", description=DESCRIPTION)
     xla.prepare_xla()
-    xla.require_devices("starjax.sim.place")
+    xla.require_devices("starjax.sim.mount_search")
 
-    from starjax.sim import mounts, place, registry
+    from starjax.sim import mount_search, mounts, registries
 
-    at = mounts.bench(registry.arms.get(chosen.arm), registry.tools.get(chosen.tool))
+    at = mounts.bench(registries.arms.get(chosen.arm), registries.tools.get(chosen.tool))
     found = []
     for name, workspace in _workspaces(chosen.workspace).items():
         print(f"{chosen.arm} with {chosen.tool} in {name}", flush=True)
-        mount, least = place.search(at, workspace, chosen.seed, chosen.tilts, _tell)
+        mount, least = mount_search.search(at, workspace, chosen.seed, chosen.tilts, _tell)
         print(f"\n{_record(chosen.tool, name, mount, least)}\n")
         found.append(mounts.is_good(least))
     if all(found):
@@ -67,17 +67,17 @@ def _tell(fit: "Fit") -> None:
 
 def _workspaces(name: str) -> "dict[str, Workspace]":
     """The workspace of that name, or those of a task's arms, each with its nominal trocar."""
-    from starjax.sim import registry
+    from starjax.sim import registries
 
-    if name in registry.workspaces.names():
-        return {name: registry.workspaces.get(name)}
-    known = [*registry.workspaces.names(), *registry.tasks.names()]
+    if name in registries.workspaces.names():
+        return {name: registries.workspaces.get(name)}
+    known = [*registries.workspaces.names(), *registries.tasks.names()]
     errors.choice("WORKSPACE", name, known)
     return {
-        slot.workspace: registry.workspaces.get(slot.workspace)._replace(
+        slot.workspace: registries.workspaces.get(slot.workspace)._replace(
             p_world_ref=slot.p_world_ref, roll_zero=slot.roll_zero
         )
-        for slot in registry.tasks.get(name).slots
+        for slot in registries.tasks.get(name).slots
     }
 
 

@@ -9,9 +9,9 @@ from starjax.commands import options, presets
 from starjax.learners import LEARNERS
 from starjax.policies import packaged
 from starjax.runtime import files
-from starjax.sim import names, registry
+from starjax.sim import names, registries
 from starjax.sim.arms.base import Arm
-from starjax.sim.registry import Registry
+from starjax.sim.registries import Registry
 from starjax.sim.tools.base import Tool
 
 if TYPE_CHECKING:  # it imports jax, which `--help` does without
@@ -26,9 +26,9 @@ def main(argv: Sequence[str]) -> int:
     """Prints the tables."""
     options.parse(options.NoFlags, argv, prog="starjax list", description=DESCRIPTION)
     tables = {
-        "tasks (--task, --camera, --demos.expert)": _parts(registry.tasks, _task),
-        "arms (--arm)": _parts(registry.arms, _arm),
-        "tools (--tool)": _parts(registry.tools, _tool),
+        "tasks (--task, --camera, --demos.expert)": _parts(registries.tasks, _task),
+        "arms (--arm)": _parts(registries.arms, _arm),
+        "tools (--tool)": _parts(registries.tools, _tool),
         "methods (--method)": _methods(),
         "learners (--policy.learner)": _learners(),
         "presets (--preset)": _presets(),
@@ -52,7 +52,7 @@ def _parts(registry: Registry, described: Callable[[Any], str]) -> Iterator[Row]
 def _task(task: "Task") -> str:
     arms = f"{task.arms} arm{'s' if task.arms > 1 else ''}"
     sees, shows = ", ".join(task.cameras), ", ".join(task.experts)
-    return f"{task.words.title}: {arms}; cameras {sees}; experts {shows}"
+    return f"{task.text.title}: {arms}; cameras {sees}; experts {shows}"
 
 
 def _arm(arm: Arm) -> str:

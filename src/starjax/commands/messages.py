@@ -47,7 +47,7 @@ def _setting(config: config_lib.RunConfig) -> list[str]:
 
     devices, scene = jax.devices(), config.scene
     robots = ", ".join(f"{arm} with {tool}" for arm, tool in zip(scene.arm, scene.tool))
-    parts = [_task(config).words.title, robots, ", ".join(scene.camera)]
+    parts = [_task(config).text.title, robots, ", ".join(scene.camera)]
     return [
         f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores",
         f"  scene           {'; '.join(filter(None, parts))}",
@@ -57,9 +57,9 @@ def _setting(config: config_lib.RunConfig) -> list[str]:
 
 
 def _task(config: config_lib.RunConfig) -> Any:
-    from starjax.sim import registry
+    from starjax.sim import registries
 
-    return registry.tasks.get(config.scene.task)
+    return registries.tasks.get(config.scene.task)
 
 
 def _learning_from(demos: config_lib.DemosConfig) -> str:

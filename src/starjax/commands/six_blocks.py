@@ -73,17 +73,17 @@ def _score(
     from starjax.evaluation import evaluate
     from starjax.rollouts import agent
     from starjax.sim import env as sim_env
-    from starjax.sim import exercise
+    from starjax.sim import six_blocks
     from starjax.sim.tasks.peg_transfer_bimanual.six import LIMIT_S
     from starjax.sim.tasks.peg_transfer_bimanual.six import TASK as task
 
     if named is None:
-        env = exercise.make(chosen.arm, observation="state")
+        env = six_blocks.make(chosen.arm, observation="state")
         name, make = next(iter(task.experts.items()))
         table = evaluate.evaluate(
             folder,
             env,
-            agent.from_single(exercise.anew(make())),
+            agent.from_single(six_blocks.reset_each_block(make())),
             (),
             task.trocars,
             evaluate.Settings(chosen.trials, chosen.seed, LIMIT_S),
@@ -95,7 +95,7 @@ def _score(
     names = who.env.names
     if names.task != TASK:
         raise errors.UsageError("RUN or --policy", f"one trained for {TASK}", f"of {names.task}")
-    env = exercise.of(sim_env.for_policy(names, who.trained.policy, variant=task))
+    env = six_blocks.wrap(sim_env.for_policy(names, who.trained.policy, variant=task))
     trials = config_lib.EvalConfig(trials=chosen.trials, time_limit_s=LIMIT_S, video_trials=0)
     subject = who._replace(env=env)
     table = policy_evaluation.rollouts(folder, subject, task.trocars, trials, chosen.seed)

@@ -75,7 +75,7 @@ def _dataset(folder: str) -> Show:
 
 def _live(chosen: Options) -> Show:
     """Makes the viewer of somebody at work."""
-    from starjax.sim import registry
+    from starjax.sim import registries
     from starjax.viewer import actors, view
 
     who = [_actor(chosen.policy, chosen.run, chosen.task)]
@@ -85,8 +85,8 @@ def _live(chosen: Options) -> Show:
     if who[-1].task != who[0].task:
         raise errors.UsageError("--compare-with", f"one that does {who[0].task}", who[-1].task)
     if chosen.arm:
-        errors.choice("--arm", chosen.arm, registry.arms.names())
-    count = len(registry.tasks.get(who[0].task).is_seen)
+        errors.choice("--arm", chosen.arm, registries.arms.names())
+    count = len(registries.tasks.get(who[0].task).is_seen)
     if chosen.trocar >= count:
         raise errors.UsageError("--trocar", f"0 to {count - 1}", chosen.trocar)
     asked = view.Asked(tuple(who), chosen.arm or view.THEIRS, chosen.trocar, chosen.seed)

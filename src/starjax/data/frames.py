@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from starjax import errors, rcm
 from starjax.rcm import arrays
-from starjax.sim import endoscope
+from starjax.sim import endoscope_camera
 from starjax.sim.tasks.base import Field, Task
 from starjax.types import Command, Observation, Pose
 
@@ -33,7 +33,7 @@ class Origins(NamedTuple):
 def origins(task: Task) -> Origins:
     """Those of a task that has an endoscope."""
     assert task.endoscope is not None
-    camera = endoscope.nominal(task.endoscope)
+    camera = endoscope_camera.nominal(task.endoscope)
     down = jnp.array([0.0, 0.0, -1.0])
     zero = jnp.array([slot.roll_zero for slot in task.slots])
     p = jnp.array([slot.p_world_ref for slot in task.slots])

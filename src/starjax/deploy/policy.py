@@ -22,7 +22,7 @@ from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import files
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.sim.names import SceneNames
 from starjax.types import Command, Pose
 
@@ -206,7 +206,7 @@ def load(
     sharing = [name for name, row in methods.METHODS.items() if row.weights_of == trained.method]
     errors.choice("method", method, sharing)
     row = methods.METHODS[method]
-    task = registry.tasks.get(trained.scene.task)
+    task = registries.tasks.get(trained.scene.task)
     made = policies.make(row, settings, task, cameras=trained.scene.cameras)
     params = made.prepare_for_inference(trained.params)
     places = np.asarray(trained.p_world_ref, np.float32)
@@ -274,7 +274,7 @@ def _decider(
     """
     p_world_ref = np.asarray(trained.p_world_ref, np.float32)
     roll_zero = np.asarray(trained.roll_zero, np.float32)
-    tools = [registry.tools.get(name) for name in trained.scene.tools]
+    tools = [registries.tools.get(name) for name in trained.scene.tools]
     is_symmetric = np.array([tool.is_symmetric for tool in tools])
 
     def decide(params, stats, keys, seen: types.Observation, trocar: rcm.Trocar):

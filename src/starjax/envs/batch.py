@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from starjax import runtime
-from starjax.envs import episodes
-from starjax.envs.settings import Settings
+from starjax.envs import mdp
+from starjax.envs.settings import EnvSettings
 
 
 class Lanes(NamedTuple):
@@ -24,79 +24,79 @@ class Lanes(NamedTuple):
     state: Any
 
 
-class Do(NamedTuple):
+class StepMode(NamedTuple):
     """Functions of a batch of episodes.
 
     Attributes:
-      restart: `[N]` bool; these lanes begin an episode and take no action.
+      reset_mask: `[N]` bool; these lanes begin an episode and take no action.
       move: bool; whether the others act, or stay.
-      anew: bool; whether those whose episode ends begin the next one at once.
+      autoreset: bool; whether those whose episode ends begin the next one at once.
     """
 
-    restart: Any
+    reset_mask: Any
     move: Any
-    anew: Any
+    autoreset: Any
 
 
-class Step(NamedTuple):
+class BatchStep(NamedTuple):
     """Result of a call for N episodes.
 
     Attributes:
       now: observation and info of the states now, leaves `[N, ...]`.
       outcome: Outcome `[N]`; of lanes that were to be restarted 0 and False.
-      last: as `now`, before lanes whose episode ended in this step began the next one.
+      final: as `now`, before lanes whose episode ended in this step began the next one.
     """
 
     now: tuple[Any, dict[str, jax.Array]]
-    outcome: episodes.Outcome
-    last: tuple[Any, dict[str, jax.Array]]
+    outcome: mdp.Outcome
+    final: tuple[Any, dict[str, jax.Array]]
 
 
-class Batch(NamedTuple):
+class EpisodeBatch(NamedTuple):
     """A compiled batch.
 
     Attributes:
       episodes: of one lane.
       empty: () -> Lanes before any episode; all are to be restarted.
-      advance: (Lanes, actions `[N, D]`, Do) -> (Lanes, Step).
+      advance: (Lanes, actions `[N, D]`, StepMode) -> (Lanes, BatchStep).
       camera: EnvState `[N]` -> `[N, h, w, 3]` uint8.
       observed: shapes and types of what one episode shows.
     """
 
-    episodes: episodes.Episodes
+    episodes: mdp.Episodes
     empty: Callable[[], Lanes]
-    advance: Callable[[Lanes, Any, Do], tuple[Lanes, Step]]
+    advance: Callable[[Lanes, Any, StepMode], tuple[Lanes, BatchStep]]
     camera: Callable[[Any], jax.Array]
     observed: Any
 
 
 @functools.lru_cache(8)
-def make(settings: Settings, lanes: int) -> Batch:
+def make(settings: EnvSettings, lanes: int) -> EpisodeBatch:
     """Builds the programs; the same arguments give the same ones, compiled once."""
     runtime.prepare_xla()
-    made = episodes.make(settings)
+    made = mdp.make(settings)
     reset, step, judge = jax.vmap(made.reset), jax.vmap(made.step), jax.vmap(made.judge)
     look = jax.vmap(lambda state: (made.observe(state), made.measure(state)))
 
-    def advance(lanes: Lanes, action: Any, do: Do) -> tuple[Lanes, Step]:
-        before, restart = lanes.state, do.restart
-        moves = do.move & ~jnp.all(restart)
+    def advance(lanes: Lanes, action: Any, do: StepMode) -> tuple[Lanes, BatchStep]:
+        before, reset_mask = lanes.state, do.reset_mask
+        moves = do.move & ~jnp.all(reset_mask)
         after = jax.lax.cond(moves, lambda: step(before, action), lambda: before)
         found = judge(before, after)
-        outcome = jax.tree.map(lambda x: _where(restart, jnp.zeros_like(x), x), found)
-        last = look(after)
-        restart = restart | (do.anew & (outcome.terminated | outcome.truncated))
+        outcome = jax.tree.map(lambda x: _where(reset_mask, jnp.zeros_like(x), x), found)
+        final = look(after)
+        reset_mask = reset_mask | (do.autoreset & (outcome.terminated | outcome.truncated))
 
         def begin() -> tuple[Lanes, Any]:
             first = reset(jax.vmap(jax.random.fold_in)(lanes.key, lanes.episode))
-            begun = lanes._replace(episode=lanes.episode + restart, state=first)
-            return _merged(restart, (begun, look(first)), (lanes._replace(state=after), last))
+            begun = lanes._replace(episode=lanes.episode + reset_mask, state=first)
+            return _merged(reset_mask, (begun, look(first)), (lanes._replace(state=after), final))
 
         # Rarely needed, and as dear as a step.
         lanes, now = jax.lax.cond(
-            jnp.any(restart), begin, lambda: (lanes._replace(state=after), last)
+            jnp.any(reset_mask), begin, lambda: (lanes._replace(state=after), final)
         )
-        return lanes, Step(now, outcome, last)
+        return lanes, BatchStep(now, outcome, final)
 
     one = jax.eval_shape(made.reset, jax.random.key(0))
 
@@ -106,7 +106,7 @@ def make(settings: Settings, lanes: int) -> Batch:
         return Lanes(keys, jnp.zeros(lanes, jnp.int32), state)
 
     observed = jax.eval_shape(made.observe, one)
-    return Batch(made, empty, jax.jit(advance), jax.jit(jax.vmap(made.camera)), observed)
+    return EpisodeBatch(made, empty, jax.jit(advance), jax.jit(jax.vmap(made.camera)), observed)
 
 
 def seeded(lanes: Lanes, seeds: Any, which: Any) -> Lanes:

@@ -38,7 +38,7 @@ def make(env: Any, scaled: Callable[[Any], jax.Array]) -> Callable[[Any], Any]:
 
     def tool(state: Any) -> jax.Array:
         speed = state.velocity[:, :4] / _FASTEST
-        trocar = features.trocar_features(state.told.trocar)
+        trocar = features.trocar_features(state.measured_trocar.trocar)
         parts = [scaled(state), speed.ravel(), trocar.ravel()]
         return jnp.concatenate(parts)
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from starjax.envs import episodes, settings
+from starjax.envs import mdp, settings
 
 
 @flax.struct.dataclass
@@ -27,7 +27,7 @@ class State:
       data: `sim.state.EnvState`.
       obs: see `observing`.
       reward, done: float32; done is 1 where the episode has ended before its time.
-      metrics: name -> float32, see `episodes.measure`.
+      metrics: name -> float32, see `mdp.measure`.
       info: whatever wrappers put there; `step` keeps it.
     """
 
@@ -50,7 +50,7 @@ class Environment(NamedTuple):
       episode_length: control steps of the time limit.
       dt, sim_dt: s, of a control step and of a physics step; n_substeps: their ratio.
       mj_model, mjx_model: the composed scene.
-      episodes: the functions beneath, see `episodes.Episodes`.
+      episodes: the functions beneath, see `mdp.Episodes`.
     """
 
     reset: Callable[[jax.Array], State]
@@ -63,7 +63,7 @@ class Environment(NamedTuple):
     n_substeps: int
     mj_model: mujoco.MjModel
     mjx_model: Any
-    episodes: episodes.Episodes
+    episodes: mdp.Episodes
 
     @property
     def unwrapped(self) -> "Environment":
@@ -75,12 +75,12 @@ def make(task: str, **given: Any) -> Environment:
     """Builds the environment.
 
     Args:
-      given: see `settings.Settings`.
+      given: see `settings.EnvSettings`.
 
     Raises:
       errors.UsageError: an argument is unknown or out of range.
     """
-    made = episodes.make(settings.make(task=task, **given))
+    made = mdp.make(settings.make(task=task, **given))
     scene = made.env.scene
 
     def metrics(data: Any) -> dict[str, jax.Array]:

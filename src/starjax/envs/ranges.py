@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.sim.tasks.base import Task
 
 # Beyond the workspace's box of the tip, m, and its rolls, rad: an action at a bound is still sound,
@@ -17,7 +17,7 @@ AZIMUTHS, ROLLS, TIPS = 16, 9, 3  # of the grid, a side
 def tips(task: Task) -> tuple[np.ndarray, np.ndarray]:
     """The boxes of the tips, low and high `[A, 3]` m in the world: the workspaces' and MARGIN, but
     no lower."""
-    spaces = [registry.workspaces.get(slot.workspace) for slot in task.slots]
+    spaces = [registries.workspaces.get(slot.workspace) for slot in task.slots]
     low, high = (np.array([getattr(space, end) for space in spaces]) for end in ("low", "high"))
     return low - MARGIN * [1, 1, 0], high + MARGIN
 
@@ -33,7 +33,7 @@ def actions(task: Task, action_space: str) -> tuple[np.ndarray, np.ndarray]:
     encode = jax.jit(space.encode)
     found = []
     for slot, low, high in zip(task.slots, *tips(task), strict=True):
-        work = registry.workspaces.get(slot.workspace)
+        work = registries.workspaces.get(slot.workspace)
         turn = np.linspace(*work.azimuth, num=AZIMUTHS)
         edge = np.meshgrid(work.radius, [*work.polar, np.mean(work.polar)], turn)
         trocar = rcm.Trocar(*(x.ravel()[:, None] for x in edge))

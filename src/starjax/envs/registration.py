@@ -3,7 +3,7 @@
 import re
 
 from starjax import extras
-from starjax.sim import registry
+from starjax.sim import registries
 
 VERSION = 0
 
@@ -23,11 +23,11 @@ def register() -> None:
     extras.require("starjax.envs", "gym")
     import gymnasium
 
-    for task in registry.tasks.names():
+    for task in registries.tasks.names():
         if name(task) not in gymnasium.registry:
             gymnasium.register(
                 name(task),
-                entry_point="starjax.envs.single:TaskEnv",
+                entry_point="starjax.envs.task_env:TaskEnv",
                 vector_entry_point="starjax.envs.vector:TaskVectorEnv",
                 kwargs={"task": task},
             )

@@ -16,20 +16,20 @@ Row = tuple[float, ...]
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class EnvSettings:
     """Settings of an environment, the keyword arguments of `gymnasium.make`.
 
     Attributes:
-      task: key of `registry.tasks`.
-      arms, tools: keys of `registry.arms` and `registry.tools`, one for each slot of the task, one
-        for all, or none for the task's own.
+      task: key of `registries.tasks`.
+      arms, tools: keys of `registries.arms` and `registries.tools`: one per slot of the task, one
+        for all slots, or none for the task's defaults.
       trocar: where the trocars are. `seen`, `unseen`, `all`: every episode draws one of the task's
         configurations; `random`: uniformly in the workspace's ranges (Eq. 19); a whole number:
         that configuration of the task; a `rcm.Trocar` or (radius m, polar rad, azimuth rad),
         fields `[]` or `[A]`: this one.
       action_space: key of `rcm.ACTION_SPACES`.
-      control: whether an action is `relative` to where the tool is, or `absolute`, see `episodes`.
-      reward: `dense` or `sparse`, see `episodes`.
+      control: whether an action is `relative` to where the tool is, or `absolute`, see `mdp`.
+      reward: `dense` or `sparse`, see `mdp`.
       observation: `state` (numbers) or `image` (pixels, and numbers of the tool).
       image_size: pixels a side of the cameras' square images, rendered ones too.
       cameras: of the task; none for its first one.
@@ -50,13 +50,13 @@ class Settings:
     max_episode_steps: int | None = None
 
 
-def make(**given: Any) -> Settings:
+def make(**given: Any) -> EnvSettings:
     """Settings of what a user gave.
 
     Raises:
       errors.UsageError: an unknown name, or a value out of range.
     """
-    known = [field.name for field in dataclasses.fields(Settings)]
+    known = [field.name for field in dataclasses.fields(EnvSettings)]
     for name in given:
         errors.choice("environment's argument", name, known)
     for name in ("arms", "tools", "cameras"):
@@ -65,7 +65,7 @@ def make(**given: Any) -> Settings:
             given[name] = (parts,) if isinstance(parts, str) else tuple(parts)
     if "trocar" in given:
         given["trocar"] = _trocar(given["trocar"])
-    settings = Settings(**given)
+    settings = EnvSettings(**given)
     errors.choice("action_space", settings.action_space, rcm.ACTION_SPACES)
     errors.choice("control", settings.control, CONTROLS)
     errors.choice("reward", settings.reward, REWARDS)

@@ -22,7 +22,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
     Lane i of `reset(seed=s)` goes through the same episodes as one environment of seed s + i.
 
     Attributes:
-      episodes: the pure functions of one episode, see `episodes.Episodes`.
+      episodes: the pure functions of one episode, see `mdp.Episodes`.
       settings: what they were made with.
     """
 
@@ -43,7 +43,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             `info["final_obs"]` and `info["final_info"]` are of the one that ended. DISABLED: it
             stays as it is until `reset(options={"reset_mask": mask})`.
           render_mode: `rgb_array` or None.
-          given: see `settings.Settings`.
+          given: see `settings.EnvSettings`.
 
         Raises:
           errors.UsageError: an argument is unknown or out of range.
@@ -96,7 +96,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             numbers = _uint32([each or 0 for each in seeds])
             self._lanes = batch.seeded(self._lanes, numbers, is_new)
         idle = np.zeros(self._shape, np.float32)
-        self._lanes, found = self._batch.advance(self._lanes, idle, batch.Do(which, False, False))
+        self._lanes, found = self._batch.advance(
+            self._lanes, idle, batch.StepMode(which, False, False)
+        )
         self._over = self._over & ~which
         observed, measured = _fetched(found.now)
         return observed, _said(measured, which)
@@ -119,16 +121,16 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         if not np.isfinite(actions).all():
             raise errors.UsageError("actions", "finite numbers", "NaN or infinity")
         is_next_step = self._mode == AutoresetMode.NEXT_STEP
-        restart = self._over if is_next_step else np.zeros(self.num_envs, bool)
-        anew = self._mode == AutoresetMode.SAME_STEP
-        do = batch.Do(restart, True, anew)
+        reset_mask = self._over if is_next_step else np.zeros(self.num_envs, bool)
+        autoreset = self._mode == AutoresetMode.SAME_STEP
+        do = batch.StepMode(reset_mask, True, autoreset)
         self._lanes, found = self._batch.advance(self._lanes, actions, do)
         now, (reward, terminated, truncated) = _fetched((found.now, found.outcome))
         observed, measured = now
         self._over = terminated | truncated
         info = _said(measured, np.ones(self.num_envs, bool))
-        if anew and self._over.any():
-            info |= self._final(_fetched(found.last), self._over)
+        if autoreset and self._over.any():
+            info |= self._final(_fetched(found.final), self._over)
         return observed, reward.astype(np.float64), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -153,14 +155,14 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             raise errors.UsageError("reset_mask", "all lanes at the first reset", "some")
         return mask
 
-    def _final(self, last: tuple[Any, dict], over: np.ndarray) -> dict[str, Any]:
+    def _final(self, ended: tuple[Any, dict], over: np.ndarray) -> dict[str, Any]:
         """Entries of `info` for episodes that ended in this step, as Gymnasium's own have them."""
-        observed, measured = last
+        observed, measured = ended
         rows = np.full(self.num_envs, None, object)
         for lane in np.flatnonzero(over):
             rows[lane] = jax.tree.map(lambda x, i=lane: x[i].copy(), observed)
-        final = {"final_obs": rows, "final_info": _said(measured, over)}
-        return final | {f"_{name}": over.copy() for name in final}
+        info = {"final_obs": rows, "final_info": _said(measured, over)}
+        return info | {f"_{name}": over.copy() for name in info}
 
 
 def _space(observed: Any) -> spaces.Space:

@@ -28,7 +28,7 @@ from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.runtime import files, jax_settings, xla
-from starjax.sim import endoscope
+from starjax.sim import endoscope_camera
 
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
 GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
@@ -237,7 +237,7 @@ def _parts(
 ) -> chunks.Parts:
     """Chunks of trials: their table, and of those that are `chosen` `[M]` the trajectories."""
     labels = env.task.labels
-    has_endoscope = endoscope.of(env.task, env.names.cameras) is not None
+    has_endoscope = endoscope_camera.of(env.task, env.names.cameras) is not None
     beside = {f"{_RECORDED}{name}" for name in recorded.names(labels, has_endoscope)}
 
     def check(number: int, arrays: chunks.Arrays) -> None:

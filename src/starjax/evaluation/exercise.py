@@ -13,7 +13,7 @@ PEOPLE = {"ways": 2, "proficient_s": 48.0, "residents_s": 84.0, "limit_s": LIMIT
 
 
 def compose(table: tables.Table, control_hz: float) -> dict[str, Any]:
-    """Figures of trials of `sim.exercise` as JSON values.
+    """Figures of trials of `sim.six_blocks` as JSON values.
 
     Returns:
       {complete: {successes, trials, rate, ci95}, moved: {mean, counts `[7]` of trials by blocks},

@@ -12,7 +12,7 @@ from starjax import config, methods, rcm
 from starjax.models import roll_net
 from starjax.policies import features, generator
 from starjax.policies import policy as policies
-from starjax.sim import endoscope
+from starjax.sim import endoscope_camera
 from starjax.sim.tasks.base import Field
 from starjax.types import Observation, Pose
 
@@ -129,7 +129,7 @@ def example(
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, frame)
     observation = Observation(pose, jnp.ones((*shape, seen.task.arms)))
     if policy_config.frame == "camera" and seen.task.endoscope:
-        camera = endoscope.nominal(seen.task.endoscope)
+        camera = endoscope_camera.nominal(seen.task.endoscope)
         held = Pose(*(jnp.broadcast_to(leaf, (*shape, *leaf.shape)) for leaf in camera))
         observation = observation._replace(endoscope=held)
     if policy_config.observation == "state":

@@ -10,7 +10,7 @@ from starjax import errors, rcm
 from starjax.evaluation import statistics
 from starjax.evaluation import trials as tables
 from starjax.rcm.trocar import Trocar
-from starjax.sim import drawn
+from starjax.sim import sampling
 from starjax.sim.tasks.base import Task
 
 BIN_WIDTH = 0.01  # m, of the distance to the nearest training trocar
@@ -23,7 +23,7 @@ def sample(seed: int, count: int, task: Task) -> Trocar:
     """
     if count < 1:
         raise errors.UsageError("count", "1 or more", count)
-    return Trocar(*map(np.asarray, drawn.trocars(jax.random.key(seed), task, (count,))))
+    return Trocar(*map(np.asarray, sampling.sample_trocars(jax.random.key(seed), task, (count,))))
 
 
 def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray, arms: int = 1) -> Trocar:

@@ -7,8 +7,8 @@ from starjax import config, errors
 from starjax.evaluation.result import Trial
 from starjax.report import outcomes, results, stats
 from starjax.report.results import Run
-from starjax.sim import registry
-from starjax.sim.tasks.base import Task, Words
+from starjax.sim import registries
+from starjax.sim.tasks.base import Task, TaskText
 
 OURS = "stardiff"  # the method that the others are compared with
 _NEAR = 1e-5  # of m and rad: machines draw the same trocar with other last bits
@@ -23,12 +23,12 @@ def task(runs: Sequence[Run]) -> Task:
     names = sorted({run.result.scene.task for run in runs})
     if len(names) != 1:
         raise errors.UsageError("runs", "results of one task", " and ".join(names))
-    return registry.tasks.get(names[0])
+    return registries.tasks.get(names[0])
 
 
-def words(runs: Sequence[Run]) -> Words:
+def words(runs: Sequence[Run]) -> TaskText:
     """Words for the task of all runs; raises as `task`."""
-    return task(runs).words
+    return task(runs).text
 
 
 def observed(runs: Sequence[Run]) -> str:

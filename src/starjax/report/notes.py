@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from starjax.report import formats, results
-from starjax.sim.tasks.base import Words
+from starjax.sim.tasks.base import TaskText
 
 CELL = "Successes/trials and the 95% Wilson interval in brackets."
 SUCCESS = (
@@ -35,7 +35,7 @@ INFERENCE = (
 )
 
 
-def tests(words: Words) -> dict[str, str]:
+def tests(words: TaskText) -> dict[str, str]:
     """Tests of success, in the task's words."""
     return {
         "strict": words.strict,
@@ -44,7 +44,7 @@ def tests(words: Words) -> dict[str, str]:
     }
 
 
-def by_test(words: Words) -> str:
+def by_test(words: TaskText) -> str:
     """All tests in one line."""
     return ". ".join(f"{name.capitalize()}: {what}" for name, what in tests(words).items()) + "."
 

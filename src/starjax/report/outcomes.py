@@ -8,7 +8,7 @@ from starjax import rcm
 from starjax.evaluation import sweep
 from starjax.evaluation.result import Trial
 from starjax.report import stats
-from starjax.sim.tasks.base import Words
+from starjax.sim.tasks.base import TaskText
 
 
 def tally(trials: Iterable[Trial], outcome: Callable[[Trial], bool] | None = None) -> stats.Rate:
@@ -76,7 +76,7 @@ SHORT = {
 }
 
 
-def meanings(words: Words) -> dict[str, str]:
+def meanings(words: TaskText) -> dict[str, str]:
     """The classes of `SHORT` in the task's words."""
     return {
         "invalid": "simulation diverged",

@@ -7,7 +7,7 @@ import importlib.resources
 from collections.abc import Mapping, Sequence
 
 from starjax.report import captions, compare, markup, results, sections, turned
-from starjax.sim.tasks.base import Words
+from starjax.sim.tasks.base import TaskText
 
 # name -> (light PNG, dark PNG)
 Figures = Mapping[str, tuple[bytes, bytes]]
@@ -83,7 +83,7 @@ def render(
     )
 
 
-def _figure(name: str, figures: Figures, words: Words) -> str:
+def _figure(name: str, figures: Figures, words: TaskText) -> str:
     if name not in figures:
         return ""
     heading, caption = CAPTIONS[name][0], CAPTIONS[name][1].format(ground=words.ground)
@@ -96,7 +96,7 @@ def _figure(name: str, figures: Figures, words: Words) -> str:
     )
 
 
-def _video(video: bytes | None, observed: str, words: Words) -> str:
+def _video(video: bytes | None, observed: str, words: TaskText) -> str:
     if video is None:
         return ""
     source = markup.uri("video/mp4", video)

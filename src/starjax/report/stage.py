@@ -33,11 +33,11 @@ def load(names: SceneNames) -> Stage:
     """
     import mujoco
 
-    from starjax.sim import registry, scene
+    from starjax.sim import registries, scene
 
     model = scene.compose(names)
     marks = [model.body(f"trocar{i}").mocapid[0] for i in range(len(names.arms))]
-    sites = [scene.tcp(i, registry.tools.get(tool)) for i, tool in enumerate(names.tools)]
+    sites = [scene.tcp(i, registries.tools.get(tool)) for i, tool in enumerate(names.tools)]
 
     def tips(qpos: np.ndarray, p_world_trocar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         data, found = mujoco.MjData(model), []
@@ -48,7 +48,7 @@ def load(names: SceneNames) -> Stage:
         p, axis = np.moveaxis(np.array(found), 2, 0)
         return p, axis
 
-    return Stage(registry.tasks.get(names.task).outline(model), tips)
+    return Stage(registries.tasks.get(names.task).outline(model), tips)
 
 
 # (qpos `[T, Q]`, p_world_trocar `[A, 3]` m, labels, first, endoscope's Pose `[T]` or None) ->
@@ -61,12 +61,12 @@ def camera(names: SceneNames, size: int) -> Draw:
     import jax
     import jax.numpy as jnp
 
-    from starjax.sim import cameras, endoscope, physics, render, scene
+    from starjax.sim import cameras, endoscope_camera, physics, render, scene
 
     # Smooth outlines cost four times as much: a matter of seconds on a GPU, of minutes on a CPU.
     samples = 1 if jax.default_backend() == "cpu" else 2
     made = scene.load(names)
-    scope = endoscope.of(made.task, names.cameras[:1])
+    scope = endoscope_camera.of(made.task, names.cameras[:1])
     (shown,) = cameras.make(made.mj_model, names.cameras[:1], size, scope=scope)
     smooth = {"samples": samples, "moves": shown.moves}
     shown = shown._replace(draw=render.make(made.mj_model, shown.name, size, size, **smooth))

@@ -91,7 +91,7 @@ def from_policy(sample: Callable[..., Command], obs_horizon: int, execute: int) 
     def init(params: Any, keys: jax.Array, state: Any, observe: Observe) -> Plan:
         def first() -> tuple[Observation, Command]:
             seen = _repeated(observe(), obs_horizon)
-            return seen, sample(*params, keys, seen, state.told)
+            return seen, sample(*params, keys, seen, state.measured_trocar)
 
         # Only the shapes: the first plan is made by `act`.
         seen, command = jax.eval_shape(first)
@@ -112,7 +112,7 @@ def from_policy(sample: Callable[..., Command], obs_horizon: int, execute: int) 
 
         def plan(command: Command) -> Command:
             keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(memory.key, t // execute)
-            return sample(*params, keys, seen, state.told)
+            return sample(*params, keys, seen, state.measured_trocar)
 
         to_plan = -t % execute  # control steps
         seen = jax.lax.cond(to_plan < obs_horizon, look, lambda seen: seen, memory.seen)

@@ -62,7 +62,7 @@ def from_policy(
         mean = jax.tree.map(lambda x: x[:, 0] / whole, total)
         pose = Pose(rcm.rot6d_decode(rcm.rot6d_encode(mean.pose.R)), mean.pose.p)
         if keeps_to_manifold:
-            pose = rcm.project(pose, state.told.p_world_trocar)
+            pose = rcm.project(pose, state.measured_trocar.p_world_trocar)
         now = Command(pose, mean.gripper)
         return now, Memory(planned, total), now
 

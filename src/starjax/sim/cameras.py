@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax.sim import endoscope, render
-from starjax.sim.engine import mjx
+from starjax.sim import endoscope_camera, render
+from starjax.sim.quiet_mjx import mjx
 from starjax.types import Pose
 
 
-class Camera(NamedTuple):
+class SceneCamera(NamedTuple):
     """One camera of a scene.
 
     Attributes:
@@ -42,8 +42,8 @@ def make(
     image_size: int,
     shadow: bool = True,
     moving: bool = False,
-    scope: endoscope.Endoscope | None = None,
-) -> tuple[Camera, ...]:
+    scope: endoscope_camera.Endoscope | None = None,
+) -> tuple[SceneCamera, ...]:
     """The cameras of these names, for square images; with `moving` all of them may move.
 
     `scope` is where the endoscope may be, if a trocar of its own holds it.
@@ -54,24 +54,26 @@ def make(
         body, R = int(camera.bodyid[0]), np.zeros(9)
         mujoco.mju_quat2Mat(R, camera.quat)
         R, p = R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32)
-        moves = moving or body != 0 or (scope is not None and name == endoscope.NAME)
+        moves = moving or body != 0 or (scope is not None and name == endoscope_camera.NAME)
         draw = render.make(mj_model, name, image_size, image_size, shadow=shadow, moves=moves)
-        found.append(Camera(name, body, R, p, moves, draw))
+        found.append(SceneCamera(name, body, R, p, moves, draw))
     return tuple(found)
 
 
-def nominal(cameras: Sequence[Camera]) -> Pose:
+def nominal(cameras: Sequence[SceneCamera]) -> Pose:
     """Poses `[C]` of the cameras in their bodies' frames, as the MJCF has them."""
     return Pose(jnp.stack([c.R for c in cameras]), jnp.stack([c.p for c in cameras]))
 
 
-def at_reset(cameras: Sequence[Camera], scope: endoscope.Endoscope | None, key: jax.Array) -> Pose:
+def at_reset(
+    cameras: Sequence[SceneCamera], scope: endoscope_camera.Endoscope | None, key: jax.Array
+) -> Pose:
     """Poses `[C]` as `nominal`, but for the endoscope's, which is drawn."""
     poses = nominal(cameras)
     if scope is None:
         return poses
-    is_drawn = jnp.array([camera.name == endoscope.NAME for camera in cameras])
-    drawn = endoscope.draw(scope, key)
+    is_drawn = jnp.array([camera.name == endoscope_camera.NAME for camera in cameras])
+    drawn = endoscope_camera.draw(scope, key)
     return Pose(
         jnp.where(is_drawn[:, None, None], drawn.R, poses.R),
         jnp.where(is_drawn[:, None], drawn.p, poses.p),
@@ -79,8 +81,8 @@ def at_reset(cameras: Sequence[Camera], scope: endoscope.Endoscope | None, key: 
 
 
 def images(
-    cameras: Sequence[Camera], poses: Pose, data: mjx.Data, rgb: jax.Array
-) -> dict[str, render.Frame]:
+    cameras: Sequence[SceneCamera], poses: Pose, data: mjx.Data, rgb: jax.Array
+) -> dict[str, render.CameraImage]:
     """Renders every camera.
 
     Args:
@@ -89,9 +91,9 @@ def images(
       data: with the poses of bodies and geoms.
       rgb: `[G, 3]` colours in [0, 1].
     """
-    found: dict[str, render.Frame] = {}
+    found: dict[str, render.CameraImage] = {}
     for i, camera in enumerate(cameras):
-        draw: Callable[..., render.Frame] = camera.draw
+        draw: Callable[..., render.CameraImage] = camera.draw
         seen = (data.geom_xpos, data.geom_xmat, rgb)
         if not camera.moves:
             found[camera.name] = draw(*seen)

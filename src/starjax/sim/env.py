@@ -14,12 +14,12 @@ import jax.numpy as jnp
 
 from starjax import errors, rcm
 from starjax.config import DEFAULT_TASK, PolicyConfig
+from starjax.sim import arm_motion, collision, endoscope_camera, ik, physics, render
 from starjax.sim import cameras as views
-from starjax.sim import collision, endoscope, ik, motion, physics, render
 from starjax.sim import scene as scenes
 from starjax.sim.names import SceneNames
 from starjax.sim.state import Env, EnvParams, EnvState
-from starjax.sim.tasks.base import CONTROL_HZ, Task, Views
+from starjax.sim.tasks.base import CONTROL_HZ, SimReadings, Task
 from starjax.types import Command, Observation, Pose
 
 __all__ = ["CONTROL_HZ", "Env", "EnvParams", "EnvState", "for_policy", "make"]
@@ -46,9 +46,9 @@ def make(
     """Builds an environment.
 
     Args:
-      task: key of `registry.tasks`.
-      arms, tools: keys of `registry.arms` and `registry.tools`, one for each slot of the task, one
-        for all, or none for the task's own.
+      task: key of `registries.tasks`.
+      arms, tools: keys of `registries.arms` and `registries.tools`: one per slot of the task, one
+        for all slots, or none for the task's defaults.
       observation: "image" (pixels) or "state" (the task's fields instead).
       image_size: pixels a side of the cameras' square images.
       cameras: of the task; none for its first one.
@@ -67,7 +67,7 @@ def make(
         expected = f"a whole number of pixels, {SMALLEST_IMAGE} or more"
         raise errors.UsageError("image_size", expected, repr(image_size))
     scene = scenes.load(scenes.name(task, arms, tools, cameras), variant)
-    names, scope = scene.names.cameras, endoscope.of(scene.task, scene.names.cameras)
+    names, scope = scene.names.cameras, endoscope_camera.of(scene.task, scene.names.cameras)
     seen = views.make(scene.mj_model, names, image_size, shadow, moving_cameras, scope)
 
     def start(key: jax.Array, params: EnvParams) -> EnvState:
@@ -75,10 +75,10 @@ def make(
         state = reset(scene, key, params, poses)
         if scope is None:
             return state
-        here = names.index(endoscope.NAME)
+        here = names.index(endoscope_camera.NAME)
         return state.replace(endoscope=jax.tree.map(lambda leaf: leaf[here], poses))
 
-    def camera(state: EnvState) -> dict[str, render.Frame]:
+    def camera(state: EnvState) -> dict[str, render.CameraImage]:
         p_world_trocar = state.trocar.p_world_trocar
         data = physics.kinematics(scene, state.physics.qpos, p_world_trocar, state.layout)
         rgb = scene.task.colours(scene.bound, state.layout, jnp.asarray(scene.geom_rgb))
@@ -89,7 +89,7 @@ def make(
         if observation == "image":
             images = {name: frame.rgb for name, frame in camera(state).items()}
         else:
-            fields = scene.task.state(scene.bound, state.layout, state.facts)
+            fields = scene.task.state(scene.bound, state.layout, state.measurements)
         return Observation(state.pose, state.gripper, images, fields, endoscope=state.endoscope)
 
     return Env(
@@ -131,16 +131,18 @@ def for_policy(
 def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose) -> EnvState:
     """The start of an episode: objects and tips as the task draws them, cameras `[C]` as given."""
     layout = scene.task.sample(scene.bound, key)
-    trocar, told = (
+    trocar, measured_trocar = (
         rcm.trocar_frame(given, scene.p_world_ref, scene.roll_zero)
-        for given in (params.trocar, params.told or params.trocar)
+        for given in (params.trocar, params.measured_trocar or params.trocar)
     )
     count = len(scene.arms)
     tips = scene.task.tips(scene.bound, layout, trocar.p_world_trocar)
     start = jnp.concatenate([jnp.zeros((count, 1)), tips], axis=-1)
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, trocar)
     solved = [
-        motion.solve(bound, trocar.p_world_trocar[a], motion.of(pose, a), None, RESET_IK_ITERATIONS)
+        arm_motion.solve(
+            bound, trocar.p_world_trocar[a], arm_motion.of(pose, a), None, RESET_IK_ITERATIONS
+        )
         for a, bound in enumerate(scene.arms)
     ]
     q = tuple(q for q, _ in solved)
@@ -149,7 +151,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     state = physics.initial(scene, q, layout)
     opening, touch = jnp.ones(count), jnp.zeros(count, bool)
     still, contacts = jnp.zeros((count, 3)), physics.no_contacts(scene)
-    views = Views(state.qpos, state.qvel, pose, still, opening, touch, contacts)
+    readings = SimReadings(state.qpos, state.qvel, pose, still, opening, touch, contacts)
     first = EnvState(
         physics=state,
         q_target=q,
@@ -158,10 +160,10 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
         correction=jnp.zeros((count, 3)),
         gripper_target=jnp.ones(count),
         trocar=trocar,
-        told=told,
+        measured_trocar=measured_trocar,
         cameras=cameras,
         layout=layout,
-        facts=scene.task.measure(scene.bound, layout, views, None),
+        measurements=scene.task.measure(scene.bound, layout, readings, None),
         step=jnp.zeros((), jnp.int32),
         settled=jnp.zeros((), jnp.int32),
         stage=jnp.zeros((), jnp.int32),
@@ -185,10 +187,12 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
 
 def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
     """One control period towards `command` `[A]`."""
-    moves = [motion.move(scene, a, state, motion.of(command, a)) for a in range(len(scene.arms))]
+    moves = [
+        arm_motion.move(scene, a, state, arm_motion.of(command, a)) for a in range(len(scene.arms))
+    ]
     dq, velocity, correction, gripper, ik_error = zip(*moves, strict=True)
     p_world_trocar, period = state.trocar.p_world_trocar, 1.0 / CONTROL_HZ
-    after, passed = physics.advance(
+    after, result = physics.advance(
         scene,
         state.physics,
         state.q_target,
@@ -210,30 +214,30 @@ def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
         gripper_target=jnp.stack(gripper),
         step=state.step + 1,
         ik_error=jnp.stack(ik_error),
-        solver_error=passed.solver_error,
-        touch=passed.touch,
-        rcm_error_within=motion.largest_within(scene, passed.qpos, p_world_trocar),
+        solver_error=result.solver_error,
+        touch=result.touch,
+        rcm_error_within=arm_motion.largest_within(scene, result.qpos, p_world_trocar),
     )
-    moved = judge(scene, _measure(scene, moved, passed.contacts))
+    moved = with_status(scene, _measure(scene, moved, result.contacts))
     stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
-    sound = physics.is_sound(scene, after) & (passed.solver_error < MAX_SOLVER_ERROR)
+    sound = physics.is_sound(scene, after) & (result.solver_error < MAX_SOLVER_ERROR)
     moved = _select(sound, moved, stopped)
     return _select(state.done, state, moved)
 
 
-def judge(scene: scenes.Scene, state: EnvState) -> EnvState:
+def with_status(scene: scenes.Scene, state: EnvState) -> EnvState:
     """The measured state with its outcome."""
-    verdict = scene.task.judge(scene.bound, state.layout, state.facts)
-    settled = jnp.where(verdict.good, state.settled + 1, 0)
+    status = scene.task.status(scene.bound, state.layout, state.measurements)
+    settled = jnp.where(status.success_now, state.settled + 1, 0)
     success = settled >= scene.task.settle_steps
     return state.replace(
         settled=settled,
         success=success,
-        loose=state.loose | verdict.loose,
-        lost=state.lost | verdict.lost,
-        stage=verdict.stage,
-        reward=verdict.reward,
-        done=success | state.lost | verdict.lost,
+        loose=state.loose | status.loose,
+        lost=state.lost | status.lost,
+        stage=status.stage,
+        reward=status.reward,
+        done=success | state.lost | status.lost,
     )
 
 
@@ -246,21 +250,21 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
     pose = jax.tree.map(lambda *x: jnp.stack(x), *(pose for pose, _, _ in found))
     opening = physics.openings(scene, qpos)
     velocity = CONTROL_HZ * (pose.p - state.pose.p)
-    views = Views(qpos, state.physics.qvel, pose, velocity, opening, state.touch, contacts)
-    facts = scene.task.measure(scene.bound, state.layout, views, state.facts)
+    readings = SimReadings(qpos, state.physics.qvel, pose, velocity, opening, state.touch, contacts)
+    measurements = scene.task.measure(scene.bound, state.layout, readings, state.measurements)
     hit = collision.detect(
         scene.arms,
         pose,
         [origins for _, origins, _ in found],
         p_world_trocar,
-        scene.task.obstacles(scene.bound, state.layout, facts),
+        scene.task.obstacles(scene.bound, state.layout, measurements),
         scene.task.floor,
     )
     rcm_error = rcm.rcm_error(pose, p_world_trocar)
     return state.replace(
         pose=pose,
         gripper=opening,
-        facts=facts,
+        measurements=measurements,
         rcm_error=rcm_error,
         rcm_error_within=jnp.maximum(state.rcm_error_within, rcm_error),
         collided=state.collided | hit,

@@ -26,7 +26,7 @@ LEVER = 0.3  # m: a radian of turn, or of a joint, counts as many metres; the le
 ITERATIONS = 40  # of inverse kinematics from home
 
 
-class Settings(NamedTuple):
+class ArmSettings(NamedTuple):
     """Part of an arm's record that the compiled programs are made for, see `Arm`."""
 
     rest_gain: float
@@ -45,7 +45,7 @@ class Bench(NamedTuple):
 
     flange: ik.Chain
     tip: ik.Chain
-    settings: Settings
+    settings: ArmSettings
 
 
 class Targets(NamedTuple):
@@ -89,7 +89,7 @@ def bench(arm: Arm, tool: Tool) -> Bench:
     flange, tip = (
         ik.chain_of(m, arm.first, site, arm.joints) for site in (robot.FLANGE, f"tool/{tool.tcp}")
     )
-    settings = Settings(arm.rest_gain, arm.remote_centre, arm.watched, arm.link_radius)
+    settings = ArmSettings(arm.rest_gain, arm.remote_centre, arm.watched, arm.link_radius)
     return Bench(flange, tip, settings)
 
 
@@ -166,7 +166,7 @@ def _rotation_y(angle: jax.Array) -> jax.Array:
 
 
 def reach(
-    chain: ik.Chain, home: jax.Array, poses: Targets, settings: Settings, iterations: int
+    chain: ik.Chain, home: jax.Array, poses: Targets, settings: ArmSettings, iterations: int
 ) -> tuple[jax.Array, ...]:
     """Residual `[P]` m, margin `[P]` rad, lowest link's axis `[P]` m, Jacobian `[P, 6, J]`."""
     slides = np.array(chain.slides)

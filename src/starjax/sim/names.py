@@ -9,7 +9,7 @@ class SceneNames(NamedTuple):
     """A scene by its parts' names in the registries.
 
     Attributes:
-      task: key of `registry.tasks`.
+      task: key of `registries.tasks`.
       arms, tools: one for each arm slot of the task.
       cameras: that are observed.
     """

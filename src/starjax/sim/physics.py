@@ -11,7 +11,7 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
 from starjax.sim import solver
-from starjax.sim.engine import mjx
+from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import BoundArm, Scene
 from starjax.sim.tasks.base import Contacts
 
@@ -32,7 +32,7 @@ class PhysicsState:
     qacc_warmstart: jax.Array
 
 
-class Passed(NamedTuple):
+class StepResult(NamedTuple):
     """Outcome of a control period.
 
     Attributes:
@@ -55,7 +55,7 @@ def initial(scene: Scene, q: Sequence[jax.Array], layout: object) -> PhysicsStat
         qpos = qpos.at[bound.q].set(q_arm)
         if bound.jaws.size:
             qpos = qpos.at[bound.jaws].set(bound.tool.open)
-    qpos = scene.task.place(scene.bound, qpos, layout)
+    qpos = scene.task.place_objects(scene.bound, qpos, layout)
     still = jnp.zeros(scene.mj_model.nv)
     return PhysicsState(qpos=qpos, qvel=still, qacc_warmstart=still)
 
@@ -79,7 +79,7 @@ def advance(
     layout: object,
     time: jax.Array,
     own: Mapping[str, jax.Array] = types.MappingProxyType({}),
-) -> tuple[PhysicsState, Passed]:
+) -> tuple[PhysicsState, StepResult]:
     """One control period: the joint targets move smoothly from `q` to `q + dq`.
 
     A target follows the cubic that begins at `velocity` and ends at `dq / period`; velocity and
@@ -114,8 +114,8 @@ def advance(
         return scene.task.drive(scene.bound, layout, ctrl, time + s * period)
 
     def substep(i, carry):
-        state, passed = carry
-        before = passed.qpos.at[i].set(state.qpos)
+        state, result = carry
+        before = result.qpos.at[i].set(state.qpos)
         data = scene.mjx_data.replace(
             qpos=state.qpos,
             qvel=state.qvel,
@@ -123,13 +123,13 @@ def advance(
             ctrl=target(i),
             mocap_pos=mocap_pos,
         )
-        data, error = solver.step(mjx_model, data, scene.solver_turns)
+        data, error = solver.step(mjx_model, data, scene.max_solver_iterations)
         found = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
-        error = jnp.maximum(passed.solver_error, error)
+        error = jnp.maximum(result.solver_error, error)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-        return state, Passed(touching(scene, found), found, before, error)
+        return state, StepResult(touching(scene, found), found, before, error)
 
-    blank = Passed(
+    blank = StepResult(
         jnp.zeros(len(scene.arms), bool),
         no_contacts(scene),
         jnp.zeros((substeps, scene.mj_model.nq)),

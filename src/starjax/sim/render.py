@@ -14,16 +14,16 @@ import mujoco
 from starjax import errors
 from starjax.sim.camera import cast, texture, tiles
 from starjax.sim.camera import geometry as scenes
-from starjax.sim.camera import view as views
+from starjax.sim.camera import viewpoint as views
 from starjax.types import Pose
 
 geom_rgb = scenes.geom_rgb
 
-Render = Callable[..., "Frame"]
+Render = Callable[..., "CameraImage"]
 
 
 @flax.struct.dataclass
-class Frame:
+class CameraImage:
     """One picture.
 
     Attributes:
@@ -49,7 +49,7 @@ def make(
     samples: int = 1,
     moves: bool = False,
 ) -> Render:
-    """Makes `render(geom_xpos, geom_xmat, geom_rgb) -> Frame` for a camera fixed in the world.
+    """Makes `render(geom_xpos, geom_xmat, geom_rgb) -> CameraImage` of a fixed camera.
 
     For a camera that `moves` it is `render(geom_xpos, geom_xmat, geom_rgb, pose_world_cam)`: x to
     the right, y up, the camera looks along -z. Textures are then checkers only, and their edges
@@ -84,7 +84,7 @@ def make(
         geom_xmat: jax.Array,
         geom_rgb: jax.Array,
         pose_world_cam: Pose | None = None,
-    ) -> Frame:
+    ) -> CameraImage:
         shape = geom_xpos.shape, geom_xmat.shape, geom_rgb.shape
         n = mj_model.ngeom
         if shape != ((n, 3), (n, 3, 3), (n, 3)):
@@ -98,7 +98,7 @@ def make(
             got = "none" if pose_world_cam is None else "one"
             raise errors.UsageError("pose_world_cam", "one" if moves else "none", got)
         t, face, word = cast.cast(scene, grid, view, shadow, *inputs)
-        frame = Frame(rgb=_bytes(grid, word, samples))
+        frame = CameraImage(rgb=_bytes(grid, word, samples))
         if depth:
             frame = frame.replace(
                 depth=tiles.picture(grid, tiles.pixels(grid, t, samples)[..., -1])

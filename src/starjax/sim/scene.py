@@ -14,19 +14,19 @@ import numpy as np
 
 from starjax import errors
 from starjax.config import DEFAULT_TASK
-from starjax.sim import assets, endoscope, ik, registry, robot, solver
+from starjax.sim import assets, endoscope_camera, ik, registries, robot, solver
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
-from starjax.sim.engine import mjx
 from starjax.sim.names import SceneNames
+from starjax.sim.quiet_mjx import mjx
 from starjax.sim.tasks.base import Task
 from starjax.sim.tools.base import Tool
 
 # Sizes that MJX compiles in. Each part says what it adds; the scene has the sum.
 CONTACT_LIMITS = ("max_geom_pairs", "max_contact_points")
 FIXED = "fixed"  # among cameras: the task's first one that is no endoscope
-# Of a task's MJCF: turns of the contact solver, where light bodies need more than usual.
-SOLVER_TURNS = "solver_turns"
+# Numeric of a task's MJCF: the contact solver's largest number of iterations, for light bodies.
+SOLVER_ITERATIONS = "solver_turns"
 
 
 class BoundArm(NamedTuple):
@@ -71,7 +71,7 @@ class Scene(NamedTuple):
       trocar_mocap: `[A]` mocap bodies that mark the trocars.
       still_mocap: `[K]` mocap bodies of `Task.still`.
       graspable: geom ids. geom_rgb: `[G, 3]` colours.
-      solver_turns: most turns of the contact solver, None for the usual number.
+      max_solver_iterations: of the contact solver, or None for `solver.MAX_ITERATIONS`.
     """
 
     names: SceneNames
@@ -87,7 +87,7 @@ class Scene(NamedTuple):
     still_mocap: np.ndarray
     graspable: np.ndarray
     geom_rgb: np.ndarray
-    solver_turns: int | None
+    max_solver_iterations: int | None
 
 
 def name(
@@ -101,8 +101,8 @@ def name(
     Raises:
       errors.UsageError: a name is unknown, or there are not as many as the task has slots.
     """
-    record: Task = registry.tasks.get(task)
-    given = {"arm": (arms, registry.arms), "tool": (tools, registry.tools)}
+    record: Task = registries.tasks.get(task)
+    given = {"arm": (arms, registries.arms), "tool": (tools, registries.tools)}
     chosen = {}
     for kind, (names, known) in given.items():
         names = tuple(names) or tuple(getattr(slot, kind) for slot in record.slots)
@@ -113,7 +113,7 @@ def name(
         for one in names:
             errors.choice(kind, one, known.names())
         chosen[kind] = names
-    still = next((one for one in record.cameras if one != endoscope.NAME), FIXED)
+    still = next((one for one in record.cameras if one != endoscope_camera.NAME), FIXED)
     cameras = tuple(still if one == FIXED else one for one in cameras) or record.cameras[:1]
     for one in cameras:
         errors.choice("camera", one, record.cameras)
@@ -127,7 +127,7 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
       errors.UsageError: no mount of an arm with its tool is known for the task's workspace, no part
         has a camera that is observed, or an arm's part lacks something, see `robot.read`.
     """
-    task: Task = variant or registry.tasks.get(names.task)
+    task: Task = variant or registries.tasks.get(names.task)
     world = _spec(task.mjcf)
     limits = _taken(world)
     for i, (arm, tool, mount) in enumerate(_mounted(task, names)):
@@ -142,7 +142,7 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
         )
         world.attach(whole, site=base, prefix=f"arm{i}/")
         _call_by_name(world, f"arm{i}/tool/")
-    if scope := endoscope.of(task, names.cameras):
+    if scope := endoscope_camera.of(task, names.cameras):
         _add_endoscope(world, scope)
     known = [camera.name for camera in world.cameras]
     for camera in names.cameras:
@@ -158,7 +158,7 @@ def load(names: SceneNames, variant: Task | None = None) -> Scene:
     Args:
       variant: of the task, with the same slots, in its place.
     """
-    task: Task = variant or registry.tasks.get(names.task)
+    task: Task = variant or registries.tasks.get(names.task)
     m = compose(names, task)
     # XLA's MJX implementation everywhere: the warp one needs CUDA.
     device = jax.local_devices()[0]  # MJX alone takes the first of all, another process's
@@ -180,7 +180,7 @@ def load(names: SceneNames, variant: Task | None = None) -> Scene:
         still_mocap=np.array([m.body(f"still{i}").mocapid[0] for i in range(_still(m))], int),
         graspable=np.array([m.geom(geom).id for geom in task.graspable], int),
         geom_rgb=geometry.geom_rgb(m),
-        solver_turns=_solver_turns(m),
+        max_solver_iterations=_max_solver_iterations(m),
     )
 
 
@@ -207,8 +207,8 @@ def tcp(i: int, tool: Tool) -> str:
 def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
     found = []
     for slot, arm_name, tool_name in zip(task.slots, names.arms, names.tools, strict=True):
-        arm, tool = registry.arms.get(arm_name), registry.tools.get(tool_name)
-        mount = registry.mount(arm, tool_name, slot.workspace)
+        arm, tool = registries.arms.get(arm_name), registries.tools.get(tool_name)
+        mount = registries.mount(arm, tool_name, slot.workspace)
         if mount is None:
             known = ", ".join(" in ".join(key) for key in arm.mounts)
             raise errors.UsageError(
@@ -268,15 +268,15 @@ def _call_by_name(world: mujoco.MjSpec, prefix: str) -> None:
             camera.name = own
 
 
-def _add_endoscope(world: mujoco.MjSpec, scope: endoscope.Endoscope) -> None:
-    pose, wxyz = endoscope.nominal(scope), np.zeros(4)
+def _add_endoscope(world: mujoco.MjSpec, scope: endoscope_camera.Endoscope) -> None:
+    pose, wxyz = endoscope_camera.nominal(scope), np.zeros(4)
     mujoco.mju_mat2Quat(wxyz, np.asarray(pose.R, float).ravel())
     p = np.asarray(pose.p, float)
-    world.worldbody.add_camera(name=endoscope.NAME, pos=p, quat=wxyz, fovy=scope.fovy)
+    world.worldbody.add_camera(name=endoscope_camera.NAME, pos=p, quat=wxyz, fovy=scope.fovy)
 
 
-def _solver_turns(m: mujoco.MjModel) -> int | None:
-    row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_NUMERIC, SOLVER_TURNS)
+def _max_solver_iterations(m: mujoco.MjModel) -> int | None:
+    row = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_NUMERIC, SOLVER_ITERATIONS)
     return None if row < 0 else int(m.numeric(row).data[0])
 
 

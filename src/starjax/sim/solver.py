@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim import linear
-from starjax.sim.engine import mjx
+from starjax.sim.quiet_mjx import mjx
 
 MAX_ITERATIONS = 10
 # The error left may move the scene with no more than this kinetic energy (J): a thing of 3 g at
@@ -62,13 +62,15 @@ class Iterate(NamedTuple):
     gradient: jax.Array
 
 
-def step(m: mjx.Model, d: mjx.Data, turns: int | None = None) -> tuple[mjx.Data, jax.Array]:
+def step(
+    m: mjx.Model, d: mjx.Data, max_iterations: int | None = None
+) -> tuple[mjx.Data, jax.Array]:
     """`mjx.step`: kinematics, contacts, forces, and the implicit integrator.
 
     For models that pass `check`, and no forces from outside (`qfrc_applied`, `xfrc_applied`).
 
     Args:
-      turns: of Newton's method, at most; `MAX_ITERATIONS` if not given.
+      max_iterations: of Newton's method, at most; `MAX_ITERATIONS` if not given.
 
     Returns:
       the state after; J `[]`, the energy that the error left in the solution may hold.
@@ -77,7 +79,7 @@ def step(m: mjx.Model, d: mjx.Data, turns: int | None = None) -> tuple[mjx.Data,
     d = mjx.fwd_velocity(m, d)
     d = mjx.fwd_actuation(m, d)
     d = d.replace(qfrc_smooth=d.qfrc_passive - d.qfrc_bias + d.qfrc_actuator)
-    x, force, error = solve(problem(m, d), d.qacc_warmstart, m.opt.timestep, turns)
+    x, force, error = solve(problem(m, d), d.qacc_warmstart, m.opt.timestep, max_iterations)
     # As `mjx.implicit`: servos and dampers at the velocity after the step. `mjx.euler` then only
     # integrates, since the model lets it do nothing about damping (flag eulerdamp).
     by_velocity = mjx.deriv_smooth_vel(m, d)
@@ -118,7 +120,7 @@ def check(m: mjx.Model, d: mjx.Data) -> None:
 
 
 def solve(
-    problem: Problem, x: jax.Array, timestep: float | jax.Array, turns: int | None = None
+    problem: Problem, x: jax.Array, timestep: float | jax.Array, max_iterations: int | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The minimum by Newton's method from `x` `[V]`, single-sample.
 
@@ -132,7 +134,7 @@ def solve(
     # An error e in x has e M e <= gradient M^-1 gradient, for the Hessian is at least M. Of M the
     # diagonal will do: the motors' armature prevails.
     limit = 2.0 * MAX_ERROR_ENERGY / timestep**2
-    turns = MAX_ITERATIONS if turns is None else turns
+    max_iterations = MAX_ITERATIONS if max_iterations is None else max_iterations
     weights = 1.0 / jnp.diagonal(M)
 
     def at(x: jax.Array, Mx: jax.Array, r: jax.Array) -> Iterate:
@@ -140,7 +142,7 @@ def solve(
 
     def is_coarse(loop: tuple[jax.Array, Iterate]) -> jax.Array:
         count, now = loop
-        return (count < turns) & (jnp.sum(now.gradient**2 * weights) > limit)
+        return (count < max_iterations) & (jnp.sum(now.gradient**2 * weights) > limit)
 
     def improve(loop: tuple[jax.Array, Iterate]) -> tuple[jax.Array, Iterate]:
         count, now = loop

@@ -20,14 +20,14 @@ class EnvParams(NamedTuple):
 
     Attributes:
       trocar: where the trocars are, fields `[A]`.
-      told: what agents are told of them, fields `[A]`, or None for the truth.
+      measured_trocar: trocars as agents see them, fields `[A]`, or None for the true ones.
       cameras: poses `[C]` of the observed cameras in their bodies' frames, or None for those of the
         MJCF; only an environment with moving cameras looks at those that are fixed in the world.
       levels: how much of each thing is wrong, by name, for an environment that is disturbed.
     """
 
     trocar: rcm.Trocar
-    told: rcm.Trocar | None = None
+    measured_trocar: rcm.Trocar | None = None
     cameras: Pose | None = None
     levels: Mapping[str, jax.typing.ArrayLike] | None = None
 
@@ -43,9 +43,11 @@ class EnvState:
       velocity: `[A, 7]` of the reference poses, see `control`.
       correction: `[A, 3]` m, feedback correction of the tools' axes at their trocars.
       gripper_target: `[A]` in [-1, 1].
-      trocar: where the trocars are, `[A]`. told: what agents are told of them, `[A]`.
+      trocar: true trocars, `[A]`.
+      measured_trocar: trocars as agents see them, `[A]`.
       cameras: `[C]` poses in their bodies' frames.
-      layout, facts: the task's own: what was drawn at reset, what is measured now.
+      layout: the task's own draws at reset.
+      measurements: the task's own measurements of this moment.
       step: int32, control steps taken. settled: consecutive steps that looked like success.
       stage: int32, see `Task.stages`. reward: in [0, 1].
       done: nothing moves any more: success, lost, or invalid.
@@ -59,13 +61,13 @@ class EnvState:
         step.
       ik_error: `[A]` m, residual of the inverse kinematics, rotations weighed; inf after a command
         that is not finite, or whose R is no rotation: the arm holds.
-      solver_error: J, see `physics.Passed`, of the last control step.
+      solver_error: J, see `physics.StepResult`, of the last control step.
       touch: `[A]` bool, the jaws touch something that they can grasp.
       pose: `[A]` measured tips in the world. gripper: `[A]` measured openings, [-1, 1].
       model: fields of the MJX model that are this episode's own, by name.
-      beside: what wrappers of the environment carry, by name.
-      endoscope: pose_world_camera that agents are told of the endoscope, see `sim.endoscope`; None
-        where the scene is not seen through one.
+      wrapper_state: memories of wrappers of the environment, by name.
+      endoscope: measured pose_world_camera of the endoscope, see `sim.endoscope_camera`; None for a
+        scene without one.
     """
 
     physics: physics.PhysicsState
@@ -75,10 +77,10 @@ class EnvState:
     correction: jax.Array
     gripper_target: jax.Array
     trocar: rcm.TrocarFrame
-    told: rcm.TrocarFrame
+    measured_trocar: rcm.TrocarFrame
     cameras: Pose
     layout: Any
-    facts: Any
+    measurements: Any
     step: jax.Array
     settled: jax.Array
     stage: jax.Array
@@ -97,7 +99,7 @@ class EnvState:
     pose: Pose
     gripper: jax.Array
     model: dict[str, jax.Array] = flax.struct.field(default_factory=dict)
-    beside: dict[str, Any] = flax.struct.field(default_factory=dict)
+    wrapper_state: dict[str, Any] = flax.struct.field(default_factory=dict)
     endoscope: Pose | None = None
 
 
@@ -109,7 +111,7 @@ class Env(NamedTuple):
       step: (EnvState, Command `[A]`) -> EnvState, one control period; the state of a done episode
         stays.
       observe: EnvState -> Observation `[A]`.
-      camera: EnvState -> camera's name -> render.Frame, at the observation's size.
+      camera: EnvState -> camera's name -> render.CameraImage, at the observation's size.
       labels: EnvState -> name of `Task.labels` -> int32.
       scene: the static scene; task: its task; names: of its parts.
       p_world_ref: `[A, 3]` m, the nominal trocars.
@@ -119,7 +121,7 @@ class Env(NamedTuple):
     reset: Callable[[jax.Array, EnvParams], EnvState]
     step: Callable[[EnvState, Command], EnvState]
     observe: Callable[[EnvState], Observation]
-    camera: Callable[[EnvState], dict[str, render.Frame]]
+    camera: Callable[[EnvState], dict[str, render.CameraImage]]
     labels: Callable[[EnvState], dict[str, jax.Array]]
     scene: Scene
     task: Task

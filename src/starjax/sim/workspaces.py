@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 from starjax.rcm import trocar
-from starjax.sim import endoscope
+from starjax.sim import endoscope_camera
 
 
 class Workspace(NamedTuple):
@@ -47,7 +47,7 @@ BOARD = Workspace(
 
 
 # The endoscope over the boards, opposite the arm. Nearer than 8 cm, pegs are out of the picture.
-BOARD_ENDOSCOPE = endoscope.Endoscope(
+BOARD_ENDOSCOPE = endoscope_camera.Endoscope(
     p_world_ref=(0.15, 0.0, 0.15),
     radius=(0.0, 0.03),
     polar=trocar.POLAR_RANGE,

@@ -7,7 +7,7 @@ from starjax import methods
 from starjax.policies import in_env, packaged
 from starjax.rollouts import agent
 from starjax.sim import env as sim_env
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.viewer import simulation
 
 EXPERT = "expert"
@@ -32,7 +32,7 @@ class Actor(NamedTuple):
 
 def expert(task: str) -> Actor:
     """The task's scripted demonstrator."""
-    slots = registry.tasks.get(task).slots
+    slots = registries.tasks.get(task).slots
     return Actor(EXPERT, task, None, tuple(slot.arm for slot in slots))
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.sim.tasks.base import Slot
 
 SPEED = 0.05  # m/s at full deflection of a device
@@ -41,7 +41,7 @@ class Bounds(NamedTuple):
 
 def bounds(slot: Slot, tip: np.ndarray) -> Bounds:
     """Range that an arm of this slot reaches, the tip `[3]` m where it starts included."""
-    space = registry.workspaces.get(slot.workspace)
+    space = registries.workspaces.get(slot.workspace)
     low, high = np.minimum(space.low, tip) - ROOM, np.maximum(space.high, tip) + ROOM
     low[2] = min(space.low[2], tip[2])  # no room below: there is the table
     return Bounds(np.array([space.rolls[0], *low]), np.array([space.rolls[1], *high]))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.sim.tasks.base import Slot, Task
 
 SCALE = 0.055  # m, length of the arrows
@@ -58,7 +58,7 @@ class TrocarHandles:
 
 def within(slot: Slot, p_world_trocar: np.ndarray) -> np.ndarray:
     """The place `[3]` m nearest in radius and angles for which the slot's mounts were found."""
-    space = registry.workspaces.get(slot.workspace)
+    space = registries.workspaces.get(slot.workspace)
     ranges = np.array([space.radius, space.polar, space.azimuth], np.float32)
     return np.asarray(_clipped(p_world_trocar, np.array(slot.p_world_ref, np.float32), ranges))
 

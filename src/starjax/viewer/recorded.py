@@ -11,7 +11,7 @@ import numpy as np
 from starjax import errors, rcm
 from starjax.data import schema, store
 from starjax.rollouts import episodes
-from starjax.sim import registry, scene
+from starjax.sim import registries, scene
 from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
 from starjax.viewer.frame import Frame
@@ -59,7 +59,7 @@ def opened(root: Path) -> Dataset:
     found = [key for key in store.keys(root) if store.verify(root, key, arrays=False)["files"]]
     if not found:
         raise errors.UsageError("--dataset", "a folder with episodes", root)
-    errors.choice("task of the dataset", names.task, registry.tasks.names())
+    errors.choice("task of the dataset", names.task, registries.tasks.names())
     return Dataset(root, description, names, scene.compose(names), found)
 
 
@@ -95,7 +95,7 @@ def read(dataset: Dataset, key: str) -> Recording:
 
 def colours(names: SceneNames, model: mujoco.MjModel, labels: Mapping[str, int]) -> np.ndarray:
     """`[G, 3]` of a scene, the goal of an episode marked."""
-    task, rgb = registry.tasks.get(names.task), jnp.asarray(geometry.geom_rgb(model))
+    task, rgb = registries.tasks.get(names.task), jnp.asarray(geometry.geom_rgb(model))
     return np.asarray(scene.marked(task, task.bind(model), labels, rgb))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts.agent import BatchAgent, Plan
 from starjax.sim import env as sim_env
-from starjax.sim import moving
+from starjax.sim import moving_trocars
 from starjax.viewer.frame import Frame
 
 # m/s at which a trocar follows its handle: tissue gives way, it does not jump. The controller keeps
@@ -69,8 +69,8 @@ def make(label: str, env: sim_env.Env, agent: BatchAgent, params: Any = None) ->
     def step(params: Any, carry: Carry, wanted: jax.Array) -> tuple[Carry, Frame]:
         def moved(state: sim_env.EnvState) -> sim_env.EnvState:
             here = state.trocar.p_world_trocar
-            there = moving.toward(here, wanted, TROCAR_SPEED / env.control_hz)
-            return moving.trocars_to(env, state, jnp.where(state.done, here, there))
+            there = moving_trocars.toward(here, wanted, TROCAR_SPEED / env.control_hz)
+            return moving_trocars.move_trocars(env, state, jnp.where(state.done, here, there))
 
         before = jax.vmap(moved)(carry.env)
         executed, memory, _ = agent.act(
@@ -78,7 +78,7 @@ def make(label: str, env: sim_env.Env, agent: BatchAgent, params: Any = None) ->
         )
         now = before.trocar.p_world_trocar
         planned = jnp.where(carry.t % max(execute, 1) == 0, now, carry.planned)
-        executed = moving.carried(executed, planned, now)
+        executed = moving_trocars.carried(executed, planned, now)
         carry = Carry(jax.vmap(env.step)(before, executed), memory, carry.t + 1, planned)
         return carry, frame(env, carry, execute)
 

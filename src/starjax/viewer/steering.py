@@ -58,14 +58,14 @@ def make(env: sim_env.Env) -> Steering:
     @jax.jit
     def start(key: jax.Array, trocar: Trocar) -> Any:
         state = env.reset(jax.random.split(key)[0], sim_env.EnvParams(trocar))
-        action = space.encode(state.pose, state.told)
+        action = space.encode(state.pose, state.measured_trocar)
         opening = state.gripper
         state = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
         return state, _frame(env, state), action, opening
 
     @jax.jit
     def step(before: Any, action: jax.Array, opening: jax.Array) -> tuple[Any, Moment]:
-        pose, _ = space.decode(action[None], before.told)
+        pose, _ = space.decode(action[None], before.measured_trocar)
         command = Command(pose, opening[None])
         after = jax.vmap(env.step)(before, command)
         seen = jax.vmap(env.observe)(before)

@@ -90,7 +90,7 @@ def run(
     """Lets a person demonstrate until `should_stop()`; returns a line about what was kept."""
     env, gui, wishes = steering.env, server.gui, Wishes()
     status = Status(gui, "Compiling\nAbout a minute the first time, seconds later.")
-    gui.add_markdown(f"Strict success: {env.task.words.strict}.")
+    gui.add_markdown(f"Strict success: {env.task.text.strict}.")
     buttons = gui.add_button_group("", ("Save", "Discard"), hint="Enter, Backspace")
     buttons.on_click(lambda event: setattr(wishes, event.target.value.lower(), True))
     save = gui.add_command("Save the episode", hotkey="enter")

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from starjax import errors
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.viewer import actors, panel
 from starjax.viewer.actors import Actor
 from starjax.viewer.clock import Clock
@@ -72,10 +72,10 @@ class Cast:
         self._choices = panel.Choices(
             gui,
             wishes,
-            task=(registry.tasks.names(), task),
+            task=(registries.tasks.names(), task),
             who=(names, labels[0]),
             beside=((panel.NOBODY, *names), labels[1] if len(labels) > 1 else panel.NOBODY),
-            arm=((THEIRS, *registry.arms.names()), asked.arm),
+            arm=((THEIRS, *registries.arms.names()), asked.arm),
             trocar=(trocars, trocars[asked.trocar]),
         )
         self._before = self._now()
@@ -133,5 +133,5 @@ def _built(server: Any, cast: Cast, status: Status) -> Rollouts:
 
 def trocar_names(task: str) -> list[str]:
     """`<number> (seen)` of each configuration."""
-    seen = registry.tasks.get(task).is_seen
+    seen = registries.tasks.get(task).is_seen
     return [f"{i} ({'seen' if is_seen else 'unseen'})" for i, is_seen in enumerate(seen)]

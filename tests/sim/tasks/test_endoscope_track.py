@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim import ik, registry, scene
-from starjax.sim.tasks.base import Contacts, Views
+from starjax.sim import ik, registries, scene
+from starjax.sim.tasks.base import Contacts, SimReadings
 from starjax.sim.tasks.endoscope_track import expert, task
 from starjax.types import Pose
 
@@ -24,13 +24,13 @@ def model(tool):
 
 
 def measured(m, pose, before=None):
-    """Facts of a tip at `pose`, the target at TARGET."""
+    """Measurements of a tip at `pose`, the target at TARGET."""
     bound = task.bind(m)
     qpos = jnp.zeros(m.nq).at[bound.target].set(TARGET)
     one = jax.tree.map(lambda leaf: leaf[None], pose)
     nothing = jnp.zeros(1)
-    views = Views(qpos, jnp.zeros(m.nv), one, nothing, nothing, nothing, NO_CONTACTS)
-    return task.measure(bound, None, views, before)
+    readings = SimReadings(qpos, jnp.zeros(m.nv), one, nothing, nothing, nothing, NO_CONTACTS)
+    return task.measure(bound, None, readings, before)
 
 
 def looking(m, trocar, turn=0.0, distance=task.DISTANCE):
@@ -62,9 +62,9 @@ def test_the_camera_is_judged_where_mujoco_has_it(tool):
 @pytest.mark.parametrize("row", [0, 8, 11])
 def test_one_pose_of_a_trocar_has_the_target_where_it_belongs(tool, row):
     m, trocar = model(tool), rcm.Trocar(*(field[row] for field in rcm.TROCARS))
-    facts = measured(m, looking(m, trocar))
-    assert facts.off < 1e-4 and facts.tilt < 1e-4 and facts.on_target
-    assert abs(facts.distance - task.DISTANCE) < 1e-5
+    measurements = measured(m, looking(m, trocar))
+    assert measurements.off < 1e-4 and measurements.tilt < 1e-4 and measurements.on_target
+    assert abs(measurements.distance - task.DISTANCE) < 1e-5
     turned = measured(m, looking(m, trocar, turn=1.5 * task.TILT))
     assert not turned.on_target
     assert not measured(m, looking(m, trocar, distance=1.25 * task.DISTANCE)).on_target
@@ -74,7 +74,7 @@ def test_one_pose_of_a_trocar_has_the_target_where_it_belongs(tool, row):
 @pytest.mark.parametrize("tool", ["endoscope", "endoscope30"])
 def test_an_episode_begins_with_its_target_in_the_picture(tool):
     bound = task.bind(model(tool))
-    work = registry.workspaces.get(task.TASK.slots[0].workspace)
+    work = registries.workspaces.get(task.TASK.slots[0].workspace)
 
     def furthest_aside(key):
         key_trocar, key_layout = jax.random.split(key)
@@ -96,11 +96,20 @@ def test_an_episode_begins_with_its_target_in_the_picture(tool):
 
 
 def test_the_expert_records_the_right_distance_from_a_disturbed_one():
-    m, told = model("endoscope"), rcm.Trocar(*(jnp.full(1, angle) for angle in (0.03, 1.5, 0.0)))
-    told = rcm.trocar_frame(told, np.array(task.TASK.slots[0].p_world_ref)[None])
-    facts = measured(m, looking(m, rcm.Trocar(0.03, 1.5, 0.0)))
-    pose = Pose(facts.camera.R[None] @ task.bind(m).R_tip_camera.T, facts.camera.p[None])
-    state = SimpleNamespace(facts=facts, pose=pose, told=told, step=jnp.int32(0))
+    m, measured_trocar = (
+        model("endoscope"),
+        rcm.Trocar(*(jnp.full(1, angle) for angle in (0.03, 1.5, 0.0))),
+    )
+    measured_trocar = rcm.trocar_frame(
+        measured_trocar, np.array(task.TASK.slots[0].p_world_ref)[None]
+    )
+    measurements = measured(m, looking(m, rcm.Trocar(0.03, 1.5, 0.0)))
+    pose = Pose(
+        measurements.camera.R[None] @ task.bind(m).R_tip_camera.T, measurements.camera.p[None]
+    )
+    state = SimpleNamespace(
+        measurements=measurements, pose=pose, measured_trocar=measured_trocar, step=jnp.int32(0)
+    )
 
     def distances(key):
         script = expert.init(key, state).replace(elapsed=jnp.array(expert.FIND_TIME[1]))
@@ -124,12 +133,14 @@ def test_the_expert_records_the_right_distance_from_a_disturbed_one():
 )
 def test_a_trial_is_judged_by_the_time_on_target(missed, unseen, good, loose, lost):
     m = model("endoscope")
-    facts = measured(m, looking(m, rcm.Trocar(0.0, 1.5, 0.0)))
-    facts = facts.replace(missed=jnp.int32(missed), unseen=jnp.array(unseen))
+    measurements = measured(m, looking(m, rcm.Trocar(0.0, 1.5, 0.0)))
+    measurements = measurements.replace(missed=jnp.int32(missed), unseen=jnp.array(unseen))
     for step, is_over in ((task.LAST - 1, False), (task.LAST, True)):
-        found = task.judge(None, None, facts.replace(step=jnp.int32(step)))
-        assert bool(found.good) == (good and is_over) and bool(found.loose) == (loose and is_over)
-        assert bool(found.lost) == lost and (float(found.reward) == 1.0) == bool(found.good)
+        found = task.status(None, None, measurements.replace(step=jnp.int32(step)))
+        assert bool(found.success_now) == (good and is_over) and bool(found.loose) == (
+            loose and is_over
+        )
+        assert bool(found.lost) == lost and (float(found.reward) == 1.0) == bool(found.success_now)
 
 
 def test_time_off_target_counts_after_the_first_seconds():
@@ -144,9 +155,9 @@ def test_time_off_target_counts_after_the_first_seconds():
 
 
 def test_a_tool_without_the_camera_is_a_mistake(monkeypatch):
-    names, mounted = scene.name("endoscope_track"), registry.mount
+    names, mounted = scene.name("endoscope_track"), registries.mount
     monkeypatch.setattr(
-        registry, "mount", lambda arm, tool, workspace: mounted(arm, "endoscope", workspace)
+        registries, "mount", lambda arm, tool, workspace: mounted(arm, "endoscope", workspace)
     )
     with mistakes.of("camera", "endoscope"):
         scene.compose(names._replace(tools=("grasper",)))

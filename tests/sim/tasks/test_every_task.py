@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim import assets, registry, scene
+from starjax.sim import assets, registries, scene
 from starjax.sim import env as envs
 from starjax.sim.tasks.needle_pick import task as needle
 
@@ -31,9 +31,9 @@ CROWDED = {"needle_pick", "needle_handover"}
 LOOKS = 10  # control steps between two looks at all contacts
 
 
-@pytest.mark.parametrize("name", registry.tasks.names())
+@pytest.mark.parametrize("name", registries.tasks.names())
 def test_a_task_is_what_it_says(name):
-    task = registry.tasks.get(name)
+    task = registries.tasks.get(name)
     assert task.name == name and task.cameras and task.time_limit_s > 0 and task.experts
     m = scene.compose(scene.name(name))
     bound = task.bind(m)
@@ -55,8 +55,8 @@ def said_by_parts(task, limit):
     """What each part's MJCF, and what that includes, adds to a limit of the scene."""
     parts = [assets.path(task.mjcf)]
     for slot in task.slots:
-        parts += [assets.path(registry.arms.get(slot.arm).mjcf)]
-        parts += [assets.path(registry.tools.get(slot.tool).mjcf)]
+        parts += [assets.path(registries.arms.get(slot.arm).mjcf)]
+        parts += [assets.path(registries.tools.get(slot.tool).mjcf)]
     while parts:
         part = parts.pop()
         root = ElementTree.parse(part).getroot()

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 from starjax.sim import scene
-from starjax.sim.tasks.base import Contacts, Views
+from starjax.sim.tasks.base import Contacts, SimReadings
 from starjax.sim.tasks.needle_handover import task
 from starjax.sim.tasks.needle_pick import task as single
 from starjax.types import Pose
@@ -16,7 +16,7 @@ GIVER, BOTH, TAKER, NOBODY = (True, False), (True, True), (False, True), (False,
 
 @pytest.fixture(scope="module")
 def play():
-    """`steps -> (Facts, Verdict)` after (who touches, height in m, taker's tip aside in m)."""
+    """`steps -> (measurements, TaskStatus)`; a step is (touch, height m, taker's tip aside m)."""
     m = scene.compose(scene.name("needle_handover"))
     bound = task.bind(m)
     layout = task.sample(bound, jax.random.key(0))
@@ -24,20 +24,22 @@ def play():
     @jax.jit
     def one(before, touch, height, aside):
         needle = layout.needle._replace(p=layout.needle.p.at[2].add(height))
-        qpos = single.place(bound, jnp.zeros(m.nq), layout.replace(needle=needle))
+        qpos = single.place_objects(bound, jnp.zeros(m.nq), layout.replace(needle=needle))
         tips = jnp.stack([needle.p, needle.p + jnp.stack([aside, 0 * aside, 0 * aside])])
         R, still = jnp.stack([jnp.eye(3)] * 2), jnp.zeros((2, 3))
         opening = jnp.zeros(2)
-        views = Views(qpos, jnp.zeros(m.nv), Pose(R, tips), still, opening, touch, NO_CONTACTS)
-        facts = task.measure(bound, layout, views, before)
-        return facts, task.judge(bound, layout, facts)
+        readings = SimReadings(
+            qpos, jnp.zeros(m.nv), Pose(R, tips), still, opening, touch, NO_CONTACTS
+        )
+        measurements = task.measure(bound, layout, readings, before)
+        return measurements, task.status(bound, layout, measurements)
 
     def play(*steps):
-        facts, verdict = None, None
+        measurements, status = None, None
         for touch, height, *aside in steps:
             given = jnp.array(touch), jnp.array(height), jnp.array(aside[0] if aside else 0.0)
-            facts, verdict = one(facts, *given)
-        return facts, verdict
+            measurements, status = one(measurements, *given)
+        return measurements, status
 
     return play
 
@@ -55,25 +57,25 @@ def test_the_needle_goes_from_one_to_the_other(play):
         )
     ]
     assert stages == [0, 1, 2, 2, 4]
-    _, verdict = play(lifted, both, (TAKER, 0.03))
-    assert verdict.good and verdict.loose and float(verdict.reward) == 1.0
+    _, status = play(lifted, both, (TAKER, 0.03))
+    assert status.success_now and status.loose and float(status.reward) == 1.0
 
 
 def test_the_other_tool_alone_does_not_count(play):
     for steps in ([(TAKER, 0.03)], [(TAKER, 0.0), (TAKER, 0.03)], [(GIVER, 0.0), (TAKER, 0.03)]):
-        _, verdict = play(*steps)
-        assert not verdict.good and not verdict.loose
+        _, status = play(*steps)
+        assert not status.success_now and not status.loose
 
 
 def test_slip_begins_a_hold_anew(play):
     start = [(GIVER, 0.03), (BOTH, 0.03), (TAKER, 0.03)]
     slipped = (TAKER, 0.03, 1.2 * single.SLIP)
-    facts, verdict = play(*start, slipped)
-    assert not verdict.good and verdict.loose
-    assert float(facts.slip) > single.SLIP
-    facts, verdict = play(*start, slipped, slipped)
-    assert verdict.good and float(facts.slip) == 0.0
-    assert play(*start, (TAKER, 0.03, 0.8 * single.SLIP))[1].good
+    measurements, status = play(*start, slipped)
+    assert not status.success_now and status.loose
+    assert float(measurements.slip) > single.SLIP
+    measurements, status = play(*start, slipped, slipped)
+    assert status.success_now and float(measurements.slip) == 0.0
+    assert play(*start, (TAKER, 0.03, 0.8 * single.SLIP))[1].success_now
 
 
 def test_a_drop_is_a_failure(play):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starjax.sim import scene
-from starjax.sim.tasks.base import Contacts, Views
+from starjax.sim.tasks.base import Contacts, SimReadings
 from starjax.sim.tasks.ring_on_wire import task
 from starjax.types import Pose
 
@@ -26,7 +26,7 @@ def hanging(bound, y, start=0, raised=0.0, rubbed=0, touch=False, speed=0.0):
     layout = task.sample(bound, jax.random.key(0))
     layout = layout.replace(start=jnp.int32(start), way=jnp.array(1.0 - 2.0 * start))
     p = jnp.array([0.0, y, float(task.height(jnp.array(y))) - task.HANG + raised])
-    facts = task.Facts(
+    measurements = task.RingMeasurements(
         Pose(jnp.eye(3), p),
         jnp.full(6, speed),
         p,
@@ -34,7 +34,7 @@ def hanging(bound, y, start=0, raised=0.0, rubbed=0, touch=False, speed=0.0):
         jnp.zeros((), bool),
         jnp.int32(rubbed),
     )
-    return layout, facts
+    return layout, measurements
 
 
 def test_the_wire_is_that_of_the_model(model, bound):
@@ -47,7 +47,7 @@ def test_the_wire_is_that_of_the_model(model, bound):
     top = model.geom("ring0")
     tube, wire = top.size[0], bound.radius
     # A regular twelve-sided polygon hangs by a corner, whose two sides lean by 15 degrees.
-    corner = max(np.linalg.norm(end) for end in task.words.capsule_ends(top))
+    corner = max(np.linalg.norm(end) for end in task.text.capsule_ends(top))
     assert abs(corner - (tube + wire) / np.cos(np.pi / 12) - task.HANG) < 1e-5
     assert abs(corner * np.cos(np.pi / 12) - tube - 0.005) < 1e-5  # inner radius 5 mm
     assert 0.8e-3 < model.body("ring").mass[0] < 1.0e-3  # kg
@@ -56,9 +56,9 @@ def test_the_wire_is_that_of_the_model(model, bound):
 @pytest.mark.parametrize("start", [0, 1])
 def test_it_is_done_at_the_other_end_alone(bound, start):
     way = 1.0 - 2.0 * start
-    layout, facts = hanging(bound, way * task.START, start)
-    found = task.judge(bound, layout, facts)
-    assert found.good and found.loose and not found.lost and float(found.reward) == 1.0
+    layout, measurements = hanging(bound, way * task.START, start)
+    found = task.status(bound, layout, measurements)
+    assert found.success_now and found.loose and not found.lost and float(found.reward) == 1.0
     for wrong in (
         {"y": -way * task.START},
         {"y": 0.0},
@@ -67,9 +67,9 @@ def test_it_is_done_at_the_other_end_alone(bound, start):
         {"raised": 0.004},
         {"rubbed": task.MAY_TOUCH + 1},
     ):
-        layout, facts = hanging(bound, **{"y": way * task.START, "start": start, **wrong})
-        found = task.judge(bound, layout, facts)
-        assert not found.good and float(found.reward) < 1.0, wrong
+        layout, measurements = hanging(bound, **{"y": way * task.START, "start": start, **wrong})
+        found = task.status(bound, layout, measurements)
+        assert not found.success_now and float(found.reward) < 1.0, wrong
         assert bool(found.lost) == ("rubbed" in wrong)
         assert bool(found.loose) == ("y" not in wrong)
 
@@ -86,10 +86,10 @@ def test_it_is_done_at_the_other_end_alone(bound, start):
 )
 def test_touching_counts_over_the_bent_part(model, bound, y, pair, dist, counts):
     layout, before = hanging(bound, y)
-    qpos = task.place(bound, jnp.zeros(model.nq), layout.replace(ring=before.ring))
+    qpos = task.place_objects(bound, jnp.zeros(model.nq), layout.replace(ring=before.ring))
     contacts = Contacts(jnp.array([[model.geom(g).id for g in pair]]), jnp.array([dist]))
     none = jnp.zeros((1, 3))
-    views = Views(
+    readings = SimReadings(
         qpos, jnp.zeros(model.nv), Pose(jnp.eye(3)[None], none), none, none, none, contacts
     )
-    assert int(task.measure(bound, layout, views, before).rubbed) == counts
+    assert int(task.measure(bound, layout, readings, before).rubbed) == counts

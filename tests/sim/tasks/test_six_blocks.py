@@ -8,7 +8,7 @@ import pytest
 
 from starjax import rcm
 from starjax.sim import env as envs
-from starjax.sim import exercise, scene
+from starjax.sim import scene, six_blocks
 from starjax.sim.tasks.peg_transfer_bimanual import six, task
 from starjax.types import Agent, Command, Pose
 
@@ -19,14 +19,14 @@ DONE = jnp.array([0.03, 0.01, 0.012])  # m, where the tips are then
 
 def put_down(state, command):
     """A step of an environment without physics."""
-    worked = state.step + 1 - state.layout.since - exercise.WITHDRAWN * (state.layout.turn > 0)
+    worked = state.step + 1 - state.layout.since - six_blocks.WITHDRAWN * (state.layout.turn > 0)
     success = worked == WORK
     there = jnp.append(state.layout.target_peg, task.single.RIM_HEIGHT) + ASIDE
-    p = jnp.where(success, there, state.facts.block.p)
+    p = jnp.where(success, there, state.measurements.block.p)
     tips = jnp.where(success, jnp.stack([DONE, DONE]), command.pose.p)
     return state.replace(
         step=state.step + 1,
-        facts=state.facts.replace(block=Pose(state.facts.block.R, p)),
+        measurements=state.measurements.replace(block=Pose(state.measurements.block.R, p)),
         pose=Pose(command.pose.R, tips),
         success=success,
         done=success,
@@ -37,14 +37,14 @@ def put_down(state, command):
 def played():
     """States before every step and after the last, and how often an agent's memory began."""
     real = envs.make(six.TASK.name, observation="state", variant=six.TASK)
-    env = exercise.of(real._replace(step=put_down))
+    env = six_blocks.wrap(real._replace(step=put_down))
     trocars = rcm.Trocar(*(jnp.asarray(field[-1]) for field in env.task.trocars))
 
     def act(memory, state):
         command = Command(Pose(state.pose.R, state.pose.p), -jnp.ones(2))
         return command, memory + 1, command
 
-    counting = exercise.anew(Agent(lambda key, state: jnp.zeros((), jnp.int32), act))
+    counting = six_blocks.reset_each_block(Agent(lambda key, state: jnp.zeros((), jnp.int32), act))
 
     def step(carry, _):
         state, memory = carry
@@ -55,7 +55,7 @@ def played():
     def play(key):
         state = env.reset(key, envs.EnvParams(trocars))
         start = state, counting.init(key, state)
-        total = six.BLOCKS * WORK + (six.BLOCKS - 1) * exercise.WITHDRAWN
+        total = six.BLOCKS * WORK + (six.BLOCKS - 1) * six_blocks.WITHDRAWN
         (last, _), (states, memories) = jax.lax.scan(step, start, None, length=total)
         return states, memories, last, env.labels(last)
 
@@ -94,13 +94,13 @@ def test_the_tools_withdraw_before_the_next_block(played):
     tips = np.asarray(states.pose.p)
     for k in begins:
         np.testing.assert_allclose(tips[k], np.stack([DONE, DONE]), atol=1e-6)
-        up = tips[k + exercise.RISE]
+        up = tips[k + six_blocks.RISE]
         np.testing.assert_allclose(up[:, :2], tips[k][:, :2], atol=1e-5)
-        np.testing.assert_allclose(up[:, 2], exercise.HEIGHT, atol=1e-5)
-        np.testing.assert_allclose(tips[k + exercise.WITHDRAWN], task.PARK, atol=1e-5)
+        np.testing.assert_allclose(up[:, 2], six_blocks.HEIGHT, atol=1e-5)
+        np.testing.assert_allclose(tips[k + six_blocks.WITHDRAWN], task.PARK, atol=1e-5)
     # The agent begins anew when it is its turn, and at no other time.
     began = np.flatnonzero(np.asarray(memories) == 1)
-    np.testing.assert_array_equal(began, [0, *(begins + exercise.WITHDRAWN)])
+    np.testing.assert_array_equal(began, [0, *(begins + six_blocks.WITHDRAWN)])
 
 
 @pytest.mark.slow
@@ -115,6 +115,8 @@ def test_what_stands_still_is_seen(played):
     still = six.still(state.layout)
     np.testing.assert_allclose(data.xpos[np.array(bodies)], still.p, atol=1e-6)
     np.testing.assert_allclose(data.xmat[np.array(bodies)], still.R, atol=1e-5)
-    assert len(env.task.obstacles(env.scene.bound, state.layout, state.facts).radius) == 12 + 18
+    assert (
+        len(env.task.obstacles(env.scene.bound, state.layout, state.measurements).radius) == 12 + 18
+    )
     usual = scene.compose(scene.name("peg_transfer_bimanual"))
     assert (m.nq, m.nv, m.nu) == (usual.nq, usual.nv, usual.nu)

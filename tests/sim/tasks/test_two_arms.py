@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.envs import trocars
+from starjax.envs import trocar_draws
 from starjax.evaluation import sweep
-from starjax.sim import registry, scene
-from starjax.sim.tasks import handing, two_arms
+from starjax.sim import registries, scene
+from starjax.sim.tasks import handover as handovers
+from starjax.sim.tasks import two_arms
 from starjax.sim.tasks.needle_handover import expert as handover
 from starjax.sim.tasks.peg_transfer_bimanual import expert as bimanual
 from starjax.types import Pose
@@ -32,7 +33,7 @@ def corners():
     """Every corner of both workspaces, `[4096, 2]`; the middle of their ranges too."""
     ends = []
     for slot in two_arms.SLOTS:
-        work = registry.workspaces.get(slot.workspace)
+        work = registries.workspaces.get(slot.workspace)
         ranges = [np.linspace(*r, 4) for r in (work.radius, work.polar, work.azimuth)]
         ends.append(np.array(list(itertools.product(*ranges)), np.float32))
     left, right = (x.reshape(-1, 3) for x in np.broadcast_arrays(ends[0][:, None], ends[1]))
@@ -42,10 +43,10 @@ def corners():
 PAIRS = {
     "twelve": lambda: two_arms.TROCARS,
     "corners": corners,
-    "swept": lambda: sweep.sample(0, DRAWN, registry.tasks.get("peg_transfer_bimanual")),
-    "played": lambda: jax.vmap(trocars.make(registry.tasks.get("needle_handover"), "random"))(
-        jax.random.split(jax.random.key(1), DRAWN)
-    ),
+    "swept": lambda: sweep.sample(0, DRAWN, registries.tasks.get("peg_transfer_bimanual")),
+    "played": lambda: jax.vmap(
+        trocar_draws.make(registries.tasks.get("needle_handover"), "random")
+    )(jax.random.split(jax.random.key(1), DRAWN)),
 }
 
 
@@ -65,7 +66,7 @@ def test_a_pair_is_100_to_170_mm_and_37_to_60_degrees_apart(source):
 
 def test_six_blocks_stand_side_by_side_at_any_yaw():
     m = scene.compose(scene.name("peg_transfer_bimanual"))
-    pegs = registry.tasks.get("peg_transfer_bimanual").bind(m).pegs
+    pegs = registries.tasks.get("peg_transfer_bimanual").bind(m).pegs
     apart = np.linalg.norm(pegs[:, None] - pegs, axis=-1)[~np.eye(len(pegs), dtype=bool)]
     parts = [g for g in range(m.ngeom) if m.geom(g).name.startswith(("wall", "corner", "leg"))]
     ends = [  # capsules: their axes, and how thick they are
@@ -94,7 +95,7 @@ def test_a_tool_first_turns_on_a_way_that_says_how(expert):
     def goals(yaw):
         there = Pose(rcm.rotation_z(yaw), jnp.array([0.003, 0.002, 0.01]))
         state = types.SimpleNamespace(
-            facts=types.SimpleNamespace(needle=there, block=there),
+            measurements=types.SimpleNamespace(needle=there, block=there),
             layout=types.SimpleNamespace(target_peg=jnp.zeros(2)),
             pose=Pose(jnp.stack([jnp.eye(3)] * 2), tips),
         )
@@ -106,8 +107,8 @@ def test_a_tool_first_turns_on_a_way_that_says_how(expert):
         turns = int(np.argmax(expert.PLAY.looks[:, arm]))
         way = (found[:, turns - 1, arm] - found[:, turns, arm] - come)[:, :2]
         along = jnp.sum(way * normals[:, arm, :2], axis=-1)
-        np.testing.assert_allclose(jnp.abs(along), handing.OUT, rtol=1e-4)
-        np.testing.assert_allclose(jnp.linalg.norm(way, axis=-1), handing.OUT, rtol=1e-4)
+        np.testing.assert_allclose(jnp.abs(along), handovers.OUT, rtol=1e-4)
+        np.testing.assert_allclose(jnp.linalg.norm(way, axis=-1), handovers.OUT, rtol=1e-4)
         assert expert.PLAY.turned[turns] < 1.0
 
 
@@ -118,8 +119,8 @@ def axis(quat):
 
 
 def test_unseen_pairs_are_at_the_edge_and_in_the_middle():
-    task = registry.tasks.get("peg_transfer_bimanual")
+    task = registries.tasks.get("peg_transfer_bimanual")
     p = ports(task.trocars)
     apart = np.linalg.norm(p[:, 0] - p[:, 1], axis=-1)
     assert set(np.argsort(apart)[[0, -1]]) <= set(np.flatnonzero(~task.is_seen))
-    assert task.trocars is registry.tasks.get("needle_handover").trocars
+    assert task.trocars is registries.tasks.get("needle_handover").trocars

@@ -21,7 +21,7 @@ from starjax.data.formats.mapping import CameraColumn, Map
 from starjax.data.formats.motion import HZ, Motion
 from starjax.rollouts import episodes
 from starjax.runtime import files, xla
-from starjax.sim import registry
+from starjax.sim import registries
 
 
 class Imported(NamedTuple):
@@ -68,7 +68,7 @@ def import_mapped(
       errors.UsageError: the mapping does not fit the files or the task, or no episode is left.
       StorageError: `root` cannot be written, or holds another dataset.
     """
-    task = registry.tasks.get(mapping.task)
+    task = registries.tasks.get(mapping.task)
     _fits(source, mapping, task)
     hz = mapping.hz or source.hz
     if not hz and not mapping.time:

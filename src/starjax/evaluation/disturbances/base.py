@@ -122,12 +122,12 @@ def _with(env: Env, name: str, kind: Disturbance) -> Env:
 
 # An inner environment meets only what it carries itself, so that its states always look alike.
 def _take(state: EnvState, name: str) -> tuple[Now, EnvState]:
-    beside = dict(state.beside)
-    return beside.pop(name), state.replace(beside=beside)
+    carried = dict(state.wrapper_state)
+    return carried.pop(name), state.replace(wrapper_state=carried)
 
 
 def _put(state: EnvState, name: str, now: Now) -> EnvState:
-    return state.replace(beside={**state.beside, name: now})
+    return state.replace(wrapper_state={**state.wrapper_state, name: now})
 
 
 def _own(key: jax.Array, name: str) -> jax.Array:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from starjax import rcm
 from starjax.evaluation.disturbances.base import Disturbance, Now
 from starjax.evaluation.disturbances.draws import directions
-from starjax.sim import moving
+from starjax.sim import moving_trocars
 from starjax.sim.state import Env, EnvParams, EnvState
 from starjax.types import Command
 
@@ -20,12 +20,14 @@ def _tell(env: Env, now: Now, params: EnvParams) -> EnvParams:
     p = rcm.trocar_position(params.trocar, env.p_world_ref)
     there = p + 1e-3 * now.level * directions(now.key, p)
     wrong = rcm.trocar_from_position(there, env.p_world_ref)
-    return params._replace(told=_if_wrong(now, wrong, params.told or params.trocar))
+    return params._replace(
+        measured_trocar=_if_wrong(now, wrong, params.measured_trocar or params.trocar)
+    )
 
 
 def _rest(env: Env, now: Now, state: EnvState) -> tuple[EnvState, Any]:
     """Where the trocars are, and are said to be, between breaths."""
-    return state, (state.trocar.p_world_trocar, state.told.p_world_trocar)
+    return state, (state.trocar.p_world_trocar, state.measured_trocar.p_world_trocar)
 
 
 def _rise(env: Env, now: Now, step: jax.Array) -> jax.Array:
@@ -39,13 +41,13 @@ def _breathe(
     env: Env, now: Now, state: EnvState, command: Command, is_told: bool
 ) -> tuple[EnvState, Any]:
     is_at, said = now.memory
-    step, told = state.step + 1, state.told
+    step, told = state.step + 1, state.measured_trocar
     if is_told:
         late = step - round(LATE_S * env.control_hz)
-        told = _if_wrong(now, moving.frame_at(env, said + _rise(env, now, late)), told)
+        told = _if_wrong(now, moving_trocars.frame_at(env, said + _rise(env, now, late)), told)
     there = _if_wrong(now, is_at + _rise(env, now, step), state.trocar.p_world_trocar)
-    moved = moving.trocars_to(env, state, there)
-    return env.step(moved.replace(told=told), command), now.memory
+    moved = moving_trocars.move_trocars(env, state, there)
+    return env.step(moved.replace(measured_trocar=told), command), now.memory
 
 
 def _if_wrong(now: Now, wrong: Any, usual: Any) -> Any:

@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 
 from starjax.sim.camera import geometry as scenes
-from starjax.sim.camera import shade, shapes, tiles
-from starjax.sim.camera.view import View
+from starjax.sim.camera import rays, shade, tiles
+from starjax.sim.camera.viewpoint import View
 
 Array = jax.Array
 
 
 def cast(
-    scene: scenes.Scene, grid: tiles.Grid, view: View, shadow: bool,
+    scene: scenes.RenderScene, grid: tiles.Grid, view: View, shadow: bool,
     geom_xpos: Array, geom_xmat: Array, geom_rgb: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Depth in m, face (-1 background) and colour (bytes of an int32); each `[T, Q]`."""
@@ -29,7 +29,9 @@ def cast(
     return t, face, shade.light(scene, view, geom_rgb[scene.ids], c, R, p, face, shaded)
 
 
-def _nearest(scene: scenes.Scene, grid: tiles.Grid, c: Array, R: Array) -> tuple[Array, Array]:
+def _nearest(
+    scene: scenes.RenderScene, grid: tiles.Grid, c: Array, R: Array
+) -> tuple[Array, Array]:
     """Depth in m and number of the face that each ray meets first.
 
     Both travel in one int32: positive floats order like their bits, and the last few bits of the
@@ -43,27 +45,27 @@ def _nearest(scene: scenes.Scene, grid: tiles.Grid, c: Array, R: Array) -> tuple
 
     seen = tiles.in_view(grid, c, R, *_bounds(scene))
     size = jnp.asarray(scene.size, jnp.float32)
-    key = pack(jnp.full_like(x, shapes.FAR), room)
+    key = pack(jnp.full_like(x, rays.FAR), room)
     for kind in (scenes.CAPSULE, scenes.CYLINDER, scenes.BOX, scenes.PLANE):
         rows, first = scene.rows(kind), scene.first_face(kind)
 
         def meet(key, row, features, x, y, kind=kind, first=first):
-            t, part = shapes.view(kind, x, y, features)
+            t, part = rays.view(kind, x, y, features)
             hit = pack(t, first + scenes.FACES[kind] * row + part)
             return jnp.where((row >= 0) & (hit < key), hit, key)
 
-        table = shapes.features(kind, c[rows], R[rows], size[rows])
+        table = rays.features(kind, c[rows], R[rows], size[rows])
         if kind == scenes.PLANE:  # few and everywhere
             for row, features in enumerate(table):
                 key = meet(key, row, list(features), x, y)
         else:
             key = tiles.each(seen[:, rows], table, meet, key, x, y)
     t = jax.lax.bitcast_convert_type(key & ~room, jnp.float32)
-    return t, jnp.where(t < shapes.FAR, key & room, -1)
+    return t, jnp.where(t < rays.FAR, key & room, -1)
 
 
 def _shaded(
-    scene: scenes.Scene, grid: tiles.Grid, R_light_cam: Any, c: Array, R: Array, t: Array,
+    scene: scenes.RenderScene, grid: tiles.Grid, R_light_cam: Any, c: Array, R: Array, t: Array,
     face: Array,
 ) -> Array:  # fmt: skip
     """Which visible points another geom hides from the sun. No convex shape hides itself."""
@@ -76,7 +78,7 @@ def _shaded(
 
     low, high = [
         jnp.stack([edge(jnp.where(face >= 0, q, far), -1) for q in points(t, x, y)], -1)
-        for edge, far in ((jnp.min, shapes.FAR), (jnp.max, -shapes.FAR))
+        for edge, far in ((jnp.min, rays.FAR), (jnp.max, -rays.FAR))
     ]
     hides = tiles.over(low, high, c, R, *_bounds(scene))
     size = jnp.asarray(scene.size, jnp.float32)
@@ -87,12 +89,12 @@ def _shaded(
         def hide(shaded, row, features, face, t, x, y, kind=kind, first=first, parts=parts):
             part = face - (first + parts * row)
             other = (row >= 0) & ((part < 0) | (part >= parts))
-            return shaded | (shapes.shadow(kind, points(t, x, y), features) & other)
+            return shaded | (rays.shadow(kind, points(t, x, y), features) & other)
 
-        table = shapes.features(kind, c[rows], R[rows], size[rows])
+        table = rays.features(kind, c[rows], R[rows], size[rows])
         shaded = tiles.each(hides[:, rows], table, hide, shaded, face, t, x, y)
     return shaded
 
 
-def _bounds(scene: scenes.Scene) -> tuple[Array, Array]:
+def _bounds(scene: scenes.RenderScene) -> tuple[Array, Array]:
     return jnp.asarray(scene.axes, jnp.float32), jnp.asarray(scene.rounding, jnp.float32)

@@ -47,7 +47,7 @@ class Texture(NamedTuple):
     p_cam_top: np.ndarray
 
 
-class Scene(NamedTuple):
+class RenderScene(NamedTuple):
     """Drawn geoms in rows sorted by kind, the camera and its lights.
 
     Pixels name the face they see: faces are numbered row by row, `FACES[kind]` for each.
@@ -101,7 +101,7 @@ class Scene(NamedTuple):
         return np.repeat(np.arange(len(self.kind)), np.take(FACES, self.kind))
 
 
-def read(mj_model: mujoco.MjModel, camera: str, aspect: float, moves: bool = False) -> Scene:
+def read(mj_model: mujoco.MjModel, camera: str, aspect: float, moves: bool = False) -> RenderScene:
     """Reads the scene.
 
     Args:
@@ -142,7 +142,7 @@ def read(mj_model: mujoco.MjModel, camera: str, aspect: float, moves: bool = Fal
     left, right, bottom, top = _frustum(mj_model, cam, aspect)
     head = mj_model.vis.headlight
     lit = np.float32(head.active != 0)
-    return Scene(
+    return RenderScene(
         ids=ids,
         kind=kind,
         axes=axes,

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim.camera import geometry as scenes
-from starjax.sim.camera import shapes
-from starjax.sim.camera.view import View
+from starjax.sim.camera import rays
+from starjax.sim.camera.viewpoint import View
 
 Array = jax.Array
 
 
 def light(
-    scene: scenes.Scene, view: View, rgb: Array, c: Array, R: Array,
+    scene: scenes.RenderScene, view: View, rgb: Array, c: Array, R: Array,
     p: list[Array], face: Array, shaded: Array,
 ) -> Array:  # fmt: skip
     """Lit colour of every sample, `[T, Q]` int32 with red in the lowest byte.
@@ -30,7 +30,7 @@ def light(
     """
     row, at = scene.row_of_face(), jnp.maximum(face, 0)
     field = _normals(scene, c, R)
-    normal = shapes.normal(p, [_pick(field[:, k], at) for k in range(7)])
+    normal = rays.normal(p, [_pick(field[:, k], at) for k in range(7)])
     specular, exponent, emission = [
         _constant(v[row]) for v in (scene.specular, scene.exponent, scene.emission)
     ]
@@ -63,11 +63,11 @@ def light(
     return word
 
 
-def _normals(scene: scenes.Scene, c: Array, R: Array) -> Array:
+def _normals(scene: scenes.RenderScene, c: Array, R: Array) -> Array:
     """`shapes.normals` of all faces in their order, `[F, 7]`."""
     size = jnp.asarray(scene.size, jnp.float32)
     kinds = [(kind, scene.rows(kind)) for kind in range(4)]
-    return jnp.concatenate([shapes.normals(k, c[rows], R[rows], size[rows]) for k, rows in kinds])
+    return jnp.concatenate([rays.normals(k, c[rows], R[rows], size[rows]) for k, rows in kinds])
 
 
 def _between(face: Array, faces: np.ndarray) -> Array:

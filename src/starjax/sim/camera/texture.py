@@ -12,7 +12,7 @@ from starjax.sim.camera import tiles
 _LOOKUPS = 6  # texel lookups along each side of a sample: smooths lines thinner than a pixel
 
 
-def draw(scene: scenes.Scene, grid: tiles.Grid) -> dict[int, np.ndarray]:
+def draw(scene: scenes.RenderScene, grid: tiles.Grid) -> dict[int, np.ndarray]:
     """RGB of each textured row through every sample, as if nothing stood before it: `[3, T, Q]`."""
     step_x = (scene.right - scene.left) / grid.width
     step_y = (scene.bottom - scene.top) / grid.height

@@ -40,7 +40,7 @@ class Grid(NamedTuple):
     width: int
 
 
-def grid(scene: scenes.Scene, height: int, width: int) -> Grid:
+def grid(scene: scenes.RenderScene, height: int, width: int) -> Grid:
     """Tiles for a picture of `height` by `width` samples."""
     side = 8 if min(height, width) <= 128 else 16  # the faster, measured on two CPU cores
     rows, cols = -(-height // side), -(-width // side)
@@ -78,7 +78,7 @@ def in_view(grid: Grid, c: Array, R: Array, axes: Array, rounding: Array) -> Arr
 
     Args:
       c, R: `[N, 3]` m and `[N, 3, 3]` in the camera frame.
-      axes, rounding: the rounded box that holds each geom, as in `Scene`; m.
+      axes, rounding: the rounded box that holds each geom, as in `RenderScene`; m.
     """
     rounding = rounding * (1 + _SLACK) + _SLACK
     depth_range = _reach(R[:, 2], axes) + rounding

@@ -1,6 +1,6 @@
 """Tasks: records of data and of pure, single-sample functions. Needs no simulator.
 
-Shape letter A: the arms of the task. `Layout` and `Facts` are the task's own pytrees.
+Shape letter A: the arms of the task. `Layout` and `Measurements` are the task's own pytrees.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.sim.endoscope import Endoscope
+from starjax.sim.endoscope_camera import Endoscope
 from starjax.types import Agent, Pose
 
 CONTROL_HZ = 30.0  # commands a second
@@ -47,25 +47,25 @@ class Slot(NamedTuple):
     tool: str = "grasper"
 
 
-class Verdict(NamedTuple):
+class TaskStatus(NamedTuple):
     """A task's judgement of one moment.
 
     Attributes:
-      good: the strict conditions hold now; success is `settle_steps` such steps in a row.
+      success_now: the strict conditions hold now; success is `settle_steps` such steps in a row.
       loose: a looser published test holds now.
       lost: the episode cannot succeed any more (a drop that counts as a failure).
       stage: int32, how far the task is: an index of `Task.stages`.
-      reward: in [0, 1], grows with the stages and within them; 1 where `good`.
+      reward: in [0, 1], grows with the stages and within them; 1 where `success_now`.
     """
 
-    good: jax.Array
+    success_now: jax.Array
     loose: jax.Array
     lost: jax.Array
     stage: jax.Array
     reward: jax.Array
 
 
-class Words(NamedTuple):
+class TaskText(NamedTuple):
     """Phrases for reports of a task, in plain English, without a capital or a full stop.
 
     Attributes:
@@ -130,7 +130,7 @@ class Capsules(NamedTuple):
     radius: jax.Array
 
 
-class Views(NamedTuple):
+class SimReadings(NamedTuple):
     """Measurements of one moment that a task may use.
 
     Attributes:
@@ -168,22 +168,24 @@ class Task(NamedTuple):
       fields: parts of the `state` observation, in order.
       labels: names of the whole numbers that tell episodes apart, e.g. `source`, `target`.
       stages: names, from the start to success.
-      words: for reports.
+      text: for reports.
       experts: variant -> `make() -> Agent` of a scripted demonstrator; the first is used unless
         another is chosen.
       graspable: geoms of the MJCF, by name, that jaws can hold.
       bind: (mj_model) -> Bound, ids resolved once.
       sample: (Bound, key) -> Layout, what is drawn at reset.
       tips: (Bound, Layout, trocars `[A, 3]` m) -> `[A, 3]` m, where the tools' tips start.
-      place: (Bound, qpos, Layout) -> qpos with the task's objects in it.
-      measure: (Bound, Layout, Views, Facts of the step before or None at reset) -> Facts.
-      judge: (Bound, Layout, Facts) -> Verdict.
-      state: (Bound, Layout, Facts) -> `[S]`, the fields one after another.
+      place_objects: (Bound, qpos, Layout) -> qpos with the task's objects in it.
+      measure: (Bound, Layout, SimReadings, Measurements of the step before, None at reset) ->
+        Measurements.
+      status: (Bound, Layout, Measurements) -> TaskStatus.
+      state: (Bound, Layout, Measurements) -> `[S]`, the fields one after another.
       relative: (state `[..., S]`, tips `[..., A, 3]` m) -> `[..., K]` of order one: differences
         that small networks would not get exactly enough from `state`.
       label: (Layout) -> name of `labels` -> int32.
       colours: (Bound, Layout, rgb `[G, 3]`) -> `[G, 3]`, the goal marked.
-      obstacles: (Bound, Layout, Facts) -> Capsules that no shaft may enter, see `sim.collision`.
+      obstacles: (Bound, Layout, Measurements) -> Capsules that shafts may not enter, see
+        `sim.collision`.
       floor: m, the lowest height that jaws may reach.
       is_sound: (Bound, qpos, qvel) -> bool, False once an object has diverged.
       outline: (mj_model) -> Outline, for figures.
@@ -209,15 +211,15 @@ class Task(NamedTuple):
     fields: tuple[Field, ...]
     labels: tuple[str, ...]
     stages: tuple[str, ...]
-    words: Words
+    text: TaskText
     experts: Mapping[str, Callable[[], Agent]]
     graspable: tuple[str, ...]
     bind: Callable[..., Any]
     sample: Callable[..., Any]
     tips: Callable[..., jax.Array]
-    place: Callable[..., jax.Array]
+    place_objects: Callable[..., jax.Array]
     measure: Callable[..., Any]
-    judge: Callable[..., Verdict]
+    status: Callable[..., TaskStatus]
     state: Callable[..., jax.Array]
     relative: Callable[..., jax.Array]
     label: Callable[..., dict[str, jax.Array]]

@@ -28,7 +28,7 @@ def command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) -> 
     """The command `[A]` of rolls `[A]` rad, tips `[A, 3]` m and jaws `[A]`, through the told
     trocars."""
     action = jnp.concatenate([roll[:, None], p], axis=-1)
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, state.told)
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, state.measured_trocar)
     return Command(pose, jaws)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.sim.tasks.base import Capsules, Field, Outline, Slot, Task, Verdict, Words
+from starjax.sim.tasks.base import Capsules, Field, Outline, Slot, Task, TaskStatus, TaskText
 from starjax.types import Agent, Command
 
 MARKS = 4
@@ -34,14 +34,14 @@ def sample(bound: Any, key: jax.Array) -> Layout:
     return Layout(goal, jnp.asarray(bound[1])[goal])
 
 
-def judge(bound: Any, layout: Layout, tip: jax.Array) -> Verdict:
+def status(bound: Any, layout: Layout, tip: jax.Array) -> TaskStatus:
     off = jnp.linalg.norm(tip - layout.p)
     close, no = off < CLOSE, jnp.zeros((), bool)
-    return Verdict(close, close, no, close.astype(jnp.int32), jnp.exp(-off / 0.03))
+    return TaskStatus(close, close, no, close.astype(jnp.int32), jnp.exp(-off / 0.03))
 
 
 def act(memory: jax.Array, state: Any) -> tuple[Command, jax.Array, Command]:
-    tip, frame = state.pose.p, state.told
+    tip, frame = state.pose.p, state.measured_trocar
     way = state.layout.p - tip[0]
     p = tip[0] + way * jnp.minimum(1.0, STEP / jnp.maximum(jnp.linalg.norm(way), 1e-9))
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(jnp.append(0.0, p)[None], frame)
@@ -59,7 +59,7 @@ TASK = Task(
     fields=(Field("goal.p", 3, "point"),),
     labels=("goal",),
     stages=("away", "close"),
-    words=Words(
+    text=TaskText(
         title="touch",
         done="touched the mark",
         strict="at the mark and at rest",
@@ -74,9 +74,9 @@ TASK = Task(
     bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: jnp.array([[0.0, 0.0, 0.05]]),
-    place=lambda bound, qpos, layout: qpos,
-    measure=lambda bound, layout, views, before: views.pose.p[0],
-    judge=judge,
+    place_objects=lambda bound, qpos, layout: qpos,
+    measure=lambda bound, layout, readings, before: readings.pose.p[0],
+    status=status,
     state=lambda bound, layout, tip: layout.p,
     relative=lambda state, tips: (state - tips[..., 0, :]) / 0.03,
     label=lambda layout: {"goal": layout.goal},

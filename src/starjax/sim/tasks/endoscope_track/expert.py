@@ -25,7 +25,7 @@ DISTURBANCE = 0.7  # how much of it acts once the target is found
 
 
 @flax.struct.dataclass
-class Script:
+class TrackScript:
     """One episode's script.
 
     Attributes:
@@ -44,11 +44,11 @@ class Script:
     noise: jax.Array
 
 
-def init(key: jax.Array, state: EnvState) -> Script:
+def init(key: jax.Array, state: EnvState) -> TrackScript:
     """Draws side, pace and disturbed distance."""
     key, key_side, key_time, key_distance = jax.random.split(key, 4)
     sign = jax.random.rademacher(key_side, (), jnp.float32)
-    return Script(
+    return TrackScript(
         key=key,
         start=jnp.append(0.0, state.pose.p[0]),
         side=sign * BULGE * jnp.array([0.0, 1.0, 0.0]),
@@ -59,7 +59,7 @@ def init(key: jax.Array, state: EnvState) -> Script:
     )
 
 
-def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+def act(script: TrackScript, state: EnvState) -> tuple[Command, TrackScript, Command]:
     """The disturbed command to execute, the script, and the undisturbed one to record."""
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
@@ -78,11 +78,11 @@ def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
 
 def _wanted(distance: jax.Array | float, state: EnvState) -> jax.Array:
     """Roll and position, `[4]`, from which the target is centred and level at `distance`."""
-    facts = state.facts
-    aim = facts.target + facts.velocity / CONTROL_HZ
-    R_tip_camera = state.pose.R[0].T @ facts.camera.R
-    pose = looking_at(aim, state.told.p_world_trocar[0], distance, R_tip_camera)
-    return jnp.append(rcm.roll_of(pose.R) - state.told.roll_zero[0], pose.p)
+    measurements = state.measurements
+    aim = measurements.target + measurements.velocity / CONTROL_HZ
+    R_tip_camera = state.pose.R[0].T @ measurements.camera.R
+    pose = looking_at(aim, state.measured_trocar.p_world_trocar[0], distance, R_tip_camera)
+    return jnp.append(rcm.roll_of(pose.R) - state.measured_trocar.roll_zero[0], pose.p)
 
 
 def _command(way: jax.Array, state: EnvState) -> Command:

@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 
 from starjax import errors
-from starjax.sim import endoscope
-from starjax.sim.tasks.base import CONTROL_HZ, Capsules, Field, Slot, Task, Verdict, Views
-from starjax.sim.tasks.endoscope_track import words
+from starjax.sim import endoscope_camera
+from starjax.sim.tasks.base import CONTROL_HZ, Capsules, Field, SimReadings, Slot, Task, TaskStatus
+from starjax.sim.tasks.endoscope_track import text
 from starjax.types import Agent, Pose
 
 CAMERA = "endoscope"
@@ -45,7 +45,7 @@ MAX_AWAY = 0.3  # beyond it the simulation has diverged
 
 
 @flax.struct.dataclass
-class Layout:
+class TrackLayout:
     """Drawn at reset.
 
     Attributes:
@@ -59,7 +59,7 @@ class Layout:
 
 
 @flax.struct.dataclass
-class Facts:
+class TrackMeasurements:
     """Measurements of one moment, and how it went so far.
 
     Attributes:
@@ -84,7 +84,7 @@ class Facts:
     unseen: jax.Array
 
 
-class Bound(NamedTuple):
+class TrackBound(NamedTuple):
     """Ids and shapes in the compiled model.
 
     Attributes:
@@ -104,7 +104,7 @@ class Bound(NamedTuple):
     radius: float
 
 
-def bind(m: mujoco.MjModel) -> Bound:
+def bind(m: mujoco.MjModel) -> TrackBound:
     """Resolves the ids of the target, and the camera's pose on the tool.
 
     Raises:
@@ -117,7 +117,7 @@ def bind(m: mujoco.MjModel) -> Bound:
     rod = m.geom("rod")
     R_tip, R_camera, R_rod = (_matrix(part.quat) for part in (tip, camera, rod))
     ends = rod.pos + np.array([[-1.0], [1.0]]) * rod.size[1] * R_rod[:, 2]
-    return Bound(
+    return TrackBound(
         target=np.array([m.joint(name).qposadr[0] for name in names]),
         dof=np.array([m.joint(name).dofadr[0] for name in names]),
         ctrl=np.array([m.actuator(name).id for name in names]),
@@ -129,14 +129,14 @@ def bind(m: mujoco.MjModel) -> Bound:
     )
 
 
-def sample(bound: Bound, key: jax.Array) -> Layout:
+def sample(bound: TrackBound, key: jax.Array) -> TrackLayout:
     """Draws the target's path and the lens's start."""
     key_rate, key_phase, key_spread = jax.random.split(key, 3)
     low, high = jnp.array(RATES).T
     rate = low[:, None] + (high - low)[:, None] * jax.random.uniform(key_rate, (2, 3))
     phase = jax.random.uniform(key_phase, (2, 3), maxval=2 * jnp.pi)
     spread = jax.random.uniform(key_spread, (3,), minval=-SPREAD, maxval=SPREAD)
-    return Layout(rate, phase, spread)
+    return TrackLayout(rate, phase, spread)
 
 
 def looking_at(
@@ -147,36 +147,38 @@ def looking_at(
     The view may lean from the shaft in the plane of the picture's vertical, as with oblique optics.
     """
     lean = R_tip_camera[2, 1], -R_tip_camera[2, 2]
-    camera = endoscope.looking_at(target, p_trocar, distance, UP, lean)
+    camera = endoscope_camera.looking_at(target, p_trocar, distance, UP, lean)
     return Pose(camera.R @ R_tip_camera.T, camera.p)
 
 
-def tips(bound: Bound, layout: Layout, p_trocars: jax.Array) -> jax.Array:
+def tips(bound: TrackBound, layout: TrackLayout, p_trocars: jax.Array) -> jax.Array:
     """Where the lens starts, `[1, 3]` m."""
     R_tip_camera = jnp.asarray(bound.R_tip_camera)
     start = looking_at(jnp.array(CENTRE), p_trocars[0], jnp.array(START), R_tip_camera)
     return start.p[None] + layout.spread
 
 
-def path(layout: Layout, time: jax.Array) -> jax.Array:
+def path(layout: TrackLayout, time: jax.Array) -> jax.Array:
     """Where the target is to be `time` s after reset, `[3]` m."""
     waves = jnp.array(SHARES) @ jnp.sin(layout.rate * time + layout.phase)
     return jnp.array(CENTRE) + jnp.array(REACH) * waves
 
 
-def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
+def place_objects(bound: TrackBound, qpos: jax.Array, layout: TrackLayout) -> jax.Array:
     """Puts the target at the beginning of its path."""
     return qpos.at[bound.target].set(path(layout, jnp.zeros(())))
 
 
-def drive(bound: Bound, layout: Layout, ctrl: jax.Array, time: jax.Array) -> jax.Array:
+def drive(bound: TrackBound, layout: TrackLayout, ctrl: jax.Array, time: jax.Array) -> jax.Array:
     """Moves the target along its path."""
     return ctrl.at[bound.ctrl].set(path(layout, time))
 
 
-def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+def measure(
+    bound: TrackBound, layout: TrackLayout, readings: SimReadings, before: TrackMeasurements | None
+) -> TrackMeasurements:
     """Where the target is in the picture, and for how long it was not where it belongs."""
-    target, tip = views.qpos[bound.target], jax.tree.map(lambda leaf: leaf[0], views.pose)
+    target, tip = readings.qpos[bound.target], jax.tree.map(lambda leaf: leaf[0], readings.pose)
     camera = Pose(tip.R @ bound.R_tip_camera, tip.p + tip.R @ bound.p_tip_camera)
     x, y, z = camera.R.T @ (target - camera.p)
     depth = jnp.maximum(-z, 1e-6)
@@ -193,9 +195,9 @@ def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) ->
         step = before.step + 1
         counts = step > FIRST
         missed, unseen = before.missed + (counts & ~on_target), before.unseen | (counts & ~is_seen)
-    return Facts(
+    return TrackMeasurements(
         target=target,
-        velocity=views.qvel[bound.dof],
+        velocity=readings.qvel[bound.dof],
         camera=camera,
         off=off,
         tilt=tilt,
@@ -207,27 +209,29 @@ def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) ->
     )
 
 
-def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+def status(bound: TrackBound, layout: TrackLayout, measurements: TrackMeasurements) -> TaskStatus:
     """Strict: on target for long enough. Loose: never out of the picture."""
-    is_over = facts.step >= LAST
-    may_succeed = facts.missed <= MAY_MISS
-    good = is_over & may_succeed
-    stage = (facts.off < 0.5).astype(jnp.int32) + facts.on_target
-    stage = jnp.where(good, 3, stage).astype(jnp.int32)
-    kept = (facts.step - facts.missed) / LAST
-    share = jnp.where(facts.on_target, jnp.clip(kept, 0.0, 1.0), jnp.exp(-facts.off / OFF_CENTRE))
-    reward = jnp.where(good, 1.0, (stage + share) / len(STAGES))
-    lost = facts.unseen & ~may_succeed
-    return Verdict(good, is_over & ~facts.unseen, lost, stage, reward)
+    is_over = measurements.step >= LAST
+    may_succeed = measurements.missed <= MAY_MISS
+    success_now = is_over & may_succeed
+    stage = (measurements.off < 0.5).astype(jnp.int32) + measurements.on_target
+    stage = jnp.where(success_now, 3, stage).astype(jnp.int32)
+    kept = (measurements.step - measurements.missed) / LAST
+    share = jnp.where(
+        measurements.on_target, jnp.clip(kept, 0.0, 1.0), jnp.exp(-measurements.off / OFF_CENTRE)
+    )
+    reward = jnp.where(success_now, 1.0, (stage + share) / len(STAGES))
+    lost = measurements.unseen & ~may_succeed
+    return TaskStatus(success_now, is_over & ~measurements.unseen, lost, stage, reward)
 
 
-def obstacles(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+def obstacles(bound: TrackBound, layout: TrackLayout, measurements: TrackMeasurements) -> Capsules:
     """The instrument."""
-    start, end = facts.target + jnp.asarray(bound.rod)
+    start, end = measurements.target + jnp.asarray(bound.rod)
     return Capsules(start[None], end[None], jnp.array([bound.radius]))
 
 
-def is_sound(bound: Bound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+def is_sound(bound: TrackBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Whether the target is near its path."""
     return jnp.max(jnp.abs(qpos[bound.target])) < MAX_AWAY
 
@@ -254,23 +258,23 @@ TASK = Task(
     fields=(Field("target.p", 3, "point"),),
     labels=(),
     stages=STAGES,
-    words=words.WORDS,
+    text=text.TEXT,
     experts={"default": _expert},
     graspable=(),
     bind=bind,
     sample=sample,
     tips=tips,
-    place=place,
+    place_objects=place_objects,
     measure=measure,
-    judge=judge,
-    state=lambda bound, layout, facts: facts.target,
+    status=status,
+    state=lambda bound, layout, measurements: measurements.target,
     relative=lambda state, tips: (state - tips[..., 0, :]) / DISTANCE,
     label=lambda layout: {},
     colours=lambda bound, layout, rgb: rgb,
     obstacles=obstacles,
     floor=0.0,
     is_sound=is_sound,
-    outline=words.outline,
+    outline=text.outline,
     drive=drive,
     least_steps=LAST,
 )

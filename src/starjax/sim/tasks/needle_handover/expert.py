@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import handing
+from starjax.sim.tasks import handover
 from starjax.sim.tasks.needle_handover.task import PARK
 from starjax.sim.tasks.needle_pick import task as single
 
@@ -48,7 +48,7 @@ PAIRS = np.array([(a, b) for a in INNER for b in INNER if abs(a - b) > 1])  # gi
 def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The pair of segments, int32 `[2]`, and the pace."""
     key, key_tempo, key_pair = jax.random.split(key, 3)
-    R = state.facts.needle.R
+    R = state.measurements.needle.R
     give, take = PAIRS.T
     skew = jnp.abs(TANGENTS @ R[1])  # of each segment's normal from the world's y
     aside = (MIDDLES[take] - MIDDLES[give]) @ R[0]
@@ -58,11 +58,11 @@ def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, jax.
     return key, tempo, jnp.asarray(PAIRS)[pair]
 
 
-def _following(script: handing.Script, state: EnvState) -> jax.Array:
+def _following(script: handover.HandoverScript, state: EnvState) -> jax.Array:
     """The phase after the present one: back to where a tool came from if it missed the wire."""
-    missed = (script.phase == PHASES.index("lift")) & ~state.facts.touch[0]
+    missed = (script.phase == PHASES.index("lift")) & ~state.measurements.touch[0]
     following = jnp.where(missed, 0, jnp.minimum(script.phase + 1, len(PHASES) - 1))
-    missed = (script.phase == PHASES.index("take")) & ~state.facts.touch[1]
+    missed = (script.phase == PHASES.index("take")) & ~state.measurements.touch[1]
     return jnp.where(missed, PHASES.index("near"), following).astype(jnp.int32)
 
 
@@ -72,15 +72,15 @@ def _weight(phase: jax.Array, share: jax.Array) -> jax.Array:
     return before + share * (weight - before)
 
 
-def _goals(script: handing.Script, state: EnvState) -> tuple[jax.Array, jax.Array]:
+def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array, jax.Array]:
     """Where the tips go in every phase, from what is seen now, and across what the jaws open."""
-    needle, tips = state.facts.needle, script.p
+    needle, tips = state.measurements.needle, script.p
     across = jnp.cross(jnp.asarray(TANGENTS)[script.held] @ needle.R.T, jnp.array([0.0, 0.0, 1.0]))
     across = across / jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), 1e-6)
     normal = across * jnp.where(across[:, 1:2] > 0, -1.0, 1.0)
     wire = needle.p + jnp.asarray(MIDDLES)[script.held] @ needle.R.T
     give, take = wire + jnp.array([0.0, 0.0, GRASP_ABOVE])
-    out = handing.OUT * across
+    out = handover.OUT * across
     park, up = jnp.array(PARK), jnp.array([0.0, 0.0, HOVER])
     goals = jnp.stack(
         [
@@ -102,7 +102,7 @@ def _goals(script: handing.Script, state: EnvState) -> tuple[jax.Array, jax.Arra
     return goals, normal
 
 
-PLAY = handing.Play(
+PLAY = handover.Play(
     choose=_choose,
     duration=np.array(DURATION),
     jaws=np.stack([GIVER, TAKER], -1),
@@ -113,4 +113,4 @@ PLAY = handing.Play(
     following=_following,
     goals=_goals,
 )
-AGENT = handing.agent(PLAY)
+AGENT = handover.agent(PLAY)

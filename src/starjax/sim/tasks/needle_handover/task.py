@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import mujoco
 
 from starjax import rcm
-from starjax.sim import bodies, endoscope, workspaces
+from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks import two_arms
-from starjax.sim.tasks.base import Capsules, Field, Task, Verdict, Views
-from starjax.sim.tasks.needle_handover import words
+from starjax.sim.tasks.base import Capsules, Field, SimReadings, Task, TaskStatus
+from starjax.sim.tasks.needle_handover import text
 from starjax.sim.tasks.needle_pick import task as single
 from starjax.types import Agent, Pose
 
@@ -28,7 +28,7 @@ STAGES = ("approach", "grasped", "lifted", "taken over", "held", "done")
 
 
 @flax.struct.dataclass
-class Layout:
+class HandoverLayout:
     """Drawn at reset: pose_world_needle; tips `[2, 3]` m."""
 
     needle: Pose
@@ -36,7 +36,7 @@ class Layout:
 
 
 @flax.struct.dataclass
-class Facts:
+class HandoverMeasurements:
     """Measurements of one moment, and what has happened.
 
     Attributes:
@@ -58,27 +58,32 @@ class Facts:
     untouched: jax.Array
 
 
-def bind(m: mujoco.MjModel) -> single.Bound:
+def bind(m: mujoco.MjModel) -> single.NeedleBound:
     """As in `needle_pick`."""
     return single.bind(m)
 
 
-def sample(bound: single.Bound, key: jax.Array) -> Layout:
+def sample(bound: single.NeedleBound, key: jax.Array) -> HandoverLayout:
     """Draws the needle's place and yaw, and the tips' starts."""
     key_place, key_yaw, key_tips = jax.random.split(key, 3)
     aside = jax.random.uniform(key_place, (2,), minval=-1.0) * jnp.array(PLACE_SPREAD)
     yaw = jax.random.uniform(key_yaw, minval=-jnp.pi, maxval=jnp.pi)
     needle = Pose(rcm.rotation_z(yaw), jnp.append(jnp.array(PLACE) + aside, bound.height))
     spread = jax.random.uniform(key_tips, (2, 3), minval=-SPREAD, maxval=SPREAD)
-    return Layout(needle, jnp.array(PARK) + spread)
+    return HandoverLayout(needle, jnp.array(PARK) + spread)
 
 
-def measure(bound: single.Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+def measure(
+    bound: single.NeedleBound,
+    layout: HandoverLayout,
+    readings: SimReadings,
+    before: HandoverMeasurements | None,
+) -> HandoverMeasurements:
     """The needle, who has held it, and how it lies in the jaws that took it over."""
-    needle, touch = bodies.free_pose(views.qpos, bound.needle), views.touch
+    needle, touch = bodies.free_pose(readings.qpos, bound.needle), readings.touch
     is_up = needle.p[2] > bound.height + single.LIFT
     lifted, passed = is_up & touch[0] & ~touch[1], jnp.zeros((), bool)
-    here = needle.R.T @ (views.pose.p[1] - needle.p)
+    here = needle.R.T @ (readings.pose.p[1] - needle.p)
     grip, untouched = here, jnp.zeros((), jnp.int32)
     if before is not None:
         is_alone = touch[1] & ~touch[0]
@@ -89,9 +94,9 @@ def measure(bound: single.Bound, layout: Layout, views: Views, before: Facts | N
         goes_on = is_alone & was_alone & (before.slip < single.SLIP)
         grip = jnp.where(goes_on, before.grip, here)
         untouched = jnp.where(touch.any(), 0, before.untouched + 1)
-    return Facts(
+    return HandoverMeasurements(
         needle=needle,
-        tips=views.pose.p,
+        tips=readings.pose.p,
         touch=touch,
         lifted=lifted,
         passed=passed,
@@ -101,20 +106,24 @@ def measure(bound: single.Bound, layout: Layout, views: Views, before: Facts | N
     )
 
 
-def judge(bound: single.Bound, layout: Layout, facts: Facts) -> Verdict:
+def status(
+    bound: single.NeedleBound, layout: HandoverLayout, measurements: HandoverMeasurements
+) -> TaskStatus:
     """Strict: taken over, held by the other tool alone without slip. Loose: taken over."""
-    is_up = facts.needle.p[2] > bound.height + single.LIFT
-    is_alone = facts.touch[1] & ~facts.touch[0]
-    good = facts.passed & is_up & is_alone & (facts.slip < single.SLIP)
-    lost = facts.lifted & (facts.untouched > DROPPED_STEPS)
-    stage = jnp.where(facts.touch[0], 1, 0)
-    stage = jnp.where(facts.lifted, 2, stage)
-    stage = jnp.where(facts.passed, 3, stage)
-    stage = jnp.where(good, 4, stage).astype(jnp.int32)
-    to_giver, to_taker = jnp.linalg.norm(facts.needle.p - facts.tips, axis=-1)
+    is_up = measurements.needle.p[2] > bound.height + single.LIFT
+    is_alone = measurements.touch[1] & ~measurements.touch[0]
+    success_now = measurements.passed & is_up & is_alone & (measurements.slip < single.SLIP)
+    lost = measurements.lifted & (measurements.untouched > DROPPED_STEPS)
+    stage = jnp.where(measurements.touch[0], 1, 0)
+    stage = jnp.where(measurements.lifted, 2, stage)
+    stage = jnp.where(measurements.passed, 3, stage)
+    stage = jnp.where(success_now, 4, stage).astype(jnp.int32)
+    to_giver, to_taker = jnp.linalg.norm(measurements.needle.p - measurements.tips, axis=-1)
     left = jnp.stack([to_giver, to_giver, to_taker, to_taker, to_taker])[stage]
     reward = (stage + jnp.exp(-left / single.NEAR)) / len(STAGES)
-    return Verdict(good, facts.passed, lost, stage, jnp.where(good, 1.0, reward))
+    return TaskStatus(
+        success_now, measurements.passed, lost, stage, jnp.where(success_now, 1.0, reward)
+    )
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
@@ -123,7 +132,9 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 
 
-def _nothing(bound: single.Bound, layout: Layout, facts: Facts) -> Capsules:
+def _nothing(
+    bound: single.NeedleBound, layout: HandoverLayout, measurements: HandoverMeasurements
+) -> Capsules:
     """The needle is no obstacle: it gives way."""
     return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
 
@@ -138,21 +149,21 @@ TASK = Task(
     name="needle_handover",
     mjcf="tasks/needle_handover/needle_handover.xml",
     slots=two_arms.SLOTS,
-    cameras=("side", endoscope.NAME),
+    cameras=("side", endoscope_camera.NAME),
     time_limit_s=60.0,
     settle_steps=single.SETTLE_STEPS,
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
     labels=(),
     stages=STAGES,
-    words=words.WORDS,
+    text=text.TEXT,
     experts={"default": _expert},
     graspable=single.TASK.graspable,
     bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tips,
-    place=single.place,
+    place_objects=single.place_objects,
     measure=measure,
-    judge=judge,
+    status=status,
     state=single.state,
     relative=relative,
     label=lambda layout: {},
@@ -160,7 +171,7 @@ TASK = Task(
     obstacles=_nothing,
     floor=single.FLOOR,
     is_sound=single.is_sound,
-    outline=words.outline,
+    outline=text.outline,
     # Between where the needle lies and where it is passed.
     endoscope=workspaces.SIDE_ENDOSCOPE._replace(work=(-0.012, 0.0, 0.02)),
     trocars=two_arms.TROCARS,

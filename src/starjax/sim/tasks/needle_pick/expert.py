@@ -36,7 +36,7 @@ MIDDLES, TANGENTS = task.segments()
 
 
 @flax.struct.dataclass
-class Script:
+class NeedleScript:
     """Where the script stands; single episode.
 
     Attributes:
@@ -67,22 +67,22 @@ class Script:
     noise: jax.Array
 
 
-def init(key: jax.Array, state: EnvState) -> Script:
+def init(key: jax.Array, state: EnvState) -> NeedleScript:
     """The script at the start of an episode."""
     key_tempo, key = jax.random.split(key)
     p, zero, none = state.pose.p[0], jnp.zeros(()), jnp.zeros((), jnp.int32)
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
     down = jnp.array([0.0, -1.0, 0.0])
-    script = Script(
+    script = NeedleScript(
         key, none, none, zero, zero, tempo, p, p, p, none, down, zero, zero, jnp.ones(()),
         jnp.ones(()), jnp.zeros((2, 4)),
     )  # fmt: skip
     return _enter(script, jnp.asarray(APPROACH, jnp.int32), state)
 
 
-def _enter(script: Script, phase: jax.Array, state: EnvState) -> Script:
+def _enter(script: NeedleScript, phase: jax.Array, state: EnvState) -> NeedleScript:
     """Begins `phase`: choose the segment if it is an approach, set goal and duration."""
-    needle, tip = state.facts.needle, script.p
+    needle, tip = state.measurements.needle, script.p
     is_approach = phase == APPROACH
     attempt = script.attempt + is_approach
     normals = jnp.cross(jnp.asarray(TANGENTS), jnp.array([0.0, 0.0, 1.0])) @ needle.R.T
@@ -121,7 +121,7 @@ def _enter(script: Script, phase: jax.Array, state: EnvState) -> Script:
     )
 
 
-def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+def act(script: NeedleScript, state: EnvState) -> tuple[Command, NeedleScript, Command]:
     """The disturbed command to execute, the script, and the undisturbed one to record."""
     dt = 1.0 / CONTROL_HZ
     is_over = script.elapsed >= script.duration - 1e-6
@@ -146,14 +146,14 @@ def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
     return rough, script, _command(script.roll, p, jaws, state)
 
 
-def _following(script: Script, state: EnvState) -> jax.Array:
+def _following(script: NeedleScript, state: EnvState) -> jax.Array:
     """The phase after the present one: again from the start if the needle is not held."""
-    is_lost = (script.phase >= LIFT) & ~state.facts.touch
+    is_lost = (script.phase >= LIFT) & ~state.measurements.touch
     following = jnp.where(is_lost, RAISE, jnp.minimum(script.phase + 1, HOLD))
     return following.astype(jnp.int32)
 
 
-def _roll(script: Script, state: EnvState) -> jax.Array:
+def _roll(script: NeedleScript, state: EnvState) -> jax.Array:
     """Roll (rad) at the present position: turning towards, or on, the segment's normal."""
     R = _command(jnp.zeros(()), script.p, script.jaws, state).pose.R[0]
     on_wire = jnp.arctan2(-script.normal @ R[:, 0], script.normal @ R[:, 1])

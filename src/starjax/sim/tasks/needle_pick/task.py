@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import bodies, endoscope, workspaces
-from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
-from starjax.sim.tasks.needle_pick import words
+from starjax.sim import bodies, endoscope_camera, workspaces
+from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
+from starjax.sim.tasks.needle_pick import text
 from starjax.types import Agent, Pose
 
 # The needle, as in needle_pick.xml (a test holds these to the compiled model).
@@ -41,7 +41,7 @@ MAX_DISTANCE = 2.0
 
 
 @flax.struct.dataclass
-class Layout:
+class NeedleLayout:
     """Drawn at reset: pose_world_needle, and `[3]` m, where the tool's tip starts."""
 
     needle: Pose
@@ -49,7 +49,7 @@ class Layout:
 
 
 @flax.struct.dataclass
-class Facts:
+class NeedleMeasurements:
     """Measurements of one moment.
 
     Attributes:
@@ -69,7 +69,7 @@ class Facts:
     slip: jax.Array
 
 
-class Bound(NamedTuple):
+class NeedleBound(NamedTuple):
     """Ids and shape in the compiled model.
 
     Attributes:
@@ -96,10 +96,10 @@ def segments() -> tuple[np.ndarray, np.ndarray]:
     return centres.astype(np.float32), tangents.astype(np.float32)
 
 
-def bind(m: mujoco.MjModel) -> Bound:
+def bind(m: mujoco.MjModel) -> NeedleBound:
     """Resolves the ids of the needle and of what touches it."""
     pads = [g for g in range(m.ngeom) if "/pad_" in m.geom(g).name]
-    return Bound(
+    return NeedleBound(
         needle=int(m.joint("needle").qposadr[0]),
         dof=int(m.joint("needle").dofadr[0]),
         height=float(m.body("needle").pos[2]),
@@ -108,7 +108,7 @@ def bind(m: mujoco.MjModel) -> Bound:
     )
 
 
-def sample(bound: Bound, key: jax.Array) -> Layout:
+def sample(bound: NeedleBound, key: jax.Array) -> NeedleLayout:
     """Draws the needle's place and yaw, and the tip's start."""
     key_place, key_yaw, key_tip = jax.random.split(key, 3)
     xy = jax.random.uniform(key_place, (2,), minval=-1.0) * jnp.array(SPREAD)
@@ -116,10 +116,10 @@ def sample(bound: Bound, key: jax.Array) -> Layout:
     tip = jnp.array(TIP_HOME) + jax.random.uniform(
         key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD
     )
-    return Layout(Pose(rcm.rotation_z(yaw), jnp.append(xy, bound.height)), tip)
+    return NeedleLayout(Pose(rcm.rotation_z(yaw), jnp.append(xy, bound.height)), tip)
 
 
-def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
+def place_objects(bound: NeedleBound, qpos: jax.Array, layout: NeedleLayout) -> jax.Array:
     """Lays the needle where it was drawn."""
     R = layout.needle.R
     half, zero = 0.5 * jnp.arctan2(R[1, 0], R[0, 0]), jnp.zeros(())
@@ -129,23 +129,28 @@ def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
     return qpos.at[bound.needle : bound.needle + 7].set(coords)
 
 
-def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+def measure(
+    bound: NeedleBound,
+    layout: NeedleLayout,
+    readings: SimReadings,
+    before: NeedleMeasurements | None,
+) -> NeedleMeasurements:
     """The needle, and how it lies in the jaws since it was lifted."""
-    needle = bodies.free_pose(views.qpos, bound.needle)
-    tip = jax.tree.map(lambda leaf: leaf[0], views.pose)
+    needle = bodies.free_pose(readings.qpos, bound.needle)
+    tip = jax.tree.map(lambda leaf: leaf[0], readings.pose)
     here = needle.R.T @ (tip.p - needle.p)
-    geom, close = views.contacts.geom, views.contacts.dist < 0
+    geom, close = readings.contacts.geom, readings.contacts.dist < 0
     of_point, of_pads = (
         jnp.any(geom[..., None] == jnp.asarray(ids), axis=(-2, -1))
         for ids in (bound.point, bound.pads)
     )
-    touch = views.touch[0]
+    touch = readings.touch[0]
     is_up = touch & (needle.p[2] > bound.height + LIFT)
     grip = here
     if before is not None:  # a hold begins anew once the needle has slipped too far
         was_up = before.touch & (before.needle.p[2] > bound.height + LIFT)
         grip = jnp.where(is_up & was_up & (before.slip < SLIP), before.grip, here)
-    return Facts(
+    return NeedleMeasurements(
         needle=needle,
         tip=tip.p,
         touch=touch,
@@ -155,23 +160,25 @@ def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) ->
     )
 
 
-def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+def status(
+    bound: NeedleBound, layout: NeedleLayout, measurements: NeedleMeasurements
+) -> TaskStatus:
     """Strict: lifted, held, without slip. Loose: lifted."""
-    height = facts.needle.p[2] - bound.height
+    height = measurements.needle.p[2] - bound.height
     lifted = height > LIFT
-    good = lifted & facts.touch & (facts.slip < SLIP) & ~facts.sticks
-    stage = jnp.where(facts.touch, 1, 0)
-    stage = jnp.where(facts.touch & lifted, 2, stage)
-    stage = jnp.where(good, 3, stage).astype(jnp.int32)
-    off = jnp.linalg.norm(facts.needle.p - facts.tip)
-    share = jnp.where(facts.touch, jnp.clip(height / LIFT, 0.0, 1.0), jnp.exp(-off / NEAR))
-    reward = jnp.where(good, 1.0, (stage + share) / (len(STAGES) - 1))
-    return Verdict(good, lifted, jnp.zeros((), bool), stage, jnp.minimum(reward, 1.0))
+    success_now = lifted & measurements.touch & (measurements.slip < SLIP) & ~measurements.sticks
+    stage = jnp.where(measurements.touch, 1, 0)
+    stage = jnp.where(measurements.touch & lifted, 2, stage)
+    stage = jnp.where(success_now, 3, stage).astype(jnp.int32)
+    off = jnp.linalg.norm(measurements.needle.p - measurements.tip)
+    share = jnp.where(measurements.touch, jnp.clip(height / LIFT, 0.0, 1.0), jnp.exp(-off / NEAR))
+    reward = jnp.where(success_now, 1.0, (stage + share) / (len(STAGES) - 1))
+    return TaskStatus(success_now, lifted, jnp.zeros((), bool), stage, jnp.minimum(reward, 1.0))
 
 
-def state(bound: Bound, layout: Layout, facts: Facts) -> jax.Array:
+def state(bound: NeedleBound, layout: NeedleLayout, measurements: NeedleMeasurements) -> jax.Array:
     """`[9]`: the needle's position and rotation."""
-    return jnp.concatenate([facts.needle.p, rcm.rot6d_encode(facts.needle.R)])
+    return jnp.concatenate([measurements.needle.p, rcm.rot6d_encode(measurements.needle.R)])
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
@@ -182,14 +189,16 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([off, turned], axis=-1) / NEAR
 
 
-def is_sound(bound: Bound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+def is_sound(bound: NeedleBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Whether the needle is slower, and nearer, than anything physical."""
     speed = jnp.max(jnp.abs(qvel[bound.dof : bound.dof + 3]))
     away = jnp.max(jnp.abs(qpos[bound.needle : bound.needle + 3]))
     return (speed < MAX_SPEED) & (away < MAX_DISTANCE)
 
 
-def _nothing(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+def _nothing(
+    bound: NeedleBound, layout: NeedleLayout, measurements: NeedleMeasurements
+) -> Capsules:
     """The needle is no obstacle: it gives way."""
     return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
 
@@ -204,21 +213,21 @@ TASK = Task(
     name="needle_pick",
     mjcf="tasks/needle_pick/needle_pick.xml",
     slots=(Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15)),),
-    cameras=("camera", endoscope.NAME),
+    cameras=("camera", endoscope_camera.NAME),
     time_limit_s=30.0,
     settle_steps=SETTLE_STEPS,
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
     labels=(),
     stages=STAGES,
-    words=words.WORDS,
+    text=text.TEXT,
     experts={"default": _expert},
     graspable=tuple(f"wire{k}{side}" for k in range(SEGMENTS) for side in "ab"),
     bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tip[None],
-    place=place,
+    place_objects=place_objects,
     measure=measure,
-    judge=judge,
+    status=status,
     state=state,
     relative=relative,
     label=lambda layout: {},
@@ -226,6 +235,6 @@ TASK = Task(
     obstacles=_nothing,
     floor=FLOOR,
     is_sound=is_sound,
-    outline=words.outline,
+    outline=text.outline,
     endoscope=workspaces.BOARD_ENDOSCOPE,
 )

@@ -53,7 +53,7 @@ HOVER_SPREAD = 0.0015  # m, standard deviation of where it hovers
 
 
 @flax.struct.dataclass
-class ExpertState:
+class PegScript:
     """Where the script stands; single episode.
 
     Attributes:
@@ -87,12 +87,12 @@ class ExpertState:
     label: Command
 
 
-def init(key: jax.Array, state: EnvState, middle: float = 0.0) -> ExpertState:
-    """The script at the start of an episode. `middle`: see `ExpertState`; the peg rows' by default,
+def init(key: jax.Array, state: EnvState, middle: float = 0.0) -> PegScript:
+    """The script at the start of an episode. `middle`: see `PegScript`; the peg rows' by default,
     and between two rows there is no choice."""
     key_tempo, key = jax.random.split(key)
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
-    expert = ExpertState(
+    expert = PegScript(
         key=key,
         phase=jnp.asarray(RAISE, jnp.int32),
         elapsed=jnp.zeros(()),
@@ -113,7 +113,7 @@ def init(key: jax.Array, state: EnvState, middle: float = 0.0) -> ExpertState:
     return _enter(expert, jnp.asarray(APPROACH, jnp.int32), state, jnp.zeros(()))
 
 
-def act(expert: ExpertState, state: EnvState) -> tuple[Command, ExpertState, Command]:
+def act(expert: PegScript, state: EnvState) -> tuple[Command, PegScript, Command]:
     """The disturbed command to execute now, the next state, and the clean command to record."""
     dt = 1.0 / CONTROL_HZ
     roll = _roll_of(expert, state)
@@ -149,27 +149,28 @@ def _of_one_arm(pose: Pose, gripper: jax.Array) -> Command:
 
 
 def _told(state: EnvState) -> rcm.TrocarFrame:
-    return jax.tree.map(lambda leaf: leaf[0], state.told)
+    return jax.tree.map(lambda leaf: leaf[0], state.measured_trocar)
 
 
 def _tip(state: EnvState) -> Pose:
     return jax.tree.map(lambda leaf: leaf[0], state.pose)
 
 
-def _following(expert: ExpertState, state: EnvState) -> jax.Array:
+def _following(expert: PegScript, state: EnvState) -> jax.Array:
     """The phase after the present one, given what the world looks like now."""
     phase = expert.phase
     grasped = (
-        state.facts.block.p + task.RIM_RADIUS * task.wall_normals(state.facts.block)[expert.wall]
+        state.measurements.block.p
+        + task.RIM_RADIUS * task.wall_normals(state.measurements.block)[expert.wall]
     )
     is_held = jnp.sum((grasped - state.pose.p[0]) ** 2) < HELD**2
     is_lost = (phase >= LIFT) & (phase <= CARRY) & ~is_held
     return jnp.where(is_lost | (phase == WAIT), RAISE, phase + 1).astype(jnp.int32)
 
 
-def _enter(expert: ExpertState, phase: jax.Array, state: EnvState, roll: jax.Array) -> ExpertState:
+def _enter(expert: PegScript, phase: jax.Array, state: EnvState, roll: jax.Array) -> PegScript:
     """Begins `phase`: choose the wall if it is an approach, set goal and duration."""
-    block, tip = state.facts.block, expert.label.pose.p
+    block, tip = state.measurements.block, expert.label.pose.p
     is_approach = phase == APPROACH
     attempt = expert.attempt + is_approach
     keys = jax.random.split(jax.random.fold_in(expert.key, attempt), 3)
@@ -232,7 +233,7 @@ def _enter(expert: ExpertState, phase: jax.Array, state: EnvState, roll: jax.Arr
     )
 
 
-def _roll_of(expert: ExpertState, state: EnvState) -> jax.Array:
+def _roll_of(expert: PegScript, state: EnvState) -> jax.Array:
     """Roll (rad) at the label's position: turning towards, or on, the wall's normal."""
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(jnp.append(0.0, expert.label.pose.p), _told(state))
     on_wall = jnp.arctan2(-expert.normal @ pose.R[:, 0], expert.normal @ pose.R[:, 1])

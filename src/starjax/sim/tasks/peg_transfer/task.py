@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import bodies, endoscope, workspaces
-from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
-from starjax.sim.tasks.peg_transfer import words
+from starjax.sim import bodies, endoscope_camera, workspaces
+from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
+from starjax.sim.tasks.peg_transfer import text
 from starjax.types import Agent, Pose
 
 # The block, as in world.xml (a test holds these to the compiled model).
@@ -54,7 +54,7 @@ TARGET_RGB = (0.98, 0.62, 0.1)
 
 
 @flax.struct.dataclass
-class Layout:
+class PegLayout:
     """Drawn at reset.
 
     Attributes:
@@ -72,7 +72,7 @@ class Layout:
 
 
 @flax.struct.dataclass
-class Facts:
+class PegMeasurements:
     """Measurements of one moment.
 
     Attributes:
@@ -88,7 +88,7 @@ class Facts:
     touch: jax.Array
 
 
-class Bound(NamedTuple):
+class PegBound(NamedTuple):
     """Ids in the compiled model.
 
     Attributes:
@@ -104,11 +104,11 @@ class Bound(NamedTuple):
     pegs: np.ndarray
 
 
-def bind(m: mujoco.MjModel) -> Bound:
+def bind(m: mujoco.MjModel) -> PegBound:
     """Resolves the ids of block, pegs and seats."""
     count = sum(m.geom(g).name.startswith("peg") for g in range(m.ngeom))
     peg_geoms = np.array([m.geom(f"peg{i}").id for i in range(count)])
-    return Bound(
+    return PegBound(
         block=int(m.joint("block").qposadr[0]),
         block_dof=int(m.joint("block").dofadr[0]),
         peg_geoms=peg_geoms,
@@ -117,7 +117,7 @@ def bind(m: mujoco.MjModel) -> Bound:
     )
 
 
-def sample(bound: Bound, key: jax.Array) -> Layout:
+def sample(bound: PegBound, key: jax.Array) -> PegLayout:
     """Draws source and target peg, the block's offset and yaw, and the tip's start."""
     key_source, key_target, key_offset, key_yaw, key_tip = jax.random.split(key, 5)
     pegs = jnp.asarray(bound.pegs)
@@ -132,10 +132,10 @@ def sample(bound: Bound, key: jax.Array) -> Layout:
         key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD
     )
     block = Pose(rcm.rotation_z(yaw), jnp.append(xy, RIM_HEIGHT))
-    return Layout(source=source, target=target, target_peg=pegs[target], block=block, tip=tip)
+    return PegLayout(source=source, target=target, target_peg=pegs[target], block=block, tip=tip)
 
 
-def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
+def place_objects(bound: PegBound, qpos: jax.Array, layout: PegLayout) -> jax.Array:
     """Puts the block upright where it was drawn."""
     half = 0.5 * jnp.arctan2(layout.block.R[1, 0], layout.block.R[0, 0])
     zero = jnp.zeros(())
@@ -144,40 +144,42 @@ def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
     return qpos.at[bound.block : bound.block + 7].set(coords)
 
 
-def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+def measure(
+    bound: PegBound, layout: PegLayout, readings: SimReadings, before: PegMeasurements | None
+) -> PegMeasurements:
     """The block's pose and velocity, and what the jaws do."""
-    return Facts(
-        block=bodies.free_pose(views.qpos, bound.block),
-        velocity=views.qvel[bound.block_dof : bound.block_dof + 6],
-        tip=views.pose.p[0],
-        touch=views.touch[0],
+    return PegMeasurements(
+        block=bodies.free_pose(readings.qpos, bound.block),
+        velocity=readings.qvel[bound.block_dof : bound.block_dof + 6],
+        tip=readings.pose.p[0],
+        touch=readings.touch[0],
     )
 
 
-def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+def status(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) -> TaskStatus:
     """Strict: threaded, released, at rest. Loose: SurRoL's test."""
-    block, peg = facts.block, layout.target_peg
+    block, peg = measurements.block, layout.target_peg
     threaded = is_threaded(block, peg)
-    good = threaded & is_at_rest(facts.velocity) & ~facts.touch
+    success_now = threaded & is_at_rest(measurements.velocity) & ~measurements.touch
     near, lifted = is_near(block, peg), block.p[2] > RIM_HEIGHT + LIFTED
-    stage = jnp.where(facts.touch, 1, 0)
-    stage = jnp.where(facts.touch & lifted, 2, stage)
+    stage = jnp.where(measurements.touch, 1, 0)
+    stage = jnp.where(measurements.touch & lifted, 2, stage)
     over = jnp.sum((block.p[:2] - peg) ** 2) < LOOSE_XY**2
-    stage = jnp.where(over & (facts.touch | near), 3, stage)
+    stage = jnp.where(over & (measurements.touch | near), 3, stage)
     stage = jnp.where(threaded, 4, stage)
-    stage = jnp.where(good, 5, stage).astype(jnp.int32)
-    to_block = jnp.linalg.norm(block.p - facts.tip)
+    stage = jnp.where(success_now, 5, stage).astype(jnp.int32)
+    to_block = jnp.linalg.norm(block.p - measurements.tip)
     to_target = jnp.linalg.norm(block.p[:2] - peg)
     left = jnp.where(stage == 0, to_block, to_target)
-    share = jnp.where(good, 1.0, jnp.exp(-left / NEAR))
-    reward = jnp.where(good, 1.0, (stage + share) / len(STAGES))
-    return Verdict(good, near, jnp.zeros((), bool), stage, reward)
+    share = jnp.where(success_now, 1.0, jnp.exp(-left / NEAR))
+    reward = jnp.where(success_now, 1.0, (stage + share) / len(STAGES))
+    return TaskStatus(success_now, near, jnp.zeros((), bool), stage, reward)
 
 
-def state(bound: Bound, layout: Layout, facts: Facts) -> jax.Array:
+def state(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) -> jax.Array:
     """`[12]`: the block's position and rotation, the target's place."""
     goal = jnp.append(layout.target_peg, RIM_HEIGHT)
-    return jnp.concatenate([facts.block.p, rcm.rot6d_encode(facts.block.R), goal])
+    return jnp.concatenate([measurements.block.p, rcm.rot6d_encode(measurements.block.R), goal])
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
@@ -193,19 +195,19 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([to_block, turned, to_target], axis=-1) / NEAR
 
 
-def colours(bound: Bound, layout: Layout, rgb: jax.Array) -> jax.Array:
+def colours(bound: PegBound, layout: PegLayout, rgb: jax.Array) -> jax.Array:
     """Marks the target peg and its seat."""
     seats, pegs = jnp.asarray(bound.seat_geoms), jnp.asarray(bound.peg_geoms)
     marked = jnp.stack([pegs[layout.target], seats[layout.target]])
     return rgb.at[marked].set(jnp.array(TARGET_RGB))
 
 
-def obstacles(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+def obstacles(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) -> Capsules:
     """Pegs and the block's walls."""
-    return around(bound, facts.block)
+    return around(bound, measurements.block)
 
 
-def around(bound: Bound, block: Pose) -> Capsules:
+def around(bound: PegBound, block: Pose) -> Capsules:
     """Pegs, and the walls of a block at this pose: the sides of a full triangle, 3.5 mm longer at
     either end than they are."""
     pegs = jnp.asarray(bound.pegs)
@@ -220,7 +222,7 @@ def around(bound: Bound, block: Pose) -> Capsules:
     )
 
 
-def is_sound(bound: Bound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+def is_sound(bound: PegBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Whether the block is slower, and nearer, than anything physical."""
     speed = jnp.max(jnp.abs(qvel[bound.block_dof : bound.block_dof + 3]))
     away = jnp.max(jnp.abs(qpos[bound.block : bound.block + 3]))
@@ -269,7 +271,7 @@ TASK = Task(
     name="peg_transfer",
     mjcf="tasks/peg_transfer/peg_transfer.xml",
     slots=(Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15)),),
-    cameras=("camera", endoscope.NAME),
+    cameras=("camera", endoscope_camera.NAME),
     time_limit_s=60.0,
     settle_steps=SETTLE_STEPS,
     fields=(
@@ -279,15 +281,15 @@ TASK = Task(
     ),
     labels=("source", "target"),
     stages=STAGES,
-    words=words.WORDS,
+    text=text.TEXT,
     experts={"default": _expert, "one_wall": _expert_with_one_wall},
     graspable=("wall0", "wall1", "wall2"),
     bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tip[None],
-    place=place,
+    place_objects=place_objects,
     measure=measure,
-    judge=judge,
+    status=status,
     state=state,
     relative=relative,
     label=lambda layout: {"source": layout.source, "target": layout.target},
@@ -295,6 +297,6 @@ TASK = Task(
     obstacles=obstacles,
     floor=0.0,
     is_sound=is_sound,
-    outline=words.outline,
+    outline=text.outline,
     endoscope=workspaces.BOARD_ENDOSCOPE,
 )

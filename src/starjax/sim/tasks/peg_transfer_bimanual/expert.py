@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import handing
+from starjax.sim.tasks import handover
 from starjax.sim.tasks.peg_transfer import task as single
 from starjax.sim.tasks.peg_transfer_bimanual.task import PARK
 
@@ -52,7 +52,7 @@ def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, Any]
     Of the wall: its normal and its direction, `[3]` each, in the block's frame.
     """
     key, key_tempo = jax.random.split(key)
-    block = state.facts.block
+    block = state.measurements.block
     normals = single.wall_normals(block)
     way = state.layout.target_peg[1] - block.p[1]
     out = normals[jnp.argmin(jnp.abs(normals[:, 0]) + RAISED * way * normals[:, 1])]
@@ -62,7 +62,7 @@ def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, Any]
     return key, tempo, (block.R.T @ out, block.R.T @ along)
 
 
-def _following(script: handing.Script, state: EnvState) -> jax.Array:
+def _following(script: handover.HandoverScript, state: EnvState) -> jax.Array:
     return jnp.minimum(script.phase + 1, len(PHASES) - 1)
 
 
@@ -70,15 +70,15 @@ def _weight(phase: jax.Array, share: jax.Array) -> jax.Array:
     return jnp.asarray(DISTURBANCE, jnp.float32)[phase]
 
 
-def _goals(script: handing.Script, state: EnvState) -> tuple[jax.Array, jax.Array]:
+def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array, jax.Array]:
     """Where the tips go in every phase, from what is seen now, and the wall's normal."""
-    block, tips = state.facts.block, script.p
+    block, tips = state.measurements.block, script.p
     wall, along = script.held
     out, along = block.R @ wall, block.R @ along
     flat = out * jnp.array([1.0, 1.0, 0.0])
     flat = flat / jnp.maximum(jnp.linalg.norm(flat), 1e-6)
     normal = flat * jnp.where(flat[1] > 0, -1.0, 1.0)
-    outside = handing.OUT * flat
+    outside = handover.OUT * flat
     low = jnp.array([0.0, 0.0, -GRASP_DROP])
     give, take = (
         block.p + single.RIM_RADIUS * out + side * SIDE * along + low for side in (-1.0, 1.0)
@@ -113,7 +113,7 @@ def _goals(script: handing.Script, state: EnvState) -> tuple[jax.Array, jax.Arra
     return goals, normal
 
 
-PLAY = handing.Play(
+PLAY = handover.Play(
     choose=_choose,
     duration=np.array(DURATION),
     jaws=np.stack([GIVER, TAKER], -1),
@@ -124,4 +124,4 @@ PLAY = handing.Play(
     following=_following,
     goals=_goals,
 )
-AGENT = handing.agent(PLAY)
+AGENT = handover.agent(PLAY)

@@ -18,7 +18,7 @@ LIMIT_S = 300.0  # of FLS
 
 
 @flax.struct.dataclass
-class Layout:
+class SixBlocksLayout:
     """The block at hand as in the task, and the whole exercise.
 
     Attributes:
@@ -40,7 +40,7 @@ class Layout:
     since: jax.Array
 
 
-def sample(bound: single.Bound, key: jax.Array) -> Layout:
+def sample(bound: single.PegBound, key: jax.Array) -> SixBlocksLayout:
     """Draws the order, every block's offset and yaw, and the tips' starts; each as in the task."""
     key_order, key_blocks = jax.random.split(key)
     keys = jax.random.split(key_blocks, BLOCKS)
@@ -51,7 +51,7 @@ def sample(bound: single.Bound, key: jax.Array) -> Layout:
     offset = drawn.block.p[:, :2] - pegs[drawn.source]
     p = drawn.block.p.at[:, :2].set(pegs[sources] + offset)
     zero, no = jnp.zeros((), jnp.int32), jnp.zeros((3,))
-    layout = Layout(
+    layout = SixBlocksLayout(
         source=zero,
         target=zero,
         target_peg=no[:2],
@@ -67,8 +67,12 @@ def sample(bound: single.Bound, key: jax.Array) -> Layout:
 
 
 def begin(
-    bound: single.Bound, layout: Layout, turn: jax.Array, tips: jax.Array, step: jax.Array
-) -> Layout:
+    bound: single.PegBound,
+    layout: SixBlocksLayout,
+    turn: jax.Array,
+    tips: jax.Array,
+    step: jax.Array,
+) -> SixBlocksLayout:
     """The layout with another block's turn, from where the tips are at a control step."""
     target = layout.targets[turn]
     return layout.replace(
@@ -82,21 +86,23 @@ def begin(
     )
 
 
-def put(layout: Layout, block: Pose) -> Layout:
+def put(layout: SixBlocksLayout, block: Pose) -> SixBlocksLayout:
     """The layout with the block at hand left at a pose."""
     blocks = jax.tree.map(lambda x, at: x.at[layout.turn].set(at), layout.blocks, block)
     return layout.replace(blocks=blocks)
 
 
-def still(layout: Layout) -> Pose:
+def still(layout: SixBlocksLayout) -> Pose:
     """Where the five others stand, Pose `[5]`."""
     others = (layout.turn + 1 + jnp.arange(BLOCKS - 1)) % BLOCKS
     return jax.tree.map(lambda x: x[others], layout.blocks)
 
 
-def _obstacles(bound: single.Bound, layout: Layout, facts: task.Facts) -> Capsules:
+def _obstacles(
+    bound: single.PegBound, layout: SixBlocksLayout, measurements: task.BimanualMeasurements
+) -> Capsules:
     """Pegs, and the walls of all blocks."""
-    own = single.around(bound, facts.block)
+    own = single.around(bound, measurements.block)
     others = jax.vmap(lambda block: single.around(bound, block))(still(layout))
     walls = (x[:, -single.WALLS :].reshape(-1, *x.shape[2:]) for x in others)
     return Capsules(*(jnp.concatenate(parts) for parts in zip(own, walls, strict=True)))

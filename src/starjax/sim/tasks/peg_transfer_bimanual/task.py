@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import mujoco
 
 from starjax import rcm
-from starjax.sim import bodies, endoscope, workspaces
+from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks import two_arms
-from starjax.sim.tasks.base import Capsules, Field, Task, Verdict, Views
+from starjax.sim.tasks.base import Capsules, Field, SimReadings, Task, TaskStatus
 from starjax.sim.tasks.peg_transfer import task as single
-from starjax.sim.tasks.peg_transfer_bimanual import words
+from starjax.sim.tasks.peg_transfer_bimanual import text
 from starjax.types import Agent, Pose
 
 # Where the tips start, and an idle one waits: the shafts lean apart.
@@ -25,7 +25,7 @@ STAGES = ("approach", "grasped", "lifted", "passed", "at the target", "threaded"
 
 
 @flax.struct.dataclass
-class Layout:
+class BimanualLayout:
     """Drawn at reset: see `peg_transfer`; tips `[2, 3]` m."""
 
     source: jax.Array
@@ -36,7 +36,7 @@ class Layout:
 
 
 @flax.struct.dataclass
-class Facts:
+class BimanualMeasurements:
     """Measurements of one moment, and what has happened.
 
     Attributes:
@@ -55,19 +55,24 @@ class Facts:
     untouched: jax.Array
 
 
-def sample(bound: single.Bound, key: jax.Array) -> Layout:
+def sample(bound: single.PegBound, key: jax.Array) -> BimanualLayout:
     """As in `peg_transfer`, with two tips."""
     key_layout, key_tips = jax.random.split(key)
     drawn = single.sample(bound, key_layout)
     spread = jax.random.uniform(key_tips, (2, 3), minval=-SPREAD, maxval=SPREAD)
     tips = jnp.array(PARK) + spread
-    return Layout(drawn.source, drawn.target, drawn.target_peg, drawn.block, tips)
+    return BimanualLayout(drawn.source, drawn.target, drawn.target_peg, drawn.block, tips)
 
 
-def measure(bound: single.Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+def measure(
+    bound: single.PegBound,
+    layout: BimanualLayout,
+    readings: SimReadings,
+    before: BimanualMeasurements | None,
+) -> BimanualMeasurements:
     """The block, the jaws, and who has held it."""
-    block = bodies.free_pose(views.qpos, bound.block)
-    touch = views.touch
+    block = bodies.free_pose(readings.qpos, bound.block)
+    touch = readings.touch
     in_air = block.p[2] > single.RIM_HEIGHT + single.LIFTED
     lifted, passed = in_air & touch[0] & ~touch[1], jnp.zeros((), bool)
     untouched = jnp.zeros((), jnp.int32)
@@ -75,10 +80,10 @@ def measure(bound: single.Bound, layout: Layout, views: Views, before: Facts | N
         lifted = before.lifted | lifted
         passed = before.passed | (before.lifted & in_air & touch[1] & ~touch[0])
         untouched = jnp.where(touch.any(), 0, before.untouched + 1)
-    return Facts(
+    return BimanualMeasurements(
         block=block,
-        velocity=views.qvel[bound.block_dof : bound.block_dof + 6],
-        tips=views.pose.p,
+        velocity=readings.qvel[bound.block_dof : bound.block_dof + 6],
+        tips=readings.pose.p,
         touch=touch,
         lifted=lifted,
         passed=passed,
@@ -86,30 +91,39 @@ def measure(bound: single.Bound, layout: Layout, views: Views, before: Facts | N
     )
 
 
-def judge(bound: single.Bound, layout: Layout, facts: Facts) -> Verdict:
+def status(
+    bound: single.PegBound, layout: BimanualLayout, measurements: BimanualMeasurements
+) -> TaskStatus:
     """Strict: passed in the air, threaded, released, at rest. Loose: SurRoL's test."""
-    block, peg = facts.block, layout.target_peg
+    block, peg = measurements.block, layout.target_peg
     threaded, near = single.is_threaded(block, peg), single.is_near(block, peg)
-    good = threaded & facts.passed & single.is_at_rest(facts.velocity) & ~facts.touch.any()
-    lost = facts.lifted & (facts.untouched > DROPPED_STEPS) & ~threaded
-    stage = jnp.where(facts.touch[0], 1, 0)
-    stage = jnp.where(facts.lifted, 2, stage)
-    stage = jnp.where(facts.passed, 3, stage)
-    stage = jnp.where(facts.passed & near, 4, stage)
-    stage = jnp.where(facts.passed & threaded, 5, stage)
-    stage = jnp.where(good, 6, stage).astype(jnp.int32)
-    to_giver = jnp.linalg.norm(block.p - facts.tips[0])
-    to_taker = jnp.linalg.norm(block.p - facts.tips[1])
+    success_now = (
+        threaded
+        & measurements.passed
+        & single.is_at_rest(measurements.velocity)
+        & ~measurements.touch.any()
+    )
+    lost = measurements.lifted & (measurements.untouched > DROPPED_STEPS) & ~threaded
+    stage = jnp.where(measurements.touch[0], 1, 0)
+    stage = jnp.where(measurements.lifted, 2, stage)
+    stage = jnp.where(measurements.passed, 3, stage)
+    stage = jnp.where(measurements.passed & near, 4, stage)
+    stage = jnp.where(measurements.passed & threaded, 5, stage)
+    stage = jnp.where(success_now, 6, stage).astype(jnp.int32)
+    to_giver = jnp.linalg.norm(block.p - measurements.tips[0])
+    to_taker = jnp.linalg.norm(block.p - measurements.tips[1])
     to_peg = jnp.linalg.norm(block.p[:2] - peg)
     left = jnp.stack([to_giver, to_giver, to_taker, to_peg, to_peg, to_peg, to_peg])[stage]
-    reward = jnp.where(good, 1.0, (stage + jnp.exp(-left / single.NEAR)) / len(STAGES))
-    return Verdict(good, near, lost, stage, reward)
+    reward = jnp.where(success_now, 1.0, (stage + jnp.exp(-left / single.NEAR)) / len(STAGES))
+    return TaskStatus(success_now, near, lost, stage, reward)
 
 
-def state(bound: single.Bound, layout: Layout, facts: Facts) -> jax.Array:
+def state(
+    bound: single.PegBound, layout: BimanualLayout, measurements: BimanualMeasurements
+) -> jax.Array:
     """`[12]`: the block's position and rotation, the target's place."""
     goal = jnp.append(layout.target_peg, single.RIM_HEIGHT)
-    return jnp.concatenate([facts.block.p, rcm.rot6d_encode(facts.block.R), goal])
+    return jnp.concatenate([measurements.block.p, rcm.rot6d_encode(measurements.block.R), goal])
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
@@ -124,11 +138,13 @@ def _expert() -> Agent:
     return expert.AGENT
 
 
-def _obstacles(bound: single.Bound, layout: Layout, facts: Facts) -> Capsules:
-    return single.around(bound, facts.block)
+def _obstacles(
+    bound: single.PegBound, layout: BimanualLayout, measurements: BimanualMeasurements
+) -> Capsules:
+    return single.around(bound, measurements.block)
 
 
-def bind(m: mujoco.MjModel) -> single.Bound:
+def bind(m: mujoco.MjModel) -> single.PegBound:
     """As in `peg_transfer`."""
     return single.bind(m)
 
@@ -137,7 +153,7 @@ TASK = Task(
     name="peg_transfer_bimanual",
     mjcf="tasks/peg_transfer_bimanual/peg_transfer_bimanual.xml",
     slots=two_arms.SLOTS,
-    cameras=("side", endoscope.NAME),
+    cameras=("side", endoscope_camera.NAME),
     time_limit_s=60.0,
     settle_steps=single.SETTLE_STEPS,
     fields=(
@@ -147,15 +163,15 @@ TASK = Task(
     ),
     labels=("source", "target"),
     stages=STAGES,
-    words=words.WORDS,
+    text=text.TEXT,
     experts={"default": _expert},
     graspable=("wall0", "wall1", "wall2"),
     bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tips,
-    place=single.place,
+    place_objects=single.place_objects,
     measure=measure,
-    judge=judge,
+    status=status,
     state=state,
     relative=relative,
     label=lambda layout: {"source": layout.source, "target": layout.target},
@@ -163,7 +179,7 @@ TASK = Task(
     obstacles=_obstacles,
     floor=0.0,
     is_sound=single.is_sound,
-    outline=words.outline,
+    outline=text.outline,
     endoscope=workspaces.SIDE_ENDOSCOPE,
     trocars=two_arms.TROCARS,
 )

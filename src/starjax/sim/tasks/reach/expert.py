@@ -21,7 +21,7 @@ CALM = 0.8  # share of the way after which the disturbance has faded
 
 
 @flax.struct.dataclass
-class Script:
+class ReachScript:
     """One episode's script.
 
     Attributes:
@@ -37,7 +37,7 @@ class Script:
     noise: jax.Array
 
 
-def init(key: jax.Array, state: EnvState) -> Script:
+def init(key: jax.Array, state: EnvState) -> ReachScript:
     """Draws side and pace."""
     key, key_side, key_tempo = jax.random.split(key, 3)
     start, goal = state.pose.p[0], state.layout.p
@@ -48,10 +48,10 @@ def init(key: jax.Array, state: EnvState) -> Script:
     side = jax.random.rademacher(key_side, (), jnp.float32) * BULGE * length * across
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
     duration = jnp.maximum(length / SPEED, LEAST_TIME) / tempo
-    return Script(key, start, side, duration, jnp.zeros(()), jnp.zeros((2, 3)))
+    return ReachScript(key, start, side, duration, jnp.zeros(()), jnp.zeros((2, 3)))
 
 
-def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+def act(script: ReachScript, state: EnvState) -> tuple[Command, ReachScript, Command]:
     """The disturbed command to execute, the script, and the undisturbed one to record."""
     dt = 1.0 / CONTROL_HZ
     elapsed = script.elapsed + dt

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax.sim import endoscope, workspaces
-from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
-from starjax.sim.tasks.reach import words
+from starjax.sim import endoscope_camera, workspaces
+from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
+from starjax.sim.tasks.reach import text
 from starjax.types import Agent
 
 # Where an episode begins.
@@ -29,7 +29,7 @@ MARK_RGB = (0.98, 0.62, 0.1)
 
 
 @flax.struct.dataclass
-class Layout:
+class ReachLayout:
     """Drawn at reset.
 
     Attributes:
@@ -43,14 +43,14 @@ class Layout:
 
 
 @flax.struct.dataclass
-class Facts:
+class ReachMeasurements:
     """Measurements of one moment: the tip `[3]` m, and its speed in m/s."""
 
     tip: jax.Array
     speed: jax.Array
 
 
-class Bound(NamedTuple):
+class ReachBound(NamedTuple):
     """Ids in the compiled model.
 
     Attributes:
@@ -62,43 +62,45 @@ class Bound(NamedTuple):
     posts: np.ndarray
 
 
-def bind(m: mujoco.MjModel) -> Bound:
+def bind(m: mujoco.MjModel) -> ReachBound:
     """Resolves the ids of marks and posts."""
     count = sum(m.geom(g).name.startswith("mark") for g in range(m.ngeom))
     geoms = np.array([m.geom(f"mark{i}").id for i in range(count)])
     posts = np.array([m.geom(f"post{i}").size[0] for i in range(count)], np.float32)
-    return Bound(geoms, np.array(m.geom_pos[geoms], np.float32), posts)
+    return ReachBound(geoms, np.array(m.geom_pos[geoms], np.float32), posts)
 
 
-def sample(bound: Bound, key: jax.Array) -> Layout:
+def sample(bound: ReachBound, key: jax.Array) -> ReachLayout:
     """Draws the mark and the tip's start."""
     key_goal, key_tip = jax.random.split(key)
     goal = jax.random.randint(key_goal, (), 0, len(bound.marks))
     spread = jax.random.uniform(key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD)
-    return Layout(goal, jnp.asarray(bound.marks)[goal], jnp.array(TIP_HOME) + spread)
+    return ReachLayout(goal, jnp.asarray(bound.marks)[goal], jnp.array(TIP_HOME) + spread)
 
 
-def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+def measure(
+    bound: ReachBound, layout: ReachLayout, readings: SimReadings, before: ReachMeasurements | None
+) -> ReachMeasurements:
     """The tip and its speed."""
-    return Facts(views.pose.p[0], jnp.linalg.norm(views.velocity[0]))
+    return ReachMeasurements(readings.pose.p[0], jnp.linalg.norm(readings.velocity[0]))
 
 
-def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+def status(bound: ReachBound, layout: ReachLayout, measurements: ReachMeasurements) -> TaskStatus:
     """Strict: at the mark and at rest. Loose: near it, moving or not."""
-    off = jnp.linalg.norm(facts.tip - layout.p)
+    off = jnp.linalg.norm(measurements.tip - layout.p)
     at_mark, near = off < TOLERANCE, off < LOOSE
-    good = at_mark & (facts.speed < REST_SPEED)
-    stage = near.astype(jnp.int32) + at_mark + good
-    reward = jnp.where(good, 1.0, (stage + jnp.exp(-off / NEAR)) / len(STAGES))
-    return Verdict(good, near, jnp.zeros((), bool), stage, reward)
+    success_now = at_mark & (measurements.speed < REST_SPEED)
+    stage = near.astype(jnp.int32) + at_mark + success_now
+    reward = jnp.where(success_now, 1.0, (stage + jnp.exp(-off / NEAR)) / len(STAGES))
+    return TaskStatus(success_now, near, jnp.zeros((), bool), stage, reward)
 
 
-def colours(bound: Bound, layout: Layout, rgb: jax.Array) -> jax.Array:
+def colours(bound: ReachBound, layout: ReachLayout, rgb: jax.Array) -> jax.Array:
     """Marks the goal."""
     return rgb.at[jnp.asarray(bound.geoms)[layout.goal]].set(jnp.array(MARK_RGB))
 
 
-def obstacles(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+def obstacles(bound: ReachBound, layout: ReachLayout, measurements: ReachMeasurements) -> Capsules:
     """The posts below the marks."""
     marks = jnp.asarray(bound.marks)
     foot = marks.at[:, 2].set(0.0)
@@ -115,28 +117,28 @@ TASK = Task(
     name="reach",
     mjcf="tasks/reach/reach.xml",
     slots=(Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15)),),
-    cameras=("camera", endoscope.NAME),
+    cameras=("camera", endoscope_camera.NAME),
     time_limit_s=15.0,
     settle_steps=SETTLE_STEPS,
     fields=(Field("goal.p", 3, "point"),),
     labels=("goal",),
     stages=STAGES,
-    words=words.WORDS,
+    text=text.TEXT,
     experts={"default": _expert},
     graspable=(),
     bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tip[None],
-    place=lambda bound, qpos, layout: qpos,
+    place_objects=lambda bound, qpos, layout: qpos,
     measure=measure,
-    judge=judge,
-    state=lambda bound, layout, facts: layout.p,
+    status=status,
+    state=lambda bound, layout, measurements: layout.p,
     relative=lambda state, tips: (state - tips[..., 0, :]) / NEAR,
     label=lambda layout: {"goal": layout.goal},
     colours=colours,
     obstacles=obstacles,
     floor=0.0,
     is_sound=lambda bound, qpos, qvel: jnp.ones((), bool),
-    outline=words.outline,
+    outline=text.outline,
     endoscope=workspaces.BOARD_ENDOSCOPE,
 )

@@ -34,11 +34,11 @@ SMOOTHED = 0.003  # m to either side over which the wire's direction is taken
 DEVIATION = (0.0012, 0.0012, 0.0012, 0.05)  # m and rad, of the disturbance
 STOPS = (*task.BENDS[1:-1], task.START)  # m along the way
 AHEAD = 0.001  # m, the least way to the next stop
-TURNS = 4  # of finding a pose whose roll and position depend on each other
+ROUNDS = 4  # of finding a pose whose roll and position depend on each other
 
 
 @flax.struct.dataclass
-class Script:
+class RingScript:
     """Where the script stands; single episode.
 
     Attributes:
@@ -69,20 +69,20 @@ class Script:
     noise: jax.Array
 
 
-def init(key: jax.Array, state: EnvState) -> Script:
+def init(key: jax.Array, state: EnvState) -> RingScript:
     """The script at the start of an episode."""
     key_tempo, key = jax.random.split(key)
     zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
     way = jnp.append(0.0, state.pose.p[0])
-    script = Script(
+    script = RingScript(
         key, none, none, zero, zero, tempo, jnp.ones(()), zero, way, way, way, zero, jnp.ones(()),
         jnp.ones(()), jnp.zeros((2, 4)),
     )  # fmt: skip
     return _enter(script, jnp.asarray(APPROACH, jnp.int32), state)
 
 
-def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Command]:
     """The disturbed command to execute, the script, and the undisturbed one to record."""
     dt = 1.0 / CONTROL_HZ
     is_over = script.elapsed >= script.duration - 1e-6
@@ -107,25 +107,25 @@ def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
     return _command(way + moved, jaws, state), script, _command(way, jaws, state)
 
 
-def _lifted(script: Script, state: EnvState) -> jax.Array:
+def _lifted(script: RingScript, state: EnvState) -> jax.Array:
     """`[4]`: from where a descent begins to as far down the shaft as it goes."""
     return jnp.append(0.0, HOVER * _shaft(script.goal[1:], state))
 
 
-def _following(script: Script, state: EnvState) -> jax.Array:
+def _following(script: RingScript, state: EnvState) -> jax.Array:
     """The phase after the present one: the next carry, or again from the start without the tab."""
     is_carry, is_there = script.phase == CARRY, script.stop >= STOPS[-1] - 1e-6
     following = jnp.where(is_carry & ~is_there, CARRY, script.phase + 1)
     is_held = (script.phase >= LIFT) & (script.phase <= CARRY)
-    following = jnp.where(is_held & ~state.facts.touch, RAISE, following)
-    is_away = state.layout.way * state.facts.ring.p[1] < task.END
+    following = jnp.where(is_held & ~state.measurements.touch, RAISE, following)
+    is_away = state.layout.way * state.measurements.ring.p[1] < task.END
     at_last = jnp.where(is_away, RAISE, WAIT)
     return jnp.where(script.phase == WAIT, at_last, following).astype(jnp.int32)
 
 
-def _enter(script: Script, phase: jax.Array, state: EnvState) -> Script:
+def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
     """Begins `phase` with a goal from what is seen now."""
-    ring, here = state.facts.ring, script.way
+    ring, here = state.measurements.ring, script.way
     is_approach = phase == APPROACH
     attempt = script.attempt + is_approach
     key_side, key_grasp = jax.random.split(jax.random.fold_in(script.key, attempt))
@@ -186,9 +186,9 @@ def _carrying(y: jax.Array, lowered: jax.Array, roll: jax.Array, state: EnvState
     rise = task.height(y + SMOOTHED) - task.height(y - SMOOTHED)
     normal = -jnp.stack([jnp.zeros(()), jnp.array(2.0 * SMOOTHED), rise])
     held: Pose = jax.tree.map(lambda leaf: leaf[0], state.pose)
-    in_tool = held.R.T @ (state.facts.ring.p - held.p)
+    in_tool = held.R.T @ (state.measurements.ring.p - held.p)
     way = jnp.append(roll, held.p)
-    for _ in range(TURNS):
+    for _ in range(ROUNDS):
         way = _turned(way[1:], normal, roll, state)
         R = _command(way, jnp.zeros(()), state).pose.R[0]
         way = way.at[1:].set(point - R @ in_tool)
@@ -204,7 +204,7 @@ def _turned(p: jax.Array, normal: jax.Array, roll: jax.Array, state: EnvState) -
 
 def _shaft(p: jax.Array, state: EnvState) -> jax.Array:
     """The direction `[3]` of a shaft with its tip at `p`."""
-    away = p - state.told.p_world_trocar[0]
+    away = p - state.measured_trocar.p_world_trocar[0]
     return away / jnp.linalg.norm(away)
 
 

@@ -13,10 +13,10 @@ import mujoco
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import bodies, endoscope, workspaces
-from starjax.sim.tasks.base import Capsules, Field, Slot, Task, Verdict, Views
+from starjax.sim import bodies, endoscope_camera, workspaces
+from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.peg_transfer.task import is_at_rest
-from starjax.sim.tasks.ring_on_wire import words
+from starjax.sim.tasks.ring_on_wire import text
 from starjax.types import Agent, Pose
 
 # As in ring_on_wire.xml (a test holds these to the compiled model).
@@ -56,7 +56,7 @@ MAX_DISTANCE = 0.3
 
 
 @flax.struct.dataclass
-class Layout:
+class RingLayout:
     """Drawn at reset.
 
     Attributes:
@@ -72,7 +72,7 @@ class Layout:
 
 
 @flax.struct.dataclass
-class Facts:
+class RingMeasurements:
     """Measurements of one moment, and how it went so far.
 
     Attributes:
@@ -90,7 +90,7 @@ class Facts:
     rubbed: jax.Array
 
 
-class Bound(NamedTuple):
+class RingBound(NamedTuple):
     """Ids and shapes in the compiled model.
 
     Attributes:
@@ -109,14 +109,14 @@ class Bound(NamedTuple):
     radius: float
 
 
-def bind(m: mujoco.MjModel) -> Bound:
+def bind(m: mujoco.MjModel) -> RingBound:
     """Resolves the ids of ring and wire."""
     names = [m.geom(g).name for g in range(m.ngeom)]
     wire = [g for g, name in enumerate(names) if name.startswith(("wire", "post"))]
     last = len(BENDS) - 2
     ends = [[f"wire{last}", "post1"], ["wire0", "post0"]]  # by the episode's start
-    pieces = np.array([words.capsule_ends(m.geom(g)) for g in wire], np.float32)
-    return Bound(
+    pieces = np.array([text.capsule_ends(m.geom(g)) for g in wire], np.float32)
+    return RingBound(
         ring=int(m.joint("ring").qposadr[0]),
         dof=int(m.joint("ring").dofadr[0]),
         tube=np.array([g for g, name in enumerate(names) if name.startswith("ring")]),
@@ -132,7 +132,7 @@ def height(y: jax.Array) -> jax.Array:
     return jnp.interp(y, jnp.array(BENDS), jnp.array(HEIGHTS))
 
 
-def sample(bound: Bound, key: jax.Array) -> Layout:
+def sample(bound: RingBound, key: jax.Array) -> RingLayout:
     """Draws the end, the ring's place on it and yaw, and the tip's start."""
     key_start, key_place, key_yaw, key_tip = jax.random.split(key, 4)
     start = jax.random.randint(key_start, (), 0, 2)
@@ -144,10 +144,10 @@ def sample(bound: Bound, key: jax.Array) -> Layout:
     tip = jnp.array(TIP_HOME) + jax.random.uniform(
         key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD
     )
-    return Layout(start, way, Pose(rcm.rotation_z(yaw), p), tip)
+    return RingLayout(start, way, Pose(rcm.rotation_z(yaw), p), tip)
 
 
-def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
+def place_objects(bound: RingBound, qpos: jax.Array, layout: RingLayout) -> jax.Array:
     """Hangs the ring where it was drawn."""
     R = layout.ring.R
     half, zero = 0.5 * jnp.arctan2(R[1, 0], R[0, 0]), jnp.zeros(())
@@ -155,10 +155,12 @@ def place(bound: Bound, qpos: jax.Array, layout: Layout) -> jax.Array:
     return qpos.at[bound.ring : bound.ring + 7].set(coords)
 
 
-def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) -> Facts:
+def measure(
+    bound: RingBound, layout: RingLayout, readings: SimReadings, before: RingMeasurements | None
+) -> RingMeasurements:
     """The ring, and how often it has touched the wire."""
-    ring = bodies.free_pose(views.qpos, bound.ring)
-    geom, close = views.contacts.geom, views.contacts.dist < 0
+    ring = bodies.free_pose(readings.qpos, bound.ring)
+    geom, close = readings.contacts.geom, readings.contacts.dist < 0
     of_tube, of_wire = (
         jnp.any(geom[..., None] == jnp.asarray(ids), axis=(-2, -1))
         for ids in (bound.tube, bound.wire)
@@ -167,39 +169,39 @@ def measure(bound: Bound, layout: Layout, views: Views, before: Facts | None) ->
     rubbed = jnp.zeros((), jnp.int32)
     if before is not None:
         rubbed = before.rubbed + (rubs & (jnp.abs(ring.p[1]) < -BENDS[1]))
-    return Facts(
+    return RingMeasurements(
         ring=ring,
-        velocity=views.qvel[bound.dof : bound.dof + 6],
-        tip=views.pose.p[0],
-        touch=views.touch[0],
+        velocity=readings.qvel[bound.dof : bound.dof + 6],
+        tip=readings.pose.p[0],
+        touch=readings.touch[0],
         rubs=rubs,
         rubbed=rubbed,
     )
 
 
-def judge(bound: Bound, layout: Layout, facts: Facts) -> Verdict:
+def status(bound: RingBound, layout: RingLayout, measurements: RingMeasurements) -> TaskStatus:
     """Strict: carried to the end with little touching, released, at rest. Loose: at the end."""
-    p, way = facts.ring.p, layout.way * facts.ring.p[1]
+    p, way = measurements.ring.p, layout.way * measurements.ring.p[1]
     raised = p[2] - (height(p[1]) - HANG)
     at_end = (way > END) & (way < -BENDS[0])
     hangs = at_end & (jnp.abs(raised) < HANG_TOLERANCE)
-    may = facts.rubbed <= MAY_TOUCH
-    good = hangs & may & ~facts.touch & is_at_rest(facts.velocity)
-    stage = jnp.where(facts.touch, 1, 0)
-    stage = jnp.where(facts.touch & (raised > LIFTED), 2, stage)
+    may = measurements.rubbed <= MAY_TOUCH
+    success_now = hangs & may & ~measurements.touch & is_at_rest(measurements.velocity)
+    stage = jnp.where(measurements.touch, 1, 0)
+    stage = jnp.where(measurements.touch & (raised > LIFTED), 2, stage)
     stage = jnp.where((stage == 2) & (way > BENDS[1]), 3, stage)
     stage = jnp.where(at_end, 4, stage)
-    stage = jnp.where(good, 5, stage).astype(jnp.int32)
-    to_tab = jnp.linalg.norm(p + TAB * facts.ring.R[:, 2] - facts.tip)
+    stage = jnp.where(success_now, 5, stage).astype(jnp.int32)
+    to_tab = jnp.linalg.norm(p + TAB * measurements.ring.R[:, 2] - measurements.tip)
     left = jnp.where(stage == 0, to_tab, jnp.maximum(END - way, 0.0))
-    reward = jnp.where(good, 1.0, (stage + jnp.exp(-left / NEAR)) / len(STAGES))
-    return Verdict(good, at_end, ~may, stage, reward)
+    reward = jnp.where(success_now, 1.0, (stage + jnp.exp(-left / NEAR)) / len(STAGES))
+    return TaskStatus(success_now, at_end, ~may, stage, reward)
 
 
-def state(bound: Bound, layout: Layout, facts: Facts) -> jax.Array:
+def state(bound: RingBound, layout: RingLayout, measurements: RingMeasurements) -> jax.Array:
     """`[12]`: the ring's position and rotation, the place where it is to hang."""
     goal = jnp.stack([jnp.zeros(()), layout.way * START, jnp.array(HEIGHTS[-1] - HANG)])
-    return jnp.concatenate([facts.ring.p, rcm.rot6d_encode(facts.ring.R), goal])
+    return jnp.concatenate([measurements.ring.p, rcm.rot6d_encode(measurements.ring.R), goal])
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
@@ -212,18 +214,18 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([off / NEAR, turned / NEAR, above, R[..., :1, 1], (goal - p) / NEAR], -1)
 
 
-def colours(bound: Bound, layout: Layout, rgb: jax.Array) -> jax.Array:
+def colours(bound: RingBound, layout: RingLayout, rgb: jax.Array) -> jax.Array:
     """Marks the end to which the ring belongs."""
     return rgb.at[jnp.asarray(bound.ends)[layout.start]].set(jnp.array(GOAL_RGB))
 
 
-def obstacles(bound: Bound, layout: Layout, facts: Facts) -> Capsules:
+def obstacles(bound: RingBound, layout: RingLayout, measurements: RingMeasurements) -> Capsules:
     """Wire and posts."""
     start, end = jnp.moveaxis(jnp.asarray(bound.pieces), 1, 0)
     return Capsules(start, end, jnp.full(len(bound.pieces), bound.radius))
 
 
-def is_sound(bound: Bound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+def is_sound(bound: RingBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Whether the ring is slower, and nearer, than anything physical."""
     speed = jnp.max(jnp.abs(qvel[bound.dof : bound.dof + 3]))
     away = jnp.max(jnp.abs(qpos[bound.ring : bound.ring + 3]))
@@ -240,7 +242,7 @@ TASK = Task(
     name="ring_on_wire",
     mjcf="tasks/ring_on_wire/ring_on_wire.xml",
     slots=(Slot(workspace="wire", p_world_ref=(0.0, 0.0, 0.15), tool="grasper_wide"),),
-    cameras=("camera", endoscope.NAME),
+    cameras=("camera", endoscope_camera.NAME),
     time_limit_s=60.0,
     settle_steps=SETTLE_STEPS,
     fields=(
@@ -250,15 +252,15 @@ TASK = Task(
     ),
     labels=("start",),
     stages=STAGES,
-    words=words.WORDS,
+    text=text.TEXT,
     experts={"default": _expert},
     graspable=("tab0", "tab1"),
     bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tip[None],
-    place=place,
+    place_objects=place_objects,
     measure=measure,
-    judge=judge,
+    status=status,
     state=state,
     relative=relative,
     label=lambda layout: {"start": layout.start},
@@ -266,6 +268,6 @@ TASK = Task(
     obstacles=obstacles,
     floor=0.0,
     is_sound=is_sound,
-    outline=words.outline,
+    outline=text.outline,
     endoscope=workspaces.WIRE_ENDOSCOPE,
 )

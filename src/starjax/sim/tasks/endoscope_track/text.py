@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax.sim.tasks.base import Outline, Words
+from starjax.sim.tasks.base import Outline, TaskText
 
-WORDS = Words(
+TEXT = TaskText(
     title="endoscope tracking",
     done="kept the instrument's tip in the middle of the picture",
     strict="tip in the middle within 5% of the picture's side, picture level within 3 degrees, tip "

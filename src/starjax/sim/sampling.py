@@ -4,15 +4,15 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
-from starjax.sim import registry
+from starjax.sim import registries
 from starjax.sim.tasks.base import Task
 
 
-def trocars(key: jax.Array, task: Task, shape: tuple[int, ...] = ()) -> rcm.Trocar:
+def sample_trocars(key: jax.Array, task: Task, shape: tuple[int, ...] = ()) -> rcm.Trocar:
     """Draws configurations, fields `[*shape, A]`: Eq. 19 with the ranges of each workspace."""
     arms = []
     for a, slot in enumerate(task.slots):
-        work = registry.workspaces.get(slot.workspace)
+        work = registries.workspaces.get(slot.workspace)
         arms.append(
             rcm.sample_trocar(
                 jax.random.fold_in(key, a) if a else key,

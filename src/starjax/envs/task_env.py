@@ -14,7 +14,7 @@ class TaskEnv(gymnasium.Env):
     """One episode of a task at a time.
 
     Attributes:
-      episodes: its pure functions, see `episodes.Episodes`.
+      episodes: its pure functions, see `mdp.Episodes`.
     """
 
     metadata = vector.METADATA
@@ -24,7 +24,7 @@ class TaskEnv(gymnasium.Env):
 
         Args:
           render_mode: `rgb_array` or None.
-          given: see `settings.Settings`.
+          given: see `settings.EnvSettings`.
 
         Raises:
           errors.UsageError: an argument is unknown or out of range.

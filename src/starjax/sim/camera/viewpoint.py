@@ -34,7 +34,7 @@ class View(NamedTuple):
     textures: dict[int, Look]
 
 
-def fixed(scene: geometry.Scene, grid: tiles.Grid) -> View:
+def fixed(scene: geometry.RenderScene, grid: tiles.Grid) -> View:
     """The view of a camera that is fixed in the world, of a scene read in its frame."""
     drawn = texture.draw(scene, grid)
     direction = None if scene.sun is None else scene.sun.direction
@@ -47,7 +47,7 @@ def fixed(scene: geometry.Scene, grid: tiles.Grid) -> View:
     )
 
 
-def moving(scene: geometry.Scene, grid: tiles.Grid, pose_world_cam: Pose) -> View:
+def moving(scene: geometry.RenderScene, grid: tiles.Grid, pose_world_cam: Pose) -> View:
     """The view from a pose, of a scene read in the world's frame."""
     R_world_cam, p_world_cam = (jnp.asarray(x, jnp.float32) for x in pose_world_cam)
     R_light_cam = to_sun = None

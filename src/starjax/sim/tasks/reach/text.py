@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax.sim.tasks.base import Outline, Words
+from starjax.sim.tasks.base import Outline, TaskText
 
-WORDS = Words(
+TEXT = TaskText(
     title="reach",
     done="brought the tip to the marked point",
     strict="within 2 mm of the marked point and at rest for 1 s, in time",

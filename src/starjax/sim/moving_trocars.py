@@ -11,7 +11,7 @@ from starjax.types import Command, Pose
 HELD = 1e-5  # m; a commanded shaft this near to its trocar was meant to pass it
 
 
-def trocars_to(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvState:
+def move_trocars(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvState:
     """The state with its trocars elsewhere, of which agents are told; what stays keeps its bits.
 
     The arms have not moved: until they do, their tools miss the trocars. The next steps bring them
@@ -22,11 +22,11 @@ def trocars_to(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvState
     """
     is_moved = jnp.any(p_world_trocar != state.trocar.p_world_trocar)
     moved = frame_at(env, p_world_trocar)
-    trocar, told = (
+    trocar, measured_trocar = (
         jax.tree.map(lambda new, old: jnp.where(is_moved, new, old), moved, frame)
-        for frame in (state.trocar, state.told)
+        for frame in (state.trocar, state.measured_trocar)
     )
-    return state.replace(trocar=trocar, told=told)
+    return state.replace(trocar=trocar, measured_trocar=measured_trocar)
 
 
 def frame_at(env: Env, p_world_trocar: jax.Array) -> rcm.TrocarFrame:

@@ -1,8 +1,8 @@
 """Phrases of needle hand-over, for reports."""
 
-from starjax.sim.tasks.needle_pick import words
+from starjax.sim.tasks.needle_pick import text
 
-WORDS = words.WORDS._replace(
+TEXT = text.TEXT._replace(
     title="needle hand-over",
     done="handed the needle over in the air",
     strict="lifted by one tool, taken over in the air, and held for 2 s by the other alone without "
@@ -13,4 +13,4 @@ WORDS = words.WORDS._replace(
     goal="the needle is to be handed over",
     lost="the needle was dropped",
 )
-outline = words.outline
+outline = text.outline

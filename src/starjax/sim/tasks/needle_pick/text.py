@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax.sim.tasks.base import Outline, Words
+from starjax.sim.tasks.base import Outline, TaskText
 
-WORDS = Words(
+TEXT = TaskText(
     title="needle pick",
     done="picked up the needle",
     strict="lifted by 20 mm and held for 2 s without slipping by more than 0.5 mm, its point free, "

@@ -15,7 +15,7 @@ from starjax.sim import env as envs
 from starjax.sim import physics
 from starjax.sim.scene import Scene
 from starjax.sim.state import Env, EnvState
-from starjax.sim.tasks.base import Views
+from starjax.sim.tasks.base import SimReadings
 from starjax.sim.tasks.peg_transfer_bimanual import six, task
 from starjax.types import Agent, Command, Pose
 
@@ -33,7 +33,7 @@ def make(
     cameras: Sequence[str] = (),
 ) -> Env:
     """Builds the exercise, see `sim.env.make`. Its label `moved` is how many blocks are over."""
-    return of(
+    return wrap(
         envs.make(
             six.TASK.name,
             arms,
@@ -46,7 +46,7 @@ def make(
     )
 
 
-def of(env: Env) -> Env:
+def wrap(env: Env) -> Env:
     """The exercise in an environment of `six.TASK`."""
 
     def step(state: EnvState, command: Command) -> EnvState:
@@ -65,7 +65,7 @@ def of(env: Env) -> Env:
     return env._replace(step=step, labels=labels)
 
 
-def anew(agent: Agent) -> Agent:
+def reset_each_block(agent: Agent) -> Agent:
     """An agent with a memory of one block's transfer, which begins again with every block."""
 
     def init(key: jax.Array, state: EnvState) -> tuple:
@@ -94,9 +94,9 @@ def _withdrawing(state: EnvState) -> Command:
     up = left.at[:, 2].set(jnp.maximum(left[:, 2], HEIGHT))
     p = jnp.where(rises, up, jnp.array(task.PARK))
     with jax.default_matmul_precision("highest"):
-        roll = rcm.ACTION_SPACES["rcm4"].encode(state.pose, state.told)[:, :1]
+        roll = rcm.ACTION_SPACES["rcm4"].encode(state.pose, state.measured_trocar)[:, :1]
         pose, _ = rcm.ACTION_SPACES["rcm4"].decode(
-            jnp.concatenate([jnp.where(rises, roll, 0.0), p], axis=-1), state.told
+            jnp.concatenate([jnp.where(rises, roll, 0.0), p], axis=-1), state.measured_trocar
         )
     return Command(pose, jnp.ones(len(p)))
 
@@ -104,23 +104,25 @@ def _withdrawing(state: EnvState) -> Command:
 def _next(scene: Scene, state: EnvState) -> EnvState:
     """The block at hand stays where it is, the next one is at hand; the arms go on as they do."""
     bound = scene.bound
-    layout = six.put(state.layout, Pose(state.facts.block.R, state.facts.block.p))
+    layout = six.put(state.layout, Pose(state.measurements.block.R, state.measurements.block.p))
     turn = jnp.minimum(layout.turn + 1, six.BLOCKS - 1)
     layout = six.begin(bound, layout, turn, state.pose.p, state.step)
     own = slice(bound.block_dof, bound.block_dof + 6)
     after = physics.PhysicsState(
-        qpos=scene.task.place(bound, state.physics.qpos, layout),
+        qpos=scene.task.place_objects(bound, state.physics.qpos, layout),
         qvel=state.physics.qvel.at[own].set(0.0),
         qacc_warmstart=state.physics.qacc_warmstart.at[own].set(0.0),
     )
     touch, still = jnp.zeros_like(state.touch), jnp.zeros_like(state.pose.p)
     contacts = physics.no_contacts(scene)
-    views = Views(after.qpos, after.qvel, state.pose, still, state.gripper, touch, contacts)
+    readings = SimReadings(
+        after.qpos, after.qvel, state.pose, still, state.gripper, touch, contacts
+    )
     no = jnp.zeros((), bool)
     return state.replace(
         physics=after,
         layout=layout,
-        facts=scene.task.measure(bound, layout, views, None),
+        measurements=scene.task.measure(bound, layout, readings, None),
         settled=jnp.zeros((), jnp.int32),
         stage=jnp.zeros((), jnp.int32),
         touch=touch,

@@ -24,8 +24,8 @@ import jax
 import jax.numpy as jnp
 
 from starjax import extras, rcm
-from starjax.envs import ranges, trocars
-from starjax.envs.settings import Settings
+from starjax.envs import ranges, trocar_draws
+from starjax.envs.settings import EnvSettings
 from starjax.types import Command, Pose
 
 SHARE = 0.1  # of half an action's range, in a control step: of a tip 0.15 m/s, as the arms can
@@ -69,7 +69,7 @@ class Episodes(NamedTuple):
     env: Any
 
 
-def make(settings: Settings) -> Episodes:
+def make(settings: EnvSettings) -> Episodes:
     """Builds the functions; they are not yet compiled.
 
     Raises:
@@ -90,7 +90,7 @@ def make(settings: Settings) -> Episodes:
     task, space = env.task, rcm.ACTION_SPACES[settings.action_space]
     low, high = (jnp.asarray(end) for end in ranges.actions(task, space.name))
     is_relative = settings.control == "relative"
-    draw = trocars.make(task, settings.trocar)
+    draw = trocar_draws.make(task, settings.trocar)
     max_steps = round(task.time_limit_s * env.control_hz)
     max_steps = min(max_steps, settings.max_episode_steps or max_steps)
 
@@ -99,14 +99,14 @@ def make(settings: Settings) -> Episodes:
         return env.reset(key_env, envs.EnvParams(draw(key_trocar)))
 
     def scaled(state: Any, pose: Pose) -> jax.Array:
-        return (2.0 * space.encode(pose, state.told) - high - low) / (high - low)
+        return (2.0 * space.encode(pose, state.measured_trocar) - high - low) / (high - low)
 
     def decode(state: Any, action: jax.Array) -> Command:
         parts = jnp.clip(action, -1.0, 1.0).reshape(task.arms, space.dim + 1)
         wanted, jaws = parts[:, :-1], parts[:, -1]
         if is_relative:
             wanted = jnp.clip(scaled(state, state.pose) + SHARE * wanted, -1.0, 1.0)
-        pose, _ = space.decode(0.5 * (high + low + (high - low) * wanted), state.told)
+        pose, _ = space.decode(0.5 * (high + low + (high - low) * wanted), state.measured_trocar)
         return Command(pose, jaws)
 
     def encode(state: Any, command: Command) -> jax.Array:

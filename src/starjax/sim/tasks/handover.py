@@ -24,7 +24,7 @@ OUT = 0.006  # m along the normal, from which a tool comes in to its grasp
 
 
 @flax.struct.dataclass
-class Script:
+class HandoverScript:
     """Where the script stands; single episode. Arrays `[2, ...]` are of both arms.
 
     Attributes:
@@ -76,17 +76,17 @@ class Play(NamedTuple):
     turned: np.ndarray
     looks: np.ndarray
     weight: Callable[[jax.Array, jax.Array], jax.Array]
-    following: Callable[[Script, EnvState], jax.Array]
-    goals: Callable[[Script, EnvState], tuple[jax.Array, jax.Array]]
+    following: Callable[[HandoverScript, EnvState], jax.Array]
+    goals: Callable[[HandoverScript, EnvState], tuple[jax.Array, jax.Array]]
 
 
 def agent(play: Play) -> Agent:
     """The demonstrator of a play."""
 
-    def init(key: jax.Array, state: EnvState) -> Script:
+    def init(key: jax.Array, state: EnvState) -> HandoverScript:
         key, tempo, held = play.choose(key, state)
         p, zero, open_ = state.pose.p, jnp.zeros(2), jnp.ones(2)
-        script = Script(
+        script = HandoverScript(
             key=key,
             phase=jnp.zeros((), jnp.int32),
             elapsed=jnp.zeros(()),
@@ -106,13 +106,15 @@ def agent(play: Play) -> Agent:
         )
         return _enter(play, script, jnp.zeros((), jnp.int32), state)
 
-    def act(script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+    def act(script: HandoverScript, state: EnvState) -> tuple[Command, HandoverScript, Command]:
         return _act(play, script, state)
 
     return Agent(init, act)
 
 
-def _act(play: Play, script: Script, state: EnvState) -> tuple[Command, Script, Command]:
+def _act(
+    play: Play, script: HandoverScript, state: EnvState
+) -> tuple[Command, HandoverScript, Command]:
     """The disturbed commands to execute, the script, and the undisturbed ones to record."""
     is_over = script.elapsed >= script.duration - 1e-6
     after = _enter(play, script, play.following(script, state), state)
@@ -142,7 +144,7 @@ def _act(play: Play, script: Script, state: EnvState) -> tuple[Command, Script, 
     return rough, script, scripting.command(script.roll, script.p, script.jaws, state)
 
 
-def _enter(play: Play, script: Script, phase: jax.Array, state: EnvState) -> Script:
+def _enter(play: Play, script: HandoverScript, phase: jax.Array, state: EnvState) -> HandoverScript:
     """Begins `phase` with goals from what is seen now."""
     goals, normal = play.goals(script, state)
     goal = goals[phase]

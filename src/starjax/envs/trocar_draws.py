@@ -1,4 +1,4 @@
-"""Where the trocars of an episode are, as `Settings.trocar` says."""
+"""Where the trocars of an episode are, as `EnvSettings.trocar` says."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import errors, rcm
-from starjax.sim import drawn
+from starjax.sim import sampling
 from starjax.sim.tasks.base import Task
 
 Draw = Callable[[jax.Array], rcm.Trocar]
@@ -20,7 +20,7 @@ def make(task: Task, trocar: str | int | tuple) -> Draw:
       errors.UsageError: the task has no configuration of that number, or not so many arms.
     """
     if trocar == "random":
-        return lambda key: drawn.trocars(key, task)
+        return lambda key: sampling.sample_trocars(key, task)
     if isinstance(trocar, tuple):
         fields = [np.asarray(field, np.float32) for field in trocar]
         if fields[0].shape not in ((1,), (task.arms,)):

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax.sim.tasks.base import Outline, Words
+from starjax.sim.tasks.base import Outline, TaskText
 
-WORDS = Words(
+TEXT = TaskText(
     title="ring on wire",
     done="carried the ring along the wire to its end",
     strict="at the marked end of the wire, released and at rest, having touched the bent part for "

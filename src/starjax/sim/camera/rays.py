@@ -26,7 +26,7 @@ def features(kind: int, c: Array, R: Array, size: Array) -> Array:
     Args:
       c: `[N, 3]` centres in m.
       R: `[N, 3, 3]` orientations, both in the camera (for `view`) or light frame (for `shadow`).
-      size: `[N, 3]` as in `Scene`.
+      size: `[N, 3]` as in `RenderScene`.
     """
     if kind in (scenes.CAPSULE, scenes.CYLINDER):
         u = R[:, :, 2]

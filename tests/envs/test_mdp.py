@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.envs import episodes, playground, ranges, settings
-from starjax.sim import registry
+from starjax.envs import mdp, playground, ranges, settings
+from starjax.sim import registries
 from starjax.types import Command, Pose
 
 STEPS = 40
@@ -34,11 +34,11 @@ def frame(task):
 @pytest.mark.parametrize("space", rcm.ACTION_SPACES)
 def test_the_workspace_lies_within_the_bounds_of_actions(task, space):
     """Poses whose tip and roll are the workspace's, seen through a trocar that nobody tried."""
-    task = registry.tasks.get(task)
+    task = registries.tasks.get(task)
     low, high = ranges.actions(task, space)
     assert low.shape == high.shape == (task.arms, rcm.ACTION_SPACES[space].dim)
     assert (high - low > 0.05).all() and np.isfinite(high - low).all()
-    work = registry.workspaces.get(task.slots[0].workspace)
+    work = registries.workspaces.get(task.slots[0].workspace)
     drawn = np.random.default_rng(0).uniform(size=(200, task.arms, 4))
     bottom, top = (np.array([r, *x]) for r, x in zip(work.rolls, (work.low, work.high)))
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(bottom + (top - bottom) * drawn, frame(task))
@@ -50,10 +50,10 @@ def test_the_workspace_lies_within_the_bounds_of_actions(task, space):
 @pytest.mark.parametrize("space", ["se3", "rcm1", "rcm2", "rcm3", "rcm4"])
 @pytest.mark.parametrize("control", settings.CONTROLS)
 def test_an_action_says_the_pose_that_it_is_made_from(env, start, space, control):
-    made = episodes.make(settings.make(task="reach", action_space=space, control=control))
+    made = mdp.make(settings.make(task="reach", action_space=space, control=control))
     near = start.data.pose.p + jnp.array([0.002, -0.001, -0.014])
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(
-        jnp.concatenate([jnp.array([[0.1]]), near], -1), start.data.told
+        jnp.concatenate([jnp.array([[0.1]]), near], -1), start.data.measured_trocar
     )
     command = Command(pose, jnp.array([0.5]))
     data = start.data.replace(pose=Pose(pose.R, near + 0.001))
@@ -65,7 +65,7 @@ def test_an_action_says_the_pose_that_it_is_made_from(env, start, space, control
 
 @pytest.mark.parametrize("space", ["rcm1", "rcm4"])
 def test_whatever_the_action_the_shaft_goes_through_the_trocar(start, space):
-    made = episodes.make(settings.make(task="reach", action_space=space))
+    made = mdp.make(settings.make(task="reach", action_space=space))
     actions = jax.random.uniform(jax.random.key(2), (500, made.action_size), minval=-3, maxval=3)
     command = jax.vmap(made.decode, (None, 0))(start.data, actions)
     error = rcm.rcm_error(command.pose, start.data.trocar.p_world_trocar)
@@ -75,7 +75,7 @@ def test_whatever_the_action_the_shaft_goes_through_the_trocar(start, space):
 def outcome(start, reward="dense", **changed):
     given = settings.make(task="reach", reward=reward, max_episode_steps=STEPS)
     after = start.data.replace(step=start.data.step + 1, **changed)
-    return episodes.make(given).judge(start.data, after)
+    return mdp.make(given).judge(start.data, after)
 
 
 def test_rewards(start):

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax.sim.tasks.base import Outline, Words
+from starjax.sim.tasks.base import Outline, TaskText
 
-WORDS = Words(
+TEXT = TaskText(
     title="peg transfer",
     done="moved the block to its peg",
     strict="on the target peg, released, at rest, in time",

@@ -31,14 +31,14 @@ def search(
     workspace: Workspace,
     seed: int = 0,
     tilts: bool = False,
-    tell: Callable[[Fit], None] = lambda _: None,
+    on_round: Callable[[Fit], None] = lambda _: None,
 ) -> tuple[Mount, Fit]:
     """The best mount that differential evolution finds, and its worst figures.
 
     Args:
       tilts: whether the base may also lean, or hang.
       seed: the same one gives the same mount on the same machine.
-      tell: called with the worst figures after each round.
+      on_round: called with the worst figures after each round.
     """
     every = mounts.targets(workspace)
     middle = mounts.middle(workspace)
@@ -75,7 +75,7 @@ def search(
         mount = _mount(at, middle, x)
         reached = mounts.fit(at, mount, every)
         least = mounts.worst(reached)
-        tell(least)
+        on_round(least)
         if best is None or _score(least) > _score(best[1]):
             best = mount, least
         chosen = _harder(reached, chosen)
@@ -106,7 +106,7 @@ def _merit(
     middle: Targets,
     poses: Targets,
     candidates: jax.Array,
-    settings: mounts.Settings,
+    settings: mounts.ArmSettings,
 ) -> jax.Array:
     """How good candidates `[S, 6 + J]` are, `[S]` rad; negative where a pose is not reached."""
 
@@ -125,7 +125,7 @@ def _merit(
 
 
 def _home(
-    chain: ik.Chain, middle: Targets, guess: jax.Array, settings: mounts.Settings
+    chain: ik.Chain, middle: Targets, guess: jax.Array, settings: mounts.ArmSettings
 ) -> tuple[jax.Array, jax.Array]:
     """The configuration at the middle of the workspace that is found from a guess `[J]`."""
     if settings.remote_centre:

@@ -1,8 +1,8 @@
 """Phrases of peg transfer with two arms, for reports."""
 
-from starjax.sim.tasks.peg_transfer import words
+from starjax.sim.tasks.peg_transfer import text
 
-WORDS = words.WORDS._replace(
+TEXT = text.TEXT._replace(
     title="bimanual peg transfer",
     done="handed the block over in the air and put it on its peg",
     strict="lifted by one tool, passed in the air, threaded on the target peg by the other, "
@@ -11,4 +11,4 @@ WORDS = words.WORDS._replace(
     collided="touched board, peg or block with shaft or arm, or shafts or arms touched",
     lost="the block was dropped",
 )
-outline = words.outline
+outline = text.outline
