@@ -52,11 +52,11 @@ def observation(height=0.03):
 @contextlib.contextmanager
 def running(batches, port=0, key=KEY, clients=8):
     """A server of compiled `batches`; yields (host, port), its counts."""
-    settings = server.ServerSettings(port=port, batch=batches.most, clients=clients)
+    settings = server.ServerSettings(port=port, batch=batches.max_robots, clients=clients)
     stop, heard = threading.Event(), queue.Queue()
-    with server._bound(settings) as address:
+    with server._bind(settings) as address:
         about = server.metadata(batches.policy, "tiny")
-        one = server._Served(batches, settings, about, key)
+        one = server._Server(batches, settings, about, key)
         work = threading.Thread(
             target=lambda: server.asyncio.run(
                 one.serve(address, stop.is_set, lambda *where: heard.put(where))

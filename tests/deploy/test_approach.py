@@ -149,8 +149,8 @@ def test_a_tip_aside_of_the_demonstrated_ones_is_not_led(compact):
     assert refused(compact, pose, trocar).argument == "max_first_move"
 
 
-@pytest.mark.parametrize(("beyond", "unknown"), [(1e-5, False), (0.05, True)])
-def test_a_tip_at_the_edge_of_the_demonstrated_ones_is_known(beyond, unknown):
+@pytest.mark.parametrize(("beyond", "outside"), [(1e-5, False), (0.05, True)])
+def test_a_tip_at_the_edge_of_the_demonstrated_ones_is_known(beyond, outside):
     """Commands end there, so rounding must not decide."""
     stats = normalizer.Normalizer(normalizer.MinMax(-0.05 * np.ones(5), 0.05 * np.ones(5)), None)
     p_world_ref = np.float32([0.0, 0.0, 0.15])
@@ -163,7 +163,7 @@ def test_a_tip_at_the_edge_of_the_demonstrated_ones_is_known(beyond, unknown):
     )
     now = jax.tree.map(lambda x: jnp.asarray(x)[None, None], pose)
     told = jax.tree.map(lambda x: jnp.asarray(x)[None, None], told)
-    assert bool(approach._is_unknown("rcm4", stats, now, told).all()) is unknown
+    assert bool(approach._is_outside("rcm4", stats, now, told).all()) is outside
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 1.0, np.pi - 1e-3, np.pi])
@@ -175,7 +175,7 @@ def test_a_way_is_straight_and_ends_at_the_command(angle):
     R = np.asarray(rcm.rot6d_decode(RNG.normal(size=(1, 1, 6))))
     p = np.zeros((1, 1, 3), np.float32)
     now, begin = (rcm.pose_at_depth(np.float32(x), d, p) for x, d in ((R, 0.01), (R @ turn, 0.1)))
-    way = approach._way(now, begin, p, 2000)
+    way = approach._approach(now, begin, p, 2000)
     assert np.abs(way.p[:, -1] - begin.p).max() < 1e-5
     if angle < np.pi:  # there two ways are as short
         assert turns(way.R[:, -1], begin.R).max() < 2e-3

@@ -111,7 +111,7 @@ def test_commands_keep_to_the_manifold_and_do_not_jump(seed):
     for _ in range(150):
         if executor.needs_plan:
             executor.on_request()
-        if rng.random() < 0.3 and executor._is_asked:
+        if rng.random() < 0.3 and executor._is_pending:
             axis = rng.normal(size=(HORIZON, 3)) * [0.5, 0.5, 0.1] - [0.0, 0.0, 1.0]
             roll, depth = rng.uniform(-3.0, 3.0, HORIZON), rng.uniform(0.02, 0.2, HORIZON)
             pose = rcm.pose_on_manifold(np.float32(axis), roll, depth, WHERE)
@@ -175,7 +175,7 @@ def test_settings_that_cannot_be_are_named(ahead, limits):
 def batches(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(registries, "tasks", registries.Registry("task", {"fake": "fakes:TASK"}))
-        made = batching.Batches(served.policy(tmp_path_factory.mktemp("client")), most=1)
+        made = batching.Batches(served.policy(tmp_path_factory.mktemp("client")), max_robots=1)
         made.warm_up()
         yield made
 

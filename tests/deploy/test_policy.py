@@ -228,15 +228,11 @@ def test_a_mistake_names_the_array(made):
     for message, given in mistakes.items():
         with pytest.raises(ValueError, match=message):
             deployed(jax.random.key(0), *given)
-    with pytest.raises(ValueError, match=r"key: expected a jax\.random\.key, .*got int"):
-        deployed(0, good, trocar)
-    with pytest.raises(ValueError, match=r"key: expected .*one for all robots, got key<fry>\[3\]"):
-        deployed(jax.random.split(jax.random.key(0), 3), good, trocar)
-    with pytest.raises(ValueError, match=r"key: expected .*got uint32\[1, 2\]"):
-        deployed(np.zeros((1, 2), np.uint32), good, trocar)
-    for no_key in (np.zeros(2), np.zeros(3, np.uint32), np.array([0, 1])):
-        with pytest.raises(ValueError, match=r"key: expected .*one for all robots"):
+    keys = jax.random.split(jax.random.key(0), 3)
+    for no_key in (0, keys, *map(np.zeros, (2, (1, 2))), np.zeros(3, np.uint32), np.array([0, 1])):
+        with pytest.raises(UsageError) as caught:
             deployed(no_key, good, trocar)
+        assert caught.value.argument == "key"
 
 
 def test_numbers_that_no_robot_measures_are_refused(made):
@@ -421,7 +417,7 @@ def test_one_number_of_one_robot_is_enough_to_refuse(made):
     pose, mirror = good.pose, np.diag([-1.0, 1.0, 1.0]).astype(np.float32)
     bad = {
         "gripper: expected finite": {"gripper": changed(good.gripper, lambda x: np.nan)},
-        "gripper: expected numbers": {"gripper": changed(good.gripper, lambda x: -2.0)},
+        "gripper: expected values": {"gripper": changed(good.gripper, lambda x: -2.0)},
         "R: expected rot": {"pose": pose._replace(R=changed(pose.R, lambda x: x @ mirror))},
         "R: expected rotations": {"pose": pose._replace(R=changed(pose.R, lambda x: 1.1 * x))},
         "p: expected tips": {"pose": pose._replace(p=changed(pose.p, lambda x: x + 1.0))},

@@ -29,7 +29,7 @@ def registered():
 
 @pytest.fixture(scope="module")
 def batches(tmp_path_factory):
-    made = batching.Batches(served.policy(tmp_path_factory.mktemp("serve")), most=3)
+    made = batching.Batches(served.policy(tmp_path_factory.mktemp("serve")), max_robots=3)
     made.warm_up()
     return made
 
@@ -80,22 +80,22 @@ def test_clients_that_share_a_call_get_their_own_plans_and_mistakes(batches):
         wire.decode_request(batches.policy.input_spec, asked(batches, seed, 0.02 + 0.01 * seed))
         for seed in range(3)
     ]
-    alone = [batches.decide([request])[0] for request in requests]
+    alone = [batches.infer([request])[0] for request in requests]
     tip = requests[1].observation.pose._replace(p=np.full((2, 3), 9.0, np.float32))
     far = requests[1]._replace(observation=requests[1].observation.replace(pose=tip))
     no_port = requests[1]._replace(trocar=rcm.Trocar(*np.float32([-1.0, 0.0, 0.0])))
-    programs = batches.policy._decide._cache_size()
+    programs = batches.policy._infer._cache_size()
     for bad, argument in ((far, "observation.pose.p"), (no_port, "trocar")):
-        first, wrong, last = batches.decide([requests[0], bad, requests[2]])
+        first, wrong, last = batches.infer([requests[0], bad, requests[2]])
         assert isinstance(wrong, UsageError) and wrong.argument == argument
         for got, wanted in ((first, alone[0]), (last, alone[2])):
             np.testing.assert_allclose(got["p"], wanted["p"], atol=1e-5)
-    together = batches.decide(requests)
+    together = batches.infer(requests)
     for got, wanted in zip(together, alone):
         np.testing.assert_allclose(got["actions"], wanted["actions"], atol=1e-4)
     assert np.abs(alone[0]["p"] - alone[1]["p"]).max() > 1e-3
     # Of 1, 2 and 3 robots, all of them compiled before.
-    assert batches.sizes == [1, 2, 3] and programs == batches.policy._decide._cache_size()
+    assert batches.sizes == [1, 2, 3] and programs == batches.policy._infer._cache_size()
 
 
 def test_a_request_without_a_key_gets_another_noise_each_time(batches, up):
@@ -123,7 +123,7 @@ def test_several_clients_at_once(batches, up):
         thread.join()
     for seed in range(6):
         request = wire.decode_request(batches.policy.input_spec, asked(batches, seed))
-        wanted = batches.decide([request])[0]["p"]
+        wanted = batches.infer([request])[0]["p"]
         for plan in plans[seed]:
             np.testing.assert_allclose(plan, wanted, atol=1e-5)
     assert counts.calls - calls <= 30
@@ -177,21 +177,21 @@ def test_a_fault_of_the_device_is_told_and_passes(batches, up, monkeypatch):
         def broken(*given):
             raise RuntimeError("out of memory")
 
-        patch.setattr(batches, "decide", broken)
+        patch.setattr(batches, "infer", broken)
         assert "out of memory" in infer(connection, asked(batches))
         patch.undo()
         assert isinstance(infer(connection, asked(batches)), dict)
 
 
 def test_it_ends_while_it_decides(batches, monkeypatch):
-    begun, decide = threading.Event(), batches.decide
+    begun, decide = threading.Event(), batches.infer
 
     def slowly(requests):
         begun.set()
         time.sleep(0.5)
         return decide(requests)
 
-    monkeypatch.setattr(batches, "decide", slowly)
+    monkeypatch.setattr(batches, "infer", slowly)
     with served.running(batches) as (where, counts):
         connections = [connect(where) for _ in range(4)]  # one more than a call takes
         for connection in connections:

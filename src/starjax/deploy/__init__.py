@@ -1,4 +1,4 @@
-"""A trained policy in a program of one's own (`load`), or served to robots elsewhere (`Client`)."""
+"""Trained policies in other programs: in this process (`load`) or over a socket (`Client`)."""
 
 from starjax.deploy.client import Client, Robot
 from starjax.deploy.inputs import FARTHEST

@@ -1,4 +1,4 @@
-"""Plans of several clients in one call: fixed batch sizes, every client's mistakes its own."""
+"""Batched inference for several clients: fixed batch sizes, errors per client."""
 
 import time
 from collections.abc import Sequence
@@ -15,79 +15,80 @@ from starjax.errors import UsageError
 from starjax.rcm import arrays
 
 _DOWN = np.array([0.0, 0.0, -1.0], np.float32)
-_DEEP = 0.07  # m, of the tool that a program is warmed up with
+_DEPTH = 0.07  # m, of the tool that the programs are compiled with
 
 
 class Batches:
-    """Decides for at most `most` robots at once, with programs of 1, 2, 4, ... of them.
+    """Plans for up to `max_robots` robots at once, with programs of 1, 2, 4, ... robots.
 
     Attributes:
-      sizes: of the batches; a smaller one is filled up with its first robot.
+      sizes: batch sizes; a smaller batch is padded with its first robot.
       key_size: words of a random key's data.
     """
 
-    def __init__(self, policy: Deployed, most: int, seed: int | None = None) -> None:
-        self.policy, self.most = policy, most
-        self.sizes = [*(1 << n for n in range((most - 1).bit_length())), most]
+    def __init__(self, policy: Deployed, max_robots: int, seed: int | None = None) -> None:
+        self.policy, self.max_robots = policy, max_robots
+        self.sizes = [*(1 << n for n in range((max_robots - 1).bit_length())), max_robots]
         self.key_size = jax.random.key_data(jax.random.key(0)).shape[-1]
-        self._drawn = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(seed)
 
     def warm_up(self) -> None:
-        """Compiles the program of every size, so that no request waits for it."""
+        """Compiles the programs of all sizes, so no request waits for a compilation."""
         for size in self.sizes:
-            self.decide([example(self.policy)] * size)
+            self.infer([example(self.policy)] * size)
 
     @arrays.broadcasting
-    def decide(self, requests: Sequence[wire.Request]) -> list[dict[str, Any] | UsageError]:
-        """Answers at most `most` requests: each with its `wire.encode_reply`, or its mistake."""
-        begun, spec = time.perf_counter(), self.policy.input_spec
-        answers: list[Any] = [None] * len(requests)
-        good, rows = [], []
-        for i, asked in enumerate(requests):
+    def infer(self, requests: Sequence[wire.Request]) -> list[dict[str, Any] | UsageError]:
+        """Answers up to `max_robots` requests, each by `wire.encode_reply` or its error."""
+        begun = time.perf_counter()
+        replies: list[Any] = [None] * len(requests)
+        valid, rows = [], []
+        for i, request in enumerate(requests):
             try:
-                rows.append(inputs.validate(spec, asked.observation, asked.trocar))
-                good.append(i)
+                spec = self.policy.input_spec
+                rows.append(inputs.validate(spec, request.observation, request.trocar))
+                valid.append(i)
             except UsageError as error:
-                answers[i] = error
-            except ValueError as error:  # `rcm.check_trocar`
-                answers[i] = UsageError("trocar", "a trocar", str(error))
-        if not good:
-            return answers
-        size = next(size for size in self.sizes if size >= len(good))
-        rows += rows[:1] * (size - len(rows))
-        keys = [self._key(requests[i].key) for i in good]
-        keys = np.stack([*keys, *keys[:1] * (size - len(keys))])
-        seen, trocar = jax.tree.map(lambda *parts: np.stack(parts), *rows)
-        planned = self.policy.plan(jax.random.wrap_key_data(jnp.asarray(keys)), seen, trocar)
-        command, found = jax.device_get(planned)
-        decided_ms = 1e3 * (time.perf_counter() - begun)
-        for row, i in enumerate(good):
-            one, first = (jax.tree.map(lambda x: x[row], part) for part in (command, found))  # noqa: B023
+                replies[i] = error
+            except ValueError as error:  # of `rcm.check_trocar`
+                replies[i] = UsageError("trocar", "finite radius >= 0 and angles", str(error))
+        if not valid:
+            return replies
+        size = next(size for size in self.sizes if size >= len(valid))
+        padding = size - len(valid)
+        rows += rows[:1] * padding
+        keys = [self._key(requests[i].key) for i in valid]
+        keys = jnp.asarray(np.stack([*keys, *keys[:1] * padding]))
+        sensors, trocar = jax.tree.map(lambda *parts: np.stack(parts), *rows)
+        plans = self.policy.plan(jax.random.wrap_key_data(keys), sensors, trocar)
+        plans = jax.device_get(plans)
+        infer_ms = 1e3 * (time.perf_counter() - begun)
+        for row, i in enumerate(valid):
+            command, offset = jax.tree.map(lambda x: x[row], plans)  # noqa: B023
             try:
-                self.policy.check_first(first)
-                answers[i] = wire.encode_reply(one, decided_ms)
+                self.policy.check_first(offset)
+                replies[i] = wire.encode_reply(command, infer_ms)
             except UsageError as error:
-                answers[i] = error
-        return answers
+                replies[i] = error
+        return replies
 
-    def _key(self, given: np.ndarray | None) -> np.ndarray:
-        if given is not None:
-            return given
-        return self._drawn.integers(0, 1 << 32, self.key_size, np.uint32)
+    def _key(self, data: np.ndarray | None) -> np.ndarray:
+        if data is not None:
+            return data
+        return self._rng.integers(0, 1 << 32, self.key_size, np.uint32)
 
 
 def example(policy: Deployed) -> wire.Request:
-    """A request of tools at rest in the nominal trocars, straight down."""
+    """Returns a request of tools at rest in the nominal trocars, straight down."""
     spec = policy.input_spec
     trocar = rcm.Trocar(*(np.full(spec.arms, x, np.float32) for x in (0.0, np.pi / 2, 0.0)))
-    pose = rcm.pose_on_manifold(_DOWN, 0.0, _DEEP, spec.p_world_ref)
-    moments = (spec.moments, *spec.arms)
+    pose = rcm.pose_on_manifold(_DOWN, 0.0, _DEPTH, spec.p_world_ref)
     repeated: list[Any] = [np.broadcast_to(x, (spec.moments, *np.shape(x))) for x in pose]
-    side = (spec.moments, spec.image_size, spec.image_size, 3)
-    images = {name: np.zeros(side, np.uint8) for name in spec.cameras}
+    size = (spec.moments, spec.image_size, spec.image_size, 3)
+    images = {name: np.zeros(size, np.uint8) for name in spec.cameras}
     observation = inputs.RobotObservation(
         pose=types.Pose(*repeated),
-        gripper=np.ones(moments, np.float32),
+        gripper=np.ones((spec.moments, *spec.arms), np.float32),
         images=images or None,
         state=None if images else np.zeros((spec.moments, spec.state_size), np.float32),
     )

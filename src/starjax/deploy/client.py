@@ -1,4 +1,4 @@
-"""A robot's end of `starjax serve`: a command every control step, whatever the network does.
+"""The robot's side of `starjax serve`: one command per control step on any network.
 
 >>> with deploy.Client("127.0.0.1:8000", trocar) as client:
 ...     report = client.run(robot, seconds=20.0)
@@ -20,15 +20,15 @@ from starjax.deploy.plan_executor import LIMITS, Limits, PlanExecutor, Report
 from starjax.errors import UsageError
 from starjax.types import Command
 
-TIMEOUT_S = 1.0  # for an answer, and for a connection
-WAIT_S = 10.0  # for the first one
+TIMEOUT_S = 1.0  # of a reply, and of a connection attempt
+WAIT_S = 10.0  # for the first connection
 
 
 class Robot(Protocol):
-    """A robot, as `Client.run` drives it."""
+    """A robot that `Client.run` can drive."""
 
     def measure(self) -> RobotObservation:
-        """This moment: pose `[*arms]`, gripper `[*arms]`, image `[h, w, 3]`, images or state."""
+        """Measures pose `[*arms]`, gripper `[*arms]`, and image `[h, w, 3]`, images or state."""
         ...
 
     def send(self, command: Command) -> None:
@@ -39,18 +39,17 @@ class Robot(Protocol):
 class Client:
     """A robot's control loop, with plans from a server.
 
-    `step` takes what is measured and gives the next command; it never waits. The next plan is asked
-    for ahead, so that it is there when the one before has been carried out. Where it is late more
-    of the old plan is carried out, and then the last command again: a pose on the RCM
-    manifold, with the jaws as they were. That is also given before the first plan, for the tool as
-    it was measured. A server that is gone is looked for until it is there again.
+    `step` maps measurements to the next command and never blocks. Plans are requested ahead, so
+    they usually arrive before the previous plan ends. While a plan is late, the client executes
+    more of the old one, then repeats the last command: a pose on the RCM manifold, with the jaws
+    unchanged. Before the first plan it holds the measured pose. It reconnects to a lost server.
 
-    Every command is on the RCM manifold of the given trocar, and no farther from the one before
-    than `limits`, whatever the server answers.
+    Every command is on the RCM manifold of the given trocar and within `limits` of the previous
+    one; no reply can break that.
 
     Attributes:
-      metadata: what the server says of itself, see `server.metadata`.
-      control_hz: commands a second.
+      metadata: the server's greeting, see `server.metadata`.
+      control_hz: commands per second.
       p_world_trocar: `[*arms, 3]` m.
     """
 
@@ -67,79 +66,77 @@ class Client:
         wait_s: float = WAIT_S,
         connect: Callable[..., Any] = Connection,
     ) -> None:
-        """Connects and compiles what a step needs.
+        """Connects and compiles the programs of `step`.
 
         Args:
-          address: `HOST:PORT`, or `ws://` or `wss://` before it.
-          trocar: where the trocars are, fields `[*arms]`.
-          key: random key of all decisions; None for one drawn by the server for each.
+          address: `HOST:PORT`, optionally with `ws://` or `wss://` in front.
+          trocar: measured trocars, fields `[*arms]`.
+          key: random key of all inferences; None: the server draws them.
           api_key: of the server.
-          ahead: control steps before a plan is due that it is asked for; None for as many as the
-            last answers took, and one.
-          limits: between two commands.
-          timeout_s: until an answer is given up, and the connection made anew.
-          wait_s: for the server to be there.
-          connect: makes the connection; a program that simulates one gives its own.
+          ahead: control steps between a request and the end of the present plan; None: the largest
+            recent latency plus one.
+          limits: between consecutive commands.
+          timeout_s: of a reply; after it the client reconnects.
+          wait_s: for the first connection.
+          connect: makes the connection; simulated ones replace it.
 
         Raises:
           UsageError: there is no server, it refuses the key, its policy does not keep to the RCM
-            manifold, or the trocar is none.
+            manifold, or the trocar is invalid.
         """
         self._connection = connect(address, api_key, timeout_s, wait_s)
         try:
             self.metadata = self._connection.metadata
-            self._input_spec = _read_spec(self.metadata)
+            self._input_spec = spec = _read_spec(self.metadata)
             self.control_hz = float(self.metadata["control_hz"])
-            self._trocar = _trocar(trocar, self._input_spec.arms)
-            where = rcm.trocar_position(self._trocar, self._input_spec.p_world_ref)
-            self.p_world_trocar = np.asarray(where, np.float32)
+            self._trocar = _trocar(trocar, spec.arms)
+            p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)
+            self.p_world_trocar = np.asarray(p_world_trocar, np.float32)
             horizon, execute = int(self.metadata["horizon"]), int(self.metadata["execute"])
             self._executor = PlanExecutor(self.p_world_trocar, horizon, execute, ahead, limits)
         except BaseException:
             self._connection.close()
             raise
-        self._key, self._asked = key, 0
-        self._next_key()
-        self._seen: collections.deque[RobotObservation] = collections.deque(
-            maxlen=self._input_spec.moments
-        )
+        self._key, self._requests = key, 0
+        self._next_key()  # compiles it
+        self._moments: collections.deque[RobotObservation] = collections.deque(maxlen=spec.moments)
 
     @property
     def report(self) -> Report:
-        """Counts of what happened so far."""
+        """Returns the counts so far."""
         return self._executor.report
 
     @property
     def reconnected(self) -> int:
-        """How often the connection was made again."""
+        """Returns the number of reconnections."""
         return self._connection.connections - 1
 
     def step(self, moment: RobotObservation) -> Command:
-        """The next command `[*arms]`, of what is measured now.
+        """Returns the next command `[*arms]`.
 
         Args:
-          moment: as `Robot.measure` gives it.
+          moment: present measurements, as of `Robot.measure`.
 
         Raises:
-          UsageError: the first moment's tool does not go through the trocar.
+          UsageError: the first moment's tool does not pass through the trocar.
         """
         executor = self._executor
         if executor.last is None:
             executor.begin(moment.pose, moment.gripper)
-            self._seen.extend([moment] * self._input_spec.moments)
+            self._moments.extend([moment] * self._input_spec.moments)
         else:
-            self._seen.append(moment)
-        self._listen()
+            self._moments.append(moment)
+        self._receive()
         if executor.needs_plan and self._connection.is_up:
             self._connection.send(self._request())
             executor.on_request()
-            self._listen()
+            self._receive()
         return executor.step()
 
     def run(
         self, robot: Robot, seconds: float, should_stop: Callable[[], bool] = lambda: False
     ) -> Report:
-        """Drives a robot in real time for so many seconds, or until `should_stop()`."""
+        """Drives a robot in real time for `seconds`, or until `should_stop()`."""
         period, due = 1.0 / self.control_hz, time.monotonic()
         for _ in range(round(seconds * self.control_hz)):
             if should_stop():
@@ -149,7 +146,7 @@ class Client:
             rest = due - time.monotonic()
             if rest < 0:
                 self.report.overran += 1
-                due -= rest  # periods that are lost are not made up for: the robot would rush
+                due -= rest  # lost periods are not made up for: the robot would rush
             time.sleep(max(rest, 0.0))
         return self.report
 
@@ -163,7 +160,7 @@ class Client:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _listen(self) -> None:
+    def _receive(self) -> None:
         reply = self._connection.poll()
         if reply is None:
             return
@@ -177,22 +174,22 @@ class Client:
 
     def _request(self) -> dict[str, Any]:
         key = self._next_key()
-        self._asked += 1
-        seen = jax.tree.map(lambda *moments: np.stack(moments), *self._seen)
-        return wire.encode_request(self._input_spec, seen, self._trocar, key)
+        self._requests += 1
+        observation = jax.tree.map(lambda *moments: np.stack(moments), *self._moments)
+        return wire.encode_request(self._input_spec, observation, self._trocar, key)
 
     def _next_key(self) -> np.ndarray | None:
         if self._key is None:
             return None
-        return np.asarray(jax.random.key_data(jax.random.fold_in(self._key, self._asked)))
+        return np.asarray(jax.random.key_data(jax.random.fold_in(self._key, self._requests)))
 
 
 def _read_spec(metadata: dict[str, Any]) -> InputSpec:
     try:
-        said: dict[str, Any] = {
+        fields: dict[str, Any] = {
             k: tuple(v) if isinstance(v, list) else v for k, v in metadata["asks"].items()
         }
-        spec = InputSpec(**said)
+        spec = InputSpec(**fields)
     except (KeyError, TypeError, AttributeError) as error:
         raise UsageError("address", "a server of starjax", f"another one: {error!r}") from None
     if not spec.keeps_to_manifold:

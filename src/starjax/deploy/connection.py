@@ -1,6 +1,6 @@
-"""A robot's connection to a server, in a thread of its own, which connects again when it breaks.
+"""A robot's connection to a server: its own thread, reconnects when the connection breaks.
 
-Nothing here waits in the caller's thread but the first connection.
+Only the first connection blocks the caller's thread.
 """
 
 import logging
@@ -14,10 +14,10 @@ from websockets.sync import client as sockets
 from starjax.deploy import wire
 from starjax.errors import UsageError
 
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.05, 1.0  # between two tries to connect
-_LOOK_S = 0.05  # between two looks whether an idle connection is still there
-_MOST_ANSWER = 1 << 24  # bytes of a frame that a server may send
-_SILENT = logging.getLogger("starjax.link")
+_FIRST_WAIT_S, _MAX_WAIT_S = 0.05, 1.0  # between two attempts to connect; doubles
+_POLL_S = 0.05  # between two checks of an idle connection
+_MAX_REPLY = 1 << 24  # bytes of a server's frame
+_SILENT = logging.getLogger("starjax.connection")
 _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
 
@@ -26,9 +26,9 @@ class Reply(NamedTuple):
     """Outcome of a request.
 
     Attributes:
-      value: the frame's value; None where there is none.
-      fault: why there is none, else empty.
-      is_lost: whether it was the connection, or time, and not the server that refused it.
+      value: the frame's value, or None without an answer.
+      fault: reason of a missing value, else empty.
+      is_lost: True if the connection broke or timed out, False if the server refused.
     """
 
     value: Any
@@ -37,30 +37,30 @@ class Reply(NamedTuple):
 
 
 class Connection:
-    """A connection that is there again and again; one request at a time.
+    """A self-reconnecting connection; one request at a time.
 
     Attributes:
       address: `ws://HOST:PORT`.
-      metadata: what the server said of itself; one that says something else later is not asked.
-      fault: why there is no connection now, else empty.
-      connections: how often it was made.
+      metadata: the server's greeting. A server with another policy's is not connected to.
+      fault: reason of a missing connection, else empty.
+      connections: number of connections so far.
     """
 
     def __init__(self, address: str, api_key: str, timeout_s: float, wait_s: float) -> None:
         """Connects.
 
         Raises:
-          UsageError: there is no such server within `wait_s`, or it refuses the key.
+          UsageError: no server answers within `wait_s`, or it refuses the key.
         """
         self.address = address if "://" in address else f"ws://{address}"
         self.metadata: dict[str, Any] = {}
-        self.fault, self.connections = "no server there", 0
+        self.fault, self.connections = "no server at this address", 0
         self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else {}
         self._timeout_s = timeout_s
         self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
         self._up, self._closing = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._work, name="starjax-link", daemon=True)
+        self._thread = threading.Thread(target=self._work, name="starjax-connection", daemon=True)
         self._thread.start()
         if not self._up.wait(wait_s):
             self.close()
@@ -68,22 +68,19 @@ class Connection:
 
     @property
     def is_up(self) -> bool:
-        """Whether a request can be sent now."""
+        """Returns True if a request can be sent now."""
         return self._up.is_set()
 
     def send(self, value: dict[str, Any]) -> None:
-        """Sends a request, where none is under way."""
+        """Sends a request; the previous one must have its reply."""
         self._requests.put(wire.pack(value))
 
     def poll(self) -> Reply | None:
-        """Outcome of the request, None as long as it is not known."""
-        try:
-            return self._replies.get_nowait()
-        except queue.Empty:
-            return None
+        """Returns the reply to the request, None while it is pending."""
+        return self.wait(0.0)
 
     def wait(self, seconds: float) -> Reply | None:
-        """Waits at most `seconds` for what `poll` returns."""
+        """Waits at most `seconds` for the reply."""
         try:
             return self._replies.get(timeout=seconds)
         except queue.Empty:
@@ -99,57 +96,59 @@ class Connection:
         wait_s = _FIRST_WAIT_S
         while not self._closing.is_set():
             try:
-                with self._connected() as connection:
-                    self._greeted(connection.recv(self._timeout_s))
+                with self._open() as socket:
+                    self._greet(socket.recv(self._timeout_s))
                     wait_s = _FIRST_WAIT_S
-                    self._talk(connection)
-            # A name that cannot be one is a ValueError of the resolver.
+                    self._exchange(socket)
+            # The resolver raises ValueError for impossible host names.
             except (OSError, ValueError, websockets.WebSocketException) as error:
                 self.fault = str(error) or type(error).__name__
             self._up.clear()
             self._closing.wait(wait_s)
-            wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+            wait_s = min(2 * wait_s, _MAX_WAIT_S)
 
-    def _connected(self) -> sockets.ClientConnection:
+    def _open(self) -> sockets.ClientConnection:
         return sockets.connect(
             self.address,
             additional_headers=self._headers,
             compression=None,
-            max_size=_MOST_ANSWER,
+            max_size=_MAX_REPLY,
             open_timeout=self._timeout_s,
             close_timeout=self._timeout_s,
             logger=_SILENT,
         )
 
-    def _greeted(self, frame: Any) -> None:
+    def _greet(self, frame: Any) -> None:
         metadata = wire.unpack(frame)
         if not isinstance(metadata, dict) or metadata.get("protocol") != wire.PROTOCOL:
             raise UsageError("address", f"a server of protocol {wire.PROTOCOL}", self.address)
-        if self.metadata and metadata.get("digest") != self.metadata.get("digest"):
-            raise UsageError("address", "the policy that was there before", "another one")
+        digest, before = metadata.get("digest"), self.metadata.get("digest")
+        if self.metadata and digest != before:
+            raise UsageError("address", f"policy {before} as before reconnecting", digest)
         self.metadata, self.fault = metadata, ""
         self.connections += 1
         self._up.set()
 
-    def _talk(self, connection: Any) -> None:
-        """Answers requests until the connection breaks, which loses the one under way."""
-        while (frame := self._next_request(connection)) is not None:
+    def _exchange(self, socket: Any) -> None:
+        """Exchanges requests and replies until the connection breaks, which loses the request."""
+        while (frame := self._next_request(socket)) is not None:
             try:
-                connection.send(frame)
-                answer = connection.recv(self._timeout_s)
+                socket.send(frame)
+                reply = socket.recv(self._timeout_s)
             except (OSError, websockets.WebSocketException) as error:
-                self._up.clear()  # before the loss is known: nobody asks a connection that is gone
+                # First down, then the reply: the caller must not send on a broken connection.
+                self._up.clear()
                 self._replies.put(Reply(None, str(error) or "no answer in time", is_lost=True))
                 raise
-            self._replies.put(_read(answer))
+            self._replies.put(_read(reply))
 
-    def _next_request(self, connection: Any) -> bytes | None:
-        """The next request, None at the end; raises where the connection breaks before it."""
+    def _next_request(self, socket: Any) -> bytes | None:
+        """Waits for the next request, None at the end; raises if the connection breaks first."""
         while True:
             try:
-                return self._requests.get(timeout=_LOOK_S)
+                return self._requests.get(timeout=_POLL_S)
             except queue.Empty:
-                if connection.protocol.state is not websockets.State.OPEN:
+                if socket.protocol.state is not websockets.State.OPEN:
                     raise ConnectionError("the server has closed the connection") from None
 
 

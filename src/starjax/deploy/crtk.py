@@ -1,15 +1,15 @@
-"""Names of CRTK, which dVRK and other surgical robots speak over ROS, mapped to our structs.
+"""Messages of CRTK, the ROS convention of dVRK and other surgical robots, as our structs.
 
-Pure functions: messages are read by their attributes and filled in place, so ROS is not imported,
-and nothing here has run with ROS. CRTK is in SI units; its quaternions are x y z w.
+Pure functions: they read messages by attribute and fill them in place, without importing ROS. The
+ROS path is untested. CRTK uses SI units and quaternions x y z w.
 
-    measured_cp   tip that is measured           `pose_of`     -> Observation.pose
-    jaw/measured_js   angle between the jaws     `opening_of`  -> Observation.gripper
-    operating_state   may it be moved?           `is_ready`
-    servo_cp      tip to be at now               `fill_pose`   <- Command.pose
-    jaw/servo_jp  angle between the jaws to have `fill_jaw`    <- Command.gripper
+    measured_cp       measured tip                 `pose_of`     -> Observation.pose
+    jaw/measured_js   measured angle of the jaws   `opening_of`  -> Observation.gripper
+    operating_state   permission to move           `is_ready`
+    servo_cp          target tip                   `fill_pose`   <- Command.pose
+    jaw/servo_jp      target angle of the jaws     `fill_jaw`    <- Command.gripper
 
-`setpoint_cp`, the tip that the robot was last sent to, has the form of `measured_cp`.
+`setpoint_cp`, the robot's last target tip, has the form of `measured_cp`.
 """
 
 from typing import Any, NamedTuple
@@ -20,16 +20,16 @@ from scipy.spatial.transform import Rotation
 from starjax.errors import UsageError
 from starjax.types import Pose
 
-_LONGEST = 1e-3  # of a quaternion's length from one
+_MAX_NORM_ERROR = 1e-3  # of a quaternion's length from one
 
 
 class Frames(NamedTuple):
-    """Where a robot's frames are; measure both, they are never the identity by luck.
+    """Transforms from a robot's frames to ours; measure both, because neither is the identity.
 
     Attributes:
-      pose_world_base: of the frame that the robot reports poses in, in the policy's world.
-      pose_tool_tip: of the tip as the policy has it, in the frame that the robot reports: z along
-        the shaft, out of the jaws, y in which they open.
+      pose_world_base: base frame of the robot's poses, in the policy's world.
+      pose_tool_tip: the policy's tip in the frame that the robot reports: z along the shaft, out
+        of the jaws, y in the direction of their opening.
     """
 
     pose_world_base: Pose
@@ -40,7 +40,8 @@ class Jaw(NamedTuple):
     """Angles between the jaws, rad.
 
     Attributes:
-      closed: where a thing is held firmly, often below 0. open: as in the demonstrations.
+      closed: for a firm grasp, often below 0.
+      open: as in the demonstrations.
     """
 
     closed: float
@@ -48,27 +49,27 @@ class Jaw(NamedTuple):
 
 
 def pose_of(message: Any, frames: Frames) -> Pose:
-    """pose_world_tip of `measured_cp`, a PoseStamped or Pose.
+    """Returns pose_world_tip of `measured_cp`, a PoseStamped or Pose.
 
     Raises:
-      UsageError: a number is not finite, or the quaternion is none.
+      UsageError: a value is not finite, or the quaternion is not of unit length.
     """
     pose = getattr(message, "pose", message)
     position, wxyz = pose.position, pose.orientation
     p = np.array([position.x, position.y, position.z], np.float64)
     xyzw = np.array([wxyz.x, wxyz.y, wxyz.z, wxyz.w], np.float64)
     if not np.isfinite(p).all():
-        raise UsageError("measured_cp.position", "finite numbers", p.tolist())
-    if not abs(np.linalg.norm(xyzw) - 1.0) < _LONGEST:
+        raise UsageError("measured_cp.position", "finite values", p.tolist())
+    if not abs(np.linalg.norm(xyzw) - 1.0) < _MAX_NORM_ERROR:
         raise UsageError("measured_cp.orientation", "a unit quaternion", xyzw.tolist())
-    measured = Pose(*_arrays(Rotation.from_quat(xyzw).as_matrix(), p))
-    return compose(compose(frames.pose_world_base, measured), frames.pose_tool_tip)
+    pose_base_tool = _pose(Rotation.from_quat(xyzw).as_matrix(), p)
+    return compose(compose(frames.pose_world_base, pose_base_tool), frames.pose_tool_tip)
 
 
 def fill_pose(message: Any, pose_world_tip: Pose, frames: Frames) -> Any:
     """Fills `servo_cp`, a PoseStamped or Pose, and returns it; its header is the caller's."""
-    tool = compose(pose_world_tip, inverse(frames.pose_tool_tip))
-    pose = compose(inverse(frames.pose_world_base), tool)
+    pose_world_tool = compose(pose_world_tip, inverse(frames.pose_tool_tip))
+    pose = compose(inverse(frames.pose_world_base), pose_world_tool)
     x, y, z, w = Rotation.from_matrix(np.asarray(pose.R, np.float64)).as_quat(canonical=True)
     part = getattr(message, "pose", message)
     part.orientation.x, part.orientation.y = float(x), float(y)
@@ -78,47 +79,47 @@ def fill_pose(message: Any, pose_world_tip: Pose, frames: Frames) -> Any:
 
 
 def opening_of(message: Any, jaw: Jaw) -> float:
-    """The gripper's opening in [-1, 1] of `jaw/measured_js`, a JointState.
+    """Returns the gripper's opening in [-1, 1] of `jaw/measured_js`, a JointState.
 
     Raises:
-      UsageError: it has no finite angle.
+      UsageError: the message has no single finite angle.
     """
     positions = list(message.position)
     if len(positions) != 1 or not np.isfinite(positions[0]):
         raise UsageError("jaw/measured_js.position", "one finite angle", positions)
-    share = (positions[0] - jaw.closed) / (_checked(jaw).open - jaw.closed)
-    return float(np.clip(2.0 * share - 1.0, -1.0, 1.0))
+    fraction = (positions[0] - jaw.closed) / _range(jaw)
+    return float(np.clip(2.0 * fraction - 1.0, -1.0, 1.0))
 
 
 def fill_jaw(message: Any, gripper: float, jaw: Jaw) -> Any:
     """Fills `jaw/servo_jp`, a JointState, and returns it."""
-    share = (np.clip(gripper, -1.0, 1.0) + 1.0) / 2.0
-    message.position = [float(jaw.closed + share * (_checked(jaw).open - jaw.closed))]
+    fraction = (np.clip(gripper, -1.0, 1.0) + 1.0) / 2.0
+    message.position = [float(jaw.closed + fraction * _range(jaw))]
     return message
 
 
 def is_ready(message: Any) -> bool:
-    """Whether `operating_state` lets the arm be moved: enabled, homed, and not busy."""
+    """Returns True if `operating_state` permits motion: enabled, homed and not busy."""
     return message.state == "ENABLED" and bool(message.is_homed) and not message.is_busy
 
 
 def compose(pose_a_b: Pose, pose_b_c: Pose) -> Pose:
-    """pose_a_c."""
+    """Returns pose_a_c."""
     R, p = (np.asarray(x, np.float64) for x in pose_a_b)
-    return Pose(*_arrays(R @ np.asarray(pose_b_c.R), R @ np.asarray(pose_b_c.p) + p))
+    return _pose(R @ np.asarray(pose_b_c.R), R @ np.asarray(pose_b_c.p) + p)
 
 
 def inverse(pose_a_b: Pose) -> Pose:
-    """pose_b_a."""
+    """Returns pose_b_a."""
     R, p = (np.asarray(x, np.float64) for x in pose_a_b)
-    return Pose(*_arrays(R.T, -R.T @ p))
+    return _pose(R.T, -R.T @ p)
 
 
-def _checked(jaw: Jaw) -> Jaw:
+def _range(jaw: Jaw) -> float:
     if not jaw.open > jaw.closed:
         raise UsageError("jaw.open", f"more than jaw.closed, {jaw.closed:g} rad", jaw.open)
-    return jaw
+    return jaw.open - jaw.closed
 
 
-def _arrays(*values: Any) -> Any:
-    return values
+def _pose(R: Any, p: Any) -> Pose:
+    return Pose(R, p)

@@ -1,14 +1,14 @@
-"""Follows plans command by command: when to ask, which command is next, what to do without one.
+"""Executes plans command by command: requests them ahead, stretches late ones, then holds.
 
-Pure arithmetic of control steps, no clock and no network: `Client` gives it both.
+It counts control steps and has neither clock nor network; `Client` connects it to both.
 
     old plan   0 . . . . . . . execute . . . . horizon
     new plan           0 . . . . . . . . execute . . . horizon
-                   asked |<ahead>| due
+               request |<ahead>| due
 
-The first commands of the new plan pass while those of the old one are carried out. Where it is
-late, more of the old one are, as long as the new one would have `execute` left; then the robot
-holds. While it holds, plans do not age: nothing moves that they would have to foresee.
+The first commands of the new plan expire while the old plan is executed. A late plan makes the
+robot execute more of the old one, as long as the new one would have `execute` commands left; then
+the robot holds. Plans do not age during holds, because nothing moves.
 """
 
 import collections
@@ -18,21 +18,23 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.spatial.transform import Rotation
 
 from starjax import rcm
+from starjax.deploy import turns
 from starjax.errors import UsageError
 from starjax.rcm import arrays
 from starjax.types import Command, Pose
 
-MAX_OFF = 1e-4  # m, of a plan's axes from the trocar: the networks' own are 1e-8
+MAX_OFF = 1e-4  # m, from a plan's axes to the trocar: the networks' plans are off by 1e-8
+MAX_SKEW = 1e-3  # of a plan's matrices from rotations
 _DOWN = np.array([0.0, 0.0, -1.0], np.float32)
-_REMEMBERED = 8  # answers whose latency is looked back at
-_SPARE = 1  # control steps asked earlier than the slowest of these was
+_DEPTH = 0.1  # m, of the tool that the programs are compiled with
+_REMEMBERED = 8  # latest latencies, whose maximum predicts the next
+_SPARE = 1  # control steps of margin over that prediction
 
 
 class Limits(NamedTuple):
-    """How far a command may be from the one before: for the owner of a robot to choose.
+    """Maximum distance between consecutive commands, for the owner of a robot to choose.
 
     Attributes:
       move: m, of the tip; 0.15 m/s at 30 Hz.
@@ -48,19 +50,19 @@ LIMITS = Limits()
 
 @dataclasses.dataclass
 class Report:
-    """Counts of what happened, in control steps unless said otherwise.
+    """Counts of a control loop, in control steps unless stated otherwise.
 
     Attributes:
-      steps: commands given.
-      plans: that were followed.
-      missed: plans whose answer was not there when the one before was carried out.
-      stretched: commands beyond `execute` of a plan, as the next one was late.
-      held: the last command again, as no plan was left; those before the first plan too.
-      limited: commands that were nearer than the plan's, as that was farther than `Limits`.
-      refused: answers without a plan that can be followed; `fault` is the last one's reason.
-      lost: requests whose connection broke, or that were not answered in time.
-      overran: control periods that took too long, of `Client.run`.
-      latencies: from asking to the answer, of every plan.
+      steps: commands sent.
+      plans: plans executed.
+      missed: plans that arrived after the previous plan ended.
+      stretched: commands beyond `execute` of a plan, while the next one was late.
+      held: repetitions of the last command, for want of a plan; also before the first plan.
+      limited: commands clipped to `Limits`.
+      refused: replies without a valid plan; `fault` is the reason of the last one.
+      lost: requests without a reply: the connection broke or timed out.
+      overran: control periods of `Client.run` that took too long.
+      latencies: of every plan, from the request to its arrival.
     """
 
     steps: int = 0
@@ -77,10 +79,10 @@ class Report:
 
 
 class PlanExecutor:
-    """One robot's plan, and where it is in it.
+    """One robot's present and next plan, and the position in the present one.
 
     Attributes:
-      report: what happened so far.
+      report: counts so far.
       last: the last command, None before the first.
     """
 
@@ -97,13 +99,13 @@ class PlanExecutor:
         Args:
           p_world_trocar: `[*arms, 3]` m.
           horizon, execute: of the policy, in control steps.
-          ahead: control steps before the last command is due that the next plan is asked for; None
-            for as many as the slowest of the last answers took, and one.
-          limits: between two commands.
+          ahead: control steps between a request and the end of the present plan; None for the
+            largest recent latency plus one.
+          limits: between consecutive commands.
         """
-        most = horizon - execute
-        if ahead is not None and not 0 <= ahead <= most:
-            raise UsageError("ahead", f"0 to horizon - execute = {most}", ahead)
+        self._max_ahead = horizon - execute
+        if ahead is not None and not 0 <= ahead <= self._max_ahead:
+            raise UsageError("ahead", f"0 to horizon - execute = {self._max_ahead}", ahead)
         for name, value in limits._asdict().items():
             if not 0 < value < np.inf:
                 raise UsageError(f"limits.{name}", "more than 0", value)
@@ -111,14 +113,13 @@ class PlanExecutor:
         self.horizon, self.execute, self._ahead, self._limits = horizon, execute, ahead, limits
         self._p_world_trocar = np.asarray(p_world_trocar, np.float32)
         self._plan: Command | None = None
-        self._next: Command | None = None  # the plan that was answered, until the present one ends
-        self._index = self._until = 0  # of the plan: its next command, and where it should end
-        self._is_asked = self._is_late = False
-        self._moved = self._waited = (
-            0  # control steps since the last request, without holds and all
-        )
+        self._next: Command | None = None  # arrived, waits for the end of the present plan
+        # Indices in the present plan: its next command, and the planned end.
+        self._index = self._until = 0
+        self._is_pending = self._is_late = False
+        self._moved = self._waited = 0  # control steps since the request, without and with holds
         self._latencies: collections.deque[int] = collections.deque(maxlen=_REMEMBERED)
-        still = rcm.pose_on_manifold(_DOWN, 0.0, 0.1, self._p_world_trocar)
+        still = rcm.pose_on_manifold(_DOWN, 0.0, _DEPTH, self._p_world_trocar)
         still = jax.device_get(_through(jax.device_get(still), self._p_world_trocar))
         self._toward(still, still)
         plan: list[Any] = [np.broadcast_to(x, (horizon, *x.shape)) for x in still]
@@ -126,42 +127,35 @@ class PlanExecutor:
 
     @property
     def ahead(self) -> int:
-        """Control steps that a plan is asked for before it is due."""
+        """Returns the control steps between a request and the end of the present plan."""
         if self._ahead is not None:
             return self._ahead
-        most = self.horizon - self.execute
-        return min(most, max(self._latencies, default=most) + _SPARE)
+        return min(self._max_ahead, max(self._latencies, default=self._max_ahead) + _SPARE)
 
     @property
     def needs_plan(self) -> bool:
-        """Whether a plan should be asked for now."""
+        """Returns True if a plan should be requested now."""
         is_near = self._plan is None or self._until - self._index <= self.ahead
-        return is_near and self._next is None and not self._is_asked
-
-    @property
-    def _is_far_enough(self) -> bool:
-        """Whether of the plan that is late, no more than `execute` commands would be left."""
-        is_beyond = self._index >= self._until
-        return is_beyond and self._moved >= self.horizon - self.execute
+        return is_near and self._next is None and not self._is_pending
 
     def on_request(self) -> None:
-        """A plan has been asked for."""
-        self._is_asked, self._moved, self._waited = True, 0, 0
+        """Records that a plan has been requested."""
+        self._is_pending, self._moved, self._waited = True, 0, 0
 
     def on_failure(self, fault: str, is_lost: bool = False) -> None:
-        """There will be no answer."""
-        self._is_asked = False
+        """Records that the request brought no plan."""
+        self._is_pending = False
         self.report.fault = fault
         self.report.lost += is_lost
         self.report.refused += not is_lost
 
     def on_plan(self, plan: Command) -> None:
-        """The plan that was asked for, `[H, *arms]`; what is off the RCM manifold is refused."""
+        """Stores the requested plan `[H, *arms]`; one off the RCM manifold is a failure."""
         off, depth, skew = map(float, _worst(plan.pose, self._p_world_trocar))
-        if not (off <= MAX_OFF and depth > 0.0 and skew <= 1e-3):
-            said = f"{1e3 * off:.3g} mm from the trocar, {1e3 * depth:.3g} mm beyond it"
-            return self.on_failure(f"plan: expected one on the RCM manifold, got axes {said}")
-        self._is_asked, self._next = False, plan
+        if not (off <= MAX_OFF and depth > 0.0 and skew <= MAX_SKEW):
+            got = f"{1e3 * off:.3g} mm from the trocar, {1e3 * depth:.3g} mm beyond it"
+            return self.on_failure(f"plan: expected one on the RCM manifold, got axes {got}")
+        self._is_pending, self._next = False, plan
         self._latencies.append(self._waited)
         self.report.latencies.append(self._waited)
 
@@ -169,23 +163,24 @@ class PlanExecutor:
         """Takes the measured pose `[*arms]` as the first to hold, its axis put through the trocar.
 
         Raises:
-          UsageError: that alone would be a jump.
+          UsageError: that alone would exceed the limits.
         """
-        given: list[Any] = [np.asarray(x, np.float32) for x in pose]
-        pose = Pose(*given)
+        sensors: list[Any] = [np.asarray(x, np.float32) for x in pose]
+        pose = Pose(*sensors)
         held = jax.device_get(_through(pose, self._p_world_trocar))
-        _, move, turn = jax.device_get(self._toward(pose, held))
-        if not (move <= self._limits.move and turn <= self._limits.turn):
+        _, move, turn = self._toward(pose, held)
+        if self._exceeds(move, turn):
             got = f"one that must turn by {turn:.2g} rad"
             raise UsageError("observation.pose", "a tool through the trocar", got)
         opening: Any = np.clip(np.asarray(gripper, np.float32), -1.0, 1.0)
         self.last = Command(held, opening)
 
     def step(self) -> Command:
-        """The next command `[*arms]`."""
+        """Returns the next command `[*arms]`."""
         assert self.last is not None
         is_spent = self._plan is None or self._index >= self._until
         if is_spent and self._next is not None:
+            # 1. Switch. Commands of the new plan that were due since its request are skipped.
             self._plan, self._next = self._next, None
             self._index, self._until = self._moved, min(self._moved + self.execute, self.horizon)
             self._is_late = False
@@ -195,62 +190,72 @@ class PlanExecutor:
             self.report.missed += 1
         self.report.steps += 1
         self._waited += 1
-        if self._plan is None or self._index >= self.horizon or self._is_far_enough:
+        # 2. Hold: no plan, its end, or a late plan would have fewer than `execute` commands left.
+        is_stretched = self._index >= self._until
+        is_stale = is_stretched and self._moved >= self._max_ahead
+        if self._plan is None or self._index >= self.horizon or is_stale:
             self.report.held += 1
             return self.last
-        wanted = jax.tree.map(lambda x: x[self._index], self._plan)
-        pose, move, turn = jax.device_get(self._toward(self.last.pose, wanted.pose))
-        self.report.limited += bool(move > self._limits.move or turn > self._limits.turn)
-        self.report.stretched += self._index >= self._until
+        # 3. Execute; beyond `_until` this stretches the plan.
+        target = jax.tree.map(lambda x: x[self._index], self._plan)
+        pose, move, turn = self._toward(self.last.pose, target.pose)
+        self.report.limited += self._exceeds(move, turn)
+        self.report.stretched += is_stretched
         self._index += 1
         self._moved += 1
-        self.last = Command(pose, np.clip(wanted.gripper, -1.0, 1.0))
+        self.last = Command(pose, np.clip(target.gripper, -1.0, 1.0))
         return self.last
 
-    def _toward(self, last: Pose, wanted: Pose) -> tuple[Pose, jax.Array, jax.Array]:
-        return _toward(last, wanted, self._p_world_trocar, *self._limits)
+    def _toward(self, last: Pose, target: Pose) -> tuple[Pose, np.ndarray, np.ndarray]:
+        return jax.device_get(_toward(last, target, self._p_world_trocar, *self._limits))
+
+    def _exceeds(self, move: np.ndarray, turn: np.ndarray) -> bool:
+        # A negated comparison: NaN exceeds the limits.
+        return not (move <= self._limits.move and turn <= self._limits.turn)
 
 
 @jax.jit
 @arrays.broadcasting
 def _toward(
-    last: Pose, wanted: Pose, p_world_trocar: jax.Array, max_move: float, max_turn: float
+    last: Pose, target: Pose, p_world_trocar: jax.Array, max_move: float, max_turn: float
 ) -> tuple[Pose, jax.Array, jax.Array]:
-    """The pose on the RCM manifold that is on the way from `last` to `wanted` `[*arms]`, at most
-    the limits away; how far `wanted` is, at most, in m and rad.
+    """Moves from `last` toward `target` `[*arms]` on the RCM manifold, at most by the limits.
 
-    Rotation and depth go straight, so the tip moves across by what the axis turns, at its depth.
+    Rotation and depth are interpolated linearly, so the axis' turn moves the tip sideways.
+
+    Returns:
+      the pose; m and rad, the largest distances from `last` to `target`.
     """
-    begin, end = (rcm.rot6d_decode(rcm.rot6d_encode(x.R)) for x in (last, wanted))
-    here, there = (rcm.insertion_depth(x, p_world_trocar) for x in (last, wanted))
-    turn = Rotation.from_matrix(arrays.matmul(begin.mT, end)).as_rotvec()
+    begin, end = (turns.orthonormal(x.R) for x in (last, target))
+    depth, end_depth = (rcm.insertion_depth(x, p_world_trocar) for x in (last, target))
+    turn = turns.between(begin, end)
     angle = arrays.norm(turn)
-    across = jnp.maximum(here, there) * arrays.norm(turn[..., :2])  # the roll moves no tip
-    move = arrays.norm(jnp.stack([across, there - here], -1))
-    share = jnp.minimum(max_move / jnp.maximum(move, 1e-9), max_turn / jnp.maximum(angle, 1e-9))
-    share = jnp.minimum(share, 1.0)
-    R = arrays.matmul(begin, Rotation.from_rotvec(share[..., None] * turn).as_matrix())
-    R = jnp.where((share < 1.0)[..., None, None], R, end)
-    pose = rcm.pose_at_depth(R, here + share * (there - here), p_world_trocar)
+    across = jnp.maximum(depth, end_depth) * arrays.norm(turn[..., :2])  # roll moves no tip
+    move = arrays.norm(jnp.stack([across, end_depth - depth], -1))
+    tiny = 1e-9  # m and rad, against a division by zero
+    fraction = jnp.minimum(max_move / jnp.maximum(move, tiny), max_turn / jnp.maximum(angle, tiny))
+    fraction = jnp.minimum(fraction, 1.0)
+    R = jnp.where((fraction < 1.0)[..., None, None], turns.part(begin, turn, fraction), end)
+    pose = rcm.pose_at_depth(R, depth + fraction * (end_depth - depth), p_world_trocar)
     return pose, jnp.max(move), jnp.max(angle)
 
 
 @jax.jit
 @arrays.broadcasting
 def _through(pose: Pose, p_world_trocar: jax.Array) -> Pose:
-    """The pose with its axis through the trocar: the tip stays, see `rcm.project`."""
-    turned = rcm.project(pose, p_world_trocar)
-    R = rcm.rot6d_decode(rcm.rot6d_encode(turned.R))
-    return rcm.pose_at_depth(R, rcm.insertion_depth(turned, p_world_trocar), p_world_trocar)
+    """Turns the tool's axis through the trocar; the tip stays (`rcm.project`)."""
+    projected = rcm.project(pose, p_world_trocar)
+    depth = rcm.insertion_depth(projected, p_world_trocar)
+    return rcm.pose_at_depth(turns.orthonormal(projected.R), depth, p_world_trocar)
 
 
 @jax.jit
 @arrays.broadcasting
 def _worst(pose: Pose, p_world_trocar: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Measures how bad the worst of the poses `[H, *arms]` is.
+    """Measures the worst of the poses `[H, *arms]`.
 
     Returns:
-      m, the farthest axis from the trocar; m, the least depth; how far the worst matrix is from a
+      m, the largest RCM error; m, the least depth; the largest distance of a matrix from a
       rotation.
     """
     x, y, z = (pose.R[..., :, i] for i in range(3))

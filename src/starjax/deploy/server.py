@@ -1,8 +1,8 @@
 """Serves a policy over websockets, in openpi's protocol, to several clients at once.
 
-The event loop reads frames, one thread decides. What came while it decided is decided together
-next, so that one client waits for nobody and many share a call. A bad frame is answered by a line
-of text; the connection, and the server, go on.
+The event loop reads frames and one thread runs the policy. Requests that arrive during an inference
+share the next one, so clients do not wait in line. An invalid frame gets a line of text as its
+reply and ends neither the connection nor the server.
 """
 
 import asyncio
@@ -25,21 +25,22 @@ from starjax.deploy.policy import Deployed
 from starjax.errors import UsageError
 from starjax.sim.tasks.base import CONTROL_HZ
 
-_ASK_S = 0.1  # between two looks whether to stop
-_LONGEST_ERROR = 2000  # characters
-_SILENT = logging.getLogger("starjax.serve")  # of handshakes that fail, as strangers' do
+_POLL_S = 0.1  # between two calls of `should_stop`
+_MAX_ERROR = 2000  # characters
+_MAX_QUEUE = 2  # unread frames of a connection
+_SILENT = logging.getLogger("starjax.serve")  # failed handshakes, as of port scanners
 _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
 
 
 class ServerSettings(NamedTuple):
-    """How a server listens.
+    """Settings of a server.
 
     Attributes:
-      host: address; 0.0.0.0 is every network of this machine.
-      port: 0 is any that is free.
-      batch: robots that one call decides for, at most.
-      clients: connections at once, at most.
+      host: address to listen at; 0.0.0.0 is every network of this machine.
+      port: 0 is any free one.
+      batch: maximum robots per inference.
+      clients: maximum connections at once.
     """
 
     host: str = "127.0.0.1"
@@ -50,17 +51,24 @@ class ServerSettings(NamedTuple):
 
 @dataclasses.dataclass
 class Counts:
-    """Counts of a server's work."""
+    """Counts of a server's work.
 
-    clients: int = 0  # that have connected
-    answered: int = 0  # requests
-    refused: int = 0  # frames that were answered by a text
-    calls: int = 0  # of the policy
+    Attributes:
+      clients: connections so far.
+      answered: requests answered by a plan.
+      refused: frames answered by an error.
+      calls: inferences.
+    """
+
+    clients: int = 0
+    answered: int = 0
+    refused: int = 0
+    calls: int = 0
 
 
 class _Job(NamedTuple):
     request: wire.Request
-    answer: asyncio.Future
+    reply: asyncio.Future
 
 
 def run(
@@ -75,52 +83,49 @@ def run(
     """Compiles the programs, then serves until `should_stop()`.
 
     Args:
-      policy: is served.
-      name: of the policy, for the clients.
-      api_key: that clients must have; empty for none.
-      listening: called with address and port, once clients may connect.
+      policy: the served policy.
+      name: of the policy, for the greeting.
+      api_key: required of clients; empty for none.
+      listening: called with address and port as soon as clients can connect.
 
     Raises:
-      UsageError: the address cannot be listened at.
+      UsageError: the address is not available.
     """
-    with _bound(settings) as address:
+    with _bind(settings) as address:
         batches = batching.Batches(policy, settings.batch)
         batches.warm_up()
-        served = _Served(batches, settings, metadata(policy, name), api_key)
-        asyncio.run(served.serve(address, should_stop, listening))
-    return served.counts
+        server = _Server(batches, settings, metadata(policy, name), api_key)
+        asyncio.run(server.serve(address, should_stop, listening))
+    return server.counts
 
 
 def metadata(policy: Deployed, name: str = "") -> dict[str, Any]:
-    """Greeting of a client that connects."""
+    """Describes the policy: the greeting of a connecting client."""
     settings, spec = policy.settings, policy.input_spec
-    described = {
-        field: {**said._asdict(), "shape": list(said.shape)}
-        for field, said in wire.request_arrays(spec).items()
-    }
+    arrays = wire.request_arrays(spec).items()
     return {
         "protocol": wire.PROTOCOL,
         "starjax": starjax.__version__,
         "policy": name,
         "digest": policy.digest,
         "method": policy.method,
-        "scene": {
-            k: v if isinstance(v, str) else list(v) for k, v in policy.scene._asdict().items()
-        },
+        "scene": _plain(policy.scene),
         "control_hz": CONTROL_HZ,
         "horizon": settings.horizon,
         "execute": settings.execute,
-        "asks": {
-            **{k: list(v) if isinstance(v, tuple) else v for k, v in spec._asdict().items()},
-            "p_world_ref": spec.p_world_ref,
-        },
-        "inputs": described,
-        "actions": list(wire.ACTION),  # of each arm
+        "asks": _plain(spec),
+        "inputs": {field: _plain(row) for field, row in arrays},
+        "actions": list(wire.ACTION),
     }
 
 
-def _bound(settings: ServerSettings) -> socket.socket:
-    """A socket at the address, before anything is compiled; nobody is listened to yet."""
+def _plain(record: Any) -> dict[str, Any]:
+    """Returns the fields of a NamedTuple, tuples as lists."""
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in record._asdict().items()}
+
+
+def _bind(settings: ServerSettings) -> socket.socket:
+    """Binds a socket to the address before the slow compilation; clients cannot connect yet."""
     host, port = settings.host, settings.port
     bound = None
     try:
@@ -131,21 +136,20 @@ def _bound(settings: ServerSettings) -> socket.socket:
     except OSError as error:
         if bound:
             bound.close()
-        where = f"{host}:{port}"
-        raise UsageError("--port", "an address that is free here", where, str(error)) from None
+        raise UsageError("--port", "a free address", f"{host}:{port}", str(error)) from None
     return bound
 
 
-class _Served:
+class _Server:
     def __init__(
         self,
         batches: batching.Batches,
         settings: ServerSettings,
-        about: dict[str, Any],
+        greeting: dict[str, Any],
         api_key: str,
     ) -> None:
         self.batches, self.settings, self.counts = batches, settings, Counts()
-        self.about, self.api_key = wire.pack(about), api_key
+        self.greeting, self.api_key = wire.pack(greeting), api_key
         self.jobs: asyncio.Queue[_Job] = asyncio.Queue()
         self.open = 0
 
@@ -159,48 +163,49 @@ class _Served:
             self._connected,
             sock=address,
             process_request=self._admit,
-            origins=[None],  # pages in a browser have one, and could reach this machine's ports
+            # Browsers send an origin: a web page must not reach this machine's ports.
+            origins=[None],
             compression=None,
             max_size=wire.max_request_bytes(self.batches.policy.input_spec),
-            max_queue=2,
+            max_queue=_MAX_QUEUE,
             logger=_SILENT,
         )
-        # It decides until the last connection is closed, as that waits for its answer.
-        async with self._deciding() as deciding, server:
+        # The server leaves first: closing its connections waits for their pending replies.
+        async with self._inference() as inference, server:
             listening(*server.sockets[0].getsockname()[:2])
-            while not (should_stop() or deciding.done()):
-                await asyncio.wait([deciding], timeout=_ASK_S)
+            while not (should_stop() or inference.done()):
+                await asyncio.wait([inference], timeout=_POLL_S)
 
     @contextlib.asynccontextmanager
-    async def _deciding(self) -> AsyncIterator[asyncio.Task]:
-        with ThreadPoolExecutor(1, "starjax-decide") as thread:
-            task = asyncio.create_task(self._decide(thread))
+    async def _inference(self) -> AsyncIterator[asyncio.Task]:
+        with ThreadPoolExecutor(1, "starjax-inference") as thread:
+            task = asyncio.create_task(self._infer(thread))
             yield task
             task.cancel()
             await asyncio.wait([task])
 
-    async def _decide(self, thread: ThreadPoolExecutor) -> None:
+    async def _infer(self, thread: ThreadPoolExecutor) -> None:
         loop = asyncio.get_running_loop()
         while True:
             jobs = [await self.jobs.get()]
-            while len(jobs) < self.batches.most and not self.jobs.empty():
+            while len(jobs) < self.batches.max_robots and not self.jobs.empty():
                 jobs.append(self.jobs.get_nowait())
-            asked = [job.request for job in jobs]
+            requests = [job.request for job in jobs]
             try:
-                answers = await loop.run_in_executor(thread, self.batches.decide, asked)
-            except Exception as error:  # of the device, say: the clients hear of it, and go on
+                replies = await loop.run_in_executor(thread, self.batches.infer, requests)
+            except Exception as error:  # as of the device: clients receive it, the server continues
                 fault = UsageError("policy", "a plan", f"{type(error).__name__}: {error}")
-                answers = [fault] * len(jobs)
+                replies = [fault] * len(jobs)
             self.counts.calls += 1
-            for job, answer in zip(jobs, answers, strict=True):
-                if not job.answer.done():
-                    job.answer.set_result(answer)
+            for job, reply in zip(jobs, replies, strict=True):
+                if not job.reply.done():
+                    job.reply.set_result(reply)
 
     async def _connected(self, connection: sockets.ServerConnection) -> None:
         self.open += 1
         self.counts.clients += 1
         try:
-            await connection.send(self.about)
+            await connection.send(self.greeting)
             async for frame in connection:
                 await connection.send(await self._answer(frame))
         except websockets.ConnectionClosed:
@@ -214,23 +219,23 @@ class _Served:
             request = wire.decode_request(spec, wire.unpack(frame), key_size)
             job = _Job(request, asyncio.get_running_loop().create_future())
             self.jobs.put_nowait(job)
-            answer = await job.answer
-            if isinstance(answer, UsageError):
-                raise answer
+            reply = await job.reply
+            if isinstance(reply, UsageError):
+                raise reply
         except UsageError as error:
             self.counts.refused += 1
-            return str(error)[:_LONGEST_ERROR]
+            return str(error)[:_MAX_ERROR]
         self.counts.answered += 1
-        return wire.pack(answer)
+        return wire.pack(reply)
 
     def _admit(self, connection: sockets.ServerConnection, request: Any) -> Any:
-        """Admits a client: None if it may connect, else the answer that refuses it."""
+        """Returns None for a client that may connect, else the response that refuses it."""
         if request.path == "/healthz":
             return connection.respond(http.HTTPStatus.OK, "OK\n")
-        given = request.headers.get_all("Authorization")
-        wanted = f"Api-Key {self.api_key}".encode()
+        sent = request.headers.get_all("Authorization")
+        expected = f"Api-Key {self.api_key}".encode()
         if self.api_key and not (
-            len(given) == 1 and hmac.compare_digest(given[0].encode(errors="replace"), wanted)
+            len(sent) == 1 and hmac.compare_digest(sent[0].encode(errors="replace"), expected)
         ):
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, "expected an API key\n")
         if self.open >= self.settings.clients:
