@@ -9,7 +9,7 @@ import pathlib
 import numpy as np
 
 from starjax.sim import scene
-from starjax.viewer import playback, recorded
+from starjax.viewer import frame, playback
 
 HZ, SECONDS = 30.0, 3.0
 
@@ -21,7 +21,7 @@ def main() -> None:
     phase = np.linspace(0.0, 2.0 * np.pi, round(HZ * SECONDS))
     qpos = np.tile(loaded.mj_model.qpos0, (len(phase), 1))
     qpos[:, arm.q] = arm.home + 0.1 * np.sin(phase)[:, None]
-    frames = recorded.frames(
+    frames = frame.from_arrays(
         qpos,
         p_world_trocar=loaded.p_world_ref,
         p_world_tip=np.zeros((len(phase), 1, 3)),

@@ -66,10 +66,9 @@ def main():
     sys.modules["easyhid"] = library(fake)  # before pyspacemouse is imported
     from starjax import rcm
     from starjax.sim import registries
-    from starjax.viewer import devices
-    from starjax.viewer import hand as hands
+    from starjax.viewer import devices, teleop_target
 
-    device = devices.opened("spacemouse")
+    device = devices.open_device("spacemouse")
     np.testing.assert_array_equal(device.read().deflection, 0.0)
     for push, expected in (
         ({"right": 1.0}, [0, 1, 0, 0]),
@@ -84,22 +83,25 @@ def main():
     assert device.read().buttons == (False, True)
 
     slot = registries.tasks.get("reach").slots[0]
-    tip, axes = np.array([0.0, 0.0, 0.06]), hands.axes_seen(np.eye(3)[:, [1, 0, 2]])
-    hand, bounds = hands.resting(np.array([0.0, *tip]), 1.0), hands.bounds(slot, tip)
+    tip, axes = np.array([0.0, 0.0, 0.06]), teleop_target.view_axes(np.eye(3)[:, [1, 0, 2]])
+    hand, bounds = (
+        teleop_target.at_rest(np.array([0.0, *tip]), 1.0),
+        teleop_target.bounds(slot, tip),
+    )
     frame = rcm.trocar_frame(
         rcm.trocar_from_position([0.02, 0.01, 0.15], slot.p_world_ref), slot.p_world_ref
     )
     worst, random = 0.0, np.random.default_rng(0)
     for _ in range(300):
         fake.push(*random.uniform(-1, 1, 4))
-        by = hands.increment(device.read().deflection, axes, 1.0, 1 / 30)
-        hand = hands.smoothed(hands.moved(hand, by, bounds), 1 / 30)
+        by = teleop_target.increment(device.read().deflection, axes, 1.0, 1 / 30)
+        hand = teleop_target.smoothed(teleop_target.moved(hand, by, bounds), 1 / 30)
         pose, _ = rcm.ACTION_SPACES["rcm4"].decode(hand.action.astype(np.float32), frame)
         worst = max(worst, float(rcm.rcm_error(pose, frame.p_world_trocar)))
     moved = 1e3 * np.linalg.norm(hand.action[1:] - tip)
     assert worst < 1e-6 and moved > 1.0
     fake.is_plugged = False
-    with pytest.raises(devices.Gone):
+    with pytest.raises(devices.DeviceLost):
         device.read()
     device.close()
     print(

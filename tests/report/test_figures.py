@@ -7,7 +7,15 @@ from matplotlib import colors
 from matplotlib.figure import Figure
 from report.conftest import edited
 
-from starjax.report import figures, outcomes, results, stage, style, training_trocars, trajectories
+from starjax.report import (
+    figures,
+    outcomes,
+    results,
+    scene_view,
+    style,
+    training_trocars,
+    trajectories,
+)
 from starjax.sim.tasks.base import Outline
 
 BOARD = np.array([[-0.05, -0.04, 0], [0.05, -0.04, 0], [0.05, 0.04, 0], [-0.05, 0.04, 0]])
@@ -15,7 +23,9 @@ BOARD = np.array([[-0.05, -0.04, 0], [0.05, -0.04, 0], [0.05, 0.04, 0], [-0.05, 
 
 def bare(_names):
     """A scene where no joints were recorded: an outline, no shafts."""
-    return stage.Stage(Outline((BOARD,), (BOARD[:2],)), lambda *_: pytest.fail("no joints"))
+    return scene_view.SceneView(
+        Outline((BOARD,), (BOARD[:2],)), lambda *_: pytest.fail("no joints")
+    )
 
 
 def test_success_is_pooled_by_distance_and_drawn_with_its_interval(one):
@@ -163,7 +173,7 @@ def test_shafts_are_drawn_where_the_joints_had_them(one):
     tcp = data.site(scene.tcp(0, registries.tools.get(names.tools[0])))
     qpos = np.tile(data.qpos, (20, 1))
     rollout = one.rollouts[0]._replace(p_world_tip=one.rollouts[0].p_world_tip[:20], qpos=qpos)
-    axis = trajectories.draw([one._replace(rollouts=[rollout])], stage.load).axes[0]
+    axis = trajectories.draw([one._replace(rollouts=[rollout])], scene_view.load).axes[0]
     fan = [line.get_xydata() for line in axis.lines if line.get_alpha() == 0.34]
     length = np.linalg.norm(tcp.xpos - rollout.p_world_trocar[0]) + trajectories._BEYOND
     ends = np.stack([tcp.xpos - length * tcp.xmat.reshape(3, 3)[:, 2], tcp.xpos])

@@ -11,7 +11,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from starjax.report import encode, stage, video
+from starjax.report import encode, scene_view, video
 from starjax.sim import scene
 
 
@@ -22,8 +22,8 @@ def with_qpos(run):
 
 def counting(qpos, trocars, labels, first, endoscope=None, size=64):
     """A camera that draws the number of the step."""
-    steps = np.minimum(np.arange(first, first + stage.BATCH), len(qpos) - 1).astype(np.uint8)
-    return np.broadcast_to(steps[:, None, None, None], (stage.BATCH, size, size, 3))
+    steps = np.minimum(np.arange(first, first + scene_view.BATCH), len(qpos) - 1).astype(np.uint8)
+    return np.broadcast_to(steps[:, None, None, None], (scene_view.BATCH, size, size, 3))
 
 
 def test_the_video_shows_seen_and_unseen_whatever_their_outcome(one):
@@ -56,7 +56,7 @@ def test_a_clip_says_what_it_shows_and_how_it_ended(one, monkeypatch, won, steps
     monkeypatch.setattr(video, "caption", lambda rows, w: said.append(rows) or np.zeros((2, w, 3)))
     trial = one.rollouts[0].trial._replace(success=won, trocar=5, seen=True)
     joints = {"p_world_tip": np.zeros((steps, 1, 3)), "qpos": np.zeros((steps, 2))}
-    shown = video.Shown("m", one.result, one.rollouts[0]._replace(trial=trial, **joints))
+    shown = video.Clip("m", one.result, one.rollouts[0]._replace(trial=trial, **joints))
     list(video._clip(functools.partial(counting, size=2), shown, ""))
     ((name, _), (ended, _)), ((about, _), (cut, _)) = said[-1]
     assert (name, about) == ("m", "seen trocar 5") and len(said) == min(steps, 360)
@@ -68,7 +68,7 @@ def test_a_clip_that_ends_early_stays_as_it_ended(one):
     chosen = []
     for rollout, n in zip(one.rollouts, (5, 20)):
         short = rollout._replace(p_world_tip=rollout.p_world_tip[:n], qpos=np.zeros((n, 2)))
-        chosen.append(video.Shown(str(n), one.result, short))
+        chosen.append(video.Clip(str(n), one.result, short))
     images = list(video.frames(chosen, lambda names: counting))
     pixels = np.array([[image[-1, 0, 0], image[-1, -1, 0]] for image in images])
     assert len(images) == 20 + 45
@@ -80,9 +80,9 @@ def test_a_clip_that_ends_early_stays_as_it_ended(one):
 def test_the_camera_draws_the_recorded_configuration(one):
     model = scene.compose(one.result.scene)
     qpos, port = np.tile(model.qpos0, (3, 1)), np.array([[0.0, 0.0, 0.15]])
-    draw = stage.camera(one.result.scene, 64)
+    draw = scene_view.camera(one.result.scene, 64)
     here = draw(qpos, port, {"source": 0, "target": 7}, 0)
-    assert here.shape == (stage.BATCH, 64, 64, 3) and here.dtype == np.uint8
+    assert here.shape == (scene_view.BATCH, 64, 64, 3) and here.dtype == np.uint8
     moved = draw(qpos, port + np.array([0, 0.04, 0]), {"source": 0, "target": 7}, 0)
     assert (here[0] == here[2]).all() and (here[0] != moved[0]).any()
     assert (draw(qpos, port, {"source": 0, "target": 8}, 0)[0] != here[0]).any()

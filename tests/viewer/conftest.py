@@ -5,7 +5,7 @@ import pytest
 
 from starjax.rollouts import agent
 from starjax.sim import env as sim_env
-from starjax.viewer import simulation, steering
+from starjax.viewer import recorder, simulation
 
 
 @pytest.fixture(scope="session")
@@ -21,5 +21,5 @@ def expert(env):
 
 @pytest.fixture(scope="session")
 def steered(env):
-    """The same in a person's hands."""
-    return steering.make(env)
+    """The same environment, steered by an operator."""
+    return recorder.steer(env)

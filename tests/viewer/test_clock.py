@@ -1,6 +1,6 @@
 """Real time, told by a clock that the test turns."""
 
-from starjax.viewer.clock import Clock
+from starjax.viewer.page import Clock
 
 
 class Hands:

@@ -14,7 +14,7 @@ def test_a_device_without_its_library_is_a_mistake(monkeypatch):
     for name, package in (("spacemouse", "pyspacemouse"), ("gamepad", "pygame")):
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(errors.UsageError) as raised:
-            devices.opened(name)
+            devices.open_device(name)
         assert package in raised.value.hint
 
 
@@ -36,7 +36,7 @@ def pygame(count=1):
 def test_a_gamepad(monkeypatch):
     library, pad, stick = pygame()
     monkeypatch.setitem(sys.modules, "pygame", library)
-    device = devices.opened("gamepad")
+    device = devices.open_device("gamepad")
     pad.axes = [0.05, 0.02, -0.03, 0.0]  # as sticks rest
     np.testing.assert_array_equal(device.read().deflection, 0.0)
     pad.axes, pad.pressed = [1.0, -0.5, 0.25, -1.0], {1}  # right, away, roll, up
@@ -44,11 +44,11 @@ def test_a_gamepad(monkeypatch):
     np.testing.assert_allclose(reading.deflection, [-0.25, 1.0, 0.5, 1.0])
     assert reading.buttons == (False, True)
     stick.get_count = lambda: 0
-    with pytest.raises(devices.Gone):
+    with pytest.raises(devices.DeviceLost):
         device.read()
 
 
 def test_no_gamepad_is_a_mistake(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", pygame(count=0)[0])
     with pytest.raises(errors.UsageError):
-        devices.opened("gamepad")
+        devices.open_device("gamepad")

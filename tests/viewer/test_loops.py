@@ -7,8 +7,8 @@ import pytest
 
 from starjax.data import load
 from starjax.rollouts import trocars
-from starjax.viewer import actors, browse, clock, devices, hand, recorded, recorder, teleop, view
-from starjax.viewer import server as pages
+from starjax.viewer import browse, devices, recorder, simulation, teleop, teleop_target, view
+from starjax.viewer import page as pages
 
 pytestmark = pytest.mark.slow
 
@@ -17,7 +17,7 @@ SEED = 7
 
 @pytest.fixture
 def page():
-    with pages.opened(pages.ANY) as server:
+    with pages.serve(pages.ANY) as server:
         yield server
 
 
@@ -44,27 +44,26 @@ def press(page, label):
 @pytest.fixture
 def hurried(monkeypatch):
     """Time that does not wait."""
-    quick = functools.partial(clock.Clock, sleep=lambda seconds: None)
-    for module in (view, browse, teleop):
-        monkeypatch.setattr(module, "Clock", quick)
+    quick = functools.partial(pages.Clock, sleep=lambda seconds: None)
+    monkeypatch.setattr(pages, "Clock", quick)
 
 
 @pytest.mark.slow
 def test_trials_follow_one_another(page, expert, hurried, monkeypatch):
-    monkeypatch.setattr(actors, "simulate", lambda who, arms=(): expert)
-    asked = view.Asked((actors.expert("reach"),), trocar=2, seed=SEED)
+    monkeypatch.setattr(simulation, "load", lambda who, arms=(): expert)
+    asked = view.ViewOptions((simulation.expert("reach"),), trocar=2, seed=SEED)
     said = view.run(page, asked, after(320, {300: lambda: press(page, "Next")}))
     won, ended = (int(word) for word in said.split(":")[1].split("trials")[0].split("of"))
     assert won == ended >= 2
 
 
 def test_a_pause_holds_and_a_step_is_one(page, expert, hurried, monkeypatch):
-    monkeypatch.setattr(actors, "simulate", lambda who, arms=(): expert)
+    monkeypatch.setattr(simulation, "load", lambda who, arms=(): expert)
     taken = []
     step = expert.step
     counted = expert._replace(step=lambda *given: (taken.append(1), step(*given))[1])
-    monkeypatch.setattr(actors, "simulate", lambda who, arms=(): counted)
-    asked = view.Asked((actors.expert("reach"),), seed=SEED)
+    monkeypatch.setattr(simulation, "load", lambda who, arms=(): counted)
+    asked = view.ViewOptions((simulation.expert("reach"),), seed=SEED)
     presses = {0: lambda: press(page, "Play"), 3: lambda: press(page, "Step")}
     view.run(page, asked, after(8, presses))
     assert len(taken) == 1
@@ -74,9 +73,9 @@ def directed(steered, trocar):
     """A device that goes straight to the mark and rests there."""
     state, _, action, _ = steered.start(SEED, trocar, 0)
     way = np.asarray(state.layout.p[0]) - action[0, 1:]
-    count = int(np.ceil(np.linalg.norm(way) * 30 / (0.8 * hand.SPEED)))
-    axes = teleop.axes_of(steered.env)
-    deflection = axes.T @ way * 30 / (count * hand.SPEED)
+    count = int(np.ceil(np.linalg.norm(way) * 30 / (0.8 * teleop_target.SPEED)))
+    axes = teleop.view_axes(steered.env)
+    deflection = axes.T @ way * 30 / (count * teleop_target.SPEED)
     steps = iter([np.array([0.0, *deflection])] * count)
     still = np.zeros(4)
     return devices.Device(
@@ -87,7 +86,7 @@ def directed(steered, trocar):
 @pytest.mark.slow
 def test_a_person_demonstrates_and_keeps_it(page, steered, hurried, tmp_path):
     trocar, root = 3, tmp_path / "demos"
-    with recorder.opened(root, steered.env, SEED) as kept:
+    with recorder.record_into(root, steered.env, SEED) as kept:
         said = teleop.run(
             page,
             steered,
@@ -102,7 +101,7 @@ def test_a_person_demonstrates_and_keeps_it(page, steered, hurried, tmp_path):
     told = trocars.select(steered.env.task.trocars, np.array([trocar]))
     np.testing.assert_allclose(np.asarray(data.trocar.trocar), np.asarray(told), rtol=1e-6)
 
-    dataset = recorded.opened(root)
+    dataset = browse.open_dataset(root)
     assert browse.run(page, dataset, after(20)).startswith("1 of 1")
 
 
@@ -112,7 +111,7 @@ def test_what_was_discarded_is_nowhere(page, steered, hurried, tmp_path):
         20: lambda: press(page, "Discard the episode"),
         25: lambda: press(page, "Save the episode"),
     }
-    with recorder.opened(root, steered.env, SEED) as kept:
+    with recorder.record_into(root, steered.env, SEED) as kept:
         teleop.run(page, steered, kept, after(40, presses), device=directed(steered, 0), seed=SEED)
         assert kept.kept == 0
     assert len(list(root.glob("episodes/*"))) <= 1  # what the hand did after it
@@ -120,26 +119,26 @@ def test_what_was_discarded_is_nowhere(page, steered, hurried, tmp_path):
 
 def test_the_hands_of_the_page(page, steered, hurried, tmp_path):
     """Keys and handle move the tip by what they say; without the clutch by nothing."""
-    from starjax.viewer.pilot import KEY_STEP, Pilot
+    from starjax.viewer.teleop_target import KEY_STEP, Pilot
 
     pilot = Pilot(page, 1, np.eye(3), None)
     start = np.array([[0.0, 0.0, 0.0, 0.06]])
-    bounds = [hand.bounds(steered.env.task.slots[0], start[0, 1:])]
+    bounds = [teleop_target.bounds(steered.env.task.slots[0], start[0, 1:])]
 
     def asked(*keys):
         for key in keys:
             press(page, key)
         pilot.read(1 / 30)
-        return pilot.hands[0].wanted - start[0]
+        return pilot.targets[0].goal - start[0]
 
     pilot.rest(start, np.ones(1), bounds)
     np.testing.assert_allclose(asked(), 0)
     assert not pilot.has_moved
     np.testing.assert_allclose(asked("To the right", "Up", "Up"), [0, KEY_STEP, 0, 2 * KEY_STEP])
-    pilot._handle.position = pilot._seen + np.array([0.0, 0.01, 0.0])  # as a drag does
+    pilot._handle.position = pilot._before + np.array([0.0, 0.01, 0.0])  # as a drag does
     np.testing.assert_allclose(asked()[2], 0.01)
     press(page, "Clutch")
     np.testing.assert_allclose(asked("To the left"), [0, KEY_STEP, 0.01, 2 * KEY_STEP])
     press(page, "Open or close the jaws")
     pilot.read(1 / 30)
-    assert pilot.hands[0].gripper == -1.0
+    assert pilot.targets[0].gripper == -1.0

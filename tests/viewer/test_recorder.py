@@ -6,7 +6,7 @@ import pytest
 from starjax import rcm
 from starjax.data import load, store
 from starjax.runtime import files
-from starjax.viewer import recorded, recorder
+from starjax.viewer import browse, recorder
 
 SEED = 4
 
@@ -30,7 +30,7 @@ def demonstrated(steered, kept, trocar, limit=200):
 def root(steered, tmp_path_factory):
     """Two successes through one trocar, a failure, and one through another trocar."""
     root = tmp_path_factory.mktemp("teleop") / "demos"
-    with recorder.opened(root, steered.env, SEED) as kept:
+    with recorder.record_into(root, steered.env, SEED) as kept:
         for trocar, limit in ((2, 200), (2, 200), (2, 5), (9, 200)):
             trial, frame = demonstrated(steered, kept, trocar, limit)
             assert bool(frame.success) == (limit > 5)
@@ -53,7 +53,7 @@ def test_episodes_load_as_demonstrations(root, steered):
 
 
 def test_more_can_be_added_and_numbers_go_on(root, steered):
-    with recorder.opened(root, steered.env, SEED) as kept:
+    with recorder.record_into(root, steered.env, SEED) as kept:
         assert (kept.kept, kept.next_trial(2), kept.next_trial(9), kept.next_trial(0)) == (
             3,
             3,
@@ -67,17 +67,17 @@ def test_more_can_be_added_and_numbers_go_on(root, steered):
 
 def test_a_folder_is_one_process_at_a_time_and_one_dataset(root, steered):
     with (
-        recorder.opened(root, steered.env, SEED),
+        recorder.record_into(root, steered.env, SEED),
         pytest.raises(files.StorageError),
-        recorder.opened(root, steered.env, SEED),
+        recorder.record_into(root, steered.env, SEED),
     ):
         pass
-    with pytest.raises(files.StorageError), recorder.opened(root, steered.env, SEED + 1):
+    with pytest.raises(files.StorageError), recorder.record_into(root, steered.env, SEED + 1):
         pass
 
 
 def test_a_full_disk_loses_no_episode(steered, tmp_path, monkeypatch):
-    with recorder.opened(tmp_path / "demos", steered.env, SEED) as kept:
+    with recorder.record_into(tmp_path / "demos", steered.env, SEED) as kept:
         trial, _ = demonstrated(steered, kept, 0, limit=3)
 
         def full(*given):
@@ -92,8 +92,8 @@ def test_a_full_disk_loses_no_episode(steered, tmp_path, monkeypatch):
 
 
 def test_recorded_episodes_are_shown_as_they_were(root):
-    dataset = recorded.opened(root)
-    shown = recorded.read(dataset, dataset.keys[0])
+    dataset = browse.open_dataset(root)
+    shown = browse.read(dataset, dataset.keys[0])
     assert shown.outcome == "success" and shown.images is None and len(dataset.keys) == 4
     folder = root / "episodes" / dataset.keys[0]
     np.testing.assert_array_equal([f.qpos for f in shown.frames], np.load(folder / "qpos.npy"))
@@ -110,7 +110,7 @@ def test_a_damaged_episode_is_named(root, tmp_path):
 
     copy = tmp_path / "copy"
     shutil.copytree(root, copy)
-    dataset = recorded.opened(copy)
+    dataset = browse.open_dataset(copy)
     (copy / "episodes" / dataset.keys[1] / "qpos.npy").write_bytes(b"")
     with pytest.raises(store.DamagedEpisode, match=dataset.keys[1]):
-        recorded.read(dataset, dataset.keys[1])
+        browse.read(dataset, dataset.keys[1])

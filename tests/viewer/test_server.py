@@ -8,12 +8,12 @@ import pytest
 from starjax import errors
 from starjax.sim import registries
 from starjax.viewer import handles
-from starjax.viewer import server as pages
+from starjax.viewer import page as pages
 
 
 @pytest.fixture(scope="module")
 def page():
-    with pages.opened(pages.ANY) as server:
+    with pages.serve(pages.ANY) as server:
         yield server
 
 
@@ -24,7 +24,7 @@ def test_only_this_machine_is_served(page):
 
 
 def test_a_second_viewer_on_the_port_is_a_mistake_and_leaves_the_first(page):
-    with pytest.raises(errors.UsageError) as raised, pages.opened(page.get_port()):
+    with pytest.raises(errors.UsageError) as raised, pages.serve(page.get_port()):
         pass
     assert raised.value.argument == "port" and raised.value.got == page.get_port()
     with socket.create_connection(("127.0.0.1", page.get_port()), timeout=5):
@@ -32,9 +32,9 @@ def test_a_second_viewer_on_the_port_is_a_mistake_and_leaves_the_first(page):
 
 
 def test_a_closed_page_gives_its_port_back():
-    with pages.opened(pages.ANY) as server:
+    with pages.serve(pages.ANY) as server:
         port = server.get_port()
-    with pages.opened(port) as server:
+    with pages.serve(port) as server:
         assert server.get_port() == port
 
 
@@ -44,9 +44,9 @@ def test_a_dragged_trocar_stays_where_the_arms_reach(page):
     found.place(np.array([[0.02, 0.0, 0.15]]))
     (handle,) = found._handles
     handle.position = (0.3, 0.0, 0.15)  # as the page's message does
-    np.testing.assert_allclose(found.wanted(), [[0.05, 0.0, 0.15]], atol=1e-6)
+    np.testing.assert_allclose(found.target(), [[0.05, 0.0, 0.15]], atol=1e-6)
     handle.position = (0.01, 0.02, 0.152)
-    np.testing.assert_allclose(found.wanted(), [[0.01, 0.02, 0.152]], atol=1e-6)
+    np.testing.assert_allclose(found.target(), [[0.01, 0.02, 0.152]], atol=1e-6)
     found.remove()
 
 

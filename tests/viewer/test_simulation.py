@@ -99,14 +99,14 @@ def test_what_was_planned_is_carried_to_where_the_trocar_is():
 
 def test_a_dragged_trocar_is_followed_and_the_task_is_done_through_it(expert):
     carry, frame = expert.start(0, 0, 0)
-    wanted = frame.p_world_trocar + np.float32([[-0.03, 0.02, 0.0]])
+    target = frame.p_world_trocar + np.float32([[-0.03, 0.02, 0.0]])
     errors, speed = [], []
     while not outcome(frame) and frame.step < 300:
         before = frame.p_world_trocar
-        carry, frame = expert.step(carry, wanted)
+        carry, frame = expert.step(carry, target)
         errors.append(float(frame.rcm_error[0]))
         speed.append(float(np.linalg.norm(frame.p_world_trocar - before)) * 30)
     assert outcome(frame) == "success" and not frame.collided
-    np.testing.assert_allclose(frame.p_world_trocar, wanted, atol=1e-6)
+    np.testing.assert_allclose(frame.p_world_trocar, target, atol=1e-6)
     assert max(speed) < 1.001 * simulation.TROCAR_SPEED
     assert max(errors) < 5e-3 and errors[-1] < 1e-4  # it lags behind the hand, and arrives

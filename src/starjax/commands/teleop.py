@@ -45,25 +45,24 @@ def main(argv: Sequence[str]) -> int:
     xla.require_devices("starjax.viewer.teleop")
 
     from starjax.sim import env as sim_env
-    from starjax.viewer import devices, recorder, steering, teleop
-    from starjax.viewer import server as pages
+    from starjax.viewer import devices, page, recorder, teleop
 
     env = sim_env.make(
         chosen.task, chosen.arm, observation=chosen.observation, image_size=chosen.image_size
     )
     if chosen.trocar >= (count := len(env.task.is_seen)):
         raise errors.UsageError("--trocar", f"0 to {count - 1}", chosen.trocar)
-    device = None if chosen.device == "none" else devices.opened(chosen.device)
+    device = None if chosen.device == "none" else devices.open_device(chosen.device)
     try:
         with (
             signals.stop_signals() as should_stop,
-            recorder.opened(Path(out), env, chosen.seed) as kept,
-            pages.opened(chosen.port) as server,
+            recorder.record_into(Path(out), env, chosen.seed) as kept,
+            page.serve(chosen.port) as server,
         ):
-            print(f"open {pages.address(server)} in a browser; Ctrl-C closes it", flush=True)
+            print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
             said = teleop.run(
                 server,
-                steering.make(env),
+                recorder.steer(env),
                 kept,
                 should_stop,
                 device=device,

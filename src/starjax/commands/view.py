@@ -53,55 +53,59 @@ def main(argv: Sequence[str]) -> int:
     xla.prepare_xla()
     xla.require_devices("starjax.viewer.view")
 
-    from starjax.viewer import server as pages
+    from starjax.viewer import page
 
     show = _dataset(chosen.dataset) if chosen.dataset else _live(chosen)
-    with signals.stop_signals() as should_stop, pages.opened(chosen.port) as server:
-        print(f"open {pages.address(server)} in a browser; Ctrl-C closes it", flush=True)
+    with signals.stop_signals() as should_stop, page.serve(chosen.port) as server:
+        print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
         print(show(server, should_stop))
     return 0
 
 
 def _dataset(folder: str) -> Show:
     """Makes the viewer of recorded episodes."""
-    from starjax.viewer import browse, recorded
+    from starjax.viewer import browse
 
     try:
-        found = recorded.opened(Path(folder))
+        dataset = browse.open_dataset(Path(folder))
     except ValueError as error:  # of a damaged file, which it names
         raise errors.UsageError("--dataset", "a folder of demonstrations", error) from error
-    return lambda server, should_stop: browse.run(server, found, should_stop)
+    return lambda server, should_stop: browse.run(server, dataset, should_stop)
 
 
 def _live(chosen: Options) -> Show:
-    """Makes the viewer of somebody at work."""
+    """Makes the live view of one agent or two."""
     from starjax.sim import registries
-    from starjax.viewer import actors, view
+    from starjax.viewer import simulation, view
 
-    who = [_actor(chosen.policy, chosen.run, chosen.task)]
+    agents = [_agent(chosen.policy, chosen.run, chosen.task)]
     if chosen.compare_with:
-        name = "" if chosen.compare_with == actors.EXPERT else chosen.compare_with
-        who.append(_actor(name, "", who[0].task))
-    if who[-1].task != who[0].task:
-        raise errors.UsageError("--compare-with", f"one that does {who[0].task}", who[-1].task)
+        name = "" if chosen.compare_with == simulation.EXPERT else chosen.compare_with
+        agents.append(_agent(name, "", agents[0].task))
+    if agents[-1].task != agents[0].task:
+        raise errors.UsageError(
+            "--compare-with", f"one that does {agents[0].task}", agents[-1].task
+        )
     if chosen.arm:
         errors.choice("--arm", chosen.arm, registries.arms.names())
-    count = len(registries.tasks.get(who[0].task).is_seen)
+    count = len(registries.tasks.get(agents[0].task).is_seen)
     if chosen.trocar >= count:
         raise errors.UsageError("--trocar", f"0 to {count - 1}", chosen.trocar)
-    asked = view.Asked(tuple(who), chosen.arm or view.THEIRS, chosen.trocar, chosen.seed)
-    return lambda server, should_stop: view.run(server, asked, should_stop)
+    initial = view.ViewOptions(
+        tuple(agents), chosen.arm or view.OWN_ARMS, chosen.trocar, chosen.seed
+    )
+    return lambda server, should_stop: view.run(server, initial, should_stop)
 
 
-def _actor(policy: str, run: str, task: str) -> Any:
-    from starjax.viewer import actors
+def _agent(policy: str, run: str, task: str) -> Any:
+    from starjax.viewer import simulation
 
     if run:
         folder = folders.existing(run)
         file = folders.weights(folder.parent, folder.name)
         if not file.is_file():
             raise errors.UsageError(str(file), "trained weights", "none")
-        return actors.from_file(file, f"{folder.parent.name}/{folder.name}")
+        return simulation.from_file(file, f"{folder.parent.name}/{folder.name}")
     if policy:
-        return actors.from_file(packaged.find("--policy", policy), Path(policy).stem)
-    return actors.expert(task)
+        return simulation.from_file(packaged.find("--policy", policy), Path(policy).stem)
+    return simulation.expert(task)

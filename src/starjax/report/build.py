@@ -10,14 +10,14 @@ from starjax.report import (
     compare,
     figures,
     page,
+    playback_3d,
     results,
-    stage,
+    scene_view,
     stress,
     style,
     tables,
     training_trocars,
     trajectories,
-    turned,
     video,
 )
 from starjax.runtime import files
@@ -51,10 +51,10 @@ def build(
         pairs, drawn = _figures(loaded, focus)
         film = _film(loaded, out / _FILM, report) if with_video and recorded else None
         clip = film.read_bytes() if film else None
-        solid = _turned(loaded, report) if with_video and recorded else None
-        html = page.render(loaded, focus, pairs, clip, solid)
+        playback = _playback(loaded, report) if with_video and recorded else None
+        html = page.render(loaded, focus, pairs, clip, playback)
         made = {"tables.md": text.encode(), **drawn, "index.html": html.encode()}
-        made |= {_SOLID: solid.html.encode()} if solid else {}
+        made |= {_PLAYBACK: playback.html.encode()} if playback else {}
         for name, data in made.items():
             files.write_bytes(out / name, data)
         for name in _NAMES.difference(made, [film.name] if film else []):
@@ -64,9 +64,9 @@ def build(
 
 _FIGURES = ("training", "ports", "fig3", "fig4", "stress")
 _FILM = "rollout.mp4"
-_SOLID = "rollout.html"
+_PLAYBACK = "rollout.html"
 # Of files that a report may have or not.
-_NAMES = {_FILM, _SOLID, *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf"))}
+_NAMES = {_FILM, _PLAYBACK, *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf"))}
 
 
 def _order(run: results.Run) -> int:
@@ -121,10 +121,12 @@ def _film(
     return film
 
 
-def _turned(runs: Sequence[results.Run], report: Callable[[str], None]) -> turned.Turned | None:
+def _playback(
+    runs: Sequence[results.Run], report: Callable[[str], None]
+) -> playback_3d.Playback | None:
     """Rollouts in 3D, or None, after a line where that has a reason."""
     try:
-        return turned.record(runs)
+        return playback_3d.record(runs)
     except (OSError, RuntimeError, errors.UsageError) as error:  # no trocar, or an unknown scene
         report(f"no rollouts in 3D: {error}")
         return None
@@ -163,5 +165,5 @@ def _figures(
 
 
 @functools.cache
-def _stage(names: SceneNames) -> stage.Stage:
-    return stage.load(names)
+def _stage(names: SceneNames) -> scene_view.SceneView:
+    return scene_view.load(names)

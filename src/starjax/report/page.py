@@ -6,7 +6,7 @@ Its only script is that of the rollouts in 3D, which are a page in a frame.
 import importlib.resources
 from collections.abc import Mapping, Sequence
 
-from starjax.report import captions, compare, markup, results, sections, turned
+from starjax.report import captions, compare, markup, playback_3d, results, sections
 from starjax.sim.tasks.base import TaskText
 
 # name -> (light PNG, dark PNG)
@@ -47,7 +47,7 @@ def render(
     focus: results.Run,
     figures: Figures,
     video: bytes | None,
-    solid: turned.Turned | None = None,
+    solid: playback_3d.Playback | None = None,
 ) -> str:
     """The page of `runs`, whose headline numbers are those of `focus`."""
     several = len(runs) > 1
@@ -107,11 +107,11 @@ def _video(video: bytes | None, observed: str, words: TaskText) -> str:
     )
 
 
-def _turned(solid: turned.Turned | None) -> str:
+def _turned(solid: playback_3d.Playback | None) -> str:
     """The rollouts in 3D, which a browser sets up when somebody opens them."""
     if solid is None:
         return ""
-    said = f"In 3D, to be turned with the mouse: {solid.said}"
+    said = f"In 3D, to be turned with the mouse: {solid.caption}"
     return (
         f"<details><summary>{markup.escape(said)}</summary>"
         f'<iframe title="{markup.escape(said)}" loading="lazy" sandbox="allow-scripts" '

@@ -9,11 +9,11 @@ import numpy as np
 from starjax import errors, methods
 from starjax.evaluation import recorded
 from starjax.evaluation.result import Result, Trial, read
-from starjax.report import beside, outcomes
+from starjax.report import outcomes, sidecars
 from starjax.types import Pose
 
 
-class Rollout(NamedTuple):
+class TrialTrajectory(NamedTuple):
     """One recorded trial of T control steps.
 
     Attributes:
@@ -54,7 +54,7 @@ class Run(NamedTuple):
     result: Result
     label: str
     group: str
-    rollouts: list[Rollout]
+    rollouts: list[TrialTrajectory]
     log: Path | None
     curves: list[dict[str, Any]]
     sweep: Result | None
@@ -91,8 +91,8 @@ def load(path: Path) -> Run:
     if result.method not in methods.METHODS:
         raise errors.UsageError(f"{file}: method", "one of starjax list", repr(result.method))
     method = methods.METHODS[result.method]
-    swept, bench = beside.sweep(path), beside.bench(path)
-    log, curves = beside.curves(path, result)
+    swept, bench = sidecars.sweep(path), sidecars.bench(path)
+    log, curves = sidecars.curves(path, result)
     weights = {"sweep.json": swept.weights if swept else None, "bench.json": bench.get("weights")}
     others = [name for name, of in weights.items() if _are_others(of, result.weights)]
     return Run(
@@ -104,7 +104,7 @@ def load(path: Path) -> Run:
         log=log,
         curves=curves,
         sweep=None if "sweep.json" in others else swept,
-        stress=beside.stress(path, result.weights),
+        stress=sidecars.stress(path, result.weights),
         bench={} if "bench.json" in others else bench,
         others=(*others, log.name) if log and not curves else tuple(others),
     )
@@ -164,7 +164,7 @@ def _are_others(found: str | None, weights: str | None) -> bool:
     return None not in (found, weights) and found != weights
 
 
-def _rollouts(path: Path, trials: Sequence[Trial]) -> list[Rollout]:
+def _rollouts(path: Path, trials: Sequence[Trial]) -> list[TrialTrajectory]:
     """Recorded trials that are among `trials`."""
     file = path / "evaluation" / "recorded.npz"
     if not file.is_file():
@@ -177,7 +177,7 @@ def _rollouts(path: Path, trials: Sequence[Trial]) -> list[Rollout]:
         ) from error
     known = {(trial.trocar, trial.trial): trial for trial in trials}
     return [
-        Rollout(trial, *(getattr(track, name) for name in Rollout._fields[1:]))
+        TrialTrajectory(trial, *(getattr(track, name) for name in TrialTrajectory._fields[1:]))
         for track in kept
         if (trial := known.get((track.trocar, track.trial))) and _is_recorded(trial, track)
     ]

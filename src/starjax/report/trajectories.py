@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from starjax.report import compare, outcomes, results, style
-from starjax.report.stage import Stage
+from starjax.report.scene_view import SceneView
 from starjax.sim.names import SceneNames
 from starjax.sim.tasks.base import Outline
 
-Stages = Callable[[SceneNames], Stage]
+Stages = Callable[[SceneNames], SceneView]
 
 _AZIMUTH, _ELEVATION = np.deg2rad(-52.0), np.deg2rad(20.0)
 _RIGHT = np.array([-np.sin(_AZIMUTH), np.cos(_AZIMUTH), 0.0])
@@ -138,11 +138,11 @@ def _path(
     axis.plot(*flat[-1], "o" if won else "s", color=color, markersize=5, zorder=7)
 
 
-def _shafts(axis: Any, rollout: results.Rollout, color: str, stage: Stage) -> None:
+def _shafts(axis: Any, rollout: results.TrialTrajectory, color: str, scene: SceneView) -> None:
     """The shafts at moments of a rollout, from the tips to beyond the trocars."""
     assert rollout.qpos is not None
     rows = np.linspace(0, len(rollout.qpos) - 1, _FAN).round().astype(int)
-    p, axis_of_shaft = stage.tips(rollout.qpos[rows], rollout.p_world_trocar)
+    p, axis_of_shaft = scene.tips(rollout.qpos[rows], rollout.p_world_trocar)
     length = np.linalg.norm(rollout.p_world_trocar - p, axis=-1) + _BEYOND  # [T, A]
     ends = np.stack([p - length[..., None] * axis_of_shaft, p])
     for shaft in ends.reshape(2, -1, 3).swapaxes(0, 1):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from starjax.evaluation.result import Result
-from starjax.report import compare, encode, outcomes, results, stage, style
+from starjax.report import compare, encode, outcomes, results, scene_view, style
 from starjax.sim.names import SceneNames
 
 SIZE = 384  # pixels a side of one rollout's images
@@ -39,21 +39,21 @@ def record(
     if not chosen:
         return None
     report(f"drawing {len(chosen)} rollouts for the video")
-    cameras = functools.cache(lambda names: stage.camera(names, SIZE))
+    cameras = functools.cache(lambda names: scene_view.camera(names, SIZE))
     note = f"sees the {compare.observed(runs)}"
     encode.write(frames(chosen, cameras, note), path, chosen[0].result.control_hz)
     return path
 
 
-class Shown(NamedTuple):
+class Clip(NamedTuple):
     """A rollout in the video: the method's name, the result that it is of, and itself."""
 
     label: str
     result: Result
-    rollout: results.Rollout
+    rollout: results.TrialTrajectory
 
 
-def choose(runs: Sequence[results.Run], most: int = 4) -> list[Shown]:
+def choose(runs: Sequence[results.Run], most: int = 4) -> list[Clip]:
     """Rollouts to show side by side, `most` at most.
 
     One run: half of them at seen and half at unseen trocars, spread over these, an even number if
@@ -67,11 +67,11 @@ def choose(runs: Sequence[results.Run], most: int = 4) -> list[Shown]:
     new = _spread(unseen, most - len(_spread(seen, most // 2)))
     chosen = [*_spread(seen, most - len(new)), *new]
     even = len(chosen) if len(chosen) < 2 else len(chosen) // 2 * 2
-    return [Shown(runs[0].label, runs[0].result, r) for r in chosen[:even]]
+    return [Clip(runs[0].label, runs[0].result, r) for r in chosen[:even]]
 
 
 def frames(
-    chosen: Sequence[Shown], cameras: Callable[[SceneNames], stage.Draw], note: str = ""
+    chosen: Sequence[Clip], cameras: Callable[[SceneNames], scene_view.Draw], note: str = ""
 ) -> Iterator[np.ndarray]:
     """Images `[h, w, 3]` uint8 of the chosen rollouts side by side in real time, captions over.
 
@@ -79,7 +79,7 @@ def frames(
 
     Args:
       chosen: from `choose`.
-      cameras: gives `stage.camera`'s function of a scene.
+      cameras: gives `scene_view.camera`'s function of a scene.
       note: said in every caption, such as what the policy observes.
     """
     clips = [_clip(cameras(shown.result.scene), shown, note) for shown in chosen]
@@ -107,7 +107,7 @@ def caption(rows: Sequence[Sequence[tuple[str, str]]], width: int) -> np.ndarray
     return np.asarray(image)
 
 
-def _clip(draw: stage.Draw, shown: Shown, note: str) -> Iterator[np.ndarray]:
+def _clip(draw: scene_view.Draw, shown: Clip, note: str) -> Iterator[np.ndarray]:
     """Images of one rollout under a bar: what is shown, the clock, and at the end the outcome."""
     rollout, hz = shown.rollout, shown.result.control_hz
     if rollout.qpos is None:
@@ -120,7 +120,7 @@ def _clip(draw: stage.Draw, shown: Shown, note: str) -> Iterator[np.ndarray]:
     cut = "" if steps == total else f"first {steps / hz:.0f} s shown"
     told = f"{kind} trocar {rollout.trial.trocar}" + (f", {note}" if note else "")
     about = (told, _MUTED), (cut, _MUTED)
-    for first in range(0, steps, stage.BATCH):
+    for first in range(0, steps, scene_view.BATCH):
         drawn = draw(rollout.qpos, rollout.p_world_trocar, rollout.labels, first, rollout.endoscope)
         for step, image in enumerate(drawn[: steps - first], start=first):
             now = outcome if step == steps - 1 else (f"{step / hz:.0f} s", _MUTED)
@@ -140,7 +140,7 @@ def _grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
     return grid
 
 
-def _spread(rollouts: list[results.Rollout], most: int) -> list[results.Rollout]:
+def _spread(rollouts: list[results.TrialTrajectory], most: int) -> list[results.TrialTrajectory]:
     """Up to `most` of them, spread evenly; each trocar's first trial before any second one."""
     ordered = sorted(rollouts, key=lambda r: (r.trial.trial, r.trial.trocar))
     first = [r for r in ordered if r.trial.trial == ordered[0].trial.trial]
@@ -149,7 +149,7 @@ def _spread(rollouts: list[results.Rollout], most: int) -> list[results.Rollout]
     return [pool[i] for i in picks]
 
 
-def _same_trial(runs: Sequence[results.Run], most: int) -> list[Shown]:
+def _same_trial(runs: Sequence[results.Run], most: int) -> list[Clip]:
     """The same trial of up to `most` runs; the last ones where there are more."""
     kept = [
         {compare.identity(r.trial): r for r in run.rollouts if r.qpos is not None} for run in runs
@@ -159,5 +159,5 @@ def _same_trial(runs: Sequence[results.Run], most: int) -> list[Shown]:
         return []
     pick = compare.most_shared(r.trial for _, rollouts in found for r in rollouts.values())
     return [
-        Shown(run.label, run.result, rollouts[pick]) for run, rollouts in found if pick in rollouts
+        Clip(run.label, run.result, rollouts[pick]) for run, rollouts in found if pick in rollouts
     ]

@@ -1,49 +1,133 @@
-"""The view of a dataset: its episodes one by one, played, stepped or dragged through."""
+"""A dataset's episodes on the page one by one, played, stepped or dragged through."""
 
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from starjax.data import store
-from starjax.viewer import panel, recorded
-from starjax.viewer.clock import Clock
+import mujoco
+import numpy as np
+
+from starjax import errors, rcm
+from starjax.data import schema, store
+from starjax.rollouts import episodes
+from starjax.sim import registries, scene
+from starjax.sim.names import SceneNames
+from starjax.viewer import frame as frames
+from starjax.viewer import page
+from starjax.viewer.frame import Frame
 from starjax.viewer.plots import Plots
 from starjax.viewer.stage import Stage, aim
-from starjax.viewer.status import Status, notify
-
-_SELDOM = 3  # control steps between two pictures and plots
-_PAUSED_S = 0.02  # between two looks at the page
 
 
-class Episode:
+class RecordedDataset(NamedTuple):
+    """A folder of demonstrations.
+
+    Attributes:
+      root: the folder.
+      description: dataset.json in the terms of schema 2.
+      names: the scene's names.
+      model: the scene's C model.
+      keys: episodes with arrays, in order.
+    """
+
+    root: Path
+    description: dict[str, Any]
+    names: SceneNames
+    model: mujoco.MjModel
+    keys: Sequence[str]
+
+
+class Recording(NamedTuple):
+    """A recorded episode.
+
+    Attributes:
+      frames: frames of its control steps.
+      images: `[T, h, w, 3]` uint8 of the first camera, or None.
+      outcome: `success` or `failed`.
+    """
+
+    frames: list[Frame]
+    images: np.ndarray | None
+    outcome: str
+
+
+def open_dataset(root: Path) -> RecordedDataset:
+    """Reads the description of a dataset.
+
+    Raises:
+      errors.UsageError: the folder has no episode, or a part of its scene is unknown here.
+    """
+    description = schema.upgraded(store.read_description(root))
+    spec = description["scene"]
+    names = SceneNames(spec["task"], *(tuple(spec[part]) for part in ("arms", "tools", "cameras")))
+    keys = [key for key in store.keys(root) if store.verify(root, key, arrays=False)["files"]]
+    if not keys:
+        raise errors.UsageError("--dataset", "a folder with episodes", root)
+    errors.choice("task of the dataset", names.task, registries.tasks.names())
+    return RecordedDataset(root, description, names, scene.compose(names), keys)
+
+
+def read(dataset: RecordedDataset, key: str) -> Recording:
+    """Reads an episode and checks every byte of it.
+
+    Raises:
+      store.DamagedEpisode: naming the file.
+    """
+    record = store.verify(dataset.root, key)
+    version, folder = dataset.description["schema"], dataset.root / "episodes" / key
+
+    def field(name: str) -> np.ndarray:
+        array = np.load(folder / schema.file_name(version, name), allow_pickle=False)
+        return schema.with_arms(version, name, array)
+
+    p_world_trocar = rcm.trocar_position(
+        schema.trocars_of([record]), np.array(dataset.description["p_world_ref"], np.float32)
+    )
+    steps = frames.from_arrays(
+        field("qpos"),
+        np.asarray(p_world_trocar)[0],
+        field("p"),
+        field("rcm_error"),
+        frames.colours(dataset.names, dataset.model, record["labels"]),
+    )
+    camera = f"{episodes.IMAGE}{dataset.names.cameras[0]}"
+    images = field(camera) if schema.file_name(version, camera) in record["files"] else None
+    last = steps[-1]._replace(done=True, success=record["success"], invalid=record["invalid"])
+    return Recording([*steps[:-1], last], images, "success" if record["success"] else "failed")
+
+
+class EpisodePlayer:
     """The episode on the page.
 
     Attributes:
-      key: its name. t: the control step that is shown.
+      hz: control steps per second.
+      key: its name.
+      t: the displayed control step.
     """
 
-    def __init__(self, server: Any, dataset: recorded.Dataset):
+    def __init__(self, server: Any, dataset: RecordedDataset):
         self._server, self._dataset = server, dataset
         self.hz = float(dataset.description["control_hz"])
-        self._status = Status(server.gui)
+        self._status = page.Status(server.gui)
         self._stage = Stage(server.scene, dataset.model)
         aim(server, 1)
-        _, tab = panel.beside(server.gui, "Recorded")
+        _, tab = page.side_panel(server.gui, "Recorded")
         with tab:
             self._plots = Plots(server.gui, ["recorded"], self.hz)
-            self._pictures = panel.Pictures(server.gui, [dataset.names.cameras[0]])
+            self._pictures = page.Pictures(server.gui, [f"{dataset.names.cameras[0]} sees"])
 
     @property
     def last(self) -> int:
-        """Number of the last control step."""
+        """Index of the last control step."""
         return len(self._recording.frames) - 1
 
     def open(self, key: str) -> None:
-        """Reads another one; a damaged one is told of, and what was shown stays."""
+        """Reads another episode; if it is damaged, notifies the user and keeps the present one."""
         try:
-            self._recording = recorded.read(self._dataset, key)
+            self._recording = read(self._dataset, key)
         except store.DamagedEpisode as error:
-            notify(self._server, "Damaged", str(error), is_bad=True)
+            page.notify(self._server, "Damaged", str(error), is_error=True)
             if not hasattr(self, "_recording"):
                 raise
             return
@@ -51,7 +135,7 @@ class Episode:
         self.show(0)
 
     def show(self, t: int, is_jump: bool = True) -> None:
-        """Shows a control step; plots begin anew after a jump."""
+        """Shows a control step; after a jump, draws the plots anew."""
         self.t, frame = t, self._recording.frames[t]
         if is_jump:
             self._plots.clear()
@@ -61,48 +145,47 @@ class Episode:
         with self._server.atomic():
             self._stage.show(frame)
         self._plots.add([frame])
-        if is_jump or t == self.last or t % _SELDOM == 0:
+        if is_jump or t == self.last or t % page.REDRAW_STEPS == 0:
             self._plots.draw()
             if self._recording.images is not None:
                 self._pictures.show([self._recording.images[t]])
-            self._status.say(
+            self._status.set(
                 f"Episode {self.key}, {self._recording.outcome}\n"
                 f"{t / self.hz:.1f} of {self.last / self.hz:.1f} s, "
-                f"RCM error {1e3 * float(frame.rcm_error.max()):.2f} mm"
+                f"RCM error {frames.rcm_error_mm(frame):.2f} mm"
             )
 
 
-def run(server: Any, dataset: recorded.Dataset, should_stop: Callable[[], bool]) -> str:
-    """Shows episodes until `should_stop()`; returns a line about what was shown."""
-    gui, wishes, keys = server.gui, panel.Wishes(), list(dataset.keys)
-    episode = Episode(server, dataset)
-    player = panel.Player(gui, wishes)
-    choices = panel.Choices(gui, wishes, episode=(keys, keys[0]))
+def run(server: Any, dataset: RecordedDataset, should_stop: Callable[[], bool]) -> str:
+    """Shows episodes until `should_stop()`; returns a summary line."""
+    gui, requests, keys = server.gui, page.UiRequests(), list(dataset.keys)
+    episode = EpisodePlayer(server, dataset)
+    player = page.Player(gui, requests)
+    choices = page.Choices(gui, requests, episode=(keys, keys[0]))
     slider = gui.add_slider("Time (%)", 0.0, 100.0, 0.1, 0.0)
-    dragged = [False]
-    slider.on_update(lambda event: dragged.__setitem__(0, event.client is not None))
+    # The loop moves the slider too: only a client's move is a request.
+    slider.on_update(lambda event: requests.add("drag") if event.client is not None else None)
     episode.open(keys[0])
-    clock, shown = Clock(episode.hz), {keys[0]}
+    clock, played = page.Clock(episode.hz), {keys[0]}
     while not should_stop():
-        wish = wishes.taken()
-        if wish.following:
+        requested = requests.pop()
+        if "next" in requested:
             choices.offer("episode", keys, keys[(keys.index(episode.key) + 1) % len(keys)])
         if choices["episode"] != episode.key:
             episode.open(choices["episode"])
             choices.offer("episode", keys, episode.key)
-            shown.add(episode.key)
-        elif wish.again:
+            played.add(episode.key)
+        elif "again" in requested:
             episode.show(0)
-        elif dragged[0]:
-            dragged[0] = False
+        elif "drag" in requested:
             episode.show(round(float(slider.value) / 100.0 * episode.last))
-        elif wish.step or (player.is_playing and episode.t < episode.last):
+        elif "step" in requested or (player.is_playing and episode.t < episode.last):
             if player.is_playing:
                 clock.wait(player.speed)
             episode.show(min(episode.t + 1, episode.last), is_jump=False)
-            if episode.t % _SELDOM == 0:
+            if episode.t % page.REDRAW_STEPS == 0:
                 slider.value = 100.0 * episode.t / max(episode.last, 1)
         else:
             clock.pause()
-            time.sleep(_PAUSED_S)
-    return f"{len(shown)} of {len(keys)} episodes shown"
+            time.sleep(page.PAUSED_S)
+    return f"{len(played)} of {len(keys)} episodes shown"

@@ -1,4 +1,4 @@
-"""Devices in a hand: a SpaceMouse or a gamepad, by the libraries that know them, if installed."""
+"""Input devices: a SpaceMouse or a gamepad, through their optional libraries."""
 
 import importlib
 from collections.abc import Callable
@@ -8,31 +8,31 @@ import numpy as np
 
 from starjax import errors
 
-_DEAD = 0.08  # of a stick's way, about its middle
+_DEAD_ZONE = 0.08  # of a stick's range, about its centre
 
 
 class Reading(NamedTuple):
-    """One look at a device.
+    """One reading of a device.
 
     Attributes:
       deflection: `[4]` in [-1, 1]: roll, right, away, up.
-      buttons: whether the first (jaws) and the second (clutch) are down.
+      buttons: pressed states of the first (jaws) and the second (clutch).
     """
 
     deflection: np.ndarray
     buttons: tuple[bool, bool]
 
 
-class Gone(OSError):
+class DeviceLost(OSError):
     """A device that can no longer be read."""
 
 
 class Device(NamedTuple):
-    """A device that is open.
+    """An open device.
 
     Attributes:
-      read: () -> Reading, at once; raises `Gone`.
-      close: ends it.
+      read: () -> Reading, without waiting; raises `DeviceLost`.
+      close: releases the device.
     """
 
     read: Callable[[], Reading]
@@ -44,7 +44,7 @@ def _spacemouse() -> Device:
     try:
         mouse = library.open(axis_convention=library.AxisConvention.HID_Z_UP)
     except (RuntimeError, OSError, ValueError) as error:
-        hint = "on Linux the user needs the right to read it: a udev rule for vendor 256f"
+        hint = "on Linux, the user needs read permission: a udev rule for vendor 256f"
         raise errors.UsageError("--device", "a SpaceMouse", error, hint) from error
 
     unplugged = _library("easyhid", "spacemouse").HIDException
@@ -53,13 +53,13 @@ def _spacemouse() -> Device:
         before = None
         try:
             state = mouse.read()
-            while state.t != before:  # all that it has sent since
+            while state.t != before:  # skips to the latest report
                 before, state = state.t, mouse.read()
         except unplugged as error:
-            raise Gone(str(error)) from error
+            raise DeviceLost(str(error)) from error
         pressed = [*map(bool, state.buttons), False, False]
-        found = np.array([state.yaw, state.x, state.y, state.z])
-        return Reading(np.clip(found, -1.0, 1.0), (pressed[0], pressed[1]))
+        deflection = np.array([state.yaw, state.x, state.y, state.z])
+        return Reading(np.clip(deflection, -1.0, 1.0), (pressed[0], pressed[1]))
 
     return Device(read, mouse.close)
 
@@ -70,20 +70,20 @@ def _gamepad() -> Device:
     library.joystick.init()
     if not library.joystick.get_count():
         library.quit()
-        raise errors.UsageError("--device", "a gamepad", "none is connected")
+        raise errors.UsageError("--device", "a connected gamepad", "no gamepad")
     pad = library.joystick.Joystick(0)
 
     def read() -> Reading:
         library.event.pump()
         if not library.joystick.get_count():
-            raise Gone("it was unplugged")
+            raise DeviceLost("unplugged")
         # left stick: right and away; right stick: roll and up
         sticks = np.array([pad.get_axis(i) for i in range(4)])
-        sticks = np.where(np.abs(sticks) < _DEAD, 0.0, sticks)
+        sticks = np.where(np.abs(sticks) < _DEAD_ZONE, 0.0, sticks)
         right, toward, roll, down = sticks
-        found = np.array([-roll, right, -toward, -down])
+        deflection = np.array([-roll, right, -toward, -down])
         buttons = bool(pad.get_button(0)), bool(pad.get_button(1))
-        return Reading(np.clip(found, -1.0, 1.0), buttons)
+        return Reading(np.clip(deflection, -1.0, 1.0), buttons)
 
     return Device(read, library.quit)
 
@@ -91,11 +91,11 @@ def _gamepad() -> Device:
 DEVICES: dict[str, Callable[[], Device]] = {"spacemouse": _spacemouse, "gamepad": _gamepad}
 
 
-def opened(name: str) -> Device:
+def open_device(name: str) -> Device:
     """Opens a device.
 
     Raises:
-      errors.UsageError: none of this kind is connected, or its library is not installed.
+      errors.UsageError: no such device is connected, or its library is not installed.
     """
     errors.choice("--device", name, DEVICES)
     return DEVICES[name]()
@@ -107,5 +107,5 @@ def _library(package: str, device: str) -> Any:
     except ImportError as error:
         hint = f"pip install {package}"
         raise errors.UsageError(f"--device {device}", package, "no such package", hint) from error
-    except (OSError, AttributeError) as error:  # its own C library is missing
+    except (OSError, AttributeError) as error:  # its C library is missing
         raise errors.UsageError(f"--device {device}", f"a working {package}", error) from error

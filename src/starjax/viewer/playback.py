@@ -1,41 +1,43 @@
-"""A rollout as one HTML file in which it plays and can be turned, without a server."""
+"""Rollouts as one HTML file with a 3D view that plays without a server."""
 
 from collections.abc import Sequence
 
 import mujoco
-import numpy as np
 
-from starjax.viewer import server as pages
+from starjax.viewer import page
 from starjax.viewer.frame import Frame
 from starjax.viewer.stage import Stage, aim
 
-_REST_S = 1.0  # that the last moment stays
-_EVERY = 2  # control steps between two moments: 15 a second play smoothly
+_HOLD_S = 1.0  # time that the last frame stays
+_STRIDE = 2  # control steps between two frames: 15 frames a second play smoothly
 
 
 def html(
     model: mujoco.MjModel, rollouts: Sequence[Sequence[Frame]], hz: float, longest_s: float
 ) -> str:
-    """The page of rollouts side by side; a shorter one stays as it ended.
+    """Returns a page of rollouts side by side; a shorter one holds its last frame.
 
     Args:
-      model: of their scene.
-      hz: control steps a second.
-      longest_s: s shown of a rollout.
+      model: their scene.
+      rollouts: frames of each.
+      hz: control steps per second.
+      longest_s: longest duration shown, in s.
     """
-    shown = [list(frames[: round(longest_s * hz)]) for frames in rollouts]
-    with pages.opened(pages.ANY) as server:
-        stages = [Stage(server.scene, model, i) for i in range(len(shown))]
-        aim(server, len(shown))
-        for stage, frames in zip(stages, shown):
-            stage.show(frames[0])
-        recording = server.get_scene_serializer()
-        steps = np.arange(0, max(map(len, shown)), _EVERY)
-        for t in steps:
-            for stage, frames in zip(stages, shown):
+    clips = [frames[: round(longest_s * hz)] for frames in rollouts]
+    with page.serve(page.ANY) as server:
+        stages = [Stage(server.scene, model, i) for i in range(len(clips))]
+        aim(server, len(clips))
+
+        def show(t: int) -> None:
+            for stage, frames in zip(stages, clips):
                 stage.show(frames[min(t, len(frames) - 1)])
-            recording.insert_sleep(_EVERY / hz)
-        for stage, frames in zip(stages, shown):
-            stage.show(frames[-1])
-        recording.insert_sleep(_REST_S)
+
+        show(0)
+        recording = server.get_scene_serializer()
+        steps = max(map(len, clips))
+        for t in range(0, steps, _STRIDE):
+            show(t)
+            recording.insert_sleep(_STRIDE / hz)
+        show(steps)
+        recording.insert_sleep(_HOLD_S)
         return recording.as_html()

@@ -1,137 +1,228 @@
-"""The live view: somebody at work, through trocars that one may drag."""
+"""The live view: an agent at work, or two side by side, through trocars that the user can drag."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from starjax import errors
 from starjax.sim import registries
-from starjax.viewer import actors, panel
-from starjax.viewer.actors import Actor
-from starjax.viewer.clock import Clock
-from starjax.viewer.side_by_side import Rollouts
-from starjax.viewer.status import Status, notify
+from starjax.viewer import page, simulation
+from starjax.viewer.frame import outcome, rcm_error_mm
+from starjax.viewer.handles import TrocarHandles
+from starjax.viewer.plots import Plots
+from starjax.viewer.simulation import AgentSpec, Simulation
+from starjax.viewer.stage import Stage, aim
 
-THEIRS = "their own"  # of arms
+OWN_ARMS = "their own"
+_REST_S = 1.5  # pause between an episode and the next trial
 
 
-class Asked(NamedTuple):
-    """Choices that the page begins with.
+class ViewOptions(NamedTuple):
+    """Initial choices of the page.
 
     Attributes:
-      who: one actor, or two of one task for side by side.
-      arm: robot instead of theirs, or `THEIRS`.
-      trocar: number of the task's configuration. seed: of the trials.
+      agents: one agent, or two with the same task for a view side by side.
+      arm: robot in place of their own, or `OWN_ARMS`.
+      trocar: index of the task's trocar configuration.
+      seed: seed of the trials.
     """
 
-    who: tuple[Actor, ...]
-    arm: str = THEIRS
+    agents: tuple[AgentSpec, ...]
+    arm: str = OWN_ARMS
     trocar: int = 0
     seed: int = 0
 
 
-def run(server: Any, asked: Asked, should_stop: Callable[[], bool]) -> str:
-    """Shows rollouts until `should_stop()`; returns a line about what was shown."""
-    wishes = panel.Wishes()
-    status = Status(server.gui)
-    player = panel.Player(server.gui, wishes)
-    cast = Cast(server.gui, wishes, asked)
-    rollouts = _built(server, cast, status)
-    rollouts.begin(asked.seed, cast.trocar, 0)
-    clock = Clock(rollouts.hz)
+def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> str:
+    """Shows rollouts until `should_stop()`; returns a summary line."""
+    requests = page.UiRequests()
+    status = page.Status(server.gui)
+    player = page.Player(server.gui, requests)
+    selection = Selection(server.gui, requests, options)
+    rollouts = _load(server, selection, status)
+    rollouts.begin(options.seed, selection.trocar, 0)
+    clock = page.Clock(rollouts.hz)
     while not should_stop():
-        wish = wishes.taken()
-        if wish.other:
+        requested = requests.pop()
+        if "choice" in requested:
             clock.pause()
-            if cast.is_changed():
+            if selection.is_changed():
                 rollouts.remove()
-                rollouts = _built(server, cast, status)
-            rollouts.begin(asked.seed, cast.trocar, 0)
-        elif wish.again or wish.following:
+                rollouts = _load(server, selection, status)
+            rollouts.begin(options.seed, selection.trocar, 0)
+        elif requested & {"again", "next"}:
             clock.pause()
-            rollouts.begin(asked.seed, cast.trocar, rollouts.trial + wish.following)
-        elif wish.step or player.is_playing:
+            trial = rollouts.trial + ("next" in requested)
+            rollouts.begin(options.seed, selection.trocar, trial)
+        elif "step" in requested or player.is_playing:
             if player.is_playing:
                 clock.wait(player.speed)
             if rollouts.advance():
-                wishes.following = True
+                requests.add("next")
         else:
             clock.pause()
             rollouts.idle()
-    return f"{rollouts.said()}; {clock.missed} of {clock.steps} control steps late"
+    return f"{rollouts.summary()}; {clock.missed} of {clock.steps} control steps late"
 
 
-class Cast:
-    """Who acts in what, as the panel's dropdowns have it."""
+class Selection:
+    """Task, agents, robot and trocar that the panel's dropdowns select."""
 
-    def __init__(self, gui: Any, wishes: panel.Wishes, asked: Asked):
-        self._given = {actor.label: actor for actor in asked.who}
-        labels = [actor.label for actor in asked.who]
-        task = asked.who[0].task
-        names = self._names(task)
-        trocars = trocar_names(task)
-        self._choices = panel.Choices(
+    def __init__(self, gui: Any, requests: page.UiRequests, options: ViewOptions):
+        self._given = {spec.label: spec for spec in options.agents}
+        labels = [spec.label for spec in options.agents]
+        task = options.agents[0].task
+        names, trocars = list(self._agents(task)), trocar_names(task)
+        self._choices = page.Choices(
             gui,
-            wishes,
+            requests,
             task=(registries.tasks.names(), task),
             who=(names, labels[0]),
-            beside=((panel.NOBODY, *names), labels[1] if len(labels) > 1 else panel.NOBODY),
-            arm=((THEIRS, *registries.arms.names()), asked.arm),
-            trocar=(trocars, trocars[asked.trocar]),
+            beside=((page.NOBODY, *names), [*labels, page.NOBODY][1]),
+            arm=((OWN_ARMS, *registries.arms.names()), options.arm),
+            trocar=(trocars, trocars[options.trocar]),
         )
-        self._before = self._now()
+        self._before = self._values()
 
     @property
     def trocar(self) -> int:
-        """Number of the task's configuration."""
+        """Index of the task's trocar configuration."""
         return int(self._choices["trocar"].split()[0])
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """Robots instead of the actors' own."""
-        return () if self._choices["arm"] == THEIRS else (self._choices["arm"],)
+        """Robots in place of the agents' own."""
+        return () if self._choices["arm"] == OWN_ARMS else (self._choices["arm"],)
 
-    def actors(self) -> list[Actor]:
-        """One, or two of one task."""
-        found = self._known(self._choices["task"])
-        chosen = [self._choices["who"], self._choices["beside"]]
-        return [found[label] for label in chosen if label in found]
+    def agents(self) -> list[AgentSpec]:
+        """Returns the selected agent, or two with the same task."""
+        known = self._agents(self._choices["task"])
+        labels = [self._choices["who"], self._choices["beside"]]
+        return [known[label] for label in labels if label in known]
 
     def is_changed(self) -> bool:
-        """Whether another scene or actor was chosen than when this was last asked."""
+        """Returns True if another scene or agent was selected since the last call."""
         task = self._choices["task"]
         if task != self._before[0]:
-            names, trocars = self._names(task), trocar_names(task)
+            names, trocars = list(self._agents(task)), trocar_names(task)
             self._choices.offer("who", names, names[0])
-            self._choices.offer("beside", (panel.NOBODY, *names), panel.NOBODY)
+            self._choices.offer("beside", (page.NOBODY, *names), page.NOBODY)
             self._choices.offer("trocar", trocars, trocars[0])
-        before, self._before = self._before, self._now()
+        before, self._before = self._before, self._values()
         return before != self._before
 
-    def _now(self) -> tuple[str, ...]:
+    def _values(self) -> tuple[str, ...]:
         return tuple(self._choices[name] for name in ("task", "who", "beside", "arm"))
 
-    def _known(self, task: str) -> dict[str, Actor]:
-        given = {name: actor for name, actor in self._given.items() if actor.task == task}
-        return given | {actor.label: actor for actor in actors.known(task)}
-
-    def _names(self, task: str) -> list[str]:
-        return list(self._known(task))
+    def _agents(self, task: str) -> dict[str, AgentSpec]:
+        given = {label: spec for label, spec in self._given.items() if spec.task == task}
+        return given | {spec.label: spec for spec in simulation.available(task)}
 
 
-def _built(server: Any, cast: Cast, status: Status) -> Rollouts:
-    """Compiles what was chosen, or the same without the arm that cannot do it."""
-    who = cast.actors()
-    labels = " and ".join(actor.label for actor in who)
-    status.say(f"Compiling {labels}\nAbout a minute the first time, seconds later.")
+class Rollouts:
+    """One rollout or two of the same trial on the page, and a tally of the trials so far.
+
+    Attributes:
+      hz: control steps per second.
+      trial: number of the present trial.
+    """
+
+    def __init__(self, server: Any, simulations: Sequence[Simulation], status: page.Status):
+        self._server, self._simulations, self._status = server, simulations, status
+        env, gui = simulations[0].env, server.gui
+        self.hz, self._limit = env.control_hz, round(env.task.time_limit_s * env.control_hz)
+        labels = [simulation.label for simulation in simulations]
+        models = [simulation.env.scene.mj_model for simulation in simulations]
+        self._stages = [Stage(server.scene, model, i) for i, model in enumerate(models)]
+        aim(server, len(simulations))
+        self._handles = TrocarHandles(server.scene, env.task)
+        self._panel, tab = page.side_panel(gui, "Measured")
+        with tab:
+            self._plots = Plots(gui, labels, self.hz)
+            self._pictures = page.Pictures(gui, [f"{label} sees" for label in labels])
+        self._tally = np.zeros((len(simulations), 2), int)  # succeeded, ended
+
+    def begin(self, seed: int, configuration: int, trial: int) -> None:
+        """Starts a trial through a trocar configuration of the task."""
+        self.trial, self._rest = trial, round(_REST_S * self.hz)
+        starts = [one.start(seed, configuration, trial) for one in self._simulations]
+        self._states, self._frames = map(list, zip(*starts))
+        self._outcomes = [""] * len(starts)
+        self._handles.place(self._frames[0].p_world_trocar)
+        self._plots.clear()
+        for stage in self._stages:
+            stage.clear()
+        self._draw(with_images=True)
+
+    def advance(self) -> bool:
+        """Runs one control step; returns True once all have ended and rested."""
+        if all(self._outcomes):
+            self._rest -= 1
+            return self._rest <= 0
+        target = self._handles.target()
+        for i in [i for i, end in enumerate(self._outcomes) if not end]:
+            self._states[i], frame = self._simulations[i].step(self._states[i], target)
+            self._frames[i], self._outcomes[i] = frame, outcome(frame, frame.step >= self._limit)
+            self._tally[i] += bool(frame.success), bool(self._outcomes[i])
+        is_due = self._frames[0].step % page.REDRAW_STEPS == 0
+        self._draw(with_images=is_due or all(self._outcomes))
+        return False
+
+    def idle(self) -> None:
+        """Waits while the view is paused; released handles return."""
+        self._handles.target()
+        time.sleep(page.PAUSED_S)
+
+    def summary(self) -> str:
+        """Returns the success so far."""
+        return "; ".join(
+            f"{simulation.label}: {successes} of {ended} trials succeeded"
+            for simulation, (successes, ended) in zip(self._simulations, self._tally)
+        )
+
+    def remove(self) -> None:
+        """Removes everything from the page."""
+        for part in (*self._stages, self._handles, self._panel):
+            part.remove()
+
+    def _draw(self, with_images: bool) -> None:
+        """Draws the 3D view and, if `with_images`, also plots, pictures and status."""
+        with self._server.atomic():
+            for stage, frame in zip(self._stages, self._frames):
+                stage.show(frame)
+        self._plots.add(self._frames)
+        if with_images:
+            self._plots.draw()
+            images = [one.look(state) for one, state in zip(self._simulations, self._states)]
+            self._pictures.show([np.asarray(next(iter(image.values()))) for image in images])
+            self._status.set("\n\n".join(map(self._line, range(len(self._stages)))))
+
+    def _line(self, i: int) -> str:
+        frame, (successes, ended) = self._frames[i], self._tally[i]
+        progress = self._outcomes[i] or self._simulations[i].env.task.stages[int(frame.stage)]
+        return (
+            f"{self._simulations[i].label}, trial {self.trial}: "
+            f"{frame.step / self.hz:.1f} s, {progress}\n"
+            f"RCM error {rcm_error_mm(frame):.2f} mm; success so far: {successes} of {ended}"
+        )
+
+
+def _load(server: Any, selection: Selection, status: page.Status) -> Rollouts:
+    """Loads the selected agents, on their own robots if the selected arm cannot do the task."""
+    specs = selection.agents()
+    labels = " and ".join(spec.label for spec in specs)
+    status.set(f"Compiling {labels}\nAbout a minute the first time, seconds later.")
     try:
-        found = [actors.simulate(actor, cast.arms) for actor in who]
+        loaded = [simulation.load(spec, selection.arms) for spec in specs]
     except errors.UsageError as error:  # an arm without a mount for this task
-        notify(server, "Not possible", str(error), is_bad=True)
-        found = [actors.simulate(actor) for actor in who]
-    return Rollouts(server, found, status)
+        page.notify(server, "Not possible", str(error), is_error=True)
+        loaded = [simulation.load(spec) for spec in specs]
+    return Rollouts(server, loaded, status)
 
 
 def trocar_names(task: str) -> list[str]:
-    """`<number> (seen)` of each configuration."""
+    """Returns `INDEX (seen)` or `INDEX (unseen)` of each trocar configuration."""
     seen = registries.tasks.get(task).is_seen
     return [f"{i} ({'seen' if is_seen else 'unseen'})" for i, is_seen in enumerate(seen)]

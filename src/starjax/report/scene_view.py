@@ -12,7 +12,7 @@ from starjax.types import Pose
 BATCH = 16  # images drawn in one call
 
 
-class Stage(NamedTuple):
+class SceneView(NamedTuple):
     """A scene, as figures draw it.
 
     Attributes:
@@ -25,7 +25,7 @@ class Stage(NamedTuple):
     tips: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
-def load(names: SceneNames) -> Stage:
+def load(names: SceneNames) -> SceneView:
     """Composes the scene of these names; nothing is compiled for a device.
 
     Raises:
@@ -48,7 +48,7 @@ def load(names: SceneNames) -> Stage:
         p, axis = np.moveaxis(np.array(found), 2, 0)
         return p, axis
 
-    return Stage(registries.tasks.get(names.task).outline(model), tips)
+    return SceneView(registries.tasks.get(names.task).outline(model), tips)
 
 
 # (qpos `[T, Q]`, p_world_trocar `[A, 3]` m, labels, first, endoscope's Pose `[T]` or None) ->

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from starjax.sim import scene
-from starjax.viewer import drawing, shapes
+from starjax.viewer import meshes, stage
 
 ROUND = ("mjGEOM_SPHERE", "mjGEOM_CAPSULE", "mjGEOM_CYLINDER", "mjGEOM_BOX", "mjGEOM_ELLIPSOID")
 
@@ -27,7 +27,7 @@ def drawn(parts, geom):
 
 def test_geoms_are_as_large_as_their_bounding_spheres(model):
     """The oracle is MuJoCo's own radius of each geom's bounding sphere."""
-    parts, seen = shapes.read(model), 0
+    parts, seen = meshes.read(model), 0
     for g in range(model.ngeom):
         if mujoco.mjtGeom(model.geom_type[g]).name not in ROUND or model.geom_group[g] >= 3:
             continue
@@ -45,7 +45,7 @@ def test_hidden_geoms_are_not_drawn():
         "<geom size='1' rgba='1 1 1 0'/><geom type='ellipsoid' size='1 2 3'/>"
         "<geom type='plane' size='0 0 1'/></worldbody></mujoco>"
     )
-    parts = shapes.read(m)
+    parts = meshes.read(m)
     assert list(parts["sphere"].geom) == [0, 3] and list(parts["box"].geom) == [4]
     assert np.abs(drawn(parts, 3)).max(0) == pytest.approx([1, 2, 3], rel=1e-3)
 
@@ -55,7 +55,7 @@ def test_meshes_are_drawn_as_they_are():
         "<mujoco><asset><mesh name='m' vertex='0 0 0  1 0 0  0 1 0  0 0 1'/></asset>"
         "<worldbody><geom type='mesh' mesh='m'/></worldbody></mujoco>"
     )
-    part = shapes.read(m)["mesh0"]
+    part = meshes.read(m)["mesh0"]
     volume = np.einsum("fi,fi->", part.vertices[part.faces[:, 0]], np.cross(*_sides(part))) / 6
     assert volume == pytest.approx(1 / 6, rel=1e-5)
 
@@ -81,18 +81,25 @@ class Scene:
     def add_grid(self, *given, **more):
         pass
 
+    def add_frame(self, *given, **more):
+        pass
+
+    def add_line_segments(self, *given, **more):
+        return type("Handle", (), {})()
+
 
 def test_instances_follow_the_simulation(model):
     page, data = Scene(), mujoco.MjData(model)
-    show = drawing.add(page, model, "/a")
+    drawn = stage.Stage(page, model)
     random = np.random.default_rng(0)
     qpos = model.qpos0 + 0.1 * random.normal(size=model.nq)
     trocar = np.array([[0.02, -0.01, 0.16]])
     rgb = random.uniform(size=(model.ngeom, 3))
-    show(qpos, trocar, rgb)
+    frame = stage.Frame(0, qpos, trocar, trocar, 0, rgb, np.zeros((0, 1, 3)), *[0] * 6)
+    drawn.show(frame)
     data.qpos[:], data.mocap_pos[0] = qpos, trocar
     mujoco.mj_forward(model, data)
-    box, part = page.sent["/a/box"], shapes.read(model)["box"]
+    box, part = page.sent["/rollout0/geoms/box"], meshes.read(model)["box"]
     for i, g in enumerate(part.geom):
         R = np.zeros(9)
         mujoco.mju_quat2Mat(R, box.batched_wxyzs[i].astype(float))
@@ -102,6 +109,6 @@ def test_instances_follow_the_simulation(model):
         shade = box.batched_colors[i] / box.batched_colors[0]
         np.testing.assert_allclose(shade, rgb[g] / rgb[part.geom[0]], rtol=0.2)
     ring = model.geom("trocar0").id
-    cylinder, part = page.sent["/a/cylinder"], shapes.read(model)["cylinder"]
+    cylinder, part = page.sent["/rollout0/geoms/cylinder"], meshes.read(model)["cylinder"]
     at = cylinder.batched_positions[list(part.geom).index(ring)]
     np.testing.assert_allclose(at, trocar[0], atol=1e-6)

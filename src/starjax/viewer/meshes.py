@@ -1,4 +1,4 @@
-"""A MuJoCo model as a few unit meshes, of which the page draws many instances each."""
+"""A MuJoCo model as a few unit meshes with many instances each, as the page draws it."""
 
 from typing import NamedTuple
 
@@ -9,9 +9,9 @@ import trimesh
 _HIDDEN_GROUP = 3  # geoms of this group and above are not drawn, as in the simulator's camera
 _SEGMENTS = 32  # around a cylinder
 _SUBDIVISIONS = 2  # of the sphere
-_SHARP = 0.5  # rad between faces, beyond which their edge is drawn as one
+_SHARP = 0.5  # rad between two faces, beyond which their edge is not shaded smooth
 _FLAT = 2e-4  # m, half thickness of a plane
-_ENDLESS = 0.5  # m, half length of a plane that has none
+_ENDLESS = 0.5  # m, half length of an infinite plane
 
 _KINDS = mujoco.mjtGeom
 
@@ -20,10 +20,11 @@ class Instances(NamedTuple):
     """All instances K of one mesh.
 
     Attributes:
-      vertices: `[V, 3]`. faces: `[F, 3]` int.
-      geom: `[K]` ids of the geoms that they belong to.
-      offset: `[K, 3]` m in the geom's frame.
-      scale: `[K, 3]`.
+      vertices: `[V, 3]` of the mesh.
+      faces: `[F, 3]` int of the mesh.
+      geom: `[K]` geom ids.
+      offset: `[K, 3]` positions in m in the geom's frame.
+      scale: `[K, 3]` factors.
     """
 
     vertices: np.ndarray
@@ -34,25 +35,25 @@ class Instances(NamedTuple):
 
 
 def read(m: mujoco.MjModel) -> dict[str, Instances]:
-    """The geoms that one sees, by mesh: a capsule is a cylinder and two spheres.
+    """Returns the visible geoms by mesh: a capsule becomes a cylinder and two spheres.
 
-    Planes are thin boxes. Kinds without a mesh, such as height fields, are left out.
+    Planes become thin boxes. Kinds without a mesh, such as height fields, are skipped.
     """
-    found: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {}
+    pieces: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {}
     for g in range(m.ngeom):
         if m.geom_group[g] >= _HIDDEN_GROUP or m.geom_rgba[g, 3] == 0:
             continue
         for name, offset, scale in _parts(m, g):
-            found.setdefault(name, []).append((g, offset, scale))
-    meshes = {name: _mesh(m, name) for name in found}
+            pieces.setdefault(name, []).append((g, offset, scale))
+    shapes = {name: _mesh(m, name) for name in pieces}
     return {
-        name: Instances(*meshes[name], *(np.array(column) for column in zip(*rows)))
-        for name, rows in found.items()
+        name: Instances(*shapes[name], *(np.array(column) for column in zip(*rows)))
+        for name, rows in pieces.items()
     }
 
 
 def _parts(m: mujoco.MjModel, g: int) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """(mesh, offset, scale) of each piece of a geom."""
+    """Returns (mesh, offset, scale) of each piece of a geom."""
     size, origin, ones = m.geom_size[g], np.zeros(3), np.ones(3)
     radius, half = size[0], np.array([0.0, 0.0, size[1]])
     match _KINDS(m.geom_type[g]):
@@ -76,7 +77,7 @@ def _parts(m: mujoco.MjModel, g: int) -> list[tuple[str, np.ndarray, np.ndarray]
 
 
 def _mesh(m: mujoco.MjModel, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of a mesh that reaches from -1 to 1, or of one of the model's own."""
+    """Returns vertices and faces of a mesh from -1 to 1, or of one of the model's own."""
     if name == "sphere":
         mesh = trimesh.creation.icosphere(subdivisions=_SUBDIVISIONS)
     elif name == "cylinder":

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from starjax.report import page, turned, video
+from starjax.report import page, playback_3d, video
 from starjax.sim import scene
 
 
@@ -26,7 +26,7 @@ def recorded(one):
 
 @pytest.fixture(scope="module")
 def solid(recorded):
-    return turned.record([recorded])
+    return playback_3d.record([recorded])
 
 
 def content(text):
@@ -58,4 +58,4 @@ def test_the_page_holds_it_in_a_frame_that_reaches_nothing_else(one, solid):
 
 
 def test_nothing_is_drawn_without_joint_positions(one):
-    assert turned.record([one]) is None
+    assert playback_3d.record([one]) is None

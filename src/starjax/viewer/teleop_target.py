@@ -1,0 +1,219 @@
+"""The target of an operator: a point of the RCM manifold that handle, keys and device move.
+
+A target has roll and tip, the coordinates of action space `rcm4`; the shaft follows from them and
+therefore always passes the trocar. Plain functions on a few numbers, 30 times a second: nothing
+here is compiled.
+"""
+
+import queue
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from starjax.sim import registries
+from starjax.sim.tasks.base import Slot
+from starjax.viewer import page
+from starjax.viewer.devices import Device, DeviceLost, Reading
+from starjax.viewer.handles import RELEASE_S
+
+SPEED = 0.05  # m/s at full deflection of a device
+SPIN = 1.5  # rad/s at full deflection
+SMOOTHING_S = 0.1  # time constant that removes key steps and tremor from the commands
+MARGIN = 0.01  # m about the workspace's tips
+KEY_STEP = 0.0015  # m per key press at scale 1; holding a key repeats it
+KEY_TURN = 0.05  # rad per key press
+_HANDLE = 0.045  # m, length of the handle's arrows
+# key -> (label, increment: roll, right, away, up)
+_MOVES = {
+    "arrowright": ("to the right", (0, 1, 0, 0)),
+    "arrowleft": ("to the left", (0, -1, 0, 0)),
+    "arrowup": ("away from you", (0, 0, 1, 0)),
+    "arrowdown": ("towards you", (0, 0, -1, 0)),
+    "pageup": ("up", (0, 0, 0, 1)),
+    "pagedown": ("down", (0, 0, 0, -1)),
+    "Q": ("roll left", (1, 0, 0, 0)),
+    "E": ("roll right", (-1, 0, 0, 0)),
+}
+_HELP = (
+    "Drag the arrows at the tip, or press arrows, Page Up and Page Down, Q and E (roll), "
+    "G (jaws), C (clutch)."
+)
+
+
+class TeleopTarget(NamedTuple):
+    """Target of one arm.
+
+    Attributes:
+      goal: `[4]` roll (rad) and tip (m, world frame) after all increments.
+      action: `[4]` the same, smoothed: the command.
+      gripper: -1 squeezes, +1 is fully open.
+    """
+
+    goal: np.ndarray
+    action: np.ndarray
+    gripper: float = 1.0
+
+
+class Bounds(NamedTuple):
+    """Limits of a target.
+
+    Attributes:
+      low: `[4]` roll (rad) and tip (m).
+      high: `[4]` likewise.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+
+
+def bounds(slot: Slot, tip: np.ndarray) -> Bounds:
+    """Returns the range of a slot's arm, widened to include the initial tip `[3]` m."""
+    space = registries.workspaces.get(slot.workspace)
+    low, high = np.minimum(space.low, tip) - MARGIN, np.maximum(space.high, tip) + MARGIN
+    low[2] = min(space.low[2], tip[2])  # no margin below: the table is there
+    return Bounds(np.array([space.rolls[0], *low]), np.array([space.rolls[1], *high]))
+
+
+def at_rest(action: np.ndarray, gripper: float) -> TeleopTarget:
+    """Makes a target that holds an action `[4]`."""
+    return TeleopTarget(np.array(action), np.array(action), gripper)
+
+
+def moved(target: TeleopTarget, by: np.ndarray, within: Bounds) -> TeleopTarget:
+    """Adds an increment `[4]` (rad, m) within bounds."""
+    return target._replace(goal=np.clip(target.goal + by, within.low, within.high))
+
+
+def toggle_jaws(target: TeleopTarget) -> TeleopTarget:
+    """Opens or closes the jaws."""
+    return target._replace(gripper=-1.0 if target.gripper > 0 else 1.0)
+
+
+def smoothed(target: TeleopTarget, period: float) -> TeleopTarget:
+    """Moves the action towards the goal for one period (s)."""
+    fraction = 1.0 - np.exp(-period / SMOOTHING_S)
+    return target._replace(action=target.action + fraction * (target.goal - target.action))
+
+
+def increment(deflection: np.ndarray, axes: np.ndarray, scale: float, period: float) -> np.ndarray:
+    """Returns the increment of a device held at a deflection for one period.
+
+    Args:
+      deflection: `[4]` in [-1, 1]: roll, right, away, up.
+      axes: `[3, 3]`, see `view_axes`.
+      scale: factor of the motion.
+      period: s.
+
+    Returns:
+      `[4]` in rad and m in the world frame.
+    """
+    tip = SPEED * (axes @ deflection[1:])
+    return scale * period * np.array([SPIN * deflection[0], *tip])
+
+
+def view_axes(R_world_cam: np.ndarray) -> np.ndarray:
+    """Returns right, away and up of a camera's image as columns `[3, 3]` in the world frame."""
+    right = np.array([*R_world_cam[:2, 0], 0.0])
+    length = np.linalg.norm(right)
+    right = right / length if length > 1e-6 else np.array([0.0, 1.0, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    return np.stack([right, np.cross(up, right), up], axis=1)
+
+
+class Pilot:
+    """Reader of handle, keys and device.
+
+    Attributes:
+      targets: one per arm.
+      has_moved: true after the first motion since `rest`.
+    """
+
+    def __init__(self, server: Any, arms: int, axes: np.ndarray, device: Device | None):
+        self._server, self._axes, self._device = server, axes, device
+        self._buttons = (False, False)
+        self._presses: queue.SimpleQueue[tuple[np.ndarray, bool]] = queue.SimpleQueue()
+        gui = server.gui
+        gui.add_markdown(_HELP)
+        names = tuple(str(i) for i in range(arms))
+        self._arm = gui.add_dropdown("Arm", names, visible=arms > 1)
+        self._clutch = gui.add_checkbox("Clutch", True, hint="C: off, the hand moves freely")
+        self._scale = gui.add_slider("Scale", 0.1, 2.0, 0.1, 1.0, hint="tool over hand")
+        self._handle = server.scene.add_transform_controls(
+            "/hand", scale=_HANDLE, disable_rotations=True, depth_test=False
+        )
+        self._before = np.zeros(3)
+
+        def bind(key: str, label: str, by: tuple[int, ...], toggles: bool = False) -> None:
+            press = (np.array(by), toggles)
+            page.add_command(gui, label, key, lambda: self._presses.put(press))
+
+        for key, (label, by) in _MOVES.items():
+            bind(key, label.capitalize(), by)
+        bind("G", "Open or close the jaws", (0, 0, 0, 0), toggles=True)
+        page.add_command(gui, "Clutch", "C", self._toggle_clutch)
+
+    def rest(self, actions: np.ndarray, openings: np.ndarray, limits: list[Bounds]) -> None:
+        """Holds actions `[A, 4]` of `rcm4` and openings `[A]`, and forgets pending keys."""
+        self.targets = [at_rest(a, float(o)) for a, o in zip(actions, openings, strict=True)]
+        self._limits, self.has_moved = limits, False
+        while not self._presses.empty():
+            self._presses.get()
+        self._settle()
+
+    def read(self, period: float) -> tuple[np.ndarray, np.ndarray]:
+        """Advances by one period (s); returns actions `[A, 4]` and openings `[A]`."""
+        arm = int(self._arm.value)
+        by, toggles = self._input(period)
+        if self._clutch.value and by.any():
+            self.targets[arm] = moved(self.targets[arm], by, self._limits[arm])
+            self.has_moved = True
+        if toggles:
+            self.targets[arm] = toggle_jaws(self.targets[arm])
+            self.has_moved = True
+        self.targets = [smoothed(target, period) for target in self.targets]
+        if time.time() - self._handle.update_timestamp > RELEASE_S:
+            self._settle()
+        return (
+            np.stack([target.action for target in self.targets]),
+            np.array([target.gripper for target in self.targets]),
+        )
+
+    def _input(self, period: float) -> tuple[np.ndarray, bool]:
+        """Returns the increment `[4]` (rad, m in the world frame) and a toggle of the jaws."""
+        by, toggles, scale = np.zeros(4), False, float(self._scale.value)
+        position = np.array(self._handle.position)
+        by[1:], self._before = scale * (position - self._before), position
+        steps = scale * np.array([KEY_TURN, KEY_STEP, KEY_STEP, KEY_STEP])
+        while not self._presses.empty():
+            press, is_toggle = self._presses.get()
+            by += steps * np.array([press[0], *(self._axes @ press[1:])])
+            toggles ^= is_toggle
+        if reading := self._reading():
+            by += increment(reading.deflection, self._axes, scale, period)
+            # A button acts when it goes down.
+            jaws, clutch = (on and not was for on, was in zip(reading.buttons, self._buttons))
+            self._buttons = reading.buttons
+            toggles ^= jaws
+            if clutch:
+                self._toggle_clutch()
+        return by, toggles
+
+    def _reading(self) -> Reading | None:
+        """Reads the device; once it is lost, handle and keys remain."""
+        try:
+            return self._device.read() if self._device else None
+        except DeviceLost as error:
+            self._device = None
+            page.notify(self._server, "The device was lost", str(error), is_error=True)
+            return None
+
+    def _settle(self) -> None:
+        """Returns the handle to the target's tip."""
+        tip = self.targets[int(self._arm.value)].goal[1:]
+        if not np.array_equal(self._before, tip):
+            self._handle.position = tip
+            self._before = np.array(self._handle.position)
+
+    def _toggle_clutch(self) -> None:
+        self._clutch.value = not self._clutch.value
