@@ -24,7 +24,7 @@ def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
     monkeypatch.setattr(demos, "collect", collect)
     few = dataclasses.replace(SMOKE.demos, max_steps=1)
     tried = dataclasses.replace(SMOKE, demos=few, out=str(tmp_path))
-    _, missing = demonstrations.plan(tried, stubs.make_env(), sharing.ALONE)
+    _, missing, _ = demonstrations.plan(tried, stubs.make_env(), sharing.ALONE)
     with mistakes.of("demos.max_steps", 1) as caught:
         missing()
     assert "0 of 10" in caught.value.hint
@@ -72,7 +72,7 @@ def test_demonstrations_are_recorded_with_what_is_wrong(tmp_path, monkeypatch):
     for wrong in ((), ("smoke=0.5", "dropped=0.3"), ("smoke=0.4",)):
         asked = dataclasses.replace(SMOKE.demos, randomise=wrong)
         chosen = dataclasses.replace(SMOKE, demos=asked, policy=seen, out=str(tmp_path))
-        root, collect = demonstrations.plan(chosen, env, sharing.ALONE)
+        root, collect, _ = demonstrations.plan(chosen, env, sharing.ALONE)
         collect()
         roots.append(root)
     assert len(set(roots)) == 3 and given[0][1] is env

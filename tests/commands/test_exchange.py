@@ -164,7 +164,7 @@ def asked(root, **policy):
 
 
 def test_a_run_learns_from_a_dataset_that_is_given(root, tmp_path):
-    found, collect = demonstrations.plan(asked(root), env(), None)
+    found, collect, _ = demonstrations.plan(asked(root), env(), None)
     before = kill.tree(root)
     collect()
     assert found == root and kill.tree(root) == before

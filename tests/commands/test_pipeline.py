@@ -35,14 +35,15 @@ def done(monkeypatch):
     calls = []
 
     def plan(settings, env, share):
-        return pipeline.Path(settings.out) / "demos-a", lambda: calls.append("collect")
+        root = pipeline.Path(settings.out) / "demos-a"
+        return demonstrations.Plan(root, lambda: calls.append("collect"))
 
     def train(settings, name, demos, env, encoder, share, compiled):
         demos()
         calls.append(f"train {name}")
 
     monkeypatch.setattr(pipeline, "_environment", lambda settings: None)
-    monkeypatch.setattr(pipeline.ahead, "begin", lambda *_: pipeline.ahead.Ahead())
+    monkeypatch.setattr(pipeline.precompile, "begin", lambda *_: pipeline.precompile.Precompiled())
     monkeypatch.setattr(demonstrations, "plan", plan)
     monkeypatch.setattr(demonstrations, "load", lambda _, root, collect, encoder, share: collect())
     monkeypatch.setattr(pipeline, "_train", train)
@@ -210,7 +211,7 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
     (tmp_path / "dp_rcm4" / "evaluation").mkdir()
     (tmp_path / "dp_rcm4" / "evaluation" / "chunk_0000.npz").write_bytes(b"trials")
     found = []
-    monkeypatch.setattr(policy_evaluation, "load", lambda *_: None)
+    monkeypatch.setattr(policy_evaluation, "load", lambda *_, **__: None)
     monkeypatch.setattr(
         policy_evaluation, "rollouts", lambda at, *_, **__: found.extend(at.glob("*.npz"))
     )

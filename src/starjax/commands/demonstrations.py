@@ -7,7 +7,7 @@ import functools
 import itertools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from starjax import config as config_lib
 from starjax import errors
@@ -16,16 +16,28 @@ from starjax.commands import messages, scenes, stage_times
 _FROM, _RANDOMISE = "demos.from_", "demos.randomise"
 
 
-def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Callable[[], None]]:
-    """The folder of a run's demonstrations, and a function that collects what it lacks.
+class Plan(NamedTuple):
+    """Demonstrations of a run.
 
-    `share` is the run's: all processes collect together.
+    Attributes:
+      root: their directory.
+      collect: collects the missing ones.
+      precompile: begins to compile the programs of `collect`.
     """
+
+    root: Path
+    collect: Callable[[], None]
+    precompile: Callable[[], None] = lambda: None
+
+
+def plan(config: config_lib.RunConfig, env: Any, share: Any) -> Plan:
+    """Plans the demonstrations of a run; `share` is the run's, because all processes collect."""
     if config.demos.from_:
         root = given(config, env)
-        return root, lambda: messages.stage("collect", f"nothing, from {root}")
+        return Plan(root, lambda: messages.stage("collect", f"nothing, from {root}"))
     from starjax.data import demos, schema, store
     from starjax.rollouts import agent, placement, success_quota, trocars
+    from starjax.runtime import precompile, processes
 
     env, most = randomised(config, env)
     task, name = env.task, config.demos.expert or next(iter(env.task.experts))
@@ -55,12 +67,20 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
         return True
 
     asked = itertools.count()
+    compiled: list[Callable[[], None]] = []
+
+    def prepare() -> None:
+        if processes.is_alone() and not placement.devices() and not store.is_sealed(root):
+            job = functools.partial(demos.precompile, env, expert, chosen, settings)
+            compiled.append(precompile.start(job))
 
     def collect() -> None:
         if share.first(f"collected {next(asked)}", is_there):
             messages.stage("collect", f"done before, {root}")
             return
         messages.stage("collect", f"into {root}")
+        for wait in compiled:
+            wait()
         layout = placement.DeviceLayout(devices=placement.devices())
         try:
             with stage_times.timed(out, f"collect {root.name}"):
@@ -78,7 +98,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> tuple[Path, Call
             "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
         )
 
-    return root, collect
+    return Plan(root, collect, prepare)
 
 
 def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, float]]:
@@ -148,6 +168,7 @@ def load(
     """The dataset to train on, with what a frozen encoder sees instead of images."""
     from starjax.data import load as loading
     from starjax.data import store
+    from starjax.runtime import precompile
 
     def is_whole() -> bool:
         try:
@@ -161,6 +182,7 @@ def load(
         return True
 
     collect()
+    precompile.settle()  # what reads and trains traces programs too
     if not share.first("whole", is_whole):
         collect()
     found = loading.load(root, verify=False, images=encoder is None, report=messages.indented)

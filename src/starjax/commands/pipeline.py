@@ -8,7 +8,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.commands import ahead, demonstrations, folders, messages, scenes, stage_times
+from starjax.commands import demonstrations, folders, messages, precompile, scenes, stage_times
 from starjax.runtime import files, xla
 from starjax.runtime.signals import stop_signals
 
@@ -51,7 +51,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     with sharing.shared(out) as share, messages.first_process_only(share.is_first):
         print(messages.plan(config, stages), flush=True)
         env = _environment(config)
-        root, collect = demonstrations.plan(config, env, share)
+        root, collect, compile_collect = demonstrations.plan(config, env, share)
         digest = folders.demos_digest(root) if config.demos.from_ else None
         dataset = f"{root.name}-{digest[:12]}" if digest else root.name
 
@@ -60,7 +60,11 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
                 folders.claim(out / name, config, dataset, encoder and encoder.fingerprint)
 
         new = next((name for name in names if methods.METHODS[name].weights_of in untrained), None)
-        compiling = ahead.begin(config, new, stages, env, encoder) if new else ahead.Ahead()
+        ready = precompile.Precompiled()
+        if untrained or "train" not in stages:
+            compile_collect()
+        if new:
+            ready = precompile.begin(config, new, stages, env, encoder)
         # Loaded once, and only if something is still to be trained with them.
         demos = functools.cache(lambda: demonstrations.load(config, root, collect, encoder, share))
         if "train" not in stages:
@@ -68,12 +72,12 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
         else:
             share.first("claimed", claim)
             for name in trained:
-                ready = compiling.step if [name] == untrained[:1] else None
-                _train(config, name, demos, env, encoder, share, ready)
+                step = ready.step if [name] == untrained[:1] else None
+                _train(config, name, demos, env, encoder, share, step)
         if "evaluate" in stages:
             for name in names:
-                ready = compiling.evaluation if name == new else None
-                _evaluate(config, name, env, root, command, share, ready)
+                policy = ready.policy if name == new else None
+                _evaluate(config, name, env, root, command, share, policy)
         if "report" in stages:
             share.first("reported", lambda: _report(out, names))
 
@@ -92,7 +96,7 @@ def _train(
     env: Any,
     encoder: Any,
     share: Any,
-    compiled: Callable[[], Any] | None = None,
+    step: Callable[[], Any] | None = None,
 ) -> None:
     """One set of weights; `policy.safetensors` is its last file."""
     from starjax.policies import policy_file
@@ -107,6 +111,7 @@ def _train(
         return
     dataset = demos()
     messages.stage("train", f"{name}, into {folder}")
+    program = step() if step else None
     begun = any((folder / "checkpoints").glob("step_*"))
     with stage_times.timed(out, f"train {name}", begun), stop_signals() as should_stop:
         result = loop.run(
@@ -120,7 +125,7 @@ def _train(
             cameras=env.names.cameras,
             should_stop=should_stop,
             description=f"Training {name}",
-            compiled=compiled() if compiled else None,
+            step_program=program,
         )
     state = processes.own(result.state)
     params = state.ema_params
@@ -155,7 +160,7 @@ def _evaluate(
     demos: Path,
     command: str,
     share: Any,
-    compiled: Callable[[], Any] | None = None,
+    policy: Callable[[], Any] | None = None,
 ) -> None:
     """Closed-loop trials of one method; `result.json` is its last file."""
     from starjax.commands import policy_evaluation
@@ -167,23 +172,18 @@ def _evaluate(
         return
     messages.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
     share.first(f"{name} has an equal evaluation", lambda: folders.adopt_equivalent(out, name))
+    compiled = policy() if policy else None
     with stage_times.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
-        who = policy_evaluation.load(name, weights, env)
-        programs = (compiled() if compiled else None) or policy_evaluation.Programs()
-        table = policy_evaluation.rollouts(
-            folder / "evaluation",
-            who,
-            env.task.trocars,
-            config.eval,
-            config.seed,
-            compiled=programs.trials,
-        )
+        who = policy_evaluation.load(name, weights, env, policy=compiled)
+        trials = folder / "evaluation"
+        table = policy_evaluation.rollouts(trials, who, env.task.trocars, config.eval, config.seed)
 
     def write() -> None:
         timings = _timings(out, name, demos.name)
         digest = folders.demos_digest(demos)
-        given = (folder, who, table, config, config.seed, command, timings, digest)
-        policy_evaluation.write_result(*given, decide=programs.decision)
+        policy_evaluation.write_result(
+            folder, who, table, config, config.seed, command, timings, digest
+        )
 
     share.first(f"{name} is scored", write)
 

@@ -4,7 +4,6 @@ import dataclasses
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -19,24 +18,16 @@ from starjax.evaluation import trials as table
 from starjax.policies import features, in_env
 from starjax.policies import policy as policies
 from starjax.policies.in_env import PolicyInEnv
-from starjax.rollouts import engine, placement
+from starjax.rollouts import placement
 from starjax.sim.state import Env
 
 
-class Programs(NamedTuple):
-    """Programs that were compiled before there were weights.
-
-    Attributes:
-      trials: of `rollouts`.
-      decision: that `write_result` times.
-    """
-
-    trials: engine.Compiled | None = None
-    decision: latency.Decide | None = None
-
-
 def load(
-    method: str, weights: Path, env: Env | None = None, arms: Sequence[str] = ()
+    method: str,
+    weights: Path,
+    env: Env | None = None,
+    arms: Sequence[str] = (),
+    policy: policies.Policy | None = None,
 ) -> PolicyInEnv:
     """Loads a method's weights from the directory of its run.
 
@@ -45,6 +36,7 @@ def load(
       weights: policy.safetensors.
       env: the environment, if it is built already.
       arms: robots instead of those of the training.
+      policy: from `precompile`.
 
     Raises:
       errors.UsageError: the file is missing or damaged.
@@ -53,7 +45,7 @@ def load(
     if not weights.exists():
         raise errors.UsageError(str(weights), "trained weights", "none", f"{again} trains them")
     trained = in_env.read(weights, str(weights), f"remove it, and {again} trains it again")
-    return in_env.load(weights, trained, method=method, arms=arms, env=env)
+    return in_env.load(weights, trained, method=method, arms=arms, env=env, policy=policy)
 
 
 def rollouts(
@@ -63,12 +55,8 @@ def rollouts(
     settings: config_lib.EvalConfig,
     seed: int,
     levels: Mapping[str, float] | None = None,
-    compiled: engine.Compiled | None = None,
 ) -> table.Table:
-    """Runs what is missing of an evaluation.
-
-    `levels` are of what disturbs its environment; `compiled` comes from `compile_ahead`.
-    """
+    """Runs the missing trials of an evaluation; `levels` are of the environment's disturbances."""
     trained = who.trained
     return evaluate.evaluate(
         directory,
@@ -83,21 +71,23 @@ def rollouts(
             "policy": config_lib.as_json(trained.policy),
         },
         levels=levels,
-        compiled=compiled,
         report=messages.indented,
     )
 
 
-def compile_ahead(
+def precompile(
     name: str, config: config_lib.RunConfig, env: Env, vision: policies.Params | None
-) -> Programs:
-    """Compiles what `rollouts` and `write_result` will run of a method that is not trained yet.
+) -> policies.Policy:
+    """Compiles the programs of `rollouts` and `write_result` for a method without weights yet.
 
     Args:
-      name: of the method.
-      config: of the run.
-      env: with the observation that it is trained on.
-      vision: parameters of its frozen encoder, None where it has none.
+      name: the method.
+      config: settings of the run.
+      env: environment with the observation of the training.
+      vision: parameters of the frozen encoder, or None.
+
+    Returns:
+      the policy, for `load`: programs belong to its functions.
     """
     row, deciding = methods.METHODS[name], config_lib.inference_settings(config.policy)
     policy = policies.make(row, deciding, env.task, cameras=env.names.cameras)
@@ -107,15 +97,16 @@ def compile_ahead(
     params = jax.eval_shape(policy.prepare_for_inference, params)
     told = policies.ablated(row, config.policy)
     stats = normalizer.shapes(told, env.task, config.policy.observation == "state")
-    trials = evaluate.compile_ahead(
+    evaluate.precompile(
         env,
-        in_env.batch_agent(name, policy, config.policy, config.eval.ensemble),
+        in_env.batch_agent(name, policy, deciding, config.eval.ensemble),
         (params, stats),
         env.task.trocars,
         _settings(config.eval, config.seed),
     )
     seen = features.select_sensors(env.task, env.names.cameras)
-    return Programs(trials, latency.compile_ahead(policy, deciding, params, stats, seen))
+    latency.precompile(policy, deciding, params, stats, seen)
+    return policy
 
 
 def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.Settings:
@@ -137,7 +128,7 @@ def settings(who: PolicyInEnv, config: config_lib.RunConfig) -> config_lib.RunCo
     )
 
 
-def inference_ms(who: PolicyInEnv, decide: latency.Decide | None = None) -> dict[str, float]:
+def inference_ms(who: PolicyInEnv) -> dict[str, float]:
     """Time of one decision at batch 1: observation in, commands out, compilation apart."""
     trained = who.trained
     return latency.policy_ms(
@@ -147,7 +138,6 @@ def inference_ms(who: PolicyInEnv, decide: latency.Decide | None = None) -> dict
         trained.normalizer,
         features.select_sensors(who.env.task, trained.scene.cameras),
         seconds=5.0,
-        decide=decide,
     )
 
 
@@ -160,7 +150,6 @@ def write_result(
     command: str,
     timings_s: dict[str, float] | None = None,
     dataset_digest: str | None = None,
-    decide: latency.Decide | None = None,
 ) -> results.Result:
     """Writes and returns `<folder>/result.json`: `statistics.compose`'s figures and what made them.
 
@@ -173,7 +162,6 @@ def write_result(
       command: what was typed.
       timings_s: seconds by stage.
       dataset_digest: of the demonstrations, if they are there.
-      decide: the program of a decision, if it is compiled.
     """
     task = who.env.task
     is_seen = task.is_seen & (np.arange(len(task.is_seen)) < config.demos.seen_trocars)
@@ -183,7 +171,7 @@ def write_result(
     )
     about = {
         "control_hz": who.env.control_hz,
-        "inference_ms": inference_ms(who, decide),
+        "inference_ms": inference_ms(who),
         "preset": config.preset,
         "seed": seed,
         "weights": who.weights,

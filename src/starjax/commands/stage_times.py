@@ -1,7 +1,6 @@
 """How long each stage took, compilation apart, summed over every start of the same run."""
 
 import contextlib
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,18 +12,6 @@ _COMPILE_EVENTS = (
     "/jax/core/compile/backend_compile_duration",
     "/jax/core/compile/jaxpr_to_mlir_module_duration",
 )
-
-_here = threading.local()
-
-
-@contextlib.contextmanager
-def apart() -> Iterator[None]:
-    """Lets what this thread compiles inside count for no stage: it is done beside them."""
-    _here.is_apart = True
-    try:
-        yield
-    finally:
-        _here.is_apart = False
 
 
 @contextlib.contextmanager
@@ -74,10 +61,12 @@ class _CompileSeconds:
     """Adds up what jax reports of its compilations while it is entered."""
 
     def __init__(self) -> None:
-        self.seconds = 0.0
+        from starjax.runtime import precompile  # imports jax
+
+        self.seconds, self._is_job = 0.0, precompile.is_job
 
     def _add(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event in _COMPILE_EVENTS and not getattr(_here, "is_apart", False):
+        if event in _COMPILE_EVENTS and not self._is_job():
             self.seconds += duration_secs
 
     def __enter__(self) -> None:

@@ -128,6 +128,21 @@ def collect(
     }
 
 
+def precompile(
+    env: Any, agent: BatchAgent, trocars: Trocar, settings: Settings, params: Any = None
+) -> None:
+    """Compiles, in the background, the programs that `collect` runs on one device."""
+    trocars = configurations.listed(trocars, len(env.p_world_ref))
+    total = settings.per_trocar * len(trocars.radius)
+    frame_bytes = _frame_bytes(schema.describe(env, trocars, settings))
+    rules = _rules(settings, _lanes(DEFAULT_LAYOUT, total, frame_bytes, 1))
+    engine.precompile(env, agent, params, trocars, rules, episodes.DEMONSTRATION)
+
+
+def _rules(settings: Settings, lanes: int) -> engine.Settings:
+    return engine.Settings(settings.seed, schema.STREAM, settings.max_steps, lanes)
+
+
 def _prepare(
     root: Path,
     description: dict[str, Any],
@@ -166,7 +181,7 @@ def _simulator(
     settings: DemoSettings,
     layout: DeviceLayout,
 ) -> Callable[[list[episodes.Trial]], Generator[list[episodes.Episode]]]:
-    rules = engine.Settings(settings.seed, schema.STREAM, settings.max_steps, layout.lanes)
+    rules = _rules(settings, layout.lanes)
     run = engine.make(env, agent, trocars, rules, episodes.DEMONSTRATION, layout.devices)
 
     def simulate(group: list[episodes.Trial]) -> Generator[list[episodes.Episode]]:

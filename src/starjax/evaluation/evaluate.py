@@ -66,7 +66,6 @@ def evaluate(
     layout: DeviceLayout = DEFAULT_LAYOUT,
     identity: Mapping[str, Any] | None = None,
     levels: Mapping[str, float] | None = None,
-    compiled: engine.Compiled | None = None,
     report: Callable[[str], None] = print,
 ) -> tables.Table:
     """Runs what is missing of an evaluation and returns all of it.
@@ -79,7 +78,6 @@ def evaluate(
       layout: where the lanes are 0, `lanes_per_device`, and so few that all devices have a share.
       identity: JSON values that tell this agent from others with the same params.
       levels: of what disturbs the environment.
-      compiled: by `compile_ahead`; used where it is for trials like these.
       report: gets lines for the user.
 
     Raises:
@@ -119,9 +117,7 @@ def evaluate(
         found = share.first("sizes", lambda: _resume(directory, plan, sizes, most, several, report))
         lanes, chunk = found
         rules = engine.Settings(settings.seed, None, max_steps, lanes * several)
-        run = engine.make(
-            env, agent, trocars, rules, episodes.SCORE, layout.devices, levels, compiled
-        )
+        run = engine.make(env, agent, trocars, rules, episodes.SCORE, layout.devices, levels)
         spans = [slice(first, first + chunk) for first in range(0, len(group), chunk)]
         parts = _parts(directory, env, lambda trials: run(params, trials), group, spans, chosen)
         made = chunks.complete(share, parts, "Evaluation", "trials", report)
@@ -130,18 +126,18 @@ def evaluate(
     return tables.join([*map(tables.from_columns, made)])
 
 
-def compile_ahead(
+def precompile(
     env: Any, agent: BatchAgent, params: Any, trocars: Trocar, settings: Settings
-) -> engine.Compiled:
-    """Compiles what `evaluate` will run on one device.
+) -> None:
+    """Compiles, in the background, the programs that `evaluate` runs on one device.
 
-    The arguments are `evaluate`'s, but for `params`: arrays like those to come, or their shapes.
+    The arguments are those of `evaluate`; `params` are arrays or their shapes.
     """
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     trials = len(trocars.radius) * settings.trials
     lanes = lanes_per_device(jax.local_devices()[0], trials)
     rules = engine.Settings(settings.seed, None, _max_steps(env, settings), lanes)
-    return engine.compile_ahead(env, agent, params, trocars, rules, episodes.SCORE)
+    engine.precompile(env, agent, params, trocars, rules, episodes.SCORE)
 
 
 def lanes_per_device(device: jax.Device, trials: int) -> int:

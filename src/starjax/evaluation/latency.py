@@ -1,5 +1,6 @@
 """How long a policy takes to answer: the rows of Table IV."""
 
+import functools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -12,14 +13,12 @@ from starjax import config, methods, rcm
 from starjax.models import roll_net
 from starjax.policies import features, generator
 from starjax.policies import policy as policies
+from starjax.runtime import precompile as precompile_lib
 from starjax.sim import endoscope_camera
 from starjax.sim.tasks.base import Field
 from starjax.types import Observation, Pose
 
 _WARM_UP = 3  # calls before the clock starts
-
-# (params, stats, keys `[B]`, Observation, trocars) -> Command
-Decide = Callable[..., Any]
 
 
 def policy_ms(
@@ -32,7 +31,6 @@ def policy_ms(
     batch: int = 1,
     calls: int = 100,
     seconds: float = 10.0,
-    decide: Decide | None = None,
 ) -> dict[str, float]:
     """Time of one call of a policy, from an observation on the device to finished commands.
 
@@ -45,28 +43,30 @@ def policy_ms(
       batch: robots that are served at once.
       calls: timed calls, fewer if they take longer than `seconds` altogether.
       seconds: see `calls`; at least five calls are made.
-      decide: from `compile_ahead` with the same arguments.
 
     Returns:
       {p50, p95, p99} in ms, and n, the number of calls.
     """
     asked = _asked(policy_config, seen, batch)
-    call = decide or _program(policy, seen)
     # Weights on the host would be copied again at each call.
     params, stats = jax.device_put((params, stats))
+    call = _program(policy.sample, _slots(seen)).select(params, stats, *asked)
     return _percentiles(lambda: call(params, stats, *asked), calls, seconds)
 
 
-def compile_ahead(
+def precompile(
     policy: policies.Policy,
     policy_config: config.PolicyConfig,
     params: Any,
     stats: Any,
     seen: features.Sensors,
-) -> Decide:
-    """Compiles what `policy_ms` times at batch 1; of `params` and `stats` the shapes are enough."""
+) -> None:
+    """Compiles, in the background, the program that `policy_ms` times at batch 1.
+
+    The arguments are those of `policy_ms`; `params` and `stats` are arrays or their shapes.
+    """
     asked = jax.eval_shape(lambda: _asked(policy_config, seen, 1))
-    return _program(policy, seen).lower(params, stats, *asked).compile()
+    _program(policy.sample, _slots(seen)).prepare(params, stats, *asked)
 
 
 def table(
@@ -125,7 +125,7 @@ def example(
     trocar = rcm.sample_trocar(jax.random.key(1), (batch, seen.task.arms))
     shape = (batch, policy_config.obs_horizon)
     action = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 0.02]), (*shape, seen.task.arms, 4))
-    frame = features.per_step(_told(seen, trocar))
+    frame = features.per_step(_frame(_slots(seen), trocar))
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, frame)
     observation = Observation(pose, jnp.ones((*shape, seen.task.arms)))
     if policy_config.frame == "camera" and seen.task.endoscope:
@@ -144,12 +144,19 @@ def example(
     return observation._replace(images=images), trocar
 
 
-def _program(policy: policies.Policy, seen: features.Sensors) -> Any:
-    @jax.jit
-    def sample(params, stats, keys, observation, trocar):
-        return policy.sample(params, stats, keys, observation, _told(seen, trocar))
+Slots = tuple[tuple[tuple[float, ...], float], ...]  # p_world_ref and roll_zero of each arm
 
-    return sample
+
+@functools.lru_cache(maxsize=4)
+def _program(sample: Callable[..., Any], slots: Slots) -> precompile_lib.Program:
+    def infer(params, stats, keys, observation, trocar):
+        return sample(params, stats, keys, observation, _frame(slots, trocar))
+
+    return precompile_lib.Program(infer)
+
+
+def _slots(seen: features.Sensors) -> Slots:
+    return tuple((tuple(map(float, s.p_world_ref)), float(s.roll_zero)) for s in seen.task.slots)
 
 
 def _asked(policy_config: config.PolicyConfig, seen: features.Sensors, batch: int) -> Any:
@@ -158,11 +165,10 @@ def _asked(policy_config: config.PolicyConfig, seen: features.Sensors, batch: in
     return keys, *example(policy_config, seen, batch)
 
 
-def _told(seen: features.Sensors, trocar: rcm.Trocar) -> rcm.TrocarFrame:
-    """Trocars `[B, A]` about the nominal ones of the task's arms."""
-    slots = seen.task.slots
-    p_world_ref = np.array([slot.p_world_ref for slot in slots], np.float32)
-    return rcm.trocar_frame(trocar, p_world_ref, np.array([slot.roll_zero for slot in slots]))
+def _frame(slots: Slots, trocar: rcm.Trocar) -> rcm.TrocarFrame:
+    """Returns the frames of trocars `[B, A]`, which are relative to the arms' nominal ones."""
+    p_world_ref, roll_zero = zip(*slots, strict=True)
+    return rcm.trocar_frame(trocar, np.array(p_world_ref, np.float32), np.array(roll_zero))
 
 
 def _plausible(field: Field) -> jax.Array:

@@ -1,5 +1,6 @@
 """A trained policy in the environment that it acts in: a file of weights to a batch agent."""
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -37,6 +38,7 @@ class PolicyInEnv(NamedTuple):
         return batch_agent(trained.method, self.policy, trained.policy, average_plans)
 
 
+@functools.lru_cache(maxsize=4)  # programs belong to the functions that they were made of
 def batch_agent(
     method: str,
     policy: policies.Policy,
@@ -83,6 +85,7 @@ def load(
     method: str = "",
     arms: Sequence[str] = (),
     env: sim_env.Env | None = None,
+    policy: policies.Policy | None = None,
 ) -> PolicyInEnv:
     """Builds the networks and the environment of a policy file.
 
@@ -92,10 +95,12 @@ def load(
       method: a method that shares the weights; by default the one that trained them.
       arms: robots instead of those of the training.
       env: the environment, if it is built already.
+      policy: its functions, if they exist already.
     """
     trained = trained._replace(method=method or trained.method)
     env = env or sim_env.for_policy(trained.scene, trained.policy, arms)
     row = methods.METHODS[trained.method]
-    policy = policies.make(row, trained.policy, env.task, cameras=trained.scene.cameras)
+    if policy is None:
+        policy = policies.make(row, trained.policy, env.task, cameras=trained.scene.cameras)
     ready = trained._replace(params=policy.prepare_for_inference(trained.params))
     return PolicyInEnv(ready, policy, env, files.sha256(file))

@@ -38,20 +38,6 @@ class Settings(NamedTuple):
     lanes: int
 
 
-class Compiled(NamedTuple):
-    """Programs of one device, compiled before what they run on was there.
-
-    Attributes:
-      settings: that they are for.
-      start: as `programs.make` has it.
-      advance: the same.
-    """
-
-    settings: Settings
-    start: Callable[..., Any]
-    advance: Callable[..., Any]
-
-
 class Progress(NamedTuple):
     """After a segment.
 
@@ -75,7 +61,6 @@ def make(
     record: episodes.Record,
     devices: Sequence[jax.Device] | None = None,
     levels: Mapping[str, float] | None = None,
-    compiled: Compiled | None = None,
 ) -> Run:
     """Builds the programs, which are compiled once for the same functions.
 
@@ -84,18 +69,13 @@ def make(
       trocars: fields `[C, A]`, on the host.
       devices: that lanes are split over; their number must divide that of the lanes.
       levels: of what disturbs the environment, see `EnvParams`; data, not part of a program.
-      compiled: programs of the same agent and record, used if they are for these settings and for
-        one device.
 
     Returns:
       run(params, group), which simulates at most `lanes` trials and yields Progress after every
       segment. A caller that needs no more may stop.
     """
     key = _key(settings)
-    if compiled and compiled.settings == settings and devices is None and not levels:
-        start, advance = compiled.start, compiled.advance
-    else:
-        start, advance = programs.make(env, agent, settings.max_steps, record, devices)
+    start, advance = programs.make(env, agent, settings.max_steps, record, devices)
     given = {name: np.float32(level) for name, level in (levels or {}).items()}
 
     def run(params: Any, group: Sequence[episodes.Trial]) -> Generator[Progress]:
@@ -148,24 +128,22 @@ def make(
     return run
 
 
-def compile_ahead(
+def precompile(
     env: Any,
     agent: BatchAgent,
     params: Any,
     trocars: Trocar,
     settings: Settings,
     record: episodes.Record,
-) -> Compiled:
-    """Compiles what `make` makes for one device.
+) -> None:
+    """Compiles, in the background, the programs that `make` builds for one device.
 
-    The arguments are `make`'s, but for `params`: arrays like those to come, or their shapes.
-    jax's cache on disk would not do: a program traced beside another, in a thread, may be written
-    down in another order, and is not found there.
+    The arguments are those of `make`; `params` are arrays or their shapes.
     """
     start, advance = programs.make(env, agent, settings.max_steps, record, None)
-    begun = start.lower(_key(settings), params, _filled(trocars, [(0, 0)], settings.lanes), {})
-    advanced = advance.lower(params, begun.out_info, np.int32(0)).compile()
-    return Compiled(settings, begun.compile(), advanced)
+    trials = _filled(trocars, [(0, 0)], settings.lanes)
+    state = start.prepare(_key(settings), params, trials, {})
+    advance.prepare(params, state, np.int32(0))
 
 
 def _key(settings: Settings) -> jax.Array:

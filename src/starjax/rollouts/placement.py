@@ -8,6 +8,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from starjax.runtime import precompile
+
 SHARED = PartitionSpec()
 LANE = PartitionSpec("lane")
 
@@ -50,7 +52,7 @@ def split(
       out_specs: the same for the result, or for its parts.
       donate: arguments whose memory may be reused.
     """
-    program = jax.jit(fn, donate_argnums=donate)
+    program = precompile.Program(fn, donate_argnums=donate)
     if devices is None:
         return program
     # A program and a thread for each device. One program over all of them would put a reduction

@@ -14,7 +14,7 @@ from starjax.data import normalizer, windows
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
-from starjax.runtime import background, processes, progress
+from starjax.runtime import background, precompile, processes, progress
 from starjax.sim.tasks.base import Task
 from starjax.training import checkpoint, devices, encoder, holdout, log, metrics, stepper
 from starjax.training import state as states
@@ -61,7 +61,7 @@ def run(
     mesh_devices: Sequence[jax.Device] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
     description: str = "train",
-    compiled: stepper.Compiled | None = None,
+    step_program: precompile.Program | None = None,
 ) -> TrainingResult:
     """Trains a method, going on from the newest sound checkpoint in the directory.
 
@@ -80,7 +80,7 @@ def run(
       mesh_devices: all of jax's by default.
       should_stop: asked about once a second; True saves and raises Interrupted.
       description: name of the progress bar.
-      compiled: from `ahead.compile_step` with these arguments.
+      step_program: from `training.precompile` with these arguments.
 
     Raises:
       Interrupted: after `should_stop`.
@@ -117,7 +117,7 @@ def run(
     resident = windows.on_device(dataset)
     steps = None
     if resident:
-        steps = stepper.resident(setup, dataset, frames, is_new, compiled)
+        steps = stepper.resident(setup, dataset, frames, is_new, step_program)
 
     state = _restored(directory / "checkpoints", shapes)
     if state is None:

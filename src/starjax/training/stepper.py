@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.data import windows
-from starjax.runtime import background, garbage, processes
+from starjax.runtime import processes
+from starjax.runtime.precompile import Program
 from starjax.training import devices, prefetch
 from starjax.training import step as steps
 from starjax.training.sharding import StateLayout, StepCarry
@@ -31,31 +32,12 @@ class Stepper(NamedTuple):
     end: Callable[[StepCarry], TrainState]
 
 
-class Compiled(NamedTuple):
-    """The step of a batch, compiled before there was one.
-
-    Attributes:
-      batch: its shapes.
-      program: (StepCarry, Batch) -> StepCarry.
-    """
-
-    batch: windows.Batch
-    program: Callable[[StepCarry, windows.Batch], StepCarry]
-
-
-def compile_ahead(setup: Setup, batch: windows.Batch) -> Compiled | None:
-    """Compiles the step of a batch of these shapes; None where steps run in a loop."""
-    if steps.runs_in_a_loop(setup.policy_config):
-        return None
-    return Compiled(batch, _step(setup).lower(*_given(setup, batch)).compile())
-
-
 def resident(
     setup: Setup,
     dataset: windows.Dataset,
     frames: np.ndarray,
     ahead: bool,
-    compiled: Compiled | None = None,
+    program: Program | None = None,
 ) -> Stepper:
     """Makes steps on a dataset that is on the device; every device of the mesh gets a copy.
 
@@ -63,8 +45,8 @@ def resident(
       setup: of the training.
       dataset: leaves are jax arrays.
       frames: `[n]` frame numbers to draw from.
-      ahead: the program is traced now, and compiled while the caller goes on until the first step.
-      compiled: the step of a batch, used where batches are such ones and steps are no loop.
+      ahead: trace the program now, and compile it in the background until the first step.
+      program: from `batch_program` of an equal setup, perhaps prepared.
     """
     layout = setup.layout
     data = devices.replicate((dataset, jnp.asarray(frames)), layout.mesh, may_alias=None)
@@ -75,16 +57,15 @@ def resident(
     split = devices.batch_sharding(layout.mesh)
     draw = jax.jit(functools.partial(steps.drawn_batch, setup), out_shardings=split)
     shapes = jax.eval_shape(draw, *_drawn_by(layout.shapes()), *data)
-    if compiled and _alike(compiled.batch, shapes):
-        program = compiled.program
-    else:
-        program = _step(setup)
-        if ahead:
-            program = _compiled_in_background(program, *_given(setup, shapes))
+    arguments = abstract_arguments(setup, shapes)
+    program = program or batch_program(setup)
+    if ahead and not program.is_prepared(*arguments):
+        program.prepare(*arguments)
 
     def run(carry: StepCarry, count: int) -> StepCarry:
+        take_step = program.select(*arguments)
         for _ in range(count):
-            carry = program(carry, draw(*_drawn_by(carry), *data))
+            carry = take_step(carry, draw(*_drawn_by(carry), *data))
         return carry
 
     return _stepper(layout, run)
@@ -94,7 +75,7 @@ def streamed(
     setup: Setup, dataset: windows.Dataset, frames: np.ndarray, state: TrainState
 ) -> Stepper:
     """Makes steps on a dataset of the host, whose batches follow those before `state`."""
-    program = _step(setup)
+    program = batch_program(setup)
     key = jnp.copy(processes.own(state.key))
     batches = prefetch.batches(setup, dataset, frames, key, int(state.step))
 
@@ -115,7 +96,7 @@ def _looped(setup: Setup, data: tuple[windows.Dataset, jax.Array], ahead: bool) 
         return devices.replicate(np.int32(count), layout.mesh)
 
     if ahead:
-        program = _compiled_in_background(program, layout.shapes(), *data, counted(1))
+        program.prepare(layout.shapes(), *data, counted(1))
     return _stepper(layout, lambda carry, count: program(carry, *data, counted(count)))
 
 
@@ -124,19 +105,13 @@ def _drawn_by(carry: StepCarry) -> tuple[Any, Any]:
     return carry.state.key, carry.state.step
 
 
-def _alike(one: windows.Batch, other: windows.Batch) -> bool:
-    """Whether two batches have the same fields, shapes and types."""
-    bare = [jax.tree.map(lambda x: (x.shape, x.dtype), shapes) for shapes in (one, other)]
-    return bare[0] == bare[1]
-
-
-def _step(setup: Setup) -> Any:
-    """The step of a batch."""
+def batch_program(setup: Setup) -> Program:
+    """Returns the program of one step on a batch: (StepCarry, Batch) -> StepCarry."""
     return _program(functools.partial(steps.train_step, setup), setup.layout)
 
 
-def _given(setup: Setup, batch: windows.Batch) -> tuple[StepCarry, windows.Batch]:
-    """Shapes and shardings of the step's arguments."""
+def abstract_arguments(setup: Setup, batch: windows.Batch) -> tuple[StepCarry, windows.Batch]:
+    """Returns shapes and shardings of the arguments of a step on a batch of these shapes."""
     split = devices.batch_sharding(setup.layout.mesh)
     return setup.layout.shapes(), jax.tree.map(lambda x: x.update(sharding=split), batch)
 
@@ -149,17 +124,8 @@ def _stepper(layout: StateLayout, run: Callable[[StepCarry, int], StepCarry]) ->
     return Stepper(begin, run, end)
 
 
-def _program(body: Callable[..., StepCarry], layout: StateLayout) -> Any:
+def _program(body: Callable[..., StepCarry], layout: StateLayout) -> Program:
     options = devices.compiler_options(layout.mesh)
-    return jax.jit(
+    return Program(
         body, donate_argnums=0, out_shardings=layout.shardings(), compiler_options=options
     )
-
-
-def _compiled_in_background(program: Any, *shapes: Any) -> Callable[..., StepCarry]:
-    """Compiles the program in a thread for arguments of these shapes; its first call waits."""
-    # Traced here: in a thread it would take turns with what the caller does, both in Python.
-    with garbage.gc_paused():
-        lowered = program.lower(*shapes)
-    compiled = background.run_in_background(lowered.compile)
-    return lambda *args: compiled()(*args)

@@ -1,4 +1,4 @@
-"""Compiles the step of a training before its demonstrations are there."""
+"""The training step, compiled before the demonstrations exist."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,26 +11,29 @@ from starjax.data import normalizer, windows
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
+from starjax.runtime import precompile
 from starjax.sim.tasks.base import Task
 from starjax.training import devices, stepper
 from starjax.training import state as states
 from starjax.training.sharding import StateLayout
-from starjax.training.step import Setup
+from starjax.training.step import Setup, runs_in_a_loop
 from starjax.types import Command, Observation, Pose
 
 
 @arrays.broadcasting
-def compile_step(
+def step_program(
     method: methods.Method,
     policy_config: config.PolicyConfig,
     train_config: config.TrainConfig,
     task: Task,
     cameras: Sequence[str],
-) -> stepper.Compiled | None:
-    """Compiles the step that `loop.run` takes with the same arguments.
+) -> precompile.Program | None:
+    """Compiles, in the background, the step that `loop.run` takes with the same arguments.
 
-    Returns None where that step knows how many frames there are, see `step.runs_in_a_loop`.
+    Returns None if the dataset is an argument of the program, see `step.runs_in_a_loop`.
     """
+    if runs_in_a_loop(policy_config):
+        return None
     mesh = devices.make_mesh(train_config.batch_size)
     policy = policies.make(method, policy_config, task, train_config, cameras)
     optimizer = states.make_optimizer(train_config)
@@ -47,7 +50,10 @@ def compile_step(
     layout = StateLayout(mesh, policy.cast_params, shapes)
     setup = Setup(policy, optimizer, policy_config, train_config, layout)
     seen = features.select_sensors(task, cameras)
-    return stepper.compile_ahead(setup, batch_shapes(policy_config, train_config.batch_size, seen))
+    program = stepper.batch_program(setup)
+    batch = batch_shapes(policy_config, train_config.batch_size, seen)
+    program.prepare(*stepper.abstract_arguments(setup, batch))
+    return program
 
 
 def batch_shapes(

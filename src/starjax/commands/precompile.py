@@ -1,0 +1,54 @@
+"""Compiles the programs of a run during its first stages, which keep the processor's cores free."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from starjax import config as config_lib
+from starjax import methods
+
+
+class Precompiled(NamedTuple):
+    """Programs of the first method that is not trained yet.
+
+    Each function waits for the compiler, and returns None if nothing was compiled.
+
+    Attributes:
+      step: returns the `precompile.Program` of a training step.
+      policy: returns the `policies.Policy` whose trials are compiled.
+    """
+
+    step: Callable[[], Any] = lambda: None
+    policy: Callable[[], Any] = lambda: None
+
+
+def begin(
+    config: config_lib.RunConfig, name: str, stages: Sequence[str], env: Any, encoder: Any
+) -> Precompiled:
+    """Begins to compile the training step of a method, and then its trials and inference.
+
+    Args:
+      config: settings of the run.
+      name: the method.
+      stages: stages of the run.
+      env: environment with the observation of the training.
+      encoder: the frozen encoder, or None.
+    """
+    import jax
+
+    from starjax.commands import policy_evaluation
+    from starjax.runtime import precompile
+    from starjax.training import precompile as training
+
+    if "train" not in stages or len(jax.devices()) > 1:
+        return Precompiled()
+    row = methods.METHODS[methods.METHODS[name].weights_of]
+    step = policy = Precompiled().step
+    if not encoder:  # its features are no images: the step's batch is known only from the dataset
+        cameras = env.names.cameras
+        step = precompile.start(
+            lambda: training.step_program(row, config.policy, config.train, env.task, cameras)
+        )
+    if "evaluate" in stages:
+        vision = encoder.params if encoder else None
+        policy = precompile.start(lambda: policy_evaluation.precompile(name, config, env, vision))
+    return Precompiled(step, policy)

@@ -1,0 +1,111 @@
+"""Programs compiled in the background, before their arguments exist.
+
+jax shares the traces of inner functions between programs. Two programs that are traced at once
+therefore divide these between them as the threads happen to run: their texts differ from process to
+process, and the cache of compiled programs does not have them. So all jobs of `start` are traced in
+one thread, in their order; only compilers, which hold no lock of Python, work side by side.
+"""
+
+import threading
+from collections.abc import Callable, Hashable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from starjax.runtime import background, garbage
+
+T = TypeVar("T")
+
+_thread = threading.local()
+_tracer = ThreadPoolExecutor(1, thread_name_prefix="starjax-tracer")
+
+
+class Program:
+    """A jitted function, some of whose executables are compiled before it is called."""
+
+    def __init__(self, function: Callable[..., Any], **options: Any):
+        self._function = jax.jit(function, **options)
+        self._executables: dict[Hashable, Callable[[], Any]] = {}
+
+    def prepare(self, *args: Any) -> Any:
+        """Traces the program here and compiles it in a thread.
+
+        Args:
+          args: arguments, or arrays' shapes with shardings.
+
+        Returns:
+          the result's shapes.
+        """
+        with garbage.gc_paused():
+            lowered = self._function.lower(*args)
+        executable = background.run_in_background(_marked(lowered.compile))
+        self._executables[_signature(args)] = executable
+        getattr(_thread, "started", []).append(executable)
+        return lowered.out_info
+
+    def is_prepared(self, *args: Any) -> bool:
+        """Returns whether `prepare` was called for arguments of these shapes."""
+        return _signature(args) in self._executables
+
+    def select(self, *args: Any) -> Callable[..., Any]:
+        """Returns the executable for arguments of these shapes, else the jitted function."""
+        executable = self._executables.get(_signature(args)) if self._executables else None
+        return executable() if executable else self._function
+
+    def __call__(self, *args: Any) -> Any:
+        return self.select(*args)(*args)
+
+
+def start(job: Callable[[], T]) -> Callable[[], T | None]:
+    """Queues a job that prepares programs.
+
+    Returns:
+      a function that waits until these are compiled, and returns the job's result; None if it
+      failed, because the same error is raised where the program is called.
+    """
+
+    def run() -> tuple[T, list[Callable[[], Any]]]:
+        _thread.is_job, _thread.started = True, []
+        return job(), _thread.started
+
+    queued = _tracer.submit(run)
+
+    def wait() -> T | None:
+        try:
+            result, started = queued.result()
+            for executable in started:
+                executable()
+        except Exception:
+            return None
+        return result
+
+    return wait
+
+
+def settle() -> None:
+    """Waits until every queued job has been traced: what is traced next is traced alone."""
+    _tracer.submit(lambda: None).result()
+
+
+def is_job() -> bool:
+    """Returns whether this thread works for a job of `start`, and thus for no stage of a run."""
+    return getattr(_thread, "is_job", False)
+
+
+def _marked(work: Callable[[], T]) -> Callable[[], T]:
+    """Returns `work`, whose thread counts as a job's if this one does."""
+    mark = is_job()
+
+    def run() -> T:
+        _thread.is_job = mark
+        return work()
+
+    return run
+
+
+def _signature(args: Any) -> Hashable:
+    """Structure, shapes and types of arguments."""
+    leaves, structure = jax.tree.flatten(args)
+    return structure, tuple((np.shape(x), getattr(x, "dtype", type(x))) for x in leaves)
