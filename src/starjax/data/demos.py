@@ -129,7 +129,7 @@ def collect(
 
 
 def precompile(
-    env: Any, agent: BatchAgent, trocars: Trocar, settings: Settings, params: Any = None
+    env: Any, agent: BatchAgent, trocars: Trocar, settings: DemoSettings, params: Any = None
 ) -> None:
     """Compiles, in the background, the programs that `collect` runs on one device."""
     trocars = configurations.listed(trocars, len(env.p_world_ref))
@@ -139,7 +139,7 @@ def precompile(
     engine.precompile(env, agent, params, trocars, rules, episodes.DEMONSTRATION)
 
 
-def _rules(settings: Settings, lanes: int) -> engine.Settings:
+def _rules(settings: DemoSettings, lanes: int) -> engine.Settings:
     return engine.Settings(settings.seed, schema.STREAM, settings.max_steps, lanes)
 
 
