@@ -1,20 +1,20 @@
 """The action spaces: SE(3) and the four parameterisations of the RCM manifold (Eq. 5), both ways.
 
 Two more are an ablation of {T}, whose x axis turns with the trocar's azimuth: `rcm1_fixed_yaw` and
-`rcm2_fixed_yaw` write the same relative poses in a {T} of one yaw for every trocar. Both then hold
-what `rcm3` holds, the world's rotation and the depth, in other coordinates.
+`rcm2_fixed_yaw` write the same relative poses in a {T} of one yaw for every trocar. Both are then
+equivalent to `rcm3`, the world's rotation and the depth, in other coordinates.
 
-`decode` is total. Whatever the numbers, its pose is finite, its rotation a rotation, and in all
-but SE(3) the shaft passes through the trocar, as nearly as float32 tells where that is: to
-2e-4 mm within a metre of the origin. If an input (action, trocar or reference) is not finite, the
+`decode` is total. For any input its pose is finite and its rotation orthonormal, and in all spaces
+except SE(3) the shaft passes through the trocar up to float32 rounding: 2e-4 mm within a metre of
+the origin. If an input (action, trocar or reference) is not finite, the
 flag `valid` is False and the pose is the **hold pose**: tool straight down, roll 0, tip
 `HOLD_DEPTH` below the trocar (whose own non-finite numbers count as zero: below the reference if
-the radius is not finite). Inputs that are finite, in float32 if that is what jax calculates in, are
-always valid: depths are clipped to [MIN_DEPTH, MAX_DEPTH], a tip at the trocar takes the axis
+the radius is not finite). Inputs that are finite, in float32 unless jax uses float64, are always
+valid: depths are clipped to [MIN_DEPTH, MAX_DEPTH], a tip at the trocar takes the axis
 straight down, degenerate 6-D columns are completed, and SE(3) positions are clipped to +-MAX_REACH.
 
-`encode` describes measured poses too, which are a little off the manifold: its depth is the
-signed one of Eq. 3, its roll and rotation those of the pose. What is computed from a NaN is NaN.
+`encode` also describes measured poses, which are slightly off the manifold: its depth is the signed
+one of Eq. 3, its roll and rotation those of the pose. NaN inputs give NaN.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +44,7 @@ class ActionSpace(NamedTuple):
       encode: (pose_world_tip `[...]`, trocar `[...]`, p_world_ref `[..., 3]` m) to `[..., A]`.
       decode: (action `[..., A]`, trocar, p_world_ref) to (pose_world_tip, valid bool `[...]`).
         Both also take a `TrocarFrame` `[...]` in place of trocar and reference.
-      slices: where the parts are: "p" m, "R" 6-D, "depth" m, "roll" rad.
+      slices: positions of the parts "p" m, "R" 6-D, "depth" m, "roll" rad.
     """
 
     name: str
@@ -100,13 +100,13 @@ def _encode_rcm4(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
 
 
 def _decode_rcm4(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
-    """Algorithm 1, its alignment taken from the z-down frame (`rotation_from_axis_roll`)."""
+    """Applies Algorithm 1, with the alignment in the z-down frame (`rotation_from_axis_roll`)."""
     axis, depth = manifold.axis_and_depth(parts["p"], frame.p)
     return manifold.pose_on_manifold(axis, parts["roll"][..., 0] + frame.roll_zero, depth, frame.p)
 
 
 def _roll(R: jax.Array, frame: "_Frame") -> jax.Array:
-    """Roll `[..., 1]` from the frame's zero, within half a turn either way."""
+    """Returns the roll `[..., 1]` from the frame's zero, within half a turn either way."""
     roll = rotations.roll_of(R) - frame.roll_zero
     return (roll - 2.0 * jnp.pi * jnp.round(roll / (2.0 * jnp.pi)))[..., None]
 
@@ -120,7 +120,7 @@ class _Frame(NamedTuple):
 
 
 def _fixed_yaw(encode_or_decode: Callable) -> Callable:
-    """A map between poses and actions with a {T} whose x axis is the world's at every trocar."""
+    """Wraps a map, with the world's x axis as that of {T} at every trocar."""
 
     def mapped(pose_or_parts: Any, frame: _Frame) -> Any:
         return encode_or_decode(pose_or_parts, frame._replace(R=_down(frame.R.dtype)))
@@ -129,12 +129,12 @@ def _fixed_yaw(encode_or_decode: Callable) -> Callable:
 
 
 def _down(dtype: jnp.dtype) -> jax.Array:
-    """Rotation of a frame with z down and x along the world's, G of `rotation_from_axis_roll`."""
+    """Returns the frame with z down and x along the world's, G of `rotation_from_axis_roll`."""
     return jnp.diag(jnp.array([1.0, -1.0, -1.0], dtype))
 
 
 def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> ActionSpace:
-    """Wrap a pair of maps: inputs checked, broadcast and bounded, the hold pose put in."""
+    """Wraps a pair of maps: checks, broadcasts and bounds the inputs, inserts the hold pose."""
     slices, dim = {}, 0
     for part, size in sizes.items():
         slices[part] = slice(dim, dim + size)
@@ -162,7 +162,7 @@ def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> Actio
         action, *rest = arrays.checked(
             action=(action, (dim,)), **_trocar_arguments(trocar, p_world_ref)
         )
-        # Of a frame: its parameters, and a position that is finite if they and the reference are.
+        # `place` is the reference of a Trocar, the position of a TrocarFrame.
         radius, polar, azimuth, place, *turned = rest
         valid = (
             jnp.isfinite(action).all(axis=-1)
@@ -188,7 +188,7 @@ def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> Actio
 def _trocar_arguments(trocar: Where, p_world_ref: ArrayLike | None) -> dict:
     if isinstance(trocar, trocars.TrocarFrame):
         if p_world_ref is not None:
-            raise ValueError("p_world_ref: expected none beside a TrocarFrame, got one")
+            raise ValueError("p_world_ref: expected None with a TrocarFrame, got a value")
         return {
             **trocars.named_fields(trocar.trocar),
             "trocar.p_world_trocar": (trocar.p_world_trocar, (3,)),
@@ -196,12 +196,12 @@ def _trocar_arguments(trocar: Where, p_world_ref: ArrayLike | None) -> dict:
             "trocar.roll_zero": (trocar.roll_zero, ()),
         }
     if p_world_ref is None:
-        raise ValueError("p_world_ref: expected [..., 3] beside a Trocar, got none")
+        raise ValueError("p_world_ref: expected [..., 3] with a Trocar, got None")
     return {**trocars.named_fields(trocar), "p_world_ref": (p_world_ref, (3,))}
 
 
 def _frame(values: Sequence[jax.Array]) -> tuple[_Frame, tuple[int, ...]]:
-    """The frame of `_trocar_arguments`, and its leading axes."""
+    """Returns the frame of `_trocar_arguments` and its leading axes."""
     radius, polar, azimuth, place, *turned = values
     scalars = [x.shape for x in (radius, polar, azimuth, *turned[1:])]
     shape = jnp.broadcast_shapes(*scalars, place.shape[:-1])
@@ -214,7 +214,7 @@ def _frame(values: Sequence[jax.Array]) -> tuple[_Frame, tuple[int, ...]]:
 
 
 def _hold_pose(p_world_trocar: jax.Array) -> types.Pose:
-    """Tool straight down, roll 0."""
+    """Returns the pose straight below the trocar, roll 0."""
     R = _down(p_world_trocar.dtype)
     return manifold.pose_at_depth(R, jnp.asarray(manifold.HOLD_DEPTH), p_world_trocar)
 

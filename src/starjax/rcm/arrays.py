@@ -8,16 +8,16 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-_BOUND = 1e30  # finite inputs are clipped to +-this, so that sums and squares cannot overflow
+_BOUND = 1e30  # bound of finite inputs: their sums and squares do not overflow
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
 def broadcasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """`function`, whose arrays may differ in number of axes and in type, and be numpy's.
+    """Lets arrays of `function` differ in number of axes and in type, and be numpy's.
 
-    Also in a program that has told jax to refuse that (`jax_numpy_rank_promotion`,
+    This also holds in a program whose settings of jax forbid it (`jax_numpy_rank_promotion`,
     `jax_numpy_dtype_promotion`, `jax_transfer_guard`).
     """
 
@@ -34,7 +34,7 @@ def broadcasting(function: Callable[Arguments, Result]) -> Callable[Arguments, R
 
 
 def checked(**named: tuple[Any, tuple[int, ...]]) -> list[jax.Array]:
-    """Convert inputs to one float type of at least 32 bits and check their shapes.
+    """Converts inputs to one float type of at least 32 bits and check their shapes.
 
     Args:
       named: argument name to `(value, trailing shape)`; the leading axes must broadcast.
@@ -65,20 +65,20 @@ def checked(**named: tuple[Any, tuple[int, ...]]) -> list[jax.Array]:
 
 
 def bounded(x: jax.Array) -> jax.Array:
-    """`x` with non-finite entries set to 0 and the others clipped to where sums stay finite."""
+    """Sets non-finite entries of `x` to 0 and clips the others to +-1e30."""
     return jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), -_BOUND, _BOUND)
 
 
 def taint(x: jax.Array) -> jax.Array:
-    """`[..., 1]`: 0 where all of `x` `[..., n]` are finite, else NaN.
+    """Returns `[..., 1]`: 0 if all of `x` `[..., n]` are finite, else NaN.
 
-    Unlike a constant NaN it is nothing that `jax_debug_nans` finds where no input is at fault.
+    A constant NaN would trip `jax_debug_nans` even for finite inputs.
     """
     return jnp.sum(x - x, axis=-1, keepdims=True)
 
 
 def epsilon(dtype: Any) -> float:
-    """Below this length (m, or sine of an angle) a direction counts as undefined.
+    """Returns the length (m, or sine of an angle) below which a direction is undefined.
 
     It also bounds derivatives: they grow like 1 / length towards a singular point.
     """
@@ -86,7 +86,7 @@ def epsilon(dtype: Any) -> float:
 
 
 def direction(v: jax.Array, fallback: ArrayLike) -> tuple[jax.Array, jax.Array]:
-    """Unit vector along `v` and its length, for any finite `v`.
+    """Splits any finite `v` into its direction and its length.
 
     Args:
       v: `[..., 3]`.
@@ -104,9 +104,9 @@ def direction(v: jax.Array, fallback: ArrayLike) -> tuple[jax.Array, jax.Array]:
 
 
 def norm(v: jax.Array) -> jax.Array:
-    """Length of `v` `[..., 3]` as `[...]`; the derivative at zero is zero, nothing overflows."""
+    """Returns the length `[...]` of `v` `[..., 3]` without overflow, its derivative at zero zero."""
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(v), axis=-1, keepdims=True))
-    # Not `scale > tiny`: a NaN has to come through.
+    # Not `scale > tiny`: a NaN must propagate.
     is_zero = scale <= jnp.finfo(v.dtype).tiny
     scaled = jnp.where(is_zero, 1.0, v) / jnp.where(is_zero, 1.0, scale)
     length = scale * jnp.sqrt(dot(scaled, scaled))
@@ -114,21 +114,21 @@ def norm(v: jax.Array) -> jax.Array:
 
 
 def dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Inner product over the last axis, kept as an axis of length 1: `[..., 1]`."""
+    """Returns the inner product over the last axis, `[..., 1]`."""
     return _sum(a[..., i : i + 1] * b[..., i : i + 1] for i in range(a.shape[-1]))
 
 
-# Products are written out: as reductions they would not fuse into what follows on a CPU, and as
-# matrix products they would be rounded to TF32 on a GPU.
+# Products are written out: reductions would not fuse with later operations on a CPU, and matrix
+# products would be rounded to TF32 on a GPU.
 
 
 def matmul(A: jax.Array, B: jax.Array) -> jax.Array:
-    """`A @ B` of `[..., 3, 3]` matrices in full precision."""
+    """Multiplies `[..., 3, 3]` matrices in full precision."""
     return _sum(A[..., :, i : i + 1] * B[..., i : i + 1, :] for i in range(3))
 
 
 def matvec(A: jax.Array, v: jax.Array) -> jax.Array:
-    """`A @ v` for `[..., 3, 3]` and `[..., 3]` in full precision."""
+    """Multiplies `[..., 3, 3]` by `[..., 3]` in full precision."""
     return _sum(A[..., :, i] * v[..., i : i + 1] for i in range(3))
 
 

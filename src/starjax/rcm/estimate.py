@@ -1,4 +1,4 @@
-"""Where the trocar must have been, from how a tool moved: the point that its lines share."""
+"""Estimation of a trocar from a moving tool: the common point of its shaft's lines."""
 
 from typing import NamedTuple
 
@@ -9,28 +9,27 @@ import numpy as np
 from starjax import types
 from starjax.rcm import arrays
 
-# rad; axes that lie closer about one direction (root mean square) do not fix the depth of a point
+# rad; a smaller spread (RMS) of the axes about one direction does not fix the point along it
 MIN_SPREAD = float(np.deg2rad(2.0))
-MIN_LINES = 3.0  # that agree on the point
-_FARTHEST = 1e3  # m; tips beyond count as not measured, like those that are not finite
-_FINEST = 1e-5  # m; no line is an outlier for missing the point by less
-_DAMPING = 1e-5  # well below the least eigenvalue that `MIN_SPREAD` asks for
+MIN_LINES = 3.0  # inliers
+_FARTHEST = 1e3  # m; tips beyond are ignored, as non-finite ones
+_FINEST = 1e-5  # m; a line nearer to the point is no outlier
+_DAMPING = 1e-5  # well below the least eigenvalue at `MIN_SPREAD`
 _COARSE, _FINE = 40, 10  # steps of the two minimisations
-_CUT = 4.685  # deviations beyond which a line counts nothing (Tukey's, for 95% efficiency)
+_CUT = 4.685  # deviations beyond which the weight is zero (Tukey's, for 95% efficiency)
 _RAYLEIGH = 1.1774  # median distance from a point, of lines with unit deviation each way
 
 
 class TrocarEstimate(NamedTuple):
-    """A trocar as the motion of one tool shows it.
+    """An estimated trocar.
 
     Attributes:
-      p_world_trocar: `[..., 3]` m; where `is_determined` is false, the median of the tips.
-      residual: `[...]` m, root mean square of the lines' distances from the point (Eq. 3), those
-        weighed that count.
-      covariance: `[..., 3, 3]` m^2 of the point, as if lines had independent errors; where
-        `is_determined` is false, that of a point that may be anywhere.
-      weight: `[..., T]` in [0, 1], what each line counts: 0 for an outlier.
-      is_determined: `[...]`, whether the axes spread by `MIN_SPREAD` and `MIN_LINES` count.
+      p_world_trocar: `[..., 3]` m; the median of the tips if undetermined.
+      residual: `[...]` m, weighted root mean square of the lines' distances from the point (Eq. 3).
+      covariance: `[..., 3, 3]` m^2 of the point, for independent errors of the lines; very large if
+        undetermined.
+      weight: `[..., T]` in [0, 1] of the lines: 0 for an outlier.
+      is_determined: `[...]`, True if the axes spread by `MIN_SPREAD` and `MIN_LINES` are inliers.
     """
 
     p_world_trocar: jax.Array
@@ -44,12 +43,12 @@ class TrocarEstimate(NamedTuple):
 def trocar_from_poses(pose: types.Pose) -> TrocarEstimate:
     """Estimates the trocar from a moving tool: the point nearest to the lines of its shaft.
 
-    The sum of distances, which is convex and which a third of wrong poses hardly moves, gives the
-    start; weighed squares (Tukey's, by the median distance) give the point. Turning about the shaft
-    and sliding along it say nothing of where on it the trocar is: see `is_determined`.
+    The minimum of the sum of distances, a convex function that tolerates a third of wrong poses, is
+    the start; weighted squares (Tukey's, by the median distance) refine it. Turning about the shaft
+    and sliding along it leave the point along it undetermined: see `is_determined`.
 
     Args:
-      pose: pose_world_tip `[..., T]`; those that are none, as of NaN, are left out.
+      pose: pose_world_tip `[..., T]`; non-finite poses are ignored.
     """
     R, p = arrays.checked(**{"pose.R": (pose.R, (3, 3)), "pose.p": (pose.p, (3,))})
     if R.ndim < 3 or R.shape[:-2] != p.shape[:-1]:
@@ -62,12 +61,14 @@ def trocar_from_poses(pose: types.Pose) -> TrocarEstimate:
     axis, length = arrays.direction(arrays.bounded(axis), np.array([0.0, 0.0, -1.0], np.float32))
     known = (is_known & (length > 0.5) & (length < 2.0)).astype(p.dtype)
     centre = _median(p, known)
-    # Where the lines are is counted from the centre: float32 has more digits there.
+    # Positions relative to the centre keep more digits in float32.
     p = jnp.where(known[..., None] > 0.0, p - centre[..., None, :], 0.0)
 
+    # Weiszfeld: weights 1 / distance make the squares a sum of distances.
     def nearer(_: int, point: jax.Array) -> jax.Array:
         return _step(point, axis, p, known / jnp.maximum(_distance(point, axis, p), _FINEST))
 
+    # Iteratively reweighted least squares with Tukey's biweight.
     def better(_: int, point: jax.Array) -> jax.Array:
         return _step(point, axis, p, _weight(_distance(point, axis, p), known))
 
@@ -95,24 +96,28 @@ def trocar_from_poses(pose: types.Pose) -> TrocarEstimate:
 
 
 def _step(point: jax.Array, axis: jax.Array, p: jax.Array, weight: jax.Array) -> jax.Array:
-    """The point that minimises weighed squares, by a step from one nearby."""
+    """Minimises the weighted squares by one Newton step.
+
+    Normal equations of sum w |(I - a a')(p - x)|^2: the weighted mean of I - a a' times the step
+    is the weighted mean offset.
+    """
     off = _off(point, axis, p)
     scale = jnp.maximum(jnp.sum(weight, -1), 1e-30)[..., None]
     towards = jnp.sum(weight[..., None] * off, -2) / scale
-    # Where lines are parallel all points along them are as good: it stays.
+    # The damping keeps the point along parallel lines, the arbitrary direction.
     damped = _normal(axis, weight) + _DAMPING * jnp.eye(3, dtype=p.dtype)
     return jnp.clip(point + arrays.matvec(_inverse(damped), towards), -1e4, 1e4)
 
 
 def _inverse(symmetric: jax.Array) -> jax.Array:
-    """Inverts a positive `[..., 3, 3]`. Written out, as jax's own fails under its error checks."""
+    """Inverts a positive `[..., 3, 3]`; jax's own inverse fails under its error checks."""
     x, y, z = (symmetric[..., i] for i in range(3))
     adjugate = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)], axis=-2)
     return adjugate / arrays.dot(x, adjugate[..., 0, :])[..., None]
 
 
 def _normal(axis: jax.Array, weight: jax.Array) -> jax.Array:
-    """Weighed mean of `I - a a'`, `[..., 3, 3]`."""
+    """Returns the weighted mean `[..., 3, 3]` of `I - a a'`."""
     scale = jnp.maximum(jnp.sum(weight, -1), 1e-30)[..., None, None]
     outer = axis[..., :, None] * axis[..., None, :]
     spanned = jnp.sum(weight[..., None, None] * outer, -3) / scale
@@ -120,7 +125,7 @@ def _normal(axis: jax.Array, weight: jax.Array) -> jax.Array:
 
 
 def _off(point: jax.Array, axis: jax.Array, p: jax.Array) -> jax.Array:
-    """Vectors from the point to the nearest place on each line, `[..., T, 3]` m."""
+    """Returns the vectors `[..., T, 3]` m from the point to the nearest position on each line."""
     away = p - point[..., None, :]
     return away - arrays.dot(away, axis) * axis
 
@@ -130,7 +135,7 @@ def _distance(point: jax.Array, axis: jax.Array, p: jax.Array) -> jax.Array:
 
 
 def _weight(distance: jax.Array, known: jax.Array) -> jax.Array:
-    """Tukey's weights, their deviation from the median distance of known lines."""
+    """Returns Tukey's weights, scaled by the median distance of known lines."""
     middle = _median(distance[..., None], known)
     deviation = jax.lax.stop_gradient(jnp.maximum(middle / _RAYLEIGH, _FINEST))
     inside = jnp.maximum(1.0 - (distance / (_CUT * deviation)) ** 2, 0.0)
@@ -138,9 +143,9 @@ def _weight(distance: jax.Array, known: jax.Array) -> jax.Array:
 
 
 def _median(x: jax.Array, known: jax.Array) -> jax.Array:
-    """Lower median over the last axis but one of the known rows; zero where none is."""
+    """Returns the lower median of the known rows over the last axis but one; zero without any."""
     large = jnp.finfo(x.dtype).max
     ordered = jnp.sort(jnp.where(known[..., None] > 0.0, x, large), axis=-2)
     middle = jnp.maximum((jnp.sum(known, -1) - 1.0) // 2.0, 0.0).astype(jnp.int32)
-    found = jnp.take_along_axis(ordered, middle[..., None, None], axis=-2)[..., 0, :]
-    return jnp.where(jnp.sum(known, -1)[..., None] > 0.0, found, 0.0)
+    median = jnp.take_along_axis(ordered, middle[..., None, None], axis=-2)[..., 0, :]
+    return jnp.where(jnp.sum(known, -1)[..., None] > 0.0, median, 0.0)

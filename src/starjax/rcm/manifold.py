@@ -8,8 +8,8 @@ from jax.typing import ArrayLike
 from starjax import types
 from starjax.rcm import arrays, rotations
 
-MIN_DEPTH = 0.005  # m; poses nearer to the trocar are moved to this depth along the tool's axis
-MAX_DEPTH = 0.4  # m; the length of shaft there can be below the trocar
+MIN_DEPTH = 0.005  # m; shallower poses are moved to this depth along the tool's axis
+MAX_DEPTH = 0.4  # m; the longest shaft below the trocar
 HOLD_DEPTH = 0.05  # m; of the hold pose
 
 _STRAIGHT_DOWN = np.array([0.0, 0.0, -1.0], np.float32)
@@ -17,14 +17,14 @@ _STRAIGHT_DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 
 @arrays.broadcasting
 def rcm_error(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
-    """Distance of the trocar from the line of the shaft (Eq. 3).
+    """Returns the distance of the trocar from the line of the shaft (Eq. 3).
 
     Args:
       pose: pose_world_tip `[...]`.
       p_world_trocar: `[..., 3]` m.
 
     Returns:
-      `[...]` m; its derivative on the line, where it has a kink, is zero.
+      `[...]` m; its derivative on the line, a kink, is zero.
     """
     R, p, p_world_trocar = _checked(pose, p_world_trocar)
     return arrays.norm(jnp.cross(p - p_world_trocar, R[..., :, 2]))
@@ -32,7 +32,7 @@ def rcm_error(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
 
 @arrays.broadcasting
 def insertion_depth(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
-    """Signed depth d of the tip beyond the trocar, along the tool's axis (Eq. 3): `[...]` m."""
+    """Returns the signed depth d `[...]` m of the tip beyond the trocar along the axis (Eq. 3)."""
     R, p, p_world_trocar = _checked(pose, p_world_trocar)
     return arrays.dot(p - p_world_trocar, R[..., :, 2])[..., 0]
 
@@ -41,7 +41,7 @@ def insertion_depth(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
 def pose_on_manifold(
     axis_world: ArrayLike, roll: ArrayLike, depth: ArrayLike, p_world_trocar: ArrayLike
 ) -> types.Pose:
-    """Pose at coordinates (axis, roll, depth) of the chart S2 x S1 x R (Eq. 4, 18).
+    """Returns the pose at coordinates (axis, roll, depth) of the chart S2 x S1 x R (Eq. 4, 18).
 
     Args:
       axis_world: `[..., 3]` tool axis, distal; a zero vector counts as straight down.
@@ -60,10 +60,10 @@ def pose_on_manifold(
 def pose_at_depth(
     R_world_tip: ArrayLike, depth: ArrayLike, p_world_trocar: ArrayLike
 ) -> types.Pose:
-    """Pose of the manifold with a given rotation and depth (Eq. 3).
+    """Returns the pose of the manifold with a given rotation and depth (Eq. 3).
 
-    The tip is built from the axis that the rotation really has, so that it lies on the shaft's
-    line to the last bit, whatever the rounding of the rotation.
+    The tip is computed from the rotation's own third column, so it lies on the shaft's line to the
+    last bit even if the rotation is rounded.
 
     Args:
       R_world_tip: `[..., 3, 3]`.
@@ -81,10 +81,10 @@ def pose_at_depth(
 def axis_and_depth(
     p_world_tip: ArrayLike, p_world_trocar: ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
-    """Direction and distance from the trocar to the tip (Alg. 1, line 2).
+    """Splits the way from the trocar to the tip into direction and distance (Alg. 1, line 2).
 
     Returns:
-      `[..., 3]` unit axis, straight down where the tip is at the trocar; `[...]` m.
+      `[..., 3]` unit axis, straight down for a tip at the trocar; `[...]` m.
     """
     p, p_world_trocar = arrays.checked(
         p_world_tip=(p_world_tip, (3,)), p_world_trocar=(p_world_trocar, (3,))
@@ -94,12 +94,11 @@ def axis_and_depth(
 
 @arrays.broadcasting
 def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
-    """Post-hoc projection onto the manifold, for DP-EE-Proj.
+    """Projects a pose onto the manifold (post hoc, for DP-EE-Proj).
 
-    The tip is kept and the tool turned by the smallest rotation that puts its axis through the
-    trocar with the tip on the far side (depth positive, Eq. 18). A tip at the trocar is on the
-    manifold whichever way the tool points: that pose is returned as it is. Where an input is not
-    finite, all of the pose is NaN.
+    The tip stays and the tool turns by the smallest rotation that puts its axis through the trocar
+    with the tip on the far side (depth positive, Eq. 18). A tip at the trocar is on the manifold
+    with any axis: that pose is returned unchanged. A non-finite input makes the whole pose NaN.
 
     Args:
       pose: pose_world_tip `[...]`.

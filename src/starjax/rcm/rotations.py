@@ -13,7 +13,7 @@ from starjax.rcm import arrays
 
 # World to the fixed-yaw frame whose z points down, G = diag(1, -1, -1); it is its own inverse.
 _DOWN = np.array([1.0, -1.0, -1.0], np.float32)
-# Entries of what should be a rotation are clipped to +-this: their squares stay finite.
+# Bound of a matrix' entries: their squares stay finite.
 _MOST_ENTRY = 1e9
 _E_X = np.array([1.0, 0.0, 0.0], np.float32)
 _E_Y = np.array([0.0, 1.0, 0.0], np.float32)
@@ -22,12 +22,12 @@ _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
 
 @arrays.broadcasting
 def rotation_align(a: ArrayLike, b: ArrayLike) -> jax.Array:
-    """Smallest rotation that turns the direction of `a` into that of `b` (Eq. 16, total).
+    """Returns the smallest rotation that turns the direction of `a` into that of `b` (Eq. 16).
 
-    Eq. 16 divides by `1 + a.b`, which cancels as `b` nears `-a`. Here the part of `b` across
-    `a` spans the plane of rotation; where the two oppose, it is made orthogonal to `a` again
-    before it is scaled up. At `b = -a` (to within `epsilon`) the plane is undefined and a fixed
-    one is taken: half a turn, about x for `a = e_z`.
+    Eq. 16 divides by `1 + a.b`, which cancels as `b` nears `-a`. Here the part of `b` across `a`
+    spans the plane of rotation; for an obtuse angle it is made orthogonal to `a` again before it is
+    scaled up. At `b = -a` (to within `epsilon`) the plane is undefined; the rotation is then half a
+    turn about a fixed axis, x for `a = e_z`.
 
     Args:
       a: `[..., 3]`, of any length: below 5e-7 (1e-12 in float64) it counts as zero, and zero as
@@ -49,9 +49,11 @@ def _align_unit(a: jax.Array, b: jax.Array) -> jax.Array:
     in_plane, sin = arrays.direction(across, _orthogonal(a))
     in_plane = in_plane - arrays.dot(in_plane, a) * a
     in_plane, _ = arrays.direction(in_plane, _orthogonal(a))
+    # Rodrigues in the plane (a, b): R = I + (w a' - a w') - (1 - cos)(a a' + e e'), with e the unit
+    # vector across a and w = sin e. Acute: (1 - cos) e e' = w w' / (1 + cos), the factor of
+    # Eq. 16, without a division by sin. Obtuse: (1 - cos) e e' with e re-orthogonalised.
     is_obtuse = cos < 0.0
     w = jnp.where(is_obtuse, sin[..., None] * in_plane, across)
-    # 1 - cos times the outer product of the unit vector in the plane, in two ways.
     spanning = jnp.where(is_obtuse, in_plane, across)
     factor = jnp.where(is_obtuse, 1.0 - cos, 1.0 / (1.0 + jnp.where(is_obtuse, 0.0, cos)))
     eye = jnp.eye(3, dtype=a.dtype)
@@ -61,7 +63,7 @@ def _align_unit(a: jax.Array, b: jax.Array) -> jax.Array:
 
 @arrays.broadcasting
 def rotation_z(angle: ArrayLike) -> jax.Array:
-    """Rotation by `angle` `[...]` rad about the z axis: `[..., 3, 3]`."""
+    """Returns the rotation `[..., 3, 3]` by `angle` `[...]` rad about the z axis."""
     (angle,) = arrays.checked(angle=(angle, ()))
     cos, sin = cos_sin(angle)
     zero, one = jnp.zeros_like(cos), jnp.ones_like(cos)
@@ -70,14 +72,14 @@ def rotation_z(angle: ArrayLike) -> jax.Array:
 
 
 def cos_sin(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Cosine and sine of `angle` `[...]` rad, whole turns removed first: huge angles are safe."""
+    """Returns cosine and sine of `angle` `[...]` rad, reduced by whole turns for huge angles."""
     angle = jax.lax.rem(angle, jnp.asarray(2.0 * np.pi, angle.dtype))
     return jnp.cos(angle), jnp.sin(angle)
 
 
 @arrays.broadcasting
 def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array:
-    """Tool rotation with a given axis and roll (Alg. 1, lines 3-6).
+    """Returns the tool rotation with a given axis and roll (Alg. 1, lines 3-6).
 
     `R_world_tip = G @ align(e_z, G' @ axis_world) @ R_z(roll)` with G = diag(1, -1, -1): the
     base rotation is taken from a z-down frame of fixed yaw. Alg. 1 reads as if it were taken
@@ -102,7 +104,7 @@ def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array
 
 @arrays.broadcasting
 def roll_of(R_world_tip: ArrayLike) -> jax.Array:
-    """Roll `[...]` in [-pi, pi] rad such that `rotation_from_axis_roll(axis, roll)` is R.
+    """Returns the roll `[...]` in [-pi, pi] rad of R, inverse to `rotation_from_axis_roll`.
 
     Continuous in R except for a tool that points straight up, and at half a turn; NaN if the first
     or the last column has one.
@@ -115,24 +117,24 @@ def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     x = jnp.clip(R_world_tip[..., :, 0], -_MOST_ENTRY, _MOST_ENTRY)
     cos = arrays.dot(base[..., :, 0], x)[..., 0]
     sin = arrays.dot(base[..., :, 1], x)[..., 0]
-    # Only a matrix that is no rotation gives (0, 0), where arctan2 has no derivative.
+    # Invalid rotations can give (0, 0), where arctan2 has no derivative.
     is_degenerate = cos**2 + sin**2 <= arrays.epsilon(x.dtype) ** 2
     roll = jnp.arctan2(sin, jnp.where(is_degenerate, 1.0, cos))
-    # `_base_rotation` takes any axis, a NaN as a tool that points straight down.
+    # `_base_rotation` reads a NaN axis as straight down.
     axis = R_world_tip[..., :, 2]
     return jnp.where(jnp.isnan(axis).any(-1), arrays.taint(axis)[..., 0], roll)
 
 
 @arrays.broadcasting
 def rot6d_encode(R: ArrayLike) -> jax.Array:
-    """First two columns of `R` `[..., 3, 3]`, one after the other: `[..., 6]`."""
+    """Returns the first two columns of `R` `[..., 3, 3]`, concatenated: `[..., 6]`."""
     (R,) = arrays.checked(R=(R, (3, 3)))
     return jnp.concatenate([R[..., :, 0], R[..., :, 1]], axis=-1)
 
 
 @arrays.broadcasting
 def rot6d_decode(rot6d: ArrayLike) -> jax.Array:
-    """Rotation from two columns by Gram-Schmidt, for any input.
+    """Builds a rotation from two columns by Gram-Schmidt, for any input.
 
     Args:
       rot6d: `[..., 6]`, columns of any length and angle; below 5e-7 (1e-12 in float64) they
@@ -148,21 +150,21 @@ def rot6d_decode(rot6d: ArrayLike) -> jax.Array:
     x, _ = arrays.direction(rot6d[..., :3], _E_X)
     spare = _orthogonal(x)
     y, _ = arrays.direction(rot6d[..., 3:], spare)
-    # Twice: what is left of nearly parallel columns is small, and then no longer orthogonal.
+    # Twice, because the remainder of nearly parallel columns is small and loses orthogonality.
     for _ in range(2):
         y, _ = arrays.direction(y - arrays.dot(x, y) * x, spare)
     return jnp.stack([x, y, jnp.cross(x, y)], axis=-1)
 
 
 def _base_rotation(axis_world: jax.Array) -> jax.Array:
-    """`G @ rotation_align(e_z, G' @ axis_world)` written out: `[..., 3]` to `[..., 3, 3]`."""
+    """Computes `G @ rotation_align(e_z, G' @ axis_world)`, written out, of `[..., 3]`."""
     axis, _ = arrays.direction(arrays.bounded(axis_world * _DOWN.astype(axis_world.dtype)), _E_Z)
     across, z = axis[..., :2], axis[..., 2]
     unit, sin = arrays.direction(across, _E_Y[:2])
     is_obtuse = z < 0.0
     spanning = jnp.where(is_obtuse[..., None], unit, across)
     factor = jnp.where(is_obtuse, 1.0 - z, 1.0 / (1.0 + jnp.where(is_obtuse, 0.0, z)))
-    # Up to rounding `across`, but zero where the tool points straight up.
+    # Equal to `across` up to rounding, but zero for a tool that points straight up.
     across = jnp.where(is_obtuse[..., None], sin[..., None] * unit, across)
     x, y = across[..., 0], across[..., 1]
     u, v = spanning[..., 0], spanning[..., 1]
@@ -172,7 +174,7 @@ def _base_rotation(axis_world: jax.Array) -> jax.Array:
 
 
 def _orthogonal(a: jax.Array) -> jax.Array:
-    """A unit vector orthogonal to unit `a`, made from the x axis unless `a` is close to it."""
+    """Returns a unit vector orthogonal to unit `a`, from the x axis unless `a` is close to it."""
     other = jnp.where(jnp.abs(a[..., :1]) < 0.7, _E_X, _E_Y).astype(a.dtype)
     across = jnp.cross(a, other)
     return across / jnp.sqrt(arrays.dot(across, across))

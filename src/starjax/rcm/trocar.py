@@ -1,4 +1,4 @@
-"""Where the trocar is: parameters and position (Eq. 1, 2), frame {T}, sampling (Eq. 19), the 12."""
+"""Trocars: parameters and position (Eq. 1, 2), frame {T}, sampling (Eq. 19), the paper's twelve."""
 
 from typing import Any, NamedTuple
 
@@ -33,14 +33,14 @@ class Trocar(NamedTuple):
 
 
 class TrocarFrame(NamedTuple):
-    """A trocar resolved once: where it is, which way {T} points, and where rolls begin.
+    """A resolved trocar: position, orientation of {T} and zero of rolls.
 
     Attributes:
       trocar: the parameters, fields `[...]`.
       p_world_trocar: `[..., 3]` m (Eq. 2).
       R_world_trocar: `[..., 3, 3]`, see `trocar_rotation`.
       roll_zero: `[...]` rad, the roll that counts as zero. Arms that face each other have zeros
-        half a turn apart, so that neither works at the wrap of its roll.
+        half a turn apart: neither works at the wrap of its roll.
     """
 
     trocar: Trocar
@@ -83,7 +83,7 @@ IS_SEEN: np.ndarray = _constant(np.arange(12) < 8)
 
 @arrays.broadcasting
 def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
-    """Position of the trocar in the world frame (Eq. 2).
+    """Returns the position of the trocar in the world frame (Eq. 2).
 
     Args:
       trocar: fields `[...]`.
@@ -110,10 +110,10 @@ def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
 
 @arrays.broadcasting
 def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> Trocar:
-    """Parameters of a trocar that was measured in the world frame: Eq. 2 solved for lambda.
+    """Returns the parameters of a trocar measured in the world frame: Eq. 2 solved for lambda.
 
-    Where a position says nothing of an angle it is as in `TROCARS`: at the nominal trocar the polar
-    angle is pi/2, and there, above and below it the azimuth is 0. That azimuth turns {T}.
+    Undefined angles are as in `TROCARS`: at the nominal trocar the polar angle is pi/2; there, and
+    straight above and below, the azimuth is 0. That azimuth turns {T}.
 
     Args:
       p_world_trocar: `[..., 3]` m.
@@ -130,7 +130,7 @@ def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> T
     offset = jnp.where(jnp.isfinite(unknown), offset, unknown)
     radius, across = arrays.norm(offset), arrays.norm(offset[..., :2])
     x, y, z = (offset[..., i] for i in range(3))
-    # Where arctan2 has no derivative, or one that grows without bound.
+    # Here arctan2 has no derivative or an unbounded one.
     is_ref, is_above = (length <= arrays.epsilon(offset.dtype) for length in (radius, across))
     polar = jnp.arctan2(jnp.where(is_ref, 1.0, across), z)
     azimuth = jnp.arctan2(jnp.where(is_above, 0.0, y), jnp.where(is_above, 1.0, x))
@@ -139,7 +139,7 @@ def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> T
 
 @arrays.broadcasting
 def trocar_rotation(trocar: Trocar) -> jax.Array:
-    """Orientation of {T}, R_world_trocar `[..., 3, 3]`: z down, x horizontal along the azimuth."""
+    """Returns R_world_trocar `[..., 3, 3]` of {T}: z down, x horizontal along the azimuth."""
     fields = arrays.checked(**named_fields(trocar))
     azimuth = jnp.broadcast_arrays(*fields)[2]
     cos, sin = rotations.cos_sin(azimuth)
@@ -180,7 +180,7 @@ def sample_trocar(
     polar_range: Range = POLAR_RANGE,
     azimuth_range: Range = AZIMUTH_RANGE,
 ) -> Trocar:
-    """Draw trocars, each parameter uniform in its range (Eq. 19).
+    """Draws trocars, each parameter uniform in its range (Eq. 19).
 
     Args:
       key: random key, consumed.
@@ -206,7 +206,7 @@ def sample_trocar(
 
 @arrays.broadcasting
 def check_trocar(trocar: Trocar) -> Trocar:
-    """Return `trocar` if it is one, for use where values are concrete; traced values pass.
+    """Validates a concrete trocar and returns it; traced values pass.
 
     Raises:
       ValueError: shapes do not broadcast, a value is not finite, the radius is negative, or the
