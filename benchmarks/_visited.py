@@ -42,7 +42,7 @@ def at_rest(scene: Scene) -> Moment:
 
 def expert(env: envs.Env) -> Agent:
     """The task's first scripted expert."""
-    return next(iter(env.task.experts.values()))()
+    return env.task.expert()
 
 
 def moments(env: envs.Env, episodes: int) -> Moment:

@@ -40,7 +40,7 @@ def main() -> None:
     experts = environment.task.experts
     expert = arguments.expert or next(iter(experts))
     errors.choice("expert", expert, experts)
-    agent, listed = experts[expert](), environment.task.trocars
+    agent, listed = environment.task.expert(expert), environment.task.trocars
     key = jax.random.key(arguments.seed)
     twelve = rcm.Trocar(*(jnp.repeat(jnp.asarray(f), arguments.per_trocar, axis=0) for f in listed))
     drawn = sampling.sample_trocars(

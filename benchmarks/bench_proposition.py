@@ -58,7 +58,7 @@ def main() -> None:
     arguments = parser.parse_args()
     environment = _scene.make(arguments, observation="state")
     task = environment.task
-    agent = next(iter(task.experts.values()))()
+    agent = task.expert()
     trials, successes = play(environment, agent, arguments.scenes, arguments.seed)
     found = {
         "scene": environment.names._asdict(),

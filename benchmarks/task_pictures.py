@@ -44,7 +44,7 @@ def main(file: Path) -> None:
 def picture(task: str, steps: int, camera: str) -> np.ndarray:
     """`[PIXELS, PIXELS, 3]` uint8, after `steps` of the task's first expert."""
     environment = envs.make(task, image_size=PIXELS, cameras=[camera])
-    expert = next(iter(registries.tasks.get(task).experts.values()))()
+    expert = registries.tasks.get(task).expert()
     trocar = jax.tree.map(lambda leaf: jnp.asarray(leaf)[TROCAR], environment.task.trocars)
 
     @jax.jit

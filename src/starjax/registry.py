@@ -8,6 +8,12 @@ from typing import Any, NamedTuple
 from starjax import errors
 
 
+def load(path: str) -> Any:
+    """Imports the object that `module:object` names."""
+    module, _, attribute = path.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
 class Registry(NamedTuple):
     """One kind of part.
 
@@ -31,8 +37,7 @@ class Registry(NamedTuple):
           errors.UsageError: there is none, or its package cannot be imported.
         """
         if name in self.built_in:
-            module, _, attribute = self.built_in[name].partition(":")
-            return getattr(importlib.import_module(module), attribute)
+            return load(self.built_in[name])
         errors.choice(self.kind, name, self.names())
         entry = next(entry for entry in self._entries() if entry.name == name)
         try:

@@ -23,7 +23,7 @@ def environment() -> envs.Env:
 
 @pytest.fixture(scope="session")
 def agent(environment):
-    return environment.task.experts["default"]()
+    return environment.task.expert()
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ def env():
 @pytest.fixture(scope="session")
 def expert(env):
     """The closed loop of the scripted expert."""
-    return simulation.make("expert", env, agent.from_single(env.task.experts["default"]()))
+    return simulation.make("expert", env, agent.from_single(env.task.expert()))
 
 
 @pytest.fixture(scope="session")

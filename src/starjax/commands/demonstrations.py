@@ -51,7 +51,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> Plan:
         expert=name,
         randomise=most,
     )
-    expert = agent.from_single(task.experts[name]())
+    expert = agent.from_single(task.expert(name))
     out = Path(config.out)
     root = out / f"demos-{store.digest(schema.describe(env, chosen, settings))}"
 

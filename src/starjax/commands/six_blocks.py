@@ -79,11 +79,11 @@ def _score(
 
     if named is None:
         env = six_blocks.make(chosen.arm, observation="state")
-        name, make = next(iter(task.experts.items()))
+        name = next(iter(task.experts))
         table = evaluate.evaluate(
             folder,
             env,
-            agent.from_single(six_blocks.reset_each_block(make())),
+            agent.from_single(six_blocks.reset_each_block(task.expert())),
             (),
             task.trocars,
             evaluate.Settings(chosen.trials, chosen.seed, LIMIT_S),

@@ -104,8 +104,7 @@ def load(spec: AgentSpec, arms: tuple[str, ...] = ()) -> Simulation:
     """Makes the closed loop of an agent, on its own robots unless `arms` names others."""
     if spec.file is None:
         env = sim_env.make(spec.task, arms, observation="state", image_size=_EXPERT_IMAGE_SIZE)
-        scripted = next(iter(env.task.experts.values()))()
-        return make(spec.label, env, agents.from_single(scripted))
+        return make(spec.label, env, agents.from_single(env.task.expert()))
     policy = in_env.load(spec.file, in_env.read(spec.file), arms=arms)
     params = (policy.trained.params, policy.trained.normalizer)
     return make(spec.label, policy.env, policy.agent(), params)

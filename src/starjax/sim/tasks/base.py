@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import numpy as np
 
-from starjax import rcm
+from starjax import rcm, registry
 from starjax.sim.endoscope_camera import Endoscope
 from starjax.types import Agent, Pose
 
@@ -169,8 +169,8 @@ class Task(NamedTuple):
       labels: names of the whole numbers that tell episodes apart, e.g. `source`, `target`.
       stages: names, from the start to success.
       text: for reports.
-      experts: variant -> `make() -> Agent` of a scripted demonstrator; the first is used unless
-        another is chosen.
+      experts: variant -> scripted demonstrator, as `module:object` of an Agent or as `() -> Agent`;
+        the first is the default. See `Task.expert`.
       graspable: geoms of the MJCF, by name, that jaws can hold.
       bind: (mj_model) -> Bound, ids resolved once.
       sample: (Bound, key) -> Layout, what is drawn at reset.
@@ -212,7 +212,7 @@ class Task(NamedTuple):
     labels: tuple[str, ...]
     stages: tuple[str, ...]
     text: TaskText
-    experts: Mapping[str, Callable[[], Agent]]
+    experts: Mapping[str, str | Callable[[], Agent]]
     graspable: tuple[str, ...]
     bind: Callable[..., Any]
     sample: Callable[..., Any]
@@ -239,6 +239,14 @@ class Task(NamedTuple):
     def arms(self) -> int:
         """A."""
         return len(self.slots)
+
+    def expert(self, variant: str = "") -> Agent:
+        """Returns a scripted demonstrator, the first one by default.
+
+        An expert named as `module:object` is imported here, so that importing a task does not.
+        """
+        expert = self.experts[variant or next(iter(self.experts))]
+        return registry.load(expert) if isinstance(expert, str) else expert()
 
     @property
     def state_size(self) -> int:

@@ -16,7 +16,7 @@ from starjax import errors
 from starjax.sim import endoscope_camera
 from starjax.sim.tasks.base import CONTROL_HZ, Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.endoscope_track import text
-from starjax.types import Agent, Pose
+from starjax.types import Pose
 
 CAMERA = "endoscope"
 UP = (-1.0, 0.0, 0.0)
@@ -242,12 +242,6 @@ def _matrix(wxyz: np.ndarray) -> np.ndarray:
     return R.reshape(3, 3)
 
 
-def _expert() -> Agent:
-    from starjax.sim.tasks.endoscope_track import expert
-
-    return expert.AGENT
-
-
 TASK = Task(
     name="endoscope_track",
     mjcf="tasks/endoscope_track/endoscope_track.xml",
@@ -259,7 +253,7 @@ TASK = Task(
     labels=(),
     stages=STAGES,
     text=text.TEXT,
-    experts={"default": _expert},
+    experts={"default": "starjax.sim.tasks.endoscope_track.expert:AGENT"},
     graspable=(),
     bind=bind,
     sample=sample,

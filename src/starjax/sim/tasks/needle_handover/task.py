@@ -14,7 +14,7 @@ from starjax.sim.tasks import two_arms
 from starjax.sim.tasks.base import Capsules, Field, SimReadings, Task, TaskStatus
 from starjax.sim.tasks.needle_handover import text
 from starjax.sim.tasks.needle_pick import task as single
-from starjax.types import Agent, Pose
+from starjax.types import Pose
 
 # Where the tips start, and an idle one waits: so near the middle that the shafts lean apart.
 PARK = ((-0.012, 0.0, 0.065), (0.012, 0.0, 0.065))
@@ -139,12 +139,6 @@ def _nothing(
     return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
 
 
-def _expert() -> Agent:
-    from starjax.sim.tasks.needle_handover import expert
-
-    return expert.AGENT
-
-
 TASK = Task(
     name="needle_handover",
     mjcf="tasks/needle_handover/needle_handover.xml",
@@ -156,7 +150,7 @@ TASK = Task(
     labels=(),
     stages=STAGES,
     text=text.TEXT,
-    experts={"default": _expert},
+    experts={"default": "starjax.sim.tasks.needle_handover.expert:AGENT"},
     graspable=single.TASK.graspable,
     bind=bind,
     sample=sample,

@@ -15,7 +15,7 @@ from starjax import rcm
 from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.needle_pick import text
-from starjax.types import Agent, Pose
+from starjax.types import Pose
 
 # The needle, as in needle_pick.xml (a test holds these to the compiled model).
 SEGMENTS = 7  # of the wire; the last one ends in the point
@@ -203,12 +203,6 @@ def _nothing(
     return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
 
 
-def _expert() -> Agent:
-    from starjax.sim.tasks.needle_pick import expert
-
-    return expert.AGENT
-
-
 TASK = Task(
     name="needle_pick",
     mjcf="tasks/needle_pick/needle_pick.xml",
@@ -220,7 +214,7 @@ TASK = Task(
     labels=(),
     stages=STAGES,
     text=text.TEXT,
-    experts={"default": _expert},
+    experts={"default": "starjax.sim.tasks.needle_pick.expert:AGENT"},
     graspable=tuple(f"wire{k}{side}" for k in range(SEGMENTS) for side in "ab"),
     bind=bind,
     sample=sample,

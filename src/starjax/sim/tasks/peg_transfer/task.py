@@ -16,7 +16,7 @@ from starjax import rcm
 from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.peg_transfer import text
-from starjax.types import Agent, Pose
+from starjax.types import Pose
 
 # The block, as in world.xml (a test holds these to the compiled model).
 RIM_RADIUS = 0.007  # from the axis to a wall's centre line
@@ -255,18 +255,6 @@ def is_at_rest(velocity: jax.Array) -> jax.Array:
     return slow & (jnp.sum(velocity[3:] ** 2) < REST_SPIN**2)
 
 
-def _expert() -> Agent:
-    from starjax.sim.tasks.peg_transfer import expert
-
-    return expert.AGENT
-
-
-def _expert_with_one_wall() -> Agent:
-    from starjax.sim.tasks.peg_transfer import expert
-
-    return expert.WITH_ONE_WALL
-
-
 TASK = Task(
     name="peg_transfer",
     mjcf="tasks/peg_transfer/peg_transfer.xml",
@@ -282,7 +270,10 @@ TASK = Task(
     labels=("source", "target"),
     stages=STAGES,
     text=text.TEXT,
-    experts={"default": _expert, "one_wall": _expert_with_one_wall},
+    experts={
+        "default": "starjax.sim.tasks.peg_transfer.expert:AGENT",
+        "one_wall": "starjax.sim.tasks.peg_transfer.expert:WITH_ONE_WALL",
+    },
     graspable=("wall0", "wall1", "wall2"),
     bind=bind,
     sample=sample,

@@ -15,7 +15,7 @@ from starjax.sim.tasks import two_arms
 from starjax.sim.tasks.base import Capsules, Field, SimReadings, Task, TaskStatus
 from starjax.sim.tasks.peg_transfer import task as single
 from starjax.sim.tasks.peg_transfer_bimanual import text
-from starjax.types import Agent, Pose
+from starjax.types import Pose
 
 # Where the tips start, and an idle one waits: the shafts lean apart.
 PARK = ((-0.02, 0.0, 0.065), (0.02, 0.0, 0.065))
@@ -132,12 +132,6 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 
 
-def _expert() -> Agent:
-    from starjax.sim.tasks.peg_transfer_bimanual import expert
-
-    return expert.AGENT
-
-
 def _obstacles(
     bound: single.PegBound, layout: BimanualLayout, measurements: BimanualMeasurements
 ) -> Capsules:
@@ -164,7 +158,7 @@ TASK = Task(
     labels=("source", "target"),
     stages=STAGES,
     text=text.TEXT,
-    experts={"default": _expert},
+    experts={"default": "starjax.sim.tasks.peg_transfer_bimanual.expert:AGENT"},
     graspable=("wall0", "wall1", "wall2"),
     bind=bind,
     sample=sample,

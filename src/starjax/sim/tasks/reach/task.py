@@ -11,7 +11,6 @@ import numpy as np
 from starjax.sim import endoscope_camera, workspaces
 from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.reach import text
-from starjax.types import Agent
 
 # Where an episode begins.
 TIP_HOME = (0.0, 0.0, 0.06)
@@ -107,12 +106,6 @@ def obstacles(bound: ReachBound, layout: ReachLayout, measurements: ReachMeasure
     return Capsules(foot, marks - jnp.array([0.0, 0.0, TOLERANCE]), jnp.asarray(bound.posts))
 
 
-def _expert() -> Agent:
-    from starjax.sim.tasks.reach import expert
-
-    return expert.AGENT
-
-
 TASK = Task(
     name="reach",
     mjcf="tasks/reach/reach.xml",
@@ -124,7 +117,7 @@ TASK = Task(
     labels=("goal",),
     stages=STAGES,
     text=text.TEXT,
-    experts={"default": _expert},
+    experts={"default": "starjax.sim.tasks.reach.expert:AGENT"},
     graspable=(),
     bind=bind,
     sample=sample,

@@ -17,7 +17,7 @@ from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.peg_transfer.task import is_at_rest
 from starjax.sim.tasks.ring_on_wire import text
-from starjax.types import Agent, Pose
+from starjax.types import Pose
 
 # As in ring_on_wire.xml (a test holds these to the compiled model).
 BENDS = (
@@ -232,12 +232,6 @@ def is_sound(bound: RingBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     return (speed < MAX_SPEED) & (away < MAX_DISTANCE)
 
 
-def _expert() -> Agent:
-    from starjax.sim.tasks.ring_on_wire import expert
-
-    return expert.AGENT
-
-
 TASK = Task(
     name="ring_on_wire",
     mjcf="tasks/ring_on_wire/ring_on_wire.xml",
@@ -253,7 +247,7 @@ TASK = Task(
     labels=("start",),
     stages=STAGES,
     text=text.TEXT,
-    experts={"default": _expert},
+    experts={"default": "starjax.sim.tasks.ring_on_wire.expert:AGENT"},
     graspable=("tab0", "tab1"),
     bind=bind,
     sample=sample,
