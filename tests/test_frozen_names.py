@@ -12,7 +12,7 @@ import jax
 import pytest
 
 from starjax.data import schema, store
-from starjax.evaluation.disturbances import DISTURBANCES
+from starjax.evaluation.disturbances import DISTURBANCES, base
 from starjax.policies import packaged, policy_file
 from starjax.sim import env, registries
 
@@ -41,7 +41,7 @@ def weights() -> list[str]:
 
 def streams() -> dict[str, int]:
     """The number that each disturbance folds into its key."""
-    return {name: zlib.crc32(name.encode()) for name in DISTURBANCES.names()}
+    return {name: zlib.crc32(base.stream(name).encode()) for name in DISTURBANCES.names()}
 
 
 FROZEN = {"datasets": datasets, "weights": weights, "streams": streams}

@@ -69,7 +69,7 @@ def test_demonstrations_are_recorded_with_what_is_wrong(tmp_path, monkeypatch):
     monkeypatch.setattr(demos, "collect", lambda *a, **_: given.append(a) or found)
     seen = dataclasses.replace(SMOKE.policy, observation="image")
     env, roots = stubs.make_env("image"), []
-    for wrong in ((), ("smoke=0.5", "dropped=0.3"), ("smoke=0.4",)):
+    for wrong in ((), ("smoke=0.5", "observation_dropout=0.3"), ("smoke=0.4",)):
         asked = dataclasses.replace(SMOKE.demos, randomise=wrong)
         chosen = dataclasses.replace(SMOKE, demos=asked, policy=seen, out=str(tmp_path))
         root, collect, _ = demonstrations.plan(chosen, env, sharing.ALONE)
@@ -80,15 +80,15 @@ def test_demonstrations_are_recorded_with_what_is_wrong(tmp_path, monkeypatch):
     assert schema.describe(env, *given[1][3:])["randomise"] == {"smoke": 0.5, "dropped": 0.3}
     params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)))
     state = given[1][1].reset(jax.random.key(0), params)
-    assert set(state.wrapper_state) == {"smoke", "dropped"}
+    assert set(state.wrapper_state) == {"smoke", "observation_dropout"}
 
 
 @pytest.mark.parametrize(
     ("observation", "wrong", "got"),
     [
-        ("image", "trocar_told=2", "trocar_told"),
+        ("image", "trocar_offset=2", "trocar_offset"),
         ("image", "breathing=2", "breathing"),
-        ("image", "late_view=5", 5),
+        ("image", "observation_delay=5", 5),
         ("state", "smoke=0.5", "smoke"),
     ],
 )

@@ -377,10 +377,10 @@ def stressed(*more):
 
 
 def test_a_policy_is_scored_at_every_level(file, capsys):
-    assert stressed("--disturbance", "trocar_told", "--levels", "0", "5") == 0
+    assert stressed("--disturbance", "trocar_offset", "--levels", "0", "5") == 0
     (result,) = file.parent.rglob("stress.json")
     found = json.loads(result.read_text())
-    levels = found["disturbances"]["trocar_told"]["levels"]
+    levels = found["disturbances"]["trocar_offset"]["levels"]
     assert list(levels) == ["0", "5"] and found["method"] == "dp_rcm2"
     assert all(level["strict"]["trials"] == 12 for level in levels.values())
     force = [level["wall_force_N"] for level in levels.values()]
@@ -389,7 +389,7 @@ def test_a_policy_is_scored_at_every_level(file, capsys):
         path.name for path in result.parent.iterdir()
     }
     chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
-    assert stressed("--disturbance", "trocar_told", "--levels", "0", "5") == 0 and chunks
+    assert stressed("--disturbance", "trocar_offset", "--levels", "0", "5") == 0 and chunks
     assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
     assert capsys.readouterr().out.count("/12 = ") == 4
 
@@ -398,7 +398,7 @@ def test_a_policy_of_states_meets_no_disturbance_of_images(file):
     with mistakes.of("disturbance", "smoke"):
         stressed("--disturbance", "smoke")
     with mistakes.of("levels", 5.0):
-        stressed("--disturbance", "late_view", "--levels", "0", "5")
+        stressed("--disturbance", "observation_delay", "--levels", "0", "5")
 
 
 def test_the_exercise_is_for_policies_of_its_task(file):

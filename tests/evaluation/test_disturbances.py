@@ -1,5 +1,7 @@
 """One thing is wrong, by as much as the level says, and nothing else."""
 
+import zlib
+
 import jax
 import jax.numpy as jnp
 import mistakes
@@ -10,7 +12,7 @@ import stubs
 
 from starjax.evaluation import disturbances
 from starjax.evaluation.disturbances import DISTURBANCES, base, images, timing, trocars
-from starjax.evaluation.disturbances.base import disturbed, varied
+from starjax.evaluation.disturbances.base import with_disturbances, with_random_levels
 from starjax.sim import env as envs
 from starjax.sim.state import EnvParams
 from starjax.types import Command, Pose
@@ -19,8 +21,12 @@ KEY = jax.random.key(3)
 PARAMS = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4, arms=2)))
 CAMERAS = Pose(jnp.stack([jnp.eye(3)] * 2), jnp.array([[0.1, 0.2, 0.3], [0.0, -0.1, 0.4]]))
 KINDS = {name: DISTURBANCES.get(name) for name in DISTURBANCES.built_in}
-PHYSICAL = ("servos", "friction", "mass")  # they need a model
-NAMES = ("late_view", "dropped", *PHYSICAL)  # states that are kept have a model of their own too
+PHYSICAL = ("weak_servos", "friction", "mass")  # they need a model
+NAMES = (
+    "observation_delay",
+    "observation_dropout",
+    *PHYSICAL,
+)  # states that are kept have a model of their own too
 OTHERS = [name for name in KINDS if name not in PHYSICAL]
 
 
@@ -48,13 +54,13 @@ def same(a, b):
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 def test_levels_begin_with_none_and_rise_as_far_as_there_are_any(kind):
-    assert kind.levels[0] == 0.0 and kind.levels[-1] <= kind.most
+    assert kind.levels[0] == 0.0 and kind.levels[-1] <= kind.max_level
     assert list(kind.levels) == sorted(set(kind.levels))
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_episodes_begin_as_without_it_and_are_their_key_s(env, name):
-    wrong, highest = disturbed(env, [name]), at(**{name: KINDS[name].levels[-1]})
+    wrong, highest = with_disturbances(env, [name]), at(**{name: KINDS[name].levels[-1]})
     usual, first, again = env.reset(KEY, PARAMS), *(wrong.reset(KEY, highest) for _ in range(2))
     assert same(first.layout, usual.layout)
     assert same(first.trocar, usual.trocar) and same(first.pose, usual.pose)
@@ -63,7 +69,7 @@ def test_episodes_begin_as_without_it_and_are_their_key_s(env, name):
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_at_level_0_and_once_it_is_over_nothing_is_wrong(env, name):
-    wrong = disturbed(env, [name])
+    wrong = with_disturbances(env, [name])
     usual, state = env.reset(KEY, PARAMS), wrong.reset(KEY, at(**{name: 0.0}))
     to = Command(Pose(usual.pose.R, usual.pose.p + 0.01), usual.gripper)
     for _ in range(3):
@@ -76,10 +82,15 @@ def test_at_level_0_and_once_it_is_over_nothing_is_wrong(env, name):
 
 
 def test_several_are_wrong_at_once_each_at_its_level_and_one_program_has_all_levels(env):
-    wrong = disturbed(env, ["late_view", "darkness", "late_commands", "dropped"])
+    wrong = with_disturbances(
+        env, ["observation_delay", "darkness", "action_delay", "observation_dropout"]
+    )
     start, step = jax.jit(wrong.reset), jax.jit(wrong.step)
     for steps in (1, 4):
-        state = start(KEY, at(late_view=0.0, darkness=0.5, late_commands=steps, dropped=0.0))
+        state = start(
+            KEY,
+            at(observation_delay=0.0, darkness=0.5, action_delay=steps, observation_dropout=0.0),
+        )
         first, to = state.pose.p, Command(Pose(state.pose.R, state.pose.p + 0.1), state.gripper)
         for _ in range(steps):
             state = step(state, to)
@@ -91,11 +102,11 @@ def test_several_are_wrong_at_once_each_at_its_level_and_one_program_has_all_lev
 
 
 def test_with_all_of_them_only_what_has_a_level_is_wrong(env):
-    together = disturbed(env, OTHERS)
+    together = with_disturbances(env, OTHERS)
     start, step_all = jax.jit(together.reset), jax.jit(together.step)
-    for only in ([], ["breathing"], ["breathing_late"]):
+    for only in ([], ["breathing"], ["breathing_tracked"]):
         wrong = dict.fromkeys(only, 5.0)
-        alone = disturbed(env, only)
+        alone = with_disturbances(env, only)
         one = alone.reset(KEY, at(**wrong))
         all_of_them = start(KEY, at(**(dict.fromkeys(OTHERS, 0.0) | wrong)))
         for _ in range(6):
@@ -111,17 +122,17 @@ def test_with_all_of_them_only_what_has_a_level_is_wrong(env):
 
 @pytest.mark.parametrize("level", [1.0, 10.0])
 def test_trocars_are_told_so_far_from_the_truth(env, level):
-    wrong = disturbed(env, ["trocar_told"])
-    states = [wrong.reset(jax.random.key(k), at(trocar_told=level)) for k in (0, 1)]
+    wrong = with_disturbances(env, ["trocar_offset"])
+    states = [wrong.reset(jax.random.key(k), at(trocar_offset=level)) for k in (0, 1)]
     for state in states:
         apart = state.measured_trocar.p_world_trocar - state.trocar.p_world_trocar
         np.testing.assert_allclose(jnp.linalg.norm(apart, axis=-1), 1e-3 * level, rtol=1e-2)
     assert not same(states[0].measured_trocar, states[1].measured_trocar)
 
 
-@pytest.mark.parametrize("name", ["breathing", "breathing_late"])
+@pytest.mark.parametrize("name", ["breathing", "breathing_tracked"])
 def test_trocars_rise_and_fall_with_the_breath(env, name):
-    wrong = disturbed(env, [name])
+    wrong = with_disturbances(env, [name])
     state = first = wrong.reset(KEY, at(**{name: 5.0}))
     step, rises, said = jax.jit(wrong.step), [], []
     for _ in range(round(env.control_hz / trocars.BREATH_HZ)):
@@ -135,13 +146,13 @@ def test_trocars_rise_and_fall_with_the_breath(env, name):
             )
         )
     np.testing.assert_allclose([max(rises), rises[-1]], [5e-3, 0.0], atol=1e-5)
-    late = round(trocars.LATE_S * env.control_hz)
-    expected = np.zeros(late).tolist() + rises[:-late] if name == "breathing_late" else 0.0
+    late = round(trocars.LATENCY_S * env.control_hz)
+    expected = np.zeros(late).tolist() + rises[:-late] if name == "breathing_tracked" else 0.0
     np.testing.assert_allclose(said, expected, atol=1e-6)
 
 
 def test_cameras_are_moved_and_turned(env):
-    state = disturbed(env, ["camera"]).reset(KEY, at(camera=4.0))
+    state = with_disturbances(env, ["camera"]).reset(KEY, at(camera=4.0))
     apart = jnp.linalg.norm(state.cameras.p - CAMERAS.p, axis=-1)
     np.testing.assert_allclose(apart, 4e-3, rtol=1e-3)
     cos = (jnp.trace(state.cameras.R, axis1=1, axis2=2) - 1) / 2
@@ -153,7 +164,7 @@ def looked(env, name, level, image, key=KEY, step=0):
     plain = env._replace(
         observe=lambda state: env.observe(state)._replace(images={"camera": jnp.asarray(image)})
     )
-    wrong = disturbed(plain, [name])
+    wrong = with_disturbances(plain, [name])
     state = wrong.reset(key, at(**{name: level}))
     return np.array(wrong.observe(state.replace(step=state.step + step)).images["camera"], float)
 
@@ -210,7 +221,7 @@ def test_noise_is_as_strong_as_said_and_new_at_every_step(env):
 
 def went(env, name, level, steps=40):
     """Tips that are seen and tips that are, of an episode in which arms move: `[steps, 3]` m."""
-    wrong = disturbed(env, [name])
+    wrong = with_disturbances(env, [name])
     step, state = jax.jit(wrong.step), wrong.reset(KEY, at(**{name: level}))
     seen, true = [], []
     for _ in range(steps):
@@ -220,15 +231,15 @@ def went(env, name, level, steps=40):
     return np.array(seen), np.array(true)
 
 
-@pytest.mark.parametrize("steps", range(1, timing.MOST_DELAY + 1))
+@pytest.mark.parametrize("steps", range(1, timing.MAX_DELAY + 1))
 def test_what_is_seen_is_so_many_steps_old(env, steps):
-    seen, true = went(env, "late_view", float(steps), steps=8)
+    seen, true = went(env, "observation_delay", float(steps), steps=8)
     np.testing.assert_array_equal(seen[steps:], true[:-steps])
     np.testing.assert_array_equal(seen[:steps], np.tile(true[0], (steps, 1)))
 
 
 def test_lost_observations_are_replaced_by_the_last_one_that_came(env):
-    seen, true = went(env, "dropped", 0.3, steps=200)
+    seen, true = went(env, "observation_dropout", 0.3, steps=200)
     is_new = np.all(seen == true, -1)
     np.testing.assert_allclose(1 - is_new[1:].mean(), 0.3, atol=0.08)
     for t in np.flatnonzero(~is_new):
@@ -238,14 +249,14 @@ def test_lost_observations_are_replaced_by_the_last_one_that_came(env):
 def test_policies_of_states_meet_what_is_no_image_s():
     env = stubs.make_env("state")
     params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)), levels={"smoke": 0.5})
-    wrong = disturbed(env, ["smoke"])
+    wrong = with_disturbances(env, ["smoke"])
     state = wrong.reset(KEY, params)
     assert same(wrong.observe(state), env.observe(state))
 
 
 def test_demonstrations_meet_levels_up_to_the_highest(env):
     most = {"smoke": 0.4, "tint": 0.2}
-    wrong = varied(env, most)
+    wrong = with_random_levels(env, most)
     drawn = [
         [float(now.level) for now in wrong.reset(jax.random.key(k), PARAMS).wrapper_state.values()]
         for k in range(60)
@@ -256,14 +267,24 @@ def test_demonstrations_meet_levels_up_to_the_highest(env):
     assert abs(np.corrcoef(np.array(drawn).T)[0, 1]) < 0.3
 
 
+def test_old_names_are_read_and_seed_the_draws_of_the_new_ones():
+    streams = {kind.stream: name for name, kind in KINDS.items() if kind.stream}
+    assert streams == disturbances.RENAMED
+    with pytest.warns(FutureWarning, match="dropped is now observation_dropout"):
+        levels = disturbances.parse_levels("demos.randomise", ["dropped=0.3", "smoke=0.5"])
+    assert levels == {"observation_dropout": 0.3, "smoke": 0.5}
+    key = base.start("weak_servos", 0.5, KEY).key
+    assert key == jax.random.fold_in(KEY, zlib.crc32(b"servos"))
+
+
 @pytest.mark.parametrize(
     "written", ["rain=1", "smoke", "smoke=much", "smoke=0", "smoke=nan", "smoke=1 smoke=2"]
 )
 def test_levels_that_are_none_are_refused(written):
     with mistakes.of("demos.randomise"):
-        disturbances.levels_of("demos.randomise", written.split())
+        disturbances.parse_levels("demos.randomise", written.split())
     with mistakes.of("levels", 5.0):
-        base.check_levels("levels", "late_view", [1.0, 5.0])
+        base.check_levels("levels", "observation_delay", [1.0, 5.0])
 
 
 @pytest.fixture(scope="module")
@@ -274,7 +295,7 @@ def reach():
 @pytest.fixture(scope="module")
 def moved(reach):
     """`levels -> state after a motion of 8 control steps`; one program."""
-    wrong = disturbed(reach, NAMES)
+    wrong = with_disturbances(reach, NAMES)
     params = EnvParams(jax.tree.map(lambda x: jnp.asarray(x)[0], reach.task.trocars))
 
     @jax.jit
@@ -288,7 +309,7 @@ def moved(reach):
 
 @pytest.mark.slow
 def test_servos_of_arms_are_weaker_by_a_share_and_move_otherwise(reach, moved):
-    usual, weak, weakest = (moved(servos=level) for level in (0.0, 0.5, 0.9))
+    usual, weak, weakest = (moved(weak_servos=level) for level in (0.0, 0.5, 0.9))
     m, of_arms = reach.scene.mj_model, reach.scene.arms[0].ctrl
     for name in ("actuator_gainprm", "actuator_biasprm"):
         wanted = getattr(m, name).copy()
@@ -308,7 +329,7 @@ def test_friction_of_all_geoms_is_less_by_a_share(reach, moved):
 def test_objects_weigh_more_or_less_as_mujoco_itself_would_have_them():
     scene = envs.scenes.load(envs.scenes.name("needle_pick"))
     env = stubs.make_env()._replace(scene=scene)
-    wrong = disturbed(env, ["mass"])
+    wrong = with_disturbances(env, ["mass"])
     params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)), levels={"mass": 0.5})
     found = {}
     for k in range(4):

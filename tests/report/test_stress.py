@@ -34,7 +34,7 @@ FOUND = {
 
 def test_the_table_has_a_row_for_every_level():
     rows = stress.table(FOUND)[1:]
-    assert [row[:2] for row in rows[:3]] == [["trocar_told", f"{x} mm"] for x in (0, 5, 10)]
+    assert [row[:2] for row in rows[:3]] == [["trocar_offset", f"{x} mm"] for x in (0, 5, 10)]
     assert len(rows) == 8 and "(3/10)" in rows[4][2] and rows[2][3:] == ["5.00", "10.00", "10.00"]
 
 
@@ -57,7 +57,7 @@ def test_a_report_shows_that_of_its_own_weights(tmp_path):
         run = results.load(folder)
         assert (run.stress != {}) == shows
         text = page.render([run], run, {"stress": (b"light", b"dark")} if shows else {}, None)
-        assert ("trocar_told" in text) == shows
+        assert ("trocar_offset" in text) == shows
     file.write_text(json.dumps({"weights": weights}))
     with pytest.raises(ValueError, match="disturbances"):
         results.load(folder)

@@ -36,8 +36,8 @@ def check(config: config_lib.RunConfig) -> None:
     for name in ("encoder_weights", "freeze_encoder"):
         sees = policy.observation == "image" or not getattr(policy, name)
         expect(sees, f"policy.{name}", "policy.observation image", policy.observation)
-    wrong = disturbances.levels_of("demos.randomise", config.demos.randomise)
-    ours = not (wrong and config.demos.from_)
+    levels = disturbances.parse_levels("demos.randomise", config.demos.randomise)
+    ours = not (levels and config.demos.from_)
     expect(ours, "demos.randomise", "the expert's demonstrations", config.demos.from_)
     turns = policy.frame == "world" or policy.trocar_yaw == "azimuth"
     expect(turns, "policy.trocar_yaw", "azimuth with policy.frame camera", policy.trocar_yaw)

@@ -39,7 +39,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> Plan:
     from starjax.rollouts import agent, placement, success_quota, trocars
     from starjax.runtime import precompile, processes
 
-    env, most = randomised(config, env)
+    env, max_levels = randomised(config, env)
     task, name = env.task, config.demos.expert or next(iter(env.task.experts))
     errors.choice("demos.expert", name, task.experts)
     chosen = trocars.select(task.trocars, slice(config.demos.seen_trocars))
@@ -49,7 +49,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> Plan:
         max_steps=max(config.demos.max_steps, task.least_steps),
         keep_failures=config.demos.keep_failures,
         expert=name,
-        randomise=most,
+        randomise=max_levels,
     )
     expert = agent.from_single(task.expert(name))
     out = Path(config.out)
@@ -102,24 +102,27 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> Plan:
 
 
 def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, float]]:
-    """The environment that demonstrations are recorded in, and the highest levels of what is wrong
-    with it.
+    """Returns the environment for recording demonstrations, and the maximum levels of its
+    disturbances as datasets hold them.
 
     Raises:
       errors.UsageError: something that these demonstrations would not show, or no such level.
     """
-    from starjax.evaluation.disturbances import DISTURBANCES, base, levels_of
+    from starjax.evaluation.disturbances import DISTURBANCES, base, parse_levels
 
-    most = levels_of(_RANDOMISE, config.demos.randomise)
-    for name, level in most.items():
+    max_levels = parse_levels(_RANDOMISE, config.demos.randomise)
+    for name, level in max_levels.items():
         kind: base.Disturbance = DISTURBANCES.get(name)
-        sees = config.policy.observation == "image" or not kind.of_images
-        if not (kind.of_demos and sees):
+        sees = config.policy.observation == "image" or not kind.image_only
+        if not (kind.for_demos and sees):
             raise errors.UsageError(_RANDOMISE, "what demonstrations can show", name)
         base.check_levels(_RANDOMISE, name, [level])
-    if not most:
-        return env, most
-    return base.varied(scenes.disturbable(env, list(most), config.policy), most), most
+    if not max_levels:
+        return env, {}
+    env = scenes.disturbable(env, list(max_levels), config.policy)
+    # Datasets hold the names that seed the draws: renamed disturbances leave their digests alone.
+    recorded = {base.stream(name): level for name, level in max_levels.items()}
+    return base.with_random_levels(env, max_levels), recorded
 
 
 def given(config: config_lib.RunConfig, env: Any) -> Path:

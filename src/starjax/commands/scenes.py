@@ -26,7 +26,7 @@ def disturbable(env: Any, disturbances: Sequence[str], policy: config_lib.Policy
     from starjax.evaluation.disturbances import DISTURBANCES
     from starjax.sim import env as sim_env
 
-    if not any(DISTURBANCES.get(name).moves_cameras for name in disturbances):
+    if not any(DISTURBANCES.get(name).on_camera for name in disturbances):
         return env
     return sim_env.for_policy(env.names, policy, moving_cameras=True)
 

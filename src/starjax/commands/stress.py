@@ -57,7 +57,8 @@ def main(argv: Sequence[str]) -> int:
     folder = _folder(named, chosen)
     if chosen.levels and len(chosen.disturbance) != 1:
         raise errors.UsageError("levels", "one --disturbance beside it", "none or several")
-    disturbances.check("disturbance", chosen.disturbance)
+    names = tuple(disturbances.resolve("disturbance", chosen.disturbance))
+    chosen = dataclasses.replace(chosen, disturbance=names)
     xla.prepare_xla()
     xla.require_devices("starjax.commands.policy_evaluation")
     files.require_writable(folder)
@@ -66,8 +67,8 @@ def main(argv: Sequence[str]) -> int:
     who = _disturbed(who, list(kinds))
     found: dict[str, Any] = {}
     for name, kind in kinds.items():
-        print(f"{name}: {kind.what}", flush=True)
-        rows = found[name] = {"what": kind.what, "unit": kind.unit, "levels": {}}
+        print(f"{name}: {kind.description}", flush=True)
+        rows = found[name] = {"what": kind.description, "unit": kind.unit, "levels": {}}
         for level in chosen.levels or kind.levels:
             place = folder / (f"{name}-{level:g}" if level else "0")
             score = _score(place, who, {**dict.fromkeys(kinds, 0.0), name: level}, chosen)
@@ -110,7 +111,7 @@ def _kinds(chosen: Options, observation: str) -> dict[str, Any]:
 
     known = disturbances.DISTURBANCES
     kinds = {name: known.get(name) for name in chosen.disturbance or known.names()}
-    meets = {n: kind for n, kind in kinds.items() if observation == "image" or not kind.of_images}
+    meets = {n: kind for n, kind in kinds.items() if observation == "image" or not kind.image_only}
     for name in chosen.disturbance:
         if name not in meets:
             raise errors.UsageError("disturbance", "one that a policy of states meets", name)
@@ -123,7 +124,7 @@ def _disturbed(who: Any, names: list[str]) -> Any:
     from starjax.evaluation.disturbances import base
 
     env = scenes.disturbable(who.env, names, who.trained.policy)
-    return who._replace(env=base.disturbed(env, names))
+    return who._replace(env=base.with_disturbances(env, names))
 
 
 def _score(place: Path, who: Any, levels: dict[str, float], chosen: Options) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from starjax.evaluation.disturbances import current_name
 from starjax.report import formats, stats, style
 
 NOTE = (
@@ -30,7 +31,7 @@ def table(found: Found) -> formats.Table:
         "Wall p99 (N)",
     ]
     rows = [header]
-    for name, kind in found["disturbances"].items():
+    for name, kind in _kinds(found).items():
         for level, score in kind["levels"].items():
             error, wall = score["rcm_error_mm"]["executed"], score.get("wall_force_N") or {}
             values = (error["mean"], error["p99"], wall.get("p99"))
@@ -46,7 +47,7 @@ def markdown(found: Found) -> str:
 
 def draw(found: Found, dark: bool = False) -> Any:
     """Success, and RCM error, of every disturbance from its lowest to its highest level."""
-    kinds = found["disturbances"]
+    kinds = _kinds(found)
     angles = np.linspace(0.0, 2.0 * np.pi, len(kinds), endpoint=False)
     names = [f"{name}\n{_span(kind)}" for name, kind in kinds.items()]
     count = max(len(kind["levels"]) for kind in kinds.values())
@@ -91,6 +92,11 @@ def files(found: Found) -> dict[str, bytes]:
         "stress.png": style.save(figure, "png"),
         "stress.pdf": style.save(figure, "pdf"),
     }
+
+
+def _kinds(found: Found) -> dict[str, Any]:
+    """Returns the disturbances by today's names."""
+    return {current_name(name): kind for name, kind in found["disturbances"].items()}
 
 
 def _rate(score: Found) -> str:

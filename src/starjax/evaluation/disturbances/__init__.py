@@ -1,6 +1,6 @@
-"""Disturbances of a theatre, by name. `--help` and mistakes read this: no jax here.
+"""Disturbances of an operating theatre, by name. `--help` and errors read this: no jax here.
 
-Others add theirs by an entry point of the group `starjax.disturbances` that names a
+Other packages add theirs by an entry point of the group `starjax.disturbances` that names a
 `base.Disturbance`.
 """
 
@@ -15,9 +15,9 @@ _HERE = "starjax.evaluation.disturbances"
 DISTURBANCES = Registry(
     "disturbance",
     {
-        "trocar_told": f"{_HERE}.trocars:TOLD_WRONGLY",
+        "trocar_offset": f"{_HERE}.trocars:TROCAR_OFFSET",
         "breathing": f"{_HERE}.trocars:BREATHING",
-        "breathing_late": f"{_HERE}.trocars:BREATHING_LATE",
+        "breathing_tracked": f"{_HERE}.trocars:BREATHING_TRACKED",
         "camera": f"{_HERE}.images:CAMERA",
         "darkness": f"{_HERE}.images:DARKNESS",
         "tint": f"{_HERE}.images:TINT",
@@ -25,37 +25,60 @@ DISTURBANCES = Registry(
         "blur": f"{_HERE}.images:BLUR",
         "smoke": f"{_HERE}.images:SMOKE",
         "blood": f"{_HERE}.images:BLOOD",
-        "late_view": f"{_HERE}.timing:LATE_VIEW",
-        "late_commands": f"{_HERE}.timing:LATE_COMMANDS",
-        "dropped": f"{_HERE}.timing:DROPPED",
-        "servos": f"{_HERE}.physics:SERVOS",
+        "observation_delay": f"{_HERE}.timing:OBSERVATION_DELAY",
+        "action_delay": f"{_HERE}.timing:ACTION_DELAY",
+        "observation_dropout": f"{_HERE}.timing:OBSERVATION_DROPOUT",
+        "weak_servos": f"{_HERE}.physics:WEAK_SERVOS",
         "friction": f"{_HERE}.physics:FRICTION",
         "mass": f"{_HERE}.physics:MASS",
     },
 )
+# Old name -> name. Files of earlier versions hold the old ones.
+RENAMED = {
+    "trocar_told": "trocar_offset",
+    "breathing_late": "breathing_tracked",
+    "late_view": "observation_delay",
+    "late_commands": "action_delay",
+    "dropped": "observation_dropout",
+    "servos": "weak_servos",
+}
 
 
-def check(argument: str, names: Sequence[str]) -> None:
-    """Raises errors.UsageError for the first of `names` that is no disturbance."""
-    known = DISTURBANCES.names()
-    for name in names:
-        errors.choice(argument, name, known)
+def current_name(name: str) -> str:
+    """Returns the name of the disturbance that a file of any version calls `name`."""
+    return RENAMED.get(name, name)
 
 
-def levels_of(argument: str, written: Sequence[str]) -> dict[str, float]:
-    """Reads levels that are written `NAME=LEVEL`.
+def resolve(argument: str, names: Sequence[str]) -> list[str]:
+    """Returns today's names of disturbances; warns of old ones.
 
     Raises:
-      errors.UsageError: one is written otherwise, is of no disturbance, or comes twice.
+      errors.UsageError: a name is unknown.
     """
-    found: dict[str, float] = {}
-    for one in written:
-        name, _, level = one.partition("=")
-        check(argument, [name])
+    known = DISTURBANCES.names()
+    for name in names:
+        if name in RENAMED:
+            errors.warn_renamed(name, RENAMED[name])
+        else:
+            errors.choice(argument, name, known)
+    return [current_name(name) for name in names]
+
+
+def parse_levels(argument: str, texts: Sequence[str]) -> dict[str, float]:
+    """Parses levels of the form `NAME=LEVEL`.
+
+    Raises:
+      errors.UsageError: a text has another form, names no disturbance, or repeats one.
+    """
+    levels: dict[str, float] = {}
+    for text in texts:
+        old_or_new, _, number = text.partition("=")
+        (name,) = resolve(argument, [old_or_new])
         try:
-            found[name], before = float(level), name in found
+            level = float(number)
         except ValueError:
-            raise errors.UsageError(argument, "NAME=LEVEL, LEVEL a number", one) from None
-        if before or not (math.isfinite(found[name]) and found[name] > 0):
-            raise errors.UsageError(argument, "each name once, its level more than 0", one)
-    return found
+            raise errors.UsageError(argument, "NAME=LEVEL, LEVEL a number", text) from None
+        if name in levels or not (math.isfinite(level) and level > 0):
+            raise errors.UsageError(argument, "each name once, its level more than 0", text)
+        levels[name] = level
+    return levels

@@ -1,8 +1,8 @@
-"""Environments in which something is wrong, by as much as a level says, which is data.
+"""Environments with disturbances, whose levels are data.
 
-Starts, keys and judging are those of the usual environment, and the executed RCM error is measured
-against the true trocar. What a disturbance draws depends on the episode's key alone. One program
-has all levels of all of them: at level 0 each leaves everything as it was.
+Starts, keys and success tests are those of the undisturbed environment, and the executed RCM error
+refers to the true trocar. Random draws depend only on the episode's key and on the disturbance.
+One program runs all levels of all disturbances: at level 0 each changes nothing.
 """
 
 import math
@@ -16,16 +16,16 @@ import jax.numpy as jnp
 from starjax import errors
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.sim.state import Env, EnvParams, EnvState
-from starjax.types import Command, Observation
+from starjax.types import Command, Observation, Pose
 
 
-class Now(NamedTuple):
-    """An episode as a disturbance knows it.
+class DisturbanceState(NamedTuple):
+    """State of one disturbance in one episode.
 
     Attributes:
-      level: `[]`, how much is wrong.
-      key: the episode's own for this disturbance.
-      memory: what it carries from step to step.
+      level: `[]`, strength in the disturbance's unit.
+      key: of the episode, for this disturbance alone.
+      memory: pytree that it carries from step to step.
     """
 
     level: jax.Array
@@ -34,101 +34,145 @@ class Now(NamedTuple):
 
 
 class Disturbance(NamedTuple):
-    """One kind of trouble. Its functions know of no other; those left out change nothing.
+    """One disturbance, as pure functions; each default changes nothing.
 
     Attributes:
-      what: a sentence.
-      unit: of its levels.
-      levels: usual ones; 0 is the undisturbed environment.
-      most: the highest level that there is.
-      tell: (Env, Now, EnvParams) -> EnvParams, before a reset.
-      begin: (Env, Now, EnvState) -> EnvState and memory, after it.
-      step: (Env, Now, EnvState, Command) -> EnvState and memory.
-      observe: (Env, Now, EnvState) -> Observation.
-      keeps_states: whether its memory holds states, which others must have changed before.
-      moves_cameras: whether it needs an environment whose cameras may move.
-      of_images: whether policies that see no images are spared.
-      of_demos: whether demonstrations that are recorded with it teach anything of it.
+      description: a sentence.
+      unit: of the levels.
+      levels: those of an evaluation; the first, 0, is undisturbed.
+      max_level: highest allowed level.
+      stream: text that seeds the draws, for a disturbance that was renamed; empty: its name.
+      on_params: (Env, DisturbanceState, EnvParams) -> EnvParams, before a reset.
+      on_reset: (Env, DisturbanceState, EnvState) -> EnvState and memory, after a reset.
+      on_camera: (DisturbanceState, Pose `[C]` of the cameras) -> Pose, after a reset; None for
+        none.
+      on_step: (Env, DisturbanceState, EnvState, Command) -> EnvState and memory.
+      on_observe: (Env, DisturbanceState, EnvState) -> Observation.
+      on_image: (DisturbanceState, image `[h, w, 3]` in [0, 1], control step) -> image, for every
+        image; None for none.
+      stores_states: the memory holds states, so other disturbances must act first.
+      for_demos: demonstrations that are recorded with it teach a policy to withstand it.
     """
 
-    what: str
+    description: str
     unit: str
     levels: tuple[float, ...]
-    most: float = math.inf
-    tell: Callable[[Env, Now, EnvParams], EnvParams] = lambda env, now, params: params
-    begin: Callable[[Env, Now, EnvState], tuple[EnvState, Any]] = lambda env, now, state: (
-        state,
-        (),
+    max_level: float = math.inf
+    stream: str = ""
+    on_params: Callable[[Env, DisturbanceState, EnvParams], EnvParams] = (
+        lambda env, disturbance, params: params
     )
-    step: Callable[[Env, Now, EnvState, Command], tuple[EnvState, Any]] = (
-        lambda env, now, state, command: (env.step(state, command), now.memory)
+    on_reset: Callable[[Env, DisturbanceState, EnvState], tuple[EnvState, Any]] = (
+        lambda env, disturbance, state: (state, ())
     )
-    observe: Callable[[Env, Now, EnvState], Observation] = lambda env, now, state: env.observe(
-        state
+    on_camera: Callable[[DisturbanceState, Pose], Pose] | None = None
+    on_step: Callable[[Env, DisturbanceState, EnvState, Command], tuple[EnvState, Any]] = (
+        lambda env, disturbance, state, command: (env.step(state, command), disturbance.memory)
     )
-    keeps_states: bool = False
-    moves_cameras: bool = False
-    of_images: bool = False
-    of_demos: bool = True
+    on_observe: Callable[[Env, DisturbanceState, EnvState], Observation] = (
+        lambda env, disturbance, state: env.observe(state)
+    )
+    on_image: Callable[[DisturbanceState, jax.Array, jax.Array], jax.Array] | None = None
+    stores_states: bool = False
+    for_demos: bool = True
+
+    @property
+    def image_only(self) -> bool:
+        """True if policies without images never meet it."""
+        return bool(self.on_camera or self.on_image)
 
 
-def disturbed(env: Env, names: Sequence[str]) -> Env:
-    """The environment in which all of these are wrong, at `EnvParams.levels`."""
+def with_disturbances(env: Env, names: Sequence[str]) -> Env:
+    """Wraps an environment so that all of these act, at `EnvParams.levels`."""
     kinds: dict[str, Disturbance] = {name: DISTURBANCES.get(name) for name in names}
-    for name in sorted(kinds, key=lambda name: kinds[name].keeps_states):
+    for name in sorted(kinds, key=lambda name: kinds[name].stores_states):
         env = _with(env, name, kinds[name])
     return env
 
 
-def varied(env: Env, most: Mapping[str, float]) -> Env:
-    """The environment in which each of these is wrong at a level that is drawn for every episode,
-    evenly from 0 to what is given."""
-    wrong = disturbed(env, list(most))
+def with_random_levels(env: Env, max_levels: Mapping[str, float]) -> Env:
+    """Wraps an environment so that all of these act, at levels drawn for every episode.
+
+    A level is uniform from 0 to the maximum.
+    """
+    disturbed = with_disturbances(env, list(max_levels))
 
     def reset(key: jax.Array, params: EnvParams) -> EnvState:
-        shares = jax.random.uniform(_own(key, "levels"), (len(most),))
-        levels = {name: share * high for share, (name, high) in zip(shares, most.items())}
-        return wrong.reset(key, params._replace(levels=levels))
+        fractions = jax.random.uniform(_fold_in(key, "levels"), (len(max_levels),))
+        levels = {
+            name: fraction * high for fraction, (name, high) in zip(fractions, max_levels.items())
+        }
+        return disturbed.reset(key, params._replace(levels=levels))
 
-    return wrong._replace(reset=reset)
+    return disturbed._replace(reset=reset)
+
+
+def stream(name: str) -> str:
+    """Returns the text that seeds a disturbance's draws, which datasets record as its name."""
+    return DISTURBANCES.get(name).stream or name
+
+
+def start(name: str, level: jax.typing.ArrayLike, key: jax.Array) -> DisturbanceState:
+    """Returns a disturbance's state at the start of the episode with this key."""
+    return DisturbanceState(jnp.asarray(level, jnp.float32), _fold_in(key, stream(name)))
+
+
+def change_image(
+    kind: Disturbance, disturbance: DisturbanceState, image: jax.Array, step: jax.Array
+) -> jax.Array:
+    """Applies `on_image` to an image `[h, w, 3]` uint8 at a control step."""
+    if kind.on_image is None:
+        return image
+    changed = kind.on_image(disturbance, image.astype(jnp.float32) / 255.0, step)
+    return jnp.round(255.0 * jnp.clip(changed, 0.0, 1.0)).astype(jnp.uint8)
 
 
 def check_levels(argument: str, name: str, levels: Sequence[float]) -> None:
-    """Raises errors.UsageError for a level that the disturbance of this name does not have."""
+    """Raises errors.UsageError for a level above the disturbance's maximum."""
     kind: Disturbance = DISTURBANCES.get(name)
     for level in levels:
-        if level > kind.most:
-            raise errors.UsageError(argument, f"at most {kind.most:g} of {name}", level)
+        if level > kind.max_level:
+            raise errors.UsageError(argument, f"at most {kind.max_level:g} of {name}", level)
 
 
 def _with(env: Env, name: str, kind: Disturbance) -> Env:
     def reset(key: jax.Array, params: EnvParams) -> EnvState:
         assert params.levels is not None, "a disturbed environment is reset with levels"
-        now = Now(jnp.asarray(params.levels[name], jnp.float32), _own(key, name))
-        state, memory = kind.begin(env, now, env.reset(key, kind.tell(env, now, params)))
-        return _put(state, name, now._replace(memory=memory))
+        disturbance = start(name, params.levels[name], key)
+        state = env.reset(key, kind.on_params(env, disturbance, params))
+        if kind.on_camera is not None:
+            state = state.replace(cameras=kind.on_camera(disturbance, state.cameras))
+        state, memory = kind.on_reset(env, disturbance, state)
+        return _put(state, name, disturbance._replace(memory=memory))
 
     def step(state: EnvState, command: Command) -> EnvState:
-        now, inner = _take(state, name)
-        after, memory = kind.step(env, now, inner, command)
-        after = _put(after, name, now._replace(memory=memory))
+        disturbance, inner = _take(state, name)
+        after, memory = kind.on_step(env, disturbance, inner, command)
+        after = _put(after, name, disturbance._replace(memory=memory))
         return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, after)
 
     def observe(state: EnvState) -> Observation:
-        return kind.observe(env, *_take(state, name))
+        disturbance, inner = _take(state, name)
+        observation = kind.on_observe(env, disturbance, inner)
+        if kind.on_image is None:
+            return observation
+        images = jax.tree.map(
+            lambda image: change_image(kind, disturbance, image, inner.step), observation.images
+        )
+        return observation._replace(images=images)
 
     return env._replace(reset=reset, step=step, observe=observe)
 
 
-# An inner environment meets only what it carries itself, so that its states always look alike.
-def _take(state: EnvState, name: str) -> tuple[Now, EnvState]:
-    carried = dict(state.wrapper_state)
-    return carried.pop(name), state.replace(wrapper_state=carried)
+# An inner environment meets only its own entries, so its states always have the same structure.
+def _take(state: EnvState, name: str) -> tuple[DisturbanceState, EnvState]:
+    others = dict(state.wrapper_state)
+    return others.pop(name), state.replace(wrapper_state=others)
 
 
-def _put(state: EnvState, name: str, now: Now) -> EnvState:
-    return state.replace(wrapper_state={**state.wrapper_state, name: now})
+def _put(state: EnvState, name: str, disturbance: DisturbanceState) -> EnvState:
+    return state.replace(wrapper_state={**state.wrapper_state, name: disturbance})
 
 
-def _own(key: jax.Array, name: str) -> jax.Array:
-    return jax.random.fold_in(key, zlib.crc32(name.encode()))
+def _fold_in(key: jax.Array, text: str) -> jax.Array:
+    return jax.random.fold_in(key, zlib.crc32(text.encode()))

@@ -1,4 +1,4 @@
-"""Robots and objects that are not as they were modelled."""
+"""Disturbances of robots and objects, whose parameters differ from the model's."""
 
 from typing import Any
 
@@ -6,60 +6,66 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.evaluation.disturbances.base import Disturbance, Now
+from starjax.evaluation.disturbances.base import Disturbance, DisturbanceState
 from starjax.sim.state import Env, EnvState
 
 
 def _scaled(env: Env, state: EnvState, factors: dict[str, jax.Array]) -> tuple[EnvState, Any]:
-    """The state with fields of its MJX model times factors, which broadcast from the left."""
-    own = dict(state.model)
+    """Scales fields of the episode's MJX model by factors, which broadcast from the left."""
+    model = dict(state.model)
     for name, factor in factors.items():
-        field = own.get(name, jnp.asarray(getattr(env.scene.mjx_model, name)))
-        own[name] = field * factor.reshape(factor.shape + (1,) * (field.ndim - factor.ndim))
-    return state.replace(model=own), ()
+        field = model.get(name, jnp.asarray(getattr(env.scene.mjx_model, name)))
+        model[name] = field * factor.reshape(factor.shape + (1,) * (field.ndim - factor.ndim))
+    return state.replace(model=model), ()
 
 
-def _weaken(env: Env, now: Now, state: EnvState) -> tuple[EnvState, Any]:
-    of_arms = np.concatenate([bound.ctrl for bound in env.scene.arms])
-    factor = jnp.ones(env.scene.mj_model.nu).at[of_arms].set(1.0 - now.level)
+def _weaken_servos(
+    env: Env, disturbance: DisturbanceState, state: EnvState
+) -> tuple[EnvState, Any]:
+    arm_servos = np.concatenate([arm.ctrl for arm in env.scene.arms])
+    factor = jnp.ones(env.scene.mj_model.nu).at[arm_servos].set(1.0 - disturbance.level)
     return _scaled(env, state, {"actuator_gainprm": factor, "actuator_biasprm": factor})
 
 
-def _grease(env: Env, now: Now, state: EnvState) -> tuple[EnvState, Any]:
-    return _scaled(env, state, {"geom_friction": 1.0 - now.level})
+def _reduce_friction(
+    env: Env, disturbance: DisturbanceState, state: EnvState
+) -> tuple[EnvState, Any]:
+    return _scaled(env, state, {"geom_friction": 1.0 - disturbance.level})
 
 
-def _weigh(env: Env, now: Now, state: EnvState) -> tuple[EnvState, Any]:
+def _change_mass(env: Env, disturbance: DisturbanceState, state: EnvState) -> tuple[EnvState, Any]:
     m = env.scene.mj_model
     objects = np.unique(m.geom_bodyid[env.scene.graspable])
-    times = 1.0 + now.level * jnp.where(jax.random.bernoulli(now.key), 1.0, -1.0)
-    factor = jnp.ones(m.nbody).at[objects].set(times)
-    # What contacts take their stiffness from; a free joint's armature counts as mass there.
+    ratio = 1.0 + disturbance.level * jnp.where(jax.random.bernoulli(disturbance.key), 1.0, -1.0)
+    factor = jnp.ones(m.nbody).at[objects].set(ratio)
+    # Contacts derive their stiffness from the inverse weight, in which a free joint's armature
+    # counts as mass.
     mass, armature = m.body_mass[objects], m.dof_armature[m.body_dofadr[objects]]
-    lighter = (mass + armature) / (times * mass + armature)
-    softer = jnp.ones(m.nbody).at[objects].set(lighter)
-    fields = {"body_mass": factor, "body_inertia": factor, "body_invweight0": softer}
+    inverse_ratio = (mass + armature) / (ratio * mass + armature)
+    inverse = jnp.ones(m.nbody).at[objects].set(inverse_ratio)
+    fields = {"body_mass": factor, "body_inertia": factor, "body_invweight0": inverse}
     return _scaled(env, state, fields)
 
 
-SERVOS = Disturbance(
-    what="the arms' servos are weaker by this share",
+WEAK_SERVOS = Disturbance(
+    description="the arms' servos are weaker by this fraction",
     unit="",
     levels=(0.0, 0.1, 0.25, 0.5),
-    most=0.9,
-    begin=_weaken,
+    max_level=0.9,
+    stream="servos",
+    on_reset=_weaken_servos,
 )
 FRICTION = Disturbance(
-    what="everything is more slippery, with friction less by this share",
+    description="all friction is lower by this fraction",
     unit="",
     levels=(0.0, 0.1, 0.25, 0.5),
-    most=0.9,
-    begin=_grease,
+    max_level=0.9,
+    on_reset=_reduce_friction,
 )
 MASS = Disturbance(
-    what="the object is heavier or lighter by this share, half of the episodes each",
+    description="the object is heavier or lighter by this fraction, each in half of the episodes",
     unit="",
     levels=(0.0, 0.25, 0.5),
-    most=0.9,
-    begin=_weigh,
+    max_level=0.9,
+    on_reset=_change_mass,
 )

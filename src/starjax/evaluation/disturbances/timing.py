@@ -1,82 +1,95 @@
-"""Disturbances of time: images and commands come late, or not at all."""
+"""Disturbances of time: observations and commands are delayed or lost."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from starjax.evaluation.disturbances.base import Disturbance, Now
+from starjax.evaluation.disturbances.base import Disturbance, DisturbanceState
 from starjax.sim.state import Env, EnvState
 from starjax.types import Command, Observation
 
-MOST_DELAY = 4  # control steps that are remembered
+MAX_DELAY = 4  # control steps in memory
 
 
-def _late(now: Now, present: Any, past: Any) -> Any:
-    """Value of `level` steps ago; `past` `[MOST_DELAY, ...]`, the latest first."""
-    steps = jnp.round(now.level).astype(jnp.int32)
-    return jax.tree.map(lambda x, old: jnp.where(steps > 0, old[steps - 1], x), present, past)
+def _delayed(disturbance: DisturbanceState, present: Any) -> Any:
+    """Returns the value of `level` steps ago; memory `[MAX_DELAY, ...]` has the latest first."""
+    steps = jnp.round(disturbance.level).astype(jnp.int32)
+    return jax.tree.map(
+        lambda x, past: jnp.where(steps > 0, past[steps - 1], x), present, disturbance.memory
+    )
 
 
-def _remembered(present: Any, past: Any) -> Any:
-    return jax.tree.map(lambda x, old: jnp.concatenate([x[None], old[:-1]]), present, past)
+def _pushed(present: Any, memory: Any) -> Any:
+    return jax.tree.map(lambda x, past: jnp.concatenate([x[None], past[:-1]]), present, memory)
 
 
-def _always(present: Any) -> Any:
-    return jax.tree.map(lambda x: jnp.stack([x] * MOST_DELAY), present)
+def _repeated(present: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.stack([x] * MAX_DELAY), present)
 
 
-def _keep_states(
-    env: Env, now: Now, state: EnvState, command: Command
+def _remember_state(
+    env: Env, disturbance: DisturbanceState, state: EnvState, command: Command
 ) -> tuple[EnvState, EnvState]:
-    return env.step(state, command), _remembered(state, now.memory)
+    return env.step(state, command), _pushed(state, disturbance.memory)
 
 
-def _see_past(env: Env, now: Now, state: EnvState) -> Observation:
-    return env.observe(_late(now, state, now.memory))
+def _observe_past(env: Env, disturbance: DisturbanceState, state: EnvState) -> Observation:
+    return env.observe(_delayed(disturbance, state))
 
 
-def _hold(env: Env, now: Now, state: EnvState) -> tuple[EnvState, Command]:
-    return state, _always(Command(state.pose, state.gripper))
+def _hold_pose(
+    env: Env, disturbance: DisturbanceState, state: EnvState
+) -> tuple[EnvState, Command]:
+    return state, _repeated(Command(state.pose, state.gripper))
 
 
-def _obey_past(env: Env, now: Now, state: EnvState, command: Command) -> tuple[EnvState, Command]:
-    after = env.step(state, _late(now, command, now.memory))
-    return after, _remembered(command, now.memory)
+def _execute_past(
+    env: Env, disturbance: DisturbanceState, state: EnvState, command: Command
+) -> tuple[EnvState, Command]:
+    after = env.step(state, _delayed(disturbance, command))
+    return after, _pushed(command, disturbance.memory)
 
 
-def _lose(env: Env, now: Now, state: EnvState, command: Command) -> tuple[EnvState, EnvState]:
-    """The state that was last seen is the memory."""
+def _drop(
+    env: Env, disturbance: DisturbanceState, state: EnvState, command: Command
+) -> tuple[EnvState, EnvState]:
+    """Steps; the memory is the last state that was observed."""
     after = env.step(state, command)
-    is_lost = jax.random.bernoulli(jax.random.fold_in(now.key, after.step), now.level)
-    return after, jax.tree.map(lambda old, x: jnp.where(is_lost, old, x), now.memory, after)
+    is_lost = jax.random.bernoulli(
+        jax.random.fold_in(disturbance.key, after.step), disturbance.level
+    )
+    return after, jax.tree.map(lambda old, x: jnp.where(is_lost, old, x), disturbance.memory, after)
 
 
-LATE_VIEW = Disturbance(
-    what="what is observed is so many control steps old",
+OBSERVATION_DELAY = Disturbance(
+    description="observations are this many control steps old",
     unit="steps",
     levels=(0.0, 1.0, 2.0, 4.0),
-    most=float(MOST_DELAY),
-    begin=lambda env, now, state: (state, _always(state)),
-    step=_keep_states,
-    observe=_see_past,
-    keeps_states=True,
+    max_level=float(MAX_DELAY),
+    stream="late_view",
+    on_reset=lambda env, disturbance, state: (state, _repeated(state)),
+    on_step=_remember_state,
+    on_observe=_observe_past,
+    stores_states=True,
 )
-LATE_COMMANDS = Disturbance(
-    what="commands are executed so many control steps late",
+ACTION_DELAY = Disturbance(
+    description="commands are executed this many control steps late",
     unit="steps",
     levels=(0.0, 1.0, 2.0, 4.0),
-    most=float(MOST_DELAY),
-    begin=_hold,
-    step=_obey_past,
+    max_level=float(MAX_DELAY),
+    stream="late_commands",
+    on_reset=_hold_pose,
+    on_step=_execute_past,
 )
-DROPPED = Disturbance(
-    what="this share of the observations is lost, and the last one that came stands in",
+OBSERVATION_DROPOUT = Disturbance(
+    description="this fraction of the observations is lost; the previous one is repeated",
     unit="",
     levels=(0.0, 0.1, 0.3, 0.5),
-    most=1.0,
-    begin=lambda env, now, state: (state, state),
-    step=_lose,
-    observe=lambda env, now, state: env.observe(now.memory),
-    keeps_states=True,
+    max_level=1.0,
+    stream="dropped",
+    on_reset=lambda env, disturbance, state: (state, state),
+    on_step=_drop,
+    on_observe=lambda env, disturbance, state: env.observe(disturbance.memory),
+    stores_states=True,
 )
