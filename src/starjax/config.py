@@ -85,9 +85,6 @@ class PolicyConfig:
     # which way {T} points where actions are relative to it (DP-RCM-1 and 2): turned with the
     # trocar's azimuth, or an ablation
     trocar_yaw: Literal["azimuth", "fixed"] = "azimuth"
-    # where what is observed and predicted counts from: the world, or the endoscope that it is seen
-    # through, an ablation
-    frame: Literal["world", "camera"] = "world"
     roll_loss_weight: NotNegative = 0.1  # lambda of Eq. 15
     # of the networks' arithmetic in training; a trained policy decides in float32
     dtype: Literal["float32", "bfloat16"] = "float32"
@@ -184,7 +181,7 @@ def differing_settings(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     filled = [
         {part: usual[part] | old.get(part, {}) for part in parts} for old in map(upgraded, configs)
     ]
-    rows = [_flat(values) for values in filled]
+    rows = [_flat(values | {"policy": _without_frame(values["policy"])}) for values in filled]
     return [
         name
         for name in dict.fromkeys(name for row in rows for name in row)
@@ -273,6 +270,9 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
 
 def _nested(policy: Mapping[str, Any]) -> dict[str, Any]:
     """A policy's settings with the learner's options by themselves."""
+    if (frame := policy.get("frame", "world")) != "world":
+        raise ValueError(f"PolicyConfig.frame: expected world, the only frame left, got {frame!r}")
+    policy = _without_frame(policy)
     learner = policy.get("learner", PolicyConfig.learner)
     if not isinstance(learner, str):
         raise ValueError(f"PolicyConfig.learner: expected str, got {learner!r}")
@@ -281,6 +281,14 @@ def _nested(policy: Mapping[str, Any]) -> dict[str, Any]:
     options = {name: value for name, value in policy.items() if name not in shared}
     rest = {name: value for name, value in policy.items() if name in shared}
     return {**rest, "options": from_dict(settings, options)}
+
+
+def _without_frame(policy: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns a policy's settings without the frame of its positions where that is the world.
+
+    Version 0.2.0 knew another one, the endoscope's, in which policies learned less.
+    """
+    return {name: value for name, value in policy.items() if (name, value) != ("frame", "world")}
 
 
 def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -127,10 +127,6 @@ def test_flags_override_the_preset_and_nothing_else():
         ("--preset cpu --task reach --arm fr5 --camera side", "runs/cpu-reach-fr5-side"),
         ("--preset gpu --cameras endoscope", "runs/gpu-endoscope"),
         ("--preset gpu --cameras fixed", "runs/gpu"),
-        (
-            "--preset gpu --camera endoscope --policy.frame camera",
-            "runs/gpu-endoscope-camera-frame",
-        ),
         ("--preset cpu --policy.observation state --seed 3", "runs/cpu-state-seed3"),
         ("--preset cpu --policy.observation state --seed 3 --out runs/cpu", "runs/cpu"),
         ("--preset cpu --policy.no-freeze-encoder", "runs/cpu-unfrozen"),

@@ -41,3 +41,14 @@ def test_configuration_survives_json(name):
     assert config.from_dict(config.RunConfig, values) == presets.PRESETS[name]
     with pytest.raises(ValueError, match="stepps"):
         config.from_dict(config.TrainConfig, {"stepps": 1})
+
+
+def test_only_policies_of_the_world_frame_are_read():
+    now = config.as_json(config.RunConfig())
+    old = now | {"policy": now["policy"] | {"frame": "world"}}
+    assert config.from_dict(config.RunConfig, old) == config.RunConfig()
+    assert config.differing_settings([old, now]) == []
+    other = now | {"policy": now["policy"] | {"frame": "camera"}}
+    assert config.differing_settings([other, now]) == ["policy.frame"]
+    with pytest.raises(ValueError, match="frame"):
+        config.from_dict(config.RunConfig, other)

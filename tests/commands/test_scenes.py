@@ -43,19 +43,14 @@ def test_a_task_gives_all_its_seen_trocars_and_no_more():
         scenes.resolved(asked(9))
 
 
-def test_only_what_is_seen_through_an_endoscope_may_count_from_it():
-    policy = config.PolicyConfig(frame="camera")
-
-    def asked(**scene):
-        return config.RunConfig(policy=policy, scene=config.SceneConfig(**scene))
+def test_cameras_that_are_named():
+    def cameras(**scene):
+        found = scenes.resolved(config.RunConfig(scene=config.SceneConfig(**scene)))
+        return found.scene.camera
 
     for camera in (("endoscope",), ("camera", "endoscope")):
-        assert scenes.resolved(asked(camera=camera)).scene.camera == camera
-    for scene in ({}, {"camera": ("fixed",)}, {"task": "endoscope_track"}):
-        with mistakes.of("policy.frame", "camera"):
-            scenes.resolved(asked(**scene))
-    tracked = config.SceneConfig(task="endoscope_track", camera=("fixed",))
-    assert scenes.resolved(config.RunConfig(scene=tracked)).scene.camera == ("camera",)
+        assert cameras(camera=camera) == camera
+    assert cameras(task="endoscope_track", camera=("fixed",)) == ("camera",)
 
 
 def test_settings_without_a_scene_are_of_the_first_one():

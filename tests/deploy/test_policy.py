@@ -516,14 +516,3 @@ def test_the_packaged_policy_commands_what_it_did(prefix, monkeypatch):
     np.testing.assert_allclose(command.pose.p, before[f"{prefix}p"], atol=1e-6)
     np.testing.assert_allclose(command.pose.R, before[f"{prefix}R"], atol=1e-6)
     np.testing.assert_allclose(command.gripper, before[f"{prefix}gripper"], atol=1e-6)
-
-
-def test_a_policy_that_counts_from_its_camera_is_refused(made, tmp_path):
-    _, trained, _ = made
-    settings = dataclasses.replace(trained.policy, frame="camera")
-    path = tmp_path / "policy.safetensors"
-    policy_file.save(path, trained._replace(policy=settings))
-    assert policy_file.load(path).policy.frame == "camera"
-    with pytest.raises(UsageError) as caught:
-        deploy.load(path)
-    assert caught.value.argument == "policy"

@@ -51,9 +51,8 @@ def test_demonstrations_tell_it(seen):
     assert len(np.unique(first, axis=0)) == len(first) == 4
 
 
-@pytest.mark.parametrize("frame", ["world", "camera"])
-def test_demonstrations_that_were_seen_otherwise_are_refused(seen, tmp_path, frame):
-    policy = config.PolicyConfig(image_size=6, frame=frame)
+def test_demonstrations_that_were_seen_otherwise_are_refused(seen, tmp_path):
+    policy = config.PolicyConfig(image_size=6)
 
     def asked(root):
         return config.RunConfig(policy=policy, demos=config.DemosConfig(from_=str(root)))

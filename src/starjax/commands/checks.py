@@ -39,8 +39,6 @@ def check(config: config_lib.RunConfig) -> None:
     levels = disturbances.parse_levels("demos.randomise", config.demos.randomise)
     ours = not (levels and config.demos.from_)
     expect(ours, "demos.randomise", "the expert's demonstrations", config.demos.from_)
-    turns = policy.frame == "world" or policy.trocar_yaw == "azimuth"
-    expect(turns, "policy.trocar_yaw", "azimuth with policy.frame camera", policy.trocar_yaw)
     trained = bool(policy.encoder_weights) or not policy.freeze_encoder
     expect(trained, "policy.freeze_encoder", "policy.encoder_weights of a trained policy", "none")
 

@@ -155,8 +155,6 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
     wanted = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
     if policy.observation == "state":
         wanted = {"state": [sum(field.size for field in env.task.fields)]}
-    if policy.frame == "camera":
-        wanted |= dict(zip(episodes.ENDOSCOPE, ([3, 3], [3]), strict=True))
     for name, shape in wanted.items():
         found = features.get(name, {}).get("shape")
         if found != shape:

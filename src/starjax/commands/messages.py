@@ -155,7 +155,6 @@ def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
     turned = yaw == "fixed" and any(row.action_space in ("rcm1", "rcm2") for row in rows)
     rolls = any(row.hierarchical for row in rows)
     found = {
-        "positions count from the endoscope (--policy.frame camera)": policy.frame == "camera",
         f"the learner's model is {given} the trocar (--policy.sees-trocar {sees})": told,
         "the frame {T} does not turn with the trocar's azimuth (--policy.trocar-yaw fixed)": turned,
         "the roll network does not read the measured rolls (--policy.no-roll-history)": (

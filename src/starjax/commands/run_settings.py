@@ -91,7 +91,6 @@ def _folder(config: config_lib.RunConfig) -> str:
     parts += [f"from-{Path(config.demos.from_).name}"] if config.demos.from_ else []
     parts += [policy.learner] if policy.learner != usual.policy.learner else []
     parts += [policy.observation] if policy.observation != usual.policy.observation else []
-    parts += ["camera-frame"] if policy.frame != usual.policy.frame else []
     sees, freezes = policy.observation == "image", policy.freeze_encoder
     if sees and freezes != usual.policy.freeze_encoder:
         parts.append("frozen" if freezes else "unfrozen")

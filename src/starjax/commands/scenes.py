@@ -38,14 +38,11 @@ def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
       errors.UsageError: a name is unknown, or the task has fewer seen trocars than were asked for.
     """
     # Imported here, as it imports jax and MuJoCo.
-    from starjax.sim import endoscope_camera, registries, scene
+    from starjax.sim import registries, scene
 
     asked, demos = config.scene, config.demos
     full = scene.name(asked.task, asked.arm, asked.tool, asked.camera)
     task = registries.tasks.get(full.task)
-    if config.policy.frame == "camera" and endoscope_camera.of(task, full.cameras) is None:
-        hint = f"--camera {endoscope_camera.NAME}" if task.endoscope else "other tasks have one"
-        raise errors.UsageError("policy.frame", "world, without an endoscope", "camera", hint)
     most = int(task.is_seen.sum())
     is_default = demos.seen_trocars == config_lib.DemosConfig().seen_trocars
     if demos.seen_trocars > most and not is_default:  # the default is all of them

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import methods, rcm
-from starjax.data import frames as camera_frames
 from starjax.data import windows
 from starjax.sim.tasks.base import Field, Task
 
@@ -81,7 +80,6 @@ def fit(
     task: Task,
     dataset: windows.Dataset,
     frames: np.ndarray,
-    frame: str = "world",
 ) -> Normalizer:
     """Statistics of the commands (and the task state) at the given frames of a dataset.
 
@@ -90,36 +88,20 @@ def fit(
       task: whose state's points are scaled, and whose arms' trocars may be drawn elsewhere.
       dataset: the demonstrations, wherever they are.
       frames: `[n]` frame numbers, those trained on.
-      frame: of the policy, "world" or "camera", see `data.frames`.
     """
 
     @jax.jit
-    def encode_commands(camera, command, trocar):
-        if camera is not None:
-            command = camera_frames.command(camera, command)
-            trocar = camera_frames.trocar(task, camera, trocar)
+    def encode_commands(command, trocar):
         return encode(method.action_space, command.pose, command.gripper, trocar)
 
-    def camera_of(observation):
-        return None if frame == "world" else camera_frames.of(observation)
-
-    actions = windows.over_frames(
-        dataset, frames, lambda seen, *rest: encode_commands(camera_of(seen), *rest)
-    )
+    actions = windows.over_frames(dataset, frames, lambda _, *rest: encode_commands(*rest))
     space = rcm.ACTION_SPACES[method.action_space]
     action = _min_max(actions, _entries_but(space, task.arms, "R"))
     if method.action_space not in _ABSOLUTE:
         action = action.replace(reach=_reach(action, space, task, dataset, frames))
     state = None
     if dataset.observation.state is not None:
-
-        def seen_state(observation: Any, *_: Any) -> Any:
-            camera = camera_of(observation)
-            if camera is None:
-                return observation.state
-            return camera_frames.observation(task, camera, observation).state
-
-        states = windows.over_frames(dataset, frames, seen_state)
+        states = windows.over_frames(dataset, frames, lambda observation, *_: observation.state)
         state = _min_max(states, _points(task.fields))
     return Normalizer(action=action, state=state)
 

@@ -196,9 +196,6 @@ def load(
     trained = policy_file.load(path)
     if trained.p_world_ref is None:
         raise errors.UsageError("policy", "one with its nominal trocar", path)
-    if trained.policy.frame != "world":
-        expected = "one that plans in the world's frame"
-        raise errors.UsageError("policy", expected, path, "train it with --policy.frame world")
     settings = _with_options(trained.policy, options)
     errors.choice(f"{path}: method", trained.method, methods.METHODS)
     method = method or trained.method

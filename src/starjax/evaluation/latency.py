@@ -14,9 +14,8 @@ from starjax.models import roll_net
 from starjax.policies import features, generator
 from starjax.policies import policy as policies
 from starjax.runtime import precompile as precompile_lib
-from starjax.sim import endoscope_camera
 from starjax.sim.tasks.base import Field
-from starjax.types import Observation, Pose
+from starjax.types import Observation
 
 _WARM_UP = 3  # calls before the clock starts
 
@@ -128,10 +127,6 @@ def example(
     frame = features.per_step(_frame(_slots(seen), trocar))
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, frame)
     observation = Observation(pose, jnp.ones((*shape, seen.task.arms)))
-    if policy_config.frame == "camera" and seen.task.endoscope:
-        camera = endoscope_camera.nominal(seen.task.endoscope)
-        held = Pose(*(jnp.broadcast_to(leaf, (*shape, *leaf.shape)) for leaf in camera))
-        observation = observation._replace(endoscope=held)
     if policy_config.observation == "state":
         state = jnp.concatenate([_plausible(field) for field in seen.task.fields])
         return observation._replace(state=jnp.broadcast_to(state, (*shape, len(state)))), trocar

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from starjax import config, methods, rcm
-from starjax.policies import features, hierarchical, in_camera, single
+from starjax.policies import features, hierarchical, single
 from starjax.policies.base import Params, Policy
 from starjax.sim.tasks.base import Task
 
@@ -40,5 +40,4 @@ def make(
     method = ablated(method, policy_config)
     build = hierarchical.make if method.hierarchical else single.make
     sensors = features.select_sensors(task, cameras)
-    policy = build(method, policy_config, sensors, train_config or config.TrainConfig())
-    return policy if policy_config.frame == "world" else in_camera.make(policy, task)
+    return build(method, policy_config, sensors, train_config or config.TrainConfig())

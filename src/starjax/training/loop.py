@@ -96,7 +96,7 @@ def run(
         dataset.start, dataset.length, dataset.trocar, train_config.holdout_demos
     )
     row = policies.ablated(method, policy_config)
-    stats = normalizer.fit(row, task, dataset, frames, policy_config.frame)
+    stats = normalizer.fit(row, task, dataset, frames)
     policy = policies.make(method, policy_config, task, train_config, cameras)
     optimizer = states.make_optimizer(train_config)
     streams = states.streams(seed)
@@ -198,9 +198,7 @@ def _observed(
     kept = "images" if policy_config.observation == "image" else "state"
     kept = "features" if policy_config.freeze_encoder else kept
     images = {name: (given.images or {}).get(name) for name in seen.cameras}
-    unseen = {name: None for name in ("images", "state", "features") if name != kept}
-    if policy_config.frame == "world":
-        unseen["endoscope"] = None
+    unseen = {name: None for name in ("images", "state", "features", "endoscope") if name != kept}
     return dataset.replace(observation=given._replace(**{"images": images, **unseen}))
 
 

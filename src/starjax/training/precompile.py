@@ -76,8 +76,6 @@ def batch_shapes(
         observation = observation._replace(images=images)
     else:
         observation = observation._replace(state=real(looks, task.state_size))
-    if policy_config.frame == "camera":
-        observation = observation._replace(endoscope=Pose(real(looks, 3, 3), real(looks, 3)))
     trocar = rcm.Trocar(*[real(task.arms)] * 3)
     told = jax.eval_shape(rcm.trocar_frame, trocar, real(task.arms, 3), real(task.arms))
     return windows.Batch(observation, Command(poses(plans), real(plans, task.arms)), told)
