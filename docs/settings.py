@@ -80,6 +80,11 @@ def table(head: list[str], lines: list[tuple[str, ...]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
 
+def is_flags(kind: object, module: str) -> bool:
+    """Returns True for the class of a command module's flags."""
+    return inspect.isclass(kind) and kind.__module__ == module and kind.__name__.endswith("Args")
+
+
 def commands() -> str:
     """The page of all commands."""
     parts = [
@@ -91,13 +96,16 @@ def commands() -> str:
         "`starjax COMMAND --help` says the same. Ranges are checked.",
     ]
     for name, (module, summary, needed) in cli.COMMANDS.items():
+        module, _, function = module.partition(":")
         loaded = importlib.import_module(module)
-        parts += ["", f"## starjax {name}", "", getattr(loaded, "DESCRIPTION", f"{summary}.")]
+        description = getattr(loaded, function.upper() or "DESCRIPTION", f"{summary}.")
+        flags_of = [kind for kind in vars(loaded).values() if is_flags(kind, module)]
+        parts += ["", f"## starjax {name}", "", description]
         parts += ["", f"Needs the extras {', '.join(f'`{extra}`' for extra in needed)}."]
         if name in ("run", "collect", "train"):
             parts += ["", "Flags: the [settings of a run](config.md)."]
-        elif hasattr(loaded, "Options"):
-            lines = rows(loaded.Options, loaded.Options)
+        elif flags_of:
+            lines = rows(flags_of[0], flags_of[0])
             lines = [(f"`{flag}`", *rest) for flag, *rest in lines]
             parts += ["", table(["flag", "takes", "default", "meaning"], lines)]
     return "\n".join(parts) + "\n"

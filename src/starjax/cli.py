@@ -14,16 +14,17 @@ from starjax.runtime import signals
 _LEARNING = ("sim", "train")
 _ALL = (*_LEARNING, "report")
 _EXCHANGE = (*_LEARNING, "formats")
-# Subcommand -> (module with `main(argv) -> exit code`, one line of help, extras that it needs).
+# Subcommand -> (module with `main(argv) -> exit code`, or module:function, one line of help, extras
+# that it needs).
 COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "run": (
         "starjax.commands.run",
         "collect, train, evaluate and report: the whole of it",
         _ALL,
     ),
-    "collect": ("starjax.commands.collect", "demonstrations only", _LEARNING),
+    "collect": ("starjax.commands.run:collect", "demonstrations only", _LEARNING),
     "train": (
-        "starjax.commands.train",
+        "starjax.commands.run:train",
         "demonstrations and training, no evaluation",
         _LEARNING,
     ),
@@ -194,7 +195,8 @@ def dispatch(argv: Sequence[str]) -> int:
     errors.choice("COMMAND", name, COMMANDS)
     module, _, needed = COMMANDS[name]
     extras.require(name, *needed)
-    return importlib.import_module(module).main(argv[1:])
+    module, _, function = module.partition(":")
+    return getattr(importlib.import_module(module), function or "main")(argv[1:])
 
 
 def _without_interrupts(ignored: Any) -> None:

@@ -36,7 +36,7 @@ class Finding(NamedTuple):
 
 def main(argv: Sequence[str]) -> int:
     """Prints every finding; returns 1 if there is a fault."""
-    options.parse(options.NoFlags, argv, prog="starjax doctor", description=DESCRIPTION)
+    options.parse("doctor", options.NoFlags, argv, DESCRIPTION)
     # The order matters: a wrong XLA flag ends the process as soon as jax starts.
     checks: list[Callable[[], list[Finding]]] = [packages, xla_flags, storage, folder_locks, memory]
     findings = [finding for check in checks for finding in _shown(check)]

@@ -139,7 +139,7 @@ def test_the_folder_of_a_run_is_no_place_for_a_result(file, held):
     place = file.parent / "here" / held
     place.parent.mkdir(parents=True)
     place.write_text("{}")
-    with mistakes.of("--out", "a run's"):
+    with mistakes.of("--out", "here"):
         score("--out", "here")
 
 
@@ -402,7 +402,7 @@ def test_a_policy_of_states_meets_no_disturbance_of_images(file):
 
 
 def test_the_exercise_is_for_policies_of_its_task(file):
-    with mistakes.of("RUN or --policy", "of reach"):
+    with mistakes.of("RUN or --policy", "one for reach"):
         six_blocks.main(["--policy", "mine.safetensors"])
 
 

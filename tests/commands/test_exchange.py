@@ -198,7 +198,7 @@ def test_a_given_dataset_that_is_damaged_is_not_touched(root, tmp_path):
 
 def test_the_flag_is_spelled_as_people_would():
     typed = ["--preset", "smoke", "--demos.from", "there/d"]
-    found = run_settings.parse(typed, "starjax train", "")
+    found = run_settings.parse("run", typed, "")
     assert found.demos.from_ == "there/d" and found.out.endswith("from-d")
     assert options.flag("demos.from_") == "--demos.from"
     assert "--demos.from" in options.flags(config.RunConfig())

@@ -28,15 +28,20 @@ from starjax.runtime import gpu
 
 OPTIONS = {
     **dict.fromkeys(("run", "collect", "train"), config.RunConfig),
-    **{"evaluate": evaluate.Options, "sweep": sweep.Options, "bench": bench.Options},
-    **{"stress": stress.Options, "pack": pack.Options, "report": report_command.Options},
-    **{"six-blocks": six_blocks.Options},
-    **{"export": export_command.Options, "import": import_command.Options},
+    "evaluate": evaluate.EvaluateArgs,
+    "sweep": sweep.SweepArgs,
+    "stress": stress.StressArgs,
+    "six-blocks": six_blocks.SixBlocksArgs,
+    "bench": bench.BenchArgs,
+    "pack": pack.PackArgs,
+    "report": report_command.ReportArgs,
+    "export": export_command.ExportArgs,
+    "import": import_command.ImportArgs,
 }
 
 
 def settings(typed: str) -> config.RunConfig:
-    return run_settings.parse(typed.split(), "starjax run", "")
+    return run_settings.parse("run", typed.split(), "")
 
 
 @pytest.mark.parametrize(
@@ -65,7 +70,7 @@ def settings(typed: str) -> config.RunConfig:
         ("sweep", "--trocars 1", "RUN or --policy", "none"),
         ("sweep", "x --eval.time-limit-s soon", "--eval.time-limit-s", "'soon'"),
         ("stress", "", "RUN or --policy", "none"),
-        ("stress", "--policy compact --levels 1", "levels", "none or several"),
+        ("stress", "--policy compact --levels 1", "levels", 0),
         ("six-blocks", "x --policy y", "RUN or --policy", "both"),
         ("stress", "--policy compact --disturbance rain", "disturbance", "'rain'"),
         ("run", "--demos.randomise rain=1", "demos.randomise", "'rain'"),
@@ -161,7 +166,7 @@ def test_a_presets_expert_is_for_its_own_task():
 )
 def test_words_may_stand_before_and_after_flags(typed):
     found = sweep._parse(typed.split())
-    assert (found.run, found.trocars) == ("x/stardiff", 3)
+    assert (found.source.run, found.trocars) == ("x/stardiff", 3)
 
 
 def test_a_word_that_is_empty_is_a_mistake():

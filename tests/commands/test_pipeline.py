@@ -38,7 +38,7 @@ def done(monkeypatch):
         root = pipeline.Path(settings.out) / "demos-a"
         return demonstrations.Plan(root, lambda: calls.append("collect"))
 
-    def train(settings, name, demos, env, encoder, share, compiled):
+    def train(work, name, demos, compiled):
         demos()
         calls.append(f"train {name}")
 
@@ -47,13 +47,20 @@ def done(monkeypatch):
     monkeypatch.setattr(demonstrations, "plan", plan)
     monkeypatch.setattr(demonstrations, "load", lambda _, root, collect, encoder, share: collect())
     monkeypatch.setattr(pipeline, "_train", train)
-    monkeypatch.setattr(pipeline, "_evaluate", lambda c, name, *_: calls.append(f"score {name}"))
+    monkeypatch.setattr(pipeline, "_evaluate", lambda _, name, *__: calls.append(f"score {name}"))
     monkeypatch.setattr(pipeline, "_report", lambda out, names: calls.append("report"))
     return calls
 
 
 def smoke(out, method):
     return dataclasses.replace(presets.PRESETS["smoke"], out=str(out), method=method)
+
+
+def started(settings, env):
+    """A run of these settings in an environment that is built already."""
+    work = pipeline.Run(settings, None, sharing.ALONE, "")
+    work.__dict__["env"] = env
+    return work
 
 
 def test_all_collects_once_trains_six_and_scores_eight(tmp_path, done):
@@ -108,8 +115,8 @@ def test_weights_that_are_kept_are_the_average(tmp_path, monkeypatch):
     raw, average = {"learner": {"w": np.zeros(3)}}, {"learner": {"w": np.ones(3)}}
     state = types.SimpleNamespace(params=raw, ema_params=average, normalizer=stats)
     monkeypatch.setattr(loop, "run", lambda *_, **__: loop.TrainingResult(state, 1.0, 0, {}))
-    env = fakes.env()
-    pipeline._train(smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None, sharing.ALONE)
+    work = started(smoke(tmp_path, "stardiff"), fakes.env())
+    pipeline._train(work, "stardiff", lambda: None)
     kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
     np.testing.assert_array_equal(kept.params["learner"]["w"], np.ones(3))
 
@@ -125,11 +132,9 @@ def test_a_stop_during_the_last_steps_ends_the_run_after_the_weights(tmp_path, m
 
     before = signal.signal(number, signal.default_int_handler)  # it may be ignored
     monkeypatch.setattr(loop, "run", last_steps)
-    env = fakes.env()
+    work = started(smoke(tmp_path, "stardiff"), fakes.env())
     with pytest.raises(KeyboardInterrupt, match=r"stopped after training stardiff;.*same command"):
-        pipeline._train(
-            smoke(tmp_path, "stardiff"), "stardiff", lambda: None, env, None, sharing.ALONE
-        )
+        pipeline._train(work, "stardiff", lambda: None)
     signal.signal(number, before)
     assert folders.weights(tmp_path, "stardiff").exists()
 
@@ -196,7 +201,7 @@ def test_more_trials_than_asked_for_are_not_thrown_away(tmp_path):
     )
     many = files.read_json(folder / "result.json")
     with mistakes.of("eval.trials", preset.eval.trials) as told:
-        pipeline._evaluate(preset, "stardiff", stubs.make_env(), "demos-a", "", sharing.ALONE)
+        pipeline._evaluate(started(preset, stubs.make_env()), "stardiff", "demos-a")
     assert f"starjax evaluate {folder}" in told.value.hint
     assert files.read_json(folder / "result.json") == many
 
@@ -216,9 +221,8 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
         policy_evaluation, "rollouts", lambda at, *_, **__: found.extend(at.glob("*.npz"))
     )
     monkeypatch.setattr(policy_evaluation, "write_result", lambda *_, **__: None)
-    pipeline._evaluate(
-        preset, "stardiff_single", stubs.make_env(), tmp_path / "demos-a", "", sharing.ALONE
-    )
+    work = started(preset, stubs.make_env())
+    pipeline._evaluate(work, "stardiff_single", tmp_path / "demos-a")
     assert found == [tmp_path / "stardiff_single" / "evaluation" / "chunk_0000.npz"]
 
 
@@ -233,7 +237,7 @@ def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):
     settings, env = smoke(tmp_path, "stardiff"), stubs.make_env()
     trained = dataclasses.replace(settings.policy, dtype="bfloat16")
     trains = dataclasses.replace(settings, policy=trained)
-    pipeline._train(trains, "stardiff", lambda: None, env, None, sharing.ALONE)
+    pipeline._train(started(trains, env), "stardiff", lambda: None)
     kept = policy_file.load(folders.weights(tmp_path, "stardiff"))
     assert (kept.method, kept.preset, kept.demos) == ("stardiff", "smoke", settings.demos)
     assert settings.policy.dtype == "float32"  # in which it decides

@@ -15,7 +15,7 @@ def test_auto_is_what_jax_says_not_what_the_system_shows(monkeypatch, capsys, gu
     monkeypatch.setattr(gpu, "is_likely", lambda: guess)
     monkeypatch.setattr(gpu, "is_used", lambda: used)
     for argv in ([], ["--preset", "auto"]):
-        found = run_settings.parse([*argv, "--train.steps", "7"], "", "")
+        found = run_settings.parse("run", [*argv, "--train.steps", "7"], "")
         assert (found.preset, found.out) == (preset, f"runs/{preset}") and found.train.steps == 7
         assert found.policy == presets.PRESETS[preset].policy
         said = capsys.readouterr().out
@@ -25,8 +25,8 @@ def test_auto_is_what_jax_says_not_what_the_system_shows(monkeypatch, capsys, gu
 def test_a_mistake_is_told_before_jax_is_asked(monkeypatch):
     monkeypatch.setattr(gpu, "is_used", lambda: pytest.fail("jax was asked"))
     with pytest.raises(errors.UsageError):
-        run_settings.parse(["--train.steps", "0"], "", "")
-    assert run_settings.parse(["--preset", "smoke"], "", "").preset == "smoke"
+        run_settings.parse("run", ["--train.steps", "0"], "")
+    assert run_settings.parse("run", ["--preset", "smoke"], "").preset == "smoke"
 
 
 def test_paper_preset_is_the_default_configuration():

@@ -73,7 +73,7 @@ def test_every_stage_speaks_and_the_table_comes_last(said, out):
 
 def test_the_same_command_again_does_nothing_twice(said):
     _, again = said
-    assert again.stdout.count("done before") == 2 and "Training" not in again.stderr
+    assert again.stdout.count("already complete") == 2 and "Training" not in again.stderr
 
 
 def test_result_holds_what_is_documented(said, out):

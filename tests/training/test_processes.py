@@ -58,7 +58,7 @@ def test_two_processes_are_one_run(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_whole_of_a_run_is_done_together(tmp_path):
-    for said in (f"into {tmp_path / 'stardiff'}", "done before"):
+    for said in (f"into {tmp_path / 'stardiff'}", "already complete"):
         started = start_two("whole", str(tmp_path))
         found = several.finish(started)
         assert [process.returncode for process in started] == [0, 0], found

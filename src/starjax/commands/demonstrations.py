@@ -76,7 +76,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> Plan:
 
     def collect() -> None:
         if share.first(f"collected {next(asked)}", is_there):
-            messages.stage("collect", f"done before, {root}")
+            messages.stage("collect", f"already complete, {root}")
             return
         messages.stage("collect", f"into {root}")
         for wait in compiled:
@@ -223,11 +223,15 @@ def _frames(root: Path, camera: str) -> Any:
     return loading.frames(root)[camera]
 
 
-def frozen_encoder(config: config_lib.RunConfig) -> Any:
-    """The vision encoder that stays frozen, None for other runs; mistakes are found here."""
-    if config.policy.observation != "image" or not config.policy.encoder_weights:
+def frozen_encoder(policy: config_lib.PolicyConfig) -> Any:
+    """Returns the frozen image encoder, None for other policies.
+
+    Raises:
+      errors.UsageError: the weights of an encoder, frozen or not, cannot be used.
+    """
+    if policy.observation != "image" or not policy.encoder_weights:
         return None
     from starjax.training import encoder
 
-    found = encoder.read(config.policy)
-    return found if config.policy.freeze_encoder else None
+    pretrained = encoder.read(policy)
+    return pretrained if policy.freeze_encoder else None

@@ -1,6 +1,7 @@
-"""`starjax evaluate`: a trained policy on the twelve trocars; a file of weights is enough."""
+"""`starjax evaluate`: scores a trained policy on its task's trocars."""
 
 import dataclasses
+import functools
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,118 +9,95 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.commands import checks, folders, messages, options, policy_args, scenes, stage_times
-from starjax.runtime import files, gpu, xla
+from starjax.commands import messages, options, policy_args, scenes, session, stage_times
+from starjax.commands.folders import is_under_way
+from starjax.limits import INLINE
+from starjax.runtime import files
 
-DESCRIPTION = """Scores a trained policy on its task's trocars, and films it.
+DESCRIPTION = """Scores a trained policy on its task's trocars and records a video.
 
-RUN is a method's folder, such as runs/cpu/stardiff; or --policy names a policy.safetensors, from
-anywhere, or a policy that ships with starjax. Trials and their time limit are those that the flags
-say, and else the defaults below, which are for this machine, not those of RUN. The same command
-again goes on from the trials that are done."""
+RUN is the directory of a method, such as runs/cpu/stardiff. --policy takes a policy.safetensors or
+the name of a packaged policy instead. Trials and time limit come from the flags below, not from
+RUN; their defaults depend on this machine. Rerun the same command to resume."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class EvaluateArgs:
     """Flags of the command."""
 
-    run: options.RunOrNone = ""  # a method's folder, such as runs/cpu/stardiff
-    # a policy.safetensors, or the name of a policy that ships with starjax, instead of RUN
-    policy: str = ""
-    arm: tuple[str, ...] = ()  # robots to score it with; left out: those it was trained with
-    seed: config_lib.Seed = 0  # of the trials
-    # folder of the result; auto: one in RUN or in runs/evaluate
-    out: str = options.AUTO
+    source: policy_args.PolicyArgs = dataclasses.field(
+        default=policy_args.PolicyArgs(), metadata=INLINE
+    )
+    seed: config_lib.Seed = 0  # random seed of the trials
+    out: str = options.AUTO  # directory of the result; auto: one in RUN or in runs/evaluate
     video: bool = True  # write rollout.mp4
     eval: config_lib.EvalConfig = dataclasses.field(default_factory=config_lib.EvalConfig)
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the trials that are missing; writes result.json and rollout.mp4."""
-    guess = gpu.is_likely()
-    asked = _asked(argv, guess)  # a mistake should not wait for jax
-    xla.prepare_xla()
-    from starjax.runtime import processes
-
-    processes.join()
-    xla.require_devices("starjax.commands.policy_evaluation")
-    chosen, named, folder = asked if gpu.is_used() == guess else _asked(argv, not guess)
-
+    """Runs the missing trials; writes result.json and rollout.mp4."""
+    args, path, folder = session.for_device(
+        functools.partial(_parse, argv), *session.POLICY_MODULES
+    )
     from starjax.commands import policy_evaluation
-    from starjax.rollouts import sharing
 
-    who, config = policy_args.load(named, chosen.arm)
-    scene = scenes.settings(who.env.names)
-    changed = {
-        "method": who.trained.method,
-        "out": str(folder),
-        "scene": scene,
-        "eval": chosen.eval,
-    }
-    config = dataclasses.replace(config, **changed)
-    about = messages.about(config, chosen.policy or chosen.run, chosen.seed)
-    with sharing.shared(folder) as share, messages.first_process_only(share.is_first):
-        same = share.first("same", lambda: _goes_on(folder, who.weights, chosen, scene))
-        print(f"{about}, into {folder}\n", flush=True)
-        with stage_times.timed(folder, "evaluate", same or folders.is_under_way(folder)):
+    who, config = policy_args.load(path)
+    started = session.start("evaluate", argv, folder)
+    method, scene = who.trained.method, scenes.settings(who.env.names)
+    config = dataclasses.replace(
+        config, method=method, out=str(folder), scene=scene, eval=args.eval
+    )
+    name = args.source.policy or args.source.run
+    with started.shared() as share:
+        resumes = share.first("same", lambda: _is_same(folder, who.weights, args, scene))
+        print(f"{messages.about(config, name, args.seed)}, into {folder}\n", flush=True)
+        with stage_times.timed(folder, "evaluate", resumes or is_under_way(folder)):
             table = policy_evaluation.rollouts(
-                folder / "evaluation", who, who.env.task.trocars, chosen.eval, chosen.seed
+                folder / "evaluation", who, who.env.task.trocars, args.eval, args.seed
             )
         if share.is_first:
-            command = options.typed("evaluate", argv)
+            times = stage_times.read(folder)
             result = policy_evaluation.write_result(
-                folder, who, table, config, chosen.seed, command, stage_times.read(folder)
+                folder, who, table, config, args.seed, started.command, times
             )
             print(f"\n{messages.outcome([result])}\n{_times(result)}\n")
-            if not same:
-                (folder / "rollout.mp4").unlink(missing_ok=True)  # of other trials
-            if chosen.video:
-                print(_film(folder, who))
+            if not resumes:
+                (folder / "rollout.mp4").unlink(missing_ok=True)  # shows other trials
+            if args.video:
+                print(_record_video(folder, method))
             hint = f"starjax report {shlex.quote(str(folder))} draws tables and figures"
             print(f"result: {folder / 'result.json'}; {hint}")
         share.meet("over")
     return 0
 
 
-def _goes_on(folder: Path, weights: str, chosen: Options, scene: config_lib.SceneConfig) -> bool:
-    """Whether the folder's result is of these weights and trials; refuses what it must not hold."""
-    before = _before(folder)
-    if chosen.out != options.AUTO:
+def _parse(argv: Sequence[str], has_gpu: bool) -> tuple[EvaluateArgs, policy_args.PolicyPath, Path]:
+    """Returns the flags, the policy's files and the directory of the result."""
+    # Two cores run 48 trials in some minutes, a GPU the paper's 360.
+    small = config_lib.EvalConfig(trials=4, time_limit_s=30.0)
+    default = EvaluateArgs() if has_gpu else EvaluateArgs(eval=small)
+    args = options.parse("evaluate", EvaluateArgs, argv, DESCRIPTION, default)
+    path = policy_args.resolve(args.source)
+    trials = f"seed{args.seed}-{args.eval.trials}x{args.eval.time_limit_s:g}s"
+    parts = [trials, *["ensemble"] * args.eval.ensemble]
+    return args, path, path.folder("evaluate", parts, args.out)
+
+
+def _is_same(folder: Path, weights: str, args: EvaluateArgs, scene: config_lib.SceneConfig) -> bool:
+    """Returns True if the directory's result has these weights and trials.
+
+    Raises:
+      errors.UsageError: the directory of --out holds results that would be lost.
+    """
+    before = _previous(folder)
+    if args.out != options.AUTO:
         _refuse_foreign(folder, before.get("weights", weights) == weights)
-    arms = list(scene.arm)
-    return _identity(before) == (weights, chosen.seed, arms, dataclasses.asdict(chosen.eval))
+    trials = dataclasses.asdict(args.eval)
+    return _identity(before) == (weights, args.seed, list(scene.arm), trials)
 
 
-def _asked(argv: Sequence[str], has_gpu: bool) -> tuple[Options, policy_args.PolicyPath, Path]:
-    """Parses the command line: its flags, the policy, the result's folder."""
-    chosen = options.parse(
-        Options, argv, prog="starjax evaluate", description=DESCRIPTION, default=_default(has_gpu)
-    )
-    named = policy_args.resolve(chosen.run, chosen.policy)
-    if named.run:
-        default = Path(chosen.run) / f"evaluate-{_trials(chosen)}"
-    else:
-        default = Path("runs/evaluate") / f"{policy_args.label(named.file)}-{_trials(chosen)}"
-    folder = default if chosen.out == options.AUTO else chosen.out
-    checks.expect_folder("--out", folder)
-    return chosen, named, Path(folder)
-
-
-def _default(has_gpu: bool) -> Options:
-    """Two cores get through 48 trials in the time of a coffee, a GPU through the paper's 360."""
-    if has_gpu:
-        return Options()
-    return Options(eval=config_lib.EvalConfig(trials=4, time_limit_s=30.0))
-
-
-def _trials(chosen: Options) -> str:
-    """A name for an evaluation's trials, so that others do not replace them."""
-    trials = f"seed{chosen.seed}-{chosen.eval.trials}x{chosen.eval.time_limit_s:g}s"
-    return "-".join([*chosen.arm, trials, *["ensemble"] * chosen.eval.ensemble])
-
-
-def _before(folder: Path) -> dict[str, Any]:
-    """The result that is there; of a damaged one nothing."""
+def _previous(folder: Path) -> dict[str, Any]:
+    """Returns the content of an earlier result.json, empty if it is missing or damaged."""
     try:
         return files.read_json(folder / "result.json")
     except (FileNotFoundError, ValueError):
@@ -127,42 +105,41 @@ def _before(folder: Path) -> dict[str, Any]:
 
 
 def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any, Any]:
-    """Identifies the trials of a result: whose they are, and which."""
+    """Returns weights, seed, arms and settings of a result's trials."""
     config = result.get("config") or {}
     arms = (config.get("scene") or {}).get("arm")
-    # Older results lack what was added since.
+    # Older results lack settings that were added later.
     trials = dataclasses.asdict(config_lib.EvalConfig()) | (config.get("eval") or {})
     return result.get("weights"), result.get("seed"), arms, trials
 
 
-def _refuse_foreign(folder: Path, is_ours: bool) -> None:
-    """Raises UsageError for a folder in which something else would be lost or hidden."""
-    held = [what for what in ("config.json", "demos-*", "*/config.json") if any(folder.glob(what))]
-    if held:
-        raise errors.UsageError("--out", "a folder of its own", f"a run's, {folder}")
-    if not is_ours:
+def _refuse_foreign(folder: Path, has_same_weights: bool) -> None:
+    """Raises UsageError for the directory of a run, or of a result of other weights."""
+    if any(any(folder.glob(name)) for name in ("config.json", "demos-*", "*/config.json")):
+        raise errors.UsageError("--out", "a directory without a run", folder)
+    if not has_same_weights:
         raise errors.UsageError(
             "--out",
-            "a folder without a result of other weights",
+            "a directory without a result of other weights",
             folder,
-            "choose another, or remove that one",
+            "choose another or remove that one",
         )
 
 
 def _times(result: Any) -> str:
-    """How long a success and a decision take."""
+    """Returns a line with the durations of a successful trial and of an inference."""
     steps = result.figures["steps"]["median"]
     success = "-" if steps is None else f"{steps / result.control_hz:.1f} s"
-    return f"  median success {success}, decision {result.about['inference_ms']['p50']:.1f} ms"
+    return f"  median success {success}, inference {result.about['inference_ms']['p50']:.1f} ms"
 
 
-def _film(folder: Path, who: Any) -> str:
-    """Writes the video of the recorded trials; says where, or why not."""
+def _record_video(folder: Path, method: str) -> str:
+    """Writes the video of the recorded trials; returns a line for the user."""
     from starjax.report import results, video
 
     try:
         path = video.record([results.load(folder)], folder / "rollout.mp4")
     except (OSError, RuntimeError) as error:  # the encoder is a program of its own
         return f"no video: {error}"
-    method = methods.METHODS[who.trained.method].label
-    return f"video: {path}" if path else f"no video: no trial of {method} was recorded"
+    label = methods.METHODS[method].label
+    return f"video: {path}" if path else f"no video: no recorded trial of {label}"

@@ -18,7 +18,7 @@ write."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class ExportArgs:
     """Flags of the command."""
 
     dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]  # a folder
@@ -29,21 +29,21 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Writes the export, says how large it is."""
-    chosen = options.parse(Options, argv, prog="starjax export", description=DESCRIPTION)
-    out = Path(chosen.out)
-    checks.expect(bool(chosen.out) and not out.exists(), "OUT", "a place not taken", chosen.out)
+    args = options.parse("export", ExportArgs, argv, DESCRIPTION)
+    out = Path(args.out)
+    checks.expect(bool(args.out) and not out.exists(), "OUT", "a place not taken", args.out)
     checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
     from starjax.data.formats import base, exchange
 
-    errors.choice("format", chosen.format, base.FORMATS.names())
-    form, root = base.FORMATS.get(chosen.format), Path(chosen.dataset)
+    errors.choice("format", args.format, base.FORMATS.names())
+    form, root = base.FORMATS.get(args.format), Path(args.dataset)
     try:
         found = exchange.source(root, form)
     except ValueError as error:
         raise errors.UsageError("DATASET", "demonstrations that are complete", error) from error
     with progress.track("Export", len(found.lengths), unit="episodes") as advance:
-        exchange.export(found, out, form, chosen.video, advance)
+        exchange.export(found, out, form, args.video, advance)
     inside = [out] if out.is_file() else [path for path in out.rglob("*") if path.is_file()]
     size = files.size(sum(path.stat().st_size for path in inside))
     counts = f"{len(found.lengths)} episodes, {sum(found.lengths)} frames"

@@ -24,7 +24,7 @@ arm's record, is the mount with the most room to joint limits and singular confi
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class FindMountArgs:
     """Flags of the command."""
 
     arm: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ARM")]  # name of an arm
@@ -37,18 +37,18 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Searches, prints each round's figures and the best mount."""
-    chosen = options.parse(Options, argv, prog="starjax find-mount", description=DESCRIPTION)
+    args = options.parse("find-mount", FindMountArgs, argv, DESCRIPTION)
     xla.prepare_xla()
     xla.require_devices("starjax.sim.mount_search")
 
     from starjax.sim import mount_search, mounts, registries
 
-    at = mounts.bench(registries.arms.get(chosen.arm), registries.tools.get(chosen.tool))
+    at = mounts.bench(registries.arms.get(args.arm), registries.tools.get(args.tool))
     found = []
-    for name, workspace in _workspaces(chosen.workspace).items():
-        print(f"{chosen.arm} with {chosen.tool} in {name}", flush=True)
-        mount, least = mount_search.search(at, workspace, chosen.seed, chosen.tilts, _tell)
-        print(f"\n{_record(chosen.tool, name, mount, least)}\n")
+    for name, workspace in _workspaces(args.workspace).items():
+        print(f"{args.arm} with {args.tool} in {name}", flush=True)
+        mount, least = mount_search.search(at, workspace, args.seed, args.tilts, _tell)
+        print(f"\n{_record(args.tool, name, mount, least)}\n")
         found.append(mounts.is_good(least))
     if all(found):
         return 0

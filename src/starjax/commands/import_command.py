@@ -20,7 +20,7 @@ comes back as it was. Of others' data a mapping file says what the columns are."
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class ImportArgs:
     """Flags of the command."""
 
     path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]  # what to read
@@ -31,21 +31,21 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Writes the dataset, says what is odd about it."""
-    chosen = options.parse(Options, argv, prog="starjax import", description=DESCRIPTION)
-    checks.expect_folder("OUT", chosen.out)
+    args = options.parse("import", ImportArgs, argv, DESCRIPTION)
+    checks.expect_folder("OUT", args.out)
     xla.prepare_xla()
     from starjax.data import store
     from starjax.data.formats import base
 
-    path, out = Path(chosen.path), Path(chosen.out)
+    path, out = Path(args.path), Path(args.out)
     checks.expect(not store.is_sealed(out), "OUT", "a folder without a dataset", out)
-    if chosen.format != options.AUTO:
-        errors.choice("format", chosen.format, base.FORMATS.names())
-    name = base.detect(path) if chosen.format == options.AUTO else chosen.format
+    if args.format != options.AUTO:
+        errors.choice("format", args.format, base.FORMATS.names())
+    name = base.detect(path) if args.format == options.AUTO else args.format
     with base.open_dataset(path, name) as source:
-        if not chosen.map:
+        if not args.map:
             return _bring_back(source, path, out)
-        return _mapped(source, Path(chosen.map), out)
+        return _mapped(source, Path(args.map), out)
 
 
 def _bring_back(source: Any, path: Path, out: Path) -> int:

@@ -21,7 +21,7 @@ _SHOWN = 20  # anomalies
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class InspectArgs:
     """Flags of the command."""
 
     path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -36,9 +36,9 @@ class Found(NamedTuple):
 
 def main(argv: Sequence[str]) -> int:
     """Prints what is there; returns 1 where something is odd."""
-    chosen = options.parse(Options, argv, prog="starjax inspect", description=DESCRIPTION)
+    args = options.parse("inspect", InspectArgs, argv, DESCRIPTION)
     xla.prepare_xla()
-    found = inspect(chosen.path)
+    found = inspect(args.path)
     width = max(len(name) for name, _ in found.rows)
     for name, text in found.rows:
         print(f"{name:{width}}  {text}".rstrip())

@@ -24,7 +24,7 @@ Row = tuple[str, str]  # name, what it is
 
 def main(argv: Sequence[str]) -> int:
     """Prints the tables."""
-    options.parse(options.NoFlags, argv, prog="starjax list", description=DESCRIPTION)
+    options.parse("list", options.NoFlags, argv, DESCRIPTION)
     tables = {
         "tasks (--task, --camera, --demos.expert)": _parts(registries.tasks, _task),
         "arms (--arm)": _parts(registries.arms, _arm),

@@ -46,38 +46,52 @@ _FIELD = re.compile(r"[a-z][a-z0-9_.]*")
 
 
 def parse(
+    name: str,
     settings: type[SettingsT],
     argv: Sequence[str],
-    *,
-    prog: str,
     description: str,
     default: SettingsT | None = None,
     renamed: Mapping[str, str] = {},
 ) -> SettingsT:
-    """Returns `settings` filled from `argv`; missing fields come from `default`.
+    """Returns the settings of a command line.
 
-    `renamed` maps flags of the previous release to those of this one.
+    Args:
+      name: subcommand, for the usage line.
+      settings: dataclass of the flags.
+      argv: words after the subcommand.
+      description: text above the flags in `--help`.
+      default: values of fields that `argv` does not set; by default those of `settings`.
+      renamed: flags of the previous release -> flags of this one.
 
     Raises:
-      errors.UsageError: a flag is unknown, or its value is not what its type and range ask for.
+      errors.UsageError: a flag is unknown, or its value has the wrong type or range.
     """
-    start = tyro.MISSING_NONPROP if default is None else default
-    about = {"prog": prog, "description": description, "default": start, "registry": _registry}
     words = [_current(word, renamed) for word in argv]
     with tyro_errors.on_parse_error(functools.partial(_refuse, default or settings)):
-        found = tyro.cli(settings, args=words, **about)
-    limits.check(found)
-    return found
-
-
-def peek(settings: type[SettingsT], argv: Sequence[str], default: SettingsT) -> SettingsT:
-    """`settings` as far as `argv` can be read, for a look at what other defaults depend on."""
-    about = {"default": default, "registry": _registry}
-    with tyro_errors.on_parse_error(functools.partial(_refuse, settings)):
-        found, _ = tyro.cli(
-            settings, args=list(argv), return_unknown_args=True, add_help=False, **about
+        parsed = tyro.cli(
+            settings,
+            args=words,
+            prog=f"starjax {name}",
+            description=description,
+            default=tyro.MISSING_NONPROP if default is None else default,
+            registry=_registry,
         )
-    return found
+    limits.check(parsed)
+    return parsed
+
+
+def typed_value(field: str, argv: Sequence[str]) -> str | None:
+    """Returns the word that follows a field's flag, the last one counts; None without the flag.
+
+    Defaults of other flags depend on such a word; the parser, which needs the defaults, comes later
+    and refuses a wrong one.
+    """
+    value = None
+    for word, following in zip(argv, [*argv[1:], ""], strict=True):
+        name, equals, inner = word.partition("=")
+        if name.replace("_", "-") == flag(field):
+            value = inner if equals else following
+    return value
 
 
 def flags(settings: Any) -> list[str]:

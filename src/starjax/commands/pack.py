@@ -20,7 +20,7 @@ itself (`starjax evaluate --policy OUT`)."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class PackArgs:
     """Flags of the command."""
 
     # a policy.safetensors, or the name of a policy that ships with starjax
@@ -33,11 +33,11 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Writes the file, says how large it is."""
-    chosen = options.parse(Options, argv, prog="starjax pack", description=DESCRIPTION)
-    source, out = packaged.find("POLICY", chosen.policy), Path(chosen.out)
+    args = options.parse("pack", PackArgs, argv, DESCRIPTION)
+    source, out = packaged.find("POLICY", args.policy), Path(args.out)
     checks.expect_folder("folder of OUT", out.parent)
     if out.exists():
-        raise errors.UsageError("OUT", "a file that is not there yet", chosen.out or "none")
+        raise errors.UsageError("OUT", "a file that is not there yet", args.out or "none")
     xla.prepare_xla()
     xla.require_devices("starjax.policies.policy_file")
 
@@ -50,10 +50,10 @@ def main(argv: Sequence[str]) -> int:
     except ValueError as error:
         raise errors.UsageError("POLICY", "a policy of starjax", error) from error
     policy = config.inference_settings(trained.policy)
-    if chosen.temperature is not None:
+    if args.temperature is not None:
         if not hasattr(policy.options, "temperature"):
             raise errors.UsageError("POLICY", "one with a temperature", f"one of {policy.learner}")
-        policy = config.with_options(policy, temperature=chosen.temperature)
+        policy = config.with_options(policy, temperature=args.temperature)
     try:
         policy_file.save(out, trained._replace(policy=policy), half=True)
     except ValueError as error:

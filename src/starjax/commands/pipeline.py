@@ -1,5 +1,6 @@
 """The stages of a run, one after another, each skipped when its result is there."""
 
+import dataclasses
 import functools
 import shlex
 from collections.abc import Callable, Sequence
@@ -8,112 +9,144 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.commands import demonstrations, folders, messages, precompile, scenes, stage_times
-from starjax.runtime import files, xla
+from starjax.commands import (
+    demonstrations,
+    folders,
+    messages,
+    precompile,
+    scenes,
+    session,
+    stage_times,
+)
+from starjax.runtime import files
 from starjax.runtime.signals import stop_signals
 
 STAGES = messages.STAGES
-LEAST_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints ask for their own
+MIN_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints check their own
 
 
-def start() -> None:
-    """Starts jax, in all processes of the run together."""
-    xla.prepare_xla()
-    from starjax.runtime import processes
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A run at work, as its stages need it.
 
-    processes.join()
-    xla.require_devices("starjax.sim.env", "starjax.training.loop")
+    Attributes:
+      config: settings with the scene named in full.
+      encoder: frozen image encoder, None if the run has none.
+      share: this process's part in the run's directory.
+      command: command line, for results.
+    """
+
+    config: config_lib.RunConfig
+    encoder: Any
+    share: Any
+    command: str
+
+    @property
+    def out(self) -> Path:
+        """Directory of the run."""
+        return Path(self.config.out)
+
+    @functools.cached_property
+    def env(self) -> Any:
+        """Environment with the observation of the training, built on first use."""
+        return _environment(self.config)
 
 
 def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> None:
-    """Does what is missing of the given stages, in the order of `STAGES`.
+    """Completes the given stages in the order of `STAGES`.
 
     Args:
       config: settings.
-      stages: some of `STAGES`; one needs those before it.
-      command: what was typed, for the record.
+      stages: some of `STAGES`; each needs those before it.
+      command: command line, for results.
     """
-    start()
-    from starjax.rollouts import sharing
-    from starjax.runtime import processes
-    from starjax.training import devices
-
+    session.start_jax(*session.RUN_MODULES)
     config = scenes.resolved(config)
-    if config.policy.freeze_encoder and not processes.is_alone():
-        raise errors.UsageError("policy.freeze_encoder", "one process", "several")
-    if "train" in stages:
-        devices.make_mesh(config.train.batch_size)  # a mistake is found before demonstrations are
-    out, names = Path(config.out), folders.selected(config)
+    _check(config.policy, config.train, stages)
+    names = folders.selected(config)
+    out, trains = Path(config.out), "train" in stages
     trained = list(dict.fromkeys(methods.METHODS[name].weights_of for name in names))
     untrained = [name for name in trained if not folders.weights(out, name).exists()]
-    encoder = demonstrations.frozen_encoder(config) if "train" in stages and untrained else None
-    files.require_writable(out, LEAST_FREE_BYTES)
-    with sharing.shared(out) as share, messages.first_process_only(share.is_first):
+    encoder = demonstrations.frozen_encoder(config.policy) if trains and untrained else None
+    files.require_writable(out, MIN_FREE_BYTES)
+    with session.Session(command, out).shared() as share:
         print(messages.plan(config, stages), flush=True)
-        env = _environment(config)
-        root, collect, compile_collect = demonstrations.plan(config, env, share)
-        digest = folders.demos_digest(root) if config.demos.from_ else None
-        dataset = f"{root.name}-{digest[:12]}" if digest else root.name
-
-        def claim() -> None:
-            for name in dict.fromkeys([*trained, *names]):
-                folders.claim(out / name, config, dataset, encoder and encoder.fingerprint)
-
-        new = next((name for name in names if methods.METHODS[name].weights_of in untrained), None)
-        ready = precompile.Precompiled()
-        if untrained or "train" not in stages:
+        work = Run(config, encoder, share, command)
+        root, collect, compile_collect = demonstrations.plan(config, work.env, share)
+        if untrained or not trains:
             compile_collect()
+        new = next((name for name in names if methods.METHODS[name].weights_of in untrained), None)
+        programs = precompile.Precompiled()
         if new:
-            ready = precompile.begin(config, new, stages, env, encoder)
-        # Loaded once, and only if something is still to be trained with them.
-        demos = functools.cache(lambda: demonstrations.load(config, root, collect, encoder, share))
-        if "train" not in stages:
+            programs = precompile.begin(work.config, new, stages, work.env, encoder)
+        if not trains:
             collect()
         else:
-            share.first("claimed", claim)
+            share.first("claimed", lambda: _claim(work, [*trained, *names], root))
+            # Loaded once, and only if weights are missing.
+            dataset = functools.cache(
+                lambda: demonstrations.load(config, root, collect, encoder, share)
+            )
             for name in trained:
-                step = ready.step if [name] == untrained[:1] else None
-                _train(config, name, demos, env, encoder, share, step)
+                _train(work, name, dataset, programs.step if [name] == untrained[:1] else None)
         if "evaluate" in stages:
             for name in names:
-                policy = ready.policy if name == new else None
-                _evaluate(config, name, env, root, command, share, policy)
+                _evaluate(work, name, root, programs.policy if name == new else None)
         if "report" in stages:
             share.first("reported", lambda: _report(out, names))
 
 
+def _check(
+    policy: config_lib.PolicyConfig, train: config_lib.TrainConfig, stages: Sequence[str]
+) -> None:
+    """Raises UsageError for settings that the devices rule out, before demonstrations begin."""
+    from starjax.runtime import processes
+    from starjax.training import devices
+
+    if policy.freeze_encoder and not processes.is_alone():
+        raise errors.UsageError("policy.freeze_encoder", "one process", "several")
+    if "train" in stages:
+        devices.make_mesh(train.batch_size)
+
+
 def _environment(config: config_lib.RunConfig) -> Any:
-    # Here and below, what brings jax is imported where it is used, after XLA has been prepared.
+    # Here and below, modules that import jax are imported where they are used, after XLA's flags
+    # are set.
     from starjax.sim import env
 
     return env.for_policy(scenes.names(config.scene), config.policy)
 
 
+def _claim(work: Run, names: Sequence[str], demos: Path) -> None:
+    """Records the settings in the directory of each method."""
+    digest = folders.demos_digest(demos) if work.config.demos.from_ else None
+    dataset = f"{demos.name}-{digest[:12]}" if digest else demos.name
+    fingerprint = work.encoder and work.encoder.fingerprint
+    for name in dict.fromkeys(names):
+        folders.claim(work.out / name, work.config, dataset, fingerprint)
+
+
 def _train(
-    config: config_lib.RunConfig,
+    work: Run,
     name: str,
     demos: Callable[[], Any],
-    env: Any,
-    encoder: Any,
-    share: Any,
     step: Callable[[], Any] | None = None,
 ) -> None:
-    """One set of weights; `policy.safetensors` is its last file."""
+    """Trains one set of weights; `policy.safetensors` is its last file."""
     from starjax.policies import policy_file
     from starjax.runtime import processes
     from starjax.training import loop
 
-    out = Path(config.out)
-    folder = out / name
-    weights = folders.weights(out, name)
+    config, env, share = work.config, work.env, work.share
+    folder, weights = work.out / name, folders.weights(work.out, name)
     if share.first(f"{name} was trained", weights.exists):
-        messages.stage("train", f"{name}: done before, {weights}")
+        messages.stage("train", f"{name}: already complete, {weights}")
         return
     dataset = demos()
     messages.stage("train", f"{name}, into {folder}")
     program = step() if step else None
     begun = any((folder / "checkpoints").glob("step_*"))
-    with stage_times.timed(out, f"train {name}", begun), stop_signals() as should_stop:
+    with stage_times.timed(work.out, f"train {name}", begun), stop_signals() as should_stop:
         result = loop.run(
             methods.METHODS[name],
             config.policy,
@@ -129,11 +162,11 @@ def _train(
         )
     state = processes.own(result.state)
     params = state.ema_params
-    made = policy_file.Trained(
+    trained = policy_file.Trained(
         method=name,
         policy=config_lib.inference_settings(config.policy),
         train=config.train,
-        params={**params, "vision": encoder.params} if encoder else params,
+        params={**params, "vision": work.encoder.params} if work.encoder else params,
         normalizer=state.normalizer,
         scene=env.names,
         p_world_ref=tuple(map(tuple, env.p_world_ref)),
@@ -141,48 +174,45 @@ def _train(
         demos=config.demos,
         preset=config.preset,
     )
-    share.first(f"{name} is saved", lambda: policy_file.save(weights, made))
+    share.first(f"{name} is saved", lambda: policy_file.save(weights, trained))
     errors = ", ".join(f"{key} {value:.3g}" for key, value in result.holdout.items())
     messages.indented(f"{result.samples_per_second:.0f} samples/s; held-out {errors or 'none'}")
-    # Asked during the last steps, whose loop looks no more. Several processes go on: the others
-    # would wait for this one.
+    # A stop during the last steps, after the loop's last look. Several processes continue: the
+    # others would wait for this one.
     if should_stop() and processes.is_alone():
         raise KeyboardInterrupt(
-            f"stopped after training {name}; its weights are {weights}, the same command goes on "
-            "from there"
+            f"stopped after training {name}; its weights are {weights}, rerun the same command to "
+            "resume"
         )
 
 
-def _evaluate(
-    config: config_lib.RunConfig,
-    name: str,
-    env: Any,
-    demos: Path,
-    command: str,
-    share: Any,
-    policy: Callable[[], Any] | None = None,
-) -> None:
-    """Closed-loop trials of one method; `result.json` is its last file."""
+def _evaluate(work: Run, name: str, demos: Path, policy: Callable[[], Any] | None = None) -> None:
+    """Runs the closed-loop trials of one method; `result.json` is its last file."""
     from starjax.commands import policy_evaluation
 
-    out = Path(config.out)
-    folder, weights = out / name, folders.weights(out, name)
+    config, env, share = work.config, work.env, work.share
+    folder, weights = work.out / name, folders.weights(work.out, name)
     if share.first(f"{name} was scored", lambda: _was_scored(config, folder, weights, env)):
-        messages.stage("evaluate", f"{name}: done before, {folder / 'result.json'}")
+        messages.stage("evaluate", f"{name}: already complete, {folder / 'result.json'}")
         return
     messages.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
-    share.first(f"{name} has an equal evaluation", lambda: folders.adopt_equivalent(out, name))
+    share.first(f"{name} has an equal evaluation", lambda: folders.adopt_equivalent(work.out, name))
     compiled = policy() if policy else None
-    with stage_times.timed(out, f"evaluate {name}", folders.is_under_way(folder)):
+    with stage_times.timed(work.out, f"evaluate {name}", folders.is_under_way(folder)):
         who = policy_evaluation.load(name, weights, env, policy=compiled)
         trials = folder / "evaluation"
         table = policy_evaluation.rollouts(trials, who, env.task.trocars, config.eval, config.seed)
 
     def write() -> None:
-        timings = _timings(out, name, demos.name)
-        digest = folders.demos_digest(demos)
         policy_evaluation.write_result(
-            folder, who, table, config, config.seed, command, timings, digest
+            folder,
+            who,
+            table,
+            config,
+            config.seed,
+            work.command,
+            timings_s=_timings(work.out, name, demos.name),
+            dataset_digest=folders.demos_digest(demos),
         )
 
     share.first(f"{name} is scored", write)

@@ -1,88 +1,111 @@
-"""Which trained policy a command means: that of a method's folder, or a file of weights."""
+"""Flags that name a trained policy, and the file and the results' directory that they mean."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import folders, scenes
+from starjax.commands import checks, folders, options, scenes
 from starjax.policies import packaged
 from starjax.runtime import files
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyArgs:
+    """Flags of commands that run a trained policy."""
+
+    run: options.RunOrNone = ""  # directory of a method, such as runs/cpu/stardiff
+    policy: str = ""  # policy.safetensors, or the name of a packaged policy, instead of RUN
+    arm: tuple[str, ...] = ()  # robots to score with; default: those of the training
 
 
 class PolicyPath(NamedTuple):
     """Files of the policy that a command line names.
 
     Attributes:
-      file: of the weights.
-      run: the method's folder, None where the file itself was named.
+      file: its weights.
+      run: directory of its method, None if the file itself was named.
+      arms: robots instead of those of the training.
     """
 
     file: Path
     run: Path | None
+    arms: tuple[str, ...] = ()
+
+    def folder(self, command: str, parts: Sequence[str], out: str = options.AUTO) -> Path:
+        """Returns the directory of a command's results.
+
+        Args:
+          command: first word of the directory's name.
+          parts: further words, which keep different evaluations apart.
+          out: value of --out.
+
+        Raises:
+          errors.UsageError: `out` is no directory that can be written.
+        """
+        if self.run:
+            default = self.run / "-".join([command, *self.arms, *parts])
+        else:
+            default = Path("runs") / command / "-".join([label(self.file), *self.arms, *parts])
+        folder = default if out == options.AUTO else Path(out)
+        checks.expect_folder("--out", out and folder)
+        return folder
 
 
-def resolve(run: str, policy: str) -> PolicyPath:
-    """Finds what one of the two names.
-
-    Args:
-      run: a method's folder, or empty.
-      policy: a file of weights or the name of a packaged policy, or empty.
+def resolve(args: PolicyArgs) -> PolicyPath:
+    """Finds the file of the policy that RUN or --policy names.
 
     Raises:
-      errors.UsageError: both are given or none, or there is no such thing.
+      errors.UsageError: both or neither are set, or there is no such file.
     """
-    if bool(run) == bool(policy):
-        got = "both" if run else "none"
+    if bool(args.run) == bool(args.policy):
+        got = "both" if args.run else "none"
         raise errors.UsageError("RUN or --policy", "one of the two", got)
-    if policy:
-        return PolicyPath(packaged.find("--policy", policy), None)
-    folder = folders.existing(run)
+    if args.policy:
+        return PolicyPath(packaged.find("--policy", args.policy), None, args.arm)
+    folder = folders.existing(args.run)
     folders.read_config(folder)
-    return PolicyPath(folders.weights(folder.parent, folder.name), folder)
+    return PolicyPath(folders.weights(folder.parent, folder.name), folder, args.arm)
 
 
 def label(file: Path) -> str:
-    """A name for a file of weights: its own, or its folder's where that says nothing, and what is
-    in it, as files of other weights are called so too."""
+    """Returns a name for a file of weights: its stem or directory plus eight digits of its hash."""
     if file.parent == packaged.FOLDER:
         return file.stem
     name = file.stem if file.stem != "policy" else file.resolve().parent.name
     return f"{name}-{files.sha256(file)[:8]}"
 
 
-def load(named: PolicyPath, arms: tuple[str, ...]) -> tuple[Any, config_lib.RunConfig]:
-    """Loads it, in its scene.
-
-    Args:
-      named: what.
-      arms: robots instead of those that it was trained with.
+def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
+    """Loads a policy in its scene.
 
     Returns:
-      `in_env.PolicyInEnv`, and the known settings of the run that it comes from.
+      `in_env.PolicyInEnv`, and the settings of the run that it comes from as far as known.
     """
     from starjax.commands import policy_evaluation  # it imports jax
     from starjax.policies import in_env
 
-    if named.run is None:
-        who = in_env.load(named.file, in_env.read(named.file), arms=arms)
+    if path.run is None:
+        who = in_env.load(path.file, in_env.read(path.file), arms=path.arms)
         return who, _settings(who.trained)
-    config = folders.read_config(named.run)
-    who = policy_evaluation.load(named.run.name, named.file, arms=arms)
-    return who, policy_evaluation.settings(who, config)
+    config = folders.read_config(path.run)
+    who = policy_evaluation.load(path.run.name, path.file, arms=path.arms)
+    trained = who.trained  # another method may have trained these weights, with other settings
+    demos = trained.demos or config.demos
+    return who, dataclasses.replace(config, policy=trained.policy, train=trained.train, demos=demos)
 
 
 def _settings(trained: Any) -> config_lib.RunConfig:
-    """Settings of the run that a policy comes from, as far as its file knows them."""
-    known = {
-        "method": trained.method,
-        "preset": trained.preset or "auto",
-        "policy": config_lib.as_json(trained.policy),
-        "train": config_lib.as_json(trained.train),
-        "demos": config_lib.as_json(trained.demos or config_lib.DemosConfig()),
-        "scene": config_lib.as_json(scenes.settings(trained.scene)),
-    }
-    unknown: dict[str, Any] = {"seed": None}  # no file of weights says it
-    found = config_lib.from_dict(config_lib.RunConfig, known)
-    return dataclasses.replace(found, **unknown)
+    """Returns the settings of a policy's run, as far as its file has them."""
+    settings = config_lib.RunConfig(
+        method=trained.method,
+        preset=trained.preset or "auto",
+        policy=trained.policy,
+        train=trained.train,
+        demos=trained.demos or config_lib.DemosConfig(),
+        scene=scenes.settings(trained.scene),
+    )
+    unknown: dict[str, Any] = {"seed": None}  # no policy file has it
+    return dataclasses.replace(settings, **unknown)

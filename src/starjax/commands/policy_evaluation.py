@@ -1,6 +1,5 @@
 """A trained policy in closed loop: rollouts of a method, and the result.json that they become."""
 
-import dataclasses
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -116,15 +115,6 @@ def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.Settings:
         time_limit_s=settings.time_limit_s,
         video_trials=settings.video_trials,
         chunk=settings.chunk,
-    )
-
-
-def settings(who: PolicyInEnv, config: config_lib.RunConfig) -> config_lib.RunConfig:
-    """A run's settings, with those that its weights were trained with: another method may have
-    trained them."""
-    trained = who.trained
-    return dataclasses.replace(
-        config, policy=trained.policy, train=trained.train, demos=trained.demos or config.demos
     )
 
 

@@ -14,7 +14,7 @@ RUN is a method's folder, such as runs/cpu/stardiff, or a folder of them, such a
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class ReportArgs:
     """Flags of the command."""
 
     run: options.Runs  # methods' folders, or folders of them
@@ -25,16 +25,16 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Builds the report."""
-    chosen = options.parse(Options, argv, prog="starjax report", description=DESCRIPTION)
-    checks.expect(bool(chosen.run), "RUN", "one folder or more", "none")
+    args = options.parse("report", ReportArgs, argv, DESCRIPTION)
+    checks.expect(bool(args.run), "RUN", "one folder or more", "none")
     once: dict[Path, Path] = {}
-    for name in chosen.run:
+    for name in args.run:
         for found in _with_results(name):
             once.setdefault(found.resolve(), found)
     runs = list(once.values())
     first = runs[0].resolve()
     beside = (first.parent if first.name in methods.METHODS else first) / "report"
-    out = beside if chosen.out == options.AUTO else chosen.out
+    out = beside if args.out == options.AUTO else args.out
     checks.expect_folder("--out", out)
     xla.prepare_xla()
     xla.require_devices("starjax.report.build")
@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     from starjax.report import build
 
     try:
-        page = build.build(runs, Path(out), with_video=chosen.video)
+        page = build.build(runs, Path(out), with_video=args.video)
     except ValueError as error:  # of a damaged file, which it names
         raise errors.UsageError("RUN", "results that are whole", error) from error
     print(f"report: {page}")

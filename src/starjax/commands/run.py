@@ -1,19 +1,38 @@
-"""The command `starjax run`, also `python -m starjax.experiments.run`: from trocar to table."""
+"""`starjax run`, `collect` and `train`: the stages of a run, from demonstrations to the report."""
 
 from collections.abc import Sequence
 
+from starjax.commands import options, run_settings
+
 DESCRIPTION = """Collects demonstrations, trains, evaluates and writes the report.
 
-The same command again goes on from what is saved. Values below are those of the chosen preset."""
+Rerun the same command to resume. The defaults below are those of the selected preset."""
+COLLECT = """Collects the demonstrations of a run; the flags are those of `starjax run`.
+
+Episodes are saved one by one; rerun the same command to resume."""
+TRAIN = """Collects demonstrations and trains; the flags are those of `starjax run`.
+
+Rerun the same command to resume from the last checkpoint."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs every stage that is not already done."""
-    # Imported late: `--help` and mistakes answer before jax loads, and missing packages before all.
-    from starjax.commands import options, run_settings
+    """Runs every stage that is not complete."""
+    return _run("run", argv, DESCRIPTION, ("collect", "train", "evaluate", "report"))
 
-    config = run_settings.parse(argv, "starjax run", DESCRIPTION)
-    from starjax.commands import pipeline
 
-    pipeline.run(config, pipeline.STAGES, options.typed("run", argv))
+def collect(argv: Sequence[str]) -> int:
+    """Collects missing demonstrations."""
+    return _run("collect", argv, COLLECT, ("collect",))
+
+
+def train(argv: Sequence[str]) -> int:
+    """Collects missing demonstrations and trains missing weights."""
+    return _run("train", argv, TRAIN, ("collect", "train"))
+
+
+def _run(name: str, argv: Sequence[str], description: str, stages: Sequence[str]) -> int:
+    config = run_settings.parse(name, argv, description)
+    from starjax.commands import pipeline  # after the settings: mistakes need not wait for jax
+
+    pipeline.run(config, stages, options.typed(name, argv))
     return 0

@@ -19,7 +19,7 @@ must know the key in the environment variable {KEY}, which may be unset for this
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class ServeArgs:
     """Flags of the command."""
 
     policy: str = "compact"  # a policy.safetensors, or the name of one that ships with starjax
@@ -31,10 +31,10 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Serves until it is stopped."""
-    chosen = options.parse(Options, argv, prog="starjax serve", description=DESCRIPTION)
-    path, api_key = packaged.find("--policy", chosen.policy), os.environ.get(KEY, "")
-    elsewhere = f"a key for clients of --host {chosen.host}"
-    checks.expect(bool(api_key) or _is_here(chosen.host), KEY, elsewhere, "none")
+    args = options.parse("serve", ServeArgs, argv, DESCRIPTION)
+    path, api_key = packaged.find("--policy", args.policy), os.environ.get(KEY, "")
+    elsewhere = f"a key for clients of --host {args.host}"
+    checks.expect(bool(api_key) or _is_here(args.host), KEY, elsewhere, "none")
     xla.prepare_xla()
     xla.require_devices("starjax.deploy.server")
 
@@ -42,8 +42,8 @@ def main(argv: Sequence[str]) -> int:
     from starjax.deploy import server
 
     policy = deploy.load(path)
-    settings = server.ServerSettings(chosen.host, chosen.port, chosen.batch, chosen.clients)
-    print(f"{chosen.policy}: compiling for batches of up to {chosen.batch}", flush=True)
+    settings = server.ServerSettings(args.host, args.port, args.batch, args.clients)
+    print(f"{args.policy}: compiling for batches of up to {args.batch}", flush=True)
 
     def listening(host: str, port: int) -> None:
         key = f"with the key of {KEY}" if api_key else "without a key"
@@ -53,7 +53,7 @@ def main(argv: Sequence[str]) -> int:
         counts = server.run(
             policy,
             settings,
-            name=chosen.policy,
+            name=args.policy,
             api_key=api_key,
             should_stop=should_stop,
             listening=listening,

@@ -1,4 +1,4 @@
-"""`starjax six-blocks`: six blocks one after another with two arms, as surgeons are scored."""
+"""`starjax six-blocks`: scores six successive transfers with two arms, as surgeons are."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,128 +7,121 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import checks, messages, options, policy_args
-from starjax.limits import Count
-from starjax.runtime import files, xla
+from starjax.commands import checks, messages, options, policy_args, session
+from starjax.limits import INLINE, Count
 
 TASK = "peg_transfer_bimanual"
 
-DESCRIPTION = """Scores six blocks, one after another, each passed from tool to tool in the air.
+DESCRIPTION = """Scores the transfer of six blocks, each passed from tool to tool in the air.
 
-RUN is the folder of a method that was trained for peg_transfer_bimanual; or --policy names a
-policy.safetensors. With neither the task's scripted expert acts. A trial ends when a block is
-dropped, or after 300 s. The same command again goes on from the trials that are done."""
+RUN is the directory of a method trained for peg_transfer_bimanual. --policy takes a
+policy.safetensors or the name of a packaged policy instead. With neither, the task's scripted
+expert acts. A trial ends when a block is dropped, or after 300 s. Rerun the same command to
+resume."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class SixBlocksArgs:
     """Flags of the command."""
 
-    run: options.RunOrNone = ""  # a method's folder, such as runs/cpu/stardiff
-    policy: str = ""  # a policy.safetensors instead of RUN
-    arm: tuple[str, ...] = ()  # robots to score it with; left out: those it was trained with
-    trials: Count = 1  # at each of the twelve pairs of trocars
-    seed: config_lib.Seed = 0  # of the trials
-    # folder of the result; auto: one in RUN or in runs/exercise
+    source: policy_args.PolicyArgs = dataclasses.field(
+        default=policy_args.PolicyArgs(), metadata=INLINE
+    )
+    trials: Count = 1  # trials for each of the twelve pairs of trocars
+    seed: config_lib.Seed = 0  # random seed of the trials
+    # directory of the result; auto: one in RUN or in runs/exercise
     out: str = options.AUTO
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the trials that are missing; writes exercise.json."""
-    chosen = options.parse(Options, argv, prog="starjax six-blocks", description=DESCRIPTION)
-    is_expert = not (chosen.run or chosen.policy)
-    named = None if is_expert else policy_args.resolve(chosen.run, chosen.policy)
-    folder = _folder(named, chosen)
-    xla.prepare_xla()
-    xla.require_devices("starjax.commands.policy_evaluation")
-    files.require_writable(folder)
+    """Runs the missing trials; writes exercise.json."""
+    args = options.parse("six-blocks", SixBlocksArgs, argv, DESCRIPTION)
+    is_expert = not (args.source.run or args.source.policy)
+    path = None if is_expert else policy_args.resolve(args.source)
+    folder = _folder(path, args)
+    started = session.start("six-blocks", argv, folder)
 
     from starjax.evaluation import exercise
 
-    table, env, about = _score(folder / "trials", named, chosen)
-    figures = exercise.compose(table, env.control_hz)
-    files.write_json(folder / "exercise.json", _content(env, chosen, argv, figures, about))
-    print(f"\n{_outcome(figures)}\nresult: {folder / 'exercise.json'}")
+    with started.shared() as share:
+        trials = folder / "trials"
+        scored = _score_policy(trials, path, args) if path else _score_expert(trials, args)
+        table, env, agent = scored
+        figures = exercise.compose(table, env.control_hz)
+        if share.is_first:
+            content = {
+                "scene": env.names._asdict(),
+                **agent,
+                "seed": args.seed,
+                "trials_at_each_trocar": args.trials,
+                **figures,
+            }
+            file = started.write("exercise.json", content)
+            print(f"\n{_outcome(figures)}\nresult: {file}")
     return 0
 
 
-def _folder(named: policy_args.PolicyPath | None, chosen: Options) -> Path:
-    name = "-".join([*chosen.arm, f"seed{chosen.seed}-{chosen.trials}"])
-    if named is None:
-        default = Path("runs/exercise") / f"expert-{name}"
-    elif named.run:
-        default = named.run / f"exercise-{name}"
-    else:
-        default = Path("runs/exercise") / f"{policy_args.label(named.file)}-{name}"
-    folder = default if chosen.out == options.AUTO else chosen.out
-    checks.expect_folder("--out", folder)
-    return Path(folder)
+def _folder(path: policy_args.PolicyPath | None, args: SixBlocksArgs) -> Path:
+    """Returns the directory of the result."""
+    trials = f"seed{args.seed}-{args.trials}"
+    if path:
+        return path.folder("exercise", [trials], args.out)
+    default = Path("runs/exercise") / "-".join(["expert", *args.source.arm, trials])
+    folder = default if args.out == options.AUTO else Path(args.out)
+    checks.expect_folder("--out", args.out and folder)
+    return folder
 
 
-def _score(
-    folder: Path, named: policy_args.PolicyPath | None, chosen: Options
-) -> tuple[Any, Any, dict]:
-    """The trials' table, the environment, and who acted."""
-    from starjax.commands import policy_evaluation
+def _score_expert(folder: Path, args: SixBlocksArgs) -> tuple[Any, Any, dict[str, str]]:
+    """Returns the trials of the scripted expert, their environment, and the expert's name."""
     from starjax.evaluation import evaluate
     from starjax.rollouts import agent
+    from starjax.sim import six_blocks
+    from starjax.sim.tasks.peg_transfer_bimanual import six
+
+    env = six_blocks.make(args.source.arm, observation="state")
+    name = next(iter(six.TASK.experts))
+    table = evaluate.evaluate(
+        folder,
+        env,
+        agent.from_single(six_blocks.reset_each_block(six.TASK.expert())),
+        (),
+        six.TASK.trocars,
+        evaluate.Settings(args.trials, args.seed, six.LIMIT_S),
+        identity={"expert": name},
+        report=messages.indented,
+    )
+    return table, env, {"expert": name}
+
+
+def _score_policy(
+    folder: Path, path: policy_args.PolicyPath, args: SixBlocksArgs
+) -> tuple[Any, Any, dict[str, str]]:
+    """Returns the trials of a policy, their environment, and the policy's method and weights."""
+    from starjax.commands import policy_evaluation
     from starjax.sim import env as sim_env
     from starjax.sim import six_blocks
-    from starjax.sim.tasks.peg_transfer_bimanual.six import LIMIT_S
-    from starjax.sim.tasks.peg_transfer_bimanual.six import TASK as task
+    from starjax.sim.tasks.peg_transfer_bimanual import six
 
-    if named is None:
-        env = six_blocks.make(chosen.arm, observation="state")
-        name = next(iter(task.experts))
-        table = evaluate.evaluate(
-            folder,
-            env,
-            agent.from_single(six_blocks.reset_each_block(task.expert())),
-            (),
-            task.trocars,
-            evaluate.Settings(chosen.trials, chosen.seed, LIMIT_S),
-            identity={"expert": name},
-            report=messages.indented,
-        )
-        return table, env, {"expert": name}
-    who, _ = policy_args.load(named, chosen.arm)
-    names = who.env.names
+    who, _ = policy_args.load(path)
+    names, trained = who.env.names, who.trained
     if names.task != TASK:
-        raise errors.UsageError("RUN or --policy", f"one trained for {TASK}", f"of {names.task}")
-    env = six_blocks.wrap(sim_env.for_policy(names, who.trained.policy, variant=task))
-    trials = config_lib.EvalConfig(trials=chosen.trials, time_limit_s=LIMIT_S, video_trials=0)
-    subject = who._replace(env=env)
-    table = policy_evaluation.rollouts(folder, subject, task.trocars, trials, chosen.seed)
-    return table, env, {"method": who.trained.method, "weights": who.weights}
+        raise errors.UsageError("RUN or --policy", f"a policy for {TASK}", f"one for {names.task}")
+    env = six_blocks.wrap(sim_env.for_policy(names, trained.policy, variant=six.TASK))
+    trials = config_lib.EvalConfig(trials=args.trials, time_limit_s=six.LIMIT_S, video_trials=0)
+    who = who._replace(env=env)
+    table = policy_evaluation.rollouts(folder, who, six.TASK.trocars, trials, args.seed)
+    return table, env, {"method": trained.method, "weights": who.weights}
 
 
 def _outcome(figures: dict[str, Any]) -> str:
-    """Two lines: what was done, and in what time."""
+    """Returns two lines: moved blocks with times, and the times of people."""
     complete, seconds, people = figures["complete"], figures["seconds"], figures["people"]
     time = f"in {seconds['median']:.0f} s (median)" if seconds else "in no trial"
     return (
         f"  all {figures['blocks']} blocks one way in {complete['successes']} of "
-        f"{complete['trials']} trials, {time}; {figures['moved']['mean']:.1f} blocks a trial, "
+        f"{complete['trials']} trials, {time}; {figures['moved']['mean']:.1f} blocks per trial, "
         f"{figures['dropped']} dropped\n"
         f"  people, both ways: proficient {people['proficient_s']:.0f} s, "
         f"residents {people['residents_s']:.0f} s"
     )
-
-
-def _content(
-    env: Any, chosen: Options, argv: Sequence[str], figures: dict[str, Any], about: dict[str, Any]
-) -> dict[str, Any]:
-    from starjax.runtime import jax_settings, provenance
-
-    return {
-        "scene": env.names._asdict(),
-        **about,
-        "seed": chosen.seed,
-        "trials_at_each_trocar": chosen.trials,
-        "command": options.typed("six-blocks", argv),
-        **figures,
-        **provenance.code()._asdict(),
-        "versions": xla.versions(),
-        "hardware": xla.hardware(),
-        **jax_settings.record(),
-    }

@@ -20,7 +20,7 @@ saves it, Backspace discards it. The same command again adds to what is there.""
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class TeleopArgs:
     """Flags of the command."""
 
     out: str = options.AUTO  # folder of the dataset; auto: runs/teleop-TASK
@@ -38,8 +38,8 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Serves the page until a stop."""
-    chosen = options.parse(Options, argv, prog="starjax teleop", description=DESCRIPTION)
-    out = f"runs/teleop-{chosen.task}" if chosen.out == options.AUTO else chosen.out
+    args = options.parse("teleop", TeleopArgs, argv, DESCRIPTION)
+    out = f"runs/teleop-{args.task}" if args.out == options.AUTO else args.out
     checks.expect_folder("--out", out)
     xla.prepare_xla()
     xla.require_devices("starjax.viewer.teleop")
@@ -48,16 +48,16 @@ def main(argv: Sequence[str]) -> int:
     from starjax.viewer import devices, page, recorder, teleop
 
     env = sim_env.make(
-        chosen.task, chosen.arm, observation=chosen.observation, image_size=chosen.image_size
+        args.task, args.arm, observation=args.observation, image_size=args.image_size
     )
-    if chosen.trocar >= (count := len(env.task.is_seen)):
-        raise errors.UsageError("--trocar", f"0 to {count - 1}", chosen.trocar)
-    device = None if chosen.device == "none" else devices.open_device(chosen.device)
+    if args.trocar >= (count := len(env.task.is_seen)):
+        raise errors.UsageError("--trocar", f"0 to {count - 1}", args.trocar)
+    device = None if args.device == "none" else devices.open_device(args.device)
     try:
         with (
             signals.stop_signals() as should_stop,
-            recorder.record_into(Path(out), env, chosen.seed) as kept,
-            page.serve(chosen.port) as server,
+            recorder.record_into(Path(out), env, args.seed) as kept,
+            page.serve(args.port) as server,
         ):
             print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
             said = teleop.run(
@@ -66,8 +66,8 @@ def main(argv: Sequence[str]) -> int:
                 kept,
                 should_stop,
                 device=device,
-                trocar=chosen.trocar,
-                seed=chosen.seed,
+                trocar=args.trocar,
+                seed=args.seed,
             )
     finally:
         if device:

@@ -23,7 +23,7 @@ Show = Callable[[Any, Callable[[], bool]], str]  # (server, should_stop) -> a la
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class ViewArgs:
     """Flags of the command."""
 
     # a policy.safetensors, or the name of a policy that ships with starjax
@@ -42,11 +42,9 @@ class Options:
 
 def main(argv: Sequence[str]) -> int:
     """Serves the page until a stop."""
-    chosen = options.parse(
-        Options, argv, prog="starjax view", description=DESCRIPTION, renamed=_RENAMED
-    )
-    named = [name for name in ("policy", "run", "dataset") if getattr(chosen, name)]
-    named += ["expert"] if chosen.expert else []
+    args = options.parse("view", ViewArgs, argv, DESCRIPTION, renamed=_RENAMED)
+    named = [name for name in ("policy", "run", "dataset") if getattr(args, name)]
+    named += ["expert"] if args.expert else []
     if len(named) > 1:
         got = " and ".join(f"--{name}" for name in named)
         raise errors.UsageError("--policy, --run, --expert or --dataset", "one of them", got)
@@ -55,8 +53,8 @@ def main(argv: Sequence[str]) -> int:
 
     from starjax.viewer import page
 
-    show = _dataset(chosen.dataset) if chosen.dataset else _live(chosen)
-    with signals.stop_signals() as should_stop, page.serve(chosen.port) as server:
+    show = _dataset(args.dataset) if args.dataset else _live(args)
+    with signals.stop_signals() as should_stop, page.serve(args.port) as server:
         print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
         print(show(server, should_stop))
     return 0
@@ -73,27 +71,25 @@ def _dataset(folder: str) -> Show:
     return lambda server, should_stop: browse.run(server, dataset, should_stop)
 
 
-def _live(chosen: Options) -> Show:
+def _live(args: ViewArgs) -> Show:
     """Makes the live view of one agent or two."""
     from starjax.sim import registries
     from starjax.viewer import simulation, view
 
-    agents = [_agent(chosen.policy, chosen.run, chosen.task)]
-    if chosen.compare_with:
-        name = "" if chosen.compare_with == simulation.EXPERT else chosen.compare_with
+    agents = [_agent(args.policy, args.run, args.task)]
+    if args.compare_with:
+        name = "" if args.compare_with == simulation.EXPERT else args.compare_with
         agents.append(_agent(name, "", agents[0].task))
     if agents[-1].task != agents[0].task:
         raise errors.UsageError(
             "--compare-with", f"one that does {agents[0].task}", agents[-1].task
         )
-    if chosen.arm:
-        errors.choice("--arm", chosen.arm, registries.arms.names())
+    if args.arm:
+        errors.choice("--arm", args.arm, registries.arms.names())
     count = len(registries.tasks.get(agents[0].task).is_seen)
-    if chosen.trocar >= count:
-        raise errors.UsageError("--trocar", f"0 to {count - 1}", chosen.trocar)
-    initial = view.ViewOptions(
-        tuple(agents), chosen.arm or view.OWN_ARMS, chosen.trocar, chosen.seed
-    )
+    if args.trocar >= count:
+        raise errors.UsageError("--trocar", f"0 to {count - 1}", args.trocar)
+    initial = view.ViewOptions(tuple(agents), args.arm or view.OWN_ARMS, args.trocar, args.seed)
     return lambda server, should_stop: view.run(server, initial, should_stop)
 
 
