@@ -26,12 +26,17 @@ from starjax.commands import (
 from starjax.data import normalizer
 from starjax.evaluation import sweep as sweeping
 from starjax.policies import in_env, packaged, policy_file
+from starjax.policies.base import Policy
 from starjax.report import video
 from starjax.runtime import files, gpu
 from starjax.sim import six_blocks as exercising
 from starjax.sim.tasks.peg_transfer_bimanual import six
 
 POLICY = dataclasses.replace(fakes.TINY, execute=4)
+
+
+def _unused(*_):
+    pytest.fail("no test trains")
 
 
 @pytest.fixture
@@ -42,7 +47,7 @@ def file(tmp_path, monkeypatch):
     def sample(_, stats, keys, observation, trocar):
         return network(params, 1.0, keys, observation, trocar)
 
-    policy = types.SimpleNamespace(sample=sample, prepare_for_inference=lambda params: params)
+    policy = Policy(lambda key: params, _unused, _unused, sample)
 
     monkeypatch.setattr(in_env.sim_env, "make", lambda *_, **__: stubs.make_env())
     monkeypatch.setattr(in_env.policies, "make", lambda *_, **__: policy)
@@ -225,7 +230,7 @@ def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
     )
     policy = dataclasses.replace(POLICY, obs_horizon=3, crop_fraction=0.5)
     trained = fakes.trained(method="stardiff", policy=policy, params=None, normalizer=None)
-    policy = types.SimpleNamespace(sample=None)
+    policy = Policy(_unused, _unused, _unused, _unused)
     who = in_env.PolicyInEnv(trained, policy, None, "")
     flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
     policy_evaluation.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
