@@ -8,7 +8,7 @@ from starjax import errors
 PACKAGES: dict[str, tuple[str, ...]] = {
     "sim": ("filelock", "flax", "mujoco", "rich", "tyro"),
     "train": ("optax", "orbax", "safetensors", "scipy"),
-    "report": ("PIL", "imageio_ffmpeg", "matplotlib", "scipy"),
+    "report": ("PIL", "imageio_ffmpeg", "jinja2", "matplotlib", "scipy"),
     "formats": ("PIL", "av", "h5py", "pyarrow", "zarr"),
     "gym": ("gymnasium",),
     "serve": ("filelock", "flax", "msgpack", "safetensors", "websockets"),

@@ -1,8 +1,9 @@
-"""The page and tables.md of committed results, golden; and what must hold of any page.
+"""The tables and the page of committed results, and properties of any page.
 
-After a change of what they say: STARJAX_GOLDEN=write pytest tests/report/test_page.py
+To rewrite the golden tables: STARJAX_GOLDEN=write pytest tests/report/test_page.py
 """
 
+import html
 import json
 import os
 import pathlib
@@ -17,6 +18,7 @@ from starjax.report import (
     figures,
     outcomes,
     page,
+    playback_3d,
     results,
     sections,
     stats,
@@ -42,14 +44,72 @@ def kept(pytestconfig):
 
 
 @pytest.mark.parametrize("name", ["several", "one"])
-def test_page_and_tables_are_the_golden_ones(kept, name):
-    runs = kept[name]
-    drawn = {"md": tables.markdown(runs), "html": page.render(runs, runs[-1], {}, None)}
-    for ending, text in drawn.items():
-        golden = GOLDEN / f"report_{name}.{ending}"
-        if os.environ.get("STARJAX_GOLDEN") == "write":
-            golden.write_text(text)
-        assert text == golden.read_text(), golden.name
+def test_tables_are_the_golden_ones(kept, name):
+    text, golden = tables.markdown(kept[name]), GOLDEN / f"report_{name}.md"
+    if os.environ.get("STARJAX_GOLDEN") == "write":
+        golden.write_text(text)
+    assert text == golden.read_text(), golden.name
+
+
+def rows(text):
+    """Tables of a page: lists of rows of cells' text; a bar's cell holds its label."""
+    found = []
+    for table in re.findall(r'<div class="scroll"><table>(.*?)</table></div>', text, re.DOTALL):
+        cells = [re.findall(r"<t[hd]\b.*?</t[hd]>", row, re.DOTALL) for row in table.split("<tr>")]
+        labelled = [
+            [re.sub(r'<span[^>]*title="([^"]*)".*', r"\1", c) for c in row] for row in cells
+        ]
+        plain = [[html.unescape(re.sub(r"<[^>]*>", " ", c)).strip() for c in r] for r in labelled]
+        found.append([row for row in plain if row])
+    return found
+
+
+def test_the_page_of_several_methods_has_the_numbers_of_tables(kept):
+    runs = kept["several"]
+    text = page.render(runs, runs[-1], {}, None)
+    shown = rows(text)
+    scores = {row[0]: row for row in shown[0] if len(row) == 6}
+    for run in runs:
+        seen, unseen = outcomes.rates(run.trials)
+        row = scores[run.label]
+        assert row[2].endswith(f"{seen.successes}/{seen.trials}")
+        assert row[4].endswith(f"{unseen.successes}/{unseen.trials}")
+        low, high = 100 * seen.low, 100 * seen.high
+        assert row[1] == f"{100 * seen.rate:.1f}%, 95% interval {low:.1f} to {high:.1f}%"
+    groups = [row[0] for row in shown[0] if len(row) == 1]
+    assert groups == list(dict.fromkeys(run.group for run in runs))
+    for table in (
+        tables.paired(runs),
+        tables.failures(runs),
+        tables.rcm(runs),
+        tables.phases(runs),
+    ):
+        assert table in shown
+    (matrix,) = (t for t in shown if t[0] == ["Method", *map(str, range(12))])
+    assert [row[0] for row in matrix[1:]] == [run.label for run in runs]
+    own = outcomes.by_trocar(runs[0].trials)
+    assert matrix[1][1:] == [
+        f"{100 * outcomes.tally(group).rate:.0f}{'' if group[0].seen else '*'}" for group in own
+    ]
+
+
+def test_the_page_of_one_method_has_its_trocars_and_failures(kept):
+    (run,) = kept["one"]
+    text = page.render([run], run, {}, None)
+    tests, trocars, *measured = rows(text)
+    assert [row[0].split()[0] for row in tests[1:]] == ["Strict", "Loose", "Safe"]
+    groups = outcomes.by_trocar(run.trials)
+    assert [row[0] for row in trocars[1:]] == [str(group[0].trocar) for group in groups]
+    for row, group in zip(trocars[1:], groups):
+        won = sum(trial.success for trial in group)
+        assert row[6].endswith(f"{won}/{len(group)}") and tuple(row[2:5]) == outcomes.place(
+            group[0]
+        )
+    failed = outcomes.failures(run.trials)
+    bars = re.findall(r'<div>([^<]*)</div><span class="unseen">.*?</i>(\d+)</span>', text)
+    assert [int(count) for _, count in bars] == list(failed.values())
+    assert tables.rcm([run]) in measured
+    assert text.count('class="card"') == len(list(sections.cards(run))) >= 5
 
 
 def test_both_schemas_draw_the_same(kept, tmp_path):
@@ -67,14 +127,26 @@ def test_both_schemas_draw_the_same(kept, tmp_path):
     assert page.render([run], run, {}, None) == page.render([old], old, {}, None)
 
 
-def test_the_page_stands_alone_and_escapes_what_it_shows(several):
-    run = edited(several[0], about={"command": "run --out '<b>&'", "warnings": ["<i>"]})
-    runs = [run, *several[1:]]
-    text = page.render(runs, runs[-1], {"fig4": (b"light", b"dark")}, b"mp4")
+def test_the_page_stands_alone(several):
+    text = page.render(several, several[-1], {"fig4": (b"light", b"dark")}, b"mp4")
     assert "<script" not in text and "http" not in text
     urls = re.findall(r'(?:src|href|srcset)="([^"]*)"', text)
     assert len(urls) == 3 and all(url.startswith("data:") for url in urls)
-    assert "&lt;b&gt;&amp;" in text and "&lt;i&gt;" in text and "<b>&" not in text
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_no_text_of_a_result_is_markup(several, count):
+    """Each text that a result's file can hold comes back as text, wherever the page shows it."""
+    attack = "</pre><script>x</script>'\"&{{ 7 * 7 }}"
+    about = {"command": attack, "warnings": [attack], "versions": {attack: attack}}
+    about |= {"hardware": {"backend": "gpu", "devices": [attack], "cpu": attack, "cores": 2}}
+    run = edited(several[-1], about=about, config={"preset": attack, "seed": 0, attack: attack})
+    runs = [*several[: count - 1], run._replace(label=attack)]
+    playback = playback_3d.Playback(attack, attack)
+    text = page.render(runs, runs[-1], {}, None, playback)
+    assert "<script" not in text and "49" not in re.sub(r"\d[\d.,/]*\d", "", text)
+    shown = html.unescape(re.sub(r"<[^>]*>", "", text))
+    assert shown.count(attack) >= 8
 
 
 def test_a_stage_that_did_not_run_leaves_no_trace(one):
@@ -121,6 +193,6 @@ def test_what_differs_between_runs_is_a_fact_of_each(one):
     seed = one.result.config["seed"]
     assert "Seed of the trials" not in sections.facts([edited(one, seed=seed)])
     runs = [edited(one, seed=seed + i, commit="0123456789abcdef", dirty=True) for i in (0, 1)]
-    text = sections.facts(runs)
-    assert f"<dt>Seed of the trials</dt><dd>{seed}; {seed + 1}</dd>" in text
-    assert "0123456789, with local changes" in text and "fr5 with grasper" in text
+    facts = sections.facts(runs)
+    assert facts["Seed of the trials"] == f"{seed}; {seed + 1}"
+    assert (facts["Code"], facts["Robot"]) == ("0123456789, with local changes", "fr5 with grasper")

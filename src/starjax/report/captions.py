@@ -8,7 +8,7 @@ from starjax.report import compare, formats, outcomes, results, stats
 def title(runs: Sequence[results.Run]) -> str:
     """Heading of the page."""
     about = runs[0].label if len(runs) == 1 else several(runs)
-    return f"{about} on {compare.words(runs).title}"
+    return f"{about} on {compare.task_text(runs).title}"
 
 
 def several(runs: Sequence[results.Run]) -> str:
@@ -20,10 +20,10 @@ def several(runs: Sequence[results.Run]) -> str:
 
 def verdict(runs: Sequence[results.Run], focus: results.Run) -> str:
     """One or two sentences that a reader in a hurry may stop after."""
-    seen, unseen = (outcomes.tally(t) if t else None for t in outcomes.split(focus.trials))
+    seen, unseen = outcomes.rates(focus.trials)
     if seen is None and unseen is None:
         return f"{focus.label} was trained but not evaluated."
-    done = f"{focus.label} {compare.words(runs).done} in"
+    done = f"{focus.label} {compare.task_text(runs).done} in"
     text = f"Through trocars it was trained on, {done} {formats.fraction(seen)}" if seen else ""
     if unseen and seen:
         percent = f"{100 * unseen.rate:.0f}%"
@@ -54,9 +54,9 @@ def _rank(runs: Sequence[results.Run], focus: results.Run) -> str:
     """How the others do on unseen trocars, where methods are meant to differ."""
     scores = []
     for run in runs:
-        unseen = outcomes.split(run.trials)[1]
+        unseen = outcomes.rates(run.trials)[1]
         if run is not focus and unseen:
-            scores.append((outcomes.tally(unseen).rate, run.label))
+            scores.append((unseen.rate, run.label))
     if not scores:
         return ""
     best, label = max(scores)

@@ -26,8 +26,8 @@ def task(runs: Sequence[Run]) -> Task:
     return registries.tasks.get(names[0])
 
 
-def words(runs: Sequence[Run]) -> TaskText:
-    """Words for the task of all runs; raises as `task`."""
+def task_text(runs: Sequence[Run]) -> TaskText:
+    """Returns the text of the task of all runs; raises as `task`."""
     return task(runs).text
 
 

@@ -17,6 +17,14 @@ def tally(trials: Iterable[Trial], outcome: Callable[[Trial], bool] | None = Non
     return stats.rate(sum(held), len(held))
 
 
+def rates(
+    trials: Iterable[Trial], outcome: Callable[[Trial], bool] | None = None
+) -> tuple[stats.Rate | None, stats.Rate | None]:
+    """Tallies seen and unseen trocars; None where there was no trial."""
+    seen, unseen = split(trials)
+    return tally(seen, outcome) if seen else None, tally(unseen, outcome) if unseen else None
+
+
 def strict(trial: Trial) -> bool:
     """The task is done, in time."""
     return trial.success

@@ -1,17 +1,19 @@
-"""One self-contained HTML page of a report, without links to other files.
+"""One self-contained HTML page of a report, from the templates in `templates/`.
 
-Its only script is that of the rollouts in 3D, which are a page in a frame.
+The page links to no other file. Its only script is that of the rollouts in 3D, a page in a frame.
 """
 
-import importlib.resources
+import base64
 from collections.abc import Mapping, Sequence
 
-from starjax.report import captions, compare, markup, playback_3d, results, sections
-from starjax.sim.tasks.base import TaskText
+import jinja2
+
+from starjax.report import captions, compare, formats, notes, playback_3d, results, sections, stress
 
 # name -> (light PNG, dark PNG)
 Figures = Mapping[str, tuple[bytes, bytes]]
 
+# name -> (heading, caption)
 CAPTIONS = {
     "fig3": (
         "Rollouts",
@@ -30,9 +32,9 @@ CAPTIONS = {
         "Trials at the trocars that none of these runs was trained at, with 95% Wilson intervals.",
     ),
     "stress": (
-        "What breaks it",
-        "Success and executed RCM error while one thing is wrong, around the circle; lines join "
-        "levels of one rank, not one trial.",
+        "Success under disturbances",
+        "Success and executed RCM error under one disturbance at a time, around the circle; lines "
+        "join levels of one rank, not one trial.",
     ),
     "training": (
         "Training",
@@ -47,74 +49,67 @@ def render(
     focus: results.Run,
     figures: Figures,
     video: bytes | None,
-    solid: playback_3d.Playback | None = None,
+    playback: playback_3d.Playback | None = None,
 ) -> str:
-    """The page of `runs`, whose headline numbers are those of `focus`."""
+    """Renders the page of `runs`, whose headline numbers are those of `focus`."""
     several = len(runs) > 1
-    title, words = captions.title(runs), compare.words(runs)
-    body = [
-        f'<p class="eyebrow">starjax report</p><h1>{markup.escape(title)}</h1>',
-        f'<p class="verdict">{markup.escape(captions.verdict(runs, focus))}</p>',
-        sections.facts(runs),
-        sections.warnings(runs),
-        sections.cards(focus),
-        _video(video, compare.observed(runs), words),
-        _turned(solid),
-        sections.comparison(runs) if several else sections.tests(focus),
-        _figure("fig3", figures, words),
-        _figure("fig4", figures, words),
-        sections.swept(runs),
-        _figure("ports", figures, words),
-        _figure("stress", figures, words),
-        sections.stressed(focus),
-        sections.matrix(runs) if several else sections.per_trocar(focus),
-        sections.failures(runs),
-        sections.measurements(runs),
-        _figure("training", figures, words),
-        sections.reproduce(runs),
-    ]
-    style = importlib.resources.files("starjax.report").joinpath("page.css").read_text()
+    text = compare.task_text(runs)
+    about = [run.result.about for run in runs]
     return (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{markup.escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>\n"
-        + "\n".join(part for part in body if part)
-        + "\n</main>\n</body>\n</html>\n"
+        _environment()
+        .get_template("page.html")
+        .render(
+            title=captions.title(runs),
+            verdict=captions.verdict(runs, focus),
+            facts=sections.facts(runs),
+            warnings=captions.notes(runs),
+            cards=list(sections.cards(focus)),
+            video=video,
+            playback=playback,
+            observed=compare.observed(runs),
+            goal=text.goal,
+            several=several,
+            focus=focus,
+            scores=sections.by_method(runs) if several else sections.by_test(focus),
+            comparisons=sections.comparisons(runs) if several else [],
+            swept=sections.swept(runs),
+            stressed=stress.table(focus.stress) if focus.stress else None,
+            stress_note=stress.NOTE,
+            trocars=[] if several else sections.trocars(focus),
+            matrix=sections.matrix(runs) if several else None,
+            failures=[] if several else sections.failures(focus),
+            failures_note=notes.FAILURES,
+            measurements=sections.measurements(runs),
+            figures={
+                name: {
+                    "heading": heading,
+                    "caption": caption.format(ground=text.ground),
+                    "light": figures[name][0],
+                    "dark": figures[name][1],
+                }
+                for name, (heading, caption) in CAPTIONS.items()
+                if name in figures
+            },
+            commands=list(dict.fromkeys(x["command"] for x in about if x.get("command"))),
+            settings=[
+                (run.label, sections.flat(run.result.config)) for run in runs if run.result.config
+            ],
+            versions=formats.listing(about[0]["versions"]) if about[0].get("versions") else "",
+        )
     )
 
 
-def _figure(name: str, figures: Figures, words: TaskText) -> str:
-    if name not in figures:
-        return ""
-    heading, caption = CAPTIONS[name][0], CAPTIONS[name][1].format(ground=words.ground)
-    light, dark = (markup.uri("image/png", image) for image in figures[name])
-    return (
-        f"<h2>{heading}</h2>\n<figure><picture>"
-        f'<source media="(prefers-color-scheme: dark)" srcset="{dark}">'
-        f'<img src="{light}" alt="{markup.escape(caption)}"></picture>'
-        f"<figcaption>{caption}</figcaption></figure>"
+def _environment() -> jinja2.Environment:
+    loader = jinja2.PackageLoader("starjax.report")
+    environment = jinja2.Environment(
+        loader=loader,
+        autoescape=True,  # labels, commands and settings come from files
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
+    environment.filters["data_uri"] = _data_uri
+    return environment
 
 
-def _video(video: bytes | None, observed: str, words: TaskText) -> str:
-    if video is None:
-        return ""
-    source = markup.uri("video/mp4", video)
-    return (
-        f'<figure><video controls loop muted autoplay playsinline src="{source}"></video>'
-        f"<figcaption>The policy, which sees the {observed}, at work in real time. The disc on the "
-        f"shaft is the trocar; {words.goal}.</figcaption></figure>"
-    )
-
-
-def _turned(solid: playback_3d.Playback | None) -> str:
-    """The rollouts in 3D, which a browser sets up when somebody opens them."""
-    if solid is None:
-        return ""
-    said = f"In 3D, to be turned with the mouse: {solid.caption}"
-    return (
-        f"<details><summary>{markup.escape(said)}</summary>"
-        f'<iframe title="{markup.escape(said)}" loading="lazy" sandbox="allow-scripts" '
-        f'style="width:100%;height:32rem;border:0" srcdoc="{markup.escape(solid.html)}"></iframe>'
-        "</details>"
-    )
+def _data_uri(data: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

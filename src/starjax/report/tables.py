@@ -18,10 +18,10 @@ _COMPILE = ": compile"  # ends the name of a phase's share spent compiling
 
 def markdown(runs: Sequence[results.Run]) -> str:
     """tables.md: every table that the runs have numbers for, each with a line on how to read it."""
-    words = compare.words(runs)
+    text = compare.task_text(runs)
     parts = [
-        (f"Table III. Task success on {words.title} (%)", success(runs), notes.SUCCESS),
-        ("Success by three tests (%)", by_test(runs), notes.by_test(words)),
+        (f"Table III. Task success on {text.title} (%)", success(runs), notes.SUCCESS),
+        ("Success by three tests (%)", by_test(runs), notes.by_test(text)),
         ("Paired comparison with STAR-Diff", paired(runs), notes.PAIRED),
         (SWEPT, swept(runs), f"{notes.SWEPT} {notes.CELL}"),
         (SWEPT_PAIRED, paired(results.swept(runs)), notes.PAIRED),
@@ -30,15 +30,15 @@ def markdown(runs: Sequence[results.Run]) -> str:
         ("Table IV. Inference time", inference(runs), notes.inference(runs)),
     ]
     filled = [f"## {h}\n\n{formats.render(t)}\n\n{note}\n" for h, t, note in parts if len(t) > 1]
-    said = "".join(f"- {text}\n" for text in captions.notes(runs))
-    head = f"# {formats.sentence(words.title)} from {compare.observed(runs)} observations\n"
+    said = "".join(f"- {line}\n" for line in captions.notes(runs))
+    head = f"# {formats.sentence(text.title)} from {compare.observed(runs)} observations\n"
     return "\n".join(part for part in (head, said, *filled) if part)
 
 
 def success(runs: Sequence[results.Run]) -> Table:
     """Table III."""
     table = [["Group", "Method", "Seen ↑", "Unseen ↑", "Gap ↓"]]
-    scores = [(run, _seen_unseen(run, outcomes.strict)) for run in runs if run.trials]
+    scores = [(run, outcomes.rates(run.trials)) for run in runs if run.trials]
     best = [max((s.rate for _, pair in scores if (s := pair[i])), default=0.0) for i in (0, 1)]
     for run, (seen, unseen) in scores:
         cells = [formats.rate(score) if score else "–" for score in (seen, unseen)]
@@ -56,7 +56,7 @@ def by_test(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = for
     table = [["Method", *header]]
     for run in runs:
         if run.trials:
-            scores = [s for test in TESTS.values() for s in _seen_unseen(run, test)]
+            scores = [s for test in TESTS.values() for s in outcomes.rates(run.trials, test)]
             table.append([run.label, *(cell(s) if s else "–" for s in scores)])
     return table
 
@@ -160,7 +160,3 @@ def _comparison(a: results.Run, b: results.Run, test: stats.Paired) -> tuple[obj
     method = b.result.method
     place = b.path.parent if b.path.name == method else b.path
     return a.path, b.result.weights or place, methods.behaviour(method), test
-
-
-def _seen_unseen(run: results.Run, test: Callable[[Trial], bool]) -> list[stats.Rate | None]:
-    return [outcomes.tally(t, test) if t else None for t in outcomes.split(run.trials)]
