@@ -1,23 +1,30 @@
-"""The simulated scene of a result, set up again for figures and the video."""
+"""The simulated scene of a result, for figures and the video.
 
-from collections.abc import Callable
+MuJoCo itself computes poses from recorded joints, in microseconds; only the pictures of the video
+need a compiled program.
+"""
+
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 
+from starjax.sim import registries, scene
+from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
 from starjax.sim.tasks.base import Outline
 from starjax.types import Pose
 
-BATCH = 16  # images drawn in one call
+BATCH = 16  # images per call of the compiled program
 
 
 class SceneView(NamedTuple):
-    """A scene, as figures draw it.
+    """A scene for figures.
 
     Attributes:
-      outline: of the task.
-      tips: (qpos `[T, Q]`, p_world_trocar `[A, 3]` m) -> positions of the tips in m, and the
+      outline: the task's outline.
+      tips: (qpos `[T, Q]`, p_world_trocar `[A, 3]` m) -> positions of the tips in m, and
         directions of their shafts, away from the arm: `[T, A, 3]` each.
     """
 
@@ -26,26 +33,20 @@ class SceneView(NamedTuple):
 
 
 def load(names: SceneNames) -> SceneView:
-    """Composes the scene of these names; nothing is compiled for a device.
+    """Composes a scene.
 
     Raises:
       errors.UsageError: one of the names is unknown here.
     """
-    import mujoco
-
-    from starjax.sim import registries, scene
-
     model = scene.compose(names)
-    marks = [model.body(f"trocar{i}").mocapid[0] for i in range(len(names.arms))]
     sites = [scene.tcp(i, registries.tools.get(tool)) for i, tool in enumerate(names.tools)]
 
     def tips(qpos: np.ndarray, p_world_trocar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        data, found = mujoco.MjData(model), []
-        data.mocap_pos[marks] = p_world_trocar
-        for data.qpos[:] in qpos:
-            mujoco.mj_kinematics(model, data)
-            found.append([np.stack([data.site(s).xpos, data.site(s).xmat[2::3]]) for s in sites])
-        p, axis = np.moveaxis(np.array(found), 2, 0)
+        rows = [
+            [np.stack([data.site(s).xpos, data.site(s).xmat[2::3]]) for s in sites]
+            for data in _kinematics(model, qpos, p_world_trocar)
+        ]
+        p, axis = np.moveaxis(np.array(rows), 2, 0)
         return p, axis
 
     return SceneView(registries.tasks.get(names.task).outline(model), tips)
@@ -57,45 +58,60 @@ Draw = Callable[..., np.ndarray]
 
 
 def camera(names: SceneNames, size: int) -> Draw:
-    """Compiles the first camera of a scene, for square images of `size` pixels a side."""
+    """Makes the compiled first camera of a scene, for square images of `size` pixels a side."""
     import jax
     import jax.numpy as jnp
 
-    from starjax.sim import cameras, endoscope_camera, physics, render, scene
+    from starjax.sim import cameras, endoscope_camera
 
-    # Smooth outlines cost four times as much: a matter of seconds on a GPU, of minutes on a CPU.
+    # Smooth outlines cost four times as much: seconds on a GPU, minutes on a CPU.
     samples = 1 if jax.default_backend() == "cpu" else 2
-    made = scene.load(names)
-    scope = endoscope_camera.of(made.task, names.cameras[:1])
-    (shown,) = cameras.make(made.mj_model, names.cameras[:1], size, scope=scope)
-    smooth = {"samples": samples, "moves": shown.moves}
-    shown = shown._replace(draw=render.make(made.mj_model, shown.name, size, size, **smooth))
-    still = cameras.nominal([shown])
-
-    def one(qpos: jax.Array, held: Any, p_world_trocar: jax.Array, rgb: jax.Array) -> jax.Array:
-        data = physics.kinematics(made, qpos, p_world_trocar)
-        poses = still if held is None else jax.tree.map(lambda leaf: leaf[None], held)
-        return cameras.images([shown], poses, data, rgb)[shown.name].rgb
+    model, task = scene.compose(names), registries.tasks.get(names.task)
+    bound, geom_rgb = task.bind(model), geometry.geom_rgb(model)
+    scope = endoscope_camera.of(task, names.cameras[:1])
+    (shown,) = cameras.make(model, names.cameras[:1], size, scope=scope, samples=samples)
 
     @jax.jit
-    def batch(
-        qpos: jax.Array, held: Any, p_world_trocar: jax.Array, labels: dict[str, Any]
-    ) -> jax.Array:
-        rgb = scene.marked(made.task, made.bound, labels, jnp.asarray(made.geom_rgb))
-        return jax.lax.map(lambda step: one(step[0], step[1], p_world_trocar, rgb), (qpos, held))
+    def batch(poses: Any, labels: dict[str, Any]) -> jax.Array:
+        rgb = scene.marked(task, bound, labels, jnp.asarray(geom_rgb))
+        return jax.lax.map(lambda step: shown.draw(*step[:2], rgb, *step[2:]).rgb, poses)
+
+    def poses(data: mujoco.MjData, held: Pose | None) -> tuple[Any, ...]:
+        """Returns positions and rotations of geoms and, if it moves, the camera's pose."""
+        geoms = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
+        if not shown.moves:
+            return geoms
+        R_world_body = data.xmat[shown.body].reshape(3, 3)
+        R, p = (shown.R, shown.p) if held is None else (held.R, held.p)
+        return *geoms, Pose(R_world_body @ R, data.xpos[shown.body] + R_world_body @ p)
 
     def draw(
         qpos: np.ndarray,
         p_world_trocar: np.ndarray,
         labels: dict[str, int],
         first: int,
-        held: Pose | None = None,
+        endoscope: Pose | None = None,
     ) -> np.ndarray:
         rows = np.minimum(np.arange(first, first + BATCH), len(qpos) - 1)
-        marked = {name: np.int32(value) for name, value in labels.items()}
-        held = held if scope else None
-        qpos, held = jax.tree.map(lambda leaf: leaf[rows].astype(np.float32), (qpos, held))
-        with jax.default_matmul_precision("highest"):  # poses to float32, as the environment's
-            return np.asarray(batch(qpos, held, p_world_trocar.astype(np.float32), marked))
+        held = endoscope if scope else None
+        steps = [
+            poses(data, None if held is None else Pose(held.R[row], held.p[row]))
+            for row, data in zip(rows, _kinematics(model, qpos[rows], p_world_trocar))
+        ]
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves).astype(np.float32), *steps)
+        with jax.default_matmul_precision("highest"):  # float32 rays, as in the environment
+            return np.asarray(batch(stacked, {name: np.int32(x) for name, x in labels.items()}))
 
     return draw
+
+
+def _kinematics(
+    model: mujoco.MjModel, qpos: np.ndarray, p_world_trocar: np.ndarray
+) -> Iterator[mujoco.MjData]:
+    """Yields the data at each of the coordinates `[T, Q]`, with the trocars `[A, 3]` m in place."""
+    data = mujoco.MjData(model)
+    trocars = [model.body(f"trocar{i}").mocapid[0] for i in range(len(p_world_trocar))]
+    data.mocap_pos[trocars] = p_world_trocar
+    for data.qpos[:] in qpos:
+        mujoco.mj_kinematics(model, data)
+        yield data

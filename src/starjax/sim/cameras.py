@@ -43,6 +43,7 @@ def make(
     shadow: bool = True,
     moving: bool = False,
     scope: endoscope_camera.Endoscope | None = None,
+    samples: int = 1,
 ) -> tuple[SceneCamera, ...]:
     """The cameras of these names, for square images; with `moving` all of them may move.
 
@@ -55,7 +56,9 @@ def make(
         mujoco.mju_quat2Mat(R, camera.quat)
         R, p = R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32)
         moves = moving or body != 0 or (scope is not None and name == endoscope_camera.NAME)
-        draw = render.make(mj_model, name, image_size, image_size, shadow=shadow, moves=moves)
+        draw = render.make(
+            mj_model, name, image_size, image_size, shadow, samples=samples, moves=moves
+        )
         found.append(SceneCamera(name, body, R, p, moves, draw))
     return tuple(found)
 
