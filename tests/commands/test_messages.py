@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from starjax import config, methods
-from starjax.commands import estimate, messages, presets
+from starjax.commands import messages, presets
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 
@@ -26,10 +26,16 @@ def test_the_plan_has_the_scene_the_observation_and_the_numbers():
     assert "image, 64 px" in said and "from scratch" in said and "state" not in said
 
 
-def test_the_plan_says_how_long_it_takes():
-    cpu = presets.PRESETS["cpu"]
-    minutes = round(estimate.seconds(cpu, messages.STAGES, 12) / 60)
-    assert f"about {minutes} min" in messages.plan(cpu, messages.STAGES)
+def test_the_plan_has_the_measured_time_of_an_unchanged_preset():
+    cpu, time = (
+        presets.PRESETS["cpu"],
+        f"{round(presets.TIMINGS['cpu'].seconds / 60)} min on 2 cores",
+    )
+    assert time in messages.plan(cpu, messages.STAGES)
+    assert time in messages.plan(dataclasses.replace(cpu, seed=3, out="x"), messages.STAGES)
+    steps = dataclasses.replace(cpu, train=dataclasses.replace(cpu.train, steps=7))
+    assert time not in messages.plan(steps, messages.STAGES)
+    assert time not in messages.plan(cpu, ("collect", "train"))
 
 
 def test_the_plan_says_where_devices_cannot_share_a_batch(monkeypatch):

@@ -1,12 +1,16 @@
 """Presets: starting values of a run, and which of them `auto` means."""
 
 import dataclasses
+import json
+import pathlib
 
 import pytest
 
 from starjax import config, errors
 from starjax.commands import presets, run_settings
 from starjax.runtime import gpu
+
+RESULTS = pathlib.Path(__file__).parents[2] / "experiments"
 
 
 @pytest.mark.parametrize("guess", [False, True])
@@ -33,6 +37,18 @@ def test_paper_preset_is_the_default_configuration():
     paper = presets.PRESETS["paper"]
     assert dataclasses.replace(paper, preset="auto") == config.RunConfig()
     assert (paper.train.steps, paper.train.batch_size) == (100_000, 256)
+
+
+@pytest.mark.parametrize("name", presets.TIMINGS)
+def test_a_presets_time_is_that_of_a_committed_result(name):
+    timing, preset = presets.TIMINGS[name], presets.PRESETS[name]
+    found = json.loads((RESULTS / timing.source).read_text())
+    stages = sum(seconds for stage, seconds in found["timings_s"].items() if ":" not in stage)
+    assert stages < timing.seconds < stages + 60
+    run = config.from_dict(config.RunConfig, found["config"])
+    same = dataclasses.replace(preset, scene=run.scene)
+    assert config.weight_settings(run) == config.weight_settings(same) and run.eval == preset.eval
+    assert found["hardware"]["backend"] == timing.backend
 
 
 @pytest.mark.parametrize("name", presets.PRESETS)

@@ -4,6 +4,8 @@ Data, not code: what a preset changes from `config.RunConfig()` (the paper) stan
 Other learners begin with a preset's options where they have them too (`config.with_learner`).
 """
 
+from typing import NamedTuple
+
 from starjax.config import DemosConfig, EvalConfig, PolicyConfig, RunConfig, TrainConfig
 from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.policies.learners.flow import FlowConfig
@@ -127,6 +129,28 @@ PRESETS: dict[str, RunConfig] = {
     ),
     # The paper: 100k iterations, batch 256, 256 x 256 pixels.
     "paper": RunConfig(preset="paper"),
+}
+
+
+class Timing(NamedTuple):
+    """Measured time of a preset's run from an empty cache.
+
+    Attributes:
+      machine: its name in words.
+      backend: its name in jax.
+      seconds: wall-clock time of the whole command.
+      source: result of the run, below `experiments/`.
+    """
+
+    machine: str
+    backend: str
+    seconds: float
+    source: str
+
+
+TIMINGS = {
+    "cpu": Timing("2 cores of an AMD EPYC", "cpu", 373.5, "cpu_main_job/result.json"),
+    "gpu": Timing("an NVIDIA H100 with 16 cores", "gpu", 234.8, "gpu_main_job/flow_again.json"),
 }
 
 
