@@ -1,4 +1,4 @@
-"""Pages that are made when the site is built: from the settings, the results, the changelog."""
+"""Pages generated with the site: from the settings, the results, the changelog."""
 
 import re
 from pathlib import Path
@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "experiments"
 IMAGES = (".png", ".gif")
-# Page -> where its text stands in the repository.
+# Page -> file of its text.
 COPIES = {
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
@@ -65,17 +65,17 @@ def relinked(source: Path, page: str) -> str:
 
     Args:
       source: the text.
-      page: where it stands in the site, relative to `docs/`.
+      page: its path in the site, relative to `docs/`.
     """
     pages = {(ROOT / path).resolve(): name for name, path in COPIES.items()}
     pages |= {(folder / "README.md").resolve(): f"results/{folder.name}.md" for folder in claims()}
     up = "../" * page.count("/")
 
-    def link(found: re.Match) -> str:
-        text, path, place = found[1], found[2], found[3] or ""
+    def link(match: re.Match) -> str:
+        text, path, place = match[1], match[2], match[3] or ""
         target = (source.parent / path).resolve()
         if "://" in path:
-            return found[0]
+            return match[0]
         if target in pages:
             return f"[{text}]({up}{pages[target]}{place})"
         if target.is_relative_to(ROOT / "docs"):

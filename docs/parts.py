@@ -6,7 +6,7 @@ from starjax.sim import registries
 
 
 def page() -> str:
-    """Everything that exists by name; `starjax list` shows it too."""
+    """Returns the page of everything with a name, as `starjax list` shows it."""
     lines = ["---", "hide: [toc]", "---", "# Tasks, arms, tools", ""]
     lines += ["Names for `--task`, `--arm` and `--tool`.", "", "## Tasks", ""]
     rows = []
@@ -14,9 +14,9 @@ def page() -> str:
         task = registries.tasks.get(name)
         state = ", ".join(f"`{field.name}` {field.size}" for field in task.fields)
         experts = ", ".join(f"`{expert}`" for expert in task.experts)
-        cells = [str(task.arms), task.text.strict, task.words.loose, f"{task.time_limit_s:g} s"]
+        cells = [str(task.arms), task.text.strict, task.text.loose, f"{task.time_limit_s:g} s"]
         rows.append((f"`{name}`", *cells, state, experts))
-    head = ["task", "arms", "strict success", "loose", "time", "state, numbers", "experts"]
+    head = ["task", "arms", "strict success", "loose", "time", "state and size", "experts"]
     lines += [settings.table(head, rows), "", "## Arms", ""]
     rows = []
     for name in registries.arms.built_in:
@@ -30,5 +30,5 @@ def page() -> str:
         tool = registries.tools.get(name)
         opening = f"{2e3 * (tool.open - tool.closed):.1f} mm" if tool.jaw else "no jaws"
         rows.append((f"`{name}`", opening, f"{2e3 * tool.shaft_radius:g} mm"))
-    lines += [settings.table(["tool", "way of the jaws", "shaft"], rows)]
+    lines += [settings.table(["tool", "opening of the jaws", "shaft"], rows)]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""Draws the reference of commands and settings from the dataclasses that `--help` is made of."""
+"""Draws the reference of commands and settings from the dataclasses behind `--help`."""
 
 import dataclasses
 import importlib
@@ -13,8 +13,8 @@ _TRAILING = re.compile(r"^\s+(\w+): .*?#\s*(.*)$")
 
 
 def comments(settings: type) -> dict[str, str]:
-    """Field -> its comment: what stands after it, else the lines above it."""
-    found, above = {}, []
+    """Returns field -> comment, of its line or of the lines above it."""
+    texts, above = {}, []
     kinds = filter(dataclasses.is_dataclass, reversed(settings.__mro__))
     for line in "".join(map(inspect.getsource, kinds)).splitlines():
         text = line.strip()
@@ -24,35 +24,35 @@ def comments(settings: type) -> dict[str, str]:
         name = re.match(r"\s+(\w+): ", line)
         if name and name[1] in {field.name for field in dataclasses.fields(settings)}:
             trailing = _TRAILING.match(line)
-            found[name[1]] = trailing[2] if trailing else " ".join(above)
+            texts[name[1]] = trailing[2] if trailing else " ".join(above)
         above = []
-    return found
+    return texts
 
 
 def rows(settings: type, default: object, prefix: str = "") -> list[tuple[str, str, str, str]]:
-    """(flag, what it takes, default, help) of every field, nested ones too."""
-    found, said = [], comments(settings)
+    """Returns (flag, type, default, help) of every field, including nested ones."""
+    table_rows, helps = [], comments(settings)
     inline = {
         field.name for field in dataclasses.fields(settings) if field.metadata == limits.INLINE
     }
     for name, hint in typing.get_type_hints(settings, include_extras=True).items():
         value = getattr(default, name, dataclasses.MISSING)
         if name in inline:
-            found += rows(type(value), value, prefix)
+            table_rows += rows(type(value), value, prefix)
             continue
         if dataclasses.is_dataclass(hint):
             if value is dataclasses.MISSING and hint.__module__ == settings.__module__:
                 value = hint()  # a command's own; another module's depends on the machine
-            found += rows(hint, value, f"{prefix}{name}.")
+            table_rows += rows(hint, value, f"{prefix}{name}.")
             continue
         is_word = options.tyro.conf.Positional in getattr(hint, "__metadata__", ())
         flag = name.upper() if is_word else options.flag(prefix + name)
-        found.append((flag, takes(hint), shown(value), said[name]))
-    return found
+        table_rows.append((flag, takes(hint), shown(value), helps[name]))
+    return table_rows
 
 
 def takes(hint: object) -> str:
-    """A field's type and range in words."""
+    """Returns a field's type and range in words."""
     limit = limits.within(hint)
     while typing.get_origin(hint) is typing.Annotated:
         hint = typing.get_args(hint)[0]
@@ -66,7 +66,7 @@ def takes(hint: object) -> str:
 
 
 def shown(value: object) -> str:
-    """A default in a table's cell."""
+    """Returns the text of a default in a table's cell."""
     if value is dataclasses.MISSING or value in ("", None, ()):
         return ""
     if isinstance(value, bool):
@@ -75,7 +75,7 @@ def shown(value: object) -> str:
 
 
 def table(head: list[str], lines: list[tuple[str, ...]]) -> str:
-    """A table in Markdown."""
+    """Returns a table in Markdown."""
     cells = [head, ["---"] * len(head), *lines]
     return "\n".join(f"| {' | '.join(line)} |" for line in cells)
 
@@ -86,14 +86,14 @@ def is_flags(kind: object, module: str) -> bool:
 
 
 def commands() -> str:
-    """The page of all commands."""
+    """Returns the page of all commands."""
     parts = [
         "---",
         "hide: [toc]",
         "---",
         "# Commands",
         "",
-        "`starjax COMMAND --help` says the same. Ranges are checked.",
+        "`starjax COMMAND --help` prints the same. Ranges are checked.",
     ]
     for name, (module, summary, needed) in cli.COMMANDS.items():
         module, _, function = module.partition(":")
@@ -112,15 +112,15 @@ def commands() -> str:
 
 
 def settings() -> str:
-    """The page of all settings of a run, with the values of every preset."""
+    """Returns the page of all settings of a run, with the values of every preset."""
     names = list(presets.PRESETS)
     parts = [
         *("---", "hide: [toc]", "---"),
         "# Settings of a run",
         "",
-        "Flags of `starjax run`, `collect` and `train`; a switch has a twin, `--demos.no-...`.",
-        "Columns of presets show what a preset changes; elsewhere the default holds, which is the",
-        "paper's where the paper says it, or – where the preset's learner has no such option.",
+        "Flags of `starjax run`, `collect` and `train`; a switch is turned off by `--demos.no-...`.",
+        "Columns of presets show their changes of the defaults, and – for options that the preset's",
+        "learner does not have. Defaults are the paper's values if it gives them.",
     ]
     groups: dict[str, list] = {}
     for row in rows(config.RunConfig, config.RunConfig()):
@@ -133,10 +133,10 @@ def settings() -> str:
     for group, lines in groups.items():
         parts += ["", f"## {group}", ""]
         drawn = []
-        for flag, kind, value, said in lines:
-            cells = [changed[name].get(flag, "–") for name in names]  # its learner has none
+        for flag, kind, value, text in lines:
+            cells = [changed[name].get(flag, "–") for name in names]  # not an option of its learner
             differs = [cell if cell != value and group != "run" else "" for cell in cells]
-            drawn.append((f"`{flag}`", value, differs, kind, said))
+            drawn.append((f"`{flag}`", value, differs, kind, text))
         used = [i for i in range(len(names)) if any(line[2][i] for line in drawn)]
         lines = [(flag, value, *(d[i] for i in used), *rest) for flag, value, d, *rest in drawn]
         head = ["flag", "default", *(names[i] for i in used), "takes", "meaning"]

@@ -16,7 +16,7 @@ P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)  # m, the policy's nominal 
 
 
 class Robot:
-    """Stands for yours: it is where it was last sent, and its camera is dark."""
+    """A perfect robot: it reaches each command at once, and its images are black."""
 
     def __init__(self, pose: deploy.Pose) -> None:
         self.pose, self.gripper = pose, 1.0
@@ -48,8 +48,8 @@ def main() -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         try:
             lines = iter(server.stdout.readline, "")  # type: ignore[union-attr]
-            found = (re.search(r"ws://\S+:\d+", line) for line in lines)
-            drive(next(match[0] for match in found if match), seconds=2.0)
+            matches = (re.search(r"ws://\S+:\d+", line) for line in lines)
+            drive(next(match[0] for match in matches if match), seconds=2.0)
         finally:
             server.terminate()
 

@@ -3,12 +3,12 @@
     python examples/ppo.py                                               # a CPU
     python examples/ppo.py --envs 4096 --iterations 60 --minibatches 32   # a GPU
 
-Needs optax and flax beside jax and mujoco-mjx. Prints one JSON object a line: the curve, with how
-often the mean action succeeds.
+Needs optax, flax, jax and mujoco-mjx. Prints the learning curve as one JSON object per line, with
+the success rate of the mean action.
 
-The noise is small, and the network says how large it is where. The controller bounds acceleration:
-under large noise steps hit that bound whatever the mean is, so a policy that leaps to and fro over
-the goal loses nothing by it, and does not learn to rest there.
+The noise is small, and the network predicts its size. The controller bounds acceleration: large
+noise saturates that bound for any mean action, and a policy that jumps across the goal then loses
+nothing and does not learn to rest there.
 """
 
 import argparse
@@ -26,10 +26,10 @@ from starjax import runtime
 GAMMA, LAMBDA, CLIP = 0.9, 0.95, 0.2
 EPOCHS = 4
 LENGTH = 32  # control steps of an iteration
-EPISODE = 150  # control steps at most while it learns
-RATE = 3e-3  # of Adam at first; it falls to nothing
-STDS = (0.003, 0.1, 0.15)  # of the noise: the least, at first, the most
-LOOKS = 8  # evaluations on the way
+EPISODE = 150  # maximum control steps of a training episode
+RATE = 3e-3  # initial learning rate of Adam, decays to zero
+STDS = (0.003, 0.1, 0.15)  # of the noise: minimum, initial, maximum
+EVALUATIONS = 8  # during training
 
 
 class ActorCritic(nn.Module):
@@ -46,8 +46,8 @@ class ActorCritic(nn.Module):
             return nn.Dense(size, kernel_init=nn.initializers.orthogonal(scale))(h)
 
         mean, wide = jnp.split(mlp(2 * self.actions, 0.01), 2, axis=-1)
-        least, first, most = STDS
-        std = least + (most - least) * nn.sigmoid(wide + jnp.log((first - least) / (most - first)))
+        low, first, high = STDS
+        std = low + (high - low) * nn.sigmoid(wide + jnp.log((first - low) / (high - first)))
         return mean, std, mlp(1, 1.0)[..., 0]
 
 
@@ -56,12 +56,12 @@ def where(which, a, b):
 
 
 def log_prob(mean, std, action):
-    """Up to a constant."""
+    """Returns the log probability up to a constant."""
     return -jnp.sum(0.5 * ((action - mean) / std) ** 2 + jnp.log(std), axis=-1)
 
 
 def make(env, envs, iterations, minibatches):
-    """(first, iterate, evaluate) of a learner in so many environments."""
+    """Returns the functions (first, iterate, evaluate) of a learner in `envs` environments."""
     network = ActorCritic(env.action_size)
     rate = optax.linear_schedule(RATE, 0.0, iterations * EPOCHS * minibatches)
     optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(rate))
@@ -75,7 +75,7 @@ def make(env, envs, iterations, minibatches):
         return params, optimizer.init(params), state
 
     def rollout(params, state, key):
-        """Acts. An episode that is over begins anew where its lane's key says, drawn once."""
+        """Acts for LENGTH steps; a finished episode restarts at its lane's one drawn start."""
         key_reset, key_act = jax.random.split(key)
         starts = reset(jax.random.split(key_reset, envs))
 
@@ -84,27 +84,27 @@ def make(env, envs, iterations, minibatches):
             action = mean + std * jax.random.normal(key, mean.shape)
             after = step(state, action)
             over = (after.done > 0) | (after.data.step >= EPISODE)
-            seen = {
+            transition = {
                 "obs": state.obs,
                 "action": action,
                 "value": value,
                 "log_prob": log_prob(mean, std, action),
                 "std": std,
-                "reward": (1 - GAMMA) * after.reward,  # so that values are of order one
+                "reward": (1 - GAMMA) * after.reward,  # keeps values of order one
                 "next": (1 - after.done) * network.apply(params, after.obs)[2],
                 "over": over,
             }
-            return where(over, starts, after), seen
+            return where(over, starts, after), transition
 
         return jax.lax.scan(body, state, jax.random.split(key_act, LENGTH))
 
-    def advantages(seen):
+    def advantages(transitions):
         def body(later, at):
             now = at["reward"] + GAMMA * at["next"] - at["value"]
             now = now + GAMMA * LAMBDA * (1 - at["over"]) * later
             return now, now
 
-        return jax.lax.scan(body, jnp.zeros(envs), seen, reverse=True)[1]
+        return jax.lax.scan(body, jnp.zeros(envs), transitions, reverse=True)[1]
 
     def loss(params, batch):
         mean, std, value = network.apply(params, batch["obs"])
@@ -116,27 +116,27 @@ def make(env, envs, iterations, minibatches):
     @partial(jax.jit, donate_argnums=(0, 1))
     def iterate(params, memory, state, key):
         key_act, key_shuffle = jax.random.split(key)
-        state, seen = rollout(params, state, key_act)
-        seen["gain"] = advantages(seen)
-        seen["target"] = seen["gain"] + seen["value"]
-        flat = jax.tree.map(lambda x: x.reshape(envs * LENGTH, *x.shape[2:]), seen)
+        state, batch = rollout(params, state, key_act)
+        batch["gain"] = advantages(batch)
+        batch["target"] = batch["gain"] + batch["value"]
+        flat = jax.tree.map(lambda x: x.reshape(envs * LENGTH, *x.shape[2:]), batch)
 
         def update(learned, rows):
             params, memory = learned
-            batch = jax.tree.map(lambda x: x[rows], flat)
-            change, memory = optimizer.update(jax.grad(loss)(params, batch), memory)
+            grads = jax.grad(loss)(params, jax.tree.map(lambda x: x[rows], flat))
+            change, memory = optimizer.update(grads, memory)
             return (optax.apply_updates(params, change), memory), None
 
         keys = jax.random.split(key_shuffle, EPOCHS)
         rows = jnp.stack([jax.random.permutation(key, envs * LENGTH) for key in keys])
         rows = rows.reshape(EPOCHS * minibatches, -1)
         (params, memory), _ = jax.lax.scan(update, (params, memory), rows)
-        said = {"reward": seen["reward"].mean() / (1 - GAMMA), "std": seen["std"].mean()}
-        return params, memory, state, said
+        metrics = {"reward": batch["reward"].mean() / (1 - GAMMA), "std": batch["std"].mean()}
+        return params, memory, state, metrics
 
     @jax.jit
     def evaluate(params, key):
-        """Share of strict successes with the mean action, and their mean time in s."""
+        """Returns the strict success rate of the mean action and the mean time in s."""
 
         def going(state):
             return jnp.any((state.done == 0) & (state.data.step < env.episode_length))
@@ -161,19 +161,19 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=160)
     parser.add_argument("--minibatches", type=int, default=8)
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    runtime.prepare_xla()  # before the first jax array: physics on a CPU wants it
+    args = parser.parse_args()
+    runtime.prepare_xla()  # before the first jax array, or physics on a CPU is slow
     from starjax.envs import playground
 
-    env = playground.make(given.task, trocar=given.trocar, action_space=given.action_space)
-    first, iterate, evaluate = make(env, given.envs, given.iterations, given.minibatches)
-    key, key_evaluate = jax.random.split(jax.random.key(given.seed))
+    env = playground.make(args.task, trocar=args.trocar, action_space=args.action_space)
+    first, iterate, evaluate = make(env, args.envs, args.iterations, args.minibatches)
+    key, key_evaluate = jax.random.split(jax.random.key(args.seed))
     params, memory, state = first(key)
-    began, every = time.perf_counter(), max(1, given.iterations // LOOKS)
-    for i in range(1, given.iterations + 1):
-        params, memory, state, said = iterate(params, memory, state, jax.random.fold_in(key, i))
-        if i % every == 0 or i == given.iterations:
-            line = {"steps": i * given.envs * LENGTH, **said}
+    began, every = time.perf_counter(), max(1, args.iterations // EVALUATIONS)
+    for i in range(1, args.iterations + 1):
+        params, memory, state, metrics = iterate(params, memory, state, jax.random.fold_in(key, i))
+        if i % every == 0 or i == args.iterations:
+            line = {"steps": i * args.envs * LENGTH, **metrics}
             line |= evaluate(params, jax.random.fold_in(key_evaluate, i))
             line["seconds"] = time.perf_counter() - began
             print(json.dumps({name: round(float(x), 4) for name, x in line.items()}), flush=True)

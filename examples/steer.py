@@ -1,4 +1,4 @@
-"""Steers a tool by hand increments; the shaft stays in the trocar whatever the hand does.
+"""Steers a tool by increments; the shaft stays in the trocar for any input.
 
 Copy this for a SpaceMouse or a keyboard: `read` stands for the device.
 """
@@ -17,7 +17,7 @@ SPACE = rcm.ACTION_SPACES["rcm4"]
 
 
 def read(t: int) -> np.ndarray:
-    """(roll, x, y, z) in [-1, 1], as a device gives them. Here: a circle that sinks."""
+    """Returns the deflection (roll, x, y, z) in [-1, 1] of a device; here a sinking circle."""
     return np.array([0.2, np.cos(0.1 * t), np.sin(0.1 * t), -0.3])
 
 
@@ -25,7 +25,7 @@ def read(t: int) -> np.ndarray:
 def steer(
     action: jax.Array, deflection: jax.Array, frame: rcm.TrocarFrame
 ) -> tuple[rcm.Pose, jax.Array]:
-    """The next pose of the tool, and the action that it is."""
+    """Returns the next pose of the tool and its action."""
     scale = PERIOD * jnp.array([SPIN, SPEED, SPEED, SPEED])
     pose, _ = SPACE.decode(action + scale * deflection, frame)
     return pose, SPACE.encode(pose, frame)

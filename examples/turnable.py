@@ -1,7 +1,7 @@
-"""Writes a page in which a scene moves and can be turned with the mouse, without a server.
+"""Writes a page with an animated scene that the mouse rotates, without a server.
 
-Needs the extra `viewer`. Here joints sway about their home: put coordinates that you recorded in
-their place, such as `qpos.npy` of an episode.
+Needs the extra `viewer`. Here joints sway about their home; replace them by recorded coordinates,
+such as `qpos.npy` of an episode.
 """
 
 import pathlib
