@@ -124,9 +124,10 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
 
     def steps(carry, dataset, count):
         drawn = jnp.arange(len(dataset.episode))
+        available = jnp.int32(len(drawn))
         if looped:
-            return step.resident_steps(setup, carry, dataset, drawn, count)
-        return step.resident_step(setup, carry, dataset, drawn)
+            return step.resident_steps(setup, carry, dataset, drawn, available, count)
+        return step.resident_step(setup, carry, dataset, drawn, available)
 
     first, dataset = devices.replicate((first, dataset), mesh)
     carry = jax.jit(layout.to_carry, out_shardings=layout.shardings())(first)

@@ -198,6 +198,7 @@ def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder
     from starjax.training import frozen
 
     dataset = demos.dataset
+    count = int(np.sum(dataset.length))
     with stage_times.timed(Path(config.out), "features"):
         parts = [
             frozen.features(
@@ -205,14 +206,15 @@ def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder
                 config.policy,
                 root,
                 demos.digest,
-                len(dataset.episode),
+                count,
                 camera,
                 functools.partial(_frames, root, camera),
                 messages.indented,
             )
             for camera in config.scene.camera
         ]
-    found = np.concatenate(parts, axis=-1)
+    rows = len(dataset.episode)
+    found = np.pad(np.concatenate(parts, axis=-1), ((0, rows - count), (0, 0)))
     features = jax.device_put(found) if windows.on_device(dataset) else found
     return dataset.replace(observation=dataset.observation._replace(features=features))
 

@@ -61,6 +61,8 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
       command: command line, for results.
     """
     session.start_jax(*session.RUN_MODULES)
+    from starjax.runtime import precompile as background
+
     config = scenes.resolved(config)
     _check(config.policy, config.train, stages)
     names = folders.selected(config)
@@ -69,7 +71,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     untrained = [name for name in trained if not folders.weights(out, name).exists()]
     encoder = demonstrations.frozen_encoder(config.policy) if trains and untrained else None
     files.require_writable(out, MIN_FREE_BYTES)
-    with session.Session(command, out).shared() as share:
+    with background.until_end(), session.Session(command, out).shared() as share:
         print(messages.plan(config, stages), flush=True)
         work = Run(config, encoder, share, command)
         root, collect, compile_collect = demonstrations.plan(config, work.env, share)

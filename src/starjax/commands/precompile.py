@@ -36,6 +36,7 @@ def begin(
     import jax
 
     from starjax.commands import policy_evaluation
+    from starjax.report import scene_view, video
     from starjax.runtime import precompile
     from starjax.training import precompile as training
 
@@ -51,4 +52,6 @@ def begin(
     if "evaluate" in stages:
         vision = encoder.params if encoder else None
         policy = precompile.start(lambda: policy_evaluation.precompile(name, config, env, vision))
+    if "report" in stages:
+        precompile.start(lambda: scene_view.precompile_camera(env.names, video.SIZE))
     return Precompiled(step, policy)

@@ -175,15 +175,18 @@ def _dataset(
     files_of: dict[str, str],
 ) -> windows.Dataset:
     length, start = _spans(records)
+    count = int(length.sum())
+    rows = windows.padded_count(count) if place == "device" else count
+    episode = np.repeat(np.arange(len(records), dtype=np.int32), length)
     fields, images = {}, {}
     for name, file in files_of.items():
         # Only images are large; everything else is read in any case.
         joined = EpisodeArray(_paths(root, records, file), start, length)
         if name.startswith(episodes.IMAGE):
             camera = name.removeprefix(episodes.IMAGE)
-            images[camera] = joined if place == "disk" else joined.read()
+            images[camera] = joined if place == "disk" else joined.read(rows)
         else:
-            fields[name] = schema.with_arms(description["schema"], name, joined.read())
+            fields[name] = schema.with_arms(description["schema"], name, joined.read(rows))
     told = rcm.trocar_frame(
         schema.trocars_of(records),
         np.array(description["p_world_ref"], np.float32),
@@ -201,7 +204,7 @@ def _dataset(
             pose=Pose(fields["command_R"], fields["command_p"]), gripper=fields["command_gripper"]
         ),
         trocar=jax.tree.map(np.asarray, told),
-        episode=np.repeat(np.arange(len(records), dtype=np.int32), length),
+        episode=np.pad(episode, (0, rows - count)),
         start=start,
         length=length,
     )
@@ -235,9 +238,9 @@ class EpisodeArray:
             out[i] = array[index[i] - self._start[episode[i]]]
         return out
 
-    def read(self) -> np.ndarray:
-        """All frames in memory."""
-        out = np.zeros(self.shape, self.dtype)
+    def read(self, rows: int = 0) -> np.ndarray:
+        """Returns all frames in memory, followed by zeros up to so many rows."""
+        out = np.zeros((max(rows, self.shape[0]), *self.shape[1:]), self.dtype)
         for path, first in zip(self._paths, self._start, strict=True):
             array = _map(path)
             out[first : first + len(array)] = array

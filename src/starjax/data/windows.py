@@ -15,12 +15,12 @@ import numpy as np
 from starjax import rcm
 from starjax.types import Command, Observation
 
-_CHUNK = 1 << 16
+_CHUNK = 1 << 13
 
 
 @flax.struct.dataclass
 class Dataset:
-    """D demonstrations, F frames in all, one after another.
+    """D demonstrations, F frames in all, one after another, and perhaps unused rows after them.
 
     The leaves are jax arrays, or on the host: numpy arrays, memory maps, or anything with `shape`,
     `dtype` and `[int array [N]] -> numpy array [N, ...]`.
@@ -90,9 +90,24 @@ def split_holdout(
     return np.concatenate(train), np.concatenate(held or [np.zeros(0, np.int32)])
 
 
-def sample_frames(key: jax.Array, frames: jax.Array, batch_size: int) -> jax.Array:
-    """Uniformly drawn training frames `[batch_size]`, with replacement: a function of the key."""
-    return frames[jax.random.randint(key, (batch_size,), 0, frames.shape[0])]
+def sample_frames(
+    key: jax.Array, frames: jax.Array, batch_size: int, count: jax.Array | None = None
+) -> jax.Array:
+    """Draws training frames `[batch_size]` uniformly, with replacement: a function of the key.
+
+    `count`, int32 `[]`, is the number of `frames` if the others fill up the array.
+    """
+    count = frames.shape[0] if count is None else count
+    return frames[jax.random.randint(key, (batch_size,), 0, count)]
+
+
+def padded_count(count: int) -> int:
+    """Returns `count` rounded up to one of eight sizes per power of two.
+
+    Programs are compiled for the size of a dataset. Datasets of two seeds differ by a hundredth.
+    """
+    step = 1 << max(count.bit_length() - 4, 0)
+    return -(-count // step) * step
 
 
 def window_frames(frame: Any, first: Any, last: Any, obs_horizon: int, horizon: int):
@@ -141,17 +156,23 @@ def gather(dataset: Dataset, frame: Any, obs_horizon: int, horizon: int) -> Batc
 
 
 def over_frames(dataset: Dataset, frames: np.ndarray, fn: Callable[..., np.ndarray]) -> np.ndarray:
-    """`fn(observation, command, trocar)` of every given frame, in chunks, as one numpy array.
+    """Computes `fn(observation, command, trocar)` of the given frames as one numpy array.
 
-    Images and their features are left out: what is computed over all frames is low-dimensional.
+    `fn` returns a row per frame, or rows that a repeated frame leaves as they are (extrema): chunks
+    have one size, so the last one is filled up with its last frame. Images and their features are
+    missing: a function of all frames is low-dimensional.
     """
-    low = (dataset.observation._replace(images=None, features=None), dataset.command)
+    observation = dataset.observation._replace(images=None, features=None)
+    low = (observation, dataset.command, dataset.trocar, dataset.episode)
+    if on_device(dataset):  # each index of a device's array would be a program of its own
+        low = jax.device_get(low)
+    *per_frame, trocars, episode = low
     parts = []
     for i in range(0, len(frames), _CHUNK):
-        frame = frames[i : i + _CHUNK]
-        observation, command = _take(low, frame)
-        trocar = _take(dataset.trocar, np.asarray(dataset.episode[frame]))
-        parts.append(np.asarray(fn(observation, command, trocar)))
+        frame = frames[np.minimum(np.arange(i, i + _CHUNK), len(frames) - 1)]
+        observation, command = _take(per_frame, frame)
+        part = np.asarray(fn(observation, command, _take(trocars, np.asarray(episode[frame]))))
+        parts.append(part[: len(frames) - i] if len(part) == len(frame) else part)
     return np.concatenate(parts)
 
 

@@ -4,6 +4,7 @@ MuJoCo itself computes poses from recorded joints, in microseconds; only the pic
 need a compiled program.
 """
 
+import functools
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -57,11 +58,30 @@ def load(names: SceneNames) -> SceneView:
 Draw = Callable[..., np.ndarray]
 
 
-def camera(names: SceneNames, size: int) -> Draw:
-    """Makes the compiled first camera of a scene, for square images of `size` pixels a side."""
+class Film(NamedTuple):
+    """The program that draws the first camera of a scene.
+
+    Attributes:
+      program: (poses, labels) -> uint8 `[BATCH, size, size, 3]`.
+      model: of the scene.
+      labels: names of the labels.
+      camera: `cameras.Camera`.
+      scope: the endoscope, or None if the camera does not belong to it.
+    """
+
+    program: Any
+    model: mujoco.MjModel
+    labels: tuple[str, ...]
+    camera: Any
+    scope: Any
+
+
+@functools.lru_cache(maxsize=4)
+def _film(names: SceneNames, size: int) -> Film:
     import jax
     import jax.numpy as jnp
 
+    from starjax.runtime import precompile
     from starjax.sim import cameras, endoscope_camera
 
     # Smooth outlines cost four times as much: seconds on a GPU, minutes on a CPU.
@@ -71,10 +91,34 @@ def camera(names: SceneNames, size: int) -> Draw:
     scope = endoscope_camera.of(task, names.cameras[:1])
     (shown,) = cameras.make(model, names.cameras[:1], size, scope=scope, samples=samples)
 
-    @jax.jit
     def batch(poses: Any, labels: dict[str, Any]) -> jax.Array:
-        rgb = scene.marked(task, bound, labels, jnp.asarray(geom_rgb))
-        return jax.lax.map(lambda step: shown.draw(*step[:2], rgb, *step[2:]).rgb, poses)
+        with jax.default_matmul_precision("highest"):  # float32 rays, as in the environment
+            rgb = scene.marked(task, bound, labels, jnp.asarray(geom_rgb))
+            return jax.lax.map(lambda step: shown.draw(*step[:2], rgb, *step[2:]).rgb, poses)
+
+    return Film(precompile.Program(batch), model, tuple(task.labels), shown, scope)
+
+
+def precompile_camera(names: SceneNames, size: int) -> None:
+    """Compiles, in the background, the program of `camera` with the same arguments."""
+    import jax
+
+    film = _film(names, size)
+
+    def rows(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct((BATCH, *shape), np.float32)
+
+    count = film.model.ngeom
+    moving = (Pose(rows(3, 3), rows(3)),) if film.camera.moves else ()
+    poses = rows(count, 3), rows(count, 3, 3), *moving
+    film.program.prepare(poses, dict.fromkeys(film.labels, np.int32(0)))
+
+
+def camera(names: SceneNames, size: int) -> Draw:
+    """Makes the compiled first camera of a scene, for square images of `size` pixels a side."""
+    import jax
+
+    program, model, _, shown, scope = _film(names, size)
 
     def poses(data: mujoco.MjData, held: Pose | None) -> tuple[Any, ...]:
         """Returns positions and rotations of geoms and, if it moves, the camera's pose."""
@@ -99,8 +143,7 @@ def camera(names: SceneNames, size: int) -> Draw:
             for row, data in zip(rows, _kinematics(model, qpos[rows], p_world_trocar))
         ]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves).astype(np.float32), *steps)
-        with jax.default_matmul_precision("highest"):  # float32 rays, as in the environment
-            return np.asarray(batch(stacked, {name: np.int32(x) for name, x in labels.items()}))
+        return np.asarray(program(stacked, {name: np.int32(x) for name, x in labels.items()}))
 
     return draw
 

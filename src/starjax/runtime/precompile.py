@@ -6,20 +6,25 @@ process, and the cache of compiled programs does not have them. So all jobs of `
 one thread, in their order; only compilers, which hold no lock of Python, work side by side.
 """
 
+import contextlib
 import threading
-from collections.abc import Callable, Hashable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Hashable, Iterator
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
-from starjax.runtime import background, garbage
+from starjax.runtime import garbage, xla
 
 T = TypeVar("T")
 
 _thread = threading.local()
 _tracer = ThreadPoolExecutor(1, thread_name_prefix="starjax-tracer")
+# First in, first out: the earliest programs are needed first. On two cores one compiler leaves the
+# other core to the simulation.
+_compilers = ThreadPoolExecutor(max(1, xla.cores() // 2), thread_name_prefix="starjax-compiler")
+_queued: list[Future] = []
 
 
 class Program:
@@ -27,7 +32,7 @@ class Program:
 
     def __init__(self, function: Callable[..., Any], **options: Any):
         self._function = jax.jit(function, **options)
-        self._executables: dict[Hashable, Callable[[], Any]] = {}
+        self._executables: dict[Hashable, Future] = {}
 
     def prepare(self, *args: Any) -> Any:
         """Traces the program here and compiles it in a thread.
@@ -40,7 +45,7 @@ class Program:
         """
         with garbage.gc_paused():
             lowered = self._function.lower(*args)
-        executable = background.run_in_background(_marked(lowered.compile))
+        executable = _submit(_compilers, _marked(lowered.compile))
         self._executables[_signature(args)] = executable
         getattr(_thread, "started", []).append(executable)
         return lowered.out_info
@@ -52,7 +57,7 @@ class Program:
     def select(self, *args: Any) -> Callable[..., Any]:
         """Returns the executable for arguments of these shapes, else the jitted function."""
         executable = self._executables.get(_signature(args)) if self._executables else None
-        return executable() if executable else self._function
+        return executable.result() if executable else self._function
 
     def __call__(self, *args: Any) -> Any:
         return self.select(*args)(*args)
@@ -66,18 +71,18 @@ def start(job: Callable[[], T]) -> Callable[[], T | None]:
       failed, because the same error is raised where the program is called.
     """
 
-    def run() -> tuple[T, list[Callable[[], Any]]]:
+    def run() -> tuple[T, list[Future]]:
         _thread.is_job, _thread.started = True, []
         return job(), _thread.started
 
-    queued = _tracer.submit(run)
+    queued = _submit(_tracer, run)
 
     def wait() -> T | None:
         try:
             result, started = queued.result()
             for executable in started:
-                executable()
-        except Exception:
+                executable.result()
+        except (Exception, CancelledError):
             return None
         return result
 
@@ -89,9 +94,25 @@ def settle() -> None:
     _tracer.submit(lambda: None).result()
 
 
+@contextlib.contextmanager
+def until_end() -> Iterator[None]:
+    """Drops, at the end of the block, what is queued and not begun: it would hold up the exit."""
+    try:
+        yield
+    finally:
+        while _queued:
+            _queued.pop().cancel()
+
+
 def is_job() -> bool:
     """Returns whether this thread works for a job of `start`, and thus for no stage of a run."""
     return getattr(_thread, "is_job", False)
+
+
+def _submit(pool: ThreadPoolExecutor, work: Callable[[], Any]) -> Future:
+    _queued[:] = [future for future in _queued if not future.done()]
+    _queued.append(pool.submit(work))
+    return _queued[-1]
 
 
 def _marked(work: Callable[[], T]) -> Callable[[], T]:

@@ -1,5 +1,6 @@
 """Action error on demonstrations kept out of training: open loop, against what was commanded."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -30,12 +31,11 @@ def make(
         return None
     count = min(_WINDOWS, len(frames))
     chosen = frames[(np.arange(count) * len(frames)) // count]
-    if not windows.on_device(dataset):
-        batch = windows.gather(dataset, chosen, policy_config.obs_horizon, policy_config.horizon)
-    else:
-        batch = windows.gather(
-            dataset, jnp.asarray(chosen), policy_config.obs_horizon, policy_config.horizon
-        )
+    gather = functools.partial(
+        windows.gather, obs_horizon=policy_config.obs_horizon, horizon=policy_config.horizon
+    )
+    gather = jax.jit(gather) if windows.on_device(dataset) else gather
+    batch = gather(dataset, chosen)
     # the same noise each time, so that the curve shows the network and not the draw
     keys = jax.random.split(jax.random.key(0), count)
 

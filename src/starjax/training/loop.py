@@ -1,5 +1,6 @@
 """Training from a dataset to a finished state: resume, log, checkpoint, stop."""
 
+import functools
 import pathlib
 import time
 from collections.abc import Callable, Sequence
@@ -101,9 +102,6 @@ def run(
     optimizer = states.make_optimizer(train_config)
     streams = states.streams(seed)
 
-    def first_state(params: policies.Params) -> states.TrainState:
-        return states.create(policy, optimizer, params, stats, streams.steps)
-
     # A new training's parameters are drawn, and its steps compiled, while the rest is done here; a
     # restored one may be finished, and then needs neither.
     is_new = not checkpoint.steps(directory / "checkpoints")
@@ -121,7 +119,10 @@ def run(
 
     state = _restored(directory / "checkpoints", shapes)
     if state is None:
-        state = states.run_once(first_state, _first_params(drawn(), policy_config))
+        params = _first_params(drawn(), policy_config)
+        # Arguments, not constants: the program is the same for every seed.
+        make = functools.partial(states.create, policy, optimizer)
+        state = states.run_once(make, params, stats, streams.steps)
         state = devices.replicate(state, mesh)
     else:
         _check_same(directory, state, streams.steps, stats, train_config.steps)

@@ -35,7 +35,12 @@ class Setup(NamedTuple):
 
 
 def resident_steps(
-    setup: Setup, carry: StepCarry, dataset: windows.Dataset, frames: jax.Array, count: jax.Array
+    setup: Setup,
+    carry: StepCarry,
+    dataset: windows.Dataset,
+    frames: jax.Array,
+    available: jax.Array,
+    count: jax.Array,
 ) -> StepCarry:
     """Takes `count` steps on a dataset that is on the device, in one program for any count.
 
@@ -43,31 +48,41 @@ def resident_steps(
       setup: of the training.
       carry: from `StateLayout.to_carry` or the step before; donated by the caller.
       dataset: leaves are jax arrays, on every device of the mesh.
-      frames: `[n]` int32 frames to draw from.
+      frames: int32 frames to draw from.
+      available: int32 `[]`, number of these; the others fill up the array.
       count: int32 `[]`, traced, so that logging and checkpoints may stop anywhere without another
         compilation.
     """
     return jax.lax.fori_loop(
-        0, count, lambda _, carry: resident_step(setup, carry, dataset, frames), carry
+        0, count, lambda _, carry: resident_step(setup, carry, dataset, frames, available), carry
     )
 
 
 @arrays.broadcasting
 def resident_step(
-    setup: Setup, carry: StepCarry, dataset: windows.Dataset, frames: jax.Array
+    setup: Setup,
+    carry: StepCarry,
+    dataset: windows.Dataset,
+    frames: jax.Array,
+    available: jax.Array,
 ) -> StepCarry:
     """Draws a batch and takes one step; see `resident_steps`."""
-    batch = drawn_batch(setup, carry.state.key, carry.state.step, dataset, frames)
+    batch = drawn_batch(setup, carry.state.key, carry.state.step, dataset, frames, available)
     return train_step(setup, carry, batch)
 
 
 def drawn_batch(
-    setup: Setup, key: jax.Array, step: jax.Array, dataset: windows.Dataset, frames: jax.Array
+    setup: Setup,
+    key: jax.Array,
+    step: jax.Array,
+    dataset: windows.Dataset,
+    frames: jax.Array,
+    available: jax.Array,
 ) -> windows.Batch:
     """The batch of a step, split over the devices; `key` and `step` are the state's."""
     policy_config, train_config = setup.policy_config, setup.train_config
     key = states.step_keys(key, step).batch
-    frame = windows.sample_frames(key, frames, train_config.batch_size)
+    frame = windows.sample_frames(key, frames, train_config.batch_size, available)
     frame = jax.lax.with_sharding_constraint(frame, devices.batch_sharding(setup.layout.mesh))
     return windows.gather(dataset, frame, policy_config.obs_horizon, policy_config.horizon)
 

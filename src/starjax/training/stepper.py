@@ -49,7 +49,9 @@ def resident(
       program: from `batch_program` of an equal setup, perhaps prepared.
     """
     layout = setup.layout
-    data = devices.replicate((dataset, jnp.asarray(frames)), layout.mesh, may_alias=None)
+    rows = windows.padded_count(len(frames))
+    available = np.pad(frames, (0, rows - len(frames))), np.int32(len(frames))
+    data = devices.replicate((dataset, *available), layout.mesh, may_alias=None)
     if steps.runs_in_a_loop(setup.policy_config):
         return _looped(setup, data, ahead)
     # The batch is drawn by a program of its own, so that the large one is the same for any number
@@ -87,7 +89,7 @@ def streamed(
     return _stepper(setup.layout, run)
 
 
-def _looped(setup: Setup, data: tuple[windows.Dataset, jax.Array], ahead: bool) -> Stepper:
+def _looped(setup: Setup, data: tuple[Any, ...], ahead: bool) -> Stepper:
     """Many steps in one program, of whose arguments the dataset is one."""
     layout = setup.layout
     program = _program(functools.partial(steps.resident_steps, setup), layout)
