@@ -75,7 +75,9 @@ def program(policy, optimizer):
     def run(state, dataset, frames, count):
         it = layout(state)
         setup = Setup(policy, optimizer, fakes.TINY, SETTINGS, it)
-        return it.to_state(step.resident_steps(setup, it.to_carry(state), dataset, frames, count))
+        return it.to_state(
+            step.resident_steps(setup, it.to_carry(state), dataset, frames, len(frames), count)
+        )
 
     return run
 
@@ -124,10 +126,12 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
 
     @jax.jit
     def unrounded(carry):
-        after = step.resident_step(setup, carry._replace(rounded=nothing), dataset, frames)
+        after = step.resident_step(
+            setup, carry._replace(rounded=nothing), dataset, frames, len(frames)
+        )
         return after._replace(rounded=nothing)
 
-    many = jax.jit(lambda c, n: step.resident_steps(setup, c, dataset, frames, n))
+    many = jax.jit(lambda c, n: step.resident_steps(setup, c, dataset, frames, len(frames), n))
     called = it.to_carry(first)
     for _ in range(3):
         called = unrounded(called)
@@ -232,7 +236,9 @@ def test_a_step_is_traced_in_every_strict_mode(observation, mode):
         it = layout(first)
         setup = Setup(policy, optimizer, settings, SETTINGS, it)
         frames, count = jnp.arange(40, dtype=jnp.int32), jnp.int32(3)
-        return it.to_state(step.resident_steps(setup, it.to_carry(first), data, frames, count))
+        return it.to_state(
+            step.resident_steps(setup, it.to_carry(first), data, frames, len(frames), count)
+        )
 
     wanted = jax.eval_shape(run)
     with STRICT[mode]():

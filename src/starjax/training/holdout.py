@@ -1,6 +1,5 @@
 """Action error on demonstrations kept out of training: open loop, against what was commanded."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -31,11 +30,11 @@ def make(
         return None
     count = min(_WINDOWS, len(frames))
     chosen = frames[(np.arange(count) * len(frames)) // count]
-    gather = functools.partial(
-        windows.gather, obs_horizon=policy_config.obs_horizon, horizon=policy_config.horizon
-    )
-    gather = jax.jit(gather) if windows.on_device(dataset) else gather
-    batch = gather(dataset, chosen)
+
+    def gather(data: windows.Dataset, frame: Any) -> windows.Batch:
+        return windows.gather(data, frame, policy_config.obs_horizon, policy_config.horizon)
+
+    batch = (jax.jit(gather) if windows.on_device(dataset) else gather)(dataset, chosen)
     # the same noise each time, so that the curve shows the network and not the draw
     keys = jax.random.split(jax.random.key(0), count)
 
