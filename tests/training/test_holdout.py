@@ -4,6 +4,7 @@ import types
 from typing import Any
 
 import fakes
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -53,6 +54,6 @@ def test_windows_are_spread_over_all_that_is_kept_out(monkeypatch):
         holdout.windows, "gather", lambda d, f, *a: asked.append(np.asarray(f)) or gather(d, f, *a)
     )
     nothing: Any = None
-    dataset = fakes.dataset(seed=0, demos=8, length=20)
+    dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=8, length=20))
     holdout.make(Policy(*[nothing] * 4), fakes.TINY, dataset, np.arange(32, 160))
     np.testing.assert_array_equal(asked, [np.arange(32, 160, 2)])

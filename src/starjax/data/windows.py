@@ -91,14 +91,15 @@ def split_holdout(
 
 
 def sample_frames(
-    key: jax.Array, frames: jax.Array, batch_size: int, count: jax.Array | None = None
+    key: jax.Array, frames: jax.Array, batch_size: int, count: int | jax.Array = 0
 ) -> jax.Array:
     """Draws training frames `[batch_size]` uniformly, with replacement: a function of the key.
 
-    `count`, int32 `[]`, is the number of `frames` if the others fill up the array.
+    `count`, int32 `[]`, is the number of `frames` if others fill up the array; 0: all of them.
     """
-    count = frames.shape[0] if count is None else count
-    return frames[jax.random.randint(key, (batch_size,), 0, count)]
+    if isinstance(count, int):
+        count = count or len(frames)
+    return frames[jax.random.randint(key, (batch_size,), 0, jnp.asarray(count))]
 
 
 def padded_count(count: int) -> int:
