@@ -1,6 +1,6 @@
-"""Settings of a run as frozen dataclasses. Standard library only: `--help` must not import jax.
+"""Settings of a run as frozen dataclasses. Imports no jax, as `--help` reads them.
 
-A field's comment is its help, its type has its range (`limits`).
+A field's comment is its help text; its type has its range (`limits`).
 """
 
 import dataclasses
@@ -9,7 +9,9 @@ import typing
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
-from starjax import json_types, schema_1
+import msgspec
+
+from starjax import schema_1
 from starjax.learners import LEARNERS
 from starjax.limits import INLINE, Count, CountOrZero, NotNegative, Positive, Range
 
@@ -260,11 +262,11 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
             fields[name] = value
         elif dataclasses.is_dataclass(hints[name]):
             fields[name] = from_dict(hints[name], value)
-        elif json_types.fits(value, hints[name]):
-            fields[name] = tuple(value) if isinstance(value, list) else value
         else:
-            expected = json_types.kind(hints[name])
-            raise ValueError(f"{settings.__name__}.{name}: expected {expected}, got {value!r}")
+            try:
+                fields[name] = msgspec.convert(value, hints[name])
+            except msgspec.ValidationError as error:
+                raise ValueError(f"{settings.__name__}.{name}: {error}") from error
     return settings(**fields)
 
 

@@ -6,12 +6,12 @@ from starjax import errors
 
 # Extra -> what Python imports of it. Without any extra there are jax, numpy and `starjax.rcm`.
 PACKAGES: dict[str, tuple[str, ...]] = {
-    "sim": ("filelock", "flax", "mujoco", "rich", "tyro"),
+    "sim": ("filelock", "flax", "msgspec", "mujoco", "rich", "tyro"),
     "train": ("optax", "orbax", "safetensors", "scipy"),
     "report": ("PIL", "imageio_ffmpeg", "jinja2", "matplotlib", "scipy"),
     "formats": ("PIL", "av", "h5py", "pyarrow", "zarr"),
     "gym": ("gymnasium",),
-    "serve": ("filelock", "flax", "msgpack", "safetensors", "websockets"),
+    "serve": ("filelock", "flax", "msgpack", "msgspec", "safetensors", "websockets"),
     "viewer": ("viser",),
 }
 

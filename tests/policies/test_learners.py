@@ -98,7 +98,7 @@ def test_it_is_trained_stored_and_deployed(tmp_path):
 
 
 def settings(*argv):
-    return run_settings._settings([*argv, "--out", "x"], "starjax run", "", has_gpu=False)
+    return run_settings.parse("run", [*argv, "--out", "x"], "")
 
 
 def test_its_options_are_flags_and_stand_in_the_settings_of_a_run():
@@ -152,7 +152,7 @@ import sys
 from starjax import config, learners
 from starjax.commands import run_settings
 config.PolicyConfig()
-run_settings._settings(["--preset", "cpu", "--out", "x"], "starjax run", "", has_gpu=False)
+run_settings.parse("run", ["--preset", "cpu", "--out", "x"], "")
 assert not {"jax", "numpy", "mujoco"} & sys.modules.keys()
 """
     subprocess.run([sys.executable, "-c", program], check=True)
