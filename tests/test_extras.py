@@ -56,6 +56,16 @@ def test_a_command_without_its_extra_names_it(monkeypatch, command, capsys):
     assert cli.guard(cli.dispatch, [command]) == 2 and capsys.readouterr().err.count("\n") == 1
 
 
+def test_an_evaluation_without_video_needs_no_report(monkeypatch):
+    for name in (*extras.PACKAGES["report"], *extras.PACKAGES["video"]):
+        if name != "scipy":  # jax's and the training's
+            monkeypatch.setitem(sys.modules, name, None)
+    for flag, argument in (("--no-video", "--policy"), ("--video", "evaluate --video")):
+        with pytest.raises(errors.UsageError) as raised:
+            cli.dispatch(["evaluate", "--policy", "no-such-policy", flag])
+        assert raised.value.argument == argument
+
+
 def test_an_installation_without_extras_lists_the_commands():
     done = bare("from starjax import cli; cli.dispatch(['--help'])")
     assert done.returncode == 0 and "evaluate" in done.stdout

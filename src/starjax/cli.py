@@ -31,7 +31,7 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "evaluate": (
         "starjax.commands.evaluate",
         "score a trained policy on its task's trocars",
-        _ALL,
+        _LEARNING,
     ),
     "sweep": (
         "starjax.commands.sweep",

@@ -8,7 +8,8 @@ from starjax import errors
 PACKAGES: dict[str, tuple[str, ...]] = {
     "sim": ("filelock", "flax", "msgspec", "mujoco", "rich", "tyro"),
     "train": ("optax", "orbax", "safetensors", "scipy"),
-    "report": ("PIL", "imageio_ffmpeg", "jinja2", "matplotlib", "scipy"),
+    "report": ("PIL", "jinja2", "matplotlib", "scipy"),
+    "video": ("imageio_ffmpeg",),
     "formats": ("PIL", "av", "h5py", "pyarrow", "zarr"),
     "gym": ("gymnasium",),
     "serve": ("filelock", "flax", "msgpack", "msgspec", "safetensors", "websockets"),

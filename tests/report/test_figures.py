@@ -1,4 +1,4 @@
-"""What figures draw, read back from their artists."""
+"""Content of figures, read back from their artists."""
 
 import mujoco
 import numpy as np
@@ -22,7 +22,7 @@ BOARD = np.array([[-0.05, -0.04, 0], [0.05, -0.04, 0], [0.05, 0.04, 0], [-0.05, 
 
 
 def bare(_names):
-    """A scene where no joints were recorded: an outline, no shafts."""
+    """A scene without recorded joints: an outline, no shafts."""
     return scene_view.SceneView(
         Outline((BOARD,), (BOARD[:2],)), lambda *_: pytest.fail("no joints")
     )

@@ -1,4 +1,4 @@
-"""Rollouts in 3D: what is in the file, and that the page holds it whole."""
+"""Rollouts in 3D: content of the file, and its frame in the page."""
 
 import base64
 import html
@@ -53,7 +53,7 @@ def test_the_page_holds_it_in_a_frame_that_reaches_nothing_else(one, solid):
     text = page.render([one], one, {}, None, solid)
     frame = re.search(r'<iframe [^>]*sandbox="allow-scripts"[^>]* srcdoc="([^"]*)"', text)
     assert frame and html.unescape(frame[1]) == solid.html
-    assert "<script" not in text  # but for the frame's
+    assert "<script" not in text  # except the frame's
     assert "<iframe" not in page.render([one], one, {}, None)
 
 

@@ -1,4 +1,4 @@
-"""What is read of a run, what of it counts, and what is said of damage."""
+"""Files of a run: reading, matching, damage."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""What breaks a policy, as a table, around a circle, and on the page of its run."""
+"""Disturbances as a table, around a circle, and on the page of their run."""
 
 import json
 

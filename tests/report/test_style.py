@@ -1,4 +1,4 @@
-"""Figures are the same bytes whatever matplotlib the user has set up."""
+"""Figures are the same bytes under any of the user's matplotlib settings."""
 
 import os
 import subprocess

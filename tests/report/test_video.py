@@ -1,4 +1,4 @@
-"""The video: which rollouts, what is said over them, and the file."""
+"""The video: choice of rollouts, captions, and the file."""
 
 import functools
 import pathlib

@@ -1,4 +1,4 @@
-"""Real time, told by a clock that the test turns."""
+"""Real time, by a clock that the test moves."""
 
 from starjax.viewer.page import Clock
 

@@ -1,4 +1,4 @@
-"""The loops of view, dataset and teleoperation, with a page that nobody has open."""
+"""The loops of view, dataset and teleoperation, without a browser."""
 
 import functools
 
@@ -35,7 +35,7 @@ def after(count, then=None):
 
 
 def press(page, label):
-    """What a hotkey does."""
+    """Triggers a hotkey."""
     handles = page.gui._command_handle_from_uuid.values()
     (call,) = next(h for h in handles if h.label == label)._impl.trigger_cb
     call(None)
@@ -114,11 +114,11 @@ def test_what_was_discarded_is_nowhere(page, steered, hurried, tmp_path):
     with recorder.record_into(root, steered.env, SEED) as kept:
         teleop.run(page, steered, kept, after(40, presses), device=directed(steered, 0), seed=SEED)
         assert kept.kept == 0
-    assert len(list(root.glob("episodes/*"))) <= 1  # what the hand did after it
+    assert len(list(root.glob("episodes/*"))) <= 1  # motion after it
 
 
 def test_the_hands_of_the_page(page, steered, hurried, tmp_path):
-    """Keys and handle move the tip by what they say; without the clutch by nothing."""
+    """Keys and handle move the tip by their increments, and without the clutch not at all."""
     from starjax.viewer.teleop_target import KEY_STEP, Pilot
 
     pilot = Pilot(page, 1, np.eye(3), None)

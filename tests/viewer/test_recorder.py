@@ -1,4 +1,4 @@
-"""What a person demonstrates is a dataset like any other, whole after each episode."""
+"""Demonstrations by an operator are an ordinary dataset, complete after each episode."""
 
 import numpy as np
 import pytest

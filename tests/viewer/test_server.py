@@ -1,4 +1,4 @@
-"""The page's server and what one drags on it; nobody is connected."""
+"""The page's server and its handles, without a client."""
 
 import socket
 

@@ -1,4 +1,4 @@
-"""The live loop: an evaluation's episodes while nobody disturbs it, and trocars that move."""
+"""The live loop: an evaluation's episodes while undisturbed, and trocars that move."""
 
 import types
 
@@ -16,7 +16,7 @@ from starjax.viewer.frame import outcome
 
 
 def stubbed():
-    """The point masses, with what the page shows of a scene."""
+    """The point masses, with the scene fields that the page shows."""
     env = stubs.make_env(unlucky=0.0)
     nothing = types.SimpleNamespace(bound=None, geom_rgb=np.zeros((1, 3)))
     task = env.task._replace(colours=lambda bound, layout, rgb: rgb)

@@ -1,4 +1,4 @@
-"""What the page draws is where the model has it, and as large."""
+"""The page draws geoms at their positions and sizes."""
 
 import mujoco
 import numpy as np
@@ -66,7 +66,7 @@ def _sides(part):
 
 
 class Scene:
-    """Stands for viser's: keeps what is sent."""
+    """A stand-in for viser's scene that keeps its messages."""
 
     def __init__(self):
         self.sent = {}

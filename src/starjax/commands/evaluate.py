@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import errors, methods
+from starjax import errors, extras, methods
 from starjax.commands import messages, options, policy_args, scenes, session, stage_times
 from starjax.commands.folders import is_under_way
 from starjax.limits import INLINE
@@ -77,6 +77,8 @@ def _parse(argv: Sequence[str], has_gpu: bool) -> tuple[EvaluateArgs, policy_arg
     small = config_lib.EvalConfig(trials=4, time_limit_s=30.0)
     default = EvaluateArgs() if has_gpu else EvaluateArgs(eval=small)
     args = options.parse("evaluate", EvaluateArgs, argv, DESCRIPTION, default)
+    if args.video:
+        extras.require("evaluate --video", "report", "video")
     path = policy_args.resolve(args.source)
     trials = f"seed{args.seed}-{args.eval.trials}x{args.eval.time_limit_s:g}s"
     parts = [trials, *["ensemble"] * args.eval.ensemble]

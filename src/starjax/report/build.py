@@ -1,4 +1,4 @@
-"""Builds the report of one or many runs: tables, figures, rollouts filmed and in 3D, the page."""
+"""The report of one run or many: tables, figures, a video, rollouts in 3D, the page."""
 
 import functools
 import pathlib
@@ -32,10 +32,10 @@ def build(
 ) -> pathlib.Path:
     """Writes the report of the run directories `runs` into `out`; returns its index.html.
 
-    Each directory holds what `results.load` reads; whatever a run did not produce is left out of
-    the report. Without a recorded rollout, or with `with_video` off, there is no video. An earlier
-    report in `out` stays as it is until all of this one has been drawn; then what the page does
-    not show goes, its video too.
+    Each directory holds the files that `results.load` reads; the report omits those that a run did
+    not produce. There is no video without a recorded rollout or with `with_video` off. An earlier
+    report in `out` stays until this one is complete; then its files that this page does not show
+    are deleted, its video too.
 
     Raises:
       ValueError: no runs, of several tasks, or a directory without a result.
@@ -58,14 +58,14 @@ def build(
         for name, data in made.items():
             files.write_bytes(out / name, data)
         for name in _NAMES.difference(made, [film.name] if film else []):
-            (out / name).unlink(missing_ok=True)  # of an earlier report
+            (out / name).unlink(missing_ok=True)  # an earlier report's
     return out / "index.html"
 
 
 _FIGURES = ("training", "ports", "fig3", "fig4", "stress")
 _FILM = "rollout.mp4"
 _PLAYBACK = "rollout.html"
-# Of files that a report may have or not.
+# Files that not every report has.
 _NAMES = {_FILM, _PLAYBACK, *(f"{name}.{kind}" for name in _FIGURES for kind in ("png", "pdf"))}
 
 
@@ -74,7 +74,7 @@ def _order(run: results.Run) -> int:
 
 
 def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:
-    """Labels with what sets runs apart: their numbers of trocars, seeds or, at last, folders."""
+    """Makes labels unique by numbers of trocars, seeds or, failing these, folders."""
     return [run._replace(label=_name(run, runs)) for run in runs]
 
 
@@ -99,7 +99,7 @@ def _all_apart(seeds: Sequence[int | None]) -> bool:
 
 
 def _place(run: results.Run, others: Sequence[results.Run]) -> str:
-    """The end of a run's path, as long as it takes to set it apart."""
+    """Returns the shortest end of a run's path that distinguishes it."""
     parts = [other.path.absolute().parts for other in others]
     for count in range(2, max(map(len, parts))):
         if len({path[-count:] for path in parts}) == len(parts):
@@ -110,10 +110,10 @@ def _place(run: results.Run, others: Sequence[results.Run]) -> str:
 def _film(
     runs: Sequence[results.Run], path: pathlib.Path, report: Callable[[str], None]
 ) -> pathlib.Path | None:
-    """The video, or None after a line that says why there is none: the page is worth more."""
+    """Writes the video; if that fails, reports the reason, because the page matters more."""
     try:
         film = video.record(runs, path, report)
-    except (OSError, RuntimeError) as error:  # the encoder is a program of its own
+    except (OSError, RuntimeError) as error:  # the encoder is a program outside Python
         report(f"no video: {error}")
         return None
     if film is None:
@@ -124,7 +124,7 @@ def _film(
 def _playback(
     runs: Sequence[results.Run], report: Callable[[str], None]
 ) -> playback_3d.Playback | None:
-    """Rollouts in 3D, or None, after a line where that has a reason."""
+    """Records rollouts in 3D; if that fails, reports the reason."""
     try:
         return playback_3d.record(runs)
     except (OSError, RuntimeError, errors.UsageError) as error:  # no trocar, or an unknown scene
@@ -133,14 +133,14 @@ def _playback(
 
 
 def _focus(runs: Sequence[results.Run]) -> results.Run:
-    """The run whose numbers head the page: the paper's own method if it is there."""
+    """Selects the run whose numbers head the page: the paper's own method if present."""
     return next((run for run in runs if run.result.method == compare.OURS), runs[-1])
 
 
 def _figures(
     runs: Sequence[results.Run], focus: results.Run
 ) -> tuple[dict[str, tuple[bytes, bytes]], dict[str, bytes]]:
-    """Each figure on light and on dark paper, and the light one's files by name."""
+    """Draws each figure on light and on dark paper; returns the pairs and the light files."""
     drawings: dict[str, Callable[[bool], Any]] = {
         "training": lambda dark: figures.training(runs, dark),
     }

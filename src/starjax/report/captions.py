@@ -1,4 +1,4 @@
-"""Sentences about the numbers, in plain words."""
+"""Sentences about the numbers, for the page and tables.md."""
 
 from collections.abc import Sequence
 
@@ -6,20 +6,20 @@ from starjax.report import compare, formats, outcomes, results, stats
 
 
 def title(runs: Sequence[results.Run]) -> str:
-    """Heading of the page."""
+    """Returns the page's heading."""
     about = runs[0].label if len(runs) == 1 else several(runs)
     return f"{about} on {compare.task_text(runs).title}"
 
 
 def several(runs: Sequence[results.Run]) -> str:
-    """E.g. `3 methods`, `4 runs of 2 methods`."""
+    """Counts methods and runs, e.g. `3 methods`, `4 runs of 2 methods`."""
     count = len({run.result.method for run in runs})
     methods = f"{count} method{'s' if count > 1 else ''}"
     return methods if count == len(runs) else f"{len(runs)} runs of {methods}"
 
 
 def verdict(runs: Sequence[results.Run], focus: results.Run) -> str:
-    """One or two sentences that a reader in a hurry may stop after."""
+    """Summarises the result in one or two sentences."""
     seen, unseen = outcomes.rates(focus.trials)
     if seen is None and unseen is None:
         return f"{focus.label} was trained but not evaluated."
@@ -51,7 +51,7 @@ def _gap(seen: stats.Rate, unseen: stats.Rate) -> str:
 
 
 def _rank(runs: Sequence[results.Run], focus: results.Run) -> str:
-    """How the others do on unseen trocars, where methods are meant to differ."""
+    """Names the best other run at unseen trocars, which distinguish the methods."""
     scores = []
     for run in runs:
         unseen = outcomes.rates(run.trials)[1]
@@ -64,19 +64,19 @@ def _rank(runs: Sequence[results.Run], focus: results.Run) -> str:
 
 
 def notes(runs: Sequence[results.Run]) -> list[str]:
-    """Warnings of the runs, each once, with the names of those that it is about if not of all, and
-    what sets their trainings apart."""
-    said: dict[str, list[str]] = {}
+    """Lists the runs' warnings, each once with the labels it concerns, and differences in training
+    and evaluation."""
+    labels_of: dict[str, list[str]] = {}
     for run in runs:
         for text in run.result.about.get("warnings") or []:
-            said.setdefault(text, []).append(run.label)
-    found = [
+            labels_of.setdefault(text, []).append(run.label)
+    lines = [
         text if len(labels) == len(runs) else f"{', '.join(labels)}: {text}"
-        for text, labels in said.items()
+        for text, labels in labels_of.items()
     ]
-    found += [
-        f"{run.label}: {' and '.join(run.others)} beside its result.json "
-        f"{'is' if len(run.others) == 1 else 'are'} of other weights, and left out; "
+    lines += [
+        f"{run.label}: {' and '.join(run.others)} next to its result.json "
+        f"{'is' if len(run.others) == 1 else 'are'} of other weights and ignored; "
         "starjax run scores the present ones."
         for run in runs
         if run.others
@@ -84,19 +84,19 @@ def notes(runs: Sequence[results.Run]) -> list[str]:
     within = [run for run in runs if run.rcm_error_mm.get("within_steps")]
     if within and len(within) < len(runs):
         names = ", ".join(run.label for run in runs if run not in within)
-        found.append(f"{names}: safe successes were read at the ends of control steps only.")
+        lines.append(f"{names}: safe successes were read at the ends of control steps only.")
     if names := compare.differing(runs):
-        found.append(f"These runs were not trained alike: they differ in {', '.join(names)}.")
+        lines.append(f"These runs were not trained alike: they differ in {', '.join(names)}.")
     limits = sorted({run.limit_s for run in runs if run.trials})
     if len(limits) > 1:
         allowed = ", ".join(f"{limit:g}" for limit in limits)
-        found.append(f"Trials were given {allowed} s; runs with different limits are not paired.")
+        lines.append(f"Trials were given {allowed} s; runs with different limits are not paired.")
     if len({tuple(sorted(results.jax_settings(run).items())) for run in runs if run.trials}) > 1:
-        found.append("These runs had other settings of jax; such runs are not paired.")
-    found += [
+        lines.append("These runs had other settings of jax; such runs are not paired.")
+    lines += [
         f"{run.label}: the sweep's trials were given {results.sweep_limit_s(run):g} s, those "
         f"through the twelve trocars {run.limit_s:g} s; Fig. 4 shows the sweep's alone."
         for run in runs
         if run.sweep and results.sweep_limit_s(run) != run.limit_s
     ]
-    return found
+    return lines

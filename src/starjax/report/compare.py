@@ -1,4 +1,4 @@
-"""Common ground of runs: the task, the trials that they met, how they were trained."""
+"""Comparisons of runs: shared task, shared trials, differences in training."""
 
 import collections
 from collections.abc import Iterable, Sequence
@@ -10,15 +10,15 @@ from starjax.report.results import Run
 from starjax.sim import registries
 from starjax.sim.tasks.base import Task, TaskText
 
-OURS = "stardiff"  # the method that the others are compared with
-_NEAR = 1e-5  # of m and rad: machines draw the same trocar with other last bits
+OURS = "stardiff"  # reference of the comparisons
+_NEAR = 1e-5  # m and rad: last bits of a drawn trocar vary between machines
 
 
 def task(runs: Sequence[Run]) -> Task:
-    """The task of all runs.
+    """Returns the task of all runs.
 
     Raises:
-      errors.UsageError: they are of several, or its package is not installed.
+      errors.UsageError: they have several tasks, or the task's package is not installed.
     """
     names = sorted({run.result.scene.task for run in runs})
     if len(names) != 1:
@@ -32,30 +32,32 @@ def task_text(runs: Sequence[Run]) -> TaskText:
 
 
 def observed(runs: Sequence[Run]) -> str:
-    """Observation of the policies, `state` or `image`, for every output's title."""
+    """Returns the observation of the policies, `state` or `image`, for titles."""
     return " and ".join(sorted({run.result.observation for run in runs}))
 
 
 def identity(trial: Trial) -> tuple[int, int, int]:
-    """Pairs the trials that two runs both met: the same trocar, number and seed."""
+    """Returns the key that pairs trials of two runs: trocar, number and seed."""
     return trial.trocar, trial.trial, trial.seed
 
 
 def most_shared(trials: Iterable[Trial]) -> tuple[int, int, int]:
-    """The trial that most runs met, of these an unseen one, of these the first."""
+    """Selects the trial that most runs share, preferring unseen trocars, then the first."""
     trials = list(trials)
     counts = collections.Counter(map(identity, trials))
     return identity(min(trials, key=lambda t: (-counts[identity(t)], t.seen, identity(t))))
 
 
 def differing(runs: Sequence[Run]) -> list[str]:
-    """Settings that decide the weights, but for the seed, that the runs do not agree on."""
+    """Lists the training settings, except the seed, that differ between the runs."""
     return config.differing_settings([run.result.config for run in runs if run.result.config])
 
 
 def pair(a: Run, b: Run) -> stats.Paired | None:
-    """McNemar's test over the trials that both methods ran with the same trocar, seed and limit,
-    under the same settings of jax."""
+    """Applies McNemar's test to the trials that two runs share.
+
+    Shared trials have the same trocar, seed, time limit and settings of jax; None without any.
+    """
     if a.limit_s != b.limit_s or results.jax_settings(a) != results.jax_settings(b):
         return None
     ours, theirs = ({identity(t): t for t in run.trials} for run in (a, b))
@@ -67,8 +69,11 @@ def pair(a: Run, b: Run) -> stats.Paired | None:
 
 
 def representatives(runs: Sequence[Run]) -> list[Run]:
-    """One run of each group, in the runs' order: STAR-Diff itself, else the most successful of
-    those that met the trials of the first STAR-Diff, if any did."""
+    """Selects one run of each group, in the runs' order.
+
+    STAR-Diff represents its group; elsewhere the most successful run does, preferring runs with
+    the trials of the first STAR-Diff.
+    """
     seed = next((run.result.seed for run in runs if run.result.method == OURS), None)
 
     def standing(run: Run) -> tuple[bool, bool, float]:
@@ -83,7 +88,7 @@ def representatives(runs: Sequence[Run]) -> list[Run]:
 
 
 def _same_place(one: Trial, other: Trial) -> bool:
-    """Whether two trials of one identity met the same trocars: sweeps number their own."""
+    """Returns True if two trials of one identity have the same trocars: sweeps number their own."""
     places = [(*trial.radius, *trial.polar, *trial.azimuth) for trial in (one, other)]
     return len({len(place) for place in places}) == 1 and all(
         abs(a - b) <= _NEAR for a, b in zip(*places, strict=True)

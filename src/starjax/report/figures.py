@@ -9,14 +9,14 @@ from starjax.evaluation.result import Trial
 from starjax.report import captions, compare, outcomes, results, stats, style
 
 _BIN = 0.005  # m of distance pooled in one point
-_SMOOTH = 0.008  # m, width of the kernel behind the heat map
-_FAR = 2.0  # kernel widths from the nearest trocar: farther off the map shows nothing
+_SMOOTH = 0.008  # m, kernel width of the heat map
+_FAR = 2.0  # kernel widths from the nearest trocar beyond which the map is blank
 _DISC = 0.05  # m, radius of Eq. 19's disc
-_FEWEST = 2  # panels of a page's width, or a single one would be as large as the page
+_MIN_PANELS = 2  # panels across the page: a single one would fill it
 
 
 def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False) -> Any:
-    """Fig. 4: success against distance to the nearest training trocar; beside it `focus`'s map."""
+    """Draws Fig. 4: success against distance to the nearest training trocar, and `focus`'s map."""
     with style.use(dark) as shades:
         figure = style.figure(7.4, 3.4)
         left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
@@ -38,7 +38,7 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
 
 
 def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
-    """Training loss and held-out action error against steps, or None if nothing was logged.
+    """Draws training loss and held-out action error against steps; None if nothing was logged.
 
     Methods that share their weights share a curve.
     """
@@ -53,9 +53,9 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
     with style.use(dark):
         from matplotlib import ticker
 
-        figure = style.figure(2.6 * max(len(panels), _FEWEST), 2.4)
+        figure = style.figure(2.6 * max(len(panels), _MIN_PANELS), 2.4)
         strokes = style.strokes([run.result.method for run in runs])
-        shape = (1, max(len(panels), _FEWEST))
+        shape = (1, max(len(panels), _MIN_PANELS))
         (grid,) = figure.subplots(*shape, squeeze=False, sharex=True)
         for unused in grid[len(panels) :]:
             unused.set_visible(False)
@@ -93,7 +93,7 @@ CURVES = {
 
 
 def _pooled(run: results.Run) -> list[tuple[float, stats.Rate]]:
-    """(mean distance in mm, score) of the trials whose distance falls in one bin."""
+    """Pools trials by distance; returns (mean distance in mm, rate) per bin."""
     swept = run.sweep.trials if run.sweep else ()
     alike = not run.sweep or results.sweep_limit_s(run) == run.limit_s
     trials = [*(run.trials if alike else ()), *swept]
@@ -104,7 +104,7 @@ def _pooled(run: results.Run) -> list[tuple[float, stats.Rate]]:
 
 
 def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
-    """One method: pooled rates in their band, the trials behind each, single trocars as dots."""
+    """Draws one method: pooled rates with their band and counts, single trocars as dots."""
     points, color = _pooled(run), style.SUCCESS
     x, scores = [at for at, _ in points], [score for _, score in points]
     if not run.sweep:
@@ -121,7 +121,7 @@ def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
 
 
 def _whiskers(axis: Any, run: results.Run, offset: float, stroke: str) -> None:
-    """One of several methods: a line with whiskers, `offset` mm aside to hide no other."""
+    """Draws one of several methods: a line with whiskers, shifted by `offset` mm."""
     points = _pooled(run)
     x, scores = [at + offset for at, _ in points], [score for _, score in points]
     style.rates(axis, x, scores, run.result.method, run.label, stroke)
@@ -162,12 +162,12 @@ def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> N
 
 
 def _from_above(trials: Sequence[Trial]) -> np.ndarray:
-    """Trocars `[N * A, 2]` in mm, those of every arm about its nominal one."""
+    """Returns trocars `[N * A, 2]` in mm, relative to the nominal trocar of their arm."""
     return 1e3 * outcomes.positions(trials)[..., :2].reshape(-1, 2)
 
 
 def _heat(axis: Any, at: np.ndarray, rates: np.ndarray, weights: np.ndarray) -> Any:
-    """Kernel mean of `rates [N]` at `at [N, 2]` mm, weighed by trials, where the disc has any."""
+    """Draws the kernel mean of `rates [N]` at `at [N, 2]` mm, weighted by trials."""
     line = 1e3 * np.linspace(-_DISC, _DISC, 161)
     x, y = np.meshgrid(line, line)
     near = ((x[..., None] - at[:, 0]) ** 2 + (y[..., None] - at[:, 1]) ** 2) / (1e3 * _SMOOTH) ** 2

@@ -1,4 +1,4 @@
-"""How to read the tables."""
+"""Notes under the tables."""
 
 from collections.abc import Sequence
 
@@ -35,22 +35,24 @@ INFERENCE = (
 )
 
 
-def tests(words: TaskText) -> dict[str, str]:
-    """Tests of success, in the task's words."""
+def tests(text: TaskText) -> dict[str, str]:
+    """Returns the definitions of the success tests for a task."""
     return {
-        "strict": words.strict,
-        "loose": words.loose,
+        "strict": text.strict,
+        "loose": text.loose,
         "safe": "strict, and the executed RCM error never passed 2 mm",
     }
 
 
-def by_test(words: TaskText) -> str:
-    """All tests in one line."""
-    return ". ".join(f"{name.capitalize()}: {what}" for name, what in tests(words).items()) + "."
+def by_test(text: TaskText) -> str:
+    """Joins the definitions in one line."""
+    return (
+        ". ".join(f"{name.capitalize()}: {meaning}" for name, meaning in tests(text).items()) + "."
+    )
 
 
 def inference(runs: Sequence[results.Run]) -> str:
-    """How to read Table IV, and where `starjax bench` ran if not on the machine of the run."""
+    """Returns the note of Table IV, with the machine of `starjax bench` if it is another one."""
     note = INFERENCE
     for run in runs:
         timed, scored = (

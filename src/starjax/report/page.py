@@ -29,7 +29,7 @@ CAPTIONS = {
     ),
     "ports": (
         "Success and the number of training trocars",
-        "Trials at the trocars that none of these runs was trained at, with 95% Wilson intervals.",
+        "Trials at trocars unseen by all of these runs, with 95% Wilson intervals.",
     ),
     "stress": (
         "Success under disturbances",

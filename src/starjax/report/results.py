@@ -1,4 +1,4 @@
-"""Reads finished runs for the report: results, rollouts, loss curves, sweep."""
+"""Finished runs as the report reads them: results, trajectories, loss curves, sweeps."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -17,12 +17,12 @@ class TrialTrajectory(NamedTuple):
     """One recorded trial of T control steps.
 
     Attributes:
-      trial: its entry of result.json.
-      p_world_tip: `[T, A, 3]` measured tip positions in m, one a control step.
+      trial: entry of result.json.
+      p_world_tip: `[T, A, 3]` measured tip positions in m.
       p_world_trocar: `[A, 3]` m.
-      qpos: `[T, Q]` generalised coordinates, or None where only the tips were kept.
-      labels: the task's, that tell how the goal is marked.
-      endoscope: pose_world_camera `[T]`, or None where the scene was not seen through one.
+      qpos: `[T, Q]` generalised coordinates, or None if only the tips were recorded.
+      labels: the task's labels, which mark the goal.
+      endoscope: pose_world_camera `[T]`, or None without an endoscope.
     """
 
     trial: Trial
@@ -37,17 +37,17 @@ class Run(NamedTuple):
     """One method's run directory.
 
     Attributes:
-      path: the run directory, or the file of a result alone.
+      path: the run directory, or the file of a single result.
       result: result.json.
       label: name of the method in tables.
       group: its group in Table III.
       rollouts: recorded trials, empty if none were.
-      log: the metrics.jsonl of the training of its weights, None if there is none.
-      curves: its lines.
-      sweep: trials through other trocars, None if no sweep was made of these weights.
-      stress: stress.json, empty if there is none of these weights.
-      bench: bench.json, empty if there is none of these weights.
-      others: names of what lies beside result.json and is of other weights.
+      log: metrics.jsonl of its training, or None.
+      curves: lines of the log.
+      sweep: trials through other trocars with these weights, or None.
+      stress: stress.json of these weights, or empty.
+      bench: bench.json of these weights, or empty.
+      others: names of files next to result.json that belong to other weights.
     """
 
     path: Path
@@ -69,17 +69,17 @@ class Run(NamedTuple):
 
     @property
     def limit_s(self) -> float:
-        """How long a trial may take, simulated."""
+        """Time limit of a trial in simulated s."""
         return self.result.time_limit_s
 
     @property
     def rcm_error_mm(self) -> dict[str, Any]:
-        """Kind (commanded, executed, within_steps) -> figures; empty where they were not kept."""
+        """Kind (commanded, executed, within_steps) -> figures; empty if not recorded."""
         return self.result.figures.get("rcm_error_mm") or {}
 
 
 def load(path: Path) -> Run:
-    """Reads the run directory `path`, or a result alone; what a stage did not leave is empty.
+    """Reads the run directory `path`, or a single result; missing files leave empty fields.
 
     Raises:
       ValueError: there is no result, a file is damaged, or the method is unknown.
@@ -111,12 +111,12 @@ def load(path: Path) -> Run:
 
 
 def with_trials(run: Run, trials: Iterable[Trial]) -> Run:
-    """The run as if these were its trials."""
+    """Replaces the trials of a run."""
     return run._replace(result=run.result._replace(trials=tuple(trials)))
 
 
 def swept(runs: Iterable[Run]) -> list[Run]:
-    """The runs that have a sweep, its trials instead of those through the twelve trocars."""
+    """Returns the runs that have a sweep, with the sweep's trials as theirs."""
     return [
         run._replace(
             result=run.result._replace(
@@ -129,43 +129,43 @@ def swept(runs: Iterable[Run]) -> list[Run]:
 
 
 def jax_settings(run: Run) -> dict[str, str]:
-    """Settings of jax that were not the usual ones (`runtime.jax_settings`) in a run's trials."""
+    """Returns the settings of jax that differed from the defaults in a run's trials."""
     return run.result.about.get("jax_settings") or {}
 
 
 def sweep_limit_s(run: Run) -> float:
-    """How long a trial of the sweep may take: that of the others where it does not say it."""
+    """Returns the time limit of the sweep's trials, by default that of the run's."""
     return (run.sweep.time_limit_s if run.sweep else 0.0) or run.limit_s
 
 
 def trained_seed(run: Run) -> int | None:
-    """Seed of the training, None if unknown."""
+    """Returns the seed of the training, None if unknown."""
     return run.result.config.get("seed")
 
 
 def training_trocars(run: Run) -> list[Trial]:
-    """One trial of each configuration of trocars that the demonstrations used."""
+    """Returns one trial of each trocar configuration in the demonstrations."""
     return [group[0] for group in outcomes.by_trocar(run.trials) if group[0].seen]
 
 
 def latencies(run: Run) -> list[tuple[int, dict[str, float]]]:
-    """(DDIM steps, {p50, p95, p99} in ms) of one policy call, fewest steps first."""
+    """Returns (DDIM steps, {p50, p95, p99} in ms) of one policy call, fewest steps first."""
     about = run.result.about
     rows = (run.bench or about).get("inference_ms_by_ddim_steps") or {}
-    found = {int(n): ms for n, ms in rows.items()}
+    by_steps = {int(n): ms for n, ms in rows.items()}
     steps = run.result.config.get("policy", {}).get("ddim_steps")
     if steps and about.get("inference_ms"):
-        found.setdefault(int(steps), about["inference_ms"])
-    return sorted(found.items())
+        by_steps.setdefault(int(steps), about["inference_ms"])
+    return sorted(by_steps.items())
 
 
-def _are_others(found: str | None, weights: str | None) -> bool:
-    """Whether something beside a result is of other weights; once neither file said it."""
-    return None not in (found, weights) and found != weights
+def _are_others(digest: str | None, weights: str | None) -> bool:
+    """Returns True if a file belongs to other weights; old files lack the digest."""
+    return None not in (digest, weights) and digest != weights
 
 
 def _rollouts(path: Path, trials: Sequence[Trial]) -> list[TrialTrajectory]:
-    """Recorded trials that are among `trials`."""
+    """Reads the recorded trajectories of `trials`."""
     file = path / "evaluation" / "recorded.npz"
     if not file.is_file():
         return []
@@ -184,11 +184,14 @@ def _rollouts(path: Path, trials: Sequence[Trial]) -> list[TrialTrajectory]:
 
 
 def _is_recorded(trial: Trial, track: recorded.Trajectory) -> bool:
-    """Whether a whole trajectory is that of a trial: after a kill it may be of another evaluation,
-    whose seed or weights gave it another length or, if it ran out of time too, other errors."""
+    """Returns True if a trajectory is complete and belongs to a trial.
+
+    After a kill it may belong to another evaluation, whose seed or weights changed its length or,
+    if both ran out of time, its errors.
+    """
     length = len(track.p_world_tip)
     if length < 2 or length != trial.steps or not np.isfinite(track.p_world_tip).all():
         return False
     if track.rcm_error is None or trial.rcm_max_mm is None:
-        return True  # written before they were: not known
+        return True  # old files lack them
     return bool(np.isclose(1e3 * track.rcm_error.max(), trial.rcm_max_mm, rtol=1e-5, atol=0))

@@ -62,11 +62,11 @@ class Film(NamedTuple):
     """The program that draws the first camera of a scene.
 
     Attributes:
-      program: (poses, labels) -> uint8 `[BATCH, size, size, 3]`.
-      model: of the scene.
-      labels: names of the labels.
-      camera: `cameras.Camera`.
-      scope: the endoscope, or None if the camera does not belong to it.
+      program: (poses, labels) -> `[BATCH, size, size, 3]` uint8.
+      model: the scene's C model.
+      labels: names of the task's labels.
+      camera: the `cameras.SceneCamera`.
+      scope: the endoscope, or None if the camera is another one.
     """
 
     program: Any
@@ -115,7 +115,7 @@ def precompile_camera(names: SceneNames, size: int) -> None:
 
 
 def camera(names: SceneNames, size: int) -> Draw:
-    """Makes the compiled first camera of a scene, for square images of `size` pixels a side."""
+    """Makes the compiled first camera of a scene, for square images of `size` pixels."""
     import jax
 
     program, model, _, shown, scope = _film(names, size)

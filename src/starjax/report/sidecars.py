@@ -1,4 +1,4 @@
-"""Reads what lies beside a result.json: sweep, stress, bench, and the log of the training."""
+"""Files next to a result.json: sweep, stress, bench, and the log of the training."""
 
 import json
 from pathlib import Path
@@ -29,13 +29,13 @@ Lines = list[dict[str, Any]]
 
 
 def sweep(folder: Path) -> result.Result | None:
-    """The last sweep of a run, or None."""
+    """Reads the last sweep of a run, or None."""
     file = folder / "sweep.json"
     return result.read_sweep(file) if file.is_file() else None
 
 
 def bench(folder: Path) -> dict[str, Any]:
-    """bench.json of a run, empty if there is none.
+    """Reads bench.json of a run, empty if missing.
 
     Raises:
       ValueError: it is damaged; the message names it.
@@ -49,7 +49,7 @@ def bench(folder: Path) -> dict[str, Any]:
 
 
 def stress(folder: Path, weights: str | None) -> dict[str, Any]:
-    """The newest stress.json of a run that is of these weights, empty if there is none.
+    """Reads the newest stress.json of a run with these weights, empty if missing.
 
     Raises:
       ValueError: it is damaged; the message names it.
@@ -64,10 +64,10 @@ def stress(folder: Path, weights: str | None) -> dict[str, Any]:
 
 
 def curves(folder: Path, scored: result.Result) -> tuple[Path | None, Lines]:
-    """The log of the training of a result's weights, and its lines.
+    """Returns the training log of a result's weights, and its lines.
 
-    Another method's folder has it where the two share weights. No lines: it is of a training with
-    other settings.
+    Methods that share weights share the log, in the folder of one of them. There are no lines if
+    the log belongs to a training with other settings.
     """
     places = [folder]
     if folder.name == scored.method:
@@ -80,17 +80,17 @@ def curves(folder: Path, scored: result.Result) -> tuple[Path | None, Lines]:
 
 
 def _is_of(folder: Path, scored: result.Result) -> bool:
-    """Whether a folder's training had the settings of a result, if it says so."""
+    """Returns True if a folder's training had the settings of a result, or if unknown."""
     try:
         trained = files.read_json(folder / "config.json")
         same_seed = trained["seed"] == scored.config.get("seed", trained["seed"])
         return same_seed and not config.differing_settings([trained, scored.config])
     except (FileNotFoundError, AttributeError, KeyError, TypeError, ValueError):
-        return True  # none, damaged, or of another version: not known
+        return True  # missing, damaged or of another version: unknown
 
 
 def _lines(file: Path) -> Lines:
-    """Whole lines of a log: a kill may have cut its last one short."""
+    """Reads the complete lines of a log: a kill may have truncated the last one."""
     lines = file.read_bytes().splitlines(keepends=True) if file.is_file() else []
     try:
         found = [json.loads(line) for line in lines if line.endswith(b"\n")]

@@ -1,4 +1,4 @@
-"""Success counts with their intervals; the statistics themselves are `evaluation.metrics`'s."""
+"""Success rates with intervals and paired tests, on top of `evaluation.statistics`."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,7 +19,14 @@ class Rate(NamedTuple):
 
 
 class Paired(NamedTuple):
-    """Two methods on the same trials: how often only one of them succeeded, and McNemar's p."""
+    """Two methods on the same trials.
+
+    Attributes:
+      pairs: number of shared trials.
+      only_a: successes of the first alone.
+      only_b: successes of the second alone.
+      p: McNemar's exact p value.
+    """
 
     pairs: int
     only_a: int
@@ -28,25 +35,25 @@ class Paired(NamedTuple):
 
 
 def rate(successes: int, trials: int) -> Rate:
-    """A rate with its interval."""
+    """Makes a rate with its interval."""
     return Rate(successes, trials, successes / trials, *statistics.wilson(successes, trials))
 
 
 def gap(seen: Rate, unseen: Rate) -> tuple[float, float, float]:
-    """Generalization gap (Eq. 20) with its 95% interval: (gap, low, high)."""
+    """Returns the generalization gap (Eq. 20) with its 95% interval: (gap, low, high)."""
     outcomes = [np.arange(score.trials) < score.successes for score in (seen, unseen)]
     middle, (low, high) = statistics.generalization_gap(*outcomes)
     return middle, low, high
 
 
 def mcnemar(a: Sequence[bool], b: Sequence[bool]) -> Paired:
-    """McNemar's exact test of outcomes on the same trials."""
-    found = statistics.mcnemar(np.array(a, bool), np.array(b, bool))
-    return Paired(len(a), found["only_a"], found["only_b"], found["p_value"])
+    """Applies McNemar's exact test to outcomes on the same trials."""
+    test = statistics.mcnemar(np.array(a, bool), np.array(b, bool))
+    return Paired(len(a), test["only_a"], test["only_b"], test["p_value"])
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Holm's step-down correction: p values that may be read together at one level."""
+    """Adjusts p values for multiple comparisons by Holm's step-down correction."""
     adjusted, worst = [0.0] * len(p_values), 0.0
     for rank, i in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
         worst = max(worst, min(1.0, (len(p_values) - rank) * p_values[i]))

@@ -1,4 +1,4 @@
-"""Draws a stress.json: a table, and success and RCM error around a circle."""
+"""Table and figure of a stress.json: success and RCM error under each disturbance."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,19 +9,19 @@ from starjax.evaluation.disturbances import current_name
 from starjax.report import formats, stats, style
 
 NOTE = (
-    "Each row is one disturbance alone, at the trials of the undisturbed policy. Success with its "
+    "Each row is one disturbance alone, on the trials of the undisturbed policy. Success with its "
     "95% Wilson interval; executed RCM error at the true trocar; force of a spring of 1 N/mm with "
-    "a damper at the port."
+    "a damper at the trocar."
 )
-_LEAST_MM = 1e-2  # in the middle of the circle of RCM errors
-# From no disturbance to the strongest.
+_MIN_MM = 1e-2  # RCM error at the centre of its circle
+# Undisturbed to strongest.
 _SHADES = ("#2083C5", "#009E73", "#E69F00", "#D55E00", "#7A1F5C")
 
-Found = Mapping[str, Any]  # the content of a stress.json
+Content = Mapping[str, Any]  # of a stress.json
 
 
-def table(found: Found) -> formats.Table:
-    """A row for each level of each disturbance."""
+def table(content: Content) -> formats.Table:
+    """Makes a row per level of each disturbance."""
     header = [
         "Disturbance",
         "Level",
@@ -31,7 +31,7 @@ def table(found: Found) -> formats.Table:
         "Wall p99 (N)",
     ]
     rows = [header]
-    for name, kind in _kinds(found).items():
+    for name, kind in _kinds(content).items():
         for level, score in kind["levels"].items():
             error, wall = score["rcm_error_mm"]["executed"], score.get("wall_force_N") or {}
             values = (error["mean"], error["p99"], wall.get("p99"))
@@ -40,14 +40,15 @@ def table(found: Found) -> formats.Table:
     return rows
 
 
-def markdown(found: Found) -> str:
-    """The table with a heading."""
-    return f"# What breaks {found['method']}\n\n{formats.render(table(found), 2)}\n\n{NOTE}\n"
+def markdown(content: Content) -> str:
+    """Renders the table with a heading."""
+    title = f"Success of {content['method']} under disturbances"
+    return f"# {title}\n\n{formats.render(table(content), 2)}\n\n{NOTE}\n"
 
 
-def draw(found: Found, dark: bool = False) -> Any:
-    """Success, and RCM error, of every disturbance from its lowest to its highest level."""
-    kinds = _kinds(found)
+def draw(content: Content, dark: bool = False) -> Any:
+    """Draws success and RCM error of every disturbance from its lowest to its highest level."""
+    kinds = _kinds(content)
     angles = np.linspace(0.0, 2.0 * np.pi, len(kinds), endpoint=False)
     names = [f"{name}\n{_span(kind)}" for name, kind in kinds.items()]
     count = max(len(kind["levels"]) for kind in kinds.values())
@@ -80,38 +81,38 @@ def draw(found: Found, dark: bool = False) -> Any:
             axis.tick_params(axis="x", pad=3)
             axis.tick_params(axis="y", labelsize=6)
             axis.set_rlabel_position(np.rad2deg(angles[1]) / 2 if len(kinds) > 1 else 90)
-        style.legend(figure, *success.get_legend_handles_labels(), most=count)
+        style.legend(figure, *success.get_legend_handles_labels(), max_columns=count)
     return figure
 
 
-def files(found: Found) -> dict[str, bytes]:
-    """The table and the figure by their files' names."""
-    figure = draw(found)
+def files(content: Content) -> dict[str, bytes]:
+    """Makes the files of table and figure, by name."""
+    figure = draw(content)
     return {
-        "stress.md": markdown(found).encode(),
+        "stress.md": markdown(content).encode(),
         "stress.png": style.save(figure, "png"),
         "stress.pdf": style.save(figure, "pdf"),
     }
 
 
-def _kinds(found: Found) -> dict[str, Any]:
+def _kinds(content: Content) -> dict[str, Any]:
     """Returns the disturbances by today's names."""
-    return {current_name(name): kind for name, kind in found["disturbances"].items()}
+    return {current_name(name): kind for name, kind in content["disturbances"].items()}
 
 
-def _rate(score: Found) -> str:
+def _rate(score: Content) -> str:
     strict = score["strict"]
     return formats.rate(stats.rate(strict["successes"], strict["trials"]))
 
 
-def _span(kind: Found) -> str:
+def _span(kind: Content) -> str:
     levels = [level for level in kind["levels"] if float(level)]
     ends = dict.fromkeys([levels[0], levels[-1]]) if levels else {}
     return f"{' to '.join(ends)} {kind['unit']}".strip()
 
 
 def _at(levels: Mapping[str, Any], rank: int) -> Any:
-    """The score of the level of this rank, or of the highest one."""
+    """Returns the score of the level of this rank, or of the highest level."""
     return list(levels.values())[min(rank, len(levels) - 1)]
 
 
@@ -121,9 +122,9 @@ def _label(rank: int, count: int, is_undisturbed: bool) -> str:
     return "highest level" if rank == count - 1 else f"level {rank if is_undisturbed else rank + 1}"
 
 
-def _logarithm(score: Found) -> float:
+def _logarithm(score: Content) -> float:
     error = score["rcm_error_mm"]["executed"]["p99"]
-    return float(np.clip(np.log10(max(error or 0.0, _LEAST_MM) / _LEAST_MM), 0.0, 3.0))
+    return float(np.clip(np.log10(max(error or 0.0, _MIN_MM) / _MIN_MM), 0.0, 3.0))
 
 
 def _around(axis: Any, angles: np.ndarray, values: list[float], line: dict[str, Any]) -> None:

@@ -17,15 +17,15 @@ from starjax import methods
 from starjax.report import stats
 
 SUCCESS, FAILURE = "#2083C5", "#D55E00"
-# In the order of the methods' table, so that a method keeps its colour in every figure.
+# In the order of the methods' table: a method keeps its colour in every figure.
 _METHODS = (
     *("#D55E00", "#E69F00", "#CC79A7", "#8C6D4F", "#7F7F7F", "#56B4E9", "#009E73", "#2083C5"),
     "#7A5FB5",
 )
 _MARKERS = "sD^v<>PoX"
 _STROKES = ("-", "--", ":", "-.")
-_LINE, _HANDLE = 110, 8  # characters in a line of a legend, and what a handle takes of them
-MAP = "cividis"  # perceptually even, the same to every kind of colour vision
+_LINE, _HANDLE = 110, 8  # characters in a line of a legend, and width of a handle
+MAP = "cividis"  # perceptually uniform, colour-blind safe
 
 _LIGHT = {"ink": "#1d2329", "muted": "#6b7480", "line": "#d9dee3", "paper": "#ffffff"}
 _DARK = {"ink": "#e6e9ec", "muted": "#98a2ad", "line": "#39424c", "paper": "#171b20"}
@@ -56,7 +56,7 @@ def library() -> ModuleType:
         return importlib.import_module("matplotlib")
     except ValueError:  # an unknown MPLBACKEND, a matplotlibrc that is not text
         for name in [name for name in sys.modules if name.startswith("matplotlib.")]:
-            del sys.modules[name]  # what the attempt left behind is not whole
+            del sys.modules[name]  # partly imported modules
         kept = dict(os.environ)
         os.environ |= {"MPLBACKEND": "agg", "MATPLOTLIBRC": os.devnull}
         try:
@@ -88,20 +88,20 @@ def use(dark: bool = False) -> Iterator[dict[str, str]]:
 
 
 def figure(width: float, height: float) -> Any:
-    """An empty figure of so many inches; to be called within `use`."""
+    """Makes an empty figure of a size in inches; called within `use`."""
     from matplotlib.figure import Figure
 
     return Figure((width, height), layout="constrained")
 
 
 def method(name: str) -> tuple[str, str]:
-    """Colour and marker of a method."""
+    """Returns colour and marker of a method."""
     index = list(methods.METHODS).index(name) % len(_METHODS)
     return _METHODS[index], _MARKERS[index]
 
 
 def strokes(names: Sequence[str]) -> list[str]:
-    """A line style for each of several runs of these methods, which share a method's colour."""
+    """Returns line styles that distinguish runs of one method, which share its colour."""
     return [_STROKES[names[:i].count(name) % len(_STROKES)] for i, name in enumerate(names)]
 
 
@@ -113,7 +113,7 @@ def rates(
     label: str,
     stroke: str = "-",
 ):
-    """A method's rates at `x`: a line in its colour, with whiskers from low to high."""
+    """Draws a method's rates at `x`: a line in its colour, with whiskers from low to high."""
     color, marker = method(name)
     middle = [score.rate for score in scores]
     ends = [[s.rate - s.low for s in scores], [s.high - s.rate for s in scores]]
@@ -127,22 +127,22 @@ def legend(
     handles: Sequence[Any],
     labels: Sequence[str],
     side: str = "center",
-    most: int = 4,
+    max_columns: int = 4,
     **settings: Any,
 ) -> None:
-    """A legend below the figure, of as many columns as its longest label leaves room for."""
-    columns = max(1, min(most, _LINE // (_HANDLE + max(map(len, labels), default=0))))
+    """Adds a legend below the figure, with as many columns as its longest label permits."""
+    columns = max(1, min(max_columns, _LINE // (_HANDLE + max(map(len, labels), default=0))))
     place = {"loc": f"outside lower {side}", "fontsize": 7, "ncols": columns}
     figure.legend(handles, labels, **place, **settings)
 
 
 def save(figure: Any, kind: str, dark: bool = False) -> bytes:
-    """The figure as the bytes of a png or a pdf file, the same bytes for the same figure.
+    """Saves a figure as bytes of a png or pdf file, reproducible to the byte.
 
     Args:
       figure: drawn under `use(dark)`.
       kind: `png` or `pdf`.
-      dark: ticks are made when a figure is saved, in the colours of then.
+      dark: style of the ticks, which are made when a figure is saved.
     """
     with use(dark):
         from matplotlib.backends import backend_agg, backend_pdf

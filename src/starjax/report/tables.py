@@ -1,4 +1,4 @@
-"""The paper's tables: success (III), paired tests, RCM error, inference time (IV)."""
+"""Tables of the paper: success (III), paired tests, RCM error, inference time (IV)."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -13,11 +13,11 @@ TESTS = {"strict": outcomes.strict, "loose": outcomes.loose, "safe": outcomes.sa
 SWEPT = "Success through other trocars (%)"
 SWEPT_PAIRED = "Paired comparison with STAR-Diff through these trocars"
 _QUANTILES = ("p50", "p95", "p99")
-_COMPILE = ": compile"  # ends the name of a phase's share spent compiling
+_COMPILE = ": compile"  # suffix of a phase's compile time
 
 
 def markdown(runs: Sequence[results.Run]) -> str:
-    """tables.md: every table that the runs have numbers for, each with a line on how to read it."""
+    """Renders tables.md: every table with numbers, each with a note."""
     text = compare.task_text(runs)
     parts = [
         (f"Table III. Task success on {text.title} (%)", success(runs), notes.SUCCESS),
@@ -36,7 +36,7 @@ def markdown(runs: Sequence[results.Run]) -> str:
 
 
 def success(runs: Sequence[results.Run]) -> Table:
-    """Table III."""
+    """Makes Table III."""
     table = [["Group", "Method", "Seen ↑", "Unseen ↑", "Gap ↓"]]
     scores = [(run, outcomes.rates(run.trials)) for run in runs if run.trials]
     best = [max((s.rate for _, pair in scores if (s := pair[i])), default=0.0) for i in (0, 1)]
@@ -51,7 +51,7 @@ def success(runs: Sequence[results.Run]) -> Table:
 
 
 def by_test(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = formats.rate) -> Table:
-    """Strict, loose and safe success, seen and unseen."""
+    """Makes the table of strict, loose and safe success, seen and unseen."""
     header = [f"{name.capitalize()}, {part}" for name in TESTS for part in ("seen", "unseen")]
     table = [["Method", *header]]
     for run in runs:
@@ -62,7 +62,7 @@ def by_test(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = for
 
 
 def swept(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = formats.rate) -> Table:
-    """Success of the sweeps' trials: all, safe, and strict by distance to training's trocars."""
+    """Makes the table of sweeps: strict, safe, and strict by distance to the training trocars."""
     runs = results.swept(runs)
     bins = sorted({_bin(trial) for run in runs for trial in run.trials})
     width = 1e3 * sweep.BIN_WIDTH
@@ -78,26 +78,26 @@ def swept(runs: Sequence[results.Run], cell: Callable[[stats.Rate], str] = forma
 
 
 def failures(runs: Sequence[results.Run]) -> Table:
-    """Failed trials by class, classes that never occurred left out."""
+    """Makes the table of failed trials by class; empty classes are omitted."""
     counts = [(run.label, outcomes.failures(run.trials)) for run in runs if run.trials]
-    classes = [key for key in outcomes.SHORT if any(key in found for _, found in counts)]
+    classes = [key for key in outcomes.SHORT if any(key in own for _, own in counts)]
     table = [["Method", *(outcomes.SHORT[key].capitalize() for key in classes)]]
     if classes:
-        table += [[label, *(str(found.get(k, 0)) for k in classes)] for label, found in counts]
+        table += [[label, *(str(own.get(k, 0)) for k in classes)] for label, own in counts]
     return table
 
 
 def paired(runs: Sequence[results.Run]) -> Table:
-    """McNemar's test of every run of STAR-Diff against each run that met the same trials."""
+    """Makes the table of McNemar's tests of STAR-Diff against each run with the same trials."""
     table = [["Against", "Pairs", "Only STAR-Diff", "Only the other", "p", "p (Holm)"]]
     ours = [run for run in runs if run.result.method == compare.OURS]
     others = [run for run in runs if run.result.method != compare.OURS]
     pairs = [*itertools.product(ours, others), *itertools.combinations(ours, 2)]
-    found = [(a, b, test) for a, b in pairs if (test := compare.pair(a, b))]
-    # Methods that are one policy, as DP-RCM-4 and STAR-Diff-Single, are one comparison.
-    single = {_comparison(a, b, test): test.p for a, b, test in found}
+    tested = [(a, b, test) for a, b in pairs if (test := compare.pair(a, b))]
+    # Methods with one policy, such as DP-RCM-4 and STAR-Diff-Single, count once for Holm.
+    single = {_comparison(a, b, test): test.p for a, b, test in tested}
     corrected = dict(zip(single, stats.holm(list(single.values())), strict=True))
-    for a, b, test in found:
+    for a, b, test in tested:
         p = corrected[_comparison(a, b, test)]
         counts = [str(n) for n in (test.pairs, test.only_a, test.only_b)]
         against = b.label if len(ours) == 1 else f"{b.label}, of {a.label}"
@@ -106,14 +106,14 @@ def paired(runs: Sequence[results.Run]) -> Table:
 
 
 def rcm(runs: Sequence[results.Run]) -> Table:
-    """Commanded and executed RCM error, at the ends of control steps and within them."""
+    """Makes the table of RCM errors, commanded and executed, at and within control steps."""
     keys = [("commanded", "max")]
-    keys += [("executed", what) for what in ("mean", "p99_of_successes", "p99", "max")]
-    keys += [("within_steps", what) for what in ("p99", "max")]
-    names = (f"{kind.capitalize()} {what}".replace("_", " ") for kind, what in keys)
+    keys += [("executed", figure) for figure in ("mean", "p99_of_successes", "p99", "max")]
+    keys += [("within_steps", figure) for figure in ("p99", "max")]
+    names = (f"{kind.capitalize()} {figure}".replace("_", " ") for kind, figure in keys)
     table = [["Method", *names]]
     for run in runs:
-        values = [(run.rcm_error_mm.get(kind) or {}).get(what) for kind, what in keys]
+        values = [(run.rcm_error_mm.get(kind) or {}).get(figure) for kind, figure in keys]
         if any(v is not None for v in values):
             cells = ("–" if v is None else formats.millimetres(v) for v in values)
             table.append([run.label, *cells])
@@ -121,7 +121,7 @@ def rcm(runs: Sequence[results.Run]) -> Table:
 
 
 def inference(runs: Sequence[results.Run]) -> Table:
-    """Table IV: latency in ms and the rate it allows, a row per method and number of DDIM steps."""
+    """Makes Table IV: latency in ms and its rate, a row per method and number of DDIM steps."""
     table = [["Method", "DDIM steps", "p50 (ms)", "p95 (ms)", "p99 (ms)", "p50 (Hz)", "p99 (Hz)"]]
     for run in runs:
         rows = [(run.label, str(steps), ms) for steps, ms in results.latencies(run)]
@@ -135,15 +135,15 @@ def inference(runs: Sequence[results.Run]) -> Table:
 
 
 def phases(runs: Sequence[results.Run]) -> Table:
-    """Wall-clock time of the phases that each result rests on."""
+    """Makes the table of wall-clock times of each result's phases."""
     times = [(run.label, run.result.about.get("timings_s") or {}) for run in runs]
-    every = dict.fromkeys(name for _, found in times for name in found)
+    every = dict.fromkeys(name for _, spent in times for name in spent)
     names = [name for name in every if not name.endswith(_COMPILE)]
-    table = [["Method", *(name.capitalize() for name in names), "Total", "Of it compiling"]]
-    for label, found in times:
-        if any(name in found for name in names):
-            sums = [sum(found.get(n + end, 0.0) for n in names) for end in ("", _COMPILE)]
-            cells = [formats.duration(found[n]) if n in found else "–" for n in names]
+    table = [["Method", *(name.capitalize() for name in names), "Total", "Compiling (included)"]]
+    for label, spent in times:
+        if any(name in spent for name in names):
+            sums = [sum(spent.get(n + end, 0.0) for n in names) for end in ("", _COMPILE)]
+            cells = [formats.duration(spent[n]) if n in spent else "–" for n in names]
             table.append([label, *cells, *(formats.duration(seconds) for seconds in sums)])
     return table
 
@@ -153,9 +153,9 @@ def _bin(trial: Trial) -> int:
 
 
 def _comparison(a: results.Run, b: results.Run, test: stats.Paired) -> tuple[object, ...]:
-    """Identity of a comparison: the two policies and their trials' outcomes.
+    """Returns the identity of a comparison: two policies and their trials' outcomes.
 
-    A policy is known by its weights, or by its folder where a result does not name them.
+    A policy is identified by its weights, or by its folder if the result does not name them.
     """
     method = b.result.method
     place = b.path.parent if b.path.name == method else b.path

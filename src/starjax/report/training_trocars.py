@@ -1,4 +1,4 @@
-"""Success at trocars that no run was trained at, by the number of training trocars."""
+"""Success at unseen trocars by the number of training trocars."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,19 +8,19 @@ from starjax.report import compare, outcomes, results, stats, style
 
 
 def trained_at(run: results.Run) -> int:
-    """Number of trocars in the demonstrations of an evaluated run."""
+    """Counts the trocars in the demonstrations of an evaluated run."""
     return len(results.training_trocars(run))
 
 
 def never_seen(runs: Sequence[results.Run]) -> set[int]:
-    """Indices of the trocars that every run was scored at and none was trained at."""
+    """Returns the trocars that every run was scored at and that no run was trained at."""
     scored = [{trial.trocar for trial in run.trials} for run in runs]
     seen = {trial.trocar for run in runs for trial in run.trials if trial.seen}
     return set.intersection(*scored) - seen
 
 
 def draw(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
-    """Success against the number of training trocars, a line a method, with Wilson intervals.
+    """Draws success against the number of training trocars, a line per method.
 
     None unless the runs were trained at different numbers of trocars and have others in common.
     """

@@ -1,7 +1,7 @@
 """Fig. 3: tip paths through several trocars over the task's outline, in an orthographic view.
 
-The scene is flat shapes in a fixed view, so plain 2-D artists in painter's order draw it sharper
-than a 3-D axis would.
+The scene is flat shapes in a fixed view: 2-D artists in painter's order draw it sharper than a
+3-D axis.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,11 +31,11 @@ _FAN = 14  # shafts drawn along a path
 _MARGIN = 0.004  # m around the task's areas
 _BEYOND = 0.02  # m of shaft drawn above the trocar
 _ABOVE = np.array([0.0, 0.0, _BEYOND + 2e-3])  # m, of a panel above its trocars
-_ROOM = 0.03  # m around areas and trocars that panels show: tools that fly off leave them
+_ROOM = 0.03  # m around areas and trocars; paths beyond are cut off
 
 
 def draw(runs: Sequence[results.Run], stages: Stages, dark: bool = False) -> Any | None:
-    """Fig. 3, or None if no run recorded a rollout.
+    """Draws Fig. 3; None if no run recorded a rollout.
 
     Top row seen, bottom row unseen, a configuration of trocars a panel, their places marked with
     crosses. One run: blue paths succeeded, orange ones failed. Several: a colour a method, failures
@@ -63,12 +63,12 @@ def draw(runs: Sequence[results.Run], stages: Stages, dark: bool = False) -> Any
         handles = _legend(runs, shades)
         labels = [handle.get_label() for handle in handles]
         title = {"title": _title(runs), "title_fontsize": 8}
-        style.legend(figure, handles, labels, most=len(handles), **title)
+        style.legend(figure, handles, labels, max_columns=len(handles), **title)
     return figure
 
 
 def _panels(runs: Sequence[results.Run], seen: bool) -> list[int]:
-    """Up to three trocars spread over those recorded, the ones most methods recorded first."""
+    """Selects up to three trocars spread over those that most methods recorded."""
     counts: dict[int, int] = {}
     for run in runs:
         for index in {r.trial.trocar for r in run.rollouts if r.trial.seen == seen}:
@@ -86,9 +86,9 @@ def _panel(
     shades: dict[str, str],
     ground: float,
 ) -> None:
-    """One configuration of trocars: paths with their shafts, the trocars."""
+    """Draws a trocar configuration: paths with their shafts, and the trocars."""
     drawn = [(i, r) for i, run in enumerate(runs) for r in run.rollouts if r.trial.trocar == index]
-    if len(runs) > 1:  # the same trial for every method, so that the paths can be compared
+    if len(runs) > 1:  # one trial for all methods: their paths compare
         shared = compare.most_shared(r.trial for _, r in drawn)
         drawn = [(i, r) for i, r in drawn if compare.identity(r.trial) == shared]
     trial, trocars = drawn[0][1].trial, drawn[0][1].p_world_trocar
@@ -129,7 +129,7 @@ def _path(
     shades: dict[str, str],
     ground: float,
 ) -> None:
-    """The path `[T, 3]` m of one tip, its shadow, its start and how it ended."""
+    """Draws the path `[T, 3]` m of one tip with its shadow, start and end."""
     below = np.concatenate([tip[:, :2], np.full((len(tip), 1), ground)], axis=-1)
     axis.plot(*_flat(below).T, color=shades["muted"], linewidth=1.0, alpha=0.4, zorder=1)
     flat = _flat(tip)
@@ -139,7 +139,7 @@ def _path(
 
 
 def _shafts(axis: Any, rollout: results.TrialTrajectory, color: str, scene: SceneView) -> None:
-    """The shafts at moments of a rollout, from the tips to beyond the trocars."""
+    """Draws the shafts along a rollout, from the tips to beyond the trocars."""
     assert rollout.qpos is not None
     rows = np.linspace(0, len(rollout.qpos) - 1, _FAN).round().astype(int)
     p, axis_of_shaft = scene.tips(rollout.qpos[rows], rollout.p_world_trocar)
@@ -156,7 +156,7 @@ def _title(runs: Sequence[results.Run]) -> str:
 
 
 def _frame(outline: Outline, runs: Sequence[results.Run]) -> tuple[tuple[float, float], ...]:
-    """Limits that hold the areas, trocars and what paths do near them, the same in all panels."""
+    """Returns limits, shared by all panels, of areas, trocars and the paths near them."""
     rollouts = [rollout for run in runs for rollout in run.rollouts]
     above = [rollout.p_world_trocar + _ABOVE for rollout in rollouts]
     fixed = [*(_flat(area) for area in outline.areas), *(_flat(trocar) for trocar in above)]
@@ -191,5 +191,5 @@ def _legend(runs: Sequence[results.Run], shades: dict[str, str]) -> list[Any]:
 
 
 def _flat(points: np.ndarray) -> np.ndarray:
-    """World points `[..., 3]` m to the drawing's plane `[..., 2]` m."""
+    """Projects world points `[..., 3]` m to the drawing's plane `[..., 2]` m."""
     return np.asarray(points) @ _VIEW

@@ -1,4 +1,4 @@
-"""The rollout video: recorded joint positions drawn again by the simulator's own camera."""
+"""The rollout video: recorded joint positions, rendered by the simulator's camera."""
 
 import functools
 import itertools
@@ -12,10 +12,10 @@ from starjax.evaluation.result import Result
 from starjax.report import compare, encode, outcomes, results, scene_view, style
 from starjax.sim.names import SceneNames
 
-SIZE = 384  # pixels a side of one rollout's images
-_BAR = 44  # pixels of the caption over it
-_HOLD = 1.5  # s that the last image stays
-_LONGEST = 12.0  # s shown of a rollout
+SIZE = 384  # pixels, side of one rollout's images
+_BAR = 44  # pixels, height of the caption
+_HOLD = 1.5  # s, time that the last image stays
+_LONGEST = 12.0  # s, longest duration shown of a rollout
 _GAP = 4  # pixels between images
 _MUTED = "#98a2ad"
 
@@ -25,15 +25,15 @@ def record(
     path: pathlib.Path,
     report: Callable[[str], None] = print,
 ) -> pathlib.Path | None:
-    """Draws a few recorded rollouts into the file `path`; returns None if there are none.
+    """Writes a video of a few recorded rollouts; returns None without any.
 
     Args:
-      runs: of whose representatives `choose` picks.
-      path: of the mp4.
-      report: gets a line for the user.
+      runs: runs whose representatives are shown.
+      path: the mp4 file.
+      report: receives a line for the user.
 
     Raises:
-      OSError, RuntimeError: the encoder failed, or there is none for this machine.
+      OSError, RuntimeError: the encoder failed or is not installed.
     """
     chosen = choose(compare.representatives(runs))
     if not chosen:
@@ -46,26 +46,32 @@ def record(
 
 
 class Clip(NamedTuple):
-    """A rollout in the video: the method's name, the result that it is of, and itself."""
+    """A rollout in the video.
+
+    Attributes:
+      label: the method's name.
+      result: its result.
+      rollout: its trajectory.
+    """
 
     label: str
     result: Result
     rollout: results.TrialTrajectory
 
 
-def choose(runs: Sequence[results.Run], most: int = 4) -> list[Clip]:
-    """Rollouts to show side by side, `most` at most.
+def choose(runs: Sequence[results.Run], max_clips: int = 4) -> list[Clip]:
+    """Selects rollouts to show side by side, regardless of their outcome.
 
-    One run: half of them at seen and half at unseen trocars, spread over these, an even number if
-    there are two or more. Several runs: one trial that as many of them as possible recorded, at an
-    unseen trocar if there is one. The choice does not look at how a rollout ended.
+    From one run: half at seen and half at unseen trocars, spread over these; an even number if
+    there are two or more. From several runs: one trial that most of them recorded, preferably at
+    an unseen trocar.
     """
     if len(runs) > 1:
-        return _same_trial(runs, most)
+        return _same_trial(runs, max_clips)
     pool = [r for run in runs for r in run.rollouts if r.qpos is not None]
     seen, unseen = ([r for r in pool if r.trial.seen is part] for part in (True, False))
-    new = _spread(unseen, most - len(_spread(seen, most // 2)))
-    chosen = [*_spread(seen, most - len(new)), *new]
+    new = _spread(unseen, max_clips - len(_spread(seen, max_clips // 2)))
+    chosen = [*_spread(seen, max_clips - len(new)), *new]
     even = len(chosen) if len(chosen) < 2 else len(chosen) // 2 * 2
     return [Clip(runs[0].label, runs[0].result, r) for r in chosen[:even]]
 
@@ -73,16 +79,16 @@ def choose(runs: Sequence[results.Run], most: int = 4) -> list[Clip]:
 def frames(
     chosen: Sequence[Clip], cameras: Callable[[SceneNames], scene_view.Draw], note: str = ""
 ) -> Iterator[np.ndarray]:
-    """Images `[h, w, 3]` uint8 of the chosen rollouts side by side in real time, captions over.
+    """Yields images `[h, w, 3]` uint8 of rollouts side by side in real time, with captions.
 
-    Drawn while they are asked for: a whole video would not fit the memory of a small machine.
+    They are drawn lazily: a whole video would not fit the memory of a small machine.
 
     Args:
       chosen: from `choose`.
-      cameras: gives `scene_view.camera`'s function of a scene.
-      note: said in every caption, such as what the policy observes.
+      cameras: a scene's names -> its `scene_view.camera`.
+      note: text of every caption, such as the policy's observation.
     """
-    clips = [_clip(cameras(shown.result.scene), shown, note) for shown in chosen]
+    clips = [_clip(cameras(clip.result.scene), clip, note) for clip in chosen]
     last: list[np.ndarray] = []
     for now in itertools.zip_longest(*clips):
         # A clip that ends early stays as it ended.
@@ -93,7 +99,7 @@ def frames(
 
 
 def caption(rows: Sequence[Sequence[tuple[str, str]]], width: int) -> np.ndarray:
-    """`[_BAR, width, 3]` uint8: a dark bar with rows of two (text, colour), left and right."""
+    """Draws a dark bar `[_BAR, width, 3]` uint8 with rows of (text, colour), left and right."""
     from PIL import Image, ImageDraw, ImageFont
 
     line = _BAR / len(rows)
@@ -107,29 +113,29 @@ def caption(rows: Sequence[Sequence[tuple[str, str]]], width: int) -> np.ndarray
     return np.asarray(image)
 
 
-def _clip(draw: scene_view.Draw, shown: Clip, note: str) -> Iterator[np.ndarray]:
-    """Images of one rollout under a bar: what is shown, the clock, and at the end the outcome."""
-    rollout, hz = shown.rollout, shown.result.control_hz
+def _clip(draw: scene_view.Draw, clip: Clip, note: str) -> Iterator[np.ndarray]:
+    """Yields images of one rollout under a bar with its name, the time and the outcome."""
+    rollout, hz = clip.rollout, clip.result.control_hz
     if rollout.qpos is None:
-        raise ValueError("shown: expected a rollout with joint positions, got none")
+        raise ValueError("clip: expected a rollout with joint positions, got none")
     kind, total = "seen" if rollout.trial.seen else "unseen", len(rollout.p_world_tip)
     steps = min(total, round(_LONGEST * hz))
     won = outcomes.strict(rollout.trial)
     end = "success" if won else outcomes.SHORT[outcomes.failure(rollout.trial)]
     outcome = (f"{end}, {total / hz:.1f} s", "#5ab4e8" if won else "#f09a5a")
     cut = "" if steps == total else f"first {steps / hz:.0f} s shown"
-    told = f"{kind} trocar {rollout.trial.trocar}" + (f", {note}" if note else "")
-    about = (told, _MUTED), (cut, _MUTED)
+    text = f"{kind} trocar {rollout.trial.trocar}" + (f", {note}" if note else "")
+    about = (text, _MUTED), (cut, _MUTED)
     for first in range(0, steps, scene_view.BATCH):
         drawn = draw(rollout.qpos, rollout.p_world_trocar, rollout.labels, first, rollout.endoscope)
         for step, image in enumerate(drawn[: steps - first], start=first):
             now = outcome if step == steps - 1 else (f"{step / hz:.0f} s", _MUTED)
-            bar = caption([[(shown.label, "#e6e9ec"), now], about], image.shape[1])
+            bar = caption([[(clip.label, "#e6e9ec"), now], about], image.shape[1])
             yield np.concatenate([bar, image])
 
 
 def _grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
-    """Tiles `[h, w, 3]` in rows of two, three in one row, `_GAP` dark pixels between them."""
+    """Arranges tiles `[h, w, 3]` in rows of two, or three in one row."""
     h, w = tiles[0].shape[:2]
     columns = len(tiles) if len(tiles) <= 3 else 2
     rows = -(-len(tiles) // columns)
@@ -140,24 +146,23 @@ def _grid(tiles: Sequence[np.ndarray]) -> np.ndarray:
     return grid
 
 
-def _spread(rollouts: list[results.TrialTrajectory], most: int) -> list[results.TrialTrajectory]:
-    """Up to `most` of them, spread evenly; each trocar's first trial before any second one."""
+def _spread(rollouts: list[results.TrialTrajectory], count: int) -> list[results.TrialTrajectory]:
+    """Selects up to `count`, spread evenly; first trials of all trocars before second ones."""
     ordered = sorted(rollouts, key=lambda r: (r.trial.trial, r.trial.trocar))
     first = [r for r in ordered if r.trial.trial == ordered[0].trial.trial]
-    pool = first if len(first) >= most else ordered
-    picks = np.linspace(0, len(pool) - 1, min(most, len(pool))).round().astype(int)
+    pool = first if len(first) >= count else ordered
+    picks = np.linspace(0, len(pool) - 1, min(count, len(pool))).round().astype(int)
     return [pool[i] for i in picks]
 
 
-def _same_trial(runs: Sequence[results.Run], most: int) -> list[Clip]:
-    """The same trial of up to `most` runs; the last ones where there are more."""
+def _same_trial(runs: Sequence[results.Run], max_clips: int) -> list[Clip]:
+    """Selects the same trial of up to `max_clips` runs, the last ones of more."""
     kept = [
         {compare.identity(r.trial): r for r in run.rollouts if r.qpos is not None} for run in runs
     ]
-    found = [(run, rollouts) for run, rollouts in zip(runs, kept) if rollouts][-most:]
-    if not found:
+    recorded = [(run, rollouts) for run, rollouts in zip(runs, kept) if rollouts][-max_clips:]
+    if not recorded:
         return []
-    pick = compare.most_shared(r.trial for _, rollouts in found for r in rollouts.values())
-    return [
-        Clip(run.label, run.result, rollouts[pick]) for run, rollouts in found if pick in rollouts
-    ]
+    pick = compare.most_shared(r.trial for _, rollouts in recorded for r in rollouts.values())
+    having = [(run, rollouts[pick]) for run, rollouts in recorded if pick in rollouts]
+    return [Clip(run.label, run.result, rollout) for run, rollout in having]

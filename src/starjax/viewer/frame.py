@@ -25,7 +25,7 @@ class Frame(NamedTuple):
       plan: `[H, A, 3]` in m, tips of the commands ahead, the next one first; H may be 0.
       stage: index into the task's stages.
       reward: in [0, 1].
-      done: see `sim.state.EnvState`, as are the next three.
+      done: true after the end, see `sim.state.EnvState`.
       success: strict success.
       invalid: true if the simulation diverged.
       collided: true after a collision.

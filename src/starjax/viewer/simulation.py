@@ -24,7 +24,7 @@ EXPERT = "expert"
 # m/s at which a trocar follows its handle: tissue yields gradually. The controller keeps the shaft
 # in the moving trocar.
 TROCAR_SPEED = 0.03
-_EXPERT_IMAGE_SIZE = 128  # pixels a side of the expert's picture; a policy brings its own size
+_EXPERT_IMAGE_SIZE = 128  # pixels, side of the expert's picture; a policy brings its own size
 
 
 class AgentSpec(NamedTuple):
@@ -44,13 +44,13 @@ class AgentSpec(NamedTuple):
 
 
 def expert(task: str) -> AgentSpec:
-    """Names the task's scripted expert."""
+    """Returns the task's scripted expert."""
     slots = registries.tasks.get(task).slots
     return AgentSpec(EXPERT, task, None, tuple(slot.arm for slot in slots))
 
 
 def from_file(file: Path, name: str = "") -> AgentSpec:
-    """Names a trained policy.
+    """Returns a trained policy.
 
     Raises:
       errors.UsageError: the file is damaged, or not a policy of this version.

@@ -71,7 +71,7 @@ def bounds(slot: Slot, tip: np.ndarray) -> Bounds:
     """Returns the range of a slot's arm, widened to include the initial tip `[3]` m."""
     space = registries.workspaces.get(slot.workspace)
     low, high = np.minimum(space.low, tip) - MARGIN, np.maximum(space.high, tip) + MARGIN
-    low[2] = min(space.low[2], tip[2])  # no margin below: the table is there
+    low[2] = min(space.low[2], tip[2])  # no margin below, towards the table
     return Bounds(np.array([space.rolls[0], *low]), np.array([space.rolls[1], *high]))
 
 
