@@ -1,8 +1,12 @@
-"""Free bodies in generalised coordinates."""
+"""Free bodies in generalised coordinates, and their contacts."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from starjax.sim.tasks.base import Contacts
 from starjax.types import Pose
 
 
@@ -16,3 +20,24 @@ def free_pose(qpos: jax.Array, start: int) -> Pose:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     )
     return Pose(jnp.stack([jnp.stack(row) for row in rows]), coords[:3])
+
+
+def upright_coords(pose: Pose) -> jax.Array:
+    """Returns the 7 coordinates of a free body that is turned about the world's z axis only."""
+    half, zero = 0.5 * jnp.arctan2(pose.R[1, 0], pose.R[0, 0]), jnp.zeros(())
+    return jnp.concatenate([pose.p, jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])])
+
+
+def is_sound(
+    qpos: jax.Array, qvel: jax.Array, start: int, dof: int, max_speed: float, max_distance: float
+) -> jax.Array:
+    """Returns True while a free body is slower (m/s), and nearer (m), than anything physical."""
+    speed = jnp.max(jnp.abs(qvel[dof : dof + 3]))
+    away = jnp.max(jnp.abs(qpos[start : start + 3]))
+    return (speed < max_speed) & (away < max_distance)
+
+
+def touch(contacts: Contacts, *groups: np.ndarray) -> jax.Array:
+    """Returns True if one contact overlaps geoms of every group of ids."""
+    hits = [jnp.any(contacts.geom[..., None] == jnp.asarray(ids), axis=(-2, -1)) for ids in groups]
+    return jnp.any(functools.reduce(jnp.logical_and, hits, contacts.dist < 0))

@@ -18,7 +18,7 @@ GIVER, BOTH, TAKER, NOBODY = (True, False), (True, True), (False, True), (False,
 def play():
     """`steps -> (measurements, TaskStatus)`; a step is (touch, height m, taker's tip aside m)."""
     m = scene.compose(scene.name("needle_handover"))
-    bound = task.bind(m)
+    bound = single.bind(m)
     layout = task.sample(bound, jax.random.key(0))
 
     @jax.jit

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from starjax.sim import scene
+from starjax.sim.tasks import outlines
 from starjax.sim.tasks.base import Contacts, SimReadings
 from starjax.sim.tasks.ring_on_wire import task
 from starjax.types import Pose
@@ -47,7 +48,7 @@ def test_the_wire_is_that_of_the_model(model, bound):
     top = model.geom("ring0")
     tube, wire = top.size[0], bound.radius
     # A regular twelve-sided polygon hangs by a corner, whose two sides lean by 15 degrees.
-    corner = max(np.linalg.norm(end) for end in task.text.capsule_ends(top))
+    corner = max(np.linalg.norm(end) for end in outlines.capsule_ends(top))
     assert abs(corner - (tube + wire) / np.cos(np.pi / 12) - task.HANG) < 1e-5
     assert abs(corner * np.cos(np.pi / 12) - tube - 0.005) < 1e-5  # inner radius 5 mm
     assert 0.8e-3 < model.body("ring").mass[0] < 1.0e-3  # kg

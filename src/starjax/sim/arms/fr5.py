@@ -28,18 +28,8 @@ ARM = Arm(
         ("grasper", "board"): _BOARD,
         ("grasper_wide", "wire"): _BOARD,
         # Two arms at either side of the board.
-        ("grasper", "left"): Mount(
-            position=(-0.58, 0.0, 0.20),
-            yaw=math.pi,
-            turn=-1.75,
-            home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
-        ),
-        ("grasper", "right"): Mount(
-            position=(0.58, 0.0, 0.20),
-            yaw=0.0,
-            turn=-1.75,
-            home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
-        ),
+        ("grasper", "left"): _BOARD,
+        ("grasper", "right"): _BOARD._replace(position=(0.58, 0.0, 0.20), yaw=0.0),
         **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
     },
 )

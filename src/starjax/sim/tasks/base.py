@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, registry
@@ -150,8 +151,7 @@ class SimReadings(NamedTuple):
     contacts: Contacts
 
 
-def _undriven(bound: Any, layout: Any, ctrl: jax.Array, time: jax.Array) -> jax.Array:
-    return ctrl
+NO_CAPSULES = Capsules(*(np.zeros(shape, np.float32) for shape in ((0, 3), (0, 3), 0)))
 
 
 class Task(NamedTuple):
@@ -209,7 +209,6 @@ class Task(NamedTuple):
     time_limit_s: float
     settle_steps: int
     fields: tuple[Field, ...]
-    labels: tuple[str, ...]
     stages: tuple[str, ...]
     text: TaskText
     experts: Mapping[str, str | Callable[[], Agent]]
@@ -217,20 +216,21 @@ class Task(NamedTuple):
     bind: Callable[..., Any]
     sample: Callable[..., Any]
     tips: Callable[..., jax.Array]
-    place_objects: Callable[..., jax.Array]
     measure: Callable[..., Any]
     status: Callable[..., TaskStatus]
     state: Callable[..., jax.Array]
     relative: Callable[..., jax.Array]
-    label: Callable[..., dict[str, jax.Array]]
-    colours: Callable[..., jax.Array]
-    obstacles: Callable[..., Capsules]
-    floor: float
-    is_sound: Callable[..., jax.Array]
     outline: Callable[..., Outline]
+    labels: tuple[str, ...] = ()
+    label: Callable[..., dict[str, jax.Array]] = lambda layout: {}
+    place_objects: Callable[..., jax.Array] = lambda bound, qpos, layout: qpos
+    colours: Callable[..., jax.Array] = lambda bound, layout, rgb: rgb
+    obstacles: Callable[..., Capsules] = lambda bound, layout, measurements: NO_CAPSULES
+    floor: float = 0.0
+    is_sound: Callable[..., jax.Array] = lambda bound, qpos, qvel: jnp.ones((), bool)
     trocars: rcm.Trocar = rcm.Trocar(*(field[:, None] for field in rcm.TROCARS))
     is_seen: np.ndarray = rcm.IS_SEEN
-    drive: Callable[..., jax.Array] = _undriven
+    drive: Callable[..., jax.Array] = lambda bound, layout, ctrl, time: ctrl
     still: Callable[..., Pose] | None = None
     least_steps: int = 0
     endoscope: Endoscope | None = None

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-import numpy as np
-
+from starjax.sim.tasks import outlines
 from starjax.sim.tasks.base import Outline, TaskText
 
 TEXT = TaskText(
@@ -22,19 +21,6 @@ HALF = 0.085  # m, of the square that is drawn
 
 
 def outline(mj_model: Any) -> Outline:
-    """Reads the vessels from the compiled model; the tissue is a square.
-
-    Args:
-      mj_model: `mujoco.MjModel` with this task in it.
-    """
-    corners = HALF * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    names = (mj_model.geom(i).name for i in range(mj_model.ngeom))
-    vessels = (mj_model.geom(name) for name in names if name.startswith("vessel"))
-    return Outline((corners,), tuple(_ends(vessel) for vessel in vessels))
-
-
-def _ends(capsule: Any) -> np.ndarray:
-    """The axis `[2, 3]` m of a capsule that lies flat: its z axis from the quaternion."""
-    w, x, y, z = capsule.quat
-    along = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    return capsule.pos + np.array([[-1.0], [1.0]]) * capsule.size[1] * along
+    """Returns a square of tissue and the vessels."""
+    vessels = tuple(map(outlines.capsule_ends, outlines.named(mj_model, "vessel")))
+    return Outline((HALF * outlines.CORNERS,), vessels)

@@ -6,12 +6,11 @@ A drop is a failure. Needle and foam are those of needle pick. Lengths in m.
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 
 from starjax import rcm
 from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks import two_arms
-from starjax.sim.tasks.base import Capsules, Field, SimReadings, Task, TaskStatus
+from starjax.sim.tasks.base import SimReadings, TaskStatus
 from starjax.sim.tasks.needle_handover import text
 from starjax.sim.tasks.needle_pick import task as single
 from starjax.types import Pose
@@ -56,11 +55,6 @@ class HandoverMeasurements:
     grip: jax.Array
     slip: jax.Array
     untouched: jax.Array
-
-
-def bind(m: mujoco.MjModel) -> single.NeedleBound:
-    """As in `needle_pick`."""
-    return single.bind(m)
 
 
 def sample(bound: single.NeedleBound, key: jax.Array) -> HandoverLayout:
@@ -132,40 +126,20 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 
 
-def _nothing(
-    bound: single.NeedleBound, layout: HandoverLayout, measurements: HandoverMeasurements
-) -> Capsules:
-    """The needle is no obstacle: it gives way."""
-    return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
-
-
-TASK = Task(
+TASK = single.TASK._replace(
     name="needle_handover",
     mjcf="tasks/needle_handover/needle_handover.xml",
     slots=two_arms.SLOTS,
     cameras=("side", endoscope_camera.NAME),
     time_limit_s=60.0,
-    settle_steps=single.SETTLE_STEPS,
-    fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
-    labels=(),
     stages=STAGES,
     text=text.TEXT,
     experts={"default": "starjax.sim.tasks.needle_handover.expert:AGENT"},
-    graspable=single.TASK.graspable,
-    bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tips,
-    place_objects=single.place_objects,
     measure=measure,
     status=status,
-    state=single.state,
     relative=relative,
-    label=lambda layout: {},
-    colours=lambda bound, layout, rgb: rgb,
-    obstacles=_nothing,
-    floor=single.FLOOR,
-    is_sound=single.is_sound,
-    outline=text.outline,
     # Between where the needle lies and where it is passed.
     endoscope=workspaces.SIDE_ENDOSCOPE._replace(work=(-0.012, 0.0, 0.02)),
     trocars=two_arms.TROCARS,

@@ -13,7 +13,7 @@ import numpy as np
 
 from starjax import rcm
 from starjax.sim import bodies, endoscope_camera, workspaces
-from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
+from starjax.sim.tasks.base import Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.needle_pick import text
 from starjax.types import Pose
 
@@ -121,11 +121,7 @@ def sample(bound: NeedleBound, key: jax.Array) -> NeedleLayout:
 
 def place_objects(bound: NeedleBound, qpos: jax.Array, layout: NeedleLayout) -> jax.Array:
     """Lays the needle where it was drawn."""
-    R = layout.needle.R
-    half, zero = 0.5 * jnp.arctan2(R[1, 0], R[0, 0]), jnp.zeros(())
-    coords = jnp.concatenate(
-        [layout.needle.p, jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])]
-    )
+    coords = bodies.upright_coords(layout.needle)
     return qpos.at[bound.needle : bound.needle + 7].set(coords)
 
 
@@ -139,11 +135,6 @@ def measure(
     needle = bodies.free_pose(readings.qpos, bound.needle)
     tip = jax.tree.map(lambda leaf: leaf[0], readings.pose)
     here = needle.R.T @ (tip.p - needle.p)
-    geom, close = readings.contacts.geom, readings.contacts.dist < 0
-    of_point, of_pads = (
-        jnp.any(geom[..., None] == jnp.asarray(ids), axis=(-2, -1))
-        for ids in (bound.point, bound.pads)
-    )
     touch = readings.touch[0]
     is_up = touch & (needle.p[2] > bound.height + LIFT)
     grip = here
@@ -154,7 +145,7 @@ def measure(
         needle=needle,
         tip=tip.p,
         touch=touch,
-        sticks=jnp.any(close & of_point & of_pads),
+        sticks=bodies.touch(readings.contacts, bound.point, bound.pads),
         grip=grip,
         slip=jnp.linalg.norm(here - grip),
     )
@@ -191,16 +182,7 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
 
 def is_sound(bound: NeedleBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Whether the needle is slower, and nearer, than anything physical."""
-    speed = jnp.max(jnp.abs(qvel[bound.dof : bound.dof + 3]))
-    away = jnp.max(jnp.abs(qpos[bound.needle : bound.needle + 3]))
-    return (speed < MAX_SPEED) & (away < MAX_DISTANCE)
-
-
-def _nothing(
-    bound: NeedleBound, layout: NeedleLayout, measurements: NeedleMeasurements
-) -> Capsules:
-    """The needle is no obstacle: it gives way."""
-    return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
+    return bodies.is_sound(qpos, qvel, bound.needle, bound.dof, MAX_SPEED, MAX_DISTANCE)
 
 
 TASK = Task(
@@ -211,7 +193,6 @@ TASK = Task(
     time_limit_s=30.0,
     settle_steps=SETTLE_STEPS,
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
-    labels=(),
     stages=STAGES,
     text=text.TEXT,
     experts={"default": "starjax.sim.tasks.needle_pick.expert:AGENT"},
@@ -224,9 +205,6 @@ TASK = Task(
     status=status,
     state=state,
     relative=relative,
-    label=lambda layout: {},
-    colours=lambda bound, layout, rgb: rgb,
-    obstacles=_nothing,
     floor=FLOOR,
     is_sound=is_sound,
     outline=text.outline,

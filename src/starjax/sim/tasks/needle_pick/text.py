@@ -2,8 +2,7 @@
 
 from typing import Any
 
-import numpy as np
-
+from starjax.sim.tasks import outlines
 from starjax.sim.tasks.base import Outline, TaskText
 
 TEXT = TaskText(
@@ -20,11 +19,5 @@ TEXT = TaskText(
 
 
 def outline(mj_model: Any) -> Outline:
-    """Reads the foam's rectangle from the compiled model.
-
-    Args:
-      mj_model: `mujoco.MjModel` with this task in it.
-    """
-    foam = mj_model.geom("foam")
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    return Outline((foam.pos * [1, 1, 0] + foam.size * corners,), ())
+    """Returns the foam's rectangle."""
+    return Outline((outlines.rectangle(mj_model, "foam"),), ())

@@ -137,11 +137,7 @@ def sample(bound: PegBound, key: jax.Array) -> PegLayout:
 
 def place_objects(bound: PegBound, qpos: jax.Array, layout: PegLayout) -> jax.Array:
     """Puts the block upright where it was drawn."""
-    half = 0.5 * jnp.arctan2(layout.block.R[1, 0], layout.block.R[0, 0])
-    zero = jnp.zeros(())
-    quat = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])
-    coords = jnp.concatenate([layout.block.p, quat])
-    return qpos.at[bound.block : bound.block + 7].set(coords)
+    return qpos.at[bound.block : bound.block + 7].set(bodies.upright_coords(layout.block))
 
 
 def measure(
@@ -224,9 +220,8 @@ def around(bound: PegBound, block: Pose) -> Capsules:
 
 def is_sound(bound: PegBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Whether the block is slower, and nearer, than anything physical."""
-    speed = jnp.max(jnp.abs(qvel[bound.block_dof : bound.block_dof + 3]))
-    away = jnp.max(jnp.abs(qpos[bound.block : bound.block + 3]))
-    return (speed < MAX_BLOCK_SPEED) & (away < MAX_BLOCK_DISTANCE)
+    limits = MAX_BLOCK_SPEED, MAX_BLOCK_DISTANCE
+    return bodies.is_sound(qpos, qvel, bound.block, bound.block_dof, *limits)
 
 
 def wall_normals(block: Pose) -> jax.Array:
@@ -286,7 +281,6 @@ TASK = Task(
     label=lambda layout: {"source": layout.source, "target": layout.target},
     colours=colours,
     obstacles=obstacles,
-    floor=0.0,
     is_sound=is_sound,
     outline=text.outline,
     endoscope=workspaces.BOARD_ENDOSCOPE,

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-import numpy as np
-
+from starjax.sim.tasks import outlines
 from starjax.sim.tasks.base import Outline, TaskText
 
 TEXT = TaskText(
@@ -20,23 +19,11 @@ BOARDS = ("board_source", "board_target")
 
 
 def outline(mj_model: Any) -> Outline:
-    """Reads the boards' rectangles and the pegs from the compiled model.
-
-    Args:
-      mj_model: `mujoco.MjModel` with this task in it.
-    """
-    boards = (mj_model.geom(name) for name in BOARDS)
-    areas = tuple(geom.pos * [1, 1, 0] + geom.size * _CORNERS for geom in boards)
-    names = (mj_model.geom(i).name for i in range(mj_model.ngeom))
-    pegs = (mj_model.geom(name) for name in names if name.startswith("peg"))
+    """Returns the boards' rectangles and the pegs."""
+    areas = tuple(outlines.rectangle(mj_model, name) for name in BOARDS)
     # A peg is a capsule along z: its cap ends the size and half the length above its middle.
-    lines = tuple(_stick(peg.pos, peg.pos[2] + peg.size.sum()) for peg in pegs)
+    lines = tuple(
+        outlines.stick(peg.pos, peg.pos[2] + peg.size.sum())
+        for peg in outlines.named(mj_model, "peg")
+    )
     return Outline(areas, lines)
-
-
-_CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-
-
-def _stick(foot: np.ndarray, height: float) -> np.ndarray:
-    """A line `[2, 3]` from the ground to `height` m above `foot`."""
-    return np.array([[foot[0], foot[1], 0.0], [foot[0], foot[1], height]])

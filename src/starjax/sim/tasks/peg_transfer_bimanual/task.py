@@ -7,12 +7,10 @@ peg. A drop is a failure.
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 
-from starjax import rcm
 from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks import two_arms
-from starjax.sim.tasks.base import Capsules, Field, SimReadings, Task, TaskStatus
+from starjax.sim.tasks.base import SimReadings, TaskStatus
 from starjax.sim.tasks.peg_transfer import task as single
 from starjax.sim.tasks.peg_transfer_bimanual import text
 from starjax.types import Pose
@@ -97,12 +95,8 @@ def status(
     """Strict: passed in the air, threaded, released, at rest. Loose: SurRoL's test."""
     block, peg = measurements.block, layout.target_peg
     threaded, near = single.is_threaded(block, peg), single.is_near(block, peg)
-    success_now = (
-        threaded
-        & measurements.passed
-        & single.is_at_rest(measurements.velocity)
-        & ~measurements.touch.any()
-    )
+    is_left = single.is_at_rest(measurements.velocity) & ~measurements.touch.any()
+    success_now = threaded & measurements.passed & is_left
     lost = measurements.lifted & (measurements.untouched > DROPPED_STEPS) & ~threaded
     stage = jnp.where(measurements.touch[0], 1, 0)
     stage = jnp.where(measurements.lifted, 2, stage)
@@ -118,62 +112,25 @@ def status(
     return TaskStatus(success_now, near, lost, stage, reward)
 
 
-def state(
-    bound: single.PegBound, layout: BimanualLayout, measurements: BimanualMeasurements
-) -> jax.Array:
-    """`[12]`: the block's position and rotation, the target's place."""
-    goal = jnp.append(layout.target_peg, single.RIM_HEIGHT)
-    return jnp.concatenate([measurements.block.p, rcm.rot6d_encode(measurements.block.R), goal])
-
-
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     """As in `peg_transfer`, from each tip, and from tip to tip: `[..., 21]`."""
     parts = [single.relative(state, tips[..., a : a + 1, :]) for a in range(2)]
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 
 
-def _obstacles(
-    bound: single.PegBound, layout: BimanualLayout, measurements: BimanualMeasurements
-) -> Capsules:
-    return single.around(bound, measurements.block)
-
-
-def bind(m: mujoco.MjModel) -> single.PegBound:
-    """As in `peg_transfer`."""
-    return single.bind(m)
-
-
-TASK = Task(
+TASK = single.TASK._replace(
     name="peg_transfer_bimanual",
     mjcf="tasks/peg_transfer_bimanual/peg_transfer_bimanual.xml",
     slots=two_arms.SLOTS,
     cameras=("side", endoscope_camera.NAME),
-    time_limit_s=60.0,
-    settle_steps=single.SETTLE_STEPS,
-    fields=(
-        Field("block.p", 3, "point"),
-        Field("block.R", 6, "rot6d"),
-        Field("target.p", 3, "point"),
-    ),
-    labels=("source", "target"),
     stages=STAGES,
     text=text.TEXT,
     experts={"default": "starjax.sim.tasks.peg_transfer_bimanual.expert:AGENT"},
-    graspable=("wall0", "wall1", "wall2"),
-    bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tips,
-    place_objects=single.place_objects,
     measure=measure,
     status=status,
-    state=state,
     relative=relative,
-    label=lambda layout: {"source": layout.source, "target": layout.target},
-    colours=single.colours,
-    obstacles=_obstacles,
-    floor=0.0,
-    is_sound=single.is_sound,
-    outline=text.outline,
     endoscope=workspaces.SIDE_ENDOSCOPE,
     trocars=two_arms.TROCARS,
 )

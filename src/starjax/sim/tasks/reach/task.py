@@ -122,7 +122,6 @@ TASK = Task(
     bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tip[None],
-    place_objects=lambda bound, qpos, layout: qpos,
     measure=measure,
     status=status,
     state=lambda bound, layout, measurements: layout.p,
@@ -130,8 +129,6 @@ TASK = Task(
     label=lambda layout: {"goal": layout.goal},
     colours=colours,
     obstacles=obstacles,
-    floor=0.0,
-    is_sound=lambda bound, qpos, qvel: jnp.ones((), bool),
     outline=text.outline,
     endoscope=workspaces.BOARD_ENDOSCOPE,
 )

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-import numpy as np
-
+from starjax.sim.tasks import outlines
 from starjax.sim.tasks.base import Outline, TaskText
 
 TEXT = TaskText(
@@ -19,14 +18,7 @@ TEXT = TaskText(
 
 
 def outline(mj_model: Any) -> Outline:
-    """Reads the pad's rectangle and the posts from the compiled model.
-
-    Args:
-      mj_model: `mujoco.MjModel` with this task in it.
-    """
-    pad = mj_model.geom("pad")
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    names = (mj_model.geom(i).name for i in range(mj_model.ngeom))
-    marks = [mj_model.geom(name).pos for name in names if name.startswith("mark")]
-    lines = tuple(np.array([[*mark[:2], 0.0], mark]) for mark in marks)
-    return Outline((pad.pos * [1, 1, 0] + pad.size * corners,), lines)
+    """Returns the pad's rectangle and the posts."""
+    marks = [mark.pos for mark in outlines.named(mj_model, "mark")]
+    lines = tuple(outlines.stick(mark, mark[2]) for mark in marks)
+    return Outline((outlines.rectangle(mj_model, "pad"),), lines)

@@ -14,21 +14,15 @@ import numpy as np
 
 from starjax import rcm
 from starjax.sim import bodies, endoscope_camera, workspaces
+from starjax.sim.tasks import outlines
 from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.peg_transfer.task import is_at_rest
 from starjax.sim.tasks.ring_on_wire import text
 from starjax.types import Pose
 
 # As in ring_on_wire.xml (a test holds these to the compiled model).
-BENDS = (
-    -0.045981,
-    -0.025981,
-    -0.01299,
-    0.0,
-    0.01299,
-    0.025981,
-    0.045981,
-)  # y of the wire's corners
+# y of the wire's corners
+BENDS = (-0.045981, -0.025981, -0.01299, 0.0, 0.01299, 0.025981, 0.045981)
 HEIGHTS = (0.022, 0.022, 0.0295, 0.022, 0.0295, 0.022, 0.022)  # z of them
 TAB = 0.0110  # from the ring's centre to where its tab is held
 HANG = 0.00414  # of the ring's centre below the wire's axis, where it hangs
@@ -115,7 +109,7 @@ def bind(m: mujoco.MjModel) -> RingBound:
     wire = [g for g, name in enumerate(names) if name.startswith(("wire", "post"))]
     last = len(BENDS) - 2
     ends = [[f"wire{last}", "post1"], ["wire0", "post0"]]  # by the episode's start
-    pieces = np.array([text.capsule_ends(m.geom(g)) for g in wire], np.float32)
+    pieces = np.array([outlines.capsule_ends(m.geom(g)) for g in wire], np.float32)
     return RingBound(
         ring=int(m.joint("ring").qposadr[0]),
         dof=int(m.joint("ring").dofadr[0]),
@@ -149,10 +143,7 @@ def sample(bound: RingBound, key: jax.Array) -> RingLayout:
 
 def place_objects(bound: RingBound, qpos: jax.Array, layout: RingLayout) -> jax.Array:
     """Hangs the ring where it was drawn."""
-    R = layout.ring.R
-    half, zero = 0.5 * jnp.arctan2(R[1, 0], R[0, 0]), jnp.zeros(())
-    coords = jnp.concatenate([layout.ring.p, jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])])
-    return qpos.at[bound.ring : bound.ring + 7].set(coords)
+    return qpos.at[bound.ring : bound.ring + 7].set(bodies.upright_coords(layout.ring))
 
 
 def measure(
@@ -160,12 +151,7 @@ def measure(
 ) -> RingMeasurements:
     """The ring, and how often it has touched the wire."""
     ring = bodies.free_pose(readings.qpos, bound.ring)
-    geom, close = readings.contacts.geom, readings.contacts.dist < 0
-    of_tube, of_wire = (
-        jnp.any(geom[..., None] == jnp.asarray(ids), axis=(-2, -1))
-        for ids in (bound.tube, bound.wire)
-    )
-    rubs = jnp.any(close & of_tube & of_wire)
+    rubs = bodies.touch(readings.contacts, bound.tube, bound.wire)
     rubbed = jnp.zeros((), jnp.int32)
     if before is not None:
         rubbed = before.rubbed + (rubs & (jnp.abs(ring.p[1]) < -BENDS[1]))
@@ -227,9 +213,7 @@ def obstacles(bound: RingBound, layout: RingLayout, measurements: RingMeasuremen
 
 def is_sound(bound: RingBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     """Whether the ring is slower, and nearer, than anything physical."""
-    speed = jnp.max(jnp.abs(qvel[bound.dof : bound.dof + 3]))
-    away = jnp.max(jnp.abs(qpos[bound.ring : bound.ring + 3]))
-    return (speed < MAX_SPEED) & (away < MAX_DISTANCE)
+    return bodies.is_sound(qpos, qvel, bound.ring, bound.dof, MAX_SPEED, MAX_DISTANCE)
 
 
 TASK = Task(
@@ -260,7 +244,6 @@ TASK = Task(
     label=lambda layout: {"start": layout.start},
     colours=colours,
     obstacles=obstacles,
-    floor=0.0,
     is_sound=is_sound,
     outline=text.outline,
     endoscope=workspaces.WIRE_ENDOSCOPE,

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-import numpy as np
-
+from starjax.sim.tasks import outlines
 from starjax.sim.tasks.base import Outline, TaskText
 
 TEXT = TaskText(
@@ -21,22 +20,6 @@ TEXT = TaskText(
 
 
 def outline(mj_model: Any) -> Outline:
-    """Reads the base's rectangle and the wire from the compiled model.
-
-    Args:
-      mj_model: `mujoco.MjModel` with this task in it.
-    """
-    base = mj_model.geom("base")
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    names = [mj_model.geom(i).name for i in range(mj_model.ngeom)]
-    pieces = tuple(
-        capsule_ends(mj_model.geom(name)) for name in names if name.startswith(("wire", "post"))
-    )
-    return Outline((base.pos * [1, 1, 0] + base.size * corners,), pieces)
-
-
-def capsule_ends(capsule: Any) -> np.ndarray:
-    """The ends `[2, 3]` m of a capsule's axis in its body's frame, from its quaternion's z axis."""
-    w, x, y, z = capsule.quat
-    along = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    return capsule.pos + np.array([[-1.0], [1.0]]) * capsule.size[1] * along
+    """Returns the base's rectangle and the wire."""
+    pieces = tuple(map(outlines.capsule_ends, outlines.named(mj_model, "wire", "post")))
+    return Outline((outlines.rectangle(mj_model, "base"),), pieces)
