@@ -11,12 +11,12 @@ from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Command, Pose
 
 STEP_IK_ITERATIONS = 4
-# Of a command's R'R from the identity: float32 and somebody's rounding are far below.
+# Largest entry of R'R - 1 of a command; float32 and rounded inputs stay far below.
 MAX_SKEW = 0.01
 
 
 def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
-    """Motion of arm a in a control period: dq, velocity, correction, gripper, residual."""
+    """Returns arm a's motion in a control period: dq, velocity, correction, gripper, residual."""
     bound, p_trocar = scene.arms[a], state.trocar.p_world_trocar[a]
     q_target, given = state.q_target[a], state.correction[a]
     chain = scenes.chain_at(bound, p_trocar)
@@ -49,7 +49,7 @@ def solve(
     q: jax.Array | None,
     iterations: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Inverse kinematics of one arm from `q` `[J]`, or from its home."""
+    """Solves the inverse kinematics of one arm from `q` `[J]`, or from its home."""
     home = jnp.asarray(bound.home)
     chain = scenes.chain_at(bound, p_world_trocar)
     start = home if q is None else q
@@ -57,7 +57,7 @@ def solve(
 
 
 def largest_within(scene: scenes.Scene, qpos: jax.Array, p_world_trocar: jax.Array) -> jax.Array:
-    """`[A]` m: the largest RCM error at the physics steps `qpos` `[substeps, Q]`."""
+    """Returns the largest RCM error `[A]` m over the physics steps `qpos` `[substeps, Q]`."""
     largest = []
     for a, bound in enumerate(scene.arms):
         chain = scenes.chain_at(bound, p_world_trocar[a])
@@ -67,12 +67,12 @@ def largest_within(scene: scenes.Scene, qpos: jax.Array, p_world_trocar: jax.Arr
 
 
 def of(tree: Pose | Command, a: int):
-    """The part of arm a."""
+    """Returns the part of arm a."""
     return jax.tree.map(lambda leaf: leaf[a], tree)
 
 
 def _is_usable(command: Command) -> jax.Array:
-    """Finite, and its R a rotation."""
+    """Returns True if the command is finite and its R a rotation."""
     finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), command)
     R = command.pose.R
     skew = jnp.max(jnp.abs(R.T @ R - jnp.eye(3)))

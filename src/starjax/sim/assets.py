@@ -1,13 +1,13 @@
-"""Where the MJCF parts are: inside an installed wheel, or beside `src/` in a checkout."""
+"""Paths of the MJCF parts, inside an installed wheel or next to `src/` in a checkout."""
 
 import pathlib
 
 
 def path(name: str) -> pathlib.Path:
-    """The file of one MJCF part, e.g. `arms/fr5/fr5.xml`, or an absolute path as it is.
+    """Returns the file of one MJCF part, e.g. `arms/fr5/fr5.xml`; an absolute path is kept.
 
     Raises:
-      FileNotFoundError: the part is in no such place; all are named.
+      FileNotFoundError: the part is missing; the message names all paths searched.
     """
     package = pathlib.Path(__file__).resolve().parents[1]
     places = [package / "mjcf" / name, package.parents[1] / "mjcf" / name]

@@ -1,4 +1,4 @@
-"""The cameras of a scene: where each one is, and what it sees.
+"""Cameras of a scene: their poses and images.
 
 A camera that is fixed in the world draws its textures and its sun once. One that rides on a body,
 and every one of an environment with moving cameras, takes its pose from the state.
@@ -24,7 +24,7 @@ class SceneCamera(NamedTuple):
       name: in the MJCF.
       body: that it rides on, 0 for the world.
       R, p: `[3, 3]` and `[3]` m, pose in that body's frame: x to the right, y up, looking along -z.
-      moves: whether its pose comes with every image.
+      moves: True if its pose comes with every image.
       draw: see `render.make`.
     """
 
@@ -45,7 +45,7 @@ def make(
     scope: endoscope_camera.Endoscope | None = None,
     samples: int = 1,
 ) -> tuple[SceneCamera, ...]:
-    """The cameras of these names, for square images; with `moving` all of them may move.
+    """Makes the named cameras, for square images; with `moving` all of them may move.
 
     `scope` is where the endoscope may be, if a trocar of its own holds it.
     """
@@ -64,14 +64,14 @@ def make(
 
 
 def nominal(cameras: Sequence[SceneCamera]) -> Pose:
-    """Poses `[C]` of the cameras in their bodies' frames, as the MJCF has them."""
+    """Returns the cameras' poses `[C]` in their bodies' frames as in the MJCF."""
     return Pose(jnp.stack([c.R for c in cameras]), jnp.stack([c.p for c in cameras]))
 
 
 def at_reset(
     cameras: Sequence[SceneCamera], scope: endoscope_camera.Endoscope | None, key: jax.Array
 ) -> Pose:
-    """Poses `[C]` as `nominal`, but for the endoscope's, which is drawn."""
+    """Returns the poses `[C]` of `nominal`, except the endoscope's, which is drawn."""
     poses = nominal(cameras)
     if scope is None:
         return poses
@@ -90,7 +90,7 @@ def images(
 
     Args:
       cameras: C of them.
-      poses: `[C]` in their bodies' frames; not looked at for cameras that do not move.
+      poses: `[C]` in their bodies' frames; ignored for cameras that do not move.
       data: with the poses of bodies and geoms.
       rgb: `[G, 3]` colours in [0, 1].
     """

@@ -17,8 +17,8 @@ class Chain:
       p_base, R_base: `[3]` m, `[3, 3]`: the frame that the first body stands in.
       offsets: `[J, 3]` m and `rotations`: `[J, 3, 3]`: each joint's frame in the one before it.
       p_tip, R_tip: the tip in the last joint's frame.
-      limits: `[J, 2]` rad (m of a slide), infinite where there are none.
-      slides: J times whether the joint is a slide.
+      limits: `[J, 2]` rad (m of a slide), infinite for an unlimited joint.
+      slides: True for each of the J joints that is a slide.
     """
 
     p_base: np.ndarray
@@ -32,13 +32,13 @@ class Chain:
 
 
 def chain_of(m: mujoco.MjModel, first: str, site: str, joints: tuple[str, ...] = ()) -> Chain:
-    """The chain from body `first` down to `site`, read off a compiled model.
+    """Reads the chain from body `first` down to `site` off a compiled model.
 
     Any axis, anchor, reference and number of joints a body will do; bodies without a joint are
     merged.
 
     Args:
-      joints: names that are expected on the way, in order; left out, any.
+      joints: expected names from `first` to the site; empty: any.
 
     Raises:
       errors.UsageError: `first` is not above the site, or a joint above it would move it; a joint
@@ -74,7 +74,7 @@ def chain_of(m: mujoco.MjModel, first: str, site: str, joints: tuple[str, ...] =
 
 
 def _path(m: mujoco.MjModel, first: str, site: str) -> list[int]:
-    """Bodies from `first` down to the site's."""
+    """Returns the bodies from `first` down to the site's."""
     path = [int(m.site(site).bodyid[0])]
     while m.body(path[-1]).name != first:
         if not path[-1]:  # the world, which is its own parent
@@ -115,7 +115,7 @@ def _limits(m: mujoco.MjModel, j: int) -> np.ndarray:
 
 
 def _from_z(axis: np.ndarray) -> np.ndarray:
-    """A rotation that takes z to the unit vector `axis`."""
+    """Returns a rotation that takes z to the unit vector `axis`."""
     wxyz = np.zeros(4)
     mujoco.mju_quatZ2Vec(wxyz, axis)
     return _matrix(wxyz)

@@ -1,9 +1,9 @@
-"""Notices where arms, shafts and jaws touch things they have no modelled contact with.
+"""Detection of overlaps of arms, shafts and jaws that the physics does not model.
 
-The physics models what each part's MJCF gives contact bits. The rest is watched here, as a
-diagnostic flag: it does not affect success. Approximations: obstacles are the task's capsules, a
-shaft is a row of points, and of the jaws only the end of their axis is looked at, so that a tool
-that leans by 30 degrees gets a pad's corner up to 3 mm below the floor unnoticed.
+The physics models contacts of geoms with contact bits in the MJCF. All others are detected here, as
+a diagnostic flag that does not affect success. Approximations: obstacles are the task's capsules, a
+shaft is a row of points, and the jaws are the end of their axis. Up to 3 mm of a pad's corner below
+the floor therefore stay undetected with a tool that leans by 30 degrees.
 """
 
 from collections.abc import Sequence
@@ -28,12 +28,12 @@ def detect(
     obstacles: Capsules,
     floor: float,
 ) -> jax.Array:
-    """Whether something overlaps by more than `DEPTH`.
+    """Returns True if any pair overlaps by more than `DEPTH`.
 
     Args:
       arms: A of them.
       pose: pose_world_tip `[A]`.
-      origins: of every arm its joints' origins, `[J, 3]` m.
+      origins: `[J, 3]` m of each arm, its joints' origins.
       p_world_trocar: `[A, 3]` m, the upper ends of the shafts that are inside.
       obstacles: of the task.
       floor: m, the lowest height that jaws may reach; the table is at 0.
@@ -54,7 +54,7 @@ def detect(
 
 
 def distance_sq(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Array:
-    """Squared distances (m^2) of `points` `[..., 3]` from segments `[..., 3]`, which broadcast."""
+    """Returns squared distances (m^2) of `points` `[..., 3]` from segments; all broadcast."""
     way, off = end - start, points - start
     square = jnp.maximum(jnp.sum(way * way, axis=-1), 1e-12)
     share = jnp.clip(jnp.sum(off * way, axis=-1) / square, 0.0, 1.0)
@@ -62,7 +62,7 @@ def distance_sq(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Arra
 
 
 def _shafts_meet(arms: Sequence[BoundArm], pose: Pose, p_world_trocar: jax.Array) -> jax.Array:
-    """Whether two shafts overlap between trocar and tip."""
+    """Returns True if two shafts overlap between the trocar and the tip."""
     hit = jnp.zeros((), bool)
     share = jnp.linspace(0.0, 1.0, 4 * SHAFT_POINTS)[:, None]
     for a, first in enumerate(arms):
@@ -76,7 +76,7 @@ def _shafts_meet(arms: Sequence[BoundArm], pose: Pose, p_world_trocar: jax.Array
 
 
 def _links_meet(arms: Sequence[BoundArm], origins: Sequence[jax.Array]) -> jax.Array:
-    """Whether joints of two arms come closer than their links are thick."""
+    """Returns True if joints of two arms are closer than the sum of their links' radii."""
     hit = jnp.zeros((), bool)
     for a, first in enumerate(arms):
         for b, second in list(enumerate(arms))[a + 1 :]:

@@ -1,12 +1,12 @@
-"""The low-level controller between two commands: bounded speed and acceleration, about the trocar.
+"""Low-level controller between two commands: bounded speed and acceleration about the trocar.
 
-A command far from where the tool is (a policy's next plan rarely begins where the last one ended)
-is approached, not leapt at. On the way the tool's axis keeps to the trocar as well as both ends do:
-a command on the RCM manifold is reached along the manifold, one that misses the trocar by d misses
-it by a share of d, and its axis passes the trocar no faster than the tip may move.
+A policy's next plan rarely begins where the last one ended, so a far command is approached at a
+bounded pace. On the way the tool's axis keeps to the trocar as well as both ends do: a command on
+the RCM manifold is reached along the manifold; one that misses the trocar by d is reached through
+poses that miss it by a fraction of d. The axis passes the trocar no faster than the tip may move.
 
-Servos give way under load, at the tip as they must, but at the trocar 0.1 mm is much. There the
-measured axis is brought back to where the reference has it, by turning the tool about its tip.
+Servos yield under load. At the tip they must; at the trocar 0.1 mm matters. A feedback turns the
+tool about its tip until the measured axis passes the trocar where the reference does.
 """
 
 import jax
@@ -15,57 +15,59 @@ import jax.numpy as jnp
 from starjax import rcm
 from starjax.types import Pose
 
-# Of the tip (m/s, m/s^2) and of the roll about the axis (rad/s, rad/s^2). The same for every arm,
-# so that a policy moves alike with each; `Arm.max_speed` bounds the joints besides. Found with the
-# first arm: its torque can follow them, and twice such a tip. A policy that is lost jumps from plan
-# to plan, and servos do not answer a jerk alike: with 1.8 m/s^2 the axis missed the trocar by
-# 0.14 mm then (99th percentile of five such trials), with 0.9 by 0.08.
+# Limits of the tip (m/s, m/s^2) and of the roll about the axis (rad/s, rad/s^2). They are equal for
+# every arm, for equal motions under one policy; `Arm.max_speed` also bounds the joints. The FR5's
+# torque suffices for twice the tip's acceleration. Jumps between plans of a failing policy set the
+# limit: with 1.8 m/s^2 the axis missed the trocar by 0.14 mm (99th percentile of five such trials),
+# with 0.9 by 0.08.
 MAX_SPEED = 0.2
 MAX_ACCELERATION = 0.9
 MAX_SPIN = 4.0
 MAX_SPIN_ACCELERATION = 40.0
-# Share of the axis's deviation at the trocar that is taken back each control period: that under a
-# load that stays shrinks to a third in 0.17 s. Deviations of single periods, which no feedback can
+# Fraction of the axis's deviation at the trocar that each control period corrects: a constant
+# load's deviation shrinks to a third in 0.17 s. Deviations of single periods, which no feedback can
 # foresee, grow by a twentieth; with twice the gain by an eighth.
 HOLD_GAIN = 0.2
-# m of depth up to which that share grows, with the square: a small turn about a tip near the trocar
-# is a large one of the joints, and with the whole share the arm swings there for ever.
+# m of depth up to which the gain grows with the square: near the trocar a small correction is a
+# large turn of the joints, and with the full gain the arm oscillates.
 FIRM_DEPTH = 0.03
-MAX_CORRECTION = 5e-3  # m at the trocar: servos that give way by more are not just elastic
+MAX_CORRECTION = 5e-3  # m at the trocar: a larger yield of servos is not elastic
 MAX_TURN = 0.05  # rad, of the tool for it: near the trocar turning moves nothing there
-# m, of a deviation that one period answers: a larger one is of servos that have reached their
-# limits, where more would be asked of them for ever
+# m, largest deviation that one period corrects: beyond it servos are saturated, and the integral
+# would wind up
 MAX_DEVIATION = 1e-3
-# m between tip and trocar within which the axis stays as it is, having no certain direction: well
-# below the least depth that actions may ask for (`rcm.MIN_DEPTH`)
+# m from the tip to the trocar within which the axis keeps its direction, as it is ill-defined: well
+# below the least depth of an action (`rcm.MIN_DEPTH`)
 NO_DIRECTION = 1e-3
 
 
 def toward(
-    present: Pose, velocity: jax.Array, wanted: Pose, p_trocar: jax.Array, period: float
+    present: Pose, velocity: jax.Array, target: Pose, p_trocar: jax.Array, period: float
 ) -> tuple[Pose, jax.Array]:
-    """The pose to be at after `period` s, single-sample.
+    """Returns the reference pose after `period` s, single-sample.
 
     Args:
       present: reference pose of the tip now.
       velocity: `[7]`, of the reference: tip (3) m/s, roll rad/s, its axis at the trocar (3) m/s.
-      wanted: the commanded pose.
+      target: the commanded pose.
       p_trocar: `[3]` m.
 
     Returns:
-      the next reference pose, equal to `wanted` if that is near enough; its velocity `[7]`.
+      the next reference pose, equal to `target` if that is near enough; its velocity `[7]`.
     """
     speed = MAX_SPEED * period
-    step = _step(wanted.p - present.p, velocity[:3] * period, speed, MAX_ACCELERATION * period**2)
+    step = _step(target.p - present.p, velocity[:3] * period, speed, MAX_ACCELERATION * period**2)
     p = present.p + step
-    length = jnp.sum((wanted.p - present.p) ** 2)
-    share = jnp.sum(step * (wanted.p - present.p)) / jnp.where(length > 0, length, 1.0)
+    length = jnp.sum((target.p - present.p) ** 2)
+    share = jnp.sum(step * (target.p - present.p)) / jnp.where(length > 0, length, 1.0)
     share = jnp.where(length > 0, jnp.clip(share, 0.0, 1.0), 1.0)
 
-    z_present, z_wanted = present.R[:, 2], wanted.R[:, 2]
-    here, there = _nearest(present, p_trocar), _nearest(wanted, p_trocar)
-    shift, most = share * (there - here), MAX_ACCELERATION * period**2
-    slower = _step(there - here, velocity[4:] * period, speed, most)
+    # The axis's point at the trocar moves by the tip's fraction of its own way, or slower if that
+    # would exceed the tip's limits there.
+    z_present, z_target = present.R[:, 2], target.R[:, 2]
+    here, there = _nearest(present, p_trocar), _nearest(target, p_trocar)
+    shift, change = share * (there - here), MAX_ACCELERATION * period**2
+    slower = _step(there - here, velocity[4:] * period, speed, change)
     is_slowed = jnp.sum(slower**2) < jnp.sum(shift**2)  # never on the manifold, where both are 0
     shift = jnp.where(is_slowed, slower, shift)
     through = jnp.where(is_slowed, here + slower, (1.0 - share) * here + share * there)
@@ -73,33 +75,34 @@ def toward(
     axis = axis * jnp.where(axis @ z_present < 0, -1.0, 1.0)  # the tip is above the trocar
     axis = jnp.where(jnp.linalg.norm(axis) < NO_DIRECTION, z_present, axis)
     z = axis / jnp.maximum(jnp.linalg.norm(axis), 1e-6)
-    carried = rcm.rotation_align(z_present, z_wanted) @ present.R
-    twist = jnp.arctan2(carried[:, 1] @ wanted.R[:, 0], carried[:, 0] @ wanted.R[:, 0])
+    # The rest of the rotation, once the axes are aligned, is a roll about the axis.
+    carried = rcm.rotation_align(z_present, z_target) @ present.R
+    twist = jnp.arctan2(carried[:, 1] @ target.R[:, 0], carried[:, 0] @ target.R[:, 0])
     spin = _step(
         twist[None], velocity[3:4] * period, MAX_SPIN * period, MAX_SPIN_ACCELERATION * period**2
     )
     R = rcm.rotation_align(z_present, z) @ present.R @ rcm.rotation_z(spin[0])
 
-    is_there = jnp.all(step == wanted.p - present.p) & (spin[0] == twist) & ~is_slowed
-    pose = jax.tree.map(lambda a, b: jnp.where(is_there, a, b), wanted, Pose(R, p))
+    is_there = jnp.all(step == target.p - present.p) & (spin[0] == twist) & ~is_slowed
+    pose = jax.tree.map(lambda a, b: jnp.where(is_there, a, b), target, Pose(R, p))
     return pose, jnp.concatenate([step, spin, shift]) / period
 
 
 def correct(
     correction: jax.Array, measured: Pose, reference: Pose, p_trocar: jax.Array
 ) -> jax.Array:
-    """The next correction `[3]` m of the axis at the trocar, from the measured deviation."""
+    """Integrates the measured deviation into the axis's correction `[3]` m at the trocar."""
     deviation = _nearest(measured, p_trocar) - _nearest(reference, p_trocar)
     far = jnp.maximum(jnp.linalg.norm(deviation), MAX_DEVIATION)
     lever = jnp.abs((reference.p - p_trocar) @ reference.R[:, 2])
     gain = HOLD_GAIN * jnp.minimum(1.0, lever / FIRM_DEPTH) ** 2
     correction = correction - gain * deviation * (MAX_DEVIATION / far)
-    most = jnp.minimum(MAX_CORRECTION, MAX_TURN * lever)
-    return correction * jnp.minimum(1.0, most / jnp.maximum(jnp.linalg.norm(correction), 1e-9))
+    largest = jnp.minimum(MAX_CORRECTION, MAX_TURN * lever)
+    return correction * jnp.minimum(1.0, largest / jnp.maximum(jnp.linalg.norm(correction), 1e-9))
 
 
 def corrected(pose: Pose, p_trocar: jax.Array, correction: jax.Array) -> Pose:
-    """The pose turned about its tip until its axis passes `correction` `[3]` m further on."""
+    """Returns the pose turned about its tip by `correction` `[3]` m of its axis at the trocar."""
     z = pose.R[:, 2]
     depth = (pose.p - p_trocar) @ z
     correction = jnp.where(depth < 0, -correction, correction)  # of a tip above the trocar
@@ -107,15 +110,17 @@ def corrected(pose: Pose, p_trocar: jax.Array, correction: jax.Array) -> Pose:
     return Pose(rcm.rotation_align(z, lever * z - correction) @ pose.R, pose.p)
 
 
-def _step(way: jax.Array, last: jax.Array, most: float, change: jax.Array | float) -> jax.Array:
-    """Displacement in one period towards `way`, given the `last` one.
+def _step(way: jax.Array, last: jax.Array, largest: float, change: jax.Array | float) -> jax.Array:
+    """Returns the displacement in one period towards `way`, after the `last` one.
 
-    No longer than `most`, no more than `change` from the last, and short enough to stop in time.
+    It is at most `largest` long, differs from the last by at most `change`, and can stop in time.
     """
     square = jnp.sum(way**2)
     length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    # Largest first step s that stops within `length` when each next one is `change` shorter:
+    # s (s + change) / (2 change) = length.
     can_stop = 0.5 * (jnp.sqrt(change**2 + 8.0 * change * length) - change)
-    target = way * jnp.minimum(1.0, jnp.minimum(most, can_stop) / length)
+    target = way * jnp.minimum(1.0, jnp.minimum(largest, can_stop) / length)
     bend = target - last
     square = jnp.sum(bend**2)
     size = jnp.sqrt(jnp.where(square > 0, square, 1.0))
@@ -123,6 +128,6 @@ def _step(way: jax.Array, last: jax.Array, most: float, change: jax.Array | floa
 
 
 def _nearest(pose: Pose, p_trocar: jax.Array) -> jax.Array:
-    """The point `[3]` of the tool's axis nearest to the trocar."""
+    """Returns the point `[3]` of the tool's axis nearest to the trocar."""
     z = pose.R[:, 2]
     return pose.p + ((p_trocar - pose.p) @ z) * z

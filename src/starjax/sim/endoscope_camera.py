@@ -1,7 +1,6 @@
-"""The endoscope through which a task may be seen: it stands in a trocar of its own, other in every
-episode, and is held still and level.
+"""Endoscope of a task: a still, level camera in a trocar of its own, drawn per episode.
 
-It is a camera, not a body: it neither touches anything nor casts a shadow.
+It is a camera without a body: it has no contacts and casts no shadow.
 """
 
 from collections.abc import Sequence
@@ -19,13 +18,14 @@ STREAM = 0x73636F70  # folded into an episode's key: objects and tips are drawn 
 
 
 class Endoscope(NamedTuple):
-    """Where a task's endoscope may be, and what its lens sees.
+    """Ranges of a task's endoscope and its lens.
 
     Attributes:
       p_world_ref: `(3,)` m, its nominal trocar.
-      radius, polar, azimuth: ranges of its trocar about that one (Eq. 19), m and rad.
-      work: `(3,)` m, what it looks at. spread: `(3,)` m, how far from there, either way.
-      distance: range, m from the lens to what it looks at.
+      radius, polar, azimuth: ranges of its trocar about the nominal one (Eq. 19), m and rad.
+      work: `(3,)` m, mean point of view.
+      spread: `(3,)` m, half the range of the point of view about it.
+      distance: range in m from the lens to the point of view.
       up: `(3,)`, the direction that is up in the picture as far as the line of sight lets it.
       fovy: degrees from the picture's lower edge to its upper one.
     """
@@ -42,12 +42,12 @@ class Endoscope(NamedTuple):
 
 
 def of(task: Any, cameras: Sequence[str]) -> Endoscope | None:
-    """The task's endoscope, if it is one of the observed cameras."""
+    """Returns the task's endoscope, or None unless it is among the observed cameras."""
     return task.endoscope if NAME in cameras else None
 
 
 def draw(endoscope: Endoscope, key: jax.Array) -> Pose:
-    """The camera's pose in one episode, which `key` is of."""
+    """Draws the camera's pose for the episode of `key`."""
     key_trocar, key_work, key_distance = jax.random.split(jax.random.fold_in(key, STREAM), 3)
     where = trocars.sample_trocar(
         key_trocar,
@@ -66,7 +66,7 @@ def draw(endoscope: Endoscope, key: jax.Array) -> Pose:
 
 
 def nominal(endoscope: Endoscope) -> Pose:
-    """The camera's pose in the middle of all that may be drawn; a constant in programs."""
+    """Returns the camera's pose at the middle of its ranges; a constant in programs."""
     work, p_trocar = np.array(endoscope.work), np.array(endoscope.p_world_ref)
     with jax.ensure_compile_time_eval(), jax.default_matmul_precision("highest"):
         return looking_at(work, p_trocar, np.mean(endoscope.distance), endoscope.up)
@@ -75,12 +75,12 @@ def nominal(endoscope: Endoscope) -> Pose:
 def looking_at(
     target: Any, p_trocar: Any, distance: Any, up: Any, lean: tuple[Any, Any] = (0.0, 1.0)
 ) -> Pose:
-    """The one pose of a scope's camera with the target in the middle of a level picture.
+    """Returns the one pose of a scope's camera with the target in the middle of a level image.
 
     Args:
       target: `[3]` m.
       p_trocar: `[3]` m, the scope's trocar.
-      distance: m, from the lens to the target.
+      distance: m from the lens to the target.
       up: `[3]`, up in the picture; not along the line of sight.
       lean: sine and cosine of the angle by which the lens looks from the shaft towards the
         picture's lower edge, as oblique optics do.
@@ -93,6 +93,8 @@ def looking_at(
     up = jnp.array(up)
     up = up - (up @ straight) * straight
     up = up / jnp.maximum(jnp.linalg.norm(up), 1e-6)
+    # Triangle of trocar, lens and target: `lean` is its angle at the lens, e the one at the trocar,
+    # and by the law of sines sin e = distance sin(lean) / length.
     sine, cosine = lean
     sine_e = distance * sine / length
     cosine_e = jnp.sqrt(1.0 - sine_e**2)

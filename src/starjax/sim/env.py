@@ -1,7 +1,7 @@
-"""The environment: reset, step(Command), observe, as single-sample pure functions.
+"""Environment: reset, step(Command) and observe as single-sample pure functions.
 
-It takes poses and knows no method, no task and no robot by name. What varies per episode is in
-`EnvParams` and the key, so a batch of trocars is one vmapped axis.
+It takes poses, independent of methods, tasks and robots. `EnvParams` and the key hold all that
+varies per episode, so a batch of trocars is one vmapped axis.
 """
 
 import functools
@@ -26,9 +26,9 @@ __all__ = ["CONTROL_HZ", "Env", "EnvParams", "EnvState", "for_policy", "make"]
 
 RESET_IK_ITERATIONS = 40
 # Energy (J) of the contact solver's error beyond which a step counts as diverged: it moves an arm's
-# first joint by 10 mrad/s. Of 1,400 trials 7 pass 1e-7 at some step without harm.
+# first joint by 10 mrad/s. 7 of 1,400 trials exceed 1e-7 at some step without harm.
 MAX_SOLVER_ERROR = 1e-4
-SMALLEST_IMAGE = 16  # pixels a side
+SMALLEST_IMAGE = 16  # pixels per side
 
 
 def make(
@@ -50,11 +50,11 @@ def make(
       arms, tools: keys of `registries.arms` and `registries.tools`: one per slot of the task, one
         for all slots, or none for the task's defaults.
       observation: "image" (pixels) or "state" (the task's fields instead).
-      image_size: pixels a side of the cameras' square images.
+      image_size: side of the cameras' square images in pixels.
       cameras: of the task; none for its first one.
-      shadow: whether the sun throws shadows.
-      moving_cameras: whether `EnvParams.cameras` may move the cameras of an episode; else those
-        that are fixed in the world are drawn faster, and to the same bytes as ever.
+      shadow: True for shadows of the sun.
+      moving_cameras: True if `EnvParams.cameras` may move the cameras of an episode; else cameras
+        fixed in the world are drawn faster, with identical pixels.
       variant: of the task, see `scene.load`.
 
     Raises:
@@ -129,7 +129,7 @@ def for_policy(
 
 
 def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose) -> EnvState:
-    """The start of an episode: objects and tips as the task draws them, cameras `[C]` as given."""
+    """Starts an episode with objects and tips drawn by the task, and cameras `[C]`."""
     layout = scene.task.sample(scene.bound, key)
     trocar, measured_trocar = (
         rcm.trocar_frame(given, scene.p_world_ref, scene.roll_zero)
@@ -186,7 +186,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
 
 
 def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
-    """One control period towards `command` `[A]`."""
+    """Advances one control period towards `command` `[A]`."""
     moves = [
         arm_motion.move(scene, a, state, arm_motion.of(command, a)) for a in range(len(scene.arms))
     ]
@@ -226,7 +226,7 @@ def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
 
 
 def with_status(scene: scenes.Scene, state: EnvState) -> EnvState:
-    """The measured state with its outcome."""
+    """Returns the measured state with its outcome."""
     status = scene.task.status(scene.bound, state.layout, state.measurements)
     settled = jnp.where(status.success_now, state.settled + 1, 0)
     success = settled >= scene.task.settle_steps
@@ -272,7 +272,7 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
 
 
 def _precisely(f: Callable) -> Callable:
-    """`f` with float32 products: a GPU's default, TF32, costs the kinematics 0.2 mm."""
+    """Returns `f` with float32 products: a GPU's default, TF32, costs the kinematics 0.2 mm."""
 
     @functools.wraps(f)
     def wrapped(*args):

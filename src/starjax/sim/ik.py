@@ -1,4 +1,4 @@
-"""Forward and inverse kinematics of a serial arm (Eq. 17), single-sample, in plain JAX."""
+"""Forward and inverse kinematics of a serial arm (Eq. 17), single-sample."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from starjax.sim.chain import Chain as Chain
 from starjax.sim.chain import chain_of as chain_of
 from starjax.types import Pose
 
-# Rotation errors weigh this many metres a radian against position errors.
+# Weight of rotation errors against position errors, m/rad.
 ROTATION_WEIGHT = 0.2
 # Damping of the least squares; small, because mounts keep singular values >= 0.05 (a test).
 DAMPING = 1e-3
@@ -17,11 +17,11 @@ DAMPING = 1e-3
 MAX_STEP = 0.35
 # Joint targets stay this far inside the limits (rad, m).
 LIMIT_MARGIN = 0.01
-POSE_SIZE = 6  # numbers of a pose: joints beyond as many are redundant
+POSE_SIZE = 6  # degrees of freedom of a pose: joints beyond six are redundant
 
 
 def forward(chain: Chain, q: jax.Array) -> tuple[Pose, jax.Array, jax.Array]:
-    """Tip pose of configuration `q` `[J]` rad (m of a slide).
+    """Computes the tip's pose for the configuration `q` `[J]` rad (m of a slide).
 
     Returns:
       pose_world_tip; the joints' origins `[J, 3]` m; their axes `[J, 3]`, both in the world.
@@ -43,7 +43,7 @@ def forward(chain: Chain, q: jax.Array) -> tuple[Pose, jax.Array, jax.Array]:
 
 
 def jacobian(chain: Chain, q: jax.Array, rotation_weight: float) -> jax.Array:
-    """`[6, J]`: motion of the tip (m, and rad times `rotation_weight` m) by joint."""
+    """Computes the Jacobian `[6, J]` of the tip, its rotation (rad) times `rotation_weight` m."""
     pose, origins, axes = forward(chain, q)
     return _jacobian(chain, pose, origins, axes, rotation_weight)
 
@@ -56,17 +56,17 @@ def solve(
     home: jax.Array | None = None,
     gain: float = 0.0,
 ) -> tuple[jax.Array, jax.Array]:
-    """Damped least squares from `q` towards `target` (Eq. 17).
+    """Solves Eq. 17 by damped least squares from `q` towards `target`.
 
-    What a pose leaves free of more than six joints returns to `home`, in every iteration but the
-    last, so that the pose stays exact. Without that the free joints would drift.
+    Redundant joints return towards `home` in every iteration except the last, which keeps the pose
+    exact. Without it they would drift.
 
     Args:
-      target: pose_world_tip wanted, single.
+      target: pose_world_tip, single.
       q: `[J]` rad (m of a slide), where to start: the present configuration.
       iterations: 3-4 from a neighbouring pose, 30 from afar, 40 for the free joints to settle.
       home: `[J]`, needed with a `gain`.
-      gain: share of the way home that the free joints take in an iteration: 0.1 to 0.3, or 0.
+      gain: fraction of the way home that redundant joints take per iteration: 0.1 to 0.3, or 0.
 
     Returns:
       `[J]` within the limits; the residual in m, rotation weighed by `ROTATION_WEIGHT`.
@@ -79,6 +79,8 @@ def solve(
         pose, origins, axes = forward(chain, q)
         J = _jacobian(chain, pose, origins, axes, ROTATION_WEIGHT)
         missing = _error(pose, target)
+        # Null-space term: dq = free + J+ (missing - J free) reaches the same pose; of `free` it keeps
+        # the part in the null space of J.
         if is_redundant:
             free = jnp.where(i + 1 < iterations, gain, 0.0) * (home - q)
             dq = free + _least_squares(J, missing - J @ free)
@@ -92,7 +94,7 @@ def solve(
 
 
 def residual(chain: Chain, target: Pose, q: jax.Array) -> jax.Array:
-    """Distance (m) of configuration `q` from `target`, rotation weighed by `ROTATION_WEIGHT`."""
+    """Returns the distance (m) of configuration `q` from `target`, rotation weighed."""
     pose, _, _ = forward(chain, q)
     return jnp.linalg.norm(_error(pose, target))
 
@@ -107,30 +109,31 @@ def _jacobian(
     return jnp.concatenate([moves.T, rotation_weight * turns.T])
 
 
-def _least_squares(J: jax.Array, wanted: jax.Array) -> jax.Array:
-    """The damped step `[J]` for a Jacobian `[6, J]`, by the smaller of two normal equations."""
+def _least_squares(J: jax.Array, missing: jax.Array) -> jax.Array:
+    """Solves J dq = missing `[6]`, damped, by the smaller of two equal normal equations."""
     joints = J.shape[1]
     if joints < POSE_SIZE:
-        return linear.solve_positive(J.T @ J + DAMPING**2 * jnp.eye(joints), J.T @ wanted)
-    return J.T @ linear.solve_positive(J @ J.T + DAMPING**2 * jnp.eye(POSE_SIZE), wanted)
+        return linear.solve_positive(J.T @ J + DAMPING**2 * jnp.eye(joints), J.T @ missing)
+    return J.T @ linear.solve_positive(J @ J.T + DAMPING**2 * jnp.eye(POSE_SIZE), missing)
 
 
 def _rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
-    """Rotation vector `[3]` rad, in the world, that takes `R` to `R_target`."""
+    """Returns the rotation vector `[3]` rad, in the world, from `R` to `R_target`."""
     E = R_target @ R.T
+    # v = sin(angle) axis, and trace E = 1 + 2 cos(angle).
     v = 0.5 * jnp.stack([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
     sine_sq = jnp.sum(v * v)
     is_small = sine_sq < 1e-12
     sine = jnp.sqrt(jnp.where(is_small, 1.0, sine_sq))
     angle = jnp.arctan2(sine, 0.5 * (jnp.trace(E) - 1.0))
     turn = v * jnp.where(is_small, 1.0, angle / sine)
-    # Half a turn about a is 2 a a' - 1.
+    # At half a turn v vanishes, but E = 2 a a' - 1: any non-zero column of E + 1 is along the axis.
     column = (E + jnp.eye(3))[:, jnp.argmax(jnp.diagonal(E))]
     half = jnp.pi * column / jnp.maximum(jnp.linalg.norm(column), 1.0)
     return jnp.where(is_small & (jnp.trace(E) < 1.0), half, turn)
 
 
 def _error(pose: Pose, target: Pose) -> jax.Array:
-    """`[6]` m: what is missing from `pose` to `target`, rotation weighed."""
+    """Returns the difference `[6]` m from `pose` to `target`, rotation weighed."""
     turn = _rotation_between(pose.R, target.R)
     return jnp.concatenate([target.p - pose.p, ROTATION_WEIGHT * turn])

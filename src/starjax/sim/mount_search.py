@@ -1,7 +1,6 @@
-"""Finds where an arm must stand, how its tool is turned, and its home, for a workspace.
+"""Search for an arm's mount in a workspace: its base, its tool's turn and its home.
 
-Placement decides whether an arm is of use: the same one reaches every trocar with room to spare, or
-almost none, by where its base is.
+The base decides: the same arm reaches every trocar with a margin, or almost none.
 """
 
 import functools
@@ -18,10 +17,10 @@ from starjax.sim.mounts import Bench, Fit, Targets
 from starjax.sim.workspaces import Workspace
 
 SINGULAR_WORTH = 4.0  # rad of margin that a metre of singular value is worth
-MEAN_WORTH = 0.1  # of the mean over the poses, beside the worst
+MEAN_WORTH = 0.1  # weight of the mean over the poses, added to the worst
 TABLE_WORTH = 5.0  # rad of margin that a metre of link in the table costs
 ITERATIONS = 20  # of inverse kinematics from home
-# Differential evolution in rounds; after each the worst poses take the place of easy ones.
+# Differential evolution in rounds; after each the worst poses replace easy ones.
 ROUNDS, GENERATIONS, CANDIDATES = 3, 20, 64
 POSES, REPLACED = 144, 48
 
@@ -33,10 +32,10 @@ def search(
     tilts: bool = False,
     on_round: Callable[[Fit], None] = lambda _: None,
 ) -> tuple[Mount, Fit]:
-    """The best mount that differential evolution finds, and its worst figures.
+    """Searches by differential evolution; returns the best mount and its worst figures.
 
     Args:
-      tilts: whether the base may also lean, or hang.
+      tilts: True if the base may also lean or hang.
       seed: the same one gives the same mount on the same machine.
       on_round: called with the worst figures after each round.
     """
@@ -84,7 +83,7 @@ def search(
 
 
 def _score(least: Fit) -> float:
-    """Objective of the search: rad, of the worst pose."""
+    """Returns the search's objective in rad, that of the worst pose."""
     if least.residual > mounts.REACHED:
         return -float(least.residual)
     ease = min(least.margin, SINGULAR_WORTH * least.singular)
@@ -92,7 +91,7 @@ def _score(least: Fit) -> float:
 
 
 def _harder(reached: Fit, chosen: np.ndarray) -> np.ndarray:
-    """The poses to go on with: the easiest of the chosen ones give way to the worst of all."""
+    """Returns the next round's poses: the worst of all replace the easiest of the chosen ones."""
     ease = np.minimum(reached.margin, SINGULAR_WORTH * reached.singular) - reached.residual
     kept = chosen[np.argsort(ease[chosen])][: POSES - REPLACED]
     others = np.setdiff1d(np.argsort(ease)[:POSES], kept, assume_unique=True)
@@ -108,7 +107,7 @@ def _merit(
     candidates: jax.Array,
     settings: mounts.ArmSettings,
 ) -> jax.Array:
-    """How good candidates `[S, 6 + J]` are, `[S]` rad; negative where a pose is not reached."""
+    """Scores candidates `[S, 6 + J]`: `[S]` rad, negative if a pose is not reached."""
 
     def one(x: jax.Array) -> jax.Array:
         chain = mounts.standing(flange, tip, x[:6])
@@ -127,16 +126,16 @@ def _merit(
 def _home(
     chain: ik.Chain, middle: Targets, guess: jax.Array, settings: mounts.ArmSettings
 ) -> tuple[jax.Array, jax.Array]:
-    """The configuration at the middle of the workspace that is found from a guess `[J]`."""
+    """Solves for the configuration at the middle of the workspace from a guess `[J]`."""
     if settings.remote_centre:
         chain = chain.replace(p_base=chain.p_base + middle.p_world_trocar)
     return ik.solve(chain, middle.pose, guess, mounts.ITERATIONS, guess, settings.rest_gain)
 
 
 def _least_singular(J: jax.Array) -> jax.Array:
-    """A smooth lower bound `[P]` of the least singular value of `J` `[P, 6, J]`: all count a bit.
+    """Returns a smooth lower bound `[P]` of the least singular value of `J` `[P, 6, J]`.
 
-    Without LAPACK, see `sim.linear`.
+    1 / sqrt(sum of 1 / s_i^2) over all singular values s_i, without LAPACK (see `sim.linear`).
     """
     small = J @ J.mT if J.shape[-1] >= ik.POSE_SIZE else J.mT @ J
     columns = jnp.eye(small.shape[-1])
@@ -145,7 +144,7 @@ def _least_singular(J: jax.Array) -> jax.Array:
 
 
 def _bounds(at: Bench, workspace: Workspace, tilts: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Ranges `[6 + J]` of a mount's numbers; where both ends are equal there is no choice."""
+    """Returns the ranges `[6 + J]` of a mount's numbers; equal ends mean a fixed number."""
     limits = np.clip(at.tip.limits, -np.pi, np.pi).astype(np.float64).T
     box = np.array([workspace.base_low, workspace.base_high])
     if at.settings.remote_centre:
@@ -157,7 +156,7 @@ def _bounds(at: Bench, workspace: Workspace, tilts: bool) -> tuple[np.ndarray, n
 
 
 def _mount(at: Bench, middle: Targets, x: np.ndarray) -> Mount:
-    """The record of a candidate `[6 + J]`, rounded as it is printed."""
+    """Returns the record of a candidate `[6 + J]`, rounded as printed."""
     place, guess = jnp.asarray(x[:6], jnp.float32), jnp.asarray(x[6:], jnp.float32)
     home, _ = _home(mounts.standing(at.flange, at.tip, place), middle, guess, at.settings)
     position, (yaw, turn, tilt), home = (

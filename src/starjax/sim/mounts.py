@@ -1,4 +1,4 @@
-"""How well an arm on its mount reaches a workspace.
+"""Reach of an arm on its mount in a workspace.
 
 A mount is as good as its worst pose: the least distance of a joint from its limits, and the least
 singular value of the Jacobian, over all trocars, targets and rolls.
@@ -18,7 +18,7 @@ from starjax.sim.tools.base import Tool
 from starjax.sim.workspaces import Workspace
 from starjax.types import Pose
 
-# What a mount must have to be used (a test holds every one to it).
+# Requirements of a usable mount (a test checks every one).
 MIN_MARGIN = 0.1  # rad to the nearest limit
 MIN_SINGULAR = 0.03  # m, of [Jv; LEVER Jw]
 REACHED = 1e-4  # m of residual
@@ -61,7 +61,7 @@ class Targets(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """How an arm reaches poses, fields `[P]`, or the worst of all.
+    """Reach of poses, fields `[P]`, or the worst of all.
 
     Attributes:
       residual: m, of inverse kinematics.
@@ -94,8 +94,10 @@ def bench(arm: Arm, tool: Tool) -> Bench:
 
 
 def targets(workspace: Workspace) -> Targets:
-    """A grid over the trocars, the box of tips and the rolls of a workspace, and the paper's twelve
-    trocars where they lie in it."""
+    """Returns a grid over the trocars, the tip's box and the rolls of a workspace.
+
+    With azimuths all round it includes the paper's twelve trocars.
+    """
     is_round = np.ptp(workspace.azimuth) > np.pi
     azimuth = np.linspace(*workspace.azimuth, 8 if is_round else 3, endpoint=not is_round)
     radius, polar = np.linspace(*workspace.radius, 3), np.linspace(*workspace.polar, 3)
@@ -113,7 +115,7 @@ def targets(workspace: Workspace) -> Targets:
 
 
 def middle(workspace: Workspace) -> Targets:
-    """The pose in the middle of the workspace."""
+    """Returns the pose in the middle of the workspace."""
     radius = 0.0 if np.ptp(workspace.azimuth) > np.pi else np.mean(workspace.radius)
     trocar = rcm.Trocar(radius, np.mean(workspace.polar), np.mean(workspace.azimuth))
     frame = frame_of(trocar, workspace)
@@ -123,8 +125,7 @@ def middle(workspace: Workspace) -> Targets:
 
 
 def fit(at: Bench, mount: Mount, poses: Targets) -> Fit:
-    """How the arm on its mount reaches each of the poses; the mount's position is from the trocar
-    for a remote centre."""
+    """Measures the reach of each pose; a remote centre's position counts from the trocar."""
     place = jnp.array([*mount.position, mount.yaw, mount.turn, mount.tilt], jnp.float32)
     chain, home = standing(at.flange, at.tip, place), jnp.asarray(mount.home, jnp.float32)
     with jax.default_matmul_precision("highest"):
@@ -135,19 +136,19 @@ def fit(at: Bench, mount: Mount, poses: Targets) -> Fit:
 
 
 def worst(found: Fit) -> Fit:
-    """The one figure of each field that a mount is judged by."""
+    """Returns the worst figure of each field."""
     return Fit(found.residual.max(), found.margin.min(), found.singular.min(), found.height.min())
 
 
 def is_good(found: Fit) -> bool:
-    """Whether a mount with this fit may be used."""
+    """Returns True if a mount with this fit is usable."""
     least = worst(found)
     enough = least.margin >= MIN_MARGIN and least.singular >= MIN_SINGULAR
     return bool(enough and least.residual < REACHED and least.height > 0)
 
 
 def standing(flange: ik.Chain, tip: ik.Chain, place: jax.Array) -> ik.Chain:
-    """The chain of an arm on its mount, `place` `[6]`: position (m), yaw, turn, tilt (rad)."""
+    """Returns an arm's chain on its mount, `place` `[6]`: position (m), yaw, turn, tilt (rad)."""
     yaw, turn, tilt = place[3:]
     R_stand = rcm.rotation_z(yaw) @ _rotation_y(tilt)
     R_flange = flange.R_tip @ rcm.rotation_z(turn)
@@ -168,7 +169,7 @@ def _rotation_y(angle: jax.Array) -> jax.Array:
 def reach(
     chain: ik.Chain, home: jax.Array, poses: Targets, settings: ArmSettings, iterations: int
 ) -> tuple[jax.Array, ...]:
-    """Residual `[P]` m, margin `[P]` rad, lowest link's axis `[P]` m, Jacobian `[P, 6, J]`."""
+    """Returns residuals `[P]` m, margins `[P]` rad, lowest axes `[P]` m, Jacobians `[P, 6, J]`."""
     slides = np.array(chain.slides)
 
     def one(pose: Pose, p_world_trocar: jax.Array) -> tuple[jax.Array, ...]:

@@ -1,4 +1,4 @@
-"""Trocars that move during an episode, as those of a patient who is turned or breathes do."""
+"""Trocars that move during an episode, as with a patient who breathes or is turned."""
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +8,11 @@ from starjax import rcm
 from starjax.sim.state import Env, EnvState
 from starjax.types import Command, Pose
 
-HELD = 1e-5  # m; a commanded shaft this near to its trocar was meant to pass it
+HELD = 1e-5  # m; a commanded shaft this near to its trocar counts as passing it
 
 
 def move_trocars(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvState:
-    """The state with its trocars elsewhere, of which agents are told; what stays keeps its bits.
+    """Returns the state with its true and measured trocars moved; unmoved ones keep their bits.
 
     The arms have not moved: until they do, their tools miss the trocars. The next steps bring them
     back at the controller's own pace (`sim.control`).
@@ -30,17 +30,17 @@ def move_trocars(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvSta
 
 
 def frame_at(env: Env, p_world_trocar: jax.Array) -> rcm.TrocarFrame:
-    """The frames of trocars at `p_world_trocar` `[A, 3]` m."""
+    """Returns the frames of trocars at `p_world_trocar` `[A, 3]` m."""
     roll_zero = np.array([slot.roll_zero for slot in env.task.slots], np.float32)
     parameters = rcm.trocar_from_position(p_world_trocar, env.p_world_ref)
     return rcm.trocar_frame(parameters, env.p_world_ref, roll_zero)
 
 
 def carried(command: Command, p_before: jax.Array, p_now: jax.Array) -> Command:
-    """A command that was planned for trocars elsewhere: a shaft that passed its trocar passes it.
+    """Turns a command that was planned for other trocars, so its shaft passes the present ones.
 
-    The tip is kept and the tool turned, see `rcm.project`. A command that missed its trocar, as
-    free poses do, and one whose trocar has not moved are left as they are.
+    The tip is kept, see `rcm.project`. Commands that missed their trocar when planned, as free
+    poses do, and those whose trocar has not moved are returned unchanged.
 
     Args:
       command: `[..., A]`.
@@ -58,7 +58,7 @@ def carried(command: Command, p_before: jax.Array, p_now: jax.Array) -> Command:
 
 
 def toward(here: jax.Array, there: jax.Array, most: float) -> jax.Array:
-    """`[..., 3]` m: from `here` to `there`, `most` m at most."""
+    """Returns the point `[..., 3]` m on the way from `here` to `there`, at most `most` m away."""
     way = there - here
     length = jnp.linalg.norm(way, axis=-1, keepdims=True)
     return jnp.where(length > most, here + way * (most / jnp.maximum(length, 1e-9)), there)

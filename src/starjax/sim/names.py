@@ -1,4 +1,4 @@
-"""Names that tell which scene something was made in: they stand in datasets, policies, results."""
+"""Names of a scene's parts, as stored in datasets, policies and results."""
 
 from typing import NamedTuple
 
@@ -10,8 +10,8 @@ class SceneNames(NamedTuple):
 
     Attributes:
       task: key of `registries.tasks`.
-      arms, tools: one for each arm slot of the task.
-      cameras: that are observed.
+      arms, tools: one name per arm slot of the task.
+      cameras: the observed ones.
     """
 
     task: str

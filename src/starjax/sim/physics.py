@@ -1,4 +1,4 @@
-"""MJX under the environment: what is carried between steps, and one control period of it."""
+"""MJX under the environment: the state between steps, and one control period."""
 
 import types
 from collections.abc import Mapping, Sequence
@@ -36,9 +36,9 @@ class StepResult(NamedTuple):
     """Outcome of a control period.
 
     Attributes:
-      touch: `[A]` bool, whether a pad touches something graspable in the last substep.
+      touch: `[A]` bool, contact of a pad with something graspable in the last substep.
       contacts: of the last substep.
-      qpos: `[substeps, Q]` where each substep began.
+      qpos: `[substeps, Q]` at the start of each substep.
       solver_error: J, the largest energy that the contact solver's error may hold in a substep.
     """
 
@@ -49,7 +49,7 @@ class StepResult(NamedTuple):
 
 
 def initial(scene: Scene, q: Sequence[jax.Array], layout: object) -> PhysicsState:
-    """At rest: arms at `q`, `[J]` rad each, jaws open, the task's objects in place."""
+    """Returns the state at rest: arms at `q` (`[J]` rad), jaws open, objects placed."""
     qpos = jnp.asarray(scene.mj_model.qpos0, jnp.float32)
     for bound, q_arm in zip(scene.arms, q, strict=True):
         qpos = qpos.at[bound.q].set(q_arm)
@@ -61,7 +61,7 @@ def initial(scene: Scene, q: Sequence[jax.Array], layout: object) -> PhysicsStat
 
 
 def no_contacts(scene: Scene) -> Contacts:
-    """Before the first step: contacts at a distance."""
+    """Returns the contacts before the first step, all apart."""
     contact = scene.mjx_data._impl.contact
     shape = contact.dist.shape
     return Contacts(jnp.zeros((*shape, 2), jnp.int32), jnp.ones(shape))
@@ -80,18 +80,18 @@ def advance(
     time: jax.Array,
     own: Mapping[str, jax.Array] = types.MappingProxyType({}),
 ) -> tuple[PhysicsState, StepResult]:
-    """One control period: the joint targets move smoothly from `q` to `q + dq`.
+    """Advances one control period: joint targets move smoothly from `q` to `q + dq`.
 
-    A target follows the cubic that begins at `velocity` and ends at `dq / period`; velocity and
-    acceleration are fed forward, or each change of speed would swing the long tool off its trocar.
+    Targets follow the cubic that begins at `velocity` and ends at `dq / period`. Its velocity and
+    acceleration are fed forward: else changes of speed would swing the long tool off its trocar.
 
     Args:
       q, dq: of every arm, `[J]` rad. velocity: of every arm, `[J]` rad/s, of the target before.
       gripper: `[A]` in [-1, 1].
       p_world_trocar: `[A, 3]` m.
       period: s.
-      layout: of the episode, for what the task itself drives. time: s since reset.
-      own: fields of the MJX model that are the episode's own.
+      layout: of the episode, for `Task.drive`. time: s since reset.
+      own: the episode's own fields of the MJX model.
     """
     substeps = round(period / scene.mj_model.opt.timestep)
     mjx_model = _model(scene, p_world_trocar).replace(**own)
@@ -99,13 +99,14 @@ def advance(
     turn = [period * v - d for v, d in zip(velocity, dq, strict=True)]
 
     def target(i: jax.Array) -> jax.Array:
-        """All servos' targets `[nu]` of substep i."""
+        """Returns all servos' targets `[nu]` of substep i."""
         s = (i + 1) / substeps
         ctrl = jnp.zeros(scene.mj_model.nu)
         for a, bound in enumerate(scene.arms):
-            # Cubic Hermite: the straight line, and the bend that its first slope asks for.
+            # Cubic Hermite spline of s in [0, 1]: a straight line plus a term for the first slope.
             x = q[a] + s * dq[a] + s * (1 - s) ** 2 * turn[a]
             v = (dq[a] + (1 - s) * (1 - 3 * s) * turn[a]) / period
+            # A critically damped servo lags its input by 2/w v + a/w^2: added in advance.
             acceleration = (6 * s - 4) * turn[a] / period**2
             w = bound.arm.servo_frequency
             ctrl = ctrl.at[bound.ctrl].set(x + 2.0 / w * v + acceleration / w**2)
@@ -139,7 +140,7 @@ def advance(
 
 
 def is_sound(scene: Scene, state: PhysicsState) -> jax.Array:
-    """False once the simulation has diverged: not finite, or faster than anything physical."""
+    """Returns False once the simulation has diverged (not finite, or implausibly fast)."""
     sound = jax.tree.reduce(lambda ok, x: ok & jnp.all(jnp.isfinite(x)), state, jnp.ones((), bool))
     for bound in scene.arms:
         sound &= jnp.max(jnp.abs(state.qvel[bound.dof])) < MAX_ARM_SPEED
@@ -147,7 +148,7 @@ def is_sound(scene: Scene, state: PhysicsState) -> jax.Array:
 
 
 def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
-    """Measured openings of the jaws, `[A]` in [-1, 1]: -1 closed on nothing, +1 fully open."""
+    """Returns the jaws' measured openings `[A]`: -1 closed on nothing, +1 fully open."""
     found = [
         jnp.ones(()) if bound.jaw is None else 2.0 * qpos[bound.jaw] / bound.tool.open - 1.0
         for bound in scene.arms
@@ -158,8 +159,10 @@ def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
 def kinematics(
     scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array, layout: object = None
 ) -> mjx.Data:
-    """Poses of all bodies and geoms, the trocars' markers at `p_world_trocar` `[A, 3]` m; with a
-    layout also those of what stands still in it."""
+    """Computes the poses of all bodies and geoms, with markers at `p_world_trocar` `[A, 3]` m.
+
+    With a layout the bodies of `Task.still` are placed too.
+    """
     mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
     data = scene.mjx_data.replace(qpos=qpos, mocap_pos=mocap_pos)
     if scene.task.still is not None and layout is not None:
@@ -175,13 +178,13 @@ def kinematics(
 def geom_poses(
     scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """`[G, 3]` m and `[G, 3, 3]` of every geom, for figures and films."""
+    """Returns all geoms' positions `[G, 3]` m and rotations `[G, 3, 3]`, for figures and videos."""
     data = kinematics(scene, qpos, p_world_trocar)
     return data.geom_xpos, data.geom_xmat
 
 
 def touching(scene: Scene, contacts: Contacts) -> jax.Array:
-    """`[A]` bool: whether a pad overlaps something graspable."""
+    """Returns `[A]` bool, True if a pad overlaps something graspable."""
     close = contacts.dist < 0
     held = jnp.any(_any_of(contacts.geom, scene.graspable), axis=-1)
     touched = [
@@ -192,9 +195,9 @@ def touching(scene: Scene, contacts: Contacts) -> jax.Array:
 
 
 def _model(scene: Scene, p_world_trocar: jax.Array) -> mjx.Model:
-    """The model; for arms that stand at a trocar with the trocars at `p_world_trocar` `[A, 3]` m.
+    """Returns the model with the bases of remote centres at `p_world_trocar` `[A, 3]` m.
 
-    In MJX bodies do not follow the mocap body that they are fixed to, but its `body_pos`.
+    In MJX, children of a mocap body follow its `body_pos`, not its mocap position.
     """
     if not any(bound.arm.remote_centre for bound in scene.arms):
         return scene.mjx_model

@@ -1,8 +1,8 @@
-"""Registries of tasks, arms, tools and workspaces. Others add theirs by entry points.
+"""Registries of tasks, arms, tools and workspaces, which packages extend by entry points.
 
-A row of `starjax.tasks`, `starjax.arms`, `starjax.tools` or `starjax.workspaces` in somebody's
-`[project.entry-points]` names an object that is a `Task`, an `Arm`, a `Tool` or a `Workspace`; a
-row of `starjax.mounts` a dict from (arm, tool, workspace) to `Mount`, for arms that are not theirs.
+An entry point of the group `starjax.tasks`, `starjax.arms`, `starjax.tools` or
+`starjax.workspaces` names a `Task`, an `Arm`, a `Tool` or a `Workspace`; one of `starjax.mounts` a
+dict from (arm, tool, workspace) to `Mount`, for arms of other packages.
 """
 
 import importlib.metadata
@@ -43,7 +43,7 @@ workspaces = Registry(
 
 
 def mount(arm: Arm, tool: str, workspace: str) -> Mount | None:
-    """Where an arm with a tool stands in a workspace; None if nobody has said."""
+    """Returns the mount of an arm with a tool in a workspace, or None if it is unknown."""
     if (tool, workspace) in arm.mounts:
         return arm.mounts[tool, workspace]
     for entry in importlib.metadata.entry_points(group="starjax.mounts"):

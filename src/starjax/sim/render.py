@@ -1,4 +1,4 @@
-"""The camera: a ray caster of MuJoCo's primitives in plain JAX, for CPU, GPU and CI alike.
+"""Camera: a ray caster of MuJoCo's primitives in plain JAX, for CPUs and GPUs.
 
 Planes, spheres, capsules, cylinders and boxes; a headlight and one sun with shadows, lit as
 MuJoCo's own renderer lights them (no GL is needed); checkered textures. Single-sample: vmap it.
@@ -24,7 +24,7 @@ Render = Callable[..., "CameraImage"]
 
 @flax.struct.dataclass
 class CameraImage:
-    """One picture.
+    """One rendered image.
 
     Attributes:
       rgb: `[h, w, 3]` uint8.
@@ -63,10 +63,10 @@ def make(
       mj_model: shapes, materials, lights and camera; only poses and colours vary afterwards.
       camera: name of the camera.
       height, width: of the picture in pixels.
-      shadow: whether the first directional light throws shadows.
-      depth, segmentation: whether these come with the picture (of a pixel's last sample).
+      shadow: True for shadows of the first directional light.
+      depth, segmentation: True to return these too (of a pixel's last sample).
       samples: rays along each side of a pixel: 1, 2 or 4; 2 smooths outlines at 4 times the cost.
-      moves: whether the camera's pose comes with every image.
+      moves: True if the camera's pose comes with every image.
     """
     for name, value in (("height", height), ("width", width)):
         if value < 1:
@@ -115,7 +115,7 @@ def make(
 
 
 def _bytes(grid: tiles.Grid, word: jax.Array, samples: int) -> jax.Array:
-    """The samples' mean colour as a picture, `[h, w, 3]` uint8."""
+    """Averages samples to an image `[h, w, 3]` uint8."""
     if samples > 1:
         parts = jax.lax.bitcast_convert_type(tiles.pixels(grid, word, samples), jnp.uint8)
         mean = (parts.astype(jnp.float32).mean(-2) + 0.5).astype(jnp.uint8)

@@ -1,4 +1,4 @@
-"""Reads an arm's MJCF, and refuses one that lacks what a scene needs of it."""
+"""Arms' MJCF files, validated for use in a scene."""
 
 from collections.abc import Iterable
 
@@ -12,7 +12,7 @@ FLANGE = "flange"  # the site that holds the tool
 
 
 def read(arm: Arm) -> mujoco.MjSpec:
-    """The arm's part, to be attached.
+    """Reads the arm's MJCF part for attachment.
 
     Raises:
       errors.UsageError: it has no site `flange`, or a joint without a servo of its name or with
@@ -34,7 +34,7 @@ def read(arm: Arm) -> mujoco.MjSpec:
         if joint.frictionloss:
             raise errors.UsageError(
                 f"arm {arm.name}: joint {joint.name}",
-                "no frictionloss, which the contact solver does not know",
+                "frictionloss 0, since the contact solver does not model it",
                 f"{joint.frictionloss:g}",
             )
     return spec

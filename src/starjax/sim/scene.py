@@ -1,7 +1,7 @@
-"""Composes a task with its arms and tools into one MuJoCo model, and resolves every id once.
+"""Scenes: a task, its arms and tools composed into one MuJoCo model, with resolved ids.
 
 Names of arm i begin with `arm<i>/` in the composed model, those of its tool with `arm<i>/tool/`.
-`mjcf/README.md` says what a part must offer.
+`mjcf/README.md` lists the requirements of a part.
 """
 
 import types
@@ -22,9 +22,9 @@ from starjax.sim.quiet_mjx import mjx
 from starjax.sim.tasks.base import Task
 from starjax.sim.tools.base import Tool
 
-# Sizes that MJX compiles in. Each part says what it adds; the scene has the sum.
+# Sizes that MJX compiles in. Each part adds its own; the scene has the sum.
 CONTACT_LIMITS = ("max_geom_pairs", "max_contact_points")
-FIXED = "fixed"  # among cameras: the task's first one that is no endoscope
+FIXED = "fixed"  # camera name: the task's first one except the endoscope
 # Numeric of a task's MJCF: the contact solver's largest number of iterations, for light bodies.
 SOLVER_ITERATIONS = "solver_turns"
 
@@ -37,8 +37,9 @@ class BoundArm(NamedTuple):
       chain: from the world to the tcp, its trocar at the nominal place; see `chain_at`.
       base_offset: `[3]` m, from the trocar to the base of an arm that stands there.
       home: `[J]` rad. max_speed: `[J]` rad/s.
-      q, dof, ctrl: `[J]` where its joints are in qpos, qvel and ctrl.
-      jaws: where all joints of the tool are in qpos. jaw: the one that tells the opening, or None.
+      q, dof, ctrl: `[J]` indices of its joints in qpos, qvel and ctrl.
+      jaws: indices of all joints of the tool in qpos.
+      jaw: index of the joint that measures the opening, or None.
       jaw_ctrl: of the jaws' servo, or None.
       pads: geom ids.
     """
@@ -66,7 +67,7 @@ class Scene(NamedTuple):
       names: of the parts.
       task: its record. bound: the ids that it resolved.
       mj_model: the C model; `mjx_model`: its MJX copy; `mjx_data`: a template of the state.
-      arms: one for each slot of the task.
+      arms: one per slot of the task.
       p_world_ref: `[A, 3]` m, nominal trocars. roll_zero: `[A]` rad, see `rcm.TrocarFrame`.
       trocar_mocap: `[A]` mocap bodies that mark the trocars.
       still_mocap: `[K]` mocap bodies of `Task.still`.
@@ -96,7 +97,7 @@ def name(
     tools: Sequence[str] = (),
     cameras: Sequence[str] = (),
 ) -> SceneNames:
-    """The names of a scene: those of the task where none are given; cameras may be `FIXED`.
+    """Completes a scene's names with the task's defaults; cameras may be `FIXED`.
 
     Raises:
       errors.UsageError: a name is unknown, or there are not as many as the task has slots.
@@ -121,7 +122,7 @@ def name(
 
 
 def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
-    """The C model of a scene; `variant` as in `load`.
+    """Compiles the C model of a scene; `variant` as in `load`.
 
     Raises:
       errors.UsageError: no mount of an arm with its tool is known for the task's workspace, no part
@@ -153,7 +154,7 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
 
 
 def load(names: SceneNames, variant: Task | None = None) -> Scene:
-    """The scene of these names, copied to MJX, ids resolved.
+    """Loads a scene: its model in MJX and its ids.
 
     Args:
       variant: of the task, with the same slots, in its place.
@@ -185,22 +186,22 @@ def load(names: SceneNames, variant: Task | None = None) -> Scene:
 
 
 def chain_at(bound: BoundArm, p_world_trocar: jax.Array) -> ik.Chain:
-    """The chain of an arm whose trocar is at `p_world_trocar` `[3]` m."""
+    """Returns the chain of an arm whose trocar is at `p_world_trocar` `[3]` m."""
     if not bound.arm.remote_centre:
         return bound.chain
     return bound.chain.replace(p_base=p_world_trocar + bound.base_offset)
 
 
 def marked(task: Task, bound: Any, labels: Mapping[str, Any], rgb: Any) -> Any:
-    """Colours `[G, 3]` with the goal marked, as far as the labels of an episode tell it."""
+    """Returns the colours `[G, 3]` with the goal marked, if an episode's labels determine it."""
     try:
         return task.colours(bound, types.SimpleNamespace(**labels), rgb)
-    except AttributeError:  # the task's colours ask for more of the layout than was recorded
+    except AttributeError:  # the task's colours depend on parts of the layout that labels lack
         return rgb
 
 
 def tcp(i: int, tool: Tool) -> str:
-    """Site of arm i's tip in the composed model."""
+    """Returns the name of the site at arm i's tip in the composed model."""
     return f"arm{i}/tool/{tool.tcp}"
 
 
@@ -250,7 +251,7 @@ def _spec(mjcf: str) -> mujoco.MjSpec:
 
 
 def _taken(part: mujoco.MjSpec) -> np.ndarray:
-    """The contact limits that a part asks for, taken out of it."""
+    """Removes the contact limits from a part and returns them."""
     sizes = np.zeros(len(CONTACT_LIMITS))
     for numeric in list(part.numerics):
         if numeric.name in CONTACT_LIMITS:
@@ -260,7 +261,7 @@ def _taken(part: mujoco.MjSpec) -> np.ndarray:
 
 
 def _call_by_name(world: mujoco.MjSpec, prefix: str) -> None:
-    """A tool's camera is called by its own name, as those of the world, where that is free."""
+    """Renames a tool's cameras without the prefix, unless that name exists."""
     taken = {camera.name for camera in world.cameras}
     for camera in list(world.cameras):
         own = camera.name.removeprefix(prefix)

@@ -1,8 +1,7 @@
-"""Six blocks in one episode: the environment of one block's transfer, begun anew with each.
+"""Six blocks in one episode: the environment of one block's transfer, restarted for each block.
 
-A block that is threaded, let go and at rest is left where it stands, and the next one's turn comes.
-Before it a script withdraws the tools to where an episode begins; its time counts. Everything else
-is the task's: the same physics, the same test, and an agent that knows one block's transfer.
+A block that is threaded, released and at rest stays in place, and the next one follows. In between a script withdraws the tools to an episode's start, which counts as time. Physics, success
+test and agent are those of one block's transfer.
 """
 
 from collections.abc import Sequence
@@ -32,7 +31,7 @@ def make(
     image_size: int = 256,
     cameras: Sequence[str] = (),
 ) -> Env:
-    """Builds the exercise, see `sim.env.make`. Its label `moved` is how many blocks are over."""
+    """Builds the exercise, see `sim.env.make`. Its label `moved` counts the blocks moved."""
     return wrap(
         envs.make(
             six.TASK.name,
@@ -47,7 +46,7 @@ def make(
 
 
 def wrap(env: Env) -> Env:
-    """The exercise in an environment of `six.TASK`."""
+    """Wraps an environment of `six.TASK` into the exercise."""
 
     def step(state: EnvState, command: Command) -> EnvState:
         between = _is_between(state)
@@ -66,7 +65,7 @@ def wrap(env: Env) -> Env:
 
 
 def reset_each_block(agent: Agent) -> Agent:
-    """An agent with a memory of one block's transfer, which begins again with every block."""
+    """Returns the agent with its memory reset for every block."""
 
     def init(key: jax.Array, state: EnvState) -> tuple:
         return key, agent.init(key, state)
@@ -88,7 +87,7 @@ def _is_between(state: EnvState) -> jax.Array:
 
 
 def _withdrawing(state: EnvState) -> Command:
-    """Jaws open, tips straight up from where they were, then to their start, with no roll."""
+    """Returns a command: jaws open, tips straight up, then to their start at roll 0."""
     rises = state.step < state.layout.since + RISE
     left = state.layout.tips
     up = left.at[:, 2].set(jnp.maximum(left[:, 2], HEIGHT))
@@ -102,7 +101,7 @@ def _withdrawing(state: EnvState) -> Command:
 
 
 def _next(scene: Scene, state: EnvState) -> EnvState:
-    """The block at hand stays where it is, the next one is at hand; the arms go on as they do."""
+    """Leaves the present block in place and starts the next one, without moving the arms."""
     bound = scene.bound
     layout = six.put(state.layout, Pose(state.measurements.block.R, state.measurements.block.p))
     turn = jnp.minimum(layout.turn + 1, six.BLOCKS - 1)

@@ -1,4 +1,4 @@
-"""One physics step of MJX with a Newton solver of our own for its contact forces.
+"""Physics step of MJX with a Newton solver of its own for contact forces.
 
 The problem is MuJoCo's (Todorov 2014, "Convex and analytically-invertible dynamics with contacts
 and constraints"; MuJoCo's documentation, chapter Computation): the acceleration minimises
@@ -6,11 +6,11 @@ and constraints"; MuJoCo's documentation, chapter Computation): the acceleration
     x M x / 2 - f x + sum over constraints of the squared distance of A x - b from a convex set / 2
 
 with A and b the constraint rows times the roots of their stiffnesses. In these units the set of a
-contact is a circular cone, whatever the contact's friction and `impratio`.
+contact is a circular cone, for any friction and `impratio`.
 
-MJX's own solver minimises the same. This one has fewer and larger operations: candidates of the
-line search are tried side by side, contacts enter the Hessian as three vectors each, and no cost is
-ever computed, only slopes, which keep their digits in float32 (`benchmarks/bench_solver.py`).
+MJX's own solver minimises the same function. This one has fewer and larger operations: the line
+search evaluates its candidates in parallel, each contact enters the Hessian as three vectors, and
+slopes replace costs, since they keep their digits in float32 (`benchmarks/bench_solver.py`).
 """
 
 from collections.abc import Callable
@@ -24,25 +24,25 @@ from starjax.sim import linear
 from starjax.sim.quiet_mjx import mjx
 
 MAX_ITERATIONS = 10
-# The error left may move the scene with no more than this kinetic energy (J): a thing of 3 g at
-# 0.08 mm/s, an arm's first joint at 2 urad/s.
+# Largest kinetic energy (J) of the remaining error: an object of 3 g at 0.08 mm/s, an arm's first
+# joint at 2 urad/s.
 MAX_ERROR_ENERGY = 1e-11
-# Shares of the Newton step that the line search tries first: it is mostly right, or far too long.
+# First candidates of the line search, as fractions of the Newton step: most often 1 is right.
 FIRST_SHARES = (
     *(0.0625, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875),
     *(1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 8.0, 16.0),
 )
-SECOND_SHARES = 16  # tried between the two that enclose the minimum
+SECOND_SHARES = 16  # second candidates, between the two that enclose the minimum
 
 
 class Problem(NamedTuple):
-    """The minimised function. V velocities, E rows, the last 3 C of them those of C contacts.
+    """Minimised function of V velocities and E rows, the last 3 C of them from C contacts.
 
     Attributes:
       M: `[V, V]` inertia; f: `[V]` force of all but the constraints.
       A: `[E, V]`, b: `[E]`: rows and their reference accelerations, times the root of stiffness.
       mu: `[C]` slope of each contact's cone, 0 at its axis.
-      equalities: how many of the first rows hold both ways; limits follow, then contacts.
+      equalities: number of equality rows, which come first; limits follow, then contacts.
     """
 
     M: jax.Array
@@ -65,12 +65,12 @@ class Iterate(NamedTuple):
 def step(
     m: mjx.Model, d: mjx.Data, max_iterations: int | None = None
 ) -> tuple[mjx.Data, jax.Array]:
-    """`mjx.step`: kinematics, contacts, forces, and the implicit integrator.
+    """Does `mjx.step`: kinematics, contacts, forces and the implicit integrator.
 
-    For models that pass `check`, and no forces from outside (`qfrc_applied`, `xfrc_applied`).
+    For models that pass `check`, without external forces (`qfrc_applied`, `xfrc_applied`).
 
     Args:
-      max_iterations: of Newton's method, at most; `MAX_ITERATIONS` if not given.
+      max_iterations: of Newton's method; `MAX_ITERATIONS` by default.
 
     Returns:
       the state after; J `[]`, the energy that the error left in the solution may hold.
@@ -91,7 +91,7 @@ def step(
 
 
 def problem(m: mjx.Model, d: mjx.Data) -> Problem:
-    """The problem of a state whose positions, velocities and actuators have been computed."""
+    """Returns the problem of a state with computed positions, velocities and actuators."""
     rows = d._impl
     root = jnp.sqrt(rows.efc_D)
     return Problem(
@@ -105,7 +105,7 @@ def problem(m: mjx.Model, d: mjx.Data) -> Problem:
 
 
 def check(m: mjx.Model, d: mjx.Data) -> None:
-    """ValueError for a model with constraints that this solver does not know."""
+    """Raises ValueError for a model with constraints that this solver does not support."""
     if d._impl.nf or np.any(d._impl.contact.dim != 3):
         raise ValueError(
             "model: expected contacts of condim 3 and no friction loss, got condim "
@@ -122,17 +122,17 @@ def check(m: mjx.Model, d: mjx.Data) -> None:
 def solve(
     problem: Problem, x: jax.Array, timestep: float | jax.Array, max_iterations: int | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The minimum by Newton's method from `x` `[V]`, single-sample.
+    """Minimises by Newton's method from `x` `[V]`, single-sample.
 
-    A lane that is not finite stays so and ends at once.
+    A non-finite lane stays so and ends at once.
 
     Returns:
-      acceleration `[V]`; the constraints' force on the velocities `[V]`; J `[]`, the energy that
-      the error left may hold: above `MAX_ERROR_ENERGY` it did not converge.
+      acceleration `[V]`; the constraints' force on the velocities `[V]`; energy bound of the
+      remaining error `[]` in J: above `MAX_ERROR_ENERGY` it did not converge.
     """
     M, f, A, b, _, _ = problem
-    # An error e in x has e M e <= gradient M^-1 gradient, for the Hessian is at least M. Of M the
-    # diagonal will do: the motors' armature prevails.
+    # An error e in x has e M e <= gradient M^-1 gradient, since the Hessian is at least M. The
+    # diagonal of M is enough: the motors' armature dominates.
     limit = 2.0 * MAX_ERROR_ENERGY / timestep**2
     max_iterations = MAX_ITERATIONS if max_iterations is None else max_iterations
     weights = 1.0 / jnp.diagonal(M)
@@ -146,6 +146,8 @@ def solve(
 
     def improve(loop: tuple[jax.Array, Iterate]) -> tuple[jax.Array, Iterate]:
         count, now = loop
+        # Newton direction: (M + B'B) p = -gradient. The cost's slope at x + s p is
+        # (M x - f) p + s p M p + pull(r + s A p) A p.
         B = half_hessian(problem, now.r)
         p = -linear.solve_positive(M + B.T @ B, now.gradient)
         Mp, Ap = M @ p, A @ p
@@ -164,10 +166,13 @@ def solve(
 
 
 def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> jax.Array:
-    """Where a convex function of one variable has its minimum on the positive axis.
+    """Finds the minimum of a convex function of one variable on the positive axis.
+
+    Two rounds of parallel candidates enclose the slope's zero, then the secant through both ends.
 
     Args:
-      slope: of a share `[]`; grows with it. first: `[]`, the slope at 0, negative.
+      slope: increasing function of a fraction `[]`.
+      first: `[]`, the negative slope at 0.
 
     Returns:
       `[]`, no larger than the last of `FIRST_SHARES`.
@@ -192,18 +197,21 @@ def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> ja
 
 
 def pull(problem: Problem, r: jax.Array) -> jax.Array:
-    """`[E]`: from the nearest point that satisfies the constraints to `r` `[E]`."""
+    """Returns the vector `[E]` to `r` from the nearest point that satisfies the constraints."""
     others, contacts = _split(problem, r)
+    # Three zones of a contact. Inside the cone (depth 0): no force. In the polar cone, mu n + t <= 0,
+    # the apex is nearest: it sticks, and all of r counts. In between the nearest point is on the
+    # cone's surface: it slips, and the force is along the surface's normal.
     slip = jnp.concatenate([-jnp.ones_like(contacts.mu), contacts.mu * contacts.along], 1)
     rows = jnp.where(contacts.sticks, contacts.r, contacts.depth * slip)
     return jnp.concatenate([jnp.where(_holds(problem, others), others, 0.0), rows.reshape(-1)])
 
 
 def half_hessian(problem: Problem, r: jax.Array) -> jax.Array:
-    """B `[E, V]`, with B' B the second derivative of the constraints' cost at `r` `[E]`.
+    """Returns B `[E, V]`: B' B is the second derivative of the constraints' cost at `r` `[E]`.
 
-    A sticking contact adds its three rows; a slipping one the cone's normal, and the cone's bend
-    across the direction in which it slips.
+    A sticking contact adds its three rows; a slipping one the cone's normal, and the cone's
+    curvature across the slip's direction.
     """
     others, contacts = _split(problem, r)
     A_others, A_contacts = problem.A[: len(others)], problem.A[len(others) :]
@@ -223,12 +231,15 @@ def half_hessian(problem: Problem, r: jax.Array) -> jax.Array:
 
 
 class _Contacts(NamedTuple):
-    """Where each contact is beside its cone; all but `along` `[C, 1]`.
+    """Positions of contacts relative to their cones; all `[C, 1]` unless stated.
 
     Attributes:
-      r: `[C, 3]`: along the normal and both tangents. along: `[C, 2]` unit vector of the tangents'.
-      mu: the cone's slope. sticks: nearest to the cone is its tip.
-      depth: distance from the cone along its axis, over 1 + mu^2. bend: of the cone there.
+      r: `[C, 3]`, along the normal and both tangents.
+      along: `[C, 2]`, unit vector of the tangential part.
+      mu: slope of the cone.
+      sticks: True if the cone's apex is the nearest point.
+      depth: distance from the cone along its axis, over 1 + mu^2.
+      bend: curvature of the squared distance across the slip's direction.
     """
 
     r: jax.Array
@@ -254,5 +265,5 @@ def _split(problem: Problem, r: jax.Array) -> tuple[jax.Array, _Contacts]:
 
 
 def _holds(problem: Problem, others: jax.Array) -> jax.Array:
-    """Which rows before the contacts' pull: equalities always, limits where they are passed."""
+    """Returns True for the active rows before the contacts': equalities and exceeded limits."""
     return (others < 0) | jnp.asarray(np.arange(others.shape[0]) < problem.equalities)

@@ -1,4 +1,4 @@
-"""Parts of an environment: its functions, its parameters and its state."""
+"""Environment record, its parameters and its state."""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -16,14 +16,14 @@ from starjax.types import Command, Observation, Pose
 
 
 class EnvParams(NamedTuple):
-    """Parameters of an episode, the caller's choice.
+    """Parameters of an episode.
 
     Attributes:
-      trocar: where the trocars are, fields `[A]`.
+      trocar: true trocars, fields `[A]`.
       measured_trocar: trocars as agents see them, fields `[A]`, or None for the true ones.
       cameras: poses `[C]` of the observed cameras in their bodies' frames, or None for those of the
-        MJCF; only an environment with moving cameras looks at those that are fixed in the world.
-      levels: how much of each thing is wrong, by name, for an environment that is disturbed.
+        MJCF; cameras fixed in the world follow them only in an environment with moving cameras.
+      levels: level of each disturbance by name, for a disturbed environment.
     """
 
     trocar: rcm.Trocar
@@ -34,12 +34,12 @@ class EnvParams(NamedTuple):
 
 @flax.struct.dataclass
 class EnvState:
-    """One episode. Every array is `[]` or as said; batches come from vmap.
+    """State of one episode. Arrays are `[]` unless stated; batches come from vmap.
 
     Attributes:
       physics: joint positions, velocities, warm start.
-      q_target: of every arm, `[J]` rad, joint target of the last command. q_velocity: of every
-        arm, `[J]` rad/s, the target's.
+      q_target: `[J]` rad of each arm, joint target of the last command.
+      q_velocity: `[J]` rad/s of each arm, its velocity.
       velocity: `[A, 7]` of the reference poses, see `control`.
       correction: `[A, 3]` m, feedback correction of the tools' axes at their trocars.
       gripper_target: `[A]` in [-1, 1].
@@ -48,23 +48,26 @@ class EnvState:
       cameras: `[C]` poses in their bodies' frames.
       layout: the task's own draws at reset.
       measurements: the task's own measurements of this moment.
-      step: int32, control steps taken. settled: consecutive steps that looked like success.
-      stage: int32, see `Task.stages`. reward: in [0, 1].
-      done: nothing moves any more: success, lost, or invalid.
-      success: strict. loose: the task's looser test was met at some step. lost: the task cannot
-        succeed any more.
-      invalid: the simulation diverged or its contact solver did not converge, and the last sound
-        state is kept; or a trocar is not finite.
-      collided: an arm, shaft or jaw was where it has no modelled contact.
+      step: int32, control steps taken.
+      settled: int32, consecutive steps with `TaskStatus.success_now`.
+      stage: int32, index of `Task.stages`.
+      reward: in [0, 1].
+      done: the episode is frozen: success, lost or invalid.
+      success: strict success.
+      loose: the task's looser test was met at some step.
+      lost: the task cannot succeed any more.
+      invalid: the simulation diverged or its contact solver did not converge (the last sound state
+        is kept), or a trocar is not finite.
+      collided: an arm, shaft or jaw overlapped something without modelled contact.
       rcm_error: `[A]` m, executed: distance of the trocar from the measured tool axis.
-      rcm_error_within: `[A]` m, the largest such distance at any physics step of the last control
-        step.
-      ik_error: `[A]` m, residual of the inverse kinematics, rotations weighed; inf after a command
-        that is not finite, or whose R is no rotation: the arm holds.
+      rcm_error_within: `[A]` m, its maximum over the physics steps of the last control step.
+      ik_error: `[A]` m, residual of the inverse kinematics, rotations weighed; inf after an invalid
+        command (not finite, or R not a rotation), during which the arm holds.
       solver_error: J, see `physics.StepResult`, of the last control step.
-      touch: `[A]` bool, the jaws touch something that they can grasp.
-      pose: `[A]` measured tips in the world. gripper: `[A]` measured openings, [-1, 1].
-      model: fields of the MJX model that are this episode's own, by name.
+      touch: `[A]` bool, the jaws touch something graspable.
+      pose: `[A]` measured tips in the world.
+      gripper: `[A]` measured openings in [-1, 1].
+      model: this episode's own fields of the MJX model, by name.
       wrapper_state: memories of wrappers of the environment, by name.
       endoscope: measured pose_world_camera of the endoscope, see `sim.endoscope_camera`; None for a
         scene without one.
@@ -104,7 +107,7 @@ class EnvState:
 
 
 class Env(NamedTuple):
-    """The simulation as pure functions of one episode.
+    """Simulation as pure functions of one episode.
 
     Attributes:
       reset: (key, EnvParams) -> EnvState.
@@ -115,7 +118,7 @@ class Env(NamedTuple):
       labels: EnvState -> name of `Task.labels` -> int32.
       scene: the static scene; task: its task; names: of its parts.
       p_world_ref: `[A, 3]` m, the nominal trocars.
-      control_hz: commands a second.
+      control_hz: commands per second.
     """
 
     reset: Callable[[jax.Array, EnvParams], EnvState]

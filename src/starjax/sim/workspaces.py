@@ -1,4 +1,4 @@
-"""Where the trocar and the tip of one arm may be: mounts are found, and tested, for a workspace."""
+"""Workspaces: regions of one arm's trocar and tip, for which mounts are searched and tested."""
 
 import math
 from typing import NamedTuple
@@ -12,7 +12,7 @@ class Workspace(NamedTuple):
 
     Attributes:
       p_world_ref: `(3,)` m, nominal trocar o_ref.
-      radius, polar, azimuth: ranges of the trocar about it (Eq. 19), m and rad.
+      radius, polar, azimuth: ranges of the trocar about the nominal one (Eq. 19), m and rad.
       low, high: `(3,)` m, the box of the tip.
       rolls: range, rad from `roll_zero`.
       roll_zero: rad, see `rcm.TrocarFrame`.
@@ -60,14 +60,14 @@ BOARD_ENDOSCOPE = endoscope_camera.Endoscope(
 )
 # The wire is longer than the boards, and higher.
 WIRE_ENDOSCOPE = BOARD_ENDOSCOPE._replace(work=(0.0, 0.0, 0.03), distance=(0.09, 0.11))
-# Across two arms, which stand along x; what they pass on is lifted.
+# Perpendicular to two arms, which stand along x; they pass objects above the board.
 SIDE_ENDOSCOPE = BOARD_ENDOSCOPE._replace(
     p_world_ref=(0.0, -0.15, 0.15), work=(0.0, 0.0, 0.02), up=(0.0, 1.0, 0.0)
 )
 
 
-# Two arms at either side, their rolls' zeros half a turn apart. Each trocar varies by 3 cm to and
-# fro and 4.3 cm along the board; for what that leaves a pair of them see `sim.tasks.two_arms`.
+# Two arms at either side, their rolls' zeros half a turn apart. Each trocar varies by 3 cm along x
+# and 4.3 cm along y; see `sim.tasks.two_arms` for their pairs.
 LEFT = BOARD._replace(
     radius=(0.054, 0.084),
     polar=(math.radians(87), math.radians(93)),
@@ -80,7 +80,7 @@ RIGHT = LEFT._replace(
     base_high=(0.8, 0.3, 1.2),
 )
 
-# Where the lens of an endoscope is that looks down on a target from 6 cm; its trocar lies higher.
+# Region of the lens of an endoscope that looks down on a target from 6 cm; its trocar is higher.
 TISSUE = BOARD._replace(
     p_world_ref=(0.0, 0.0, 0.18),
     low=(-0.05, -0.028, 0.062),
@@ -88,7 +88,7 @@ TISSUE = BOARD._replace(
     rolls=(-0.3, 0.3),
 )
 
-# Where a tool holds a ring on a wire along y by its tab.
+# Region of a tool that holds a ring by its tab, on a wire along y.
 WIRE = BOARD._replace(
     low=(-0.012, -0.045, 0.026),
     high=(0.012, 0.045, 0.066),

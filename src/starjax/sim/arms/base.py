@@ -1,4 +1,4 @@
-"""Arms, and where they stand: what the MJCF does not say. Data only."""
+"""Arms and their mounts: data beyond the MJCF."""
 
 import math
 from collections.abc import Mapping
@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 
 class Mount(NamedTuple):
-    """An arm with a tool in a workspace; found by `starjax find-mount`, held by a test.
+    """Placement of an arm with a tool in a workspace; from `starjax find-mount`, tested.
 
     Attributes:
       position: `(3,)` m, of the arm's base in the world; for a remote centre from the trocar.
       yaw: rad, of the base about the world's z axis.
       turn: rad, of the tool about the flange's z axis.
-      home: rad (m for a slide), one a joint: where inverse kinematics starts, and what redundant
-        joints return to.
+      home: rad (m for a slide) per joint, where inverse kinematics starts and redundant joints
+        return.
       tilt: rad, of the base about its own y axis, after the yaw: pi/2 on a wall, pi hanging.
     """
 
@@ -31,7 +31,7 @@ class Mount(NamedTuple):
 
 
 def opposite(mount: Mount) -> Mount:
-    """The mount on the other side of the world's z axis: as good, in the opposite workspace."""
+    """Returns the mount half a turn about the world's z axis away, for the opposite workspace."""
     x, y, z = mount.position
     yaw = math.remainder(mount.yaw + math.pi, 2 * math.pi)
     return mount._replace(position=(-x, -y, z), yaw=yaw)
@@ -45,14 +45,14 @@ class Arm(NamedTuple):
       mjcf: a part below `mjcf/`, or the path of a file; it ends in the site `flange`.
       first: its first moving body.
       joints: names from the base on; every one has a position servo of the same name.
-      max_speed: rad/s (m/s for a slide), one a joint.
+      max_speed: rad/s (m/s for a slide) per joint.
       servo_frequency: rad/s, natural frequency of its critically damped joint servos.
       mounts: (tool, workspace) -> Mount.
-      rest_gain: share of the way home that joints beyond six take in an iteration of inverse
-        kinematics; 0 without such joints.
+      rest_gain: fraction of the way home that redundant joints take per iteration of inverse
+        kinematics; 0 for up to six joints.
       link_radius: m, of its links, for the collision watch.
       watched: the first joint whose origin must stay above the table.
-      remote_centre: whether its base stands at the trocar, being a mechanical remote centre.
+      remote_centre: True for a mechanical remote centre, whose base stands at the trocar.
     """
 
     name: str

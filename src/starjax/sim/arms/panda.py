@@ -43,5 +43,5 @@ ARM = Arm(
     },
     rest_gain=0.1,
     link_radius=0.055,
-    watched=4,  # it stands beside the table and lower, and so does its elbow
+    watched=4,  # its base and elbow are below the table top, next to the table
 )

@@ -1,4 +1,4 @@
-"""Tools: what the MJCF does not say. Data only."""
+"""Tools: data beyond the MJCF."""
 
 from typing import NamedTuple
 
@@ -10,16 +10,15 @@ class Tool(NamedTuple):
       name: key in the registry.
       mjcf: a part below `mjcf/`, or the path of a file.
       tcp: site of the tip, {E}.
-      jaw: joint whose position tells the opening, or None for a tool without jaws.
+      jaw: joint that measures the opening, or None for a tool without jaws.
       servo: actuator of the jaws, or None.
-      closed, open: m a side, of the jaws at gripper -1 (past closed, so that the servo squeezes)
-        and +1.
+      closed, open: m per jaw at gripper -1 (past closed, for a squeezing force) and +1.
       pads: geoms that grasp.
-      is_symmetric: whether half a turn about its axis changes nothing.
+      is_symmetric: True if half a turn about its axis changes nothing.
       shaft_radius: m.
       shaft_end: m, the shaft's lower end lies this far before the tcp.
       pad_end: m, the pads' ends lie this far past the tcp.
-      shaft_reach: m of shaft above its end that can touch what lies on the table.
+      shaft_reach: m of shaft above its end that can touch objects on the table.
     """
 
     name: str
