@@ -1,7 +1,6 @@
-"""A batch of episodes as one compiled program, which also begins new ones.
+"""Batch of episodes as one compiled program, which also starts new ones.
 
-Episode e of a lane begins with `fold_in(key, e)` of the lane's key, so what a lane goes through
-does not depend on the others.
+Episode e of a lane starts with `fold_in(key, e)` of the lane's key, so lanes are independent.
 """
 
 import functools
@@ -17,7 +16,7 @@ from starjax.envs.settings import EnvSettings
 
 
 class Lanes(NamedTuple):
-    """N episodes under way: keys `[N]`, `[N]` int32 episodes begun, EnvState `[N]`."""
+    """N episodes in progress: keys `[N]`, int32 counts `[N]` of started episodes, EnvState `[N]`."""
 
     key: jax.Array
     episode: jax.Array
@@ -25,12 +24,12 @@ class Lanes(NamedTuple):
 
 
 class StepMode(NamedTuple):
-    """Functions of a batch of episodes.
+    """Modes of one call.
 
     Attributes:
-      reset_mask: `[N]` bool; these lanes begin an episode and take no action.
-      move: bool; whether the others act, or stay.
-      autoreset: bool; whether those whose episode ends begin the next one at once.
+      reset_mask: `[N]` bool, lanes that start an episode without an action.
+      move: bool, True if the other lanes act.
+      autoreset: bool, True if lanes whose episode ends start the next one at once.
     """
 
     reset_mask: Any
@@ -43,8 +42,8 @@ class BatchStep(NamedTuple):
 
     Attributes:
       now: observation and info of the states now, leaves `[N, ...]`.
-      outcome: Outcome `[N]`; of lanes that were to be restarted 0 and False.
-      final: as `now`, before lanes whose episode ended in this step began the next one.
+      outcome: Outcome `[N]`, 0 and False for lanes in the reset mask.
+      final: as `now`, but before any automatic reset.
     """
 
     now: tuple[Any, dict[str, jax.Array]]
@@ -57,10 +56,10 @@ class EpisodeBatch(NamedTuple):
 
     Attributes:
       episodes: of one lane.
-      empty: () -> Lanes before any episode; all are to be restarted.
+      empty: () -> Lanes before any episode; reset all of them.
       advance: (Lanes, actions `[N, D]`, StepMode) -> (Lanes, BatchStep).
       camera: EnvState `[N]` -> `[N, h, w, 3]` uint8.
-      observed: shapes and types of what one episode shows.
+      observed: shapes and types of one episode's observation.
     """
 
     episodes: mdp.Episodes
@@ -92,7 +91,7 @@ def make(settings: EnvSettings, lanes: int) -> EpisodeBatch:
             begun = lanes._replace(episode=lanes.episode + reset_mask, state=first)
             return _merged(reset_mask, (begun, look(first)), (lanes._replace(state=after), final))
 
-        # Rarely needed, and as dear as a step.
+        # Skipped if possible: a reset costs as much as a step.
         lanes, now = jax.lax.cond(
             jnp.any(reset_mask), begin, lambda: (lanes._replace(state=after), final)
         )
@@ -110,7 +109,7 @@ def make(settings: EnvSettings, lanes: int) -> EpisodeBatch:
 
 
 def seeded(lanes: Lanes, seeds: Any, which: Any) -> Lanes:
-    """Some lanes with keys of these seeds `[N]` uint32, before their first episode."""
+    """Returns the lanes, those of `which` with keys of `seeds` `[N]` uint32 and no episode yet."""
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
     fresh = lanes._replace(key=keys, episode=jnp.zeros_like(lanes.episode))
     return _merged(which, fresh, lanes)

@@ -10,7 +10,7 @@ Rewards of a control step:
 
 - `dense`: the task's stage-wise reward, which is 1 where success holds, minus 1. So every step
   before success costs, and a quick success is best. An episode that fails before its time costs
-  what its remaining steps could: failing never pays.
+  as much as its remaining steps could, so failing never pays.
 - `sparse`: 1 at success, else 0.
 
 An episode terminates at success, when it is lost, or when its simulation has diverged (`invalid`),
@@ -46,8 +46,8 @@ class Episodes(NamedTuple):
       reset: key -> EnvState.
       step: (EnvState, action `[D]`) -> EnvState.
       judge: (EnvState before, EnvState after) -> Outcome.
-      observe: EnvState -> what an agent sees, see `observing`.
-      measure: EnvState -> name -> number, for whoever watches.
+      observe: EnvState -> observation, see `observing`.
+      measure: EnvState -> name -> number, for `info`.
       camera: EnvState -> `[h, w, 3]` uint8 of the first camera.
       decode: (EnvState, action `[D]`) -> Command `[A]`.
       encode: (EnvState, Command `[A]`) -> action `[D]`, not clipped.
@@ -149,12 +149,12 @@ def make(settings: EnvSettings) -> Episodes:
 
 
 def is_terminated(state: Any) -> jax.Array:
-    """Whether an episode is over before its time."""
+    """Returns True if an episode ended before its time."""
     return state.success | state.lost | state.invalid
 
 
 def measure(state: Any) -> dict[str, jax.Array]:
-    """Content of `info`; `rcm_error` in m is the largest of the arms', executed."""
+    """Returns the content of `info`; `rcm_error` in m is the arms' largest executed one."""
     return {
         "is_success": state.success,
         "loose": state.loose,

@@ -1,13 +1,13 @@
-"""Observations of an agent: numbers of order one, and images if it is to see them.
+"""Observations of an agent: features of order one, optionally with images.
 
-`tool`, of each arm after the others' where there are several, is what a robot measures and is told:
+`tool` has a robot's measurements and its measured trocar, arm after arm:
 
 - its pose in the action space, in [-1, 1] within `ranges.actions`, and its jaws' opening;
-- velocity of the tip (3) and of the roll (1) that the controller was at, in shares of the fastest;
-- 7 numbers that say where its trocar is (`policies.features.trocar_features`).
+- the controller's velocity of the tip (3) and of the roll (1), as fractions of the largest;
+- 7 features of its trocar (`policies.features.trocar_features`).
 
-Seen as `state`, the task's fields follow, points scaled by the tip's box, and `Task.relative`. Seen
-as `image`, there are the cameras' images beside `tool`.
+With `state` the task's fields follow, points scaled by the tip's box, and `Task.relative`. With
+`image` the cameras' images accompany `tool`.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ _FASTEST = np.array([control.MAX_SPEED] * 3 + [control.MAX_SPIN], np.float32)
 
 
 def make(env: Any, scaled: Callable[[Any], jax.Array]) -> Callable[[Any], Any]:
-    """EnvState -> `[O]` float32, or `{camera's name: [h, w, 3] uint8, "tool": [O] float32}`.
+    """Makes EnvState -> `[O]` float32 or `{camera's name: [h, w, 3] uint8, "tool": [O] float32}`.
 
     Args:
       env: `sim.env.Env`.

@@ -1,11 +1,11 @@
-"""A task in the shape of a MuJoCo Playground environment, by duck typing: no other package.
+"""Tasks with the interface of a MuJoCo Playground environment, by duck typing.
 
 >>> env = playground.make("reach")
 >>> state = jax.jit(env.reset)(jax.random.key(0))
 >>> state = jax.jit(env.step)(state, jnp.zeros(env.action_size))
 
-One environment, for `vmap`, `jit` and `scan`. As there, it does not begin episodes anew and knows
-no time limit: wrappers do that, with `episode_length`.
+One environment, for `vmap`, `jit` and `scan`. As in Playground, wrappers start new episodes and
+apply the time limit `episode_length`.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class State:
       obs: see `observing`.
       reward, done: float32; done is 1 where the episode has ended before its time.
       metrics: name -> float32, see `mdp.measure`.
-      info: whatever wrappers put there; `step` keeps it.
+      info: entries of wrappers, which `step` keeps.
     """
 
     data: Any

@@ -1,4 +1,4 @@
-"""Ranges that actions in [-1, 1] span: where tools can be in a task, in its action space."""
+"""Ranges that actions in [-1, 1] span in a task's action space."""
 
 import jax
 import numpy as np
@@ -7,27 +7,29 @@ from starjax import rcm
 from starjax.sim import registries
 from starjax.sim.tasks.base import Task
 
-# Beyond the workspace's box of the tip, m, and its rolls, rad: an action at a bound is still sound,
-# and a command past the goal hurries the tool.
+# Margins of the workspace's box of the tip (m) and of its rolls (rad): goals at the edge stay inside
+# the range, and a command past the goal speeds the tool up.
 MARGIN = np.array([0.005, 0.005, 0.015])
 ROLL_MARGIN = 0.2
 AZIMUTHS, ROLLS, TIPS = 16, 9, 3  # of the grid, a side
 
 
 def tips(task: Task) -> tuple[np.ndarray, np.ndarray]:
-    """The boxes of the tips, low and high `[A, 3]` m in the world: the workspaces' and MARGIN, but
-    no lower."""
+    """Returns the tips' boxes, low and high `[A, 3]` m in the world.
+
+    They are the workspaces' boxes with MARGIN added, except downwards.
+    """
     spaces = [registries.workspaces.get(slot.workspace) for slot in task.slots]
     low, high = (np.array([getattr(space, end) for space in spaces]) for end in ("low", "high"))
     return low - MARGIN * [1, 1, 0], high + MARGIN
 
 
 def actions(task: Task, action_space: str) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest encoding `[A, dim]` of poses whose tip lies in its box.
+    """Returns the lowest and highest encodings `[A, dim]` of poses with the tip in its box.
 
     All poses are on the RCM manifold, through trocars at the edge of the workspace's ranges, with
-    rolls of the workspace and ROLL_MARGIN. So positions, depths and rolls are bounded by what the
-    task asks for, and the middle of the box is near a tool that points down.
+    rolls of the workspace and ROLL_MARGIN. So the task bounds positions, depths and rolls, and the
+    middle of the box is near a tool that points down.
     """
     space = rcm.ACTION_SPACES[action_space]
     encode = jax.jit(space.encode)

@@ -1,4 +1,4 @@
-"""Every task as an environment of Gymnasium, by name. Imports neither jax nor mjx."""
+"""Registration of every task as a Gymnasium environment. Imports neither jax nor mjx."""
 
 import re
 
@@ -9,13 +9,13 @@ VERSION = 0
 
 
 def name(task: str) -> str:
-    """Gymnasium's name of a task: `starjax/PegTransfer-v0` of `peg_transfer`."""
+    """Returns Gymnasium's name of a task: `starjax/PegTransfer-v0` of `peg_transfer`."""
     words = re.split(r"[_\W]+", task)
     return f"starjax/{''.join(word[:1].upper() + word[1:] for word in words)}-v{VERSION}"
 
 
 def register() -> None:
-    """Registers all tasks, those of other packages too, unless they are.
+    """Registers all tasks, including those of other packages, once.
 
     Raises:
       errors.UsageError: Gymnasium is not installed.

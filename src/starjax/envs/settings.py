@@ -23,15 +23,15 @@ class EnvSettings:
       task: key of `registries.tasks`.
       arms, tools: keys of `registries.arms` and `registries.tools`: one per slot of the task, one
         for all slots, or none for the task's defaults.
-      trocar: where the trocars are. `seen`, `unseen`, `all`: every episode draws one of the task's
+      trocar: true trocars. `seen`, `unseen`, `all`: every episode draws one of the task's
         configurations; `random`: uniformly in the workspace's ranges (Eq. 19); a whole number:
         that configuration of the task; a `rcm.Trocar` or (radius m, polar rad, azimuth rad),
         fields `[]` or `[A]`: this one.
       action_space: key of `rcm.ACTION_SPACES`.
-      control: whether an action is `relative` to where the tool is, or `absolute`, see `mdp`.
+      control: actions `relative` to the measured pose, or `absolute`, see `mdp`.
       reward: `dense` or `sparse`, see `mdp`.
       observation: `state` (numbers) or `image` (pixels, and numbers of the tool).
-      image_size: pixels a side of the cameras' square images, rendered ones too.
+      image_size: side in pixels of the cameras' square images, rendered ones too.
       cameras: of the task; none for its first one.
       max_episode_steps: control steps after which an episode is truncated, if fewer than the task's
         time limit has.
@@ -51,7 +51,7 @@ class EnvSettings:
 
 
 def make(**given: Any) -> EnvSettings:
-    """Settings of what a user gave.
+    """Validates a user's settings.
 
     Raises:
       errors.UsageError: an unknown name, or a value out of range.

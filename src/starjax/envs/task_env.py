@@ -1,4 +1,4 @@
-"""One environment of Gymnasium: a batch of one."""
+"""Gymnasium environment of one episode at a time: a batch of one."""
 
 from typing import Any
 
@@ -46,7 +46,7 @@ class TaskEnv(gymnasium.Env):
         return _only(observed), _numbers(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One control step (1/30 s) towards `action` `[D]` in [-1, 1]."""
+        """Advances one control step (1/30 s) towards `action` `[D]` in [-1, 1]."""
         observed, reward, terminated, truncated, info = self._lanes.step(np.asarray(action)[None])
         return (
             _only(observed),

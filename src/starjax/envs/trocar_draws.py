@@ -1,4 +1,4 @@
-"""Where the trocars of an episode are, as `EnvSettings.trocar` says."""
+"""Draws of an episode's trocars, as chosen by `EnvSettings.trocar`."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ Draw = Callable[[jax.Array], rcm.Trocar]
 
 
 def make(task: Task, trocar: str | int | tuple) -> Draw:
-    """key -> trocars, fields `[A]`.
+    """Makes key -> trocars, fields `[A]`.
 
     Raises:
       errors.UsageError: the task has no configuration of that number, or not so many arms.

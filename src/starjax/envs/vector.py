@@ -1,4 +1,4 @@
-"""A batch of environments of Gymnasium, simulated by one compiled program."""
+"""Batch of Gymnasium environments, simulated by one compiled program."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,7 +23,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
 
     Attributes:
       episodes: the pure functions of one episode, see `mdp.Episodes`.
-      settings: what they were made with.
+      settings: validated settings.
     """
 
     def __init__(
@@ -38,10 +38,10 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
 
         Args:
           num_envs: N.
-          autoreset_mode: what happens to a lane whose episode is over. NEXT_STEP: the next step
-            begins another, whatever the action. SAME_STEP: the same step does, and
-            `info["final_obs"]` and `info["final_info"]` are of the one that ended. DISABLED: it
-            stays as it is until `reset(options={"reset_mask": mask})`.
+          autoreset_mode: treatment of a lane whose episode is over. NEXT_STEP: the next step starts
+            another one, ignoring the action. SAME_STEP: the same step does, and
+            `info["final_obs"]` and `info["final_info"]` belong to the ended episode. DISABLED: the
+            lane is frozen until `reset(options={"reset_mask": mask})`.
           render_mode: `rgb_array` or None.
           given: see `settings.EnvSettings`.
 
@@ -75,9 +75,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         """Begins episodes.
 
         Args:
-          seed: of lane 0, lane i having seed + i; or one for each lane; or None, and every lane
-            goes on with its next episode.
-          options: `reset_mask`, `[N]` bool: the lanes to reset, all where it is missing.
+          seed: of lane 0, with seed + i for lane i; or one per lane; or None to continue every lane
+            with its next episode.
+          options: `reset_mask`, `[N]` bool, the lanes to reset; all by default.
 
         Raises:
           errors.UsageError: seeds or mask are not of N lanes, or a mask comes before all lanes
@@ -100,11 +100,11 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             self._lanes, idle, batch.StepMode(which, False, False)
         )
         self._over = self._over & ~which
-        observed, measured = _fetched(found.now)
-        return observed, _said(measured, which)
+        observed, measured = _to_host(found.now)
+        return observed, _info(measured, which)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One control step (1/30 s) of every lane.
+        """Advances every lane by one control step (1/30 s).
 
         Args:
           actions: `[N, D]` in [-1, 1], clipped.
@@ -125,16 +125,16 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         autoreset = self._mode == AutoresetMode.SAME_STEP
         do = batch.StepMode(reset_mask, True, autoreset)
         self._lanes, found = self._batch.advance(self._lanes, actions, do)
-        now, (reward, terminated, truncated) = _fetched((found.now, found.outcome))
+        now, (reward, terminated, truncated) = _to_host((found.now, found.outcome))
         observed, measured = now
         self._over = terminated | truncated
-        info = _said(measured, np.ones(self.num_envs, bool))
+        info = _info(measured, np.ones(self.num_envs, bool))
         if autoreset and self._over.any():
-            info |= self._final(_fetched(found.final), self._over)
+            info |= self._final(_to_host(found.final), self._over)
         return observed, reward.astype(np.float64), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Renders the first camera of every lane, `[h, w, 3]` uint8 each."""
+        """Renders the first camera of every lane, `[h, w, 3]` uint8."""
         if self.render_mode is None or self._lanes is None:
             return None
         return tuple(np.array(self._batch.camera(self._lanes.state)))
@@ -156,12 +156,12 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         return mask
 
     def _final(self, ended: tuple[Any, dict], over: np.ndarray) -> dict[str, Any]:
-        """Entries of `info` for episodes that ended in this step, as Gymnasium's own have them."""
+        """Returns Gymnasium's entries of `info` for episodes that ended in this step."""
         observed, measured = ended
         rows = np.full(self.num_envs, None, object)
         for lane in np.flatnonzero(over):
             rows[lane] = jax.tree.map(lambda x, i=lane: x[i].copy(), observed)
-        info = {"final_obs": rows, "final_info": _said(measured, over)}
+        info = {"final_obs": rows, "final_info": _info(measured, over)}
         return info | {f"_{name}": over.copy() for name in info}
 
 
@@ -173,14 +173,14 @@ def _space(observed: Any) -> spaces.Space:
     return spaces.Box(-observing.LARGEST, observing.LARGEST, observed.shape, np.float32)
 
 
-def _said(measured: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:
-    """Gymnasium's info of some lanes: zeros for the others, and which they are."""
+def _info(measured: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns Gymnasium's info of some lanes, with masks and zeros for the others."""
     masks = {f"_{name}": which.copy() for name in measured}
     return {name: np.where(which, x, np.zeros_like(x)) for name, x in measured.items()} | masks
 
 
-def _fetched(tree: Any) -> Any:
-    """On the host, in arrays that are the user's own."""
+def _to_host(tree: Any) -> Any:
+    """Copies to writable arrays on the host."""
     return jax.tree.map(np.array, jax.device_get(tree))
 
 

@@ -11,7 +11,7 @@ from starjax.types import Pose
 
 
 def free_pose(qpos: jax.Array, start: int) -> Pose:
-    """Returns the world pose of the free body with the 7 coordinates from `start` of `qpos` `[Q]`."""
+    """Returns the world pose of the free body with 7 coordinates from `start` of `qpos` `[Q]`."""
     coords = qpos[start : start + 7]
     w, x, y, z = coords[3:] / jnp.linalg.norm(coords[3:])
     rows = (

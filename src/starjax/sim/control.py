@@ -36,8 +36,8 @@ MAX_TURN = 0.05  # rad, of the tool for it: near the trocar turning moves nothin
 # m, largest deviation that one period corrects: beyond it servos are saturated, and the integral
 # would wind up
 MAX_DEVIATION = 1e-3
-# m from the tip to the trocar within which the axis keeps its direction, as it is ill-defined: well
-# below the least depth of an action (`rcm.MIN_DEPTH`)
+# m from the tip to the trocar within which the axis keeps its direction: there it is ill-defined.
+# Well below the least depth of an action (`rcm.MIN_DEPTH`).
 NO_DIRECTION = 1e-3
 
 

@@ -79,8 +79,8 @@ def solve(
         pose, origins, axes = forward(chain, q)
         J = _jacobian(chain, pose, origins, axes, ROTATION_WEIGHT)
         missing = _error(pose, target)
-        # Null-space term: dq = free + J+ (missing - J free) reaches the same pose; of `free` it keeps
-        # the part in the null space of J.
+        # Null-space term: dq = free + J+ (missing - J free) reaches the same pose, with the part of
+        # `free` in the null space of J.
         if is_redundant:
             free = jnp.where(i + 1 < iterations, gain, 0.0) * (home - q)
             dq = free + _least_squares(J, missing - J @ free)

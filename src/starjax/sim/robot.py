@@ -22,13 +22,16 @@ def read(arm: Arm) -> mujoco.MjSpec:
     sites = [site.name for site in spec.sites]
     if FLANGE not in sites:
         raise errors.UsageError(
-            f"arm {arm.name}", f"the site {FLANGE} at its end", _said(sites), arm.mjcf
+            f"arm {arm.name}", f"the site {FLANGE} at its end", _joined(sites), arm.mjcf
         )
     servos = {servo.name: servo.target for servo in spec.actuators}
     for joint in arm.joints:
         if servos.get(joint) != joint:
             raise errors.UsageError(
-                f"arm {arm.name}", f"a servo of joint {joint} by its name", _said(servos), arm.mjcf
+                f"arm {arm.name}",
+                f"a servo named {joint}",
+                _joined(servos),
+                arm.mjcf,
             )
     for joint in spec.joints:
         if joint.frictionloss:
@@ -40,5 +43,5 @@ def read(arm: Arm) -> mujoco.MjSpec:
     return spec
 
 
-def _said(names: Iterable[str]) -> str:
+def _joined(names: Iterable[str]) -> str:
     return ", ".join(names) or "none"

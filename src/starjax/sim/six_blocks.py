@@ -1,7 +1,8 @@
 """Six blocks in one episode: the environment of one block's transfer, restarted for each block.
 
-A block that is threaded, released and at rest stays in place, and the next one follows. In between a script withdraws the tools to an episode's start, which counts as time. Physics, success
-test and agent are those of one block's transfer.
+A block that is threaded, released and at rest stays in place, and the next one follows. In between
+a script withdraws the tools to an episode's start, which counts as time. Physics, success test and
+agent are those of one block's transfer.
 """
 
 from collections.abc import Sequence

@@ -199,9 +199,9 @@ def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> ja
 def pull(problem: Problem, r: jax.Array) -> jax.Array:
     """Returns the vector `[E]` to `r` from the nearest point that satisfies the constraints."""
     others, contacts = _split(problem, r)
-    # Three zones of a contact. Inside the cone (depth 0): no force. In the polar cone, mu n + t <= 0,
-    # the apex is nearest: it sticks, and all of r counts. In between the nearest point is on the
-    # cone's surface: it slips, and the force is along the surface's normal.
+    # Three zones of a contact. Inside the cone depth is 0: no force. In the polar cone, where
+    # mu n + t <= 0, the apex is nearest: it sticks, and all of r counts. In between the nearest
+    # point is on the cone's surface: it slips, and the force is along the surface's normal.
     slip = jnp.concatenate([-jnp.ones_like(contacts.mu), contacts.mu * contacts.along], 1)
     rows = jnp.where(contacts.sticks, contacts.r, contacts.depth * slip)
     return jnp.concatenate([jnp.where(_holds(problem, others), others, 0.0), rows.reshape(-1)])

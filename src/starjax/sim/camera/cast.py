@@ -1,4 +1,4 @@
-"""One picture: the nearest face along every ray, the sun's shadow, the colour."""
+"""Image of a scene: the nearest face along every ray, the sun's shadow, the colour."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ def cast(
     scene: scenes.RenderScene, grid: tiles.Grid, view: View, shadow: bool,
     geom_xpos: Array, geom_xmat: Array, geom_rgb: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Depth in m, face (-1 background) and colour (bytes of an int32); each `[T, Q]`."""
+    """Returns depth in m, face (-1 background) and colour (bytes of an int32), each `[T, Q]`."""
     offset = geom_xpos[scene.ids] - view.p_world_cam
     c = jnp.einsum("ij,gj->gi", view.R_cam_world, offset, precision="highest")
     R = jnp.einsum("ij,gjk->gik", view.R_cam_world, geom_xmat[scene.ids], precision="highest")
@@ -32,11 +32,9 @@ def cast(
 def _nearest(
     scene: scenes.RenderScene, grid: tiles.Grid, c: Array, R: Array
 ) -> tuple[Array, Array]:
-    """Depth in m and number of the face that each ray meets first.
-
-    Both travel in one int32: positive floats order like their bits, and the last few bits of the
-    mantissa (2^-16 of the depth with 127 faces) make room for the face.
-    """
+    """Returns depth in m and number of the first face that each ray meets."""
+    # Both travel in one int32: positive floats order like their bits, and the last few bits of the
+    # mantissa (2^-16 of the depth with 127 faces) hold the face.
     room = (1 << len(scene.row_of_face()).bit_length()) - 1
     x, y = jnp.asarray(grid.x), jnp.asarray(grid.y)
 
@@ -68,7 +66,7 @@ def _shaded(
     scene: scenes.RenderScene, grid: tiles.Grid, R_light_cam: Any, c: Array, R: Array, t: Array,
     face: Array,
 ) -> Array:  # fmt: skip
-    """Which visible points another geom hides from the sun. No convex shape hides itself."""
+    """Returns True for visible points that another geom shades. No convex shape shades itself."""
     c = jnp.einsum("ij,gj->gi", R_light_cam, c, precision="highest")
     R = jnp.einsum("ij,gjk->gik", R_light_cam, R, precision="highest")
     x, y = jnp.asarray(grid.x), jnp.asarray(grid.y)

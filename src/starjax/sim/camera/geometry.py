@@ -1,4 +1,4 @@
-"""Geometry that never changes between two images, read once from the MuJoCo model (numpy)."""
+"""Constant geometry of all images, read once from the MuJoCo model (numpy)."""
 
 from typing import NamedTuple
 
@@ -35,7 +35,7 @@ class Texture(NamedTuple):
     Attributes:
       texels: `[h, w, 3]` RGB.
       scale: `[2]` texture coordinates per metre along the geom's x and y.
-      corner: `[2]` m, where both are 0.
+      corner: `[2]` m, the point at texture coordinates 0.
       R_cam_geom, p_cam_top: `[3, 3]` and `[3]` m, pose of the textured face in the frame of the
         scene: the camera's, or the world's for a camera that moves.
     """
@@ -50,7 +50,7 @@ class Texture(NamedTuple):
 class RenderScene(NamedTuple):
     """Drawn geoms in rows sorted by kind, the camera and its lights.
 
-    Pixels name the face they see: faces are numbered row by row, `FACES[kind]` for each.
+    Pixels refer to faces, which are numbered row by row, `FACES[kind]` per row.
 
     Attributes:
       ids: `[N]` geom id of every row.
@@ -64,7 +64,7 @@ class RenderScene(NamedTuple):
       left, right, bottom, top: the picture's sides in the plane at depth 1.
       sun: the first directional light, or None.
       headlight: shines along the view.
-      background: `[3]` RGB where no geom is hit.
+      background: `[3]` RGB of rays without a hit.
     """
 
     ids: np.ndarray
@@ -88,16 +88,16 @@ class RenderScene(NamedTuple):
     background: np.ndarray
 
     def rows(self, kind: int) -> slice:
-        """Rows of one kind."""
+        """Returns the rows of one kind."""
         start, stop = np.searchsorted(self.kind, (kind, kind + 1))
         return slice(int(start), int(stop))
 
     def first_face(self, kind: int) -> int:
-        """Number of the first face of a kind."""
+        """Returns the number of the first face of a kind."""
         return int(np.sum(np.take(FACES, self.kind[self.kind < kind])))
 
     def row_of_face(self) -> np.ndarray:
-        """`[F]` row of every face."""
+        """Returns the row `[F]` of every face."""
         return np.repeat(np.arange(len(self.kind)), np.take(FACES, self.kind))
 
 
@@ -108,7 +108,7 @@ def read(mj_model: mujoco.MjModel, camera: str, aspect: float, moves: bool = Fal
       mj_model: the model.
       camera: name of the camera.
       aspect: width over height, for cameras given by `fovy` alone.
-      moves: whether the camera's pose comes with every image. Sun and textures are then in the
+      moves: True if the camera's pose comes with every image. Sun and textures are then in the
         world's frame; else in the camera's, which must be fixed in the world.
     """
     cam = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
@@ -168,12 +168,12 @@ def read(mj_model: mujoco.MjModel, camera: str, aspect: float, moves: bool = Fal
 
 
 def geom_rgb(mj_model: mujoco.MjModel) -> np.ndarray:
-    """Colour of every geom as the MJCF gives it, `[G, 3]` float32 in [0, 1]."""
+    """Returns the MJCF's colour of every geom, `[G, 3]` float32 in [0, 1]."""
     return _rgba(mj_model)[:, :3].astype(np.float32)
 
 
 def _rgba(mj_model: mujoco.MjModel) -> np.ndarray:
-    """MuJoCo's rule: a geom's own rgba wins over its material's unless it is the default grey."""
+    """Returns MuJoCo's colours: a geom's rgba overrides its material's unless it is the default."""
     rgba = mj_model.geom_rgba.copy()
     default = np.isclose(rgba, [0.5, 0.5, 0.5, 1.0]).all(1) & (mj_model.geom_matid >= 0)
     rgba[default] = mj_model.mat_rgba[mj_model.geom_matid[default]]
@@ -181,7 +181,7 @@ def _rgba(mj_model: mujoco.MjModel) -> np.ndarray:
 
 
 def _sizes(mj_model, ids, kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sizes by row, and the rounded box that holds each shape."""
+    """Returns sizes by row, and the rounded box around each shape."""
     size = mj_model.geom_size[ids].copy()
     size[mj_model.geom_type[ids] == mujoco.mjtGeom.mjGEOM_SPHERE, 1] = 0
     size[np.isin(kind, (CAPSULE, CYLINDER)), 2] = 0
@@ -196,7 +196,7 @@ def _sizes(mj_model, ids, kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _materials(mj_model, ids) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Specular, shininess and emission by row; MuJoCo's defaults without a material."""
+    """Returns specular, shininess and emission by row; MuJoCo's defaults without a material."""
     mat = mj_model.geom_matid[ids]
     if mj_model.nmat == 0:
         return np.full(len(ids), 0.5), np.full(len(ids), 0.5), np.zeros(len(ids))
@@ -208,7 +208,7 @@ def _materials(mj_model, ids) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _frustum(mj_model, cam: int, aspect: float) -> tuple[float, float, float, float]:
-    """Sides of the picture at depth 1, with the shifted principal point of a sensor if given."""
+    """Returns the image's sides at depth 1, with a sensor's shifted principal point if given."""
     width, height = mj_model.cam_sensorsize[cam]
     if height > 0:
         fx, fy, cx, cy = mj_model.cam_intrinsic[cam]
@@ -223,7 +223,7 @@ def _frustum(mj_model, cam: int, aspect: float) -> tuple[float, float, float, fl
 
 
 def _sun(mj_model, data, R_world_cam) -> Light | None:
-    """The first active directional light."""
+    """Returns the first active directional light."""
     for i in range(mj_model.nlight):
         directional = mj_model.light_type[i] == mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
         if mj_model.light_active[i] and directional:
@@ -237,7 +237,7 @@ def _sun(mj_model, data, R_world_cam) -> Light | None:
 
 
 def _texels(mj_model, tex: int) -> np.ndarray:
-    """A texture's RGB, `[h, w, 3]` in [0, 1]."""
+    """Returns a texture's RGB, `[h, w, 3]` in [0, 1]."""
     h, w, c = mj_model.tex_height[tex], mj_model.tex_width[tex], mj_model.tex_nchannel[tex]
     start = mj_model.tex_adr[tex]
     texels = mj_model.tex_data[start : start + h * w * c].reshape(h, w, c)
@@ -245,7 +245,7 @@ def _texels(mj_model, tex: int) -> np.ndarray:
 
 
 def _sky(mj_model) -> np.ndarray:
-    """Mean colour of the skybox, black without one."""
+    """Returns the mean colour of the skybox, black without one."""
     for tex in range(mj_model.ntex):
         if mj_model.tex_type[tex] == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             return _texels(mj_model, tex).mean((0, 1))
@@ -253,7 +253,7 @@ def _sky(mj_model) -> np.ndarray:
 
 
 def _textures(mj_model, data, ids, R_world_cam, p_world_cam) -> dict[int, Texture]:
-    """Textures of the rows whose material has one, mapped as MuJoCo maps 2d textures."""
+    """Returns the textures of rows whose material has one, mapped as MuJoCo maps 2d textures."""
     found = {}
     for row, g in enumerate(ids):
         mat = mj_model.geom_matid[g]

@@ -1,9 +1,9 @@
-"""Rays against capsules (and spheres), cylinders, boxes and planes, in the camera frame.
+"""Intersections of rays with capsules (and spheres), cylinders, boxes and planes.
 
 A view ray is `t * (x, y, -1)`: `t` is planar depth. A shadow ray starts at a point and runs along
 the third axis of the light frame. Each function takes the features of one geom, broadcast against
-the pixels, and works in float32: differences of large squares are avoided, so that a 1 mm capsule
-at half a metre keeps its outline to about 1e-3 px.
+the pixels, in float32. It avoids differences of large squares, which keeps the outline of a 1 mm
+capsule at half a metre within about 1e-3 px.
 """
 
 import jax
@@ -21,7 +21,7 @@ Array = jax.Array
 
 
 def features(kind: int, c: Array, R: Array, size: Array) -> Array:
-    """Numbers of geoms of one kind for `view` and `shadow`: `[N, 16]`.
+    """Returns the features `[N, 16]` of geoms of one kind for `view` and `shadow`.
 
     Args:
       c: `[N, 3]` centres in m.
@@ -40,17 +40,17 @@ def features(kind: int, c: Array, R: Array, size: Array) -> Array:
 
 
 def view(kind: int, x: Array, y: Array, f: list[Array]) -> tuple[Array, Array | int]:
-    """Where the rays through (x, y, -1) meet a geom: depth in m, FAR for a miss, and which face."""
+    """Intersects rays through (x, y, -1) with a geom: depth in m (FAR for a miss) and face."""
     return (_view_capsule, _view_cylinder, _view_box, _view_plane)[kind](x, y, f)
 
 
 def shadow(kind: int, p: list[Array], f: list[Array]) -> Array:
-    """Whether a capsule, cylinder or box lies above the points `p`, given in the light frame."""
+    """Returns True for points `p`, in the light frame, below a capsule, cylinder or box."""
     return (_shadow_capsule, _shadow_cylinder, _shadow_box)[kind](p, f)
 
 
 def normals(kind: int, c: Array, R: Array, size: Array) -> Array:
-    """The field of normals of every face: `[N * FACES[kind], 7]` as (c, u, half) of `normal`.
+    """Returns each face's field of normals `[N * FACES[kind], 7]` as (c, u, half) of `normal`.
 
     Args:
       c, R, size: as for `features`, in the camera frame.
@@ -68,9 +68,9 @@ def normals(kind: int, c: Array, R: Array, size: Array) -> Array:
 
 
 def normal(p: list[Array], f: list[Array]) -> list[Array]:
-    """Unit normal at the points `p` of a face: away from the nearest point of its axis.
+    """Returns the unit normal at points `p` of a face, away from the nearest point of its axis.
 
-    Capsule and cylinder differ in how far the axis reaches; a flat face is a ball far behind it.
+    Capsule and cylinder differ in the length of the axis; a flat face is a ball far behind it.
     """
     w = [p[k] - f[k] for k in range(3)]
     along = jnp.clip(w[0] * f[3] + w[1] * f[4] + w[2] * f[5], -f[6], f[6])
@@ -80,11 +80,13 @@ def normal(p: list[Array], f: list[Array]) -> list[Array]:
 
 
 def _round(x, y, f):
-    """Ray against the infinite cylinder around an axis: terms that capsule and cylinder share."""
+    """Intersects a ray with the infinite cylinder around an axis, for capsule and cylinder."""
     cx, cy, cz, ux, uy, uz, wx, wy, wz, n, _, r, _ = f[:13]
     square = x * x + y * y + 1
     m = x * ux + y * uy - uz
     away = cz - x * cx - y * cy
+    # a t^2 + 2 b t + c = 0 is the distance from the axis squared minus r^2. Its discriminant
+    # b^2 - a c = a r^2 - s^2, by Lagrange's identity, has no difference of large squares.
     a = jnp.maximum(square - m * m, _TINY)
     b = away - m * n
     s = x * wx + y * wy - wz  # of ray and axis: the distance between them times sqrt(a)
@@ -96,6 +98,7 @@ def _round(x, y, f):
 def _view_capsule(x, y, f):
     n, oc2, r, half = f[9:13]
     square, m, away, _, _, _, h, t = _round(x, y, f)
+    # Beyond the cylinder's ends the ray meets the ball at the nearer end.
     along = n + t * m
     end = jnp.where(along > 0, half, -half)
     b = away - end * m
@@ -119,7 +122,7 @@ def _view_cylinder(x, y, f):
 
 
 def _local(x, y, f):
-    """Direction of the rays in the frame of a box or plane."""
+    """Returns the rays' direction in the frame of a box or plane."""
     return [x * f[3 + k] + y * f[6 + k] - f[9 + k] for k in range(3)]
 
 
@@ -128,6 +131,7 @@ def _inverse(v):
 
 
 def _view_box(x, y, f):
+    # Slab method: the ray is inside while it is between all three pairs of faces.
     near, far, face = -FAR, FAR, 0
     for k, v in enumerate(_local(x, y, f)):
         inverse = _inverse(v)
@@ -149,8 +153,8 @@ def _shadow_capsule(p, f):
     cx, cy, cz, ux, uy, uz = f[:6]
     r, half = f[11], f[12]
     dx, dy = p[0] - cx, p[1] - cy
-    # Where the axis, seen along the light, passes nearest. There the axis is inside the capsule,
-    # so that a point outside is in shadow exactly if it lies below.
+    # Point of the axis nearest to the light ray. It is inside the capsule, so a point outside is in
+    # shadow exactly if it lies below.
     along = (dx * ux + dy * uy) / jnp.maximum(ux * ux + uy * uy, _TINY)
     along = jnp.clip(along, -half, half)
     dx, dy = dx - along * ux, dy - along * uy

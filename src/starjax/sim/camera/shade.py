@@ -18,10 +18,10 @@ def light(
     scene: scenes.RenderScene, view: View, rgb: Array, c: Array, R: Array,
     p: list[Array], face: Array, shaded: Array,
 ) -> Array:  # fmt: skip
-    """Lit colour of every sample, `[T, Q]` int32 with red in the lowest byte.
+    """Returns the lit colour of every sample, `[T, Q]` int32 with red in the lowest byte.
 
     Args:
-      view: where the camera is.
+      view: the camera's.
       rgb: `[N, 3]` colour of every row.
       c, R: `[N, 3]` m and `[N, 3, 3]` geom poses in the camera frame.
       p: x, y, z of the visible points in the camera frame; `[T, Q]` m each.
@@ -41,7 +41,7 @@ def light(
         for source, to_light in zip(lights, ways)
     ]
     on = {r: _between(face, np.flatnonzero(row == r)) for r in view.textures}
-    # Where fusion would compute them for each of the three colours, the barrier shares them.
+    # The barrier computes these once; fusion would repeat them for each of the three colours.
     at, terms = jax.lax.optimization_barrier((at, terms))
 
     textures = {r: look(p) for r, look in view.textures.items()}
@@ -64,7 +64,7 @@ def light(
 
 
 def _normals(scene: scenes.RenderScene, c: Array, R: Array) -> Array:
-    """`shapes.normals` of all faces in their order, `[F, 7]`."""
+    """Returns `rays.normals` of all faces in their order, `[F, 7]`."""
     size = jnp.asarray(scene.size, jnp.float32)
     kinds = [(kind, scene.rows(kind)) for kind in range(4)]
     return jnp.concatenate([rays.normals(k, c[rows], R[rows], size[rows]) for k, rows in kinds])
@@ -75,7 +75,7 @@ def _between(face: Array, faces: np.ndarray) -> Array:
 
 
 def _pick(column: Array, at: Array) -> Array:
-    """A value by face; a column with one value for all costs nothing."""
+    """Returns a value by face; a column with one value for all costs nothing."""
     return column.at[at].get(mode="promise_in_bounds") if column.ndim else column
 
 
@@ -88,7 +88,7 @@ def _reflect(
     source: scenes.Light, to_light: Sequence[Any], p: list[Array], normal: list[Array],
     exponent: Array,
 ) -> tuple[Array, Array | None]:  # fmt: skip
-    """Diffuse and, if any, specular factor of a directional light (Blinn and Phong)."""
+    """Returns a directional light's diffuse and specular factor or None (Blinn-Phong)."""
     diffuse = jnp.maximum(sum(n * v for n, v in zip(normal, to_light)), 0.0)
     if not np.any(source.specular > 0):
         return diffuse, None

@@ -1,4 +1,4 @@
-"""Textures as a camera sees them: drawn once for a fixed one, looked up for one that moves."""
+"""Textures in images: drawn once for a fixed camera, evaluated per image for a moving one."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,11 +9,11 @@ import numpy as np
 from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import tiles
 
-_LOOKUPS = 6  # texel lookups along each side of a sample: smooths lines thinner than a pixel
+_LOOKUPS = 6  # texel lookups along each side of a sample, to smooth lines thinner than a pixel
 
 
 def draw(scene: scenes.RenderScene, grid: tiles.Grid) -> dict[int, np.ndarray]:
-    """RGB of each textured row through every sample, as if nothing stood before it: `[3, T, Q]`."""
+    """Returns the RGB `[3, T, Q]` of each textured row through every sample, without occlusion."""
     step_x = (scene.right - scene.left) / grid.width
     step_y = (scene.bottom - scene.top) / grid.height
     shifts = (np.arange(_LOOKUPS) + 0.5) / _LOOKUPS - 0.5
@@ -31,7 +31,7 @@ def draw(scene: scenes.RenderScene, grid: tiles.Grid) -> dict[int, np.ndarray]:
 
 
 def _look(texture: scenes.Texture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Texels where the rays through (x, y, -1) meet the plane of the texture, `[3, ...]`."""
+    """Returns the texels `[3, ...]` at the rays through (x, y, -1) on the texture's plane."""
     ray = np.stack([x, y, -np.ones_like(x)], -1) @ texture.R_cam_geom
     origin = -texture.p_cam_top @ texture.R_cam_geom
     t = -origin[2] / np.where(np.abs(ray[..., 2]) < 1e-9, 1e-9, ray[..., 2])
@@ -45,7 +45,7 @@ def _look(texture: scenes.Texture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def looker(
     texture: scenes.Texture, step: float, R_world_cam: Any, p_world_cam: Any
 ) -> Callable[[Sequence[Any]], list[Any]]:
-    """A texture of two colours in squares, filtered over each pixel, from any pose.
+    """Makes a function that evaluates a checker from any pose, filtered over each pixel.
 
     Args:
       texture: in the world's frame, a checker. Its first and last texel of a row are the colours.
@@ -67,7 +67,7 @@ def looker(
             at = R_geom_cam[k, 0] * p[0] + R_geom_cam[k, 1] * p[1] + R_geom_cam[k, 2] * p[2]
             scale = float(texture.scale[k])
             u = (at + origin[k] - float(texture.corner[k])) * scale
-            # What a pixel covers at the depth of the point, if it is met head on.
+            # Width of a pixel at the depth of the point, for a face perpendicular to the ray.
             wave = wave * _square_wave(u, -p[2] * step * abs(scale))
         middle, half = 0.5 * (first + second), 0.5 * (first - second)
         return [float(m) + float(h) * wave for m, h in zip(middle, half)]
@@ -76,7 +76,7 @@ def looker(
 
 
 def is_checker(texture: scenes.Texture) -> bool:
-    """Whether `looker` can draw it: two colours in four equal squares."""
+    """Returns True for two colours in four equal squares, as `looker` requires."""
     texels, (h, w) = texture.texels, np.array(texture.texels.shape[:2]) // 2
     same = np.all(texels[:h, :w] == texels[0, 0]) and np.all(texels[h:, w:] == texels[0, 0])
     return bool(
@@ -85,7 +85,7 @@ def is_checker(texture: scenes.Texture) -> bool:
 
 
 def _square_wave(u: Any, width: Any) -> Any:
-    """Mean over `width` of the wave that is 1 on the first half of each unit and -1 on the rest."""
+    """Averages, over `width`, the wave of 1 on the first half of each unit and -1 on the other."""
 
     def integral(x: Any) -> Any:
         share = x - jnp.floor(x)

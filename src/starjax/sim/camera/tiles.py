@@ -1,8 +1,8 @@
-"""The picture in tiles, and a loop over just the geoms that can matter to each tile.
+"""Tiles of an image, and a loop over the geoms that can be visible in each tile.
 
-Every tile keeps its geoms as bits of a 32-bit word. The loop takes the lowest bit of every tile at
-once until no word has any left: as many rounds as the fullest tile has geoms, and no list whose
-length could be too short. Bounds are conservative, so the picture is that of testing all geoms.
+Every tile keeps its geoms as bits of 32-bit words. Each round of the loop takes the lowest bit of
+every tile, until all words are 0: as many rounds as the fullest tile has geoms, without a list of
+limited length. Bounds are conservative, so the image equals that of testing all geoms.
 """
 
 import math
@@ -15,14 +15,14 @@ import numpy as np
 
 from starjax.sim.camera import geometry as scenes
 
-_SLACK = 1e-5  # m, and relative: keeps float32 rounding on the safe side
+_SLACK = 1e-5  # m and relative: margin for float32 rounding
 
 Array = jax.Array
 Visit = Callable[..., Array]
 
 
 class Grid(NamedTuple):
-    """Rays through (x, y, -1), tile by tile. T tiles of Q samples, V by U tiles of them.
+    """Rays through (x, y, -1) in T tiles of Q samples, V rows of U tiles.
 
     Attributes:
       side: samples along the side of a tile.
@@ -41,8 +41,8 @@ class Grid(NamedTuple):
 
 
 def grid(scene: scenes.RenderScene, height: int, width: int) -> Grid:
-    """Tiles for a picture of `height` by `width` samples."""
-    side = 8 if min(height, width) <= 128 else 16  # the faster, measured on two CPU cores
+    """Makes the tiles of an image of `height` by `width` samples."""
+    side = 8 if min(height, width) <= 128 else 16  # the faster one on two CPU cores
     rows, cols = -(-height // side), -(-width // side)
     step_x, step_y = (scene.right - scene.left) / width, (scene.bottom - scene.top) / height
     x = scene.left + (np.arange(cols * side) + 0.5) * step_x
@@ -60,21 +60,21 @@ def grid(scene: scenes.RenderScene, height: int, width: int) -> Grid:
 
 
 def picture(grid: Grid, tiled: Array) -> Array:
-    """Puts tiles `[T, n * n]`, n a divisor of the side, together to `[h, w]`; cuts the overhang."""
+    """Joins tiles `[T, n * n]`, n a divisor of the side, to an image `[h, w]` without overhang."""
     rows, cols, n = len(grid.edges_y) - 1, len(grid.edges_x) - 1, math.isqrt(tiled.shape[1])
     whole = tiled.reshape(rows, cols, n, n).swapaxes(1, 2).reshape(rows * n, cols * n)
     return whole[: grid.height * n // grid.side, : grid.width * n // grid.side]
 
 
 def pixels(grid: Grid, tiled: Array, samples: int) -> Array:
-    """The samples of every pixel apart: from `[T, Q]` to `[T, q, samples * samples]`."""
+    """Splits the samples of every pixel: from `[T, Q]` to `[T, q, samples * samples]`."""
     n = grid.side // samples
     parts = tiled.reshape(-1, n, samples, n, samples).swapaxes(2, 3)
     return parts.reshape(-1, n * n, samples * samples)
 
 
 def in_view(grid: Grid, c: Array, R: Array, axes: Array, rounding: Array) -> Array:
-    """Which geoms can be seen in which tile: `[T, N]` bool.
+    """Returns `[T, N]` bool, True for geoms that can be visible in a tile.
 
     Args:
       c, R: `[N, 3]` m and `[N, 3, 3]` in the camera frame.
@@ -85,7 +85,7 @@ def in_view(grid: Grid, c: Array, R: Array, axes: Array, rounding: Array) -> Arr
     nearest = -c[:, 2] - depth_range
 
     def sides(edges: np.ndarray, axis: int) -> Array:
-        """Between the planes through the camera and two neighbouring tile edges: `[U, N]`."""
+        """Returns `[U, N]` bool: between the planes through the camera and two adjacent edges."""
         e = edges[:, None]
         middle = c[:, axis] + e * c[:, 2]
         spread = _reach(R[:, axis] + e[..., None] * R[:, 2], axes) + rounding * jnp.hypot(1.0, e)
@@ -94,7 +94,7 @@ def in_view(grid: Grid, c: Array, R: Array, axes: Array, rounding: Array) -> Arr
         low, high = (above, below) if ascending else (below, above)
         return low[:-1] & high[1:]
 
-    # A long geom across the picture: only tiles near the plane through the camera and its axis.
+    # A long diagonal geom overlaps only tiles near the plane through the camera and its axis.
     u = _long_axis(R, axes)
     normal = jnp.cross(c, u)
     normal /= jnp.maximum(jnp.linalg.norm(normal, axis=-1, keepdims=True), _SLACK)
@@ -114,7 +114,7 @@ def in_view(grid: Grid, c: Array, R: Array, axes: Array, rounding: Array) -> Arr
 
 
 def over(low: Array, high: Array, c: Array, R: Array, axes: Array, rounding: Array) -> Array:
-    """Which geoms can throw a shadow into boxes of points, in the light frame: `[T, N]` bool.
+    """Returns `[T, N]` bool, True for geoms that can shade a tile's box of points (light frame).
 
     Args:
       low, high: `[T, 3]` corners of each tile's points in m; low > high for an empty tile.
@@ -129,23 +129,23 @@ def over(low: Array, high: Array, c: Array, R: Array, axes: Array, rounding: Arr
     flat = jnp.hypot(u[:, 0], u[:, 1])[:, None]
     normal = jnp.stack([-u[:, 1], u[:, 0]], -1) / jnp.maximum(flat, _SLACK)
     reach = jnp.einsum("gi,gij->gj", normal, R[:, :2], precision="highest")
-    # Both axes written out: XLA 0.10 for CPU adds up other numbers where a large array's last axis
-    # of two is sliced, broadcast and summed, and whole shadows were missing.
+    # Both axes are written out: XLA for CPU (jaxlib 0.10) sums wrong numbers if a large array's last
+    # axis of two is sliced, broadcast and summed; whole shadows were missing.
     i, j = normal[:, 0], normal[:, 1]
-    beside = jnp.abs(i) * half[..., 0] + jnp.abs(j) * half[..., 1]
-    limit = _reach(reach, axes) + rounding + beside
+    extent = jnp.abs(i) * half[..., 0] + jnp.abs(j) * half[..., 1]
+    limit = _reach(reach, axes) + rounding + extent
     aside = jnp.abs(i * (c[:, 0] - middle[..., 0]) + j * (c[:, 1] - middle[..., 1]))
     return near & (aside <= limit)
 
 
 def each(overlap: Array, table: Array, visit: Visit, carry: Array, *pixels: Array) -> Array:
-    """Folds `carry = visit(carry, row, features, *pixels)` over the overlapping geoms of each tile.
+    """Folds `carry = visit(carry, row, features, *pixels)` over each tile's overlapping geoms.
 
     Args:
       overlap: `[T, N]` bool.
       table: `[N, F]`.
-      visit: sees row `[T, 1]` (-1 where a tile has none left) and F features `[T, 1]`.
-      carry, pixels: `[T, Q]`; in `visit` perhaps those of fewer tiles.
+      visit: gets row `[T, 1]` (-1 for a finished tile) and F features `[T, 1]`.
+      carry, pixels: `[T, Q]`; `visit` may get those of fewer tiles.
     """
     if not overlap.shape[1]:  # a scene without any of this kind
         return carry
@@ -158,7 +158,7 @@ def each(overlap: Array, table: Array, visit: Visit, carry: Array, *pixels: Arra
 def _rounds(
     words: Array, table: Array, visit: Visit, carry: Array, pixels: tuple[Array, ...]
 ) -> Array:
-    """Rounds over all tiles while many have geoms left, then over the few that still have.
+    """Loops over all tiles while many are unfinished, then over the few that remain.
 
     Args:
       words: `[T, W]` uint32, a bit for every geom left.
@@ -171,6 +171,7 @@ def _rounds(
 
     def one(state):
         words, carry = state
+        # w & -w keeps the lowest set bit; clz gives its index.
         lowest = 31 - jax.lax.clz(words & (~words + jnp.uint32(1))).astype(jnp.int32)
         row = jnp.min(jnp.where(words > 0, 32 * order + lowest, 32 * len(order)), -1)
         words ^= jnp.where(order == row[:, None] >> 5, _bit(row[:, None] & 31), 0)
@@ -192,10 +193,10 @@ def _bit(index: Array) -> Array:
 
 
 def _reach(direction: Array, axes: Array) -> Array:
-    """Half the extent of a box along a direction given in its own frame: `[..., N]`."""
+    """Returns half the extent `[..., N]` of a box along a direction in its own frame."""
     return jnp.sum(jnp.abs(direction) * axes, -1)
 
 
 def _long_axis(R: Array, axes: Array) -> Array:
-    """Direction of the longest axis of each box, `[N, 3]`."""
+    """Returns the direction `[N, 3]` of each box's longest axis."""
     return jnp.take_along_axis(R, jnp.argmax(axes, -1)[:, None, None], axis=2)[..., 0]

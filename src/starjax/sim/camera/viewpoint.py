@@ -1,7 +1,7 @@
-"""Where the camera is in one image: known on the host for a fixed camera, traced for a moving one.
+"""Camera of one image: constants for a fixed camera, traced for a moving one.
 
-A fixed camera's sun and textures are worked out once, on the host. A moving one's scene is read
-with the camera frame at the world's, and the pose comes with every image.
+A fixed camera's sun and textures are computed once, on the host. A moving one's scene is read in
+the world's frame, and the pose comes with every image.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ class View(NamedTuple):
 
     Attributes:
       R_cam_world: `[3, 3]`. p_world_cam: `[3]` m.
-      R_light_cam: `[3, 3]`, to a frame whose z axis points to the sun, or None without one.
+      R_light_cam: `[3, 3]`, to a frame whose z axis points to the sun, or None without a sun.
       to_sun: x, y, z in the camera frame, or None.
       textures: by row.
     """
@@ -35,7 +35,7 @@ class View(NamedTuple):
 
 
 def fixed(scene: geometry.RenderScene, grid: tiles.Grid) -> View:
-    """The view of a camera that is fixed in the world, of a scene read in its frame."""
+    """Makes the view of a camera fixed in the world, for a scene read in its frame."""
     drawn = texture.draw(scene, grid)
     direction = None if scene.sun is None else scene.sun.direction
     return View(
@@ -48,7 +48,7 @@ def fixed(scene: geometry.RenderScene, grid: tiles.Grid) -> View:
 
 
 def moving(scene: geometry.RenderScene, grid: tiles.Grid, pose_world_cam: Pose) -> View:
-    """The view from a pose, of a scene read in the world's frame."""
+    """Makes the view from a pose, for a scene read in the world's frame."""
     R_world_cam, p_world_cam = (jnp.asarray(x, jnp.float32) for x in pose_world_cam)
     R_light_cam = to_sun = None
     if scene.sun is not None:
@@ -69,7 +69,7 @@ def moving(scene: geometry.RenderScene, grid: tiles.Grid, pose_world_cam: Pose) 
 
 
 def _frame(z: np.ndarray) -> np.ndarray:
-    """A rotation whose third row is the unit vector `z`, float32."""
+    """Returns a rotation whose third row is the unit vector `z`, float32."""
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z]).astype(np.float32)
