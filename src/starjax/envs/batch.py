@@ -16,7 +16,7 @@ from starjax.envs.settings import EnvSettings
 
 
 class Lanes(NamedTuple):
-    """N episodes in progress: keys `[N]`, int32 counts `[N]` of started episodes, EnvState `[N]`."""
+    """N episodes in progress: keys `[N]`, int32 counts `[N]` of episodes, EnvState `[N]`."""
 
     key: jax.Array
     episode: jax.Array

@@ -7,7 +7,7 @@ from starjax import rcm
 from starjax.sim import registries
 from starjax.sim.tasks.base import Task
 
-# Margins of the workspace's box of the tip (m) and of its rolls (rad): goals at the edge stay inside
+# Margins of the workspace's box of the tip (m) and of its rolls (rad): goals at the edge are inside
 # the range, and a command past the goal speeds the tool up.
 MARGIN = np.array([0.005, 0.005, 0.015])
 ROLL_MARGIN = 0.2

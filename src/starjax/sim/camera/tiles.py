@@ -129,7 +129,7 @@ def over(low: Array, high: Array, c: Array, R: Array, axes: Array, rounding: Arr
     flat = jnp.hypot(u[:, 0], u[:, 1])[:, None]
     normal = jnp.stack([-u[:, 1], u[:, 0]], -1) / jnp.maximum(flat, _SLACK)
     reach = jnp.einsum("gi,gij->gj", normal, R[:, :2], precision="highest")
-    # Both axes are written out: XLA for CPU (jaxlib 0.10) sums wrong numbers if a large array's last
+    # Both axes are written out: XLA for CPU (jaxlib 0.10) sums wrongly if a large array's last
     # axis of two is sliced, broadcast and summed; whole shadows were missing.
     i, j = normal[:, 0], normal[:, 1]
     extent = jnp.abs(i) * half[..., 0] + jnp.abs(j) * half[..., 1]

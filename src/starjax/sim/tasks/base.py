@@ -14,15 +14,15 @@ from starjax import rcm, registry
 from starjax.sim.endoscope_camera import Endoscope
 from starjax.types import Agent, Pose
 
-CONTROL_HZ = 30.0  # commands a second
+CONTROL_HZ = 30.0  # commands per second
 
 
 class Field(NamedTuple):
-    """A part of the `state` observation.
+    """Part of the `state` observation.
 
     Attributes:
-      name: what it is, e.g. `needle.p`.
-      size: how many numbers.
+      name: e.g. `needle.p`.
+      size: number of entries.
       kind: `point` m in the world frame, scaled for networks; `rot6d`, `unit`: within [-1, 1].
     """
 
@@ -32,13 +32,13 @@ class Field(NamedTuple):
 
 
 class Slot(NamedTuple):
-    """Where one arm of a task works.
+    """Arm slot of a task.
 
     Attributes:
-      workspace: names the region of trocars and targets; mounts are found for a workspace.
+      workspace: name of the region of trocars and targets, which mounts are searched for.
       p_world_ref: `(3,)` m, nominal trocar o_ref.
       roll_zero: rad, see `rcm.TrocarFrame`.
-      arm, tool: used unless the user chooses others.
+      arm, tool: defaults.
     """
 
     workspace: str
@@ -49,13 +49,13 @@ class Slot(NamedTuple):
 
 
 class TaskStatus(NamedTuple):
-    """A task's judgement of one moment.
+    """Progress of a task at one moment.
 
     Attributes:
       success_now: the strict conditions hold now; success is `settle_steps` such steps in a row.
-      loose: a looser published test holds now.
+      loose: a looser, published test holds now.
       lost: the episode cannot succeed any more (a drop that counts as a failure).
-      stage: int32, how far the task is: an index of `Task.stages`.
+      stage: int32, index of `Task.stages`.
       reward: in [0, 1], grows with the stages and within them; 1 where `success_now`.
     """
 
@@ -67,18 +67,18 @@ class TaskStatus(NamedTuple):
 
 
 class TaskText(NamedTuple):
-    """Phrases for reports of a task, in plain English, without a capital or a full stop.
+    """Phrases of a task for reports, without a capital or a full stop.
 
     Attributes:
       title: e.g. `needle pick`.
       done: completes "the policy ...", e.g. `lifted the needle`.
-      strict: when a trial is a strict success.
-      loose: when it passes the loose test.
+      strict: condition of strict success.
+      loose: condition of the loose test.
       nearly: a failed trial that passed the loose test.
-      collided: what a collision is here.
-      ground: what the tool works over, e.g. `the boards`.
-      goal: how a picture shows what is asked for, e.g. `the tip belongs at the coloured mark`.
-      lost: what makes a trial hopeless before its time is up; empty where nothing does.
+      collided: meaning of a collision.
+      ground: surface below the tool, e.g. `the boards`.
+      goal: the goal in an image, e.g. `the tip belongs at the coloured mark`.
+      lost: condition of a lost trial; empty if none is.
     """
 
     title: str
@@ -96,9 +96,9 @@ class Outline(NamedTuple):
     """Fixed parts of a task, for line drawings. Points are m in the world frame.
 
     Attributes:
-      areas: closed polygons `[K, 3]`, filled; a drawing shows all of them.
+      areas: closed polygons `[K, 3]`, filled and always in view.
       lines: open polylines `[K, 3]`, drawn over the areas.
-      ground: m, height of the plane on which a path's shadow lies.
+      ground: m, height of the plane of a path's shadow.
     """
 
     areas: tuple[np.ndarray, ...]
@@ -107,11 +107,11 @@ class Outline(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Contacts C of one moment.
+    """Contacts C at one moment.
 
     Attributes:
       geom: `[C, 2]` int32 ids.
-      dist: `[C]` m, negative where the two overlap.
+      dist: `[C]` m, negative for an overlap.
     """
 
     geom: jax.Array
@@ -132,13 +132,14 @@ class Capsules(NamedTuple):
 
 
 class SimReadings(NamedTuple):
-    """Measurements of one moment that a task may use.
+    """Quantities of the simulation at one moment, for `Task.measure`.
 
     Attributes:
       qpos, qvel: generalised coordinates of the whole model.
-      pose: measured tips, Pose `[A]`, and `opening`: `[A]` in [-1, 1].
+      pose: Pose `[A]`, measured tips.
       velocity: `[A, 3]` m/s, of the tips over the last control step.
-      touch: `[A]` bool, whether the jaws touch something that they can grasp.
+      opening: `[A]` in [-1, 1], of the jaws.
+      touch: `[A]` bool, True if the jaws touch something graspable.
       contacts: of the last physics step.
     """
 
@@ -155,33 +156,32 @@ NO_CAPSULES = Capsules(*(np.zeros(shape, np.float32) for shape in ((0, 3), (0, 3
 
 
 class Task(NamedTuple):
-    """One task, a row of the registry.
+    """Task, a row of the registry.
 
     Attributes:
       name: key in the registry.
       mjcf: the world: a part below `mjcf/`, or the path of a file.
-      slots: one for each arm.
-      cameras: of the MJCF or of a tool, that policies may see; the first one is used unless others
-        are chosen.
-      time_limit_s: s of simulated time that a trial may take.
-      settle_steps: control steps in a row that a strict success must hold.
+      slots: one per arm.
+      cameras: available names, of the MJCF or a tool; the first one is the default.
+      time_limit_s: s of simulated time per trial.
+      settle_steps: consecutive control steps with `success_now` for strict success.
       fields: parts of the `state` observation, in order.
-      labels: names of the whole numbers that tell episodes apart, e.g. `source`, `target`.
+      labels: names of integers that characterise an episode, e.g. `source`, `target`.
       stages: names, from the start to success.
       text: for reports.
       experts: variant -> scripted demonstrator, as `module:object` of an Agent or as `() -> Agent`;
         the first is the default. See `Task.expert`.
       graspable: geoms of the MJCF, by name, that jaws can hold.
       bind: (mj_model) -> Bound, ids resolved once.
-      sample: (Bound, key) -> Layout, what is drawn at reset.
-      tips: (Bound, Layout, trocars `[A, 3]` m) -> `[A, 3]` m, where the tools' tips start.
+      sample: (Bound, key) -> Layout, the draws at reset.
+      tips: (Bound, Layout, trocars `[A, 3]` m) -> `[A, 3]` m, the tips' start.
       place_objects: (Bound, qpos, Layout) -> qpos with the task's objects in it.
       measure: (Bound, Layout, SimReadings, Measurements of the step before, None at reset) ->
         Measurements.
       status: (Bound, Layout, Measurements) -> TaskStatus.
       state: (Bound, Layout, Measurements) -> `[S]`, the fields one after another.
-      relative: (state `[..., S]`, tips `[..., A, 3]` m) -> `[..., K]` of order one: differences
-        that small networks would not get exactly enough from `state`.
+      relative: (state `[..., S]`, tips `[..., A, 3]` m) -> `[..., K]` of order one, differences
+        that small networks compute too coarsely from `state`.
       label: (Layout) -> name of `labels` -> int32.
       colours: (Bound, Layout, rgb `[G, 3]`) -> `[G, 3]`, the goal marked.
       obstacles: (Bound, Layout, Measurements) -> Capsules that shafts may not enter, see
@@ -189,17 +189,15 @@ class Task(NamedTuple):
       floor: m, the lowest height that jaws may reach.
       is_sound: (Bound, qpos, qvel) -> bool, False once an object has diverged.
       outline: (mj_model) -> Outline, for figures.
-      trocars: configurations of trocars to train and to be scored on, fields `[C, A]`; the seen
-        ones, of which the first may be chosen for training, come first.
+      trocars: configurations for training and evaluation, fields `[C, A]`; seen ones come first.
       is_seen: `[C]` bool.
-      drive: (Bound, Layout, ctrl `[nu]`, s since reset) -> ctrl with what actuators of the task's
-        own MJCF are to do, for things that move by themselves.
-      still: (Layout) -> Pose `[K]` of the mocap bodies `still0`, .. of the MJCF, which are seen and
-        touch nothing; None if there are none.
-      least_steps: control steps that any success takes; demonstrations may take so many whatever
-        the usual limit is.
-      endoscope: of the camera `endoscope`, where the task can be seen through one that is held in a
-        trocar of its own; None where no such camera is among `cameras`, or a tool carries it.
+      drive: (Bound, Layout, ctrl `[nu]`, s since reset) -> ctrl with targets of the task's own
+        actuators, for objects that move by themselves.
+      still: (Layout) -> Pose `[K]` of the MJCF's mocap bodies `still0`, .., visible without
+        contacts, or None.
+      least_steps: least control steps of a success, a lower bound of demonstrations' limit.
+      endoscope: ranges of the camera `endoscope` in a trocar of its own, or None if `cameras` has
+        no such one or a tool carries it.
     """
 
     name: str
@@ -237,18 +235,18 @@ class Task(NamedTuple):
 
     @property
     def arms(self) -> int:
-        """A."""
+        """Number of arms A."""
         return len(self.slots)
 
     def expert(self, variant: str = "") -> Agent:
         """Returns a scripted demonstrator, the first one by default.
 
-        An expert named as `module:object` is imported here, so that importing a task does not.
+        An expert named as `module:object` is imported here: a task's module imports none.
         """
         expert = self.experts[variant or next(iter(self.experts))]
         return registry.load(expert) if isinstance(expert, str) else expert()
 
     @property
     def state_size(self) -> int:
-        """S."""
+        """Size S of the `state` observation."""
         return sum(field.size for field in self.fields)

@@ -1,9 +1,8 @@
-"""Common parts of scripts that hand a thing from one arm to the other, in phases of both arms.
+"""Scripted hand-over of an object from one arm to the other, in common phases of both arms.
 
-A script is a `Play`: how long each phase is, what the jaws do, who turns to what, where to go. It
-comes with a memory, `Script`; what it holds on to beside that is the task's own.
-As with one arm, a roll follows from that arm's coming tip positions and its trocar: a tool turns on
-its way in, which begins `OUT` to one side along what the jaws are to open along.
+A `Play` has the phases: durations, jaws, turns and goals. Its memory is a `HandoverScript`, with a
+field `held` of the task's own. As with one arm, rolls follow from coming tip positions and trocars:
+a tool turns on its way in, which begins `OUT` to one side along the jaws' opening direction.
 """
 
 from collections.abc import Callable
@@ -19,19 +18,24 @@ from starjax.sim.tasks import scripting
 from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Agent, Command
 
-DEVIATION = (0.001, 0.001, 0.001, 0.04)  # m and rad, of the disturbance of each arm
-OUT = 0.006  # m along the normal, from which a tool comes in to its grasp
+DEVIATION = (0.001, 0.001, 0.001, 0.04)  # m and rad, of each arm's disturbance
+OUT = 0.006  # m along the normal, the start of a tool's way in to its grasp
 
 
 @flax.struct.dataclass
 class HandoverScript:
-    """Where the script stands; single episode. Arrays `[2, ...]` are of both arms.
+    """Progress of the script in one episode. Arrays `[2, ...]` are of both arms.
 
     Attributes:
-      key: of everything random. phase: int32. elapsed, duration: s, of the phase. tempo: pace.
-      held: the task's own: which part of the thing is held.
-      start, goal, p: `[2, 3]` m, undisturbed positions. normal: `[2, 3]`, what the jaws open along.
-      roll_from, roll_to, roll: `[2]` rad. jaws_from, jaws: `[2]`.
+      key: of all draws.
+      phase: int32.
+      elapsed, duration: s, of the phase.
+      tempo: pace.
+      held: the task's own, the held part of the object.
+      start, goal, p: `[2, 3]` m, undisturbed positions.
+      normal: `[2, 3]`, the jaws' opening directions.
+      roll_from, roll_to, roll: `[2]` rad.
+      jaws_from, jaws: `[2]` openings.
       noise: `[2, 8]` disturbance of both arms, rough and smooth.
     """
 
@@ -57,16 +61,16 @@ class Play(NamedTuple):
     """Motions of both arms, phase by phase P.
 
     Attributes:
-      choose: (key, EnvState) -> (key, tempo, held), what is drawn at the start.
+      choose: (key, EnvState) -> (key, tempo, held), the draws at the start.
       duration: `[P]` s at tempo 1.
       jaws: `[P, 2]`, at the end of each phase.
-      aligned: `[P]`, share of a phase after which a tool goes straight down.
-      turned: `[P]`, share of a phase after which a tool has turned.
-      looks: `[P, 2]` bool, who turns to what it holds; the others keep their turn.
-      weight: (phase, share of the way) -> how much of the disturbance acts.
-      following: (Script, EnvState) -> int32, the phase after the present one.
-      goals: (Script, EnvState) -> positions `[P, 2, 3]` m, and what the jaws are to open along,
-        `[2, 3]` or for both `[3]`.
+      aligned: `[P]`, fraction of a phase after which a tool goes straight down.
+      turned: `[P]`, fraction of a phase after which a tool has turned.
+      looks: `[P, 2]` bool, True for arms that turn to their grasp; others keep their roll.
+      weight: (phase, fraction of the way) -> weight of the disturbance.
+      following: (HandoverScript, EnvState) -> int32, the next phase.
+      goals: (HandoverScript, EnvState) -> positions `[P, 2, 3]` m, and the jaws' opening
+        directions `[2, 3]`, or `[3]` for both.
     """
 
     choose: Callable[..., tuple[jax.Array, jax.Array, Any]]
@@ -81,7 +85,7 @@ class Play(NamedTuple):
 
 
 def agent(play: Play) -> Agent:
-    """The demonstrator of a play."""
+    """Makes the demonstrator of a play."""
 
     def init(key: jax.Array, state: EnvState) -> HandoverScript:
         key, tempo, held = play.choose(key, state)
@@ -115,14 +119,14 @@ def agent(play: Play) -> Agent:
 def _act(
     play: Play, script: HandoverScript, state: EnvState
 ) -> tuple[Command, HandoverScript, Command]:
-    """The disturbed commands to execute, the script, and the undisturbed ones to record."""
+    """Returns the disturbed commands to execute, the script, and the undisturbed ones to record."""
     is_over = script.elapsed >= script.duration - 1e-6
     after = _enter(play, script, play.following(script, state), state)
     script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
     usual = jnp.asarray(play.duration, jnp.float32)[script.phase]
     s = jnp.clip(elapsed * script.tempo / usual, 0.0, 1.0)
-    # On the way down a tool is over its goal by the time anything can touch.
+    # On the way down a tool is above its goal before anything can touch.
     aside, turned = (
         scripting.minimum_jerk(jnp.minimum(s / jnp.asarray(at, jnp.float32)[script.phase], 1.0))
         for at in (play.aligned, play.turned)
@@ -145,7 +149,7 @@ def _act(
 
 
 def _enter(play: Play, script: HandoverScript, phase: jax.Array, state: EnvState) -> HandoverScript:
-    """Begins `phase` with goals from what is seen now."""
+    """Begins `phase` with goals from the present state."""
     goals, normal = play.goals(script, state)
     goal = goals[phase]
     normals = jnp.where(jnp.asarray(play.looks)[phase][:, None], normal, script.normal)

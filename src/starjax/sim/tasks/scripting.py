@@ -1,4 +1,4 @@
-"""Common parts of scripted experts: smooth motion, jaws, turns, a disturbance they correct."""
+"""Common parts of scripted experts: smooth motion, jaws, rolls, and a disturbance to correct."""
 
 import jax
 import jax.numpy as jnp
@@ -8,44 +8,48 @@ from starjax.sim.state import EnvState
 from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Command
 
-NOISE_STREAM = 1 << 20  # folded into the key: apart from every attempt's stream
-CORRELATION = 0.4  # s, after which the disturbance forgets
-SMOOTHING = 0.15  # s, of its low-pass: an arm's tool does not jump
+NOISE_STREAM = 1 << 20  # folded into the key: distinct from every attempt's stream
+CORRELATION = 0.4  # s, correlation time of the disturbance
+SMOOTHING = 0.15  # s, time constant of its low-pass, for smooth motion
 JAW_TIME = 0.25  # s to close or open
 
 
 def minimum_jerk(share: jax.Array) -> jax.Array:
-    """Share of the way `[...]` after a `share` in [0, 1] of the time, at rest at both ends."""
+    """Returns the fraction of the way after a fraction `[...]` of the time, at rest at its ends."""
     return share**3 * (10.0 + share * (-15.0 + 6.0 * share))
 
 
-def jaws(before: jax.Array, wanted: jax.Array, elapsed: jax.Array) -> jax.Array:
-    """Openings `[...]` in [-1, 1], `elapsed` s after they began to go from `before` to `wanted`."""
-    return before + jnp.clip(elapsed / JAW_TIME, 0.0, 1.0) * (wanted - before)
+def jaws(before: jax.Array, target: jax.Array, elapsed: jax.Array) -> jax.Array:
+    """Returns the openings `[...]` `elapsed` s after the start of a motion to `target`."""
+    return before + jnp.clip(elapsed / JAW_TIME, 0.0, 1.0) * (target - before)
 
 
 def command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) -> Command:
-    """The command `[A]` of rolls `[A]` rad, tips `[A, 3]` m and jaws `[A]`, through the told
-    trocars."""
+    """Returns the command `[A]` of rolls `[A]` rad, tips `[A, 3]` m and jaws `[A]`.
+
+    Shafts pass the measured trocars.
+    """
     action = jnp.concatenate([roll[:, None], p], axis=-1)
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, state.measured_trocar)
     return Command(pose, jaws)
 
 
 def turn_to(normal: jax.Array, R: jax.Array) -> jax.Array:
-    """The roll `[A]` (rad) with which jaws open along `normal` `[A, 3]`; `R` `[A, 3, 3]`: of tools
-    there at no roll."""
+    """Returns the roll `[A]` (rad) that opens jaws along `normal` `[A, 3]`.
+
+    `R` `[A, 3, 3]` are the tools' rotations at roll 0.
+    """
     across = jnp.einsum("ai,aij->aj", normal, R, precision="highest")
     return jnp.arctan2(-across[:, 0], across[:, 1])
 
 
 def nearer_half(turned: jax.Array, roll: jax.Array) -> jax.Array:
-    """`turned` rad, or half a turn from it, as jaws are the same then: the one nearer to `roll`."""
+    """Returns `turned` rad plus a multiple of half a turn (jaws are symmetric), next to `roll`."""
     return roll + (turned - roll + jnp.pi / 2) % jnp.pi - jnp.pi / 2
 
 
 def disturb(key: jax.Array, noise: jax.Array, step: jax.Array, deviation: jax.Array) -> jax.Array:
-    """The next value of an Ornstein-Uhlenbeck process and of its low-passed copy.
+    """Advances an Ornstein-Uhlenbeck process and its low-passed copy.
 
     Args:
       key: of the episode.

@@ -1,8 +1,8 @@
-"""Two arms that face each other: where each works, and the twelve pairs of their trocars.
+"""Slots of two opposite arms, and the twelve pairs of their trocars.
 
-Wherever in the workspaces `left` and `right` a pair is drawn, its trocars are 100 to 170 mm apart,
-and shafts through them that meet at the middle of the board enclose 37 to 60 degrees: what surgeons
-choose. Nearer ones would bring shafts and wrists against each other.
+The trocars of any pair in the workspaces `left` and `right` are 100 to 170 mm apart, and shafts
+through them that meet at the middle of the board enclose 37 to 60 degrees, as surgeons choose. If
+they were nearer, shafts and wrists would collide.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ SLOTS = (
     Slot(workspace="right", p_world_ref=(0.0, 0.0, 0.15), roll_zero=float(np.pi)),
 )
 
-# Of the left arm and of the right one, `(mm, deg, deg)`, azimuths from each arm's own side.
+# Left and right trocar, `(mm, deg, deg)`, azimuths from each arm's own side.
 _PAIRS = (
     ((61, 88, -11), (76, 92, 4)),
     ((76, 92, -4), (69, 88, -11)),
@@ -25,7 +25,7 @@ _PAIRS = (
     ((65, 88, 0), (80, 90, -7)),
     ((80, 91, -7), (73, 91, 11)),
     ((73, 89, 11), (65, 92, 0)),
-    # Unseen: the corners that are farthest and nearest, one of each, and the middle.
+    # Unseen: the farthest and the nearest corners, one of each, and the middle.
     ((84, 87, -15), (84, 93, 15)),
     ((54, 93, 15), (54, 87, -15)),
     ((84, 93, 15), (54, 87, 15)),

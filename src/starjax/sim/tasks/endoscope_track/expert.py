@@ -1,9 +1,9 @@
 """Scripted expert of endoscope tracking: to the target along an arc, then with it.
 
-Centring, distance and level leave one pose of the scope, in closed form. It aims where the target
-will be at the end of the control step. Side of the arc and pace are drawn, never by the trocar. It
-is disturbed on purpose and comes back. What an episode executes is too near or too far all along,
-so that a policy learns to come back from there.
+Centring, distance and level determine the scope's pose in closed form. It aims at the target's
+position at the end of the control step. Side of the arc and pace are drawn, never by the trocar. It
+is disturbed on purpose and corrects itself. Executed commands are too near or too far throughout an
+episode, so a policy learns to correct that.
 """
 
 import flax.struct
@@ -18,21 +18,23 @@ from starjax.sim.tasks.endoscope_track.task import DISTANCE, looking_at
 from starjax.types import Agent, Command
 
 FIND_TIME = (1.0, 1.6)  # s, range of the way to the target
-DISTURBED_DISTANCE = (0.9, 1.1)  # of DISTANCE, range of what an episode executes
-BULGE = 0.008  # m, how far the arc leaves the straight way
+DISTURBED_DISTANCE = (0.9, 1.1)  # of DISTANCE, range of an episode's executed distance
+BULGE = 0.008  # m, the arc's largest offset from the line
 DEVIATION = (0.0008, 0.0008, 0.0008, 0.012)  # m and rad, of the disturbance
-DISTURBANCE = 0.7  # how much of it acts once the target is found
+DISTURBANCE = 0.7  # its weight once the target is reached
 
 
 @flax.struct.dataclass
 class TrackScript:
-    """One episode's script.
+    """Script of one episode.
 
     Attributes:
-      key: of everything random. start: `[4]` roll (rad) and position (m).
-      side: `[3]` m, how far the arc leaves the line.
-      distance: m, executed in place of DISTANCE.
-      duration, elapsed: s. noise: `[2, 4]`, disturbance of position and roll, rough and smooth.
+      key: of all draws.
+      start: `[4]` roll (rad) and position (m).
+      side: `[3]` m, the arc's largest offset from the line.
+      distance: m, executed instead of DISTANCE.
+      duration, elapsed: s.
+      noise: `[2, 4]`, disturbance of position and roll, rough and smooth.
     """
 
     key: jax.Array
@@ -60,13 +62,13 @@ def init(key: jax.Array, state: EnvState) -> TrackScript:
 
 
 def act(script: TrackScript, state: EnvState) -> tuple[Command, TrackScript, Command]:
-    """The disturbed command to execute, the script, and the undisturbed one to record."""
+    """Returns the disturbed command to execute, the script, and the undisturbed one to record."""
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
     share = scripting.minimum_jerk(s)
 
     def way(distance: jax.Array | float) -> jax.Array:
-        line = script.start + share * (_wanted(distance, state) - script.start)
+        line = script.start + share * (_target(distance, state) - script.start)
         return line.at[1:].add(4.0 * share * (1.0 - share) * script.side)
 
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
@@ -76,8 +78,8 @@ def act(script: TrackScript, state: EnvState) -> tuple[Command, TrackScript, Com
     return _command(disturbed, state), script, _command(way(DISTANCE), state)
 
 
-def _wanted(distance: jax.Array | float, state: EnvState) -> jax.Array:
-    """Roll and position, `[4]`, from which the target is centred and level at `distance`."""
+def _target(distance: jax.Array | float, state: EnvState) -> jax.Array:
+    """Returns roll and position `[4]` with the target centred and level at `distance`."""
     measurements = state.measurements
     aim = measurements.target + measurements.velocity / CONTROL_HZ
     R_tip_camera = state.pose.R[0].T @ measurements.camera.R

@@ -1,7 +1,7 @@
 """Endoscope tracking: a camera on a straight scope keeps a moving tip in view. Lengths in m.
 
-The scope looks down through its trocar, so gravity is no horizon: where the tip passes below the
-trocar the picture would have to spin. What is up in the picture is a horizontal direction, `UP`.
+The scope looks down through its trocar, so gravity cannot define the horizon: with the tip below
+the trocar the image would have to spin. Up in the image is a horizontal direction, `UP`.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ REACH = (0.032, 0.024, 0.012)
 SHARES = (0.7, 0.3)
 RATES = ((0.35, 0.6), (0.8, 1.2))  # rad/s, ranges
 
-# Where an episode begins: the lens looks at CENTRE from afar, so that the target is in the picture.
+# Start of an episode: the lens looks at CENTRE from afar, with the target in the image.
 START = 0.07  # of CENTRE from the lens
 SPREAD = 0.003  # of the lens, each axis, at most
 
@@ -46,11 +46,11 @@ MAX_AWAY = 0.3  # beyond it the simulation has diverged
 
 @flax.struct.dataclass
 class TrackLayout:
-    """Drawn at reset.
+    """Draws at reset.
 
     Attributes:
       rate: `[2, 3]` rad/s and phase: `[2, 3]` rad of the target's oscillations.
-      spread: `[3]` m, how far from its usual place the lens starts.
+      spread: `[3]` m, offset of the lens's start from the nominal one.
     """
 
     rate: jax.Array
@@ -60,16 +60,19 @@ class TrackLayout:
 
 @flax.struct.dataclass
 class TrackMeasurements:
-    """Measurements of one moment, and how it went so far.
+    """Measurements of one moment and history of the episode.
 
     Attributes:
-      target: `[3]` m. velocity: `[3]` m/s of it.
+      target: `[3]` m.
+      velocity: `[3]` m/s of the target.
       camera: pose_world_camera: x to the right, y up, it looks along -z.
-      off: how far the target is from the picture's middle, in sides of the picture; 9 behind it.
-      tilt: rad, of the picture from level. distance: m, of the target from the lens.
+      off: distance of the target from the image's centre, in sides of the image; 9 behind the lens.
+      tilt: rad, of the image from level.
+      distance: m, of the target from the lens.
       on_target: all three are within the limits.
-      step: int32, control steps since reset. missed: int32, those that count without `on_target`.
-      unseen: the target has left the picture.
+      step: int32, control steps since reset.
+      missed: int32, counted control steps without `on_target`.
+      unseen: the target has left the image.
     """
 
     target: jax.Array
@@ -88,10 +91,11 @@ class TrackBound(NamedTuple):
     """Ids and shapes in the compiled model.
 
     Attributes:
-      target, dof, ctrl: `[3]` where the target's coordinates are in qpos, qvel and ctrl.
+      target, dof, ctrl: `[3]` indices of the target's coordinates in qpos, qvel and ctrl.
       R_tip_camera, p_tip_camera: the camera in the tip's frame.
       half: tangent of half the field of view.
-      rod: `[2, 3]` m, ends of the instrument's rod, from the target. radius: m, of the rod.
+      rod: `[2, 3]` m, ends of the instrument's rod, from the target.
+      radius: m, of the rod.
     """
 
     target: np.ndarray
@@ -142,9 +146,9 @@ def sample(bound: TrackBound, key: jax.Array) -> TrackLayout:
 def looking_at(
     target: jax.Array, p_trocar: jax.Array, distance: jax.Array | float, R_tip_camera: jax.Array
 ) -> Pose:
-    """The tip's one pose with the target in the middle of a level picture at `distance` m.
+    """Returns the tip's pose with the target in the middle of a level image at `distance` m.
 
-    The view may lean from the shaft in the plane of the picture's vertical, as with oblique optics.
+    The view may lean from the shaft in the plane of the image's vertical, as with oblique optics.
     """
     lean = R_tip_camera[2, 1], -R_tip_camera[2, 2]
     camera = endoscope_camera.looking_at(target, p_trocar, distance, UP, lean)
@@ -152,20 +156,20 @@ def looking_at(
 
 
 def tips(bound: TrackBound, layout: TrackLayout, p_trocars: jax.Array) -> jax.Array:
-    """Where the lens starts, `[1, 3]` m."""
+    """Returns the lens's start, `[1, 3]` m."""
     R_tip_camera = jnp.asarray(bound.R_tip_camera)
     start = looking_at(jnp.array(CENTRE), p_trocars[0], jnp.array(START), R_tip_camera)
     return start.p[None] + layout.spread
 
 
 def path(layout: TrackLayout, time: jax.Array) -> jax.Array:
-    """Where the target is to be `time` s after reset, `[3]` m."""
+    """Returns the target's commanded position `[3]` m, `time` s after reset."""
     waves = jnp.array(SHARES) @ jnp.sin(layout.rate * time + layout.phase)
     return jnp.array(CENTRE) + jnp.array(REACH) * waves
 
 
 def place_objects(bound: TrackBound, qpos: jax.Array, layout: TrackLayout) -> jax.Array:
-    """Puts the target at the beginning of its path."""
+    """Places the target at the start of its path."""
     return qpos.at[bound.target].set(path(layout, jnp.zeros(())))
 
 
@@ -177,7 +181,7 @@ def drive(bound: TrackBound, layout: TrackLayout, ctrl: jax.Array, time: jax.Arr
 def measure(
     bound: TrackBound, layout: TrackLayout, readings: SimReadings, before: TrackMeasurements | None
 ) -> TrackMeasurements:
-    """Where the target is in the picture, and for how long it was not where it belongs."""
+    """Measures the target in the image and counts the steps off target."""
     target, tip = readings.qpos[bound.target], jax.tree.map(lambda leaf: leaf[0], readings.pose)
     camera = Pose(tip.R @ bound.R_tip_camera, tip.p + tip.R @ bound.p_tip_camera)
     x, y, z = camera.R.T @ (target - camera.p)
@@ -191,7 +195,7 @@ def measure(
     is_near = jnp.abs(distance - DISTANCE) < FAR * DISTANCE
     on_target = (off < OFF_CENTRE) & (tilt < TILT) & is_near
     step, missed, unseen = jnp.array(-1, jnp.int32), jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    if before is not None:  # at reset once for the start, so that the count begins at 0
+    if before is not None:  # reset measures twice, so the count starts at -1
         step = before.step + 1
         counts = step > FIRST
         missed, unseen = before.missed + (counts & ~on_target), before.unseen | (counts & ~is_seen)
@@ -210,7 +214,7 @@ def measure(
 
 
 def status(bound: TrackBound, layout: TrackLayout, measurements: TrackMeasurements) -> TaskStatus:
-    """Strict: on target for long enough. Loose: never out of the picture."""
+    """Tests strict success (on target for long enough) and loose (never out of the image)."""
     is_over = measurements.step >= LAST
     may_succeed = measurements.missed <= MAY_MISS
     success_now = is_over & may_succeed
@@ -226,13 +230,13 @@ def status(bound: TrackBound, layout: TrackLayout, measurements: TrackMeasuremen
 
 
 def obstacles(bound: TrackBound, layout: TrackLayout, measurements: TrackMeasurements) -> Capsules:
-    """The instrument."""
+    """Returns the instrument."""
     start, end = measurements.target + jnp.asarray(bound.rod)
     return Capsules(start[None], end[None], jnp.array([bound.radius]))
 
 
 def is_sound(bound: TrackBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    """Whether the target is near its path."""
+    """Returns False once the target has left its path."""
     return jnp.max(jnp.abs(qpos[bound.target])) < MAX_AWAY
 
 

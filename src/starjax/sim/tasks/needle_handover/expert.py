@@ -1,9 +1,8 @@
 """Scripted expert of needle hand-over: pick up, meet in the air, take over, hold.
 
-The tools hold the wire two to four segments apart, the one that takes over nearer to its own side.
-Which pair is drawn among those across which both jaws open without much of a turn; wanted positions
-never look at a trocar. It tries again where a tool has missed the wire; a needle that is dropped is
-a failure.
+The tools hold the wire two to four segments apart, the taker nearer to its own side. The pair is
+drawn among those that need little roll of both tools; positions are independent of the trocars. A
+tool that has missed the wire tries again; a dropped needle is a failure.
 """
 
 import jax
@@ -23,30 +22,31 @@ PHASES = (
 DURATION = (1.6, 1.1, 0.5, 0.9, 1.2, 1.2, 1.0, 0.3, 0.5, 0.4, 0.8, 0.8, 1.0)
 GIVER = (1, 1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1)
 TAKER = (1, 1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1)
-# Which arms turn to their segment in which phase; the others keep their turn.
+# Arms that turn to their segment, by phase; the others keep their roll.
 LOOKS = np.zeros((len(PHASES), 2), bool)
 LOOKS[1, 0] = LOOKS[6, 1] = True
-# How much of the disturbance acts at the end of each phase: also where a tool comes to the wire, so
-# that it is shown what to do a little beside it.
+# Weight of the disturbance at the end of each phase. It acts near the wire too, to demonstrate
+# corrections there.
 DISTURBANCE = (1, 0.4, 0, 0.1, 0.3, 0.5, 0.4, 0.2, 0, 0, 0, 0.1, 0.1)
 
 TEMPO = (0.9, 1.15)  # range of an episode's pace
-ALIGNED = 0.6  # share of the ways in after which a tool has turned, and of "down", is over its goal
+# Fraction of the ways in after which a tool has turned, and in "down" is above its goal.
+ALIGNED = 0.6
 MEET = (0.0, 0.0, 0.04)  # m, of the giver's segment at the hand-over
 HOVER = 0.02  # m above a grasp
 GRASP_ABOVE = 0.001  # m of the tip above the wire: the pads' ends lie 1.5 mm below it
-COME = (0.012, 0.0, 0.021)  # m, from where the taker comes to the wire
-GO = (-0.015, 0.0, 0.026)  # m, where the giver goes once it has let go
+COME = (0.012, 0.0, 0.021)  # m, start of the taker's way to the wire
+GO = (-0.015, 0.0, 0.026)  # m, the giver's way after the release
 RAISE = 0.01  # m
 SKEW = 0.1  # sine of the angle between jaws and the world's y at which a preference shows
-ASIDE = 150.0  # 1/m, what it is worth that the taker's segment lies on its own side
+ASIDE = 150.0  # 1/m, preference for a taker's segment on its own side
 MIDDLES, TANGENTS = single.segments()
 INNER = range(1, single.SEGMENTS - 1)
 PAIRS = np.array([(a, b) for a in INNER for b in INNER if abs(a - b) > 1])  # giver's, taker's
 
 
 def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The pair of segments, int32 `[2]`, and the pace."""
+    """Draws the pair of segments, int32 `[2]`, and the pace."""
     key, key_tempo, key_pair = jax.random.split(key, 3)
     R = state.measurements.needle.R
     give, take = PAIRS.T
@@ -59,7 +59,7 @@ def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, jax.
 
 
 def _following(script: handover.HandoverScript, state: EnvState) -> jax.Array:
-    """The phase after the present one: back to where a tool came from if it missed the wire."""
+    """Returns the next phase, an earlier one if a tool missed the wire."""
     missed = (script.phase == PHASES.index("lift")) & ~state.measurements.touch[0]
     following = jnp.where(missed, 0, jnp.minimum(script.phase + 1, len(PHASES) - 1))
     missed = (script.phase == PHASES.index("take")) & ~state.measurements.touch[1]
@@ -73,7 +73,7 @@ def _weight(phase: jax.Array, share: jax.Array) -> jax.Array:
 
 
 def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array, jax.Array]:
-    """Where the tips go in every phase, from what is seen now, and across what the jaws open."""
+    """Returns the tips' goals of every phase from the present state, and the wire's normals."""
     needle, tips = state.measurements.needle, script.p
     across = jnp.cross(jnp.asarray(TANGENTS)[script.held] @ needle.R.T, jnp.array([0.0, 0.0, 1.0]))
     across = across / jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), 1e-6)

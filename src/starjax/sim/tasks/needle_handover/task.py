@@ -15,10 +15,10 @@ from starjax.sim.tasks.needle_handover import text
 from starjax.sim.tasks.needle_pick import task as single
 from starjax.types import Pose
 
-# Where the tips start, and an idle one waits: so near the middle that the shafts lean apart.
+# Start of the tips, and waiting position of an idle one: near the middle, so the shafts lean apart.
 PARK = ((-0.012, 0.0, 0.065), (0.012, 0.0, 0.065))
 SPREAD = 0.005  # each axis, at most
-# Where the needle lies: on the side of the tool that picks it up.
+# Mean position of the needle: on the side of the tool that picks it up.
 PLACE = (-0.024, 0.0)
 PLACE_SPREAD = (0.012, 0.02)  # either way
 
@@ -28,7 +28,7 @@ STAGES = ("approach", "grasped", "lifted", "taken over", "held", "done")
 
 @flax.struct.dataclass
 class HandoverLayout:
-    """Drawn at reset: pose_world_needle; tips `[2, 3]` m."""
+    """Draws at reset: pose_world_needle; tips `[2, 3]` m."""
 
     needle: Pose
     tips: jax.Array
@@ -36,15 +36,17 @@ class HandoverLayout:
 
 @flax.struct.dataclass
 class HandoverMeasurements:
-    """Measurements of one moment, and what has happened.
+    """Measurements of one moment and history of the episode.
 
     Attributes:
-      needle: pose_world_needle. tips: `[2, 3]` m.
-      touch: `[2]` bool, whose jaws hold some of the wire.
-      lifted: by arm 0 alone, at some time. passed: held by arm 1 alone in the air, after that.
-      grip: `[3]` m, tip 1 in the needle's frame when its present hold, alone, began.
-      slip: m, how far it has moved along the wire, or off it, since.
-      untouched: int32, control steps in a row without a tool at the needle.
+      needle: pose_world_needle.
+      tips: `[2, 3]` m.
+      touch: `[2]` bool, True if an arm's jaws hold the wire.
+      lifted: the needle was lifted by arm 0 alone.
+      passed: after that it was held by arm 1 alone in the air.
+      grip: `[3]` m, tip 1 in the needle's frame at the start of its present hold alone.
+      slip: m, the tip's distance from `grip`.
+      untouched: int32, consecutive control steps without a tool at the needle.
     """
 
     needle: Pose
@@ -58,7 +60,7 @@ class HandoverMeasurements:
 
 
 def sample(bound: single.NeedleBound, key: jax.Array) -> HandoverLayout:
-    """Draws the needle's place and yaw, and the tips' starts."""
+    """Draws the needle's position and yaw, and the tips' start."""
     key_place, key_yaw, key_tips = jax.random.split(key, 3)
     aside = jax.random.uniform(key_place, (2,), minval=-1.0) * jnp.array(PLACE_SPREAD)
     yaw = jax.random.uniform(key_yaw, minval=-jnp.pi, maxval=jnp.pi)
@@ -73,7 +75,7 @@ def measure(
     readings: SimReadings,
     before: HandoverMeasurements | None,
 ) -> HandoverMeasurements:
-    """The needle, who has held it, and how it lies in the jaws that took it over."""
+    """Measures the needle, its holders, and its slip in the taker's jaws."""
     needle, touch = bodies.free_pose(readings.qpos, bound.needle), readings.touch
     is_up = needle.p[2] > bound.height + single.LIFT
     lifted, passed = is_up & touch[0] & ~touch[1], jnp.zeros((), bool)
@@ -84,7 +86,7 @@ def measure(
         lifted = before.lifted | lifted
         passed = before.passed | (before.lifted & is_up & is_alone)
         was_alone = before.touch[1] & ~before.touch[0]
-        # A hold begins anew once the needle has slipped too far.
+        # A hold restarts once the needle has slipped too far.
         goes_on = is_alone & was_alone & (before.slip < single.SLIP)
         grip = jnp.where(goes_on, before.grip, here)
         untouched = jnp.where(touch.any(), 0, before.untouched + 1)
@@ -103,7 +105,7 @@ def measure(
 def status(
     bound: single.NeedleBound, layout: HandoverLayout, measurements: HandoverMeasurements
 ) -> TaskStatus:
-    """Strict: taken over, held by the other tool alone without slip. Loose: taken over."""
+    """Tests strict success (taken over, held alone without slip) and loose success (taken over)."""
     is_up = measurements.needle.p[2] > bound.height + single.LIFT
     is_alone = measurements.touch[1] & ~measurements.touch[0]
     success_now = measurements.passed & is_up & is_alone & (measurements.slip < single.SLIP)
@@ -121,7 +123,7 @@ def status(
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
-    """As in `needle_pick`, from each tip, and from tip to tip: `[..., 15]`."""
+    """Returns `[..., 15]`: as in `needle_pick` from each tip, and from tip to tip."""
     parts = [single.relative(state, tips[..., a : a + 1, :]) for a in range(2)]
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 
@@ -140,7 +142,7 @@ TASK = single.TASK._replace(
     measure=measure,
     status=status,
     relative=relative,
-    # Between where the needle lies and where it is passed.
+    # Between the needle's start and the hand-over.
     endoscope=workspaces.SIDE_ENDOSCOPE._replace(work=(-0.012, 0.0, 0.02)),
     trocars=two_arms.TROCARS,
 )

@@ -10,7 +10,7 @@ TEXT = text.TEXT._replace(
     loose="the other tool alone held the needle in the air, slipping or not",
     nearly="needle taken over, but it slipped or was not held for 2 s",
     collided="pressed jaws or shaft into the foam, or shafts or arms touched",
-    goal="the needle is to be handed over",
+    goal="the needle must be handed over",
     lost="the needle was dropped",
 )
 outline = text.outline

@@ -1,8 +1,8 @@
 """Scripted expert of needle pick: above the wire, down, close, lift, hold.
 
-Of the inner segments it takes one across which the jaws open without much of a turn, at random
-(never by the trocar), at its own pace, is disturbed on purpose, and starts over when the needle is
-not held. It comes in along the segment's normal, so that the path says how the jaws are turned.
+It draws one of the inner segments that need little roll (never by the trocar) and a pace, is
+disturbed on purpose, and starts over if the needle is not held. It comes in along the segment's
+normal: the path determines the roll.
 """
 
 import flax.struct
@@ -20,12 +20,12 @@ RAISE, APPROACH, DESCEND, CLOSE, LIFT, HOLD = range(6)
 DURATION = (0.5, 1.2, 0.9, 0.4, 0.9, 1.0)
 SPEED = (0.04, 0.04, 0.024, 1.0, 0.02, 1.0)
 JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0)
-DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.1)  # how much of it acts in each phase
+DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.1)  # its weight in each phase
 
 TEMPO = (0.85, 1.2)  # range of an episode's pace
 TURN_LEAD = 0.25  # s before the end of the approach at which the tool begins to turn
 TURN_TIME = 0.80  # s the turn takes
-ALIGNED = 0.6  # share of a descent after which it goes straight down
+ALIGNED = 0.6  # fraction of a descent after which it goes straight down
 HOVER = 0.02  # m above the grasp point
 HOVER_OUT = 0.006  # m out from it along the segment's normal
 GRASP_ABOVE = 0.001  # m of the tip above the wire: the pads' ends lie 1.5 mm below it
@@ -37,15 +37,20 @@ MIDDLES, TANGENTS = task.segments()
 
 @flax.struct.dataclass
 class NeedleScript:
-    """Where the script stands; single episode.
+    """Progress of the script in one episode.
 
     Attributes:
-      key: folded with the attempt or the step for everything random.
-      phase, attempt: int32. elapsed, duration: s. tempo: pace.
-      start, goal: `[3]` m, undisturbed positions at the phase's ends. p: the present one.
-      segment: int32, of the wire. normal: `[3]`, across it, or the opposite: jaws are symmetric,
-        and this keeps the roll on one branch.
-      roll_from: rad, where the next turn begins. roll: rad. jaws_from, jaws: openings.
+      key: of all draws, folded with the attempt or the step.
+      phase, attempt: int32.
+      elapsed, duration: s.
+      tempo: pace.
+      start, goal, p: `[3]` m, undisturbed positions at the phase's ends and now.
+      segment: int32, of the wire.
+      normal: `[3]`, across it, or its opposite: jaws are symmetric, and this keeps the roll on one
+        branch.
+      roll_from: rad, the roll at the start of the next turn.
+      roll: rad.
+      jaws_from, jaws: openings.
       noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
     """
 
@@ -68,7 +73,7 @@ class NeedleScript:
 
 
 def init(key: jax.Array, state: EnvState) -> NeedleScript:
-    """The script at the start of an episode."""
+    """Starts the script of an episode."""
     key_tempo, key = jax.random.split(key)
     p, zero, none = state.pose.p[0], jnp.zeros(()), jnp.zeros((), jnp.int32)
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
@@ -122,14 +127,14 @@ def _enter(script: NeedleScript, phase: jax.Array, state: EnvState) -> NeedleScr
 
 
 def act(script: NeedleScript, state: EnvState) -> tuple[Command, NeedleScript, Command]:
-    """The disturbed command to execute, the script, and the undisturbed one to record."""
+    """Returns the disturbed command to execute, the script, and the undisturbed one to record."""
     dt = 1.0 / CONTROL_HZ
     is_over = script.elapsed >= script.duration - 1e-6
     after = _enter(script, _following(script, state), state)
     script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
     elapsed = script.elapsed + dt
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
-    # On the way down it is over its goal by the time anything can touch.
+    # On the way down it is above its goal before anything can touch.
     aligned = jnp.where(script.phase == DESCEND, ALIGNED, 1.0)
     aside = scripting.minimum_jerk(jnp.minimum(s / aligned, 1.0))
     share = jnp.stack([aside, aside, scripting.minimum_jerk(s)])
@@ -147,14 +152,14 @@ def act(script: NeedleScript, state: EnvState) -> tuple[Command, NeedleScript, C
 
 
 def _following(script: NeedleScript, state: EnvState) -> jax.Array:
-    """The phase after the present one: again from the start if the needle is not held."""
+    """Returns the next phase, the first one if the needle is not held."""
     is_lost = (script.phase >= LIFT) & ~state.measurements.touch
     following = jnp.where(is_lost, RAISE, jnp.minimum(script.phase + 1, HOLD))
     return following.astype(jnp.int32)
 
 
 def _roll(script: NeedleScript, state: EnvState) -> jax.Array:
-    """Roll (rad) at the present position: turning towards, or on, the segment's normal."""
+    """Returns the roll (rad) at the present position, turning towards the segment's normal."""
     R = _command(jnp.zeros(()), script.p, script.jaws, state).pose.R[0]
     on_wire = jnp.arctan2(-script.normal @ R[:, 0], script.normal @ R[:, 1])
     is_approach = script.phase == APPROACH

@@ -33,8 +33,8 @@ SLIP = 0.0005
 SETTLE_STEPS = 60
 
 STAGES = ("approach", "grasped", "lifted", "held", "done")
-NEAR = 0.03  # the distance at which the tool works on the needle
-FLOOR = -0.0035  # the foam gives way to the pads: a straight tool leans by up to 40 degrees
+NEAR = 0.03  # scale of distances in rewards and features
+FLOOR = -0.0035  # the foam yields to the pads: a straight tool leans by up to 40 degrees
 # Beyond these the simulation has diverged.
 MAX_SPEED = 20.0  # m/s; a flicked needle is fast
 MAX_DISTANCE = 2.0
@@ -42,7 +42,7 @@ MAX_DISTANCE = 2.0
 
 @flax.struct.dataclass
 class NeedleLayout:
-    """Drawn at reset: pose_world_needle, and `[3]` m, where the tool's tip starts."""
+    """Draws at reset: pose_world_needle, and the tip's start `[3]` m."""
 
     needle: Pose
     tip: jax.Array
@@ -57,8 +57,8 @@ class NeedleMeasurements:
       tip: `[3]` m, the tool's tip.
       touch: the jaws hold some of the wire.
       sticks: the jaws touch the segment with the point.
-      grip: `[3]` m, the tip in the needle's frame when the present hold began.
-      slip: m, how far it has moved along the wire, or off it, since.
+      grip: `[3]` m, the tip in the needle's frame at the start of the present hold.
+      slip: m, the tip's distance from `grip`.
     """
 
     needle: Pose
@@ -73,9 +73,10 @@ class NeedleBound(NamedTuple):
     """Ids and shape in the compiled model.
 
     Attributes:
-      needle, dof: where the needle's coordinates begin in qpos and qvel.
-      height: m, of its centre as it lies.
-      point: geom ids of the segment with the point. pads: of the jaws.
+      needle, dof: first index of the needle's coordinates in qpos and qvel.
+      height: m, of the resting needle's centre.
+      point: geom ids of the segment with the point.
+      pads: geom ids of the jaws' pads.
     """
 
     needle: int
@@ -86,7 +87,7 @@ class NeedleBound(NamedTuple):
 
 
 def segments() -> tuple[np.ndarray, np.ndarray]:
-    """Centres `[K, 3]` m and tangents `[K, 3]` of the wire's segments in the needle's frame."""
+    """Returns centres `[K, 3]` m and tangents `[K, 3]` of the segments in the needle's frame."""
     half = SWEEP / SEGMENTS / 2
     middle = (np.arange(SEGMENTS) - (SEGMENTS - 1) / 2) * 2 * half
     zero = np.zeros(SEGMENTS)
@@ -97,7 +98,7 @@ def segments() -> tuple[np.ndarray, np.ndarray]:
 
 
 def bind(m: mujoco.MjModel) -> NeedleBound:
-    """Resolves the ids of the needle and of what touches it."""
+    """Resolves the ids of the needle and the pads."""
     pads = [g for g in range(m.ngeom) if "/pad_" in m.geom(g).name]
     return NeedleBound(
         needle=int(m.joint("needle").qposadr[0]),
@@ -109,7 +110,7 @@ def bind(m: mujoco.MjModel) -> NeedleBound:
 
 
 def sample(bound: NeedleBound, key: jax.Array) -> NeedleLayout:
-    """Draws the needle's place and yaw, and the tip's start."""
+    """Draws the needle's position and yaw, and the tip's start."""
     key_place, key_yaw, key_tip = jax.random.split(key, 3)
     xy = jax.random.uniform(key_place, (2,), minval=-1.0) * jnp.array(SPREAD)
     yaw = jax.random.uniform(key_yaw, minval=-jnp.pi, maxval=jnp.pi)
@@ -120,7 +121,7 @@ def sample(bound: NeedleBound, key: jax.Array) -> NeedleLayout:
 
 
 def place_objects(bound: NeedleBound, qpos: jax.Array, layout: NeedleLayout) -> jax.Array:
-    """Lays the needle where it was drawn."""
+    """Places the needle."""
     coords = bodies.upright_coords(layout.needle)
     return qpos.at[bound.needle : bound.needle + 7].set(coords)
 
@@ -131,14 +132,14 @@ def measure(
     readings: SimReadings,
     before: NeedleMeasurements | None,
 ) -> NeedleMeasurements:
-    """The needle, and how it lies in the jaws since it was lifted."""
+    """Measures the needle and its slip in the jaws since it was lifted."""
     needle = bodies.free_pose(readings.qpos, bound.needle)
     tip = jax.tree.map(lambda leaf: leaf[0], readings.pose)
     here = needle.R.T @ (tip.p - needle.p)
     touch = readings.touch[0]
     is_up = touch & (needle.p[2] > bound.height + LIFT)
     grip = here
-    if before is not None:  # a hold begins anew once the needle has slipped too far
+    if before is not None:  # a hold restarts once the needle has slipped too far
         was_up = before.touch & (before.needle.p[2] > bound.height + LIFT)
         grip = jnp.where(is_up & was_up & (before.slip < SLIP), before.grip, here)
     return NeedleMeasurements(
@@ -154,7 +155,7 @@ def measure(
 def status(
     bound: NeedleBound, layout: NeedleLayout, measurements: NeedleMeasurements
 ) -> TaskStatus:
-    """Strict: lifted, held, without slip. Loose: lifted."""
+    """Tests strict success (lifted, held, without slip) and loose success (lifted)."""
     height = measurements.needle.p[2] - bound.height
     lifted = height > LIFT
     success_now = lifted & measurements.touch & (measurements.slip < SLIP) & ~measurements.sticks
@@ -168,12 +169,12 @@ def status(
 
 
 def state(bound: NeedleBound, layout: NeedleLayout, measurements: NeedleMeasurements) -> jax.Array:
-    """`[9]`: the needle's position and rotation."""
+    """Returns `[9]`: the needle's position and rotation."""
     return jnp.concatenate([measurements.needle.p, rcm.rot6d_encode(measurements.needle.R)])
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
-    """Tip to needle, in the world's frame and in the needle's: `[..., 6]`."""
+    """Returns `[..., 6]`: from the tip to the needle, in the world's and in the needle's frame."""
     off = state[..., :3] - tips[..., 0, :]
     needle = rcm.rot6d_decode(state[..., 3:9])
     turned = jnp.einsum("...ji,...j->...i", needle, off, precision="highest")
@@ -181,7 +182,7 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
 
 
 def is_sound(bound: NeedleBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    """Whether the needle is slower, and nearer, than anything physical."""
+    """Returns False once the needle's simulation has diverged."""
     return bodies.is_sound(qpos, qvel, bound.needle, bound.dof, MAX_SPEED, MAX_DISTANCE)
 
 

@@ -14,7 +14,7 @@ TEXT = TaskText(
     nearly="needle lifted, but it slipped or was not held for 2 s",
     collided="pressed jaws or shaft into the foam",
     ground="the foam",
-    goal="the needle is to be lifted",
+    goal="the needle must be lifted",
 )
 
 

@@ -1,11 +1,10 @@
-"""Scripted expert of peg transfer: a phase machine that looks at the block, in pure JAX.
+"""Scripted expert of peg transfer: a phase machine on the block's pose.
 
-It grasps a wall to the left or right of its middle and, of two walls that are alike, either, at
-random (never by the trocar), at its own pace, is disturbed on purpose, and starts over when the
-block is not where it should be.
+It draws a side of the wall's middle, one of two equivalent walls (never by the trocar) and a pace,
+is disturbed on purpose, and starts over if the block is misplaced.
 The roll follows from tip positions and trocar alone: the tool turns only once the coming positions
-hold the grasp point, and the jaws' axis then stays on the wall's normal. It comes in along that
-normal, from outside, so that the path says which way the wall faces, and ways to two walls differ.
+include the grasp point, and the jaws' axis then stays on the wall's normal. It comes in along that
+normal, from outside: the path determines the wall, and paths to two walls differ.
 """
 
 import functools
@@ -27,17 +26,17 @@ RAISE, APPROACH, DESCEND, CLOSE, LIFT, CARRY, LOWER, OPEN, RETREAT, WAIT = range
 DURATION = (0.5, 1.2, 0.9, 0.4, 0.6, 0.9, 0.7, 0.4, 0.5, 1.0)
 SPEED = (0.04, 0.04, 0.024, 1.0, 0.035, 0.038, 0.024, 1.0, 0.04, 1.0)
 JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
-# How much of the disturbance acts in each phase.
+# Weight of the disturbance in each phase.
 DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.6, 0.3, 0.0, 0.3, 0.0)
 
 TEMPO = (0.85, 1.2)  # range of an episode's pace
 TURN_LEAD = 0.25  # s before the end of the approach at which the tool begins to turn
 TURN_TIME = 0.80  # s the turn takes
 
-ALIGNED = 0.6  # share of a descent after which it goes straight down
+ALIGNED = 0.6  # fraction of a descent after which it goes straight down
 HOVER = 0.026  # m above the grasp point
 GRASP_DROP = 0.001  # m below the rim's centre line
-RELEASE_HEIGHT = 0.0007  # m above the grasp's height at which the block is let go
+RELEASE_HEIGHT = 0.0007  # m above the grasp's height, of the release
 RELEASE_SHIFT = 0.0005  # m further out along the grasped wall's normal: room for the inner pad
 HELD = 0.006  # m from the tip within which the grasped wall counts as held
 GRASP_SIDE = 0.0015  # m along the wall, to either side of its middle
@@ -54,18 +53,23 @@ HOVER_SPREAD = 0.0015  # m, standard deviation of where it hovers
 
 @flax.struct.dataclass
 class PegScript:
-    """Where the script stands; single episode.
+    """Progress of the script in one episode.
 
     Attributes:
-      key: typed key, folded with the step for everything random.
-      phase: int32. elapsed, duration: s. attempt: int32, grasps begun.
+      key: of all draws, folded with the attempt or the step.
+      phase: int32.
+      elapsed, duration: s.
+      attempt: int32, number of started grasps.
       start, goal: `[3]` m, label positions at the phase's ends.
-      wall: int32, the wall grasped; side: -1 or 1, on which side of its middle.
+      wall: int32, the grasped wall.
+      side: -1 or 1, side of its middle.
       normal: `[3]`, the wall's direction, or the opposite: jaws are symmetric, and this keeps the
         roll on one branch.
-      roll_from: rad, the roll that the next turn begins at. jaws_from: jaws at the phase's start.
-      middle: m, y of the row on which either wall may be taken.
-      tempo: pace. noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
+      roll_from: rad, the roll at the start of the next turn.
+      jaws_from: jaws at the phase's start.
+      middle: m, y of the row with a free choice of the wall.
+      tempo: pace.
+      noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
       label: the undisturbed command of the one arm.
     """
 
@@ -88,8 +92,10 @@ class PegScript:
 
 
 def init(key: jax.Array, state: EnvState, middle: float = 0.0) -> PegScript:
-    """The script at the start of an episode. `middle`: see `PegScript`; the peg rows' by default,
-    and between two rows there is no choice."""
+    """Starts the script of an episode.
+
+    `middle`: see `PegScript`; by default the pegs' middle row. Between two rows nothing is chosen.
+    """
     key_tempo, key = jax.random.split(key)
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
     expert = PegScript(
@@ -114,7 +120,7 @@ def init(key: jax.Array, state: EnvState, middle: float = 0.0) -> PegScript:
 
 
 def act(expert: PegScript, state: EnvState) -> tuple[Command, PegScript, Command]:
-    """The disturbed command to execute now, the next state, and the clean command to record."""
+    """Returns the disturbed command to execute, the script, and the undisturbed one to record."""
     dt = 1.0 / CONTROL_HZ
     roll = _roll_of(expert, state)
     is_over = expert.elapsed >= expert.duration - 1e-6
@@ -123,7 +129,7 @@ def act(expert: PegScript, state: EnvState) -> tuple[Command, PegScript, Command
     expert = expert.replace(elapsed=expert.elapsed + dt)
 
     s = jnp.clip(expert.elapsed / expert.duration, 0.0, 1.0)
-    # On the way down it is over its goal by the time anything can touch.
+    # On the way down it is above its goal before anything can touch.
     is_down = (expert.phase == DESCEND) | (expert.phase == LOWER)
     aside = scripting.minimum_jerk(jnp.minimum(s / jnp.where(is_down, ALIGNED, 1.0), 1.0))
     share = jnp.stack([aside, aside, scripting.minimum_jerk(s)])
@@ -157,7 +163,7 @@ def _tip(state: EnvState) -> Pose:
 
 
 def _following(expert: PegScript, state: EnvState) -> jax.Array:
-    """The phase after the present one, given what the world looks like now."""
+    """Returns the next phase, the first one if the block is not held."""
     phase = expert.phase
     grasped = (
         state.measurements.block.p
@@ -179,8 +185,8 @@ def _enter(expert: PegScript, phase: jax.Array, state: EnvState, roll: jax.Array
     # The jaws' axis stays within 60 degrees of the world's y: the roll then never meets its wrap.
     skew = jnp.abs(normals[:, 0])
     is_candidate = skew <= jnp.sort(skew)[CANDIDATES - 1]
-    # Of these, the one towards the board's middle, where the shaft leans away from the peg; on the
-    # middle row the one that asks for less of a turn, or either if they are alike.
+    # The candidate towards the board's middle is preferred: its shaft leans away from the peg.
+    # On the middle row it is the one that needs less roll, or either if they are equivalent.
     unlike = normals[:, 1] * (block.p[1] - expert.middle) / OUTWARD + skew / SKEW
     chosen = jax.random.categorical(key_wall, jnp.where(is_candidate, -unlike, -jnp.inf))
     wall = jnp.where(is_approach, chosen, expert.wall)
@@ -194,8 +200,8 @@ def _enter(expert: PegScript, phase: jax.Array, state: EnvState, roll: jax.Array
     grasp = grasp - jnp.array([0.0, 0.0, GRASP_DROP])
     spread = HOVER_SPREAD * jax.random.normal(key_hover, (3,)) * jnp.array([1.0, 1.0, 0.5])
     hover = task.RIM_HEIGHT - GRASP_DROP + HOVER
-    # Where the tip must be once the block, tilted by now, is pressed upright over the target peg:
-    # on its wall, as far along it as the grasp is.
+    # The tip's position once the block, tilted by now, is upright over the target peg: on its wall,
+    # as far along it as the grasp is.
     along = jnp.array([-out[1], out[0]])
     aside = ((state.pose.p[0] - block.p)[:2] @ along) * along
     over = state.layout.target_peg + (task.RIM_RADIUS + RELEASE_SHIFT) * out[:2] + aside
@@ -234,7 +240,7 @@ def _enter(expert: PegScript, phase: jax.Array, state: EnvState, roll: jax.Array
 
 
 def _roll_of(expert: PegScript, state: EnvState) -> jax.Array:
-    """Roll (rad) at the label's position: turning towards, or on, the wall's normal."""
+    """Returns the roll (rad) at the label's position, turning towards the wall's normal."""
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(jnp.append(0.0, expert.label.pose.p), _told(state))
     on_wall = jnp.arctan2(-expert.normal @ pose.R[:, 0], expert.normal @ pose.R[:, 1])
     lead = TURN_LEAD + jnp.where(

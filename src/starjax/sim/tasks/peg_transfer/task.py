@@ -28,7 +28,7 @@ PEG_RADIUS = 0.001125
 
 # Where an episode begins.
 BLOCK_OFFSET = 0.001  # block's centre from its peg, each axis, at most
-BLOCK_YAW = 0.5236  # rad, either way: half of all that can be told apart, the rim being triangular
+BLOCK_YAW = 0.5236  # rad, either way: half of the distinguishable angles of a triangular rim
 TIP_HOME = (0.0, 0.0, 0.05)
 TIP_SPREAD = 0.01  # each axis, at most
 
@@ -49,19 +49,19 @@ MAX_BLOCK_DISTANCE = 1.0  # m from the board's centre
 
 STAGES = ("approach", "grasped", "lifted", "at the target", "threaded", "done")
 LIFTED = 0.004  # m above its resting height at which the block counts as lifted
-NEAR = 0.03  # m, the distance at which the tool works on the block
+NEAR = 0.03  # m, scale of distances in rewards and features
 TARGET_RGB = (0.98, 0.62, 0.1)
 
 
 @flax.struct.dataclass
 class PegLayout:
-    """Drawn at reset.
+    """Draws at reset.
 
     Attributes:
       source, target: `[]` int32 peg indices, 0-5 and 6-11.
       target_peg: `[2]` m, the target's axis.
       block: pose_world_block at the start.
-      tip: `[3]` m, where the tool's tip starts.
+      tip: `[3]` m, the tip's start.
     """
 
     source: jax.Array
@@ -92,7 +92,7 @@ class PegBound(NamedTuple):
     """Ids in the compiled model.
 
     Attributes:
-      block, block_dof: where the block's coordinates begin in qpos and qvel.
+      block, block_dof: first index of the block's coordinates in qpos and qvel.
       peg_geoms, seat_geoms: `[P]` geom ids.
       pegs: `[P, 2]` m, the pegs' axes; the first half are sources, the second targets.
     """
@@ -136,14 +136,14 @@ def sample(bound: PegBound, key: jax.Array) -> PegLayout:
 
 
 def place_objects(bound: PegBound, qpos: jax.Array, layout: PegLayout) -> jax.Array:
-    """Puts the block upright where it was drawn."""
+    """Places the block upright."""
     return qpos.at[bound.block : bound.block + 7].set(bodies.upright_coords(layout.block))
 
 
 def measure(
     bound: PegBound, layout: PegLayout, readings: SimReadings, before: PegMeasurements | None
 ) -> PegMeasurements:
-    """The block's pose and velocity, and what the jaws do."""
+    """Measures the block's pose and velocity, the tip and its touch."""
     return PegMeasurements(
         block=bodies.free_pose(readings.qpos, bound.block),
         velocity=readings.qvel[bound.block_dof : bound.block_dof + 6],
@@ -153,7 +153,7 @@ def measure(
 
 
 def status(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) -> TaskStatus:
-    """Strict: threaded, released, at rest. Loose: SurRoL's test."""
+    """Tests strict success (threaded, released, at rest) and loose success (SurRoL's test)."""
     block, peg = measurements.block, layout.target_peg
     threaded = is_threaded(block, peg)
     success_now = threaded & is_at_rest(measurements.velocity) & ~measurements.touch
@@ -173,16 +173,16 @@ def status(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) ->
 
 
 def state(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) -> jax.Array:
-    """`[12]`: the block's position and rotation, the target's place."""
+    """Returns `[12]`: the block's position and rotation, the target's position."""
     goal = jnp.append(layout.target_peg, RIM_HEIGHT)
     return jnp.concatenate([measurements.block.p, rcm.rot6d_encode(measurements.block.R), goal])
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
-    """Tip to block, in the world's frame and in the block's, and tip to target: `[..., 9]`.
+    """Returns `[..., 9]`: tip to block, in the world's and the block's frame, and tip to target.
 
-    They decide a grasp, and a small network does not get such small differences exactly enough
-    from positions in the scale of the workspace.
+    A grasp depends on them, and small networks compute such differences too coarsely from
+    positions in the scale of the workspace.
     """
     tip = tips[..., 0, :]
     to_block, to_target = state[..., :3] - tip, state[..., 9:12] - tip
@@ -199,13 +199,15 @@ def colours(bound: PegBound, layout: PegLayout, rgb: jax.Array) -> jax.Array:
 
 
 def obstacles(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) -> Capsules:
-    """Pegs and the block's walls."""
+    """Returns the pegs and the block's walls."""
     return around(bound, measurements.block)
 
 
 def around(bound: PegBound, block: Pose) -> Capsules:
-    """Pegs, and the walls of a block at this pose: the sides of a full triangle, 3.5 mm longer at
-    either end than they are."""
+    """Returns the pegs, and the walls of a block at this pose.
+
+    Walls are the sides of a full triangle, longer by 3.5 mm at either end than the real ones.
+    """
     pegs = jnp.asarray(bound.pegs)
     foot = jnp.concatenate([pegs, jnp.zeros((len(pegs), 1))], axis=-1)
     normals = wall_normals(block)
@@ -219,33 +221,33 @@ def around(bound: PegBound, block: Pose) -> Capsules:
 
 
 def is_sound(bound: PegBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    """Whether the block is slower, and nearer, than anything physical."""
+    """Returns False once the block's simulation has diverged."""
     limits = MAX_BLOCK_SPEED, MAX_BLOCK_DISTANCE
     return bodies.is_sound(qpos, qvel, bound.block, bound.block_dof, *limits)
 
 
 def wall_normals(block: Pose) -> jax.Array:
-    """`[3, 3]` outward normals of the walls in the world, one a row."""
+    """Returns the walls' outward normals in the world, rows of `[3, 3]`."""
     angle = jnp.arange(WALLS) * (2 * jnp.pi / WALLS)
     in_block = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(WALLS)], axis=-1)
     return in_block @ block.R.T
 
 
 def is_threaded(block: Pose, peg: jax.Array) -> jax.Array:
-    """Whether the block stands on the board with the peg `[2]` m inside its opening."""
+    """Returns True if the block stands on the board with the peg `[2]` m inside its opening."""
     reach = jnp.max(wall_normals(block)[:, :2] @ (peg - block.p[:2]))
     stands = jnp.abs(block.p[2] - RIM_HEIGHT) < HEIGHT_TOLERANCE
     return (reach < RIM_RADIUS - WALL_RADIUS) & stands & (block.R[2, 2] > UPRIGHT_COS)
 
 
 def is_near(block: Pose, peg: jax.Array) -> jax.Array:
-    """SurRoL's success test: close to the peg, whether threaded, released, at rest or not."""
+    """Tests SurRoL's success: close to the peg, without conditions on threading or release."""
     off = block.p[:2] - peg
     return (jnp.sum(off * off) < LOOSE_XY**2) & (jnp.abs(block.p[2] - RIM_HEIGHT) < LOOSE_Z)
 
 
 def is_at_rest(velocity: jax.Array) -> jax.Array:
-    """Whether the block's free-joint velocity `[6]` (m/s, rad/s) is that of a block at rest."""
+    """Returns True if the free-joint velocity `[6]` (m/s, rad/s) is that of a block at rest."""
     slow = jnp.sum(velocity[:3] ** 2) < REST_SPEED**2
     return slow & (jnp.sum(velocity[3:] ** 2) < REST_SPIN**2)
 

@@ -11,7 +11,7 @@ TEXT = TaskText(
     strict="on the target peg, released, at rest, in time",
     loose="SurRoL's test: the block was near its place on the target peg",
     nearly="block at its peg, but not threaded, released and at rest",
-    collided="touched board, peg or block with shaft or arm",
+    collided="touched the board, a peg or the block with the shaft or an arm",
     ground="the boards",
     goal="the block belongs on the marked peg",
 )

@@ -1,8 +1,8 @@
 """Scripted expert of bimanual peg transfer: lift, meet in the air, take over, thread.
 
 Both tools hold the same wall, `SIDE` to either side of its middle; their shafts lean apart and both
-jaws open along the world's y. Wanted positions never look at a trocar. It has no second try: a
-block that is dropped is a failure.
+jaws open along the world's y. Positions are independent of the trocars. It never retries: a dropped
+block is a failure.
 """
 
 from typing import Any
@@ -24,32 +24,33 @@ PHASES = (
 DURATION = (1.6, 1.1, 0.5, 0.9, 1.0, 0.9, 0.8, 0.5, 0.4, 0.6, 1.2, 0.9, 0.5, 0.7, 0.5)
 GIVER = (1, 1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1, 1, 1, 1)
 TAKER = (1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1, 1, 1, 1)
-# Which arms turn to the wall in which phase; the others keep their turn.
+# Arms that turn to the wall, by phase; the others keep their roll.
 LOOKS = np.zeros((len(PHASES), 2), bool)
 LOOKS[1, 0] = LOOKS[[6, 10, 11], 1] = True
-# How much of the disturbance acts.
+# Weight of the disturbance in each phase.
 DISTURBANCE = (1, 0.4, 0, 0.1, 0.3, 0.3, 0.1, 0, 0, 0, 0.3, 0.1, 0, 0.3, 0)
 
 TEMPO = (0.9, 1.15)  # range of an episode's pace
-# 1/m, how much turn (its sine) it is worth to hold the wall that the block's way leads away from: a
-# block sinks about the wall that holds it, and on its way shafts lean so as to raise it again.
+# 1/m, roll (its sine) that is accepted to hold the wall at the back of the block's path: a block
+# sinks about the wall that holds it, and on the path the shafts' lean raises it again.
 RAISED = 5.0
 SIDE = 0.0048  # m along the wall, from its middle to either tool
 PLACE = (0.0, 0.0, 0.045)  # m, of the block at the hand-over
-ALIGNED = 0.6  # share of the ways in after which a tool has turned, and of "down", is over its goal
+# Fraction of the ways in after which a tool has turned, and in "down" is above its goal.
+ALIGNED = 0.6
 HOVER = 0.026  # m above a grasp
 GRASP_DROP = 0.001  # m below the rim's centre line
 OVER = 0.012  # m more above the target: the block hangs below the taker
-RELEASE_HEIGHT = 0.0012  # m above the grasp's height at which the block is let go
+RELEASE_HEIGHT = 0.0012  # m above the grasp's height, of the release
 RELEASE_SHIFT = 0.0005  # m further out along the wall's normal: room for the inner pad
-COME = (0.0125, 0.0, 0.0215)  # m, from where the taker comes to the wall
-GO = (-0.015, 0.0, 0.026)  # m, where the giver goes once it has let go
+COME = (0.0125, 0.0, 0.0215)  # m, start of the taker's way to the wall
+GO = (-0.015, 0.0, 0.026)  # m, the giver's way after the release
 
 
 def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, Any]:
-    """The wall, one of little turn from which the block will hang well, and the pace.
+    """Chooses a wall with little roll from which the block hangs well, and draws the pace.
 
-    Of the wall: its normal and its direction, `[3]` each, in the block's frame.
+    The wall is given as its normal `[3]` and its direction `[3]` in the block's frame.
     """
     key, key_tempo = jax.random.split(key)
     block = state.measurements.block
@@ -71,7 +72,7 @@ def _weight(phase: jax.Array, share: jax.Array) -> jax.Array:
 
 
 def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array, jax.Array]:
-    """Where the tips go in every phase, from what is seen now, and the wall's normal."""
+    """Returns the tips' goals of every phase from the present state, and the wall's normal."""
     block, tips = state.measurements.block, script.p
     wall, along = script.held
     out, along = block.R @ wall, block.R @ along
@@ -85,9 +86,9 @@ def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array,
     )
     park, up = jnp.array(PARK), jnp.array([0.0, 0.0, HOVER])
     carried = tips[0] + jnp.array(PLACE) - block.p
-    # Where the taker must be once the block is pressed upright over the target peg.
-    beside = jnp.array([-flat[1], flat[0]])
-    aside = ((state.pose.p[1] - block.p)[:2] @ beside) * beside
+    # The taker's position once the block is upright over the target peg.
+    tangent = jnp.array([-flat[1], flat[0]])
+    aside = ((state.pose.p[1] - block.p)[:2] @ tangent) * tangent
     over = state.layout.target_peg + (single.RIM_RADIUS + RELEASE_SHIFT) * flat[:2] + aside
     height = single.RIM_HEIGHT - GRASP_DROP
     held = tips

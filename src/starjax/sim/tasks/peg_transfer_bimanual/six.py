@@ -1,7 +1,7 @@
 """Six blocks one after another, the exercise of FLS one way: a variant of the task.
 
-Blocks are alike, so one body is whichever block is to be moved, and the other five stand where they
-are: seen, and watched for shafts that enter them, but without contacts. Lengths in m.
+Blocks are alike, so one body is the block to move, and five others stand still: visible, and
+obstacles for shafts, but without contacts. Lengths in m.
 """
 
 import flax.struct
@@ -19,13 +19,15 @@ LIMIT_S = 300.0  # of FLS
 
 @flax.struct.dataclass
 class SixBlocksLayout:
-    """The block at hand as in the task, and the whole exercise.
+    """Present block as in the task, and the whole exercise.
 
     Attributes:
-      source, target, target_peg, block: of the block at hand, see `peg_transfer`.
-      tips: `[2, 3]`, where the tools' tips were when its turn came.
-      sources, targets: `[6]` int32 pegs, in order. blocks: Pose `[6]`, where each stands.
-      turn: int32, how many are over. since: int32, the control step at which this turn began.
+      source, target, target_peg, block: of the present block, see `peg_transfer`.
+      tips: `[2, 3]`, the tips at the start of its turn.
+      sources, targets: `[6]` int32 pegs, in order.
+      blocks: Pose `[6]` of all blocks.
+      turn: int32, number of finished blocks.
+      since: int32, the control step at the start of this turn.
     """
 
     source: jax.Array
@@ -41,7 +43,7 @@ class SixBlocksLayout:
 
 
 def sample(bound: single.PegBound, key: jax.Array) -> SixBlocksLayout:
-    """Draws the order, every block's offset and yaw, and the tips' starts; each as in the task."""
+    """Draws the order, and as in the task every block's offset and yaw and the tips' start."""
     key_order, key_blocks = jax.random.split(key)
     keys = jax.random.split(key_blocks, BLOCKS)
     drawn = jax.vmap(lambda key: task.sample(bound, key))(keys)
@@ -73,7 +75,7 @@ def begin(
     tips: jax.Array,
     step: jax.Array,
 ) -> SixBlocksLayout:
-    """The layout with another block's turn, from where the tips are at a control step."""
+    """Returns the layout with another block's turn, starting from these tips and control step."""
     target = layout.targets[turn]
     return layout.replace(
         source=layout.sources[turn],
@@ -87,13 +89,13 @@ def begin(
 
 
 def put(layout: SixBlocksLayout, block: Pose) -> SixBlocksLayout:
-    """The layout with the block at hand left at a pose."""
+    """Returns the layout with the present block left at a pose."""
     blocks = jax.tree.map(lambda x, at: x.at[layout.turn].set(at), layout.blocks, block)
     return layout.replace(blocks=blocks)
 
 
 def still(layout: SixBlocksLayout) -> Pose:
-    """Where the five others stand, Pose `[5]`."""
+    """Returns the other blocks, Pose `[5]`."""
     others = (layout.turn + 1 + jnp.arange(BLOCKS - 1)) % BLOCKS
     return jax.tree.map(lambda x: x[others], layout.blocks)
 
@@ -101,7 +103,7 @@ def still(layout: SixBlocksLayout) -> Pose:
 def _obstacles(
     bound: single.PegBound, layout: SixBlocksLayout, measurements: task.BimanualMeasurements
 ) -> Capsules:
-    """Pegs, and the walls of all blocks."""
+    """Returns the pegs and the walls of all blocks."""
     own = single.around(bound, measurements.block)
     others = jax.vmap(lambda block: single.around(bound, block))(still(layout))
     walls = (x[:, -single.WALLS :].reshape(-1, *x.shape[2:]) for x in others)

@@ -15,7 +15,7 @@ from starjax.sim.tasks.peg_transfer import task as single
 from starjax.sim.tasks.peg_transfer_bimanual import text
 from starjax.types import Pose
 
-# Where the tips start, and an idle one waits: the shafts lean apart.
+# Start of the tips, and waiting position of an idle one: the shafts lean apart.
 PARK = ((-0.02, 0.0, 0.065), (0.02, 0.0, 0.065))
 SPREAD = 0.008  # each axis, at most
 DROPPED_STEPS = 15  # control steps without a tool after which a block that was lifted is dropped
@@ -24,7 +24,7 @@ STAGES = ("approach", "grasped", "lifted", "passed", "at the target", "threaded"
 
 @flax.struct.dataclass
 class BimanualLayout:
-    """Drawn at reset: see `peg_transfer`; tips `[2, 3]` m."""
+    """Draws at reset, see `peg_transfer`; tips `[2, 3]` m."""
 
     source: jax.Array
     target: jax.Array
@@ -35,13 +35,16 @@ class BimanualLayout:
 
 @flax.struct.dataclass
 class BimanualMeasurements:
-    """Measurements of one moment, and what has happened.
+    """Measurements of one moment and history of the episode.
 
     Attributes:
-      block: pose_world_block. velocity: `[6]` of it, m/s and rad/s.
-      tips: `[2, 3]` m. touch: `[2]` bool, whose jaws touch the block.
-      lifted: by arm 0, at some time. passed: held by arm 1 alone in the air, at some time.
-      untouched: int32, control steps in a row without a tool at the block.
+      block: pose_world_block.
+      velocity: `[6]` of the block, m/s and rad/s.
+      tips: `[2, 3]` m.
+      touch: `[2]` bool, True if an arm's jaws touch the block.
+      lifted: the block was lifted by arm 0.
+      passed: it was then held by arm 1 alone in the air.
+      untouched: int32, consecutive control steps without a tool at the block.
     """
 
     block: Pose
@@ -54,7 +57,7 @@ class BimanualMeasurements:
 
 
 def sample(bound: single.PegBound, key: jax.Array) -> BimanualLayout:
-    """As in `peg_transfer`, with two tips."""
+    """Draws as in `peg_transfer`, with two tips."""
     key_layout, key_tips = jax.random.split(key)
     drawn = single.sample(bound, key_layout)
     spread = jax.random.uniform(key_tips, (2, 3), minval=-SPREAD, maxval=SPREAD)
@@ -68,7 +71,7 @@ def measure(
     readings: SimReadings,
     before: BimanualMeasurements | None,
 ) -> BimanualMeasurements:
-    """The block, the jaws, and who has held it."""
+    """Measures the block, the jaws, and its holders."""
     block = bodies.free_pose(readings.qpos, bound.block)
     touch = readings.touch
     in_air = block.p[2] > single.RIM_HEIGHT + single.LIFTED
@@ -92,7 +95,7 @@ def measure(
 def status(
     bound: single.PegBound, layout: BimanualLayout, measurements: BimanualMeasurements
 ) -> TaskStatus:
-    """Strict: passed in the air, threaded, released, at rest. Loose: SurRoL's test."""
+    """Tests strict success (passed in the air, threaded, released, at rest) and SurRoL's test."""
     block, peg = measurements.block, layout.target_peg
     threaded, near = single.is_threaded(block, peg), single.is_near(block, peg)
     is_left = single.is_at_rest(measurements.velocity) & ~measurements.touch.any()
@@ -113,7 +116,7 @@ def status(
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
-    """As in `peg_transfer`, from each tip, and from tip to tip: `[..., 21]`."""
+    """Returns `[..., 21]`: as in `peg_transfer` from each tip, and from tip to tip."""
     parts = [single.relative(state, tips[..., a : a + 1, :]) for a in range(2)]
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 

@@ -8,7 +8,7 @@ TEXT = text.TEXT._replace(
     strict="lifted by one tool, passed in the air, threaded on the target peg by the other, "
     "released and at rest, in time",
     nearly="block at its peg, but not passed in the air, or not threaded, released and at rest",
-    collided="touched board, peg or block with shaft or arm, or shafts or arms touched",
+    collided="touched the board, a peg or the block with a shaft or an arm, or the arms met",
     lost="the block was dropped",
 )
 outline = text.outline

@@ -15,18 +15,21 @@ from starjax.types import Agent, Command
 SPEED = 0.035  # m/s, mean along the straight line
 LEAST_TIME = 0.8  # s
 TEMPO = (0.85, 1.2)  # range of an episode's pace
-BULGE = 0.25  # of the straight line's length, how far the arc leaves it
+BULGE = 0.25  # the arc's largest offset from the line, as a fraction of its length
 DEVIATION = 0.0012  # m, of the disturbance
-CALM = 0.8  # share of the way after which the disturbance has faded
+CALM = 0.8  # fraction of the way after which the disturbance has faded
 
 
 @flax.struct.dataclass
 class ReachScript:
-    """One episode's script.
+    """Script of one episode.
 
     Attributes:
-      key: of everything random. start: `[3]` m. side: `[3]` m, how far the arc leaves the line.
-      duration, elapsed: s. noise: `[2, 3]` m, disturbance, rough and smooth.
+      key: of all draws.
+      start: `[3]` m.
+      side: `[3]` m, the arc's largest offset from the line.
+      duration, elapsed: s.
+      noise: `[2, 3]` m, disturbance, rough and smooth.
     """
 
     key: jax.Array
@@ -52,7 +55,7 @@ def init(key: jax.Array, state: EnvState) -> ReachScript:
 
 
 def act(script: ReachScript, state: EnvState) -> tuple[Command, ReachScript, Command]:
-    """The disturbed command to execute, the script, and the undisturbed one to record."""
+    """Returns the disturbed command to execute, the script, and the undisturbed one to record."""
     dt = 1.0 / CONTROL_HZ
     elapsed = script.elapsed + dt
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)

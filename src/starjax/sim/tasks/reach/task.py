@@ -20,20 +20,21 @@ TIP_SPREAD = 0.015  # each axis, at most
 TOLERANCE = 0.002
 REST_SPEED = 0.005  # m/s
 SETTLE_STEPS = 30
-LOOSE = 0.005  # m from the mark, moving or not: surgical suites ask for no more
+LOOSE = 0.005  # m from the mark, moving or not: the usual test of surgical suites
 
 STAGES = ("far", "near", "at the mark", "done")
-NEAR = 0.03  # m, the scale of distances that decide
+NEAR = 0.03  # m, scale of distances in rewards and features
 MARK_RGB = (0.98, 0.62, 0.1)
 
 
 @flax.struct.dataclass
 class ReachLayout:
-    """Drawn at reset.
+    """Draws at reset.
 
     Attributes:
-      goal: `[]` int32, number of the mark. p: `[3]` m, where it is.
-      tip: `[3]` m, where the tool's tip starts.
+      goal: `[]` int32, number of the mark.
+      p: `[3]` m, its position.
+      tip: `[3]` m, the tip's start.
     """
 
     goal: jax.Array
@@ -53,7 +54,9 @@ class ReachBound(NamedTuple):
     """Ids in the compiled model.
 
     Attributes:
-      geoms: `[M]` of the marks. marks: `[M, 3]` m, where they are. posts: `[M]` m, their radii.
+      geoms: `[M]` geom ids of the marks.
+      marks: `[M, 3]` m, their positions.
+      posts: `[M]` m, radii of the posts.
     """
 
     geoms: np.ndarray
@@ -80,12 +83,12 @@ def sample(bound: ReachBound, key: jax.Array) -> ReachLayout:
 def measure(
     bound: ReachBound, layout: ReachLayout, readings: SimReadings, before: ReachMeasurements | None
 ) -> ReachMeasurements:
-    """The tip and its speed."""
+    """Measures the tip and its speed."""
     return ReachMeasurements(readings.pose.p[0], jnp.linalg.norm(readings.velocity[0]))
 
 
 def status(bound: ReachBound, layout: ReachLayout, measurements: ReachMeasurements) -> TaskStatus:
-    """Strict: at the mark and at rest. Loose: near it, moving or not."""
+    """Tests strict success (at the mark and at rest) and loose success (near it)."""
     off = jnp.linalg.norm(measurements.tip - layout.p)
     at_mark, near = off < TOLERANCE, off < LOOSE
     success_now = at_mark & (measurements.speed < REST_SPEED)
@@ -100,7 +103,7 @@ def colours(bound: ReachBound, layout: ReachLayout, rgb: jax.Array) -> jax.Array
 
 
 def obstacles(bound: ReachBound, layout: ReachLayout, measurements: ReachMeasurements) -> Capsules:
-    """The posts below the marks."""
+    """Returns the posts below the marks."""
     marks = jnp.asarray(bound.marks)
     foot = marks.at[:, 2].set(0.0)
     return Capsules(foot, marks - jnp.array([0.0, 0.0, TOLERANCE]), jnp.asarray(bound.posts))

@@ -1,9 +1,9 @@
 """Scripted expert of ring on wire: take the tab, lift the ring free, carry it along, let it hang.
 
-It goes from bend to bend and stops at each. The tip's place for a ring's place follows from how the
-ring is held and how the tool leans there, so from the trocar: a straight tool cannot do otherwise.
-Pace, the place on the tab and the side from which it comes are drawn, never by the trocar. It is
-disturbed on purpose, and starts over when it does not hold the tab.
+It goes from bend to bend and stops at each. With a straight tool the tip's position for a ring's
+pose depends on the grasp and on the tool's lean, hence on the trocar. Pace, the point on the tab
+and the side of approach are drawn, never by the trocar. It is disturbed on purpose, and starts over
+if it does not hold the tab.
 """
 
 import flax.struct
@@ -21,33 +21,35 @@ RAISE, APPROACH, DESCEND, CLOSE, LIFT, CARRY, LOWER, OPEN, LEAVE, WAIT = range(1
 DURATION = (0.5, 1.2, 0.9, 0.6, 1.2, 0.4, 0.8, 0.5, 0.7, 0.8)
 SPEED = (0.04, 0.04, 0.024, 1.0, 0.02, 0.015, 0.02, 1.0, 0.03, 1.0)
 JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
-# How much of the disturbance acts at the end of each phase.
+# Weight of the disturbance at the end of each phase.
 DISTURBANCE = (1.0, 1.0, 0.0, 0.0, 0.1, 0.15, 0.0, 0.0, 0.3, 0.1)
 
 TEMPO = (0.85, 1.15)  # range of an episode's pace
-ALIGNED = 0.6  # share of a descent after which it goes straight along the shaft
+ALIGNED = 0.6  # fraction of a descent after which it goes straight along the shaft
 HOVER = 0.02  # m along the shaft before the tab
 HOVER_ASIDE = 0.006  # m along the wire, either way
 GRASP_SPREAD = 0.0008  # m along the tab, either way
-RELEASE = 0.55  # share of the way down to where the ring hangs at which it is let go
+RELEASE = 0.55  # fraction of the way down to the hanging ring, of the release
 SMOOTHED = 0.003  # m to either side over which the wire's direction is taken
 DEVIATION = (0.0012, 0.0012, 0.0012, 0.05)  # m and rad, of the disturbance
 STOPS = (*task.BENDS[1:-1], task.START)  # m along the way
 AHEAD = 0.001  # m, the least way to the next stop
-ROUNDS = 4  # of finding a pose whose roll and position depend on each other
+ROUNDS = 4  # fixed-point iterations for a pose whose roll and position depend on each other
 
 
 @flax.struct.dataclass
 class RingScript:
-    """Where the script stands; single episode.
+    """Progress of the script in one episode.
 
     Attributes:
-      key: folded with the attempt or the step for everything random.
-      phase, attempt: int32. elapsed, duration: s. tempo: pace.
-      side: 1 or -1, from where it comes. grasp: m, where the tab is held.
-      start, goal: `[4]` roll (rad) and position (m), undisturbed, at the phase's ends. way: the
-        present one.
-      stop: `[]` m along the way, where the present carry ends.
+      key: of all draws, folded with the attempt or the step.
+      phase, attempt: int32.
+      elapsed, duration: s.
+      tempo: pace.
+      side: 1 or -1, side of the approach.
+      grasp: m along the tab, from the ring's centre.
+      start, goal, way: `[4]` roll (rad) and position (m), undisturbed, at the phase's ends and now.
+      stop: `[]` m along the way, end of the present carry.
       jaws_from, jaws: openings.
       noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
     """
@@ -70,7 +72,7 @@ class RingScript:
 
 
 def init(key: jax.Array, state: EnvState) -> RingScript:
-    """The script at the start of an episode."""
+    """Starts the script of an episode."""
     key_tempo, key = jax.random.split(key)
     zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
@@ -83,7 +85,7 @@ def init(key: jax.Array, state: EnvState) -> RingScript:
 
 
 def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Command]:
-    """The disturbed command to execute, the script, and the undisturbed one to record."""
+    """Returns the disturbed command to execute, the script, and the undisturbed one to record."""
     dt = 1.0 / CONTROL_HZ
     is_over = script.elapsed >= script.duration - 1e-6
     after = _enter(script, _following(script, state), state)
@@ -92,7 +94,7 @@ def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Comma
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
     share = scripting.minimum_jerk(s)
     way = script.start + share * (script.goal - script.start)
-    # On the way down the tool has turned, and goes along its shaft, by the time it can touch.
+    # On the way down the tool has turned, and goes along its shaft, before it can touch.
     early = scripting.minimum_jerk(jnp.minimum(s / ALIGNED, 1.0))
     back = HOVER * (1.0 - share) * _shaft(script.goal[1:], state)
     aside = (1.0 - early) * (script.start + _lifted(script, state) - script.goal)
@@ -108,12 +110,12 @@ def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Comma
 
 
 def _lifted(script: RingScript, state: EnvState) -> jax.Array:
-    """`[4]`: from where a descent begins to as far down the shaft as it goes."""
+    """Returns the motion `[4]` of a descent along the shaft."""
     return jnp.append(0.0, HOVER * _shaft(script.goal[1:], state))
 
 
 def _following(script: RingScript, state: EnvState) -> jax.Array:
-    """The phase after the present one: the next carry, or again from the start without the tab."""
+    """Returns the next phase: another carry, or the first one if the tab is not held."""
     is_carry, is_there = script.phase == CARRY, script.stop >= STOPS[-1] - 1e-6
     following = jnp.where(is_carry & ~is_there, CARRY, script.phase + 1)
     is_held = (script.phase >= LIFT) & (script.phase <= CARRY)
@@ -124,7 +126,7 @@ def _following(script: RingScript, state: EnvState) -> jax.Array:
 
 
 def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
-    """Begins `phase` with a goal from what is seen now."""
+    """Begins `phase` with a goal from the present state."""
     ring, here = state.measurements.ring, script.way
     is_approach = phase == APPROACH
     attempt = script.attempt + is_approach
@@ -176,10 +178,11 @@ def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
 
 
 def _carrying(y: jax.Array, lowered: jax.Array, roll: jax.Array, state: EnvState) -> jax.Array:
-    """Roll and position `[4]` with the ring, as it is held now, about the wire at `y` m.
+    """Returns roll and position `[4]` that hold the ring, in its present grasp, about the wire.
 
     Args:
-      lowered: share of the way down to where the ring hangs.
+      y: m, position along the wire.
+      lowered: fraction of the way down to the hanging ring.
       roll: rad, the present one.
     """
     point = jnp.stack([jnp.zeros(()), y, task.height(y) - lowered * task.HANG])
@@ -196,14 +199,14 @@ def _carrying(y: jax.Array, lowered: jax.Array, roll: jax.Array, state: EnvState
 
 
 def _turned(p: jax.Array, normal: jax.Array, roll: jax.Array, state: EnvState) -> jax.Array:
-    """Roll and position `[4]` at `p`, the jaws opening along `normal`, as near `roll` as may be."""
+    """Returns roll and position `[4]` at `p`, jaws along `normal`, the roll nearest to `roll`."""
     R = _command(jnp.append(0.0, p), jnp.zeros(()), state).pose.R[0]
     turned = jnp.arctan2(-normal @ R[:, 0], normal @ R[:, 1])
     return jnp.append(scripting.nearer_half(turned, roll), p)
 
 
 def _shaft(p: jax.Array, state: EnvState) -> jax.Array:
-    """The direction `[3]` of a shaft with its tip at `p`."""
+    """Returns the direction `[3]` of a shaft with its tip at `p`."""
     away = p - state.measured_trocar.p_world_trocar[0]
     return away / jnp.linalg.norm(away)
 

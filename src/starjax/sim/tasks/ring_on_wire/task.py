@@ -25,7 +25,7 @@ from starjax.types import Pose
 BENDS = (-0.045981, -0.025981, -0.01299, 0.0, 0.01299, 0.025981, 0.045981)
 HEIGHTS = (0.022, 0.022, 0.0295, 0.022, 0.0295, 0.022, 0.022)  # z of them
 TAB = 0.0110  # from the ring's centre to where its tab is held
-HANG = 0.00414  # of the ring's centre below the wire's axis, where it hangs
+HANG = 0.00414  # of the hanging ring's centre below the wire's axis
 
 # Where an episode begins.
 START = 0.037  # from the wire's middle
@@ -42,7 +42,7 @@ SETTLE_STEPS = 10
 
 STAGES = ("approach", "grasped", "lifted", "on the way", "at the end", "done")
 LIFTED = 0.002  # above where it hangs
-NEAR = 0.03  # the scale of distances that decide
+NEAR = 0.03  # scale of distances in rewards and features
 GOAL_RGB = (0.98, 0.62, 0.1)
 # Beyond these the simulation has diverged.
 MAX_SPEED = 5.0  # m/s
@@ -51,12 +51,13 @@ MAX_DISTANCE = 0.3
 
 @flax.struct.dataclass
 class RingLayout:
-    """Drawn at reset.
+    """Draws at reset.
 
     Attributes:
-      start: int32, the end at which the ring hangs: 0 at y < 0, 1 at y > 0.
-      way: `[]`, 1 or -1: along y, to the other end.
-      ring: pose_world_ring. tip: `[3]` m, where the tool's tip starts.
+      start: int32, the ring's end of the wire: 0 at y < 0, 1 at y > 0.
+      way: `[]`, 1 or -1, direction along y to the other end.
+      ring: pose_world_ring.
+      tip: `[3]` m, the tip's start.
     """
 
     start: jax.Array
@@ -67,13 +68,15 @@ class RingLayout:
 
 @flax.struct.dataclass
 class RingMeasurements:
-    """Measurements of one moment, and how it went so far.
+    """Measurements of one moment and history of the episode.
 
     Attributes:
-      ring: pose_world_ring. velocity: `[6]` of it, m/s and rad/s.
-      tip: `[3]` m. touch: the jaws touch the tab.
-      rubs: the ring touches the wire. rubbed: int32, control steps in which it did so over the bent
-        part.
+      ring: pose_world_ring.
+      velocity: `[6]` of the ring, m/s and rad/s.
+      tip: `[3]` m.
+      touch: the jaws touch the tab.
+      rubs: the ring touches the wire.
+      rubbed: int32, control steps with such a touch over the bent part.
     """
 
     ring: Pose
@@ -88,10 +91,11 @@ class RingBound(NamedTuple):
     """Ids and shapes in the compiled model.
 
     Attributes:
-      ring, dof: where the ring's coordinates begin in qpos and qvel.
+      ring, dof: first index of the ring's coordinates in qpos and qvel.
       tube, wire: geom ids of the ring's tube, and of the wire with its posts.
       ends: `[2, 2]` geom ids, the last piece and the post of either end.
-      pieces: `[K, 2, 3]` m, axes of wire and posts. radius: m, of them.
+      pieces: `[K, 2, 3]` m, axes of wire and posts.
+      radius: m, of wire and posts.
     """
 
     ring: int
@@ -122,12 +126,12 @@ def bind(m: mujoco.MjModel) -> RingBound:
 
 
 def height(y: jax.Array) -> jax.Array:
-    """Height of the wire's axis at `y` `[...]` m."""
+    """Returns the height (m) of the wire's axis at `y` `[...]` m."""
     return jnp.interp(y, jnp.array(BENDS), jnp.array(HEIGHTS))
 
 
 def sample(bound: RingBound, key: jax.Array) -> RingLayout:
-    """Draws the end, the ring's place on it and yaw, and the tip's start."""
+    """Draws the end, the ring's position and yaw, and the tip's start."""
     key_start, key_place, key_yaw, key_tip = jax.random.split(key, 4)
     start = jax.random.randint(key_start, (), 0, 2)
     way = 1.0 - 2.0 * start
@@ -142,14 +146,14 @@ def sample(bound: RingBound, key: jax.Array) -> RingLayout:
 
 
 def place_objects(bound: RingBound, qpos: jax.Array, layout: RingLayout) -> jax.Array:
-    """Hangs the ring where it was drawn."""
+    """Places the ring on the wire."""
     return qpos.at[bound.ring : bound.ring + 7].set(bodies.upright_coords(layout.ring))
 
 
 def measure(
     bound: RingBound, layout: RingLayout, readings: SimReadings, before: RingMeasurements | None
 ) -> RingMeasurements:
-    """The ring, and how often it has touched the wire."""
+    """Measures the ring and counts its touches of the wire."""
     ring = bodies.free_pose(readings.qpos, bound.ring)
     rubs = bodies.touch(readings.contacts, bound.tube, bound.wire)
     rubbed = jnp.zeros((), jnp.int32)
@@ -166,7 +170,7 @@ def measure(
 
 
 def status(bound: RingBound, layout: RingLayout, measurements: RingMeasurements) -> TaskStatus:
-    """Strict: carried to the end with little touching, released, at rest. Loose: at the end."""
+    """Tests strict success (at the end, few touches, released, at rest) and loose (at the end)."""
     p, way = measurements.ring.p, layout.way * measurements.ring.p[1]
     raised = p[2] - (height(p[1]) - HANG)
     at_end = (way > END) & (way < -BENDS[0])
@@ -185,14 +189,17 @@ def status(bound: RingBound, layout: RingLayout, measurements: RingMeasurements)
 
 
 def state(bound: RingBound, layout: RingLayout, measurements: RingMeasurements) -> jax.Array:
-    """`[12]`: the ring's position and rotation, the place where it is to hang."""
+    """Returns `[12]`: the ring's position and rotation, and its goal's position."""
     goal = jnp.stack([jnp.zeros(()), layout.way * START, jnp.array(HEIGHTS[-1] - HANG)])
     return jnp.concatenate([measurements.ring.p, rcm.rot6d_encode(measurements.ring.R), goal])
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
-    """Tip to tab, in the world's frame and in the ring's; the ring above the wire, its normal from
-    the wire's plane, and to the goal: `[..., 11]`."""
+    """Returns `[..., 11]`: differences of the tip, the ring, the wire and the goal.
+
+    From the tip to the tab in the world's and in the ring's frame, the ring's height above the
+    wire, its normal across the wire's plane, and from the ring to the goal.
+    """
     p, R, goal = state[..., :3], rcm.rot6d_decode(state[..., 3:9]), state[..., 9:12]
     off = p + TAB * R[..., 2] - tips[..., 0, :]
     turned = jnp.einsum("...ji,...j->...i", R, off, precision="highest")
@@ -201,18 +208,18 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
 
 
 def colours(bound: RingBound, layout: RingLayout, rgb: jax.Array) -> jax.Array:
-    """Marks the end to which the ring belongs."""
+    """Marks the ring's goal."""
     return rgb.at[jnp.asarray(bound.ends)[layout.start]].set(jnp.array(GOAL_RGB))
 
 
 def obstacles(bound: RingBound, layout: RingLayout, measurements: RingMeasurements) -> Capsules:
-    """Wire and posts."""
+    """Returns the wire and its posts."""
     start, end = jnp.moveaxis(jnp.asarray(bound.pieces), 1, 0)
     return Capsules(start, end, jnp.full(len(bound.pieces), bound.radius))
 
 
 def is_sound(bound: RingBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    """Whether the ring is slower, and nearer, than anything physical."""
+    """Returns False once the ring's simulation has diverged."""
     return bodies.is_sound(qpos, qvel, bound.ring, bound.dof, MAX_SPEED, MAX_DISTANCE)
 
 

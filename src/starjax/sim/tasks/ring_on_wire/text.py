@@ -12,7 +12,7 @@ TEXT = TaskText(
     "0.3 s at most, in time",
     loose="the ring came to the marked end, however often it touched the wire",
     nearly="ring at the marked end, but not released and at rest there",
-    collided="touched base or wire with shaft or arm",
+    collided="touched the base or the wire with the shaft or an arm",
     ground="the base",
     goal="the ring belongs at the marked end of the wire",
     lost="the ring touched the bent part of the wire for longer than 0.3 s",
