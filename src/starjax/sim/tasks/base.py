@@ -152,7 +152,8 @@ class SimReadings(NamedTuple):
     contacts: Contacts
 
 
-NO_CAPSULES = Capsules(*(np.zeros(shape, np.float32) for shape in ((0, 3), (0, 3), 0)))
+def _no_obstacles(bound: Any, layout: Any, measurements: Any) -> Capsules:
+    return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
 
 
 class Task(NamedTuple):
@@ -223,7 +224,7 @@ class Task(NamedTuple):
     label: Callable[..., dict[str, jax.Array]] = lambda layout: {}
     place_objects: Callable[..., jax.Array] = lambda bound, qpos, layout: qpos
     colours: Callable[..., jax.Array] = lambda bound, layout, rgb: rgb
-    obstacles: Callable[..., Capsules] = lambda bound, layout, measurements: NO_CAPSULES
+    obstacles: Callable[..., Capsules] = _no_obstacles
     floor: float = 0.0
     is_sound: Callable[..., jax.Array] = lambda bound, qpos, qvel: jnp.ones((), bool)
     trocars: rcm.Trocar = rcm.Trocar(*(field[:, None] for field in rcm.TROCARS))
