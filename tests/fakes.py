@@ -17,6 +17,7 @@ from starjax.sim import names
 from starjax.sim.tasks import base
 from starjax.types import Command, Observation, Pose
 
+SCENE = names.SceneNames("peg_transfer", ("fr5",), ("grasper",), ("camera",))
 P_WORLD_REF = np.array([[0.0, 0.0, 0.15]], np.float32)
 OTHER_REF = (0.02, 0.1, 0.16)  # m, of a second arm, that faces the first one
 
@@ -73,7 +74,7 @@ TWO_ARMS = task(2)
 
 def env() -> types.SimpleNamespace:
     """As much of an `Env` as training looks at."""
-    return types.SimpleNamespace(task=TASK, names=names.FIRST, p_world_ref=P_WORLD_REF)
+    return types.SimpleNamespace(task=TASK, names=SCENE, p_world_ref=P_WORLD_REF)
 
 
 def trained(**changed: Any) -> policy_file.Trained:
@@ -85,7 +86,7 @@ def trained(**changed: Any) -> policy_file.Trained:
         "train": config.TrainConfig(),
         "params": {},
         "normalizer": normalizer.Normalizer(box, None),
-        "scene": names.FIRST,
+        "scene": SCENE,
         "p_world_ref": ((0.0, 0.0, 0.15),),
         "roll_zero": (0.0,),
     }

@@ -6,7 +6,7 @@ from typing import Any
 import fakes
 import numpy as np
 
-from starjax.data import schema, store
+from starjax.data import store
 from starjax.rollouts import episodes
 from starjax.sim import names
 
@@ -45,7 +45,7 @@ def write(
     scene = names.SceneNames("peg_transfer", ("fr5",) * arms, ("grasper",) * arms, shown)
     slots = fakes.task(arms).slots
     description = {
-        "schema": schema.SCHEMA,
+        "schema": store.SCHEMA,
         "per_trocar": 2,
         "seed": 0,
         "max_steps": length,

@@ -3,6 +3,7 @@
 import json
 import pathlib
 
+import fakes
 import numpy as np
 import stubs
 
@@ -10,7 +11,7 @@ from starjax import config, rcm
 from starjax.evaluation import result, statistics, sweep
 from starjax.evaluation import trials as table
 from starjax.rollouts import trocars
-from starjax.sim import names, registries
+from starjax.sim import registries
 
 P_REF = np.array([[0.0, 0.0, 0.15]], np.float32)
 WEIGHTS = "0" * 64
@@ -35,7 +36,7 @@ def run(path: pathlib.Path, method="stardiff", skill=(0.85, 0.7), trials=6, swee
         )
         about = {"method": method, "observation": "state", "weights": WEIGHTS}
         about |= {"control_hz": 30.0, "time_limit_s": 60.0, "seed": 0}
-        result.write(path / "sweep.json", names.FIRST, figures, about)
+        result.write(path / "sweep.json", fakes.SCENE, figures, about)
     return path
 
 
@@ -96,7 +97,7 @@ def about(method, seed=0):
 
 def write(file, method, rows, seed=0):
     """result.json of an evaluation."""
-    return result.write(file, names.FIRST, figures(method, rows), about(method, seed))
+    return result.write(file, fakes.SCENE, figures(method, rows), about(method, seed))
 
 
 def curves(rng):

@@ -7,7 +7,7 @@ SOURCE = pathlib.Path(__file__).parents[1] / "src" / "starjax"
 # From left to right; a layer may import itself and those of the rows before its own.
 ROWS = (
     ("errors",),
-    ("extras", "types", "methods", "limits", "registry", "runtime", "schema_1"),
+    ("extras", "types", "methods", "limits", "registry", "runtime"),
     ("learners",),
     ("config", "rcm"),
     ("models", "sim"),

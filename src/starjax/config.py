@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
-from starjax import schema_1
 from starjax.learners import LEARNERS
 from starjax.limits import INLINE, Count, CountOrZero, NotNegative, Positive, Range
 
@@ -180,9 +179,7 @@ def differing_settings(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     """
     usual = as_json(RunConfig())
     parts = [part for part in _WEIGHT_SECTIONS if part != "seed"]
-    filled = [
-        {part: usual[part] | old.get(part, {}) for part in parts} for old in map(upgraded, configs)
-    ]
+    filled = [{part: usual[part] | old.get(part, {}) for part in parts} for old in configs]
     rows = [_flat(values | {"policy": _without_frame(values["policy"])}) for values in filled]
     return [
         name
@@ -248,7 +245,6 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
     """
     if not isinstance(values, Mapping):
         raise ValueError(f"{settings.__name__}: expected an object, got {values!r}")
-    values = upgraded(values)
     hints = typing.get_type_hints(settings)
     if settings is PolicyConfig:
         values = _nested(values)
@@ -291,22 +287,3 @@ def _without_frame(policy: Mapping[str, Any]) -> dict[str, Any]:
     Version 0.2.0 knew another one, the endoscope's, in which policies learned less.
     """
     return {name: value for name, value in policy.items() if (name, value) != ("frame", "world")}
-
-
-def upgraded(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a run from JSON, or parts of them, with those of earlier versions as today's."""
-    found = dict(values)
-    train, policy = found.get("train"), found.get("policy")
-    if train is not None:  # a whole run's
-        task, arm, tool, camera = schema_1.SCENE
-        scene = SceneConfig(task=task, arm=arm, tool=tool, camera=camera)
-        found.setdefault("scene", as_json(scene))
-    if isinstance(train, Mapping) and isinstance(policy, Mapping) and "crop_fraction" in train:
-        rest = dict(train)
-        found["policy"] = {**policy, "crop_fraction": rest.pop("crop_fraction")}
-        found["train"] = rest
-    demos = found.get("demos", found)
-    if isinstance(demos, Mapping) and schema_1.has_switch(demos):
-        rest = schema_1.with_expert(demos, usual="")
-        found = {**found, "demos": rest} if "demos" in found else rest
-    return found

@@ -23,7 +23,6 @@ from starjax.commands import (
     run_settings,
 )
 from starjax.data import store
-from starjax.sim import names
 
 MAP = """
 task = "peg_transfer"
@@ -96,7 +95,7 @@ def test_inspect_shows_columns_of_others_and_what_is_not_finite(exported, tmp_pa
 def test_inspect_reads_policies_and_results(request):
     found = inspect_command.inspect("compact")
     assert "stardiff" in found.rows[0][1] and not found.odd
-    file = request.config.rootpath / "tests/golden/result_schema_1/result.json"
+    file = request.config.rootpath / "tests/golden/result/result.json"
     rows = dict(inspect_command.inspect(str(file)).rows)
     assert rows["trials"] == "72" and rows["seen"].startswith("46/48")
 
@@ -153,7 +152,7 @@ def test_inspect_finds_damage(root, tmp_path):
 def env():
     """As much of the environment as the check of a dataset looks at."""
     return types.SimpleNamespace(
-        task=fakes.TASK, names=names.FIRST, p_world_ref=np.float32([[0.0, 0.0, 0.15]])
+        task=fakes.TASK, names=fakes.SCENE, p_world_ref=np.float32([[0.0, 0.0, 0.15]])
     )
 
 

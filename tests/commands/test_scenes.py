@@ -1,18 +1,16 @@
 """The scene of a run, by name: what is left out is the task's, what is wrong names its flag."""
 
-import dataclasses
-
+import fakes
 import mistakes
 import pytest
 
 from starjax import cli, config
 from starjax.commands import folders, scenes
-from starjax.sim import names
 
 
 def test_names_that_are_left_out_are_the_tasks():
     found = scenes.resolved(config.RunConfig()).scene
-    assert found == scenes.settings(names.FIRST)
+    assert found == scenes.settings(fakes.SCENE)
     assert scenes.resolved(config.RunConfig(scene=found)).scene == found
     both = config.SceneConfig(task="peg_transfer_bimanual", arm=("fr5",))
     assert scenes.resolved(config.RunConfig(scene=both)).scene.arm == ("fr5", "fr5")
@@ -51,17 +49,6 @@ def test_cameras_that_are_named():
     for camera in (("endoscope",), ("camera", "endoscope")):
         assert cameras(camera=camera) == camera
     assert cameras(task="endoscope_track", camera=("fixed",)) == ("camera",)
-
-
-def test_settings_without_a_scene_are_of_the_first_one():
-    old = config.as_json(config.RunConfig())
-    del old["scene"]
-    found = config.from_dict(config.RunConfig, old)
-    assert found.scene == scenes.settings(names.FIRST)
-    now = config.as_json(scenes.resolved(config.RunConfig()))
-    assert config.differing_settings([old, now]) == []
-    other = dataclasses.replace(found, scene=config.SceneConfig(task="reach"))
-    assert "scene.task" in config.differing_settings([old, config.as_json(other)])
 
 
 def test_a_folder_of_another_scene_is_refused(tmp_path):

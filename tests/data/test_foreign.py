@@ -95,7 +95,7 @@ def test_it_is_a_dataset_like_any_other(plain):
     np.testing.assert_allclose(dataset.command.pose.p[240:-1, 0], p[1:], atol=1e-7)
     np.testing.assert_allclose(dataset.trocar.p_world_trocar[:, 0], TROCARS[[0, 0, 1]], atol=5e-6)
     assert store.keys(root) == ["0000-0000-0", "0000-0001-0", "0001-0000-0"]
-    description = schema.upgraded(store.read_description(root))
+    description = store.read_description(root)
     assert description["imported"]["mapping"]["arms"][0]["position"] == "p0"
 
 

@@ -14,7 +14,7 @@ import zarr
 from scipy.spatial import transform
 
 from starjax import errors
-from starjax.data import load, schema, store
+from starjax.data import load, store
 from starjax.data.formats import base, exchange
 from starjax.rollouts import episodes
 
@@ -77,22 +77,6 @@ def test_videos_lose_little_and_nothing_else(roots, exported, tmp_path):
             for root in (roots / "images", tmp_path / "back")
         )
         assert 10 * np.log10(255**2 / np.mean((one - other) ** 2)) >= 35.0
-
-
-@pytest.mark.parametrize("observation", ["state", "image"])
-@pytest.mark.parametrize("name", base.FORMATS.names())
-def test_a_dataset_of_schema_1_comes_back_as_one_of_today(tmp_path, request, observation, name):
-    root = request.config.rootpath / f"tests/golden/demonstrations/schema_1_{observation}"
-    form, out = base.FORMATS.get(name), tmp_path / f"out{SUFFIX.get(name, '')}"
-    exchange.export(exchange.source(root, form), out, form, False)
-    restore(out, tmp_path / "back")
-    assert store.read_description(tmp_path / "back")["schema"] == schema.SCHEMA
-    before, after = (
-        load.load(path, report=lambda _: None).dataset for path in (root, tmp_path / "back")
-    )
-    import jax
-
-    jax.tree.map(np.testing.assert_array_equal, before, after)
 
 
 @pytest.mark.parametrize("kind", ["state", "two_arms"])

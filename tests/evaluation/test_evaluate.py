@@ -289,8 +289,7 @@ def test_recorded_trocars_are_those_of_the_trials(whole):
         np.testing.assert_allclose(kept["p_world_trocar"], places[kept["trocar"]], atol=1e-7)
 
 
-def test_recorded_files_of_both_forms_are_read_alike(whole):
-    """The golden one is of before the axis of arms."""
+def test_recorded_trajectories_are_the_golden_ones(whole):
     ours, theirs = (recorded.read(x / "recorded.npz") for x in (whole[0], GOLDEN))
     assert len(ours) == len(theirs) == 4
     for one, other in zip(ours, theirs, strict=True):

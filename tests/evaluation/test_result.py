@@ -4,6 +4,7 @@ import copy
 import json
 import pathlib
 
+import fakes
 import numpy as np
 import pytest
 import stubs
@@ -25,16 +26,10 @@ def rows(arms):
     return synthetic.outcomes(np.random.default_rng(0), places, index, np.full(24, 0.7))
 
 
-def first():
-    """A file's content as schema 1 has it."""
-    found = {**synthetic.figures("stardiff", rows(1)), **synthetic.about("stardiff")}
-    for row in [*found["trials"], *found["per_trocar"]]:
-        row |= {name: row[name][0] for name in ("radius", "polar", "azimuth")}
-    for row in found["trials"]:
-        row |= row.pop("labels")
-        del row["lost"], row["stage"]
-    del found["control_hz"], found["weights"]
-    return found
+def content():
+    """Returns the values of a file."""
+    made = {**synthetic.figures("stardiff", rows(1)), **synthetic.about("stardiff")}
+    return {"schema": 2, "scene": fakes.SCENE._asdict(), **made}
 
 
 def written(tmp_path, value):
@@ -50,19 +45,6 @@ def test_every_result_of_the_repository_is_read():
         assert len(found.trials) == found.figures["strict"]["all"]["trials"] > 0
         won = sum(trial.success for trial in found.trials)
         assert won == raw["strict"]["all"]["successes"]
-
-
-def test_schema_1_is_peg_transfer_with_one_arm(tmp_path):
-    raw = first()
-    found = result.read(written(tmp_path, raw))
-    assert found.schema == 1 and found.scene == names.FIRST and found.control_hz == 30.0
-    assert (found.commit, found.dirty, found.dataset_digest) == (None, None, None)
-    trial, row = found.trials[-1], raw["trials"][-1]
-    assert trial.radius == (row["radius"],) and trial.azimuth == (row["azimuth"],)
-    assert trial.labels == {"source": row["source"], "target": row["target"]}
-    assert (trial.lost, trial.stage) == (False, None)
-    assert found.figures["per_trocar"][0]["polar"] == [raw["per_trocar"][0]["polar"]]
-    assert found.time_limit_s == raw["config"]["eval"]["time_limit_s"]
 
 
 @pytest.fixture
@@ -114,7 +96,7 @@ def test_trials_in_a_file_beside_it_are_found(made):
     ],
 )
 def test_what_is_not_as_expected_is_named(tmp_path, place, value, argument):
-    raw = at = copy.deepcopy(first())
+    raw = at = copy.deepcopy(content())
     for name in place[:-1]:
         at = at[name]
     at[place[-1]] = value
@@ -125,8 +107,8 @@ def test_what_is_not_as_expected_is_named(tmp_path, place, value, argument):
 
 
 def test_a_later_schema_and_a_damaged_file_are_named(tmp_path):
-    file = written(tmp_path, first() | {"schema": 9})
-    with pytest.raises(ValueError, match="expected schema 1 or 2, got 9"):
+    file = written(tmp_path, content() | {"schema": 9})
+    with pytest.raises(ValueError, match="expected schema 2, got 9"):
         result.read(file)
     file.write_bytes(b"{")
     with pytest.raises(ValueError, match=r"result\.json is damaged"):

@@ -49,46 +49,12 @@ def test_round_trip(tmp_path):
     jax.tree.map(np.testing.assert_array_equal, found.normalizer, trained().normalizer)
 
 
-def of_schema_1(path, p_world_ref):
-    """Writes `trained` as versions before scenes had names did."""
-    with safetensors.safe_open(path, "numpy") as file:
-        about = json.loads(file.metadata()["starjax"])["about"]
-        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    kernel = arrays.pop("params/learner/unet/kernel")
-    names = {"params/vision/bias": "params/diffuser/vision/bias"}
-    arrays = {names.get(name, name): array for name, array in arrays.items()}
-    arrays["params/diffuser/unet/kernel"] = kernel
-    del about["scene"], about["roll_zero"], about["policy"]["learner"]
-    about["train"]["crop_fraction"] = about["policy"].pop("crop_fraction")
-    about |= {"schema": 1, "p_world_ref": p_world_ref}
-    envelope = {"about": about, "sha256": policy_file._hash(about, arrays)}
-    safetensors.numpy.save_file(arrays, path, {"starjax": json.dumps(envelope)})
-
-
-@pytest.mark.parametrize("place", [[0.0, 0.0, 0.15], None])
-def test_a_policy_of_schema_1_is_of_the_first_scene(tmp_path, place):
-    policy_file.save(tmp_path / "p", trained())
-    of_schema_1(tmp_path / "p", place)
-    found = policy_file.load(tmp_path / "p")
-    assert found.scene == names.FIRST and found.roll_zero == (0.0,)
-    assert found.p_world_ref == (place and (tuple(place),))
-    assert found.policy == POLICY
-    jax.tree.map(np.testing.assert_array_equal, found.params, trained().params)
-
-
-def test_parameters_of_a_single_model_lay_side_by_side(tmp_path):
-    unet, roll = {"kernel": jnp.ones((2, 3))}, {"bias": jnp.ones(3)}
-    policy_file.save(tmp_path / "p", trained()._replace(params={"unet": unet, "state": roll}))
-    found = policy_file.load(tmp_path / "p").params
-    assert jax.tree.structure(found) == jax.tree.structure(
-        {"learner": {"unet": unet}, "state": roll}
-    )
-
-
-def test_the_packaged_policy_is_of_schema_1():
+def test_the_packaged_policy_is_whole():
     found = policy_file.load(packaged.find("policy", "compact"))
-    assert (found.scene, found.policy.crop_fraction) == (names.FIRST, 0.9)
+    assert (found.scene, found.policy.crop_fraction) == (fakes.SCENE, 0.9)
     np.testing.assert_allclose(found.p_world_ref, [[0.0, 0.0, 0.15]], atol=1e-6)
+    weights = "a136113a2624f1c184c0f15e3d4df31d000876997d05ed6cc183cfe8572d96ff"
+    assert policy_file.fingerprint(found.params) == weights  # of the training, in half precision
 
 
 def test_same_policy_same_bytes(tmp_path):

@@ -4,7 +4,6 @@ To rewrite the golden tables: STARJAX_GOLDEN=write pytest tests/report/test_page
 """
 
 import html
-import json
 import os
 import pathlib
 import re
@@ -24,18 +23,17 @@ from starjax.report import (
     stats,
     tables,
 )
-from starjax.runtime import files
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden"
 
 
 @pytest.fixture(scope="module")
 def kept(pytestconfig):
-    """Results of all methods with their sweeps, and one alone of schema 1, which stays."""
+    """Results of all methods with their sweeps, and one alone."""
     folder = pytestconfig.rootpath / "experiments"
     paths = {
         "several": [file.parent for file in sorted(folder.glob("all_methods/*/result.json"))],
-        "one": [GOLDEN / "result_schema_1" / "result.json"],
+        "one": [GOLDEN / "result" / "result.json"],
     }
     return {
         name: build._named_apart(sorted(map(results.load, found), key=build._order))
@@ -110,21 +108,6 @@ def test_the_page_of_one_method_has_its_trocars_and_failures(kept):
     assert [int(count) for _, count in bars] == list(failed.values())
     assert tables.rcm([run]) in measured
     assert text.count('class="card"') == len(list(sections.cards(run))) >= 5
-
-
-def test_both_schemas_draw_the_same(kept, tmp_path):
-    (old,) = kept["one"]
-    trials = [
-        {name: value for name, value in trial._asdict().items() if value is not None}
-        for trial in old.trials
-    ]
-    new = {"schema": 2, "scene": old.result.scene._asdict(), "control_hz": 30.0, "per_trocar": []}
-    content = json.loads(old.path.read_text()) | new | {"trials": trials}
-    files.write_json(tmp_path / "result.json", content)
-    run = results.load(tmp_path)
-    assert (old.result.schema, run.result.schema) == (1, 2)
-    assert tables.markdown([run]) == tables.markdown([old])
-    assert page.render([run], run, {}, None) == page.render([old], old, {}, None)
 
 
 def test_the_page_stands_alone(several):

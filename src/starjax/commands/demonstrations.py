@@ -133,12 +133,12 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
     """
     import numpy as np
 
-    from starjax.data import schema, store
+    from starjax.data import store
     from starjax.rollouts import episodes
 
     root = Path(config.demos.from_)
     try:
-        about = schema.upgraded(store.read_description(root))
+        about = store.read_description(root)
         store.read_seal(root)
         task, features = about["scene"]["task"], about["features"]
         reference = np.array(about["p_world_ref"], np.float32)

@@ -76,9 +76,9 @@ def inspect(name: str) -> Found:
 
 
 def _dataset(path: Path) -> Found:
-    from starjax.data import anomalies, schema, store
+    from starjax.data import anomalies, store
 
-    about = schema.upgraded(store.read_description(path))
+    about = store.read_description(path)
     scene, keys = about["scene"], store.keys(path)
     records = [
         r for r in store.verify_all(path, keys, arrays=False).values() if isinstance(r, dict)

@@ -9,7 +9,7 @@ from starjax.commands import options, presets
 from starjax.learners import LEARNERS
 from starjax.policies import packaged
 from starjax.runtime import files
-from starjax.sim import names, registries
+from starjax.sim import registries
 from starjax.sim.arms.base import Arm
 from starjax.sim.registries import Registry
 from starjax.sim.tools.base import Tool
@@ -99,5 +99,5 @@ def _policies() -> Iterator[Row]:
             f"{part} {about[part]['successes']}/{about[part]['trials']}"
             for part in ("seen", "unseen")
         )
-        task = about.get("scene", {}).get("task", names.FIRST.task)
+        task = about["scene"]["task"]
         yield name, f"{label} for {task}; successes at trocars: {scores}"

@@ -24,7 +24,7 @@ def find(root: Path) -> Iterator[str]:
     Raises:
       ValueError: it is none.
     """
-    about = schema.upgraded(store.read_description(root))
+    about = store.read_description(root)
     try:
         store.read_seal(root)
     except ValueError as error:
@@ -54,10 +54,11 @@ def _of_episode(
     """(kind, detail) of each anomaly."""
     if record["length"] < SHORT:
         yield f"shorter than {SHORT} control steps", str(record["length"])
+    folder = root / "episodes" / record["key"]
     arrays = {
-        name: schema.with_arms(about["schema"], name, _mapped(root, about, record, name))
+        name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
         for name in about["features"]
-        if schema.file_name(about["schema"], name) in record["files"]
+        if f"{name}.npy" in record["files"]
     }
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -88,10 +89,3 @@ def _of_episode(
     turned = np.abs(np.diff(np.mod(rolls + np.pi, 2 * np.pi), axis=0))
     if turned.size and turned.max() > np.pi:
         yield "rolls pass half a turn, where an action's roll wraps", ""
-
-
-def _mapped(
-    root: Path, about: Mapping[str, Any], record: Mapping[str, Any], name: str
-) -> np.ndarray:
-    path = root / "episodes" / record["key"] / schema.file_name(about["schema"], name)
-    return np.load(path, mmap_mode="r", allow_pickle=False)

@@ -32,7 +32,7 @@ class Demos(NamedTuple):
       digest: hash that names the content on disk.
       residency: where the frames are.
       bytes: memory they take there (on the disk: what is read from there).
-      description: dataset.json as schema 2 says it.
+      description: the content of dataset.json.
     """
 
     dataset: windows.Dataset
@@ -66,7 +66,7 @@ def load(
       ValueError: no dataset, or not complete.
     """
     root = Path(root)
-    description = schema.upgraded(store.read_description(root))
+    description = store.read_description(root)
     sealed = store.read_seal(root)
     records = _successful(root, sealed, verify)
     fields = _fields(description, records[0], images)
@@ -93,7 +93,7 @@ def frames(root: Path) -> "dict[str, EpisodeArray]":
       DamagedEpisode, ValueError: as `load`; also where no images were recorded.
     """
     root = Path(root)
-    description = schema.upgraded(store.read_description(root))
+    description = store.read_description(root)
     records = _successful(root, store.read_seal(root), verify=False)
     fields = _fields(description, records[0], images=True)
     length, start = _spans(records)
@@ -137,7 +137,7 @@ def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.
 def _fields(description: dict[str, Any], record: store.Record, images: bool) -> dict[str, str]:
     """Fields that training reads, and the file of each."""
     found = {
-        name: schema.file_name(description["schema"], name)
+        name: f"{name}.npy"
         for name in description["features"]
         if name not in _UNREAD and (images or not name.startswith(episodes.IMAGE))
     }
@@ -186,7 +186,7 @@ def _dataset(
             camera = name.removeprefix(episodes.IMAGE)
             images[camera] = joined if place == "disk" else joined.read(rows)
         else:
-            fields[name] = schema.with_arms(description["schema"], name, joined.read(rows))
+            fields[name] = joined.read(rows)
     told = rcm.trocar_frame(
         schema.trocars_of(records),
         np.array(description["p_world_ref"], np.float32),

@@ -1,8 +1,4 @@
-"""Schema of dataset.json, and how schema 1 becomes it.
-
-Schema 1 is of one arm: episodes have fields without the axis A, one camera's `image`, numbers for
-radius, polar and azimuth; trocars are `[C][3]`, `scene` is the hash that is now `model`.
-"""
+"""Schema of dataset.json."""
 
 import hashlib
 import types
@@ -11,19 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import errors, schema_1
+from starjax import errors
+from starjax.data import store
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs
 from starjax.runtime import jax_settings, xla
-from starjax.sim import names
 
-SCHEMA = 2
 IMPORTED = "imported.json"  # beside dataset.json: what was odd about the files of others
 # Demonstrations never start from the states that an evaluation with the same seed draws.
 STREAM = 0x64656D6F
-
-_PER_ARM = ("p", "R", "gripper", "command_p", "command_R", "command_gripper", "rcm_error")
-_PLACE = ("radius", "polar", "azimuth")
 
 
 class DemoSettings(NamedTuple):
@@ -64,7 +56,7 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
     }
     rule = f"fold_in(fold_in(fold_in(key(seed), {STREAM}), trocar), trial)"
     return {
-        "schema": SCHEMA,
+        "schema": store.SCHEMA,
         **{name: x for name, x in settings._asdict().items() if name != "randomise"},
         # Where nothing is wrong, datasets are called as they were before anything could be.
         **({"randomise": dict(settings.randomise)} if settings.randomise else {}),
@@ -94,39 +86,9 @@ def expert_name(task: Any, settings: DemoSettings) -> str:
     return name
 
 
-def upgraded(description: Mapping[str, Any]) -> dict[str, Any]:
-    """A description of any schema as schema 2 says it; `schema` stays that of the files."""
-    if description["schema"] == SCHEMA:
-        return dict(description)
-    found = schema_1.with_expert(description, usual="default")
-    camera = episodes.IMAGE + names.FIRST.cameras[0]
-    return found | {
-        "scene": names.FIRST._asdict(),
-        "model": description["scene"],
-        "trocars": [[trocar] for trocar in description["trocars"]],
-        "p_world_ref": [description["p_world_ref"]],
-        "roll_zero": [0.0],
-        "features": {
-            camera if name == "image" else name: feature
-            | {"shape": [1, *feature["shape"]] if name in _PER_ARM else feature["shape"]}
-            for name, feature in description["features"].items()
-        },
-    }
-
-
-def file_name(schema: int, field: str) -> str:
-    """The file that a field of schema 2 lies in."""
-    return f"{'image' if schema == 1 and field.startswith(episodes.IMAGE) else field}.npy"
-
-
-def with_arms(schema: int, field: str, array: np.ndarray) -> np.ndarray:
-    """A field's `[F, ...]` with its axis of arms, `[F, A, ...]`, if it is one that has it."""
-    return array[:, None] if schema == 1 and field in _PER_ARM else array
-
-
 def trocars_of(records: Sequence[Mapping[str, Any]]) -> Trocar:
-    """Trocars `[D, A]` of episodes' records of any schema."""
-    rows = ([np.atleast_1d(record[name]) for record in records] for name in _PLACE)
+    """Returns the trocars `[D, A]` of episodes' records."""
+    rows = ([record[name] for record in records] for name in Trocar._fields)
     return Trocar(*(np.array(row, np.float32) for row in rows))
 
 

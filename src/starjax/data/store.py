@@ -23,7 +23,7 @@ import numpy as np
 from starjax import errors
 from starjax.runtime import files, xla
 
-SCHEMAS = (1, 2)
+SCHEMA = 2
 _KEY = re.compile(r"\d{4,}-\d{4,}-\d+")  # what `key` gives
 
 Record = dict[str, Any]  # the content of an episode.json
@@ -88,8 +88,8 @@ def read_description(root: Path) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         got = f"{path}: {error}"
         raise errors.UsageError("root", "a folder of demonstrations", got) from error
-    if schema not in SCHEMAS:
-        raise ValueError(f"{path}: expected one of schemas {SCHEMAS}, got {schema!r}")
+    if schema != SCHEMA:
+        raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}; collect it again")
     return description
 
 
@@ -187,7 +187,7 @@ def seal(root: Path, records: Mapping[str, Record]) -> str:
     """Declares the dataset complete; returns the one hash that names its content."""
     episodes = {key: records[key]["digest"] for key in sorted(records)}
     described = files.sha256(root / "dataset.json")
-    sealed = {"schema": SCHEMAS[-1], "dataset.json": described, "episodes": episodes}
+    sealed = {"schema": SCHEMA, "dataset.json": described, "episodes": episodes}
     files.write_json(root / "SEALED.json", {**sealed, "digest": _hash(sealed)})
     return _hash(sealed)
 

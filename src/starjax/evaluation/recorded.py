@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import rcm, schema_1
+from starjax import rcm
 from starjax.rollouts.episodes import ENDOSCOPE, Episode
 from starjax.runtime import files
 from starjax.types import Pose
@@ -108,7 +108,7 @@ def join(kept: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def read(file: Path) -> list[Trajectory]:
-    """The trials in a recorded.npz, also one of before the axis of arms.
+    """Reads the trials of a recorded.npz.
 
     Raises:
       FileNotFoundError: there is none.
@@ -116,12 +116,8 @@ def read(file: Path) -> list[Trajectory]:
     """
     always = ("trocar", "trial", "length", "p_world_tip", "p_world_trocar")
     found = files.read_npz(file, always)
-    if found["p_world_tip"].ndim == 3:
-        for name in ("p_world_tip", "p_world_trocar", "rcm_error"):
-            if name in found:
-                found[name] = np.expand_dims(found[name], 1 if name == "p_world_trocar" else 2)
-        labels = schema_1.recorded_labels(found)
-        found |= {f"{_LABEL}{name}": array for name, array in labels.items()}
+    if found["p_world_tip"].ndim != 4:
+        raise ValueError(f"{file}: expected tips [N, T, A, 3], got an older file; evaluate again")
     return [_row(found, row, int(length)) for row, length in enumerate(found["length"])]
 
 

@@ -1,8 +1,7 @@
 """Typed results: the schema of result.json and sweep.json.
 
-Written and read here alone. Schema 2 says in which scene, with which code and on which
-demonstrations; a trial's radius, polar and azimuth are lists `[A]`, its labels an object. Files of
-schema 1, which does not say it, are of the first scene, with one arm: numbers become lists of one.
+Written and read here alone. A trial's radius, polar and azimuth are lists `[A]`, its labels an
+object.
 """
 
 import json
@@ -10,13 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from starjax import schema_1
 from starjax.evaluation import kinds, structure, trial_file
 from starjax.runtime import files, jax_settings, provenance, xla
 from starjax.sim import names
 
 SCHEMA = kinds.NEWEST
-CONTROL_HZ = 30.0  # of all results of schema 1
 
 
 class Trial(NamedTuple):
@@ -31,7 +28,7 @@ class Trial(NamedTuple):
       invalid: the simulation diverged. collided: an arm touched what it must not. lost: the task
         could not be done any more.
       steps: control steps taken.
-      stage: how far the task came, an index of `Task.stages`; None in schema 1.
+      stage: how far the task came, an index of `Task.stages`; None if the file lacks it.
       labels: the task's, e.g. source and target.
       rcm_max_mm, rcm_within_max_mm, rcm_commanded_max_mm: the largest of all arms, executed at the
         ends of control steps, within them, and commanded; None where the file does not say it.
@@ -152,11 +149,9 @@ def _parse(file: Path, found: dict[str, Any], further: Mapping[str, Any]) -> Res
       further: kinds of what this sort of result has beside what all have.
     """
     schema = found.get("schema", 1)
-    if schema not in kinds.KINDS:
-        raise ValueError(f"{file}: expected schema 1 or {SCHEMA}, got {schema!r}")
-    structure.check(file, found, kinds.KINDS[schema] | dict(further))
-    if schema == 1:
-        found = _upgraded(found)
+    if schema != SCHEMA:
+        raise ValueError(f"{file}: expected schema {SCHEMA}, got {schema!r}; evaluate again")
+    structure.check(file, found, kinds.RESULT | dict(further))
     scene, config = found["scene"], found.get("config") or {}
     limit_s = found.get("time_limit_s") or (config.get("eval") or {}).get("time_limit_s") or 0.0
     known = {*Result._fields, *_FIGURES}
@@ -182,24 +177,3 @@ def _trial(row: dict[str, Any]) -> Trial:
     fields: dict[str, Any] = {name: row.get(name) for name in Trial._fields}
     fields |= {name: tuple(row[name]) for name in kinds.PLACE}
     return Trial(**fields)
-
-
-def _upgraded(found: dict[str, Any]) -> dict[str, Any]:
-    """The content of a file of schema 1 as schema 2 would say it."""
-
-    def placed(row: dict[str, Any]) -> dict[str, Any]:
-        return row | {name: [row[name]] for name in kinds.PLACE}
-
-    def labelled(row: dict[str, Any]) -> dict[str, Any]:
-        row = placed(row) | {"lost": False}
-        labels = schema_1.labels(row)
-        rest = {name: value for name, value in row.items() if name not in labels}
-        return rest | {"labels": labels}
-
-    return found | {
-        "scene": names.FIRST._asdict(),
-        "control_hz": CONTROL_HZ,
-        "version": (found.get("versions") or {}).get("starjax"),
-        "trials": [labelled(row) for row in found.get("trials") or []],
-        "per_trocar": [placed(row) for row in found.get("per_trocar") or []],
-    }

@@ -1,7 +1,7 @@
 """The finished policy as one file, policy.safetensors: weights, statistics and settings, no pickle.
 
 The same policy always gives the same bytes. In half precision its parameters are half as large, and
-float32 again once they are loaded. Files of schema 1, which name no scene, are of the first one.
+float32 again once they are loaded.
 """
 
 import hashlib
@@ -115,12 +115,12 @@ def load(path: pathlib.Path | str) -> Trained:
         schema = about["schema"]
     except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a readable starjax policy: {error}") from error
-    if schema not in (1, SCHEMA):
-        raise ValueError(f"{path}: expected schema 1 or {SCHEMA}, got {schema!r}")
+    if schema != SCHEMA:
+        raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}; train it again")
     if _hash(about, arrays) != expected:
         raise ValueError(f"{path}: damaged, its content is not what was written (sha256)")
     try:
-        return _trained(_of_first_scene(about) if schema == 1 else about, _unflatten(arrays))
+        return _trained(about, _unflatten(arrays))
     except (KeyError, TypeError, ValueError) as error:
         why = f"no {error} in it" if isinstance(error, KeyError) else error
         raise ValueError(f"{path}: made by another version of starjax: {why}") from error
@@ -140,17 +140,6 @@ def fingerprint(params: Params) -> str:
     return _hash({}, dict(_flatten(params)))
 
 
-def _of_first_scene(about: dict[str, Any]) -> dict[str, Any]:
-    """Upgrades what a file of schema 1 says."""
-    one = about["p_world_ref"]
-    return {
-        **config.upgraded(about),
-        "scene": names.FIRST._asdict(),
-        "p_world_ref": None if one is None else [one],
-        "roll_zero": [0.0],
-    }
-
-
 def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
     """Parses what `save` wrote; raises KeyError, TypeError or ValueError for anything else."""
     stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
@@ -159,7 +148,7 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
         method=about["method"],
         policy=config.from_dict(config.PolicyConfig, about["policy"]),
         train=config.from_dict(config.TrainConfig, about["train"]),
-        params=_by_parts(tree["params"]),
+        params=tree["params"],
         normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
         scene=names.SceneNames(
             scene["task"], *(tuple(scene[part]) for part in ("arms", "tools", "cameras"))
@@ -169,16 +158,6 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
         demos=None if demos is None else config.from_dict(config.DemosConfig, demos),
         preset=about.get("preset"),
     )
-
-
-def _by_parts(params: Params) -> Params:
-    """Parameters as policies have them today, of files in which the learner's lie among others."""
-    if "learner" in params:
-        return params
-    found = dict(params.get("diffuser", params))
-    around = {name: found.pop(name) for name in ("vision", "state", "roll") if name in found}
-    rest = {name: params[name] for name in ("roll",) if name in params}
-    return {**around, **rest, "learner": found}
 
 
 def _floats(values: Any) -> Any:

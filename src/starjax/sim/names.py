@@ -2,8 +2,6 @@
 
 from typing import NamedTuple
 
-from starjax import schema_1
-
 
 class SceneNames(NamedTuple):
     """A scene by its parts' names in the registries.
@@ -18,7 +16,3 @@ class SceneNames(NamedTuple):
     arms: tuple[str, ...]
     tools: tuple[str, ...]
     cameras: tuple[str, ...]
-
-
-# The scene of everything that was stored before scenes had names (schema 1).
-FIRST = SceneNames(*schema_1.SCENE)

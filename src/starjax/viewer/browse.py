@@ -58,7 +58,7 @@ def open_dataset(root: Path) -> RecordedDataset:
     Raises:
       errors.UsageError: the folder has no episode, or a part of its scene is unknown here.
     """
-    description = schema.upgraded(store.read_description(root))
+    description = store.read_description(root)
     spec = description["scene"]
     names = SceneNames(spec["task"], *(tuple(spec[part]) for part in ("arms", "tools", "cameras")))
     keys = [key for key in store.keys(root) if store.verify(root, key, arrays=False)["files"]]
@@ -75,11 +75,10 @@ def read(dataset: RecordedDataset, key: str) -> Recording:
       store.DamagedEpisode: naming the file.
     """
     record = store.verify(dataset.root, key)
-    version, folder = dataset.description["schema"], dataset.root / "episodes" / key
+    folder = dataset.root / "episodes" / key
 
     def field(name: str) -> np.ndarray:
-        array = np.load(folder / schema.file_name(version, name), allow_pickle=False)
-        return schema.with_arms(version, name, array)
+        return np.load(folder / f"{name}.npy", allow_pickle=False)
 
     p_world_trocar = rcm.trocar_position(
         schema.trocars_of([record]), np.array(dataset.description["p_world_ref"], np.float32)
@@ -92,7 +91,7 @@ def read(dataset: RecordedDataset, key: str) -> Recording:
         frames.colours(dataset.names, dataset.model, record["labels"]),
     )
     camera = f"{episodes.IMAGE}{dataset.names.cameras[0]}"
-    images = field(camera) if schema.file_name(version, camera) in record["files"] else None
+    images = field(camera) if f"{camera}.npy" in record["files"] else None
     last = steps[-1]._replace(done=True, success=record["success"], invalid=record["invalid"])
     return Recording([*steps[:-1], last], images, "success" if record["success"] else "failed")
 

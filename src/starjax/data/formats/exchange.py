@@ -30,7 +30,7 @@ def source(root: Path, form: base.Format) -> Source:
     Raises:
       ValueError: it is not complete, or damaged.
     """
-    description = schema.upgraded(store.read_description(root))
+    description = store.read_description(root)
     sealed = store.read_seal(root)
     records = list(_records(root, sealed).values())
     kept = [record for record in records if record["files"]]
@@ -60,7 +60,7 @@ def source(root: Path, form: base.Format) -> Source:
         origin={
             "schema": 1,
             **provenance.code()._asdict(),
-            "description": _today(description),
+            "description": description,
             "records": [_outcome(record) for record in records],
             "stored": [bool(record["files"]) for record in records],
             "columns": named,
@@ -160,16 +160,9 @@ def _records(root: Path, sealed: dict[str, Any]) -> dict[str, store.Record]:
     return found
 
 
-def _today(description: dict[str, Any]) -> dict[str, Any]:
-    return description | {"schema": schema.SCHEMA}
-
-
 def _outcome(record: store.Record) -> dict[str, Any]:
-    """A record as schema 2 has it, without what `store.commit` adds."""
-    found = {name: value for name, value in record.items() if name not in ("files", "digest")}
-    place = zip(rcm.Trocar._fields, schema.trocars_of([record]))
-    per_arm = {name: np.asarray(record[name]).reshape(-1).tolist() for name, _ in place}
-    return found | per_arm
+    """Returns a record without the entries that `store.commit` adds."""
+    return {name: value for name, value in record.items() if name not in ("files", "digest")}
 
 
 def _column(field: str) -> str:
@@ -177,13 +170,9 @@ def _column(field: str) -> str:
 
 
 def _arrays(root: Path, about: dict[str, Any], record: store.Record) -> dict[str, np.ndarray]:
-    """Fields of an episode as schema 2 has them."""
+    """Reads the fields of an episode."""
     folder = root / "episodes" / record["key"]
-    found = {}
-    for name in about["features"]:
-        array = np.load(folder / schema.file_name(about["schema"], name), allow_pickle=False)
-        found[name] = schema.with_arms(about["schema"], name, array)
-    return found
+    return {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in about["features"]}
 
 
 def _extra(description: dict[str, Any]) -> dict[str, Column]:
@@ -202,7 +191,7 @@ def _extra(description: dict[str, Any]) -> dict[str, Column]:
     }
     if "state" in description["features"]:
         count = description["features"]["state"]["shape"]
-        said = description.get("task", {}).get("fields", [])  # schema 1 does not say them
+        said = description.get("task", {}).get("fields", [])
         labels = tuple(f"{name}.{i}" for name, size, *_ in said for i in range(size))
         found["environment_state"] = Column(tuple(count), "float32", labels)
     return found

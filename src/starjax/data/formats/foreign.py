@@ -139,7 +139,7 @@ def _describe(
     shapes = _shapes(source, mapping, len(task.slots))
     unknown = [source.robot or "unknown"] * len(task.slots)
     return {
-        "schema": schema.SCHEMA,
+        "schema": store.SCHEMA,
         "per_trocar": int(np.bincount([k.trocar for k in kept]).max()),
         "seed": 0,
         "max_steps": max(k.length for k in kept),
