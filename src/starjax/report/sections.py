@@ -1,4 +1,4 @@
-"""Contents of the page's sections, as data for its templates; empty where a run has nothing."""
+"""Facts, headline numbers and tables of the page, without those that a run lacks."""
 
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,8 +15,7 @@ from starjax.report import (
 )
 from starjax.report.formats import Table
 
-# heading, table, number of its first columns that hold names, note
-TitledTable = tuple[str, Table, int, str]
+TitledTable = tuple[str, Table, str]  # heading, table, note
 
 
 class Card(NamedTuple):
@@ -37,46 +36,6 @@ class Card(NamedTuple):
     more: str
     rate: stats.Rate | None = None
     part: str = ""
-
-
-class Scores(NamedTuple):
-    """A row of success rates.
-
-    Attributes:
-      name: method or test.
-      seen: rate at seen trocars, None without trials.
-      unseen: rate at unseen trocars, None without trials.
-      meaning: definition of a test.
-      group: group of a method in Table III.
-      gap: seen minus unseen as text.
-    """
-
-    name: str
-    seen: stats.Rate | None
-    unseen: stats.Rate | None
-    meaning: str = ""
-    group: str = ""
-    gap: str = ""
-
-
-class TrocarRow(NamedTuple):
-    """A row of the table of trocars.
-
-    Attributes:
-      index: number of the configuration.
-      part: `seen` or `unseen`.
-      place: radius, polar angle and azimuth as text.
-      rate: success.
-      time: median time of a success as text.
-      worst: largest RCM error as text.
-    """
-
-    index: int
-    part: str
-    place: tuple[str, str, str]
-    rate: stats.Rate
-    time: str
-    worst: str
 
 
 def facts(runs: Sequence[results.Run]) -> dict[str, str]:
@@ -136,27 +95,6 @@ def cards(run: results.Run) -> Iterator[Card]:
         yield Card("One policy call", f"{ms['p50']:.1f}", " ms", more)
 
 
-def by_test(run: results.Run) -> list[Scores]:
-    """Returns the success of one run by three tests."""
-    meanings = notes.tests(compare.task_text([run]))
-    return [
-        Scores(name.capitalize(), *outcomes.rates(run.trials, test), meaning=meanings[name])
-        for name, test in tables.TESTS.items()
-        if run.trials
-    ]
-
-
-def by_method(runs: Sequence[results.Run]) -> list[Scores]:
-    """Returns the rows of Table III."""
-    rows = []
-    for run in runs:
-        if run.trials:
-            seen, unseen = outcomes.rates(run.trials)
-            gap = formats.points(stats.gap(seen, unseen)) if seen and unseen else "–"
-            rows.append(Scores(run.label, seen, unseen, group=run.group, gap=gap))
-    return rows
-
-
 def comparisons(runs: Sequence[results.Run]) -> list[TitledTable]:
     """Returns paired tests and success by three tests of several runs."""
     by_test_note = notes.by_test(compare.task_text(runs))
@@ -184,47 +122,6 @@ def measurements(runs: Sequence[results.Run]) -> list[TitledTable]:
     )
 
 
-def trocars(run: results.Run) -> list[TrocarRow]:
-    """Returns a row per trocar of one run."""
-    rows = []
-    for group in outcomes.by_trocar(run.trials):
-        times = outcomes.times(group, run.result.control_hz)
-        worst = max((e for t in group if (e := outcomes.worst_rcm_mm(t)) is not None), default=None)
-        rows.append(
-            TrocarRow(
-                index=group[0].trocar,
-                part="seen" if group[0].seen else "unseen",
-                place=outcomes.place(group[0]),
-                rate=outcomes.tally(group),
-                time=f"{statistics.median(times):.1f} s" if times else "–",
-                worst="–" if worst is None else f"{formats.millimetres(worst)} mm",
-            )
-        )
-    return rows
-
-
-def matrix(runs: Sequence[results.Run]) -> tuple[list[int], list[tuple[str, list[Any]]]] | None:
-    """Returns trocars, and per run its label and a rate and mark at each of them."""
-    every = sorted({trial.trocar for run in runs for trial in run.trials})
-    rows = []
-    for run in runs:
-        groups = {group[0].trocar: group for group in outcomes.by_trocar(run.trials)}
-        cells = [
-            {"rate": outcomes.tally(group).rate, "mark": "" if group[0].seen else "*"}
-            if (group := groups.get(index))
-            else None
-            for index in every
-        ]
-        rows.append((run.label, cells))
-    return (every, rows) if every else None
-
-
-def failures(run: results.Run) -> list[tuple[str, int]]:
-    """Returns the meaning and number of each class of failed trials."""
-    meanings = outcomes.meanings(compare.task_text([run]))
-    return [(meanings[key], n) for key, n in outcomes.failures(run.trials).items()]
-
-
 def flat(config: Mapping[str, Any], prefix: str = "") -> list[str]:
     """Returns settings as lines `name.name = value`."""
     lines = []
@@ -236,6 +133,6 @@ def flat(config: Mapping[str, Any], prefix: str = "") -> list[str]:
     return lines
 
 
-def _titled(*parts: tuple[str, Table, str]) -> list[TitledTable]:
+def _titled(*parts: TitledTable) -> list[TitledTable]:
     """Drops tables without rows."""
-    return [(h, rows, formats.names_in(rows[0]), n) for h, rows, n in parts if len(rows) > 1]
+    return [part for part in parts if len(part[1]) > 1]

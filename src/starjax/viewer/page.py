@@ -159,12 +159,13 @@ class Player:
 
 
 class Choices:
-    """Dropdowns; a change of one requests `choice`."""
+    """Dropdowns by name; a change of one requests `choice`."""
 
     def __init__(self, gui: Any, requests: UiRequests, **options: tuple[Sequence[str], str]):
         self._dropdowns = {}
         for name, (names, value) in options.items():
-            dropdown = gui.add_dropdown(name.capitalize(), tuple(names), initial_value=value)
+            label = name.capitalize().replace("_", " ")
+            dropdown = gui.add_dropdown(label, tuple(names), initial_value=value)
             dropdown.on_update(lambda _: requests.add("choice"))
             self._dropdowns[name] = dropdown
 

@@ -79,8 +79,8 @@ class Selection:
             gui,
             requests,
             task=(registries.tasks.names(), task),
-            who=(names, labels[0]),
-            beside=((page.NOBODY, *names), [*labels, page.NOBODY][1]),
+            agent=(names, labels[0]),
+            compare_with=((page.NOBODY, *names), [*labels, page.NOBODY][1]),
             arm=((OWN_ARMS, *registries.arms.names()), options.arm),
             trocar=(trocars, trocars[options.trocar]),
         )
@@ -99,7 +99,7 @@ class Selection:
     def agents(self) -> list[AgentSpec]:
         """Returns the selected agent, or two with the same task."""
         known = self._agents(self._choices["task"])
-        labels = [self._choices["who"], self._choices["beside"]]
+        labels = [self._choices["agent"], self._choices["compare_with"]]
         return [known[label] for label in labels if label in known]
 
     def is_changed(self) -> bool:
@@ -107,14 +107,14 @@ class Selection:
         task = self._choices["task"]
         if task != self._before[0]:
             names, trocars = list(self._agents(task)), trocar_names(task)
-            self._choices.offer("who", names, names[0])
-            self._choices.offer("beside", (page.NOBODY, *names), page.NOBODY)
+            self._choices.offer("agent", names, names[0])
+            self._choices.offer("compare_with", (page.NOBODY, *names), page.NOBODY)
             self._choices.offer("trocar", trocars, trocars[0])
         before, self._before = self._before, self._values()
         return before != self._before
 
     def _values(self) -> tuple[str, ...]:
-        return tuple(self._choices[name] for name in ("task", "who", "beside", "arm"))
+        return tuple(self._choices[name] for name in ("task", "agent", "compare_with", "arm"))
 
     def _agents(self, task: str) -> dict[str, AgentSpec]:
         given = {label: spec for label, spec in self._given.items() if spec.task == task}
