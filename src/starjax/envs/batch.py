@@ -81,8 +81,8 @@ def make(settings: EnvSettings, lanes: int) -> EpisodeBatch:
         before, reset_mask = lanes.state, do.reset_mask
         moves = do.move & ~jnp.all(reset_mask)
         after = jax.lax.cond(moves, lambda: step(before, action), lambda: before)
-        found = judge(before, after)
-        outcome = jax.tree.map(lambda x: _where(reset_mask, jnp.zeros_like(x), x), found)
+        raw = judge(before, after)
+        outcome = jax.tree.map(lambda x: _where(reset_mask, jnp.zeros_like(x), x), raw)
         final = look(after)
         reset_mask = reset_mask | (do.autoreset & (outcome.terminated | outcome.truncated))
 

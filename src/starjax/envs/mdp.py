@@ -103,17 +103,17 @@ def make(settings: EnvSettings) -> Episodes:
 
     def decode(state: Any, action: jax.Array) -> Command:
         parts = jnp.clip(action, -1.0, 1.0).reshape(task.arms, space.dim + 1)
-        wanted, jaws = parts[:, :-1], parts[:, -1]
+        target, jaws = parts[:, :-1], parts[:, -1]
         if is_relative:
-            wanted = jnp.clip(scaled(state, state.pose) + SHARE * wanted, -1.0, 1.0)
-        pose, _ = space.decode(0.5 * (high + low + (high - low) * wanted), state.measured_trocar)
+            target = jnp.clip(scaled(state, state.pose) + SHARE * target, -1.0, 1.0)
+        pose, _ = space.decode(0.5 * (high + low + (high - low) * target), state.measured_trocar)
         return Command(pose, jaws)
 
     def encode(state: Any, command: Command) -> jax.Array:
-        wanted = scaled(state, command.pose)
+        target = scaled(state, command.pose)
         if is_relative:
-            wanted = (wanted - scaled(state, state.pose)) / SHARE
-        return jnp.concatenate([wanted, command.gripper[:, None]], axis=-1).ravel()
+            target = (target - scaled(state, state.pose)) / SHARE
+        return jnp.concatenate([target, command.gripper[:, None]], axis=-1).ravel()
 
     def tool(state: Any) -> jax.Array:
         return jnp.concatenate([scaled(state, state.pose), state.gripper[:, None]], axis=-1).ravel()

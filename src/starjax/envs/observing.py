@@ -43,15 +43,15 @@ def make(env: Any, scaled: Callable[[Any], jax.Array]) -> Callable[[Any], Any]:
         return jnp.concatenate(parts)
 
     def observe(state: Any) -> Any:
-        seen = env.observe(state)
-        if seen.images is not None:
-            return {**seen.images, "tool": _clipped(tool(state))}
+        observation = env.observe(state)
+        if observation.images is not None:
+            return {**observation.images, "tool": _clipped(tool(state))}
         parts, at = [tool(state)], 0
         for field in task.fields:
-            part = seen.state[at : at + field.size]
+            part = observation.state[at : at + field.size]
             at += field.size
             parts.append((2 * part - high - low) / (high - low) if field.kind == "point" else part)
-        parts.append(task.relative(seen.state, state.pose.p))
+        parts.append(task.relative(observation.state, state.pose.p))
         return _clipped(jnp.concatenate(parts))
 
     return observe

@@ -71,16 +71,16 @@ class Environment(NamedTuple):
         return self
 
 
-def make(task: str, **given: Any) -> Environment:
+def make(task: str, **arguments: Any) -> Environment:
     """Builds the environment.
 
     Args:
-      given: see `settings.EnvSettings`.
+      arguments: see `settings.EnvSettings`.
 
     Raises:
       errors.UsageError: an argument is unknown or out of range.
     """
-    made = mdp.make(settings.make(task=task, **given))
+    made = mdp.make(settings.make(task=task, **arguments))
     scene = made.env.scene
 
     def metrics(data: Any) -> dict[str, jax.Array]:

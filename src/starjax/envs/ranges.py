@@ -33,7 +33,7 @@ def actions(task: Task, action_space: str) -> tuple[np.ndarray, np.ndarray]:
     """
     space = rcm.ACTION_SPACES[action_space]
     encode = jax.jit(space.encode)
-    found = []
+    bounds = []
     for slot, low, high in zip(task.slots, *tips(task), strict=True):
         work = registries.workspaces.get(slot.workspace)
         turn = np.linspace(*work.azimuth, num=AZIMUTHS)
@@ -45,6 +45,6 @@ def actions(task: Task, action_space: str) -> tuple[np.ndarray, np.ndarray]:
         poses = np.stack([x.ravel() for x in np.meshgrid(*axes)], axis=-1)
         pose, _ = rcm.ACTION_SPACES["rcm4"].decode(poses[None], frame)
         encoded = np.asarray(encode(pose, frame)).reshape(-1, space.dim)
-        found.append((encoded.min(axis=0), encoded.max(axis=0)))
-    low, high = (np.stack(ends).astype(np.float32) for ends in zip(*found, strict=True))
+        bounds.append((encoded.min(axis=0), encoded.max(axis=0)))
+    low, high = (np.stack(ends).astype(np.float32) for ends in zip(*bounds, strict=True))
     return low, high

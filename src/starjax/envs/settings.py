@@ -50,22 +50,22 @@ class EnvSettings:
     max_episode_steps: int | None = None
 
 
-def make(**given: Any) -> EnvSettings:
+def make(**arguments: Any) -> EnvSettings:
     """Validates a user's settings.
 
     Raises:
       errors.UsageError: an unknown name, or a value out of range.
     """
     known = [field.name for field in dataclasses.fields(EnvSettings)]
-    for name in given:
+    for name in arguments:
         errors.choice("environment's argument", name, known)
     for name in ("arms", "tools", "cameras"):
-        if name in given:
-            parts = given[name]
-            given[name] = (parts,) if isinstance(parts, str) else tuple(parts)
-    if "trocar" in given:
-        given["trocar"] = _trocar(given["trocar"])
-    settings = EnvSettings(**given)
+        if name in arguments:
+            parts = arguments[name]
+            arguments[name] = (parts,) if isinstance(parts, str) else tuple(parts)
+    if "trocar" in arguments:
+        arguments["trocar"] = _trocar(arguments["trocar"])
+    settings = EnvSettings(**arguments)
     errors.choice("action_space", settings.action_space, rcm.ACTION_SPACES)
     errors.choice("control", settings.control, CONTROLS)
     errors.choice("reward", settings.reward, REWARDS)
@@ -76,17 +76,17 @@ def make(**given: Any) -> EnvSettings:
     return settings
 
 
-def _trocar(given: Any) -> str | int | tuple[Row, Row, Row]:
-    if isinstance(given, str):
-        errors.choice("trocar", given, TROCARS)
-        return given
-    if isinstance(given, int | np.integer):
-        return int(given)
+def _trocar(choice: Any) -> str | int | tuple[Row, Row, Row]:
+    if isinstance(choice, str):
+        errors.choice("trocar", choice, TROCARS)
+        return choice
+    if isinstance(choice, int | np.integer):
+        return int(choice)
     try:
-        fields = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in given))
+        fields = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in choice))
         radius, polar, azimuth = (tuple(field.tolist()) for field in fields)
         rcm.check_trocar(rcm.Trocar(radius, polar, azimuth))
     except (TypeError, ValueError) as error:
         expected = f"{', '.join(TROCARS)}, a number, or (radius m, polar rad, azimuth rad)"
-        raise errors.UsageError("trocar", expected, repr(given), str(error)) from error
+        raise errors.UsageError("trocar", expected, repr(choice), str(error)) from error
     return radius, polar, azimuth

@@ -19,18 +19,18 @@ class TaskEnv(gymnasium.Env):
 
     metadata = vector.METADATA
 
-    def __init__(self, *, render_mode: str | None = None, **given: Any) -> None:
+    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
         """Makes the environment; the first reset compiles its program.
 
         Args:
           render_mode: `rgb_array` or None.
-          given: see `settings.EnvSettings`.
+          arguments: see `settings.EnvSettings`.
 
         Raises:
           errors.UsageError: an argument is unknown or out of range.
         """
         self._lanes = vector.TaskVectorEnv(
-            1, autoreset_mode=AutoresetMode.DISABLED, render_mode=render_mode, **given
+            1, autoreset_mode=AutoresetMode.DISABLED, render_mode=render_mode, **arguments
         )
         self.render_mode = render_mode
         self.episodes = self._lanes.episodes

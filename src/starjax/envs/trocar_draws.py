@@ -25,8 +25,8 @@ def make(task: Task, trocar: str | int | tuple) -> Draw:
         fields = [np.asarray(field, np.float32) for field in trocar]
         if fields[0].shape not in ((1,), (task.arms,)):
             raise errors.UsageError("trocar", f"fields of {task.arms}", f"{len(fields[0])}")
-        given = rcm.Trocar(*(np.broadcast_to(field, (task.arms,)) for field in fields))
-        return lambda key: jax.tree.map(jnp.asarray, given)
+        fixed = rcm.Trocar(*(np.broadcast_to(field, (task.arms,)) for field in fields))
+        return lambda key: jax.tree.map(jnp.asarray, fixed)
     if isinstance(trocar, int):
         if not 0 <= trocar < len(task.is_seen):
             raise errors.UsageError("trocar", f"0 to {len(task.is_seen) - 1}", trocar)

@@ -32,7 +32,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         *,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
-        **given: Any,
+        **arguments: Any,
     ) -> None:
         """Makes the environments; the first reset compiles their program.
 
@@ -43,7 +43,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             `info["final_obs"]` and `info["final_info"]` belong to the ended episode. DISABLED: the
             lane is frozen until `reset(options={"reset_mask": mask})`.
           render_mode: `rgb_array` or None.
-          given: see `settings.EnvSettings`.
+          arguments: see `settings.EnvSettings`.
 
         Raises:
           errors.UsageError: an argument is unknown or out of range.
@@ -51,7 +51,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         if num_envs < 1:
             raise errors.UsageError("num_envs", "1 or more", num_envs)
         errors.choice("render_mode", str(render_mode), ["None", *METADATA["render_modes"]])
-        self.settings = settings.make(**given)
+        self.settings = settings.make(**arguments)
         self.render_mode = render_mode
         self._mode = AutoresetMode(autoreset_mode)
         self.metadata = {**METADATA, "autoreset_mode": self._mode}
@@ -96,11 +96,11 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             numbers = _uint32([each or 0 for each in seeds])
             self._lanes = batch.seeded(self._lanes, numbers, is_new)
         idle = np.zeros(self._shape, np.float32)
-        self._lanes, found = self._batch.advance(
+        self._lanes, result = self._batch.advance(
             self._lanes, idle, batch.StepMode(which, False, False)
         )
         self._over = self._over & ~which
-        observed, measured = _to_host(found.now)
+        observed, measured = _to_host(result.now)
         return observed, _info(measured, which)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -124,13 +124,13 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         reset_mask = self._over if is_next_step else np.zeros(self.num_envs, bool)
         autoreset = self._mode == AutoresetMode.SAME_STEP
         do = batch.StepMode(reset_mask, True, autoreset)
-        self._lanes, found = self._batch.advance(self._lanes, actions, do)
-        now, (reward, terminated, truncated) = _to_host((found.now, found.outcome))
+        self._lanes, result = self._batch.advance(self._lanes, actions, do)
+        now, (reward, terminated, truncated) = _to_host((result.now, result.outcome))
         observed, measured = now
         self._over = terminated | truncated
         info = _info(measured, np.ones(self.num_envs, bool))
         if autoreset and self._over.any():
-            info |= self._final(_to_host(found.final), self._over)
+            info |= self._final(_to_host(result.final), self._over)
         return observed, reward.astype(np.float64), terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:

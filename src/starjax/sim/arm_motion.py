@@ -18,16 +18,16 @@ MAX_SKEW = 0.01
 def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
     """Returns arm a's motion in a control period: dq, velocity, correction, gripper, residual."""
     bound, p_trocar = scene.arms[a], state.trocar.p_world_trocar[a]
-    q_target, given = state.q_target[a], state.correction[a]
+    q_target, last_correction = state.q_target[a], state.correction[a]
     chain = scenes.chain_at(bound, p_trocar)
     reference, _, _ = ik.forward(chain, q_target)
-    present = control.corrected(reference, p_trocar, -given)
-    correction = control.correct(given, of(state.pose, a), present, p_trocar)
+    present = control.corrected(reference, p_trocar, -last_correction)
+    correction = control.correct(last_correction, of(state.pose, a), present, p_trocar)
     target, velocity = control.toward(
         present, state.velocity[a], command.pose, p_trocar, 1.0 / CONTROL_HZ
     )
-    wanted = control.corrected(target, p_trocar, correction)
-    q, _ = solve(bound, p_trocar, wanted, q_target, STEP_IK_ITERATIONS)
+    ik_target = control.corrected(target, p_trocar, correction)
+    q, _ = solve(bound, p_trocar, ik_target, q_target, STEP_IK_ITERATIONS)
     usable = _is_usable(command) & jnp.all(jnp.isfinite(q))
     dq = jnp.where(usable, q - q_target, 0.0)
     fastest = jnp.maximum(jnp.max(jnp.abs(dq) / bound.max_speed), 1e-9)
@@ -36,7 +36,7 @@ def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
     return (
         dq,
         jnp.where(usable, velocity, 0.0),
-        jnp.where(usable, correction, given),
+        jnp.where(usable, correction, last_correction),
         jnp.where(usable, jnp.clip(command.gripper, -1.0, 1.0), state.gripper_target[a]),
         jnp.where(usable, ik.residual(chain, goal, q_target + dq), jnp.inf),
     )

@@ -49,7 +49,7 @@ def make(
 
     `scope` is where the endoscope may be, if a trocar of its own holds it.
     """
-    found = []
+    made = []
     for name in names:
         camera = mj_model.camera(name)
         body, R = int(camera.bodyid[0]), np.zeros(9)
@@ -59,8 +59,8 @@ def make(
         draw = render.make(
             mj_model, name, image_size, image_size, shadow, samples=samples, moves=moves
         )
-        found.append(SceneCamera(name, body, R, p, moves, draw))
-    return tuple(found)
+        made.append(SceneCamera(name, body, R, p, moves, draw))
+    return tuple(made)
 
 
 def nominal(cameras: Sequence[SceneCamera]) -> Pose:
@@ -94,14 +94,14 @@ def images(
       data: with the poses of bodies and geoms.
       rgb: `[G, 3]` colours in [0, 1].
     """
-    found: dict[str, render.CameraImage] = {}
+    frames: dict[str, render.CameraImage] = {}
     for i, camera in enumerate(cameras):
         draw: Callable[..., render.CameraImage] = camera.draw
-        seen = (data.geom_xpos, data.geom_xmat, rgb)
+        inputs = (data.geom_xpos, data.geom_xmat, rgb)
         if not camera.moves:
-            found[camera.name] = draw(*seen)
+            frames[camera.name] = draw(*inputs)
             continue
         R_world_body, p_world_body = data.xmat[camera.body], data.xpos[camera.body]
         pose = Pose(R_world_body @ poses.R[i], p_world_body + R_world_body @ poses.p[i])
-        found[camera.name] = draw(*seen, pose)
-    return found
+        frames[camera.name] = draw(*inputs, pose)
+    return frames

@@ -57,17 +57,17 @@ def distance_sq(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Arra
     """Returns squared distances (m^2) of `points` `[..., 3]` from segments; all broadcast."""
     way, off = end - start, points - start
     square = jnp.maximum(jnp.sum(way * way, axis=-1), 1e-12)
-    share = jnp.clip(jnp.sum(off * way, axis=-1) / square, 0.0, 1.0)
-    return jnp.sum((off - share[..., None] * way) ** 2, axis=-1)
+    fraction = jnp.clip(jnp.sum(off * way, axis=-1) / square, 0.0, 1.0)
+    return jnp.sum((off - fraction[..., None] * way) ** 2, axis=-1)
 
 
 def _shafts_meet(arms: Sequence[BoundArm], pose: Pose, p_world_trocar: jax.Array) -> jax.Array:
     """Returns True if two shafts overlap between the trocar and the tip."""
     hit = jnp.zeros((), bool)
-    share = jnp.linspace(0.0, 1.0, 4 * SHAFT_POINTS)[:, None]
+    fraction = jnp.linspace(0.0, 1.0, 4 * SHAFT_POINTS)[:, None]
     for a, first in enumerate(arms):
         ends = pose.p[a] - first.tool.shaft_end * pose.R[a, :, 2]
-        points = p_world_trocar[a] + share * (ends - p_world_trocar[a])
+        points = p_world_trocar[a] + fraction * (ends - p_world_trocar[a])
         for b, second in list(enumerate(arms))[a + 1 :]:
             end = pose.p[b] - second.tool.shaft_end * pose.R[b, :, 2]
             gap = first.tool.shaft_radius + second.tool.shaft_radius - DEPTH

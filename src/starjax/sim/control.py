@@ -59,18 +59,18 @@ def toward(
     step = _step(target.p - present.p, velocity[:3] * period, speed, MAX_ACCELERATION * period**2)
     p = present.p + step
     length = jnp.sum((target.p - present.p) ** 2)
-    share = jnp.sum(step * (target.p - present.p)) / jnp.where(length > 0, length, 1.0)
-    share = jnp.where(length > 0, jnp.clip(share, 0.0, 1.0), 1.0)
+    fraction = jnp.sum(step * (target.p - present.p)) / jnp.where(length > 0, length, 1.0)
+    fraction = jnp.where(length > 0, jnp.clip(fraction, 0.0, 1.0), 1.0)
 
     # The axis's point at the trocar moves by the tip's fraction of its own way, or slower if that
     # would exceed the tip's limits there.
     z_present, z_target = present.R[:, 2], target.R[:, 2]
     here, there = _nearest(present, p_trocar), _nearest(target, p_trocar)
-    shift, change = share * (there - here), MAX_ACCELERATION * period**2
+    shift, change = fraction * (there - here), MAX_ACCELERATION * period**2
     slower = _step(there - here, velocity[4:] * period, speed, change)
     is_slowed = jnp.sum(slower**2) < jnp.sum(shift**2)  # never on the manifold, where both are 0
     shift = jnp.where(is_slowed, slower, shift)
-    through = jnp.where(is_slowed, here + slower, (1.0 - share) * here + share * there)
+    through = jnp.where(is_slowed, here + slower, (1.0 - fraction) * here + fraction * there)
     axis = p - through
     axis = axis * jnp.where(axis @ z_present < 0, -1.0, 1.0)  # the tip is above the trocar
     axis = jnp.where(jnp.linalg.norm(axis) < NO_DIRECTION, z_present, axis)

@@ -68,10 +68,12 @@ def make(
         raise errors.UsageError("image_size", expected, repr(image_size))
     scene = scenes.load(scenes.name(task, arms, tools, cameras), variant)
     names, scope = scene.names.cameras, endoscope_camera.of(scene.task, scene.names.cameras)
-    seen = views.make(scene.mj_model, names, image_size, shadow, moving_cameras, scope)
+    scene_cameras = views.make(scene.mj_model, names, image_size, shadow, moving_cameras, scope)
 
     def start(key: jax.Array, params: EnvParams) -> EnvState:
-        poses = views.at_reset(seen, scope, key) if params.cameras is None else params.cameras
+        poses = (
+            views.at_reset(scene_cameras, scope, key) if params.cameras is None else params.cameras
+        )
         state = reset(scene, key, params, poses)
         if scope is None:
             return state
@@ -82,7 +84,7 @@ def make(
         p_world_trocar = state.trocar.p_world_trocar
         data = physics.kinematics(scene, state.physics.qpos, p_world_trocar, state.layout)
         rgb = scene.task.colours(scene.bound, state.layout, jnp.asarray(scene.geom_rgb))
-        return views.images(seen, state.cameras, data, rgb)
+        return views.images(scene_cameras, state.cameras, data, rgb)
 
     def observe(state: EnvState) -> Observation:
         images = fields = None
@@ -132,8 +134,8 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     """Starts an episode with objects and tips drawn by the task, and cameras `[C]`."""
     layout = scene.task.sample(scene.bound, key)
     trocar, measured_trocar = (
-        rcm.trocar_frame(given, scene.p_world_ref, scene.roll_zero)
-        for given in (params.trocar, params.measured_trocar or params.trocar)
+        rcm.trocar_frame(parameters, scene.p_world_ref, scene.roll_zero)
+        for parameters in (params.trocar, params.measured_trocar or params.trocar)
     )
     count = len(scene.arms)
     tips = scene.task.tips(scene.bound, layout, trocar.p_world_trocar)
@@ -243,11 +245,11 @@ def with_status(scene: scenes.Scene, state: EnvState) -> EnvState:
 
 def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts") -> EnvState:
     qpos, p_world_trocar = state.physics.qpos, state.trocar.p_world_trocar
-    found = [
+    kinematics = [
         ik.forward(scenes.chain_at(bound, p_world_trocar[a]), qpos[bound.q])
         for a, bound in enumerate(scene.arms)
     ]
-    pose = jax.tree.map(lambda *x: jnp.stack(x), *(pose for pose, _, _ in found))
+    pose = jax.tree.map(lambda *x: jnp.stack(x), *(pose for pose, _, _ in kinematics))
     opening = physics.openings(scene, qpos)
     velocity = CONTROL_HZ * (pose.p - state.pose.p)
     readings = SimReadings(qpos, state.physics.qvel, pose, velocity, opening, state.touch, contacts)
@@ -255,7 +257,7 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
     hit = collision.detect(
         scene.arms,
         pose,
-        [origins for _, origins, _ in found],
+        [origins for _, origins, _ in kinematics],
         p_world_trocar,
         scene.task.obstacles(scene.bound, state.layout, measurements),
         scene.task.floor,

@@ -54,7 +54,7 @@ def search(
             with jax.default_matmul_precision("highest"):
                 return -np.asarray(merit(jnp.asarray(whole.T, jnp.float32), at.settings))
 
-        found = optimize.differential_evolution(
+        evolution = optimize.differential_evolution(
             cost,
             list(zip(low[free], high[free])),
             vectorized=True,
@@ -68,26 +68,26 @@ def search(
             init=population,
             rng=seed + round_,
         )
-        population = found.population
+        population = evolution.population
         x = low.copy()
-        x[free] = found.x
+        x[free] = evolution.x
         mount = _mount(at, middle, x)
         reached = mounts.fit(at, mount, every)
-        least = mounts.worst(reached)
-        on_round(least)
-        if best is None or _score(least) > _score(best[1]):
-            best = mount, least
+        worst_fit = mounts.worst(reached)
+        on_round(worst_fit)
+        if best is None or _score(worst_fit) > _score(best[1]):
+            best = mount, worst_fit
         chosen = _harder(reached, chosen)
     assert best
     return best
 
 
-def _score(least: Fit) -> float:
+def _score(worst_fit: Fit) -> float:
     """Returns the search's objective in rad, that of the worst pose."""
-    if least.residual > mounts.REACHED:
-        return -float(least.residual)
-    ease = min(least.margin, SINGULAR_WORTH * least.singular)
-    return float(ease + TABLE_WORTH * min(least.height, 0.0))
+    if worst_fit.residual > mounts.REACHED:
+        return -float(worst_fit.residual)
+    ease = min(worst_fit.margin, SINGULAR_WORTH * worst_fit.singular)
+    return float(ease + TABLE_WORTH * min(worst_fit.height, 0.0))
 
 
 def _harder(reached: Fit, chosen: np.ndarray) -> np.ndarray:
@@ -149,8 +149,8 @@ def _bounds(at: Bench, workspace: Workspace, tilts: bool) -> tuple[np.ndarray, n
     box = np.array([workspace.base_low, workspace.base_high])
     if at.settings.remote_centre:
         box = np.zeros((2, 3))
-    most = np.array([np.pi, np.pi, np.pi * tilts])  # yaw, turn, tilt
-    angles = np.stack([-most, most])
+    largest = np.array([np.pi, np.pi, np.pi * tilts])  # yaw, turn, tilt
+    angles = np.stack([-largest, largest])
     low, high = np.concatenate([box, angles, limits], axis=1)
     return low, high
 

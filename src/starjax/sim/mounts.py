@@ -135,16 +135,16 @@ def fit(at: Bench, mount: Mount, poses: Targets) -> Fit:
     return Fit(np.asarray(residual), np.asarray(margin), singular, height)
 
 
-def worst(found: Fit) -> Fit:
+def worst(fits: Fit) -> Fit:
     """Returns the worst figure of each field."""
-    return Fit(found.residual.max(), found.margin.min(), found.singular.min(), found.height.min())
+    return Fit(fits.residual.max(), fits.margin.min(), fits.singular.min(), fits.height.min())
 
 
-def is_good(found: Fit) -> bool:
+def is_good(fits: Fit) -> bool:
     """Returns True if a mount with this fit is usable."""
-    least = worst(found)
-    enough = least.margin >= MIN_MARGIN and least.singular >= MIN_SINGULAR
-    return bool(enough and least.residual < REACHED and least.height > 0)
+    lowest = worst(fits)
+    enough = lowest.margin >= MIN_MARGIN and lowest.singular >= MIN_SINGULAR
+    return bool(enough and lowest.residual < REACHED and lowest.height > 0)
 
 
 def standing(flange: ik.Chain, tip: ik.Chain, place: jax.Array) -> ik.Chain:

@@ -57,8 +57,8 @@ def carried(command: Command, p_before: jax.Array, p_now: jax.Array) -> Command:
     )
 
 
-def toward(here: jax.Array, there: jax.Array, most: float) -> jax.Array:
-    """Returns the point `[..., 3]` m on the way from `here` to `there`, at most `most` m away."""
+def toward(here: jax.Array, there: jax.Array, largest: float) -> jax.Array:
+    """Returns the point `[..., 3]` m from `here` towards `there`, at most `largest` m away."""
     way = there - here
     length = jnp.linalg.norm(way, axis=-1, keepdims=True)
-    return jnp.where(length > most, here + way * (most / jnp.maximum(length, 1e-9)), there)
+    return jnp.where(length > largest, here + way * (largest / jnp.maximum(length, 1e-9)), there)

@@ -125,10 +125,10 @@ def advance(
             mocap_pos=mocap_pos,
         )
         data, error = solver.step(mjx_model, data, scene.max_solver_iterations)
-        found = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
+        contacts = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
         error = jnp.maximum(result.solver_error, error)
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-        return state, StepResult(touching(scene, found), found, before, error)
+        return state, StepResult(touching(scene, contacts), contacts, before, error)
 
     blank = StepResult(
         jnp.zeros(len(scene.arms), bool),
@@ -149,11 +149,11 @@ def is_sound(scene: Scene, state: PhysicsState) -> jax.Array:
 
 def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
     """Returns the jaws' measured openings `[A]`: -1 closed on nothing, +1 fully open."""
-    found = [
+    values = [
         jnp.ones(()) if bound.jaw is None else 2.0 * qpos[bound.jaw] / bound.tool.open - 1.0
         for bound in scene.arms
     ]
-    return jnp.clip(jnp.stack(found), -1.0, 1.0)
+    return jnp.clip(jnp.stack(values), -1.0, 1.0)
 
 
 def kinematics(

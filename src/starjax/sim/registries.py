@@ -47,6 +47,6 @@ def mount(arm: Arm, tool: str, workspace: str) -> Mount | None:
     if (tool, workspace) in arm.mounts:
         return arm.mounts[tool, workspace]
     for entry in importlib.metadata.entry_points(group="starjax.mounts"):
-        if found := entry.load().get((arm.name, tool, workspace)):
-            return found
+        if record := entry.load().get((arm.name, tool, workspace)):
+            return record
     return None

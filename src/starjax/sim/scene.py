@@ -103,9 +103,9 @@ def name(
       errors.UsageError: a name is unknown, or there are not as many as the task has slots.
     """
     record: Task = registries.tasks.get(task)
-    given = {"arm": (arms, registries.arms), "tool": (tools, registries.tools)}
+    requests = {"arm": (arms, registries.arms), "tool": (tools, registries.tools)}
     chosen = {}
-    for kind, (names, known) in given.items():
+    for kind, (names, known) in requests.items():
         names = tuple(names) or tuple(getattr(slot, kind) for slot in record.slots)
         if len(names) == 1:  # the same for all
             names *= record.arms
@@ -206,7 +206,7 @@ def tcp(i: int, tool: Tool) -> str:
 
 
 def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
-    found = []
+    parts = []
     for slot, arm_name, tool_name in zip(task.slots, names.arms, names.tools, strict=True):
         arm, tool = registries.arms.get(arm_name), registries.tools.get(tool_name)
         mount = registries.mount(arm, tool_name, slot.workspace)
@@ -218,8 +218,8 @@ def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
                 known or "none",
                 f"starjax find-mount {arm_name} {tool_name} {task.name} searches one",
             )
-        found.append((arm, tool, mount))
-    return found
+        parts.append((arm, tool, mount))
+    return parts
 
 
 def _bind(m: mujoco.MjModel, i: int, arm: Arm, tool: Tool, mount: Mount) -> BoundArm:

@@ -52,7 +52,7 @@ def wrap(env: Env) -> Env:
     def step(state: EnvState, command: Command) -> EnvState:
         between = _is_between(state)
         command = jax.tree.map(
-            lambda own, given: jnp.where(between, own, given), _withdrawing(state), command
+            lambda own, other: jnp.where(between, own, other), _withdrawing(state), command
         )
         after = env.step(state, command)
         goes_on = after.success & ~state.done & (state.layout.turn < six.BLOCKS - 1)

@@ -28,11 +28,11 @@ MAX_ITERATIONS = 10
 # joint at 2 urad/s.
 MAX_ERROR_ENERGY = 1e-11
 # First candidates of the line search, as fractions of the Newton step: most often 1 is right.
-FIRST_SHARES = (
+FIRST_FRACTIONS = (
     *(0.0625, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875),
     *(1.0, 1.25, 1.5, 2.0, 3.0, 4.0, 8.0, 16.0),
 )
-SECOND_SHARES = 16  # second candidates, between the two that enclose the minimum
+SECOND_FRACTIONS = 16  # second candidates, between the two that enclose the minimum
 
 
 class Problem(NamedTuple):
@@ -111,8 +111,12 @@ def check(m: mjx.Model, d: mjx.Data) -> None:
             "model: expected contacts of condim 3 and no friction loss, got condim "
             f"{sorted(set(d._impl.contact.dim.tolist()))} and {d._impl.nf} rows of friction loss"
         )
-    found = m.opt.cone, m.opt.integrator, m.opt.disableflags & mjx.DisableBit.EULERDAMP
-    if found != (mjx.ConeType.ELLIPTIC, mjx.IntegratorType.IMPLICITFAST, mjx.DisableBit.EULERDAMP):
+    settings = m.opt.cone, m.opt.integrator, m.opt.disableflags & mjx.DisableBit.EULERDAMP
+    if settings != (
+        mjx.ConeType.ELLIPTIC,
+        mjx.IntegratorType.IMPLICITFAST,
+        mjx.DisableBit.EULERDAMP,
+    ):
         raise ValueError(
             "model: expected an elliptic cone, the integrator implicitfast and eulerdamp disabled, "
             f"got {m.opt.cone.name}, {m.opt.integrator.name} and flags {m.opt.disableflags!r}"
@@ -153,11 +157,11 @@ def solve(
         Mp, Ap = M @ p, A @ p
         slope_0, bend = p @ (now.Mx - f), p @ Mp
 
-        def slope(share: jax.Array) -> jax.Array:
-            return slope_0 + share * bend + pull(problem, now.r + share * Ap) @ Ap
+        def slope(fraction: jax.Array) -> jax.Array:
+            return slope_0 + fraction * bend + pull(problem, now.r + fraction * Ap) @ Ap
 
-        share = line_search(slope, now.gradient @ p)
-        return count + 1, at(now.x + share * p, now.Mx + share * Mp, now.r + share * Ap)
+        fraction = line_search(slope, now.gradient @ p)
+        return count + 1, at(now.x + fraction * p, now.Mx + fraction * Mp, now.r + fraction * Ap)
 
     start = at(x, M @ x, A @ x - b)
     _, end = jax.lax.while_loop(is_coarse, improve, (jnp.zeros((), jnp.int32), start))
@@ -175,25 +179,25 @@ def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> ja
       first: `[]`, the negative slope at 0.
 
     Returns:
-      `[]`, no larger than the last of `FIRST_SHARES`.
+      `[]`, no larger than the last of `FIRST_FRACTIONS`.
     """
-    low, high = jnp.zeros_like(first), jnp.full_like(first, FIRST_SHARES[-1])
+    low, high = jnp.zeros_like(first), jnp.full_like(first, FIRST_FRACTIONS[-1])
     slopes = first, jnp.full_like(first, jnp.inf)
-    between = np.linspace(0.0, 1.0, SECOND_SHARES + 2, dtype=np.float32)[1:-1]
+    between = np.linspace(0.0, 1.0, SECOND_FRACTIONS + 2, dtype=np.float32)[1:-1]
     for second in (False, True):
-        shares = low + (high - low) * between if second else jnp.asarray(FIRST_SHARES)
-        found = jax.vmap(slope)(shares)
-        falls = found < 0
-        low = jnp.max(shares, where=falls, initial=low)
-        high = jnp.min(shares, where=~falls, initial=high)
+        fractions = low + (high - low) * between if second else jnp.asarray(FIRST_FRACTIONS)
+        values = jax.vmap(slope)(fractions)
+        falls = values < 0
+        low = jnp.max(fractions, where=falls, initial=low)
+        high = jnp.min(fractions, where=~falls, initial=high)
         slopes = (
-            jnp.max(found, where=falls, initial=slopes[0]),
-            jnp.min(found, where=~falls, initial=slopes[1]),
+            jnp.max(values, where=falls, initial=slopes[0]),
+            jnp.min(values, where=~falls, initial=slopes[1]),
         )
     rise = slopes[1] - slopes[0]
     is_enclosed = jnp.isfinite(rise) & (rise > 0)
-    share = jnp.where(is_enclosed, -slopes[0] / jnp.where(is_enclosed, rise, 1.0), 1.0)
-    return low + (high - low) * jnp.clip(share, 0.0, 1.0)
+    fraction = jnp.where(is_enclosed, -slopes[0] / jnp.where(is_enclosed, rise, 1.0), 1.0)
+    return low + (high - low) * jnp.clip(fraction, 0.0, 1.0)
 
 
 def pull(problem: Problem, r: jax.Array) -> jax.Array:

@@ -41,7 +41,7 @@ def _nearest(
     def pack(t, face):
         return (jax.lax.bitcast_convert_type(t, jnp.int32) & ~room) | face
 
-    seen = tiles.in_view(grid, c, R, *_bounds(scene))
+    visible = tiles.in_view(grid, c, R, *_bounds(scene))
     size = jnp.asarray(scene.size, jnp.float32)
     key = pack(jnp.full_like(x, rays.FAR), room)
     for kind in (scenes.CAPSULE, scenes.CYLINDER, scenes.BOX, scenes.PLANE):
@@ -57,7 +57,7 @@ def _nearest(
             for row, features in enumerate(table):
                 key = meet(key, row, list(features), x, y)
         else:
-            key = tiles.each(seen[:, rows], table, meet, key, x, y)
+            key = tiles.each(visible[:, rows], table, meet, key, x, y)
     t = jax.lax.bitcast_convert_type(key & ~room, jnp.float32)
     return t, jnp.where(t < rays.FAR, key & room, -1)
 

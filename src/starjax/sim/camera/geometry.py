@@ -254,7 +254,7 @@ def _sky(mj_model) -> np.ndarray:
 
 def _textures(mj_model, data, ids, R_world_cam, p_world_cam) -> dict[int, Texture]:
     """Returns the textures of rows whose material has one, mapped as MuJoCo maps 2d textures."""
-    found = {}
+    textures = {}
     for row, g in enumerate(ids):
         mat = mj_model.geom_matid[g]
         tex = mj_model.mat_texid[mat, mujoco.mjtTextureRole.mjTEXROLE_RGB] if mat >= 0 else -1
@@ -272,8 +272,8 @@ def _textures(mj_model, data, ids, R_world_cam, p_world_cam) -> dict[int, Textur
             scale = scale / size[:2]
         R_world_geom = data.geom_xmat[g].reshape(3, 3)
         top = data.geom_xpos[g] + R_world_geom[:, 2] * size[2] * (shape == BOX)
-        found[row] = Texture(
+        textures[row] = Texture(
             _texels(mj_model, tex), scale, -size[:2] * signs, R_world_cam.T @ R_world_geom,
             R_world_cam.T @ (top - p_world_cam),
         )  # fmt: skip
-    return found
+    return textures

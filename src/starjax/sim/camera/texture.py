@@ -88,8 +88,8 @@ def _square_wave(u: Any, width: Any) -> Any:
     """Averages, over `width`, the wave of 1 on the first half of each unit and -1 on the other."""
 
     def integral(x: Any) -> Any:
-        share = x - jnp.floor(x)
-        return jnp.where(share < 0.5, share, 1.0 - share)
+        fraction = x - jnp.floor(x)
+        return jnp.where(fraction < 0.5, fraction, 1.0 - fraction)
 
     width = jnp.maximum(width, 1e-6)
     mean = (integral(u + 0.5 * width) - integral(u - 0.5 * width)) / width

@@ -109,8 +109,8 @@ def in_view(grid: Grid, c: Array, R: Array, axes: Array, rounding: Array) -> Arr
     by_plane = (low <= limit) & (high >= -limit)
 
     in_front = c[:, 2] - depth_range < 0
-    seen = sides(grid.edges_x, 0)[None] & sides(grid.edges_y, 1)[:, None] & by_plane & in_front
-    return seen.reshape(-1, c.shape[0])
+    visible = sides(grid.edges_x, 0)[None] & sides(grid.edges_y, 1)[:, None] & by_plane & in_front
+    return visible.reshape(-1, c.shape[0])
 
 
 def over(low: Array, high: Array, c: Array, R: Array, axes: Array, rounding: Array) -> Array:

@@ -62,8 +62,8 @@ def moving(scene: geometry.RenderScene, grid: tiles.Grid, pose_world_cam: Pose) 
         R_light_cam=R_light_cam,
         to_sun=to_sun,
         textures={
-            row: texture.looker(found, step, R_world_cam, p_world_cam)
-            for row, found in scene.textures.items()
+            row: texture.looker(checker, step, R_world_cam, p_world_cam)
+            for row, checker in scene.textures.items()
         },
     )
 

@@ -124,25 +124,25 @@ def _act(
     after = _enter(play, script, play.following(script, state), state)
     script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
-    usual = jnp.asarray(play.duration, jnp.float32)[script.phase]
-    s = jnp.clip(elapsed * script.tempo / usual, 0.0, 1.0)
+    nominal = jnp.asarray(play.duration, jnp.float32)[script.phase]
+    s = jnp.clip(elapsed * script.tempo / nominal, 0.0, 1.0)
     # On the way down a tool is above its goal before anything can touch.
     aside, turned = (
         scripting.minimum_jerk(jnp.minimum(s / jnp.asarray(at, jnp.float32)[script.phase], 1.0))
         for at in (play.aligned, play.turned)
     )
-    share = scripting.minimum_jerk(s)
+    fraction = scripting.minimum_jerk(s)
     deviation = jnp.array(DEVIATION * 2)
     noise = scripting.disturb(script.key, script.noise, state.step, deviation)
-    wanted = jnp.asarray(play.jaws, jnp.float32)[script.phase]
+    target = jnp.asarray(play.jaws, jnp.float32)[script.phase]
     script = script.replace(
         elapsed=elapsed,
-        p=script.start + jnp.stack([aside, aside, share]) * (script.goal - script.start),
+        p=script.start + jnp.stack([aside, aside, fraction]) * (script.goal - script.start),
         roll=script.roll_from + turned * (script.roll_to - script.roll_from),
-        jaws=scripting.jaws(script.jaws_from, wanted, elapsed),
+        jaws=scripting.jaws(script.jaws_from, target, elapsed),
         noise=noise,
     )
-    moved = play.weight(script.phase, share) * noise[1].reshape(2, 4)
+    moved = play.weight(script.phase, fraction) * noise[1].reshape(2, 4)
     roll, p = script.roll + moved[:, 3], script.p + moved[:, :3]
     rough = scripting.command(roll, p, script.jaws, state)
     return rough, script, scripting.command(script.roll, script.p, script.jaws, state)

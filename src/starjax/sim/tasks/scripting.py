@@ -14,9 +14,9 @@ SMOOTHING = 0.15  # s, time constant of its low-pass, for smooth motion
 JAW_TIME = 0.25  # s to close or open
 
 
-def minimum_jerk(share: jax.Array) -> jax.Array:
+def minimum_jerk(fraction: jax.Array) -> jax.Array:
     """Returns the fraction of the way after a fraction `[...]` of the time, at rest at its ends."""
-    return share**3 * (10.0 + share * (-15.0 + 6.0 * share))
+    return fraction**3 * (10.0 + fraction * (-15.0 + 6.0 * fraction))
 
 
 def jaws(before: jax.Array, target: jax.Array, elapsed: jax.Array) -> jax.Array:

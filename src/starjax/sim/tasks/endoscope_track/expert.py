@@ -65,11 +65,11 @@ def act(script: TrackScript, state: EnvState) -> tuple[Command, TrackScript, Com
     """Returns the disturbed command to execute, the script, and the undisturbed one to record."""
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
-    share = scripting.minimum_jerk(s)
+    fraction = scripting.minimum_jerk(s)
 
     def way(distance: jax.Array | float) -> jax.Array:
-        line = script.start + share * (_target(distance, state) - script.start)
-        return line.at[1:].add(4.0 * share * (1.0 - share) * script.side)
+        line = script.start + fraction * (_target(distance, state) - script.start)
+        return line.at[1:].add(4.0 * fraction * (1.0 - fraction) * script.side)
 
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
     weight = 1.0 - (1.0 - DISTURBANCE) * s

@@ -221,10 +221,10 @@ def status(bound: TrackBound, layout: TrackLayout, measurements: TrackMeasuremen
     stage = (measurements.off < 0.5).astype(jnp.int32) + measurements.on_target
     stage = jnp.where(success_now, 3, stage).astype(jnp.int32)
     kept = (measurements.step - measurements.missed) / LAST
-    share = jnp.where(
+    fraction = jnp.where(
         measurements.on_target, jnp.clip(kept, 0.0, 1.0), jnp.exp(-measurements.off / OFF_CENTRE)
     )
-    reward = jnp.where(success_now, 1.0, (stage + share) / len(STAGES))
+    reward = jnp.where(success_now, 1.0, (stage + fraction) / len(STAGES))
     lost = measurements.unseen & ~may_succeed
     return TaskStatus(success_now, is_over & ~measurements.unseen, lost, stage, reward)
 

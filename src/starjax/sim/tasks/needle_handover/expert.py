@@ -66,10 +66,10 @@ def _following(script: handover.HandoverScript, state: EnvState) -> jax.Array:
     return jnp.where(missed, PHASES.index("near"), following).astype(jnp.int32)
 
 
-def _weight(phase: jax.Array, share: jax.Array) -> jax.Array:
+def _weight(phase: jax.Array, fraction: jax.Array) -> jax.Array:
     weights = jnp.asarray(DISTURBANCE, jnp.float32)
     before, weight = weights[jnp.maximum(phase - 1, 0)], weights[phase]
-    return before + share * (weight - before)
+    return before + fraction * (weight - before)
 
 
 def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array, jax.Array]:

@@ -111,12 +111,12 @@ def _enter(script: NeedleScript, phase: jax.Array, state: EnvState) -> NeedleScr
     )
     goal = goals[phase]
     way = jnp.linalg.norm(goal - tip)
-    least = jnp.maximum(jnp.asarray(DURATION)[phase], way / jnp.asarray(SPEED)[phase])
+    duration = jnp.maximum(jnp.asarray(DURATION)[phase], way / jnp.asarray(SPEED)[phase])
     return script.replace(
         phase=phase,
         attempt=attempt,
         elapsed=jnp.zeros(()),
-        duration=least / script.tempo,
+        duration=duration / script.tempo,
         start=tip,
         goal=goal,
         segment=segment,
@@ -137,10 +137,10 @@ def act(script: NeedleScript, state: EnvState) -> tuple[Command, NeedleScript, C
     # On the way down it is above its goal before anything can touch.
     aligned = jnp.where(script.phase == DESCEND, ALIGNED, 1.0)
     aside = scripting.minimum_jerk(jnp.minimum(s / aligned, 1.0))
-    share = jnp.stack([aside, aside, scripting.minimum_jerk(s)])
-    p = script.start + share * (script.goal - script.start)
-    wanted = jnp.asarray(JAWS)[script.phase]
-    jaws = scripting.jaws(script.jaws_from, wanted, elapsed)
+    fraction = jnp.stack([aside, aside, scripting.minimum_jerk(s)])
+    p = script.start + fraction * (script.goal - script.start)
+    target = jnp.asarray(JAWS)[script.phase]
+    jaws = scripting.jaws(script.jaws_from, target, elapsed)
     script = script.replace(elapsed=elapsed, p=p, jaws=jaws)
     script = script.replace(roll=_roll(script, state))
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))

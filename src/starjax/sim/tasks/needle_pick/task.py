@@ -163,8 +163,10 @@ def status(
     stage = jnp.where(measurements.touch & lifted, 2, stage)
     stage = jnp.where(success_now, 3, stage).astype(jnp.int32)
     off = jnp.linalg.norm(measurements.needle.p - measurements.tip)
-    share = jnp.where(measurements.touch, jnp.clip(height / LIFT, 0.0, 1.0), jnp.exp(-off / NEAR))
-    reward = jnp.where(success_now, 1.0, (stage + share) / (len(STAGES) - 1))
+    fraction = jnp.where(
+        measurements.touch, jnp.clip(height / LIFT, 0.0, 1.0), jnp.exp(-off / NEAR)
+    )
+    reward = jnp.where(success_now, 1.0, (stage + fraction) / (len(STAGES) - 1))
     return TaskStatus(success_now, lifted, jnp.zeros((), bool), stage, jnp.minimum(reward, 1.0))
 
 

@@ -132,12 +132,12 @@ def act(expert: PegScript, state: EnvState) -> tuple[Command, PegScript, Command
     # On the way down it is above its goal before anything can touch.
     is_down = (expert.phase == DESCEND) | (expert.phase == LOWER)
     aside = scripting.minimum_jerk(jnp.minimum(s / jnp.where(is_down, ALIGNED, 1.0), 1.0))
-    share = jnp.stack([aside, aside, scripting.minimum_jerk(s)])
-    p = expert.start + share * (expert.goal - expert.start)
+    fraction = jnp.stack([aside, aside, scripting.minimum_jerk(s)])
+    p = expert.start + fraction * (expert.goal - expert.start)
     expert = expert.replace(label=Command(expert.label.pose._replace(p=p), expert.label.gripper))
     roll = _roll_of(expert, state)
-    wanted = jnp.asarray(JAWS)[expert.phase]
-    gripper = scripting.jaws(expert.jaws_from, wanted, expert.elapsed)
+    target = jnp.asarray(JAWS)[expert.phase]
+    gripper = scripting.jaws(expert.jaws_from, target, expert.elapsed)
 
     weight = jnp.asarray(DISTURBANCE)[expert.phase]
     deviation = jnp.array([NOISE_POSITION] * 3 + [NOISE_ROLL])
@@ -221,13 +221,13 @@ def _enter(expert: PegScript, phase: jax.Array, state: EnvState, roll: jax.Array
         ]
     )
     goal = goals[phase]
-    least = jnp.maximum(
+    duration = jnp.maximum(
         jnp.asarray(DURATION)[phase], jnp.linalg.norm(goal - tip) / jnp.asarray(SPEED)[phase]
     )
     return expert.replace(
         phase=phase,
         elapsed=jnp.zeros(()),
-        duration=least / expert.tempo,
+        duration=duration / expert.tempo,
         attempt=attempt,
         start=tip,
         goal=goal,

@@ -167,8 +167,8 @@ def status(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) ->
     to_block = jnp.linalg.norm(block.p - measurements.tip)
     to_target = jnp.linalg.norm(block.p[:2] - peg)
     left = jnp.where(stage == 0, to_block, to_target)
-    share = jnp.where(success_now, 1.0, jnp.exp(-left / NEAR))
-    reward = jnp.where(success_now, 1.0, (stage + share) / len(STAGES))
+    fraction = jnp.where(success_now, 1.0, jnp.exp(-left / NEAR))
+    reward = jnp.where(success_now, 1.0, (stage + fraction) / len(STAGES))
     return TaskStatus(success_now, near, jnp.zeros((), bool), stage, reward)
 
 

@@ -67,7 +67,7 @@ def _following(script: handover.HandoverScript, state: EnvState) -> jax.Array:
     return jnp.minimum(script.phase + 1, len(PHASES) - 1)
 
 
-def _weight(phase: jax.Array, share: jax.Array) -> jax.Array:
+def _weight(phase: jax.Array, fraction: jax.Array) -> jax.Array:
     return jnp.asarray(DISTURBANCE, jnp.float32)[phase]
 
 

@@ -59,9 +59,9 @@ def act(script: ReachScript, state: EnvState) -> tuple[Command, ReachScript, Com
     dt = 1.0 / CONTROL_HZ
     elapsed = script.elapsed + dt
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
-    share = scripting.minimum_jerk(s)
-    p = script.start + share * (state.layout.p - script.start)
-    p = p + 4.0 * share * (1.0 - share) * script.side
+    fraction = scripting.minimum_jerk(s)
+    p = script.start + fraction * (state.layout.p - script.start)
+    p = p + 4.0 * fraction * (1.0 - fraction) * script.side
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.full(3, DEVIATION))
     weight = jnp.clip((CALM - s) / CALM, 0.0, 1.0)
     script = script.replace(elapsed=elapsed, noise=noise)

@@ -92,19 +92,19 @@ def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Comma
     script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
     elapsed = script.elapsed + dt
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
-    share = scripting.minimum_jerk(s)
-    way = script.start + share * (script.goal - script.start)
+    fraction = scripting.minimum_jerk(s)
+    way = script.start + fraction * (script.goal - script.start)
     # On the way down the tool has turned, and goes along its shaft, before it can touch.
     early = scripting.minimum_jerk(jnp.minimum(s / ALIGNED, 1.0))
-    back = HOVER * (1.0 - share) * _shaft(script.goal[1:], state)
+    back = HOVER * (1.0 - fraction) * _shaft(script.goal[1:], state)
     aside = (1.0 - early) * (script.start + _lifted(script, state) - script.goal)
     way = jnp.where(script.phase == DESCEND, (script.goal + aside).at[1:].add(-back), way)
-    wanted = jnp.asarray(JAWS)[script.phase]
-    jaws = scripting.jaws(script.jaws_from, wanted, elapsed)
+    target = jnp.asarray(JAWS)[script.phase]
+    jaws = scripting.jaws(script.jaws_from, target, elapsed)
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
     weights = jnp.asarray(DISTURBANCE)
     before, weight = weights[jnp.maximum(script.phase - 1, 0)], weights[script.phase]
-    moved = (before + share * (weight - before)) * jnp.roll(noise[1], 1)
+    moved = (before + fraction * (weight - before)) * jnp.roll(noise[1], 1)
     script = script.replace(elapsed=elapsed, way=way, jaws=jaws, noise=noise)
     return _command(way + moved, jaws, state), script, _command(way, jaws, state)
 
@@ -162,12 +162,12 @@ def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
     )
     goal = goals[phase]
     length = jnp.linalg.norm(goal[1:] - here[1:])
-    least = jnp.maximum(jnp.asarray(DURATION)[phase], length / jnp.asarray(SPEED)[phase])
+    duration = jnp.maximum(jnp.asarray(DURATION)[phase], length / jnp.asarray(SPEED)[phase])
     return script.replace(
         phase=phase,
         attempt=attempt,
         elapsed=jnp.zeros(()),
-        duration=least / script.tempo,
+        duration=duration / script.tempo,
         side=side,
         grasp=grasp,
         start=here,
