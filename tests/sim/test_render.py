@@ -146,9 +146,9 @@ def test_geom_and_depth_agree_with_mujoco_rays(camera):
     mj_model = pile()
     qpos = poses(mj_model, 3)
     frames = draw(mj_model, qpos, camera=camera)
-    p_world_cam, rays = view_rays(mj_model, camera)
+    p_world_cam, directions = view_rays(mj_model, camera)
     for i, q in enumerate(qpos):
-        ids, t = cast(mj_model, q, np.broadcast_to(p_world_cam, rays.shape), rays)
+        ids, t = cast(mj_model, q, np.broadcast_to(p_world_cam, directions.shape), directions)
         ours = frames.segmentation[i].ravel()
         assert len(np.unique(ids)) >= 8, "the picture shows too little to compare"
         assert np.mean(ours == ids) >= 0.999
@@ -168,13 +168,15 @@ def test_shadow_agrees_with_mujoco_rays():
     mj_model.light_diffuse[:] = 1
     qpos = poses(mj_model, 3, seed=1)
     frames = draw(mj_model, qpos)
-    p_world_cam, rays = view_rays(mj_model, "camera")
+    p_world_cam, directions = view_rays(mj_model, "camera")
     data = mujoco.MjData(mj_model)
     mujoco.mj_forward(mj_model, data)
     to_light = -data.light_xdir[0]
     for i, q in enumerate(qpos):
         seen = frames.segmentation[i].ravel() >= 0
-        points = p_world_cam + frames.depth[i].ravel()[seen, None] * rays[seen] + 3e-5 * to_light
+        points = (
+            p_world_cam + frames.depth[i].ravel()[seen, None] * directions[seen] + 3e-5 * to_light
+        )
         hidden, _ = cast(mj_model, q, points, np.broadcast_to(to_light, points.shape))
         dark = frames.rgb[i].reshape(-1, 3)[seen].max(-1) == 0
         assert 0.05 < dark.mean() < 0.7, "too little shadow to compare"

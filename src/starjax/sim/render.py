@@ -28,7 +28,7 @@ class CameraImage:
 
     Attributes:
       rgb: `[h, w, 3]` uint8.
-      depth: `[h, w]` float32 distance from the camera's plane in m, `shapes.FAR` without a hit,
+      depth: `[h, w]` float32 distance from the camera's plane in m, `rays.FAR` without a hit,
         or None.
       segmentation: `[h, w]` int32 geom id, -1 for the background, or None.
     """

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.sim.tasks.base import Capsules, Field, Outline, Slot, Task, TaskStatus, TaskText
+from starjax.sim.tasks.base import Field, Outline, Slot, Task, TaskStatus, TaskText
 from starjax.types import Agent, Command
 
 MARKS = 4
@@ -74,15 +74,11 @@ TASK = Task(
     bind=bind,
     sample=sample,
     tips=lambda bound, layout, p_trocars: jnp.array([[0.0, 0.0, 0.05]]),
-    place_objects=lambda bound, qpos, layout: qpos,
     measure=lambda bound, layout, readings, before: readings.pose.p[0],
     status=status,
     state=lambda bound, layout, tip: layout.p,
     relative=lambda state, tips: (state - tips[..., 0, :]) / 0.03,
     label=lambda layout: {"goal": layout.goal},
     colours=lambda bound, layout, rgb: rgb.at[jnp.asarray(bound[0])[layout.goal]].set(1.0),
-    obstacles=lambda bound, layout, tip: Capsules(*jnp.full((2, 1, 3), -1.0), jnp.zeros(1)),
-    floor=0.0,
-    is_sound=lambda bound, qpos, qvel: jnp.ones((), bool),
     outline=lambda m: Outline((np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0]]) * 0.05,), ()),
 )
