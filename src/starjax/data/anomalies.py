@@ -1,4 +1,4 @@
-"""Looks at every number of demonstrations for what is odd, before anybody learns from them."""
+"""Anomalies of demonstrations: damage, jumps, values that are not finite, wrong trocars."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,17 +12,17 @@ from starjax.rollouts import episodes
 from starjax.runtime import files
 
 FAST = 1.0  # m/s; faster tips are jumps
-MISSED = 1e-3  # m; a shaft that passes the trocar so far is not on its manifold
-MOVED = 2e-3  # m; between the trocar that is told and the one that the motion shows
-SURE = 5e-4  # m; a standard deviation above this says nothing against what is told
+MISSED = 1e-3  # m; shafts farther from the trocar are not on its manifold
+MOVED = 2e-3  # m; between the recorded trocar and the estimated one
+SURE = 5e-4  # m; estimates with a larger standard deviation are ignored
 SHORT = 16  # control steps; shorter episodes are less than a plan
 
 
 def find(root: Path) -> Iterator[str]:
-    """Lines on what is odd about a dataset of ours, damage first; one for each kind.
+    """Yields one line per kind of anomaly of a starjax dataset, damage first.
 
     Raises:
-      ValueError: it is none.
+      ValueError: `root` is not a dataset.
     """
     about = store.read_description(root)
     try:
@@ -43,7 +43,7 @@ def find(root: Path) -> Iterator[str]:
 
 
 def import_notes(root: Path) -> list[str]:
-    """Notes of `starjax import` on the files that it read."""
+    """Reads the notes of `starjax import` on the imported files."""
     path = root / schema.IMPORTED
     return files.read_json(path).get("notes", []) if path.exists() else []
 
@@ -51,7 +51,7 @@ def import_notes(root: Path) -> list[str]:
 def _of_episode(
     root: Path, about: Mapping[str, Any], record: Mapping[str, Any]
 ) -> Iterator[tuple[str, str]]:
-    """(kind, detail) of each anomaly."""
+    """Yields (kind, detail) of each anomaly."""
     if record["length"] < SHORT:
         yield f"shorter than {SHORT} control steps", str(record["length"])
     folder = root / "episodes" / record["key"]
@@ -84,7 +84,10 @@ def _of_episode(
     is_sure = np.asarray(seen.is_determined) & (deviation < SURE)
     away = np.linalg.norm(np.asarray(seen.p_world_trocar) - np.asarray(told), axis=-1)
     if (is_sure & (away > MOVED)).any():
-        yield "the motion shows another trocar than is told", f"{1e3 * away[is_sure].max():.2g} mm"
+        yield (
+            "the motion shows another trocar than the recorded one",
+            f"{1e3 * away[is_sure].max():.2g} mm",
+        )
     rolls = np.asarray(rcm.roll_of(pose.R)) - np.array(about["roll_zero"])
     turned = np.abs(np.diff(np.mod(rolls + np.pi, 2 * np.pi), axis=0))
     if turned.size and turned.max() > np.pi:

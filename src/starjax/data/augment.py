@@ -27,7 +27,7 @@ def augment(
     noise: float = 0.02,
     dtype: jnp.dtype = jnp.float32,
 ) -> tuple[jax.Array, jax.Array]:
-    """Random crop, colour jitter and Gaussian noise, another draw for each frame.
+    """Applies random crop, colour jitter and Gaussian noise, drawn anew for each frame.
 
     Contrast turns about mid-grey, not about the frame's mean, and values are clipped once at the
     end: both spare a pass over the frames.
@@ -61,17 +61,17 @@ def augment(
 
 
 def center(images: jax.Array, *, crop: int, dtype: jnp.dtype = jnp.float32) -> jax.Array:
-    """Centre crop and normalisation, for evaluation: uint8 `[..., h, w, 3] -> [..., c, c, 3]`."""
+    """Crops at the centre and normalises: uint8 `[..., h, w, 3] -> [..., c, c, 3]`."""
     top, left = _centre(*_check(images, crop), crop)
     x = images[..., top : top + crop, left : left + crop, :]
     return _normalize(x.astype(jnp.float32) / 255.0, dtype)
 
 
 def hash_normal(seed: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Nearly normal noise (mean 0, deviation 1), a few integer operations for each value.
+    """Draws nearly normal noise (mean 0, deviation 1) with a few integer operations per value.
 
     Each value is the sum of the four bytes of a hashed counter (Irwin-Hall: within +-3.5, excess
-    kurtosis -0.3). Not for sampling from a model; for pixels nobody can tell.
+    kurtosis -0.3): good enough for pixels, not for sampling from a model.
 
     Args:
       seed: random uint32 `[N]`.
@@ -90,7 +90,7 @@ def hash_normal(seed: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 def _jitter(x: jax.Array, brightness: jax.Array, contrast: jax.Array, saturation: jax.Array):
-    """Colour jitter of `[N, c, c, 3]` in [0, 1] by factors `[N]`; not clipped."""
+    """Scales the colours of `[N, c, c, 3]` in [0, 1] by factors `[N]`, without clipping."""
     brightness, contrast, saturation = (
         factor[:, None, None, None] for factor in (brightness, contrast, saturation)
     )
@@ -108,7 +108,7 @@ def _centre(height: int, width: int, crop: int) -> tuple[int, int]:
 
 
 def _check(images: jax.Array, crop: int) -> tuple[int, int]:
-    """Height and width, once `images` is known to be uint8 frames that hold the crop."""
+    """Returns height and width; raises if `images` is not uint8 or smaller than the crop."""
     if images.ndim < 3 or images.shape[-1] != 3 or images.dtype != jnp.uint8:
         raise ValueError(
             f"images: expected uint8 [..., h, w, 3], got {images.dtype} {images.shape}"

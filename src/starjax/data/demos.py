@@ -32,7 +32,7 @@ from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.runtime import files, progress, xla
 
-COMMITS = 16  # episodes written at once; most of it is waiting for the disk
+COMMITS = 16  # threads that write episodes; they mostly wait for the disk
 FRAME_GUESS = 300  # control steps of a typical demonstration, for estimates of disk and memory
 MEMORY_SHARE = 0.25  # of the host's, for images of the episodes that are simulated together
 GPU_LANES = 256  # episodes a GPU simulates together
@@ -54,7 +54,7 @@ def collect(
     Args:
       root: folder of the dataset.
       env: `sim.env.Env`; its observation decides whether images or task states are stored.
-      agent: what it says is to be recorded is the command of a demonstration.
+      agent: its recorded command is the command of the demonstration.
       trocars: fields `[C, A]`.
       params: of the agent.
       report: gets lines for the user.
@@ -66,7 +66,7 @@ def collect(
     Raises:
       StorageError: the folder cannot be read or written, is in use, holds another dataset, or is
         too small.
-      ValueError: an argument out of range, a trocar that is none, an agent that fails too often.
+      ValueError: an argument out of range, an invalid trocar, or an agent that fails too often.
     """
     if settings.per_trocar < 1 or settings.max_steps < 1 or layout.lanes < 0:
         got = (settings.per_trocar, settings.max_steps, layout.lanes)
@@ -166,7 +166,7 @@ def _records(root: Path, keys: Iterable[str]) -> dict[str, store.Record]:
 def _shown(
     share: sharing.Share, total: int, records: dict[str, store.Record]
 ) -> contextlib.AbstractContextManager[Any]:
-    """The progress, which the first process shows for all."""
+    """Shows the progress of all processes on the first one."""
     if not share.is_first:
         return contextlib.nullcontext(lambda count: None)
     done = sum(record["success"] for record in records.values())
@@ -243,18 +243,18 @@ def _writer(
 
 
 def _frame_bytes(description: dict[str, Any]) -> int:
-    """Size of one recorded control step."""
+    """Returns the bytes of one recorded control step."""
     features = description["features"].values()
     return sum(math.prod(x["shape"]) * np.dtype(x["dtype"]).itemsize for x in features)
 
 
 def _fitting(frame_bytes: int) -> int:
-    """Episodes whose images fit the memory, twice: being simulated and being written."""
+    """Returns the episodes whose images fit in memory twice: while simulated and while written."""
     return int(MEMORY_SHARE * xla.memory_bytes() // (2 * FRAME_GUESS * frame_bytes))
 
 
 def _lanes(layout: DeviceLayout, total: int, frame_bytes: int, processes: int) -> int:
-    """Lanes of a chunk."""
+    """Returns the lanes of a chunk."""
     fast = _fast(layout.devices, total, processes)
     lanes = layout.lanes or max(1, min(fast, _fitting(frame_bytes)))
     several = len(layout.devices or [0])
@@ -262,8 +262,10 @@ def _lanes(layout: DeviceLayout, total: int, frame_bytes: int, processes: int) -
 
 
 def _fast(devices: Sequence[jax.Device] | None, total: int, processes: int) -> int:
-    """Episodes that make the most of a program, where `total` are wanted: several GPUs share what
-    one would do alone. Not of what is there already, as the size of a batch may change last bits.
+    """Returns the episodes per process at which a program is fastest, of `total` in all.
+
+    Several GPUs share the load of one. Finished episodes do not change it: the size of a batch may
+    change last bits.
     """
     if jax.default_backend() == "cpu":
         return workers.CPU_LANES

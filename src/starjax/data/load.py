@@ -19,8 +19,8 @@ Residency = Literal["auto", "device", "host", "disk"]
 DEVICE_SHARE = 0.5  # of the device's free memory that demonstrations may take
 HOST_SHARE = 0.6  # of the host's
 _MOST_OPEN = 256  # files of a field at once; systems allow a process about 1,000
-# The same for each core that reads one episode after another: what was read of an open file counts
-# as the process's memory.
+# Files per core that reads one episode after another: pages read from an open file count as the
+# process's memory.
 _OPEN_IN_TURN = 2
 
 
@@ -30,7 +30,7 @@ class Demos(NamedTuple):
     Attributes:
       dataset: the frames, as `windows.Dataset`.
       digest: hash that names the content on disk.
-      residency: where the frames are.
+      residency: `device`, `host` or `disk`.
       bytes: memory they take there (on the disk: what is read from there).
       description: the content of dataset.json.
     """
@@ -84,7 +84,7 @@ def verify(root: Path) -> None:
 
 
 def frames(root: Path) -> "dict[str, EpisodeArray]":
-    """The images of the successful episodes by camera, memory-mapped, in the order of `load`.
+    """Returns the images of successful episodes by camera, memory-mapped, in the order of `load`.
 
     They are for reading in that order: few files stay open.
     Only the episodes' records are checked.
@@ -135,7 +135,7 @@ def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.
 
 
 def _fields(description: dict[str, Any], record: store.Record, images: bool) -> dict[str, str]:
-    """Fields that training reads, and the file of each."""
+    """Returns the fields that training reads, and the file of each."""
     found = {
         name: f"{name}.npy"
         for name in description["features"]
@@ -145,7 +145,7 @@ def _fields(description: dict[str, Any], record: store.Record, images: bool) -> 
 
 
 def _spans(records: list[store.Record]) -> tuple[np.ndarray, np.ndarray]:
-    """`[D]` number of frames of each episode, and `[D]` its first frame."""
+    """Returns each episode's number of frames `[D]` and first frame `[D]`."""
     length = np.array([record["length"] for record in records], np.int32)
     return length, (np.cumsum(length) - length).astype(np.int32)
 
@@ -229,7 +229,7 @@ class EpisodeArray:
         self.dtype = first.dtype
 
     def __getitem__(self, index: Any) -> np.ndarray:
-        """EpisodeArray at `index`, `[N]` integers, as `[N, ...]` in memory."""
+        """Returns the frames at `index` `[N]` as `[N, ...]` in memory."""
         index = np.asarray(index)
         out = np.zeros((*index.shape, *self.shape[1:]), self.dtype)
         episode = np.searchsorted(self._start, index, side="right") - 1

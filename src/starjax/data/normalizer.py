@@ -4,9 +4,9 @@ Lengths and angles are scaled; 6-D rotations and the gripper are in [-1, 1] by n
 unchanged. Proprioception is the measured pose in the method's own action space and so shares the
 actions' statistics: what was commanded and what was measured stay comparable.
 
-A policy's samples are clipped to [-1, 1], so what was demonstrated is as far as a tool can be sent.
-Where positions or depths count from the trocar, samples reach farther: to the demonstrated tips as
-seen from any trocar that may be drawn (Eq. 19), since from a higher one a tip is farther away.
+A policy's samples are clipped to [-1, 1], the demonstrated range. If positions or depths are
+relative to the trocar, the range grows to the demonstrated tips seen from any trocar of Eq. 19,
+since a tip is farther from a higher trocar.
 
 Vectors hold the arms one after another: each its pose in the action space, then its gripper.
 """
@@ -62,13 +62,13 @@ class Normalizer:
 
 
 def encode(action_space: str, pose: Any, gripper: Any, trocar: rcm.TrocarFrame) -> jax.Array:
-    """Poses and grippers `[..., A]` as one vector `[..., A * (dim + 1)]`, not yet scaled.
+    """Encodes poses and grippers `[..., A]` as one vector `[..., A * (dim + 1)]`, unscaled.
 
     Args:
       action_space: key of `rcm.ACTION_SPACES`, whose vectors have `dim` entries.
       pose: of the tips, `[..., A]`.
       gripper: `[..., A]`.
-      trocar: what broadcasts against them.
+      trocar: frames, broadcastable against the poses.
     """
     encoded = rcm.ACTION_SPACES[action_space].encode(pose, trocar)
     vector = jnp.concatenate([encoded, jnp.asarray(gripper)[..., None]], axis=-1)
@@ -81,7 +81,7 @@ def fit(
     dataset: windows.Dataset,
     frames: np.ndarray,
 ) -> Normalizer:
-    """Statistics of the commands (and the task state) at the given frames of a dataset.
+    """Computes statistics of commands (and task states) at the given frames of a dataset.
 
     Args:
       method: whose action space to use.
@@ -107,7 +107,7 @@ def fit(
 
 
 def shapes(method: methods.Method, task: Task, state: bool) -> Normalizer:
-    """Structure of what `fit` returns, for a dataset with or without the task state."""
+    """Returns the structure of `fit`'s result, with or without the task state."""
     size = task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
     ends = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (size, task.state_size)]
     reach = jax.ShapeDtypeStruct((2, size), jnp.float32)
@@ -118,10 +118,10 @@ def shapes(method: methods.Method, task: Task, state: bool) -> Normalizer:
 def _reach(
     box: MinMax, space: rcm.ActionSpace, task: Task, dataset: windows.Dataset, frames: np.ndarray
 ) -> jax.Array:
-    """`[2, A * (dim + 1)]`, scaled: what the commanded tips ask for through trocars of the edge.
+    """Returns the scaled range `[2, A * (dim + 1)]` that reaches demonstrated tips.
 
-    Those are the highest, lowest and outermost ones of Eq. 19 about each arm's nominal trocar, and
-    the centre: {T} turns there too.
+    The tips are encoded through extreme trocars: the highest, lowest and outermost ones of Eq. 19
+    about each arm's nominal trocar, and the centre, where {T} turns too.
     """
     around = np.linspace(*rcm.AZIMUTH_RANGE, _EDGE_AZIMUTHS, endpoint=False)
     heights = [*rcm.POLAR_RANGE, np.mean(rcm.POLAR_RANGE)]
@@ -140,7 +140,9 @@ def _reach(
         low, high = jax.vmap(through)(trocars)
         return jnp.concatenate([low, high])
 
+    # 1. range of each entry over all frames, through every extreme trocar
     edge = windows.over_frames(dataset, frames, lambda _, command, __: ends(command))
+    # 2. union with [-1, 1]; rotations and rolls keep that range, whatever the trocar
     reach = np.stack([np.full(edge.shape[-1], -1.0), np.full(edge.shape[-1], 1.0)])
     counted = _entries_but(space, task.arms, "R", "roll")
     reach[0, counted] = np.minimum(edge[:, counted].min(axis=0), -1.0)
@@ -149,7 +151,7 @@ def _reach(
 
 
 def _entries_but(space: rcm.ActionSpace, arms: int, *names: str) -> np.ndarray:
-    """Where the parts of each arm's action lie in the vector, without those of these names."""
+    """Returns the indices of all parts of the arms' actions except those of these names."""
     parts = [part for name, part in space.slices.items() if name not in names]
     of_one = np.concatenate([np.arange(part.start, part.stop) for part in parts])
     first = np.arange(arms) * (space.dim + 1)
@@ -157,7 +159,7 @@ def _entries_but(space: rcm.ActionSpace, arms: int, *names: str) -> np.ndarray:
 
 
 def _points(fields: tuple[Field, ...]) -> np.ndarray:
-    """Where the points lie in the task state."""
+    """Returns the indices of points in the task state."""
     is_point = np.repeat([field.kind == "point" for field in fields], [f.size for f in fields])
     return np.flatnonzero(is_point)
 

@@ -19,15 +19,15 @@ STREAM = 0x64656D6F
 
 
 class DemoSettings(NamedTuple):
-    """Which demonstrations a dataset has.
+    """Settings of a dataset of demonstrations.
 
     Attributes:
       per_trocar: successful episodes wanted at each configuration of trocars.
       seed: of all of them.
       max_steps: control steps after which an episode has failed.
-      keep_failures: whether failed episodes are stored too.
-      expert: which of the task's; empty for its first one.
-      randomise: what is wrong with their environment: highest levels by name.
+      keep_failures: store failed episodes too.
+      expert: key of `Task.experts`; empty for the first one.
+      randomise: maximum levels of disturbances by name.
     """
 
     per_trocar: int
@@ -58,7 +58,7 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
     return {
         "schema": store.SCHEMA,
         **{name: x for name, x in settings._asdict().items() if name != "randomise"},
-        # Where nothing is wrong, datasets are called as they were before anything could be.
+        # Omitted if empty, so digests of datasets without disturbances hold.
         **({"randomise": dict(settings.randomise)} if settings.randomise else {}),
         "expert": expert_name(env.task, settings),
         "scene": env.names._asdict(),
@@ -80,7 +80,7 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
 
 
 def expert_name(task: Any, settings: DemoSettings) -> str:
-    """Which of the task's experts the settings mean."""
+    """Returns the name of the expert, by default the task's first one."""
     name = settings.expert or next(iter(task.experts))
     errors.choice("expert", name, task.experts)
     return name

@@ -12,12 +12,12 @@ _estimate = jax.jit(rcm.trocar_from_poses)
 
 
 def subsample(x: Any) -> np.ndarray:
-    """At most `ROWS` of `[T, ...]`, evenly spaced."""
+    """Returns at most `ROWS` evenly spaced rows of `[T, ...]`."""
     return np.asarray(x)[np.linspace(0, len(x) - 1, min(len(x), ROWS)).astype(int)]
 
 
 def estimate(R: Any, p: Any) -> rcm.TrocarEstimate:
-    """Trocars as the motion of A arms shows them.
+    """Estimates the trocars of A arms from their motion.
 
     Args:
       R: `[T, A, 3, 3]` R_world_tip.

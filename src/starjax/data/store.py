@@ -34,17 +34,17 @@ class DamagedEpisode(ValueError):
 
 
 def key(trocar: int, trial: int, seed: int) -> str:
-    """Name of a trial's folder."""
+    """Returns the name of a trial's folder."""
     return f"{trocar:04d}-{trial:04d}-{seed}"
 
 
 def is_key(name: object) -> bool:
-    """Whether a name is one that `key` gives, and so of no other folder."""
+    """Returns True for a name in the form of `key`."""
     return isinstance(name, str) and bool(_KEY.fullmatch(name))
 
 
 def digest(description: Mapping[str, Any]) -> str:
-    """Twelve hexadecimal digits that name a dataset by what it is, versions of software aside."""
+    """Returns twelve hexadecimal digits of a description, without software versions."""
     return _hash({k: v for k, v in description.items() if k != "versions"})[:12]
 
 
@@ -76,10 +76,10 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
 
 
 def read_description(root: Path) -> dict[str, Any]:
-    """The content of dataset.json.
+    """Reads dataset.json.
 
     Raises:
-      ValueError: there is none, or its schema is not one that this version reads.
+      ValueError: it is missing, or has another schema.
     """
     path = root / "dataset.json"
     try:
@@ -148,7 +148,7 @@ def verify(root: Path, key: str, arrays: bool = True) -> Record:
 def verify_all(
     root: Path, keys: Iterable[str], arrays: bool = True
 ) -> dict[str, Record | DamagedEpisode]:
-    """`verify` of many episodes, on all cores; damage is a value here, not raised."""
+    """Verifies many episodes on all cores; damage is returned, not raised."""
 
     def one(key: str) -> Record | DamagedEpisode:
         try:
@@ -162,7 +162,7 @@ def verify_all(
 
 
 def keys(root: Path) -> list[str]:
-    """Committed episodes, in order of trocar, trial and seed."""
+    """Returns the keys of committed episodes, ordered by trocar, trial and seed."""
     folder = root / "episodes"
     # others are not ours: file systems and desktops leave files there, and folders (`@eaDir`)
     return sorted(path.name for path in folder.glob("*/") if is_key(path.name))
@@ -179,7 +179,7 @@ def remove(root: Path, key: str) -> None:
 
 
 def is_sealed(root: Path) -> bool:
-    """Whether the dataset is complete."""
+    """Returns True if the dataset is complete."""
     return (root / "SEALED.json").exists()
 
 
@@ -193,7 +193,7 @@ def seal(root: Path, records: Mapping[str, Record]) -> str:
 
 
 def read_seal(root: Path) -> dict[str, Any]:
-    """The content of SEALED.json after checking it and dataset.json.
+    """Reads SEALED.json, and checks it and dataset.json.
 
     Raises:
       ValueError: the dataset is not complete, or one of the two files is damaged.

@@ -60,7 +60,7 @@ class Batch:
 def split_holdout(
     start: Any, length: Any, trocar: rcm.TrocarFrame, holdout: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames to train on and frames kept out, by whole demonstrations.
+    """Splits the frames into training and held-out ones, by whole demonstrations.
 
     Args:
       start: `[D]` first frame of each demonstration.
@@ -112,7 +112,7 @@ def padded_count(count: int) -> int:
 
 
 def window_frames(frame: Any, first: Any, last: Any, obs_horizon: int, horizon: int):
-    """Frame numbers of each window; the first and last frames of a demonstration repeat.
+    """Returns the frame numbers of each window; a demonstration's ends repeat.
 
     Args:
       frame: `[B]` frame t of each window; works on numpy and on jax arrays alike.
@@ -134,7 +134,7 @@ def window_frames(frame: Any, first: Any, last: Any, obs_horizon: int, horizon: 
 
 
 def gather(dataset: Dataset, frame: Any, obs_horizon: int, horizon: int) -> Batch:
-    """The windows at frames `[...]`, as arrays of the dataset's own kind (numpy or jax)."""
+    """Gathers the windows at frames `[...]`, as arrays of the dataset's kind (numpy or jax)."""
     shape = frame.shape
     frame = frame.reshape(-1)
     episode = dataset.episode[frame]
@@ -178,7 +178,7 @@ def over_frames(dataset: Dataset, frames: np.ndarray, fn: Callable[..., np.ndarr
 
 
 def on_device(dataset: Dataset) -> bool:
-    """Whether the frames are jax arrays, so that a compiled step may gather from them."""
+    """Returns True if the frames are jax arrays, which a compiled step can gather from."""
     return isinstance(dataset.episode, jax.Array)
 
 

@@ -17,7 +17,7 @@ WORST = ("rcm_max_mm", "rcm_within_max_mm", "rcm_commanded_max_mm", "distance_m"
 
 _TRIAL = {
     **dict.fromkeys(("trocar", "trial", "seed", "steps"), int),
-    **dict.fromkeys(PLACE, [NUMBER]),
+    **{name: [NUMBER] for name in PLACE},
     **dict.fromkeys(_FLAGS, bool),
     **dict.fromkeys([f"{name}?" for name in WORST], NUMBER),
     "labels": {"*": int},
@@ -29,7 +29,7 @@ RESULT: dict[str, Any] = {
     "method": str,
     "observation": str,
     "trials?": [_TRIAL],
-    "per_trocar?": [dict.fromkeys(PLACE, [NUMBER]) | {"trocar": int, "seen": bool} | _RATE],
+    "per_trocar?": [{name: [NUMBER] for name in PLACE} | {"trocar": int, "seen": bool} | _RATE],
     "seed?": int,
     "time_limit_s?": NUMBER,
     "control_hz": NUMBER,

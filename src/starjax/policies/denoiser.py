@@ -1,4 +1,4 @@
-"""A U-Net that undoes noise, whatever the process: a model of sequences."""
+"""Sequence model of a U-Net and a noising process (diffusion, flow, shortcut)."""
 
 from typing import Any
 
@@ -17,11 +17,11 @@ _MATRICES = {"kernel", "film_time", "film_cond"}
 def make(
     unet: unet1d.ConditionalUnet1D, process: Process, horizon: int, temperature: float
 ) -> SequenceModel:
-    """The model of a network and a process.
+    """Builds the model of a network and a process.
 
     Args:
-      unet: predicts what the process asks for.
-      process: how sequences become noise and are generated.
+      unet: predicts the target of the process.
+      process: noising and sampling of sequences.
       horizon: H.
       temperature: of a sample's first noise.
     """

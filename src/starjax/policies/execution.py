@@ -15,10 +15,10 @@ def command(
     action: jax.Array,
     trocar: rcm.TrocarFrame,
 ) -> Command:
-    """Commands `[B, H, A]` of normalised actions `[B, H, A * (dim + 1)]`, as `normalizer.encode`.
+    """Decodes normalised actions `[B, H, A * (dim + 1)]` to commands `[B, H, A]`.
 
-    A non-finite action of an arm becomes its action space's hold pose, with the jaws closed: what
-    is held is not dropped.
+    A non-finite action of an arm becomes its action space's hold pose with the jaws closed, which
+    keeps a held object.
 
     Args:
       method: gives the action space, and whether poses are projected onto the RCM manifold.

@@ -17,10 +17,10 @@ _LENGTH = 0.05  # m, the largest displacement of a trocar in Eq. 19: features ar
 
 
 class Sensors(NamedTuple):
-    """Observations that a policy is given.
+    """Observations of a policy.
 
     Attributes:
-      task: says what the state is made of.
+      task: fields of the state.
       cameras: K names, in the order in which the networks read their images.
     """
 
@@ -45,17 +45,17 @@ class Inputs(NamedTuple):
 
 
 def select_sensors(task: Task, cameras: Sequence[str] = ()) -> Sensors:
-    """The given cameras of a task, or its first one."""
+    """Returns a task's sensors with the given cameras, by default the first one."""
     return Sensors(task, tuple(cameras) or task.cameras[:1])
 
 
 def per_step(trocar: rcm.TrocarFrame) -> rcm.TrocarFrame:
-    """Frames `[B, A]` as `[B, 1, A]`, beside what has a time axis."""
+    """Adds a time axis: frames `[B, A]` become `[B, 1, A]`."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], trocar)
 
 
 def trocar_features(trocar: rcm.Trocar) -> jax.Array:
-    """A trocar `[...]` as `[..., 7]` numbers of order one, continuous in the azimuth."""
+    """Encodes trocars `[...]` as `[..., 7]` numbers of order one, continuous in the azimuth."""
     shift = rcm.trocar_position(trocar, jnp.zeros(3))  # from the nominal one
     scalars = jnp.stack(
         [
@@ -70,18 +70,18 @@ def trocar_features(trocar: rcm.Trocar) -> jax.Array:
 
 
 def trocar_condition_dim(method: methods.Method, task: Task) -> int:
-    """Width of `trocar_condition`."""
+    """Returns the size of `trocar_condition`."""
     return TROCAR_FEATURES * task.arms if method.sees_trocar else 0
 
 
 def trocar_condition(method: methods.Method, trocar: rcm.TrocarFrame) -> jax.Array:
-    """Condition of a model beside the observation: all trocars' features `[B, E]`, or none."""
+    """Returns the features of all trocars `[B, E]`; E = 0 if the method ignores the trocar."""
     found = trocar_features(trocar.trocar)
     return found.reshape(len(found), -1) if method.sees_trocar else jnp.zeros((len(found), 0))
 
 
 def history_dim(policy_config: config.PolicyConfig, task: Task, proprioception: int) -> int:
-    """Width of `Inputs.history`, of which so much is proprioception."""
+    """Returns the size of `Inputs.history`; `proprioception` is that of measured poses."""
     if policy_config.observation == "image":
         return proprioception
     state, tips = jnp.zeros(task.state_size), jnp.zeros((task.arms, 3))
@@ -95,7 +95,7 @@ def encode_proprioception(
     observation: Observation,
     trocar: rcm.TrocarFrame,
 ) -> jax.Array:
-    """Proprioception `[B, O, D]`: measured poses and grippers as normalised actions."""
+    """Encodes measured poses and grippers as normalised actions `[B, O, D]`."""
     encoded = normalizer.encode(
         action_space, observation.pose, observation.gripper, per_step(trocar)
     )
@@ -105,7 +105,7 @@ def encode_proprioception(
 def encode_commands(
     stats: normalizer.Normalizer, action_space: str, batch: windows.Batch
 ) -> jax.Array:
-    """Demonstrated commands of a batch as normalised actions `[B, H, D]`."""
+    """Encodes the commands of a batch as normalised actions `[B, H, D]`."""
     command = batch.command
     encoded = normalizer.encode(action_space, command.pose, command.gripper, per_step(batch.trocar))
     return stats.action.normalize(encoded)
@@ -118,7 +118,7 @@ def inference_inputs(
     observation: Observation,
     proprioception: jax.Array,
 ) -> Inputs:
-    """Inputs as they are at inference: centre crops, no noise."""
+    """Returns the inputs of inference: centre crops, no noise."""
     history = _history(policy_config, sensors.task, stats, observation, proprioception)
     if policy_config.observation == "state":
         return Inputs(history)
@@ -136,9 +136,9 @@ def training_inputs(
     observation: Observation,
     proprioception: jax.Array,
 ) -> Inputs:
-    """Augmented inputs: noise on every low-dimensional number; crop, jitter, noise on images.
+    """Returns augmented inputs: noise on low-dimensional entries; crop, jitter, noise on images.
 
-    What a frozen encoder saw in centre crops stays as it is, so that inference sees the same.
+    Features of a frozen encoder, computed on centre crops, are not augmented.
     """
     key_history, key_image = jax.random.split(key)
     history = _history(policy_config, sensors.task, stats, observation, proprioception)
@@ -160,14 +160,14 @@ def training_inputs(
 
 
 def centre_crop(policy_config: config.PolicyConfig, images: jax.Array) -> jax.Array:
-    """Images `[..., h, w, 3]` uint8 as the vision encoder sees them at inference."""
+    """Crops images `[..., h, w, 3]` uint8 at the centre for the vision encoder."""
     return augment.center(
         images, crop=crop_size(policy_config), dtype=jnp.dtype(policy_config.dtype)
     )
 
 
 def crop_size(policy_config: config.PolicyConfig) -> int:
-    """Side of the crop in pixels."""
+    """Returns the side of the crop in pixels."""
     return round(policy_config.image_size * policy_config.crop_fraction)
 
 
@@ -191,7 +191,7 @@ def _history(
 
 
 def _images(sensors: Sensors, observation: Observation) -> jax.Array:
-    """`[B, O, K, h, w, 3]`."""
+    """Stacks the images of all cameras to `[B, O, K, h, w, 3]`."""
     given = observation.images or {}
     missing = [name for name in sensors.cameras if name not in given]
     if missing:

@@ -1,4 +1,4 @@
-"""Networks that read observations, and a learner's model of sequences given what they make of them.
+"""Observation encoders, and a learner's sequence model conditioned on their output.
 
 Images are read one by one, by one encoder for all moments and cameras.
 """
@@ -39,7 +39,7 @@ class Generator(NamedTuple):
 def sizes(
     policy_config: config.PolicyConfig, sensors: features.Sensors, action: int, trocar: int = 0
 ) -> Sizes:
-    """Sizes for actions of so many numbers, where so many tell of the trocars."""
+    """Returns the sizes for actions of `action` entries and trocar features of size `trocar`."""
     sees_image = policy_config.observation == "image"
     return Sizes(
         horizon=policy_config.horizon,
@@ -57,12 +57,12 @@ def make(
     sensors: features.Sensors,
     action: int,
 ) -> Generator:
-    """The networks of the settings.
+    """Builds the networks of the settings.
 
     Args:
-      method: says whether trocars are told.
+      method: its row says if the model is conditioned on the trocar.
       policy_config: networks, and the learner.
-      sensors: what is observed.
+      sensors: observed cameras and task.
       action: D, numbers of an action, and of the proprioception of a moment.
     """
     dtype = jnp.dtype(policy_config.dtype)
@@ -102,7 +102,7 @@ def make(
     def prepare_for_inference(params: Params) -> Params:
         found = _cast_vision(params, dtype)
         if packed_params.pays(jax.default_backend()):
-            # A decision for one robot begins the later, the more arrays it is handed.
+            # One robot's inference starts later the more arrays are passed: pack them.
             readers = found.keys() - {"learner"}
             found = {**found, **{name: packed_params.packed(found[name]) for name in readers}}
         return {**found, "learner": model.prepare_for_inference(params["learner"])}
@@ -111,7 +111,7 @@ def make(
 
 
 def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:
-    """The network that reads images, whose parameters are `params["vision"]`."""
+    """Builds the image encoder, whose parameters are `params["vision"]`."""
     return encoders.ImageEncoder(
         trunk=policy_config.encoder,
         features=policy_config.vision_dim,
@@ -120,7 +120,7 @@ def vision_encoder(policy_config: config.PolicyConfig) -> encoders.ImageEncoder:
 
 
 def _cast_vision(params: Params, dtype: jnp.dtype) -> Params:
-    """The trunk's kernels cast_params; other parameters as they are."""
+    """Casts the trunk's kernels; returns other parameters unchanged."""
     if "vision" not in params:
         return params
     inner = params["vision"]["params"]

@@ -1,7 +1,7 @@
-"""STAR-Diff: a model of (position, gripper), not trocar the trocar, and a network for the roll.
+"""STAR-Diff: a trocar-agnostic model of (position, gripper), and a network for the roll.
 
-Of several arms, positions and grippers are generated together; one roll network serves each arm in
-turn, with that arm's path, trocar and measured rolls.
+Positions and grippers of several arms are generated together; one roll network serves every arm,
+with that arm's path, trocar and measured rolls.
 """
 
 from typing import Any, NamedTuple
@@ -17,9 +17,9 @@ from starjax.policies import execution, features, generator, sequences
 from starjax.policies.base import Params, Policy
 from starjax.types import Command, Observation
 
-# Demonstrated positions and rolls are exact, sampled and measured ones are not: noise on the roll
-# network's inputs (standard deviation, normalised units) keeps small errors from feeding on
-# themselves, and a history that cannot be trusted keeps it from copying the last roll.
+# Noise on the roll network's inputs (standard deviation, normalised units): demonstrated positions
+# and rolls are exact, sampled and measured ones are not. It keeps small errors from accumulating,
+# and the network from copying the last measured roll.
 POSITION_NOISE = 0.02
 ROLL_NOISE = 0.05
 
@@ -28,9 +28,9 @@ class PreparedHierarchy(NamedTuple):
     """A batch as the networks learn from it.
 
     Attributes:
-      inputs: what was observed.
-      trocar_condition: `[B, E]`, what conditions the model of positions beside it.
-      model_inputs: what that model learns from.
+      inputs: observations.
+      trocar_condition: `[B, E]` trocar features of the position model; E = 0 by default.
+      model_inputs: prepared inputs of the position model's loss.
       p: `[B, H, A, 3]` demonstrated positions with noise, for the roll network.
       trocar: `[B, A, 7]` features.
       history: `[B, O, A]` measured rolls with noise.
@@ -52,7 +52,7 @@ def make(
     sensors: features.Sensors,
     train_config: config.TrainConfig,
 ) -> Policy:
-    """The hierarchical policy in an action space of (roll, position)."""
+    """Builds the hierarchical policy in an action space of (roll, position)."""
     space = rcm.ACTION_SPACES[method.action_space]
     if set(space.slices) != {"roll", "p"}:
         raise ValueError(
@@ -90,7 +90,7 @@ def make(
         history: jax.Array,
         condition: sequences.Condition,
     ) -> jax.Array:
-        """Eq. 13 `[B, H, A]`, but for what an ablation adds or leaves out."""
+        """Predicts the rolls `[B, H, A]` along a path (Eq. 13, with the inputs of ablations)."""
         batch, horizon = p.shape[:2]
         more = None
         if policy_config.roll_observation:
@@ -132,7 +132,7 @@ def make(
         )
 
     def loss(params: Params, prepared: PreparedHierarchy) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Eq. 15."""
+        """Returns position loss + lambda * roll loss (Eq. 15)."""
         condition = networks.observe(params, prepared.inputs, prepared.trocar_condition)
         position_loss, metrics = model.loss(params["learner"], condition, prepared.model_inputs)
         path = prepared.p, prepared.trocar, prepared.history
@@ -148,6 +148,7 @@ def make(
         observation: Observation,
         trocar: rcm.TrocarFrame,
     ) -> Command:
+        # 1. positions and grippers (Eq. 12), conditioned on the trocar by some methods only
         measured = _measured(stats, observation, trocar)
         inputs = features.inference_inputs(
             policy_config, sensors, stats, observation, generated(measured)
@@ -157,10 +158,11 @@ def make(
         reach = None if reach is None else generated(reach)
         x0 = model.sample(params["learner"], keys, condition, reach)
         p, gripper = jnp.split(by_arm(x0), [3], axis=-1)
+        # 2. rolls along the sampled path (Eq. 13), clipped to the demonstrated range
         about = features.trocar_features(trocar.trocar)
         gamma = rolls_along(params, p, about, by_arm(measured)[..., roll], condition)
-        # within the demonstrated range, as what is generated
         gamma = jnp.clip(gamma, -1.0, 1.0)[..., None]
+        # 3. action vector in the order of the space, decoded on the RCM manifold (Alg. 1)
         parts = {"roll": gamma, "p": p}
         ordered = sorted(parts, key=lambda name: space.slices[name].start)
         action = jnp.concatenate([*(parts[name] for name in ordered), gripper], axis=-1)
@@ -168,11 +170,11 @@ def make(
         return execution.command(method, stats, action, trocar)
 
     def by_arm(vector: jax.Array) -> jax.Array:
-        """`[..., A * n]` as `[..., A, n]`."""
+        """Splits `[..., A * n]` by arm into `[..., A, n]`."""
         return vector.reshape(*vector.shape[:-1], arms, -1)
 
     def generated(vector: jax.Array) -> jax.Array:
-        """Each arm's position and gripper `[..., A * 4]` of actions `[..., A * (dim + 1)]`."""
+        """Extracts positions and grippers `[..., A * 4]` from actions `[..., A * (dim + 1)]`."""
         parts = by_arm(vector)
         kept = jnp.concatenate([parts[..., position], parts[..., -1:]], axis=-1)
         return kept.reshape(*vector.shape[:-1], -1)

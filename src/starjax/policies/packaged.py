@@ -14,21 +14,21 @@ _SUFFIX = ".safetensors"
 
 
 def names() -> list[str]:
-    """Names of the policies that are there."""
+    """Lists packaged policies."""
     return sorted(path.stem for path in FOLDER.glob(f"*{_SUFFIX}"))
 
 
 def locate(name_or_path: str) -> Path:
-    """The packaged file of this name, else the path as it is; it may not exist."""
+    """Returns the packaged file of this name, else the path itself, which may not exist."""
     is_packaged = name_or_path in names()
     return FOLDER / f"{name_or_path}{_SUFFIX}" if is_packaged else Path(name_or_path)
 
 
 def find(argument: str, name_or_path: str) -> Path:
-    """The file that `locate` gives; `./name` is never a packaged one.
+    """Returns the file that `locate` names; `./name` is never a packaged one.
 
     Raises:
-      errors.UsageError: there is none, or it may not be read; of `argument`.
+      errors.UsageError: the file of `argument` is missing or not readable.
     """
     path = locate(name_or_path)
     if not path.is_file():

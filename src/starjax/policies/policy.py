@@ -1,4 +1,4 @@
-"""The policy of a method: what its row says, learned as the settings say."""
+"""Policies of methods: a row of the table and the settings give pure functions."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ __all__ = ["Params", "Policy", "ablated", "make"]
 
 
 def ablated(method: methods.Method, policy_config: config.PolicyConfig) -> methods.Method:
-    """The row as settings change it: what it sees and how its poses are written."""
+    """Returns the row with the ablations of the settings: trocar condition and frame {T}."""
     if policy_config.sees_trocar != "method":
         method = method._replace(sees_trocar=policy_config.sees_trocar == "always")
     fixed = f"{method.action_space}_fixed_yaw"
@@ -27,15 +27,14 @@ def make(
     train_config: config.TrainConfig | None = None,
     cameras: Sequence[str] = (),
 ) -> Policy:
-    """The policy of a method.
+    """Builds the policy of a method.
 
     Args:
       method: a row of `methods.METHODS`.
       policy_config: networks, and the learner.
-      task: gives the number of arms, and what a state observation is made of.
+      task: number of arms and fields of the state.
       train_config: augmentation, which inference does not need.
-      cameras: that are observed, in the order in which the networks read them; empty: the task's
-        first one.
+      cameras: observed cameras in the networks' order; by default the task's first one.
     """
     method = ablated(method, policy_config)
     build = hierarchical.make if method.hierarchical else single.make

@@ -31,13 +31,13 @@ class Trained(NamedTuple):
     Attributes:
       method: its name, a key of `methods.METHODS`.
       policy: networks and diffusion.
-      train: how it was trained, for the record.
+      train: training settings, for the record.
       params: the averaged (EMA) parameters.
       normalizer: fitted to the training demonstrations.
       scene: names of its task, arms and tools, and of the cameras in the order that it reads them.
       p_world_ref: `[A][3]` m, each arm's nominal trocar, None in old files that do not say it.
       roll_zero: `[A]` rad, see `rcm.TrocarFrame`.
-      demos: what it learned from, if it was given; for the record, and for what it has seen.
+      demos: settings of its demonstrations, if known; they name the seen trocars.
       preset: the preset of its run, if it was given; for the record.
     """
 
@@ -58,9 +58,9 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
 
     Args:
       path: of the file.
-      trained: what to write.
-      half: floating-point parameters as float16, within a 2048th of what they were, or 3e-8 where
-        they are below 6e-5. The normaliser stays as it is.
+      trained: the policy.
+      half: store floating-point parameters as float16, with a relative error of at most 1/2048,
+        or an absolute one of 3e-8 below 6e-5. The normaliser stays float32.
 
     Raises:
       ValueError: a parameter is not finite, or too large for float16.
@@ -103,7 +103,7 @@ def load(path: pathlib.Path | str) -> Trained:
     path = pathlib.Path(path)
     if not path.is_file():
         raise ValueError(f"policy: expected a file, got {path}")
-    open(path, "rb").close()  # safetensors would say of one that may not be read that it is missing
+    open(path, "rb").close()  # safetensors reports an unreadable file as missing
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
@@ -118,7 +118,7 @@ def load(path: pathlib.Path | str) -> Trained:
     if schema != SCHEMA:
         raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}; train it again")
     if _hash(about, arrays) != expected:
-        raise ValueError(f"{path}: damaged, its content is not what was written (sha256)")
+        raise ValueError(f"{path}: damaged, its content has another sha256")
     try:
         return _trained(about, _unflatten(arrays))
     except (KeyError, TypeError, ValueError) as error:
@@ -127,7 +127,7 @@ def load(path: pathlib.Path | str) -> Trained:
 
 
 def is_policy(path: pathlib.Path | str) -> bool:
-    """Whether a file begins as `save` begins one; it may still be damaged."""
+    """Returns True if a file has the metadata of `save`; it may still be damaged."""
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             return _KEY in (file.metadata() or {})
@@ -136,12 +136,12 @@ def is_policy(path: pathlib.Path | str) -> bool:
 
 
 def fingerprint(params: Params) -> str:
-    """SHA-256 of parameters and of their names."""
+    """Returns the SHA-256 of parameters and their names."""
     return _hash({}, dict(_flatten(params)))
 
 
 def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
-    """Parses what `save` wrote; raises KeyError, TypeError or ValueError for anything else."""
+    """Parses the content of a file; raises KeyError, TypeError or ValueError if it is malformed."""
     stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
     places, demos, scene = about["p_world_ref"], about.get("demos"), about["scene"]
     return Trained(
@@ -161,12 +161,12 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
 
 
 def _floats(values: Any) -> Any:
-    """Nested sequences of numbers, of numpy or not, as lists for JSON."""
+    """Converts nested sequences of numbers to lists for JSON."""
     return None if values is None else np.asarray(values, np.float64).tolist()
 
 
 def _flatten(tree: Any, prefix: str = ""):
-    """(path, numpy array) of every leaf of nested dicts."""
+    """Yields (path, numpy array) for every leaf of nested dicts."""
     for name in sorted(tree):
         value, path = tree[name], f"{prefix}{name}"
         if isinstance(value, dict):
@@ -176,7 +176,7 @@ def _flatten(tree: Any, prefix: str = ""):
 
 
 def _as_half(name: str, array: np.ndarray) -> np.ndarray:
-    """Floating-point numbers as float16, others as they are."""
+    """Casts floating-point numbers to float16; returns other arrays unchanged."""
     if not np.issubdtype(array.dtype, np.floating):
         return array
     most, largest = np.finfo(np.float16).max, np.abs(array).max(initial=0)

@@ -1,4 +1,4 @@
-"""A learner, as policies know it: sequences of normalised actions, given what was observed."""
+"""Interface of learners: generative models of normalised action sequences."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ class Sizes(NamedTuple):
       obs_horizon: O, that are observed.
       vision: V, numbers that one moment's images become; 0 without images.
       state: d_s, numbers that the low-dimensional history becomes.
-      trocar: E, numbers that tell of the trocars; may be 0.
+      trocar: E, size of the trocar features; may be 0.
     """
 
     horizon: int
@@ -65,7 +65,7 @@ class SequenceModel(NamedTuple):
         and highest, or if it is None within [-1, 1]. Sample i depends on `keys[i]` alone.
       cast_params: `params -> params` whose large matrices are in the type that is calculated in.
       prepare_for_inference: `params -> params` as `sample` uses them fastest here.
-      metrics: names of what `loss` tells beside its value.
+      metrics: names of the metrics that `loss` returns.
     """
 
     init: Callable[[jax.Array], Params]
@@ -78,7 +78,7 @@ class SequenceModel(NamedTuple):
 
 
 def observation_vector(condition: Condition) -> jax.Array:
-    """`[B, N]`, all that was observed."""
+    """Returns the observation `[B, N]`: image features, then the low-dimensional history."""
     if condition.vision is None:
         return condition.state
     flat = condition.vision.reshape(len(condition.vision), -1)
@@ -86,7 +86,7 @@ def observation_vector(condition: Condition) -> jax.Array:
 
 
 def condition_vector(condition: Condition) -> jax.Array:
-    """`[B, N + E]`, what was observed and what is trocar."""
+    """Returns the observation and the trocar features `[B, N + E]`."""
     vector = observation_vector(condition)
     # XLA of jax 0.11 crashes on an empty array that is concatenated under `shard_map`
     return (
@@ -97,10 +97,10 @@ def condition_vector(condition: Condition) -> jax.Array:
 
 
 def cast_params(params: Any, names: set[str], dtype: Any) -> Any:
-    """Parameters with the leaves of these names in another type.
+    """Casts the leaves of these names to another dtype.
 
-    Networks round them so anyway, to the same numbers, wherever they use them. Done before, they
-    are not read in float32 and cast_params again at each of many evaluations.
+    Networks cast them anyway, to the same numbers. Casting once avoids reading float32 at each of
+    many evaluations.
     """
 
     def one(path: tuple[Any, ...], leaf: Any) -> Any:

@@ -25,7 +25,7 @@ def make(
     sensors: features.Sensors,
     train_config: config.TrainConfig,
 ) -> Policy:
-    """The policy that generates (pose in the method's action space, gripper) of all arms."""
+    """Builds the policy that generates poses in the action space and grippers of all arms."""
     dim = sensors.task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
     networks = generator.make(method, policy_config, sensors, dim)
     model = networks.model

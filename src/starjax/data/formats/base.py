@@ -1,4 +1,4 @@
-"""Common ground of all formats: datasets as named columns of episodes, records of functions."""
+"""Interface of all formats: datasets as named columns of episodes."""
 
 import contextlib
 import math
@@ -20,8 +20,8 @@ FORMATS = Registry(
         "zarr": "starjax.data.formats.zarr:FORMAT",
     },
 )
-OURS = "starjax"  # name of what an export adds so that it comes back whole
-MEMORY_SHARE = 0.25  # of the host's, that what is read of one episode may take
+OURS = "starjax"  # name of the metadata and columns from which an export is restored
+MEMORY_SHARE = 0.25  # of the host's memory, for one episode
 _MOST_HZ = 1e5
 
 
@@ -31,7 +31,7 @@ class Column(NamedTuple):
     Attributes:
       shape: of one control step.
       dtype: numpy's name, e.g. `float32`.
-      names: of its numbers, empty where nobody has named them.
+      names: names of its entries, may be empty.
     """
 
     shape: tuple[int, ...]
@@ -40,7 +40,7 @@ class Column(NamedTuple):
 
     @property
     def is_image(self) -> bool:
-        """Whether its steps are pictures, `[h, w, 3]` uint8."""
+        """True for images `[h, w, 3]` uint8."""
         return self.dtype == "uint8" and len(self.shape) == 3 and self.shape[2] == 3
 
 
@@ -48,13 +48,14 @@ class Source(NamedTuple):
     """A dataset of any format, read an episode at a time.
 
     Attributes:
-      hz: control steps a second; 0 where nobody says.
+      hz: control steps per second; 0 if unknown.
       lengths: control steps of each episode.
-      columns: by the names that the format calls them.
+      columns: by the format's names.
       read: (episode, names of columns) -> name -> `[T, ...]`.
-      origin: what `exchange.origin` says of an export of ours, None of other people's files.
-      task: what is done, in words. robot: who does it.
-      notes: what is odd about the files, a line each.
+      origin: metadata of a starjax export, None for other datasets.
+      task: description of the task.
+      robot: name of the robot.
+      notes: anomalies of the files, one per line.
     """
 
     hz: float
@@ -73,7 +74,7 @@ class Format(NamedTuple):
     Attributes:
       description: a line for people.
       named: a column of ours, e.g. `state` or `image_camera` -> as the format's users call it.
-      recognises: whether a path holds a dataset of it, by a look at names alone.
+      recognises: path -> True if it holds a dataset of this format, judged by file names alone.
       open: (path) -> context with its `Source`. It may raise anything: `open_dataset` explains it.
       write: (path that is not there, Source, video) writes it; `video` is whether images may lose
         a little, where the format has such.
@@ -87,26 +88,26 @@ class Format(NamedTuple):
 
 
 def detect(path: Path) -> str:
-    """Name of the format of what lies at `path`.
+    """Returns the name of the format of the dataset at `path`.
 
     Raises:
-      errors.UsageError: nothing lies there, or nothing that a format knows.
+      errors.UsageError: the path does not exist or has an unknown format.
     """
     if not path.exists():
-        raise errors.UsageError("PATH", "a dataset", f"{path}: nothing is there")
+        raise errors.UsageError("PATH", "a dataset", f"{path}, which does not exist")
     found = [name for name in FORMATS.names() if FORMATS.get(name).recognises(path)]
     if not found:
         known = ", ".join(FORMATS.names())
-        raise errors.UsageError("PATH", f"a dataset of {known}", f"{path}: none of them")
+        raise errors.UsageError("PATH", known, f"{path} of unknown format")
     return found[0]
 
 
 @contextlib.contextmanager
 def open_dataset(path: Path, name: str) -> Iterator[Source]:
-    """The dataset of format `name` at `path`; what is wrong with its files is one line.
+    """Opens the dataset of format `name` at `path`; errors of its files become one line.
 
     Raises:
-      errors.UsageError: naming the path, and what the library that reads it says.
+      errors.UsageError: names the path and the error of the library that reads it.
     """
     form = FORMATS.get(name)
     with contextlib.ExitStack() as stack:
@@ -133,26 +134,26 @@ class Damaged(ValueError):
 
 
 def require(holds: bool, what: str, got: Any) -> None:
-    """Raises Damaged, for a reader, unless `holds`."""
+    """Raises Damaged unless `holds`."""
     if not holds:
         raise Damaged(f"expected {what}, got {got}")
 
 
 def require_inside(root: Path, path: Path) -> Path:
-    """A file of a dataset that lies in its folder: names in files are not trusted."""
+    """Returns `path` if it lies in the dataset's folder: names in files are not trusted."""
     require(path.resolve().is_relative_to(root.resolve()), f"a path inside {root}", path)
     return path
 
 
 def require_fits(name: str, shape: Sequence[int], dtype: Any) -> None:
-    """Raises Damaged for an array that a file only claims, larger than this machine can hold."""
+    """Raises Damaged for an array whose header claims more than this machine's memory."""
     count = math.prod(shape) * np.dtype(dtype).itemsize
     most = MEMORY_SHARE * xla.memory_bytes()
     require(0 <= count <= most, f"at most {files.size(most)} an episode of {name}", count)
 
 
 def _require_all_fit(source: Source, episode: int, names: Collection[str]) -> None:
-    """Raises Damaged where columns, none of them too large, are so together."""
+    """Raises Damaged if the columns together need too much memory."""
     columns = [source.columns[name] for name in names]
     row = sum(math.prod(c.shape) * np.dtype(c.dtype).itemsize for c in columns)
     require_fits("all columns", (source.lengths[episode], row), np.uint8)

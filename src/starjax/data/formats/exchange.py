@@ -1,4 +1,4 @@
-"""Our datasets as other formats, and back: exports carry enough to come back as they were.
+"""Export of starjax datasets to other formats, and restoring them byte by byte.
 
 An export has the columns that its peers expect (state, action, trocar, images) and every field of
 ours as it is, under `starjax.<field>`. Images are there once.
@@ -25,7 +25,7 @@ _AXES = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
 
 
 def source(root: Path, form: base.Format) -> Source:
-    """A sealed dataset of ours as what a format writes.
+    """Returns a sealed starjax dataset as the source of an export.
 
     Raises:
       ValueError: it is not complete, or damaged.
@@ -78,10 +78,10 @@ def export(
     video: bool = True,
     note: Callable[[int], None] = lambda count: None,
 ) -> None:
-    """Writes what `source` found; `out` appears once all of it is there.
+    """Writes a source in a format; `out` appears once complete.
 
     Args:
-      note: hears of every episode that is written.
+      note: called with 1 after every written episode.
     """
 
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
@@ -104,7 +104,7 @@ def restore_export(
       {"digest", "episodes", "same"}: `same` is whether every byte is as it was.
 
     Raises:
-      errors.UsageError: what the origin says is not what a dataset has.
+      errors.UsageError: the origin does not describe a dataset.
     """
     assert found.origin is not None
     origin = _checked(found.origin, found)
@@ -129,7 +129,7 @@ def restore_export(
 
 @contextlib.contextmanager
 def _staged(out: Path) -> Iterator[Path]:
-    """Where to write what then becomes `out` at once."""
+    """Yields a path to write; it becomes `out` at once."""
     staged = out.with_name(f".{out.name}.tmp")
     out.parent.mkdir(parents=True, exist_ok=True)
     _remove(staged)
@@ -176,7 +176,7 @@ def _arrays(root: Path, about: dict[str, Any], record: store.Record) -> dict[str
 
 
 def _extra(description: dict[str, Any]) -> dict[str, Column]:
-    """Columns that peers expect, made of ours."""
+    """Returns the columns that other tools expect, derived from starjax's fields."""
     arms = len(description["p_world_ref"])
     names = [f"arm{i}_{axis}" if arms > 1 else axis for i in range(arms) for axis in _AXES]
     places = [
@@ -215,10 +215,10 @@ def _derived(
 
 
 def _poses(p: np.ndarray, R: np.ndarray, gripper: np.ndarray) -> np.ndarray:
-    """Positions, quaternions xyzw without jumps, jaws: `[T, 8 A]`."""
+    """Packs positions, continuous quaternions xyzw and grippers to `[T, 8 A]`."""
     turned = transform.Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
     turned = turned.reshape(*R.shape[:2], 4)
-    # A quaternion and its opposite are one rotation: that nearer to the last one.
+    # q and -q are one rotation: keep the one nearer to the previous step.
     ahead = np.where(np.sum(turned[1:] * turned[:-1], -1, keepdims=True) < 0, -1.0, 1.0)
     turned[1:] *= np.cumprod(ahead, axis=0)
     rows = np.concatenate([p, turned, gripper[..., None]], -1)
@@ -226,7 +226,7 @@ def _poses(p: np.ndarray, R: np.ndarray, gripper: np.ndarray) -> np.ndarray:
 
 
 def _checked(origin: dict[str, Any], found: Source) -> dict[str, Any]:
-    """An origin whose parts are there and fit the files; it may have been edited by anybody."""
+    """Checks that an origin is complete and fits the files; it is untrusted input."""
     try:
         description, records = origin["description"], origin["records"]
         counts = len(records), len(origin["stored"])
@@ -251,7 +251,7 @@ def _checked(origin: dict[str, Any], found: Source) -> dict[str, Any]:
 
 
 def _ours(found: Source, origin: dict[str, Any], episode: int) -> dict[str, list[np.ndarray]]:
-    """Fields of an episode in the order in which `rollouts.episodes.assemble` has them."""
+    """Reads the fields of an episode in the order of `rollouts.episodes.assemble`."""
     names, features = origin["columns"], origin["description"]["features"]
     arrays = found.read(episode, [names[field] for field in features])
     return {

@@ -1,6 +1,6 @@
-"""Somebody's demonstrations as a dataset of ours, by a mapping: two readings of the files.
+"""Import of other datasets through a mapping, in two passes over the files.
 
-The first reads numbers alone: what is odd, and where the trocars are. The second writes episodes,
+The first reads numbers only, for anomalies and trocars. The second writes episodes,
 with images, as `data.demos` would have.
 """
 
@@ -32,7 +32,7 @@ class Imported(NamedTuple):
       episodes: kept. left_out: not kept. frames: of those that are kept.
       p_world_trocar: `[E, A, 3]` m of the kept episodes.
       residual_mm: `[E, A]` root mean square of the shafts' distances from it.
-      notes: what is odd, a line each.
+      notes: anomalies, one per line.
     """
 
     digest: str
@@ -58,11 +58,11 @@ def import_mapped(
     folder: Path,
     note: Callable[[int], None] = lambda count: None,
 ) -> Imported:
-    """Writes a sealed dataset at `root`; of a killed run what is there is kept.
+    """Writes a sealed dataset at `root`; a killed run is resumed.
 
     Args:
       folder: of the mapping file, where robots' models lie.
-      note: hears of every episode that is read.
+      note: called with 1 after every read or written episode.
 
     Raises:
       errors.UsageError: the mapping does not fit the files or the task, or no episode is left.
@@ -273,7 +273,7 @@ def _fields(
 
 
 def pictures(images: np.ndarray, camera: CameraColumn) -> np.ndarray:
-    """Images `[T, h, w, 3]` cropped, with red first, at the size that is asked for."""
+    """Crops images `[T, h, w, 3]`, orders them red first, and resizes them."""
     if camera.crop:
         top, left, height, width = camera.crop
         cut = images[:, top : top + height, left : left + width]

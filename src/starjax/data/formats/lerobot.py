@@ -8,7 +8,7 @@ v3.0 has episodes one after another in files of about 100 MB, v2.1 a file an epi
     videos/<camera>/chunk-000/...      images as video (v2.1: videos/chunk-000/<camera>/...)
     meta/starjax.json                  of our exports: what they need to come back whole
 
-Where files lie is not taken from templates in info.json, which anybody may have written.
+Templates of paths in info.json are untrusted and not used.
 """
 
 import contextlib
@@ -42,14 +42,14 @@ _CHUNK = 1000  # files a folder, where v2.1 does not say
 
 
 def named(column: str) -> str:
-    """LeRobot's name of a column of ours."""
+    """Returns LeRobot's name of a starjax column."""
     if column.startswith(episodes.IMAGE):
         return f"observation.images.{column.removeprefix(episodes.IMAGE)}"
     return _NAMES.get(column, column)
 
 
 class _Place(NamedTuple):
-    """Where an episode lies: its number, its file of numbers, of each camera video and start."""
+    """Files of an episode: its number, its table, and each camera's video and start time."""
 
     number: int
     length: int
@@ -94,7 +94,7 @@ def _open(path: Path) -> Iterator[Source]:
 
 
 def _column(feature: dict[str, Any]) -> Column | None:
-    """A feature as a column; None of one that has no numbers."""
+    """Converts a feature to a column; returns None for text."""
     kind, shape = feature["dtype"], tuple(int(n) for n in feature["shape"])
     base.require(all(n > 0 for n in shape), "sizes above 0", list(shape))
     if kind in ("image", "video"):
@@ -160,7 +160,7 @@ def _length(value: Any) -> int:
 
 
 def _rows(root: Path, place: _Place, names: list[str]) -> Any:
-    """The rows of an episode; row groups of others are skipped by their statistics."""
+    """Reads the rows of an episode; statistics let parquet skip other row groups."""
     if not names:
         return {}
     base.require(place.table.is_file(), "a file of numbers", f"none at {place.table}")
@@ -193,7 +193,7 @@ def _picture(cell: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _task(path: Path) -> str:
-    """The only task, in words; empty where there are several, or none is said."""
+    """Returns the task's description; empty if there is not exactly one."""
     modern, old = path / "meta/tasks.parquet", path / "meta/tasks.jsonl"
     said = []
     if modern.exists():

@@ -1,4 +1,4 @@
-"""The README of an exported dataset, as hubs show it: what it holds, and where it comes from."""
+"""README of an exported dataset for hubs: content and origin."""
 
 from typing import Any
 
@@ -20,11 +20,11 @@ configs:
 
 
 def card(info: dict[str, Any], source: Source) -> str:
-    """Text of the card.
+    """Returns the card's text.
 
     Args:
       info: content of meta/info.json.
-      source: what was written.
+      source: the written dataset.
     """
     origin = source.origin or {}
     about = origin.get("description", {})

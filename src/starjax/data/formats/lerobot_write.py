@@ -65,7 +65,7 @@ class _Numbered:
         self._root, self._kind, self._ending, self.count = root, kind, ending, -1
 
     def next(self) -> Path:
-        """The path of another one."""
+        """Returns the path of the next file."""
         self.count += 1
         chunk, file = divmod(self.count, CHUNK)
         path = self._root / self._kind / f"chunk-{chunk:03d}/file-{file:03d}.{self._ending}"
@@ -73,7 +73,7 @@ class _Numbered:
         return path
 
     def place(self) -> dict[str, int]:
-        """Columns that say which one it is."""
+        """Returns the columns that locate the current file."""
         chunk, file = divmod(self.count, CHUNK)
         return {f"{self._kind}/chunk_index": chunk, f"{self._kind}/file_index": file}
 
@@ -150,7 +150,7 @@ def _features(source: Source, hz: int, with_video: bool) -> dict[str, Any]:
 
 
 def _feature(column: Column) -> dict[str, Any]:
-    """Numbers of a step, in a row: peers read rows only."""
+    """Describes a column as a flat vector per step, the only shape that other tools read."""
     count = int(np.prod(column.shape))
     return {"dtype": column.dtype, "shape": [count], "names": list(column.names) or None}
 
@@ -202,7 +202,7 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def _described(feature: dict[str, Any]) -> dict[str, Any]:
-    """A feature as the package datasets says it."""
+    """Converts a feature to the notation of the package datasets."""
     if feature["dtype"] == "image":
         return {"_type": "Image"}
     value = {"dtype": feature["dtype"], "_type": "Value"}
@@ -274,7 +274,7 @@ def _meta(
 
 
 def _tasks(task: str) -> pa.Table:
-    """Tasks as pandas writes them: their words are the index."""
+    """Returns the table of tasks as pandas writes it, with the text as index."""
     table = pa.table({"task_index": pa.array([0]), "task": pa.array([task])})
     number = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
     words = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}

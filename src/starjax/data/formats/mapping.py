@@ -1,4 +1,4 @@
-"""A mapping file: which columns of somebody's dataset are what, in which units and frames.
+"""Mapping file: meaning, units and frames of the columns of a dataset.
 
 TOML or JSON. A column is named as the files name it, with the numbers that are meant:
 `observation.state[0:3]`, `action[6]`, or several as a list.
@@ -97,12 +97,12 @@ def load(path: Path) -> Map:
 
 
 def as_json(mapping: Map) -> dict[str, Any]:
-    """The mapping as JSON has it, for the record."""
+    """Returns the mapping as JSON values, for the record."""
     return json.loads(json.dumps(dataclasses.asdict(mapping)))
 
 
 def pick(arrays: Mapping[str, np.ndarray], columns: Columns, count: int = 0) -> np.ndarray:
-    """The numbers `[T, n]` that columns mean; `count` is how many there must be, 0 for any.
+    """Returns the entries `[T, n]` of columns; n must equal `count` unless that is 0.
 
     Raises:
       errors.UsageError: there are others, or one is not finite.
@@ -124,7 +124,7 @@ def pick(arrays: Mapping[str, np.ndarray], columns: Columns, count: int = 0) -> 
 
 
 def names(mapping: Map) -> list[str]:
-    """Columns that a mapping reads, but for images."""
+    """Returns the columns that a mapping reads, except images."""
     given = [mapping.time, mapping.state, mapping.success]
     for arm in mapping.arms:
         given += [arm.position, arm.rotation, arm.joints, arm.gripper, arm.trocar]
@@ -181,7 +181,7 @@ def _said(columns: Columns) -> str:
 
 
 def _part(text: str) -> tuple[str, int, int | None]:
-    """Column, first number, number after the last."""
+    """Parses a column's name and its slice: first index, and index after the last or None."""
     found = _PART.fullmatch(text)
     assert found is not None
     name, low, colon, high = found.groups()

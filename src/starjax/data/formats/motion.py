@@ -1,4 +1,4 @@
-"""Turns an episode of somebody's dataset into poses in the task's world, at our rate."""
+"""Conversion of an episode of another dataset to poses in the task's world at `HZ`."""
 
 import functools
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ class Motion(NamedTuple):
       gripper, command_gripper: `[T, A]` in [-1, 1].
       p_world_trocar: `[T, A, 3]` m, NaN where it is to be estimated.
       nearest: `[T]` step of the files whose images are shown.
-      notes: what is odd, a line each.
+      notes: anomalies, one per line.
     """
 
     pose: TipPoses
@@ -137,7 +137,7 @@ def _arm(arrays: Mapping[str, np.ndarray], arm: ArmColumns, mapping: Map, folder
 
 
 def rotations(numbers: np.ndarray, arm: ArmColumns) -> np.ndarray:
-    """Matrices `[T, 3, 3]` of rotations as somebody wrote them."""
+    """Converts rotations of any notation to matrices `[T, 3, 3]`."""
     kind = arm.rotation_as
     if kind.startswith("quat"):
         length = np.linalg.norm(numbers, axis=-1)
@@ -188,7 +188,7 @@ def _kinematics(joints: np.ndarray, arm: ArmColumns, path: Path) -> tuple[np.nda
 
 @functools.cache
 def _model(path: Path, joints: tuple[str, ...], tip: str, count: int) -> tuple:
-    """A robot's model, addresses of its joints, and the number of the site or body of its tip."""
+    """Loads a robot's model, its joints' addresses, and the id of the tip's site or body."""
     import mujoco
 
     try:
@@ -248,7 +248,7 @@ def _jumps(times: np.ndarray, pose: TipPoses, whose: str) -> list[str]:
 
 
 def _even(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Even times at our rate, and of each the nearest step of the files."""
+    """Returns even times at `HZ`, and the nearest recorded step of each."""
     if len(times) == 1 or np.abs(np.diff(times) * HZ - 1.0).max() < _EVEN:
         return times, np.arange(len(times))
     count = int(np.floor((times[-1] - times[0]) * HZ + 1e-6)) + 1
@@ -258,7 +258,7 @@ def _even(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sampled(arm: _Arm, times: np.ndarray, wanted: np.ndarray) -> _Arm:
-    """An arm at other times; what was not asked for is the next of its steps."""
+    """Resamples an arm; a missing command is the arm's next step."""
     if wanted is not times:
 
         def along(x: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ _MOST_DEEP = 6  # groups within groups
 
 
 def named(column: str) -> str:
-    """robomimic's name of a column of ours."""
+    """Returns robomimic's name of a starjax column."""
     if column.startswith(episodes.IMAGE):
         return f"obs/{column.removeprefix(episodes.IMAGE)}_image"
     return _NAMES.get(column, column.replace(".", "/", 1))
@@ -151,7 +151,7 @@ def _is_data(item: Any) -> bool:
 
 
 def _length(demo: Any) -> int:
-    """Control steps of an episode: of its actions, or what most of its datasets have."""
+    """Returns the control steps of an episode: those of its actions, or the most common length."""
     base.require(isinstance(demo, h5py.Group), "a group an episode", f"a dataset {demo.name}")
     if "actions" in demo:
         actions = demo["actions"]

@@ -1,4 +1,4 @@
-"""Where the trocars of imported episodes are: said by a column, or estimated from the motion."""
+"""Trocars of imported episodes: read from a column, or estimated from the motion."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ def subsample(found: Motion) -> Tips:
 def locate(
     tips: list[Tips], mapping: Map, numbers: list[int], notes: list[str]
 ) -> tuple[list[np.ndarray], list[bool]]:
-    """Finds every episode's trocars `[A, 3]`, and whether they are known."""
+    """Finds every episode's trocars `[A, 3]`, and flags for those that are determined."""
     if not tips:
         return [], []
     said = np.array([trocar for *_, trocar in tips])
@@ -53,7 +53,7 @@ def locate(
 
 
 def group(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Episodes `[E, A, 3]` by trocars: `[E]` which group, `[C, A, 3]` its mean."""
+    """Groups episodes' trocars `[E, A, 3]`: returns group indices `[E]` and means `[C, A, 3]`."""
     firsts, groups = [], []
     for place in places:
         near = [i for i, first in enumerate(firsts) if np.abs(first - place).max() < SAME]
@@ -67,7 +67,7 @@ def group(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def residual(
     tips: list[Tips], places: np.ndarray, numbers: list[int], notes: list[str]
 ) -> np.ndarray:
-    """`[E, A]` mm; notes where shafts miss their trocar by much."""
+    """Returns the shafts' RMS distance from the trocar `[E, A]` in mm; notes large ones."""
     found = []
     for (R, p, _), place, number in zip(tips, places, numbers):
         off = np.linalg.norm(np.cross(p - place, R[..., 2]), axis=-1)

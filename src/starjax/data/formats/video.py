@@ -40,12 +40,12 @@ class Writer:
 
     @property
     def seconds(self) -> float:
-        """Where the next frame begins."""
+        """Time of the next frame in s."""
         return self.frames / self._hz
 
     @property
     def bytes(self) -> int:
-        """How much is on the disk."""
+        """Bytes on the disk."""
         return self._path.stat().st_size
 
     def close(self) -> None:
@@ -55,7 +55,7 @@ class Writer:
 
 
 def read(path: Path, first: float, length: int, hz: float, shape: tuple[int, ...]) -> np.ndarray:
-    """Frames `[length, h, w, 3]` of a video, from the time `first` in s on.
+    """Reads frames `[length, h, w, 3]` of a video, from the time `first` in s on.
 
     Raises:
       Damaged: a frame is not where its time says, or is of another size.
@@ -93,7 +93,7 @@ def _frames(file: Any, first: float) -> Iterator[tuple[float, Any]]:
 
 
 def _colours(stream: Any) -> Any:
-    """A graph of filters from a stream's frames to RGB."""
+    """Builds the filter graph from a stream's frames to RGB."""
     graph = av.filter.Graph()
     scale = graph.add("scale", _ROUNDED), graph.add("format", "rgb24")
     graph.link_nodes(graph.add_buffer(template=stream), *scale, graph.add("buffersink"))

@@ -23,7 +23,7 @@ _MOST_CHUNKS = 1_000_000  # of a column of an episode
 
 
 def named(column: str) -> str:
-    """Diffusion Policy's name of a column of ours: the same."""
+    """Returns Diffusion Policy's name of a starjax column: the same."""
     return column
 
 
@@ -91,7 +91,7 @@ def _write(path: Path, source: Source, video: bool) -> None:
 
 
 class _Buffer:
-    """Appends to an array in whole chunks, so that none is read again to be filled up."""
+    """Appends to an array in whole chunks, which never reads a chunk back."""
 
     def __init__(self, array: Any):
         self._array, self._parts, self._held, self._at = array, [], 0, 0

@@ -1,1 +1,1 @@
-"""One module a learner: its options, their check, and what makes its model."""
+"""Learners, one module per learner: options, their check, and the model's builder."""

@@ -36,7 +36,7 @@ def check(options: ActConfig, policy_config: config.PolicyConfig) -> None:
 
 
 def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes") -> "SequenceModel":
-    """The model of these options."""
+    """Builds the model of these options."""
     import jax
     import jax.numpy as jnp
 

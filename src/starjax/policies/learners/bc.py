@@ -1,4 +1,4 @@
-"""Behaviour cloning: an MLP says the whole sequence at once. The floor that others must beat.
+"""Behaviour cloning: an MLP predicts the whole sequence at once, the baseline of the others.
 
 Not in the paper. Sources: `models.regression`.
 """
@@ -27,11 +27,11 @@ class BcConfig:
 
 
 def check(options: BcConfig, policy_config: config.PolicyConfig) -> None:
-    """All options go together."""
+    """Accepts all combinations of options."""
 
 
 def make(options: BcConfig, policy_config: config.PolicyConfig, sizes: "Sizes") -> "SequenceModel":
-    """The model of these options."""
+    """Builds the model of these options."""
     import jax
     import jax.numpy as jnp
 

@@ -35,7 +35,7 @@ def check(options: DiffusionConfig, policy_config: config.PolicyConfig) -> None:
 def make(
     options: DiffusionConfig, policy_config: config.PolicyConfig, sizes: "Sizes"
 ) -> "SequenceModel":
-    """The model of these options."""
+    """Builds the model of these options."""
     from starjax.models import process
 
     diffusion = process.diffusion(options.diffusion_steps, options.ddim_steps)

@@ -25,7 +25,7 @@ class FlowConfig(unet.UnetConfig):
 def make(
     options: FlowConfig, policy_config: config.PolicyConfig, sizes: "Sizes"
 ) -> "SequenceModel":
-    """The model of these options."""
+    """Builds the model of these options."""
     from starjax.models import process
 
     return unet.make(options, policy_config, sizes, process.flow(options.euler_steps))

@@ -22,7 +22,7 @@ class OnestepConfig(unet.UnetConfig):
 def make(
     options: OnestepConfig, policy_config: config.PolicyConfig, sizes: "Sizes"
 ) -> "SequenceModel":
-    """The model of these options."""
+    """Builds the model of these options."""
     from starjax.models import process
 
     return unet.make(options, policy_config, sizes, process.shortcut())

@@ -42,7 +42,7 @@ def check(options: UnetConfig, policy_config: config.PolicyConfig) -> None:
 def make(
     options: UnetConfig, policy_config: config.PolicyConfig, sizes: "Sizes", process: "Process"
 ) -> "SequenceModel":
-    """The model of these options that undoes `process`."""
+    """Builds the model that inverts `process`."""
     import jax.numpy as jnp
 
     from starjax.models import unet1d
