@@ -75,7 +75,7 @@ def bring(tmp_path, given=None, made=MAP, name="d"):
 
 
 def loaded(root):
-    return load.load(root, report=lambda _: None).dataset
+    return load.load(root, residency="host", report=lambda _: None).dataset
 
 
 @pytest.fixture(scope="module")
