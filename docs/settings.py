@@ -118,9 +118,9 @@ def settings() -> str:
         *("---", "hide: [toc]", "---"),
         "# Settings of a run",
         "",
-        "Flags of `starjax run`, `collect` and `train`; a switch is turned off by `--demos.no-...`.",
-        "Columns of presets show their changes of the defaults, and – for options that the preset's",
-        "learner does not have. Defaults are the paper's values if it gives them.",
+        "Flags of `starjax run`, `collect` and `train`; `--demos.no-...` turns a switch off.",
+        "Columns of presets show changes of the defaults, and – for options of other learners.",
+        "Defaults are the paper's values if it gives them.",
     ]
     groups: dict[str, list] = {}
     for row in rows(config.RunConfig, config.RunConfig()):
