@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, placement
@@ -170,11 +169,17 @@ def _fields(env: Any, record: episodes.Record, state: Any) -> dict[str, jax.Arra
 
 
 def frame(env: Any, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
-    """Shapes of one recorded control step, without computing anything."""
+    """Returns the shapes of one recorded control step, without computing anything."""
+    functions = _EnvFns(env.reset, env.step, env.observe, env.labels)
+    return dict(_frame(functions, len(env.p_world_ref), record))
+
+
+@functools.lru_cache(maxsize=4)  # a trace takes seconds, and a dataset is described several times
+def _frame(env: _EnvFns, arms: int, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
     from starjax.sim import env as sim_env
 
     def one(key: jax.Array) -> dict[str, jax.Array]:
-        zeros = jnp.zeros(np.shape(env.p_world_ref)[0])
+        zeros = jnp.zeros(arms)
         state = env.reset(key, sim_env.EnvParams(Trocar(zeros, zeros, zeros)))
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
         return jax.tree.map(lambda x: x[0], _fields(env, record, batch))

@@ -7,6 +7,7 @@ one thread, in their order; only compilers, which hold no lock of Python, work s
 """
 
 import contextlib
+import sys
 import threading
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
@@ -21,9 +22,10 @@ T = TypeVar("T")
 
 _thread = threading.local()
 _tracer = ThreadPoolExecutor(1, thread_name_prefix="starjax-tracer")
-# First in, first out: the earliest programs are needed first. On two cores one compiler leaves the
-# other core to the simulation.
-_compilers = ThreadPoolExecutor(max(1, xla.cores() // 2), thread_name_prefix="starjax-compiler")
+# First in, first out, because the earliest programs are needed first; a GPU's compiler uses several
+# cores itself. On two cores one compiler leaves the other core to the simulation.
+_compilers = ThreadPoolExecutor(1 if xla.cores() < 4 else 2, thread_name_prefix="starjax-compiler")
+_SWITCH_S = 2e-4  # Python's 5 ms would stop each wait of the main work behind the tracer
 _queued: list[Future] = []
 
 
@@ -96,10 +98,16 @@ def settle() -> None:
 
 @contextlib.contextmanager
 def until_end() -> Iterator[None]:
-    """Drops, at the end of the block, what is queued and not begun: it would hold up the exit."""
+    """Lets jobs work beside the block.
+
+    At its end those not begun are dropped, because the exit of Python would wait for them.
+    """
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
     try:
         yield
     finally:
+        sys.setswitchinterval(interval)
         while _queued:
             _queued.pop().cancel()
 

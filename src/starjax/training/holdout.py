@@ -10,21 +10,27 @@ import numpy as np
 from starjax import config, rcm
 from starjax.data import windows
 from starjax.policies.base import Policy
+from starjax.runtime.precompile import Program
 from starjax.training.state import TrainState
 
 _WINDOWS = 64
 
 
 def make(
-    policy: Policy, policy_config: config.PolicyConfig, dataset: windows.Dataset, frames: np.ndarray
+    policy: Policy,
+    policy_config: config.PolicyConfig,
+    dataset: windows.Dataset,
+    frames: np.ndarray,
+    shapes: TrainState | None = None,
 ) -> Callable[[TrainState], dict[str, float]] | None:
-    """A function from the state to the errors of its average, or None without such frames.
+    """Makes the function from a state to the errors of its average; None without such frames.
 
     Args:
       policy: to be judged.
       policy_config: the horizons of a window.
       dataset: the demonstrations, wherever they are.
       frames: `[n]` frame numbers kept out of training; 64 of them, evenly spaced, are used.
+      shapes: of the state on one device, for which the function is compiled in the background.
     """
     if len(frames) == 0:
         return None
@@ -38,14 +44,17 @@ def make(
     # the same noise each time, so that the curve shows the network and not the draw
     keys = jax.random.split(jax.random.key(0), count)
 
-    @jax.jit
     def errors(params: Any, stats: Any, batch: windows.Batch) -> dict[str, jax.Array]:
-        said = policy.sample(params, stats, keys, batch.observation, batch.trocar)
-        return action_errors(said, batch.command)
+        predicted = policy.sample(params, stats, keys, batch.observation, batch.trocar)
+        return action_errors(predicted, batch.command)
+
+    program = Program(errors)
+    if shapes is not None:
+        program.prepare(*jax.eval_shape(lambda x: (x.ema_params, x.normalizer), shapes), batch)
 
     def evaluate(state: TrainState) -> dict[str, float]:
-        found = errors(state.ema_params, state.normalizer, batch)
-        return {name: float(value) for name, value in found.items()}
+        values = program(state.ema_params, state.normalizer, batch)
+        return {name: float(value) for name, value in values.items()}
 
     return evaluate
 

@@ -119,10 +119,9 @@ def run(
 
     state = _restored(directory / "checkpoints", shapes)
     if state is None:
-        params = _first_params(drawn(), policy_config)
         # Arguments, not constants: the program is the same for every seed.
         make = functools.partial(states.create, policy, optimizer)
-        state = states.run_once(make, params, stats, streams.steps)
+        state = states.run_once(make, _first_params(drawn(), policy_config), stats, streams.steps)
         state = devices.replicate(state, mesh)
     else:
         _check_same(directory, state, streams.steps, stats, train_config.steps)
@@ -131,7 +130,8 @@ def run(
     holdout_error = None
     if processes.is_first():
         log.resume(directory / "metrics.jsonl", int(state.step))
-        holdout_error = holdout.make(policy, policy_config, dataset, held_out)
+        alone = shapes if mesh.size == 1 else None
+        holdout_error = holdout.make(policy, policy_config, dataset, held_out, alone)
     if int(state.step) == train_config.steps:
         found = holdout_error(processes.own(state)) if holdout_error else {}
         return TrainingResult(state, 0.0, int(state.skipped), found)
