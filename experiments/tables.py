@@ -32,7 +32,7 @@ def redraw(text: str, draw: Callable[[str], str]) -> str:
 
 
 def table(name: str) -> str:
-    """Returns the table of a marker's name; KeyError if there is none."""
+    """Returns the table of a marker's name, KeyError for an unknown one."""
     if name == "claims":
         return claims.index([claims.load(folder) for folder in claims.folders()])
     if name == "presets":
