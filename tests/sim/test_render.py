@@ -17,7 +17,7 @@ from starjax.sim import render
 from starjax.sim import scene as model
 from starjax.sim.arms import fr5
 from starjax.sim.camera import geometry as scenes
-from starjax.sim.camera import tiles
+from starjax.sim.camera import rays, tiles
 from starjax.types import Pose
 
 # Every primitive, tilted, in a pile, with what must not be drawn: groups 3 and up, alpha 0, sites.
