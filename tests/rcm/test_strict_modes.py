@@ -1,5 +1,6 @@
 """Every public map works, with the same values, whatever a surrounding program makes jax refuse."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -25,6 +26,7 @@ ROTATION = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 POSE = rcm.Pose(ROTATION, drawn(N, 3))
 TROCAR = rcm.Trocar(np.full(N, 2.0), np.ones(N), np.full(N, 3.0))
 POINT = drawn(3)
+WRIST = rcm.Wrist(0.25, 0.5, 1.0, 1.0)
 # Axes in every direction, of which bfloat16 has the entries; their lines meet.
 AXES = np.array(
     [[0.0, 0.5, -1.0], [0.5, 0.25, -1.0], [-0.5, 0.0, -1.0], [0.25, -0.5, -1.0], [1, 1, 1]]
@@ -50,8 +52,17 @@ GIVEN = {
     "trocar_position": (TROCAR, POINT),
     "trocar_rotation": (TROCAR,),
 }
-SPACES = rcm.ACTION_SPACES.values()
+SPACES = [*rcm.ACTION_SPACES.values(), rcm.rcm6(WRIST)]
+WRISTED = {
+    "angles_through": (POSE, POINT),
+    "shaft_of": (POSE, drawn(2)),
+    "through": (POSE, POINT),
+    "tip_of": (POSE, drawn(2)),
+}
 FUNCTIONS = {name: (getattr(rcm, name), given) for name, given in GIVEN.items()}
+FUNCTIONS |= {
+    name: (functools.partial(getattr(rcm, name), WRIST), given) for name, given in WRISTED.items()
+}
 FUNCTIONS |= {f"{s.name}.decode": (s.decode, (drawn(N, s.dim), TROCAR, POINT)) for s in SPACES}
 FUNCTIONS |= {f"{s.name}.encode": (s.encode, (POSE, TROCAR, POINT)) for s in SPACES}
 TYPES = {"bfloat16": jnp.bfloat16, "int32": jnp.int32}
@@ -65,10 +76,10 @@ def as_type(given, dtype):
 
 def test_all_public_functions_are_here():
     public = {name for name in rcm.__all__ if callable(getattr(rcm, name))}
-    assert public - {"ActionSpace", "Pose", "Trocar", "TrocarEstimate", "TrocarFrame"} == {
-        *GIVEN,
-        "sample_trocar",
-    }
+    assert public - {"ActionSpace", "Pose", "Trocar", "TrocarEstimate", "TrocarFrame"} - {
+        "Wrist",
+        "WristPose",
+    } == {*GIVEN, *WRISTED, "rcm6", "sample_trocar"}
 
 
 def assert_same_program(name, arrays, strict, wanted):
@@ -141,7 +152,7 @@ def test_a_program_that_looks_for_nan_finds_none_where_inputs_are_finite():
 
 def look_for_nan():
     """These return NaN for inputs that are not finite; without jit each operation is looked at."""
-    for name in ("project", "roll_of", "trocar_from_position"):
+    for name in ("angles_through", "project", "roll_of", "through", "trocar_from_position"):
         function, given = FUNCTIONS[name]
         with mode({"jax_debug_nans": True, "jax_disable_jit": True}):
             function(*given)

@@ -40,6 +40,17 @@ from starjax.rcm.trocar import (
     trocar_position,
     trocar_rotation,
 )
+from starjax.rcm.wrist import (
+    LARGE_NEEDLE_DRIVER,
+    PROGRASP,
+    Wrist,
+    WristPose,
+    angles_through,
+    shaft_of,
+    through,
+    tip_of,
+)
+from starjax.rcm.wrist_actions import rcm6
 from starjax.types import Pose
 
 __all__ = [
@@ -47,12 +58,14 @@ __all__ = [
     "AZIMUTH_RANGE",
     "HOLD_DEPTH",
     "IS_SEEN",
+    "LARGE_NEEDLE_DRIVER",
     "MAX_DEPTH",
     "MAX_REACH",
     "MIN_DEPTH",
     "MIN_SPREAD",
     "POLAR_RANGE",
     "POLAR_RANGE_WIDE",
+    "PROGRASP",
     "RADIUS_RANGE",
     "TROCARS",
     "ActionSpace",
@@ -60,11 +73,15 @@ __all__ = [
     "Trocar",
     "TrocarEstimate",
     "TrocarFrame",
+    "Wrist",
+    "WristPose",
+    "angles_through",
     "check_trocar",
     "insertion_depth",
     "pose_at_depth",
     "pose_on_manifold",
     "project",
+    "rcm6",
     "rcm_error",
     "roll_of",
     "rot6d_decode",
@@ -73,6 +90,9 @@ __all__ = [
     "rotation_from_axis_roll",
     "rotation_z",
     "sample_trocar",
+    "shaft_of",
+    "through",
+    "tip_of",
     "trocar_frame",
     "trocar_from_poses",
     "trocar_from_position",

@@ -54,64 +54,64 @@ class ActionSpace(NamedTuple):
     slices: dict[str, slice]
 
 
-def _encode_se3(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
+def _encode_se3(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
     return [pose.p, rotations.rot6d_encode(pose.R)]
 
 
-def _decode_se3(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+def _decode_se3(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:
     R = rotations.rot6d_decode(parts["R"])
     return types.Pose(R=R, p=jnp.clip(parts["p"], -MAX_REACH, MAX_REACH))
 
 
-def _encode_rcm1(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
+def _encode_rcm1(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
     depth = manifold.insertion_depth(pose, frame.p)
     R_trocar_tip = arrays.matmul(frame.R.mT, pose.R)
     return [depth[..., None], rotations.rot6d_encode(R_trocar_tip)]
 
 
-def _decode_rcm1(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+def _decode_rcm1(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:
     R = arrays.matmul(frame.R, rotations.rot6d_decode(parts["R"]))
     return manifold.pose_at_depth(R, parts["depth"][..., 0], frame.p)
 
 
-def _encode_rcm2(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
+def _encode_rcm2(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
     p_trocar_tip = arrays.matvec(frame.R.mT, pose.p - frame.p)
-    return [_roll(pose.R, frame), p_trocar_tip]
+    return [roll_from_zero(pose.R, frame), p_trocar_tip]
 
 
-def _decode_rcm2(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+def _decode_rcm2(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:
     offset_world = arrays.matvec(frame.R, parts["p"])
     axis, depth = manifold.axis_and_depth(offset_world, jnp.zeros_like(offset_world))
     return manifold.pose_on_manifold(axis, parts["roll"][..., 0] + frame.roll_zero, depth, frame.p)
 
 
-def _encode_rcm3(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
+def _encode_rcm3(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
     depth = manifold.insertion_depth(pose, frame.p)
     return [depth[..., None], rotations.rot6d_encode(pose.R)]
 
 
-def _decode_rcm3(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+def _decode_rcm3(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:
     R = rotations.rot6d_decode(parts["R"])
     return manifold.pose_at_depth(R, parts["depth"][..., 0], frame.p)
 
 
-def _encode_rcm4(pose: types.Pose, frame: "_Frame") -> list[jax.Array]:
-    return [_roll(pose.R, frame), pose.p]
+def _encode_rcm4(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
+    return [roll_from_zero(pose.R, frame), pose.p]
 
 
-def _decode_rcm4(parts: dict[str, jax.Array], frame: "_Frame") -> types.Pose:
+def _decode_rcm4(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:
     """Applies Algorithm 1, with the alignment in the z-down frame (`rotation_from_axis_roll`)."""
     axis, depth = manifold.axis_and_depth(parts["p"], frame.p)
     return manifold.pose_on_manifold(axis, parts["roll"][..., 0] + frame.roll_zero, depth, frame.p)
 
 
-def _roll(R: jax.Array, frame: "_Frame") -> jax.Array:
+def roll_from_zero(R: jax.Array, frame: "SpaceFrame") -> jax.Array:
     """Returns the roll `[..., 1]` from the frame's zero, within half a turn either way."""
     roll = rotations.roll_of(R) - frame.roll_zero
     return (roll - 2.0 * jnp.pi * jnp.round(roll / (2.0 * jnp.pi)))[..., None]
 
 
-class _Frame(NamedTuple):
+class SpaceFrame(NamedTuple):
     """The trocar frame {T}, pose_world_trocar, and the roll that counts as zero."""
 
     R: jax.Array
@@ -122,7 +122,7 @@ class _Frame(NamedTuple):
 def _fixed_yaw(encode_or_decode: Callable) -> Callable:
     """Wraps a map, with the world's x axis as that of {T} at every trocar."""
 
-    def mapped(pose_or_parts: Any, frame: _Frame) -> Any:
+    def mapped(pose_or_parts: Any, frame: SpaceFrame) -> Any:
         return encode_or_decode(pose_or_parts, frame._replace(R=_down(frame.R.dtype)))
 
     return mapped
@@ -133,7 +133,7 @@ def _down(dtype: jnp.dtype) -> jax.Array:
     return jnp.diag(jnp.array([1.0, -1.0, -1.0], dtype))
 
 
-def _space(name: str, encode: Callable, decode: Callable, **sizes: int) -> ActionSpace:
+def make_space(name: str, encode: Callable, decode: Callable, **sizes: int) -> ActionSpace:
     """Wraps a pair of maps: checks, broadcasts and bounds the inputs, inserts the hold pose."""
     slices, dim = {}, 0
     for part, size in sizes.items():
@@ -200,17 +200,17 @@ def _trocar_arguments(trocar: Where, p_world_ref: ArrayLike | None) -> dict:
     return {**trocars.named_fields(trocar), "p_world_ref": (p_world_ref, (3,))}
 
 
-def _frame(values: Sequence[jax.Array]) -> tuple[_Frame, tuple[int, ...]]:
+def _frame(values: Sequence[jax.Array]) -> tuple[SpaceFrame, tuple[int, ...]]:
     """Returns the frame of `_trocar_arguments` and its leading axes."""
     radius, polar, azimuth, place, *turned = values
     scalars = [x.shape for x in (radius, polar, azimuth, *turned[1:])]
     shape = jnp.broadcast_shapes(*scalars, place.shape[:-1])
     if turned:
         R, roll_zero = turned
-        return _Frame(R, place, roll_zero), shape
+        return SpaceFrame(R, place, roll_zero), shape
     trocar = trocars.Trocar(radius, polar, azimuth)
     R, p = trocars.trocar_rotation(trocar), trocars.trocar_position(trocar, place)
-    return _Frame(R, p, jnp.zeros((), p.dtype)), shape
+    return SpaceFrame(R, p, jnp.zeros((), p.dtype)), shape
 
 
 def _hold_pose(p_world_trocar: jax.Array) -> types.Pose:
@@ -220,15 +220,15 @@ def _hold_pose(p_world_trocar: jax.Array) -> types.Pose:
 
 
 ACTION_SPACES: dict[str, ActionSpace] = {
-    "se3": _space("se3", _encode_se3, _decode_se3, p=3, R=6),
-    "rcm1": _space("rcm1", _encode_rcm1, _decode_rcm1, depth=1, R=6),
-    "rcm2": _space("rcm2", _encode_rcm2, _decode_rcm2, roll=1, p=3),
-    "rcm3": _space("rcm3", _encode_rcm3, _decode_rcm3, depth=1, R=6),
-    "rcm4": _space("rcm4", _encode_rcm4, _decode_rcm4, roll=1, p=3),
-    "rcm1_fixed_yaw": _space(
+    "se3": make_space("se3", _encode_se3, _decode_se3, p=3, R=6),
+    "rcm1": make_space("rcm1", _encode_rcm1, _decode_rcm1, depth=1, R=6),
+    "rcm2": make_space("rcm2", _encode_rcm2, _decode_rcm2, roll=1, p=3),
+    "rcm3": make_space("rcm3", _encode_rcm3, _decode_rcm3, depth=1, R=6),
+    "rcm4": make_space("rcm4", _encode_rcm4, _decode_rcm4, roll=1, p=3),
+    "rcm1_fixed_yaw": make_space(
         "rcm1_fixed_yaw", _fixed_yaw(_encode_rcm1), _fixed_yaw(_decode_rcm1), depth=1, R=6
     ),
-    "rcm2_fixed_yaw": _space(
+    "rcm2_fixed_yaw": make_space(
         "rcm2_fixed_yaw", _fixed_yaw(_encode_rcm2), _fixed_yaw(_decode_rcm2), roll=1, p=3
     ),
 }

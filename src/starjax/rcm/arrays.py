@@ -104,7 +104,7 @@ def direction(v: jax.Array, fallback: ArrayLike) -> tuple[jax.Array, jax.Array]:
 
 
 def norm(v: jax.Array) -> jax.Array:
-    """Returns the length `[...]` of `v` `[..., 3]` without overflow, its derivative at zero zero."""
+    """Returns the length `[...]` of `v` `[..., 3]`, its derivative zero at zero."""
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(v), axis=-1, keepdims=True))
     # Not `scale > tiny`: a NaN must propagate.
     is_zero = scale <= jnp.finfo(v.dtype).tiny

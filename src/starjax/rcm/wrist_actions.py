@@ -1,0 +1,62 @@
+"""The action space of instruments with a wrist, `rcm6`: roll, wrist angles and tip."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.rcm import actions, arrays, rotations
+from starjax.rcm import wrist as wrists
+from starjax.types import Pose
+
+_E_X = np.array([1.0, 0.0, 0.0], np.float32)
+_E_Z = np.array([0.0, 0.0, 1.0], np.float32)
+_G = np.array([1.0, -1.0, -1.0], np.float32)  # world to the z-down frame of fixed yaw, diagonal
+
+
+def rcm6(wrist: wrists.Wrist) -> actions.ActionSpace:
+    """Returns the space (roll of the shaft, wrist pitch and yaw, tip in the world) of a wrist.
+
+    With angles of zero it is `rcm4`. `decode` returns the tip's pose; `angles_through` has its
+    wrist angles, which are the action's, within the limits. The roll is singular for a shaft that
+    points straight up, as in `rcm4`.
+
+    Args:
+      wrist: sizes and limits.
+    """
+
+    def encode(pose: Pose, frame: actions.SpaceFrame) -> list[jax.Array]:
+        angles = wrists.angles_through(wrist, pose, frame.p)
+        shaft = wrists.shaft_of(wrist, pose, angles)
+        return [actions.roll_from_zero(shaft.R, frame), angles, pose.p]
+
+    def decode(parts: dict[str, jax.Array], frame: actions.SpaceFrame) -> Pose:
+        angles = wrists.limited(wrist, parts["wrist"])
+        bend = wrists.bent(wrist, angles)
+        offset = parts["p"] - frame.p
+        line, length = arrays.direction(offset, -_E_Z)
+        depth, _ = wrists.tip_depth(bend, length)
+        roll = parts["roll"][..., 0] + frame.roll_zero
+        # R_world_shaft = G align(e_z, a) Rz(roll) as in Alg. 1, where `align` turns about a
+        # horizontal axis. It must take the rolled tip's direction to the line from trocar to tip.
+        tip = jnp.concatenate([bend.p[..., :2], depth[..., None]], -1)
+        tip, _ = arrays.direction(arrays.matvec(rotations.rotation_z(roll), tip), _E_Z)
+        axis = _turned_z(*jnp.broadcast_arrays(tip, line * _G))
+        R = rotations.rotation_from_axis_roll(axis * _G, roll)
+        return wrists.tip_of(wrist, wrists.shaft_at(R, depth, bend, frame.p), angles)
+
+    return actions.make_space("rcm6", encode, decode, roll=1, wrist=2, p=3)
+
+
+def _turned_z(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Turns e_z as the rotation about a horizontal axis does that takes unit `a` to unit `b`.
+
+    The axis n is orthogonal to b - a, so n is along e_z x (b - a). Across n, the parts of a and b
+    are equally long; that of a has a positive z, so it is not zero.
+    """
+    n = jnp.stack([a[..., 1] - b[..., 1], b[..., 0] - a[..., 0], jnp.zeros_like(a[..., 0])], -1)
+    n, _ = arrays.direction(n, _E_X)
+    a, b = (x - arrays.dot(x, n) * n for x in (a, b))
+    turn = jnp.concatenate([arrays.dot(a, b), arrays.dot(n, jnp.cross(a, b))], -1)
+    turn, _ = arrays.direction(turn, _E_X[:2])
+    cos, sin = turn[..., :1], turn[..., 1:]
+    return cos * _E_Z.astype(a.dtype) + sin * jnp.cross(n, jnp.broadcast_to(_E_Z, n.shape))
