@@ -129,3 +129,55 @@ def test_derivatives_are_finite_also_where_it_is_refused(rng):
 def test_shapes_are_named(shapes):
     with pytest.raises(ValueError, match="pose"):
         rcm.trocar_from_poses(rcm.Pose(*map(np.zeros, shapes)))
+
+
+WRIST = rcm.LARGE_NEEDLE_DRIVER
+
+
+def bent(rng, degrees):
+    """Shafts through the trocar, and tips and angles of wrists that move by so much."""
+    shaft = moved(rng, over_the_board(rng))
+    angles = np.deg2rad(degrees * rng.uniform(-1.0, 1.0, (300, 2))).astype(np.float32)
+    return shaft, rcm.tip_of(WRIST, shaft, angles), angles
+
+
+@pytest.mark.parametrize("degrees", [5.0, 10.0, 40.0, 80.0])
+def test_a_bent_wrist_is_no_straight_shaft(rng, estimate, degrees):
+    """Tips of a wrist fit every trocar, so their common point means nothing."""
+    _, tip, _ = bent(rng, degrees)
+    found = estimate(tip)
+    assert not found.is_determined and not found.is_straight
+    assert found.residual > rcm.MAX_RESIDUAL and np.trace(found.covariance) > 1e6
+    why = rcm.why_undetermined(found)
+    assert "wrist" in why and "\n" not in why
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 80.0])
+def test_with_angles_or_shafts_a_wrist_gives_the_trocar(rng, estimate, degrees):
+    shaft, tip, angles = bent(rng, degrees)
+    wrong = tip.p.at[::10].add(0.05)
+    lost = angles.copy()
+    lost[1::10, 0] = np.nan
+    with_angles = jax.jit(lambda pose, angles: rcm.trocar_from_poses(pose, WRIST, angles))
+    for found in (
+        estimate(shaft),
+        with_angles(tip, angles),
+        with_angles(tip._replace(p=wrong), lost),
+    ):
+        np.testing.assert_allclose(found.p_world_trocar, TRUE, atol=3e-6)
+        assert found.is_determined and rcm.why_undetermined(found) == ""
+    with pytest.raises(ValueError, match="angles"):
+        rcm.trocar_from_poses(tip, WRIST)
+
+
+def test_a_trocar_that_yields_by_a_few_millimetres_is_determined(rng, estimate):
+    found = estimate(moved(rng, over_the_board(rng), 2e-3))
+    assert found.is_determined and 2e-3 < found.residual < rcm.MAX_RESIDUAL
+
+
+def test_the_first_undetermined_arm_has_its_reason(rng, estimate):
+    poses = [moved(rng, over_the_board(rng)), undetermined(rng)["parallel"], bent(rng, 20.0)[1]]
+    found = estimate(jax.tree.map(lambda *x: np.stack(x), *poses))
+    np.testing.assert_array_equal(found.is_determined, [True, False, False])
+    reasons = [rcm.why_undetermined(jax.tree.map(lambda x: x[i:], found)) for i in range(3)]  # noqa: B023
+    assert reasons[0] == reasons[1] != reasons[2] and all(reasons)

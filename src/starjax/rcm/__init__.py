@@ -5,7 +5,13 @@
 """
 
 from starjax.rcm.actions import ACTION_SPACES, MAX_REACH, ActionSpace
-from starjax.rcm.estimate import MIN_SPREAD, TrocarEstimate, trocar_from_poses
+from starjax.rcm.estimate import (
+    MAX_RESIDUAL,
+    MIN_SPREAD,
+    TrocarEstimate,
+    trocar_from_poses,
+    why_undetermined,
+)
 from starjax.rcm.manifold import (
     HOLD_DEPTH,
     MAX_DEPTH,
@@ -61,6 +67,7 @@ __all__ = [
     "LARGE_NEEDLE_DRIVER",
     "MAX_DEPTH",
     "MAX_REACH",
+    "MAX_RESIDUAL",
     "MIN_DEPTH",
     "MIN_SPREAD",
     "POLAR_RANGE",
@@ -98,4 +105,5 @@ __all__ = [
     "trocar_from_position",
     "trocar_position",
     "trocar_rotation",
+    "why_undetermined",
 ]

@@ -5,13 +5,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax import types
 from starjax.rcm import arrays
+from starjax.rcm import wrist as wrists
 
 # rad; a smaller spread (RMS) of the axes about one direction does not fix the point along it
 MIN_SPREAD = float(np.deg2rad(2.0))
 MIN_LINES = 3.0  # inliers
+MAX_RESIDUAL = 5e-3  # m; straight shafts miss their trocar by less, even in a yielding wall
 _FARTHEST = 1e3  # m; tips beyond are ignored, as non-finite ones
 _FINEST = 1e-5  # m; a line nearer to the point is no outlier
 _DAMPING = 1e-5  # well below the least eigenvalue at `MIN_SPREAD`
@@ -29,7 +32,10 @@ class TrocarEstimate(NamedTuple):
       covariance: `[..., 3, 3]` m^2 of the point, for independent errors of the lines; very large if
         undetermined.
       weight: `[..., T]` in [0, 1] of the lines: 0 for an outlier.
-      is_determined: `[...]`, True if the axes spread by `MIN_SPREAD` and `MIN_LINES` are inliers.
+      is_determined: `[...]`, True if the axes spread by `MIN_SPREAD`, `MIN_LINES` are inliers and
+        `is_straight`; see `why_undetermined`.
+      is_straight: `[...]`, True if the residual is at most `MAX_RESIDUAL`. Tips of instruments with
+        a moving wrist have no common point on their axes and exceed it.
     """
 
     p_world_trocar: jax.Array
@@ -37,10 +43,15 @@ class TrocarEstimate(NamedTuple):
     covariance: jax.Array
     weight: jax.Array
     is_determined: jax.Array
+    is_straight: jax.Array
 
 
 @arrays.broadcasting
-def trocar_from_poses(pose: types.Pose) -> TrocarEstimate:
+def trocar_from_poses(
+    pose: types.Pose,
+    wrist: wrists.Wrist | None = None,
+    angles: ArrayLike | None = None,
+) -> TrocarEstimate:
     """Estimates the trocar from a moving tool: the point nearest to the lines of its shaft.
 
     The minimum of the sum of distances, a convex function that tolerates a third of wrong poses, is
@@ -48,14 +59,24 @@ def trocar_from_poses(pose: types.Pose) -> TrocarEstimate:
     and sliding along it leave the point along it undetermined: see `is_determined`.
 
     Args:
-      pose: pose_world_tip `[..., T]`; non-finite poses are ignored.
+      pose: pose_world_tip `[..., T]` of a straight tool, or pose_world_shaft; with `wrist`
+        pose_world_tip of an instrument with that wrist. Non-finite poses are ignored.
+      wrist: sizes.
+      angles: `[..., T, 2]` rad, measured pitch and yaw of the wrist.
+
+    Raises:
+      ValueError: shapes differ, or only one of `wrist` and `angles` is given.
     """
+    if (wrist is None) != (angles is None):
+        raise ValueError("wrist, angles: expected both or neither")
     R, p = arrays.checked(**{"pose.R": (pose.R, (3, 3)), "pose.p": (pose.p, (3,))})
     if R.ndim < 3 or R.shape[:-2] != p.shape[:-1]:
         raise ValueError(
             f"pose: expected R [..., T, 3, 3] and p [..., T, 3], got {list(R.shape)}, "
             f"{list(p.shape)}"
         )
+    if wrist is not None:
+        R, p = wrists.shaft_of(wrist, types.Pose(R, p), angles)
     axis = R[..., :, 2]
     is_known = jnp.isfinite(axis).all(-1) & (jnp.abs(p) <= _FARTHEST).all(-1)
     axis, length = arrays.direction(arrays.bounded(axis), np.array([0.0, 0.0, -1.0], np.float32))
@@ -80,18 +101,38 @@ def trocar_from_poses(pose: types.Pose) -> TrocarEstimate:
     normal = _normal(axis, weight)
     # The least eigenvalue is the mean square of sin(angle to the axes' common direction).
     spread = jnp.linalg.eigvalsh(jax.lax.stop_gradient(normal))[..., 0]
-    is_determined = (spread >= np.sin(MIN_SPREAD) ** 2) & (count >= MIN_LINES)
     total = jnp.sum(weight * distance**2, -1)
+    residual = jnp.sqrt(jnp.maximum(total / jnp.maximum(count, 1.0), 1e-30))
+    is_straight = residual <= MAX_RESIDUAL
+    is_spread = (spread >= np.sin(MIN_SPREAD) ** 2) & (count >= MIN_LINES)
+    is_determined = is_spread & is_straight
     variance = total / jnp.maximum(2.0 * count - 3.0, 1.0)  # a line fixes two coordinates
     eye = jnp.eye(3, dtype=p.dtype)
     safe = jnp.where(is_determined[..., None, None], normal, eye)
     covariance = (variance / jnp.maximum(count, 1.0))[..., None, None] * _inverse(safe)
     return TrocarEstimate(
         p_world_trocar=centre + jnp.where(is_determined[..., None], point, 0.0),
-        residual=jnp.sqrt(jnp.maximum(total / jnp.maximum(count, 1.0), 1e-30)),
+        residual=residual,
         covariance=jnp.where(is_determined[..., None, None], covariance, _FARTHEST**2 * eye),
         weight=weight,
         is_determined=is_determined,
+        is_straight=is_straight,
+    )
+
+
+def why_undetermined(estimate: TrocarEstimate) -> str:
+    """Returns the reason of a first undetermined estimate on the host, empty if there is none."""
+    is_determined, is_straight, residual = (
+        np.ravel(x) for x in (estimate.is_determined, estimate.is_straight, estimate.residual)
+    )
+    if is_determined.all():
+        return ""
+    i = int(np.argmin(is_determined))
+    if is_straight[i]:
+        return "the shaft does not lean in enough directions"
+    return (
+        f"the axes miss any one point by {1e3 * residual[i]:.0f} mm: another frame or axis, or an "
+        "instrument with a wrist, which needs its angles or the poses of its shaft"
     )
 
 

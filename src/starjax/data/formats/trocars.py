@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from starjax import rcm
 from starjax.data import shafts
 from starjax.data.formats.mapping import Map
 from starjax.data.formats.motion import Motion
@@ -44,11 +45,13 @@ def locate(
     is_said: Any = np.isfinite(said).all(-1)
     places = np.where(is_said[..., None], said, places)
     known: Any = is_said | is_sure
-    for number, sure in zip(numbers, known):
+    for number, sure, estimate in zip(numbers, known, each):
         if not sure.all():
             arm = int(np.argmin(sure))
-            why = f"the motion of arm {arm} does not determine its trocar"
-            notes.append(f"episode {number}: {why}; left out")
+            why = rcm.why_undetermined(rcm.TrocarEstimate(*(x[arm] for x in estimate)))
+            notes.append(
+                f"episode {number}: arm {arm} does not determine its trocar: {why}; left out"
+            )
     return list(places), list(known.all(-1))
 
 
