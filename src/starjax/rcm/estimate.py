@@ -75,7 +75,7 @@ def trocar_from_poses(
             f"pose: expected R [..., T, 3, 3] and p [..., T, 3], got {list(R.shape)}, "
             f"{list(p.shape)}"
         )
-    if wrist is not None:
+    if wrist is not None and angles is not None:
         R, p = wrists.shaft_of(wrist, types.Pose(R, p), angles)
     axis = R[..., :, 2]
     is_known = jnp.isfinite(axis).all(-1) & (jnp.abs(p) <= _FARTHEST).all(-1)
