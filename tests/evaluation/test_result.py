@@ -1,4 +1,4 @@
-"""Results of both schemas are read as one type; damage is named; what made them is written."""
+"""Results are read as one type; damage is named; their origin is written."""
 
 import copy
 import json

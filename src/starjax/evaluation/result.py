@@ -1,7 +1,7 @@
-"""Typed results: the schema of result.json and sweep.json.
+"""Typed results: result.json and sweep.json, written and read here alone.
 
-Written and read here alone. A trial's radius, polar and azimuth are lists `[A]`, its labels an
-object.
+A result names its scene, the code and the demonstrations. A trial's radius, polar and azimuth are
+lists `[A]`, its labels an object.
 """
 
 import json
@@ -9,71 +9,35 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from starjax.evaluation import kinds, structure, trial_file
+import msgspec
+
+from starjax.evaluation import structure, trial_file
+from starjax.evaluation.content import Evaluation, Sweep, Trial
 from starjax.runtime import files, jax_settings, provenance, xla
 from starjax.sim import names
 
-SCHEMA = kinds.NEWEST
-
-
-class Trial(NamedTuple):
-    """One finished trial, a row of `trials`.
-
-    Attributes:
-      trocar: index of the configuration; trial: number there; seed: of the trials.
-      radius: `(A,)` m. polar, azimuth: `(A,)` rad.
-      seen: the configuration was trained on.
-      success: strict. loose: the task's looser test was met. safe: strict, and the executed RCM
-        error always below `safe_rcm_mm`.
-      invalid: the simulation diverged. collided: an arm touched what it must not. lost: the task
-        could not be done any more.
-      steps: control steps taken.
-      stage: how far the task came, an index of `Task.stages`; None if the file lacks it.
-      labels: the task's, e.g. source and target.
-      rcm_max_mm, rcm_within_max_mm, rcm_commanded_max_mm: the largest of all arms, executed at the
-        ends of control steps, within them, and commanded; None where the file does not say it.
-      distance_m: in sweeps, m to the nearest configuration of training.
-    """
-
-    trocar: int
-    trial: int
-    seed: int
-    radius: tuple[float, ...]
-    polar: tuple[float, ...]
-    azimuth: tuple[float, ...]
-    seen: bool
-    success: bool
-    loose: bool
-    safe: bool
-    invalid: bool
-    collided: bool
-    lost: bool
-    steps: int
-    stage: int | None
-    labels: dict[str, int]
-    rcm_max_mm: float | None = None
-    rcm_within_max_mm: float | None = None
-    rcm_commanded_max_mm: float | None = None
-    distance_m: float | None = None
+SCHEMA = 2
 
 
 class Result(NamedTuple):
-    """An evaluation or a sweep, and what made it. None and empty: the file does not say it.
+    """An evaluation or a sweep, and its origin; None and empty: the file lacks the field.
 
     Attributes:
       schema: of the file.
       scene: the task, its arms, tools and cameras.
-      method: a row of `methods.METHODS`. observation: `image` or `state`.
+      method: a row of `methods.METHODS`.
+      observation: `image` or `state`.
       seed: of the trials.
-      time_limit_s: of a trial, simulated, 0 where the file does not say it.
-      control_hz: control steps a second.
+      time_limit_s: of a trial, simulated; 0 if unknown.
+      control_hz: control steps per second.
       trials: in order of configuration and number.
-      figures: what `statistics.compose` or `sweep.compose` gave, without the trials.
+      figures: from `statistics.compose` or `sweep.compose`, without the trials.
       config: settings of the run as JSON values, empty for a sweep.
-      weights: SHA-256 of the policy's file; dataset_digest: of the demonstrations it comes from.
-      commit, dirty, version: the code, see `provenance.Code`.
-      about: everything else that stands in the file: command, preset, versions, hardware,
-        timings_s, warnings, inference_ms and so on.
+      weights: SHA-256 of the policy's file.
+      dataset_digest: of the demonstrations that trained the policy.
+      commit, dirty, version: of the code, see `provenance.Code`.
+      about: all other fields: command, preset, versions, hardware, timings_s, warnings,
+        inference_ms and so on.
     """
 
     schema: int
@@ -98,22 +62,21 @@ _FIGURES = (
     "seen", "unseen", "generalization_gap", "generalization_gap_ci95", "strict", "loose", "safe",
     "safe_rcm_mm", "per_trocar", "by_distance", "rcm_error_mm", "steps", "invalid", "collided",
 )  # fmt: skip
-_MADE_BY = ("weights", "dataset_digest", "commit", "dirty", "version")
 
 
 def read(file: Path) -> Result:
-    """Reads a result.json of any schema.
+    """Reads a result.json.
 
     Raises:
-      FileNotFoundError: there is none.
-      ValueError: it is damaged, or no result; the message names the file and the place in it.
+      FileNotFoundError: the file is missing.
+      ValueError: it is damaged, or no result; the message names the file and the field.
     """
-    return _parse(file, trial_file.read(file), kinds.EVALUATION)
+    return _parse(file, trial_file.read(file), Evaluation)
 
 
 def read_sweep(file: Path) -> Result:
-    """Reads a sweep.json of any schema; raises as `read`."""
-    return _parse(file, trial_file.read(file), kinds.SWEEP)
+    """Reads a sweep.json; raises as `read`."""
+    return _parse(file, trial_file.read(file), Sweep)
 
 
 def write(
@@ -122,7 +85,7 @@ def write(
     """Writes a result.json or sweep.json, with the code and the machine that made it.
 
     Args:
-      figures: of `statistics.compose` or `sweep.compose`.
+      figures: from `statistics.compose` or `sweep.compose`.
       about: JSON values by name: control_hz, seed, weights, dataset_digest and command; of an
         evaluation config, preset, inference_ms, timings_s and warnings; of a sweep time_limit_s.
     """
@@ -136,44 +99,40 @@ def write(
         "hardware": xla.hardware(),
         **jax_settings.record(),
     }
-    found = json.loads(json.dumps(content))
-    result = _parse(file, found, kinds.SWEEP if "by_distance" in found else kinds.EVALUATION)
-    files.write_json(file, found)
+    values = json.loads(json.dumps(content))
+    result = _parse(file, values, Sweep if "by_distance" in values else Evaluation)
+    files.write_json(file, values)
     return result
 
 
-def _parse(file: Path, found: dict[str, Any], further: Mapping[str, Any]) -> Result:
-    """The typed result in JSON values read from `file`, which is only named in errors.
-
-    Args:
-      further: kinds of what this sort of result has beside what all have.
-    """
-    schema = found.get("schema", 1)
+def _parse(file: Path, values: dict[str, Any], kind: type[Evaluation] | type[Sweep]) -> Result:
+    """Returns the typed result in JSON values; `file` is named in errors."""
+    schema = values.get("schema", 1)
     if schema != SCHEMA:
         raise ValueError(f"{file}: expected schema {SCHEMA}, got {schema!r}; evaluate again")
-    structure.check(file, found, kinds.RESULT | dict(further))
-    scene, config = found["scene"], found.get("config") or {}
-    limit_s = found.get("time_limit_s") or (config.get("eval") or {}).get("time_limit_s") or 0.0
+    content = structure.convert(file, values, kind)
+    config = content.config
+    seed, limit_s = content.seed, content.time_limit_s
+    if config is not None:
+        seed = config.seed if seed is None else seed
+        limit_s = limit_s or (config.eval and config.eval.time_limit_s)
+    scene = content.scene
     known = {*Result._fields, *_FIGURES}
     return Result(
         schema=schema,
-        scene=names.SceneNames(
-            scene["task"], *(tuple(scene[name]) for name in ("arms", "tools", "cameras"))
-        ),
-        method=found["method"],
-        observation=found["observation"],
-        seed=found.get("seed", config.get("seed")),
-        time_limit_s=limit_s,
-        control_hz=found["control_hz"],
-        trials=tuple(map(_trial, found.get("trials") or [])),
-        figures={name: found[name] for name in _FIGURES if name in found},
-        config=config,
-        about={name: value for name, value in found.items() if name not in known},
-        **{name: found.get(name) for name in _MADE_BY},
+        scene=names.SceneNames(scene.task, scene.arms, scene.tools, scene.cameras),
+        method=content.method,
+        observation=content.observation,
+        seed=seed,
+        time_limit_s=limit_s or 0.0,
+        control_hz=content.control_hz,
+        trials=tuple(Trial(**msgspec.structs.asdict(row)) for row in content.trials or ()),
+        figures={name: values[name] for name in _FIGURES if name in values},
+        config=values.get("config") or {},
+        about={name: value for name, value in values.items() if name not in known},
+        weights=content.weights,
+        dataset_digest=content.dataset_digest,
+        commit=content.commit,
+        dirty=content.dirty,
+        version=content.version,
     )
-
-
-def _trial(row: dict[str, Any]) -> Trial:
-    fields: dict[str, Any] = {name: row.get(name) for name in Trial._fields}
-    fields |= {name: tuple(row[name]) for name in kinds.PLACE}
-    return Trial(**fields)

@@ -1,39 +1,43 @@
-"""Checks the structure of JSON that was read from a file, and says where it is not as expected.
+"""Typed values from JSON; an error names the file and the field."""
 
-A kind is a type, a list of one kind, or an object: a kind by name, `?` after the names of what may
-be missing or null, or one kind by `*` for every name.
-"""
-
-import json
+import re
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
+
+import msgspec
 
 from starjax import errors
 
-NUMBER = int | float
-_WORDS = {
-    dict: "an object",
-    list: "a list",
-    str: "text",
-    bool: "true or false",
-    int: "a whole number",
-    NUMBER: "a number",
-}
+T = TypeVar("T")
+_PLACE = re.compile(r" - at `\$\.?(.*)`$")
+_MISSING = re.compile(r"Object missing required field `(.*)`")
+_EXPECTED = re.compile(r"Expected (.*), got (.*)")
 
 
-def check(file: Path, value: Any, kind: Any, place: str = "") -> None:
-    """Raises a UsageError that names `file` and the place in it if `value` is not of `kind`."""
-    types = type(kind) if isinstance(kind, dict | list) else kind
-    if not isinstance(value, types):
-        got = "nothing" if value is None else json.dumps(value)[:60]
-        where = f"{file}: {place}" if place else str(file)
-        raise errors.UsageError(where, _WORDS[types], got)
-    if isinstance(kind, list):
-        for i, item in enumerate(value):
-            check(file, item, kind[0], f"{place}[{i}]")
-    if isinstance(kind, dict):
-        for name, part in kind.items():
-            for key in value if name == "*" else [name.removesuffix("?")]:
-                found = value.get(key)
-                if found is not None or not name.endswith("?"):
-                    check(file, found, part, f"{place}.{key}" if place else key)
+def convert(file: Path, value: object, kind: type[T], place: str = "") -> T:
+    """Converts JSON values to `kind`, e.g. a `msgspec.Struct`; fields that it lacks are ignored.
+
+    Args:
+      file: where the value was read, for errors.
+      place: of the value in the file, for errors.
+
+    Raises:
+      errors.UsageError: a field is missing or of another type.
+    """
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        # msgspec has the field only in its message: "Expected `int`, got `str` - at `$.a[3].b`".
+        text = str(error)
+        located = _PLACE.search(text)
+        fields = [place, located[1] if located else ""]
+        text = _PLACE.sub("", text)
+        expected, got = "a value", "nothing"
+        if missing := _MISSING.fullmatch(text):
+            fields.append(missing[1])
+        elif mismatch := _EXPECTED.fullmatch(text):
+            expected, got = (part.replace("`", "") for part in mismatch.groups())
+        else:
+            expected, got = "a valid value", text
+        field = ".".join(filter(None, fields))
+        raise errors.UsageError(f"{file}: {field}" if field else str(file), expected, got) from None

@@ -78,8 +78,8 @@ def read(file: Path) -> dict[str, Any]:
         beside = file.parent / name
         if beside.parent != file.parent or not beside.is_file():
             raise ValueError(f"{file}: trials: expected a file in its folder, got {name!r}")
-        nothing = {} if result.get("schema", 1) == 1 else {"labels": {}}  # of a task without labels
-        result["trials"] = [nothing | trial for trial in records(files.read_npz(beside))]
+        without = {"labels": {}}  # of a task without labels
+        result["trials"] = [without | trial for trial in records(files.read_npz(beside))]
     return result
 
 

@@ -4,28 +4,63 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from starjax import config, methods
 from starjax.evaluation import result, structure
-from starjax.evaluation.structure import NUMBER
+from starjax.evaluation.content import Hardware, Milliseconds
 from starjax.runtime import files
 
-_MS = {"p50": NUMBER, "p95": NUMBER, "p99": NUMBER}
-_BENCH = {
-    "weights?": str,
-    "inference_ms_by_ddim_steps": {"*": _MS},
-    "roll_network_ms?": _MS,
-    "hardware?": {"devices?": [str], "memory_gb?": NUMBER},
-}
-_RATE = {"successes": int, "trials": int, "rate": NUMBER}
-_ERROR = {"executed": {"mean": NUMBER, "p99?": NUMBER}}
-_LEVEL = {"strict": _RATE, "rcm_error_mm": _ERROR, "wall_force_N?": {"p99?": NUMBER}}
-_STRESS = {
-    "weights": str,
-    "disturbances": {"*": {"unit": str, "levels": {"*": _LEVEL}}},
-}
-_LINE = {"step": int, "loss?": NUMBER, "position_error_mm?": NUMBER, "roll_error_deg?": NUMBER}
-
 Lines = list[dict[str, Any]]
+
+
+class _Bench(msgspec.Struct, kw_only=True):
+    weights: str | None = None
+    inference_ms_by_ddim_steps: dict[str, Milliseconds]
+    roll_network_ms: Milliseconds | None = None
+    hardware: Hardware | None = None
+
+
+class _Strict(msgspec.Struct):
+    successes: int
+    trials: int
+    rate: float
+
+
+class _Executed(msgspec.Struct):
+    mean: float
+    p99: float | None = None
+
+
+class _RcmError(msgspec.Struct):
+    executed: _Executed
+
+
+class _WallForce(msgspec.Struct):
+    p99: float | None = None
+
+
+class _Level(msgspec.Struct):
+    strict: _Strict
+    rcm_error_mm: _RcmError
+    wall_force_N: _WallForce | None = None
+
+
+class _Levels(msgspec.Struct):
+    unit: str
+    levels: dict[str, _Level]
+
+
+class _Stress(msgspec.Struct):
+    weights: str
+    disturbances: dict[str, _Levels]
+
+
+class _Line(msgspec.Struct):
+    step: int
+    loss: float | None = None
+    position_error_mm: float | None = None
+    roll_error_deg: float | None = None
 
 
 def sweep(folder: Path) -> result.Result | None:
@@ -44,7 +79,7 @@ def bench(folder: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     found = files.read_json(file)
-    structure.check(file, found, _BENCH)
+    structure.convert(file, found, _Bench)
     return found
 
 
@@ -57,7 +92,7 @@ def stress(folder: Path, weights: str | None) -> dict[str, Any]:
     found = sorted(folder.glob("stress-seed*/stress.json"), key=lambda path: path.stat().st_mtime)
     for file in reversed(found):
         content = files.read_json(file)
-        structure.check(file, content, _STRESS)
+        structure.convert(file, content, _Stress)
         if weights is None or content["weights"] == weights:
             return content
     return {}
@@ -97,5 +132,5 @@ def _lines(file: Path) -> Lines:
     except ValueError as error:
         raise ValueError(f"{file} is damaged: {error}") from error
     for number, line in enumerate(found, 1):
-        structure.check(file, line, _LINE, f"line {number}")
+        structure.convert(file, line, _Line, f"line {number}")
     return found
