@@ -72,7 +72,7 @@ def test_the_first_successes_of_every_trocar_are_kept(sealed):
 
 def test_an_episode_is_what_the_expert_did(sealed):
     root, _ = sealed
-    demo = load.load(root, report=lambda _: None).dataset
+    demo = load.load(root, residency="host", report=lambda _: None).dataset
     first, last = int(demo.start[1]), int(demo.start[1] + demo.length[1] - 1)
     p, command = np.asarray(demo.observation.pose.p)[:, 0], np.asarray(demo.command.pose.p)[:, 0]
     np.testing.assert_allclose(p[first + 1 : last + 1], command[first:last], atol=1e-5)
@@ -109,7 +109,7 @@ def test_images_do_not_depend_on_the_segment(images, tmp_path, monkeypatch):
 
 
 def test_images_are_those_of_their_own_episode(images):
-    observation = load.load(images, report=lambda _: None).dataset.observation
+    observation = load.load(images, residency="host", report=lambda _: None).dataset.observation
     drawn = np.asarray(observation.images[stubs.CAMERA])[:, :3, 0, 0]
     p = np.asarray(observation.pose.p)[:, 0]
     np.testing.assert_allclose(drawn, p * 1000 + 128, atol=1.01)
@@ -469,7 +469,7 @@ def test_the_label_of_a_disturbed_command_is_what_is_recorded(tmp_path):
     disturbed = agent.from_single(Agent(stubs.EXPERT.init, act))
     env, settings = stubs.make_env(unlucky=0.0), SETTINGS._replace(per_trocar=1)
     demos.collect(tmp_path, env, disturbed, TROCARS, settings, layout=DeviceLayout(lanes=2))
-    dataset = load.load(tmp_path, report=lambda _: None).dataset
+    dataset = load.load(tmp_path, residency="host", report=lambda _: None).dataset
     np.testing.assert_array_equal(dataset.command.gripper, -1.0)
     np.testing.assert_array_equal(dataset.observation.gripper, 1.0)
 
@@ -488,7 +488,7 @@ def test_every_field_is_loaded_as_itself(tmp_path):
     store.create(tmp_path, description)
     outcome = {"success": True, "length": 3, **place}
     store.seal(tmp_path, {"k": store.commit(tmp_path, "k", outcome, arrays)})
-    it = load.load(tmp_path, report=lambda _: None).dataset
+    it = load.load(tmp_path, residency="host", report=lambda _: None).dataset
     seen, said = it.observation, it.command
     found = {
         "p": seen.pose.p,

@@ -119,16 +119,8 @@ _UNREAD = ("qpos", "rcm_error")  # recorded, but not trained on
 
 
 def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.Record]:
-    """Records of the successful episodes, once all are known to be those that were sealed."""
-    records = []
-    for key, found in store.verify_all(root, sealed["episodes"], verify).items():
-        if isinstance(found, store.DamagedEpisode):
-            raise found
-        if found["digest"] != sealed["episodes"][key]:
-            where = root / "episodes" / key / "episode.json"
-            raise store.DamagedEpisode(f"{where}: is not the episode that SEALED.json lists")
-        if found["success"]:
-            records.append(found)
+    """Returns the records of successful episodes, once all episodes are verified."""
+    records = [r for r in store.sealed_records(root, sealed, verify) if r["success"]]
     if not records:
         raise ValueError(f"root: expected successful demonstrations, got none in {root}")
     return records

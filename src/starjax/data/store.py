@@ -161,6 +161,23 @@ def verify_all(
         return dict(zip(keys, pool.map(one, keys), strict=True))
 
 
+def sealed_records(root: Path, sealed: Mapping[str, Any], arrays: bool = True) -> list[Record]:
+    """Verifies the episodes of SEALED.json.
+
+    Raises:
+      DamagedEpisode: one is damaged, or is not the sealed one.
+    """
+    records = []
+    for key, record in verify_all(root, sealed["episodes"], arrays).items():
+        if isinstance(record, DamagedEpisode):
+            raise record
+        if record["digest"] != sealed["episodes"][key]:
+            path = root / "episodes" / key / "episode.json"
+            raise DamagedEpisode(f"{path}: is not the episode that SEALED.json lists")
+        records.append(record)
+    return records
+
+
 def keys(root: Path) -> list[str]:
     """Returns the keys of committed episodes, ordered by trocar, trial and seed."""
     folder = root / "episodes"

@@ -32,7 +32,7 @@ def source(root: Path, form: base.Format) -> Source:
     """
     description = store.read_description(root)
     sealed = store.read_seal(root)
-    records = list(_records(root, sealed).values())
+    records = store.sealed_records(root, sealed)
     kept = [record for record in records if record["files"]]
     if not kept:
         raise errors.UsageError("DATASET", "episodes", f"{root}: none was kept")
@@ -147,17 +147,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
-
-
-def _records(root: Path, sealed: dict[str, Any]) -> dict[str, store.Record]:
-    found = {}
-    for key, record in store.verify_all(root, sealed["episodes"]).items():
-        if isinstance(record, store.DamagedEpisode):
-            raise record
-        if record["digest"] != sealed["episodes"][key]:
-            raise store.DamagedEpisode(f"{root}: {key} is not the episode that SEALED.json lists")
-        found[key] = record
-    return found
 
 
 def _outcome(record: store.Record) -> dict[str, Any]:
