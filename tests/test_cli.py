@@ -182,7 +182,7 @@ def test_ctrl_c_in_a_callback_of_the_collector_is_not_lost():
     command = [sys.executable, "-c", textwrap.dedent(code)]
     found = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert found.returncode == 130, found.stderr
-    assert found.stderr == "starjax: stopped; the same command goes on from what is saved\n"
+    assert found.stderr == "starjax: stopped; rerun the same command to resume\n"
 
 
 def test_a_job_whose_reader_went_away_does_not_claim_to_be_done():

@@ -1,4 +1,4 @@
-"""The console script `starjax`: one subcommand, one module, imported only when it is called."""
+"""The console script `starjax`: imports the module of the called subcommand only."""
 
 import errno
 import importlib
@@ -14,89 +14,50 @@ from starjax.runtime import signals
 _LEARNING = ("sim", "train")
 _ALL = (*_LEARNING, "report")
 _EXCHANGE = (*_LEARNING, "formats")
-# Subcommand -> (module with `main(argv) -> exit code`, or module:function, one line of help, extras
-# that it needs).
-COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
-    "run": (
-        "starjax.commands.run",
-        "collect, train, evaluate and report: the whole of it",
-        _ALL,
-    ),
-    "collect": ("starjax.commands.run:collect", "demonstrations only", _LEARNING),
-    "train": (
-        "starjax.commands.run:train",
-        "demonstrations and training, no evaluation",
-        _LEARNING,
-    ),
-    "evaluate": (
-        "starjax.commands.evaluate",
-        "score a trained policy on its task's trocars",
-        _LEARNING,
-    ),
-    "sweep": (
-        "starjax.commands.sweep",
-        "score a trained policy on a grid or sample of trocars",
-        _LEARNING,
-    ),
-    "stress": (
-        "starjax.commands.stress",
-        "score a trained policy while something is wrong",
-        _LEARNING,
-    ),
-    "six-blocks": (
-        "starjax.commands.six_blocks",
-        "six blocks one after another with two arms, beside people's times",
-        _LEARNING,
-    ),
-    "bench": ("starjax.commands.bench", "inference latency of a policy (Table IV)", _LEARNING),
-    "serve": (
-        "starjax.commands.serve",
-        "a trained policy for robots elsewhere, over websockets",
-        ("sim", "serve"),
-    ),
-    "pack": ("starjax.commands.pack", "a policy in a file of half the size", _LEARNING),
+_VIEWER = (*_LEARNING, "viewer")
+# Subcommand -> (module with `main(argv) -> exit code`, or module:function; help; extras).
+_TABLE: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "run": ("commands.run", "run the full pipeline: collect, train, evaluate, report", _ALL),
+    "collect": ("commands.run:collect", "collect demonstrations only", _LEARNING),
+    "train": ("commands.run:train", "collect demonstrations and train", _LEARNING),
+    "evaluate": ("commands.evaluate", "evaluate a policy on its task's trocars", _LEARNING),
+    "sweep": ("commands.sweep", "evaluate a policy on a grid or sample of trocars", _LEARNING),
+    "stress": ("commands.stress", "evaluate a policy under disturbances", _LEARNING),
+    "six-blocks": ("commands.six_blocks", "evaluate six successive bimanual transfers", _LEARNING),
+    "bench": ("commands.bench", "measure the inference latency of a policy (Table IV)", _LEARNING),
+    "serve": ("commands.serve", "serve a policy to robots over websockets", ("sim", "serve")),
+    "pack": ("commands.pack", "write a policy in half precision", _LEARNING),
     "export": (
-        "starjax.commands.export_command",
-        "demonstrations as a LeRobot, robomimic or zarr dataset",
+        "commands.export_command",
+        "export demonstrations to LeRobot, robomimic or zarr",
         _EXCHANGE,
     ),
     "import": (
-        "starjax.commands.import_command",
-        "a dataset from LeRobot, robomimic or zarr, to train on",
+        "commands.import_command",
+        "import a dataset from LeRobot, robomimic or zarr",
         _EXCHANGE,
     ),
     "inspect": (
-        "starjax.commands.inspect_command",
-        "what is in a dataset, policy or result, and what is odd about it",
+        "commands.inspect_command",
+        "summarise a dataset, policy or result and flag anomalies",
         _EXCHANGE,
     ),
     "report": (
-        "starjax.commands.report_command",
-        "tables, figures, video, page from results",
+        "commands.report_command",
+        "draw tables, figures, video and page from results",
         ("sim", "report"),
     ),
-    "view": (
-        "starjax.commands.view",
-        "a policy, an expert or a dataset at work, live in a browser",
-        (*_LEARNING, "viewer"),
-    ),
-    "teleop": (
-        "starjax.commands.teleop",
-        "demonstrate by hand in a browser; episodes become a dataset",
-        (*_LEARNING, "viewer"),
-    ),
-    "list": ("starjax.commands.list_command", "what flags can name", ("sim",)),
-    "find-mount": (
-        "starjax.commands.find_mount",
-        "search where an arm must stand for a task",
-        ("sim", "train"),
-    ),
-    "doctor": (
-        "starjax.doctor",
-        "what of this machine and installation works, and what to do",
+    "view": ("commands.view", "show a policy, an expert or a dataset in the browser", _VIEWER),
+    "teleop": ("commands.teleop", "record demonstrations by hand in the browser", _VIEWER),
+    "list": (
+        "commands.list_command",
+        "list tasks, arms, tools, methods, presets and policies",
         ("sim",),
     ),
+    "find-mount": ("commands.find_mount", "search the mount of an arm for a task", _LEARNING),
+    "doctor": ("doctor", "check the installation and suggest fixes", ("sim",)),
 }
+COMMANDS = {name: (f"starjax.{module}", *rest) for name, (module, *rest) in _TABLE.items()}
 
 # Names of the previous release; dropped in the next.
 _RENAMED = {"exercise": "six-blocks", "place": "find-mount"}
@@ -107,32 +68,32 @@ _STORAGE = (
 _STOPPED = 130  # exit code after a stop, see `signals`
 _BROKEN_PIPE = 141  # exit code if the output pipe is closed (128 + SIGPIPE), as by `| head`
 _OURS = os.path.join(os.path.dirname(os.path.abspath(__file__)), "")
-_with_its_place = warnings.formatwarning
+_format_with_location = warnings.formatwarning
 _CACHE_ENTRY = "persistent compilation cache entry"  # in jax's warnings
-_told: set[str] = set()  # warnings that are said once
+_shown: set[str] = set()  # warnings that are printed once
 
 
 def main() -> NoReturn:
-    """Entry of the console script."""
+    """Runs the console script."""
     run(dispatch)
 
 
 def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
-    """The whole of a process: `command` with the words of its command line."""
+    """Runs a process: `command` with the words of its command line, then exits."""
     # None for an output that was closed before the process began, as by `>&-`.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
-    sys.unraisablehook = _without_interrupts
-    warnings.formatwarning = _warning
+    sys.unraisablehook = _raise_interrupts
+    warnings.formatwarning = _format_warning
     signals.interrupt_on_stops()
     code = _STOPPED
     try:
         code = guard(command, sys.argv[1:])
         if code == _STOPPED:
             signals.ignore_stops()
-    except KeyboardInterrupt:  # once more, between two lines of ours
+    except KeyboardInterrupt:  # a second stop, outside `guard`
         signals.ignore_stops()
-    if code == _STOPPED:  # jax's threads may still run, and would meet an interpreter that is gone
+    if code == _STOPPED:  # jax's threads may still run, and would use a finalised interpreter
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
@@ -140,42 +101,41 @@ def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
 
 
 def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
-    """Runs a command; what its user can mend becomes one line and an exit code, no traceback.
+    """Runs a command; turns errors that its user can fix into one line and an exit code.
 
-    Returns 2 for a mistake on the command line, 71 for too little memory, 74 for a disk that is
-    full or cannot be used, 130 after a stop such as Ctrl-C or SIGTERM (whatever was running has
-    saved by then, and says how to go on), 141 once nobody reads the output.
+    Returns 2 for an error on the command line, 71 for too little memory, 74 for a full or unusable
+    disk, 130 after a stop such as Ctrl-C or SIGTERM (the command has saved its work and says how to
+    resume), 141 if the output pipe is closed.
     """
     try:
         return command(argv)
     except errors.UsageError as error:
-        return _fail(_spelled(error), 2)
+        return _fail(_with_flags(error), 2)
     except KeyboardInterrupt as stop:
-        text = str(stop) or "stopped; the same command goes on from what is saved"
-        return _fail(text, _STOPPED)
+        return _fail(str(stop) or "stopped; rerun the same command to resume", _STOPPED)
     except BrokenPipeError:
-        # What Python still holds for the reader would fail again when the process ends.
+        # Python's buffered output would fail again when the process ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     except OSError as error:
-        # Imported late: it brings numpy, and `--help` need not wait for it.
+        # Imported late: it imports numpy, which `--help` does without.
         from starjax.runtime import files
 
         if isinstance(error, files.StorageError):
             return _fail(error, 74)
         if error.errno not in _STORAGE:
             raise
-        place = f": {error.filename}" if error.filename else ""
-        does = "write" if error.errno in _WRITING else "read or write"
-        return _fail(f"cannot {does}{place}: {error.strerror}", 74)
+        file = f": {error.filename}" if error.filename else ""
+        verb = "write" if error.errno in _WRITING else "read or write"
+        return _fail(f"cannot {verb}{file}: {error.strerror}", 74)
     except MemoryError as error:
         return _fail(f"too little memory ({error or 'none left'}): close other programs", 71)
     except RuntimeError as error:
         if not str(error).startswith("RESOURCE_EXHAUSTED"):
             raise
-        said = str(error).splitlines()[0].removeprefix("RESOURCE_EXHAUSTED: ")
-        less = "in training lower --train.batch-size, for the rest start with JAX_PLATFORMS=cpu"
-        return _fail(f"{said} Too much for this device's memory: {less}", 71)
+        text = str(error).splitlines()[0].removeprefix("RESOURCE_EXHAUSTED: ")
+        hint = "lower --train.batch-size in training, else start with JAX_PLATFORMS=cpu"
+        return _fail(f"{text} Too much for this device's memory: {hint}", 71)
 
 
 def dispatch(argv: Sequence[str]) -> int:
@@ -199,37 +159,37 @@ def dispatch(argv: Sequence[str]) -> int:
     return getattr(importlib.import_module(module), function or "main")(argv[1:])
 
 
-def _without_interrupts(ignored: Any) -> None:
-    """Says what Python dropped, but for a stop, which is raised again."""
+def _raise_interrupts(ignored: Any) -> None:
+    """Prints an exception that Python dropped; a stop among them is raised again."""
     if ignored.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(ignored)
 
 
-def _warning(message: Warning | str, kind: type[Warning], place: str, *rest: Any) -> str:
-    """Formats a warning: ours as one line, those of others with their place.
+def _format_warning(message: Warning | str, kind: type[Warning], file: str, *rest: Any) -> str:
+    """Returns the text of a warning: ours as one line, others with their location.
 
-    jax warns of every program, hundreds of them, that its cache cannot keep or read: one line says
-    so, once.
+    jax warns of each of hundreds of programs that its cache cannot store or load: the first warning
+    becomes one line, the others are dropped.
     """
-    if os.path.abspath(place).startswith(_OURS):
+    if os.path.abspath(file).startswith(_OURS):
         return f"starjax: {message}\n"
-    what, found, why = str(message).partition(_CACHE_ENTRY)
-    if not found:
-        return _with_its_place(message, kind, place, *rest)
-    if _CACHE_ENTRY in _told:
+    action, entry, details = str(message).partition(_CACHE_ENTRY)
+    if not entry:
+        return _format_with_location(message, kind, file, *rest)
+    if _CACHE_ENTRY in _shown:
         return ""
-    _told.add(_CACHE_ENTRY)
-    reason = " ".join(why.partition(": ")[2].split())
+    _shown.add(_CACHE_ENTRY)
+    reason = " ".join(details.partition(": ")[2].split())
     return (
-        f"starjax: {what.strip().lower()} compiled programs: {reason}; the work goes on, and every "
-        "start compiles them again (starjax doctor says more)\n"
+        f"starjax: {action.strip().lower()} compiled programs: {reason}; every start compiles them "
+        "again (run starjax doctor)\n"
     )
 
 
-def _spelled(error: errors.UsageError) -> str:
-    """A mistake's line, with flags instead of fields if tyro is there to read them."""
+def _with_flags(error: errors.UsageError) -> str:
+    """Returns the line of an error, with flags for field names if tyro is installed."""
     try:
-        from starjax.commands import options  # late: `--version` need not wait for tyro
+        from starjax.commands import options  # late: `--version` does without tyro
     except ModuleNotFoundError:
         return str(error)
     return options.spelled(error)
