@@ -1,9 +1,9 @@
-"""Evaluates an agent over all trocars x trials, chunk by chunk, going on where a run was killed.
+"""Evaluates an agent over all trocars x trials in chunks; a killed run resumes.
 
-Several processes share the chunks out; each has all trials at the end.
+Chunks are split over the processes of a run; each process has all trials at the end.
 
-<directory>/plan.json          what is being evaluated; other weights, settings, scenes or versions
-                               start afresh
+<directory>/plan.json          identity of the evaluation; other weights, settings, scenes or
+                               versions replace the chunks
 <directory>/chunk_<n>.npz      a `trials.Table` of the chunk's trials; its recorded trials
 <directory>/recorded.npz       trajectories of a few trials, for figures and the video
 """
@@ -37,13 +37,13 @@ _RECORDED = "recorded."
 
 
 class Settings(NamedTuple):
-    """Which trials are run.
+    """Trials of an evaluation.
 
     Attributes:
       trials: at each configuration of trocars.
       seed: decides every trial's start and noise; methods with the same seed meet the same trials.
       time_limit_s: of a trial, simulated.
-      video_trials: how many trials get their joint positions recorded, at least.
+      video_trials: minimum number of trials with recorded joint positions.
       chunk: trials that are simulated and saved together, at most; 0 for as many as the lanes.
         Changes neither the result nor the memory taken.
     """
@@ -68,21 +68,21 @@ def evaluate(
     levels: Mapping[str, float] | None = None,
     report: Callable[[str], None] = print,
 ) -> tables.Table:
-    """Runs what is missing of an evaluation and returns all of it.
+    """Runs the missing chunks of an evaluation and returns all trials.
 
     Args:
       directory: folder of this evaluation alone.
-      env: `sim.env.Env`, with the observation that the agent knows.
+      env: `sim.env.Env`, with the agent's observation type.
       params: of the agent: a policy's (weights, statistics).
       trocars: fields `[C, A]`.
-      layout: where the lanes are 0, `lanes_per_device`, and so few that all devices have a share.
+      layout: lanes 0 stands for `lanes_per_device`, reduced until every device gets trials.
       identity: JSON values that tell this agent from others with the same params.
-      levels: of what disturbs the environment.
+      levels: of the environment's disturbances.
       report: gets lines for the user.
 
     Raises:
       StorageError: the folder cannot be written or is in use.
-      ValueError: an argument out of range, a trocar that is none.
+      ValueError: an argument out of range, an invalid trocar.
     """
     _check(settings, layout)
     trocars = configurations.listed(trocars, len(env.p_world_ref))
@@ -103,7 +103,7 @@ def evaluate(
             "weights": fingerprint(params),
             "agent": agent.about,
             "identity": dict(identity or {}),
-            # Not those of 0: trials are the same ones, whatever else might have been wrong.
+            # Levels of 0 are omitted: they leave the trials unchanged.
             **({"levels": wrong} if wrong else {}),
             "scene": env.names._asdict(),
             "model": schema.model_hash(env.scene),
@@ -141,7 +141,7 @@ def precompile(
 
 
 def lanes_per_device(device: jax.Device, trials: int) -> int:
-    """Trials that a device of this kind runs together, where its share of them are `trials`.
+    """Returns the number of trials that a device of this kind runs together, out of `trials`.
 
     A GPU's are as many as make the fewest chunks, and no more than these need.
     """
@@ -153,7 +153,7 @@ def lanes_per_device(device: jax.Device, trials: int) -> int:
 
 
 def most_lanes(device: jax.Device) -> int:
-    """Trials that a device of this kind can run together."""
+    """Returns the maximum number of trials that a device of this kind runs together."""
     if device.platform == "cpu":
         return workers.CPU_LANES
     limit = (device.memory_stats() or {}).get("bytes_limit", 0)
@@ -161,7 +161,7 @@ def most_lanes(device: jax.Device) -> int:
 
 
 def fingerprint(tree: Any) -> str:
-    """SHA-256 of all arrays of a pytree and of their places in it."""
+    """Returns the SHA-256 of all arrays of a pytree and of their paths in it."""
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         array = np.asarray(leaf)
@@ -231,7 +231,7 @@ def _parts(
     spans: list[slice],
     chosen: np.ndarray,
 ) -> chunks.Parts:
-    """Chunks of trials: their table, and of those that are `chosen` `[M]` the trajectories."""
+    """Describes the chunks: tables of trials, and trajectories of the `chosen` `[M]` ones."""
     labels = env.task.labels
     has_endoscope = endoscope_camera.of(env.task, env.names.cameras) is not None
     beside = {f"{_RECORDED}{name}" for name in recorded.names(labels, has_endoscope)}
@@ -262,7 +262,7 @@ def _parts(
 
 
 def _recorded(arrays: chunks.Arrays) -> chunks.Arrays:
-    """The trajectories of a chunk."""
+    """Returns the trajectories of a chunk."""
     return {
         name.removeprefix(_RECORDED): values
         for name, values in arrays.items()

@@ -1,4 +1,4 @@
-"""Figures of the exercise with six blocks, beside those of people."""
+"""Figures of the exercise with six blocks, and those of people for comparison."""
 
 from typing import Any
 
@@ -13,12 +13,12 @@ PEOPLE = {"ways": 2, "proficient_s": 48.0, "residents_s": 84.0, "limit_s": LIMIT
 
 
 def compose(table: tables.Table, control_hz: float) -> dict[str, Any]:
-    """Figures of trials of `sim.six_blocks` as JSON values.
+    """Computes figures of trials of `sim.six_blocks` as JSON values.
 
     Returns:
       {complete: {successes, trials, rate, ci95}, moved: {mean, counts `[7]` of trials by blocks},
       dropped, collided, invalid: numbers of trials, seconds: {median, p90} of complete ones or
-      None, blocks, ways: what a trial asks for, rcm_error_mm: as in result.json, people: PEOPLE}.
+      None, blocks, ways: of a whole trial, rcm_error_mm: as in result.json, people: PEOPLE}.
     """
     moved, seconds = table.labels["moved"], table.steps[table.success] / control_hz
     return {

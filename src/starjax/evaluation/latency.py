@@ -1,4 +1,4 @@
-"""How long a policy takes to answer: the rows of Table IV."""
+"""Inference times of policies: the rows of Table IV."""
 
 import functools
 import time
@@ -31,7 +31,7 @@ def policy_ms(
     calls: int = 100,
     seconds: float = 10.0,
 ) -> dict[str, float]:
-    """Time of one call of a policy, from an observation on the device to finished commands.
+    """Measures one call of a policy, from an observation on the device to finished commands.
 
     Args:
       policy: to be timed.
@@ -79,7 +79,7 @@ def table(
     calls: int = 100,
     seconds: float = 10.0,
 ) -> Iterator[dict[str, float]]:
-    """Rows {ddim_steps, p50, p95, p99, n} of one method at batch 1, times in ms, as they come.
+    """Yields rows {ddim_steps, p50, p95, p99, n} of one method at batch 1, times in ms.
 
     Its learner must have the option `ddim_steps`.
     """
@@ -98,7 +98,7 @@ def roll_ms(
     calls: int = 200,
     seconds: float = 5.0,
 ) -> dict[str, float]:
-    """Time of the roll network alone, the hierarchy's overhead; its weights do not matter."""
+    """Measures the roll network alone, the hierarchy's overhead; weights do not matter."""
     batch *= seen.task.arms
     net = roll_net.RollNet(
         width=policy_config.roll_width,
@@ -120,7 +120,7 @@ def roll_ms(
 def example(
     policy_config: config.PolicyConfig, seen: features.Sensors, batch: int
 ) -> tuple[Observation, rcm.Trocar]:
-    """A plausible observation `[batch, O, A]`, tools above the ground, and trocars `[batch, A]`."""
+    """Returns a plausible observation `[batch, O, A]`, tools above ground; trocars `[batch, A]`."""
     trocar = rcm.sample_trocar(jax.random.key(1), (batch, seen.task.arms))
     shape = (batch, policy_config.obs_horizon)
     action = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 0.02]), (*shape, seen.task.arms, 4))
@@ -155,7 +155,7 @@ def _slots(seen: features.Sensors) -> Slots:
 
 
 def _asked(policy_config: config.PolicyConfig, seen: features.Sensors, batch: int) -> Any:
-    """What a decision is made from, beside the policy: keys, observation, trocars."""
+    """Returns the inputs of one inference: keys, observation, trocars."""
     keys = jax.random.split(jax.random.key(0), batch)
     return keys, *example(policy_config, seen, batch)
 
@@ -167,7 +167,7 @@ def _frame(slots: Slots, trocar: rcm.Trocar) -> rcm.TrocarFrame:
 
 
 def _plausible(field: Field) -> jax.Array:
-    """Numbers that a part of the state may have: a point 1 cm above the origin, no rotation."""
+    """Returns plausible values of a state field: a point 1 cm above the origin, no rotation."""
     if field.kind == "point":
         return jnp.resize(jnp.array([0.0, 0.0, 0.01]), (field.size,))
     if field.kind == "rot6d":

@@ -1,4 +1,4 @@
-"""Trajectories of a few trials, for figures and the video: which ones, and what of them."""
+"""Trajectories of a few trials, for figures and the video."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,7 +23,8 @@ class Trajectory(NamedTuple):
     """One recorded trial of T control steps; poses and joints are those after each step.
 
     Attributes:
-      trocar, trial: which one.
+      trocar: index of the configuration.
+      trial: number at this configuration.
       p_world_tip: `[T, A, 3]` m.
       p_world_trocar: `[A, 3]` m.
       rcm_error: `[T, A]` m, executed, or None where the file does not have it.
@@ -43,7 +44,7 @@ class Trajectory(NamedTuple):
 
 
 def choose(count: int, trials: int, video_trials: int) -> np.ndarray:
-    """Which of the `[count * trials]` trials are recorded: the first of every trocar, and so on."""
+    """Selects the recorded trials, as a mask `[count * trials]`: first trials of trocars first."""
     if not video_trials:
         return np.zeros(count * trials, bool)
     wanted = min(max(video_trials, count if count <= FIGURE_TROCARS else 0), count * trials)
@@ -58,13 +59,13 @@ def choose(count: int, trials: int, video_trials: int) -> np.ndarray:
 
 
 def names(labels: Sequence[str], has_endoscope: bool = False) -> list[str]:
-    """Names of what `take` gives of trials with these labels."""
+    """Returns the names of the columns of `take` for trials with these labels."""
     more = ENDOSCOPE if has_endoscope else ()
     return [*_COLUMNS, *more, *(f"{_LABEL}{name}" for name in labels)]
 
 
 def take(episodes: Sequence[Episode], p_world_ref: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of R recorded trials, NaN after each one's end.
+    """Returns columns of R recorded trials, NaN after the end of each.
 
     Args:
       episodes: recorded as `episodes.SCORE` says.
@@ -97,7 +98,7 @@ def take(episodes: Sequence[Episode], p_world_ref: np.ndarray) -> dict[str, np.n
 
 
 def join(kept: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Columns of all chunks, those without a recorded trial left out."""
+    """Joins the columns of all chunks that have recorded trials."""
     kept = [part for part in kept if part]
     joined = {}
     for name in kept[0]:
@@ -111,7 +112,7 @@ def read(file: Path) -> list[Trajectory]:
     """Reads the trials of a recorded.npz.
 
     Raises:
-      FileNotFoundError: there is none.
+      FileNotFoundError: the file is missing.
       ValueError: the file is damaged; the message names it.
     """
     always = ("trocar", "trial", "length", "p_world_tip", "p_world_trocar")
@@ -139,7 +140,7 @@ def _row(found: dict[str, np.ndarray], row: int, length: int) -> Trajectory:
 
 
 def _padded(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows `[T, ...]` of different lengths as one array, NaN after each one's end."""
+    """Pads rows `[T, ...]` of different lengths with NaN to one array."""
     longest = max(1, *map(len, rows))
     found = np.full((len(rows), longest, *rows[0].shape[1:]), np.nan, np.float32)
     for out, row in zip(found, rows, strict=True):

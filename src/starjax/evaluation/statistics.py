@@ -18,7 +18,7 @@ Written by `compose`, figures in SI units unless the name says otherwise, interv
     invalid, collided     number of trials
     trials                list of `result.Trial`s, radius, polar and azimuth lists [A]
 
-Rates, intervals and the quantile of successes are null where there are none.
+Rates and intervals are null without trials, the quantile of successes without a success.
 """
 
 import math
@@ -33,7 +33,10 @@ CONFIDENCE = 0.95
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's interval of a success rate."""
+    """Computes Wilson's score interval of a success rate.
+
+    (p + z^2/2n ± z sqrt(p(1-p)/n + z^2/4n^2)) / (1 + z^2/n), with z = 1.96 for 95%.
+    """
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(
             "successes, trials: expected 0 <= successes <= trials and trials > 0, "
@@ -44,7 +47,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 
 def rate(success: np.ndarray) -> dict[str, Any]:
-    """Successes `[M]` bool as {successes, trials, rate, ci95}."""
+    """Counts successes `[M]` bool: {successes, trials, rate, ci95}."""
     successes, trials = int(np.sum(success)), len(success)
     if not trials:
         return {"successes": 0, "trials": 0, "rate": None, "ci95": None}
@@ -57,9 +60,10 @@ def rate(success: np.ndarray) -> dict[str, Any]:
 
 
 def generalization_gap(seen: np.ndarray, unseen: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """SR_seen - SR_unseen (Eq. 20) of successes `[M]` bool, with Newcombe's interval.
+    """Computes SR_seen - SR_unseen (Eq. 20) of successes `[M]` bool, with Newcombe's interval.
 
-    Newcombe's hybrid score method (1998, no. 10): the two Wilson intervals, joined.
+    Newcombe's hybrid score method (1998, no. 10) combines the two Wilson intervals [l, u]:
+    gap - sqrt((a - l_a)^2 + (u_b - b)^2) to gap + sqrt((u_a - a)^2 + (b - l_b)^2).
     """
     a, b = rate(seen), rate(unseen)
     if a["rate"] is None or b["rate"] is None:
@@ -71,7 +75,9 @@ def generalization_gap(seen: np.ndarray, unseen: np.ndarray) -> tuple[float, tup
 
 
 def mcnemar(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
-    """McNemar's exact test of two methods on the same trials, `[M]` bool each.
+    """Computes McNemar's exact test of two methods on the same trials, `[M]` bool each.
+
+    Under the null hypothesis, trials that one method alone solved are binomial with p = 1/2.
 
     Returns:
       {only_a, only_b, p_value}: trials that one alone solved, and the two-sided p value.
@@ -86,7 +92,7 @@ def mcnemar(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
 
 
 def rcm_error_mm(table: tables.Table) -> dict[str, Any]:
-    """Commanded, executed and within_steps, as documented at the top of this file."""
+    """Computes rcm_error_mm, as documented at the top of this file."""
     # The mean and the maximum come from float32 figures: float16 is for the quantile only.
     mean = np.sum(table.rcm_mean * table.steps.astype(np.float64)) / max(np.sum(table.steps), 1)
     return {
@@ -100,7 +106,7 @@ def rcm_error_mm(table: tables.Table) -> dict[str, Any]:
 
 
 def _worst(table: tables.Table, column: str, largest: np.ndarray) -> dict[str, float | None]:
-    """99th percentiles and maximum of a per-step column; `largest` `[M]` m: that of each trial."""
+    """Computes percentiles and maximum of a per-step column; `largest` `[M]` m is per trial."""
     return {
         "p99": _p99(getattr(table, column)),
         "max": 1e3 * _max(largest),
@@ -115,7 +121,7 @@ def _p99(errors: np.ndarray) -> float | None:
 def compose(
     table: tables.Table, is_seen: np.ndarray, *, method: str, observation: str, seed: int
 ) -> dict[str, Any]:
-    """The figures of an evaluation, as documented at the top of this file.
+    """Computes the figures of an evaluation, as documented at the top of this file.
 
     Args:
       table: all trials.
@@ -159,7 +165,7 @@ def compose(
 
 
 def trials(table: tables.Table, seen: np.ndarray, seed: int) -> list[dict[str, Any]]:
-    """One JSON record a trial; `seen` `[M]` bool."""
+    """Returns one JSON record per trial; `seen` `[M]` bool."""
     fields = (
         "trocar", "radius", "polar", "azimuth", "trial", "success", "loose", "safe", "invalid",
         "collided", "lost", "steps", "stage",

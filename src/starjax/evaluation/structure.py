@@ -18,7 +18,7 @@ def convert(file: Path, value: object, kind: type[T], place: str = "") -> T:
     """Converts JSON values to `kind`, e.g. a `msgspec.Struct`; fields that it lacks are ignored.
 
     Args:
-      file: where the value was read, for errors.
+      file: source of the value, for errors.
       place: of the value in the file, for errors.
 
     Raises:

@@ -27,10 +27,10 @@ def sample(seed: int, count: int, task: Task) -> Trocar:
 
 
 def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray, arms: int = 1) -> Trocar:
-    """Every combination of the given radii (m), polar angles and azimuths (rad): `[C, arms]`.
+    """Combines all radii (m), polar angles and azimuths (rad): `[C, arms]`.
 
-    All arms have the same one, each about its own nominal trocar. Places that coincide (at radius
-    0, and at polar angles 0 and pi) are there once.
+    All arms have the same one, each about its own nominal trocar. Positions that coincide (at
+    radius 0, and at polar angles 0 and pi) appear once.
     """
     fields = (np.asarray(x, np.float32).reshape(-1) for x in (radii, polars, azimuths))
     combined = np.stack(np.meshgrid(*fields, indexing="ij"), -1).reshape(-1, 3)
@@ -41,7 +41,7 @@ def grid(radii: np.ndarray, polars: np.ndarray, azimuths: np.ndarray, arms: int 
 
 
 def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: np.ndarray) -> np.ndarray:
-    """Distance `[C]` in m of each configuration to the nearest one of training.
+    """Returns the distance `[C]` in m of each configuration to the nearest one of training.
 
     Between two configurations it is that of the arm whose trocars are farthest apart.
 
@@ -55,14 +55,14 @@ def distance_to_nearest(trocars: Trocar, training: Trocar, p_world_ref: np.ndarr
 
 
 def bin_of(distance: ArrayLike) -> np.ndarray:
-    """Which bin of `BIN_WIDTH` distances (m) lie in: in float64, in which results are read back."""
+    """Returns the bin of `BIN_WIDTH` of each distance (m), in float64 as results are read back."""
     return np.floor(np.asarray(distance, np.float64) / BIN_WIDTH).astype(int)
 
 
 def compose(
     table: tables.Table, training: Trocar, p_world_ref: np.ndarray, *, seed: int
 ) -> dict[str, Any]:
-    """A sweep's result as JSON values: figures over all, over distance, and every trial.
+    """Computes a sweep's result as JSON values: figures overall, by distance, and all trials.
 
     Args:
       table: trials at any trocars.

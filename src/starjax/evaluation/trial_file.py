@@ -1,8 +1,8 @@
-"""The trials of a result in a compressed file beside it, a twentieth of their size as JSON.
+"""The trials of a result in a compressed file next to it, a twentieth of their size as JSON.
 
 result.json may hold `trials` as a list of records, or as the name of such a file in its folder.
 There every field is a column, `[M]` or `[M, A]`; a field within a record, as `labels`, is a column
-for each of its names, `labels.<name>`. Floats are kept as float32, which is what they come from.
+for each of its names, `labels.<name>`. Floats are stored as float32, their original type.
 """
 
 from collections.abc import Mapping, Sequence
@@ -54,7 +54,7 @@ def records(columns: Mapping[str, np.ndarray]) -> list[Record]:
 
 
 def detach(file: Path) -> None:
-    """Moves the trials of the result `file` into a file beside it; one without a list stays.
+    """Moves the trials of the result `file` into a file next to it; no-op if already moved.
 
     Raises:
       ValueError: the file is damaged, or its trials are no table.

@@ -1,4 +1,4 @@
-"""Finished trials as columns, one row a trial: what is stored, counted and reported."""
+"""Finished trials as columns, one row per trial, which are stored, counted and reported."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ class Table(NamedTuple):
       trocar: `[M]` int32, index of the configuration.
       radius: `[M, A]` m. polar, azimuth: `[M, A]` rad.
       trial: `[M]` int32, number within the configuration.
-      success: `[M]` bool, strict. An invalid (diverged) trial is none.
+      success: `[M]` bool, strict. An invalid (diverged) trial fails.
       loose: `[M]` bool, the task's looser test.
       safe: `[M]` bool, strict, and the executed RCM error never above `SAFE_RCM_M`, at no physics
         step.
@@ -57,7 +57,7 @@ class Table(NamedTuple):
 
 
 def from_episodes(episodes: Sequence[Episode]) -> Table:
-    """Columns of episodes that were recorded as `episodes.SCORE` says."""
+    """Returns the table of episodes with the fields of `episodes.SCORE`."""
     outcomes = [episode.outcome for episode in episodes]
 
     def column(name: str, kind: Any) -> np.ndarray:
@@ -96,7 +96,7 @@ def from_episodes(episodes: Sequence[Episode]) -> Table:
 
 
 def names(labels: Sequence[str]) -> list[str]:
-    """Names of the `columns` of a table with these labels."""
+    """Returns the names of the `columns` of a table with these labels."""
     return [
         *(name for name in Table._fields if name != "labels"),
         *(f"{_LABEL}{name}" for name in labels),
@@ -104,14 +104,14 @@ def names(labels: Sequence[str]) -> list[str]:
 
 
 def columns(table: Table) -> dict[str, np.ndarray]:
-    """A table as arrays by name, each label one of its own."""
+    """Returns the arrays of a table by name, one per label."""
     found = table._asdict()
     labels = found.pop("labels")
     return found | {f"{_LABEL}{name}": values for name, values in labels.items()}
 
 
 def from_columns(found: Mapping[str, np.ndarray]) -> Table:
-    """The table that `columns` took apart; other names are passed over."""
+    """Inverts `columns`; ignores other names."""
     labels = {k.removeprefix(_LABEL): v for k, v in found.items() if k.startswith(_LABEL)}
     fields: dict[str, Any] = {name: found.get(name) for name in Table._fields}
     fields["labels"] = labels
@@ -119,13 +119,13 @@ def from_columns(found: Mapping[str, np.ndarray]) -> Table:
 
 
 def join(tables: Sequence[Table]) -> Table:
-    """One table after another."""
+    """Concatenates tables."""
     parts = [columns(table) for table in tables]
     return from_columns({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
 
 
 def select(table: Table, rows: np.ndarray) -> Table:
-    """The rows where `rows` `[M]` bool holds."""
+    """Returns the rows where `rows` `[M]` bool is True."""
     steps = np.repeat(rows, table.steps)
     found = columns(table).items()
     return from_columns({name: x[steps if name in BY_STEP else rows] for name, x in found})

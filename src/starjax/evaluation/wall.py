@@ -1,6 +1,6 @@
 """The force that a tool's shaft puts on the abdominal wall at its trocar.
 
-The wall is a spring with a damper between the port's centre and the point of the shaft nearest to
+The wall is a spring with a damper between the trocar's centre and the point of the shaft nearest to
 it. The force is computed from the executed RCM error alone: the wall does not push back on the
 simulated arm, whose servos are far stiffer.
 """
@@ -18,10 +18,10 @@ DAMPING = 10.0  # N s/m
 
 
 def force(table: tables.Table, control_hz: float) -> dict[str, Any]:
-    """Mean, 99th percentile and maximum, in N, over all control steps of all trials.
+    """Computes mean, 99th percentile and maximum, in N, over all control steps of all trials.
 
-    The damper feels how fast the RCM error changes; what moves around the port at one distance is
-    the spring's alone.
+    The damper acts on the rate of the RCM error; motion around the trocar at constant distance
+    loads the spring alone.
     """
     found = []
     for error in np.split(table.rcm_error_mm.astype(np.float64), np.cumsum(table.steps)[:-1]):

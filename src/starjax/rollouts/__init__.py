@@ -1,1 +1,1 @@
-"""Closed-loop rollouts of any agent: the loop, its devices, what is missing."""
+"""Closed-loop rollouts of any agent: the loop, its devices, missing parts."""

@@ -1,7 +1,7 @@
 """Agents of a whole batch: experts and recorded episodes by vmap, policies with plans.
 
-A policy plans anew every `execute` control steps, for all episodes at once, and looks only at the
-moments that its next plan needs, so that pictures are drawn for these alone.
+A policy plans anew every `execute` control steps, for all episodes at once, and observes only at
+the control steps that its next plan needs; images are drawn for these alone.
 """
 
 import functools
@@ -18,14 +18,14 @@ Observe = Callable[[], Observation]
 
 
 class BatchAgent(NamedTuple):
-    """Whoever acts in N episodes at once, as pure functions.
+    """An agent of N episodes at once, as pure functions.
 
     Attributes:
       init: (params, keys `[N]`, EnvState `[N]`, observe) -> memory, leaves `[N, ...]`.
       act: (params, memory, EnvState `[N]`, observe, t) -> (Command `[N, A]` to execute, memory,
         Command `[N, A]` to record). `observe() -> Observation [N]` looks at the state; `t` int32
         is the number of the control step, the same in all episodes.
-      about: JSON values that tell it from others.
+      about: JSON values that identify it.
     """
 
     init: Callable[..., Any]
@@ -114,7 +114,9 @@ def from_policy(sample: Callable[..., Command], obs_horizon: int, execute: int) 
             keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(memory.key, t // execute)
             return sample(*params, keys, seen, state.measured_trocar)
 
-        to_plan = -t % execute  # control steps
+        # A plan starts at t % execute == 0. Observed are that step and the O - 1 steps before it:
+        # with O = 2 and execute = 8, t = 0, 7, 8, 15, 16, ...
+        to_plan = -t % execute  # control steps until the next plan
         seen = jax.lax.cond(to_plan < obs_horizon, look, lambda seen: seen, memory.seen)
         command = jax.lax.cond(to_plan == 0, plan, lambda command: command, memory.command)
         now = jax.tree.map(lambda x: x[:, t % execute], command)

@@ -1,8 +1,8 @@
-"""Makes what is missing of a job whose parts are files of arrays, and reads the rest.
+"""Makes the missing parts of a job, which are files of arrays, and reads the others.
 
-A part appears whole or not at all, and its archive has checksums: after a kill the same command
-makes what is missing, and a damaged part is named and made again. Several processes make parts in
-turn, and all of them read all.
+Files are written atomically and have checksums: after a kill, the same command makes the missing
+parts, and names damaged ones and makes them again. Parts are split over the processes of a run,
+and every process reads all of them.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ def complete(
 
     Args:
       title, unit: of the progress that the first process shows, e.g. Evaluation and trials.
-      report: gets a line for each damaged part.
+      report: called with a line per damaged part.
 
     Raises:
       StorageError: a part cannot be written.
@@ -76,7 +76,7 @@ def _checked(parts: Parts, number: int) -> Arrays:
 
 
 def _read(parts: Parts, number: int, report: Callable[[str], None]) -> Arrays | None:
-    """A finished part, or None if it is missing or damaged."""
+    """Reads a finished part; returns None if it is missing or damaged."""
     try:
         return _checked(parts, number)
     except FileNotFoundError:

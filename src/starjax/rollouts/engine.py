@@ -1,13 +1,13 @@
 """Runs an agent in closed loop, as one program over a batch of episodes, until all are over.
 
 A trial is named by (trocar, trial). Its key is `fold_in(fold_in(key, trocar), trial)`: one half
-resets the environment, the other is the agent's. So a trial does not know in which batch, on which
-device or beside whom it runs. Only the size of the compiled batch may change last bits (of matrix
-products, and of the simulator when it is small), so each device always runs equally many, some of
-them idle if there are fewer.
+resets the environment, the other is the agent's. So a trial's result does not depend on its batch,
+device or neighbours. Only the size of the compiled batch may change last bits (of matrix products,
+and of the simulator when it is small), so each device always runs equally many lanes, some of them
+idle.
 
 The program runs in segments of a fixed number of control steps, which end early when all episodes
-are over. While the device runs a segment, the host fetches what the one before recorded.
+are over. While the device runs a segment, the host fetches the records of the one before.
 """
 
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -23,11 +23,11 @@ from starjax.rollouts.agent import BatchAgent
 
 
 class Settings(NamedTuple):
-    """How trials are run.
+    """Settings of trials.
 
     Attributes:
       seed: of all trials.
-      stream: folded into the seed's key if given, so that others with this seed start otherwise.
+      stream: folded into the seed's key if given, for starts of its own with the same seed.
       max_steps: control steps after which a trial is over.
       lanes: N, size of the batch over all devices.
     """
@@ -68,7 +68,7 @@ def make(
       env: `sim.env.Env`.
       trocars: fields `[C, A]`, on the host.
       devices: that lanes are split over; their number must divide that of the lanes.
-      levels: of what disturbs the environment, see `EnvParams`; data, not part of a program.
+      levels: of the environment's disturbances, see `EnvParams`; data, not part of a program.
 
     Returns:
       run(params, group), which simulates at most `lanes` trials and yields Progress after every
@@ -83,8 +83,8 @@ def make(
         running = list(range(len(group)))
         images: dict[int, dict[str, list[np.ndarray]]] = {lane: {} for lane in running}
         others: list[dict[str, np.ndarray]] = []
-        # In a thread: on a GPU a call may hold its caller while its loops ask the host whether to
-        # go on.
+        # In a thread: on a GPU a call may hold its caller while its loops check their conditions
+        # on the host.
         with ThreadPoolExecutor(1) as device:
             ahead = device.submit(advance, params, carry, np.int32(0))
             del carry
@@ -152,7 +152,7 @@ def _key(settings: Settings) -> jax.Array:
 
 
 def _filled(trocars: Trocar, group: Sequence[episodes.Trial], lanes: int) -> programs.Trials:
-    """A full batch: the first trial repeats, inactive, where there are too few."""
+    """Returns a full batch; repetitions of the first trial, inactive, fill it."""
     index, trial = np.array([*group, *[group[0]] * (lanes - len(group))], np.int32).T
     active = np.arange(lanes) < len(group)
     return programs.Trials(Trocar(*(field[index] for field in trocars)), index, trial, active)

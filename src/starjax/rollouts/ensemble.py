@@ -39,8 +39,8 @@ def from_policy(
 
     Args:
       sample: as `Policy.sample`.
-      obs_horizon: O, observations it sees, at most 2, as it plans at every control step.
-      keeps_to_manifold: whether its poses are on the RCM manifold.
+      obs_horizon: O, observation horizon, at most 2 because it plans at every control step.
+      keeps_to_manifold: True if its poses are on the RCM manifold.
     """
     planner = agent.from_policy(sample, obs_horizon, 1)
 
@@ -70,8 +70,8 @@ def from_policy(
 
 
 def weights(horizon: int, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What the plan of control step `t` weighs at each of its `[H]` moments, and what all plans for
-    the first of them weigh together."""
+    """Returns the weights `[H]` of the plan of control step `t`, one per planned step, and the sum
+    of the weights of all plans for the first of these steps."""
     earlier = jnp.minimum(t, horizon - 1 - jnp.arange(horizon))
     each = jnp.exp(-DECAY * jnp.arange(horizon))
     return each[earlier], jnp.sum(jnp.where(jnp.arange(horizon) <= earlier[0], each, 0.0))

@@ -1,6 +1,6 @@
-"""Finished episodes: which trial it was, how it ended, what was recorded of it.
+"""Finished episodes: their trial, outcome and recorded fields.
 
-The fields that are recorded of each control step are chosen by whoever receives the episodes.
+The receiver of the episodes chooses the fields that are recorded at each control step.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,7 +21,7 @@ ENDOSCOPE = ("endoscope_R", "endoscope_p")  # parts of the endoscope's pose
 # How an episode ended: fields of EnvState.
 FLAGS = ("collided", "invalid", "loose", "lost", "success")
 
-# Of a demonstration; images and state are there where they are observed.
+# Fields of a demonstration; images and state only if they are observed.
 FIELDS = {
     "p": "m, measured tip positions, world frame",
     "R": "measured tip rotations R_world_tip",
@@ -51,11 +51,11 @@ class Episode(NamedTuple):
 
     @property
     def trial(self) -> Trial:
-        """Which one it is."""
+        """Index of the configuration, and number there."""
         return self.outcome["trocar"], self.outcome["trial"]
 
     def joined(self, name: str) -> np.ndarray:
-        """A field, `[length, ...]`."""
+        """Returns a field `[length, ...]`."""
         return np.concatenate(self.arrays[name])
 
 
@@ -63,7 +63,7 @@ class Step(NamedTuple):
     """One control step of N episodes.
 
     Attributes:
-      observed: Observation before it, None where nothing that is recorded needs one.
+      observed: Observation before it, None if no recorded field needs it.
       label: Command `[N, A]` to record. executed: Command `[N, A]`.
       before, after: EnvState.
     """
@@ -80,7 +80,7 @@ class Record(NamedTuple):
 
     Attributes:
       fields: (Step) -> name -> `[N, ...]`.
-      observes: whether it needs `Step.observed`.
+      observes: True if it needs `Step.observed`.
       frames: control steps between two looks of the host; it bounds the memory that images take on
         the device.
     """
@@ -145,7 +145,7 @@ def assemble(
     others: list[dict[str, np.ndarray]],
     images: Mapping[str, list[np.ndarray]],
 ) -> Episode:
-    """Puts together the episode of a lane that is over, of what was fetched after every segment.
+    """Assembles the episode of a finished lane from the arrays fetched after every segment.
 
     Args:
       trocars: fields `[C, A]`.

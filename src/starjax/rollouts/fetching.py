@@ -30,8 +30,8 @@ def fetch(arrays: Sequence[jax.Array]) -> list[np.ndarray]:
 
 
 def _through_pinned(array: jax.Array) -> np.ndarray:
-    """A copy by way of pinned memory, which a GPU writes at its full speed.
+    """Copies by way of pinned memory, which a GPU writes at its full speed.
 
-    It takes that long to come by that it must be used again and again: what is returned holds none.
+    Pinned memory is slow to allocate and must be reused, so the returned array holds none.
     """
     return np.array(jax.device_put(array, array.sharding.with_memory_kind("pinned_host")))

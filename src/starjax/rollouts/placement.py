@@ -15,11 +15,11 @@ LANE = PartitionSpec("lane")
 
 
 class DeviceLayout(NamedTuple):
-    """Where a batch runs.
+    """Lanes and devices of a batch.
 
     Attributes:
       lanes: episodes simulated together on all devices; of a CPU with one, each core has as many.
-        0 for what suits the machine. It decides memory, and may change last bits.
+        0: chosen for the machine. It decides memory use, and may change last bits.
       devices: that lanes are split over, None for the default one.
     """
 
@@ -31,7 +31,7 @@ DEFAULT_LAYOUT = DeviceLayout()
 
 
 def devices() -> list[jax.Device] | None:
-    """Devices that lanes are split over: this process's if there are several, None for one."""
+    """Returns the devices that lanes are split over: this process's, or None if it has one."""
     found = jax.local_devices()
     return found if len(found) > 1 else None
 
@@ -55,7 +55,7 @@ def split(
     program = precompile.Program(fn, donate_argnums=donate)
     if devices is None:
         return program
-    # A program and a thread for each device. One program over all of them would put a reduction
+    # A program and a thread per device. One program over all of them would put a reduction
     # into every loop's condition, the solver's included; under shard_map it would not, but there
     # XLA's compiler for GPUs dies with a segmentation fault (jaxlib 0.11.2).
     mesh = Mesh(np.array(devices), ("lane",))

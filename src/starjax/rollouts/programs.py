@@ -1,6 +1,6 @@
 """Programs of the engine: one starts a batch of trials, one runs a segment of control steps.
 
-They are compiled once for the same functions: what is data, as trials and levels, is an argument.
+They are compiled once for the same functions: data, e.g. trials and levels, are arguments.
 """
 
 import functools
@@ -68,7 +68,7 @@ def make(
 
 
 class _EnvFns(NamedTuple):
-    """The functions of an `Env` that programs call: what they are known by."""
+    """The functions of an `Env` that programs call, which are part of the compile cache's key."""
 
     reset: Callable[..., Any]
     step: Callable[..., Any]
@@ -91,7 +91,7 @@ def _programs(
     record: episodes.Record,
     devices: Sequence[jax.Device] | None,
 ) -> tuple[Callable[..., RolloutState], Callable[..., Any]]:
-    """As `make`, by the functions alone: other environments may share them."""
+    """Makes the programs from the functions alone: other environments may share them."""
     shared, lane = placement.SHARED, placement.LANE
     start = placement.split(_starter(env, agent), devices, (shared, shared, lane, shared), lane)
     advance = placement.split(
@@ -134,7 +134,7 @@ def _advancer(
         return RolloutState(after, memory, carry.length + ~before.done, carry.active), fields
 
     def advance(params: Any, carry: RolloutState, first: jax.Array) -> Any:
-        """Control steps `first` up to `first + record.frames`, fewer when all episodes are over.
+        """Runs control steps `first` to `first + record.frames`, fewer if all episodes end.
 
         Returns the carry, records `[N, record.frames]`, and the status `[N]`.
         """
@@ -188,7 +188,7 @@ def _frame(env: _EnvFns, arms: int, record: episodes.Record) -> dict[str, jax.Sh
 
 
 def status(env: Any, carry: RolloutState) -> dict[str, Any]:
-    """How N episodes stand: `over`, `length`, `episodes.FLAGS`, `stage`, `labels`, `[N]` each."""
+    """Returns the status of N episodes: `over`, `length`, flags, `stage` and `labels`, `[N]`."""
     state = carry.env
     found = {
         "over": state.done,

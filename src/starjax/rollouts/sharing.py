@@ -1,9 +1,9 @@
 """Shares out work in one folder among the processes of a run.
 
-Every process runs the same command on a shared folder. Its parts belong to the processes in turn;
-what one makes, the others read from the folder. They wait for each other by small files in
-`<folder>/.shared`, named by the run and by the piece of work, so that those of a killed run mean
-nothing. With one process there are no such files, and nothing waits.
+Every process runs the same command on a shared folder. Parts are assigned to processes in turn,
+and every process reads the others' parts from the folder. Protocol: a process announces an event by
+a small JSON file in `<folder>/.shared`, and others poll for it. File names contain the run and the
+piece of work, so files of a killed run are ignored. A single process writes none and never waits.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ import jax
 
 from starjax.runtime import files, processes
 
-POLL_S = 0.2  # between two looks for what another process writes
+POLL_S = 0.2  # polling interval for other processes' files
 _SIGNS = ".shared"
 
 Part = TypeVar("Part")
@@ -45,11 +45,11 @@ class Share(NamedTuple):
 
     @property
     def is_first(self) -> bool:
-        """Whether this process does what is done once."""
+        """True for the process that does the work of `first`."""
         return self.index == 0
 
     def mine(self, parts: Sequence[Part]) -> list[Part]:
-        """The parts that this process makes."""
+        """Returns the parts that this process makes."""
         return list(parts[self.index :: self.count])
 
     def first(self, what: str, act: Callable[[], Any]) -> Any:
@@ -67,7 +67,7 @@ class Share(NamedTuple):
             self._wait(f"{what}-{index}")
 
     def pause(self) -> None:
-        """Waits a moment for what others write.
+        """Waits for one polling interval.
 
         Raises:
           ProcessFailed: one of them ended with an error.
@@ -138,6 +138,6 @@ def _told(share: Share) -> Iterator[None]:
 
 
 def _failed(index: int) -> str:
-    """Names what a process writes that ends with an error. Each has its own file: processes that
-    are stopped together write at the same moment."""
+    """Returns the name of the file of a process that ends with an error. Each has its own, because
+    processes that are stopped together write at the same time."""
     return f"failed-{index}"

@@ -1,8 +1,8 @@
 """Runs trials until every trocar configuration has its quota of successes.
 
 A configuration needs its trials in order, up to the one with its last success of the quota. Trials
-end in any order, so an episode is yielded once its need is certain: when the trials before it
-cannot fill the quota, even if all unfinished ones succeed.
+end in any order, so an episode is yielded once its need is certain, i.e. when the trials before
+it cannot fill the quota, even if all unfinished ones succeed.
 
 Trials are drawn in rounds, and a round's groups are split over processes. Each process reads the
 other processes' outcomes from their files. The trials before the first unfinished one all have

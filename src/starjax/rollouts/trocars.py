@@ -7,15 +7,15 @@ from starjax.rcm.trocar import Trocar
 
 
 def select(trocars: Trocar, rows: slice | np.ndarray) -> Trocar:
-    """Some of the configurations."""
+    """Selects some of the configurations."""
     return Trocar(*(field[rows] for field in trocars))
 
 
 def listed(trocars: Trocar, arms: int) -> Trocar:
-    """Concrete configurations as float32 fields `[C, A]`.
+    """Returns concrete configurations as float32 fields `[C, A]`.
 
     Raises:
-      ValueError: a trocar is none, there are none, or they are not `[C, arms]`.
+      ValueError: a trocar is invalid, or the fields are not `[C, arms]` with C >= 1.
     """
     rcm.check_trocar(trocars)
     fields = np.broadcast_arrays(*(np.asarray(field, np.float32) for field in trocars))

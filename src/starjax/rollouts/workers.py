@@ -43,7 +43,7 @@ def run(
       start: makes a job's generator, which runs in one thread at a time.
       max_workers: number of jobs that run in parallel.
       is_needed: called in the caller's thread, before a job begins and after each of its items has
-        been taken; a job that is no longer needed ends there.
+        been taken; it then closes generators of superfluous jobs.
     """
     waiting = collections.deque(jobs)
     running: dict[concurrent.futures.Future, tuple[Job, Generator[Item]]] = {}

@@ -83,7 +83,7 @@ class Disturbance(NamedTuple):
 
 
 def with_disturbances(env: Env, names: Sequence[str]) -> Env:
-    """Wraps an environment so that all of these act, at `EnvParams.levels`."""
+    """Wraps an environment with these disturbances, at `EnvParams.levels`."""
     kinds: dict[str, Disturbance] = {name: DISTURBANCES.get(name) for name in names}
     for name in sorted(kinds, key=lambda name: kinds[name].stores_states):
         env = _with(env, name, kinds[name])
@@ -91,7 +91,7 @@ def with_disturbances(env: Env, names: Sequence[str]) -> Env:
 
 
 def with_random_levels(env: Env, max_levels: Mapping[str, float]) -> Env:
-    """Wraps an environment so that all of these act, at levels drawn for every episode.
+    """Wraps an environment with these disturbances, at levels drawn for every episode.
 
     A level is uniform from 0 to the maximum.
     """

@@ -26,7 +26,7 @@ def _displace(disturbance: DisturbanceState, cameras: Pose) -> Pose:
 
 def _tint(disturbance: DisturbanceState, image: jax.Array, step: jax.Array) -> jax.Array:
     cast = jax.random.uniform(disturbance.key, (3,), minval=-1.0)
-    # Scaled so that the most affected colour changes by `level`.
+    # The most affected colour changes by `level`.
     return image * (1.0 + disturbance.level * cast / jnp.max(jnp.abs(cast)))
 
 

@@ -54,7 +54,7 @@ def _execute_past(
 def _drop(
     env: Env, disturbance: DisturbanceState, state: EnvState, command: Command
 ) -> tuple[EnvState, EnvState]:
-    """Steps; the memory is the last state that was observed."""
+    """Advances one step; the memory is the last state that was observed."""
     after = env.step(state, command)
     is_lost = jax.random.bernoulli(
         jax.random.fold_in(disturbance.key, after.step), disturbance.level
