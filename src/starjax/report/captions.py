@@ -51,7 +51,7 @@ def _gap(seen: stats.Rate, unseen: stats.Rate) -> str:
 
 
 def _rank(runs: Sequence[results.Run], focus: results.Run) -> str:
-    """Names the best other run at unseen trocars, which distinguish the methods."""
+    """Returns a sentence on the best other run at unseen trocars."""
     scores = []
     for run in runs:
         unseen = outcomes.rates(run.trials)[1]

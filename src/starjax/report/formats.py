@@ -22,45 +22,45 @@ def names_in(header: Sequence[str]) -> int:
 
 
 def rate(score: stats.Rate) -> str:
-    """Formats a rate, e.g. `74.0 (71/96) [64.4, 81.7]`."""
+    """Renders a rate, e.g. `74.0 (71/96) [64.4, 81.7]`."""
     percent = [100 * x for x in (score.rate, score.low, score.high)]
     counts = f"{score.successes}/{score.trials}"
     return f"{percent[0]:.1f} ({counts}) [{percent[1]:.1f}, {percent[2]:.1f}]"
 
 
 def brief(score: stats.Rate) -> str:
-    """Formats a rate without its interval, e.g. `74 (71/96)`."""
+    """Renders a rate without its interval, e.g. `74 (71/96)`."""
     return f"{100 * score.rate:.0f} ({score.successes}/{score.trials})"
 
 
 def points(difference: tuple[float, float, float]) -> str:
-    """Formats a difference in percentage points, e.g. `+13.5 [-2.7, +29.9]`."""
+    """Renders a difference in percentage points, e.g. `+13.5 [-2.7, +29.9]`."""
     middle, low, high = (100 * x for x in difference)
     return f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
 def millimetres(value: float) -> str:
-    """Formats mm with three decimals, or four below 0.01; below 1e-4 gives a bound."""
+    """Renders mm with three decimals, or four below 0.01; below 1e-4 gives a bound."""
     return "<0.0001" if 0 < value < 1e-4 else f"{value:.4f}" if value < 0.01 else f"{value:.3f}"
 
 
 def p_value(p: float) -> str:
-    """Formats a p value with two digits; below 1e-4 gives a bound."""
+    """Renders a p value with two digits; below 1e-4 gives a bound."""
     return "<0.0001" if p < 1e-4 else f"{p:.4f}" if p < 0.01 else f"{p:.2f}"
 
 
 def fraction(score: stats.Rate) -> str:
-    """Formats a rate as a phrase, e.g. `40 of 48 trials (83%)`."""
+    """Renders a rate as a phrase, e.g. `40 of 48 trials (83%)`."""
     return f"{score.successes} of {score.trials} trials ({100 * score.rate:.0f}%)"
 
 
 def interval(score: stats.Rate) -> str:
-    """Formats an interval, e.g. `95% interval 70-91%`."""
+    """Renders an interval, e.g. `95% interval 70-91%`."""
     return f"95% interval {100 * score.low:.0f}–{100 * score.high:.0f}%"
 
 
 def duration(seconds: float) -> str:
-    """Formats a duration, e.g. `42 s`, `7 min 2 s`, `3 h 12 min`."""
+    """Renders a duration, e.g. `42 s`, `7 min 2 s`, `3 h 12 min`."""
     if seconds < 59.95:
         return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -87,12 +87,12 @@ def machine(about: dict[str, Any]) -> str:
 
 
 def code(commit: str | None, dirty: bool | None) -> str:
-    """Names a commit, e.g. `0a1b2c3d4e, with local changes`; empty if unknown."""
+    """Returns a commit as text, e.g. `0a1b2c3d4e, with local changes`; empty if unknown."""
     return f"{commit[:10]}{', with local changes' if dirty else ''}" if commit else ""
 
 
 def listing(value: Any) -> str:
-    """Formats a small JSON value as a phrase."""
+    """Renders a small JSON value as a phrase."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {listing(part)}" for key, part in value.items())
     if value is None:

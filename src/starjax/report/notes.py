@@ -20,8 +20,8 @@ SWEPT = (
 )
 FAILURES = "Each failed trial is counted under the first class that applies."
 RCM = (
-    "Distance of the shaft's axis from the trocar. Commanded: as the policy asked for it. "
-    "Executed: as the simulated arm did it, at the ends of all control steps of all trials or of "
+    "Distance of the shaft's axis from the trocar. Commanded: of the policy's command. "
+    "Executed: of the simulated arm, at the ends of all control steps of all trials or of "
     "the successful ones; a trial that fails has up to ten times as many steps. Within steps: the "
     "largest at any physics step of each control step, where the servos have not answered yet."
 )

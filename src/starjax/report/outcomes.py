@@ -65,7 +65,7 @@ def worst_rcm_mm(trial: Trial) -> float | None:
 
 
 def place(trial: Trial) -> tuple[str, str, str]:
-    """Formats radius, polar angle and azimuth, with a value per arm."""
+    """Renders radius, polar angle and azimuth, with a value per arm."""
     radius = " / ".join(f"{100 * r:.3g}" for r in trial.radius)
     polar, azimuth = (
         " / ".join(f"{np.degrees(x):.4g}°" for x in angles)

@@ -89,14 +89,14 @@ def _film(names: SceneNames, size: int) -> Film:
     model, task = scene.compose(names), registries.tasks.get(names.task)
     bound, geom_rgb = task.bind(model), geometry.geom_rgb(model)
     scope = endoscope_camera.of(task, names.cameras[:1])
-    (shown,) = cameras.make(model, names.cameras[:1], size, scope=scope, samples=samples)
+    (view,) = cameras.make(model, names.cameras[:1], size, scope=scope, samples=samples)
 
     def batch(poses: Any, labels: dict[str, Any]) -> jax.Array:
         with jax.default_matmul_precision("highest"):  # float32 rays, as in the environment
             rgb = scene.marked(task, bound, labels, jnp.asarray(geom_rgb))
-            return jax.lax.map(lambda step: shown.draw(*step[:2], rgb, *step[2:]).rgb, poses)
+            return jax.lax.map(lambda step: view.draw(*step[:2], rgb, *step[2:]).rgb, poses)
 
-    return Film(precompile.Program(batch), model, tuple(task.labels), shown, scope)
+    return Film(precompile.Program(batch), model, tuple(task.labels), view, scope)
 
 
 def precompile_camera(names: SceneNames, size: int) -> None:
@@ -118,16 +118,16 @@ def camera(names: SceneNames, size: int) -> Draw:
     """Makes the compiled first camera of a scene, for square images of `size` pixels."""
     import jax
 
-    program, model, _, shown, scope = _film(names, size)
+    program, model, _, view, scope = _film(names, size)
 
     def poses(data: mujoco.MjData, held: Pose | None) -> tuple[Any, ...]:
         """Returns positions and rotations of geoms and, if it moves, the camera's pose."""
         geoms = data.geom_xpos.copy(), data.geom_xmat.reshape(-1, 3, 3).copy()
-        if not shown.moves:
+        if not view.moves:
             return geoms
-        R_world_body = data.xmat[shown.body].reshape(3, 3)
-        R, p = (shown.R, shown.p) if held is None else (held.R, held.p)
-        return *geoms, Pose(R_world_body @ R, data.xpos[shown.body] + R_world_body @ p)
+        R_world_body = data.xmat[view.body].reshape(3, 3)
+        R, p = (view.R, view.p) if held is None else (held.R, held.p)
+        return *geoms, Pose(R_world_body @ R, data.xpos[view.body] + R_world_body @ p)
 
     def draw(
         qpos: np.ndarray,

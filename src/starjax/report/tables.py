@@ -30,9 +30,9 @@ def markdown(runs: Sequence[results.Run]) -> str:
         ("Table IV. Inference time", inference(runs), notes.inference(runs)),
     ]
     filled = [f"## {h}\n\n{formats.render(t)}\n\n{note}\n" for h, t, note in parts if len(t) > 1]
-    said = "".join(f"- {line}\n" for line in captions.notes(runs))
+    warnings = "".join(f"- {line}\n" for line in captions.notes(runs))
     head = f"# {formats.sentence(text.title)} from {compare.observed(runs)} observations\n"
-    return "\n".join(part for part in (head, said, *filled) if part)
+    return "\n".join(part for part in (head, warnings, *filled) if part)
 
 
 def success(runs: Sequence[results.Run]) -> Table:
