@@ -22,7 +22,7 @@ import pytest
 from starjax.data import windows
 from starjax.methods import METHODS
 from starjax.models.kernels import packed_params
-from starjax.runtime import files, signals
+from starjax.runtime import files, precompile, signals
 from starjax.training import checkpoint, log, loop, state, step, stepper
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -199,9 +199,7 @@ def test_a_stop_right_after_a_checkpoint_does_not_write_it_again(monkeypatch, tm
 
 def test_a_finished_run_is_only_loaded(whole, monkeypatch):
     directory, result = whole
-    monkeypatch.setattr(
-        stepper, "_compiled_in_background", lambda *_: pytest.fail("compiles a step")
-    )
+    monkeypatch.setattr(stepper, "_program", lambda *_: precompile.Program(pytest.fail))
     before = (directory / "metrics.jsonl").read_bytes()
     again = jobs.train(directory)
     assert_same_bytes(again.state, result.state)
