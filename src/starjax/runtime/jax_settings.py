@@ -1,13 +1,11 @@
-"""Every setting of jax, and what is done about it: the one list of them.
+"""Settings of jax that change results or end programs, and their treatment.
 
-A setting can change random numbers (JAX_THREEFRY_PARTITIONABLE), arithmetic (JAX_ENABLE_X64), what
-is an error (JAX_DEBUG_NANS), or none of these (JAX_LOG_COMPILES). Shells set them for other
-projects. So a command sets those of `FIXED` and `CHECKS` itself. Those of `RECORDED`, and XLA's
-flags, stay the user's: where they are not the usual ones, `recorded` tells, and saved trials and
-demonstrations are used again only where all it tells agrees.
+Shells set them for other projects. Commands set those of `FIXED` (random numbers and types) and
+`CHECKS` (what they find is an error) to jax's defaults. Those of `RECORDED` and XLA's flags stay
+the user's: `recorded` lists the ones that differ from the defaults, and saved trials and
+demonstrations are used again only if all of these agree.
 
-In a program of somebody else's, `deploy` and `rcm` set nothing; there `recorded` tells of `FIXED`
-too.
+`deploy` and `rcm`, used in programs of others, set nothing; `recorded` then lists `FIXED` too.
 """
 
 import os
@@ -60,82 +58,17 @@ CHECKS: Mapping[str, Any] = MappingProxyType({
     "jax_transfer_guard_host_to_device": None,
 })  # fmt: skip
 
-# Left to the user, and recorded where it is not jax's default: precision, and what decides which
-# program is compiled, of which the last bits of a sum may be others.
+# Left to the user, and recorded unless they are jax's defaults: precision and optimisation, which
+# change the last bits of sums.
 RECORDED: Mapping[str, Any] = MappingProxyType({
-    "eager_constant_folding": False,
     "jax_allow_f16_reductions": True,
-    "jax_bcoo_cusparse_lowering": False,
-    "jax_compilation_cache_expect_pgle": False,
     "jax_compiler_enable_remat_pass": True,
-    "jax_cpu_collectives_implementation": "gloo",
-    "jax_custom_jvp3": False,
-    "jax_custom_vjp3": False,
     "jax_default_matmul_precision": None,
     "jax_disable_most_optimizations": False,
-    "jax_enable_pgle": False,
     "jax_exec_time_optimization_effort": 0.0,
-    "jax_memory_fitting_effort": 0.0,
-    "jax_memory_fitting_level": "O2",
-    "jax_mock_gpu_topology": "",
-    "jax_mosaic_allow_hlo": False,
     "jax_optimization_level": "UNKNOWN",
-    "jax_pallas_poison_buffers": False,
-    "jax_pallas_use_mosaic_gpu": True,
-    "jax_pjrt_client_create_options": None,
-    "jax_ragged_dot_use_gpu_pallas_triton_lowering": False,
-    "jax_ragged_dot_use_ragged_dot_instruction": True,
-    "jax_remat3": False,
-    "jax_remat_barrier_no_cotangents": False,
-    "jax_scan3": False,
     "jax_softmax_custom_jvp": False,
-    "jax_use_direct_linearize": True,
-    "jax_use_emit_pipeline_primitive": False,
-    "jax_use_hlo_logistic_lowering": None,
-    "jax_use_magma": "auto",
     "jax_use_shardy_partitioner": True,
-    "jax_xla_profile_version": 0,
-    "mock_num_gpu_processes": 0,
-})  # fmt: skip
-
-# They change no number: devices (`hardware` tells them), caches, logs, dumps, error messages,
-# connections, `jax.export`, `jax2tf`, and checks of a program's types while it is traced.
-FREE = frozenset({
-    "check_vma", "jax2tf_associative_scan_reductions", "jax2tf_default_native_serialization",
-    "jax_auto_pcast", "jax_backend_target", "jax_captured_constants_report_frames",
-    "jax_captured_constants_warn_bytes", "jax_check_proxy_envs", "jax_compilation_cache_dir",
-    "jax_compilation_cache_include_metadata_in_key", "jax_compilation_cache_max_size",
-    "jax_compiler_detailed_logging_min_ops", "jax_cpu_enable_async_dispatch",
-    "jax_cpu_get_global_topology_timeout_minutes", "jax_cpu_get_local_topology_timeout_minutes",
-    "jax_cross_host_transfer_socket_address", "jax_cross_host_transfer_timeout_seconds",
-    "jax_cross_host_transfer_transfer_size", "jax_cross_host_transport_addresses",
-    "jax_cuda_visible_devices", "jax_debug_leaked_clients_on_clear_backends",
-    "jax_debug_log_modules", "jax_default_device", "jax_disable_bwd_checks",
-    "jax_disable_vmap_shmap_error", "jax_distributed_debug",
-    "jax_distributed_verify_secure_credentials", "jax_dump_ir_modes", "jax_dump_ir_to",
-    "jax_embedded_constants_max_bytes", "jax_enable_compilation_cache",
-    "jax_enable_preemption_service", "jax_enable_recoverability",
-    "jax_experimental_unsafe_xla_runtime_errors", "jax_explain_cache_misses",
-    "jax_export_calling_convention_version", "jax_export_deserialize_expired_versions",
-    "jax_export_ignore_forward_compatibility", "jax_force_dcn_cross_host_transfers",
-    "jax_hlo_source_file_canonicalization_regex", "jax_include_debug_info_in_dumps",
-    "jax_include_full_tracebacks_in_locations", "jax_log_checkpoint_residuals",
-    "jax_log_compiles", "jax_logging_level", "jax_mtls_ca_file", "jax_mtls_cert_file",
-    "jax_mtls_key_file", "jax_mtls_peer_uri_prefix", "jax_num_cpu_devices",
-    "jax_oneapi_visible_devices", "jax_pallas_auto_assign_collective_ids",
-    "jax_pallas_auto_assign_collective_ids_limit", "jax_pallas_enable_debug_checks",
-    "jax_pallas_verbose_errors", "jax_persistent_cache_enable_xla_caches",
-    "jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes",
-    "jax_pgle_aggregation_percentile", "jax_pgle_profiling_runs", "jax_platform_name",
-    "jax_platforms", "jax_pprint_use_color", "jax_raise_on_ppermute_sort_diff",
-    "jax_refs_to_pins", "jax_remove_custom_partitioning_ptr_from_cache_key",
-    "jax_remove_size_one_mesh_axis_from_type", "jax_rocm_visible_devices",
-    "jax_send_traceback_to_runtime", "jax_serialization_version",
-    "jax_share_binary_between_hosts", "jax_share_binary_between_hosts_timeout_ms",
-    "jax_sort_devices_by_process_index", "jax_source_url_schema", "jax_traceback_filtering",
-    "jax_traceback_in_locations_limit", "jax_tracer_error_num_traceback_frames",
-    "jax_use_cpp_shard_args", "jax_use_rgv3", "jax_use_simplified_jaxpr_constants",
-    "jax_xla_backend",
 })  # fmt: skip
 
 # Variables of the environment that XLA reads flags from, and one of NVIDIA's libraries.
@@ -161,11 +94,6 @@ def recorded() -> dict[str, str]:
     """
     usual = {**FIXED, **RECORDED}
     names = [name for name in usual if _differs(name, usual[name])]
-    # A jax newer than this list may have more of them; what the environment sets, it changes.
-    known = usual.keys() | CHECKS.keys() | FREE
-    names += [
-        name for name in jax.config.values if name not in known and name.upper() in os.environ
-    ]
     found = {name: str(_plain(_value(name))) for name in names}
     ours = xla.usual_flags()
     for name, value in sorted({**dict.fromkeys(ours, "unset"), **_flags()}.items()):

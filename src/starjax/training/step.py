@@ -13,6 +13,7 @@ from starjax.policies.base import Policy
 from starjax.rcm import arrays
 from starjax.training import devices
 from starjax.training import state as states
+from starjax.training.metrics import added
 from starjax.training.sharding import StateLayout, StepCarry
 
 
@@ -99,6 +100,7 @@ def train_step(setup: Setup, carry: StepCarry, batch: windows.Batch) -> StepCarr
 def _update(setup: Setup, carry: StepCarry, prepared: Any) -> StepCarry:
     """Takes one step on a device's share of a prepared batch."""
     layout, state = setup.layout, carry.state
+    # 1. Gradient of the batch, whose shares the devices average.
     (loss, metrics), gradients = jax.value_and_grad(
         lambda params: setup.policy.loss(layout.gather_params(params), prepared), has_aux=True
     )(layout.params(carry))
@@ -114,9 +116,7 @@ def _update(setup: Setup, carry: StepCarry, prepared: Any) -> StepCarry:
     ema_params = optax.incremental_update(params, state.ema_params, 1.0 - decay)
 
     metrics["gradient_norm"] = norm
-    sums = {name: state.sums[name] + jnp.where(finite, metrics[name], 0.0) for name in metrics}
-    sums["taken"] = state.sums["taken"] + jnp.where(finite, 1.0, 0.0)
-    sums["skipped"] = state.sums["skipped"] + jnp.where(finite, 0.0, 1.0)
+    sums = added(state.sums, metrics, finite)
 
     def keep(new: Any, old: Any) -> Any:
         return jax.tree.map(functools.partial(jax.lax.select, finite), new, old)
