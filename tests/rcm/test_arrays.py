@@ -1,5 +1,6 @@
 """Every public map broadcasts as its docstring says, whatever jax is told about ranks."""
 
+import functools
 import inspect
 
 import jax
@@ -42,11 +43,17 @@ MIXED = {
     "trocar_position": (TROCAR, POINT),
     "trocar_rotation": (TROCAR,),
 }
+WRISTED = {
+    "angles_through": (POSE, drawn(2, N, 3)),
+    "shaft_of": (POSE, drawn(2, N, 2)),
+    "through": (POSE, drawn(2, N, 3)),
+    "tip_of": (POSE, drawn(2, N, 2)),
+}
 
 
 def test_no_public_function_is_left_out():
     public = {name for name in rcm.__all__ if inspect.isfunction(getattr(rcm, name))}
-    assert public == set(MIXED)
+    assert public == {*MIXED, *WRISTED, "rcm6", "why_undetermined"}
 
 
 @pytest.mark.parametrize("setting", ["raise", "warn"])
@@ -56,7 +63,16 @@ def test_ranks_may_differ_where_jax_forbids_it(name, setting):
     alike(getattr(rcm, name), MIXED[name], setting)
 
 
-@pytest.mark.parametrize("space", rcm.ACTION_SPACES.values(), ids=rcm.ACTION_SPACES.keys())
+@pytest.mark.parametrize("name", WRISTED)
+def test_ranks_of_a_wrist_may_differ_where_jax_forbids_it(name):
+    function = functools.partial(getattr(rcm, name), rcm.LARGE_NEEDLE_DRIVER)
+    alike(function, WRISTED[name])
+
+
+SPACES = [*rcm.ACTION_SPACES.values(), rcm.rcm6(rcm.LARGE_NEEDLE_DRIVER)]
+
+
+@pytest.mark.parametrize("space", SPACES, ids=[space.name for space in SPACES])
 def test_ranks_of_an_action_may_differ_where_jax_forbids_it(space):
     alike(space.decode, (drawn(N, space.dim), TROCAR, POINT))
     alike(space.encode, (POSE, TROCAR, POINT))

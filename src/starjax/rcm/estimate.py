@@ -121,7 +121,7 @@ def trocar_from_poses(
 
 
 def why_undetermined(estimate: TrocarEstimate) -> str:
-    """Returns the reason of a first undetermined estimate on the host, empty if there is none."""
+    """Returns the reason of a first undetermined estimate on the host, or an empty string."""
     is_determined, is_straight, residual = (
         np.ravel(x) for x in (estimate.is_determined, estimate.is_straight, estimate.residual)
     )

@@ -147,8 +147,8 @@ def through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike) -> Wr
     depth, _ = tip_depth(bend, length)
     # 1. Any shaft whose tip lies on the line: the least turn of the target's.
     R_shaft = arrays.matmul(R, bend.R.mT)
-    local, _ = arrays.direction(jnp.concatenate([bend.p[..., :2], depth[..., None]], -1), _E_Z)
-    align = rotations.rotation_align(arrays.matvec(R_shaft, local), line)
+    toward_tip = arrays.matvec(R_shaft, tip_direction(bend, depth))
+    align = rotations.rotation_align(toward_tip, line)
     R_shaft = arrays.matmul(align, R_shaft)
     # 2. The turn about the line that maximises tr(turn A), A = R_tip R_target': nearest rotation.
     A = arrays.matmul(arrays.matmul(R_shaft, bend.R), R.mT)
@@ -197,6 +197,13 @@ def tip_depth(bend: Pose, length: jax.Array) -> tuple[jax.Array, jax.Array]:
     depth = jnp.sqrt(jnp.maximum(room, least**2))
     is_reached = (room >= least**2) & (depth <= manifold.MAX_DEPTH)
     return jnp.minimum(depth, manifold.MAX_DEPTH), is_reached
+
+
+def tip_direction(bend: Pose, depth: jax.Array) -> jax.Array:
+    """Returns the unit vector `[..., 3]` in {L} from the trocar to a tip at a depth."""
+    across = (bend.p[..., 0], bend.p[..., 1])
+    offset = jnp.stack(jnp.broadcast_arrays(*across, depth), -1)
+    return arrays.direction(offset, _E_Z)[0]
 
 
 def _is_feasible(wrist: Wrist, angles: jax.Array, length: jax.Array) -> tuple[jax.Array, jax.Array]:

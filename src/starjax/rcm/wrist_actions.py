@@ -38,8 +38,7 @@ def rcm6(wrist: wrists.Wrist) -> actions.ActionSpace:
         roll = parts["roll"][..., 0] + frame.roll_zero
         # R_world_shaft = G align(e_z, a) Rz(roll) as in Alg. 1, where `align` turns about a
         # horizontal axis. It must take the rolled tip's direction to the line from trocar to tip.
-        tip = jnp.concatenate([bend.p[..., :2], depth[..., None]], -1)
-        tip, _ = arrays.direction(arrays.matvec(rotations.rotation_z(roll), tip), _E_Z)
+        tip = arrays.matvec(rotations.rotation_z(roll), wrists.tip_direction(bend, depth))
         axis = _turned_z(*jnp.broadcast_arrays(tip, line * _G))
         R = rotations.rotation_from_axis_roll(axis * _G, roll)
         return wrists.tip_of(wrist, wrists.shaft_at(R, depth, bend, frame.p), angles)
