@@ -10,10 +10,10 @@ import pytest
 from starjax import config, limits
 from starjax.commands import bench, evaluate, pack, sweep
 
-STARTS = (config.RunConfig(), evaluate.Options(), sweep.Options("x"), bench.Options("x"))
+STARTS = (config.RunConfig(), evaluate.EvaluateArgs(), sweep.SweepArgs(), bench.BenchArgs("x"))
 RANGES = [
     (start, setting, found)
-    for start in (*STARTS, pack.Options("x", "y"))
+    for start in (*STARTS, pack.PackArgs("x", "y"))
     for setting in limits.fields(start)
     if (found := limits.within(setting.hint))
 ]

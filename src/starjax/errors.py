@@ -1,4 +1,4 @@
-"""A user's mistake: three fields, put into one line in one place. Standard library only."""
+"""Errors of users as three fields and one line. Imports the standard library only."""
 
 import difflib
 import warnings
@@ -7,13 +7,13 @@ from typing import Any
 
 
 class UsageError(ValueError):
-    """A mistake of whoever typed the command or called the function; shown as one line.
+    """An error of the user of a command or function, shown as one line.
 
     Attributes:
-      argument: name of the flag, field or array, as the user knows it.
-      expected: what it may be.
-      got: what came.
-      hint: what to do about it, may be empty.
+      argument: name of the flag, field or array.
+      expected: allowed values, a noun phrase.
+      got: value of the user.
+      hint: suggested fix, may be empty.
     """
 
     def __init__(self, argument: str, expected: str, got: Any, hint: str = "") -> None:
@@ -30,7 +30,7 @@ def choice(argument: str, value: str, known: Iterable[str]) -> None:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """`did you mean ...?` for the known word that is nearest, empty if none is near."""
+    """Returns `did you mean ...?` with the nearest known word, empty if all are far."""
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f"did you mean {near[0]}?" if near else ""
 

@@ -4,7 +4,7 @@ import importlib.util
 
 from starjax import errors
 
-# Extra -> what Python imports of it. Without any extra there are jax, numpy and `starjax.rcm`.
+# Extra -> imported packages. Without extras, `starjax.rcm` works with jax and numpy.
 PACKAGES: dict[str, tuple[str, ...]] = {
     "sim": ("filelock", "flax", "msgspec", "mujoco", "rich", "tyro"),
     "train": ("optax", "orbax", "safetensors", "scipy"),
@@ -21,7 +21,7 @@ def require(user: str, *extras: str) -> None:
     """Raises UsageError if a package of these extras is not installed.
 
     Args:
-      user: who cannot work without them, e.g. the command `train`.
+      user: command or function that needs them, e.g. `train`.
       extras: keys of `PACKAGES`.
     """
     absent = {

@@ -1,7 +1,7 @@
-"""The learners by name: how sequences of actions are generated. `--help` reads this: no jax here.
+"""Learners of action sequences by name. `--help` reads this module, which imports no jax.
 
-A method (`methods`) says in which action space they are, what is told and whether the roll is left
-to a network of its own; every method works with every learner. Others add theirs by an entry point
+A method (`methods`) defines the action space, the conditioning and whether a separate network
+predicts the roll; every method works with every learner. Others add theirs by an entry point
 of the group `starjax.learners` that names a `Learner`.
 """
 
@@ -16,7 +16,7 @@ class Learner(NamedTuple):
 
     Attributes:
       settings: frozen dataclass of its own options, all with defaults, none of them called as a
-        field of `config.PolicyConfig` is. They are flags beside those of the policy.
+        field of `config.PolicyConfig` is. They are flags like those of the policy.
       check: (options, PolicyConfig) -> None; raises UsageError for options that do not go together
         or with the policy's. It imports no jax.
       make: (options, PolicyConfig, policies.sequences.Sizes) -> policies.sequences.SequenceModel.

@@ -1,4 +1,4 @@
-"""Ranges of settings. They stand on the fields: the check and `--help` read them there.
+"""Ranges of settings, part of the fields' types, where the check and `--help` read them.
 
 Standard library only.
 """
@@ -15,7 +15,7 @@ from starjax import errors
 MOST = 2**31 - 1  # whole numbers of compiled programs have 32 bits
 # Metadata of a field that holds settings whose names stand among those of the dataclass itself.
 INLINE = {"inline": True}
-_OPEN = (MOST, math.inf)  # bounds that need not be said
+_OPEN = (MOST, math.inf)  # bounds that messages omit
 
 
 class Range(NamedTuple):
@@ -23,7 +23,7 @@ class Range(NamedTuple):
 
     Attributes:
       low, high: bounds.
-      ends: brackets as in mathematics; beside a round one the bound itself is left out.
+      ends: brackets as in mathematics; a round one excludes the bound.
       step: between two whole numbers, from `low` on.
     """
 
@@ -41,13 +41,13 @@ class Range(NamedTuple):
         return f"{self.low}{between}{self.high}"
 
     def holds(self, value: float) -> bool:
-        """Whether a number is in the range; nan never is."""
+        """Returns True for a number in the range; False for nan."""
         above = value >= self.low if self.ends[0] == "[" else value > self.low
         below = value <= self.high if self.ends[1] == "]" else value < self.high
         return above and below and (isinstance(value, float) or not (value - self.low) % self.step)
 
 
-# The usual ones.
+# Common ranges.
 Count = Annotated[int, Range(1, MOST)]
 CountOrZero = Annotated[int, Range(0, MOST)]
 Positive = Annotated[float, Range(0.0, math.inf, "()")]
@@ -69,7 +69,7 @@ class Setting(NamedTuple):
 
 
 def fields(settings: Any, prefix: str = "", path: str = "") -> Iterator[Setting]:
-    """The settings of a dataclass, or of an instance, which says what its parts are."""
+    """Yields the settings of a dataclass, or of an instance with the types of its parts."""
     kind = settings if isinstance(settings, type) else type(settings)
     hints = typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
@@ -85,13 +85,13 @@ def fields(settings: Any, prefix: str = "", path: str = "") -> Iterator[Setting]
 
 
 def within(hint: Any) -> Range | None:
-    """The range that stands on a field with this type, if one does."""
+    """Returns the range in a field's type, or None."""
     found = [item for item in getattr(hint, "__metadata__", ()) if isinstance(item, Range)]
     return found[-1] if found else None
 
 
 def check(settings: Any) -> None:
-    """Raises UsageError for the first field that is out of its range; None has none."""
+    """Raises UsageError for the first field out of its range; None is always valid."""
     for name, path, hint in fields(settings):
         value, limit = operator.attrgetter(path)(settings), within(hint)
         for number in value if isinstance(value, tuple) else (value,):
@@ -101,7 +101,7 @@ def check(settings: Any) -> None:
 
 
 def _expected(limit: Range, number: float) -> str:
-    """Describes what a number out of range should have been."""
+    """Returns the range as error messages show it."""
     if isinstance(number, float) and not math.isfinite(number):
         return "a finite number"
     return f"at most {MOST}" if number > limit.high == MOST else str(limit)

@@ -1,19 +1,19 @@
-"""The methods as data: the eight of Table II, and rows beside them. Standard library only."""
+"""Methods as data: the eight of Table II and further rows. Standard library only."""
 
 from typing import NamedTuple
 
 
 class Method(NamedTuple):
-    """One row of Table II, or one beside it.
+    """A row of Table II, or a further one.
 
     Attributes:
       action_space: key of `starjax.rcm.ACTION_SPACES`.
-      sees_trocar: whether the learner's model is told the trocar; the roll's network always is.
-      projects: whether poses are projected onto the RCM manifold at execution.
+      sees_trocar: the learner's model is conditioned on the trocar; the roll network always is.
+      projects: poses are projected onto the RCM manifold at execution.
       hierarchical: the learner for (position, gripper) and a network for the roll, else one model.
       weights_of: the method whose weights it shares (its own name if it trains its own).
       label: name in tables.
-      group: group in Tables II and III; a row beside the paper's has another.
+      group: group in Tables II and III; further rows have another.
     """
 
     action_space: str
@@ -26,7 +26,7 @@ class Method(NamedTuple):
 
     @property
     def keeps_to_manifold(self) -> bool:
-        """Whether what it executes is on the RCM manifold."""
+        """True if executed poses are on the RCM manifold."""
         return self.projects or self.action_space != "se3"
 
 
@@ -107,7 +107,7 @@ METHODS: dict[str, Method] = {
         label="STAR-Diff",
         group=_OURS,
     ),
-    # Proposition 1 says that its position model needs no trocar: this one is told it all the same.
+    # By Proposition 1 the position model needs no trocar; this one is conditioned on it too.
     "stardiff_told": Method(
         action_space="rcm4",
         sees_trocar=True,
@@ -119,10 +119,10 @@ METHODS: dict[str, Method] = {
     ),
 }
 
-# What `--method all` runs; a row beside these is asked for by its name.
+# Methods of `--method all`; further rows are selected by name.
 TABLE_II = tuple(name for name, row in METHODS.items() if row.group in (_NAIVE, _RCM, _OURS))
 
 
 def behaviour(name: str) -> Method:
-    """A row without its names: methods with the same one act alike."""
+    """Returns a row without its names; methods with equal rows behave identically."""
     return METHODS[name]._replace(label="", group="")

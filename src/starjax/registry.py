@@ -18,7 +18,7 @@ class Registry(NamedTuple):
     """One kind of part.
 
     Attributes:
-      kind: what it is called, e.g. `task`; its entry points are those of `starjax.<kind>s`.
+      kind: its name, e.g. `task`; entry points are those of the group `starjax.<kind>s`.
       built_in: name -> `module:object`.
     """
 
@@ -26,15 +26,15 @@ class Registry(NamedTuple):
     built_in: Mapping[str, str]
 
     def names(self) -> list[str]:
-        """All names, built-in ones first."""
+        """Returns all names, built-in ones first."""
         found = [entry.name for entry in self._entries() if entry.name not in self.built_in]
         return [*self.built_in, *sorted(found)]
 
     def get(self, name: str) -> Any:
-        """The part of that name.
+        """Returns the part of a name.
 
         Raises:
-          errors.UsageError: there is none, or its package cannot be imported.
+          errors.UsageError: the name is unknown, or its package cannot be imported.
         """
         if name in self.built_in:
             return load(self.built_in[name])

@@ -43,8 +43,8 @@ class Observation(NamedTuple):
       gripper: measured openings of the jaws, `[..., A]` in [-1 closed, +1 open].
       images: camera's name -> `[..., h, w, 3]` uint8, or None where pixels are not observed.
       state: the task's fields instead of pixels, `[..., S]`, or None.
-      features: what a frozen vision encoder makes of the images, `[..., d_v]` float32, instead of
-        them; only in the data that such a policy is trained on.
+      features: outputs of a frozen image encoder, `[..., d_v]` float32, in place of the images;
+        only in training data.
       endoscope: pose_world_camera `[...]` of an endoscope that is elsewhere in every episode, x to
         the right, y up, looking along -z; None where the scene is not seen through one.
     """
@@ -58,13 +58,13 @@ class Observation(NamedTuple):
 
 
 class Agent(NamedTuple):
-    """Whoever acts in an environment, as pure functions of one episode.
+    """An agent in an environment, as pure functions of one episode.
 
     Attributes:
       init: (key, EnvState) -> memory.
       act: (memory, EnvState) -> (Command `[A]` to execute, memory, Command `[A]` to record). The
-        last is what demonstrations teach: an expert that disturbs itself records the undisturbed
-        command, others what they execute.
+        last is the target of imitation: an expert that disturbs itself records the undisturbed
+        command, others the executed one.
     """
 
     init: Callable[..., Any]

@@ -1,4 +1,4 @@
-"""`starjax export DATASET OUT`: demonstrations of ours in a format that others read."""
+"""`starjax export`: writes demonstrations in the format of another library."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,27 +11,30 @@ from starjax import errors
 from starjax.commands import checks, options
 from starjax.runtime import files, progress, xla
 
-DESCRIPTION = """Writes demonstrations in another format, with all that brings them back whole.
+DESCRIPTION = """Exports demonstrations in another format, from which they can be restored exactly.
 
-DATASET is a folder of demonstrations such as runs/cpu/demos-0123456789ab, OUT the file or folder to
-write."""
+DATASET is a directory of demonstrations such as runs/cpu/demos-0123456789ab, OUT the new file or
+directory."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportArgs:
     """Flags of the command."""
 
-    dataset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")]  # a folder
-    out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]  # what to write
-    format: str = "lerobot"  # lerobot (LeRobotDataset v3.0), robomimic (HDF5) or zarr
-    video: bool = True  # of lerobot: images as video, which loses a little; else as PNG
+    dataset: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar="DATASET")
+    ]  # directory of demonstrations
+    # new file or directory
+    out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    format: str = "lerobot"  # format: lerobot (LeRobotDataset v3.0), robomimic (HDF5) or zarr
+    video: bool = True  # lerobot: store images as lossy video, else as PNG
 
 
 def main(argv: Sequence[str]) -> int:
-    """Writes the export, says how large it is."""
+    """Writes the export; prints its size."""
     args = options.parse("export", ExportArgs, argv, DESCRIPTION)
     out = Path(args.out)
-    checks.expect(bool(args.out) and not out.exists(), "OUT", "a place not taken", args.out)
+    checks.expect(bool(args.out) and not out.exists(), "OUT", "a new file or directory", args.out)
     checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
     from starjax.data.formats import base, exchange

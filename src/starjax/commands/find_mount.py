@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from starjax.sim.mounts import Fit
     from starjax.sim.workspaces import Workspace
 
-DESCRIPTION = """Searches where an arm must stand, how its tool is turned, and its home.
+DESCRIPTION = """Searches the base pose of an arm, the rotation of its tool, and its home.
 
-WORKSPACE is a region of trocars and targets; a task stands for the workspaces of its arms. The arm
-must reach every target through every trocar with every roll. What is printed, as a row for the
-arm's record, is the mount with the most room to joint limits and singular configurations."""
+WORKSPACE is a region of trocars and targets, or a task for the workspaces of its arms. The arm must
+reach every target through every trocar with every roll. The command prints the mount that is
+farthest from joint limits and singular configurations, as a row of the arm's record."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,12 +31,12 @@ class FindMountArgs:
     tool: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TOOL")]  # name of a tool
     # name of a workspace or of a task
     workspace: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="WORKSPACE")]
-    seed: config_lib.Seed = 0  # of the search
-    tilts: bool = False  # let the base also lean, or hang
+    seed: config_lib.Seed = 0  # random seed of the search
+    tilts: bool = False  # also try tilted and hanging bases
 
 
 def main(argv: Sequence[str]) -> int:
-    """Searches, prints each round's figures and the best mount."""
+    """Prints the figures of each round and the best mount."""
     args = options.parse("find-mount", FindMountArgs, argv, DESCRIPTION)
     xla.prepare_xla()
     xla.require_devices("starjax.sim.mount_search")
@@ -55,7 +55,7 @@ def main(argv: Sequence[str]) -> int:
     print(
         f"Not every mount may be used. It needs at least {mounts.MIN_MARGIN:g} rad to the limits, "
         f"a singular value of {mounts.MIN_SINGULAR:g} m, every pose reached and no link in the "
-        "table. Another --seed, or --tilts, may find one. Beside the table an elbow may be lower: "
+        "table. Another --seed, or --tilts, may find one. Next to the table an elbow may be lower: "
         "`watched` in the arm's record is the first joint that may not."
     )
     return 1
@@ -66,7 +66,7 @@ def _tell(fit: "Fit") -> None:
 
 
 def _workspaces(name: str) -> "dict[str, Workspace]":
-    """The workspace of that name, or those of a task's arms, each with its nominal trocar."""
+    """Returns a workspace by name, or those of a task's arms with their nominal trocars."""
     from starjax.sim import registries
 
     if name in registries.workspaces.names():
@@ -90,7 +90,7 @@ def _figures(fit: "Fit") -> str:
 
 
 def _record(tool: str, workspace: str, mount: "Mount", fit: "Fit") -> str:
-    """The row of `Arm.mounts`, its figures in a comment."""
+    """Returns the row of `Arm.mounts` with its figures in a comment."""
     usual = mount._field_defaults
     said = {name: value for name, value in mount._asdict().items() if value != usual.get(name)}
     inside = "".join(f"\n    {name}={value!r}," for name, value in said.items())

@@ -1,4 +1,4 @@
-"""`starjax import PATH OUT`: exports of ours as they were, others' demonstrations by a mapping."""
+"""`starjax import`: restores exports, and imports other datasets by a mapping file."""
 
 import dataclasses
 import shlex
@@ -13,24 +13,24 @@ from starjax.commands import checks, messages, options
 from starjax.runtime import progress, xla
 
 _SHOWN = 10  # anomalies, the others are in a file
-DESCRIPTION = """Makes a dataset of demonstrations in another format, to train on.
+DESCRIPTION = """Imports demonstrations in another format as a dataset to train on.
 
-PATH is a LeRobot or zarr folder or an HDF5 file, OUT the dataset's folder. An export of starjax
-comes back as it was. Of others' data a mapping file says what the columns are."""
+PATH is a LeRobot or zarr directory or an HDF5 file, OUT the new dataset. An export of starjax is
+restored exactly. For other datasets, a mapping file describes the columns."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportArgs:
     """Flags of the command."""
 
-    path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]  # what to read
-    out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]  # folder to write
-    map: str = ""  # mapping file, .toml or .json; left out, PATH must be an export of starjax
-    format: str = options.AUTO  # lerobot, robomimic or zarr; auto: as PATH looks
+    path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]  # dataset to import
+    out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]  # new dataset
+    map: str = ""  # mapping file, .toml or .json; only exports of starjax need none
+    format: str = options.AUTO  # format: lerobot, robomimic or zarr; auto: detected
 
 
 def main(argv: Sequence[str]) -> int:
-    """Writes the dataset, says what is odd about it."""
+    """Writes the dataset; prints its anomalies."""
     args = options.parse("import", ImportArgs, argv, DESCRIPTION)
     checks.expect_folder("OUT", args.out)
     xla.prepare_xla()
@@ -38,7 +38,7 @@ def main(argv: Sequence[str]) -> int:
     from starjax.data.formats import base
 
     path, out = Path(args.path), Path(args.out)
-    checks.expect(not store.is_sealed(out), "OUT", "a folder without a dataset", out)
+    checks.expect(not store.is_sealed(out), "OUT", "a directory without a dataset", out)
     if args.format != options.AUTO:
         errors.choice("format", args.format, base.FORMATS.names())
     name = base.detect(path) if args.format == options.AUTO else args.format

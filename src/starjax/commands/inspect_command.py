@@ -1,4 +1,4 @@
-"""`starjax inspect PATH`: what is in a dataset, a policy or a result, and what is odd about it."""
+"""`starjax inspect`: summarises a dataset, policy or result and its anomalies."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -11,12 +11,12 @@ from starjax import errors
 from starjax.commands import options
 from starjax.runtime import files, xla
 
-DESCRIPTION = """Says what is in a dataset, a policy or a result, and what is odd about it.
+DESCRIPTION = """Summarises a dataset, policy or result and flags anomalies.
 
-PATH is a folder of demonstrations, a LeRobot or zarr folder, a robomimic file, a policy.safetensors
-or the name of a policy that ships with starjax, a result.json or a method's folder with one."""
+PATH is a directory of demonstrations, a LeRobot or zarr directory, a robomimic file, a
+policy.safetensors or the name of a packaged policy, a result.json or a directory with one."""
 
-_LOOKED_AT = 50  # episodes of somebody's dataset whose numbers are read
+_LOOKED_AT = 50  # episodes of a foreign dataset whose values are read
 _SHOWN = 20  # anomalies
 
 
@@ -28,14 +28,14 @@ class InspectArgs:
 
 
 class Found(NamedTuple):
-    """A printed report: rows of names and texts, and anomalies, a line each."""
+    """Summary: rows of names and texts, and one line per anomaly."""
 
     rows: list[tuple[str, str]]
     odd: list[str]
 
 
 def main(argv: Sequence[str]) -> int:
-    """Prints what is there; returns 1 where something is odd."""
+    """Prints the summary; returns 1 if there are anomalies."""
     args = options.parse("inspect", InspectArgs, argv, DESCRIPTION)
     xla.prepare_xla()
     found = inspect(args.path)
@@ -50,10 +50,10 @@ def main(argv: Sequence[str]) -> int:
 
 
 def inspect(name: str) -> Found:
-    """Looks at whatever lies at a path, or is the policy of this name.
+    """Summarises the file or directory at a path, or the packaged policy of this name.
 
     Raises:
-      errors.UsageError: it is nothing that starjax knows, or cannot be read.
+      errors.UsageError: its kind is unknown, or it cannot be read.
     """
     from starjax.policies import packaged
 

@@ -1,4 +1,4 @@
-"""`starjax list`: everything that flags can name, a line each."""
+"""`starjax list`: lists the names that flags take."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -17,9 +17,9 @@ from starjax.sim.tools.base import Tool
 if TYPE_CHECKING:  # it imports jax, which `--help` does without
     from starjax.sim.tasks.base import Task
 
-DESCRIPTION = "Lists what flags can name: tasks, arms, tools, methods, learners, presets, policies."
+DESCRIPTION = "Lists tasks, arms, tools, methods, learners, presets and policies by name."
 
-Row = tuple[str, str]  # name, what it is
+Row = tuple[str, str]  # name, description
 
 
 def main(argv: Sequence[str]) -> int:
@@ -68,7 +68,7 @@ def _tool(tool: Tool) -> str:
 def _methods() -> Iterator[Row]:
     for name, row in methods.METHODS.items():
         rolls = "; a network for the roll" * row.hierarchical
-        told = "; told the trocar" * row.sees_trocar + "; projected" * row.projects
+        told = "; conditioned on the trocar" * row.sees_trocar + "; projected" * row.projects
         yield name, f"{row.label}: actions {row.action_space}{rolls}{told}"
     yield "all", f"the {len(methods.TABLE_II)} of the paper's Table II"
 

@@ -1,4 +1,4 @@
-"""`starjax pack POLICY OUT`: a trained policy in half the space, to pass on."""
+"""`starjax pack`: writes a trained policy in half precision."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,29 +15,29 @@ from starjax.runtime import files, xla
 
 DESCRIPTION = """Writes a policy for inference: weights in float16, arithmetic in float32.
 
-POLICY is a policy.safetensors, OUT the file to write. Weights are rounded to 11 bits, so score OUT
-itself (`starjax evaluate --policy OUT`)."""
+POLICY is a policy.safetensors, OUT the new file. Weights are rounded to 11 bits: evaluate OUT
+itself  (`starjax evaluate --policy OUT`)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PackArgs:
     """Flags of the command."""
 
-    # a policy.safetensors, or the name of a policy that ships with starjax
+    # policy.safetensors, or the name of a packaged policy
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
-    # the file to write
+    # new file
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    # of a sample's first noise; left out: POLICY's
+    # scale of the initial noise; default: that of POLICY
     temperature: Annotated[options.FloatOrNone, Range(0.0, 1.0)] = None
 
 
 def main(argv: Sequence[str]) -> int:
-    """Writes the file, says how large it is."""
+    """Writes the file; prints its size."""
     args = options.parse("pack", PackArgs, argv, DESCRIPTION)
     source, out = packaged.find("POLICY", args.policy), Path(args.out)
     checks.expect_folder("folder of OUT", out.parent)
     if out.exists():
-        raise errors.UsageError("OUT", "a file that is not there yet", args.out or "none")
+        raise errors.UsageError("OUT", "a new file", f"{args.out or 'none'}, which exists")
     xla.prepare_xla()
     xla.require_devices("starjax.policies.policy_file")
 

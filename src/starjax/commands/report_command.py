@@ -1,4 +1,4 @@
-"""`starjax report RUN...`: tables, figures, video and page from results that are there."""
+"""`starjax report`: draws tables, figures, video and page from results."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,15 +10,15 @@ from starjax.runtime import xla
 
 DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
 
-RUN is a method's folder, such as runs/cpu/stardiff, or a folder of them, such as runs/cpu."""
+RUN is the directory of a method, such as runs/cpu/stardiff, or its parent, such as runs/cpu."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ReportArgs:
     """Flags of the command."""
 
-    run: options.Runs  # methods' folders, or folders of them
-    # folder of the report; auto: `report` beside a method's folder, or in an evaluation's
+    run: options.Runs  # directories of methods, or their parents
+    # directory of the report; auto: `report` next to a method's directory or in an evaluation's
     out: str = options.AUTO
     video: bool = True  # write rollout.mp4
 
@@ -26,7 +26,7 @@ class ReportArgs:
 def main(argv: Sequence[str]) -> int:
     """Builds the report."""
     args = options.parse("report", ReportArgs, argv, DESCRIPTION)
-    checks.expect(bool(args.run), "RUN", "one folder or more", "none")
+    checks.expect(bool(args.run), "RUN", "at least one directory", "none")
     once: dict[Path, Path] = {}
     for name in args.run:
         for found in _with_results(name):
@@ -50,9 +50,11 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _with_results(name: str) -> list[Path]:
-    """A method's folder, or those inside a folder."""
+    """Returns a directory with a result, or those inside it."""
     path = Path(name)
     found = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
     if not (name and found):
-        raise errors.UsageError("RUN", "a folder with a result.json, or of such", name or "none")
+        raise errors.UsageError(
+            "RUN", "a directory with result.json, or a parent of such directories", name or "none"
+        )
     return [file if file.is_dir() else file.parent for file in found]

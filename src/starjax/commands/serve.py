@@ -1,4 +1,4 @@
-"""`starjax serve --policy NAME`: a trained policy for clients elsewhere."""
+"""`starjax serve`: serves a trained policy over websockets."""
 
 import dataclasses
 import ipaddress
@@ -12,29 +12,29 @@ from starjax.policies import packaged
 from starjax.runtime import signals, xla
 
 KEY = "STARJAX_API_KEY"
-DESCRIPTION = f"""Answers robots over websockets: observation in, commands out.
+DESCRIPTION = f"""Serves a policy over websockets: observations in, commands out.
 
-The protocol is openpi's, so that openpi-client and starjax.deploy.Client can talk to it. Clients
-must know the key in the environment variable {KEY}, which may be unset for this machine alone."""
+The protocol is that of openpi: openpi-client and starjax.deploy.Client can connect. Clients send
+the key in the environment variable {KEY}, which only local clients can do without."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ServeArgs:
     """Flags of the command."""
 
-    policy: str = "compact"  # a policy.safetensors, or the name of one that ships with starjax
-    host: str = "127.0.0.1"  # address to listen at; 0.0.0.0 is every network of this machine
-    port: Annotated[int, Range(0, 65535)] = 8000  # 0: any that is free
-    batch: Annotated[int, Range(1, 256)] = 4  # robots that one call decides for, at most
-    clients: Count = 32  # connections at once, at most
+    policy: str = "compact"  # policy.safetensors, or the name of a packaged policy
+    host: str = "127.0.0.1"  # listening address; 0.0.0.0: all networks of this machine
+    port: Annotated[int, Range(0, 65535)] = 8000  # listening port; 0: a free one
+    batch: Annotated[int, Range(1, 256)] = 4  # maximum robots per inference
+    clients: Count = 32  # maximum simultaneous connections
 
 
 def main(argv: Sequence[str]) -> int:
-    """Serves until it is stopped."""
+    """Serves until a stop."""
     args = options.parse("serve", ServeArgs, argv, DESCRIPTION)
     path, api_key = packaged.find("--policy", args.policy), os.environ.get(KEY, "")
     elsewhere = f"a key for clients of --host {args.host}"
-    checks.expect(bool(api_key) or _is_here(args.host), KEY, elsewhere, "none")
+    checks.expect(bool(api_key) or _is_local(args.host), KEY, elsewhere, "none")
     xla.prepare_xla()
     xla.require_devices("starjax.deploy.server")
 
@@ -58,18 +58,18 @@ def main(argv: Sequence[str]) -> int:
             should_stop=should_stop,
             listening=listening,
         )
-    raise KeyboardInterrupt(_said(counts))
+    raise KeyboardInterrupt(_summary(counts))
 
 
-def _said(counts: Any) -> str:
+def _summary(counts: Any) -> str:
     return (
         f"stopped; {counts.answered} requests of {counts.clients} clients answered in "
         f"{counts.calls} calls, {counts.refused} refused"
     )
 
 
-def _is_here(host: str) -> bool:
-    """Whether only programs of this machine reach an address."""
+def _is_local(host: str) -> bool:
+    """Returns True for an address that only this machine can reach."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -1,4 +1,4 @@
-"""`starjax teleop`: a person demonstrates in the browser; what is kept is an ordinary dataset."""
+"""`starjax teleop`: records demonstrations by hand in the browser, as an ordinary dataset."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,26 +14,27 @@ from starjax.runtime import signals, xla
 
 DESCRIPTION = """Opens a page on which a person demonstrates a task.
 
-The tool follows a handle in the 3D, the page's hotkeys, a SpaceMouse or a gamepad; its shaft stays
-in the trocar whatever the hand does. An episode is recorded from the hand's first motion on. Enter
-saves it, Backspace discards it. The same command again adds to what is there."""
+The tool follows a handle in the 3D scene, the page's hotkeys, a SpaceMouse or a gamepad. Its shaft
+always passes through the trocar, because these move only roll and tip. Recording begins with the
+first motion. Enter saves an episode, Backspace discards it. Rerun the same command to add
+episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TeleopArgs:
     """Flags of the command."""
 
-    out: str = options.AUTO  # folder of the dataset; auto: runs/teleop-TASK
-    task: str = config_lib.DEFAULT_TASK  # what is to be done
-    arm: tuple[str, ...] = ()  # robots; left out: the task's
-    # pixels, or what the task says of its state: what is recorded, and policies can learn from
+    out: str = options.AUTO  # directory of the dataset; auto: runs/teleop-TASK
+    task: str = config_lib.DEFAULT_TASK  # task (see starjax list)
+    arm: tuple[str, ...] = ()  # robots; default: the task's
+    # recorded observation: pixels or the state of the task
     observation: Literal["image", "state"] = "image"
-    image_size: Annotated[int, Range(32, 1_024)] = 128  # pixels a side of the pictures
-    trocar: Annotated[int, Range(0, 999)] = 0  # number of the task's configuration of trocars
-    seed: config_lib.Seed = 0  # of what is drawn at the start of an episode
-    # beside handle and hotkeys: a SpaceMouse (needs pyspacemouse) or a gamepad (needs pygame)
+    image_size: Annotated[int, Range(32, 1_024)] = 128  # width and height of the images in pixels
+    trocar: Annotated[int, Range(0, 999)] = 0  # index of the trocar configuration
+    seed: config_lib.Seed = 0  # random seed of the initial states
+    # additional input: a SpaceMouse (needs pyspacemouse) or a gamepad (needs pygame)
     device: Literal["none", "spacemouse", "gamepad"] = "none"
-    port: Port = 8080  # of the page, on this machine only; 0 takes a free one
+    port: Port = 8080  # port of the page, on this machine only; 0: a free one
 
 
 def main(argv: Sequence[str]) -> int:

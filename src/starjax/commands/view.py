@@ -12,10 +12,10 @@ from starjax.limits import Range
 from starjax.policies import packaged
 from starjax.runtime import signals, xla
 
-DESCRIPTION = """Shows somebody at work on a page in the browser.
+DESCRIPTION = """Shows a policy, an expert or a dataset on a page in the browser.
 
-The scene in 3D, the camera's picture, RCM error and plan. Drag a trocar by its arrows, and the
-policy goes on through it. Ctrl-C closes the page."""
+The page has the scene in 3D, the camera's image, the RCM error and the plan. Drag a trocar by its
+arrows and the policy continues through it. Ctrl-C closes the page."""
 
 _RENAMED = {"--beside": "--compare-with"}  # flags of the previous release
 Port = Annotated[int, Range(0, 65_535)]
@@ -26,18 +26,18 @@ Show = Callable[[Any, Callable[[], bool]], str]  # (server, should_stop) -> a la
 class ViewArgs:
     """Flags of the command."""
 
-    # a policy.safetensors, or the name of a policy that ships with starjax
+    # policy.safetensors, or the name of a packaged policy
     policy: str = ""
-    run: str = ""  # a method's folder, such as runs/cpu/stardiff: its policy
-    expert: bool = False  # the task's scripted demonstrator; so it is where nobody is named
-    dataset: str = ""  # a folder of demonstrations: its episodes
-    # a second one at the same trial: expert, or a policy as above
+    run: str = ""  # directory of a method, such as runs/cpu/stardiff: its policy
+    expert: bool = False  # the task's scripted demonstrator, the default
+    dataset: str = ""  # directory of demonstrations: its episodes
+    # second agent at the same trial: expert, or a policy as above
     compare_with: str = ""
-    task: str = config_lib.DEFAULT_TASK  # of the expert
-    arm: str = ""  # robot instead of their own
-    trocar: Annotated[int, Range(0, 999)] = 8  # number of the task's configuration of trocars
-    seed: config_lib.Seed = 0  # of the trials
-    port: Port = 8080  # of the page, on this machine only; 0 takes a free one
+    task: str = config_lib.DEFAULT_TASK  # task of the expert
+    arm: str = ""  # robot instead of those of the training
+    trocar: Annotated[int, Range(0, 999)] = 8  # index of the trocar configuration
+    seed: config_lib.Seed = 0  # random seed of the trials
+    port: Port = 8080  # port of the page, on this machine only; 0: a free one
 
 
 def main(argv: Sequence[str]) -> int:
@@ -47,7 +47,9 @@ def main(argv: Sequence[str]) -> int:
     named += ["expert"] if args.expert else []
     if len(named) > 1:
         got = " and ".join(f"--{name}" for name in named)
-        raise errors.UsageError("--policy, --run, --expert or --dataset", "one of them", got)
+        raise errors.UsageError(
+            "--policy, --run, --expert or --dataset", "at most one of them", got
+        )
     xla.prepare_xla()
     xla.require_devices("starjax.viewer.view")
 
@@ -61,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _dataset(folder: str) -> Show:
-    """Makes the viewer of recorded episodes."""
+    """Returns the viewer of recorded episodes."""
     from starjax.viewer import browse
 
     try:
