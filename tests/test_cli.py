@@ -226,11 +226,11 @@ def test_a_cache_that_takes_no_program_is_one_line_and_work_goes_on():
     process = started(
         """
         from starjax import cli
-        from starjax.runtime import xla
+        from starjax.runtime import jax_start, xla
 
         def work(argv):
             xla.prepare_xla()
-            xla.require_devices()
+            jax_start.require_devices()
             import jax, jax.numpy as jnp
             for i in range(3):
                 print(float(jax.jit(lambda x: x + i)(jnp.ones(3 + i)).sum()))

@@ -106,10 +106,10 @@ def test_a_command_scores_the_same_trials_whatever_the_environment_says(tmp_path
     job().job(tmp_path / "usual")
     code = f"""
         import importlib.util, pathlib, sys
-        from starjax.runtime import xla
+        from starjax.runtime import jax_start, xla
 
         xla.prepare_xla()
-        xla.require_devices()
+        jax_start.require_devices()
         spec = importlib.util.spec_from_file_location("jobs", {str(JOBS)!r})
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from starjax.runtime import gpu, xla
+from starjax.runtime import gpu, jax_start, xla
 
 SMALLEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 FLAG = "--xla_cpu_use_fusion_emitters=false"
@@ -89,9 +89,9 @@ def test_a_platform_that_jax_cannot_use_is_a_mistake():
     code = """
         import sys
         from starjax import cli
-        from starjax.runtime import xla
+        from starjax.runtime import jax_start, xla
         xla.prepare_xla()
-        sys.exit(cli.guard(lambda argv: xla.require_devices("starjax.sim.env"), []))
+        sys.exit(cli.guard(lambda argv: jax_start.require_devices("starjax.sim.env"), []))
     """
     for name in ("nonsense",) if gpu.has_plugin() else ("nonsense", "cuda"):
         environment = {**_env(), "JAX_PLATFORMS": name}
@@ -178,7 +178,7 @@ def test_modules_are_imported_while_jax_starts(monkeypatch):
 
     monkeypatch.setattr("jax.local_devices", start)
     monkeypatch.setattr(importlib, "import_module", import_module)
-    xla.require_devices("somewhere.there")
+    jax_start.require_devices("somewhere.there")
     assert seen == ["somewhere.there"]
 
 
@@ -191,5 +191,5 @@ def test_a_start_takes_the_memory_of_each_device_unless_it_is_full(monkeypatch):
 
     monkeypatch.setattr("jax.device_put", put)
     monkeypatch.setattr("jax.local_devices", lambda: ["first", "second"])
-    xla.require_devices()
+    jax_start.require_devices()
     assert asked == ["first", "second"]

@@ -9,7 +9,7 @@ import tyro
 from starjax import config as config_lib
 from starjax import errors
 from starjax.commands import options
-from starjax.runtime import xla
+from starjax.runtime import jax_start, xla
 
 if TYPE_CHECKING:
     from starjax.sim.arms.base import Mount
@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> int:
     """Prints the figures of each round and the best mount."""
     args = options.parse("find-mount", FindMountArgs, argv, DESCRIPTION)
     xla.prepare_xla()
-    xla.require_devices("starjax.sim.mount_search")
+    jax_start.require_devices("starjax.sim.mount_search")
 
     from starjax.sim import mount_search, mounts, registries
 

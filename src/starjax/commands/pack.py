@@ -11,7 +11,7 @@ from starjax import config, errors
 from starjax.commands import checks, options
 from starjax.limits import Range
 from starjax.policies import packaged
-from starjax.runtime import files, xla
+from starjax.runtime import files, jax_start, xla
 
 DESCRIPTION = """Writes a policy for inference: weights in float16, arithmetic in float32.
 
@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> int:
     if out.exists():
         raise errors.UsageError("OUT", "a new file", f"{args.out or 'none'}, which exists")
     xla.prepare_xla()
-    xla.require_devices("starjax.policies.policy_file")
+    jax_start.require_devices("starjax.policies.policy_file")
 
     import jax
 

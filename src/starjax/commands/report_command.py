@@ -6,7 +6,7 @@ from pathlib import Path
 
 from starjax import errors, methods
 from starjax.commands import checks, options
-from starjax.runtime import xla
+from starjax.runtime import jax_start, xla
 
 DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
 
@@ -37,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     out = beside if args.out == options.AUTO else args.out
     checks.expect_folder("--out", out)
     xla.prepare_xla()
-    xla.require_devices("starjax.report.build")
+    jax_start.require_devices("starjax.report.build")
 
     from starjax.report import build
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from starjax.commands import checks, options
 from starjax.limits import Count, Range
 from starjax.policies import packaged
-from starjax.runtime import signals, xla
+from starjax.runtime import jax_start, signals, xla
 
 KEY = "STARJAX_API_KEY"
 DESCRIPTION = f"""Serves a policy over websockets: observations in, commands out.
@@ -36,7 +36,7 @@ def main(argv: Sequence[str]) -> int:
     elsewhere = f"a key for clients of --host {args.host}"
     checks.expect(bool(api_key) or _is_local(args.host), KEY, elsewhere, "none")
     xla.prepare_xla()
-    xla.require_devices("starjax.deploy.server")
+    jax_start.require_devices("starjax.deploy.server")
 
     from starjax import deploy
     from starjax.deploy import server

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from starjax.commands import options
-from starjax.runtime import gpu, xla
+from starjax.runtime import gpu, jax_start, xla
 
 SettingsT = TypeVar("SettingsT")
 
@@ -63,7 +63,7 @@ def start_jax(*modules: str) -> None:
     from starjax.runtime import processes
 
     processes.join()
-    xla.require_devices(*modules)
+    jax_start.require_devices(*modules)
 
 
 def start(name: str, argv: Sequence[str], folder: Path, free_bytes: int = 0) -> Session:

@@ -10,7 +10,7 @@ from starjax import errors
 from starjax.commands import checks, options
 from starjax.commands.view import Port
 from starjax.limits import Range
-from starjax.runtime import signals, xla
+from starjax.runtime import jax_start, signals, xla
 
 DESCRIPTION = """Opens a page on which a person demonstrates a task.
 
@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
     out = f"runs/teleop-{args.task}" if args.out == options.AUTO else args.out
     checks.expect_folder("--out", out)
     xla.prepare_xla()
-    xla.require_devices("starjax.viewer.teleop")
+    jax_start.require_devices("starjax.viewer.teleop")
 
     from starjax.sim import env as sim_env
     from starjax.viewer import devices, page, recorder, teleop

@@ -10,7 +10,7 @@ from starjax import errors
 from starjax.commands import folders, options
 from starjax.limits import Range
 from starjax.policies import packaged
-from starjax.runtime import signals, xla
+from starjax.runtime import jax_start, signals, xla
 
 DESCRIPTION = """Shows a policy, an expert or a dataset on a page in the browser.
 
@@ -51,7 +51,7 @@ def main(argv: Sequence[str]) -> int:
             "--policy, --run, --expert or --dataset", "at most one of them", got
         )
     xla.prepare_xla()
-    xla.require_devices("starjax.viewer.view")
+    jax_start.require_devices("starjax.viewer.view")
 
     from starjax.viewer import page
 

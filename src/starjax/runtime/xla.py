@@ -14,9 +14,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from starjax import errors
-from starjax.runtime import background
-
 _GROUPS, _GROUPS_OF_THIS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
 _PACKAGES = (
@@ -102,46 +99,6 @@ def compilation_cache() -> Path:
     """Folder of compiled programs: JAX_COMPILATION_CACHE_DIR, else this machine's own in ours."""
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     return Path(chosen) if chosen else cache_directory() / "xla" / _machine()
-
-
-def require_devices(*modules: str) -> None:
-    """Starts jax for a command, and beside it, because a GPU takes two seconds, imports `modules`.
-
-    Settings of jax that would change results or end programs are set as always; a line names those
-    that the user's environment has otherwise.
-
-    Raises:
-      errors.UsageError: jax cannot use what JAX_PLATFORMS asks for.
-    """
-    import jax
-
-    from starjax.runtime import jax_settings
-
-    typed = [name.upper() for name in jax_settings.fix() if name.upper() in os.environ]
-    if typed:
-        why = "results of all users have the same"
-        print(f"starjax: {', '.join(typed)} of the environment: not used, {why}", file=sys.stderr)
-
-    def start() -> None:
-        for device in jax.local_devices():
-            # A GPU's memory is taken with the first array, the longer part of its start.
-            with contextlib.suppress(RuntimeError):  # a full one will say so where it is used
-                jax.device_put(0, device)
-
-    started = background.run_in_background(start)
-    for module in modules:
-        importlib.import_module(module)
-    try:
-        started()
-    except (AssertionError, RuntimeError) as error:  # the first for a platform without its plugin
-        asked = os.environ.get("JAX_PLATFORMS", "")
-        reason = str(error).splitlines()[0] if str(error) else "its plugin is not installed"
-        raise errors.UsageError(
-            "JAX_PLATFORMS",
-            "a platform that jax can use here",
-            f"{asked!r}: {reason}",
-            "starjax doctor says more",
-        ) from error
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,49 @@
+"""The start of jax in a command. Importing it imports no jax."""
+
+import contextlib
+import importlib
+import os
+import sys
+
+from starjax import errors
+from starjax.runtime import background
+
+
+def require_devices(*modules: str) -> None:
+    """Starts jax for a command and imports `modules` meanwhile, because a GPU takes two seconds.
+
+    Settings of jax that would change results or end programs get their usual values; a line names
+    those that the user's environment sets to others.
+
+    Raises:
+      errors.UsageError: jax cannot use what JAX_PLATFORMS asks for.
+    """
+    import jax
+
+    from starjax.runtime import jax_settings
+
+    typed = [name.upper() for name in jax_settings.fix() if name.upper() in os.environ]
+    if typed:
+        why = "results of all users have the same"
+        print(f"starjax: {', '.join(typed)} of the environment: not used, {why}", file=sys.stderr)
+
+    def start() -> None:
+        for device in jax.local_devices():
+            # A GPU's memory is taken with the first array, the longer part of its start.
+            with contextlib.suppress(RuntimeError):  # a full one will say so where it is used
+                jax.device_put(0, device)
+
+    started = background.run_in_background(start)
+    for module in modules:
+        importlib.import_module(module)
+    try:
+        started()
+    except (AssertionError, RuntimeError) as error:  # the first for a platform without its plugin
+        requested = os.environ.get("JAX_PLATFORMS", "")
+        reason = str(error).splitlines()[0] if str(error) else "its plugin is not installed"
+        raise errors.UsageError(
+            "JAX_PLATFORMS",
+            "a platform that jax can use here",
+            f"{requested!r}: {reason}",
+            "starjax doctor says more",
+        ) from error
