@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import names
+from starjax.sim import names, render
+from starjax.sim.state import ImageSource
 from starjax.sim.tasks import base
 from starjax.types import Agent, Command, Observation, Pose
 
@@ -67,6 +68,8 @@ class Env(NamedTuple):
     reset: Any
     step: Any
     observe: Any
+    camera: Any
+    draw: Any
     labels: Any
     scene: Any
     task: base.Task
@@ -165,12 +168,19 @@ def make_env(
         )
         return jax.tree.map(lambda old, new: jnp.where(state.done, old, new), state, after)
 
+    def draw(source):
+        pixels = jnp.concatenate([source.qpos[:3], source.layout.goal[0]]) * 1000 + 128
+        image = jnp.broadcast_to(pixels[:, None, None], (6, 6, 3)).astype(jnp.uint8)
+        return {name: render.CameraImage(image + i) for i, name in enumerate(cameras)}
+
+    def camera(state):
+        at = state.trocar.p_world_trocar
+        return draw(ImageSource(state.physics.qpos, at, state.layout, state.cameras))
+
     def observe(state):
         goal, images, low = state.layout.goal[0], None, None
         if observation == "image":
-            pixels = jnp.concatenate([state.pose.p[0], goal]) * 1000 + 128
-            image = jnp.broadcast_to(pixels[:, None, None], (6, 6, 3)).astype(jnp.uint8)
-            images = {camera: image + i for i, camera in enumerate(cameras)}
+            images = {name: frame.rgb for name, frame in camera(state).items()}
         else:
             low = jnp.concatenate([goal, jnp.zeros(6), goal])
         return Observation(state.pose, state.gripper, images, low)
@@ -179,6 +189,8 @@ def make_env(
         reset,
         step,
         observe,
+        camera=camera,
+        draw=draw,
         labels=lambda state: state.layout.labels,
         scene=types.SimpleNamespace(),
         task=make_task(arms),

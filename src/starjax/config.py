@@ -129,6 +129,8 @@ class TrainConfig:
     checkpoint_every: Count = 5_000  # training steps between checkpoints
     keep_checkpoints: Count = 2  # number of newest checkpoints to keep
     log_every: Count = 100  # training steps between lines of metrics.jsonl
+    # control steps between the windows of a demonstration; 1 trains on all of them
+    window_stride: Count = 1
     # demonstrations held out to measure the action error
     holdout_demos: CountOrZero = 8
 

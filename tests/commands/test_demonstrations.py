@@ -75,7 +75,10 @@ def test_demonstrations_are_recorded_with_what_is_wrong(tmp_path, monkeypatch):
         root, collect, _ = demonstrations.plan(chosen, env, sharing.ALONE)
         collect()
         roots.append(root)
-    assert len(set(roots)) == 3 and given[0][1] is env
+    assert len(set(roots)) == 3
+    # Undisturbed images are drawn in training; a dataset keeps those that were disturbed.
+    recorded = [schema.describe(asked[1], *asked[3:])["features"] for asked in given]
+    assert ["image_camera" in features for features in recorded] == [False, True, True]
     assert "randomise" not in schema.describe(env, *given[0][3:])
     assert schema.describe(env, *given[1][3:])["randomise"] == {"smoke": 0.5, "dropped": 0.3}
     params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)))

@@ -191,7 +191,7 @@ def test_a_given_dataset_that_is_damaged_is_not_touched(root, tmp_path):
     file.write_bytes(file.read_bytes()[:-1])
     before, given = kill.tree(copy), asked(copy)
     with mistakes.of("demos.from_", "p.npy"):
-        demonstrations.load(given, copy, lambda: None, None, sharing.ALONE)
+        demonstrations.load(given, None, copy, lambda: None, None, sharing.ALONE)
     assert kill.tree(copy) == before
 
 

@@ -45,7 +45,7 @@ def done(monkeypatch):
     monkeypatch.setattr(pipeline, "_environment", lambda settings: None)
     monkeypatch.setattr(pipeline.precompile, "begin", lambda *_: pipeline.precompile.Precompiled())
     monkeypatch.setattr(demonstrations, "plan", plan)
-    monkeypatch.setattr(demonstrations, "load", lambda _, root, collect, encoder, share: collect())
+    monkeypatch.setattr(demonstrations, "load", lambda config, env, root, collect, *_: collect())
     monkeypatch.setattr(pipeline, "_train", train)
     monkeypatch.setattr(pipeline, "_evaluate", lambda _, name, *__: calls.append(f"score {name}"))
     monkeypatch.setattr(pipeline, "_report", lambda out, names: calls.append("report"))

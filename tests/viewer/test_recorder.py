@@ -94,7 +94,7 @@ def test_a_full_disk_loses_no_episode(steered, tmp_path, monkeypatch):
 def test_recorded_episodes_are_shown_as_they_were(root):
     dataset = browse.open_dataset(root)
     shown = browse.read(dataset, dataset.keys[0])
-    assert shown.outcome == "success" and shown.images is None and len(dataset.keys) == 4
+    assert shown.outcome == "success" and shown.images is not None and len(dataset.keys) == 4
     folder = root / "episodes" / dataset.keys[0]
     np.testing.assert_array_equal([f.qpos for f in shown.frames], np.load(folder / "qpos.npy"))
     assert shown.frames[-1].success and not shown.frames[0].success

@@ -38,8 +38,11 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> Plan:
     from starjax.data import demos, schema, store
     from starjax.rollouts import agent, placement, success_quota, trocars
     from starjax.runtime import precompile, processes
+    from starjax.sim import env as sim_env
 
     env, max_levels = randomised(config, env)
+    if config.policy.observation == "image" and not max_levels:
+        env = sim_env.without_images(env)  # training draws them: collecting waits for no camera
     task, name = env.task, config.demos.expert or next(iter(env.task.experts))
     errors.choice("demos.expert", name, task.experts)
     chosen = trocars.select(task.trocars, slice(config.demos.seen_trocars))
@@ -133,7 +136,7 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
     """
     import numpy as np
 
-    from starjax.data import store
+    from starjax.data import redraw, store
     from starjax.rollouts import episodes
 
     root = Path(config.demos.from_)
@@ -155,6 +158,8 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
     wanted = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
     if policy.observation == "state":
         wanted = {"state": [sum(field.size for field in env.task.fields)]}
+    if policy.observation == "image" and redraw.is_possible(about):
+        wanted = {}
     for name, shape in wanted.items():
         found = features.get(name, {}).get("shape")
         if found != shape:
@@ -164,9 +169,14 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
 
 
 def load(
-    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], encoder: Any, share: Any
+    config: config_lib.RunConfig,
+    env: Any,
+    root: Path,
+    collect: Callable[[], None],
+    encoder: Any,
+    share: Any,
 ) -> Any:
-    """The dataset to train on, with what a frozen encoder sees instead of images."""
+    """Returns the dataset to train on, with the features of a frozen encoder instead of images."""
     from starjax.data import load as loading
     from starjax.data import store
     from starjax.runtime import precompile
@@ -186,15 +196,21 @@ def load(
     precompile.settle()  # what reads and trains traces programs too
     if not share.first("whole", is_whole):
         collect()
-    found = loading.load(root, verify=False, images=encoder is None, report=messages.indented)
-    return found.dataset if encoder is None else _with_features(config, root, found, encoder)
+    draws = env if config.policy.observation == "image" else None
+    report = messages.indented
+    if encoder is None:
+        return loading.load(root, verify=False, env=draws, report=report).dataset
+    found = loading.load(root, verify=False, images=False, report=report)
+    return _with_features(config, draws, root, found, encoder)
 
 
-def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder: Any) -> Any:
+def _with_features(
+    config: config_lib.RunConfig, env: Any, root: Path, demos: Any, encoder: Any
+) -> Any:
     import jax
     import numpy as np
 
-    from starjax.data import windows
+    from starjax.data import load, windows
     from starjax.training import frozen
 
     dataset = demos.dataset
@@ -208,8 +224,11 @@ def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder
                 demos.digest,
                 count,
                 camera,
-                functools.partial(_frames, root, camera),
+                lambda camera=camera: load.frames(root, env)[camera],
                 messages.indented,
+                windows.observed_frames(
+                    dataset, config.policy.obs_horizon, config.train.window_stride
+                ),
             )
             for camera in config.scene.camera
         ]
@@ -217,12 +236,6 @@ def _with_features(config: config_lib.RunConfig, root: Path, demos: Any, encoder
     found = np.pad(np.concatenate(parts, axis=-1), ((0, rows - count), (0, 0)))
     features = jax.device_put(found) if windows.on_device(dataset) else found
     return dataset.replace(observation=dataset.observation._replace(features=features))
-
-
-def _frames(root: Path, camera: str) -> Any:
-    from starjax.data import load as loading
-
-    return loading.frames(root)[camera]
 
 
 def frozen_encoder(policy: config_lib.PolicyConfig) -> Any:

@@ -9,6 +9,7 @@ import tyro
 
 from starjax import errors
 from starjax.commands import checks, options
+from starjax.config import Range
 from starjax.runtime import files, progress, xla
 
 DESCRIPTION = """Exports demonstrations in another format, from which they can be restored exactly.
@@ -27,6 +28,8 @@ class ExportArgs:
     # new file or directory
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     format: str = "lerobot"  # format: lerobot (LeRobotDataset v3.0), robomimic (HDF5) or zarr
+    # image size, pixels per side, for a dataset without recorded images; 0: no images
+    image_size: Annotated[int, Range(0, 4_096)] = 256
     video: bool = True  # lerobot: store images as lossy video, else as PNG
 
 
@@ -42,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     errors.choice("format", args.format, base.FORMATS.names())
     form, root = base.FORMATS.get(args.format), Path(args.dataset)
     try:
-        found = exchange.source(root, form)
+        found = exchange.source(root, form, args.image_size)
     except ValueError as error:
         raise errors.UsageError("DATASET", "demonstrations that are complete", error) from error
     with progress.track("Export", len(found.lengths), unit="episodes") as advance:

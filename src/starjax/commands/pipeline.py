@@ -87,7 +87,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
             share.first("claimed", lambda: _claim(work, [*trained, *names], root))
             # Loaded once, and only if weights are missing.
             dataset = functools.cache(
-                lambda: demonstrations.load(config, root, collect, encoder, share)
+                lambda: demonstrations.load(config, work.env, root, collect, encoder, share)
             )
             for name in trained:
                 _train(work, name, dataset, programs.step if [name] == untrained[:1] else None)

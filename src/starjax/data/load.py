@@ -1,7 +1,8 @@
 """Reads collected demonstrations: checked, and placed where they fit (device, host, or disk)."""
 
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -9,7 +10,7 @@ import jax
 import numpy as np
 
 from starjax import errors, rcm
-from starjax.data import schema, store, windows
+from starjax.data import redraw, schema, store, windows
 from starjax.rollouts import episodes, workers
 from starjax.runtime import files, xla
 from starjax.types import Command, Observation, Pose
@@ -48,6 +49,7 @@ def load(
     residency: Residency = "auto",
     verify: bool = True,
     images: bool = True,
+    env: Any = None,
     report: Callable[[str], None] = print,
 ) -> Demos:
     """Loads the successful episodes of a sealed dataset, after checking every byte of them.
@@ -59,6 +61,7 @@ def load(
       verify: without it only the episodes' records are checked, not their arrays: for a caller
         that has just run `demos.collect`, which checks all.
       images: without them they stay on disk, whatever the residency; `frames` reads them.
+      env: `sim.env.Env` that draws the images that were not recorded at its size.
       report: gets one line with the place and the bytes, before any is allocated.
 
     Raises:
@@ -69,12 +72,15 @@ def load(
     description = store.read_description(root)
     sealed = store.read_seal(root)
     records = _successful(root, sealed, verify)
-    fields = _fields(description, records[0], images)
+    drawn = _drawn(root, description, records, env) if images else {}
+    fields = _fields(description, records[0], images and not drawn)
     total = sum(r["files"][file]["bytes"] for r in records for file in fields.values())
+    total += sum(math.prod(array.shape) for array in drawn.values())
     place = _place(total) if residency == "auto" else residency
     without = "" if images else " without images"
-    report(f"{len(records)} demonstrations, {files.size(total)}{without}: {_WHERE[place]}")
-    dataset = _dataset(root, description, records, place, fields)
+    where = _DRAWN if drawn and place == "disk" else _WHERE[place]
+    report(f"{len(records)} demonstrations, {files.size(total)}{without}: {where}")
+    dataset = _dataset(root, description, records, place, fields, drawn)
     return Demos(dataset, sealed["digest"], place, total, description)
 
 
@@ -83,18 +89,24 @@ def verify(root: Path) -> None:
     _successful(Path(root), store.read_seal(Path(root)), verify=True)
 
 
-def frames(root: Path) -> "dict[str, EpisodeArray]":
-    """Returns the images of successful episodes by camera, memory-mapped, in the order of `load`.
+def frames(root: Path, env: Any = None) -> "Mapping[str, EpisodeArray | redraw.DrawnImages]":
+    """Returns the images of the successful episodes by camera, in the order of `load`.
 
-    They are for reading in that order: few files stay open.
-    Only the episodes' records are checked.
+    Recorded ones are memory-mapped, for reading in that order: few files stay open. Others are
+    drawn when they are indexed. Only the episodes' records are checked.
+
+    Args:
+      root: folder of the dataset.
+      env: as for `load`.
 
     Raises:
-      DamagedEpisode, ValueError: as `load`; also where no images were recorded.
+      DamagedEpisode, ValueError: as `load`; also without images or an environment to draw them.
     """
     root = Path(root)
     description = store.read_description(root)
     records = _successful(root, store.read_seal(root), verify=False)
+    if drawn := _drawn(root, description, records, env):
+        return drawn
     fields = _fields(description, records[0], images=True)
     length, start = _spans(records)
     few = _OPEN_IN_TURN * workers.worker_count()
@@ -115,6 +127,7 @@ _WHERE = {
     "host": "in host memory (they do not fit the device)",
     "disk": "memory-mapped from disk (they fit neither the device nor host memory)",
 }
+_DRAWN = "drawn for each batch (they fit neither the device nor host memory)"
 _UNREAD = ("qpos", "rcm_error")  # recorded, but not trained on
 
 
@@ -134,6 +147,15 @@ def _fields(description: dict[str, Any], record: store.Record, images: bool) -> 
         if name not in _UNREAD and (images or not name.startswith(episodes.IMAGE))
     }
     return {name: file for name, file in found.items() if file in record["files"]}
+
+
+def _drawn(
+    root: Path, description: dict[str, Any], records: list[store.Record], env: Any
+) -> dict[str, redraw.DrawnImages]:
+    """Returns the images that an environment draws, none if they were recorded at its size."""
+    if env is None or redraw.are_recorded(description, env) or not redraw.is_possible(description):
+        return {}
+    return redraw.images(root, description, records, env)
 
 
 def _spans(records: list[store.Record]) -> tuple[np.ndarray, np.ndarray]:
@@ -165,6 +187,7 @@ def _dataset(
     records: list[store.Record],
     place: str,
     files_of: dict[str, str],
+    drawn: Mapping[str, redraw.DrawnImages],
 ) -> windows.Dataset:
     length, start = _spans(records)
     count = int(length.sum())
@@ -179,6 +202,11 @@ def _dataset(
             images[camera] = joined if place == "disk" else joined.read(rows)
         else:
             fields[name] = joined.read(rows)
+    for camera, array in drawn.items():
+        if place == "device":
+            images[camera] = array.on_device(rows)
+        else:
+            images[camera] = array.read() if place == "host" else array
     told = rcm.trocar_frame(
         schema.trocars_of(records),
         np.array(description["p_world_ref"], np.float32),

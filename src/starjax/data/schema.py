@@ -16,6 +16,7 @@ from starjax.runtime import jax_settings, xla
 IMPORTED = "imported.json"  # beside dataset.json: what was odd about the files of others
 # Demonstrations never start from the states that an evaluation with the same seed draws.
 STREAM = 0x64656D6F
+SEED_RULE = f"fold_in(fold_in(fold_in(key(seed), {STREAM}), trocar), trial)"
 
 
 class DemoSettings(NamedTuple):
@@ -54,7 +55,6 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
         }
         for name, leaf in frame.items()
     }
-    rule = f"fold_in(fold_in(fold_in(key(seed), {STREAM}), trocar), trial)"
     return {
         "schema": store.SCHEMA,
         **{name: x for name, x in settings._asdict().items() if name != "randomise"},
@@ -73,7 +73,7 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
         },
         "features": features,
         "model": model_hash(env.scene),
-        "seed_rule": rule,
+        "seed_rule": SEED_RULE,
         "versions": xla.versions(),
         **jax_settings.record(),
     }

@@ -90,6 +90,23 @@ def split_holdout(
     return np.concatenate(train), np.concatenate(held or [np.zeros(0, np.int32)])
 
 
+def strided(dataset: Dataset, frames: np.ndarray, stride: int) -> np.ndarray:
+    """Returns every `stride`-th frame of each demonstration, of those given."""
+    first = np.asarray(dataset.start)[np.asarray(dataset.episode)[frames]]
+    return frames[(frames - first) % stride == 0]
+
+
+def observed_frames(dataset: Dataset, obs_horizon: int, stride: int) -> np.ndarray | None:
+    """Returns the frames `[R]` that windows of a stride observe, None for all."""
+    if stride <= obs_horizon:
+        return None
+    frames = np.arange(int(np.sum(dataset.length)), dtype=np.int32)
+    first = np.asarray(dataset.start)[np.asarray(dataset.episode)[frames]]
+    last = strided(dataset, frames, stride)[:, None]
+    observed = np.maximum(last + np.arange(1 - obs_horizon, 1), first[last])
+    return np.unique(observed).astype(np.int32)
+
+
 def sample_frames(
     key: jax.Array, frames: jax.Array, batch_size: int, count: int | jax.Array = 0
 ) -> jax.Array:

@@ -18,11 +18,20 @@ from starjax.sim import arm_motion, collision, endoscope_camera, ik, physics, re
 from starjax.sim import cameras as views
 from starjax.sim import scene as scenes
 from starjax.sim.names import SceneNames
-from starjax.sim.state import Env, EnvParams, EnvState
+from starjax.sim.state import Env, EnvParams, EnvState, ImageSource
 from starjax.sim.tasks.base import CONTROL_HZ, SimReadings, Task
 from starjax.types import Command, Observation, Pose
 
-__all__ = ["CONTROL_HZ", "Env", "EnvParams", "EnvState", "for_policy", "make"]
+__all__ = [
+    "CONTROL_HZ",
+    "Env",
+    "EnvParams",
+    "EnvState",
+    "ImageSource",
+    "for_policy",
+    "make",
+    "without_images",
+]
 
 RESET_IK_ITERATIONS = 40
 # Energy (J) of the contact solver's error beyond which a step counts as diverged: it moves an arm's
@@ -80,11 +89,14 @@ def make(
         here = names.index(endoscope_camera.NAME)
         return state.replace(endoscope=jax.tree.map(lambda leaf: leaf[here], poses))
 
+    def draw(source: ImageSource) -> dict[str, render.CameraImage]:
+        data = physics.kinematics(scene, source.qpos, source.p_world_trocar, source.layout)
+        rgb = scene.task.colours(scene.bound, source.layout, jnp.asarray(scene.geom_rgb))
+        return views.images(scene_cameras, source.cameras, data, rgb)
+
     def camera(state: EnvState) -> dict[str, render.CameraImage]:
         p_world_trocar = state.trocar.p_world_trocar
-        data = physics.kinematics(scene, state.physics.qpos, p_world_trocar, state.layout)
-        rgb = scene.task.colours(scene.bound, state.layout, jnp.asarray(scene.geom_rgb))
-        return views.images(scene_cameras, state.cameras, data, rgb)
+        return draw(ImageSource(state.physics.qpos, p_world_trocar, state.layout, state.cameras))
 
     def observe(state: EnvState) -> Observation:
         images = fields = None
@@ -99,6 +111,7 @@ def make(
         step=_precisely(functools.partial(step, scene)),
         observe=_precisely(observe),
         camera=_precisely(camera),
+        draw=_precisely(draw),
         labels=lambda state: scene.task.label(state.layout),
         scene=scene,
         task=scene.task,
@@ -106,6 +119,15 @@ def make(
         p_world_ref=scene.p_world_ref,
         control_hz=CONTROL_HZ,
     )
+
+
+def without_images(env: Env) -> Env:
+    """Returns the environment with observations that lack images and the task's fields."""
+
+    def observe(state: EnvState) -> Observation:
+        return Observation(state.pose, state.gripper, None, None, endoscope=state.endoscope)
+
+    return env._replace(observe=observe)
 
 
 def for_policy(

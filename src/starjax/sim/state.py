@@ -32,6 +32,22 @@ class EnvParams(NamedTuple):
     levels: Mapping[str, jax.typing.ArrayLike] | None = None
 
 
+class ImageSource(NamedTuple):
+    """Everything that the images of one moment are a function of.
+
+    Attributes:
+      qpos: `[Q]` generalised coordinates of the model.
+      p_world_trocar: `[A, 3]` m.
+      layout: the task's draws at reset.
+      cameras: poses `[C]` of the cameras in their bodies' frames.
+    """
+
+    qpos: jax.Array
+    p_world_trocar: jax.Array
+    layout: Any
+    cameras: Pose
+
+
 @flax.struct.dataclass
 class EnvState:
     """State of one episode. Arrays are `[]` unless stated; batches come from vmap.
@@ -115,6 +131,7 @@ class Env(NamedTuple):
         stays.
       observe: EnvState -> Observation `[A]`.
       camera: EnvState -> camera's name -> render.CameraImage, at the observation's size.
+      draw: ImageSource -> the same, without a simulation.
       labels: EnvState -> name of `Task.labels` -> int32.
       scene: the static scene; task: its task; names: of its parts.
       p_world_ref: `[A, 3]` m, the nominal trocars.
@@ -125,6 +142,7 @@ class Env(NamedTuple):
     step: Callable[[EnvState, Command], EnvState]
     observe: Callable[[EnvState], Observation]
     camera: Callable[[EnvState], dict[str, render.CameraImage]]
+    draw: Callable[[ImageSource], dict[str, render.CameraImage]]
     labels: Callable[[EnvState], dict[str, jax.Array]]
     scene: Scene
     task: Task

@@ -37,8 +37,9 @@ def features(
     camera: str,
     frames: Callable[[], Any],
     report: Callable[[str], None] = print,
+    rows: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Features `[F, d_v]` float32 of the centre crop of each frame, those that inference sees.
+    """Computes features `[F, d_v]` float32 of frames' centre crops, as inference sees them.
 
     Args:
       encoder: stays as it is.
@@ -50,12 +51,14 @@ def features(
       frames: gives them, uint8 `[F, h, w, 3]` as `windows.Dataset` may hold them; called only if
         something is missing.
       report: gets lines for the user.
+      rows: `[R]` the frames that training reads, None for all; features of the others are zero.
 
     Raises:
       StorageError: the folder cannot be written.
     """
-    folder = root / "features" / _key(encoder, policy_config, digest, camera)
-    spans = [(first, min(first + PART, count)) for first in range(0, count, PART)]
+    read = np.arange(count) if rows is None else rows
+    folder = root / "features" / _key(encoder, policy_config, digest, camera, rows)
+    spans = [(first, min(first + PART, len(read))) for first in range(0, len(read), PART)]
     paths = [folder / f"part_{number:04d}.npz" for number in range(len(spans))]
     parts: dict[Path, np.ndarray] = {}
     missing = []
@@ -73,19 +76,20 @@ def features(
             path, first, last = part
             seen = []
             for start in range(first, last, BATCH):
-                rows = np.minimum(np.arange(start, start + BATCH), last - 1)
-                seen.append(np.asarray(see(pictures[rows]))[: last - start])
+                batch = read[np.minimum(np.arange(start, start + BATCH), last - 1)]
+                seen.append(np.asarray(see(pictures[batch]))[: last - start])
                 yield len(seen[-1])
             parts[path] = np.concatenate(seen)
             files.write_npz(path, {"features": parts[path]})
 
         done = sum(map(len, parts.values()))
-        with progress.track("Features", count, unit="frames", done=done) as advance:
+        with progress.track("Features", len(read), unit="frames", done=done) as advance:
             for seen in workers.run(missing, make, workers.worker_count()):
                 advance(seen)
-    joined = np.concatenate([parts[path] for path in paths])
+    joined = np.zeros((count, policy_config.vision_dim), np.float32)
+    joined[read] = np.concatenate([parts[path] for path in paths])
     said = "in" if missing else "done before,"
-    report(f"features of {count} frames, {files.size(joined.nbytes)}: {said} {folder}")
+    report(f"features of {len(read)} frames, {files.size(joined.nbytes)}: {said} {folder}")
     return joined
 
 
@@ -103,8 +107,14 @@ def _make_see(
     return lambda frames: see(params, frames)
 
 
-def _key(encoder: Encoder, policy_config: config.PolicyConfig, digest: str, camera: str) -> str:
-    """Names the features by what they are made of."""
+def _key(
+    encoder: Encoder,
+    policy_config: config.PolicyConfig,
+    digest: str,
+    camera: str,
+    rows: np.ndarray | None,
+) -> str:
+    """Names the features by everything that decides them."""
     about = {
         "encoder": encoder.fingerprint,
         "trunk": policy_config.encoder,
@@ -112,6 +122,7 @@ def _key(encoder: Encoder, policy_config: config.PolicyConfig, digest: str, came
         "crop": inputs.crop_size(policy_config),
         "demonstrations": digest,
         "camera": camera,
+        **({} if rows is None else {"frames": hashlib.sha256(rows.tobytes()).hexdigest()}),
     }
     return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -98,6 +98,9 @@ def run(
     )
     row = policies.ablated(method, policy_config)
     stats = normalizer.fit(row, task, dataset, frames)
+    frames, held_out = (
+        windows.strided(dataset, kept, train_config.window_stride) for kept in (frames, held_out)
+    )
     policy = policies.make(method, policy_config, task, train_config, cameras)
     optimizer = states.make_optimizer(train_config)
     streams = states.streams(seed)

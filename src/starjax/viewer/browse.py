@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from starjax import errors, rcm
-from starjax.data import schema, store
+from starjax.data import redraw, schema, store
 from starjax.rollouts import episodes
 from starjax.sim import registries, scene
 from starjax.sim.names import SceneNames
@@ -18,6 +18,8 @@ from starjax.viewer import page
 from starjax.viewer.frame import Frame
 from starjax.viewer.plots import Plots
 from starjax.viewer.stage import Stage, aim
+
+IMAGE_SIZE = 256  # pixels per side of images that are drawn for the page
 
 
 class RecordedDataset(NamedTuple):
@@ -29,6 +31,8 @@ class RecordedDataset(NamedTuple):
       names: the scene's names.
       model: the scene's C model.
       keys: episodes with arrays, in order.
+      drawn: images of all their frames, None if they were recorded or cannot be drawn.
+      first: `[D + 1]` each episode's first frame there.
     """
 
     root: Path
@@ -36,6 +40,8 @@ class RecordedDataset(NamedTuple):
     names: SceneNames
     model: mujoco.MjModel
     keys: Sequence[str]
+    drawn: redraw.DrawnImages | None
+    first: np.ndarray
 
 
 class Recording(NamedTuple):
@@ -61,11 +67,20 @@ def open_dataset(root: Path) -> RecordedDataset:
     description = store.read_description(root)
     spec = description["scene"]
     names = SceneNames(spec["task"], *(tuple(spec[part]) for part in ("arms", "tools", "cameras")))
-    keys = [key for key in store.keys(root) if store.verify(root, key, arrays=False)["files"]]
+    records = [store.verify(root, key, arrays=False) for key in store.keys(root)]
+    records = [record for record in records if record["files"]]
+    keys = [record["key"] for record in records]
     if not keys:
         raise errors.UsageError("--dataset", "a folder with episodes", root)
     errors.choice("task of the dataset", names.task, registries.tasks.names())
-    return RecordedDataset(root, description, names, scene.compose(names), keys)
+    camera, drawn = names.cameras[0], None
+    is_recorded = f"{episodes.IMAGE}{camera}" in description["features"]
+    if not is_recorded and redraw.is_possible(description):
+        env = redraw.scene_env(description, IMAGE_SIZE)
+        drawn = redraw.images(root, description, records, env)[camera]
+    first = np.cumsum([0, *(record["length"] for record in records)])
+    model = scene.compose(names)
+    return RecordedDataset(root, description, names, model, keys, drawn, first)
 
 
 def read(dataset: RecordedDataset, key: str) -> Recording:
@@ -92,6 +107,9 @@ def read(dataset: RecordedDataset, key: str) -> Recording:
     )
     camera = f"{episodes.IMAGE}{dataset.names.cameras[0]}"
     images = field(camera) if f"{camera}.npy" in record["files"] else None
+    if dataset.drawn is not None:
+        episode = dataset.keys.index(key)
+        images = dataset.drawn[np.arange(dataset.first[episode], dataset.first[episode + 1])]
     last = steps[-1]._replace(done=True, success=record["success"], invalid=record["invalid"])
     return Recording([*steps[:-1], last], images, "success" if record["success"] else "failed")
 

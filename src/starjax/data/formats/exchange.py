@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import transform
 
 from starjax import errors, rcm
-from starjax.data import schema, store
+from starjax.data import redraw, schema, store
 from starjax.data.formats import base
 from starjax.data.formats.base import Column, Source
 from starjax.rollouts import episodes
@@ -24,8 +24,14 @@ from starjax.runtime import files, provenance
 _AXES = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
 
 
-def source(root: Path, form: base.Format) -> Source:
+def source(root: Path, form: base.Format, image_size: int = 0) -> Source:
     """Returns a sealed starjax dataset as the source of an export.
+
+    Args:
+      root: folder of the dataset.
+      form: format of the export.
+      image_size: pixels per side of images that are drawn, for a dataset that recorded none; 0
+        leaves them out.
 
     Raises:
       ValueError: it is not complete, or damaged.
@@ -43,15 +49,21 @@ def source(root: Path, form: base.Format) -> Source:
     named = {name: form.named(_column(name)) for name in fields}
     scene = description["scene"]
 
+    drawn = _drawn(root, description, kept, form, image_size)
+    first = np.cumsum([0, *(record["length"] for record in kept)])
+
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
         arrays = _arrays(root, description, kept[episode])
         found = {named[name]: array for name, array in arrays.items()}
         made = _derived(arrays, kept[episode], description)
         found |= {form.named(name): array for name, array in made.items()}
+        rows = np.arange(first[episode], first[episode + 1])
+        found |= {name: drawn[name][rows] for name in drawn if name in names}
         return {name: found[name] for name in names}
 
     columns = {form.named(name): column for name, column in _extra(description).items()}
     columns |= {named[name]: column for name, column in fields.items()}
+    columns |= {name: Column(images.shape[1:], "uint8") for name, images in drawn.items()}
     return Source(
         hz=description["control_hz"],
         lengths=[record["length"] for record in kept],
@@ -69,6 +81,22 @@ def source(root: Path, form: base.Format) -> Source:
         task=scene["task"].replace("_", " "),
         robot="_".join(scene["arms"]),
     )
+
+
+def _drawn(
+    root: Path,
+    description: dict[str, Any],
+    records: list[store.Record],
+    form: base.Format,
+    size: int,
+) -> dict[str, redraw.DrawnImages]:
+    """Returns images by column, none if they were recorded or cannot be drawn."""
+    is_recorded = any(name.startswith(episodes.IMAGE) for name in description["features"])
+    if not size or is_recorded or not redraw.is_possible(description):
+        return {}
+    env = redraw.scene_env(description, size)
+    drawn = redraw.images(root, description, records, env)
+    return {form.named(f"{episodes.IMAGE}{camera}"): array for camera, array in drawn.items()}
 
 
 def export(

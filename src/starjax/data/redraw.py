@@ -1,0 +1,199 @@
+"""Images of recorded episodes, drawn when they are needed: an image is a function of the state.
+
+A dataset keeps joint positions and the numbers of its trials. The layout and the cameras' poses of
+an episode follow from the key of its trial, as they did when it was recorded.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import errors
+from starjax.data import schema
+from starjax.rcm.trocar import Trocar
+from starjax.rollouts import episodes, workers
+
+# Images per call: as many on each device, because the batch size may change last bits. A core's
+# cache holds 16; a GPU needs more to be busy.
+CPU_BATCH, GPU_BATCH = 16, 1024
+
+
+class DrawnImages:
+    """The images of one camera as if they were one array `[F, h, w, 3]` uint8, drawn when indexed.
+
+    Attributes:
+      shape: of the whole.
+      dtype: uint8.
+    """
+
+    dtype = np.dtype(np.uint8)
+
+    def __init__(self, draw: Callable[[Any, Any], jax.Array], qpos: Any, episode: Any, size: int):
+        """Keeps what the images are drawn from.
+
+        Args:
+          draw: (qpos `[B, Q]`, episode `[B]`) -> images `[B, h, w, 3]`.
+          qpos: `[F, Q]`.
+          episode: `[F]` number of each frame's episode.
+          size: pixels per side.
+        """
+        self._draw, self._qpos, self._episode = draw, np.asarray(qpos), np.asarray(episode)
+        self.shape = (len(self._qpos), size, size, 3)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        """Draws the images at `index`, integers `[...]`, as `[..., h, w, 3]` in host memory."""
+        index = np.asarray(index)
+        rows, batch = index.reshape(-1), _batch()
+        parts = []
+        for first in range(0, len(rows), batch):
+            part = rows[first : first + batch]
+            parts.append(np.asarray(self._at(_padded(part, batch)))[: len(part)])
+        shape = (*index.shape, *self.shape[1:])
+        return np.concatenate(parts).reshape(shape) if parts else np.zeros(shape, self.dtype)
+
+    def read(self) -> np.ndarray:
+        """Draws all images into host memory, on all cores."""
+        batch, count = _batch(), self.shape[0]
+        out = np.zeros(self.shape, self.dtype)
+
+        def draw(first: int):
+            rows = np.arange(first, min(first + batch, count))
+            out[rows] = np.asarray(self._at(_padded(rows, batch)))[: len(rows)]
+            yield len(rows)
+
+        for _ in workers.run(range(0, count, batch), draw, workers.worker_count()):
+            pass
+        return out
+
+    def on_device(self, rows: int) -> jax.Array:
+        """Draws all images into the device's memory, followed by zeros up to so many rows."""
+        batch, count = _batch(), self.shape[0]
+        if count < batch or jax.default_backend() == "cpu":
+            return jnp.asarray(np.pad(self.read(), ((0, rows - count), *[(0, 0)] * 3)))
+        # In place: the buffer is donated. The last batch overlaps the one before it.
+        put = jax.jit(
+            lambda out, part, first: jax.lax.dynamic_update_slice_in_dim(out, part, first, 0),
+            donate_argnums=0,
+        )
+        out = jnp.zeros((rows, *self.shape[1:]), self.dtype)
+        for first in [*range(0, count - batch, batch), count - batch]:
+            out = put(out, self._at(np.arange(first, first + batch)), first)
+        return out
+
+    def _at(self, rows: np.ndarray) -> jax.Array:
+        return self._draw(self._qpos[rows], self._episode[rows])
+
+
+def is_possible(description: Mapping[str, Any]) -> bool:
+    """True if images of a dataset can be drawn from what it recorded."""
+    is_undisturbed = not description.get("randomise")
+    is_ours = description.get("seed_rule") == schema.SEED_RULE
+    return is_ours and is_undisturbed and "qpos" in description["features"]
+
+
+def are_recorded(description: Mapping[str, Any], env: Any) -> bool:
+    """True if a dataset holds images of all cameras of an environment, at its image size."""
+    recorded = description["features"]
+    return all(
+        list(recorded.get(f"{episodes.IMAGE}{camera}", {}).get("shape", ())) == [size, size, 3]
+        for camera, size in image_sizes(env).items()
+    )
+
+
+def image_sizes(env: Any) -> dict[str, int]:
+    """Returns the pixels per side of each camera of an environment."""
+    from starjax.sim.state import EnvParams
+
+    def look(key: jax.Array) -> Any:
+        zeros = jnp.zeros(np.shape(env.p_world_ref)[0])
+        return env.camera(env.reset(key, EnvParams(Trocar(zeros, zeros, zeros))))
+
+    shapes = jax.eval_shape(look, jax.random.key(0))
+    return {camera: frame.rgb.shape[0] for camera, frame in shapes.items()}
+
+
+def scene_env(description: Mapping[str, Any], image_size: int) -> Any:
+    """Builds the environment of a dataset's scene, with cameras of an image size."""
+    from starjax.sim import env
+
+    scene = description["scene"]
+    return env.make(
+        scene["task"],
+        scene["arms"],
+        scene["tools"],
+        image_size=image_size,
+        cameras=tuple(scene["cameras"]),
+    )
+
+
+def images(
+    root: Path, description: Mapping[str, Any], records: Sequence[Mapping[str, Any]], env: Any
+) -> dict[str, DrawnImages]:
+    """Returns the images of all frames of episodes by camera, none of them drawn yet.
+
+    Args:
+      root: folder of the dataset.
+      description: dataset.json.
+      records: of D episodes.
+      env: `sim.env.Env` of the dataset's scene, with the cameras and their image size.
+
+    Raises:
+      errors.UsageError: the scene is not the recorded one.
+    """
+    if schema.model_hash(env.scene) != description["model"]:
+        raise errors.UsageError(
+            "dataset",
+            "images, or the scene of this version",
+            f"another version of {description['scene']['task']}",
+            "collect it again",
+        )
+    from starjax.sim.state import EnvParams, ImageSource
+
+    def start(key: jax.Array, trocar: Any) -> ImageSource:
+        state = env.reset(key, EnvParams(trocar))
+        still = jnp.zeros(0)  # replaced by each frame's
+        return ImageSource(still, state.trocar.p_world_trocar, state.layout, state.cameras)
+
+    trocars = schema.trocars_of(records)
+    sources = jax.jit(jax.vmap(start))(_keys(description["seed"], records), trocars)
+    folders = (root / "episodes" / record["key"] for record in records)
+    joints = [np.load(folder / "qpos.npy", allow_pickle=False) for folder in folders]
+    qpos = np.concatenate(joints)
+    episode = np.repeat(np.arange(len(records), dtype=np.int32), [len(part) for part in joints])
+
+    def drawn(camera: str) -> Callable[[Any, Any], jax.Array]:
+        @jax.jit
+        def draw(qpos: jax.Array, episode: jax.Array) -> jax.Array:
+            source = jax.tree.map(lambda leaf: leaf[episode], sources)._replace(qpos=qpos)
+            return jax.vmap(env.draw)(source)[camera].rgb
+
+        return draw
+
+    return {
+        camera: DrawnImages(drawn(camera), qpos, episode, size)
+        for camera, size in image_sizes(env).items()
+    }
+
+
+def _keys(seed: int, records: Sequence[Mapping[str, Any]]) -> jax.Array:
+    """Returns the environment keys `[D]` of trials, the first halves of `schema.SEED_RULE`'s."""
+    of_dataset = jax.random.fold_in(jax.random.key(seed), schema.STREAM)
+
+    def one(trocar: jax.Array, trial: jax.Array) -> jax.Array:
+        key = jax.random.fold_in(jax.random.fold_in(of_dataset, trocar), trial)
+        return jax.random.split(key)[0]
+
+    numbers = np.array([(record["trocar"], record["trial"]) for record in records], np.int32)
+    return jax.vmap(one)(*numbers.T)
+
+
+def _batch() -> int:
+    return CPU_BATCH if jax.default_backend() == "cpu" else GPU_BATCH
+
+
+def _padded(rows: np.ndarray, count: int) -> np.ndarray:
+    return np.concatenate([rows, np.repeat(rows[-1:], count - len(rows))])

@@ -1,0 +1,66 @@
+"""Images drawn from what a dataset recorded: the recorded ones, to the byte."""
+
+import jax
+import numpy as np
+import pytest
+
+from starjax import errors
+from starjax.data import demos, load, redraw, schema, store
+from starjax.rollouts import agent
+from starjax.sim import env as envs
+
+pytestmark = pytest.mark.slow
+
+SIZE, SETTINGS = 32, schema.DemoSettings(per_trocar=1, seed=3, max_steps=200)
+
+
+@pytest.fixture(scope="module", params=["camera", "endoscope"])
+def scene(request):
+    return envs.make("reach", image_size=SIZE, cameras=(request.param,))
+
+
+def collect(root, env):
+    trocars = jax.tree.map(lambda x: x[1:3], env.task.trocars)
+    expert = agent.from_single(env.task.expert(next(iter(env.task.experts))))
+    demos.collect(root, env, expert, trocars, SETTINGS, report=lambda line: None)
+    return root
+
+
+@pytest.fixture(scope="module")
+def recorded(scene, tmp_path_factory):
+    return collect(tmp_path_factory.mktemp("recorded") / "demos", scene)
+
+
+def drawn(root, env):
+    """Images that are drawn although they were recorded."""
+    records = [store.verify(root, key) for key in store.keys(root)]
+    return redraw.images(root, store.read_description(root), records, env)
+
+
+def test_drawn_images_are_the_recorded_ones(scene, recorded):
+    camera = scene.names.cameras[0]
+    images = load.frames(recorded)[camera].read()
+    assert images.std() > 10
+    redrawn = drawn(recorded, scene)[camera]
+    assert redrawn.shape == images.shape
+    np.testing.assert_array_equal(redrawn.read(), images)
+    rows = np.array([[5, 0], [len(images) - 1, 40]])
+    np.testing.assert_array_equal(redrawn[rows], images[rows])
+
+
+def test_a_dataset_without_images_trains_at_any_size(scene, tmp_path):
+    root = collect(tmp_path / "demos", envs.without_images(scene))
+    assert not any("image" in name for name in store.read_description(root)["features"])
+    other = envs.make("reach", image_size=16, cameras=scene.names.cameras)
+    for residency in ("device", "host", "disk"):
+        kept = load.load(root, env=other, residency=residency, report=lambda line: None)
+        images = kept.dataset.observation.images[scene.names.cameras[0]]
+        assert images.shape[1:] == (16, 16, 3)
+        assert np.asarray(images[np.array([3, 7])]).std() > 5
+
+
+def test_another_scene_is_refused(scene, recorded):
+    records = [store.verify(recorded, key) for key in store.keys(recorded)]
+    description = store.read_description(recorded) | {"model": "another"}
+    with pytest.raises(errors.UsageError, match="reach"):
+        redraw.images(recorded, description, records, scene)
