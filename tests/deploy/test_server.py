@@ -1,5 +1,7 @@
 """A policy behind a socket: the same plans, and nothing that a client sends ends it."""
 
+import contextlib
+import socket
 import threading
 import time
 
@@ -15,6 +17,7 @@ from starjax import rcm
 from starjax.commands import serve
 from starjax.deploy import batching, server, wire
 from starjax.errors import UsageError
+from starjax.runtime import connections
 from starjax.sim import registries
 
 FRAMES = 300  # bad ones
@@ -148,6 +151,22 @@ def test_more_clients_than_it_may_have_are_sent_away(batches):
         with pytest.raises(websockets.InvalidStatus) as caught:
             connect(where)
         assert caught.value.response.status_code == 503
+
+
+def test_unfinished_handshakes_count_and_time_out(batches, monkeypatch):
+    monkeypatch.setattr(connections, "HANDSHAKE_S", 1.0)
+    with served.running(batches, clients=1) as (where, _), contextlib.ExitStack() as stack:
+        half = [stack.enter_context(socket.create_connection(where, 5)) for _ in range(40)]
+        time.sleep(0.3)
+        with pytest.raises((OSError, websockets.WebSocketException)):
+            connect(where)
+        time.sleep(1.2)
+        with connect(where) as connection:
+            connection.recv()
+        for connection in half:
+            connection.settimeout(5)
+            with contextlib.suppress(ConnectionResetError):
+                assert connection.recv(1) == b""
 
 
 def test_no_frame_ends_it(batches, up):

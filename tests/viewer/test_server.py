@@ -1,11 +1,13 @@
 """The page's server and its handles, without a client."""
 
+import contextlib
 import socket
 
 import numpy as np
 import pytest
 
 from starjax import errors
+from starjax.runtime import connections
 from starjax.sim import registries
 from starjax.viewer import handles
 from starjax.viewer import page as pages
@@ -63,3 +65,42 @@ def test_within_is_a_projection_onto_the_workspace(name):
             polar = np.arccos(offset[2] / max(radius, 1e-9))
             assert radius < 1e-6 or space.polar[0] - 1e-3 <= polar <= space.polar[1] + 1e-3
             np.testing.assert_allclose(handles.within(slot, found), found, atol=1e-6)
+
+
+def handshake(page, **headers):
+    """The status of a websocket handshake with the page's server."""
+    lines = {
+        "Host": f"127.0.0.1:{page.get_port()}",
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec-WebSocket-Version": "13",
+        **headers,
+    }
+    text = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    with socket.create_connection(("127.0.0.1", page.get_port()), timeout=5) as connection:
+        connection.sendall(f"GET / HTTP/1.1\r\n{text}\r\n".encode())
+        return int(connection.recv(100).split()[1])
+
+
+def test_a_page_of_another_origin_is_refused(page):
+    port = page.get_port()
+    own, mapped = f"http://127.0.0.1:{port}", "localhost:9000"  # as through a forwarded port
+    assert handshake(page) == handshake(page, Origin=own) == 101
+    assert handshake(page, Host=mapped, Origin=f"http://{mapped}") == 101
+    for origin in ("http://www.w3.org", f"http://127.0.0.1:{port + 1}", "null", ""):
+        assert handshake(page, Origin=origin) == 403, origin
+    rebound = f"www.w3.org:{port}"
+    assert handshake(page, Host=rebound, Origin=f"http://{rebound}") == 403
+
+
+def test_unfinished_handshakes_are_dropped(page):
+    most = connections.MAX_PAGES
+    with contextlib.ExitStack() as stack:
+        half = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", page.get_port()), 5))
+            for _ in range(2 * most)
+        ]
+        half[-1].settimeout(5)
+        with contextlib.suppress(ConnectionResetError):
+            assert half[-1].recv(1) == b""

@@ -23,6 +23,7 @@ import starjax
 from starjax.deploy import batching, wire
 from starjax.deploy.policy import Deployed
 from starjax.errors import UsageError
+from starjax.runtime import connections
 from starjax.sim.tasks.base import CONTROL_HZ
 
 _POLL_S = 0.1  # between two calls of `should_stop`
@@ -40,7 +41,7 @@ class ServerSettings(NamedTuple):
       host: address to listen at; 0.0.0.0 is every network of this machine.
       port: 0 is any free one.
       batch: maximum robots per inference.
-      clients: maximum connections at once.
+      clients: maximum connections at once, unfinished handshakes included.
     """
 
     host: str = "127.0.0.1"
@@ -151,7 +152,6 @@ class _Server:
         self.batches, self.settings, self.counts = batches, settings, Counts()
         self.greeting, self.api_key = wire.pack(greeting), api_key
         self.jobs: asyncio.Queue[_Job] = asyncio.Queue()
-        self.open = 0
 
     async def serve(
         self,
@@ -165,6 +165,8 @@ class _Server:
             process_request=self._admit,
             # Browsers send an origin: a web page must not reach this machine's ports.
             origins=[None],
+            create_connection=connections.limited(self.settings.clients),
+            open_timeout=connections.HANDSHAKE_S,
             compression=None,
             max_size=wire.max_request_bytes(self.batches.policy.input_spec),
             max_queue=_MAX_QUEUE,
@@ -202,7 +204,6 @@ class _Server:
                     job.reply.set_result(reply)
 
     async def _connected(self, connection: sockets.ServerConnection) -> None:
-        self.open += 1
         self.counts.clients += 1
         try:
             await connection.send(self.greeting)
@@ -210,8 +211,6 @@ class _Server:
                 await connection.send(await self._answer(frame))
         except websockets.ConnectionClosed:
             pass
-        finally:
-            self.open -= 1
 
     async def _answer(self, frame: str | bytes) -> str | bytes:
         spec, key_size = self.batches.policy.input_spec, self.batches.key_size
@@ -238,6 +237,6 @@ class _Server:
             len(sent) == 1 and hmac.compare_digest(sent[0].encode(errors="replace"), expected)
         ):
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, "expected an API key\n")
-        if self.open >= self.settings.clients:
+        if connections.count(connection) > self.settings.clients:
             return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many clients\n")
         return None

@@ -38,7 +38,10 @@ def serve(port: int = PORT, label: str = "starjax", host: str = HOST) -> Iterato
     """
     import viser
 
-    with contextlib.redirect_stdout(io.StringIO()):  # viser's banner
+    from starjax.runtime import connections
+
+    # viser prints a banner, and lets pages of other origins connect.
+    with contextlib.redirect_stdout(io.StringIO()), connections.only_own_pages():
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     try:
         # viser silently takes the next free port, which the user would not open.
