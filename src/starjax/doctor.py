@@ -52,7 +52,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def packages() -> list[Finding]:
-    """Versions, and whether they fit together."""
+    """Checks that the versions fit together."""
     found = xla.versions()
     text = "  ".join(f"{name} {version}" for name, version in found.items())
     remedy = ""
@@ -69,7 +69,7 @@ def packages() -> list[Finding]:
 
 
 def xla_flags() -> list[Finding]:
-    """Whether XLA_FLAGS suits this jaxlib: the flag that speeds up 0.10 makes 0.11 abort."""
+    """Checks XLA_FLAGS: the flag that speeds up jaxlib 0.10 makes 0.11 abort."""
     flag = "--xla_cpu_use_fusion_emitters"
     typed = os.environ.get("XLA_FLAGS", "")
     try:
@@ -86,7 +86,7 @@ def xla_flags() -> list[Finding]:
 
 
 def settings() -> list[Finding]:
-    """Which settings of jax a command passes over, and which it records with its results."""
+    """Lists settings of jax that commands do not use or record with their results."""
     try:
         from starjax.runtime import jax_settings
     except (ImportError, RuntimeError):  # `devices` says why
@@ -97,7 +97,7 @@ def settings() -> list[Finding]:
 
 
 def storage() -> list[Finding]:
-    """Room and rights in the working folder, in the cache, and where compiled programs are kept."""
+    """Checks room and rights in the working folder, the cache and that of programs."""
     programs = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
     places = [
         ("folder", pathlib.Path.cwd, "another working folder", "--out"),  # it may have been removed
@@ -123,7 +123,7 @@ def storage() -> list[Finding]:
 
 
 def folder_locks() -> list[Finding]:
-    """Whether a run can hold its folder, if the working folder is on its disk."""
+    """Checks that a run can lock its folder, if the working folder is on its disk."""
     try:
         with (
             tempfile.TemporaryDirectory(prefix=".starjax-", dir=".") as trial,
@@ -138,7 +138,7 @@ def folder_locks() -> list[Finding]:
 
 
 def memory() -> list[Finding]:
-    """Free memory of the host."""
+    """Returns free memory of the host."""
     free = xla.available_bytes()
     value = f"{files.size(free)} free of {files.size(xla.memory_bytes())}"
     remedy = f"close programs: {files.size(NEEDED_MEMORY)} are wanted"
@@ -168,7 +168,7 @@ def devices() -> list[Finding]:
 
 
 def _unused_gpu() -> list[Finding]:
-    """A fault where jax cannot use the GPU that the system shows, though nothing forbids it."""
+    """Reports a GPU that the system shows and jax does not use, though nothing forbids it."""
     if gpu.is_used() or not gpu.is_shown() or gpu.forbidden():
         return []
     if gpu.has_plugin():
@@ -179,7 +179,7 @@ def _unused_gpu() -> list[Finding]:
 
 
 def scene() -> list[Finding]:
-    """Whether the MJCF parts are found and compile."""
+    """Checks that the MJCF parts exist and compile."""
     try:
         from starjax.sim import scene as model
     except (ImportError, RuntimeError) as error:
@@ -192,7 +192,7 @@ def scene() -> list[Finding]:
 
 
 def video() -> list[Finding]:
-    """Whether the report can write videos."""
+    """Checks that the report can write videos."""
     try:
         import imageio_ffmpeg
 

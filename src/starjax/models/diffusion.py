@@ -15,7 +15,7 @@ from starjax.models.schedule import Schedule
 
 
 def add_noise(schedule: Schedule, x0: jax.Array, k: jax.Array, noise: jax.Array) -> jax.Array:
-    """Eq. 7: the noisy version of `x0` `[B, ...]` after step `k` (int `[B]` or `[]`)."""
+    """Computes Eq. 7: the noisy version of `x0` `[B, ...]` after step `k` (int `[B]` or `[]`)."""
     signal = _at(schedule.sqrt_alpha_bar, k, x0.ndim)
     spread = _at(schedule.sqrt_one_minus_alpha_bar, k, x0.ndim)
     return signal * x0 + spread * noise
@@ -36,7 +36,7 @@ class Noised(NamedTuple):
 
 
 def noised(schedule: Schedule, key: jax.Array, x0: jax.Array) -> Noised:
-    """Clean sequences `[B, ...]`, about [-1, 1], each after a random step.
+    """Returns clean sequences `[B, ...]`, about [-1, 1], each after a random step.
 
     `key` is one typed key for the whole batch.
     """
@@ -47,12 +47,12 @@ def noised(schedule: Schedule, key: jax.Array, x0: jax.Array) -> Noised:
 
 
 def eps_loss(eps_fn: Callable[[jax.Array, jax.Array], jax.Array], given: Noised) -> jax.Array:
-    """Eq. 9: mean squared error of the noise that `eps_fn(x, k)` `[B, ...]` predicts."""
+    """Computes Eq. 9: mean squared error of the noise that `eps_fn(x, k)` `[B, ...]` predicts."""
     return jnp.mean((eps_fn(given.x, given.k) - given.noise) ** 2)
 
 
 def predict_x0(schedule: Schedule, x: jax.Array, k: jax.Array, eps: jax.Array) -> jax.Array:
-    """Eq. 7 solved for the clean sequence, clipped to [-1, 1].
+    """Computes Eq. 7 solved for the clean sequence, clipped to [-1, 1].
 
     Without the clip the division by sqrt(alpha_bar), 4.9e-4 at k = 99, would amplify the error.
     """
@@ -64,7 +64,7 @@ def predict_x0(schedule: Schedule, x: jax.Array, k: jax.Array, eps: jax.Array) -
 def ddpm_step(
     schedule: Schedule, x: jax.Array, k: jax.Array, eps: jax.Array, noise: jax.Array
 ) -> jax.Array:
-    """Eq. 12: one ancestral step from `x` `[B, ...]` at `k` to k - 1.
+    """Computes Eq. 12: one ancestral step from `x` `[B, ...]` at `k` to k - 1.
 
     The mean is written through the clean sequence, so that it can be clipped; where the clip does
     not bind it is Eq. 12 term by term. sigma_k is the posterior's, 0 at k = 0 whatever `noise` is.
@@ -78,7 +78,7 @@ def ddpm_step(
 
 
 def sample_noise(keys: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Standard normal `[B, *shape]`; row i depends on `keys[i]` alone, whatever the batch."""
+    """Draws standard normal `[B, *shape]`; row i depends on `keys[i]` alone."""
     return jax.vmap(lambda key: jax.random.normal(key, shape, jnp.float32))(keys)
 
 
@@ -91,7 +91,7 @@ def ddim_sample(
     prepare: Callable[[jax.Array], Any] = lambda k: k,
     reach: Any = None,
 ) -> jax.Array:
-    """Deterministic DDIM (eta = 0, 'leading' steps, clean sequence clipped to `reach`).
+    """Samples by deterministic DDIM (eta = 0, 'leading' steps, clean sequence in `reach`).
 
     Args:
       eps_fn: `(x [B, ...], prepared) -> eps [B, ...]`.
@@ -130,6 +130,6 @@ def within(x: jax.Array, reach: Any) -> jax.Array:
 
 
 def _at(table: np.ndarray, k: jax.Array, ndim: int) -> jax.Array:
-    """`table[k]` with the axes that broadcast against `[B, ...]` of `ndim` axes."""
+    """Returns `table[k]` with the axes that broadcast against `[B, ...]` of `ndim` axes."""
     row = jnp.asarray(table)[k]
     return row.reshape(row.shape + (1,) * (ndim - row.ndim)) if row.ndim else row

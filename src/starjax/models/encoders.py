@@ -32,7 +32,7 @@ class ImageEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, image: jax.Array, offset: jax.Array | None = None) -> jax.Array:
-        """`[N, h, w, 3]` normalised frames to float32 `[N, features]`.
+        """Maps normalised frames `[N, h, w, 3]` to float32 `[N, features]`.
 
         `offset` `[N, 2]` (row, column) is the crop's displacement from the centre crop in pixels,
         from `data.augment`; None means centre crops.
@@ -63,7 +63,7 @@ class SmallTrunk(nn.Module):
 
     @nn.compact
     def __call__(self, image: jax.Array) -> jax.Array:
-        """`[N, h, w, 3]` normalised -> `[N, ceil(h/8), ceil(w/8), 4 width]`."""
+        """Maps `[N, h, w, 3]` normalised -> `[N, ceil(h/8), ceil(w/8), 4 width]`."""
         x = image.astype(self.dtype)
         for doubling, stride in ((0, 2), (0, 1), (1, 2), (1, 1), (2, 2), (2, 1), (2, 1)):
             x = resnet.Conv2d(self.width << doubling, 3, stride)(x)
@@ -82,7 +82,7 @@ class StateEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, history: jax.Array) -> jax.Array:
-        """float32 `[B, features]`; `history` normalised."""
+        """Returns float32 `[B, features]`; `history` normalised."""
         x = history.astype(self.dtype)
         x = layers.mish(layers.Conv1d(self.features // 4, 3)(x))
         x = layers.mish(layers.Conv1d(self.features // 2, 3)(x))

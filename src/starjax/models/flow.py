@@ -33,7 +33,7 @@ class NoisedFlow(NamedTuple):
 
 
 def noised(key: jax.Array, x0: jax.Array) -> NoisedFlow:
-    """Clean sequences `[B, ...]`, about [-1, 1], each at a random time.
+    """Returns clean sequences `[B, ...]`, about [-1, 1], each at a random time.
 
     `key` is one typed key for the whole batch.
     """
@@ -47,7 +47,7 @@ def noised(key: jax.Array, x0: jax.Array) -> NoisedFlow:
 def velocity_loss(
     predict: Callable[[jax.Array, jax.Array], jax.Array], given: NoisedFlow
 ) -> jax.Array:
-    """Mean squared error of the velocity that `predict(x, time)` `[B, ...]` predicts."""
+    """Returns the mean squared error of the velocity that `predict(x, time)` returns."""
     return jnp.mean((predict(given.x, given.time) - given.velocity) ** 2)
 
 
@@ -59,7 +59,7 @@ def sample(
     prepare: Callable[[jax.Array], Any] = lambda time: time,
     reach: Any = None,
 ) -> jax.Array:
-    """Euler steps of one length from `noise` `[B, ...]` to a clean sequence.
+    """Takes Euler steps of one length from `noise` `[B, ...]` to a clean sequence.
 
     At each step the way ends in a clean sequence, which is clipped to `reach`: lowest and highest
     value, None for -1 and 1.

@@ -19,7 +19,7 @@ class GroupNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[B, ..., C] -> [B, ..., C]`."""
+        """Maps `[B, ..., C] -> [B, ..., C]`."""
         return group_norm(x, *scale_and_shift(self, x, self.groups), self.groups)
 
 
@@ -45,7 +45,7 @@ def group_norm(x: jax.Array, scale: jax.Array, shift: jax.Array, groups: int) ->
 
 
 def moments(x: jax.Array, entries: int | None = None) -> tuple[jax.Array, jax.Array]:
-    """Means of `[B, ..., C]` and of its squares over positions, each `[B, C]` float32.
+    """Returns means of `[B, ..., C]` and of its squares over positions, each `[B, C]` float32.
 
     `entries` is how many positions count where the others are zero.
     """
@@ -58,7 +58,7 @@ def moments(x: jax.Array, entries: int | None = None) -> tuple[jax.Array, jax.Ar
 def affine(
     mean: jax.Array, square: jax.Array, scale: jax.Array, shift: jax.Array, groups: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Gain and offset `[B, C]` that normalise samples of these `moments` over groups."""
+    """Returns the gain and offset `[B, C]` that normalise samples of these `moments`."""
     shape = mean.shape
     mean, square = (m.reshape(len(m), groups, -1).mean(-1) for m in (mean, square))
     inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + EPSILON)
@@ -68,7 +68,7 @@ def affine(
 
 
 def normalized(x: jax.Array, gain: jax.Array, offset: jax.Array) -> jax.Array:
-    """`[B, ..., C]` times gain plus offset, `[B, C]` each."""
+    """Returns `[B, ..., C]` times gain plus offset, `[B, C]` each."""
     y = x.astype(jnp.float32) * over_positions(gain, x) + over_positions(offset, x)
     return y.astype(x.dtype)
 

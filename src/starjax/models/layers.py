@@ -48,7 +48,7 @@ _spread.defvjp(
 
 
 def uniform_init(fan_in: int, gain: float = 1.0) -> Callable[..., jax.Array]:
-    """Uniform within +-gain/sqrt(fan_in), hashed from the key and each entry's number.
+    """Draws uniformly within +-gain/sqrt(fan_in), hashed from the key and each entry's number.
 
     XLA on CPU takes over a second to compile each `jax.random` draw, and every parameter has its
     own: initialising the U-Net took 80 s. The hash compiles to a few integer operations.
@@ -60,7 +60,7 @@ def uniform_init(fan_in: int, gain: float = 1.0) -> Callable[..., jax.Array]:
 
 @functools.partial(jax.jit, static_argnames="shape")
 def _hashed(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Uniform in [-1, 1)."""
+    """Draws uniformly in [-1, 1)."""
     bits = jnp.arange(math.prod(shape), dtype=jnp.uint32)
     for word in jax.random.key_data(key).ravel():
         bits = hashing.lowbias32(bits ^ word)
@@ -75,7 +75,7 @@ class Dense(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[..., C] -> [..., features]`."""
+        """Maps `[..., C] -> [..., features]`."""
         init = uniform_init(x.shape[-1], gain=0.0 if self.zero else 1.0)
         kernel = self.param("kernel", init, (x.shape[-1], self.features))
         bias = self.param("bias", init, (self.features,))
@@ -122,7 +122,7 @@ class Conv1d(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[B, L, C] -> [B, (L + 2 padding - kernel_size) // stride + 1, features]`."""
+        """Maps `[B, L, C] -> [B, (L + 2 padding - kernel_size) // stride + 1, features]`."""
         batch, length, channels = x.shape
         padding = self.kernel_size // 2 if self.padding is None else self.padding
         out = (length + 2 * padding - self.kernel_size) // self.stride + 1
@@ -157,7 +157,7 @@ class Upsample1d(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[B, L, C] -> [B, 2 L, C]`."""
+        """Maps `[B, L, C] -> [B, 2 L, C]`."""
         batch, length, channels = x.shape
         init = uniform_init(4 * channels)
         kernel = self.param("kernel", init, (2, 2 * channels, channels)).astype(x.dtype)
@@ -172,7 +172,7 @@ class Upsample1d(nn.Module):
 
 
 def _live_taps(kernel_size: int, stride: int, padding: int, length: int, out: int) -> range:
-    """Taps that meet the input at one output position at least; they are always contiguous."""
+    """Returns the contiguous taps that meet the input at one output position at least."""
     live = [
         tap
         for tap in range(kernel_size)

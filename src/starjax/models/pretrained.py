@@ -67,7 +67,7 @@ def read_weights(path: str | pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def _is_pickle(path: pathlib.Path) -> bool:
-    """Whether a file that is no `.safetensors` begins as torch's do, whatever its name."""
+    """Returns whether a file that is no `.safetensors` begins as torch's do, whatever its name."""
     try:
         with path.open("rb") as file:
             return file.read(4).startswith(_PICKLES)
@@ -81,7 +81,7 @@ def _name(names: tuple[str, ...]) -> str:
 
 
 def _prefix(found: Collection[str], wanted: Collection[str], path: str | pathlib.Path) -> str:
-    """Prefix of the names of the one ResNet-18 that is found."""
+    """Returns the prefix of the names of the one ResNet-18 that is found."""
     first = "conv1.weight"
     prefixes = [
         name.removesuffix(first) for name in found if re.search(r"(^|\.)conv1\.weight$", name)
@@ -108,7 +108,7 @@ def _listed(names: Collection[str]) -> str:
 
 
 def _kernel(weight: np.ndarray, like: Any, name: str, path: str | pathlib.Path) -> Any:
-    """A kernel, from torch's OIHW to HWIO, checked against the one that it replaces."""
+    """Returns a kernel, from torch's OIHW to HWIO, checked against the one that it replaces."""
     expected = (like.shape[3], like.shape[2], like.shape[0], like.shape[1])
     if weight.shape != expected:
         raise errors.UsageError(str(path), f"shape {expected} of {name}", weight.shape)

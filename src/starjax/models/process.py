@@ -13,7 +13,7 @@ from starjax.models.kernels import parallel_ddim
 
 
 class Sample(Protocol):
-    """How a sequence is generated."""
+    """A way to generate sequences."""
 
     def __call__(
         self,
@@ -53,7 +53,7 @@ class Process(NamedTuple):
 
 
 def diffusion(diffusion_steps: int, ddim_steps: int) -> Process:
-    """Denoising diffusion: K steps of a cosine schedule, whose noise is predicted; DDIM back."""
+    """Makes denoising diffusion: K steps of a cosine schedule, sampled by DDIM."""
     tables = schedule.cosine(diffusion_steps)
 
     def noised(key: jax.Array, x0: jax.Array) -> ddpm.Noised:
@@ -74,7 +74,7 @@ def diffusion(diffusion_steps: int, ddim_steps: int) -> Process:
 
 
 def flow(steps: int) -> Process:
-    """Flow matching on straight ways, whose velocity is predicted; Euler steps back."""
+    """Makes flow matching on straight ways: a network predicts the velocity of Euler steps."""
 
     def sample(predict, noise, *, prepare, reach=None):
         return flow_matching.sample(predict, noise, steps=steps, prepare=prepare, reach=reach)
@@ -83,5 +83,5 @@ def flow(steps: int) -> Process:
 
 
 def shortcut() -> Process:
-    """Flow matching whose network also learns to take the whole way at once."""
+    """Makes flow matching whose network also learns to take the whole way at once."""
     return Process(shortcuts.noised, shortcuts.loss, shortcuts.sample)

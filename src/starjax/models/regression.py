@@ -47,7 +47,7 @@ class MixtureNet(nn.Module):
 
     @nn.compact
     def __call__(self, condition: jax.Array) -> Mixture:
-        """The mixture for conditions `[B, C]`."""
+        """Returns the mixture for conditions `[B, C]`."""
         x = layers.residual_mlp(condition.astype(self.dtype), self.width, self.blocks, self.dtype)
         size = self.components * self.horizon * self.action_dim
         said = layers.Dense(self.components + size, name="out")(x).astype(jnp.float32)
@@ -75,6 +75,6 @@ def loss(mixture: Mixture, x0: jax.Array, spread: float) -> jax.Array:
 
 
 def draw(mixture: Mixture, keys: jax.Array) -> jax.Array:
-    """The mean `[B, H, D]` of a component that is drawn with each of the keys `[B]`."""
+    """Returns the mean `[B, H, D]` of a component that is drawn with each of the keys `[B]`."""
     chosen = jax.vmap(jax.random.categorical)(keys, mixture.logits)
     return jnp.take_along_axis(mixture.means, chosen[:, None, None, None], axis=1)[:, 0]

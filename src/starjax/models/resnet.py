@@ -29,7 +29,7 @@ class ResNet18(nn.Module):
 
     @nn.compact
     def __call__(self, image: jax.Array) -> jax.Array:
-        """`[N, h, w, 3]` normalised -> `[N, ceil(h/32), ceil(w/32), 8 width]`."""
+        """Maps `[N, h, w, 3]` normalised -> `[N, ceil(h/32), ceil(w/32), 8 width]`."""
         x = Stem(self.width, name="conv1")(image.astype(self.dtype))
         size = math.ceil(image.shape[1] / 2), math.ceil(image.shape[2] / 2)
         x = PooledNorm(_groups(x), size, name="bn1")(x)
@@ -71,7 +71,7 @@ class BasicBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[N, h, w, C] -> [N, ceil(h/stride), ceil(w/stride), features]`."""
+        """Maps `[N, h, w, C] -> [N, ceil(h/stride), ceil(w/stride), features]`."""
         y = Conv2d(self.features, 3, self.stride, name="conv1")(x)
         y = nn.relu(group_norm("bn1", y))
         y = group_norm("bn2", Conv2d(self.features, 3, name="conv2")(y))
@@ -90,7 +90,7 @@ class Conv2d(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[N, h, w, C] -> [N, ceil(h/stride), ceil(w/stride), features]`."""
+        """Maps `[N, h, w, C] -> [N, ceil(h/stride), ceil(w/stride), features]`."""
         size, pad = self.kernel_size, self.kernel_size // 2
         init = _kernel_init(size, self.features)
         kernel = self.param("kernel", init, (size, size, x.shape[-1], self.features))
@@ -98,7 +98,7 @@ class Conv2d(nn.Module):
 
 
 def group_norm(name: str, x: jax.Array) -> jax.Array:
-    """GroupNorm with 16 channels a group, inside a compact module."""
+    """Applies GroupNorm with 16 channels a group, inside a compact module."""
     return GroupNorm(_groups(x), name=name)(x)
 
 
@@ -108,7 +108,7 @@ def _groups(x: jax.Array) -> int:
 
 @jax.custom_vjp
 def _relu_of_sum(x: jax.Array, y: jax.Array) -> jax.Array:
-    """ReLU of x + y, whose gradient reads the output, which is kept anyway, not both summands."""
+    """Returns the ReLU of x + y; its gradient reads the output, which is kept anyway."""
     return nn.relu(x + y)
 
 
@@ -127,7 +127,7 @@ _relu_of_sum.defvjp(_relu_of_sum_forward, _relu_of_sum_gradient)
 
 
 def _kernel_init(size: int, features: int) -> Callable[..., jax.Array]:
-    """Variance 2 / fan-out, as torchvision's."""
+    """Draws with variance 2 / fan-out, as torchvision does."""
     return layers.uniform_init(size * size * features, gain=math.sqrt(6.0))
 
 

@@ -34,7 +34,7 @@ class RollNet(nn.Module):
         roll_history: jax.Array,
         observed: jax.Array | None = None,
     ) -> jax.Array:
-        """Eq. 13: one roll for each future position.
+        """Computes Eq. 13: one roll for each future position.
 
         The paper's Embed(lambda) is a linear layer with GELU: the trocar is continuous, and a table
         of embeddings could not serve an unseen one.

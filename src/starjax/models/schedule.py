@@ -55,7 +55,7 @@ class DdimTable(NamedTuple):
 
 
 def cosine(steps: int = 100) -> Schedule:
-    """Squared-cosine schedule of K steps: alpha_bar(t) = cos^2((t + 0.008) / 1.008 * pi / 2).
+    """Makes the schedule of K steps alpha_bar(t) = cos^2((t + 0.008) / 1.008 * pi / 2).
 
     Each beta is capped at 0.999, as the paper's reference and Diffusion Policy do.
     """
@@ -74,7 +74,7 @@ def cosine(steps: int = 100) -> Schedule:
 
 
 def ddim_table(diffusion_steps: int, steps: int) -> DdimTable:
-    """`steps` DDIM steps, spread evenly over a `cosine(diffusion_steps)` schedule.
+    """Returns a table of `steps` DDIM steps, spread over a `cosine(diffusion_steps)` schedule.
 
     With 100 and 10 they are k = 90, 80, .., 0, the 'leading' spacing, which starts in the middle
     of the schedule where `steps` is no divisor: k = 50, .. for 51 of 100 instead of 98, .. .
@@ -91,7 +91,7 @@ def ddim_table(diffusion_steps: int, steps: int) -> DdimTable:
 
 
 def _beta_and_alpha_bar(steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """float64 `[K]` each."""
+    """Returns float64 `[K]` each."""
     if steps < 1:
         raise ValueError(f"steps: expected at least 1 diffusion step, got {steps}")
     cosines = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * math.pi / 2) ** 2

@@ -42,7 +42,7 @@ class NoisedShortcut(NamedTuple):
 
 
 def noised(key: jax.Array, x0: jax.Array) -> NoisedShortcut:
-    """Clean sequences `[B, ...]`, about [-1, 1], each at a random time, or a start of a way.
+    """Adds noise to clean sequences `[B, ...]` at a random time, or at a way's start.
 
     A way starts from a random share of the noise, as samples of any temperature do. `key` is one
     typed key for the whole batch.
@@ -60,7 +60,7 @@ def noised(key: jax.Array, x0: jax.Array) -> NoisedShortcut:
 
 
 def loss(predict: Callable[..., jax.Array], given: NoisedShortcut) -> jax.Array:
-    """Mean squared error of the velocity, or of the mean velocity over the whole way.
+    """Returns the mean squared error of the velocity, or of a whole way's mean velocity.
 
     It is what `predict(x, told)` `[B, ...]` predicts, of some rows `predict(x, told, rows)`.
     """
@@ -69,7 +69,7 @@ def loss(predict: Callable[..., jax.Array], given: NoisedShortcut) -> jax.Array:
 
 
 def targets(predict: Callable[..., jax.Array], given: NoisedShortcut) -> jax.Array:
-    """Target of the prediction `[B, ...]`: for a whole way, the mean velocity of the flow."""
+    """Returns the target of the prediction `[B, ...]`: a whole way's mean velocity."""
     count = len(given.x)
     most = -(-count // EVERY)
     (rows,) = jnp.nonzero(given.time == WHOLE_WAY, size=most, fill_value=count)
@@ -92,7 +92,7 @@ def sample(
     prepare: Callable[[jax.Array], Any] = lambda time: time,
     reach: Any = None,
 ) -> jax.Array:
-    """One step from `noise` `[B, ...]` to a clean sequence, clipped to `reach`.
+    """Takes one step from `noise` `[B, ...]` to a clean sequence, clipped to `reach`.
 
     Args:
       predict: `(x [B, ...], prepared) -> velocity [B, ...]`.
@@ -105,5 +105,5 @@ def sample(
 
 
 def _beside(numbers: jax.Array, x: jax.Array) -> jax.Array:
-    """`[B]` with the axes that broadcast against `x` `[B, ...]`."""
+    """Returns values `[B]` with the axes that broadcast against `x` `[B, ...]`."""
     return numbers.reshape(-1, *[1] * (x.ndim - 1))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 def spatial_softmax(
     logits: jax.Array, image_size: tuple[int, int], offset: jax.Array | None = None
 ) -> jax.Array:
-    """Expected coordinate under the softmax of each map, in float32.
+    """Returns the expected coordinate under the softmax of each map, in float32.
 
     The unit is half the image's side and the origin its centre, so an image that is not shifted
     spans [-1, 1]. A cell counts as the centre of the pixels it covers.
@@ -39,5 +39,5 @@ def spatial_softmax(
 
 
 def _centres(cells: int) -> jax.Array:
-    """`[cells]` centres of equal cells that tile [-1, 1]."""
+    """Returns `[cells]` centres of equal cells that tile [-1, 1]."""
     return (2.0 * jnp.arange(cells, dtype=jnp.float32) + 1.0) / cells - 1.0

@@ -32,12 +32,12 @@ class Style(NamedTuple):
 
 
 def drawn(style: Style, noise: jax.Array) -> jax.Array:
-    """z `[B, Z]` of standard normal noise `[B, Z]`."""
+    """Returns z `[B, Z]` of standard normal noise `[B, Z]`."""
     return style.mean + jnp.exp(0.5 * style.log_variance) * noise
 
 
 def divergence(style: Style) -> jax.Array:
-    """Mean Kullback-Leibler divergence from the standard normal distribution, summed over z."""
+    """Returns the mean Kullback-Leibler divergence from the standard normal, summed over z."""
     each = jnp.exp(style.log_variance) + style.mean**2 - 1.0 - style.log_variance
     return jnp.mean(0.5 * jnp.sum(each, axis=-1))
 
@@ -57,7 +57,7 @@ class Layer(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, others: jax.Array | None = None) -> jax.Array:
-        """`[B, L, C] -> [B, L, C]`, in `dtype`; `others` `[B, N, C]`."""
+        """Maps `[B, L, C] -> [B, L, C]`, in `dtype`; `others` `[B, N, C]`."""
         h = self._normalised(x)
         x = x + self._attention("attend_itself")(h, h)
         if others is not None:
@@ -93,7 +93,7 @@ class StyleEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, x0: jax.Array, state: jax.Array) -> Style:
-        """The style of sequences `[B, H, D]`, seen in `state` `[B, S]`."""
+        """Returns the style of sequences `[B, H, D]`, seen in `state` `[B, S]`."""
         actions = layers.Dense(self.width, name="actions")(x0.astype(self.dtype))
         now = layers.Dense(self.width, name="state")(state.astype(self.dtype))[:, None]
         first = self.param("first", _start, (1, self.width)).astype(self.dtype)
@@ -130,7 +130,7 @@ class Decoder(nn.Module):
     def __call__(
         self, z: jax.Array, vision: jax.Array | None, state: jax.Array, told: jax.Array
     ) -> jax.Array:
-        """float32 `[B, H, D]`.
+        """Returns float32 `[B, H, D]`.
 
         Args:
           z: `[B, Z]`.
@@ -161,11 +161,11 @@ class Decoder(nn.Module):
 
 
 def _placed(module: nn.Module, x: jax.Array) -> jax.Array:
-    """Tokens `[B, L, C]` with learned positions, parameters of the module that calls this."""
+    """Adds learned positions, parameters of the calling module, to tokens `[B, L, C]`."""
     positions = module.param("positions", _start, x.shape[1:])
     return x + positions.astype(x.dtype)
 
 
 def _start(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Small and random: learned tokens before training."""
+    """Draws small random numbers, learned tokens before training."""
     return layers.uniform_init(1, START)(key, shape)

@@ -52,7 +52,7 @@ class ConvBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[B, L, C] -> [B, L, features]`."""
+        """Maps `[B, L, C] -> [B, L, features]`."""
         x = layers.Conv1d(self.features, self.kernel_size)(x)
         return layers.mish(GroupNorm(self.groups)(x))
 
@@ -103,12 +103,12 @@ class ConditionalUnet1D(nn.Module):
         self.film_bias = self.param("film_bias", init, (size,))
 
     def __call__(self, x: jax.Array, k: jax.Array, cond: jax.Array) -> jax.Array:
-        """Noise in `x` `[B, H, A]` at step `k` (int `[B]` or `[]`), given `cond` `[B, C]`."""
+        """Predicts the noise in `x` `[B, H, A]` at `k` (int `[B]` or `[]`) given `cond`."""
         k = jnp.broadcast_to(k, x.shape[:1])
         return self.denoise(x, self.condition(cond) + self.embed_step(k))
 
     def condition(self, cond: jax.Array) -> jax.Array:
-        """The condition's part of every FiLM: `[B, C] -> float32 [B, F]`, the same at every k."""
+        """Returns the condition's part of every FiLM: `[B, C] -> float32 [B, F]`."""
         if cond.shape[-1] != self.cond_dim:
             raise ValueError(f"cond: expected [B, {self.cond_dim}], got {cond.shape}")
         active = layers.mish(cond.astype(self.dtype))
@@ -116,7 +116,7 @@ class ConditionalUnet1D(nn.Module):
         return film + layers.spread(self.film_bias, film.shape)
 
     def embed_step(self, k: jax.Array) -> jax.Array:
-        """The diffusion step's part of every FiLM: int `[...] -> float32 [..., F]`."""
+        """Returns the diffusion step's part of every FiLM: int `[...] -> float32 [..., F]`."""
         half = self.time_dim // 2
         fall = -math.log(10_000.0) / max(half - 1, 1)
         frequency = jnp.exp(jnp.arange(half, dtype=jnp.float32) * fall)
@@ -128,7 +128,7 @@ class ConditionalUnet1D(nn.Module):
         return _matmul_f32(layers.mish(embedding), self.film_time)
 
     def denoise(self, x: jax.Array, film: jax.Array) -> jax.Array:
-        """Noise in `x` `[B, H, A]`, float32, given the summed FiLM `[B, F]`."""
+        """Predicts the noise in `x` `[B, H, A]`, float32, given the summed FiLM `[B, F]`."""
         factor = 2 ** (len(self.channels) - 1)
         if x.ndim != 3 or x.shape[1] % factor or x.shape[2] != self.action_dim:
             raise ValueError(

@@ -45,7 +45,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file.
+    """Returns the object in a JSON file.
 
     Raises:
       ValueError: the file is damaged; the message names it.
@@ -67,7 +67,7 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_npz(path: Path, names: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """All arrays of an .npz, whose checksums are checked.
+    """Returns all arrays of an .npz, whose checksums are checked.
 
     Raises:
       ValueError: the file is damaged, or one of `names` is not in it; the message names it.
@@ -85,7 +85,7 @@ def read_npz(path: Path, names: Sequence[str] = ()) -> dict[str, np.ndarray]:
 
 
 def npy(parts: Sequence[np.ndarray]) -> list[bytes | memoryview]:
-    """Arrays, joined along their first axis, in numpy's .npy format, without copying them."""
+    """Joins arrays along their first axis in numpy's .npy format, without copying them."""
     first = parts[0]
     if first.dtype.hasobject:
         raise ValueError("parts: expected numbers, got Python objects")
@@ -128,7 +128,7 @@ def commit_directory(
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file's content, in hexadecimal."""
+    """Returns the SHA-256 of a file's content, in hexadecimal."""
     digest = hashlib.sha256()
     with open(path, "rb") as file:
         while block := file.read(_BLOCK):
@@ -199,7 +199,7 @@ def sync_directory(path: Path) -> None:
 
 
 def size(count: float) -> str:
-    """A number of bytes for people, e.g. `14.2 GB`."""
+    """Returns a number of bytes for people, e.g. `14.2 GB`."""
     for unit in ("B", "kB", "MB"):
         if count < 1000:
             return f"{count:.3g} {unit}"

@@ -1,4 +1,4 @@
-"""Whether jax runs on a GPU: what the system shows before jax has started, what jax says after.
+"""Use of a GPU: devices of the system before jax has started, jax's own answer after.
 
 Only what is asked after the start imports jax.
 """
@@ -14,17 +14,17 @@ _DEV = Path("/dev")
 
 
 def is_shown() -> bool:
-    """Whether the system shows a device that may be an NVIDIA GPU."""
+    """Returns whether the system shows a device that may be an NVIDIA GPU."""
     return any(any(_DEV.glob(pattern)) for pattern in _DEVICES)
 
 
 def has_plugin() -> bool:
-    """Whether one of jax's CUDA plugins is installed."""
+    """Returns whether one of jax's CUDA plugins is installed."""
     return any(importlib.util.find_spec(name) for name in _PLUGINS)
 
 
 def forbidden() -> str:
-    """The variable of the environment that keeps jax from a GPU, with its value; else empty."""
+    """Returns the variable, with its value, that keeps jax from a GPU; else empty."""
     for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
         first = os.environ.get(name, "").split(",")[0]
         if first not in ("", "cuda", "gpu"):
@@ -36,19 +36,19 @@ def forbidden() -> str:
 
 
 def is_likely() -> bool:
-    """Whether jax will run on a GPU, as far as that shows before it has started (2 s)."""
+    """Returns whether jax will run on a GPU, as far as that shows before it has started (2 s)."""
     return is_shown() and has_plugin() and not forbidden()
 
 
 def is_used() -> bool:
-    """Whether jax runs on a GPU; starts jax."""
+    """Returns whether jax runs on a GPU; starts jax."""
     import jax
 
     return jax.default_backend() == "gpu"
 
 
 def why_unused() -> str:
-    """Why jax does not run on the GPU that the system shows; empty if it shows none."""
+    """Returns the reason why jax does not use the GPU of the system; empty if there is no GPU."""
     if not is_shown():
         return ""
     if by_variable := forbidden():

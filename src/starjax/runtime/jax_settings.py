@@ -87,7 +87,7 @@ def fix() -> list[str]:
 
 
 def recorded() -> dict[str, str]:
-    """Settings that change random numbers or arithmetic and are not the usual ones.
+    """Returns settings that change random numbers or arithmetic and are not the usual ones.
 
     Returns:
       name of the setting -> its value; empty where all is as usual, as `xla.prepare_xla` leaves it.
@@ -105,13 +105,13 @@ def recorded() -> dict[str, str]:
 
 
 def record() -> dict[str, dict[str, str]]:
-    """`recorded` as an entry of a JSON object; no entry where all is as usual."""
+    """Returns `recorded` as an entry of a JSON object; no entry where all is as usual."""
     found = recorded()
     return {"jax_settings": found} if found else {}
 
 
 def _flags() -> dict[str, str]:
-    """XLA's flags in the environment by name, of which the last of each name counts."""
+    """Returns XLA's flags in the environment by name, of which the last of each name counts."""
     words = (word.partition("=") for text in map(xla.flags, _FLAGS) for word in text.split())
     return {name: value.lower() if equals else "true" for name, equals, value in words}
 
@@ -121,10 +121,10 @@ def _differs(name: str, usual: Any) -> bool:
 
 
 def _value(name: str) -> Any:
-    """The value of a setting in this thread, where a context may have changed it."""
+    """Returns the value of a setting in this thread, where a context may have changed it."""
     return getattr(jax.config, name, jax.config.values[name])
 
 
 def _plain(value: Any) -> Any:
-    """A member of one of jax's enumerations as the word that sets it."""
+    """Returns a member of one of jax's enumerations as the word that sets it."""
     return value.name.lower() if hasattr(value, "name") else value

@@ -135,6 +135,6 @@ def _marked(work: Callable[[], T]) -> Callable[[], T]:
 
 
 def _signature(args: Any) -> Hashable:
-    """Structure, shapes and types of arguments."""
+    """Returns the structure, shapes and types of arguments."""
     leaves, structure = jax.tree.flatten(args)
     return structure, tuple((np.shape(x), getattr(x, "dtype", type(x))) for x in leaves)

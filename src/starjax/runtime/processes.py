@@ -65,23 +65,23 @@ def _initialize(**given: Any) -> None:
 
 
 def is_alone() -> bool:
-    """Whether this process is the whole run."""
+    """Returns whether this process is the whole run."""
     return jax.process_count() == 1
 
 
 def is_first() -> bool:
-    """Whether this process is the one that writes."""
+    """Returns whether this process is the one that writes."""
     return jax.process_index() == 0
 
 
 @functools.cache
 def run_number() -> int:
-    """A number that all processes of this run have, and hardly any other run."""
+    """Returns a number that all processes of this run have, and hardly any other run."""
     return agree(secrets.randbelow(2**31))[0]
 
 
 def agree(*values: int) -> tuple[int, ...]:
-    """The first process's values, in all of them; each waits here for the others."""
+    """Returns the first process's values, in all of them; each waits here for the others."""
     return tuple(said[0] for said in gathered(*values))
 
 
@@ -94,7 +94,7 @@ def gathered(*values: int) -> list[list[int]]:
 
 
 def spread(x: Any, sharding: NamedSharding, may_alias: bool | None) -> jax.Array:
-    """An array over the devices of all processes, of which each holds all of `x`.
+    """Returns an array over the devices of all processes, of which each holds all of `x`.
 
     `may_alias`, of `jax.device_put`: whether it may share the memory of `x`.
     """
@@ -108,7 +108,7 @@ def spread(x: Any, sharding: NamedSharding, may_alias: bool | None) -> jax.Array
 
 
 def own(tree: Any) -> Any:
-    """This process's copy of arrays that are replicated over all processes."""
+    """Returns this process's copy of arrays that are replicated over all processes."""
     if is_alone():
         return tree
     return jax.tree.map(lambda x: x.addressable_data(0), tree)

@@ -124,7 +124,7 @@ class _Meter:
         return f"{rate:.3g} {unit}/s" if rate >= 0.1 else f"{60 * rate:.3g} {unit}/min"
 
     def eta(self) -> str:
-        """Time left in words; empty until there is a rate, and after the end."""
+        """Returns time left in words; empty until there is a rate, and after the end."""
         rate = self.per_second()
         if not self._is_past_first() or rate <= 0 or self.is_over():
             return ""

@@ -13,7 +13,7 @@ _TIMEOUT_S = 10.0  # of git, which may wait for a network's file system
 
 
 class Code(NamedTuple):
-    """Which code runs.
+    """The code that runs.
 
     Attributes:
       version: of the package.
@@ -28,7 +28,7 @@ class Code(NamedTuple):
 
 @functools.cache
 def code() -> Code:
-    """The code of this process. Never fails; asked early, it is not that of a later checkout."""
+    """Returns the code of this process, as of the first call. Never fails."""
     try:
         version = importlib.metadata.version("starjax")
     except importlib.metadata.PackageNotFoundError:
@@ -38,7 +38,7 @@ def code() -> Code:
 
 
 def of_version(version: str) -> tuple[str, bool] | None:
-    """Commit and dirty flag in a version that was made from git tags: `1.2.dev3+g0a1b2c3.d2025`."""
+    """Reads commit and dirty flag of a version made from git tags: `1.2.dev3+g0a1b2c3.d2025`."""
     found = re.search(r"\+g([0-9a-f]{7,40})(\.d\d+)?$", version)
     return (found[1], bool(found[2])) if found else None
 
@@ -61,7 +61,7 @@ def _of_checkout(package: Path) -> tuple[str, bool] | None:
 
 
 def _of_origin() -> tuple[str, bool] | None:
-    """The commit that an installation from a repository records (PEP 610)."""
+    """Returns the commit that an installation from a repository records (PEP 610)."""
     try:
         said = importlib.metadata.distribution("starjax").read_text("direct_url.json")
         return str(json.loads(said or "")["vcs_info"]["commit_id"]), False

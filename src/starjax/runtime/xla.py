@@ -58,12 +58,12 @@ def _warn_if_started() -> None:
 
 
 def usual_flags() -> dict[str, str]:
-    """The flags that `prepare_xla` sets with this jaxlib."""
+    """Returns the flags that `prepare_xla` sets with this jaxlib."""
     return {_FUSION_FLAG: "false"} if _jaxlib_version() < (0, 11) else {}
 
 
 def flags(variable: str = "XLA_FLAGS") -> str:
-    """The flags in a variable of the environment, or in the file that it names, as XLA reads it."""
+    """Returns the flags in a variable of the environment, or in the file that it names."""
     text = os.environ.get(variable, "").strip()
     if not text or text.startswith("-"):
         return text
@@ -74,7 +74,7 @@ def flags(variable: str = "XLA_FLAGS") -> str:
 
 
 def options_without_kinematics() -> dict[str, Any]:
-    """Options of `jax.jit` for programs on a CPU that simulate nothing.
+    """Returns options of `jax.jit` for programs on a CPU that simulate nothing.
 
     They get back the fusion emitters that `prepare_xla` turns off: with them a training step takes
     0.8 to 0.95 times as long. So they are on there also where the user's XLA_FLAGS turn them off.
@@ -96,13 +96,13 @@ def cache_directory() -> Path:
 
 
 def compilation_cache() -> Path:
-    """Folder of compiled programs: JAX_COMPILATION_CACHE_DIR, else this machine's own in ours."""
+    """Returns the folder of compiled programs: JAX_COMPILATION_CACHE_DIR or this machine's."""
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     return Path(chosen) if chosen else cache_directory() / "xla" / _machine()
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, starjax and the packages that decide numbers."""
+    """Returns versions of Python, starjax and the packages that decide numbers."""
     import starjax
 
     found = {"python": platform.python_version(), "starjax": starjax.__version__}
@@ -115,7 +115,7 @@ def versions() -> dict[str, str]:
 
 
 def hardware() -> dict[str, Any]:
-    """Processor, cores this process may use, memory, and jax's devices if jax has been imported."""
+    """Returns processor, cores, memory, and jax's devices if jax has been imported."""
     info: dict[str, Any] = {
         "platform": platform.platform(),
         "cpu": _cpuinfo("model name") or platform.processor() or platform.machine(),
@@ -129,19 +129,19 @@ def hardware() -> dict[str, Any]:
 
 
 def cores() -> int:
-    """Processor cores this process may use."""
+    """Returns the number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def memory_bytes() -> int:
-    """Memory that this process may use: the machine's, or its container's if that is less."""
+    """Returns the memory of the machine, or of the container if that is less."""
     return min([_physical_bytes(), *(limit for limit, _ in _limits())])
 
 
 def available_bytes() -> int:
-    """Memory that can be taken now without swapping, or being killed by a container's limit."""
+    """Returns the memory that is free: without swapping, within a container's limit."""
     return min([_free_bytes(), *(max(limit - used, 0) for limit, used in _limits())])
 
 
@@ -161,7 +161,7 @@ def _free_bytes() -> int:
 
 
 def _limits() -> Iterator[tuple[int, int]]:
-    """Limits of the control groups that this process is in, and how much of each is in use."""
+    """Yields the limit and usage of each control group of this process."""
     try:
         lines = _GROUPS_OF_THIS.read_text().splitlines()
     except OSError:

@@ -30,7 +30,7 @@ class DamagedCheckpoint(Exception):
 
 
 def steps(directory: str | os.PathLike) -> list[int]:
-    """Steps with a committed checkpoint, oldest first."""
+    """Returns steps with a committed checkpoint, oldest first."""
     root = pathlib.Path(directory)
     if not root.is_dir():
         return []
@@ -85,7 +85,7 @@ def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> p
 
 
 def restore(directory: str | os.PathLike, like: Any) -> tuple[int, Any] | None:
-    """The newest undamaged step, or None where there is none.
+    """Returns the newest undamaged step, or None where there is none.
 
     Args:
       directory: where `save` wrote.
@@ -114,7 +114,7 @@ def restore(directory: str | os.PathLike, like: Any) -> tuple[int, Any] | None:
 
 
 def verify(path: str | os.PathLike) -> dict[str, Any]:
-    """The manifest of a step after comparing every file with it; raises DamagedCheckpoint."""
+    """Returns a step's manifest after comparing every file; raises DamagedCheckpoint."""
     root = pathlib.Path(path)
     try:
         envelope = json.loads((root / _MANIFEST).read_text())

@@ -39,17 +39,17 @@ def make_mesh(batch_size: int, devices: Sequence[jax.Device] | None = None) -> M
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
-    """Leading axis split over the devices."""
+    """Returns the sharding of a leading axis that is split over the devices."""
     return NamedSharding(mesh, PartitionSpec(AXIS))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """A full copy on every device."""
+    """Returns the sharding of a full copy on every device."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def compiler_options(mesh: Mesh) -> dict[str, Any]:
-    """Options of `jax.jit` for a training step on the mesh."""
+    """Returns options of `jax.jit` for a training step on the mesh."""
     platform = mesh.devices.flat[0].platform
     if platform == "cpu":
         return xla.options_without_kinematics()

@@ -28,7 +28,7 @@ class Encoder(NamedTuple):
 
 
 def read(policy_config: config.PolicyConfig) -> Encoder | None:
-    """The encoder that the settings name, if a starjax policy holds it.
+    """Returns the encoder that the settings name, if a starjax policy holds it.
 
     Returns None for a ResNet-18's ImageNet weights, which fill the ResNet's trunk and nothing else.
 
@@ -58,7 +58,7 @@ def read(policy_config: config.PolicyConfig) -> Encoder | None:
 
 
 def start(params: Params, policy_config: config.PolicyConfig) -> Params:
-    """A policy's parameters before the first step, with the encoder that the settings name."""
+    """Returns a policy's first parameters, with the encoder that the settings name."""
     found = read(policy_config)
     if found is not None:
         return {**params, "vision": found.params}
@@ -68,7 +68,7 @@ def start(params: Params, policy_config: config.PolicyConfig) -> Params:
 
 
 def _differing(policy_config: config.PolicyConfig, trained: policy_file.Trained) -> list[str]:
-    """Settings of the encoder that are not as they were: `policy.vision_dim 64 (here 128)`."""
+    """Lists settings of the encoder that differ: `policy.vision_dim 64 (here 128)`."""
     names = ["observation", "encoder", "vision_dim"]
     # Where it goes on learning, it may get used to another picture.
     names += ["image_size"] if policy_config.freeze_encoder else []
@@ -105,7 +105,7 @@ def _check_resnet18(policy_config: config.PolicyConfig, path: Path) -> None:
 
 
 def _check_shapes(policy_config: config.PolicyConfig, params: Params, name: str | Path) -> None:
-    """UsageError unless the network of today has these parameters."""
+    """Raises UsageError unless today's network has these parameters."""
     shapes = [
         {jax.tree_util.keystr(path): leaf.shape for path, leaf in leaves}
         for leaves in map(jax.tree_util.tree_leaves_with_path, (_shapes(policy_config), params))
@@ -117,6 +117,6 @@ def _check_shapes(policy_config: config.PolicyConfig, params: Params, name: str 
 
 
 def _shapes(policy_config: config.PolicyConfig) -> Params:
-    """The vision encoder's parameters without their numbers."""
+    """Returns the vision encoder's parameters without their numbers."""
     vision, size = generator.vision_encoder(policy_config), policy_config.image_size
     return jax.eval_shape(vision.init, jax.random.key(0), jnp.zeros((1, size, size, 3)))

@@ -96,7 +96,7 @@ def features(
 def _make_see(
     encoder: Encoder, policy_config: config.PolicyConfig
 ) -> Callable[[np.ndarray], jax.Array]:
-    """Frames `[BATCH, h, w, 3]` uint8 to features `[BATCH, d_v]`."""
+    """Makes the function from frames `[BATCH, h, w, 3]` uint8 to features `[BATCH, d_v]`."""
     vision = generator.vision_encoder(policy_config)
 
     @jax.jit
@@ -128,7 +128,7 @@ def _key(
 
 
 def _read(path: Path, shape: tuple[int, int], report: Callable[[str], None]) -> np.ndarray | None:
-    """A finished part, or None if it is missing or damaged."""
+    """Returns a finished part, or None if it is missing or damaged."""
     try:
         found = files.read_npz(path, ["features"])["features"]
     except FileNotFoundError:

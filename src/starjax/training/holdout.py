@@ -60,7 +60,7 @@ def make(
 
 
 def action_errors(said: Any, wanted: Any) -> dict[str, jax.Array]:
-    """Mean errors of commands `[..., A]`: tip in mm, roll in degrees, gripper in its unit."""
+    """Returns mean errors of commands `[..., A]`: tip in mm, roll in degrees, gripper."""
     distance = jnp.linalg.norm(said.pose.p - wanted.pose.p, axis=-1)
     turn = rcm.roll_of(said.pose.R) - rcm.roll_of(wanted.pose.R)
     turn = jnp.abs((turn + jnp.pi) % (2.0 * jnp.pi) - jnp.pi)

@@ -35,7 +35,7 @@ def append(path: str | os.PathLike, step: int, kind: str, values: Mapping[str, A
 
 
 def read(path: str | os.PathLike) -> list[dict[str, Any]]:
-    """All lines, oldest first."""
+    """Returns all lines, oldest first."""
     return [json.loads(line) for line in pathlib.Path(path).read_text().splitlines()]
 
 

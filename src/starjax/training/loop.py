@@ -207,7 +207,7 @@ def _observed(
 
 
 def _restored(checkpoints: pathlib.Path, shapes: Any) -> states.TrainState | None:
-    """The state of the newest sound checkpoint, None where there is none."""
+    """Returns the state of the newest sound checkpoint, None where there is none."""
     restored = checkpoint.restore(checkpoints, shapes) if checkpoint.steps(checkpoints) else None
     step = -1 if restored is None else restored[0]
     if processes.agree(step) != (step,):
@@ -242,7 +242,7 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def _first_params(drawn: policies.Params, policy_config: config.PolicyConfig) -> policies.Params:
-    """The parameters of a new training, with the encoder's weights that the settings name."""
+    """Returns a new training's parameters, with the encoder that the settings name."""
     params = states.on_device(drawn)
     learns_to_see = policy_config.observation == "image" and not policy_config.freeze_encoder
     if learns_to_see and policy_config.encoder_weights:
@@ -276,7 +276,7 @@ def _save(
 
 
 def _next(step: int, every: int) -> int:
-    """The next multiple of `every` after a step."""
+    """Returns the next multiple of `every` after a step."""
     return step + every - step % every
 
 

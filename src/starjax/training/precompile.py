@@ -59,7 +59,7 @@ def step_program(
 def batch_shapes(
     policy_config: config.PolicyConfig, batch_size: int, seen: features.Sensors
 ) -> windows.Batch:
-    """Shapes of the batches of a training that looks at pictures, or at the task's state."""
+    """Returns shapes of the batches of a training from images or the task's state."""
     task, size = seen.task, policy_config.image_size
 
     def real(*shape: int) -> Any:

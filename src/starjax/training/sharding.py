@@ -37,7 +37,7 @@ class StepCarry(NamedTuple):
 
 
 class StateLayout(NamedTuple):
-    """How a training's state lies on the devices from step to step.
+    """The layout of a training's state on the devices between steps.
 
     Large matrices are flat and shared out over the devices; on a GPU vectors are packed.
 
@@ -70,7 +70,7 @@ class StateLayout(NamedTuple):
         return self._unpacked(state)
 
     def shapes(self) -> StepCarry:
-        """Shapes and shardings of a carry."""
+        """Returns shapes and shardings of a carry."""
         shardings = {True: devices.batch_sharding(self.mesh), False: devices.replicated(self.mesh)}
 
         def one(path: tuple[Any, ...], x: Any) -> jax.ShapeDtypeStruct:
@@ -83,7 +83,7 @@ class StateLayout(NamedTuple):
         return jax.tree_util.tree_map_with_path(one, carry)
 
     def shardings(self) -> Any:
-        """Shardings of a carry, for `jax.jit`."""
+        """Returns shardings of a carry, for `jax.jit`."""
         if self.mesh.size == 1:
             return devices.replicated(self.mesh)
         return jax.tree.map(lambda x: x.sharding, self.shapes())
@@ -101,7 +101,7 @@ class StateLayout(NamedTuple):
         )
 
     def params(self, carry: StepCarry) -> Params:
-        """The networks' parameters, with the rounded matrices; shared out where the carry is."""
+        """Returns the networks' parameters with rounded matrices, shared out as the carry."""
         params = carry.state.params
         if self._packs:
             matrices = _replaced(params.matrices, carry.rounded)
@@ -109,13 +109,13 @@ class StateLayout(NamedTuple):
         return _replaced(params, carry.rounded)
 
     def rounded(self, params: Any) -> Params:
-        """The matrices of a carry's parameters in the networks' type, None for other leaves."""
+        """Returns a carry's matrices in the networks' type, None for other leaves."""
         return _rounded(params.matrices if self._packs else params, self.round)
 
     # Within `on_each_device`:
 
     def gather_params(self, params: Params) -> Params:
-        """Parameters put together; of their gradient each device gets the sum of its share."""
+        """Gathers parameters; each device gets the sum of its share of their gradient."""
         if self.mesh.size == 1:
             return params
         gather = functools.partial(jax.lax.all_gather, axis_name=devices.AXIS, tiled=True)
@@ -126,11 +126,11 @@ class StateLayout(NamedTuple):
         )
 
     def mean(self, tree: Any) -> Any:
-        """The mean of every device's numbers."""
+        """Returns the mean of every device's numbers."""
         return tree if self.mesh.size == 1 else jax.lax.pmean(tree, devices.AXIS)
 
     def mean_gradients(self, gradients: Params) -> Any:
-        """The batch's gradients from each device's, laid out as a carry's parameters."""
+        """Returns the batch's gradients from each device's, laid out as a carry's parameters."""
         count, shapes = self.mesh.size, self._packed_shapes(self.whole.params)
         found = self._packed(gradients)
         if self._packs:
@@ -145,7 +145,7 @@ class StateLayout(NamedTuple):
         return jax.tree.map(lambda g: g / count, found) if count > 1 else found
 
     def norm(self, gradients: Any) -> jax.Array:
-        """Euclidean norm of all gradients."""
+        """Returns the Euclidean norm of all gradients."""
         leaves = jax.tree.leaves(gradients)
         if self.mesh.size == 1:
             return jnp.sqrt(_squares(leaves))
@@ -166,11 +166,11 @@ class StateLayout(NamedTuple):
         return packed_params.unpack_all(tree, self.whole.params) if self._packs else tree
 
     def _packed_shapes(self, shapes: Any) -> Any:
-        """Shapes of the state, or of its parameters, packed but not shared out."""
+        """Returns shapes of the state, or of its parameters, packed but not shared out."""
         return jax.eval_shape(self._packed, shapes)
 
     def _is_shared_out(self, path: tuple[Any, ...], x: Any) -> bool:
-        """Whether a leaf of a carry is shared out: a large matrix, but not the vision encoder's.
+        """Returns whether a leaf is shared out: a large matrix outside the vision encoder.
 
         The encoder is used first, and its gradient known last: nothing could run meanwhile.
         """
@@ -182,20 +182,20 @@ class StateLayout(NamedTuple):
 
 @functools.partial(jax.jit, static_argnums=1)  # called outside of any, one program for all of them
 def _rounded(params: Params, change: Callable[[Params], Params]) -> Params:
-    """The matrices that `Policy.cast_params` changes, as it gives them; None for the others."""
+    """Returns the matrices that `Policy.cast_params` changes, None for the others."""
     changed = change(params)
     return jax.tree.map(lambda old, new: None if new.dtype == old.dtype else new, params, changed)
 
 
 def _replaced(tree: Any, some: Any) -> Any:
-    """`tree` with the leaves of `some` that are not None."""
+    """Returns `tree` with the leaves of `some` that are not None."""
     return jax.tree.map(
         lambda one, leaf: leaf if one is None else one, some, tree, is_leaf=lambda x: x is None
     )
 
 
 def _row_major(gradient: jax.Array) -> jax.Array:
-    """Forces a convolution kernel's gradient into the order of its axes.
+    """Returns a convolution kernel's gradient in the order of its axes.
 
     XLA computes a 3x3 kernel's gradient as a forward convolution with another layout, and would
     transpose all of the optimiser's arrays to it, in five kernels. What is flat has one order only.
@@ -206,7 +206,7 @@ def _row_major(gradient: jax.Array) -> jax.Array:
 
 
 def _squares(leaves: list[jax.Array]) -> jax.Array:
-    """Sum of all squares.
+    """Returns the sum of all squares.
 
     A GPU needs two kernels for the sum of a large array, and starting them takes longer than most
     of them run: the second is shared, and so are both of small arrays.

@@ -76,7 +76,7 @@ class TrainState:
 
 
 def learning_rate(train_config: config.TrainConfig) -> optax.Schedule:
-    """Linear warm-up, then half a cosine down to zero."""
+    """Returns linear warm-up, then half a cosine down to zero."""
     warmup = min(train_config.warmup_steps, train_config.steps // 2)
     return optax.warmup_cosine_decay_schedule(
         init_value=0.0,
@@ -190,7 +190,7 @@ def shapes(
     key: jax.Array,
     sharding: jax.sharding.Sharding,
 ) -> TrainState:
-    """Shapes and sharding of what `create` makes of these, or of their shapes."""
+    """Returns shapes and sharding of what `create` makes of these, or of their shapes."""
     state = jax.eval_shape(functools.partial(create, policy, optimizer), params, stats, key)
     return jax.tree.map(lambda x: x.update(sharding=sharding), state)
 

@@ -80,7 +80,7 @@ def drawn_batch(
     frames: jax.Array,
     available: jax.Array,
 ) -> windows.Batch:
-    """The batch of a step, split over the devices; `key` and `step` are the state's."""
+    """Returns the batch of a step, split over the devices; `key` and `step` are the state's."""
     policy_config, train_config = setup.policy_config, setup.train_config
     key = states.step_keys(key, step).batch
     frame = windows.sample_frames(key, frames, train_config.batch_size, available)

@@ -90,7 +90,7 @@ def streamed(
 
 
 def _looped(setup: Setup, data: tuple[Any, ...], ahead: bool) -> Stepper:
-    """Many steps in one program, of whose arguments the dataset is one."""
+    """Returns many steps in one program, of whose arguments the dataset is one."""
     layout = setup.layout
     program = _program(functools.partial(steps.resident_steps, setup), layout)
 
@@ -103,7 +103,7 @@ def _looped(setup: Setup, data: tuple[Any, ...], ahead: bool) -> Stepper:
 
 
 def _drawn_by(carry: StepCarry) -> tuple[Any, Any]:
-    """What a batch is drawn by: the key and the number of the step."""
+    """Returns the key and the number of the step, which decide its batch."""
     return carry.state.key, carry.state.step
 
 

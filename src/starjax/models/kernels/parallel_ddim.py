@@ -32,12 +32,12 @@ _TINY = 1e-12  # squared distance of sequences that count as the same
 
 
 def evaluations_for(steps: int) -> int:
-    """How many times the network sees the sequences of so many steps."""
+    """Returns the number of evaluations of the network for so many steps."""
     return _EVALUATIONS + max(0, math.ceil(math.log2(steps / _STEPS)))
 
 
 def pays(batch: int, steps: int) -> bool:
-    """Whether so many robots' sequences take less time here than step by step."""
+    """Returns whether so many robots' sequences take less time here than step by step."""
     beside = evaluations_for(steps) * (_WEIGHTS_IN_SEQUENCES + batch * steps)
     return kernels.on_gpu() and beside < steps * (_WEIGHTS_IN_SEQUENCES + batch)
 
@@ -52,7 +52,7 @@ def ddim_sample(
     prepare: Callable[[jax.Array], Any] = lambda k: k,
     reach: Any = None,
 ) -> jax.Array:
-    """`diffusion.ddim_sample`, approximately.
+    """Approximates `diffusion.ddim_sample`.
 
     Args:
       eps_fn: `(x [steps, B, H, A], prepared) -> eps [steps, B, H, A]`.
@@ -100,7 +100,7 @@ def ddim_sample(
 
 
 def _secant(dx: jax.Array, dx0: jax.Array, most: jax.Array) -> jax.Array:
-    """Slope of each entry of a vector, over all times: 0 (of no noise) to `most` (of no signal)."""
+    """Returns the slope of each entry over all times: 0 (no noise) to `most` (no signal)."""
     square = jnp.sum(dx * dx, axis=-2, keepdims=True)
     slope = jnp.sum(dx * dx0, axis=-2, keepdims=True) / jnp.maximum(square, _TINY)
     return jnp.clip(slope, 0.0, most)

@@ -58,7 +58,7 @@ class SamplingBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, film: jax.Array) -> jax.Array:
-        """`[B, L, C]`, `[B, 2 features]` -> `[B, L, features]`."""
+        """Maps `[B, L, C]`, `[B, 2 features]` -> `[B, L, features]`."""
         first, second = (self.get_variable("params", name) for name in ("first", "second"))
         parts = jnp.split(film[:, None, :], 2, axis=-1)
         scale, bias = (_by_groups(part, self.groups) for part in parts)
@@ -78,7 +78,7 @@ class SamplingConv(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[B, L, C] -> [B, L, features]`."""
+        """Maps `[B, L, C] -> [B, L, features]`."""
         return _flat(_normalized(self.variables["params"], x, self.groups)[0])
 
 
@@ -154,5 +154,5 @@ def _flat(x: jax.Array) -> jax.Array:
 
 
 def _per_group(vector: jax.Array, groups: int) -> jax.Array:
-    """`[features]` for rows `[B, groups, L, features / groups]`."""
+    """Returns `[features]` for rows `[B, groups, L, features / groups]`."""
     return vector.reshape(1, groups, 1, -1)
