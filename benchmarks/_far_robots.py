@@ -1,9 +1,8 @@
-"""The simulation as robots that a server drives, with a clock of its own and a network that is bad.
+"""Simulated robots that a server drives over a simulated bad network.
 
-The clock counts control steps, and stands still while an answer is awaited that has to be there by
-now: how busy this machine is changes nothing. Frames go over real sockets to a real server; delays,
-jitter and drops are of the simulated clock, and count from the question to its answer, the time of
-the decision with it.
+A simulated clock counts control steps and stands still while a due reply is awaited: the load of
+this machine has no effect. Frames use real sockets to a real server. Delays, jitter and drops are
+in simulated time, from a request to its reply, inference included.
 """
 
 import dataclasses
@@ -28,13 +27,15 @@ _SETTLED_S = 120.0  # for a server to start
 
 @dataclasses.dataclass(frozen=True)
 class Network:
-    """What goes wrong, in s of the simulated clock.
+    """Faults of a network, in s of the simulated clock.
 
     Attributes:
-      delay_s: of every answer. jitter_s: more of it, the mean of an exponential distribution.
-      drop: share of answers that never come. timeout_s: after which they are given up.
-      kills_s: when the server is killed (SIGKILL), and started again.
-      ahead: control steps that plans are asked for before they are due, None for the client's own.
+      delay_s: of every reply.
+      jitter_s: mean of an exponential distribution of additional delay.
+      drop: fraction of replies that never arrive.
+      timeout_s: of a reply.
+      kills_s: times at which the server is killed (SIGKILL) and restarted.
+      ahead: as of `deploy.Client`.
     """
 
     delay_s: float = 0.0
@@ -61,7 +62,7 @@ class Server:
         self.start()
 
     def start(self) -> None:
-        """Starts it, at the port that it had before; returns at once if it had one."""
+        """Starts it at its previous port, if any, and then returns at once."""
         port = self.address.rpartition(":")[2] or "0"
         command = [sys.executable, "-m", "starjax", "serve", *self._flags, "--port", port]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -73,13 +74,13 @@ class Server:
                 raise RuntimeError("the server has not started")
 
     def kill(self) -> None:
-        """Ends it at once, as a loss of power would."""
+        """Kills it, as a loss of power would."""
         self._process.send_signal(signal.SIGKILL)
         self._process.wait()
 
 
 class BadConnection(Connection):
-    """A connection whose answers come when the simulated clock says, or never."""
+    """A connection whose replies arrive by the simulated clock, or never."""
 
     def __init__(self, clock: Clock, network: Network, rng: np.random.Generator, *given: Any):
         self._clock, self._network, self._rng = clock, network, rng
@@ -104,7 +105,7 @@ class BadConnection(Connection):
 
 
 class Driven:
-    """What came of trials of one network: episodes, reports of the clients, their largest steps.
+    """Results of trials with one network: episodes, reports of the clients, their largest steps.
 
     Attributes:
       move, turn: m and rad, the largest between two commands.
@@ -120,7 +121,7 @@ class Driven:
 
 
 def programs(image_size: int) -> tuple[envs.Env, Callable, Callable, Callable]:
-    """The environment, and its reset, step and observe of a batch."""
+    """Makes the environment, and its reset, step and observe of a batch."""
     made = envs.make(image_size=image_size)
     reset = jax.jit(jax.vmap(lambda key, trocar: made.reset(key, envs.EnvParams(trocar))))
     step, observe = (jax.jit(jax.vmap(f)) for f in (made.step, made.observe))
@@ -190,7 +191,7 @@ def drive(
 
 
 def _moment(seen: Any, i: int) -> deploy.Observation:
-    """What one-armed robot i measures."""
+    """Returns the measurements of one-armed robot i."""
     R, p, gripper = seen.pose.R[i, 0], seen.pose.p[i, 0], seen.gripper[i, 0]
     return deploy.Observation(Pose(R, p), gripper, image=seen.images["camera"][i])
 
@@ -227,7 +228,7 @@ def _episode(
     ports: rcm.Trocar,
     seed: int,
 ) -> episodes.Episode:
-    """As an evaluation records it."""
+    """Builds the episode as an evaluation records it."""
     taken = [n for n, (_, record) in enumerate(records) if not record["was_done"][i]]
     where = np.asarray(rcm.trocar_position(ports, made.p_world_ref), np.float64)[i, 0]
     poses = [records[n][0][i].pose for n in taken]

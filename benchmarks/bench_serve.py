@@ -1,10 +1,10 @@
-"""Time of a decision over the socket, beside the same policy called in this process.
+"""Times an inference over the socket and the same policy called in this process.
 
     python benchmarks/bench_serve.py [--policy compact] [--calls 200] [--tiny]
 
-`starjax serve` runs in a process of its own on this machine. Calls to it and calls here alternate,
-so that what else the machine does meets both. Then a robot that is where it was sent is driven at
-30 Hz, and its missed deadlines are counted.
+`starjax serve` runs in its own process on this machine. Calls to it and calls here alternate, so
+other load affects both equally. Then the loop drives an ideal robot at 30 Hz and counts missed
+deadlines.
 """
 
 import argparse
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def decisions(policy: deploy.Deployed, address: str, calls: int) -> dict:
-    """Percentiles of a call here, over the socket, and of what the socket adds to it, ms."""
+    """Returns percentiles, ms, of calls here, over the socket, and of the difference."""
     request = batching.example(policy)
     seen, trocar = request.observation, request.trocar
     connection = Connection(address, "", 60.0, 60.0)
@@ -81,7 +81,7 @@ def percentiles(times: list[float]) -> dict[str, float]:
 
 
 class Robot:
-    """It is where it was last sent."""
+    """An ideal robot: it reaches every command."""
 
     def __init__(self, moment: deploy.Observation) -> None:
         self.moment = moment
@@ -94,7 +94,7 @@ class Robot:
 
 
 def loop(policy: deploy.Deployed, address: str, seconds: float) -> dict:
-    """What a client reports of a robot in real time."""
+    """Drives a robot in real time and returns the client's counts."""
     request = batching.example(policy)
     port = rcm.Trocar(*(float(np.ravel(field)[0]) for field in request.trocar))
     robot = Robot(jax.tree.map(lambda x: x[0], request.observation))

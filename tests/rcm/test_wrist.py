@@ -166,6 +166,34 @@ def test_no_other_turn_about_the_line_is_nearer(rng, p_world_ref):
         assert (turned(turn @ got.pose.R, tip.R) >= nearest - 1e-5).all()
 
 
+def test_no_other_posture_is_much_nearer(p_world_ref):
+    """Against a search of the limits' edges and all rolls, for rotations outside the limits."""
+    rng, n = np.random.default_rng(1), 400
+    tip = board_poses(rng, n)
+    got = through(tip, p_world_ref)
+    edge, limit = np.linspace(-LIMIT, LIMIT, 25), np.full(25, LIMIT)
+    sides = [(edge, limit), (edge, -limit), (limit, edge), (-limit, edge)]
+    angles = np.concatenate([np.stack(side, -1) for side in sides])
+    roll = np.linspace(-np.pi, np.pi, 120, endpoint=False)
+    postures = np.concatenate(
+        [np.repeat(roll, len(angles))[:, None], np.tile(angles, (len(roll), 1))], -1
+    )
+
+    @jax.jit
+    def search(R, p):
+        action = jnp.concatenate([postures, jnp.broadcast_to(p, (len(postures), 3))], -1)
+        pose, _ = SPACE.decode(action, rcm.Trocar(0.0, np.pi / 2, 0.0), p_world_ref)
+        return jnp.max(jnp.einsum("nij,ij->n", pose.R, R))  # trace: cosine of the angle
+
+    cos = (np.array([search(R, p) for R, p in zip(*tip)]) - 1.0) / 2.0
+    best = np.rad2deg(np.arccos(np.clip(cos, -1.0, 1.0)))
+    excess = np.rad2deg(turned(got.pose.R, tip.R)) - best
+    outside = ~np.asarray(got.is_feasible)
+    near = outside & (best < 10.0)
+    assert near.sum() > 10 and excess[near].max() < 0.5
+    assert np.median(excess[outside]) < 2.0 and excess[outside].max() < 22.0
+
+
 def test_a_tip_too_near_the_trocar_or_too_far_is_moved_along_the_line(p_world_ref):
     down = np.float32([0, 0, -1])
     R = np.diag([1.0, -1.0, -1.0]).astype(np.float32)

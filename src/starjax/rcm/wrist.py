@@ -122,8 +122,8 @@ def through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike) -> Wr
 
     A feasible pose is returned unchanged, up to rounding. Otherwise the angles are clipped to the
     limits and the tool turns about the line from the trocar to the tip until its rotation is as
-    near as possible. Tips are moved along that line if W would be shallower than `MIN_DEPTH` or the
-    tip deeper than `MAX_DEPTH`.
+    near as possible: a close, continuous stand-in for the nearest feasible rotation. Tips are moved
+    along that line if W would be shallower than `MIN_DEPTH` or the tip deeper than `MAX_DEPTH`.
 
     Args:
       wrist: sizes and limits.
