@@ -55,7 +55,7 @@ def expect_folder(argument: str, name: str | Path) -> None:
         try:
             place.lstat()
         except (FileNotFoundError, NotADirectoryError, PermissionError):
-            continue  # the folder above it tells
+            continue  # decided by the directory above
         except OSError as error:
             raise errors.UsageError(argument, "a folder", f"{path}: {error.strerror}") from error
         above = place != path

@@ -1,6 +1,6 @@
-"""Demonstrations of a run: where they lie, collecting what is missing, and what training sees.
+"""Demonstrations of a run: their directory, their collection and the training dataset.
 
-What brings jax is imported where it is used, after XLA has been prepared.
+Modules that import jax are imported inside functions, after XLA's flags are set.
 """
 
 import functools
@@ -118,7 +118,7 @@ def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, f
         kind: base.Disturbance = DISTURBANCES.get(name)
         sees = config.policy.observation == "image" or not kind.image_only
         if not (kind.for_demos and sees):
-            raise errors.UsageError(_RANDOMISE, "what demonstrations can show", name)
+            raise errors.UsageError(_RANDOMISE, "a disturbance of demonstrations", name)
         base.check_levels(_RANDOMISE, name, [level])
     if not max_levels:
         return env, {}
@@ -129,10 +129,10 @@ def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, f
 
 
 def given(config: config_lib.RunConfig, env: Any) -> Path:
-    """The folder of somebody's dataset, once it is known to be one that this run can learn from.
+    """Returns the directory of --demos.from, if the run can train on that dataset.
 
     Raises:
-      errors.UsageError: it is none, or of another task, or lacks what the policy observes.
+      errors.UsageError: it is no dataset, of another task, or without the policy's observation.
     """
     import numpy as np
 

@@ -16,16 +16,16 @@ from starjax import config as config_lib
 from starjax import errors, methods
 from starjax.runtime import files
 
-_BESIDE = ("dataset", "encoder", "jax_settings")  # what a config.json records beside the settings
+_BESIDE = ("dataset", "encoder", "jax_settings")  # further entries of a config.json
 
 
 def existing(run: str) -> Path:
-    """The absolute path of a method's folder that a command line names.
+    """Returns the absolute path of a method's directory on the command line.
 
     Raises:
       errors.UsageError: it is not called as a method is.
     """
-    folder = Path(run).absolute()  # a link is called what its user calls it
+    folder = Path(run).absolute()  # a symbolic link keeps its own name
     if folder.name not in methods.METHODS:
         folder = folder.resolve()
     if folder.name not in methods.METHODS:
@@ -41,12 +41,12 @@ def existing(run: str) -> Path:
 
 
 def weights(out: Path, method: str) -> Path:
-    """The file of the weights that `method` runs on: those of another method for some."""
+    """Returns the file of a method's weights, which some methods share."""
     return out / methods.METHODS[method].weights_of / "policy.safetensors"
 
 
 def equivalent_methods(method: str) -> list[str]:
-    """Other methods that behave just as `method` does, so that one evaluation serves both."""
+    """Returns methods of equal behaviour, which can share an evaluation."""
     return [
         name
         for name in methods.METHODS
@@ -55,7 +55,7 @@ def equivalent_methods(method: str) -> list[str]:
 
 
 def adopt_equivalent(out: Path, method: str) -> None:
-    """Takes over the evaluation of a twin that was scored before, chunk by chunk."""
+    """Copies the evaluation of an equivalent method, if there is one."""
     for name in equivalent_methods(method):
         if (out / name / "evaluation").is_dir() and not (out / method / "evaluation").exists():
             staged = out / method / ".evaluation"
@@ -70,12 +70,12 @@ def adopt_equivalent(out: Path, method: str) -> None:
 
 
 def selected(config: config_lib.RunConfig) -> list[str]:
-    """The methods of a run, in the order of Table II."""
+    """Returns the methods of a run, in the order of Table II."""
     return list(methods.TABLE_II) if config.method == "all" else [config.method]
 
 
 def is_under_way(folder: Path) -> bool:
-    """Whether `folder` has trials of an evaluation that has no result.json yet."""
+    """Returns True for a directory with trials of an evaluation but without its result."""
     plan, result = folder / "evaluation" / "plan.json", folder / "result.json"
     if not plan.exists() or not any(plan.parent.glob("chunk_*")):
         return False
@@ -90,13 +90,13 @@ def claim(
     Args:
       folder: of one method.
       config: settings of this run.
-      dataset: name of its demonstrations, which also tells the scene that they were made in.
-      encoder: fingerprint of its frozen vision encoder; None if it has none, or is trained.
+      dataset: name of the demonstrations, which identifies their scene.
+      encoder: fingerprint of the frozen image encoder, or None.
 
     Raises:
-      errors.UsageError: naming the first setting that differs, or what weights are there without.
+      errors.UsageError: a setting differs, or the settings of existing weights are missing.
     """
-    # Imported here, as it imports jax.
+    # Imported here because it imports jax.
     from starjax.runtime import jax_settings
 
     started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
@@ -120,12 +120,12 @@ def claim(
 
 
 def read_config(folder: Path) -> config_lib.RunConfig:
-    """Settings of a finished or running method folder."""
+    """Returns the settings of a method's directory."""
     return _settings(folder, _recorded(folder))
 
 
 def _recorded(folder: Path) -> dict[str, Any]:
-    """The content of a method folder's config.json."""
+    """Returns the content of a method's config.json."""
     path = folder / "config.json"
     if not path.is_file():
         hint = _remedy(folder) if (folder / "policy.safetensors").is_file() else ""
@@ -141,7 +141,7 @@ def _recorded(folder: Path) -> dict[str, Any]:
 
 
 def _remedy(folder: Path) -> str:
-    """Advice on a method's folder whose settings are lost, or others."""
+    """Returns the suggested fix for a directory with lost or other settings."""
     weights = folder / "policy.safetensors"
     scores = f"; starjax evaluate --policy {shlex.quote(str(weights))} scores its weights"
     return "train in another folder by --out, or remove this one" + scores * weights.is_file()
@@ -166,7 +166,7 @@ def _refuse(folder: Path, name: str, before: Any, now: Any) -> None:
 
 
 def demos_digest(root: Path) -> str | None:
-    """The digest of a sealed dataset, None of one that is not there."""
+    """Returns the digest of a sealed dataset, None without one."""
     try:
         return files.read_json(root / "SEALED.json")["digest"]
     except (FileNotFoundError, KeyError, TypeError, ValueError):

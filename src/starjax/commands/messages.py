@@ -17,7 +17,7 @@ STAGES = ("collect", "train", "evaluate", "report")
 
 
 def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
-    """Describes what is going to happen, for the start of a run."""
+    """Returns the plan of a run, for its start."""
     lines = [
         f"starjax {starjax.__version__}: method {config.method}, preset {config.preset}, "
         f"seed {config.seed}, folder {config.out}",
@@ -30,7 +30,7 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
 
 
 def about(config: config_lib.RunConfig, name: str, seed: int) -> str:
-    """Describes what is scored: the policy `name`, how it was made, the trials and their seed."""
+    """Returns the plan of an evaluation: the policy `name`, its training, its trials and seed."""
     lines = [
         f"starjax {starjax.__version__}: {methods.METHODS[config.method].label} of {name}",
         *_setting(config),
@@ -42,7 +42,7 @@ def about(config: config_lib.RunConfig, name: str, seed: int) -> str:
 
 
 def _setting(config: config_lib.RunConfig) -> list[str]:
-    """Lines that say where it happens, and what the policy sees."""
+    """Returns lines with devices, scene, observation and ablations."""
     import jax
 
     devices, scene = jax.devices(), config.scene
@@ -79,7 +79,7 @@ def _training(config: config_lib.RunConfig) -> str:
 
 
 def _idle(batch_size: int) -> list[str]:
-    """A line if some devices cannot share a batch."""
+    """Returns a line if some devices cannot share a batch."""
     import jax
 
     from starjax.training import devices
@@ -114,7 +114,7 @@ def _time(config: config_lib.RunConfig, stages: Sequence[str]) -> list[str]:
 
 
 def _seeing(config: config_lib.RunConfig) -> list[str]:
-    """Lines that say what the policy sees, and with which encoder."""
+    """Returns lines with the observation and its encoder."""
     policy = config.policy
     if policy.observation == "state":
         return [
@@ -132,7 +132,7 @@ def _fields(config: config_lib.RunConfig) -> str:
 
 
 def encoder(config: config_lib.RunConfig) -> str:
-    """Where the weights of the image encoder come from, and whether they still learn."""
+    """Returns the origin of the image encoder's weights, and if they are frozen."""
     policy, name = config.policy, config.policy.encoder_weights
     if not name:
         return "trained from scratch"
@@ -145,8 +145,7 @@ def encoder(config: config_lib.RunConfig) -> str:
 
 
 def _scene_of(encoder_weights: str) -> Any:
-    """Names of the scene that an encoder's policy was trained in; None of a file that is none, or
-    gone."""
+    """Returns the scene of an encoder's training, None without a readable policy file."""
     from starjax.policies import packaged, policy_file
 
     try:
@@ -156,7 +155,7 @@ def _scene_of(encoder_weights: str) -> Any:
 
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
-    """Active ablations: settings that deviate from the method's row."""
+    """Returns the active ablations: settings that deviate from the method's row."""
     rows = [methods.METHODS[name] for name in (methods.TABLE_II if method == "all" else [method])]
     sees, yaw = policy.sees_trocar, policy.trocar_yaw
     given = "given" if sees == "always" else "not given"
@@ -180,7 +179,7 @@ def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
 
 
 def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[str]:
-    """Warnings for readers of the result whose method `figures` names, a sentence each."""
+    """Returns warnings for readers of a result, one sentence per warning."""
     found = []
     if config.policy.observation == "state":
         found.append(
@@ -199,7 +198,7 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
 
 
 def outcome(results: Sequence[Any]) -> str:
-    """Seen against unseen trocars, one line for each `result.Result`, for the end of a run."""
+    """Returns a table of success at seen and unseen trocars, one line per `result.Result`."""
     rows = [("success [95% interval]", "seen", "unseen", "safe", "RCM executed")]
     for result in results:
         figures = result.figures
@@ -223,7 +222,7 @@ def outcome(results: Sequence[Any]) -> str:
 
 
 def hint(run: Path, weights: str, does: str) -> str:
-    """Which command `does` something with figures of these weights that lie in a run's folder."""
+    """Returns the command that `does` something with these weights' figures in a directory."""
     try:
         scored = files.read_json(run / "result.json").get("weights", weights)
     except (FileNotFoundError, ValueError):
@@ -234,7 +233,7 @@ def hint(run: Path, weights: str, does: str) -> str:
 
 @contextlib.contextmanager
 def first_process_only(is_first: bool) -> Iterator[None]:
-    """Keeps what is printed to the first process of several."""
+    """Silences all but the first process."""
     with open(os.devnull, "w") as nowhere, contextlib.ExitStack() as changed:
         if not is_first:
             changed.enter_context(contextlib.redirect_stdout(nowhere))

@@ -19,7 +19,7 @@ from starjax import errors, limits
 
 SettingsT = TypeVar("SettingsT")
 
-AUTO = "auto"  # of a flag that is left out, where what it then means is said in its help
+AUTO = "auto"  # default of flags whose help explains it
 # The words before the flags, as help names them.
 Run = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 RunOrNone = Annotated[
@@ -37,7 +37,7 @@ _ALIASES = {(config_lib.SceneConfig, "camera"): ("--cameras",)}
 
 @dataclasses.dataclass(frozen=True)
 class NoFlags:
-    """Flags of a command that has none."""
+    """Settings of a command without flags."""
 
 
 _UNNAMED = "scene"  # the part of settings whose flags do not name it
@@ -95,7 +95,7 @@ def typed_value(field: str, argv: Sequence[str]) -> str | None:
 
 
 def flags(settings: Any) -> list[str]:
-    """Every flag of a (nested) dataclass, e.g. `--train.steps`; switches have a `no-` twin."""
+    """Returns all flags of a (nested) dataclass, such as `--train.steps`, and `no-` flags."""
     found = []
     for name, _, hint in limits.fields(settings):
         if tyro.conf.Positional not in getattr(hint, "__metadata__", ()):
@@ -106,13 +106,12 @@ def flags(settings: Any) -> list[str]:
 
 
 def flag(field: str) -> str:
-    """How a field is typed: `train.steps` as `--train.steps`, `scene.task` as `--task`, `from_` as
-    `--from`."""
+    """Returns the flag of a field, e.g. `--task` for `scene.task`, `--from` for `from_`."""
     return f"--{field.removeprefix(f'{_UNNAMED}.').rstrip('_').replace('_', '-')}"
 
 
 def spelled(error: errors.UsageError) -> str:
-    """A mistake's line, with flags instead of the fields that library code names."""
+    """Returns the line of an error, with flags for the names of fields."""
     line = str(error)
     if _FIELD.fullmatch(error.argument):
         line = line.replace(error.argument, flag(error.argument), 1)
@@ -123,7 +122,7 @@ def spelled(error: errors.UsageError) -> str:
 
 
 def typed(name: str, argv: Sequence[str]) -> str:
-    """The command line, for the record in result.json."""
+    """Returns the command line, for results."""
     return shlex.join(["starjax", name, *argv])
 
 
@@ -137,7 +136,7 @@ def _current(word: str, renamed: Mapping[str, str]) -> str:
 
 
 def _refuse(settings: Any, event: Any) -> NoReturn:
-    """Raises UsageError for what tyro is about to refuse.
+    """Raises UsageError in place of an error of tyro.
 
     tyro prints a box of five lines, and its public interface hands out neither the argument nor the
     value. Its hook for errors does; it is private, so a release of tyro may change it: pyproject
@@ -166,14 +165,14 @@ def _name(argument: Any) -> str:
     return argument.lowered.name_or_flags[-1] if argument else "FLAG"
 
 
-_busy: list[type] = []  # dataclasses whose fields tyro is asked for
+_busy: list[type] = []  # dataclasses whose fields tyro is listing
 
 
 @_registry.struct_rule
 def _with_ranges(
     info: tyro.constructors.StructTypeInfo,
 ) -> tyro.constructors.StructConstructorSpec | None:
-    """Adds what is in the hint at the end of a field's help: its range and its default."""
+    """Appends range and default to the help of each field."""
     if not dataclasses.is_dataclass(info.type) or info.type in _busy:
         return None
     _busy.append(info.type)
@@ -205,7 +204,7 @@ def _is_annotated(hint: Any) -> bool:
 
 
 def _hint(limit: limits.Range | None, default: str) -> str:
-    """`(1 to 8; default: 8)`, without what there is nothing to say of."""
+    """Returns `(1 to 8; default: 8)`, or the part of it that exists."""
     has_default = default not in ("", "None", "''")
     parts = [str(limit)] * bool(limit) + [f"default: {default}"] * has_default
     return f"({'; '.join(parts)})" if parts else ""

@@ -1,4 +1,4 @@
-"""The stages of a run, one after another, each skipped when its result is there."""
+"""Stages of a run in their order; complete ones are skipped."""
 
 import dataclasses
 import functools
@@ -27,11 +27,11 @@ MIN_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A run at work, as its stages need it.
+    """A run at work: the argument of its stages.
 
     Attributes:
       config: settings with the scene named in full.
-      encoder: frozen image encoder, None if the run has none.
+      encoder: frozen image encoder, or None.
       share: this process's part in the run's directory.
       command: command line, for results.
     """
@@ -221,7 +221,7 @@ def _evaluate(work: Run, name: str, demos: Path, policy: Callable[[], Any] | Non
 
 
 def _was_scored(config: config_lib.RunConfig, folder: Path, weights: Path, env: Any) -> bool:
-    """Whether a method's result is there.
+    """Returns True if the result of a method is complete.
 
     Raises:
       errors.UsageError: fewer trials would replace it.
@@ -241,7 +241,7 @@ def _was_scored(config: config_lib.RunConfig, folder: Path, weights: Path, env: 
 
 
 def _scored(folder: Path, weights: str) -> Any:
-    """The `result.Result` in result.json, None if it is missing, damaged or of other weights."""
+    """Returns the result of these weights, None if it is missing or damaged."""
     from starjax.evaluation import result
 
     try:
@@ -253,7 +253,7 @@ def _scored(folder: Path, weights: str) -> Any:
 
 
 def _is_of(found: Any, config: config_lib.RunConfig) -> bool:
-    """Whether a result is of these settings."""
+    """Returns True if a result has these settings."""
     try:
         before = config_lib.from_dict(config_lib.RunConfig, found.config)
     except (AttributeError, KeyError, TypeError, ValueError):
@@ -263,7 +263,7 @@ def _is_of(found: Any, config: config_lib.RunConfig) -> bool:
 
 
 def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
-    """Seconds of the stages that a method's result rests on, compilation apart.
+    """Returns the seconds of the stages behind a method's result, and of their compilations.
 
     `demos` is the folder of its demonstrations.
     """
@@ -283,7 +283,7 @@ def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
 
 
 def _report(out: Path, names: Sequence[str]) -> None:
-    """The report of every method in the folder, and the outcome of this run's."""
+    """Writes the report of all methods in the directory; prints the outcome of this run."""
     from starjax.evaluation import result
     from starjax.report import build
 
@@ -293,6 +293,6 @@ def _report(out: Path, names: Sequence[str]) -> None:
         try:
             page = build.build(scored, out / "report", report=messages.indented)
         except ValueError as error:  # of a damaged file, which it names
-            raise errors.UsageError(str(out), "results that are whole", error) from error
+            raise errors.UsageError(str(out), "complete results", error) from error
     results = [result.read(out / name / "result.json") for name in names]
     print(f"\n{messages.outcome(results)}\n\nreport: {page}", flush=True)

@@ -119,7 +119,7 @@ def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.Settings:
 
 
 def inference_ms(who: PolicyInEnv) -> dict[str, float]:
-    """Time of one decision at batch 1: observation in, commands out, compilation apart."""
+    """Measures the time of one inference at batch size 1, from observation to commands."""
     trained = who.trained
     return latency.policy_ms(
         who.policy,
@@ -141,7 +141,7 @@ def write_result(
     timings_s: dict[str, float] | None = None,
     dataset_digest: str | None = None,
 ) -> results.Result:
-    """Writes and returns `<folder>/result.json`: `statistics.compose`'s figures and what made them.
+    """Writes `<folder>/result.json`: figures of `statistics.compose` and their origin.
 
     Args:
       folder: of the result.
@@ -149,9 +149,9 @@ def write_result(
       trials: of the task's trocars.
       config: settings of the run and of this evaluation.
       seed: of the trials; the run's own is in `config`.
-      command: what was typed.
+      command: command line.
       timings_s: seconds by stage.
-      dataset_digest: of the demonstrations, if they are there.
+      dataset_digest: digest of the demonstrations, if available.
     """
     task = who.env.task
     is_seen = task.is_seen & (np.arange(len(task.is_seen)) < config.demos.seen_trocars)

@@ -1,7 +1,7 @@
 """Presets: starting values of a run, any field of which the command line can override.
 
-Data, not code: what a preset changes from `config.RunConfig()` (the paper) stands in one literal.
-Other learners begin with a preset's options where they have them too (`config.with_learner`).
+Each preset is a literal with its changes of `config.RunConfig()`, the paper's settings.
+Other learners keep the options that they share with the preset's (`config.with_learner`).
 """
 
 from typing import NamedTuple
@@ -64,7 +64,7 @@ PRESETS: dict[str, RunConfig] = {
             checkpoint_every=1_000,
             log_every=100,
         ),
-        # Of the successes in experiments/cpu_main_job none took 19 s; a failure takes all of it.
+        # No success in experiments/cpu_main_job took 19 s; a failure takes the whole limit.
         eval=EvalConfig(trials=6, time_limit_s=20.0, video_trials=4),
     ),
     # One modern GPU, four minutes, from pixels: networks of `compact`, which flow matching trains
@@ -87,11 +87,11 @@ PRESETS: dict[str, RunConfig] = {
             ema_max=0.9995,
             checkpoint_every=4_000,
         ),
-        # Of the successes in experiments/gpu_main_job none took 10 s; a failure takes all of it.
+        # No success in experiments/gpu_main_job took 10 s; a failure takes the whole limit.
         eval=EvalConfig(time_limit_s=30.0),
     ),
-    # One modern GPU, six minutes: the paper's encoder from scratch and its learner. Of the paper's
-    # 240 demonstrations the roll network would learn the rolls by heart.
+    # One modern GPU, six minutes: the paper's learner and its encoder from scratch. With its
+    # 240 demonstrations the roll network would overfit.
     "resnet": RunConfig(
         preset="resnet",
         demos=DemosConfig(per_trocar=100),
@@ -160,7 +160,7 @@ def resolve(name: str, has_gpu: bool) -> RunConfig:
 
 
 def reason(has_gpu: bool) -> str:
-    """Why `auto` takes the preset that it does, once jax has started; one line."""
+    """Returns the reason for the preset of `auto` in one line; jax has started."""
     if has_gpu:
         return "jax runs on a GPU"
     why = gpu.why_unused()

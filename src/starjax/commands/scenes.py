@@ -1,4 +1,4 @@
-"""The scene of a run: names that are left out become the task's own."""
+"""Scenes of runs: missing names become those of the task."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from starjax.sim.names import SceneNames
 
 
 def settings(names: SceneNames) -> config_lib.SceneConfig:
-    """The settings that name a scene in full."""
+    """Returns the settings of a scene with all names."""
     return config_lib.SceneConfig(
         task=names.task, arm=names.arms, tool=names.tools, camera=names.cameras
     )
@@ -22,7 +22,7 @@ def names(scene: config_lib.SceneConfig) -> SceneNames:
 
 
 def disturbable(env: Any, disturbances: Sequence[str], policy: config_lib.PolicyConfig) -> Any:
-    """The environment, with cameras that may move if one of these disturbances moves them."""
+    """Returns the environment, with movable cameras if a disturbance moves them."""
     from starjax.evaluation.disturbances import DISTURBANCES
     from starjax.sim import env as sim_env
 
@@ -32,12 +32,12 @@ def disturbable(env: Any, disturbances: Sequence[str], policy: config_lib.Policy
 
 
 def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
-    """Settings that name their scene in full, and train with trocars that its task has.
+    """Returns settings with all names of the scene and a number of trocars that its task has.
 
     Raises:
-      errors.UsageError: a name is unknown, or the task has fewer seen trocars than were asked for.
+      errors.UsageError: a name is unknown, or the task has fewer seen trocars.
     """
-    # Imported here, as it imports jax and MuJoCo.
+    # Imported here because it imports jax and MuJoCo.
     from starjax.sim import registries, scene
 
     asked, demos = config.scene, config.demos

@@ -1,4 +1,4 @@
-"""How long each stage took, compilation apart, summed over every start of the same run."""
+"""Durations of stages with the part of compilation, summed over all starts of a run."""
 
 import contextlib
 import time
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from starjax.runtime import files
 
-# Tracing is left out: its events nest, so that their sum says nothing.
+# Tracing does not count: its events nest, and their sum means nothing.
 _COMPILE_EVENTS = (
     "/jax/core/compile/backend_compile_duration",
     "/jax/core/compile/jaxpr_to_mlir_module_duration",
@@ -43,14 +43,14 @@ def timed(out: Path, stage: str, resumes: bool = True) -> Iterator[None]:
         with compiling:
             yield
     except BaseException:
-        with contextlib.suppress(OSError):  # a full disk is told by what it stopped
+        with contextlib.suppress(OSError):  # the interrupted work reports a full disk
             note()
         raise
     note()
 
 
 def read(out: Path) -> dict[str, float]:
-    """Seconds a stage so far; of a damaged file none."""
+    """Returns the seconds of each stage so far, empty for a damaged file."""
     try:
         return files.read_json(out / "timings.json")
     except (FileNotFoundError, ValueError):
@@ -58,7 +58,7 @@ def read(out: Path) -> dict[str, float]:
 
 
 class _CompileSeconds:
-    """Adds up what jax reports of its compilations while it is entered."""
+    """Sum of the durations of compilations that jax reports inside the context."""
 
     def __init__(self) -> None:
         from starjax.runtime import precompile  # imports jax
