@@ -10,7 +10,7 @@ ROWS = (
     ("extras", "types", "methods", "limits", "registry", "runtime"),
     ("learners",),
     ("config", "rcm"),
-    ("models", "sim"),
+    ("models", "monitor", "sim"),
     ("rollouts",),
     ("data",),
     ("policies",),

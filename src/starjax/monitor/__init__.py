@@ -1,0 +1,1 @@
+"""A runtime monitor: scores of plans and poses, one conformal threshold, alarms in closed loop."""

@@ -1,0 +1,132 @@
+"""Laws of the conformal threshold, on synthetic trials of unequal length."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from starjax import errors
+from starjax.monitor import calibrate, scores
+
+SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=6)
+
+
+def trials(rng: np.random.Generator, count: int, longest: int = 30) -> np.ndarray:
+    """Scores `[count, longest, 3]`, dependent in time, of trials that end anywhere."""
+    walks = rng.normal(size=(count, longest, 2)).cumsum(axis=1) * [1e-3, 5.0]
+    clock = np.broadcast_to(np.arange(longest) * SETTINGS.period_s, (count, longest))
+    values = np.concatenate([walks, clock[..., None]], axis=-1)
+    values[:, : SETTINGS.still, 1] = np.nan
+    length = rng.integers(2, longest + 1, count)
+    values[np.arange(longest) >= length[:, None]] = np.nan
+    return values
+
+
+def made(rng: np.random.Generator, alpha: float = 0.05, count: int = 400) -> calibrate.Monitor:
+    return calibrate.calibrate(trials(rng, 200), trials(rng, count), alpha, SETTINGS, "weights")
+
+
+@pytest.mark.parametrize("alpha", [0.02, 0.05, 0.2])
+def test_the_false_alarm_rate_is_within_its_interval(alpha):
+    rng = np.random.default_rng(1)
+    rates = []
+    for _ in range(40):
+        times, _ = calibrate.first_alarms(made(rng, alpha, 199), trials(rng, 200))
+        rates.append(np.isfinite(times).mean())
+    alarms = round(sum(rates) * 200)
+    # Given the calibration set the rate follows a beta distribution (Vovk, 2012).
+    rank = math.ceil(200 * (1 - alpha) - 1e-9)
+    deviation = scipy.stats.beta(200 - rank, rank).std() / math.sqrt(40)
+    binomial = math.sqrt(alpha * (1 - alpha) / 8000)
+    assert abs(alarms / 8000 - alpha) < 4 * math.hypot(deviation, binomial)
+
+
+@pytest.mark.parametrize("count", [19, 20, 39, 100])
+def test_the_rank_is_exact_over_all_choices_of_the_new_trial(count):
+    values, alpha = np.random.default_rng(count).normal(size=count + 1), 0.05
+    over = [values[i] > calibrate.threshold(np.delete(values, i), alpha) for i in range(count + 1)]
+    assert sum(over) == math.floor((count + 1) * alpha + 1e-9)
+
+
+def test_too_few_successes_give_no_threshold():
+    assert calibrate.required(0.05) == 19
+    assert calibrate.threshold(np.arange(18.0), 0.05) == math.inf
+    assert calibrate.threshold(np.arange(19.0), 0.05) == 18.0
+    rng = np.random.default_rng(0)
+    with pytest.raises(errors.UsageError):
+        made(rng, 0.05, 18)
+
+
+def test_a_larger_alpha_never_raises_the_threshold():
+    values = np.random.default_rng(2).normal(size=500)
+    limits = [calibrate.threshold(values, alpha) for alpha in np.linspace(0.01, 0.9, 50)]
+    assert (np.diff(limits) <= 0).all()
+
+
+def test_bands_are_one_sided():
+    rng = np.random.default_rng(3)
+    monitor, fresh = made(rng), trials(rng, 300)
+    before, _ = calibrate.first_alarms(monitor, fresh)
+    lower, _ = calibrate.first_alarms(monitor, fresh - np.array([1.0, 1e6, 10.0]))
+    assert np.isinf(lower).all()
+    higher, _ = calibrate.first_alarms(monitor, fresh + np.array([1e-3, 1.0, 0.0]))
+    assert (higher <= before).all()
+
+
+def test_units_do_not_matter():
+    first, second, fresh = (trials(np.random.default_rng(i), 300) for i in range(3))
+    unit, zero = np.array([1e3, 0.2, 1.0]), np.array([5.0, -2.0, 0.0])
+    one = calibrate.calibrate(first, second, 0.05, SETTINGS)
+    two = calibrate.calibrate(unit * first + zero, unit * second + zero, 0.05, SETTINGS)
+    for a, b in zip(
+        calibrate.first_alarms(one, fresh), calibrate.first_alarms(two, unit * fresh + zero)
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_nan_neither_alarms_nor_hides_another_score():
+    monitor = made(np.random.default_rng(4))
+    blank = np.full((1, 5, 3), np.nan)
+    assert np.isinf(calibrate.first_alarms(monitor, blank)[0]).all()
+    for score, limit in enumerate(monitor.limits):
+        over = blank.copy()
+        over[0, 3, score] = limit + monitor.width[score]
+        time, which = calibrate.first_alarms(monitor, over)
+        assert time == pytest.approx(3 * SETTINGS.period_s)
+        assert which == score
+    assert calibrate.maxima(blank, monitor.center, monitor.width) == -np.inf
+
+
+def test_an_undefined_score_leaves_the_others():
+    def undefined(seed):
+        values = trials(np.random.default_rng(seed), 300)
+        values[..., 0] = np.nan
+        return values
+
+    monitor = calibrate.calibrate(undefined(5), undefined(6), 0.05, SETTINGS)
+    rate = np.isfinite(calibrate.first_alarms(monitor, undefined(7))[0]).mean()
+    assert 0.01 < rate < 0.12
+
+
+def test_the_clock_alone_is_a_quantile_of_durations():
+    durations = np.arange(1, 101)
+    values = np.full((100, 100, 3), np.nan)
+    for trial, length in enumerate(durations):
+        values[trial, :length, 2] = np.arange(length)
+    monitor = calibrate.calibrate(values, values, 0.05, SETTINGS)
+    assert monitor.clock_s == 95.0  # the 96th of 0 to 99
+
+
+def test_json_round_trip_and_refusals():
+    monitor = made(np.random.default_rng(8))
+    values = calibrate.to_json(monitor)
+    again = calibrate.from_json(values)
+    np.testing.assert_array_equal(again.limits, monitor.limits)
+    assert again[2:] == monitor[2:]
+    for change in ({"scores": ["clock"]}, {"width": [1.0]}, {"width": [0.0] * 3}, {"count": None}):
+        broken = {**values, **change}
+        if broken["count"] is None:
+            del broken["count"]
+        with pytest.raises(ValueError):
+            calibrate.from_json(broken)
