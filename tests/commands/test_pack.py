@@ -12,6 +12,7 @@ import safetensors.numpy
 from starjax import config, errors
 from starjax.commands import pack
 from starjax.data import normalizer
+from starjax.monitor import calibrate, scores
 from starjax.policies import policy_file
 
 POLICY = config.with_options(dataclasses.replace(fakes.TINY, dtype="bfloat16"), temperature=0.5)
@@ -85,3 +86,15 @@ def test_a_mistake_names_what_was_wrong(made, tmp_path, argv, argument, got):
     assert caught.value.argument == argument and got in str(caught.value.got)
     assert not (tmp_path / "out").exists()
     assert (tmp_path / "mine.safetensors").read_bytes() == before
+
+
+@pytest.mark.parametrize("argv", [[], ["--temperature", "0.5"], ["--temperature", "0"]])
+def test_a_monitor_is_kept_unless_samples_change(made, argv):
+    monitor = calibrate.Monitor(
+        np.zeros(3), np.ones(3), 1.0, 7.9, 0.05, 20, scores.ScoreSettings(8, 30.0, 6),
+        policy_file.monitor_digest(made.params),
+    )  # fmt: skip
+    policy_file.save("monitored.safetensors", made._replace(monitor=monitor))
+    assert pack.main(["monitored.safetensors", "small.safetensors", *argv]) == 0
+    is_kept = policy_file.load("small.safetensors").monitor is not None
+    assert is_kept == (argv[-1:] != ["0"])

@@ -12,6 +12,7 @@ import safetensors
 import safetensors.numpy
 
 from starjax.data import normalizer
+from starjax.monitor import calibrate, scores
 from starjax.policies import packaged, policy_file
 from starjax.sim import names
 
@@ -34,6 +35,59 @@ def trained(scale=1.0):
         p_world_ref=((0.0, 0.0, 0.15), (0.0, 0.1, 0.15)),
         roll_zero=(0.0, 3.14),
     )
+
+
+def with_monitor(policy, digest=None):
+    monitor = calibrate.Monitor(
+        center=np.array([1e-3, -2e-3, 6.7]),
+        width=np.array([0.1, 0.2, 1.0]) / 3,
+        threshold=1.25,
+        clock_s=7.9,
+        alpha=0.05,
+        count=1000,
+        settings=scores.ScoreSettings(8, 30.0, 6),
+        digest=digest or policy_file.monitor_digest(policy.params),
+    )
+    return policy._replace(monitor=monitor)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_a_monitor_stays_with_its_weights_also_in_half_precision(tmp_path, half):
+    path, made = tmp_path / "policy.safetensors", with_monitor(trained(scale=1 / 3))
+    policy_file.save(path, made, half=half)
+    found = policy_file.load(path)
+    assert calibrate.to_json(found.monitor) == calibrate.to_json(made.monitor)
+    assert policy_file.is_half(found.params) == half
+    policy_file.save(path, found._replace(monitor=None), half=half)
+    assert policy_file.load(path).monitor is None
+
+
+def test_a_monitor_of_other_weights_is_refused(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    other = policy_file.monitor_digest(trained(2.0).params)
+    with pytest.raises(ValueError, match="monitor"):
+        policy_file.save(path, with_monitor(trained(), other))
+    assert not path.exists()
+    policy_file.save(path, with_monitor(trained()))
+    data = safetensors.numpy.load_file(path)
+    about = about_of(path)
+    data["params/roll/bias"] = data["params/roll/bias"] + 1
+    envelope = {"about": about, "sha256": policy_file._hash(about, data)}
+    safetensors.numpy.save_file(data, path, {"starjax": json.dumps(envelope)})
+    with pytest.raises(ValueError, match="monitor"):
+        policy_file.load(path)
+
+
+def about_of(path):
+    with safetensors.safe_open(path, framework="numpy") as file:
+        return json.loads(file.metadata()["starjax"])["about"]
+
+
+def test_a_file_without_a_monitor_does_not_mention_it(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, trained())
+    assert "monitor" not in about_of(path)
+    assert not [name for name in safetensors.numpy.load_file(path) if "monitor" in name]
 
 
 def test_round_trip(tmp_path):

@@ -54,6 +54,9 @@ def main(argv: Sequence[str]) -> int:
         if not hasattr(policy.options, "temperature"):
             raise errors.UsageError("POLICY", "one with a temperature", f"one of {policy.learner}")
         policy = config.with_options(policy, temperature=args.temperature)
+    if trained.monitor and policy.options != trained.policy.options:
+        trained = trained._replace(monitor=None)  # it was calibrated with other samples
+        print("without the monitor: starjax calibrate makes one for this temperature")
     try:
         policy_file.save(out, trained._replace(policy=policy), half=True)
     except ValueError as error:

@@ -16,6 +16,7 @@ import safetensors.numpy
 
 from starjax import config
 from starjax.data import normalizer
+from starjax.monitor import calibrate
 from starjax.policies.base import Params
 from starjax.runtime import files
 from starjax.sim import names
@@ -23,6 +24,8 @@ from starjax.sim import names
 SCHEMA = 2
 _KEY = "starjax"  # one metadata entry: the format does not keep the order of several
 _SEPARATOR = "/"
+_MONITOR = "monitor"  # prefix of its arrays, and key of its other values
+_MONITOR_ARRAYS = ("center", "width")
 
 
 class Trained(NamedTuple):
@@ -39,6 +42,7 @@ class Trained(NamedTuple):
       roll_zero: `[A]` rad, see `rcm.TrocarFrame`.
       demos: settings of its demonstrations, if known; they name the seen trocars.
       preset: the preset of its run, if it was given; for the record.
+      monitor: runtime monitor calibrated with these parameters, None without one.
     """
 
     method: str
@@ -51,6 +55,7 @@ class Trained(NamedTuple):
     roll_zero: tuple[float, ...]
     demos: config.DemosConfig | None = None
     preset: str | None = None
+    monitor: calibrate.Monitor | None = None
 
 
 def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None:
@@ -88,6 +93,12 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
         "demos": None if trained.demos is None else config.as_json(trained.demos),
         "preset": trained.preset,
     }
+    if trained.monitor is not None:
+        _check_monitor(trained)
+        values = calibrate.to_json(trained.monitor)
+        parts = {name: values.pop(name) for name in _MONITOR_ARRAYS}
+        arrays |= dict(_flatten({_MONITOR: parts}))
+        about[_MONITOR] = values
     envelope = {"about": about, "sha256": _hash(about, arrays)}
     data = safetensors.numpy.save(arrays, {_KEY: json.dumps(envelope, sort_keys=True)})
     files.write_bytes(pathlib.Path(path), data)
@@ -120,7 +131,10 @@ def load(path: pathlib.Path | str) -> Trained:
     if _hash(about, arrays) != expected:
         raise ValueError(f"{path}: damaged, its content has another sha256")
     try:
-        return _trained(about, _unflatten(arrays))
+        monitor = _monitor(about, arrays)
+        trained = _trained(about, _unflatten(arrays))._replace(monitor=monitor)
+        _check_monitor(trained)
+        return trained
     except (KeyError, TypeError, ValueError) as error:
         why = f"no {error} in it" if isinstance(error, KeyError) else error
         raise ValueError(f"{path}: made by another version of starjax: {why}") from error
@@ -138,6 +152,39 @@ def is_policy(path: pathlib.Path | str) -> bool:
 def fingerprint(params: Params) -> str:
     """Returns the SHA-256 of parameters and their names."""
     return _hash({}, dict(_flatten(params)))
+
+
+def monitor_digest(params: Params) -> str:
+    """Returns the digest of the parameters that a monitor belongs to.
+
+    They are rounded to float16 first: a file in half precision keeps the monitor.
+    """
+    with np.errstate(over="ignore"):
+        arrays = {
+            name: array.astype(np.float16) if np.issubdtype(array.dtype, np.floating) else array
+            for name, array in _flatten(params)
+        }
+    return _hash({}, arrays)
+
+
+def is_half(params: Params) -> bool:
+    """Returns True if float16 stores all parameters exactly."""
+    with np.errstate(over="ignore"):
+        return all(np.array_equal(x, np.float16(x)) for _, x in _flatten(params))
+
+
+def _check_monitor(trained: Trained) -> None:
+    """Raises ValueError if the monitor was calibrated with other parameters."""
+    monitor = trained.monitor
+    if monitor is not None and monitor.digest != (digest := monitor_digest(trained.params)):
+        raise ValueError(f"monitor: expected one of weights {digest[:8]}, got {monitor.digest[:8]}")
+
+
+def _monitor(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> calibrate.Monitor | None:
+    if _MONITOR not in about:
+        return None
+    parts = {name: arrays[f"{_MONITOR}{_SEPARATOR}{name}"] for name in _MONITOR_ARRAYS}
+    return calibrate.from_json({**about[_MONITOR], **parts})
 
 
 def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
