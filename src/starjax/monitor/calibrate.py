@@ -133,9 +133,9 @@ def first_alarms(monitor: Monitor, scores: np.ndarray) -> tuple[np.ndarray, np.n
       `[M]` s, time of the first alarm, infinity without one; `[M]` index of its score.
     """
     z = np.nan_to_num((scores - monitor.center) / monitor.width, nan=-np.inf, posinf=np.inf)
-    over = (z > monitor.threshold).any(axis=-1)
+    over = np.any(z > monitor.threshold, axis=-1)
     first = over.argmax(axis=1)
-    times = np.where(over.any(axis=1), first * monitor.settings.period_s, np.inf)
+    times = np.where(np.any(over, axis=1), first * monitor.settings.period_s, np.inf)
     return times, z[np.arange(len(z)), first].argmax(axis=-1)
 
 
@@ -154,13 +154,17 @@ def from_json(values: dict[str, Any]) -> Monitor:
     """
     if (names := values.get("scores")) != list(scores_lib.NAMES):
         raise ValueError(f"monitor: expected the scores {_listed(scores_lib.NAMES)}, got {names}")
+    shape = (len(scores_lib.NAMES),)
     try:
-        shape = (len(scores_lib.NAMES),)
-        arrays = {k: np.asarray(values[k], float).reshape(shape) for k in ("center", "width")}
-        numbers = {k: float(values[k]) for k in ("threshold", "clock_s", "alpha")}
-        settings = ScoreSettings(**values["settings"])
         monitor = Monitor(
-            **arrays, **numbers, count=values["count"], settings=settings, digest=values["digest"]
+            center=np.asarray(values["center"], float).reshape(shape),
+            width=np.asarray(values["width"], float).reshape(shape),
+            threshold=float(values["threshold"]),
+            clock_s=float(values["clock_s"]),
+            alpha=float(values["alpha"]),
+            count=int(values["count"]),
+            settings=ScoreSettings(**values["settings"]),
+            digest=str(values["digest"]),
         )
     except (KeyError, TypeError) as error:
         raise ValueError(f"monitor: malformed: {error}") from error
