@@ -245,13 +245,13 @@ def test_a_mistake_waits_for_nothing(argv, argument, monkeypatch):
 
 def test_its_own_machine_needs_no_key():
     here = {"127.0.0.1": True, "localhost": True, "::1": True, "0.0.0.0": False, "robot": False}
-    assert {host: serve._is_here(host) for host in here} == here
+    assert {host: serve._is_local(host) for host in here} == here
 
 
 def test_the_largest_frame_holds_every_request():
-    asks = fakes_asks()
+    spec = fake_spec()
     request = wire.encode_request(
-        asks,
+        spec,
         served.observation().replace(images={n: np.zeros((2, 48, 48, 3), np.uint8) for n in "ab"}),
         served.PORT,
         np.zeros(2),
@@ -259,10 +259,10 @@ def test_the_largest_frame_holds_every_request():
     doubled = {k: v if v.dtype == np.uint8 else v.astype(np.float64) for k, v in request.items()}
     doubled["key"] = request["key"]
     frame = wire.pack(doubled)
-    assert len(frame) <= wire.max_request_bytes(asks) < 2 * len(frame)
-    again = wire.decode_request(asks, wire.unpack(frame))
+    assert len(frame) <= wire.max_request_bytes(spec) < 2 * len(frame)
+    again = wire.decode_request(spec, wire.unpack(frame))
     assert set(again.observation.images) == {"a", "b"} and again.observation.state is None
 
 
-def fakes_asks():
+def fake_spec():
     return server.wire.InputSpec(2, (), fakes.P_WORLD_REF[0], True, 48, ("a", "b"), 12)
