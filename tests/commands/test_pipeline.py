@@ -16,7 +16,7 @@ import synthetic
 from starjax import config, methods
 from starjax.commands import demonstrations, folders, pipeline, presets, scenes
 from starjax.data import normalizer
-from starjax.policies import policy_file
+from starjax.policies import in_env, policy_file
 from starjax.rollouts import sharing
 from starjax.runtime import files, signals
 from starjax.training import loop
@@ -214,7 +214,8 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
     (tmp_path / "dp_rcm4" / "evaluation").mkdir()
     (tmp_path / "dp_rcm4" / "evaluation" / "chunk_0000.npz").write_bytes(b"trials")
     found = []
-    monkeypatch.setattr(policy_evaluation, "load", lambda *_, **__: None)
+    monkeypatch.setattr(policy_evaluation, "read", lambda _: None)
+    monkeypatch.setattr(in_env, "place", lambda *_, **__: None)
     monkeypatch.setattr(
         policy_evaluation, "rollouts", lambda at, *_, **__: found.extend(at.glob("*.npz"))
     )

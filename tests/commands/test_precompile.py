@@ -12,8 +12,8 @@ from starjax import config
 from starjax.commands import pipeline, policy_evaluation, precompile, stage_times
 from starjax.data import normalizer
 from starjax.methods import METHODS
+from starjax.policies import in_env, policy_file
 from starjax.policies import policy as policies
-from starjax.policies import policy_file
 from starjax.runtime import precompile as programs
 
 EVAL = config.EvalConfig(trials=1, time_limit_s=0.5, video_trials=1)
@@ -47,7 +47,8 @@ def test_weights_that_come_later_meet_their_programs(tmp_path, monkeypatch):
     policy_file.save(tmp_path / "policy.safetensors", made)
 
     def scored(folder, policy):
-        who = policy_evaluation.load(name, tmp_path / "policy.safetensors", env, policy=policy)
+        file = tmp_path / "policy.safetensors"
+        who = in_env.place(file, policy_evaluation.read(file), env, method=name, policy=policy)
         place = tmp_path / folder
         found = policy_evaluation.rollouts(place, who, env.task.trocars, EVAL, settings.seed)
         return who, found

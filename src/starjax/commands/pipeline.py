@@ -191,6 +191,7 @@ def _train(
 def _evaluate(work: Run, name: str, demos: Path, policy: Callable[[], Any] | None = None) -> None:
     """Runs the closed-loop trials of one method; `result.json` is its last file."""
     from starjax.commands import policy_evaluation
+    from starjax.policies import in_env
 
     config, env, share = work.config, work.env, work.share
     folder, weights = work.out / name, folders.weights(work.out, name)
@@ -201,7 +202,8 @@ def _evaluate(work: Run, name: str, demos: Path, policy: Callable[[], Any] | Non
     share.first(f"{name} has an equal evaluation", lambda: folders.adopt_equivalent(work.out, name))
     compiled = policy() if policy else None
     with stage_times.timed(work.out, f"evaluate {name}", folders.is_under_way(folder)):
-        who = policy_evaluation.load(name, weights, env, policy=compiled)
+        trained = policy_evaluation.read(weights)
+        who = in_env.place(weights, trained, env, method=name, policy=compiled)
         trials = folder / "evaluation"
         table = policy_evaluation.rollouts(trials, who, env.task.trocars, config.eval, config.seed)
 

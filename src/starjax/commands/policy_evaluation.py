@@ -14,28 +14,29 @@ from starjax.data import normalizer
 from starjax.evaluation import evaluate, latency, statistics
 from starjax.evaluation import result as results
 from starjax.evaluation import trials as table
-from starjax.policies import features, in_env
+from starjax.policies import features, in_env, policy_file
 from starjax.policies import policy as policies
 from starjax.policies.in_env import PolicyInEnv
 from starjax.rollouts import placement
 from starjax.sim.state import Env
 
 
-def load(
-    method: str,
-    weights: Path,
-    env: Env | None = None,
-    arms: Sequence[str] = (),
-    policy: policies.Policy | None = None,
-) -> PolicyInEnv:
-    """Loads a method's weights from the directory of its run.
+def load(method: str, weights: Path, arms: Sequence[str] = ()) -> PolicyInEnv:
+    """Loads a method's weights from the directory of its run, and builds their environment.
 
     Args:
       method: a row of `methods.METHODS`.
       weights: policy.safetensors.
-      env: the environment, if it is built already.
       arms: robots instead of those of the training.
-      policy: from `precompile`.
+
+    Raises:
+      errors.UsageError: the file is missing or damaged.
+    """
+    return in_env.load(weights, read(weights), method=method, arms=arms)
+
+
+def read(weights: Path) -> policy_file.Trained:
+    """Reads weights in the directory of a run.
 
     Raises:
       errors.UsageError: the file is missing or damaged.
@@ -43,8 +44,7 @@ def load(
     again = f"starjax run with its flags and --out {shlex.quote(str(weights.parent.parent))}"
     if not weights.exists():
         raise errors.UsageError(str(weights), "trained weights", "none", f"{again} trains them")
-    trained = in_env.read(weights, str(weights), f"remove it, and {again} trains it again")
-    return in_env.load(weights, trained, method=method, arms=arms, env=env, policy=policy)
+    return in_env.read(weights, str(weights), f"remove it, and {again} trains it again")
 
 
 def rollouts(

@@ -79,13 +79,7 @@ def read(file: Path, argument: str = "--policy", hint: str = "") -> policy_file.
 
 
 def load(
-    file: Path,
-    trained: policy_file.Trained,
-    *,
-    method: str = "",
-    arms: Sequence[str] = (),
-    env: sim_env.Env | None = None,
-    policy: policies.Policy | None = None,
+    file: Path, trained: policy_file.Trained, *, method: str = "", arms: Sequence[str] = ()
 ) -> PolicyInEnv:
     """Builds the networks and the environment of a policy file.
 
@@ -94,11 +88,29 @@ def load(
       trained: its content.
       method: a method that shares the weights; by default the one that trained them.
       arms: robots instead of those of the training.
-      env: the environment, if it is built already.
+    """
+    env = sim_env.for_policy(trained.scene, trained.policy, arms)
+    return place(file, trained, env, method=method)
+
+
+def place(
+    file: Path,
+    trained: policy_file.Trained,
+    env: sim_env.Env,
+    *,
+    method: str = "",
+    policy: policies.Policy | None = None,
+) -> PolicyInEnv:
+    """Builds the networks of a policy file for an environment.
+
+    Args:
+      file: the policy file.
+      trained: its content.
+      env: environment with the observation of its training.
+      method: a method that shares the weights; by default the one that trained them.
       policy: its functions, if they exist already.
     """
     trained = trained._replace(method=method or trained.method)
-    env = env or sim_env.for_policy(trained.scene, trained.policy, arms)
     row = methods.METHODS[trained.method]
     if policy is None:
         policy = policies.make(row, trained.policy, env.task, cameras=trained.scene.cameras)
