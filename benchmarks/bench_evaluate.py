@@ -112,7 +112,7 @@ def subject(asked: argparse.Namespace):
     one of the right size."""
     if asked.policy:
         file = packaged.find("--policy", asked.policy)
-        who = in_env.load(file, in_env.read(file))
+        who = in_env.place_in_own_scene(file, in_env.read(file))
         trained = jax.device_put((who.trained.params, who.trained.normalizer))
         return who.env, who.policy, *trained, who.trained.policy
     case = _setup.paper(224) if _peer.platform() == "gpu" else _setup.small(1, asked.image)

@@ -88,7 +88,7 @@ def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
     from starjax.policies import in_env
 
     if path.run is None:
-        who = in_env.load(path.file, in_env.read(path.file), arms=path.arms)
+        who = in_env.place_in_own_scene(path.file, in_env.read(path.file), arms=path.arms)
         return who, _settings(who.trained)
     config = folders.read_config(path.run)
     who = policy_evaluation.load(path.run.name, path.file, arms=path.arms)

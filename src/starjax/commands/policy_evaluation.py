@@ -32,7 +32,7 @@ def load(method: str, weights: Path, arms: Sequence[str] = ()) -> PolicyInEnv:
     Raises:
       errors.UsageError: the file is missing or damaged.
     """
-    return in_env.load(weights, read(weights), method=method, arms=arms)
+    return in_env.place_in_own_scene(weights, read(weights), method=method, arms=arms)
 
 
 def read(weights: Path) -> policy_file.Trained:

@@ -78,10 +78,10 @@ def read(file: Path, argument: str = "--policy", hint: str = "") -> policy_file.
     return trained
 
 
-def load(
+def place_in_own_scene(
     file: Path, trained: policy_file.Trained, *, method: str = "", arms: Sequence[str] = ()
 ) -> PolicyInEnv:
-    """Builds the networks and the environment of a policy file.
+    """Builds the networks of a policy file and the environment of its training.
 
     Args:
       file: the policy file.

@@ -105,7 +105,7 @@ def load(spec: AgentSpec, arms: tuple[str, ...] = ()) -> Simulation:
     if spec.file is None:
         env = sim_env.make(spec.task, arms, observation="state", image_size=_EXPERT_IMAGE_SIZE)
         return make(spec.label, env, agents.from_single(env.task.expert()))
-    policy = in_env.load(spec.file, in_env.read(spec.file), arms=arms)
+    policy = in_env.place_in_own_scene(spec.file, in_env.read(spec.file), arms=arms)
     params = (policy.trained.params, policy.trained.normalizer)
     return make(spec.label, policy.env, policy.agent(), params)
 
