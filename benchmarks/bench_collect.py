@@ -48,7 +48,7 @@ def main() -> None:
         asked.image, asked.per_trocar, asked.chunk = 16, 1, SEEN
     env = envs.make(image_size=asked.image)
     expert, chosen = agent.from_single(_visited.expert(env)), seen(env)
-    rules = engine.Settings(0, schema.STREAM, MAX_STEPS, asked.chunk)
+    rules = engine.RolloutSettings(0, schema.STREAM, MAX_STEPS, asked.chunk)
     simulate = engine.make(env, expert, chosen, rules, episodes.DEMONSTRATION)
     group = [(lane % SEEN, lane // SEEN) for lane in range(asked.chunk)]
     first_s, again_s = (_timing.time_once(lambda: next(simulate(None, group))) for _ in range(2))

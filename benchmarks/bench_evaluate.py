@@ -139,7 +139,7 @@ def runner(env, policy, settings, max_steps: int, lanes: int, devices=None) -> e
     nowhere = np.full((1, env.task.arms), np.nan, np.float32)
     trocars = rcm.Trocar(*(np.concatenate([field, nowhere]) for field in env.task.trocars))
     planner = agent.from_policy(policy.sample, settings.obs_horizon, settings.execute)
-    rules = engine.Settings(0, None, max_steps, lanes)
+    rules = engine.RolloutSettings(0, None, max_steps, lanes)
     return engine.make(env, planner, trocars, rules, episodes.SCORE, devices)
 
 

@@ -50,7 +50,7 @@ def measure(env: envs.Env, lanes: int, max_workers: int, segments: int) -> dict:
     """Rate of `max_workers` simulations of `lanes` episodes each."""
     trocars, record = env.task.trocars, episodes.DEMONSTRATION
     steps, configurations = segments * record.frames, len(trocars.radius)
-    rules = engine.Settings(0, schema.STREAM, steps, lanes)
+    rules = engine.RolloutSettings(0, schema.STREAM, steps, lanes)
     expert = agent.from_single(_visited.expert(env))
     simulation = engine.make(env, expert, trocars, rules, record)
 

@@ -36,7 +36,7 @@ def done(monkeypatch):
 
     def plan(settings, env, share):
         root = pipeline.Path(settings.out) / "demos-a"
-        return demonstrations.Plan(root, lambda: calls.append("collect"))
+        return demonstrations.DemosWork(root, lambda: calls.append("collect"))
 
     def train(work, name, demos, compiled):
         demos()

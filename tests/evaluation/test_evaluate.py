@@ -28,7 +28,7 @@ from starjax.rollouts.placement import DeviceLayout
 from starjax.runtime import files
 
 TROCARS = stubs.trocars(0, 4, 8)
-SETTINGS = evaluate.Settings(trials=2, seed=0, time_limit_s=1.0)
+SETTINGS = evaluate.EvaluationSettings(trials=2, seed=0, time_limit_s=1.0)
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden" / "evaluation"
 
 

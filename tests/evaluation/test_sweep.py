@@ -75,7 +75,7 @@ def test_a_sweep_of_a_policy(tmp_path):
         agent.from_policy(sample, 2, 4),
         (params, jnp.float32(1.0)),
         drawn,
-        evaluate.Settings(trials=1, seed=0, time_limit_s=1.0),
+        evaluate.EvaluationSettings(trials=1, seed=0, time_limit_s=1.0),
     )
     result = sweep.compose(found, TRAINING, P_REF, seed=0)
     assert sum(b["trials"] for b in result["by_distance"]) == 12 == result["strict"]["trials"]

@@ -67,7 +67,7 @@ def test_demonstrations_that_were_seen_otherwise_are_refused(seen, tmp_path):
 
 def test_trajectories_have_it(tmp_path):
     env, expert = make_env(), agent.from_single(stubs.EXPERT)
-    settings = evaluate.Settings(trials=2, seed=0, time_limit_s=2.0, video_trials=2)
+    settings = evaluate.EvaluationSettings(trials=2, seed=0, time_limit_s=2.0, video_trials=2)
     run = lambda: evaluate.evaluate(  # noqa: E731
         tmp_path, env, expert, (), stubs.trocars(0, 8), settings, layout=DeviceLayout(lanes=4)
     )

@@ -29,7 +29,7 @@ def run(out: Path) -> None:
         agent.from_policy(sample, 2, 4),
         (params, jnp.float32(1.0)),
         trocars,
-        evaluate.Settings(trials=4, seed=0, time_limit_s=1.0, video_trials=3),
+        evaluate.EvaluationSettings(trials=4, seed=0, time_limit_s=1.0, video_trials=3),
         layout=layout,
     )
     np.savez(out / f"table-{jax.process_index()}.npz", **tables.columns(found))

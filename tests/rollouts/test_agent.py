@@ -15,7 +15,7 @@ CENTRE = stubs.trocars(11)
 
 def run(env, batch_agent, params=(None, None), trials=2, max_steps=30, record=episodes.SCORE):
     """All episodes of a group, by trial."""
-    settings = engine.Settings(0, None, max_steps, trials)
+    settings = engine.RolloutSettings(0, None, max_steps, trials)
     simulate = engine.make(env, batch_agent, CENTRE, settings, record)
     ended = [e for s in simulate(params, [(0, i) for i in range(trials)]) for e in s.ended]
     return sorted(ended, key=lambda episode: episode.trial)
@@ -124,7 +124,7 @@ def test_a_replayed_episode_is_the_recorded_one(arms):
     env = stubs.make_env(arms=arms, unlucky=0.0)
     expert = agent.from_single(stubs.EXPERT)
     trocars = stubs.trocars(11, arms=arms)
-    settings = engine.Settings(0, None, 60, 1)
+    settings = engine.RolloutSettings(0, None, 60, 1)
 
     def first(batch_agent):
         simulate = engine.make(env, batch_agent, trocars, settings, episodes.DEMONSTRATION)
@@ -164,7 +164,7 @@ def test_each_program_is_traced_once():
         return sample(*args)
 
     env = stubs.make_env()
-    settings = engine.Settings(0, None, 450, 2)
+    settings = engine.RolloutSettings(0, None, 450, 2)
     policy = agent.from_policy(counted, 2, 4)
     simulate = engine.make(env, policy, CENTRE, settings, episodes.SCORE)
     for group in ([(0, 0), (0, 1)], [(0, 2)]):

@@ -40,7 +40,7 @@ def executed(keeps_to_manifold, obs_horizon=2):
 
     env = base._replace(reset=reset, step=step)
     planner = ensemble.from_policy(sample, obs_horizon, keeps_to_manifold)
-    settings = engine.Settings(0, None, STEPS, 1)
+    settings = engine.RolloutSettings(0, None, STEPS, 1)
     simulate = engine.make(env, planner, stubs.trocars(11), settings, episodes.SCORE)
     (episode,) = [e for s in simulate((None, None), [(0, 0)]) for e in s.ended]
     log = episode.joined("reached_qpos")

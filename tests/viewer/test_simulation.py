@@ -33,7 +33,9 @@ def test_undisturbed_it_is_the_episode_of_an_evaluation(who):
     }
     batch, params = acting[who]
     trocars = env.task.trocars
-    run = engine.make(env, batch, trocars, engine.Settings(seed, None, 60, lanes=1), episodes.SCORE)
+    run = engine.make(
+        env, batch, trocars, engine.RolloutSettings(seed, None, 60, lanes=1), episodes.SCORE
+    )
     (progress,) = [p for p in run(params, [trial]) if p.ended]
     expected = progress.ended[0].joined("reached_p")
     live = simulation.make(who, env, batch, params)

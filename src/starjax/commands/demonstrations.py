@@ -16,7 +16,7 @@ from starjax.commands import messages, scenes, stage_times
 _FROM, _RANDOMISE = "demos.from_", "demos.randomise"
 
 
-class Plan(NamedTuple):
+class DemosWork(NamedTuple):
     """Demonstrations of a run.
 
     Attributes:
@@ -30,11 +30,11 @@ class Plan(NamedTuple):
     precompile: Callable[[], None] = lambda: None
 
 
-def plan(config: config_lib.RunConfig, env: Any, share: Any) -> Plan:
+def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
     """Plans the demonstrations of a run; `share` is the run's, because all processes collect."""
     if config.demos.from_:
         root = given(config, env)
-        return Plan(root, lambda: messages.stage("collect", f"nothing, from {root}"))
+        return DemosWork(root, lambda: messages.stage("collect", f"nothing, from {root}"))
     from starjax.data import demos, schema, store
     from starjax.rollouts import agent, placement, success_quota, trocars
     from starjax.runtime import precompile, processes
@@ -101,7 +101,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> Plan:
             "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
         )
 
-    return Plan(root, collect, prepare)
+    return DemosWork(root, collect, prepare)
 
 
 def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, float]]:

@@ -26,7 +26,7 @@ MIN_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
+class RunContext:
     """A run at work: the argument of its stages.
 
     Attributes:
@@ -73,7 +73,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     files.require_writable(out, MIN_FREE_BYTES)
     with background.until_end(), session.Session(command, out).shared() as share:
         print(messages.plan(config, stages), flush=True)
-        work = Run(config, encoder, share, command)
+        work = RunContext(config, encoder, share, command)
         root, collect, compile_collect = demonstrations.plan(config, work.env, share)
         if untrained or not trains:
             compile_collect()
@@ -119,7 +119,7 @@ def _environment(config: config_lib.RunConfig) -> Any:
     return env.for_policy(scenes.names(config.scene), config.policy)
 
 
-def _claim(work: Run, names: Sequence[str], demos: Path) -> None:
+def _claim(work: RunContext, names: Sequence[str], demos: Path) -> None:
     """Records the settings in the directory of each method."""
     digest = folders.demos_digest(demos) if work.config.demos.from_ else None
     dataset = f"{demos.name}-{digest[:12]}" if digest else demos.name
@@ -129,7 +129,7 @@ def _claim(work: Run, names: Sequence[str], demos: Path) -> None:
 
 
 def _train(
-    work: Run,
+    work: RunContext,
     name: str,
     demos: Callable[[], Any],
     step: Callable[[], Any] | None = None,
@@ -188,7 +188,9 @@ def _train(
         )
 
 
-def _evaluate(work: Run, name: str, demos: Path, policy: Callable[[], Any] | None = None) -> None:
+def _evaluate(
+    work: RunContext, name: str, demos: Path, policy: Callable[[], Any] | None = None
+) -> None:
     """Runs the closed-loop trials of one method; `result.json` is its last file."""
     from starjax.commands import policy_evaluation
     from starjax.policies import in_env

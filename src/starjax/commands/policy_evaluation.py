@@ -108,8 +108,8 @@ def precompile(
     return policy
 
 
-def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.Settings:
-    return evaluate.Settings(
+def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.EvaluationSettings:
+    return evaluate.EvaluationSettings(
         trials=settings.trials,
         seed=seed,
         time_limit_s=settings.time_limit_s,

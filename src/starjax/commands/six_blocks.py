@@ -87,7 +87,7 @@ def _score_expert(folder: Path, args: SixBlocksArgs) -> tuple[Any, Any, dict[str
         agent.from_single(six_blocks.reset_each_block(six.TASK.expert())),
         (),
         six.TASK.trocars,
-        evaluate.Settings(args.trials, args.seed, six.LIMIT_S),
+        evaluate.EvaluationSettings(args.trials, args.seed, six.LIMIT_S),
         identity={"expert": name},
         report=messages.indented,
     )

@@ -139,8 +139,8 @@ def precompile(
     engine.precompile(env, agent, params, trocars, rules, episodes.DEMONSTRATION)
 
 
-def _rules(settings: DemoSettings, lanes: int) -> engine.Settings:
-    return engine.Settings(settings.seed, schema.STREAM, settings.max_steps, lanes)
+def _rules(settings: DemoSettings, lanes: int) -> engine.RolloutSettings:
+    return engine.RolloutSettings(settings.seed, schema.STREAM, settings.max_steps, lanes)
 
 
 def _prepare(

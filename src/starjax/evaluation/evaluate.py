@@ -36,7 +36,7 @@ GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
 _RECORDED = "recorded."
 
 
-class Settings(NamedTuple):
+class EvaluationSettings(NamedTuple):
     """Trials of an evaluation.
 
     Attributes:
@@ -61,7 +61,7 @@ def evaluate(
     agent: BatchAgent,
     params: Any,
     trocars: Trocar,
-    settings: Settings,
+    settings: EvaluationSettings,
     *,
     layout: DeviceLayout = DEFAULT_LAYOUT,
     identity: Mapping[str, Any] | None = None,
@@ -116,7 +116,7 @@ def evaluate(
         most = layout.lanes or most_lanes(device)
         found = share.first("sizes", lambda: _resume(directory, plan, sizes, most, several, report))
         lanes, chunk = found
-        rules = engine.Settings(settings.seed, None, max_steps, lanes * several)
+        rules = engine.RolloutSettings(settings.seed, None, max_steps, lanes * several)
         run = engine.make(env, agent, trocars, rules, episodes.SCORE, layout.devices, levels)
         spans = [slice(first, first + chunk) for first in range(0, len(group), chunk)]
         parts = _parts(directory, env, lambda trials: run(params, trials), group, spans, chosen)
@@ -127,7 +127,7 @@ def evaluate(
 
 
 def precompile(
-    env: Any, agent: BatchAgent, params: Any, trocars: Trocar, settings: Settings
+    env: Any, agent: BatchAgent, params: Any, trocars: Trocar, settings: EvaluationSettings
 ) -> None:
     """Compiles, in the background, the programs that `evaluate` runs on one device.
 
@@ -136,7 +136,7 @@ def precompile(
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     trials = len(trocars.radius) * settings.trials
     lanes = lanes_per_device(jax.local_devices()[0], trials)
-    rules = engine.Settings(settings.seed, None, _max_steps(env, settings), lanes)
+    rules = engine.RolloutSettings(settings.seed, None, _max_steps(env, settings), lanes)
     engine.precompile(env, agent, params, trocars, rules, episodes.SCORE)
 
 
@@ -170,11 +170,11 @@ def fingerprint(tree: Any) -> str:
     return digest.hexdigest()
 
 
-def _max_steps(env: Any, settings: Settings) -> int:
+def _max_steps(env: Any, settings: EvaluationSettings) -> int:
     return math.ceil(settings.time_limit_s * env.control_hz - 1e-6)
 
 
-def _check(settings: Settings, layout: DeviceLayout) -> None:
+def _check(settings: EvaluationSettings, layout: DeviceLayout) -> None:
     for name, value in (("trials", settings.trials), ("time_limit_s", settings.time_limit_s)):
         if value <= 0:
             raise errors.UsageError(name, "more than 0", value)

@@ -22,7 +22,7 @@ from starjax.rollouts import episodes, fetching, programs
 from starjax.rollouts.agent import BatchAgent
 
 
-class Settings(NamedTuple):
+class RolloutSettings(NamedTuple):
     """Settings of trials.
 
     Attributes:
@@ -57,7 +57,7 @@ def make(
     env: Any,
     agent: BatchAgent,
     trocars: Trocar,
-    settings: Settings,
+    settings: RolloutSettings,
     record: episodes.Record,
     devices: Sequence[jax.Device] | None = None,
     levels: Mapping[str, float] | None = None,
@@ -133,7 +133,7 @@ def precompile(
     agent: BatchAgent,
     params: Any,
     trocars: Trocar,
-    settings: Settings,
+    settings: RolloutSettings,
     record: episodes.Record,
 ) -> None:
     """Compiles, in the background, the programs that `make` builds for one device.
@@ -146,7 +146,7 @@ def precompile(
     advance.prepare(params, state, np.int32(0))
 
 
-def _key(settings: Settings) -> jax.Array:
+def _key(settings: RolloutSettings) -> jax.Array:
     key = jax.random.key(settings.seed)
     return key if settings.stream is None else jax.random.fold_in(key, settings.stream)
 
