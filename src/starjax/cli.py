@@ -22,6 +22,11 @@ _TABLE: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "train": ("commands.run:train", "collect demonstrations and train", _LEARNING),
     "evaluate": ("commands.evaluate", "evaluate a policy on its task's trocars", _LEARNING),
     "sweep": ("commands.sweep", "evaluate a policy on a grid or sample of trocars", _LEARNING),
+    "calibrate": (
+        "commands.calibrate",
+        "add a runtime monitor to a trained policy",
+        _LEARNING,
+    ),
     "stress": ("commands.stress", "evaluate a policy under disturbances", _LEARNING),
     "six-blocks": ("commands.six_blocks", "evaluate six successive bimanual transfers", _LEARNING),
     "bench": ("commands.bench", "measure the inference latency of a policy (Table IV)", _LEARNING),

@@ -60,7 +60,10 @@ def main(argv: Sequence[str]) -> int:
             result = policy_evaluation.write_result(
                 folder, who, table, config, args.seed, started.command, times
             )
-            print(f"\n{messages.outcome([result])}\n{_times(result)}\n")
+            print(f"\n{messages.outcome([result])}\n{_times(result)}")
+            if "alarms" in result.about:
+                print(f"  {messages.alarms(result.about['alarms'])}")
+            print()
             if not resumes:
                 (folder / "rollout.mp4").unlink(missing_ok=True)  # shows other trials
             if args.video:

@@ -221,6 +221,17 @@ def outcome(results: Sequence[Any]) -> str:
     )
 
 
+def alarms(figures: Mapping[str, Any]) -> str:
+    """Returns a line with the figures of `alarms.compose`."""
+    early, false, silent = (figures[name] for name in ("before_clock", "false_alarms", "silent"))
+    median = "" if figures["median_s"] is None else f", median {figures['median_s']:.1f} s"
+    return (
+        f"alarms: {early['successes']}/{early['trials']} failures before "
+        f"{figures['clock_s']:.1f} s{median}; {false['successes']}/{false['trials']} successes; "
+        f"success without alarm {_rate(silent)}"
+    )
+
+
 def hint(run: Path, weights: str, does: str) -> str:
     """Returns the command that `does` something with these weights' figures in a directory."""
     try:

@@ -11,9 +11,11 @@ from starjax import config as config_lib
 from starjax import errors, methods, rcm
 from starjax.commands import messages
 from starjax.data import normalizer
-from starjax.evaluation import evaluate, latency, statistics
+from starjax.evaluation import alarms, evaluate, latency, statistics
 from starjax.evaluation import result as results
 from starjax.evaluation import trials as table
+from starjax.monitor.calibrate import Monitor
+from starjax.monitor.scores import ScoreSettings
 from starjax.policies import features, in_env, policy_file
 from starjax.policies import policy as policies
 from starjax.policies.in_env import PolicyInEnv
@@ -54,9 +56,22 @@ def rollouts(
     settings: config_lib.EvalConfig,
     seed: int,
     levels: Mapping[str, float] | None = None,
+    score_settings: ScoreSettings | None = None,
 ) -> table.Table:
-    """Runs the missing trials of an evaluation; `levels` are of the environment's disturbances."""
+    """Runs the missing trials of an evaluation.
+
+    Args:
+      directory: of this evaluation alone.
+      who: the policy in its environment.
+      trocars: fields `[C, A]`.
+      settings: number of trials, time limit and so on.
+      seed: of the trials.
+      levels: of the environment's disturbances.
+      score_settings: of the table's scores; by default those of the policy's monitor, if any.
+    """
     trained = who.trained
+    if score_settings is None and (monitor := monitor_of(who, settings)):
+        score_settings = monitor.settings
     return evaluate.evaluate(
         directory,
         who.env,
@@ -70,8 +85,14 @@ def rollouts(
             "policy": config_lib.as_json(trained.policy),
         },
         levels=levels,
+        score_settings=score_settings,
         report=messages.indented,
     )
+
+
+def monitor_of(who: PolicyInEnv, settings: config_lib.EvalConfig) -> Monitor | None:
+    """Returns the policy's monitor, None if its plans are averaged: it compares single plans."""
+    return None if settings.ensemble else who.trained.monitor
 
 
 def precompile(
@@ -171,4 +192,6 @@ def write_result(
         "timings_s": timings_s or {},
         "warnings": messages.warnings(config, figures),
     }
+    if monitor := monitor_of(who, config.eval):
+        about["alarms"] = alarms.compose(trials, monitor)
     return results.write(folder / "result.json", who.env.names, figures, about)

@@ -8,7 +8,7 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import options, policy_args, scenes, session
+from starjax.commands import messages, options, policy_args, scenes, session
 from starjax.evaluation import disturbances
 from starjax.limits import INLINE, NotNegative
 from starjax.runtime import files
@@ -117,18 +117,20 @@ def _disturbed(who: Any, names: list[str]) -> Any:
 
 
 def _score(folder: Path, who: Any, levels: dict[str, float], args: StressArgs) -> dict[str, Any]:
-    """Returns success, RCM error and force on the abdominal wall in all trials of a level."""
+    """Returns success, RCM error, force on the abdominal wall and alarms in a level's trials."""
     from starjax.commands import policy_evaluation
-    from starjax.evaluation import statistics, wall
+    from starjax.evaluation import alarms, statistics, wall
 
     trocars = who.env.task.trocars
     table = policy_evaluation.rollouts(folder, who, trocars, args.eval, args.seed, levels)
+    monitor = policy_evaluation.monitor_of(who, args.eval)
     return {
         "strict": statistics.rate(table.success),
         "safe": statistics.rate(table.safe),
         "invalid": int(table.invalid.sum()),
         "rcm_error_mm": statistics.rcm_error_mm(table),
         "wall_force_N": wall.force(table, who.env.control_hz),
+        **({"alarms": alarms.compose(table, monitor)} if monitor else {}),
     }
 
 
@@ -136,4 +138,5 @@ def _line(level: str, score: dict[str, Any]) -> str:
     strict, errors_mm = score["strict"], score["rcm_error_mm"]["executed"]
     rate = f"{strict['successes']}/{strict['trials']} = {100 * strict['rate']:.0f}%"
     error = f"RCM error {errors_mm['mean']:.3f} mm, p99 {errors_mm['p99']:.2f}"
-    return f"  {level:10} {rate:16} {error}; wall {score['wall_force_N']['p99']:.2f} N"
+    line = f"  {level:10} {rate:16} {error}; wall {score['wall_force_N']['p99']:.2f} N"
+    return f"{line}\n{'':13}{messages.alarms(score['alarms'])}" if "alarms" in score else line

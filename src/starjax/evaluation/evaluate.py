@@ -8,6 +8,7 @@ Chunks are split over the processes of a run; each process has all trials at the
 <directory>/recorded.npz       trajectories of a few trials, for figures and the video
 """
 
+import functools
 import hashlib
 import json
 import math
@@ -20,10 +21,11 @@ import numpy as np
 
 from starjax import errors
 from starjax.data import schema
-from starjax.evaluation import recorded
+from starjax.evaluation import alarms, recorded
 from starjax.evaluation import trials as tables
+from starjax.monitor.scores import ScoreSettings
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import chunks, engine, episodes, sharing, workers
+from starjax.rollouts import chunks, engine, episodes, plans, sharing, workers
 from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
@@ -66,6 +68,7 @@ def evaluate(
     layout: DeviceLayout = DEFAULT_LAYOUT,
     identity: Mapping[str, Any] | None = None,
     levels: Mapping[str, float] | None = None,
+    score_settings: ScoreSettings | None = None,
     report: Callable[[str], None] = print,
 ) -> tables.Table:
     """Runs the missing chunks of an evaluation and returns all trials.
@@ -78,6 +81,7 @@ def evaluate(
       layout: lanes 0 stands for `lanes_per_device`, reduced until every device gets trials.
       identity: JSON values that tell this agent from others with the same params.
       levels: of the environment's disturbances.
+      score_settings: of the runtime monitor, for the table's scores; None without them.
       report: gets lines for the user.
 
     Raises:
@@ -105,6 +109,7 @@ def evaluate(
             "identity": dict(identity or {}),
             # Levels of 0 are omitted: they leave the trials unchanged.
             **({"levels": wrong} if wrong else {}),
+            **({"scores": score_settings._asdict()} if score_settings else {}),
             "scene": env.names._asdict(),
             "model": schema.model_hash(env.scene),
             "platform": device.platform,
@@ -117,9 +122,16 @@ def evaluate(
         found = share.first("sizes", lambda: _resume(directory, plan, sizes, most, several, report))
         lanes, chunk = found
         rules = engine.RolloutSettings(settings.seed, None, max_steps, lanes * several)
-        run = engine.make(env, agent, trocars, rules, episodes.SCORE, layout.devices, levels)
+        record = plans.record(score_settings.execute) if score_settings else episodes.SCORE
+        run = engine.make(env, agent, trocars, rules, record, layout.devices, levels)
         spans = [slice(first, first + chunk) for first in range(0, len(group), chunk)]
-        parts = _parts(directory, env, lambda trials: run(params, trials), group, spans, chosen)
+        score = None
+        if score_settings:
+            score = functools.partial(
+                alarms.of_episodes, settings=score_settings, max_steps=max_steps
+            )
+        simulate = functools.partial(run, params)
+        parts = _parts(directory, env, simulate, group, spans, chosen, score)
         made = chunks.complete(share, parts, "Evaluation", "trials", report)
         if share.is_first and chosen.any():
             files.write_npz(directory / "recorded.npz", recorded.join([*map(_recorded, made)]))
@@ -230,15 +242,17 @@ def _parts(
     group: list[episodes.Trial],
     spans: list[slice],
     chosen: np.ndarray,
+    score: Callable[[list[episodes.Episode]], np.ndarray] | None = None,
 ) -> chunks.Parts:
     """Describes the chunks: tables of trials, and trajectories of the `chosen` `[M]` ones."""
+    names = tables.names(env.task.labels, has_scores=score is not None)
     labels = env.task.labels
     has_endoscope = endoscope_camera.of(env.task, env.names.cameras) is not None
     beside = {f"{_RECORDED}{name}" for name in recorded.names(labels, has_endoscope)}
 
     def check(number: int, arrays: chunks.Arrays) -> None:
         rows = spans[number]
-        wanted = {*tables.names(labels), *(beside if chosen[rows].any() else ())}
+        wanted = {*names, *(beside if chosen[rows].any() else ())}
         if different := wanted ^ arrays.keys():
             raise ValueError(f"{min(different)} is missing or too much")
         trials = [arrays[name].tolist() for name in ("trocar", "trial")]
@@ -255,7 +269,8 @@ def _parts(
         kept = [e for e, keep in zip(ended, chosen[rows], strict=True) if keep]
         found = recorded.take(kept, env.p_world_ref)
         trajectories = {f"{_RECORDED}{name}": values for name, values in found.items()}
-        return tables.columns(tables.from_episodes(ended)) | trajectories
+        table = tables.from_episodes(ended)._replace(scores=score and score(ended))
+        return tables.columns(table) | trajectories
 
     paths = [directory / f"chunk_{number:04d}.npz" for number in range(len(spans))]
     return chunks.Parts(paths, [len(group[rows]) for rows in spans], check, make)

@@ -32,6 +32,7 @@ class Table(NamedTuple):
       rcm_within_max: `[M]` m, the largest at any physics step.
       rcm_error_mm: `[sum(steps)]` float16 mm, executed, at the ends of all steps, trial by trial.
       rcm_within_mm: the same, the largest within each step.
+      scores: `[M, D, S]` float32 of the runtime monitor's decisions, see `alarms`; None without.
     """
 
     trocar: np.ndarray
@@ -54,6 +55,7 @@ class Table(NamedTuple):
     rcm_within_max: np.ndarray
     rcm_error_mm: np.ndarray
     rcm_within_mm: np.ndarray
+    scores: np.ndarray | None = None
 
 
 def from_episodes(episodes: Sequence[Episode]) -> Table:
@@ -95,17 +97,18 @@ def from_episodes(episodes: Sequence[Episode]) -> Table:
     )
 
 
-def names(labels: Sequence[str]) -> list[str]:
+def names(labels: Sequence[str], has_scores: bool = False) -> list[str]:
     """Returns the names of the `columns` of a table with these labels."""
+    absent = {"labels"} if has_scores else {"labels", "scores"}
     return [
-        *(name for name in Table._fields if name != "labels"),
+        *(name for name in Table._fields if name not in absent),
         *(f"{_LABEL}{name}" for name in labels),
     ]
 
 
 def columns(table: Table) -> dict[str, np.ndarray]:
     """Returns the arrays of a table by name, one per label."""
-    found = table._asdict()
+    found = {name: column for name, column in table._asdict().items() if column is not None}
     labels = found.pop("labels")
     return found | {f"{_LABEL}{name}": values for name, values in labels.items()}
 

@@ -110,7 +110,8 @@ def place(
       method: a method that shares the weights; by default the one that trained them.
       policy: its functions, if they exist already.
     """
-    trained = trained._replace(method=method or trained.method)
+    if method and method != trained.method:  # a monitor was calibrated with the other's plans
+        trained = trained._replace(method=method, monitor=None)
     row = methods.METHODS[trained.method]
     if policy is None:
         policy = policies.make(row, trained.policy, env.task, cameras=trained.scene.cameras)

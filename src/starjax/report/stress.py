@@ -30,13 +30,18 @@ def table(content: Content) -> formats.Table:
         "RCM p99 (mm)",
         "Wall p99 (N)",
     ]
-    rows = [header]
-    for name, kind in _kinds(content).items():
+    kinds = _kinds(content)
+    is_watched = any(
+        "alarms" in score for kind in kinds.values() for score in kind["levels"].values()
+    )
+    rows = [header + ["Alarms on failures", "On successes"] * is_watched]
+    for name, kind in kinds.items():
         for level, score in kind["levels"].items():
             error, wall = score["rcm_error_mm"]["executed"], score.get("wall_force_N") or {}
             values = (error["mean"], error["p99"], wall.get("p99"))
             cells = ["\u2013" if value is None else f"{value:.2f}" for value in values]
             rows.append([name, f"{level} {kind['unit']}".strip(), _rate(score), *cells])
+            rows[-1] += _alarms(score) if is_watched else []
     return rows
 
 
@@ -103,6 +108,12 @@ def _kinds(content: Content) -> dict[str, Any]:
 def _rate(score: Content) -> str:
     strict = score["strict"]
     return formats.rate(stats.rate(strict["successes"], strict["trials"]))
+
+
+def _alarms(score: Content) -> list[str]:
+    """Returns the failures announced before the clock's alarm, and the false alarms."""
+    rates = [score["alarms"][name] for name in ("before_clock", "false_alarms")]
+    return [f"{rate['successes']}/{rate['trials']}" for rate in rates]
 
 
 def _span(kind: Content) -> str:

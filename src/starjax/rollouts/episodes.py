@@ -66,6 +66,7 @@ class Step(NamedTuple):
       observed: Observation before it, None if no recorded field needs it.
       label: Command `[N, A]` to record. executed: Command `[N, A]`.
       before, after: EnvState.
+      memory: the agent's after it acted, None while shapes are traced without an agent.
     """
 
     observed: Observation | None
@@ -73,6 +74,7 @@ class Step(NamedTuple):
     executed: Command
     before: Any
     after: Any
+    memory: Any = None
 
 
 class Record(NamedTuple):

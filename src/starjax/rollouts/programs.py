@@ -130,7 +130,8 @@ def _advancer(
         look = (lambda: observe(before)) if observed is None else lambda: observed
         executed, memory, label = agent.act(params, carry.memory, before, look, t)
         after = step_all(before, executed)
-        fields = record.fields(episodes.Step(observed, label, executed, before, after))
+        made = episodes.Step(observed, label, executed, before, after, memory)
+        fields = record.fields(made)
         return RolloutState(after, memory, carry.length + ~before.done, carry.active), fields
 
     def advance(params: Any, carry: RolloutState, first: jax.Array) -> Any:
@@ -138,7 +139,7 @@ def _advancer(
 
         Returns the carry, records `[N, record.frames]`, and the status `[N]`.
         """
-        shapes = jax.eval_shape(lambda state: _fields(env, record, state), carry.env)
+        shapes = jax.eval_shape(lambda carry: _fields(env, record, carry.env, carry.memory), carry)
         blank = jax.tree.map(
             lambda s: jnp.zeros((s.shape[0], record.frames, *s.shape[1:]), s.dtype), shapes
         )
@@ -161,11 +162,13 @@ def _advancer(
     return advance
 
 
-def _fields(env: Any, record: episodes.Record, state: Any) -> dict[str, jax.Array]:
+def _fields(
+    env: Any, record: episodes.Record, state: Any, memory: Any = None
+) -> dict[str, jax.Array]:
     """Records N episodes that stand still, for the shapes."""
     observed = jax.vmap(env.observe)(state) if record.observes else None
     command = Command(state.pose, state.gripper)
-    return record.fields(episodes.Step(observed, command, command, state, state))
+    return record.fields(episodes.Step(observed, command, command, state, state, memory))
 
 
 def frame(env: Any, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
