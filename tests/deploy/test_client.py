@@ -1,6 +1,7 @@
 """A robot's loop whatever the network does: which command is next, and none is a jump."""
 
 import collections
+import dataclasses
 import threading
 import time
 
@@ -13,6 +14,7 @@ from starjax import deploy, rcm
 from starjax.deploy import batching, plan_executor, wire
 from starjax.deploy.connection import Connection, Reply
 from starjax.errors import UsageError
+from starjax.monitor import calibrate, scores
 from starjax.sim import registries
 from starjax.types import Command, Pose
 
@@ -236,6 +238,62 @@ def test_a_loop_over_the_socket_is_the_loop_in_the_process(batches):
     for got, wanted in zip(robot.commands, here.commands, strict=True):
         np.testing.assert_allclose(got.pose.p, wanted.pose.p, atol=1e-4)
         np.testing.assert_allclose(got.gripper, wanted.gripper, atol=1e-3)
+
+
+def clock_monitor(seconds):
+    """A monitor with an alarm after so many seconds, and no other."""
+    return calibrate.Monitor(
+        center=np.zeros(3),
+        width=np.array([1e9, 1e9, 1.0]),
+        threshold=seconds,
+        clock_s=seconds,
+        alpha=0.05,
+        count=20,
+        settings=scores.ScoreSettings(EXECUTE, 30.0, 6),
+        digest="weights",
+    )
+
+
+def test_an_alarm_holds_the_robot_on_the_manifold_until_it_is_resumed(batches, monkeypatch):
+    watched = dataclasses.replace(batches.policy, monitor=clock_monitor(0.9))
+    monkeypatch.setattr(batches, "policy", watched)
+    robot, options = Robot(), {"ahead": 0, "connect": AtOnce, "limits": deploy.Limits(1.0, 3.1)}
+    with served.running(batches) as (where, _):
+        with client_of(where, **options) as client:
+            assert client.metadata["monitor"]["clock_s"] == 0.9
+            for _ in range(50):
+                robot.send(client.step(robot.measure()))
+            # 0.9 s are 27 control steps; the next decision is after the 32nd.
+            assert client.report.plans == 4 and client.report.held == 50 - 32
+            assert client.report.alarms == 1 and "clock" in client.report.alarm
+            held = list(robot.commands)[31:]
+            for command in held:
+                np.testing.assert_array_equal(command.pose.p, held[0].pose.p)
+            assert float(rcm.rcm_error(held[-1].pose, client.p_world_trocar)) < 1e-6
+            client.resume()
+            for _ in range(50):
+                robot.send(client.step(robot.measure()))
+            assert client.report.alarms == 2 and client.report.plans == 8
+        with client_of(where, **options, is_watched=False) as client:
+            for _ in range(50):
+                robot.send(client.step(robot.measure()))
+            assert client.report.alarms == client.report.held == 0
+
+
+def test_an_alarm_drops_the_next_plan_too():
+    executor = plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, 8, deploy.Limits(1.0, 3.0))
+    executor.begin(poses(0.0, 0.1), 1.0)
+    for number in (1, 2):
+        executor.on_request()
+        assert executor.on_plan(plan(number))
+        last = executor.step()
+    executor.on_alarm("too long")
+    for _ in range(20):
+        assert not executor.needs_plan
+        np.testing.assert_array_equal(executor.step().pose.R, last.pose.R)
+    assert (executor.report.alarm, executor.report.missed) == ("too long", 0)
+    executor.resume()
+    assert executor.needs_plan
 
 
 def driven_until(holds, client, robot, seconds=60.0):

@@ -16,6 +16,7 @@ from starjax import config, deploy, rcm
 from starjax.data import normalizer
 from starjax.errors import UsageError
 from starjax.methods import METHODS
+from starjax.monitor import calibrate, scores
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.sim import names, registries
@@ -516,3 +517,17 @@ def test_the_packaged_policy_commands_what_it_did(prefix, monkeypatch):
     np.testing.assert_allclose(command.pose.p, before[f"{prefix}p"], atol=1e-6)
     np.testing.assert_allclose(command.pose.R, before[f"{prefix}R"], atol=1e-6)
     np.testing.assert_allclose(command.gripper, before[f"{prefix}gripper"], atol=1e-6)
+
+
+def test_a_monitor_is_loaded_unless_an_option_changes_the_plans(made, tmp_path):
+    path, trained, _ = made
+    assert load(path).monitor is None
+    monitor = calibrate.Monitor(
+        np.zeros(3), np.ones(3), 1.0, 7.9, 0.05, 20, scores.ScoreSettings(8, 30.0, 6),
+        policy_file.monitor_digest(trained.params),
+    )  # fmt: skip
+    policy_file.save(tmp_path / "watched.safetensors", trained._replace(monitor=monitor))
+    watched = load(tmp_path / "watched.safetensors")
+    assert watched.monitor is not None
+    assert calibrate.to_json(watched.monitor) == calibrate.to_json(monitor)
+    assert load(tmp_path / "watched.safetensors", temperature=0.0).monitor is None

@@ -18,7 +18,7 @@ TROCARS = stubs.trocars(0, 4, 8)
 
 def run(directory, score_settings=SETTINGS, **changed):
     sample, weights = stubs.make_policy(HORIZON, width=32)
-    settings = evaluate.Settings(trials=2, seed=0, time_limit_s=1.0)
+    settings = evaluate.EvaluationSettings(trials=2, seed=0, time_limit_s=1.0)
     return evaluate.evaluate(
         directory,
         stubs.make_env(),
@@ -51,7 +51,7 @@ def test_recorded_plans_are_those_that_a_watch_would_meet():
     batch = agent.from_policy(spied, 2, EXECUTE)
     env = stubs.make_env(unlucky=0.0)
     simulate = engine.make(
-        env, batch, TROCARS, engine.Settings(0, None, 28, 1), plans.record(EXECUTE)
+        env, batch, TROCARS, engine.RolloutSettings(0, None, 28, 1), plans.record(EXECUTE)
     )
     params = (weights, jnp.float32(1.0))
     (episode,) = (e for s in simulate(params, [(0, 0)]) for e in s.ended)

@@ -18,6 +18,8 @@ from starjax.deploy.connection import Connection
 from starjax.deploy.inputs import InputSpec, RobotObservation
 from starjax.deploy.plan_executor import LIMITS, Limits, PlanExecutor, Report
 from starjax.errors import UsageError
+from starjax.monitor import calibrate
+from starjax.monitor.watch import Watch
 from starjax.types import Command
 
 TIMEOUT_S = 1.0  # of a reply, and of a connection attempt
@@ -44,6 +46,9 @@ class Client:
     more of the old one, then repeats the last command: a pose on the RCM manifold, with the jaws
     unchanged. Before the first plan it holds the measured pose. It reconnects to a lost server.
 
+    If the policy has a runtime monitor, an alarm makes the client hold the last command and request
+    no plans until `resume`; `report.alarm` has the score, its value and its threshold.
+
     Every command is on the RCM manifold of the given trocar and within `limits` of the previous
     one; no reply can break that.
 
@@ -64,6 +69,7 @@ class Client:
         limits: Limits = LIMITS,
         timeout_s: float = TIMEOUT_S,
         wait_s: float = WAIT_S,
+        is_watched: bool = True,
         connect: Callable[..., Any] = Connection,
     ) -> None:
         """Connects and compiles the programs of `step`.
@@ -78,6 +84,7 @@ class Client:
           limits: between consecutive commands.
           timeout_s: of a reply; after it the client reconnects.
           wait_s: for the first connection.
+          is_watched: hold on an alarm of the policy's runtime monitor.
           connect: makes the connection; simulated ones replace it.
 
         Raises:
@@ -93,10 +100,13 @@ class Client:
             p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)
             self.p_world_trocar = np.asarray(p_world_trocar, np.float32)
             horizon, execute = int(self.metadata["horizon"]), int(self.metadata["execute"])
+            self._watch = _watch(self.metadata) if is_watched else None
             self._executor = PlanExecutor(self.p_world_trocar, horizon, execute, ahead, limits)
         except BaseException:
             self._connection.close()
             raise
+        self._tip = np.zeros(3, np.float32)  # m, measured at the latest request
+        self._moved = self._watched = 0  # control steps executed at the latest request, and scored
         self._key, self._requests = key, 0
         self._next_key()  # compiles it
         self._moments: collections.deque[RobotObservation] = collections.deque(maxlen=spec.moments)
@@ -128,10 +138,17 @@ class Client:
             self._moments.append(moment)
         self._receive()
         if executor.needs_plan and self._connection.is_up:
+            self._tip, self._moved = moment.pose.p, self.report.steps - self.report.held
             self._connection.send(self._request())
             executor.on_request()
             self._receive()
         return executor.step()
+
+    def resume(self) -> None:
+        """Begins another episode for the monitor, and continues after its alarm."""
+        if self._watch:
+            self._watch.reset()
+        self._executor.resume()
 
     def run(
         self, robot: Robot, seconds: float, should_stop: Callable[[], bool] = lambda: False
@@ -170,7 +187,10 @@ class Client:
             plan = wire.decode_reply(self._input_spec, self._executor.horizon, reply.value)
         except UsageError as error:
             return self._executor.on_failure(str(error))
-        self._executor.on_plan(plan)
+        if self._executor.on_plan(plan) and self._watch:
+            steps, self._watched = self._moved - self._watched, self._moved
+            if alarm := self._watch.update(np.asarray(plan.pose.p), self._tip, steps):
+                self._executor.on_alarm(str(alarm))
 
     def _request(self) -> dict[str, Any]:
         key = self._next_key()
@@ -196,6 +216,15 @@ def _read_spec(metadata: dict[str, Any]) -> InputSpec:
         expected = "a policy that keeps to the RCM manifold"
         raise UsageError("address", expected, f"one of method {metadata.get('method')}")
     return spec
+
+
+def _watch(metadata: dict[str, Any]) -> Watch | None:
+    if "monitor" not in metadata:
+        return None
+    try:
+        return Watch(calibrate.from_json(metadata["monitor"]))
+    except ValueError as error:
+        raise UsageError("address", "a server with a readable monitor", str(error)) from None
 
 
 def _trocar(trocar: rcm.Trocar, arms: tuple[int, ...]) -> rcm.Trocar:

@@ -62,6 +62,7 @@ class Report:
       refused: replies without a valid plan; `fault` is the reason of the last one.
       lost: requests without a reply: the connection broke or timed out.
       overran: control periods of `Client.run` that took too long.
+      alarms: of the policy's runtime monitor; `alarm` describes the last one.
       latencies: of every plan, from the request to its arrival.
     """
 
@@ -74,7 +75,9 @@ class Report:
     refused: int = 0
     lost: int = 0
     overran: int = 0
+    alarms: int = 0
     fault: str = ""
+    alarm: str = ""
     latencies: list[int] = dataclasses.field(default_factory=list)
 
 
@@ -116,7 +119,7 @@ class PlanExecutor:
         self._next: Command | None = None  # arrived, waits for the end of the present plan
         # Indices in the present plan: its next command, and the planned end.
         self._index = self._until = 0
-        self._is_pending = self._is_late = False
+        self._is_pending = self._is_late = self._is_stopped = False
         self._moved = self._waited = 0  # control steps since the request, without and with holds
         self._latencies: collections.deque[int] = collections.deque(maxlen=_REMEMBERED)
         still = rcm.pose_on_manifold(_DOWN, 0.0, _DEPTH, self._p_world_trocar)
@@ -136,7 +139,7 @@ class PlanExecutor:
     def needs_plan(self) -> bool:
         """Returns True if a plan should be requested now."""
         is_near = self._plan is None or self._until - self._index <= self.ahead
-        return is_near and self._next is None and not self._is_pending
+        return not self._is_stopped and is_near and self._next is None and not self._is_pending
 
     def on_request(self) -> None:
         """Records that a plan has been requested."""
@@ -149,15 +152,28 @@ class PlanExecutor:
         self.report.lost += is_lost
         self.report.refused += not is_lost
 
-    def on_plan(self, plan: Command) -> None:
-        """Stores the requested plan `[H, *arms]`; one off the RCM manifold is a failure."""
+    def on_alarm(self, alarm: str) -> None:
+        """Drops all plans: the robot holds its last command until `resume`."""
+        self.report.alarm = alarm
+        self.report.alarms += 1
+        self._plan = self._next = None
+        self._is_stopped = True
+
+    def resume(self) -> None:
+        """Allows requests again after an alarm."""
+        self._is_stopped = False
+
+    def on_plan(self, plan: Command) -> bool:
+        """Stores the requested plan `[H, *arms]`; returns False for one off the RCM manifold."""
         off, depth, skew = map(float, _worst(plan.pose, self._p_world_trocar))
         if not (off <= MAX_OFF and depth > 0.0 and skew <= MAX_SKEW):
             got = f"{1e3 * off:.3g} mm from the trocar, {1e3 * depth:.3g} mm beyond it"
-            return self.on_failure(f"plan: expected one on the RCM manifold, got axes {got}")
+            self.on_failure(f"plan: expected one on the RCM manifold, got axes {got}")
+            return False
         self._is_pending, self._next = False, plan
         self._latencies.append(self._waited)
         self.report.latencies.append(self._waited)
+        return True
 
     def begin(self, pose: Pose, gripper: np.ndarray) -> None:
         """Takes the measured pose `[*arms]` as the first to hold, its axis put through the trocar.

@@ -18,6 +18,7 @@ from starjax import config, errors, limits, methods, rcm, types
 from starjax.deploy import approach, inputs
 from starjax.deploy.inputs import RobotObservation
 from starjax.learners import LEARNERS
+from starjax.monitor.calibrate import Monitor
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
@@ -41,6 +42,8 @@ class Deployed:
       max_first_move: m, maximum distance from the measured tip to a plan's first tip.
       max_first_turn: rad, the same of the rotation.
       input_spec: shapes of the inputs.
+      monitor: runtime monitor of the file, None without one or if other options or another method
+        change the plans; `monitor.watch.Watch` runs it.
 
     It pickles as the arguments of `load`: another process loads the same file.
     """
@@ -55,6 +58,7 @@ class Deployed:
     _source: tuple[Any, ...] = dataclasses.field(repr=False)
     _infer: Callable[..., tuple[Command, approach.StartOffset]] = dataclasses.field(repr=False)
     _weights: tuple[Any, Any] = dataclasses.field(repr=False)
+    monitor: Monitor | None = dataclasses.field(default=None, repr=False)
 
     @property
     def digest(self) -> str:
@@ -229,6 +233,7 @@ def load(
         _source=(str(path.absolute()), files.sha256(path), {"method": method, **options}),
         _infer=jax.jit(infer),
         _weights=jax.device_put((params, trained.normalizer)),
+        monitor=None if options or method != trained.method else trained.monitor,
     )
 
 

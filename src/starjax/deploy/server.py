@@ -23,6 +23,7 @@ import starjax
 from starjax.deploy import batching, wire
 from starjax.deploy.policy import Deployed
 from starjax.errors import UsageError
+from starjax.monitor import calibrate
 from starjax.runtime import connections
 from starjax.sim.tasks.base import CONTROL_HZ
 
@@ -117,6 +118,7 @@ def metadata(policy: Deployed, name: str = "") -> dict[str, Any]:
         "asks": _plain(spec),
         "inputs": {field: _plain(row) for field, row in arrays},
         "actions": list(wire.ACTION),
+        **({"monitor": calibrate.to_json(policy.monitor)} if policy.monitor else {}),
     }
 
 
