@@ -18,7 +18,6 @@ import pytest
 from starjax.data import load
 from starjax.policies import policy_file
 
-pytestmark = pytest.mark.slow
 SITE = pathlib.Path(__file__).parents[1] / "extension" / "site"
 TINY = ["--task", "touch", "--arm", "gantry", "--preset", "smoke", "--demos.seen-trocars", "4"]
 TINY += ["--train.steps", "20", "--eval.time-limit-s", "2"]

@@ -87,7 +87,6 @@ def short_segments(monkeypatch, frames):
     monkeypatch.setattr(episodes, "DEMONSTRATION", shorter)
 
 
-@pytest.mark.slow
 def test_kills_leave_no_trace(tmp_path):
     survived = kill.survive(__file__, "job", tmp_path, kills=12)
     assert survived.kills == 12

@@ -141,7 +141,6 @@ def _first_trials(found):
     return tables.select(found, found.trial == 0)
 
 
-@pytest.mark.slow
 def test_kills_leave_no_trace(tmp_path):
     survived = kill.survive(__file__, "job", tmp_path, kills=10)
     assert survived.kills == 10
@@ -415,7 +414,6 @@ print("same")
 """
 
 
-@pytest.mark.slow
 def test_two_devices_give_the_same_bits(tmp_path):
     here = pathlib.Path(__file__).parent
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"

@@ -38,7 +38,6 @@ def same(out, alone):
     return len(tables) - 1
 
 
-@pytest.mark.slow
 def test_processes_that_share_do_what_one_does(tmp_path, alone):
     started = several.start(SCRIPT, str(tmp_path), "0", "-1")
     said = several.finish(started)
@@ -46,7 +45,6 @@ def test_processes_that_share_do_what_one_does(tmp_path, alone):
     assert same(tmp_path, alone) == 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("victim", "where"), [(0, "demos/episodes"), (1, "trials")])
 def test_a_killed_process_is_a_line_and_the_same_command_goes_on(tmp_path, alone, victim, where):
     started = several.start(SCRIPT, str(tmp_path), "0.2", "-1")
@@ -66,7 +64,6 @@ def test_a_killed_process_is_a_line_and_the_same_command_goes_on(tmp_path, alone
     assert same(tmp_path, alone) == 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("failing", [0, 1])
 def test_an_error_of_one_process_is_a_line_in_all(tmp_path, failing):
     started = several.start(SCRIPT, str(tmp_path), "0", str(failing))

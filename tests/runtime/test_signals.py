@@ -101,7 +101,6 @@ def seconds_a_round():
         yield (time.perf_counter() - start) / 20_000
 
 
-@pytest.mark.slow
 def test_a_stop_during_a_compilation_says_that_it_was_heard():
     """The hash stands for a compiler: a call into C that looks at no signal for some seconds."""
     body = f"""
@@ -111,7 +110,6 @@ def test_a_stop_during_a_compilation_says_that_it_was_heard():
     assert len(said) == 2 and "heard" in said[0] and "same command" in said[1]
 
 
-@pytest.mark.slow
 def test_a_stop_that_training_looks_at_late_says_that_it_was_heard():
     body = """
             with signals.stop_signals() as should_stop:

@@ -208,9 +208,9 @@ def gl_pictures(tmp_path_factory):
 @pytest.mark.parametrize(
     ("compose", "camera", "height", "width"),
     [
-        pytest.param(pile, "camera", 144, 208, marks=pytest.mark.slow),
+        (pile, "camera", 144, 208),
         (pile, "shifted", 192, 256),
-        pytest.param(composed, "camera", 256, 256, marks=pytest.mark.slow),
+        (composed, "camera", 256, 256),
     ],
 )
 def test_agrees_with_the_gl_renderer(gl_pictures, compose, camera, height, width):

@@ -280,7 +280,6 @@ def test_training_learns(tmp_path):
     assert result.samples_per_second > 0
 
 
-@pytest.mark.slow
 def test_killed_again_and_again_ends_the_same(tmp_path):
     found = kill.survive(jobs.__file__, "train_and_export", tmp_path, kills=7)
     assert found.kills == 7
@@ -292,7 +291,6 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
 
 # Adam turns the rounding of a gradient near zero into a whole step of the learning rate: wide for
 # bfloat16, whose parameters are compared on average.
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "observation", "dtype", "tolerance"),
     [(4, "state", "float32", 1e-4), (2, "image", "bfloat16", 5e-2)],

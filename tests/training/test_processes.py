@@ -37,7 +37,6 @@ def run_two(folder: Path, asks: int) -> list[str]:
     return [out for out, _ in said]
 
 
-@pytest.mark.slow
 def test_two_processes_are_one_run(tmp_path, monkeypatch):
     stopped = run_two(tmp_path, asks=3)
     assert all("same command goes on" in line for line in stopped)
@@ -56,7 +55,6 @@ def test_two_processes_are_one_run(tmp_path, monkeypatch):
     assert ours == theirs  # the log of the first process alone
 
 
-@pytest.mark.slow
 def test_the_whole_of_a_run_is_done_together(tmp_path):
     for said in (f"into {tmp_path / 'stardiff'}", "already complete"):
         started = start_two("whole", str(tmp_path))
@@ -93,7 +91,6 @@ def stop_two(
     return [error for _, error in said]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "told"), [(signal.SIGINT, (1, 0)), (signal.SIGTERM, (1,)), (signal.SIGTERM, (0,))]
 )
@@ -105,7 +102,6 @@ def test_a_stop_while_all_train_saves(tmp_path, number, told):
     assert len(checkpoint.steps(tmp_path / "stardiff/checkpoints")) == 1
 
 
-@pytest.mark.slow
 def test_sigterm_ends_several_processes_that_do_not_train(tmp_path):
     started = start_two("waits", str(tmp_path))
     stop_two(started, lambda: len(list(tmp_path.iterdir())) == 2, signal.SIGTERM)

@@ -48,7 +48,6 @@ def hurried(monkeypatch):
     monkeypatch.setattr(pages, "Clock", quick)
 
 
-@pytest.mark.slow
 def test_trials_follow_one_another(page, expert, hurried, monkeypatch):
     monkeypatch.setattr(simulation, "load", lambda who, arms=(): expert)
     asked = view.ViewOptions((simulation.expert("reach"),), trocar=2, seed=SEED)
@@ -83,7 +82,6 @@ def directed(steered, trocar):
     )
 
 
-@pytest.mark.slow
 def test_a_person_demonstrates_and_keeps_it(page, steered, hurried, tmp_path):
     trocar, root = 3, tmp_path / "demos"
     with recorder.record_into(root, steered.env, SEED) as kept:
