@@ -28,7 +28,7 @@ def main() -> None:
 
 
 def draw_shafts(axes: plt.Axes) -> None:
-    """The yaw axis is across the picture, so all shafts lie in it and the pitch is zero."""
+    """Draws shafts with the yaw axis across the picture: all lie in it and the pitch is zero."""
     x, z = np.array([0.0, 1.0, 0.0]), np.array([np.sin(LEAN), 0.0, -np.cos(LEAN)])
     tip = rcm.Pose(np.stack([x, np.cross(z, x), z], -1).astype(np.float32), TIP)
     for trocar in TROCARS:

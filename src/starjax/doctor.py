@@ -24,9 +24,9 @@ class Finding(NamedTuple):
     """One line of the answer.
 
     Attributes:
-      name: what was looked at.
-      value: what was found.
-      remedy: what to do about it; empty if nothing is wrong.
+      name: name of the check.
+      value: finding.
+      remedy: action against it; empty if nothing is wrong.
     """
 
     name: str
@@ -129,7 +129,7 @@ def folder_locks() -> list[Finding]:
             tempfile.TemporaryDirectory(prefix=".starjax-", dir=".") as trial,
             locks.hold(pathlib.Path(trial) / "lock") as is_systems,
         ):
-            kind = "the file system's" if is_systems else "marker files: the file system has none"
+            kind = "the file system's" if is_systems else "marker files (no locks of the system)"
     except (FileNotFoundError, PermissionError):  # said before
         return []
     except (locks.Held, OSError) as error:

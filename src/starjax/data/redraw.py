@@ -89,14 +89,14 @@ class DrawnImages:
 
 
 def is_possible(description: Mapping[str, Any]) -> bool:
-    """True if images of a dataset can be drawn from what it recorded."""
+    """Returns True if images of a dataset can be drawn from what it recorded."""
     is_undisturbed = not description.get("randomise")
     is_ours = description.get("seed_rule") == schema.SEED_RULE
     return is_ours and is_undisturbed and "qpos" in description["features"]
 
 
 def are_recorded(description: Mapping[str, Any], env: Any) -> bool:
-    """True if a dataset holds images of all cameras of an environment, at its image size."""
+    """Returns True if a dataset holds images of an environment's cameras at its image size."""
     recorded = description["features"]
     return all(
         list(recorded.get(f"{episodes.IMAGE}{camera}", {}).get("shape", ())) == [size, size, 3]

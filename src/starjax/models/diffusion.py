@@ -97,10 +97,10 @@ def ddim_sample(
       eps_fn: `(x [B, ...], prepared) -> eps [B, ...]`.
       noise: the start, standard normal `[B, ...]`; see `sample_noise`.
       diffusion_steps: K of the cosine schedule that the network was trained with.
-      steps: how many network evaluations.
+      steps: number of network evaluations.
       prepare: maps the int32 steps `[n]` to a pytree with leading axis n, once, before the loop;
         `eps_fn` gets its slice. By default the step k itself, int32 `[]`.
-      reach: lowest and highest value, what broadcasts against `[B, ...]` each; None: -1 and 1.
+      reach: (lowest, highest) value, each broadcastable against `[B, ...]`; None: -1 and 1.
 
     Returns:
       Clean sequences, the shape of `noise`, within `reach`.

@@ -67,10 +67,10 @@ def sample(
     Args:
       predict: `(x [B, ...], prepared) -> velocity [B, ...]`.
       noise: the start, standard normal.
-      steps: how many network evaluations.
+      steps: number of network evaluations.
       prepare: maps the times `[n]` in TIME_UNIT to a pytree with leading axis n, once, before the
         loop; `predict` gets its slice.
-      reach: what broadcasts against `[B, ...]` each.
+      reach: (lowest, highest) value, each broadcastable against `[B, ...]`.
     """
     time = np.arange(steps, 0, -1, dtype=np.float32) / steps
 

@@ -17,10 +17,10 @@ from starjax.models.kernels import channel_sums
 from starjax.runtime import hashing
 
 
-# Jitted inside of jitted programs: what many layers share is then traced once a shape.
+# Jitted inside jitted programs, so a function shared by many layers is traced once per shape.
 @jax.jit
 def mish(x: jax.Array) -> jax.Array:
-    """x tanh(softplus(x)), with one exponential: tanh(log(1 + e)) = e (e + 2) / (e (e + 2) + 2)."""
+    """Returns x tanh(softplus(x)), by e = exp(x): tanh(log(1 + e)) = e (e + 2) / (e (e + 2) + 2)."""
     wide = x.astype(jnp.float32)
     # Above 20 the ratio is 1 in float32; the clamp keeps the square from overflowing.
     e = jnp.exp(jnp.minimum(wide, 20.0))
@@ -84,7 +84,7 @@ class Dense(nn.Module):
 
 
 def xavier_init(key: jax.Array, shape: tuple[int, int], dtype: Any = None) -> jax.Array:
-    """Uniform within +-sqrt(6 / (inputs + outputs)), hashed as in `uniform_init`: of attention."""
+    """Returns attention's weights: uniform within +-sqrt(6 / (inputs + outputs)), hashed."""
     return math.sqrt(6.0 / sum(shape)) * _hashed(key, tuple(shape))
 
 

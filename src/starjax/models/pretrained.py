@@ -76,7 +76,7 @@ def _is_pickle(path: pathlib.Path) -> bool:
 
 
 def _name(names: tuple[str, ...]) -> str:
-    """torchvision's name: `layer2.0.downsample.0.weight` of (layer2_0, downsample_0, kernel)."""
+    """Returns torchvision's name: `layer2.0.conv1.weight` of (layer2_0, conv1, kernel)."""
     return ".".join(names[:-1]).replace("_", ".") + ".weight"
 
 

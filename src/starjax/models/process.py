@@ -1,4 +1,4 @@
-"""Ways from noise to sequences, which a network learns to go back: what a denoiser is made of."""
+"""Processes from sequences to noise, which a network learns to reverse: parts of a denoiser."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -23,12 +23,12 @@ class Sample(Protocol):
         prepare: Callable[[jax.Array], Any],
         reach: Any,
     ) -> jax.Array:
-        """Sequences of noise `[B, H, D]`, within `reach` `[2, D]`, or if it is None [-1, 1].
+        """Draws sequences of noise `[B, H, D]` within `reach` `[2, D]`, by default [-1, 1].
 
         Args:
           predict: `(x, prepared)`, of `x` `[B, H, D]` at one time, or `[n, B, H, D]` at n times.
           noise: standard normal, or a share of it.
-          prepare: what `predict` is given, of times `[n]` all at once, a pytree `[n, ...]`.
+          prepare: function of times `[n]`; its pytree `[n, ...]` holds an argument of `predict`.
           reach: lowest and highest values.
         """
         ...

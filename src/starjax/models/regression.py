@@ -57,7 +57,7 @@ class MixtureNet(nn.Module):
 
 
 def loss(mixture: Mixture, x0: jax.Array, spread: float) -> jax.Array:
-    """Mean negative log likelihood of sequences `[B, H, D]`, times 2 spread², a constant left out:
+    """Returns mean negative log likelihood of `[B, H, D]`, times 2 spread², without a constant:
     with one component the mean squared error, whatever the spread.
 
     A sequence counts as one number, since its numbers are far from independent: the exponent has

@@ -16,7 +16,7 @@ class Schedule(NamedTuple):
 
     Attributes:
       beta: variance added at step k (Eq. 6).
-      sqrt_alpha_bar: what is left of the clean action after step k (Eq. 7).
+      sqrt_alpha_bar: factor of the clean action after step k (Eq. 7).
       sqrt_one_minus_alpha_bar: standard deviation of the noise after step k.
       posterior_x0: weight of the clean action in the mean of q(a_{k-1} | a_k, a_0).
       posterior_xk: weight of a_k in that mean.

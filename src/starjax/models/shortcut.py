@@ -98,7 +98,7 @@ def sample(
       predict: `(x [B, ...], prepared) -> velocity [B, ...]`.
       noise: the start, standard normal or a share of it.
       prepare: maps what is told `[1]` to a pytree with leading axis 1; `predict` gets its slice.
-      reach: lowest and highest value, what broadcasts against `[B, ...]` each; None: -1 and 1.
+      reach: (lowest, highest) value, each broadcastable against `[B, ...]`; None: -1 and 1.
     """
     prepared = jax.tree.map(lambda leaf: leaf[0], prepare(jnp.array([WHOLE_WAY])))
     return within(noise - predict(noise, prepared), reach)

@@ -1,4 +1,4 @@
-"""Spatial softmax: where in the picture each feature map looks (part of Eq. 10)."""
+"""Spatial softmax: mean image position of each feature map (part of Eq. 10)."""
 
 import jax
 import jax.numpy as jnp

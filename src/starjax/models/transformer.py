@@ -81,7 +81,7 @@ class StyleEncoder(nn.Module):
       features: Z.
       width: of all tokens.
       heads, mlp, dtype: of the layers, see `Layer`.
-      layers: how many.
+      layers: number of layers.
     """
 
     features: int

@@ -110,7 +110,7 @@ def commit_directory(
 
     Args:
       final: must not exist.
-      staged: where it is built, on the same file system; whatever is there is removed.
+      staged: path of construction, on the same file system; an existing one is removed.
       contents: bytes of each file by name, in parts.
     """
     try:

@@ -1,4 +1,4 @@
-"""An exclusive lock on a file: the system's, or a marker beside it where there is none to have."""
+"""An exclusive lock on a file: the system's, or a marker file if the file system has no locks."""
 
 import contextlib
 import errno

@@ -12,7 +12,7 @@ import sys
 
 LINE = "another process of this run was lost; the same command goes on from what is done"
 _FATAL = b"JAX distributed service detected fatal errors"
-# Of lines that come before that one.
+# Lines before that one.
 _SIGNS = (b"coordination_service", b"preemption_sync_manager")
 _HELD_S = 2.0  # how long lines may be held that begin with such a sign
 

@@ -1,4 +1,4 @@
-"""Progress of anything long: how far, how fast, until when. A bar on a terminal, else lines."""
+"""Progress of long work: fraction, speed and remaining time, as a bar on a terminal, else lines."""
 
 import contextlib
 import sys
@@ -23,11 +23,11 @@ def track(
     """Shows progress towards `total` units.
 
     Args:
-      description: what is being done.
+      description: name of the work.
       total: units in all.
       unit: their name, as in "episodes".
       done: units that an earlier run finished; they do not count for the throughput.
-      stream: where to show it; the standard error stream unless given.
+      stream: text stream of the output; default: standard error.
 
     Yields:
       `advance(count, note="")`: `count` more units are done; `note` is shown beside the bar.
@@ -112,7 +112,7 @@ class _Meter:
         return self.done >= self.total - 1e-6  # shares of a unit rarely add up to the last bit
 
     def per_second(self) -> float:
-        is_past = self._is_past_first() and not self.is_over()  # in the end all of it counts
+        is_past = self._is_past_first() and not self.is_over()  # the last report counts everything
         done, since = self._first if self._first and is_past else self._begun
         return (self.done - done) / max(time.monotonic() - since, 1e-9)
 

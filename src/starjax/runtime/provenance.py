@@ -18,7 +18,7 @@ class Code(NamedTuple):
     Attributes:
       version: of the package.
       commit: hexadecimal, None where neither a checkout nor the installation says it.
-      dirty: whether the package's tracked files differ from it, None where there is none.
+      dirty: True if the package's tracked files differ from the commit; None without a commit.
     """
 
     version: str
@@ -44,7 +44,7 @@ def of_version(version: str) -> tuple[str, bool] | None:
 
 
 def _of_checkout(package: Path) -> tuple[str, bool] | None:
-    """Asks git, if it tracks the package: it may also lie in somebody's repository."""
+    """Asks git if it tracks the package, which may also lie in an unrelated repository."""
 
     def git(*words: str) -> str:
         command = ["git", "-C", str(package), *words]

@@ -29,7 +29,7 @@ _answered = False
 
 
 def interrupt_on_stops() -> None:
-    """Lets every stop raise KeyboardInterrupt in the main thread, from now on.
+    """Lets every stop raise KeyboardInterrupt in the main thread.
 
     Python drops what is raised in a callback of its collector, and jax's C++ some of what is raised
     while it calls Python, at every start for some milliseconds. So it is raised again and again,
@@ -122,7 +122,7 @@ def _announce_unanswered() -> None:
 
 
 def _drop_dead_outputs(number: int) -> None:
-    """After SIGHUP, sends lines nowhere whose terminal or reader is gone: they would end the work
+    """Discards lines after SIGHUP whose terminal or reader is gone: they would end the work
     before it has saved."""
     if number != getattr(signal, "SIGHUP", None):
         return

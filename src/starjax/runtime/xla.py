@@ -83,7 +83,7 @@ def options_without_kinematics() -> dict[str, Any]:
 
 
 def cache_directory() -> Path:
-    """Folder for what can be made again: STARJAX_CACHE, else the user's cache directory, or the
+    """Returns the cache folder: STARJAX_CACHE, else the user's cache directory, or the
     system's temporary one where the user has no home."""
     if chosen := os.environ.get("STARJAX_CACHE"):
         return Path(chosen)

@@ -85,10 +85,10 @@ def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> p
 
 
 def restore(directory: str | os.PathLike, like: Any) -> tuple[int, Any] | None:
-    """Returns the newest undamaged step, or None where there is none.
+    """Returns the newest undamaged step, None without one.
 
     Args:
-      directory: where `save` wrote.
+      directory: argument of `save`.
       like: a state of the same structure, of arrays or `jax.ShapeDtypeStruct` with shardings.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The vision encoder of another policy: where a new policy's begins, or what stays frozen in it."""
+"""The vision encoder of another policy, from which a new policy's begins or which stays frozen."""
 
 import dataclasses
 from pathlib import Path
@@ -33,7 +33,7 @@ def read(policy_config: config.PolicyConfig) -> Encoder | None:
     Returns None for a ResNet-18's ImageNet weights, which fill the ResNet's trunk and nothing else.
 
     Raises:
-      errors.UsageError: there is no such file, it is damaged, or the encoder in it is not the one
+      errors.UsageError: the file is missing or damaged, or the encoder in it is not the one
         that the settings describe.
     """
     name = policy_config.encoder_weights
@@ -70,7 +70,7 @@ def start(params: Params, policy_config: config.PolicyConfig) -> Params:
 def _differing(policy_config: config.PolicyConfig, trained: policy_file.Trained) -> list[str]:
     """Lists settings of the encoder that differ: `policy.vision_dim 64 (here 128)`."""
     names = ["observation", "encoder", "vision_dim"]
-    # Where it goes on learning, it may get used to another picture.
+    # An encoder that is trained further may adapt to another image.
     names += ["image_size"] if policy_config.freeze_encoder else []
     ours, theirs = policy_config, trained.policy
     found = [

@@ -22,7 +22,7 @@ from starjax.rollouts import workers
 from starjax.runtime import files, progress
 from starjax.training.encoder import Encoder
 
-PART = 1024  # frames a file: what a kill may cost
+PART = 1024  # frames per file: the most that a kill costs
 # Frames a call: always as many, since the size of a batch may change last bits. With more, what a
 # CPU's core works on leaves its cache.
 BATCH = 16
@@ -114,7 +114,7 @@ def _key(
     camera: str,
     rows: np.ndarray | None,
 ) -> str:
-    """Names the features by everything that decides them."""
+    """Returns the features' name, a digest of everything that decides them."""
     about = {
         "encoder": encoder.fingerprint,
         "trunk": policy_config.encoder,

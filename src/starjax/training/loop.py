@@ -23,7 +23,7 @@ from starjax.training.sharding import StateLayout, StepCarry
 from starjax.training.step import Setup
 from starjax.training.stepper import Stepper
 
-_CALL_SECONDS = 1.0  # aim of one compiled call: how long Ctrl-C waits, how often the bar moves
+_CALL_SECONDS = 1.0  # aim of one compiled call: the wait of Ctrl-C, the period of the bar
 
 HoldoutError = Callable[[states.TrainState], dict[str, float]]
 
@@ -37,7 +37,7 @@ class TrainingResult(NamedTuple):
 
     Attributes:
       state: after the last step.
-      samples_per_second: of this process, compilation aside; 0 if there was nothing left to do.
+      samples_per_second: of this process, without compilation; 0 if the training was complete.
       skipped: steps left out because their loss or gradient was not finite.
       holdout: last errors on demonstrations kept out; empty if none were.
     """
@@ -197,7 +197,7 @@ def _train(
 def _observed(
     dataset: windows.Dataset, policy_config: config.PolicyConfig, seen: features.Sensors
 ) -> windows.Dataset:
-    """Leaves out what the policy does not look at, so that nobody gathers it."""
+    """Removes observations that the policy does not use, so no batch gathers them."""
     given = dataset.observation
     kept = "images" if policy_config.observation == "image" else "state"
     kept = "features" if policy_config.freeze_encoder else kept
@@ -207,7 +207,7 @@ def _observed(
 
 
 def _restored(checkpoints: pathlib.Path, shapes: Any) -> states.TrainState | None:
-    """Returns the state of the newest sound checkpoint, None where there is none."""
+    """Returns the state of the newest undamaged checkpoint, None without one."""
     restored = checkpoint.restore(checkpoints, shapes) if checkpoint.steps(checkpoints) else None
     step = -1 if restored is None else restored[0]
     if processes.agree(step) != (step,):

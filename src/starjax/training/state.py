@@ -1,4 +1,4 @@
-"""The state of a training: what goes from step to step, and what a checkpoint holds."""
+"""The state of a training: the carry from step to step and the content of a checkpoint."""
 
 import functools
 from collections.abc import Callable
@@ -32,7 +32,7 @@ class StepKeys(NamedTuple):
     """Typed keys of one step.
 
     Attributes:
-      batch: which frames it sees.
+      batch: key of the draws of frames.
       loss: augmentation, noise and diffusion steps.
     """
 

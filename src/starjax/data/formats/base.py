@@ -114,7 +114,7 @@ def open_dataset(path: Path, name: str) -> Iterator[Source]:
         with explained(path, name):
             source = stack.enter_context(form.open(path))
             require(bool(source.lengths), "episodes", 0)
-            require(0.0 <= source.hz < _MOST_HZ, "steps a second", source.hz)
+            require(0.0 <= source.hz < _MOST_HZ, "steps per second", source.hz)
 
         def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
             for column in names:

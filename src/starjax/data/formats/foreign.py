@@ -72,7 +72,7 @@ def import_mapped(
     _fits(source, mapping, task)
     hz = mapping.hz or source.hz
     if not hz and not mapping.time:
-        raise errors.UsageError("--map: hz", "steps a second, which the files do not say", "none")
+        raise errors.UsageError("--map: hz", "steps per second, which the files do not say", "none")
 
     def moved(arrays: dict[str, np.ndarray]) -> Motion:
         return motion.read(arrays, mapping, hz, folder)

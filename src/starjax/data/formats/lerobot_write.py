@@ -32,7 +32,7 @@ def write(path: Path, source: Source, with_video: bool) -> None:
     """Writes the folder; `with_video` is whether images go into videos, else into PNG."""
     hz = round(source.hz)
     if hz != source.hz or hz < 1:
-        raise errors.UsageError("DATASET", "a whole number of steps a second", source.hz)
+        raise errors.UsageError("DATASET", "a whole number of steps per second", source.hz)
     features = _features(source, hz, with_video)
     moving = {name: column for name, column in source.columns.items() if column.is_image}
     moving = moving if with_video else {}

@@ -58,7 +58,7 @@ class CameraColumn:
 
     column: str
     crop: tuple[int, ...] = ()  # top, left, height, width in pixels
-    size: int = 0  # pixels a side afterwards; 0: as they are
+    size: int = 0  # pixels per side afterwards; 0: as they are
     bgr: bool = False  # whether blue comes first
 
 

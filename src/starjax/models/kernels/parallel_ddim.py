@@ -61,7 +61,7 @@ def ddim_sample(
       steps: n of DDIM.
       evaluations: of the network, with n sequences for each of B; None: `evaluations_for(n)`.
       prepare: maps the int32 steps `[n]` to a pytree with leading axis n, once; `eps_fn` gets it.
-      reach: lowest and highest value, what broadcasts against `[B, H, A]` each; None: -1 and 1.
+      reach: (lowest, highest) value, each broadcastable against `[B, H, A]`; None: -1 and 1.
 
     Returns:
       Clean sequences `[B, H, A]` within `reach`.
@@ -74,7 +74,7 @@ def ddim_sample(
     )
 
     def through(x0: jax.Array, at: jax.Array, slope: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The end, and every step's noisy sequence, were x0 + slope (x - at) the clean ones."""
+        """Returns the end and all noisy sequences, if x0 + slope (x - at) were the clean ones."""
         clipped = within(x0)
         # what one more of the clean sequence adds to the next noisy one
         gain = jnp.where(clipped == x0, signal_next, 0.0) - spread_next * signal / spread

@@ -32,7 +32,7 @@ class PooledNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """`[N, h, 2, w, 2, C] -> [N, h, w, C]`, from h pairs of rows and w pairs of columns."""
+        """Pools `[N, h, 2, w, 2, C] -> [N, h, w, C]`, over h pairs of rows, w of columns."""
         return _pooled(x, *group_norm.scale_and_shift(self, x, self.groups), self.groups, self.size)
 
 

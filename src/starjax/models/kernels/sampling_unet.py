@@ -112,9 +112,9 @@ def _conv_block(block: Params, skip: Params | None = None) -> dict[str, Any]:
 
 
 def _normalized(params: Params, x: jax.Array, groups: int) -> tuple[jax.Array, jax.Array | None]:
-    """Mish of the normalised convolution, `[B, L, groups, features / groups]`, and the skip.
+    """Computes mish of the normalised convolution, `[B, L, groups, features / groups]`, and a skip.
 
-    The skip is `[B, L, more]`, or None where the parameters have none.
+    The skip is `[B, L, more]`, or None without such parameters.
     """
     kernel, bias = params["kernel"], params["bias"]
     features = len(params["gain"])
