@@ -20,7 +20,7 @@ from starjax.runtime import hashing
 # Jitted inside jitted programs, so a function shared by many layers is traced once per shape.
 @jax.jit
 def mish(x: jax.Array) -> jax.Array:
-    """Returns x tanh(softplus(x)), by e = exp(x): tanh(log(1 + e)) = e (e + 2) / (e (e + 2) + 2)."""
+    """Returns x tanh(softplus(x)), e = exp(x): tanh(log(1 + e)) = e (e + 2) / (e (e + 2) + 2)."""
     wide = x.astype(jnp.float32)
     # Above 20 the ratio is 1 in float32; the clamp keeps the square from overflowing.
     e = jnp.exp(jnp.minimum(wide, 20.0))
