@@ -52,7 +52,7 @@ class Stem(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Maps `[N, h, w, 3]` to row and column pairs `[N, ceil(h/4), 2, ceil(w/4), 2, features]`."""
+        """Maps `[N, h, w, 3]` to pairs `[N, ceil(h/4), 2, ceil(w/4), 2, features]`."""
         init = _kernel_init(7, self.features)
         kernel = self.param("kernel", init, (7, 7, x.shape[-1], self.features))
         height, width = x.shape[1:3]
