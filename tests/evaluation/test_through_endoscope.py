@@ -44,7 +44,7 @@ def seen(tmp_path_factory):
 
 
 def test_demonstrations_tell_it(seen):
-    dataset = load.load(seen).dataset
+    dataset = load.load(seen, residency="host").dataset
     held = dataset.observation.endoscope
     first = np.asarray(held.p)[np.asarray(dataset.start)]
     np.testing.assert_array_equal(held.p, first[np.asarray(dataset.episode)])

@@ -81,6 +81,7 @@ def gradients(params):
     return jax.jit(jax.grad(output, (0, 1, 2)))(params, x, cond)
 
 
+@pytest.mark.slow
 def test_every_parameter_gets_a_gradient(gradients):
     """Tap by tap: a dead one would get exactly zero."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradients[0]):

@@ -71,6 +71,7 @@ def test_every_method_works_with_every_learner(name):
     assert (float(error.max()) <= 1e-6) == (name != "dp_ee")
 
 
+@pytest.mark.slow
 def test_it_is_trained_stored_and_deployed(tmp_path):
     given = METHODS["stardiff"], toy(), TRAIN, fakes.dataset(seed=0), fakes.TASK
     state = loop.run(*given, tmp_path, 0).state

@@ -81,6 +81,7 @@ def test_a_tool_near_the_port_comes_to_rest(follow):
     assert after.rcm_error.max() < 0.01 and after.rcm_error[-15:].max() < 5e-5
 
 
+@pytest.mark.slow
 def test_what_is_no_command_holds_the_arm_and_a_good_one_is_followed_again(reset, step):
     state = reset(1)
     not_finite = np.full((3, 3), np.nan, np.float32)

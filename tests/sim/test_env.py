@@ -108,6 +108,7 @@ def test_success_wants_a_block_let_go_and_at_rest_on_its_peg_five_steps_in_a_row
         assert int(again.settled) == 0 and not again.success and not again.done
 
 
+@pytest.mark.slow
 def test_a_diverged_lane_is_frozen_and_leaves_its_neighbours_alone(reset, begin, drive):
     """Bit-identical neighbours, beside NaN, infinity and a body at 1e20 m/s."""
     state = reset(3)

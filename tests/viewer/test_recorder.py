@@ -40,7 +40,7 @@ def root(steered, tmp_path_factory):
 
 @pytest.mark.slow
 def test_episodes_load_as_demonstrations(root, steered):
-    found = load.load(root, report=lambda line: None)
+    found = load.load(root, residency="host", report=lambda line: None)
     data = found.dataset
     assert len(data.length) == 3 and found.description["expert"] == "operator"
     assert store.keys(root) == [f"0002-000{i}-{SEED}" for i in range(3)] + [f"0009-0000-{SEED}"]

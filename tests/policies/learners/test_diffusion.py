@@ -31,6 +31,7 @@ def test_samples_are_what_was_learned(learned):
     assert np.abs(found - wanted).mean() < 0.05
 
 
+@pytest.mark.slow
 def test_samples_are_the_same_where_steps_are_side_by_side(learned, monkeypatch):
     params, _ = learned
     ten = tiny(ddim_steps=10)
