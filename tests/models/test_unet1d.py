@@ -90,6 +90,7 @@ def test_every_parameter_gets_a_gradient(gradients):
         assert (jnp.abs(taps).max(1) > 0).all(), path
 
 
+@pytest.mark.slow
 def test_the_last_step_sees_the_first_and_the_condition_but_no_other_sample(gradients):
     for gradient in gradients[1:]:
         assert (jnp.abs(gradient[0]).max(-1) > 0).all()

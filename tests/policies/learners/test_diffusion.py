@@ -49,6 +49,7 @@ def test_samples_are_the_same_where_steps_are_side_by_side(learned, monkeypatch)
     assert calls == []
 
 
+@pytest.mark.slow
 def test_at_temperature_zero_no_sample_depends_on_its_key(learned):
     params, _ = learned
     cold, warm = (tiny(ddim_steps=10, temperature=share) for share in (0.0, 1.0))
