@@ -1,6 +1,5 @@
 """Demonstrations of others: whatever their conventions, the same dataset; anomalies are said."""
 
-import dataclasses
 import json
 import shutil
 
@@ -9,6 +8,7 @@ import mistakes
 import numpy as np
 import pytest
 import recorded
+from msgspec import structs
 from scipy.spatial import transform
 
 from starjax import errors, rcm
@@ -126,7 +126,7 @@ def written_as(kind):
 def test_every_way_to_write_a_rotation_is_the_same_motion(kind, hz):
     """At another rate too, where what wraps would be averaged."""
     given = source(hz=hz, change=written_as(kind))
-    made = dataclasses.replace(MAP, arms=(dataclasses.replace(ARM, rotation_as=kind),))
+    made = structs.replace(MAP, arms=(structs.replace(ARM, rotation_as=kind),))
     found = motion.read(given.read(0, mapping.names(made)), made, hz, None)
     times = np.arange(len(found.gripper)) / 30
     R, p, jaws = moved(times, TROCARS[0], 0)
@@ -148,16 +148,18 @@ def test_units_frames_and_tips_of_others(plain, tmp_path):
             "jaws0": np.rad2deg(0.25 * (arrays["jaws0"] + 1.0)),
         }
 
-    arm = dataclasses.replace(
+    arm = structs.replace(
         ARM,
         position="pose[0:3]",
         rotation="pose[3:12]",
         gripper_closed=0.0,
         gripper_open=float(np.rad2deg(0.5)),
-        tip=tuple(TIP),
+        tip=tuple(TIP.tolist()),
         tip_turn=wxyz(TIP_TURN),
     )
-    made = dataclasses.replace(MAP, units="mm", origin=tuple(ORIGIN), turn=wxyz(TURN), arms=(arm,))
+    made = structs.replace(
+        MAP, units="mm", origin=tuple(ORIGIN.tolist()), turn=wxyz(TURN), arms=(arm,)
+    )
     bring(tmp_path, source(change=change), made)
     one, other = loaded(tmp_path / "d"), loaded(plain[1])
     for ours, theirs in zip(one.observation.pose + one.command.pose, other.observation.pose * 2):
@@ -177,7 +179,7 @@ def test_a_robots_joints_give_its_tip(tmp_path):
     joints = RNG.uniform(-1, 1, (40, 2))
     arrays = {"q": joints[:, ::-1], "state": np.zeros((40, 12))}
     arm = ArmColumns(joints="q", joint_names=("b", "a"), model="robot.xml", body="tip")
-    found = motion.read(arrays, dataclasses.replace(MAP, arms=(arm,)), 30.0, tmp_path)
+    found = motion.read(arrays, structs.replace(MAP, arms=(arm,)), 30.0, tmp_path)
     first = transform.Rotation.from_euler("z", joints[:, :1])
     second = first * transform.Rotation.from_euler("y", joints[:, 1:])
     p = np.array([0, 0, 0.1]) + first.apply([0.2, 0, 0]) + second.apply([0, 0, 0.1])
@@ -189,7 +191,7 @@ def test_a_robots_joints_give_its_tip(tmp_path):
         ({"joint_names": ("b",)}, "joints"),
         ({"model": "none.xml"}, "model"),
     ):
-        bad = dataclasses.replace(MAP, arms=(dataclasses.replace(arm, **changed),))
+        bad = structs.replace(MAP, arms=(structs.replace(arm, **changed),))
         with mistakes.of(argument):
             motion.read(arrays, bad, 30.0, tmp_path)
 
@@ -197,7 +199,7 @@ def test_a_robots_joints_give_its_tip(tmp_path):
 def test_uneven_times_with_small_gaps_are_filled_in_and_said(tmp_path):
     times = np.arange(0.0, SECONDS, 1 / 60) + RNG.uniform(-0.002, 0.002, 240)
     times = np.delete(times, slice(100, 108))
-    made = dataclasses.replace(MAP, time="time")
+    made = structs.replace(MAP, time="time")
     found = bring(tmp_path, source(times, hz=60.0), made)
     dataset = loaded(tmp_path / "d")
     length = int(dataset.length[0])
@@ -209,11 +211,11 @@ def test_uneven_times_with_small_gaps_are_filled_in_and_said(tmp_path):
 
 def test_long_gaps_leave_the_episode_out():
     times = np.concatenate([np.arange(60) / 30, 3.0 + np.arange(60) / 30])
-    made = dataclasses.replace(MAP, time="time")
+    made = structs.replace(MAP, time="time")
     given = source(times)
     with pytest.raises(motion.Gap):
         motion.read(given.read(0, mapping.names(made)), made, 30.0, None)
-    patient = dataclasses.replace(made, max_gap_s=2.0)
+    patient = structs.replace(made, max_gap_s=2.0)
     assert motion.read(given.read(0, mapping.names(made)), patient, 30.0, None).notes
 
 
@@ -223,7 +225,7 @@ def test_jumps_and_other_rates_are_said():
         p[50:] += 0.1
         return arrays | {"p0": p}
 
-    made = dataclasses.replace(MAP, time="time")
+    made = structs.replace(MAP, time="time")
     given = source(change=change)
     arrays = given.read(0, mapping.names(made))
     (jump,) = motion.read(arrays, made, 30.0, None).notes
@@ -237,10 +239,10 @@ def test_what_was_asked_for_is_the_command(tmp_path):
         ahead = {"p0": arrays["p0"] + 0.01, "R0": arrays["R0"], "jaws0": -np.ones(120)}
         return arrays | {f"asked_{name}": array for name, array in ahead.items()}
 
-    arm = dataclasses.replace(
+    arm = structs.replace(
         ARM, command_position="asked_p0", command_rotation="asked_R0", command_gripper="asked_jaws0"
     )
-    bring(tmp_path, source(change=change), dataclasses.replace(MAP, arms=(arm,)))
+    bring(tmp_path, source(change=change), structs.replace(MAP, arms=(arm,)))
     dataset = loaded(tmp_path / "d")
     offset = dataset.command.pose.p - dataset.observation.pose.p
     np.testing.assert_allclose(offset, 0.01, atol=1e-6)
@@ -251,7 +253,7 @@ def test_a_column_may_say_the_trocar(tmp_path):
     def change(arrays):
         return arrays | {"trocar": np.tile([0.01, 0.02, 0.14], (len(arrays["time"]), 1))}
 
-    made = dataclasses.replace(MAP, arms=(dataclasses.replace(ARM, trocar="trocar"),))
+    made = structs.replace(MAP, arms=(structs.replace(ARM, trocar="trocar"),))
     found = bring(tmp_path, source(change=change), made)
     np.testing.assert_allclose(found.p_world_trocar, np.tile([0.01, 0.02, 0.14], (3, 1, 1)))
     assert len(found.notes) == 3 and found.residual_mm.min() > 1e3 * trocars.MISSED  # a false one
@@ -273,16 +275,16 @@ def test_a_motion_that_tells_no_trocar_is_left_out_or_shares_one(tmp_path):
     found = bring(tmp_path, given)
     assert (found.episodes, found.left_out) == (2, 1)
     assert len(found.notes) == 1 and found.notes[0].startswith("episode 1")
-    together = dataclasses.replace(MAP, trocars="dataset")
+    together = structs.replace(MAP, trocars="dataset")
     shared = bring(tmp_path, given._replace(lengths=given.lengths[:2]), together, name="shared")
     np.testing.assert_allclose(shared.p_world_trocar, TROCARS[[0, 0], None], atol=1e-4)
 
 
 def test_two_arms_have_a_trocar_each(tmp_path):
-    arms = (ARM, dataclasses.replace(ARM, position="p1", rotation="R1", gripper="jaws1"))
-    made = dataclasses.replace(MAP, task="peg_transfer_bimanual", arms=arms)
+    arms = (ARM, structs.replace(ARM, position="p1", rotation="R1", gripper="jaws1"))
+    made = structs.replace(MAP, task="peg_transfer_bimanual", arms=arms)
     with mistakes.of("--map: arms", 1):
-        bring(tmp_path, source(arms=2), dataclasses.replace(made, arms=(ARM,)))
+        bring(tmp_path, source(arms=2), structs.replace(made, arms=(ARM,)))
     found = bring(tmp_path, source(arms=2), made)
     expected = [TROCARS, TROCARS, TROCARS[::-1]]
     np.testing.assert_allclose(found.p_world_trocar, expected, atol=5e-6)
@@ -292,7 +294,7 @@ def test_two_arms_have_a_trocar_each(tmp_path):
 def test_images_are_cut_turned_and_resized(tmp_path):
     given = source(hz=60.0, images=True)
     cameras = {"camera": CameraColumn(column="image", crop=(2, 3, 8, 8), bgr=True)}
-    bring(tmp_path, given, dataclasses.replace(MAP, state=(), cameras=cameras))
+    bring(tmp_path, given, structs.replace(MAP, state=(), cameras=cameras))
     drawn = np.asarray(loaded(tmp_path / "d").observation.images["camera"])
     theirs = given.read(0, ["image"])["image"]
     np.testing.assert_array_equal(drawn[:120], theirs[::2, 2:10, 3:11, ::-1])
@@ -302,7 +304,7 @@ def test_images_are_cut_turned_and_resized(tmp_path):
     with mistakes.of("--map: crop", "[12, 16]"):
         foreign.pictures(theirs, CameraColumn(column="image", crop=(8, 0, 8, 8)))
     with mistakes.of("--map: cameras", "wrist"):
-        bring(tmp_path, given, dataclasses.replace(MAP, cameras={"wrist": cameras["camera"]}))
+        bring(tmp_path, given, structs.replace(MAP, cameras={"wrist": cameras["camera"]}))
 
 
 def test_failures_are_marked_and_not_learned_from(tmp_path):
@@ -310,7 +312,7 @@ def test_failures_are_marked_and_not_learned_from(tmp_path):
         good = arrays["p0"][0, 0] > 0.0
         return arrays | {"good": np.full(len(arrays["time"]), float(good))}
 
-    found = bring(tmp_path, source(change=change), dataclasses.replace(MAP, success="good"))
+    found = bring(tmp_path, source(change=change), structs.replace(MAP, success="good"))
     good = sum(
         float(moved(np.zeros(1), t, e)[1][0, 0]) > 0 for e, t in enumerate(TROCARS[[0, 0, 1]])
     )
@@ -345,7 +347,7 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_columns_that_are_not_what_the_mapping_says(tmp_path, name):
     change, changed, argument, got = BAD[name]
-    made = dataclasses.replace(MAP, arms=(dataclasses.replace(ARM, **changed),))
+    made = structs.replace(MAP, arms=(structs.replace(ARM, **changed),))
     with mistakes.of(argument, got) as caught:
         bring(tmp_path, source(change=change), made)
     assert "episode 0" in caught.value.got and not (tmp_path / "d").exists()
@@ -355,7 +357,7 @@ def test_times_rise(tmp_path):
     times = np.arange(120) / 30
     times[60] = times[59]
     with mistakes.of("time", "step 60"):
-        bring(tmp_path, source(times), dataclasses.replace(MAP, time="time"))
+        bring(tmp_path, source(times), structs.replace(MAP, time="time"))
     with mistakes.of("--map: hz", "none"):
         bring(tmp_path, source()._replace(hz=0.0))
 
@@ -363,7 +365,7 @@ def test_times_rise(tmp_path):
 def test_a_wrong_order_of_quaternions_is_seen(tmp_path):
     """All is well formed, but no shaft passes through one point."""
     given = source(change=written_as("quat_wxyz"))
-    made = dataclasses.replace(MAP, arms=(dataclasses.replace(ARM, rotation_as="quat_xyzw"),))
+    made = structs.replace(MAP, arms=(structs.replace(ARM, rotation_as="quat_xyzw"),))
     found = None
     try:
         found = bring(tmp_path, given, made)
@@ -415,14 +417,12 @@ def test_missing_files_and_columns_are_named(tmp_path):
     with mistakes.of("--map", "none.toml"):
         mapping.load(tmp_path / "none.toml")
     with mistakes.of("--map: column", "p7"):
-        bring(
-            tmp_path, made=dataclasses.replace(MAP, arms=(dataclasses.replace(ARM, position="p7"),))
-        )
+        bring(tmp_path, made=structs.replace(MAP, arms=(structs.replace(ARM, position="p7"),)))
     with mistakes.of("--map: image column", "p0"):
         cameras = {"camera": CameraColumn(column="p0")}
-        bring(tmp_path, made=dataclasses.replace(MAP, cameras=cameras))
+        bring(tmp_path, made=structs.replace(MAP, cameras=cameras))
     with mistakes.of("--map", "neither"):
-        bring(tmp_path, made=dataclasses.replace(MAP, state=()))
+        bring(tmp_path, made=structs.replace(MAP, state=()))
 
 
 def test_a_stopped_import_ends_in_the_same_bytes(plain, tmp_path):

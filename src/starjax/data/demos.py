@@ -14,13 +14,11 @@
 import collections
 import concurrent.futures
 import contextlib
-import math
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 
 from starjax import errors
 from starjax.data import schema, store
@@ -77,7 +75,7 @@ def collect(
     with sharing.shared(root) as share:
         share.first("sound", lambda: _prepare(root, description, settings, total, report))
         records = _records(root, store.keys(root))
-        frame_bytes = _frame_bytes(description)
+        frame_bytes = schema.frame_bytes(description)
         lanes = share.first("lanes", lambda: _lanes(layout, total, frame_bytes, share.count))
         max_workers = max(1, min(workers.worker_count(), _fitting(frame_bytes) // lanes))
         simulate = _simulator(env, agent, params, trocars, settings, layout._replace(lanes=lanes))
@@ -134,7 +132,7 @@ def precompile(
     """Compiles, in the background, the programs that `collect` runs on one device."""
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     total = settings.per_trocar * len(trocars.radius)
-    frame_bytes = _frame_bytes(schema.describe(env, trocars, settings))
+    frame_bytes = schema.frame_bytes(schema.describe(env, trocars, settings))
     rules = _rules(settings, _lanes(DEFAULT_LAYOUT, total, frame_bytes, 1))
     engine.precompile(env, agent, params, trocars, rules, episodes.DEMONSTRATION)
 
@@ -154,7 +152,7 @@ def _prepare(
     store.create(root, description)
     store.clean(root)
     done = _check_episodes(root, settings.seed, report)
-    guess = min(settings.max_steps, FRAME_GUESS) * _frame_bytes(description)
+    guess = min(settings.max_steps, FRAME_GUESS) * schema.frame_bytes(description)
     files.require_writable(root, max(total - done, 0) * guess)
 
 
@@ -240,12 +238,6 @@ def _writer(
         settle(0)
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _frame_bytes(description: dict[str, Any]) -> int:
-    """Returns the bytes of one recorded control step."""
-    features = description["features"].values()
-    return sum(math.prod(x["shape"]) * np.dtype(x["dtype"]).itemsize for x in features)
 
 
 def _fitting(frame_bytes: int) -> int:

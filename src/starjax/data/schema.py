@@ -1,6 +1,7 @@
 """Schema of dataset.json."""
 
 import hashlib
+import math
 import types
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -77,6 +78,12 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
         "versions": xla.versions(),
         **jax_settings.record(),
     }
+
+
+def frame_bytes(description: Mapping[str, Any]) -> int:
+    """Returns the bytes of one recorded control step."""
+    features = description["features"].values()
+    return sum(math.prod(x["shape"]) * np.dtype(x["dtype"]).itemsize for x in features)
 
 
 def expert_name(task: Any, settings: DemoSettings) -> str:

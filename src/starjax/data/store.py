@@ -61,8 +61,9 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
     except (FileNotFoundError, ValueError):  # never written, or damaged
         files.write_json(path, description)
         return
-    found = read_description(root)
-    differing = [k for k in {**description, **found} if description.get(k) != found.get(k)]
+    present = read_description(root)
+    names = {**description, **present}
+    differing = [k for k in names if description.get(k) != present.get(k)]
     if is_sealed(root):
         differing = [k for k in differing if k != "versions"]
     if differing:
@@ -70,7 +71,7 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
         incomplete = "an incomplete dataset of other software"
         kind = incomplete if name == "versions" else "another dataset"
         raise files.StorageError(
-            f"{root} holds {kind}: its {name} is {found.get(name)}, not "
+            f"{root} holds {kind}: its {name} is {present.get(name)}, not "
             f"{description.get(name)}; choose another folder, or remove this one"
         )
 
@@ -133,16 +134,16 @@ def verify(root: Path, key: str, arrays: bool = True) -> Record:
     content = _read(path, Path.read_bytes)
     try:
         record = json.loads(content)
-        said = record.pop("digest")
+        expected = record.pop("digest")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DamagedEpisode(f"{path}: {_reason(error)}") from error
-    if _hash(record) != said or record["key"] != key:
-        raise DamagedEpisode(f"{path}: expected content with hash {said}, got {_hash(record)}")
+    if _hash(record) != expected or record["key"] != key:
+        raise DamagedEpisode(f"{path}: expected content with hash {expected}, got {_hash(record)}")
     for name, file in record["files"].items() if arrays else ():
         got = _read(folder / name, files.sha256)
         if got != file["sha256"]:
             raise DamagedEpisode(f"{folder / name}: expected sha256 {file['sha256']}, got {got}")
-    return {**record, "digest": said}
+    return {**record, "digest": expected}
 
 
 def verify_all(
@@ -220,16 +221,46 @@ def read_seal(root: Path) -> dict[str, Any]:
         raise ValueError(f"{root}: the demonstrations are not complete; run the collection again")
     try:
         sealed = json.loads(path.read_bytes())
-        said = sealed.pop("digest")
+        expected = sealed.pop("digest")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: {_reason(error)}") from error
-    if _hash(sealed) != said:
-        raise ValueError(f"{path}: expected content with hash {said}, got {_hash(sealed)}")
+    if _hash(sealed) != expected:
+        raise ValueError(f"{path}: expected content with hash {expected}, got {_hash(sealed)}")
     where = root / "dataset.json"
     got = files.sha256(where) if where.exists() else "no file"
     if got != sealed["dataset.json"]:
         raise ValueError(f"{where}: expected sha256 {sealed['dataset.json']}, got {got}")
-    return {**sealed, "digest": said}
+    return {**sealed, "digest": expected}
+
+
+def write(
+    root: Path,
+    description: Mapping[str, Any],
+    episodes: Iterable[tuple[str, Record, Callable[[], Mapping[str, Sequence[np.ndarray]]]]],
+    size: int = 0,
+    note: Callable[[int], None] = lambda count: None,
+) -> str:
+    """Writes and seals a dataset; a killed run is resumed. Returns its digest.
+
+    Args:
+      episodes: key, outcome and reader of the arrays, see `commit`.
+      size: bytes of all arrays, for the check of free space.
+      note: called with 1 after every episode.
+
+    Raises:
+      StorageError: `root` cannot be written, or holds another dataset.
+    """
+    with files.lock(root):
+        create(root, description)
+        clean(root)
+        files.require_writable(root, size)
+        present, records = set(keys(root)), {}
+        for key, outcome, read in episodes:
+            # Episodes of a killed run are checked, not written again.
+            is_present = key in present
+            records[key] = verify(root, key) if is_present else commit(root, key, outcome, read())
+            note(1)
+        return seal(root, records)
 
 
 def _hashed(parts: Sequence[bytes | memoryview]) -> dict[str, Any]:

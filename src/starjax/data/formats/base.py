@@ -22,7 +22,7 @@ FORMATS = Registry(
 )
 OURS = "starjax"  # name of the metadata and columns from which an export is restored
 MEMORY_SHARE = 0.25  # of the host's memory, for one episode
-_MOST_HZ = 1e5
+_MAX_HZ = 1e5
 
 
 class Column(NamedTuple):
@@ -95,11 +95,10 @@ def detect(path: Path) -> str:
     """
     if not path.exists():
         raise errors.UsageError("PATH", "a dataset", f"{path}, which does not exist")
-    found = [name for name in FORMATS.names() if FORMATS.get(name).recognises(path)]
-    if not found:
-        known = ", ".join(FORMATS.names())
-        raise errors.UsageError("PATH", known, f"{path} of unknown format")
-    return found[0]
+    for name in FORMATS.names():
+        if FORMATS.get(name).recognises(path):
+            return name
+    raise errors.UsageError("PATH", ", ".join(FORMATS.names()), f"{path} of unknown format")
 
 
 @contextlib.contextmanager
@@ -114,23 +113,28 @@ def open_dataset(path: Path, name: str) -> Iterator[Source]:
         with explained(path, name):
             source = stack.enter_context(form.open(path))
             require(bool(source.lengths), "episodes", 0)
-            require(0.0 <= source.hz < _MOST_HZ, "steps per second", source.hz)
+            require(0.0 <= source.hz < _MAX_HZ, "steps per second", source.hz)
 
         def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
             for column in names:
                 errors.choice("column", column, source.columns)
             with explained(path, name, episode):
                 _require_all_fit(source, episode, names)
-                found = source.read(episode, names)
+                arrays = source.read(episode, names)
                 for column in names:
-                    _check(column, found[column], source, episode)
-            return found
+                    _check(column, arrays[column], source, episode)
+            return arrays
 
         yield source._replace(read=read)
 
 
 class Damaged(ValueError):
     """Raised by a format's reader where a file is wrong; becomes the line of `open_dataset`."""
+
+
+def origin_hz(origin: Mapping[str, Any] | None) -> float:
+    """Returns the control steps per second of a starjax export; 0 for other datasets."""
+    return float((origin or {}).get("description", {}).get("control_hz", 0.0))
 
 
 def require(holds: bool, what: str, got: Any) -> None:
@@ -148,8 +152,8 @@ def require_inside(root: Path, path: Path) -> Path:
 def require_fits(name: str, shape: Sequence[int], dtype: Any) -> None:
     """Raises Damaged for an array whose header claims more than this machine's memory."""
     count = math.prod(shape) * np.dtype(dtype).itemsize
-    most = MEMORY_SHARE * xla.memory_bytes()
-    require(0 <= count <= most, f"at most {files.size(most)} an episode of {name}", count)
+    max_count = MEMORY_SHARE * xla.memory_bytes()
+    require(0 <= count <= max_count, f"at most {files.size(max_count)} an episode of {name}", count)
 
 
 def _require_all_fit(source: Source, episode: int, names: Collection[str]) -> None:
@@ -169,12 +173,12 @@ def explained(path: Path, name: str, episode: int | None = None) -> Iterator[Non
     # Damaged files make these libraries raise nearly anything.
     except Exception as error:
         where = f"{path}" if episode is None else f"{path}, episode {episode}"
-        said = " ".join(str(error).split())[:200] or type(error).__name__
-        raise errors.UsageError(where, f"a sound {name} dataset", said) from error
+        text = " ".join(str(error).split())[:200] or type(error).__name__
+        raise errors.UsageError(where, f"a sound {name} dataset", text) from error
 
 
 def _check(name: str, array: np.ndarray, source: Source, episode: int) -> None:
     column, length = source.columns[name], source.lengths[episode]
-    wanted = (length, *column.shape)
-    require(array.shape == wanted, f"{name} of shape {list(wanted)}", list(array.shape))
+    shape = (length, *column.shape)
+    require(array.shape == shape, f"{name} of shape {list(shape)}", list(array.shape))
     require(array.dtype == column.dtype, f"{name} of {column.dtype}", array.dtype)

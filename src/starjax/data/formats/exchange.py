@@ -5,6 +5,7 @@ ours as it is, under `starjax.<field>`. Images are there once.
 """
 
 import contextlib
+import functools
 import json
 import shutil
 from collections.abc import Callable, Collection, Iterator
@@ -54,12 +55,12 @@ def source(root: Path, form: base.Format, image_size: int = 0) -> Source:
 
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
         arrays = _arrays(root, description, kept[episode])
-        found = {named[name]: array for name, array in arrays.items()}
-        made = _derived(arrays, kept[episode], description)
-        found |= {form.named(name): array for name, array in made.items()}
+        by_column = {named[name]: array for name, array in arrays.items()}
+        derived = _derived(arrays, kept[episode], description)
+        by_column |= {form.named(name): array for name, array in derived.items()}
         rows = np.arange(first[episode], first[episode + 1])
-        found |= {name: drawn[name][rows] for name in drawn if name in names}
-        return {name: found[name] for name in names}
+        by_column |= {name: drawn[name][rows] for name in drawn if name in names}
+        return {name: by_column[name] for name in names}
 
     columns = {form.named(name): column for name, column in _extra(description).items()}
     columns |= {named[name]: column for name, column in fields.items()}
@@ -100,7 +101,7 @@ def _drawn(
 
 
 def export(
-    found: Source,
+    dataset: Source,
     out: Path,
     form: base.Format,
     video: bool = True,
@@ -114,19 +115,19 @@ def export(
 
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
         note(1)
-        return found.read(episode, names)
+        return dataset.read(episode, names)
 
     with _staged(out) as staged:
-        form.write(staged, found._replace(read=read), video)
+        form.write(staged, dataset._replace(read=read), video)
 
 
 def restore_export(
-    found: Source, root: Path, note: Callable[[int], None] = lambda count: None
+    dataset: Source, root: Path, note: Callable[[int], None] = lambda count: None
 ) -> dict[str, Any]:
     """Writes an export of ours, which has an origin, as the dataset that it was.
 
     Args:
-      note: hears of every episode that is written.
+      note: called with 1 after every episode.
 
     Returns:
       {"digest", "episodes", "same"}: `same` is whether every byte is as it was.
@@ -134,24 +135,17 @@ def restore_export(
     Raises:
       errors.UsageError: the origin does not describe a dataset.
     """
-    assert found.origin is not None
-    origin = _checked(found.origin, found)
-    description, stored = origin["description"], iter(range(len(found.lengths)))
-    with files.lock(root):
-        store.create(root, description)
-        store.clean(root)
-        known, records = set(store.keys(root)), {}
-        for outcome, is_stored in zip(origin["records"], origin["stored"], strict=True):
-            episode = next(stored) if is_stored else None
-            key = outcome["key"]
-            if key in known:  # of a run that was killed
-                records[key] = store.verify(root, key)
-                continue
-            arrays = {} if episode is None else _ours(found, origin, episode)
-            records[key] = store.commit(root, key, outcome, arrays)
-            note(1)
-        digest = store.seal(root, records)
+    assert dataset.origin is not None
+    origin = _checked(dataset.origin, dataset)
     count = sum(map(bool, origin["stored"]))
+    stored = iter(range(count))
+    rows = (
+        (outcome["key"], outcome, functools.partial(_ours, dataset, origin, next(stored)))
+        if is_stored
+        else (outcome["key"], outcome, dict)
+        for outcome, is_stored in zip(origin["records"], origin["stored"], strict=True)
+    )
+    digest = store.write(root, origin["description"], rows, note=note)
     return {"digest": digest, "episodes": count, "same": digest == origin["digest"]}
 
 
@@ -199,7 +193,7 @@ def _extra(description: dict[str, Any]) -> dict[str, Column]:
     places = [
         name.replace("gripper", "") for name in names if name[-1] in "xyz" and "q" not in name
     ]
-    found = {
+    columns = {
         "state": Column((8 * arms,), "float32", tuple(names)),
         "action": Column((8 * arms,), "float32", tuple(names)),
         "trocar": Column((3 * arms,), "float32", tuple(places)),
@@ -208,10 +202,10 @@ def _extra(description: dict[str, Any]) -> dict[str, Column]:
     }
     if "state" in description["features"]:
         count = description["features"]["state"]["shape"]
-        said = description.get("task", {}).get("fields", [])
-        labels = tuple(f"{name}.{i}" for name, size, *_ in said for i in range(size))
-        found["environment_state"] = Column(tuple(count), "float32", labels)
-    return found
+        fields = description.get("task", {}).get("fields", [])
+        labels = tuple(f"{name}.{i}" for name, size, *_ in fields for i in range(size))
+        columns["environment_state"] = Column(tuple(count), "float32", labels)
+    return columns
 
 
 def _derived(
@@ -221,14 +215,14 @@ def _derived(
     reference = np.asarray(description["p_world_ref"], np.float32)
     trocar = np.asarray(rcm.trocar_position(places, reference)).reshape(1, -1)
     last = np.arange(length) == length - 1
-    found = {
+    derived = {
         "state": _poses(arrays["p"], arrays["R"], arrays["gripper"]),
         "action": _poses(arrays["command_p"], arrays["command_R"], arrays["command_gripper"]),
         "trocar": np.repeat(trocar, length, axis=0).astype(np.float32),
         "reward": (last & record["success"]).astype(np.float32),
         "done": last,
     }
-    return found | ({"environment_state": arrays["state"]} if "state" in arrays else {})
+    return derived | ({"environment_state": arrays["state"]} if "state" in arrays else {})
 
 
 def _poses(p: np.ndarray, R: np.ndarray, gripper: np.ndarray) -> np.ndarray:
@@ -242,7 +236,7 @@ def _poses(p: np.ndarray, R: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     return rows.reshape(len(p), -1).astype(np.float32)
 
 
-def _checked(origin: dict[str, Any], found: Source) -> dict[str, Any]:
+def _checked(origin: dict[str, Any], dataset: Source) -> dict[str, Any]:
     """Checks that an origin is complete and fits the files; it is untrusted input."""
     try:
         description, records = origin["description"], origin["records"]
@@ -250,31 +244,31 @@ def _checked(origin: dict[str, Any], found: Source) -> dict[str, Any]:
         base.require(counts[0] == counts[1], f"{counts[0]} episodes", counts[1])
         stored = [r for r, kept in zip(records, origin["stored"]) if kept]
         lengths = [record["length"] for record in stored]
-        base.require(lengths == list(found.lengths), f"lengths {lengths}", list(found.lengths))
+        base.require(lengths == list(dataset.lengths), f"lengths {lengths}", list(dataset.lengths))
         for record in records:
             base.require(store.is_key(record["key"]), "an episode's key", record["key"])
         for field, feature in description["features"].items():
             base.require(field.replace("_", "").isalnum(), "a field's name", field)
-            column = found.columns[origin["columns"][field]]
+            column = dataset.columns[origin["columns"][field]]
             same = np.prod(column.shape) == np.prod(feature["shape"])
             base.require(bool(same), f"{field} of shape {feature['shape']}", column.shape)
         json.dumps(description)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        said = f"{type(error).__name__}: {error}"
+        text = f"{type(error).__name__}: {error}"
         raise errors.UsageError(
-            "PATH", "what an export of starjax says of itself", said, "a --map reads it as others'"
+            "PATH", "what an export of starjax says of itself", text, "a --map reads it as others'"
         ) from error
     return origin
 
 
-def _ours(found: Source, origin: dict[str, Any], episode: int) -> dict[str, list[np.ndarray]]:
+def _ours(dataset: Source, origin: dict[str, Any], episode: int) -> dict[str, list[np.ndarray]]:
     """Reads the fields of an episode in the order of `rollouts.episodes.assemble`."""
     names, features = origin["columns"], origin["description"]["features"]
-    arrays = found.read(episode, [names[field] for field in features])
+    arrays = dataset.read(episode, [names[field] for field in features])
     return {
         field: [
             arrays[names[field]]
-            .reshape(found.lengths[episode], *features[field]["shape"])
+            .reshape(dataset.lengths[episode], *features[field]["shape"])
             .astype(np.dtype(features[field]["dtype"]), copy=False)
         ]
         for field in sorted(features)

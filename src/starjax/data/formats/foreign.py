@@ -4,8 +4,9 @@ The first reads numbers only, for anomalies and trocars. The second writes episo
 with images, as `data.demos` would have.
 """
 
+import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from starjax.data.formats import mapping as maps
 from starjax.data.formats import motion, trocars
 from starjax.data.formats.base import Source
 from starjax.data.formats.mapping import CameraColumn, Map
-from starjax.data.formats.motion import HZ, Motion
+from starjax.data.formats.motion import HZ
 from starjax.rollouts import episodes
 from starjax.runtime import files, xla
 from starjax.sim import registries
@@ -74,61 +75,76 @@ def import_mapped(
     if not hz and not mapping.time:
         raise errors.UsageError("--map: hz", "steps per second, which the files do not say", "none")
 
-    def moved(arrays: dict[str, np.ndarray]) -> Motion:
-        return motion.read(arrays, mapping, hz, folder)
-
     kept, tips, notes = [], [], list(source.notes)
     for episode in range(len(source.lengths)):
         arrays = source.read(episode, maps.names(mapping))
         try:
-            found = moved(arrays)
-            is_good = _succeeded(arrays, mapping)
+            poses = motion.read(arrays, mapping, hz, folder)
+            success = not mapping.success or bool(
+                maps.pick(arrays, mapping.success, 1)[-1, 0] > 0.5
+            )
         except motion.Gap as gap:
             notes.append(f"episode {episode}: {gap}; left out")
         except errors.UsageError as error:
             line = f"{error.got} in episode {episode}"
             raise errors.UsageError(error.argument, error.expected, line) from error
         else:
-            notes += [f"episode {episode}: {line}" for line in found.notes]
-            tips.append(trocars.subsample(found))
-            kept.append(_Kept(episode, len(found.pose.p), -1, is_good))
+            notes += [f"episode {episode}: {line}" for line in poses.notes]
+            tips.append(trocars.subsample(poses))
+            kept.append(_Kept(episode, len(poses.pose.p), -1, success))
         note(1)
     places, is_known = trocars.locate(tips, mapping, [k.episode for k in kept], notes)
-    kept, places = (list(itertools.compress(items, is_known)) for items in (kept, places))
-    tips = list(itertools.compress(tips, is_known))
+    kept, places, tips = (
+        list(itertools.compress(items, is_known)) for items in (kept, places, tips)
+    )
     if not kept:
-        said = notes[-1] if notes else "no episode"
-        raise errors.UsageError("PATH", "demonstrations to keep", said)
+        reason = notes[-1] if notes else "no episode"
+        raise errors.UsageError("PATH", "demonstrations to keep", reason)
     groups, centres = trocars.group(np.array(places))
     kept = [k._replace(trocar=int(group)) for k, group in zip(kept, groups)]
     residual = trocars.residual(tips, centres[groups], [k.episode for k in kept], notes)
     description = _describe(source, mapping, task, kept, centres, hz)
-    about = {"notes": notes, "residual_mm": np.round(residual, 4).tolist()}
-    digest = _written(root, description, about, source, mapping, kept, centres, task, moved, note)
-    return Imported(
-        digest,
-        len(kept),
-        len(source.lengths) - len(kept),
-        sum(k.length for k in kept),
-        centres[groups],
-        residual,
-        notes,
-    )
+    trials = np.zeros(len(centres), int)
+
+    def episodes_to_write() -> Iterator[tuple[str, store.Record, Callable[[], Any]]]:
+        for k in kept:
+            trial = int(trials[k.trocar])
+            trials[k.trocar] += 1
+            outcome = {
+                "trocar": k.trocar,
+                **dict(zip(rcm.Trocar._fields, zip(*description["trocars"][k.trocar]))),
+                "trial": trial,
+                "seed": 0,
+                "length": k.length,
+                **dict.fromkeys(episodes.FLAGS, False),
+                "success": k.success,
+                "loose": k.success,
+                "stage": 0,
+                "labels": dict.fromkeys(task.labels, 0),
+                "episode": k.episode,
+            }
+            read = functools.partial(_fields, source, mapping, k, hz, folder, centres[k.trocar])
+            yield store.key(k.trocar, trial, 0), outcome, read
+        # After the last episode and before the seal.
+        about = {"notes": notes, "residual_mm": np.round(residual, 4).tolist()}
+        files.write_json(root / schema.IMPORTED, about)
+
+    frames = sum(k.length for k in kept)
+    size = schema.frame_bytes(description) * frames
+    digest = store.write(root, description, episodes_to_write(), size, note)
+    left_out = len(source.lengths) - len(kept)
+    return Imported(digest, len(kept), left_out, frames, centres[groups], residual, notes)
 
 
 def _fits(source: Source, mapping: Map, task: Any) -> None:
     maps.check(mapping, source)
-    arms, wanted = len(mapping.arms), len(task.slots)
-    if arms != wanted:
-        raise errors.UsageError("--map: arms", f"{wanted}, as task {mapping.task} has", arms)
+    arms, slots = len(mapping.arms), len(task.slots)
+    if arms != slots:
+        raise errors.UsageError("--map: arms", f"{slots}, as task {mapping.task} has", arms)
     for name in mapping.cameras:
         errors.choice("--map: cameras", name, task.cameras)
     if not mapping.cameras and not mapping.state:
         raise errors.UsageError("--map", "cameras or a state, to learn from", "neither")
-
-
-def _succeeded(arrays: dict[str, np.ndarray], mapping: Map) -> bool:
-    return not mapping.success or bool(maps.pick(arrays, mapping.success, 1)[-1, 0] > 0.5)
 
 
 def _describe(
@@ -171,105 +187,47 @@ def _describe(
 
 def _shapes(source: Source, mapping: Map, arms: int) -> dict[str, tuple[tuple[int, ...], str]]:
     real = np.dtype(np.float32).str
-    found: dict[str, tuple[tuple[int, ...], str]] = {
+    shapes: dict[str, tuple[tuple[int, ...], str]] = {
         f"{before}{name}": ((arms, *shape), real)
         for before in ("", "command_")
         for name, shape in (("p", (3,)), ("R", (3, 3)), ("gripper", ()))
     }
-    found["rcm_error"] = ((arms,), real)
+    shapes["rcm_error"] = ((arms,), real)
     if mapping.state:
-        some = maps.pick(source.read(0, maps.names(mapping)), mapping.state)
-        found["state"] = (some.shape[1:], real)
+        rows = maps.pick(source.read(0, maps.names(mapping)), mapping.state)
+        shapes["state"] = (rows.shape[1:], real)
     for name, camera in mapping.cameras.items():
         shape = source.columns[camera.column].shape
         blank = pictures(np.zeros((1, *shape), np.uint8), camera)
-        found[f"{episodes.IMAGE}{name}"] = (blank.shape[1:], np.dtype(np.uint8).str)
-    return found
-
-
-def _written(
-    root: Path,
-    description: dict[str, Any],
-    about: dict[str, Any],
-    source: Source,
-    mapping: Map,
-    kept: list[_Kept],
-    centres: np.ndarray,
-    task: Any,
-    moved: Callable[[dict[str, np.ndarray]], Motion],
-    note: Callable[[int], None],
-) -> str:
-    """Commits the episodes; returns the digest."""
-    labels = dict.fromkeys(task.labels, 0)
-    trials = np.zeros(len(centres), int)
-    frame_bytes = sum(
-        int(np.prod(f["shape"])) * np.dtype(f["dtype"]).itemsize
-        for f in description["features"].values()
-    )
-    with files.lock(root):
-        store.create(root, description)
-        store.clean(root)
-        files.require_writable(root, frame_bytes * sum(k.length for k in kept))
-        known, records = set(store.keys(root)), {}
-        for k in kept:
-            key = store.key(k.trocar, int(trials[k.trocar]), 0)
-            outcome = {
-                "trocar": k.trocar,
-                **_place(description["trocars"][k.trocar]),
-                "trial": int(trials[k.trocar]),
-                "seed": 0,
-                "length": k.length,
-                **dict.fromkeys(episodes.FLAGS, False),
-                "success": k.success,
-                "loose": k.success,
-                "stage": 0,
-                "labels": labels,
-                "episode": k.episode,
-            }
-            trials[k.trocar] += 1
-            if key in known:  # of a run that was killed
-                records[key] = store.verify(root, key)
-            else:
-                raw = source.read(k.episode, maps.names(mapping))
-                arrays = _fields(source, mapping, k, raw, moved(raw), centres[k.trocar])
-                parts = {name: [arrays[name]] for name in sorted(arrays)}
-                records[key] = store.commit(root, key, outcome, parts)
-            note(1)
-        files.write_json(root / schema.IMPORTED, about)
-        return store.seal(root, records)
-
-
-def _place(trocar: list[list[float]]) -> dict[str, list[float]]:
-    return {name: [arm[i] for arm in trocar] for i, name in enumerate(rcm.Trocar._fields)}
+        shapes[f"{episodes.IMAGE}{name}"] = (blank.shape[1:], np.dtype(np.uint8).str)
+    return shapes
 
 
 def _fields(
-    source: Source,
-    mapping: Map,
-    kept: _Kept,
-    raw: dict[str, np.ndarray],
-    found: Motion,
-    place: np.ndarray,
-) -> dict[str, np.ndarray]:
-    off = np.cross(found.pose.p - place, found.pose.R[..., 2])
+    source: Source, mapping: Map, kept: _Kept, hz: float, folder: Path, p_world_trocar: np.ndarray
+) -> dict[str, list[np.ndarray]]:
+    """Reads the fields of an episode."""
+    columns = source.read(kept.episode, maps.names(mapping))
+    poses = motion.read(columns, mapping, hz, folder)
+    off = np.cross(poses.pose.p - p_world_trocar, poses.pose.R[..., 2])
     arrays = {
-        "p": found.pose.p,
-        "R": found.pose.R,
-        "gripper": found.gripper,
-        "command_p": found.command.p,
-        "command_R": found.command.R,
-        "command_gripper": found.command_gripper,
+        "p": poses.pose.p,
+        "R": poses.pose.R,
+        "gripper": poses.gripper,
+        "command_p": poses.command.p,
+        "command_R": poses.command.R,
+        "command_gripper": poses.command_gripper,
         "rcm_error": np.linalg.norm(off, axis=-1),
     }
     if mapping.state:
-        arrays["state"] = maps.pick(raw, mapping.state)[found.nearest]
+        arrays["state"] = maps.pick(columns, mapping.state)[poses.nearest]
     arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
-    columns = [camera.column for camera in mapping.cameras.values()]
-    images = source.read(kept.episode, columns) if columns else {}
+    cameras = [camera.column for camera in mapping.cameras.values()]
+    images = source.read(kept.episode, cameras) if cameras else {}
     for name, camera in mapping.cameras.items():
-        shown = images[camera.column][found.nearest]
+        shown = images[camera.column][poses.nearest]
         arrays[f"{episodes.IMAGE}{name}"] = pictures(shown, camera)
-    return arrays
+    return {name: [arrays[name]] for name in sorted(arrays)}
 
 
 def pictures(images: np.ndarray, camera: CameraColumn) -> np.ndarray:

@@ -74,18 +74,18 @@ def _open(path: Path) -> Iterator[Source]:
 
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
         place = places[episode]
-        low = [name for name in names if kinds[name] != "video"]
-        table = _rows(path, place, low)
-        found = {
+        numeric = [name for name in names if kinds[name] != "video"]
+        table = _rows(path, place, numeric)
+        arrays = {
             name: _array(name, table[name], columns[name], kinds[name], place.length)
-            for name in low
+            for name in numeric
         }
         for name in names:
             if kinds[name] == "video":
                 file, first = place.videos[name]
                 base.require_inside(path, file)
-                found[name] = video.read(file, first, place.length, hz, columns[name].shape)
-        return found
+                arrays[name] = video.read(file, first, place.length, hz, columns[name].shape)
+        return arrays
 
     ours = path / "meta" / f"{base.OURS}.json"
     origin = files.read_json(ours) if ours.exists() else None
@@ -110,12 +110,12 @@ def _column(feature: dict[str, Any]) -> Column | None:
 
 
 def _places_v3(root: Path, info: dict[str, Any], cameras: list[str]) -> Iterator[_Place]:
-    found = sorted((root / "meta/episodes").glob("*/*.parquet"))
-    base.require(bool(found), "meta/episodes/*/*.parquet", "none")
-    for path in found:
+    paths = sorted((root / "meta/episodes").glob("*/*.parquet"))
+    base.require(bool(paths), "meta/episodes/*/*.parquet", "none")
+    for path in paths:
         table = parquet.read_table(base.require_inside(root, path))
-        wanted = [name for name in table.column_names if not name.startswith("stats/")]
-        for row in table.select(wanted).to_pylist():
+        names = [name for name in table.column_names if not name.startswith("stats/")]
+        for row in table.select(names).to_pylist():
             videos = {
                 name: (
                     root / "videos" / name / _file(row, f"videos/{name}", "mp4"),
@@ -135,9 +135,7 @@ def _file(row: dict[str, Any], kind: str, ending: str) -> str:
 
 def _places_v2(root: Path, info: dict[str, Any], cameras: list[str]) -> Iterator[_Place]:
     size = int(info.get("chunks_size") or _CHUNK)
-    with open(root / "meta/episodes.jsonl") as lines:
-        rows = [json.loads(line) for line in lines if line.strip()]
-    for row in rows:
+    for row in _json_lines(root / "meta/episodes.jsonl"):
         number = int(row["episode_index"])
         base.require(number >= 0, "an episode's number", number)
         chunk, name = f"chunk-{number // size:03d}", f"episode_{number:06d}"
@@ -164,11 +162,11 @@ def _rows(root: Path, place: _Place, names: list[str]) -> Any:
     if not names:
         return {}
     base.require(place.table.is_file(), "a file of numbers", f"none at {place.table}")
-    lies = datasets.dataset(base.require_inside(root, place.table), format="parquet")
+    table = datasets.dataset(base.require_inside(root, place.table), format="parquet")
     is_its = datasets.field("episode_index") == place.number
-    order = "frame_index" if "frame_index" in lies.schema.names else "episode_index"
-    wanted = dict.fromkeys([*names, order])
-    return lies.to_table(columns=list(wanted), filter=is_its).sort_by(order)
+    order = "frame_index" if "frame_index" in table.schema.names else "episode_index"
+    columns = dict.fromkeys([*names, order])
+    return table.to_table(columns=list(columns), filter=is_its).sort_by(order)
 
 
 def _array(name: str, cells: Any, column: Column, kind: str, length: int) -> np.ndarray:
@@ -195,14 +193,18 @@ def _picture(cell: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
 def _task(path: Path) -> str:
     """Returns the task's description; empty if there is not exactly one."""
     modern, old = path / "meta/tasks.parquet", path / "meta/tasks.jsonl"
-    said = []
+    tasks = []
     if modern.exists():
         table = parquet.read_table(modern)
         texts = [name for name in table.column_names if pa.types.is_string(table[name].type)]
-        said = table[texts[0]].to_pylist() if texts else []
+        tasks = table[texts[0]].to_pylist() if texts else []
     elif old.exists():
-        said = [json.loads(line)["task"] for line in old.read_text().splitlines() if line.strip()]
-    return str(said[0]) if len(said) == 1 else ""
+        tasks = [row["task"] for row in _json_lines(old)]
+    return str(tasks[0]) if len(tasks) == 1 else ""
+
+
+def _json_lines(path: Path) -> list[Any]:
+    return [json.loads(line) for line in path.read_text().split("\n") if line.strip()]
 
 
 def _recognises(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ _COUNTED = {
     "task_index": "int64",
 }
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-_LOOKED_AT = 20  # images of an episode whose statistics are taken
+_SAMPLES = 20  # images of an episode whose statistics are taken
 _EVERY = 4  # pixels of them
 
 
@@ -34,119 +35,93 @@ def write(path: Path, source: Source, with_video: bool) -> None:
     if hz != source.hz or hz < 1:
         raise errors.UsageError("DATASET", "a whole number of steps per second", source.hz)
     features = _features(source, hz, with_video)
-    moving = {name: column for name, column in source.columns.items() if column.is_image}
-    moving = moving if with_video else {}
-    table, films = _Table(path, features), {name: _Films(path, name, hz) for name in moving}
-    rows, seen, first = [], {}, 0
+    cameras = [name for name, column in source.columns.items() if column.is_image]
+    tables = _Files(path, "data", "parquet", DATA_MB)
+    videos = {
+        name: _Files(path, f"videos/{name}", "mp4", VIDEO_MB) for name in cameras if with_video
+    }
+    rows, samples, first = [], {}, 0
     for episode, length in enumerate(source.lengths):
         arrays = source.read(episode, source.columns)
         arrays |= _counted(episode, length, first, hz)
         row = {"episode_index": episode, "tasks": [source.task], "length": length}
         row |= {"dataset_from_index": first, "dataset_to_index": first + length}
         row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-        for name, film in films.items():
-            row |= film.append(arrays.pop(name))
-        row |= table.append(arrays)
-        for name, figures in _looked_at(source, arrays, films).items():
-            row |= {f"stats/{name}/{key}": value for key, value in _stats(figures).items()}
-            seen.setdefault(name, []).append(figures)
+        for name, files_of_camera in videos.items():
+            row |= _append_images(files_of_camera, name, arrays[name], hz)
+        row |= _append_rows(tables, features, arrays)
+        # Videos come first: the order of the columns is part of the file.
+        for name in [*videos, *(name for name in arrays if name not in videos)]:
+            array = _sampled(arrays[name]) if name in cameras else arrays[name]
+            row |= {f"stats/{name}/{key}": value for key, value in _stats(array).items()}
+            samples.setdefault(name, []).append(array)
         rows.append(row)
         first += length
-    table.close()
-    for film in films.values():
-        film.close()
-    _meta(path, source, features, rows, seen, hz)
+    for some in (tables, *videos.values()):
+        some.close()
+    _meta(path, source, features, rows, samples, hz)
 
 
-class _Numbered:
-    """Files of about a size, numbered as LeRobot does."""
+class _Files:
+    """Files of at most `max_mb`, until the next episode, one after another as LeRobot has them."""
 
-    def __init__(self, root: Path, kind: str, ending: str):
-        self._root, self._kind, self._ending, self.count = root, kind, ending, -1
+    def __init__(self, root: Path, kind: str, ending: str, max_mb: int):
+        self._root, self._kind, self._ending, self._max_bytes = root, kind, ending, max_mb * 1e6
+        self._writer: Any = None
+        self._path, self._count = root, -1
 
-    def next(self) -> Path:
-        """Returns the path of the next file."""
-        self.count += 1
-        chunk, file = divmod(self.count, CHUNK)
-        path = self._root / self._kind / f"chunk-{chunk:03d}/file-{file:03d}.{self._ending}"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return path
-
-    def place(self) -> dict[str, int]:
-        """Returns the columns that locate the current file."""
-        chunk, file = divmod(self.count, CHUNK)
-        return {f"{self._kind}/chunk_index": chunk, f"{self._kind}/file_index": file}
-
-
-class _Table:
-    """data/*: an episode a row group."""
-
-    def __init__(self, root: Path, features: dict[str, Any]):
-        self._files, self._writer, self._features = (
-            _Numbered(root, "data", "parquet"),
-            None,
-            features,
-        )
-        self._path = root
-
-    def append(self, arrays: dict[str, np.ndarray]) -> dict[str, int]:
-        """Writes an episode; returns where it is."""
-        names = [name for name, feature in self._features.items() if feature["dtype"] != "video"]
-        table = pa.table({name: _cells(arrays[name], self._features[name]) for name in names})
-        described = {name: _described(self._features[name]) for name in names}
-        said = json.dumps({"info": {"features": described}})
-        table = table.replace_schema_metadata({"huggingface": said})
-        if self._writer and self._path.stat().st_size > DATA_MB * 1e6:
+    def writer(self, open_file: Callable[[Path], Any]) -> Any:
+        """Returns the writer of the present file, or of the next one if that is full."""
+        if self._writer and self._path.stat().st_size > self._max_bytes:
             self.close()
         if self._writer is None:
-            self._path = self._files.next()
-            self._writer = parquet.ParquetWriter(self._path, table.schema)
-        self._writer.write_table(table)
-        return self._files.place()
+            self._count += 1
+            chunk, file = divmod(self._count, CHUNK)
+            name = f"chunk-{chunk:03d}/file-{file:03d}.{self._ending}"
+            self._path = self._root / self._kind / name
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = open_file(self._path)
+        return self._writer
+
+    def place(self) -> dict[str, int]:
+        """Returns the columns that locate the present file."""
+        chunk, file = divmod(self._count, CHUNK)
+        return {f"{self._kind}/chunk_index": chunk, f"{self._kind}/file_index": file}
 
     def close(self) -> None:
-        """Ends the file."""
-        assert self._writer is not None
+        """Ends the present file."""
         self._writer.close()
         self._writer = None
 
 
-class _Films:
-    """videos/<camera>/*: episodes one after another."""
+def _append_rows(
+    tables: _Files, features: dict[str, Any], arrays: dict[str, np.ndarray]
+) -> dict[str, int]:
+    """Writes the numbers of an episode as one row group of data/*; returns its place."""
+    names = [name for name, feature in features.items() if feature["dtype"] != "video"]
+    table = pa.table({name: _cells(arrays[name], features[name]) for name in names})
+    described = {name: _described(features[name]) for name in names}
+    text = json.dumps({"info": {"features": described}})
+    table = table.replace_schema_metadata({"huggingface": text})
+    tables.writer(lambda path: parquet.ParquetWriter(path, table.schema)).write_table(table)
+    return tables.place()
 
-    def __init__(self, root: Path, name: str, hz: int):
-        self._files, self._hz, self._name = _Numbered(root, f"videos/{name}", "mp4"), hz, name
-        self._film: video.Writer | None = None
-        self.sampled = np.zeros(0)
 
-    def append(self, images: np.ndarray) -> dict[str, Any]:
-        """Writes an episode; returns where it is."""
-        self.sampled = _sampled(images)
-        if self._film and self._film.bytes > VIDEO_MB * 1e6:
-            self.close()
-        if self._film is None:
-            self._film = video.Writer(self._files.next(), images.shape[1:], self._hz)
-        begins = self._film.seconds
-        self._film.append(images)
-        times = {"from_timestamp": begins, "to_timestamp": self._film.seconds}
-        return self._files.place() | {f"videos/{self._name}/{k}": v for k, v in times.items()}
-
-    def close(self) -> None:
-        """Ends the file."""
-        assert self._film is not None
-        self._film.close()
-        self._film = None
+def _append_images(videos: _Files, name: str, images: np.ndarray, hz: int) -> dict[str, Any]:
+    """Writes the images of an episode to videos/<camera>/*; returns their place."""
+    writer = videos.writer(lambda path: video.Writer(path, images.shape[1:], hz))
+    start = writer.seconds
+    writer.append(images)
+    times = {"from_timestamp": start, "to_timestamp": writer.seconds}
+    return videos.place() | {f"videos/{name}/{key}": time for key, time in times.items()}
 
 
 def _features(source: Source, hz: int, with_video: bool) -> dict[str, Any]:
-    found = {
+    columns = {name: Column((1,), dtype) for name, dtype in _COUNTED.items()}
+    return {
         name: _picture(column, hz, with_video) if column.is_image else _feature(column)
-        for name, column in source.columns.items()
+        for name, column in {**source.columns, **columns}.items()
     }
-    counted = {
-        name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _COUNTED.items()
-    }
-    return found | counted
 
 
 def _feature(column: Column) -> dict[str, Any]:
@@ -157,9 +132,9 @@ def _feature(column: Column) -> dict[str, Any]:
 
 def _picture(column: Column, hz: int, with_video: bool) -> dict[str, Any]:
     shape = list(column.shape)
-    found = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+    feature = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
     if not with_video:
-        return found
+        return feature
     about = {
         "video.height": shape[0],
         "video.width": shape[1],
@@ -170,19 +145,19 @@ def _picture(column: Column, hz: int, with_video: bool) -> dict[str, Any]:
         "video.channels": 3,
         "has_audio": False,
     }
-    return found | {"dtype": "video", "info": about}
+    return feature | {"dtype": "video", "info": about}
 
 
 def _counted(episode: int, length: int, first: int, hz: int) -> dict[str, np.ndarray]:
     steps = np.arange(length)
-    found = {
+    arrays = {
         "timestamp": steps / hz,
         "frame_index": steps,
         "episode_index": np.full(length, episode),
         "index": first + steps,
         "task_index": np.zeros(length),
     }
-    return {name: array.astype(_COUNTED[name]) for name, array in found.items()}
+    return {name: array.astype(_COUNTED[name]) for name, array in arrays.items()}
 
 
 def _cells(array: np.ndarray, feature: dict[str, Any]) -> pa.Array:
@@ -211,29 +186,18 @@ def _described(feature: dict[str, Any]) -> dict[str, Any]:
 
 
 def _sampled(images: np.ndarray) -> np.ndarray:
-    chosen = np.linspace(0, len(images) - 1, min(len(images), _LOOKED_AT)).astype(int)
+    chosen = np.linspace(0, len(images) - 1, min(len(images), _SAMPLES)).astype(int)
     return images[chosen][:, ::_EVERY, ::_EVERY]
-
-
-def _looked_at(
-    source: Source, arrays: dict[str, np.ndarray], films: dict[str, _Films]
-) -> dict[str, np.ndarray]:
-    images = {name: film.sampled for name, film in films.items()}
-    rest = {
-        name: _sampled(array) if name in source.columns and source.columns[name].is_image else array
-        for name, array in arrays.items()
-    }
-    return images | rest
 
 
 def _stats(array: np.ndarray) -> dict[str, list]:
     is_image = array.ndim == 4 and array.dtype == np.uint8
     rows = array.reshape(-1, 3) / 255.0 if is_image else array.reshape(len(array), -1)
     rows = np.where(np.isfinite(rows), rows, 0.0)  # JSON has no other numbers
-    found = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
-    found |= dict(zip(_QUANTILES, np.quantile(rows, list(_QUANTILES.values()), axis=0)))
+    figures = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+    figures |= dict(zip(_QUANTILES, np.quantile(rows, list(_QUANTILES.values()), axis=0)))
     shape = (3, 1, 1) if is_image else (-1,)
-    return {n: x.reshape(shape).tolist() for n, x in found.items()} | {"count": [len(array)]}
+    return {n: x.reshape(shape).tolist() for n, x in figures.items()} | {"count": [len(array)]}
 
 
 def _meta(
@@ -241,14 +205,14 @@ def _meta(
     source: Source,
     features: dict[str, Any],
     rows: list[dict[str, Any]],
-    seen: dict[str, list[np.ndarray]],
+    samples: dict[str, list[np.ndarray]],
     hz: int,
 ) -> None:
-    placed = path / "meta/episodes/chunk-000/file-000.parquet"
-    placed.parent.mkdir(parents=True)
-    parquet.write_table(pa.Table.from_pylist(rows), placed)
+    index = path / "meta/episodes/chunk-000/file-000.parquet"
+    index.parent.mkdir(parents=True)
+    parquet.write_table(pa.Table.from_pylist(rows), index)
     parquet.write_table(_tasks(source.task), path / "meta/tasks.parquet")
-    stats = {name: _stats(np.concatenate(parts)) for name, parts in seen.items()}
+    stats = {name: _stats(np.concatenate(parts)) for name, parts in samples.items()}
     files.write_json(path / "meta/stats.json", stats)
     has_video = any(feature["dtype"] == "video" for feature in features.values())
     place = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -278,7 +242,7 @@ def _tasks(task: str) -> pa.Table:
     table = pa.table({"task_index": pa.array([0]), "task": pa.array([task])})
     number = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
     words = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-    said = {
+    metadata = {
         "index_columns": ["task"],
         "column_indexes": [],
         "columns": [
@@ -288,4 +252,4 @@ def _tasks(task: str) -> pa.Table:
         "creator": {"library": "pyarrow", "version": pa.__version__},
         "pandas_version": "2.2.0",
     }
-    return table.replace_schema_metadata({"pandas": json.dumps(said)})
+    return table.replace_schema_metadata({"pandas": json.dumps(metadata)})

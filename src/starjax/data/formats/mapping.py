@@ -4,21 +4,22 @@ TOML or JSON. A column is named as the files name it, with the numbers that are 
 `observation.state[0:3]`, `action[6]`, or several as a list.
 """
 
-import dataclasses
-import json
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 
-from starjax import config, errors
+from starjax import errors
 from starjax.data.formats.base import Source
 
 Columns = str | tuple[str, ...]
 Turned = Literal["quat_xyzw", "quat_wxyz", "matrix", "rot6d", "rotvec", "euler_xyz"]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]  # wxyz
+Pixels = Annotated[int, msgspec.Meta(ge=0)]
 
 # Numbers of each way to write a rotation: a matrix by rows, rot6d by its first two columns, Euler's
 # angles about fixed axes x, y, z in rad.
@@ -29,8 +30,11 @@ _PART = re.compile(r"(.+?)(?:\[(\d+)(?:(:)(\d+))?\])?")
 _FILE = "--map"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ArmColumns:
+class _Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Part of a mapping file."""
+
+
+class ArmColumns(_Strict, frozen=True, kw_only=True):
     """Columns of one arm. Empty ones are not there."""
 
     position: Columns = ()  # of the tip, 3 numbers
@@ -47,37 +51,50 @@ class ArmColumns:
     command_rotation: Columns = ()
     command_gripper: Columns = ()
     trocar: Columns = ()  # its position, 3 numbers; left out, estimated from the motion
-    tip: tuple[float, ...] = (0.0, 0.0, 0.0)  # m, the tip in the frame that the poses are of
-    # of the tip in that frame, wxyz: z of the tip is the shaft, distal, y where the jaws open
-    tip_turn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    tip: Vector = (0.0, 0.0, 0.0)  # m, the tip in the frame that the poses are of
+    # of the tip in that frame: z of the tip is the shaft, distal, y where the jaws open
+    tip_turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        poses = bool(self.position and self.rotation) and not self.joints
+        kinematics = bool(self.joints and self.model and self.body) and not self.position
+        if not (poses or kinematics):
+            raise ValueError("expected position and rotation, or joints, model and body")
+        is_whole = bool(self.command_position) == bool(self.command_rotation)
+        if not is_whole or (self.joints and self.command_position):
+            raise ValueError("expected a whole command, of position and rotation")
+        if self.gripper_open == self.gripper_closed:
+            raise ValueError("expected gripper_open other than gripper_closed")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraColumn:
+class CameraColumn(_Strict, frozen=True, kw_only=True):
     """A camera of the task, and the column of its images."""
 
     column: str
-    crop: tuple[int, ...] = ()  # top, left, height, width in pixels
-    size: int = 0  # pixels per side afterwards; 0: as they are
+    crop: tuple[Pixels, ...] = ()  # top, left, height, width in pixels
+    size: Pixels = 0  # pixels per side afterwards; 0: as they are
     bgr: bool = False  # whether blue comes first
 
+    def __post_init__(self) -> None:
+        if len(self.crop) not in (0, 4):
+            raise ValueError("expected crop [top, left, height, width]")
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Map:
+
+class Map(_Strict, frozen=True, kw_only=True):
     """A whole mapping file."""
 
     task: str  # of starjax, whose nominal trocars and cameras the dataset gets
     units: Literal["m", "mm"] = "m"  # of positions
     hz: float = 0.0  # of the files, where they do not say it, or say it wrong
     time: Columns = ()  # s, where steps are not evenly spaced
-    origin: tuple[float, ...] = (0.0, 0.0, 0.0)  # m, of the files' frame in the task's world
-    turn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)  # of the files' frame in that world, wxyz
+    origin: Vector = (0.0, 0.0, 0.0)  # m, of the files' frame in the task's world
+    turn: Quaternion = (1.0, 0.0, 0.0, 0.0)  # of the files' frame in that world
     state: Columns = ()  # what the task says of its state
     success: Columns = ()  # above 0.5 at the end where an episode succeeded; left out, all did
     trocars: Literal["episode", "dataset"] = "episode"  # what shares a trocar that is estimated
     max_gap_s: float = 0.5  # episodes with a longer gap are left out
-    arms: tuple[Any, ...] = ()
-    cameras: Any = dataclasses.field(default_factory=dict)
+    arms: Annotated[tuple[ArmColumns, ...], msgspec.Meta(min_length=1)]
+    cameras: dict[str, CameraColumn] = {}
 
 
 def load(path: Path) -> Map:
@@ -86,19 +103,19 @@ def load(path: Path) -> Map:
     Raises:
       errors.UsageError: it cannot be read, or says something that a mapping does not.
     """
+    decode = msgspec.json.decode if path.suffix == ".json" else msgspec.toml.decode
     try:
-        text = path.read_text()
-        values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-        return _parsed(values)
+        return decode(path.read_bytes(), type=Map)
     except OSError as error:
         raise errors.UsageError(_FILE, "a mapping file", f"{path}: {error.strerror}") from error
-    except (ValueError, TypeError, AttributeError) as error:
-        raise errors.UsageError(_FILE, "a mapping", f"{path}: {error}") from error
+    except (ValueError, msgspec.MsgspecError) as error:
+        text = " ".join(str(error).split())
+        raise errors.UsageError(_FILE, "a mapping", f"{path}: {text}") from error
 
 
 def as_json(mapping: Map) -> dict[str, Any]:
     """Returns the mapping as JSON values, for the record."""
-    return json.loads(json.dumps(dataclasses.asdict(mapping)))
+    return msgspec.json.decode(msgspec.json.encode(mapping))
 
 
 def pick(arrays: Mapping[str, np.ndarray], columns: Columns, count: int = 0) -> np.ndarray:
@@ -117,20 +134,19 @@ def pick(arrays: Mapping[str, np.ndarray], columns: Columns, count: int = 0) -> 
             where = f"{rows[bad][0].tolist()} at step {int(np.argmax(bad))}"
             raise errors.UsageError(text, "finite numbers", where)
         parts.append(rows)
-    found = np.concatenate(parts, -1)
-    if count and found.shape[1] != count:
-        raise errors.UsageError(_said(columns), f"{count} numbers", found.shape[1])
-    return found
+    entries = np.concatenate(parts, -1)
+    if count and entries.shape[1] != count:
+        raise errors.UsageError(", ".join(_listed(columns)), f"{count} numbers", entries.shape[1])
+    return entries
 
 
 def names(mapping: Map) -> list[str]:
     """Returns the columns that a mapping reads, except images."""
-    given = [mapping.time, mapping.state, mapping.success]
+    columns = [mapping.time, mapping.state, mapping.success]
     for arm in mapping.arms:
-        given += [arm.position, arm.rotation, arm.joints, arm.gripper, arm.trocar]
-        given += [arm.command_position, arm.command_rotation, arm.command_gripper]
-    parts = [_part(text)[0] for columns in given for text in _listed(columns)]
-    return list(dict.fromkeys(parts))
+        columns += [arm.position, arm.rotation, arm.joints, arm.gripper, arm.trocar]
+        columns += [arm.command_position, arm.command_rotation, arm.command_gripper]
+    return list(dict.fromkeys(_part(text)[0] for some in columns for text in _listed(some)))
 
 
 def check(mapping: Map, source: Source) -> None:
@@ -142,49 +158,15 @@ def check(mapping: Map, source: Source) -> None:
         errors.choice(f"{_FILE}: image column", camera.column, images or ["none: no images"])
 
 
-def _parsed(values: dict[str, Any]) -> Map:
-    rest = {name: value for name, value in values.items() if name not in ("arms", "cameras")}
-    arms = tuple(config.from_dict(ArmColumns, arm) for arm in values.get("arms", []))
-    cameras = {
-        name: config.from_dict(CameraColumn, camera)
-        for name, camera in values.get("cameras", {}).items()
-    }
-    found = dataclasses.replace(config.from_dict(Map, rest), arms=arms, cameras=cameras)
-    _expect(bool(arms), "one [[arms]] or more", "none")
-    for name, count in (("origin", 3), ("turn", 4)):
-        _expect(len(getattr(found, name)) == count, f"{name} of {count} numbers", rest.get(name))
-    for arm in arms:
-        poses = bool(arm.position and arm.rotation) and not arm.joints
-        kinematics = bool(arm.joints and arm.model and arm.body) and not arm.position
-        _expect(poses or kinematics, "position and rotation, or joints, model and body", arm)
-        asked = bool(arm.command_position) == bool(arm.command_rotation)
-        _expect(asked and not (arm.joints and arm.command_position), "a whole command", arm)
-        _expect(len(arm.tip) == 3 and len(arm.tip_turn) == 4, "tip [3], tip_turn [4]", arm)
-        _expect(arm.gripper_open != arm.gripper_closed, "jaws that differ", arm.gripper_open)
-    for camera in cameras.values():
-        _expect(len(camera.crop) in (0, 4), "crop [top, left, height, width]", camera.crop)
-        _expect(min(camera.crop, default=0) >= 0 and camera.size >= 0, "pixels", camera)
-    return found
-
-
-def _expect(holds: bool, expected: str, got: object) -> None:
-    if not holds:
-        raise ValueError(f"expected {expected}, got {got}")
-
-
 def _listed(columns: Columns) -> tuple[str, ...]:
     return (columns,) if isinstance(columns, str) else columns
 
 
-def _said(columns: Columns) -> str:
-    return ", ".join(_listed(columns))
-
-
 def _part(text: str) -> tuple[str, int, int | None]:
     """Parses a column's name and its slice: first index, and index after the last or None."""
-    found = _PART.fullmatch(text)
-    assert found is not None
-    name, low, colon, high = found.groups()
+    match = _PART.fullmatch(text)
+    assert match is not None
+    name, low, colon, high = match.groups()
     if low is None:
         return name, 0, None
     return name, int(low), int(high) if colon else int(low) + 1

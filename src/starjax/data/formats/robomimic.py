@@ -31,7 +31,7 @@ _NAMES = {
     "done": "dones",
 }
 _DEMO = re.compile(r"(?:demo|episode|traj)_?(\d+)")
-_MOST_DEEP = 6  # groups within groups
+_MAX_DEPTH = 6  # groups within groups
 
 
 def named(column: str) -> str:
@@ -47,8 +47,8 @@ def _open(path: Path) -> Iterator[Source]:
         _refuse_links(file)
         data: Any = file.get("data", file)
         base.require(isinstance(data, h5py.Group), "a group of episodes", data)
-        found = {int(match[1]): name for name in data if (match := _DEMO.fullmatch(name))}
-        demos = [data[found[number]] for number in sorted(found)]
+        names = {int(match[1]): name for name in data if (match := _DEMO.fullmatch(name))}
+        demos = [data[names[number]] for number in sorted(names)]
         base.require(bool(demos), "groups data/demo_<i>", sorted(data)[:5])
         lengths = [_length(demo) for demo in demos]
         first: dict[str, Any] = _datasets(demos[0])
@@ -68,12 +68,12 @@ def _open(path: Path) -> Iterator[Source]:
             return arrays
 
         origin = None
-        if _is_bytes(ours):
+        if _is_data(ours) and ours.dtype == np.uint8 and ours.ndim == 1:
             base.require_fits(base.OURS, ours.shape, ours.dtype)
             origin = json.loads(bytes(ours[()]))
             base.require(isinstance(origin, dict), f"a map in {base.OURS}", type(origin).__name__)
         about = _attribute(data, "env_args")
-        hz = float((origin or {}).get("description", {}).get("control_hz", 0.0) or _hz(about))
+        hz = base.origin_hz(origin) or float(_hz(about))
         yield Source(hz, lengths, columns, read, origin, task=str(about.get("env_name", "")))
 
 
@@ -87,25 +87,22 @@ def _write(path: Path, source: Source, video: bool) -> None:
             demo.attrs["num_samples"] = length
             for name, array in source.read(episode, source.columns).items():
                 if name == "actions":
-                    most = float(np.abs(array).max())
-                    base.require(most <= 1.0, "actions in [-1, 1] (m from the origin)", most)
-                is_image = source.columns[name].is_image
-                packed = {"compression": "gzip", "compression_opts": 1} if is_image else {}
-                # A frame a chunk: learners read them in any order.
-                chunks = {"chunks": (1, *array.shape[1:])} if is_image else {}
-                demo.create_dataset(name, data=_plain(array), **packed, **chunks)
+                    largest = float(np.abs(array).max())
+                    base.require(largest <= 1.0, "actions in [-1, 1] (m from the origin)", largest)
+                packed: dict[str, Any] = {}
+                if source.columns[name].is_image:  # a frame per chunk: they are read in any order
+                    packed = {"compression": "gzip", "compression_opts": 1}
+                    packed["chunks"] = (1, *array.shape[1:])
+                array = array.astype(np.uint8) if array.dtype == bool else array
+                demo.create_dataset(name, data=array, **packed)
         data.attrs["total"] = sum(source.lengths)
         about = {"env_name": source.task, "env_type": 2, "env_kwargs": {"robot": source.robot}}
         data.attrs["env_args"] = np.bytes_(json.dumps(about | {"control_freq": source.hz}))
         file.create_dataset("mask/train", data=np.array(names, h5py.string_dtype()))
         if source.origin:
             # Bytes of a dataset: attributes hold 64 kB, and a damaged string hangs HDF5.
-            said = json.dumps(source.origin).encode()
-            file.create_dataset(base.OURS, data=np.frombuffer(said, np.uint8))
-
-
-def _plain(array: np.ndarray) -> np.ndarray:
-    return array.astype(np.uint8) if array.dtype == bool else array
+            text = json.dumps(source.origin).encode()
+            file.create_dataset(base.OURS, data=np.frombuffer(text, np.uint8))
 
 
 def _recognises(path: Path) -> bool:
@@ -114,14 +111,14 @@ def _recognises(path: Path) -> bool:
 
 def _refuse_links(file: h5py.File) -> None:
     """Refuses files that lead out of themselves, in circles, or many ways to the same place."""
-    met = set()
+    addresses = set()
 
     def look(group: Any, depth: int) -> None:
-        base.require(depth <= _MOST_DEEP, f"at most {_MOST_DEEP} groups deep", group.name)
+        base.require(depth <= _MAX_DEPTH, f"at most {_MAX_DEPTH} groups deep", group.name)
         address = h5py.h5o.get_info(group.id).addr
         # With sixty names a group, six deep, a file of 100 kB has more paths than can be walked.
-        base.require(address not in met, "one name a group", f"another: {group.name}")
-        met.add(address)
+        base.require(address not in addresses, "one name a group", f"another: {group.name}")
+        addresses.add(address)
         for name in group:
             link = group.get(name, getlink=True)
             plain = isinstance(link, h5py.HardLink)
@@ -137,13 +134,9 @@ def _refuse_links(file: h5py.File) -> None:
 
 
 def _datasets(group: Any) -> dict[str, Any]:
-    found = {}
-    group.visititems(lambda name, item: found.update({name: item} if _is_data(item) else {}))
-    return found
-
-
-def _is_bytes(item: Any) -> bool:
-    return _is_data(item) and item.dtype == np.uint8 and item.ndim == 1
+    datasets = {}
+    group.visititems(lambda name, item: datasets.update({name: item} if _is_data(item) else {}))
+    return datasets
 
 
 def _is_data(item: Any) -> bool:
@@ -168,10 +161,10 @@ def _attribute(data: Any, name: str) -> dict[str, Any]:
     if name not in data.attrs or data.attrs.get_id(name).dtype.kind != "S":
         return {}
     try:
-        found = json.loads(data.attrs[name])
+        value = json.loads(data.attrs[name])
     except (KeyError, TypeError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return value if isinstance(value, dict) else {}
 
 
 def _hz(about: dict[str, Any]) -> float:

@@ -22,8 +22,7 @@ class Writer:
     """Appends episodes to one video file."""
 
     def __init__(self, path: Path, shape: tuple[int, ...], hz: int):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._path, self._hz, self.frames = path, hz, 0
+        self._hz, self.frames = hz, 0
         self._file = av.open(str(path), "w", options={"movflags": "faststart"})
         self._stream = self._file.add_stream("libx264", rate=hz, options=_OPTIONS)
         self._stream.height, self._stream.width = shape[:2]
@@ -43,11 +42,6 @@ class Writer:
         """Time of the next frame in s."""
         return self.frames / self._hz
 
-    @property
-    def bytes(self) -> int:
-        """Bytes on the disk."""
-        return self._path.stat().st_size
-
     def close(self) -> None:
         """Ends the file."""
         self._file.mux(self._stream.encode(None))
@@ -62,8 +56,8 @@ def read(path: Path, first: float, length: int, hz: float, shape: tuple[int, ...
     """
     base.require(path.is_file(), "a video", f"none at {path}")
     base.require_fits(path.name, (length, *shape), np.uint8)
-    found = np.zeros((length, *shape), np.uint8)
-    got = 0
+    frames = np.zeros((length, *shape), np.uint8)
+    count = 0
     with contextlib.closing(av.open(str(path))) as file:
         base.require(bool(file.streams.video), "a video stream", f"none in {path}")
         for seconds, frame in _frames(file, first):
@@ -72,13 +66,13 @@ def read(path: Path, first: float, length: int, hz: float, shape: tuple[int, ...
                 continue
             if index >= length:
                 break
-            is_near = index == got and abs(seconds - first - index / hz) < 0.5 / hz
-            base.require(is_near, f"frame {got} of {path.name}", f"one at {seconds:.3f} s")
+            is_near = index == count and abs(seconds - first - index / hz) < 0.5 / hz
+            base.require(is_near, f"frame {count} of {path.name}", f"one at {seconds:.3f} s")
             image = frame.to_ndarray()
             base.require(image.shape == shape, f"frames {list(shape)}", list(image.shape))
-            found[got], got = image, got + 1
-    base.require(got == length, f"{length} frames in {path.name}", got)
-    return found
+            frames[count], count = image, count + 1
+    base.require(count == length, f"{length} frames in {path.name}", count)
+    return frames
 
 
 def _frames(file: Any, first: float) -> Iterator[tuple[float, Any]]:

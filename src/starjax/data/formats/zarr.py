@@ -19,7 +19,7 @@ from starjax.data.formats.base import Column, Source
 from starjax.runtime import files
 
 _CHUNK_BYTES = 2_000_000  # as Diffusion Policy has them
-_MOST_CHUNKS = 1_000_000  # of a column of an episode
+_MAX_CHUNKS = 1_000_000  # of a column of an episode
 
 
 def named(column: str) -> str:
@@ -38,8 +38,8 @@ def _open(path: Path) -> Iterator[Source]:
     rises = ends.ndim == 1 and len(ends) > 0 and bool((np.diff(ends, prepend=0) > 0).all())
     base.require(rises, "episode_ends that rise", ends.tolist()[:5])
     starts = np.concatenate([[0], ends[:-1]])
-    found = {place.name: _array(place) for place in sorted((path / "data").glob("*/"))}
-    arrays = {name: array for name, array in found.items() if array.dtype.kind in "biuf"}
+    arrays = {folder.name: _array(folder) for folder in sorted((path / "data").glob("*/"))}
+    arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf"}
     for name, array in arrays.items():
         whole = array.ndim > 0 and array.shape[0] == ends[-1]
         base.require(whole, f"{ends[-1]} frames of {name}", list(array.shape))
@@ -54,11 +54,11 @@ def _open(path: Path) -> Iterator[Source]:
         return {name: np.asarray(arrays[name][first:last]) for name in names}
 
     attributes = path / ".zattrs"
-    said = files.read_json(attributes) if attributes.exists() else {}
-    origin = said.get(base.OURS)
-    hz = float((origin or {}).get("description", {}).get("control_hz", 0.0) or said.get("hz", 0.0))
+    about = files.read_json(attributes) if attributes.exists() else {}
+    origin = about.get(base.OURS)
+    hz = base.origin_hz(origin) or float(about.get("hz", 0.0))
     lengths = (ends - starts).tolist()
-    yield Source(hz, lengths, columns, read, origin, str(said.get("task", "")))
+    yield Source(hz, lengths, columns, read, origin, str(about.get("task", "")))
 
 
 def _write(path: Path, source: Source, video: bool) -> None:
@@ -77,16 +77,14 @@ def _write(path: Path, source: Source, video: bool) -> None:
             dtype=column.dtype,
             compressors=packed,
         )
-    written = {name: _Buffer(array) for name, array in arrays.items()}
+    buffers = {name: _Buffer(array) for name, array in arrays.items()}
     for episode in range(len(source.lengths)):
         for name, array in source.read(episode, source.columns).items():
-            written[name].append(array)
-    for buffer in written.values():
+            buffers[name].append(array)
+    for buffer in buffers.values():
         buffer.flush()
     ends = np.cumsum(source.lengths, dtype=np.int64)
-    meta.create_array("episode_ends", shape=ends.shape, dtype=ends.dtype, compressors=None)[:] = (
-        ends
-    )
+    meta.create_array("episode_ends", data=ends, compressors=None)
     root.attrs.update({"hz": source.hz, "task": source.task, base.OURS: source.origin})
 
 
@@ -125,7 +123,7 @@ def _require_readable(name: str, array: Any, shape: Sequence[int]) -> None:
     base.require_fits(name, shape, array.dtype)
     base.require_fits(f"{name}'s chunks", array.chunks, array.dtype)
     count = math.prod(-(-size // chunk) for size, chunk in zip(shape, array.chunks))
-    base.require(count <= _MOST_CHUNKS, f"{_MOST_CHUNKS} chunks of {name} at most", count)
+    base.require(count <= _MAX_CHUNKS, f"{_MAX_CHUNKS} chunks of {name} at most", count)
 
 
 def _recognises(path: Path) -> bool:
