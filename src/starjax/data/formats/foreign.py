@@ -94,9 +94,8 @@ def import_mapped(
             kept.append(_Kept(episode, len(poses.pose.p), -1, success))
         note(1)
     places, is_known = trocars.locate(tips, mapping, [k.episode for k in kept], notes)
-    kept, places, tips = (
-        list(itertools.compress(items, is_known)) for items in (kept, places, tips)
-    )
+    kept, places = (list(itertools.compress(items, is_known)) for items in (kept, places))
+    tips = list(itertools.compress(tips, is_known))
     if not kept:
         reason = notes[-1] if notes else "no episode"
         raise errors.UsageError("PATH", "demonstrations to keep", reason)
