@@ -11,21 +11,21 @@ import jax
 import jax.numpy as jnp
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import scripting
-from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.tasks import phases, scripting
+from starjax.sim.tasks.phases import ALIGNED, APPROACH, DESCEND, RAISE
 from starjax.sim.tasks.ring_on_wire import task
 from starjax.types import Agent, Command, Pose
 
-RAISE, APPROACH, DESCEND, CLOSE, LIFT, CARRY, LOWER, OPEN, LEAVE, WAIT = range(10)
-# Least duration (s) and mean speed (m/s) of each phase, and jaws: +1 open, -1 closed at its end.
-DURATION = (0.5, 1.2, 0.9, 0.6, 1.2, 0.4, 0.8, 0.5, 0.7, 0.8)
-SPEED = (0.04, 0.04, 0.024, 1.0, 0.02, 0.015, 0.02, 1.0, 0.03, 1.0)
-JAWS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
+CLOSE, LIFT, CARRY, LOWER, OPEN, LEAVE, WAIT = range(3, 10)
+TIMING = phases.Timing(
+    duration=(0.5, 1.2, 0.9, 0.6, 1.2, 0.4, 0.8, 0.5, 0.7, 0.8),
+    speed=(0.04, 0.04, 0.024, 1.0, 0.02, 0.015, 0.02, 1.0, 0.03, 1.0),
+    jaws=(1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0),
+    tempo=(0.85, 1.15),
+)
 # Weight of the disturbance at the end of each phase.
 DISTURBANCE = (1.0, 1.0, 0.0, 0.0, 0.1, 0.15, 0.0, 0.0, 0.3, 0.1)
 
-TEMPO = (0.85, 1.15)  # range of an episode's pace
-ALIGNED = 0.6  # fraction of a descent after which it goes straight along the shaft
 HOVER = 0.02  # m along the shaft before the tab
 HOVER_ASIDE = 0.006  # m along the wire, either way
 GRASP_SPREAD = 0.0008  # m along the tab, either way
@@ -38,80 +38,45 @@ ROUNDS = 4  # fixed-point iterations for a pose whose roll and position depend o
 
 
 @flax.struct.dataclass
-class RingScript:
-    """Progress of the script in one episode.
+class RingScript(phases.PhaseScript):
+    """Progress of the script in one episode; positions have the roll in front.
 
     Attributes:
-      key: of all draws, folded with the attempt or the step.
-      phase, attempt: int32.
-      elapsed, duration: s.
-      tempo: pace.
       side: 1 or -1, side of the approach.
       grasp: m along the tab, from the ring's centre.
-      start, goal, way: `[4]` roll (rad) and position (m), undisturbed, at the phase's ends and now.
       stop: `[]` m along the way, end of the present carry.
-      jaws_from, jaws: openings.
-      noise: `[2, 4]` disturbance of position (m) and roll (rad), rough and smooth.
     """
 
-    key: jax.Array
-    phase: jax.Array
-    attempt: jax.Array
-    elapsed: jax.Array
-    duration: jax.Array
-    tempo: jax.Array
     side: jax.Array
     grasp: jax.Array
-    start: jax.Array
-    goal: jax.Array
-    way: jax.Array
     stop: jax.Array
-    jaws_from: jax.Array
-    jaws: jax.Array
-    noise: jax.Array
 
 
 def init(key: jax.Array, state: EnvState) -> RingScript:
     """Starts the script of an episode."""
-    key_tempo, key = jax.random.split(key)
-    zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
-    tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
-    way = jnp.append(0.0, state.pose.p[0])
-    script = RingScript(
-        key, none, none, zero, zero, tempo, jnp.ones(()), zero, way, way, way, zero, jnp.ones(()),
-        jnp.ones(()), jnp.zeros((2, 4)),
-    )  # fmt: skip
+    own = {"side": jnp.ones(()), "grasp": jnp.zeros(()), "stop": jnp.zeros(())}
+    script = phases.begin(RingScript, TIMING, key, jnp.append(0.0, state.pose.p[0]), **own)
     return _enter(script, jnp.asarray(APPROACH, jnp.int32), state)
 
 
 def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Command]:
     """Returns the disturbed command to execute, the script, and the undisturbed one to record."""
-    dt = 1.0 / CONTROL_HZ
-    is_over = script.elapsed >= script.duration - 1e-6
     after = _enter(script, _following(script, state), state)
-    script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
-    elapsed = script.elapsed + dt
-    s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
+    script, s = phases.advance(script, TIMING, after)
     fraction = scripting.minimum_jerk(s)
     way = script.start + fraction * (script.goal - script.start)
     # On the way down the tool has turned, and goes along its shaft, before it can touch.
     early = scripting.minimum_jerk(jnp.minimum(s / ALIGNED, 1.0))
-    back = HOVER * (1.0 - fraction) * _shaft(script.goal[1:], state)
-    aside = (1.0 - early) * (script.start + _lifted(script, state) - script.goal)
+    shaft = _shaft(script.goal[1:], state)
+    back = HOVER * (1.0 - fraction) * shaft
+    aside = (1.0 - early) * (script.start + jnp.append(0.0, HOVER * shaft) - script.goal)
     way = jnp.where(script.phase == DESCEND, (script.goal + aside).at[1:].add(-back), way)
-    target = jnp.asarray(JAWS)[script.phase]
-    jaws = scripting.jaws(script.jaws_from, target, elapsed)
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
     weights = jnp.asarray(DISTURBANCE)
     before, weight = weights[jnp.maximum(script.phase - 1, 0)], weights[script.phase]
     moved = (before + fraction * (weight - before)) * jnp.roll(noise[1], 1)
-    script = script.replace(elapsed=elapsed, way=way, jaws=jaws, noise=noise)
-    return _command(way + moved, jaws, state), script, _command(way, jaws, state)
-
-
-def _lifted(script: RingScript, state: EnvState) -> jax.Array:
-    """Returns the motion `[4]` of a descent along the shaft."""
-    return jnp.append(0.0, HOVER * _shaft(script.goal[1:], state))
+    script = script.replace(at=way, noise=noise)
+    return _command(way + moved, script.jaws, state), script, _command(way, script.jaws, state)
 
 
 def _following(script: RingScript, state: EnvState) -> jax.Array:
@@ -127,7 +92,7 @@ def _following(script: RingScript, state: EnvState) -> jax.Array:
 
 def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
     """Begins `phase` with a goal from the present state."""
-    ring, here = state.measurements.ring, script.way
+    ring, here = state.measurements.ring, script.at
     is_approach = phase == APPROACH
     attempt = script.attempt + is_approach
     key_side, key_grasp = jax.random.split(jax.random.fold_in(script.key, attempt))
@@ -137,7 +102,7 @@ def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
     grasp = jnp.where(is_approach, task.TAB + spread, script.grasp)
     at_tab = ring.p + grasp * ring.R[:, 2]
     shaft = _shaft(at_tab, state)
-    normal = ring.R[:, 1] * jnp.where(ring.R[1, 1] > 0, -1.0, 1.0)
+    normal = phases.towards_arm(ring.R[:, 1])
     above = at_tab - HOVER * shaft + jnp.array([0.0, HOVER_ASIDE, 0.0]) * side
     progress = state.layout.way * ring.p[1]
     stops = jnp.array(STOPS)
@@ -146,35 +111,20 @@ def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
     on_wire = _carrying(state.layout.way * stop, jnp.zeros(()), here[0], state)
     hung = _carrying(state.layout.way * stop, jnp.array(RELEASE), here[0], state)
     leaving = here.at[1:].add(-HOVER * _shaft(here[1:], state))
-    goals = jnp.stack(
-        [
-            here.at[3].set(jnp.maximum(here[3], task.TIP_HOME[2])),
-            _turned(above, normal, here[0], state),
-            _turned(at_tab, normal, here[0], state),
-            here,
-            on_wire,
-            on_wire,
-            hung,
-            here,
-            leaving,
-            here,
-        ]
-    )
-    goal = goals[phase]
-    length = jnp.linalg.norm(goal[1:] - here[1:])
-    duration = jnp.maximum(jnp.asarray(DURATION)[phase], length / jnp.asarray(SPEED)[phase])
-    return script.replace(
-        phase=phase,
-        attempt=attempt,
-        elapsed=jnp.zeros(()),
-        duration=duration / script.tempo,
-        side=side,
-        grasp=grasp,
-        start=here,
-        goal=goal,
-        stop=stop,
-        jaws_from=script.jaws,
-    )
+    goals = [
+        here.at[3].set(jnp.maximum(here[3], task.TIP_HOME[2])),
+        _turned(above, normal, here[0], state),
+        _turned(at_tab, normal, here[0], state),
+        here,
+        on_wire,
+        on_wire,
+        hung,
+        here,
+        leaving,
+        here,
+    ]
+    own = {"attempt": attempt, "side": side, "grasp": grasp, "stop": stop}
+    return phases.enter(script, TIMING, phase, goals, **own)
 
 
 def _carrying(y: jax.Array, lowered: jax.Array, roll: jax.Array, state: EnvState) -> jax.Array:
