@@ -173,12 +173,16 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "median": ("median success (s)", _median),
 }
 
+
+def _with_trials(run: results.Run, trials: Sequence[Trial]) -> results.Run:
+    """Replaces the trials of a run."""
+    return run._replace(result=run.result._replace(trials=tuple(trials)))
+
+
 PARTS: dict[str, Callable[[Scored], Any]] = {
     "twelve": lambda x: x.run,
-    "seen": lambda x: results.with_trials(x.run, _seen(x)),
-    "unseen": lambda x: results.with_trials(x.run, _unseen(x)),
+    "seen": lambda x: _with_trials(x.run, _seen(x)),
+    "unseen": lambda x: _with_trials(x.run, _unseen(x)),
     "trocars": _swept,
-    "far": lambda x: results.with_trials(
-        _swept(x), [t for t in _swept(x).trials if t.distance_m >= 0.02]
-    ),
+    "far": lambda x: _with_trials(_swept(x), [t for t in _swept(x).trials if t.distance_m >= 0.02]),
 }

@@ -17,12 +17,12 @@ class Method(NamedTuple):
     """
 
     action_space: str
-    sees_trocar: bool
-    projects: bool
-    hierarchical: bool
-    weights_of: str
-    label: str
-    group: str
+    sees_trocar: bool = False
+    projects: bool = False
+    hierarchical: bool = False
+    weights_of: str = ""
+    label: str = ""
+    group: str = ""
 
     @property
     def keeps_to_manifold(self) -> bool:
@@ -34,84 +34,25 @@ _NAIVE, _RCM, _OURS = "Naive", "RCM action spaces", "Ours"
 _BESIDE = "Ours (ablation)"
 
 METHODS: dict[str, Method] = {
-    "dp_ee": Method(
-        action_space="se3",
-        sees_trocar=False,
-        projects=False,
-        hierarchical=False,
-        weights_of="dp_ee",
-        label="DP-EE",
-        group=_NAIVE,
-    ),
+    "dp_ee": Method("se3", weights_of="dp_ee", label="DP-EE", group=_NAIVE),
     "dp_ee_proj": Method(
-        action_space="se3",
-        sees_trocar=False,
-        projects=True,
-        hierarchical=False,
-        weights_of="dp_ee",
-        label="DP-EE-Proj",
-        group=_NAIVE,
+        "se3", projects=True, weights_of="dp_ee", label="DP-EE-Proj", group=_NAIVE
     ),
-    "dp_rcm1": Method(
-        action_space="rcm1",
-        sees_trocar=True,
-        projects=False,
-        hierarchical=False,
-        weights_of="dp_rcm1",
-        label="DP-RCM-1",
-        group=_RCM,
-    ),
-    "dp_rcm2": Method(
-        action_space="rcm2",
-        sees_trocar=True,
-        projects=False,
-        hierarchical=False,
-        weights_of="dp_rcm2",
-        label="DP-RCM-2",
-        group=_RCM,
-    ),
-    "dp_rcm3": Method(
-        action_space="rcm3",
-        sees_trocar=True,
-        projects=False,
-        hierarchical=False,
-        weights_of="dp_rcm3",
-        label="DP-RCM-3",
-        group=_RCM,
-    ),
-    "dp_rcm4": Method(
-        action_space="rcm4",
-        sees_trocar=True,
-        projects=False,
-        hierarchical=False,
-        weights_of="dp_rcm4",
-        label="DP-RCM-4",
-        group=_RCM,
-    ),
+    "dp_rcm1": Method("rcm1", sees_trocar=True, weights_of="dp_rcm1", label="DP-RCM-1", group=_RCM),
+    "dp_rcm2": Method("rcm2", sees_trocar=True, weights_of="dp_rcm2", label="DP-RCM-2", group=_RCM),
+    "dp_rcm3": Method("rcm3", sees_trocar=True, weights_of="dp_rcm3", label="DP-RCM-3", group=_RCM),
+    "dp_rcm4": Method("rcm4", sees_trocar=True, weights_of="dp_rcm4", label="DP-RCM-4", group=_RCM),
     # Table II's own note: STAR-Diff-Single and DP-RCM-4 are one model, listed in both groups.
     "stardiff_single": Method(
-        action_space="rcm4",
-        sees_trocar=True,
-        projects=False,
-        hierarchical=False,
-        weights_of="dp_rcm4",
-        label="STAR-Diff-Single",
-        group=_OURS,
+        "rcm4", sees_trocar=True, weights_of="dp_rcm4", label="STAR-Diff-Single", group=_OURS
     ),
     "stardiff": Method(
-        action_space="rcm4",
-        sees_trocar=False,
-        projects=False,
-        hierarchical=True,
-        weights_of="stardiff",
-        label="STAR-Diff",
-        group=_OURS,
+        "rcm4", hierarchical=True, weights_of="stardiff", label="STAR-Diff", group=_OURS
     ),
     # By Proposition 1 the position model needs no trocar; this one is conditioned on it too.
     "stardiff_told": Method(
-        action_space="rcm4",
+        "rcm4",
         sees_trocar=True,
-        projects=False,
         hierarchical=True,
         weights_of="stardiff_told",
         label="STAR-Diff-Told",

@@ -106,27 +106,6 @@ def test_ddim_prepares_every_step_once():
     np.testing.assert_allclose(prepared, diffusion.ddim_sample(eps_fn, noise, steps=5), rtol=1e-6)
 
 
-def test_ddpm_with_a_perfect_network_returns_the_clean_sequence():
-    x0 = clean((1, 16, 4))
-    x, z = normal(*x0.shape), normal(100, *x0.shape, seed=3)
-    for k in range(99, -1, -1):
-        x = diffusion.ddpm_step(SCHEDULE, x, jnp.array(k), perfect(x0)(x, k), z[k])
-    np.testing.assert_allclose(x, x0, atol=1e-5)
-
-
-@pytest.mark.parametrize("k", [1, 40, 80])
-def test_ddpm_step_is_eq_12_where_nothing_is_clipped(k):
-    x0, eps, z = 0.3, 0.8, -1.1
-    alpha_bar = np.asarray(SCHEDULE.sqrt_alpha_bar, float) ** 2
-    beta = float(SCHEDULE.beta[k])
-    x = np.sqrt(alpha_bar[k]) * x0 + np.sqrt(1 - alpha_bar[k]) * eps
-    mean = (x - beta / np.sqrt(1 - alpha_bar[k]) * eps) / np.sqrt(1 - beta)
-    sigma = np.sqrt(beta * (1 - alpha_bar[k - 1]) / (1 - alpha_bar[k]))
-    one = lambda value: jnp.full((1, 1), value)  # noqa: E731
-    step = diffusion.ddpm_step(SCHEDULE, one(x), jnp.array([k]), one(eps), one(z))
-    assert float(step[0, 0]) == pytest.approx(mean + sigma * z, abs=2e-6)
-
-
 def test_noise_of_a_sample_depends_on_its_key_alone():
     keys = jax.random.split(jax.random.key(7), 5)
     full = diffusion.sample_noise(keys, (16, 4))

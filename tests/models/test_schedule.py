@@ -32,22 +32,6 @@ def test_signal_and_noise_have_unit_variance_together():
     assert (np.diff(table.sqrt_alpha_bar) < 0).all()
 
 
-def test_posterior_is_bayes_rule():
-    """Means and variances of q(a_{k-1} | a_k, a_0), from the product of two Gaussians."""
-    table = schedule.cosine(50)
-    alpha_bar = np.array([alpha_bar_closed_form(k, 50) for k in range(49)])
-    for k in range(1, 49):
-        alpha = alpha_bar[k] / alpha_bar[k - 1]
-        precision = alpha / (1 - alpha) + 1 / (1 - alpha_bar[k - 1])
-        assert table.posterior_std[k] ** 2 == pytest.approx(1 / precision, rel=1e-5)
-        from_xk = math.sqrt(alpha) / (1 - alpha) / precision
-        from_x0 = math.sqrt(alpha_bar[k - 1]) / (1 - alpha_bar[k - 1]) / precision
-        assert table.posterior_xk[k] == pytest.approx(from_xk, rel=1e-5)
-        assert table.posterior_x0[k] == pytest.approx(from_x0, rel=1e-5)
-    assert table.posterior_std[0] == 0.0
-    assert table.posterior_x0[0] == 1.0
-
-
 @pytest.mark.parametrize(("steps", "first", "stride"), [(10, 90, 10), (100, 99, 1), (1, 0, 100)])
 def test_ddim_steps_are_leading(steps, first, stride):
     table = schedule.ddim_table(100, steps)

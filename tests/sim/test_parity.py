@@ -93,7 +93,7 @@ def test_kinematics_agree(sim):
     rng = np.random.default_rng(0)
     qpos, _, m = settled(sim)
     p_trocar = np.array([[0.01, -0.02, 0.16]])
-    poses = jax.jit(lambda q: physics.geom_poses(sim, q, jnp.asarray(p_trocar)))
+    poses = jax.jit(lambda q: physics.kinematics(sim, q, jnp.asarray(p_trocar)))
     start = sim.bound.block + 3
     for _ in range(5):
         q = qpos + rng.normal(0, 0.2, m.nq)
@@ -101,9 +101,9 @@ def test_kinematics_agree(sim):
         data = mujoco.MjData(m)
         data.qpos[:], data.mocap_pos[:] = q, p_trocar
         mujoco.mj_kinematics(m, data)
-        xpos, xmat = poses(jnp.asarray(q, jnp.float32))
-        np.testing.assert_allclose(xpos, data.geom_xpos, atol=2e-6)
-        np.testing.assert_allclose(xmat, data.geom_xmat.reshape(-1, 3, 3), atol=2e-6)
+        placed = poses(jnp.asarray(q, jnp.float32))
+        np.testing.assert_allclose(placed.geom_xpos, data.geom_xpos, atol=2e-6)
+        np.testing.assert_allclose(placed.geom_xmat, data.geom_xmat.reshape(-1, 3, 3), atol=2e-6)
 
 
 def test_one_step_of_every_contact_pair_agrees(sim, step):

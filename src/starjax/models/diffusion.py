@@ -61,22 +61,6 @@ def predict_x0(schedule: Schedule, x: jax.Array, k: jax.Array, eps: jax.Array) -
     return jnp.clip((x - spread * eps) / signal, -1.0, 1.0)
 
 
-def ddpm_step(
-    schedule: Schedule, x: jax.Array, k: jax.Array, eps: jax.Array, noise: jax.Array
-) -> jax.Array:
-    """Computes Eq. 12: one ancestral step from `x` `[B, ...]` at `k` to k - 1.
-
-    The mean is written through the clean sequence, so that it can be clipped; where the clip does
-    not bind it is Eq. 12 term by term. sigma_k is the posterior's, 0 at k = 0 whatever `noise` is.
-    """
-    x0 = predict_x0(schedule, x, k, eps)
-    return (
-        _at(schedule.posterior_x0, k, x.ndim) * x0
-        + _at(schedule.posterior_xk, k, x.ndim) * x
-        + _at(schedule.posterior_std, k, x.ndim) * noise
-    )
-
-
 def sample_noise(keys: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """Draws standard normal `[B, *shape]`; row i depends on `keys[i]` alone."""
     return jax.vmap(lambda key: jax.random.normal(key, shape, jnp.float32))(keys)

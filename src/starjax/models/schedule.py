@@ -18,17 +18,11 @@ class Schedule(NamedTuple):
       beta: variance added at step k (Eq. 6).
       sqrt_alpha_bar: factor of the clean action after step k (Eq. 7).
       sqrt_one_minus_alpha_bar: standard deviation of the noise after step k.
-      posterior_x0: weight of the clean action in the mean of q(a_{k-1} | a_k, a_0).
-      posterior_xk: weight of a_k in that mean.
-      posterior_std: its standard deviation, sigma_k of Eq. 12; exactly 0 at k = 0.
     """
 
     beta: np.ndarray
     sqrt_alpha_bar: np.ndarray
     sqrt_one_minus_alpha_bar: np.ndarray
-    posterior_x0: np.ndarray
-    posterior_xk: np.ndarray
-    posterior_std: np.ndarray
 
     @property
     def steps(self) -> int:
@@ -60,16 +54,7 @@ def cosine(steps: int = 100) -> Schedule:
     Each beta is capped at 0.999, as the paper's reference and Diffusion Policy do.
     """
     beta, alpha_bar = _beta_and_alpha_bar(steps)
-    previous = np.concatenate([[1.0], alpha_bar[:-1]])
-    variance = beta * (1.0 - previous) / (1.0 - alpha_bar)
-    tables = (
-        beta,
-        np.sqrt(alpha_bar),
-        np.sqrt(1.0 - alpha_bar),
-        beta * np.sqrt(previous) / (1.0 - alpha_bar),
-        np.sqrt(1.0 - beta) * (1.0 - previous) / (1.0 - alpha_bar),
-        np.sqrt(variance),
-    )
+    tables = beta, np.sqrt(alpha_bar), np.sqrt(1.0 - alpha_bar)
     return Schedule(*(table.astype(np.float32) for table in tables))
 
 

@@ -110,11 +110,6 @@ def load(path: Path) -> Run:
     )
 
 
-def with_trials(run: Run, trials: Iterable[Trial]) -> Run:
-    """Replaces the trials of a run."""
-    return run._replace(result=run.result._replace(trials=tuple(trials)))
-
-
 def swept(runs: Iterable[Run]) -> list[Run]:
     """Returns the runs that have a sweep, with the sweep's trials as theirs."""
     return [

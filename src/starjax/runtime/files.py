@@ -183,12 +183,6 @@ def lock(directory: Path) -> Iterator[None]:
         yield
 
 
-def wait_until_free(directory: Path) -> None:
-    """Waits while another process holds `directory` by `lock`."""
-    with locks.hold(directory / ".lock", wait=True):
-        pass
-
-
 def sync_directory(path: Path) -> None:
     """Makes what was created, renamed or removed in a folder survive a crash."""
     descriptor = os.open(path, os.O_RDONLY)

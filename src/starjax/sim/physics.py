@@ -175,14 +175,6 @@ def kinematics(
     return mjx.kinematics(_model(scene, p_world_trocar), data)
 
 
-def geom_poses(
-    scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Returns all geoms' positions `[G, 3]` m and rotations `[G, 3, 3]`, for figures and videos."""
-    data = kinematics(scene, qpos, p_world_trocar)
-    return data.geom_xpos, data.geom_xmat
-
-
 def touching(scene: Scene, contacts: Contacts) -> jax.Array:
     """Returns `[A]` bool, True if a pad overlaps something graspable."""
     close = contacts.dist < 0
