@@ -78,14 +78,7 @@ def test_a_run_that_ends_lets_go(tmp_path, kind):
         assert is_systems == (kind == SYSTEMS)
         with pytest.raises(files.StorageError, match=f"in use by process {os.getpid()} on "):
             hold(tmp_path)
-    with locks.hold(tmp_path / ".lock", wait=True):
-        pass
-
-
-def test_waiting_ends_with_the_holder(tmp_path, holder):
-    holder.stdin.close()
-    with locks.hold(tmp_path / ".lock", wait=True):
-        pass
+    hold(tmp_path)
 
 
 def test_a_marker_of_a_killed_process_elsewhere_says_how_to_go_on(tmp_path, monkeypatch):

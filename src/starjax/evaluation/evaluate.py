@@ -117,10 +117,13 @@ def evaluate(
             **jax_settings.record(),
         }
         each = -(-len(group) // (several * share.count))
-        sizes = _Sizes(layout.lanes or lanes_per_device(device, each), settings.chunk)
-        most = layout.lanes or most_lanes(device)
-        found = share.first("sizes", lambda: _resume(directory, plan, sizes, most, several, report))
-        lanes, chunk = found
+        lanes = layout.lanes or lanes_per_device(device, each)
+        batch = lanes * several
+        sizes = {"lanes": lanes, "chunk": min(settings.chunk or batch, batch)}
+        max_lanes = layout.lanes or most_lanes(device)
+        lanes, chunk = share.first(
+            "sizes", lambda: _resume(directory, plan, sizes, max_lanes, several, report)
+        )
         rules = engine.RolloutSettings(settings.seed, None, max_steps, lanes * several)
         record = plans.record(score_settings.execute) if score_settings else episodes.SCORE
         run = engine.make(env, agent, trocars, rules, record, layout.devices, levels)
@@ -196,18 +199,11 @@ def _check(settings: EvaluationSettings, layout: DeviceLayout) -> None:
             raise errors.UsageError(name, "0 or more", value)
 
 
-class _Sizes(NamedTuple):
-    """Lanes of each device, and trials of a chunk, 0 for as many as all lanes."""
-
-    lanes: int
-    chunk: int
-
-
 def _resume(
     directory: Path,
     plan: dict[str, Any],
-    sizes: _Sizes,
-    most: int,
+    sizes: dict[str, int],
+    max_lanes: int,
     several: int,
     report: Callable[[str], None],
 ) -> list[int]:
@@ -215,13 +211,13 @@ def _resume(
     takes so many lanes; removes others. Returns lanes and chunk."""
     path = directory / "plan.json"
     try:
-        found = files.read_json(path) if path.exists() else {}
+        previous = files.read_json(path) if path.exists() else {}
     except ValueError as error:
         report(str(error))
-        found = {}
-    before = [found.pop(name, 0) for name in _Sizes._fields]
-    fits = 1 <= before[0] <= most and 1 <= before[1] <= before[0] * several
-    if fits and found == json.loads(json.dumps(plan)):
+        previous = {}
+    before = [previous.pop(name, 0) for name in sizes]
+    fits = 1 <= before[0] <= max_lanes and 1 <= before[1] <= before[0] * several
+    if fits and previous == json.loads(json.dumps(plan)):
         return before
     old = len(list(directory.glob("chunk_*.npz")))
     if old:
@@ -229,10 +225,8 @@ def _resume(
     # The plan goes first: chunks without one belong to nothing.
     for file in [path, directory / "recorded.npz", *directory.glob("chunk_*.npz")]:
         file.unlink(missing_ok=True)
-    batch = sizes.lanes * several
-    chosen = _Sizes(sizes.lanes, min(sizes.chunk or batch, batch))
-    files.write_json(path, {**plan, **chosen._asdict()})
-    return list(chosen)
+    files.write_json(path, {**plan, **sizes})
+    return list(sizes.values())
 
 
 def _parts(

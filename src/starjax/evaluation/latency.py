@@ -25,7 +25,7 @@ def policy_ms(
     policy_config: config.PolicyConfig,
     params: Any,
     stats: Any,
-    seen: features.Sensors,
+    sensors: features.Sensors,
     *,
     batch: int = 1,
     calls: int = 100,
@@ -38,7 +38,7 @@ def policy_ms(
       policy_config: shapes of its observations.
       params: of the policy.
       stats: its normaliser.
-      seen: the task and the cameras that it was made for.
+      sensors: the task and the cameras that it was made for.
       batch: robots that are served at once.
       calls: timed calls, fewer if they take longer than `seconds` altogether.
       seconds: see `calls`; at least five calls are made.
@@ -46,11 +46,11 @@ def policy_ms(
     Returns:
       {p50, p95, p99} in ms, and n, the number of calls.
     """
-    asked = _asked(policy_config, seen, batch)
+    inputs = _inputs(policy_config, sensors, batch)
     # Weights on the host would be copied again at each call.
     params, stats = jax.device_put((params, stats))
-    call = _program(policy.sample, _slots(seen)).select(params, stats, *asked)
-    return _percentiles(lambda: call(params, stats, *asked), calls, seconds)
+    call = _program(policy.sample, _slots(sensors)).select(params, stats, *inputs)
+    return _percentiles(lambda: call(params, stats, *inputs), calls, seconds)
 
 
 def precompile(
@@ -58,14 +58,14 @@ def precompile(
     policy_config: config.PolicyConfig,
     params: Any,
     stats: Any,
-    seen: features.Sensors,
+    sensors: features.Sensors,
 ) -> None:
     """Compiles, in the background, the program that `policy_ms` times at batch 1.
 
     The arguments are those of `policy_ms`; `params` and `stats` are arrays or their shapes.
     """
-    asked = jax.eval_shape(lambda: _asked(policy_config, seen, 1))
-    _program(policy.sample, _slots(seen)).prepare(params, stats, *asked)
+    inputs = jax.eval_shape(lambda: _inputs(policy_config, sensors, 1))
+    _program(policy.sample, _slots(sensors)).prepare(params, stats, *inputs)
 
 
 def table(
@@ -73,7 +73,7 @@ def table(
     policy_config: config.PolicyConfig,
     params: Any,
     stats: Any,
-    seen: features.Sensors,
+    sensors: features.Sensors,
     *,
     ddim_steps: Sequence[int],
     calls: int = 100,
@@ -85,21 +85,21 @@ def table(
     """
     for steps in ddim_steps:
         changed = config.with_options(policy_config, ddim_steps=steps)
-        policy = policies.make(method, changed, seen.task, cameras=seen.cameras)
-        given = (policy, changed, params, stats, seen)
-        yield {"ddim_steps": steps, **policy_ms(*given, calls=calls, seconds=seconds)}
+        policy = policies.make(method, changed, sensors.task, cameras=sensors.cameras)
+        times = policy_ms(policy, changed, params, stats, sensors, calls=calls, seconds=seconds)
+        yield {"ddim_steps": steps, **times}
 
 
 def roll_ms(
     policy_config: config.PolicyConfig,
-    seen: features.Sensors,
+    sensors: features.Sensors,
     *,
     batch: int = 1,
     calls: int = 200,
     seconds: float = 5.0,
 ) -> dict[str, float]:
     """Measures the roll network alone, the hierarchy's overhead; weights do not matter."""
-    batch *= seen.task.arms
+    batch *= sensors.task.arms
     net = roll_net.RollNet(
         width=policy_config.roll_width,
         blocks=policy_config.roll_blocks,
@@ -111,30 +111,32 @@ def roll_ms(
         jnp.zeros((batch, policy_config.obs_horizon)),
     ]
     if policy_config.roll_observation:
-        inputs.append(jnp.zeros((batch, generator.sizes(policy_config, seen, action=4).observed)))
+        inputs.append(
+            jnp.zeros((batch, generator.sizes(policy_config, sensors, action=4).observed))
+        )
     params = net.init(jax.random.key(0), *inputs)
     apply = jax.jit(net.apply)
     return _percentiles(lambda: apply(params, *inputs), calls, seconds)
 
 
 def example(
-    policy_config: config.PolicyConfig, seen: features.Sensors, batch: int
+    policy_config: config.PolicyConfig, sensors: features.Sensors, batch: int
 ) -> tuple[Observation, rcm.Trocar]:
     """Returns a plausible observation `[batch, O, A]`, tools above ground; trocars `[batch, A]`."""
-    trocar = rcm.sample_trocar(jax.random.key(1), (batch, seen.task.arms))
+    trocar = rcm.sample_trocar(jax.random.key(1), (batch, sensors.task.arms))
     shape = (batch, policy_config.obs_horizon)
-    action = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 0.02]), (*shape, seen.task.arms, 4))
-    frame = features.per_step(_frame(_slots(seen), trocar))
+    action = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 0.02]), (*shape, sensors.task.arms, 4))
+    frame = features.per_step(_frame(_slots(sensors), trocar))
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, frame)
-    observation = Observation(pose, jnp.ones((*shape, seen.task.arms)))
+    observation = Observation(pose, jnp.ones((*shape, sensors.task.arms)))
     if policy_config.observation == "state":
-        state = jnp.concatenate([_plausible(field) for field in seen.task.fields])
+        state = jnp.concatenate([_plausible(field) for field in sensors.task.fields])
         return observation._replace(state=jnp.broadcast_to(state, (*shape, len(state)))), trocar
     size = (*shape, policy_config.image_size, policy_config.image_size, 3)
-    keys = jax.random.split(jax.random.key(2), len(seen.cameras))
+    keys = jax.random.split(jax.random.key(2), len(sensors.cameras))
     images = {
         name: jax.random.randint(key, size, 0, 256, jnp.uint8)
-        for name, key in zip(seen.cameras, keys, strict=True)
+        for name, key in zip(sensors.cameras, keys, strict=True)
     }
     return observation._replace(images=images), trocar
 
@@ -150,14 +152,14 @@ def _program(sample: Callable[..., Any], slots: Slots) -> precompile_lib.Program
     return precompile_lib.Program(infer)
 
 
-def _slots(seen: features.Sensors) -> Slots:
-    return tuple((tuple(map(float, s.p_world_ref)), float(s.roll_zero)) for s in seen.task.slots)
+def _slots(sensors: features.Sensors) -> Slots:
+    return tuple((tuple(map(float, s.p_world_ref)), float(s.roll_zero)) for s in sensors.task.slots)
 
 
-def _asked(policy_config: config.PolicyConfig, seen: features.Sensors, batch: int) -> Any:
+def _inputs(policy_config: config.PolicyConfig, sensors: features.Sensors, batch: int) -> Any:
     """Returns the inputs of one inference: keys, observation, trocars."""
     keys = jax.random.split(jax.random.key(0), batch)
-    return keys, *example(policy_config, seen, batch)
+    return keys, *example(policy_config, sensors, batch)
 
 
 def _frame(slots: Slots, trocar: rcm.Trocar) -> rcm.TrocarFrame:

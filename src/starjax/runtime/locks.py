@@ -19,7 +19,7 @@ class Held(Exception):
 
 
 @contextlib.contextmanager
-def hold(path: Path, wait: bool = False) -> Iterator[bool]:
+def hold(path: Path) -> Iterator[bool]:
     """Holds the lock of the file `path`.
 
     The system lets go of a file's lock however its process ends. A marker of a process that was
@@ -28,7 +28,6 @@ def hold(path: Path, wait: bool = False) -> Iterator[bool]:
 
     Args:
       path: made if it is missing, and left there. The name of the holder is in a file beside it.
-      wait: for the lock, instead of raising Held.
 
     Yields:
       whether the lock is the system's, not a marker.
@@ -42,7 +41,7 @@ def hold(path: Path, wait: bool = False) -> Iterator[bool]:
 
     marker, note = path.with_name(f"{path.name}-marker"), path.with_name(f"{path.name}-holder")
     try:
-        lock = filelock.FileLock(path, blocking=wait, fallback_to_soft=False)
+        lock = filelock.FileLock(path, blocking=False, fallback_to_soft=False)
         lock.acquire()
         is_systems = True
     except filelock.Timeout:
@@ -50,7 +49,7 @@ def hold(path: Path, wait: bool = False) -> Iterator[bool]:
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise
-        lock = filelock.SoftFileLock(marker, timeout=-1 if wait else _ATTEMPT_S)
+        lock = filelock.SoftFileLock(marker, timeout=_ATTEMPT_S)
         try:
             lock.acquire()
         except filelock.Timeout:
