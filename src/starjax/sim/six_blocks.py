@@ -6,6 +6,7 @@ agent are those of one block's transfer.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,40 +25,24 @@ RISE, WITHDRAWN = 18, 45
 HEIGHT = 0.045  # m to which they rise: over blocks that stand
 
 
-def make(
-    arms: Sequence[str] = (),
-    tools: Sequence[str] = (),
-    *,
-    observation: str = "image",
-    image_size: int = 256,
-    cameras: Sequence[str] = (),
-) -> Env:
-    """Builds the exercise, see `sim.env.make`. Its label `moved` counts the blocks moved."""
-    return wrap(
-        envs.make(
-            six.TASK.name,
-            arms,
-            tools,
-            observation=observation,
-            image_size=image_size,
-            cameras=cameras,
-            variant=six.TASK,
-        )
-    )
+def make(arms: Sequence[str] = (), tools: Sequence[str] = (), **options: Any) -> Env:
+    """Builds the exercise, `options` as of `sim.env.make`. Its label `moved` counts blocks."""
+    return wrap(envs.make(six.TASK.name, arms, tools, variant=six.TASK, **options))
 
 
 def wrap(env: Env) -> Env:
     """Wraps an environment of `six.TASK` into the exercise."""
 
     def step(state: EnvState, command: Command) -> EnvState:
-        between = _is_between(state)
+        layout = state.layout
+        between = (layout.turn > 0) & (state.step < layout.since + WITHDRAWN)
         command = jax.tree.map(
             lambda own, other: jnp.where(between, own, other), _withdrawing(state), command
         )
         after = env.step(state, command)
-        goes_on = after.success & ~state.done & (state.layout.turn < six.BLOCKS - 1)
-        begun = _next(env.scene, after)
-        return jax.tree.map(lambda x, y: jnp.where(goes_on, x, y), begun, after)
+        continues = after.success & ~state.done & (state.layout.turn < six.BLOCKS - 1)
+        following = _next(env.scene, after)
+        return jax.tree.map(lambda x, y: jnp.where(continues, x, y), following, after)
 
     def labels(state: EnvState) -> dict[str, jax.Array]:
         return {"moved": state.layout.turn + state.success}
@@ -81,10 +66,6 @@ def reset_each_block(agent: Agent) -> Agent:
         return command, (key, inner), label
 
     return Agent(init, act)
-
-
-def _is_between(state: EnvState) -> jax.Array:
-    return (state.layout.turn > 0) & (state.step < state.layout.since + WITHDRAWN)
 
 
 def _withdrawing(state: EnvState) -> Command:
