@@ -73,7 +73,7 @@ ScriptT = TypeVar("ScriptT", bound=PhaseScript)
 GraspT = TypeVar("GraspT", bound=GraspScript)
 
 
-class Timing(NamedTuple):
+class PhaseTable(NamedTuple):
     """Phases P.
 
     Attributes:
@@ -104,7 +104,7 @@ class Grasp(NamedTuple):
         differ by rounding.
     """
 
-    timing: Timing
+    timing: PhaseTable
     disturbance: tuple[float, ...]
     deviation: tuple[float, ...]
     straight: tuple[int, ...]
@@ -115,7 +115,7 @@ class Grasp(NamedTuple):
 
 
 def begin(
-    kind: Callable[..., ScriptT], timing: Timing, key: jax.Array, at: jax.Array, **own: Any
+    kind: Callable[..., ScriptT], timing: PhaseTable, key: jax.Array, at: jax.Array, **own: Any
 ) -> ScriptT:
     """Returns a script of class `kind` before its first phase, with the task's own fields."""
     key_tempo, key = jax.random.split(key)
@@ -148,7 +148,7 @@ def grasp_fields() -> dict[str, jax.Array]:
 
 
 def enter(
-    script: ScriptT, timing: Timing, phase: jax.Array, goals: list[jax.Array], **own: Any
+    script: ScriptT, timing: PhaseTable, phase: jax.Array, goals: list[jax.Array], **own: Any
 ) -> ScriptT:
     """Returns the script at the start of `phase`, whose goal is that of `goals` `[P]`."""
     goal = jnp.stack(goals)[phase]
@@ -165,7 +165,7 @@ def enter(
     )
 
 
-def advance(script: ScriptT, timing: Timing, after: ScriptT) -> tuple[ScriptT, jax.Array]:
+def advance(script: ScriptT, timing: PhaseTable, after: ScriptT) -> tuple[ScriptT, jax.Array]:
     """Returns the script a control step later, `after` if its phase is over, and the time's share.
 
     Jaws are those of the new step; the position is the caller's to set.

@@ -15,7 +15,7 @@ from starjax.sim.tasks.needle_pick import task
 from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE, TURN_LEAD
 
 CLOSE, LIFT, HOLD = range(3, 6)
-TIMING = phases.Timing(
+TIMING = phases.PhaseTable(
     duration=(0.5, 1.2, 0.9, 0.4, 0.9, 1.0),
     speed=(0.04, 0.04, 0.024, 1.0, 0.02, 1.0),
     jaws=(1.0, 1.0, 1.0, -1.0, -1.0, -1.0),

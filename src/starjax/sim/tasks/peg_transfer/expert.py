@@ -19,7 +19,7 @@ from starjax.sim.tasks.peg_transfer import task
 from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE, TURN_LEAD
 
 CLOSE, LIFT, CARRY, LOWER, OPEN, RETREAT, WAIT = range(3, 10)
-TIMING = phases.Timing(
+TIMING = phases.PhaseTable(
     duration=(0.5, 1.2, 0.9, 0.4, 0.6, 0.9, 0.7, 0.4, 0.5, 1.0),
     speed=(0.04, 0.04, 0.024, 1.0, 0.035, 0.038, 0.024, 1.0, 0.04, 1.0),
     jaws=(1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0),

@@ -17,7 +17,7 @@ from starjax.sim.tasks.ring_on_wire import task
 from starjax.types import Agent, Command, Pose
 
 CLOSE, LIFT, CARRY, LOWER, OPEN, LEAVE, WAIT = range(3, 10)
-TIMING = phases.Timing(
+TIMING = phases.PhaseTable(
     duration=(0.5, 1.2, 0.9, 0.6, 1.2, 0.4, 0.8, 0.5, 0.7, 0.8),
     speed=(0.04, 0.04, 0.024, 1.0, 0.02, 0.015, 0.02, 1.0, 0.03, 1.0),
     jaws=(1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0),
