@@ -30,11 +30,11 @@ _PART = re.compile(r"(.+?)(?:\[(\d+)(?:(:)(\d+))?\])?")
 _FILE = "--map"
 
 
-class _Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _MapPart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Part of a mapping file."""
 
 
-class ArmColumns(_Strict, frozen=True, kw_only=True):
+class ArmColumns(_MapPart, frozen=True, kw_only=True):
     """Columns of one arm. Empty ones are not there."""
 
     position: Columns = ()  # of the tip, 3 numbers
@@ -67,7 +67,7 @@ class ArmColumns(_Strict, frozen=True, kw_only=True):
             raise ValueError("expected gripper_open other than gripper_closed")
 
 
-class CameraColumn(_Strict, frozen=True, kw_only=True):
+class CameraColumn(_MapPart, frozen=True, kw_only=True):
     """A camera of the task, and the column of its images."""
 
     column: str
@@ -80,7 +80,7 @@ class CameraColumn(_Strict, frozen=True, kw_only=True):
             raise ValueError("expected crop [top, left, height, width]")
 
 
-class Map(_Strict, frozen=True, kw_only=True):
+class Map(_MapPart, frozen=True, kw_only=True):
     """A whole mapping file."""
 
     task: str  # of starjax, whose nominal trocars and cameras the dataset gets
