@@ -133,7 +133,7 @@ def evaluate(
             score = functools.partial(
                 alarms.of_episodes, settings=score_settings, max_steps=max_steps
             )
-        simulate = functools.partial(run, params)
+        simulate = lambda trials: run(params, trials)  # noqa: E731
         parts = _parts(directory, env, simulate, group, spans, chosen, score)
         made = chunks.complete(share, parts, "Evaluation", "trials", report)
         if share.is_first and chosen.any():
