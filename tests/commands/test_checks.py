@@ -78,7 +78,7 @@ def test_a_folder_that_cannot_be_used_is_a_mistake_of_its_flag(out, places):
 
 def test_a_report_that_cannot_be_made_leaves_nothing(places):
     before = sorted(places.rglob("*"))
-    with mistakes.of("RUN", "method: expected text"):
+    with mistakes.of("RUN", "expected schema"):
         report_command.main([".", "--out", "new"])
     assert sorted(places.rglob("*")) == before
 

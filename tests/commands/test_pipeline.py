@@ -58,7 +58,7 @@ def smoke(out, method):
 
 def started(settings, env):
     """A run of these settings in an environment that is built already."""
-    work = pipeline.Run(settings, None, sharing.ALONE, "")
+    work = pipeline.RunContext(settings, None, sharing.ALONE, "")
     work.__dict__["env"] = env
     return work
 

@@ -136,7 +136,7 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
     """
     import numpy as np
 
-    from starjax.data import redraw, store
+    from starjax.data import redraw, schema, store
     from starjax.rollouts import episodes
 
     root = Path(config.demos.from_)
@@ -158,7 +158,9 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
     wanted = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
     if policy.observation == "state":
         wanted = {"state": [sum(field.size for field in env.task.fields)]}
-    if policy.observation == "image" and redraw.is_possible(about):
+    model = schema.model_hash(env.scene)  # empty without a MuJoCo model
+    is_drawn = redraw.is_possible(about) and model and about["model"] == model
+    if policy.observation == "image" and is_drawn:
         wanted = {}
     for name, shape in wanted.items():
         found = features.get(name, {}).get("shape")

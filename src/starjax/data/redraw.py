@@ -1,7 +1,7 @@
 """Images of recorded episodes, drawn when they are needed: an image is a function of the state.
 
 A dataset keeps joint positions and the numbers of its trials. The layout and the cameras' poses of
-an episode follow from the key of its trial, as they did when it was recorded.
+an episode follow from the key of its trial, just like in the recording.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Demonstrations on disk: one committed folder per episode, hashed, so that damage is noticed.
+"""Demonstrations on disk: one committed folder per episode, hashed, so damage is noticed.
 
     <root>/dataset.json            what the dataset is; never changes
     <root>/episodes/<key>/*.npy    one array a field, `[T, ...]`, T the episode's control steps

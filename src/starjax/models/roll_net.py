@@ -11,7 +11,7 @@ class RollNet(nn.Module):
     """A residual MLP from (positions, trocar, roll history) to the rolls of the horizon.
 
     It predicts the roll itself, as the paper does, not its change since the last measured one. Its
-    last layer starts at zero, so that an untrained network says "no roll" and not a random one.
+    last layer starts at zero, so an untrained network says "no roll" and not a random one.
     Inputs should be of order one.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Runs a function in a background thread, so that its result is there when it is needed."""
+"""Runs a function in a background thread, so its result is ready when it is needed."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -92,7 +92,7 @@ def start(job: Callable[[], T]) -> Callable[[], T | None]:
 
 
 def settle() -> None:
-    """Waits until every queued job has been traced, so that the next trace runs alone."""
+    """Waits until every queued job has been traced, so the next trace runs alone."""
     _tracer.submit(lambda: None).result()
 
 

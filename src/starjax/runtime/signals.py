@@ -29,7 +29,7 @@ _answered = False
 
 
 def interrupt_on_stops() -> None:
-    """Lets every stop raise KeyboardInterrupt in the main thread.
+    """Lets every stop raise KeyboardInterrupt in the process's main thread.
 
     Python drops what is raised in a callback of its collector, and jax's C++ some of what is raised
     while it calls Python, at every start for some milliseconds. So it is raised again and again,
