@@ -8,10 +8,12 @@ import pytest
 import stubs
 
 from starjax import rcm
-from starjax.rollouts import agent, engine, episodes
+from starjax.evaluation import alarms
+from starjax.monitor import calibrate, scores
+from starjax.rollouts import agent, engine, episodes, plans
 from starjax.sim import moving_trocars
 from starjax.types import Command
-from starjax.viewer import simulation
+from starjax.viewer import episode_alarm, simulation
 from starjax.viewer.frame import outcome
 
 
@@ -112,3 +114,31 @@ def test_a_dragged_trocar_is_followed_and_the_task_is_done_through_it(expert):
     np.testing.assert_allclose(frame.p_world_trocar, target, atol=1e-6)
     assert max(speed) < 1.001 * simulation.TROCAR_SPEED
     assert max(errors) < 5e-3 and errors[-1] < 1e-4  # it lags behind the hand, and arrives
+
+
+ALARM_SETTINGS = scores.ScoreSettings(4, 30.0, 2)
+
+
+def test_a_live_episode_has_the_alarm_of_its_evaluation():
+    env = stubbed()
+    sample, params = stubs.make_policy(horizon=6)
+    batch, params = agent.from_policy(sample, 2, 4), (params, 1.0)
+    rules = engine.RolloutSettings(5, None, 60, lanes=1)
+    run = engine.make(env, batch, env.task.trocars, rules, plans.record(4))
+    (episode,) = [e for p in run(params, [(3, 2)]) for e in p.ended]
+    values = alarms.of_episodes([episode], ALARM_SETTINGS, 60)
+    limit = np.nanmax(values[0, :4, 0]) * 0.999
+    width = np.array([1.0, 1e9, 1e9])
+    monitor = calibrate.Monitor(np.zeros(3), width, limit, 1.0, 0.05, 20, ALARM_SETTINGS, "")
+    times, _ = calibrate.first_alarms(monitor, values)
+    for watched, text in ((None, ""), (monitor, f"alarm at {times[0]:.1f} s: disagreement")):
+        live = simulation.make("policy", env, batch, params)
+        alarm = episode_alarm.EpisodeAlarm(watched)
+        carry, frame = live.start(5, 3, 2)
+        for _ in range(13):
+            before = frame
+            carry, frame = live.step(carry, frame.p_world_trocar)
+            alarm.update(before, carry)
+        assert alarm.text.startswith(text) and bool(alarm.text) == bool(text)
+    alarm.reset()
+    assert alarm.text == ""

@@ -120,6 +120,8 @@ def _policy(path: Path) -> Found:
         ("plans", f"{policy.horizon} commands, {policy.execute} executed"),
         ("trained", f"{train.steps} steps of {train.batch_size}"),
     ]
+    if monitor := trained.monitor:
+        rows.append(("monitor", f"alpha {monitor.alpha:g}, {monitor.count} calibration successes"))
     odd = [] if all(np.isfinite(leaf).all() for leaf in leaves) else ["weights are not finite"]
     for name, box in (("actions", trained.normalizer.action), ("state", trained.normalizer.state)):
         if box is not None:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import methods
+from starjax.monitor.calibrate import Monitor
 from starjax.policies import in_env, packaged
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import agent as agents
@@ -91,6 +92,7 @@ class Simulation(NamedTuple):
       start: (seed, index of the trocar configuration, trial) -> (LiveState, Frame).
       step: (LiveState, target p_world_trocar `[A, 3]` m) -> (LiveState, Frame on the host).
       look: LiveState -> camera's name -> `[h, w, 3]` uint8.
+      monitor: the policy's runtime monitor, if it has one.
     """
 
     label: str
@@ -98,6 +100,7 @@ class Simulation(NamedTuple):
     start: Callable[[int, int, int], tuple[LiveState, Frame]]
     step: Callable[[LiveState, np.ndarray], tuple[LiveState, Frame]]
     look: Callable[[LiveState], dict[str, jax.Array]]
+    monitor: Monitor | None = None
 
 
 def load(spec: AgentSpec, arms: tuple[str, ...] = ()) -> Simulation:
@@ -107,7 +110,8 @@ def load(spec: AgentSpec, arms: tuple[str, ...] = ()) -> Simulation:
         return make(spec.label, env, agents.from_single(env.task.expert()))
     policy = in_env.place_in_own_scene(spec.file, in_env.read(spec.file), arms=arms)
     params = (policy.trained.params, policy.trained.normalizer)
-    return make(spec.label, policy.env, policy.agent(), params)
+    made = make(spec.label, policy.env, policy.agent(), params)
+    return made._replace(monitor=policy.trained.monitor)
 
 
 def make(label: str, env: sim_env.Env, agent: agents.BatchAgent, params: Any = None) -> Simulation:

@@ -9,6 +9,7 @@ import numpy as np
 from starjax import errors
 from starjax.sim import registries
 from starjax.viewer import page, simulation
+from starjax.viewer.episode_alarm import EpisodeAlarm
 from starjax.viewer.frame import outcome, rcm_error_mm
 from starjax.viewer.handles import TrocarHandles
 from starjax.viewer.plots import Plots
@@ -142,6 +143,7 @@ class Rollouts:
         with tab:
             self._plots = Plots(gui, labels, self.hz)
             self._pictures = page.Pictures(gui, [f"{label} sees" for label in labels])
+        self._alarms = [EpisodeAlarm(simulation.monitor) for simulation in simulations]
         self._tally = np.zeros((len(simulations), 2), int)  # succeeded, ended
 
     def begin(self, seed: int, configuration: int, trial: int) -> None:
@@ -154,6 +156,8 @@ class Rollouts:
         self._plots.clear()
         for stage in self._stages:
             stage.clear()
+        for alarm in self._alarms:
+            alarm.reset()
         self._draw(with_images=True)
 
     def advance(self) -> bool:
@@ -164,6 +168,7 @@ class Rollouts:
         target = self._handles.target()
         for i in [i for i, end in enumerate(self._outcomes) if not end]:
             self._states[i], frame = self._simulations[i].step(self._states[i], target)
+            self._alarms[i].update(self._frames[i], self._states[i])
             self._frames[i], self._outcomes[i] = frame, outcome(frame, frame.step >= self._limit)
             self._tally[i] += bool(frame.success), bool(self._outcomes[i])
         is_due = self._frames[0].step % page.REDRAW_STEPS == 0
@@ -202,11 +207,13 @@ class Rollouts:
     def _line(self, i: int) -> str:
         frame, (successes, ended) = self._frames[i], self._tally[i]
         progress = self._outcomes[i] or self._simulations[i].env.task.stages[int(frame.stage)]
-        return (
+        lines = [
             f"{self._simulations[i].label}, trial {self.trial}: "
-            f"{frame.step / self.hz:.1f} s, {progress}\n"
-            f"RCM error {rcm_error_mm(frame):.2f} mm; success so far: {successes} of {ended}"
-        )
+            f"{frame.step / self.hz:.1f} s, {progress}",
+            f"RCM error {rcm_error_mm(frame):.2f} mm; success so far: {successes} of {ended}",
+            self._alarms[i].text,
+        ]
+        return "\n".join(filter(None, lines))
 
 
 def _load(server: Any, selection: Selection, status: page.Status) -> Rollouts:
