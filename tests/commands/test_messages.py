@@ -26,11 +26,11 @@ def test_the_plan_has_the_scene_the_observation_and_the_numbers():
     assert "image, 64 px" in said and "from scratch" in said and "state" not in said
 
 
-def test_the_plan_has_the_measured_time_of_an_unchanged_preset():
-    cpu, time = (
-        presets.PRESETS["cpu"],
-        f"{round(presets.TIMINGS['cpu'].seconds / 60)} min on 2 cores",
-    )
+def test_the_plan_has_the_measured_time_of_an_unchanged_preset(monkeypatch):
+    cpu = presets.PRESETS["cpu"]
+    timing = presets.Timing("2 cores of a test", "cpu", 431.0, "result.json")
+    monkeypatch.setitem(presets.TIMINGS, "cpu", timing)
+    time = "7 min on 2 cores of a test"
     assert time in messages.plan(cpu, messages.STAGES)
     assert time in messages.plan(dataclasses.replace(cpu, seed=3, out="x"), messages.STAGES)
     steps = dataclasses.replace(cpu, train=dataclasses.replace(cpu.train, steps=7))
