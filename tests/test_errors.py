@@ -37,3 +37,8 @@ def test_a_choice_suggests_the_nearest_name():
     with mistakes.of("method", "x") as caught:
         errors.choice("method", "x", ["dp_ee"])
     assert caught.value.hint == ""
+
+
+def test_texts_of_others_cannot_steer_the_terminal():
+    text = "a\x1b]52;c;eHg=\x07b\u202ec\nä"
+    assert errors.printable(text) == "a\\x1b]52;c;eHg=\\x07b\\u202ec\nä"

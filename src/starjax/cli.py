@@ -177,7 +177,7 @@ def _format_warning(message: Warning | str, kind: type[Warning], file: str, *res
     becomes one line, the others are dropped.
     """
     if os.path.abspath(file).startswith(_OURS):
-        return f"starjax: {message}\n"
+        return errors.printable(f"starjax: {message}\n")
     action, entry, details = str(message).partition(_CACHE_ENTRY)
     if not entry:
         return _format_with_location(message, kind, file, *rest)
@@ -201,5 +201,5 @@ def _with_flags(error: errors.UsageError) -> str:
 
 
 def _fail(message: object, code: int) -> int:
-    print(f"starjax: {message}", file=sys.stderr)
+    print(errors.printable(f"starjax: {message}"), file=sys.stderr)
     return code

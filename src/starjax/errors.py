@@ -22,6 +22,16 @@ class UsageError(ValueError):
         super().__init__(f"{argument}: expected {expected}, got {got}{ending}")
 
 
+def printable(text: str) -> str:
+    """Replaces control characters other than line ends by their escapes.
+
+    Texts of foreign files and servers could otherwise move the cursor or change the clipboard.
+    """
+    return "".join(
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+    )
+
+
 def choice(argument: str, value: str, known: Iterable[str]) -> None:
     """Raises UsageError unless `value` is one of `known`; suggests the nearest one."""
     names = list(known)

@@ -36,4 +36,5 @@ LEARNERS = Registry(
         "act": "starjax.policies.learners.act:LEARNER",
         "bc": "starjax.policies.learners.bc:LEARNER",
     },
+    "starjax.learners:Learner",
 )

@@ -1,8 +1,11 @@
 """Parts that exist by name, some of them from other packages. Standard library only."""
 
+import functools
 import importlib
 import importlib.metadata
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
+from importlib.metadata import EntryPoint
 from typing import Any, NamedTuple
 
 from starjax import errors
@@ -20,32 +23,70 @@ class Registry(NamedTuple):
     Attributes:
       kind: its name, e.g. `task`; entry points are those of the group `starjax.<kind>s`.
       built_in: name -> `module:object`.
+      record: type of a part, as `module:object`; empty for any.
     """
 
     kind: str
     built_in: Mapping[str, str]
+    record: str = ""
 
     def names(self) -> list[str]:
         """Returns all names, built-in ones first."""
-        found = [entry.name for entry in self._entries() if entry.name not in self.built_in]
-        return [*self.built_in, *sorted(found)]
+        return [*self.built_in, *sorted({e.name for e in self._entries()} - {*self.built_in})]
 
     def get(self, name: str) -> Any:
         """Returns the part of a name.
 
         Raises:
-          errors.UsageError: the name is unknown, or its package cannot be imported.
+          errors.UsageError: the name is unknown, several packages provide it, or its package cannot
+            be imported or provides another type or name.
         """
-        if name in self.built_in:
-            return load(self.built_in[name])
         errors.choice(self.kind, name, self.names())
-        entry = next(entry for entry in self._entries() if entry.name == name)
+        entries = [entry for entry in self._entries() if entry.name == name]
+        owners = ["starjax"] * (name in self.built_in) + list(map(_owner, entries))
+        expected = f"one package that provides {name}"
+        if len(owners) > 1:
+            raise errors.UsageError(self.kind, expected, ", ".join(owners))
+        if not entries:
+            return load(self.built_in[name])
+        where = f"{entries[0].value} of {owners[0]}"
         try:
-            return entry.load()
-        except (ImportError, AttributeError) as error:
+            part = entries[0].load()
+        except Exception as error:  # a module of another package may raise anything
+            got = f"{where}: {type(error).__name__}: {error}"
+            raise errors.UsageError(self.kind, expected, got) from error
+        if self.record and not isinstance(part, load(self.record)):
+            expected = f"a {self.record.partition(':')[2]} that is called {name}"
+            raise errors.UsageError(self.kind, expected, f"{where}: a {type(part).__name__}")
+        if getattr(part, "name", name) != name:
             raise errors.UsageError(
-                self.kind, f"a package that provides {name}", f"{entry.value}: {error}"
-            ) from error
+                self.kind, f"one that is called {name}", f"{where}: {part.name}"
+            )
+        return part
 
-    def _entries(self) -> list[importlib.metadata.EntryPoint]:
-        return list(importlib.metadata.entry_points(group=f"starjax.{self.kind}s"))
+    def path(self, name: str) -> str:
+        """Returns the `module:object` that a name stands for; empty for an unknown name."""
+        if name in self.built_in:
+            return self.built_in[name]
+        return next((entry.value for entry in self._entries() if entry.name == name), "")
+
+    def _entries(self) -> tuple[EntryPoint, ...]:
+        return entries(f"starjax.{self.kind}s")
+
+
+def entries(group: str) -> tuple[EntryPoint, ...]:
+    """Returns the entry points of a group; each is listed once however often its path is."""
+    return _entries_at(group, tuple(sys.path), importlib.metadata.entry_points)
+
+
+@functools.lru_cache(maxsize=64)
+def _entries_at(
+    group: str, paths: tuple[str, ...], find: Callable[..., Any]
+) -> tuple[EntryPoint, ...]:
+    """Caches `entries`: a look-up reads the metadata of every installed package."""
+    found = {(entry.name, entry.value, _owner(entry)): entry for entry in find(group=group)}
+    return tuple(found.values())
+
+
+def _owner(entry: EntryPoint) -> str:
+    return entry.dist.name if entry.dist is not None else entry.value.partition(".")[0]

@@ -10,6 +10,7 @@ import stubs
 from starjax import config
 from starjax.commands import demonstrations, presets
 from starjax.rollouts import sharing
+from starjax.runtime import sources
 
 SMOKE = presets.PRESETS["smoke"]
 
@@ -48,6 +49,14 @@ def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, see
     wanted = {"per_trocar": 3, "seed": 5, "max_steps": max(7, least)}
     wanted["expert"] = expert or "default"
     assert {name: settings._asdict()[name] for name in wanted} == wanted
+
+
+def test_an_edit_of_the_tasks_code_asks_for_new_demonstrations(tmp_path, monkeypatch):
+    chosen, env = dataclasses.replace(SMOKE, out=str(tmp_path)), stubs.make_env()
+    before = demonstrations.plan(chosen, env, sharing.ALONE).root
+    assert demonstrations.plan(chosen, env, sharing.ALONE).root == before
+    monkeypatch.setattr(sources, "digests", lambda *_: {"mylab": "edited"})
+    assert demonstrations.plan(chosen, env, sharing.ALONE).root != before
 
 
 def test_an_expert_that_the_task_lacks_is_a_mistake(tmp_path):

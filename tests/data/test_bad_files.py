@@ -14,7 +14,7 @@ import pytest
 import zarr
 
 from starjax import errors
-from starjax.data.formats import base
+from starjax.data.formats import base, lerobot
 from starjax.runtime import xla
 
 NAMES = base.FORMATS.names()
@@ -235,3 +235,57 @@ def test_what_is_brought_back_stays_in_its_folder(tmp_path):
     assert set(found) == {"read", "refused"}, found
     assert {p.name for p in tmp_path.iterdir()} <= {"d", "out", "deep"}
     assert {p.name for p in (tmp_path / "deep").iterdir()} == {"er"}
+
+
+def test_more_rows_than_an_episode_has_are_not_unpacked(copy, monkeypatch):
+    path = copy("lerobot")
+    with base.open_dataset(path, "lerobot") as source:
+        names = [name for name, about in source.columns.items() if not about.is_image]
+    row = parquet.read_table(path / DATA).slice(0, 1)
+    parquet.write_table(row.take(pa.array(np.zeros(300_000, np.int64))), path / DATA)
+    del row
+    pool = pa.system_memory_pool()
+    monkeypatch.setattr(lerobot, "_BATCH", 1 << 8)
+    with pytest.raises(errors.UsageError) as caught, base.open_dataset(path, "lerobot") as source:
+        pa.set_memory_pool(pool)
+        before = pool.max_memory()
+        source.read(0, names)
+    pa.set_memory_pool(pa.default_memory_pool())
+    assert caught.value.got.endswith("more") and pool.max_memory() - before < 1 << 24
+
+
+def test_cells_longer_than_their_column_are_refused(copy):
+    path = copy("lerobot")
+    rewritten(path / DATA, "action", lambda old: pa.array([[0.0] * 1000] * len(old)))
+    assert "numbers" in refused(path, "lerobot")
+
+
+def test_links_into_the_cache_of_the_hub_are_followed(copy, tmp_path):
+    path = copy("lerobot")
+    cache = tmp_path / "datasets--someone--something"
+    snapshot, blobs = cache / "snapshots" / "0a1b2c", cache / "blobs"
+    blobs.mkdir(parents=True)
+    for i, file in enumerate(sorted(path.rglob("*"))):
+        if file.is_file():
+            link = snapshot / file.relative_to(path)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(file, blobs / str(i))
+            link.symlink_to(os.path.relpath(blobs / str(i), link.parent))
+    with base.open_dataset(snapshot, "lerobot") as source:
+        assert source.read(0, source.columns)
+    outside = tmp_path / "outside.parquet"
+    shutil.copy(path / DATA, outside)
+    (snapshot / DATA).unlink()
+    (snapshot / DATA).symlink_to(outside)
+    assert "a link to" in refused(snapshot, "lerobot")
+
+
+def test_other_kinds_of_columns_are_left_out_with_a_note(copy):
+    path = copy("lerobot")
+    features = info(path)["features"]
+    features["depth"] = {"dtype": "image", "shape": [40, 96, 1], "names": None}
+    features["said"] = {"dtype": "language", "shape": [1], "names": None}
+    info(path, features=features)
+    with base.open_dataset(path, "lerobot") as source:
+        assert not {"depth", "said"} & set(source.columns) and len(source.notes) == 2
+        assert source.read(0, ["action"])

@@ -405,12 +405,20 @@ def test_mappings_are_toml_or_json(tmp_path, kind):
         'task = "reach"\ncameras = "x"\n[[arms]]\nposition = "p"\nrotation = "q"',
         'task = "reach"\n[cameras.c]\ncolumn="x"\ncrop=[1]\n[[arms]]\nposition="p"\nrotation="q"',
         "\x00",
+        "a = " + "[" * 100_000,
     ],
 )
 def test_a_mapping_that_is_none_is_one_line(tmp_path, text):
     (tmp_path / "m.toml").write_text(text)
     with mistakes.of("--map", "m.toml"):
         mapping.load(tmp_path / "m.toml")
+
+
+def test_a_mapping_may_begin_with_a_byte_order_mark(tmp_path):
+    path = tmp_path / "map.toml"
+    text = 'task = "reach"\n[[arms]]\nposition = "p"\nrotation = "q"\n'
+    path.write_text(text, "utf-8-sig")
+    assert mapping.load(path).task == "reach"
 
 
 def test_missing_files_and_columns_are_named(tmp_path):
@@ -480,3 +488,57 @@ def test_an_export_without_its_trocars_comes_back_with_them(tmp_path, name):
     np.testing.assert_array_equal(after.command.pose.p, before.command.pose.p)
     np.testing.assert_array_equal(after.observation.state, before.observation.state)
     shutil.rmtree(tmp_path / "d")
+
+
+def changed_arm(**changed):
+    return structs.replace(MAP, arms=(structs.replace(ARM, **changed),))
+
+
+COMMANDS = {"command_position": "cp", "command_rotation": "R0"}
+
+
+def _relative(arrays):
+    steps = np.diff(arrays["p0"], axis=0, append=arrays["p0"][-1:])
+    return arrays | {"cp": steps}
+
+
+def _absolute(arrays):
+    return arrays | {"cp": np.concatenate([arrays["p0"][1:], arrays["p0"][-1:]])}
+
+
+SLIPS = {
+    "relative commands": (changed_arm(**COMMANDS), _relative, "relative"),
+    "gripper 0 to 1": (
+        MAP,
+        lambda arrays: arrays | {"jaws0": 0.5 + 0.2 * arrays["jaws0"]},
+        "gripper",
+    ),
+    "gripper in mm": (
+        MAP,
+        lambda arrays: arrays | {"jaws0": 40 + 40 * arrays["jaws0"]},
+        "gripper",
+    ),
+    "shaft reversed": (changed_arm(tip_turn=(0.0, 1.0, 0.0, 0.0)), None, "before the trocar"),
+    "origin off": (
+        structs.replace(MAP, origin=(0.0, 0.0, 0.5)),
+        None,
+        "nominal",
+    ),
+    "state of 8": (
+        MAP,
+        lambda arrays: arrays | {"state": arrays["state"][:, :8]},
+        "state",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SLIPS)
+def test_slips_are_noted(tmp_path, name):
+    made, change, word = SLIPS[name]
+    found = bring(tmp_path, source(change=change), made)
+    assert any(word in line for line in found.notes), found.notes
+
+
+def test_absolute_commands_are_not(tmp_path):
+    given = source(change=_absolute)
+    assert not bring(tmp_path, given, changed_arm(**COMMANDS)).notes

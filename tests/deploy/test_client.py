@@ -46,7 +46,7 @@ def followed(latency, steps, ahead=None):
 
     Held steps are None.
     """
-    executor = plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, ahead, deploy.Limits(1.0, 3.0))
+    executor = plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, ahead, deploy.Limits(30.0, 90.0))
     executor.begin(poses(0.0, 0.1), 1.0)
     given, number, due = [], 0, None
     for t in range(steps):
@@ -128,9 +128,9 @@ def test_commands_keep_to_the_manifold_and_do_not_jump(seed):
     R, p = (np.stack([c.pose[n] for c in commands]).astype(np.float64) for n in (0, 1))
     off = np.linalg.norm(np.cross(p - WHERE, R[:, :, 2]), axis=-1)
     assert off.max() < 1e-6 and ((p - WHERE) * R[:, :, 2]).sum(-1).min() > 0.0
-    assert np.linalg.norm(np.diff(p, axis=0), axis=-1).max() <= limits.move * (1 + 1e-4)
+    assert np.linalg.norm(np.diff(p, axis=0), axis=-1).max() <= limits.per_step[0] * (1 + 1e-4)
     cos = (np.einsum("tij,tij->t", R[1:], R[:-1]) - 1.0) / 2.0
-    assert np.arccos(np.clip(cos, -1.0, 1.0)).max() <= limits.turn * (1 + 1e-2)
+    assert np.arccos(np.clip(cos, -1.0, 1.0)).max() <= limits.per_step[1] * (1 + 1e-2)
     assert all(-1.0 <= c.gripper <= 1.0 for c in commands)
 
 
@@ -221,7 +221,7 @@ class AtOnce(Connection):
 def test_a_loop_over_the_socket_is_the_loop_in_the_process(batches):
     policy, key, robot = batches.policy, jax.random.key(0), Robot()
     execute = policy.settings.execute
-    options = {"ahead": 0, "connect": AtOnce, "limits": deploy.Limits(1.0, 3.1)}
+    options = {"ahead": 0, "connect": AtOnce, "limits": deploy.Limits(30.0, 93.0)}
     with served.running(batches) as (where, _), client_of(where, **options) as client:
         for _ in range(3 * execute):
             robot.send(client.step(robot.measure()))
@@ -317,7 +317,7 @@ def test_a_server_that_goes_and_comes_back_is_found_again(batches):
         assert client.reconnected >= 1
         client.close()
     steps = np.diff([c.pose.p for c in robot.commands], axis=0)
-    assert np.linalg.norm(steps, axis=-1).max() <= deploy.Limits().move * (1 + 1e-4)
+    assert np.linalg.norm(steps, axis=-1).max() <= deploy.Limits().per_step[0] * (1 + 1e-4)
 
 
 def test_another_policy_at_the_address_is_not_asked(batches, monkeypatch):
@@ -349,6 +349,28 @@ def test_what_cannot_be_served_is_said_at_the_start(batches, about, argument):
             deploy.Client(f"{where[0]}:{where[1]}", trocar, **given)
         assert argument is None or caught.value.argument == argument
     assert threading.active_count() <= threads
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        {"control_hz": 3000.0},
+        {"control_hz": float("nan")},
+        {"control_hz": -30.0},
+        {"horizon": 10**9},
+        {"execute": 0},
+        {"execute": "8"},
+    ],
+)
+def test_numbers_of_a_server_are_checked(batches, lie):
+    class Liar(Connection):
+        def _greet(self, frame):
+            super()._greet(frame)
+            self.metadata |= lie
+
+    with served.running(batches) as (where, _), pytest.raises(UsageError) as caught:
+        client_of(where, connect=Liar)
+    assert caught.value.argument == "address"
 
 
 def test_answers_that_are_none_are_refused_and_it_holds(batches):

@@ -264,3 +264,15 @@ def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path, monkeypatch
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"policy: expected a file, got .*nowhere"):
         policy_file.load(tmp_path / "nowhere")
+
+
+def test_scalar_parameters_stay_scalars():
+    flat = dict(policy_file._flatten({"sharp": np.zeros(()), "T": np.zeros((2, 3)).T}))
+    assert flat["sharp"].shape == () and flat["T"].flags.c_contiguous
+
+
+def test_deeply_nested_metadata_is_refused(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    safetensors.numpy.save_file({"x": np.zeros(1)}, path, {"starjax": "[" * 100_000})
+    with pytest.raises(ValueError, match="not a readable"):
+        policy_file.load(path)

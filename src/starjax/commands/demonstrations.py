@@ -56,7 +56,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
     )
     expert = agent.from_single(task.expert(name))
     out = Path(config.out)
-    root = out / f"demos-{store.digest(schema.describe(env, chosen, settings))}"
+    root = store.folder(out, schema.describe(env, chosen, settings))
 
     def is_there() -> bool:
         if not store.is_sealed(root):

@@ -14,9 +14,15 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, methods
-from starjax.runtime import files
+from starjax.learners import LEARNERS
+from starjax.runtime import files, sources
 
-_BESIDE = ("dataset", "encoder", "jax_settings")  # further entries of a config.json
+_BESIDE = (
+    "dataset",
+    "encoder",
+    "jax_settings",
+    "learner_source",
+)  # further entries of a config.json
 
 
 def existing(run: str) -> Path:
@@ -99,6 +105,7 @@ def claim(
     # Imported here because it imports jax.
     from starjax.runtime import jax_settings
 
+    source = sources.digests(LEARNERS.path(config.policy.learner))
     started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
     found = _recorded(folder) if (folder / "config.json").exists() else {}
     if started and not found:
@@ -111,11 +118,16 @@ def claim(
         settings = (record.get("jax_settings", {}) for record in (found, jax_settings.record()))
         _refuse(folder, "the settings of jax", *settings)
         _refuse(folder, "the demonstrations", found.get("dataset", dataset), dataset)
+        _refuse(folder, "the learner's code", found.get("learner_source", source), source)
         encoder_before = found.get("encoder") or encoder
         _refuse(folder, "policy.encoder_weights", encoder_before, encoder or encoder_before)
     known = found.get("encoder") if started or config.policy.freeze_encoder else None
     frozen = encoder or known
-    extra = {"dataset": dataset} | ({"encoder": frozen} if frozen else {}) | jax_settings.record()
+    extra = (
+        {"dataset": dataset, **({"learner_source": source} if source else {})}
+        | ({"encoder": frozen} if frozen else {})
+        | jax_settings.record()
+    )
     files.write_json(folder / "config.json", {**config_lib.as_json(config), **extra})
 
 

@@ -26,11 +26,12 @@ class ImportArgs:
     path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]  # dataset to import
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]  # new dataset
     map: str = ""  # mapping file, .toml or .json; only exports of starjax need none
+    accept: bool = False  # exit code 0 in spite of notes
     format: str = options.AUTO  # format: lerobot, robomimic or zarr; auto: detected
 
 
 def main(argv: Sequence[str]) -> int:
-    """Writes the dataset; prints its anomalies."""
+    """Writes the dataset; prints its anomalies, and returns 1 if there are any."""
     args = options.parse("import", ImportArgs, argv, DESCRIPTION)
     checks.expect_folder("OUT", args.out)
     xla.prepare_xla()
@@ -45,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
     with base.open_dataset(path, name) as source:
         if not args.map:
             return _bring_back(source, path, out)
-        return _mapped(source, Path(args.map), out)
+        return _mapped(source, Path(args.map), out, args.accept)
 
 
 def _bring_back(source: Any, path: Path, out: Path) -> int:
@@ -62,7 +63,7 @@ def _bring_back(source: Any, path: Path, out: Path) -> int:
     return 0
 
 
-def _mapped(source: Any, map_path: Path, out: Path) -> int:
+def _mapped(source: Any, map_path: Path, out: Path, accept: bool) -> int:
     from starjax.data import schema
     from starjax.data.formats import foreign, mapping
 
@@ -79,4 +80,7 @@ def _mapped(source: Any, map_path: Path, out: Path) -> int:
     )
     print(f"shafts pass their trocars at {worst}")
     print(f"starjax train --demos.from {shlex.quote(str(out))} --task {given.task} trains on it")
+    if found.notes and not accept:
+        print(f"{len(found.notes)} notes: exit code 1 unless --accept")
+        return 1
     return 0

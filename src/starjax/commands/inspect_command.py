@@ -1,7 +1,8 @@
 """`starjax inspect`: summarises a dataset, policy or result and its anomalies."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -41,9 +42,9 @@ def main(argv: Sequence[str]) -> int:
     found = inspect(args.path)
     width = max(len(name) for name, _ in found.rows)
     for name, text in found.rows:
-        print(f"{name:{width}}  {text}".rstrip())
+        print(errors.printable(f"{name:{width}}  {text}".rstrip()))
     for line in found.odd[:_SHOWN]:
-        print(f"odd: {line}")
+        print(errors.printable(f"odd: {line}"))
     if len(found.odd) > _SHOWN:
         print(f"odd: {len(found.odd) - _SHOWN} more")
     return int(bool(found.odd))
@@ -177,29 +178,49 @@ def _others(path: Path) -> Found:
             ("rate", rate),
         ]
         low = [column for column, about in source.columns.items() if not about.is_image]
-        seen = [source.read(i, low) for i in range(min(len(lengths), _LOOKED_AT))]
-        rows += [(f"  {column}", _said(source, column, seen)) for column in source.columns]
-        return Found(rows, [*source.notes, *_odd(low, seen)])
+        ranges = {column: _Numbers() for column in low}
+        for episode in range(min(len(lengths), _LOOKED_AT)):  # one at a time in memory
+            for column, values in source.read(episode, low).items():
+                ranges[column].add(episode, values)
+        rows += [
+            (f"  {column}", _said(about, ranges.get(column)))
+            for column, about in source.columns.items()
+        ]
+        return Found(rows, [*source.notes, *_odd(ranges)])
 
 
-def _said(source: Any, name: str, seen: list[dict[str, Any]]) -> str:
-    import numpy as np
+@dataclasses.dataclass
+class _Numbers:
+    """Range of a column's finite numbers, and the episodes with others."""
 
-    column = source.columns[name]
+    low: float = math.inf
+    high: float = -math.inf
+    bad: list[int] = dataclasses.field(default_factory=list)
+
+    def add(self, episode: int, values: Any) -> None:
+        """Takes the values of an episode."""
+        import numpy as np
+
+        is_finite = np.isfinite(values)
+        if not is_finite.all():
+            self.bad.append(episode)
+        self.low = float(np.min(values, initial=self.low, where=is_finite))
+        self.high = float(np.max(values, initial=self.high, where=is_finite))
+
+
+def _said(column: Any, numbers: _Numbers | None) -> str:
     text = f"{column.dtype} {list(column.shape)}  {', '.join(column.names[:16])}"
-    if column.is_image or (not column.shape and column.dtype == "bool"):
+    is_flag = not column.shape and column.dtype == "bool"
+    if numbers is None or is_flag or numbers.low > numbers.high:
         return text
-    values = np.concatenate([arrays[name].reshape(-1) for arrays in seen])
-    return f"{text}  {np.nanmin(values):.4g} to {np.nanmax(values):.4g}" if values.size else text
+    return f"{text}  {numbers.low:.4g} to {numbers.high:.4g}"
 
 
-def _odd(names: Sequence[str], seen: list[dict[str, Any]]) -> Iterator[str]:
-    import numpy as np
-
-    for name in names:
-        bad = [i for i, arrays in enumerate(seen) if not np.isfinite(arrays[name]).all()]
-        if bad:
-            yield f"{name} is not finite in episode {bad[0]} and {len(bad) - 1} more"
+def _odd(ranges: Mapping[str, _Numbers]) -> Iterator[str]:
+    for name, numbers in ranges.items():
+        if numbers.bad:
+            first, *others = numbers.bad
+            yield f"{name} is not finite in episode {first} and {len(others)} more"
 
 
 def _scene(scene: dict[str, Any]) -> str:

@@ -25,12 +25,17 @@ Row = tuple[str, str]  # name, description
 def main(argv: Sequence[str]) -> int:
     """Prints the tables."""
     options.parse("list", options.NoFlags, argv, DESCRIPTION)
+    from starjax.data.formats import base
+    from starjax.evaluation.disturbances import DISTURBANCES
+
     tables = {
         "tasks (--task, --camera, --demos.expert)": _parts(registries.tasks, _task),
         "arms (--arm)": _parts(registries.arms, _arm),
         "tools (--tool)": _parts(registries.tools, _tool),
         "methods (--method)": _methods(),
-        "learners (--policy.learner)": _learners(),
+        "learners (--policy.learner)": _parts(LEARNERS, _learner),
+        "formats (export --format, import)": _parts(base.FORMATS, _format),
+        "disturbances (stress, --demos.randomise)": _parts(DISTURBANCES, _disturbance),
         "presets (--preset)": _presets(),
         "policies (--policy, --policy.encoder-weights)": _policies(),
     }
@@ -45,8 +50,10 @@ def _parts(registry: Registry, described: Callable[[Any], str]) -> Iterator[Row]
     for name in registry.names():
         try:
             yield name, described(registry.get(name))
-        except errors.UsageError as error:  # of a package that cannot be imported
+        except errors.UsageError as error:  # of a package that cannot be used
             yield name, f"cannot be used: {error.got}"
+        except Exception as error:
+            yield name, f"cannot be used: {registry.path(name)}: {type(error).__name__}: {error}"
 
 
 def _task(task: "Task") -> str:
@@ -73,13 +80,16 @@ def _methods() -> Iterator[Row]:
     yield "all", f"the {len(methods.TABLE_II)} of the paper's Table II"
 
 
-def _learners() -> Iterator[Row]:
-    for name in LEARNERS.names():
-        try:
-            kind = LEARNERS.get(name).settings
-            yield name, ", ".join(field.name for field in dataclasses.fields(kind))
-        except errors.UsageError as error:  # of a package that cannot be imported
-            yield name, f"cannot be used: {error.got}"
+def _learner(learner: Any) -> str:
+    return ", ".join(field.name for field in dataclasses.fields(learner.settings))
+
+
+def _format(form: Any) -> str:
+    return form.description
+
+
+def _disturbance(disturbance: Any) -> str:
+    return disturbance.description
 
 
 def _presets() -> Iterator[Row]:

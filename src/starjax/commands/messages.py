@@ -9,7 +9,7 @@ from typing import Any
 
 import starjax
 from starjax import config as config_lib
-from starjax import methods
+from starjax import errors, methods
 from starjax.commands import presets
 from starjax.runtime import files, xla
 
@@ -258,7 +258,7 @@ def stage(name: str, text: str) -> None:
 
 def indented(text: str) -> None:
     """Prints a line that belongs to the stage above it."""
-    print(f"      {text}", flush=True)
+    print(errors.printable(f"      {text}"), flush=True)
 
 
 def _rate(rate: Mapping[str, Any]) -> str:

@@ -18,8 +18,10 @@ from starjax.commands import (
     session,
     stage_times,
 )
-from starjax.runtime import files
+from starjax.learners import LEARNERS
+from starjax.runtime import files, sources
 from starjax.runtime.signals import stop_signals
+from starjax.sim import registries
 
 STAGES = messages.STAGES
 MIN_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints check their own
@@ -175,6 +177,9 @@ def _train(
         roll_zero=tuple(slot.roll_zero for slot in env.task.slots),
         demos=config.demos,
         preset=config.preset,
+        packages=sources.versions(
+            *registries.paths(env.names), LEARNERS.path(config.policy.learner)
+        ),
     )
     share.first(f"{name} is saved", lambda: policy_file.save(weights, trained))
     errors = ", ".join(f"{key} {value:.3g}" for key, value in result.holdout.items())
@@ -230,8 +235,12 @@ def _was_scored(config: config_lib.RunConfig, folder: Path, weights: Path, env: 
     Raises:
       errors.UsageError: fewer trials would replace it.
     """
+    from starjax.evaluation import result
+
     found = _scored(folder, files.sha256(weights))
-    if found and _is_of(found, config):
+    source = sources.digests(*result.parts_of(env.names, config.policy.learner))
+    is_current = found and found.about.get("source", source) == source
+    if is_current and _is_of(found, config):
         return True
     count = len(env.task.is_seen)
     if found and (more := len(found.trials)) > count * config.eval.trials:

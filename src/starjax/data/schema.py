@@ -11,13 +11,18 @@ import numpy as np
 from starjax import errors
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
+from starjax.registry import Registry
 from starjax.rollouts import episodes, programs
-from starjax.runtime import jax_settings, xla
+from starjax.runtime import jax_settings, sources, xla
+from starjax.sim import registries
 
 IMPORTED = "imported.json"  # beside dataset.json: what was odd about the files of others
 # Demonstrations never start from the states that an evaluation with the same seed draws.
 STREAM = 0x64656D6F
 SEED_RULE = f"fold_in(fold_in(fold_in(key(seed), {STREAM}), trocar), trial)"
+
+
+_DISTURBANCES = Registry("disturbance", {})  # of other packages
 
 
 class DemoSettings(NamedTuple):
@@ -48,6 +53,11 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
       trocars: fields `[C, A]`.
     """
     frame = programs.frame(env, episodes.DEMONSTRATION)
+    parts = [
+        *registries.paths(env.names),
+        env.task.experts[expert_name(env.task, settings)],
+        *(_DISTURBANCES.path(name) for name in settings.randomise),
+    ]
     features = {
         name: {
             "shape": list(leaf.shape),
@@ -75,7 +85,8 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
         "features": features,
         "model": model_hash(env.scene),
         "seed_rule": SEED_RULE,
-        "versions": xla.versions(),
+        "source": sources.digests(*parts),
+        "versions": {**xla.versions(), **sources.versions(*parts)},
         **jax_settings.record(),
     }
 

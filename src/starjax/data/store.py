@@ -48,6 +48,12 @@ def digest(description: Mapping[str, Any]) -> str:
     return _hash({k: v for k, v in description.items() if k != "versions"})[:12]
 
 
+def folder(out: Path, description: Mapping[str, Any]) -> Path:
+    """Returns the folder of a run's dataset, an older one without a digest of the source if any."""
+    older = out / f"demos-{digest({k: v for k, v in description.items() if k != 'source'})}"
+    return older if older.exists() else out / f"demos-{digest(description)}"
+
+
 def create(root: Path, description: Mapping[str, Any]) -> None:
     """Starts a dataset, or makes sure that the one at `root` is the one described.
 
@@ -64,6 +70,8 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
     present = read_description(root)
     names = {**description, **present}
     differing = [k for k in names if description.get(k) != present.get(k)]
+    if not ("source" in description and "source" in present):  # older datasets lack it
+        differing = [k for k in differing if k != "source"]
     if is_sealed(root):
         differing = [k for k in differing if k != "versions"]
     if differing:

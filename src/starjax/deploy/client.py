@@ -20,10 +20,12 @@ from starjax.deploy.plan_executor import LIMITS, Limits, PlanExecutor, Report
 from starjax.errors import UsageError
 from starjax.monitor import calibrate
 from starjax.monitor.watch import Watch
+from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Command
 
 TIMEOUT_S = 1.0  # of a reply, and of a connection attempt
 WAIT_S = 10.0  # for the first connection
+_MAX_HORIZON = 1024  # control steps of a plan
 
 
 class Robot(Protocol):
@@ -81,7 +83,7 @@ class Client:
           api_key: of the server.
           ahead: control steps between a request and the end of the present plan; None: the largest
             recent latency plus one.
-          limits: between consecutive commands.
+          limits: of the commands' speeds.
           timeout_s: of a reply; after it the client reconnects.
           wait_s: for the first connection.
           is_watched: hold on an alarm of the policy's runtime monitor.
@@ -95,11 +97,10 @@ class Client:
         try:
             self.metadata = self._connection.metadata
             self._input_spec = spec = _read_spec(self.metadata)
-            self.control_hz = float(self.metadata["control_hz"])
+            self.control_hz, horizon, execute = _read_timing(self.metadata)
             self._trocar = _trocar(trocar, spec.arms)
             p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)
             self.p_world_trocar = np.asarray(p_world_trocar, np.float32)
-            horizon, execute = int(self.metadata["horizon"]), int(self.metadata["execute"])
             self._watch = _watch(self.metadata) if is_watched else None
             self._executor = PlanExecutor(self.p_world_trocar, horizon, execute, ahead, limits)
         except BaseException:
@@ -225,6 +226,22 @@ def _watch(metadata: dict[str, Any]) -> Watch | None:
         return Watch(calibrate.from_json(metadata["monitor"]))
     except ValueError as error:
         raise UsageError("address", "a server with a readable monitor", str(error)) from None
+
+
+def _read_timing(metadata: dict[str, Any]) -> tuple[float, int, int]:
+    """Reads commands per second, commands per plan and how many of them are executed.
+
+    Raises:
+      UsageError: the rate is not that of all policies, or the lengths are none of a plan.
+    """
+    hz, *lengths = (metadata.get(name) for name in ("control_hz", "horizon", "execute"))
+    if hz != CONTROL_HZ:
+        raise UsageError("address", f"a policy at {CONTROL_HZ:g} Hz", hz)
+    horizon, execute = (n if type(n) is int else 0 for n in lengths)
+    if not 1 <= execute <= horizon <= _MAX_HORIZON:
+        expected = f"1 <= execute <= horizon <= {_MAX_HORIZON}"
+        raise UsageError("address", expected, f"{lengths[1]} and {lengths[0]}")
+    return CONTROL_HZ, horizon, execute
 
 
 def _trocar(trocar: rcm.Trocar, arms: tuple[int, ...]) -> rcm.Trocar:

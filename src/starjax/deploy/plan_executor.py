@@ -23,6 +23,7 @@ from starjax import rcm
 from starjax.deploy import turns
 from starjax.errors import UsageError
 from starjax.rcm import arrays
+from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Command, Pose
 
 MAX_OFF = 1e-4  # m, from a plan's axes to the trocar: the networks' plans are off by 1e-8
@@ -34,15 +35,20 @@ _SPARE = 1  # control steps of margin over that prediction
 
 
 class Limits(NamedTuple):
-    """Maximum distance between consecutive commands, for the owner of a robot to choose.
+    """Maximum speeds of the commands, for the owner of a robot to choose.
 
     Attributes:
-      move: m, of the tip; 0.15 m/s at 30 Hz.
-      turn: rad, of the tool; 3 rad/s at 30 Hz.
+      speed: m/s, of the tip.
+      turn_rate: rad/s, of the tool.
     """
 
-    move: float = 0.005
-    turn: float = 0.1
+    speed: float = 0.15
+    turn_rate: float = 3.0
+
+    @property
+    def per_step(self) -> tuple[float, float]:
+        """Returns m and rad between consecutive commands."""
+        return self.speed / CONTROL_HZ, self.turn_rate / CONTROL_HZ
 
 
 LIMITS = Limits()
@@ -104,7 +110,7 @@ class PlanExecutor:
           horizon, execute: of the policy, in control steps.
           ahead: control steps between a request and the end of the present plan; None for the
             largest recent latency plus one.
-          limits: between consecutive commands.
+          limits: of the commands' speeds.
         """
         self._max_ahead = horizon - execute
         if ahead is not None and not 0 <= ahead <= self._max_ahead:
@@ -223,11 +229,12 @@ class PlanExecutor:
         return self.last
 
     def _toward(self, last: Pose, target: Pose) -> tuple[Pose, np.ndarray, np.ndarray]:
-        return jax.device_get(_toward(last, target, self._p_world_trocar, *self._limits))
+        return jax.device_get(_toward(last, target, self._p_world_trocar, *self._limits.per_step))
 
     def _exceeds(self, move: np.ndarray, turn: np.ndarray) -> bool:
         # A negated comparison: NaN exceeds the limits.
-        return not (move <= self._limits.move and turn <= self._limits.turn)
+        max_move, max_turn = self._limits.per_step
+        return not (move <= max_move and turn <= max_turn)
 
 
 @jax.jit

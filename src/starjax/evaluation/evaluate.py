@@ -29,8 +29,8 @@ from starjax.rollouts import chunks, engine, episodes, plans, sharing, workers
 from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
-from starjax.runtime import files, jax_settings, xla
-from starjax.sim import endoscope_camera
+from starjax.runtime import files, jax_settings, sources, xla
+from starjax.sim import endoscope_camera, registries
 
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
 GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
@@ -113,6 +113,7 @@ def evaluate(
             "scene": env.names._asdict(),
             "model": schema.model_hash(env.scene),
             "platform": device.platform,
+            "source": sources.digests(*registries.paths(env.names)),
             "versions": xla.versions(),
             **jax_settings.record(),
         }
@@ -217,6 +218,7 @@ def _resume(
         previous = {}
     before = [previous.pop(name, 0) for name in sizes]
     fits = 1 <= before[0] <= max_lanes and 1 <= before[1] <= before[0] * several
+    previous.setdefault("source", plan["source"])  # older evaluations lack it
     if fits and previous == json.loads(json.dumps(plan)):
         return before
     old = len(list(directory.glob("chunk_*.npz")))

@@ -13,8 +13,9 @@ import msgspec
 
 from starjax.evaluation import structure, trial_file
 from starjax.evaluation.content import Evaluation, Sweep, Trial
-from starjax.runtime import files, jax_settings, provenance, xla
-from starjax.sim import names
+from starjax.learners import LEARNERS
+from starjax.runtime import files, jax_settings, provenance, sources, xla
+from starjax.sim import names, registries
 
 SCHEMA = 2
 
@@ -89,13 +90,16 @@ def write(
       about: JSON values by name: control_hz, seed, weights, dataset_digest and command; of an
         evaluation config, preset, inference_ms, timings_s and warnings; of a sweep time_limit_s.
     """
+    policy = about.get("config", {}).get("policy", {})
+    parts = parts_of(scene, policy.get("learner", ""))
     content = {
         "schema": SCHEMA,
         "scene": scene._asdict(),
         **figures,
         **about,
         **provenance.code()._asdict(),
-        "versions": xla.versions(),
+        "source": sources.digests(*parts),
+        "versions": {**xla.versions(), **sources.versions(*parts)},
         "hardware": xla.hardware(),
         **jax_settings.record(),
     }
@@ -103,6 +107,11 @@ def write(
     result = _parse(file, values, Sweep if "by_distance" in values else Evaluation)
     files.write_json(file, values)
     return result
+
+
+def parts_of(scene: names.SceneNames, learner: str) -> list[str]:
+    """Returns the `module:object` of each part that a result depends on, for `runtime.sources`."""
+    return [*registries.paths(scene), LEARNERS.path(learner)]
 
 
 def _parse(file: Path, values: dict[str, Any], kind: type[Evaluation] | type[Sweep]) -> Result:

@@ -7,6 +7,8 @@ float32 again once they are loaded.
 import hashlib
 import json
 import pathlib
+import types
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -42,6 +44,7 @@ class Trained(NamedTuple):
       roll_zero: `[A]` rad, see `rcm.TrocarFrame`.
       demos: settings of its demonstrations, if known; they name the seen trocars.
       preset: the preset of its run, if it was given; for the record.
+      packages: versions of the other packages that provide its task, arms, tools or learner.
       monitor: runtime monitor calibrated with these parameters, None without one.
     """
 
@@ -55,6 +58,7 @@ class Trained(NamedTuple):
     roll_zero: tuple[float, ...]
     demos: config.DemosConfig | None = None
     preset: str | None = None
+    packages: Mapping[str, str] = types.MappingProxyType({})
     monitor: calibrate.Monitor | None = None
 
 
@@ -92,6 +96,8 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
         "roll_zero": _floats(trained.roll_zero),
         "demos": None if trained.demos is None else config.as_json(trained.demos),
         "preset": trained.preset,
+        # Omitted if empty, so files of starjax's own parts keep their bytes.
+        **({"packages": dict(trained.packages)} if trained.packages else {}),
     }
     if trained.monitor is not None:
         _check_monitor(trained)
@@ -124,7 +130,9 @@ def load(path: pathlib.Path | str) -> Trained:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         about, expected = envelope["about"], envelope["sha256"]
         schema = about["schema"]
-    except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+    except (
+        safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError
+    ) as error:  # fmt: skip
         raise ValueError(f"{path}: not a readable starjax policy: {error}") from error
     if schema != SCHEMA:
         raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}; train it again")
@@ -204,6 +212,7 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
         roll_zero=tuple(about["roll_zero"]),
         demos=None if demos is None else config.from_dict(config.DemosConfig, demos),
         preset=about.get("preset"),
+        packages=about.get("packages", {}),
     )
 
 
@@ -219,7 +228,7 @@ def _flatten(tree: Any, prefix: str = ""):
         if isinstance(value, dict):
             yield from _flatten(value, path + _SEPARATOR)
         else:
-            yield path, np.ascontiguousarray(value)
+            yield path, np.asarray(value, order="C")  # unlike ascontiguousarray, keeps scalars
 
 
 def _as_half(name: str, array: np.ndarray) -> np.ndarray:

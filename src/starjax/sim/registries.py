@@ -5,10 +5,11 @@ An entry point of the group `starjax.tasks`, `starjax.arms`, `starjax.tools` or
 dict from (arm, tool, workspace) to `Mount`, for arms of other packages.
 """
 
-import importlib.metadata
+import warnings
 
-from starjax.registry import Registry
+from starjax.registry import Registry, entries
 from starjax.sim.arms.base import Arm, Mount
+from starjax.sim.names import SceneNames
 
 tasks = Registry(
     "task",
@@ -21,10 +22,12 @@ tasks = Registry(
         "ring_on_wire": "starjax.sim.tasks.ring_on_wire.task:TASK",
         "endoscope_track": "starjax.sim.tasks.endoscope_track.task:TASK",
     },
+    "starjax.sim.tasks.base:Task",
 )
 arms = Registry(
     "arm",
     {name: f"starjax.sim.arms.{name}:ARM" for name in ("fr5", "ur5e", "panda", "iiwa14", "rcm4")},
+    "starjax.sim.arms.base:Arm",
 )
 tools = Registry(
     "tool",
@@ -32,6 +35,7 @@ tools = Registry(
         name: f"starjax.sim.tools.{name}:TOOL"
         for name in ("grasper", "grasper_wide", "endoscope", "endoscope30")
     },
+    "starjax.sim.tools.base:Tool",
 )
 workspaces = Registry(
     "workspace",
@@ -39,14 +43,29 @@ workspaces = Registry(
         name: f"starjax.sim.workspaces:{name.upper()}"
         for name in ("board", "left", "right", "tissue", "wire")
     },
+    "starjax.sim.workspaces:Workspace",
 )
+
+
+def paths(names: SceneNames) -> list[str]:
+    """Returns the `module:object` of each part of a scene, empty for unknown names."""
+    return [
+        tasks.path(names.task),
+        *(arms.path(name) for name in names.arms),
+        *(tools.path(name) for name in names.tools),
+    ]
 
 
 def mount(arm: Arm, tool: str, workspace: str) -> Mount | None:
     """Returns the mount of an arm with a tool in a workspace, or None if it is unknown."""
     if (tool, workspace) in arm.mounts:
         return arm.mounts[tool, workspace]
-    for entry in importlib.metadata.entry_points(group="starjax.mounts"):
-        if record := entry.load().get((arm.name, tool, workspace)):
+    for entry in entries("starjax.mounts"):
+        try:
+            record = entry.load().get((arm.name, tool, workspace))
+        except Exception as error:  # a broken package leaves those of others
+            warnings.warn(f"mounts of {entry.value} are skipped: {error}", stacklevel=2)
+            continue
+        if record:
             return record
     return None

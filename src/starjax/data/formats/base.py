@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ FORMATS = Registry(
         "robomimic": "starjax.data.formats.robomimic:FORMAT",
         "zarr": "starjax.data.formats.zarr:FORMAT",
     },
+    "starjax.data.formats.base:Format",
 )
 OURS = "starjax"  # name of the metadata and columns from which an export is restored
 MEMORY_SHARE = 0.25  # of the host's memory, for one episode
@@ -96,9 +98,20 @@ def detect(path: Path) -> str:
     if not path.exists():
         raise errors.UsageError("PATH", "a dataset", f"{path}, which does not exist")
     for name in FORMATS.names():
-        if FORMATS.get(name).recognises(path):
+        if _recognises(name, path):
             return name
     raise errors.UsageError("PATH", ", ".join(FORMATS.names()), f"{path} of unknown format")
+
+
+def _recognises(name: str, path: Path) -> bool:
+    """Returns True if `path` is of a format; False, with a warning, if a package is broken."""
+    try:
+        return bool(FORMATS.get(name).recognises(path))
+    except Exception as error:
+        if name in FORMATS.built_in:
+            raise
+        warnings.warn(f"format {name} is skipped: {error}", stacklevel=2)
+        return False
 
 
 @contextlib.contextmanager
@@ -145,7 +158,11 @@ def require(holds: bool, what: str, got: Any) -> None:
 
 def require_inside(root: Path, path: Path) -> Path:
     """Returns `path` if it lies in the dataset's folder: names in files are not trusted."""
-    require(path.resolve().is_relative_to(root.resolve()), f"a path inside {root}", path)
+    roots, real = [root.resolve()], path.resolve()
+    if root.absolute().parent.name == "snapshots":  # the Hub's cache: files are links to blobs
+        roots.append(root.resolve().parents[1] / "blobs")
+    is_inside = any(real.is_relative_to(folder) for folder in roots)
+    require(is_inside, f"a path inside {root}", f"a link to {real}" if real != path else path)
     return path
 
 

@@ -15,8 +15,8 @@ from PIL import Image
 
 from starjax import errors, rcm
 from starjax.data import schema, store
+from starjax.data.formats import doubts, motion, trocars
 from starjax.data.formats import mapping as maps
-from starjax.data.formats import motion, trocars
 from starjax.data.formats.base import Source
 from starjax.data.formats.mapping import CameraColumn, Map
 from starjax.data.formats.motion import HZ
@@ -75,7 +75,7 @@ def import_mapped(
     if not hz and not mapping.time:
         raise errors.UsageError("--map: hz", "steps per second, which the files do not say", "none")
 
-    kept, tips, notes = [], [], list(source.notes)
+    kept, tips, notes, jaws = [], [], list(source.notes), doubts.Jaws(mapping.arms)
     for episode in range(len(source.lengths)):
         arrays = source.read(episode, maps.names(mapping))
         try:
@@ -89,7 +89,10 @@ def import_mapped(
             line = f"{error.got} in episode {episode}"
             raise errors.UsageError(error.argument, error.expected, line) from error
         else:
-            notes += [f"episode {episode}: {line}" for line in poses.notes]
+            odd = [*poses.notes, *doubts.of_commands(poses, mapping)]
+            notes += [f"episode {episode}: {line}" for line in odd]
+            notes += [] if kept else doubts.of_state(arrays, mapping, task)
+            jaws.add(arrays)
             tips.append(trocars.subsample(poses))
             kept.append(_Kept(episode, len(poses.pose.p), -1, success))
         note(1)
@@ -101,7 +104,9 @@ def import_mapped(
         raise errors.UsageError("PATH", "demonstrations to keep", reason)
     groups, centres = trocars.group(np.array(places))
     kept = [k._replace(trocar=int(group)) for k, group in zip(kept, groups)]
-    residual = trocars.residual(tips, centres[groups], [k.episode for k in kept], notes)
+    numbers = [k.episode for k in kept]
+    residual = trocars.residual(tips, centres[groups], numbers, notes)
+    notes += [*jaws.notes(), *doubts.of_dataset(tips, centres[groups], numbers, task)]
     description = _describe(source, mapping, task, kept, centres, hz)
     trials = np.zeros(len(centres), int)
 

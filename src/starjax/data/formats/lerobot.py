@@ -14,6 +14,7 @@ Templates of paths in info.json are untrusted and not used.
 import contextlib
 import io
 import json
+import math
 import re
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -21,7 +22,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.dataset as datasets
 import pyarrow.parquet as parquet
 from PIL import Image
 
@@ -38,6 +38,12 @@ _NAMES = {
     "done": "next.done",
 }
 _FEATURE = re.compile(r"[\w.][\w.\- ]*")  # a feature's name, which is also a folder's
+_NUMBERS = (
+    *("bool", "float16", "float32", "float64", "int8", "int16", "int32", "int64"),
+    *("uint8", "uint16", "uint32", "uint64"),
+)
+_RGB = ("RGB", "RGBA", "P", "L")  # modes that convert to 8-bit colours
+_BATCH = 1 << 12  # rows that are read at once
 _CHUNK = 1000  # files a folder, where v2.1 does not say
 
 
@@ -64,18 +70,20 @@ def _open(path: Path) -> Iterator[Source]:
     base.require(version[:3] in _READERS, "version v3.0 or v2.1", version)
     hz = float(info["fps"])
     base.require(0.0 < hz < 1e5, "fps above 0", hz)
-    columns, kinds = {}, {}
+    columns, kinds, notes = {}, {}, []
     for name, feature in info["features"].items():
         base.require(bool(_FEATURE.fullmatch(name)) and ".." not in name, "a name", name)
         if (column := _column(feature)) is not None:
             columns[name], kinds[name] = column, feature["dtype"]
+        elif feature["dtype"] != "string":
+            notes.append(f"{name}: {feature['dtype']} {feature['shape']} is not read; left out")
     cameras = [name for name, kind in kinds.items() if kind == "video"]
     places = list(_READERS[version[:3]](path, info, cameras))
 
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
         place = places[episode]
         numeric = [name for name in names if kinds[name] != "video"]
-        table = _rows(path, place, numeric)
+        table = _rows(path, place, {name: columns[name] for name in numeric})
         arrays = {
             name: _array(name, table[name], columns[name], kinds[name], place.length)
             for name in numeric
@@ -90,19 +98,21 @@ def _open(path: Path) -> Iterator[Source]:
     ours = path / "meta" / f"{base.OURS}.json"
     origin = files.read_json(ours) if ours.exists() else None
     robot = str(info.get("robot_type") or "")
-    yield Source(hz, [p.length for p in places], columns, read, origin, _task(path), robot)
+    lengths = [place.length for place in places]
+    yield Source(hz, lengths, columns, read, origin, _task(path), robot, notes)
 
 
 def _column(feature: dict[str, Any]) -> Column | None:
-    """Converts a feature to a column; returns None for text."""
+    """Converts a feature to a column; returns None for text, depth and other kinds."""
     kind, shape = feature["dtype"], tuple(int(n) for n in feature["shape"])
-    base.require(all(n > 0 for n in shape), "sizes above 0", list(shape))
     if kind in ("image", "video"):
         base.require(len(shape) == 3, "[h, w, 3]", list(shape))
         first = shape[0] == 3 and shape[2] != 3
-        return Column((*shape[1:], 3) if first else shape, "uint8")
-    if kind == "string":
+        column = Column((*shape[1:], 3) if first else shape, "uint8")
+        return column if column.is_image else None
+    if kind not in _NUMBERS:
         return None
+    base.require(all(n > 0 for n in shape), "sizes above 0", list(shape))
     names = feature.get("names")
     names = next(iter(names.values())) if isinstance(names, dict) and names else names
     named = tuple(map(str, names)) if isinstance(names, list) else ()
@@ -157,16 +167,50 @@ def _length(value: Any) -> int:
     return int(value)
 
 
-def _rows(root: Path, place: _Place, names: list[str]) -> Any:
-    """Reads the rows of an episode; statistics let parquet skip other row groups."""
-    if not names:
+def _rows(root: Path, place: _Place, columns: dict[str, Column]) -> Any:
+    """Reads the rows of an episode; statistics let parquet skip other row groups.
+
+    A small file may unpack to gigabytes: reading ends after more rows than the episode has.
+    """
+    if not columns:
         return {}
     base.require(place.table.is_file(), "a file of numbers", f"none at {place.table}")
-    table = datasets.dataset(base.require_inside(root, place.table), format="parquet")
-    is_its = datasets.field("episode_index") == place.number
-    order = "frame_index" if "frame_index" in table.schema.names else "episode_index"
-    columns = dict.fromkeys([*names, order])
-    return table.to_table(columns=list(columns), filter=is_its).sort_by(order)
+    file = parquet.ParquetFile(base.require_inside(root, place.table))
+    order = "frame_index" if "frame_index" in file.schema_arrow.names else "episode_index"
+    wanted = list(dict.fromkeys([*columns, order, "episode_index"]))
+    groups = [
+        i
+        for i in range(file.num_row_groups)
+        if _may_hold(file.metadata.row_group(i), columns, place.number)
+    ]
+    batches, count = [], 0
+    for batch in file.iter_batches(_BATCH, groups, wanted):
+        is_its = batch["episode_index"].to_numpy(zero_copy_only=False) == place.number
+        rows = batch.filter(pa.array(is_its))
+        batches.append(rows)
+        count += rows.num_rows
+        base.require(count <= place.length, f"{place.length} rows", "more")
+    base.require(bool(batches), f"{place.length} rows", 0)
+    return pa.Table.from_batches(batches).sort_by(order)
+
+
+def _may_hold(group: Any, columns: dict[str, Column], number: int) -> bool:
+    """Returns False for a row group without rows of the episode, by its statistics.
+
+    Raises:
+      Damaged: lists in it are longer than their columns.
+    """
+    holds = True
+    for i in range(group.num_columns):
+        part = group.column(i)
+        name, numbers = part.path_in_schema, part.statistics
+        if name == "episode_index" and numbers is not None and numbers.has_min_max:
+            holds = numbers.min <= number <= numbers.max
+        name = name.removesuffix(".list.element").removesuffix(".list.item")
+        if name in columns and not columns[name].is_image:
+            most = group.num_rows * math.prod(columns[name].shape)
+            base.require(part.num_values <= most, f"{most} numbers of {name}", part.num_values)
+    return holds
 
 
 def _array(name: str, cells: Any, column: Column, kind: str, length: int) -> np.ndarray:
@@ -187,6 +231,7 @@ def _picture(cell: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
     base.require(bool(cell.get("bytes")), "an image in the file", cell.get("path"))
     with Image.open(io.BytesIO(cell["bytes"]), formats=("PNG", "JPEG")) as image:
         base.require((image.height, image.width) == shape[:2], f"{list(shape)}", image.size)
+        base.require(image.mode in _RGB, "8-bit colours", f"a picture of mode {image.mode}")
         return np.asarray(image.convert("RGB"))
 
 

@@ -105,10 +105,11 @@ def load(path: Path) -> Map:
     """
     decode = msgspec.json.decode if path.suffix == ".json" else msgspec.toml.decode
     try:
-        return decode(path.read_bytes(), type=Map)
+        text = path.read_text("utf-8-sig")  # editors may put a byte order mark in front
+        return decode(text, type=Map)
     except OSError as error:
         raise errors.UsageError(_FILE, "a mapping file", f"{path}: {error.strerror}") from error
-    except (ValueError, msgspec.MsgspecError) as error:
+    except (ValueError, RecursionError, msgspec.MsgspecError) as error:
         text = " ".join(str(error).split())
         raise errors.UsageError(_FILE, "a mapping", f"{path}: {text}") from error
 

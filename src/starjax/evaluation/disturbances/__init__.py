@@ -32,6 +32,7 @@ DISTURBANCES = Registry(
         "friction": f"{_HERE}.physics:FRICTION",
         "mass": f"{_HERE}.physics:MASS",
     },
+    f"{_HERE}.base:Disturbance",
 )
 # Old name -> name. Files of earlier versions hold the old ones.
 RENAMED = {
