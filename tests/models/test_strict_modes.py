@@ -60,7 +60,7 @@ def sampled_unet(change, dtype):
     """A U-Net of parameters as a GPU's decisions take them, and the trained one's."""
     module, given = unet(dtype), jax.tree.map(jnp.asarray, (X, K, COND))
     params = module.init(KEY, *given)
-    apply = packed_params.applied(sampling_unet.applied(module))
+    apply = kernels.applied(module)
     return apply(change(params), *given), apply(params, *given)
 
 
@@ -82,7 +82,7 @@ CASES = {
         for dtype in (jnp.float32, jnp.bfloat16)
     },
     "blocks for sampling": lambda: sampled_unet(sampling_unet.prepared, jnp.bfloat16),
-    "packed": lambda: sampled_unet(packed_params.packed, jnp.bfloat16),
+    "packed": lambda: sampled_unet(lambda params: packed_params.pack(params, params), jnp.bfloat16),
     "learning": learned,
     **{
         f"{sampler.__module__} {reach is None}": lambda sampler=sampler, reach=reach: samples(

@@ -7,6 +7,7 @@ import optax
 import pytest
 
 from starjax import config
+from starjax.models import kernels
 from starjax.models.kernels import packed_params
 from starjax.training import state
 
@@ -40,7 +41,7 @@ def test_only_kernels_of_the_roll_network_decay_faster(packs):
     still = jax.tree.map(jnp.zeros_like, given)
     updates, _ = optimizer.update(still, optimizer.init(given), given)
     if packs:
-        updates = packed_params.unpack(updates, params)
+        updates = kernels.unpacked(updates)
     slow, fast = -0.1 * 0.25 * 2.0, -0.1 * (0.25 + 0.5) * 2.0
     wanted = jax.tree.map(lambda x: jnp.full_like(x, slow), params)
     wanted["roll"]["params"]["out"]["kernel"] = jnp.full_like(kernel, fast)

@@ -13,7 +13,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from starjax.models.kernels import channel_sums
+from starjax.models import kernels
 from starjax.runtime import hashing
 
 
@@ -35,9 +35,9 @@ def spread(vector: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 
 def _sum_of_positions(g: jax.Array) -> jax.Array:
-    if channel_sums.pays():
-        return channel_sums.in_two_steps(g)
-    return jnp.sum(g, range(g.ndim - 1))
+    """Sums `[..., C]` to `[C]`."""
+    reference = lambda g: jnp.sum(g, range(g.ndim - 1))  # noqa: E731
+    return kernels.choose("sum_of_positions", reference)(g)
 
 
 _spread: Any = jax.custom_vjp(jnp.broadcast_to, nondiff_argnums=(1,))

@@ -7,9 +7,8 @@ import jax
 
 from starjax.models import diffusion as ddpm
 from starjax.models import flow as flow_matching
-from starjax.models import schedule
+from starjax.models import kernels, schedule
 from starjax.models import shortcut as shortcuts
-from starjax.models.kernels import parallel_ddim
 
 
 class Sample(Protocol):
@@ -60,8 +59,7 @@ def diffusion(diffusion_steps: int, ddim_steps: int) -> Process:
         return ddpm.noised(tables, key, x0)
 
     def sample(predict, noise, *, prepare, reach=None):
-        side_by_side = parallel_ddim.pays(len(noise), ddim_steps)
-        return (parallel_ddim if side_by_side else ddpm).ddim_sample(
+        return kernels.choose("ddim_sample", ddpm.ddim_sample, len(noise), ddim_steps)(
             predict,
             noise,
             diffusion_steps=diffusion_steps,

@@ -5,8 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax.models import diffusion, unet1d
-from starjax.models.kernels import packed_params, sampling_unet
+from starjax.models import diffusion, kernels, unet1d
 from starjax.models.process import Process
 from starjax.policies import sequences
 from starjax.policies.sequences import Condition, Params, SequenceModel
@@ -25,7 +24,7 @@ def make(
       horizon: H.
       temperature: of a sample's first noise.
     """
-    apply = packed_params.applied(sampling_unet.applied(unet))
+    apply = kernels.applied(unet)
     shape = (horizon, unet.action_dim)
 
     def init(key: jax.Array) -> Params:
@@ -62,11 +61,6 @@ def make(
         return sequences.cast_params(params, _MATRICES, unet.dtype)
 
     def prepare_for_inference(params: Params) -> Params:
-        network = params["unet"]
-        if sampling_unet.pays():
-            network = sampling_unet.prepared(network)
-        network = cast_params(network)
-        packs = packed_params.pays(jax.default_backend())
-        return {"unet": packed_params.packed(network) if packs else network}
+        return {"unet": kernels.packed(cast_params(kernels.fused_unet(params["unet"])))}
 
     return SequenceModel(init, process.noised, loss, sample, cast_params, prepare_for_inference)

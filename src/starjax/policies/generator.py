@@ -11,8 +11,7 @@ import jax.numpy as jnp
 
 from starjax import config, methods
 from starjax.learners import LEARNERS
-from starjax.models import encoders
-from starjax.models.kernels import packed_params
+from starjax.models import encoders, kernels
 from starjax.policies import features, sequences
 from starjax.policies.base import Params
 from starjax.policies.sequences import Condition, SequenceModel, Sizes
@@ -68,7 +67,7 @@ def make(
     dtype = jnp.dtype(policy_config.dtype)
     vision = vision_encoder(policy_config)
     state = encoders.StateEncoder(features=policy_config.state_dim, dtype=dtype)
-    of_state, of_vision = map(packed_params.applied, (state.apply, vision.apply))
+    of_state, of_vision = map(kernels.applied, (state, vision))
     learner, size = LEARNERS.get(policy_config.learner), policy_config.image_size
     dims = sizes(
         policy_config, sensors, action, features.trocar_condition_dim(method, sensors.task)
@@ -100,12 +99,10 @@ def make(
         return {**_cast_vision(params, dtype), "learner": model.cast_params(params["learner"])}
 
     def prepare_for_inference(params: Params) -> Params:
-        found = _cast_vision(params, dtype)
-        if packed_params.pays(jax.default_backend()):
-            # One robot's inference starts later the more arrays are passed: pack them.
-            readers = found.keys() - {"learner"}
-            found = {**found, **{name: packed_params.packed(found[name]) for name in readers}}
-        return {**found, "learner": model.prepare_for_inference(params["learner"])}
+        # One robot's inference starts later the more arrays are passed: pack them.
+        readers = _cast_vision({**params, "learner": {}}, dtype)
+        ready = {name: kernels.packed(network) for name, network in readers.items()}
+        return {**ready, "learner": model.prepare_for_inference(params["learner"])}
 
     return Generator(init, observe, model, cast_params, prepare_for_inference)
 

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 
 from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
-from starjax.models import roll_net
-from starjax.models.kernels import packed_params
+from starjax.models import kernels, roll_net
 from starjax.policies import execution, features, generator, sequences
 from starjax.policies.base import Params, Policy
 from starjax.types import Command, Observation
@@ -69,7 +68,7 @@ def make(
     )
     history_weight = float(policy_config.roll_history)
     trocar_weight = float(policy_config.roll_trocar)
-    predict = packed_params.applied(rolls.apply)
+    predict = kernels.applied(rolls)
 
     def init(key: jax.Array) -> Params:
         key_model, key_roll = jax.random.split(key)
@@ -183,9 +182,7 @@ def make(
         return features.encode_proprioception(stats, method.action_space, observation, trocar)
 
     def prepare_for_inference(params: Params) -> Params:
-        found, of_rolls = networks.prepare_for_inference(params), params["roll"]
-        packs = packed_params.pays(jax.default_backend())
-        return {**found, "roll": packed_params.packed(of_rolls) if packs else of_rolls}
+        return {**networks.prepare_for_inference(params), "roll": kernels.packed(params["roll"])}
 
     metrics = ("position_loss", "roll_loss", *model.metrics)
     return Policy(init, prepare, loss, sample, metrics, networks.cast_params, prepare_for_inference)

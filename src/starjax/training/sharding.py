@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from starjax.models.kernels import packed_params
+from starjax.models import kernels
 from starjax.policies.base import Params
 from starjax.training import devices
 from starjax.training.state import TrainState
@@ -67,7 +67,7 @@ class StateLayout(NamedTuple):
             carry.state,
             shapes,
         )
-        return self._unpacked(state)
+        return kernels.unpacked(state)
 
     def shapes(self) -> StepCarry:
         """Returns shapes and shardings of a carry."""
@@ -102,15 +102,13 @@ class StateLayout(NamedTuple):
 
     def params(self, carry: StepCarry) -> Params:
         """Returns the networks' parameters with rounded matrices, shared out as the carry."""
-        params = carry.state.params
-        if self._packs:
-            matrices = _replaced(params.matrices, carry.rounded)
-            return self._unpacked(params._replace(matrices=matrices))
-        return _replaced(params, carry.rounded)
+        return kernels.unpacked(_replaced(carry.state.params, carry.rounded))
 
-    def rounded(self, params: Any) -> Params:
+    def rounded(self, params: Any) -> Any:
         """Returns a carry's matrices in the networks' type, None for other leaves."""
-        return _rounded(params.matrices if self._packs else params, self.round)
+        types = self._packed_shapes(jax.eval_shape(self.round, self.whole.params))
+        leaves, tree = jax.tree.flatten(params)
+        return tree.unflatten(_rounded(leaves, tuple(x.dtype for x in jax.tree.leaves(types))))
 
     # Within `on_each_device`:
 
@@ -133,7 +131,7 @@ class StateLayout(NamedTuple):
         """Returns the batch's gradients from each device's, laid out as a carry's parameters."""
         count, shapes = self.mesh.size, self._packed_shapes(self.whole.params)
         found = self._packed(gradients)
-        if self._packs:
+        if found is not gradients:  # packed: on a GPU
             found = jax.tree.map(_row_major, found)
         if count > 1:  # those of gathered matrices are summed already
             found = jax.tree.map(
@@ -155,15 +153,8 @@ class StateLayout(NamedTuple):
             (everywhere if leaf.shape == like.shape else shared_out).append(leaf)
         return jnp.sqrt(_squares(everywhere) + jax.lax.psum(_squares(shared_out), devices.AXIS))
 
-    @property
-    def _packs(self) -> bool:
-        return packed_params.pays(self.mesh.devices.flat[0].platform)
-
     def _packed(self, tree: Any) -> Any:
-        return packed_params.pack_all(tree, self.whole.params) if self._packs else tree
-
-    def _unpacked(self, tree: Any) -> Any:
-        return packed_params.unpack_all(tree, self.whole.params) if self._packs else tree
+        return kernels.packed(tree, self.whole.params, self.mesh.devices.flat[0].platform)
 
     def _packed_shapes(self, shapes: Any) -> Any:
         """Returns shapes of the state, or of its parameters, packed but not shared out."""
@@ -181,10 +172,10 @@ class StateLayout(NamedTuple):
 
 
 @functools.partial(jax.jit, static_argnums=1)  # called outside of any, one program for all of them
-def _rounded(params: Params, change: Callable[[Params], Params]) -> Params:
-    """Returns the matrices that `Policy.cast_params` changes, None for the others."""
-    changed = change(params)
-    return jax.tree.map(lambda old, new: None if new.dtype == old.dtype else new, params, changed)
+def _rounded(leaves: list[jax.Array], types: tuple[Any, ...]) -> list[jax.Array | None]:
+    """Returns the leaves whose type changes, None for the others."""
+    pairs = zip(leaves, types, strict=True)
+    return [None if x.dtype == dtype else x.astype(dtype) for x, dtype in pairs]
 
 
 def _replaced(tree: Any, some: Any) -> Any:

@@ -18,7 +18,7 @@ def normal(*shape):
 def test_a_convolution_as_a_product_is_the_same(size, kernel, stride, pad):
     x, w = normal(2, *size, 5), normal(kernel, kernel, 5, 3)
     actual = few_images.convolution(x, w, stride, pad)
-    np.testing.assert_allclose(actual, resnet._convolve(x, w, stride, pad), atol=1e-4)
+    np.testing.assert_allclose(actual, resnet.convolve(x, w, stride, pad), atol=1e-4)
 
 
 def test_a_strided_slice_is_kept_out_of_a_products_kernel():

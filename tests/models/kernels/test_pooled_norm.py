@@ -22,6 +22,7 @@ def stem(request):
     x, size = normal(3, *request.param, 3), tuple(-(-side // 2) for side in request.param)
     ours, norm = resnet.Stem(32), pooled_norm.PooledNorm(2, size)
     plain, plain_norm = resnet.Conv2d(32, 7, 2), GroupNorm(2)
+    reference = resnet.NormReluPool(2, size)
     params = plain.init(KEY, x), plain_norm.init(KEY, normal(3, *size, 32))
     # half of the gains negative, where the largest comes from the smallest
     params = jax.tree.map(lambda leaf: leaf * normal(*leaf.shape), params)
@@ -38,17 +39,27 @@ def stem(request):
         y, pullback = jax.vjp(start, params, x)
         return y, pullback(normal(*y.shape))
 
-    return [outputs(jax.jit(start)) for start in (actual, expected)]
+    def without_variant(params, x):
+        return reference.apply(params[1], ours.apply(params[0], x))
+
+    return [outputs(jax.jit(start)) for start in (actual, expected, without_variant)]
 
 
 def test_the_stem_is_what_it_stands_for(stem):
-    (actual, _), (expected, _) = stem
+    (actual, _), (expected, _), (reference, _) = stem
     assert actual.shape == expected.shape
     assert (expected == 0).any()
-    np.testing.assert_allclose(actual, expected, atol=1e-5 * float(jnp.abs(expected).max()))
+    tolerance = 1e-5 * float(jnp.abs(expected).max())
+    np.testing.assert_allclose(actual, expected, atol=tolerance)
+    np.testing.assert_allclose(reference, expected, atol=tolerance)
 
 
 def test_the_stems_gradient_is_too(stem):
-    (_, actual), (_, expected) = stem
+    (_, *ours), (_, expected), (_, reference) = stem
+    for actual in (*ours, reference):
+        close(actual, expected)
+
+
+def close(actual, expected):
     for ours, jaxs in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(ours, jaxs, atol=1e-5 * float(jnp.abs(jaxs).max()))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import unet1d
+from starjax.models import kernels, unet1d
 from starjax.models.kernels import sampling_unet
 
 GROUPS = 4
@@ -63,7 +63,7 @@ def test_a_whole_unet_takes_either_parameters(dtype):
     )
     given = inputs(3, 4, 4), jnp.arange(3) * 30, inputs(3, 10, seed=2)
     params = {"params": made(unet, *given)[0]}
-    apply = jax.jit(sampling_unet.applied(unet))
+    apply = jax.jit(kernels.applied(unet))
     prepared = sampling_unet.prepared(params)
     assert jax.tree.structure(prepared.params) != jax.tree.structure(params)
     expected, found = apply(params, *given), apply(prepared, *given)

@@ -1,18 +1,92 @@
 """Variants of parts of the networks that are faster on one kind of device.
 
-One file holds one variant: the reference that it equals stands in its first lines, `pays` is the
-only function that decides whether it is used, and tests/models/kernels holds it to its reference.
-To drop a variant, delete its file and the line that asks `pays`.
-
-    channel_sums    gradients of biases in two sums                training on a GPU
-    few_images      convolutions of one or two images as products  decisions on a GPU
-    packed_params   vectors in one array, kernels turned           training and decisions on a GPU
-    parallel_ddim   all DDIM steps side by side                    few robots on a GPU
-    pooled_norm     GroupNorm, ReLU, max-pooling in one gradient   everywhere
-    sampling_unet   a U-Net block in two kernels                   decisions on a GPU
+One file holds one variant. Its first lines name the reference that it equals, its function `pays`
+decides from the device and the shapes if it is used, and tests/models/kernels compares the two.
+`choose` is the only door: to drop a variant, delete its file and its line of `VARIANTS`.
 """
 
+import importlib
+from collections.abc import Callable
+from typing import Any, TypeVar
+
 import jax
+from flax import struct
+
+Reference = TypeVar("Reference")
+
+# part of a network: "module:name" of its variant, and what it accelerates
+VARIANTS = {
+    "sum_of_positions": "channel_sums:in_two_steps",  # biases' gradients; training on a GPU
+    "convolve": "few_images:convolution",  # products of one or two images; decisions on a GPU
+    "pack": "packed_params:pack",  # vectors in one array; training and decisions on a GPU
+    "ddim_sample": "parallel_ddim:ddim_sample",  # steps side by side; few robots on a GPU
+    "NormReluPool": "pooled_norm:PooledNorm",  # one gradient for all three; everywhere
+    "fuse_unet": "sampling_unet:prepared",  # a U-Net's block in two kernels; decisions on a GPU
+}
+
+
+class RewrittenParams(struct.PyTreeNode):
+    """Parameters in another form; each variant that rewrites them extends this."""
+
+    def resolve(self, module: Any) -> tuple[Any, Any]:
+        """Returns the module to apply, in place of `module`, and the parameters that it takes."""
+        raise NotImplementedError
+
+
+def choose(part: str, reference: Reference, *size: Any) -> Reference:
+    """Returns the variant of a part that is faster here, else the reference.
+
+    Args:
+      part: of `VARIANTS`.
+      reference: function or module, used if there is no variant or it does not pay.
+      *size: arguments of the variant's `pays`.
+    """
+    if part not in VARIANTS:
+        return reference
+    module, name = VARIANTS[part].split(":")
+    variant = importlib.import_module(f"{__name__}.{module}")
+    return getattr(variant, name) if variant.pays(*size) else reference
+
+
+def packed(tree: Any, params: Any = None, platform: str | None = None) -> Any:
+    """Returns `tree` with its parts of the structure of `params` in fewer arrays, if faster.
+
+    Args:
+      tree: parameters, or a state with parameters, averages and moments.
+      params: parameters or their shapes; None: `tree`.
+      platform: "cpu" or "gpu"; None: jax's default.
+    """
+    pack = choose("pack", lambda tree, params: tree, platform or jax.default_backend())
+    return pack(tree, tree if params is None else params)
+
+
+def unpacked(tree: Any) -> Any:
+    """Returns the tree that `packed` was called with."""
+    is_packed = lambda x: isinstance(x, RewrittenParams)  # noqa: E731
+    return jax.tree.map(
+        lambda x: x.resolve(None)[1] if is_packed(x) else x, tree, is_leaf=is_packed
+    )
+
+
+def fused_unet(params: Any) -> Any:
+    """Returns the parameters of a `ConditionalUnet1D` in the form fastest to sample with."""
+    return choose("fuse_unet", lambda params: params)(params)
+
+
+def applied(module: Any) -> Callable[..., Any]:
+    """Returns a network's `apply` that also takes rewritten parameters.
+
+    Called within a loop it unpacks parameters there, in the kernels that use them; before the loop
+    a GPU would need a kernel for each.
+    """
+
+    def apply(params: Any, *args: Any, **options: Any) -> Any:
+        network = module
+        while isinstance(params, RewrittenParams):
+            network, params = params.resolve(network)
+        return network.apply(params, *args, **options)
+
+    return apply
 
 
 def on_gpu() -> bool:

@@ -1,6 +1,6 @@
 """Convolves one or two images as a matrix product of the shifted inputs.
 
-Reference: `jax.lax.conv_general_dilated`. On a GPU cuDNN's convolutions are launched one by one
+Reference: `resnet.convolve`. On a GPU cuDNN's convolutions are launched one by one
 between CUDA graphs, which takes longer than they run: 0.35 ms of a decision for one robot, whose
 encoder sees two images.
 """

@@ -4,44 +4,43 @@ Reference: the parameters as they are; unpacking gives them back. On a GPU an op
 takes longer to start on a vector than to run, and every array that a program is called with costs
 the host some microseconds; half of the paper's parameters are vectors. Convolutions read their
 kernels, and write the gradients, with the outputs as the first axis: kept that way, neither these
-nor what the optimiser knows of them are transposed at every step.
+nor the optimiser's moments are transposed at every step.
 """
 
 import functools
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from starjax.models.kernels import RewrittenParams
+
 PLATFORMS = {"gpu"}  # a CPU updates a vector as fast by itself
 
 
-class Packed(NamedTuple):
+class Packed(RewrittenParams):
     """Packed parameters.
 
     Attributes:
-      matrices: the parameters with None in the vectors' places; of kernels `[h, w, C, F]` the last
-        axis is the first.
+      matrices: the parameters, with None in place of vectors; kernels `[h, w, C, F]` have their
+        last axis first.
       vectors: `[n]`, all of them, in the order of jax's leaves.
+      shapes: structure of the parameters, and the shape of each leaf.
     """
 
     matrices: Any
     vectors: jax.Array
+    shapes: tuple[Any, tuple[tuple[int, ...], ...]] = struct.field(pytree_node=False)
 
-
-class PackedNetwork(struct.PyTreeNode):
-    """A network's packed parameters, with what is needed to unpack them.
-
-    Attributes:
-      arrays: the parameters.
-      shapes: their structure and the shapes of its leaves.
-    """
-
-    arrays: Packed
-    shapes: tuple[Any, tuple[jax.ShapeDtypeStruct, ...]] = struct.field(pytree_node=False)
+    def resolve(self, module: Any) -> tuple[Any, Any]:
+        """Returns `module` and the parameters that were packed."""
+        tree, shapes = self.shapes
+        matrices = _turned(tree.flatten_up_to(self.matrices), 0, -1)
+        vectors = iter(_split(self.vectors, tuple(x for x in shapes if not is_matrix(x))))
+        pairs = zip(matrices, shapes, strict=True)
+        return module, tree.unflatten([x if is_matrix(s) else next(vectors) for x, s in pairs])
 
 
 def pays(platform: str) -> bool:
@@ -49,73 +48,29 @@ def pays(platform: str) -> bool:
     return platform in PLATFORMS
 
 
-def pack(params: Any, shapes: Any) -> Packed:
-    """Packs parameters.
+def pack(state: Any, params: Any) -> Any:
+    """Packs every part of `state` with the structure of `params`: parameters, averages, moments.
 
-    `shapes` has the same structure and tells vectors from matrices: a matrix may be held flat.
+    `params`, or their shapes, tell vectors from matrices: `state` may hold a matrix flat.
     """
-    leaves, tree = jax.tree.flatten(shapes)
-    given = tree.flatten_up_to(params)
-    matrices = [x if is_matrix(shape) else None for x, shape in zip(given, leaves, strict=True)]
-    vectors = [x for x, shape in zip(given, leaves, strict=True) if not is_matrix(shape)]
-    return Packed(tree.unflatten(_turned(matrices, -1, 0)), _concatenated(vectors))
-
-
-def unpack(packed: Packed, shapes: Any) -> Any:
-    """Returns the parameters that `pack` was given."""
-    leaves, tree = jax.tree.flatten(shapes)
-    matrices = _turned(tree.flatten_up_to(packed.matrices), 0, -1)
-    vectors = iter(_apart(packed.vectors, tuple(x.shape for x in leaves if not is_matrix(x))))
-    given = zip(matrices, leaves, strict=True)
-    return tree.unflatten([x if is_matrix(shape) else next(vectors) for x, shape in given])
-
-
-def pack_all(state: Any, shapes: Any) -> Any:
-    """Packs every part of `state` with this structure: parameters, averages, moments."""
-    structure = jax.tree.structure(shapes)
+    leaves, structure = jax.tree.flatten(params)
+    shapes = tuple(x.shape for x in leaves)
 
     def are_params(x: Any) -> bool:
         return jax.tree.structure(x) == structure
 
-    return jax.tree.map(
-        lambda x: pack(x, shapes) if are_params(x) else x, state, is_leaf=are_params
-    )
+    def packed(params: Any) -> Packed:
+        pairs = list(zip(structure.flatten_up_to(params), shapes, strict=True))
+        matrices = _turned([x if is_matrix(shape) else None for x, shape in pairs], -1, 0)
+        vectors = _concatenated([x for x, shape in pairs if not is_matrix(shape)])
+        return Packed(structure.unflatten(matrices), vectors, (structure, shapes))
+
+    return jax.tree.map(lambda x: packed(x) if are_params(x) else x, state, is_leaf=are_params)
 
 
-def unpack_all(state: Any, shapes: Any) -> Any:
-    """Returns the state that `pack_all` was given."""
-    return jax.tree.map(
-        lambda x: unpack(x, shapes) if isinstance(x, Packed) else x,
-        state,
-        is_leaf=lambda x: isinstance(x, Packed),
-    )
-
-
-def packed(params: Any) -> PackedNetwork:
-    """Packs a network's parameters, which `applied` takes as it takes others."""
-    leaves, tree = jax.tree.flatten(jax.eval_shape(lambda x: x, params))
-    return PackedNetwork(pack(params, tree.unflatten(leaves)), (tree, tuple(leaves)))
-
-
-def applied(apply: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a network's `apply` that also takes a `PackedNetwork`.
-
-    Called within a loop it unpacks the parameters there, in the kernels that use them; before the
-    loop a GPU would need one for each.
-    """
-
-    def unpacking(params: Any, *given: Any, **options: Any) -> Any:
-        if isinstance(params, PackedNetwork):
-            tree, leaves = params.shapes
-            params = unpack(params.arrays, tree.unflatten(leaves))
-        return apply(params, *given, **options)
-
-    return unpacking
-
-
-def is_matrix(x: Any) -> bool:
+def is_matrix(shape: tuple[int, ...]) -> bool:
     """Returns whether a parameter of this shape stays an array of its own."""
-    return x.ndim > 1
+    return len(shape) > 1
 
 
 def _turned(matrices: list[Any], old: int, new: int) -> list[Any]:
@@ -128,7 +83,7 @@ def _is_kernel(x: Any) -> bool:
     return x is not None and x.ndim == 4
 
 
-# Programs of their own, so that called outside of any they are one, and not one for each array.
+# Jitted: called outside of a program, each is one program and not one for every array.
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def _moved(kernels: list[jax.Array], old: int, new: int) -> list[jax.Array]:
     return [jnp.moveaxis(x, old, new) for x in kernels]
@@ -140,10 +95,10 @@ def _concatenated(vectors: list[jax.Array]) -> jax.Array:
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _apart(vectors: jax.Array, shapes: tuple[tuple[int, ...], ...]) -> list[jax.Array]:
-    found, first = [], 0
+def _split(vectors: jax.Array, shapes: tuple[tuple[int, ...], ...]) -> list[jax.Array]:
+    parts, first = [], 0
     for shape in shapes:
         size = math.prod(shape)
-        found.append(jax.lax.slice_in_dim(vectors, first, first + size).reshape(shape))
+        parts.append(jax.lax.slice_in_dim(vectors, first, first + size).reshape(shape))
         first += size
-    return found
+    return parts

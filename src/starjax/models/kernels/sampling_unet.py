@@ -7,13 +7,12 @@ is part of the first product. Then each group of a sample lies in one row, becau
 kernel of what follows sums over rows (not over other axes), up to the next product.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from flax import struct
 
 from starjax.models import group_norm, kernels, layers
 from starjax.models.unet1d import ConditionalUnet1D
@@ -21,10 +20,15 @@ from starjax.models.unet1d import ConditionalUnet1D
 Params = Mapping[str, Any]
 
 
-class PreparedUnet(struct.PyTreeNode):
+class PreparedUnet(kernels.RewrittenParams):
     """A U-Net's parameters as the blocks below take them."""
 
     params: Any
+
+    def resolve(self, module: ConditionalUnet1D) -> tuple[ConditionalUnet1D, Any]:
+        """Returns the U-Net with the blocks below, and its parameters."""
+        blocks = {"residual_block": SamplingBlock, "conv_block": SamplingConv}
+        return module.clone(**blocks), self.params
 
 
 def pays() -> bool:
@@ -35,18 +39,6 @@ def pays() -> bool:
 def prepared(params: Params) -> PreparedUnet:
     """Rewrites the parameters of a `ConditionalUnet1D`."""
     return PreparedUnet(_prepared(params))
-
-
-def applied(unet: ConditionalUnet1D) -> Callable[..., Any]:
-    """Returns `unet.apply` that also takes `PreparedUnet` parameters."""
-    sampling = unet.clone(residual_block=SamplingBlock, conv_block=SamplingConv)
-
-    def apply(params: Any, *given: Any, **options: Any) -> Any:
-        if isinstance(params, PreparedUnet):
-            return sampling.apply(params.params, *given, **options)
-        return unet.apply(params, *given, **options)
-
-    return apply
 
 
 class SamplingBlock(nn.Module):

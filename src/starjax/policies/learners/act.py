@@ -40,8 +40,7 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
     import jax
     import jax.numpy as jnp
 
-    from starjax.models import diffusion, transformer
-    from starjax.models.kernels import packed_params
+    from starjax.models import diffusion, kernels, transformer
     from starjax.policies import sequences
     from starjax.policies.sequences import Condition, Params
 
@@ -57,7 +56,7 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
         decoder_layers=options.decoder_layers,
         **shared,
     )
-    decode = packed_params.applied(decoder.apply)
+    decode = kernels.applied(decoder)
 
     def init(key: jax.Array) -> Params:
         key_style, key_decoder = jax.random.split(key)
@@ -91,9 +90,7 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
         return sequences.cast_params(params, {"kernel"}, dtype)
 
     def prepare_for_inference(params: Params) -> Params:
-        network = cast_params(params["decoder"])
-        packs = packed_params.pays(jax.default_backend())
-        return {"decoder": packed_params.packed(network) if packs else network}
+        return {"decoder": kernels.packed(cast_params(params["decoder"]))}
 
     metrics = ("l1", "divergence")
     return sequences.SequenceModel(

@@ -35,8 +35,7 @@ def make(options: BcConfig, policy_config: config.PolicyConfig, sizes: "Sizes") 
     import jax
     import jax.numpy as jnp
 
-    from starjax.models import diffusion, regression
-    from starjax.models.kernels import packed_params
+    from starjax.models import diffusion, kernels, regression
     from starjax.policies import sequences
     from starjax.policies.sequences import Condition, Params
 
@@ -50,7 +49,7 @@ def make(options: BcConfig, policy_config: config.PolicyConfig, sizes: "Sizes") 
         dtype=dtype,
     )
 
-    apply = packed_params.applied(network.apply)
+    apply = kernels.applied(network)
 
     def init(key: jax.Array) -> Params:
         return {"mixture": network.init(key, jnp.zeros((1, sizes.condition)))}
@@ -69,9 +68,7 @@ def make(options: BcConfig, policy_config: config.PolicyConfig, sizes: "Sizes") 
         return sequences.cast_params(params, {"kernel"}, dtype)
 
     def prepare_for_inference(params: Params) -> Params:
-        network = cast_params(params["mixture"])
-        packs = packed_params.pays(jax.default_backend())
-        return {"mixture": packed_params.packed(network) if packs else network}
+        return {"mixture": kernels.packed(cast_params(params["mixture"]))}
 
     return sequences.SequenceModel(
         init, lambda key, x0: x0, loss, sample, cast_params, prepare_for_inference
