@@ -56,7 +56,7 @@ def test_what_is_not_installed_ends_the_search_before_it_is_needed(monkeypatch, 
     monkeypatch.setattr(doctor, "devices", lambda: pytest.fail("jax was asked"))
     assert doctor.main([]) == 1
     said = capsys.readouterr().out
-    assert "jax, jaxlib, mujoco, mujoco-mjx not installed" in said and "left out" in said
+    assert "jax, jaxlib, mujoco, mujoco-mjx not installed" in said and "skipped" in said
 
 
 def test_a_folder_that_is_gone_is_a_fault(tmp_path, monkeypatch):

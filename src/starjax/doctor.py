@@ -1,6 +1,7 @@
-"""`starjax doctor`: what of this machine and installation works; one remedy for each fault."""
+"""`starjax doctor`: checks of machine and installation, with one remedy per fault."""
 
 import importlib.metadata
+import itertools
 import os
 import pathlib
 import shutil
@@ -12,7 +13,7 @@ from starjax import cli
 from starjax.commands import options, presets
 from starjax.runtime import files, gpu, locks, xla
 
-DESCRIPTION = """Looks at what of this machine and installation works; one remedy for each fault.
+DESCRIPTION = """Checks this machine and the installation; suggests one remedy per fault.
 
 The exit code is 1 if there is a fault.
 """
@@ -24,9 +25,9 @@ class Finding(NamedTuple):
     """One line of the answer.
 
     Attributes:
-      name: name of the check.
-      value: finding.
-      remedy: action against it; empty if nothing is wrong.
+      name: subject of the check.
+      value: its state.
+      remedy: suggested fix; empty if healthy.
     """
 
     name: str
@@ -38,14 +39,11 @@ def main(argv: Sequence[str]) -> int:
     """Prints every finding; returns 1 if there is a fault."""
     options.parse("doctor", options.NoFlags, argv, DESCRIPTION)
     # The order matters: a wrong XLA flag ends the process as soon as jax starts.
-    checks: list[Callable[[], list[Finding]]] = [packages, xla_flags, storage, folder_locks, memory]
-    findings = [finding for check in checks for finding in _shown(check)]
+    findings = _shown(packages, xla_flags, storage, folder_locks, memory)
     if any(finding.name in ("packages", "XLA_FLAGS") and finding.remedy for finding in findings):
-        print("       the checks that start jax were left out: it would fail")
+        print("       checks that start jax are skipped: it would fail")
     else:
-        findings += [
-            finding for check in (settings, devices, scene, video) for finding in _shown(check)
-        ]
+        findings += _shown(settings, devices, scene, video)
     faults = sum(bool(finding.remedy) for finding in findings)
     print(f"\n{faults} fault(s)" if faults else "\nno fault found")
     return 1 if faults else 0
@@ -53,19 +51,19 @@ def main(argv: Sequence[str]) -> int:
 
 def packages() -> list[Finding]:
     """Checks that the versions fit together."""
-    found = xla.versions()
-    text = "  ".join(f"{name} {version}" for name, version in found.items())
-    remedy = ""
-    missing = [name for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx") if name not in found]
+    versions = xla.versions()
+    name, remedy, jax = "packages", "", versions.get("jax", "")
+    missing = [part for part in ("jax", "jaxlib", "mujoco", "mujoco-mjx") if part not in versions]
     if missing:
         remedy = f"{', '.join(missing)} not installed: pip install -e . in starjax's folder"
-        return [Finding("packages", text, remedy)]
-    if found["jax"] != found["jaxlib"]:
-        remedy = f"jax and jaxlib differ: pip install jax=={found['jax']} jaxlib=={found['jax']}"
-        return [Finding("packages", text, remedy)]
-    if not (0, 10) <= _numbers(found["jax"])[:2] < (0, 12):
-        remedy = f"jax {found['jax']} is untested: pip install 'jax>=0.10.2,<0.12'"
-    return [Finding("versions", text, remedy)]
+    elif jax != versions["jaxlib"]:
+        remedy = f"jax and jaxlib differ: pip install jax=={jax} jaxlib=={jax}"
+    else:
+        name = "versions"  # jax can start
+        if not (0, 10) <= _numbers(jax)[:2] < (0, 12):
+            remedy = f"jax {jax} is untested: pip install 'jax>=0.10.2,<0.12'"
+    text = "  ".join(f"{part} {version}" for part, version in versions.items())
+    return [Finding(name, text, remedy)]
 
 
 def xla_flags() -> list[Finding]:
@@ -74,7 +72,7 @@ def xla_flags() -> list[Finding]:
     typed = os.environ.get("XLA_FLAGS", "")
     try:
         recent = _numbers(importlib.metadata.version("jaxlib"))[:2] >= (0, 11)
-    except importlib.metadata.PackageNotFoundError:  # said before
+    except importlib.metadata.PackageNotFoundError:  # reported before
         return []
     if recent and flag in typed:
         return [Finding("XLA_FLAGS", typed, f"jaxlib >= 0.11 aborts on {flag}: take it out")]
@@ -129,8 +127,8 @@ def folder_locks() -> list[Finding]:
             tempfile.TemporaryDirectory(prefix=".starjax-", dir=".") as trial,
             locks.hold(pathlib.Path(trial) / "lock") as is_systems,
         ):
-            kind = "the file system's" if is_systems else "marker files (no locks of the system)"
-    except (FileNotFoundError, PermissionError):  # said before
+            kind = "the file system's" if is_systems else "marker files, without the file system"
+    except (FileNotFoundError, PermissionError):  # reported before
         return []
     except (locks.Held, OSError) as error:
         return [Finding("locks", str(error), "choose a folder on another disk by --out")]
@@ -141,7 +139,7 @@ def memory() -> list[Finding]:
     """Returns free memory of the host."""
     free = xla.available_bytes()
     value = f"{files.size(free)} free of {files.size(xla.memory_bytes())}"
-    remedy = f"close programs: {files.size(NEEDED_MEMORY)} are wanted"
+    remedy = f"close programs: {files.size(NEEDED_MEMORY)} needed"
     return [Finding("memory", value, remedy if free < NEEDED_MEMORY else "")]
 
 
@@ -172,7 +170,7 @@ def _unused_gpu() -> list[Finding]:
     if gpu.is_used() or not gpu.is_shown() or gpu.forbidden():
         return []
     if gpu.has_plugin():
-        remedy = "see to its driver: nvidia-smi, and a version that jax's CUDA asks for"
+        remedy = "update its driver to a version for jax's CUDA (see nvidia-smi)"
     else:
         remedy = "jax cannot use this GPU yet: pip install -e '.[cuda]'"
     return [Finding("GPU", f"shown by the system, not used by jax: {gpu.why_unused()}", remedy)]
@@ -182,12 +180,10 @@ def scene() -> list[Finding]:
     """Checks that the MJCF parts exist and compile."""
     try:
         from starjax.sim import scene as model
-    except (ImportError, RuntimeError) as error:
-        return [Finding("scene", _first_line(error), "pip install -e . in starjax's folder")]
-    try:
+
         made = model.compose(model.name())
-    except (OSError, ValueError) as error:
-        return [Finding("scene", str(error), "reinstall starjax: parts of its scene are missing")]
+    except (ImportError, RuntimeError, OSError, ValueError) as error:
+        return [Finding("scene", _first_line(error), "pip install -e . in starjax's folder, anew")]
     return [Finding("scene", f"{made.ngeom} geoms, {made.nq} coordinates")]
 
 
@@ -201,9 +197,11 @@ def video() -> list[Finding]:
         return [Finding("ffmpeg", _first_line(error), "pip install imageio-ffmpeg")]
 
 
-def _shown(check: Callable[[], list[Finding]]) -> list[Finding]:
-    findings = check()
-    for finding in findings:
+def _shown(*checks: Callable[[], list[Finding]]) -> list[Finding]:
+    """Runs the checks; prints each finding at once, because the next check may end the process."""
+    findings = []
+    for finding in itertools.chain.from_iterable(check() for check in checks):
+        findings.append(finding)
         print(f"{'FAULT' if finding.remedy else 'ok':6} {finding.name:9} {finding.value}")
         if finding.remedy:
             print(f"       -> {finding.remedy}")
