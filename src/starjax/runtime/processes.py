@@ -10,6 +10,7 @@ the first does alone. With one process nothing here does anything.
 import functools
 import os
 import secrets
+import sys
 from typing import Any
 
 import jax
@@ -18,13 +19,13 @@ from jax.experimental import multihost_utils
 from jax.sharding import NamedSharding
 
 from starjax import errors
-from starjax.runtime import lost
 
 _VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 _SLURM_TASKS = "SLURM_STEP_NUM_TASKS"
 _PREEMPTION = "jax_enable_preemption_service"
 # A process that ended without a word is missed after so long; jax's own is 100.
 _HEARTBEAT_S = 30
+LOST_HINT = "starjax: if a process of this run is lost, the others stop; rerun the same command"
 
 
 def join() -> None:
@@ -60,8 +61,9 @@ def _initialize(**given: Any) -> None:
     # Its handler of SIGTERM, in C++, would take the signal from Python's.
     if hasattr(jax.config, _PREEMPTION):
         jax.config.update(_PREEMPTION, False)
-    lost.watch()
     jax.distributed.initialize(heartbeat_timeout_seconds=_HEARTBEAT_S, **given)
+    if is_first():  # said now: when a process is lost, jax's C++ code aborts the others
+        print(LOST_HINT, file=sys.stderr, flush=True)
 
 
 def is_alone() -> bool:
