@@ -163,7 +163,7 @@ def test_data_on_the_host_goes_on_where_it_was_stopped(quick, tmp_path):
 def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
     directory, result = whole
     asked = iter(range(100))
-    with pytest.raises(loop.Interrupted, match=r"stopped after step .*same command goes on"):
+    with pytest.raises(loop.Interrupted, match=r"stopped after step .*same command resumes"):
         jobs.train(tmp_path, should_stop=lambda: next(asked) == 2)
     stopped = checkpoint.steps(tmp_path / "checkpoints")[-1]
     assert 0 < stopped < 12 and stopped % 4  # not where it would have saved anyway

@@ -39,7 +39,7 @@ def run_two(folder: Path, asks: int) -> list[str]:
 
 def test_two_processes_are_one_run(tmp_path, monkeypatch):
     stopped = run_two(tmp_path, asks=3)
-    assert all("same command goes on" in line for line in stopped)
+    assert all("same command resumes" in line for line in stopped)
     assert 0 < checkpoint.steps(tmp_path / "run/checkpoints")[-1] < jobs.SETTINGS.steps
     run_two(tmp_path, asks=0)
     first, second = (dict(np.load(tmp_path / name)) for name in ("found-0.npz", "found-1.npz"))
@@ -98,7 +98,7 @@ def test_a_stop_while_all_train_saves(tmp_path, number, told):
     path = tmp_path / "stardiff/metrics.jsonl"
     started = start_two("trains", str(tmp_path))
     said = stop_two(started, lambda: path.exists() and path.read_text() != "", number, told)
-    assert all("same command goes on from there" in error for error in said)
+    assert all("same command resumes from it" in error for error in said)
     assert len(checkpoint.steps(tmp_path / "stardiff/checkpoints")) == 1
 
 

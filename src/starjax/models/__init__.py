@@ -1,1 +1,1 @@
-"""Networks and diffusion. flax.linen lives here only, and nothing here knows a robot."""
+"""Networks and diffusion. Only this package uses flax.linen; it does not depend on robots."""

@@ -1,6 +1,6 @@
 """Diffusion over action sequences: noising, the training loss, and the two ways back.
 
-No network here: `eps_fn` is whatever predicts the noise. All arithmetic is float32.
+`eps_fn` is any predictor of the noise; this module has no network. All arithmetic is float32.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ class Noised(NamedTuple):
     Attributes:
       x: `[B, ...]`, with noise.
       k: int32 `[B]`, the step after which they look so.
-      noise: `[B, ...]`, what is to be predicted.
+      noise: `[B, ...]`, the target of the prediction.
     """
 
     x: jax.Array
@@ -84,7 +84,7 @@ def ddim_sample(
       steps: number of network evaluations.
       prepare: maps the int32 steps `[n]` to a pytree with leading axis n, once, before the loop;
         `eps_fn` gets its slice. By default the step k itself, int32 `[]`.
-      reach: (lowest, highest) value, each broadcastable against `[B, ...]`; None: -1 and 1.
+      reach: lowest and highest value, each broadcast against `[B, ...]`; None: -1 and 1.
 
     Returns:
       Clean sequences, the shape of `noise`, within `reach`.
@@ -95,6 +95,7 @@ def ddim_sample(
     def step(x, inputs):
         row, at_k = inputs
         eps = eps_fn(x, at_k)
+        # DDIM with eta = 0 (Song et al., 2021, Eq. 12): predict x0, then go to the next noise level
         x0 = (x - row.sqrt_one_minus_alpha_bar * eps) / row.sqrt_alpha_bar
         x0 = within(x0, reach)
         x = row.sqrt_alpha_bar_next * x0 + row.sqrt_one_minus_alpha_bar_next * eps

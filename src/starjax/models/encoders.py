@@ -74,7 +74,7 @@ class SmallTrunk(nn.Module):
 class StateEncoder(nn.Module):
     """Eq. 11: a history `[B, O, S]` to `[B, features]` by three 1-D convolutions.
 
-    The third has the history's length and no padding, so it spans the history.
+    The third has the history's length and no padding, so it covers the whole history.
     """
 
     features: int = 256

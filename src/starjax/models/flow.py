@@ -1,4 +1,4 @@
-"""Flow matching: straight ways from noise to action sequences, and the steps along them.
+"""Flow matching: straight paths from noise to action sequences, and Euler steps along them.
 
 Lipman et al., "Flow Matching for Generative Modeling", and Liu et al., "Flow Straight and Fast"
 (both ICLR 2023). At time t a sequence is `(1 - t) x0 + t noise`: clean at 0, noise at 1. A network
@@ -14,7 +14,7 @@ import numpy as np
 
 from starjax.models.diffusion import within
 
-# Networks are told times in this unit: their embedding is made for steps from 0 to about 100.
+# Unit of the network's times, whose embedding is made for steps from 0 to about 100.
 TIME_UNIT = 0.01
 
 
@@ -24,7 +24,7 @@ class NoisedFlow(NamedTuple):
     Attributes:
       x: `[B, ...]`, with noise.
       time: `[B]`, in TIME_UNIT.
-      velocity: `[B, ...]`, what is to be predicted.
+      velocity: `[B, ...]`, the target of the prediction.
     """
 
     x: jax.Array
@@ -40,8 +40,8 @@ def noised(key: jax.Array, x0: jax.Array) -> NoisedFlow:
     key_time, key_noise = jax.random.split(key)
     time = jax.random.uniform(key_time, x0.shape[:1])
     noise = jax.random.normal(key_noise, x0.shape, x0.dtype)
-    share = time.reshape(-1, *[1] * (x0.ndim - 1))
-    return NoisedFlow(x0 + share * (noise - x0), time / TIME_UNIT, noise - x0)
+    level = time.reshape(-1, *[1] * (x0.ndim - 1))
+    return NoisedFlow(x0 + level * (noise - x0), time / TIME_UNIT, noise - x0)
 
 
 def velocity_loss(
@@ -61,8 +61,8 @@ def sample(
 ) -> jax.Array:
     """Takes Euler steps of one length from `noise` `[B, ...]` to a clean sequence.
 
-    At each step the way ends in a clean sequence, which is clipped to `reach`: lowest and highest
-    value, None for -1 and 1.
+    At each step the end of the straight path is clipped to `reach`: lowest and highest value, None
+    for -1 and 1.
 
     Args:
       predict: `(x [B, ...], prepared) -> velocity [B, ...]`.
@@ -70,15 +70,16 @@ def sample(
       steps: number of network evaluations.
       prepare: maps the times `[n]` in TIME_UNIT to a pytree with leading axis n, once, before the
         loop; `predict` gets its slice.
-      reach: (lowest, highest) value, each broadcastable against `[B, ...]`.
+      reach: two bounds, each broadcast against `[B, ...]`.
     """
     time = np.arange(steps, 0, -1, dtype=np.float32) / steps
 
     def step(x: jax.Array, inputs: Any) -> tuple[jax.Array, None]:
         time, left, prepared = inputs
+        # x = (1 - t) x0 + t noise and v = noise - x0, so x0 = x - t v; then noise at t - 1 / steps
         clean = within(x - time * predict(x, prepared), reach)
         return clean + left * (x - clean), None
 
-    left = 1.0 - 1.0 / (steps * time)  # share of the way that is left after the step
+    left = 1.0 - 1.0 / (steps * time)  # fraction of the path that remains after the step
     rows = (jnp.asarray(time), jnp.asarray(left), prepare(jnp.asarray(time / TIME_UNIT)))
     return jax.lax.scan(step, noise, rows)[0]

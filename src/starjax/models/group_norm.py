@@ -1,4 +1,4 @@
-"""GroupNorm, with statistics in float32 whatever the type of the input."""
+"""GroupNorm, with statistics in float32 for inputs of any type."""
 
 import functools
 import math
@@ -38,9 +38,9 @@ def scale_and_shift(module: nn.Module, x: jax.Array, groups: int) -> tuple[jax.A
 @functools.partial(jax.jit, static_argnames="groups")  # traced once a shape
 def group_norm(x: jax.Array, scale: jax.Array, shift: jax.Array, groups: int) -> jax.Array:
     """Normalises `[B, ..., C]`, then scales and shifts each channel by `[C]`."""
-    # Positions first, channels after: both reductions then run along contiguous memory, and
-    # what remains is one multiply-add for each element.
-    wide = x.astype(jnp.float32)  # once, so that its gradient is summed before it is rounded
+    # Positions first, channels after: both reductions then run along contiguous memory,
+    # followed by one multiply-add per element.
+    wide = x.astype(jnp.float32)  # once: its gradient is summed before it is rounded
     return normalized(wide, *affine(*moments(wide), scale, shift, groups)).astype(x.dtype)
 
 

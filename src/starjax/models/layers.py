@@ -17,10 +17,13 @@ from starjax.models import kernels
 from starjax.runtime import hashing
 
 
-# Jitted inside jitted programs, so a function shared by many layers is traced once per shape.
+# Jitted inside of jitted programs: functions that many layers share are traced once per shape.
 @jax.jit
 def mish(x: jax.Array) -> jax.Array:
-    """Returns x tanh(softplus(x)), e = exp(x): tanh(log(1 + e)) = e (e + 2) / (e (e + 2) + 2)."""
+    """Computes x tanh(softplus(x)) by one exponential e = exp(x).
+
+    tanh(log(1 + e)) = e (e + 2) / (e (e + 2) + 2).
+    """
     wide = x.astype(jnp.float32)
     # Above 20 the ratio is 1 in float32; the clamp keeps the square from overflowing.
     e = jnp.exp(jnp.minimum(wide, 20.0))
@@ -84,7 +87,7 @@ class Dense(nn.Module):
 
 
 def xavier_init(key: jax.Array, shape: tuple[int, int], dtype: Any = None) -> jax.Array:
-    """Returns attention's weights: uniform within +-sqrt(6 / (inputs + outputs)), hashed."""
+    """Draws within +-sqrt(6 / (inputs + outputs)), hashed as in `uniform_init`, for attention."""
     return math.sqrt(6.0 / sum(shape)) * _hashed(key, tuple(shape))
 
 
@@ -131,7 +134,7 @@ class Conv1d(nn.Module):
                 f"x: expected a length that kernel {self.kernel_size} fits, got {length}"
             )
         taps = _live_taps(self.kernel_size, self.stride, padding, length, out)
-        # The fan-in counts the dropped taps, so that the start is distributed as with them.
+        # The fan-in counts the dropped taps: initial values are distributed as with them.
         init = uniform_init(self.kernel_size * channels)
         kernel = self.param("kernel", init, (len(taps), channels, self.features))
         bias = self.param("bias", init, (self.features,))

@@ -20,7 +20,7 @@ import safetensors.numpy
 from starjax import errors
 
 _PICKLES = (b"PK\x03\x04", b"\x80")  # how torch's files begin: zipped since 1.6, and before
-# Copies beside the encoder in a file of MoCo (its momentum encoder) or DINO (its student).
+# Copies next to the encoder in a file of MoCo (its momentum encoder) or DINO (its student).
 _COPIES = ("encoder_k.", "momentum_encoder.", "student.")
 _SHOWN = 4  # names in a message
 
@@ -57,8 +57,8 @@ def read_weights(path: str | pathlib.Path) -> dict[str, np.ndarray]:
         if _is_pickle(path):
             got = f"{path.name}, a pickle of torch's"
             hint = (
-                "convert it where torch is installed: safetensors.torch.save_file of what "
-                "torch.load returns (docs/howto/encoder-weights.md)"
+                "convert it where torch is installed: safetensors.torch.save_file of the result of "
+                "torch.load (docs/howto/encoder-weights.md)"
             )
         raise errors.UsageError(str(path), expected, got, hint) from error
     except (AttributeError, KeyError, TypeError) as error:  # a type that numpy lacks
@@ -67,7 +67,7 @@ def read_weights(path: str | pathlib.Path) -> dict[str, np.ndarray]:
 
 
 def _is_pickle(path: pathlib.Path) -> bool:
-    """Returns whether a file that is no `.safetensors` begins as torch's do, whatever its name."""
+    """Returns True if a file of any name begins as torch's pickles do."""
     try:
         with path.open("rb") as file:
             return file.read(4).startswith(_PICKLES)
@@ -76,7 +76,7 @@ def _is_pickle(path: pathlib.Path) -> bool:
 
 
 def _name(names: tuple[str, ...]) -> str:
-    """Returns torchvision's name: `layer2.0.conv1.weight` of (layer2_0, conv1, kernel)."""
+    """Returns torchvision's name: layer2.0.conv1.weight for (layer2_0, conv1, kernel)."""
     return ".".join(names[:-1]).replace("_", ".") + ".weight"
 
 

@@ -1,4 +1,4 @@
-"""Processes from sequences to noise, which a network learns to reverse: parts of a denoiser."""
+"""Generative processes: noise is added to sequences, and a network learns to remove it."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -22,12 +22,12 @@ class Sample(Protocol):
         prepare: Callable[[jax.Array], Any],
         reach: Any,
     ) -> jax.Array:
-        """Draws sequences of noise `[B, H, D]` within `reach` `[2, D]`, by default [-1, 1].
+        """Returns sequences from noise `[B, H, D]`, within `reach` `[2, D]`, None: [-1, 1].
 
         Args:
           predict: `(x, prepared)`, of `x` `[B, H, D]` at one time, or `[n, B, H, D]` at n times.
-          noise: standard normal, or a share of it.
-          prepare: function of times `[n]`; its pytree `[n, ...]` holds an argument of `predict`.
+          noise: standard normal, or scaled by the temperature.
+          prepare: maps times `[n]` to the second arguments of `predict`, a pytree `[n, ...]`.
           reach: lowest and highest values.
         """
         ...
@@ -36,11 +36,11 @@ class Sample(Protocol):
 class Process(NamedTuple):
     """A generative process: from data to noise and back.
 
-    A time is what the network is told of how noisy a sequence is, in the process's own unit.
+    A time is the noise level of a sequence, input of the network, in the process's own unit.
 
     Attributes:
-      noised: `(key, x0 [B, H, D]) -> given`, what is learned from clean sequences, about [-1, 1]:
-        a pytree whose leading axis is the batch.
+      noised: `(key, x0 [B, H, D]) -> given`, inputs and targets from clean sequences, about
+        [-1, 1]: a pytree whose leading axis is the batch.
       loss: `(predict, given) -> scalar`, where `predict(x [B, H, D], time [B])` is the network;
         of some rows of the batch alone `predict(x [n, H, D], time [n], rows [n])`.
       sample: see `Sample`.
@@ -72,7 +72,7 @@ def diffusion(diffusion_steps: int, ddim_steps: int) -> Process:
 
 
 def flow(steps: int) -> Process:
-    """Makes flow matching on straight ways: a network predicts the velocity of Euler steps."""
+    """Makes flow matching on straight paths: a network predicts the velocity of Euler steps."""
 
     def sample(predict, noise, *, prepare, reach=None):
         return flow_matching.sample(predict, noise, steps=steps, prepare=prepare, reach=reach)
@@ -81,5 +81,5 @@ def flow(steps: int) -> Process:
 
 
 def shortcut() -> Process:
-    """Makes flow matching whose network also learns to take the whole way at once."""
+    """Makes flow matching whose network also learns to take the whole path in one step."""
     return Process(shortcuts.noised, shortcuts.loss, shortcuts.sample)

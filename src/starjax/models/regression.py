@@ -1,4 +1,4 @@
-"""Behaviour cloning without noise: a network says the sequence, or several with their likelihood.
+"""Behaviour cloning without noise: a network predicts a sequence, or several with likelihoods.
 
 With several it is a mixture of normal distributions over whole sequences (Bishop, "Mixture Density
 Networks", 1994), all with one spread: its loss with one component is the mean squared error. Ten
@@ -50,15 +50,16 @@ class MixtureNet(nn.Module):
         """Returns the mixture for conditions `[B, C]`."""
         x = layers.residual_mlp(condition.astype(self.dtype), self.width, self.blocks, self.dtype)
         size = self.components * self.horizon * self.action_dim
-        said = layers.Dense(self.components + size, name="out")(x).astype(jnp.float32)
-        logits, means = jnp.split(said, [self.components], axis=-1)
+        outputs = layers.Dense(self.components + size, name="out")(x).astype(jnp.float32)
+        logits, means = jnp.split(outputs, [self.components], axis=-1)
         shape = (-1, self.components, self.horizon, self.action_dim)
         return Mixture(logits, means.reshape(shape))
 
 
 def loss(mixture: Mixture, x0: jax.Array, spread: float) -> jax.Array:
-    """Returns mean negative log likelihood of `[B, H, D]`, times 2 spread², without a constant:
-    with one component the mean squared error, whatever the spread.
+    """Returns the mean negative log likelihood of sequences `[B, H, D]` times 2 spread².
+
+    Without its constant: with one component it is the mean squared error for any spread.
 
     A sequence counts as one number, since its numbers are far from independent: the exponent has
     their mean squared error, not the sum.
@@ -69,9 +70,10 @@ def loss(mixture: Mixture, x0: jax.Array, spread: float) -> jax.Array:
       spread: standard deviation of a component.
     """
     scale = 2.0 * spread**2
-    off = jnp.mean((mixture.means - x0[:, None]) ** 2, axis=(-2, -1))  # [B, M]
-    likely = jax.nn.logsumexp(jax.nn.log_softmax(mixture.logits) - off / scale, axis=-1)
-    return -scale * jnp.mean(likely)
+    error = jnp.mean((mixture.means - x0[:, None]) ** 2, axis=(-2, -1))  # [B, M]
+    # log sum_m pi_m exp(-error_m / 2 spread^2)
+    log_likelihood = jax.nn.logsumexp(jax.nn.log_softmax(mixture.logits) - error / scale, axis=-1)
+    return -scale * jnp.mean(log_likelihood)
 
 
 def draw(mixture: Mixture, keys: jax.Array) -> jax.Array:

@@ -1,6 +1,6 @@
 """ResNet-18's trunk with GroupNorm: BatchNorm's running statistics break under weight averaging.
 
-Names and shapes follow torchvision's, so that `pretrained` can fill in its ImageNet weights.
+Names and shapes follow torchvision's: `pretrained` fills in its ImageNet weights.
 """
 
 import math
@@ -51,7 +51,7 @@ class Stem(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Maps `[N, h, w, 3]` to pairs `[N, ceil(h/4), 2, ceil(w/4), 2, features]`."""
+        """Maps `[N, h, w, 3] -> [N, ceil(h/4), 2, ceil(w/4), 2, features]` in pairs."""
         init = _kernel_init(7, self.features)
         kernel = self.param("kernel", init, (7, 7, x.shape[-1], self.features))
         height, width = x.shape[1:3]

@@ -11,7 +11,7 @@ class RollNet(nn.Module):
     """A residual MLP from (positions, trocar, roll history) to the rolls of the horizon.
 
     It predicts the roll itself, as the paper does, not its change since the last measured one. Its
-    last layer starts at zero, so an untrained network says "no roll" and not a random one.
+    last layer starts at zero: an untrained network predicts zero and not a random roll.
     Inputs should be of order one.
 
     Attributes:
@@ -43,7 +43,7 @@ class RollNet(nn.Module):
           p: `[B, H, 3]` future tip positions, normalised.
           trocar: `[B, F]` features of the trocar.
           roll_history: `[B, O]` measured rolls, in the unit of the output.
-          observed: `[B, C]` whatever else it is to see; the paper's sees nothing else.
+          observed: `[B, C]` features of the observation, an ablation; None in the paper.
 
         Returns:
           Rolls float32 `[B, H]`.

@@ -16,7 +16,7 @@ class Schedule(NamedTuple):
 
     Attributes:
       beta: variance added at step k (Eq. 6).
-      sqrt_alpha_bar: factor of the clean action after step k (Eq. 7).
+      sqrt_alpha_bar: scale of the clean action after step k (Eq. 7).
       sqrt_one_minus_alpha_bar: standard deviation of the noise after step k.
     """
 
@@ -63,8 +63,8 @@ def ddim_table(diffusion_steps: int, steps: int) -> DdimTable:
 
     With 100 and 10 they are k = 90, 80, .., 0, the 'leading' spacing, which starts in the middle
     of the schedule where `steps` is no divisor: k = 50, .. for 51 of 100 instead of 98, .. .
-    One step alone is k = 0, where the input counts as nearly clean: what comes out is the noise
-    that went in, good for measuring time only.
+    One step alone is k = 0, where the input counts as nearly clean: the output is the input noise,
+    of use for measuring time only.
     """
     if not 1 <= steps <= diffusion_steps:
         raise ValueError(f"steps: expected 1..{diffusion_steps} (the diffusion steps), got {steps}")

@@ -1,4 +1,4 @@
-"""Spatial softmax: mean image position of each feature map (part of Eq. 10)."""
+"""Spatial softmax: the expected image position of each feature map (part of Eq. 10)."""
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,10 @@ def spatial_softmax(
       logits: `[N, h, w, K]`.
       image_size: height and width in pixels of the image that the maps came from.
       offset: `[N, 2]` pixels (row, column) by which that image was cut away from the centre crop.
-        With it, coordinates are those of the uncropped image, and a random crop moves no keypoint
-        where it is a whole number of cells. Else its last cell reaches beyond it, all are taken for
-        narrower than they are, and that share of the offset is left: 4% (115 px in cells of 8) to
-        10% (230 px in cells of 32).
+        With it, coordinates are those of the uncropped image, and a random crop of a whole number
+        of cells moves no keypoint. In other crops the last cell extends past the edge, cells are
+        taken as narrower, and that fraction of the offset remains: 4% (115 px in cells of 8) to 10%
+        (230 px in cells of 32).
 
     Returns:
       float32 `[N, K, 2]`, (row, column).

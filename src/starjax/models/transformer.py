@@ -1,11 +1,11 @@
 """Action chunking with transformers: a conditional variational autoencoder of sequences.
 
 Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware" (RSS 2023). In
-training an encoder reads the demonstrated sequence and says its style z; at inference z is 0, the
-mean of what it may be. A decoder turns z and the observation into the sequence.
+training an encoder maps the demonstrated sequence to its style z; at inference z is 0, the mean of
+its prior. A decoder turns z and the observation into the sequence.
 
-Other than there: layers are normalised before attention, not after it, and have no dropout; an
-image is one token, what the encoder of all learners makes of it, and not one token a cell.
+Differences: layers are normalised before attention, not after it, and have no dropout; an
+image is one token, the output of the encoder that all learners share, not one token per cell.
 """
 
 from typing import NamedTuple
@@ -33,17 +33,19 @@ class Style(NamedTuple):
 
 def drawn(style: Style, noise: jax.Array) -> jax.Array:
     """Returns z `[B, Z]` of standard normal noise `[B, Z]`."""
+    # reparametrisation: z = mu + sigma * noise
     return style.mean + jnp.exp(0.5 * style.log_variance) * noise
 
 
 def divergence(style: Style) -> jax.Array:
     """Returns the mean Kullback-Leibler divergence from the standard normal, summed over z."""
+    # KL(N(mu, sigma^2) || N(0, 1)) = (sigma^2 + mu^2 - 1 - log sigma^2) / 2 per entry
     each = jnp.exp(style.log_variance) + style.mean**2 - 1.0 - style.log_variance
     return jnp.mean(0.5 * jnp.sum(each, axis=-1))
 
 
 class Layer(nn.Module):
-    """One layer of a transformer: attention to itself, to others if they are given, and an MLP.
+    """A transformer layer: self-attention, cross-attention if `others` are passed, and an MLP.
 
     Attributes:
       heads: of the attention; divides the width.
@@ -75,7 +77,7 @@ class Layer(nn.Module):
 
 
 class StyleEncoder(nn.Module):
-    """Reads a demonstrated sequence. Only training has it.
+    """Encoder of a demonstrated sequence, used in training only.
 
     Attributes:
       features: Z.
@@ -93,7 +95,7 @@ class StyleEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, x0: jax.Array, state: jax.Array) -> Style:
-        """Returns the style of sequences `[B, H, D]`, seen in `state` `[B, S]`."""
+        """Returns the style of sequences `[B, H, D]`, observed with `state` `[B, S]`."""
         actions = layers.Dense(self.width, name="actions")(x0.astype(self.dtype))
         now = layers.Dense(self.width, name="state")(state.astype(self.dtype))[:, None]
         first = self.param("first", _start, (1, self.width)).astype(self.dtype)
@@ -101,20 +103,20 @@ class StyleEncoder(nn.Module):
         x = _placed(self, x)
         for _ in range(self.layers):
             x = Layer(self.heads, self.mlp, self.dtype)(x)
-        said = layers.Dense(2 * self.features, name="out")(x[:, 0].astype(jnp.float32))
-        return Style(*jnp.split(said, 2, axis=-1))
+        outputs = layers.Dense(2 * self.features, name="out")(x[:, 0].astype(jnp.float32))
+        return Style(*jnp.split(outputs, 2, axis=-1))
 
 
 class Decoder(nn.Module):
-    """Turns a style and an observation into a sequence.
+    """Decoder of a style and an observation to a sequence.
 
     Attributes:
       horizon: H.
       action_dim: D.
       width: of all tokens.
       heads, mlp, dtype: of the layers, see `Layer`.
-      encoder_layers: in which the tokens of what is observed attend to each other.
-      decoder_layers: in which those of the actions attend to each other and to them.
+      encoder_layers: layers in which the tokens of the observation attend to each other.
+      decoder_layers: layers in which the tokens of actions attend to each other and to those.
     """
 
     horizon: int
@@ -128,20 +130,20 @@ class Decoder(nn.Module):
 
     @nn.compact
     def __call__(
-        self, z: jax.Array, vision: jax.Array | None, state: jax.Array, told: jax.Array
+        self, z: jax.Array, vision: jax.Array | None, state: jax.Array, trocar: jax.Array
     ) -> jax.Array:
         """Returns float32 `[B, H, D]`.
 
         Args:
           z: `[B, Z]`.
-          vision: `[B, O, V]`, one token a moment, or None.
+          vision: `[B, O, V]`, one token per observation, or None.
           state: `[B, S]`.
-          told: `[B, E]`; E may be 0.
+          trocar: `[B, E]` features of the trocar; E may be 0.
         """
         parts = {"style": z[:, None], "state": state[:, None], "vision": vision}
-        if told.shape[-1]:
-            parts["told"] = told[:, None]
-        seen = jnp.concatenate(
+        if trocar.shape[-1]:
+            parts["told"] = trocar[:, None]  # the parameters' name
+        tokens = jnp.concatenate(
             [
                 layers.Dense(self.width, name=name)(part.astype(self.dtype))
                 for name, part in parts.items()
@@ -149,13 +151,13 @@ class Decoder(nn.Module):
             ],
             axis=1,
         )
-        seen = _placed(self, seen)
+        tokens = _placed(self, tokens)
         for _ in range(self.encoder_layers):
-            seen = Layer(self.heads, self.mlp, self.dtype)(seen)
+            tokens = Layer(self.heads, self.mlp, self.dtype)(tokens)
         queries = self.param("queries", _start, (self.horizon, self.width)).astype(self.dtype)
         x = jnp.broadcast_to(queries, (len(z), *queries.shape))
         for _ in range(self.decoder_layers):
-            x = Layer(self.heads, self.mlp, self.dtype)(x, seen)
+            x = Layer(self.heads, self.mlp, self.dtype)(x, tokens)
         x = nn.LayerNorm()(x.astype(jnp.float32))
         return layers.Dense(self.action_dim, name="out")(x)
 

@@ -35,7 +35,7 @@ class ResidualBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array, film: jax.Array) -> jax.Array:
-        """Maps `x` `[B, L, C]`, `film` `[B, 2 features]` (scale, bias) to `[B, L, features]`."""
+        """Maps `x` `[B, L, C]`, `film` `[B, 2 features]` (scale, bias) -> `[B, L, features]`."""
         scale, bias = jnp.split(film[:, None, :], 2, axis=-1)
         h = ConvBlock(self.features, self.kernel_size, self.groups)(x)
         h = ConvBlock(self.features, self.kernel_size, self.groups)(scale * h + bias)
@@ -156,8 +156,11 @@ class ConditionalUnet1D(nn.Module):
 
 @jax.custom_vjp
 def _matmul_f32(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """Multiplies in the dtype of `x`, accumulated and returned in float32: the two FiLM parts are
-    added before they are rounded. So is their gradient, which is therefore exact in that dtype."""
+    """Multiplies in the dtype of `x`; accumulates and returns float32.
+
+    The two FiLM parts are added before they are rounded. So is their gradient, which is therefore
+    exact in that dtype.
+    """
     return jnp.matmul(x, kernel.astype(x.dtype), preferred_element_type=jnp.float32)
 
 

@@ -1,4 +1,4 @@
-"""Runs a function in a background thread, so its result is ready when it is needed."""
+"""Functions in background threads, whose results are ready when they are needed."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

@@ -16,7 +16,7 @@ _SCHEMES = ("http", "https")
 
 
 def is_own(request: Any) -> bool:
-    """Returns True for a page that this server sent, and for programs other than browsers.
+    """Returns True for a page that this server sent, and for a program other than a browser.
 
     A browser sends the origin of the page that connects. The server's own page has the host of the
     request. That host is an address or a name of this machine: another name may lead here by its

@@ -1,7 +1,7 @@
 """Files that survive a kill: atomic writes, committed folders, hashes, free space, a folder's lock.
 
 A reader sees a file or folder whole or not at all. Temporary names are fixed, one a target, so the
-next run writes over what a killed one left behind; the lock makes sure that there is only one.
+next run writes over the remains of a killed one; the lock makes sure that only one runs.
 """
 
 import contextlib
@@ -110,7 +110,7 @@ def commit_directory(
 
     Args:
       final: must not exist.
-      staged: path of construction, on the same file system; an existing one is removed.
+      staged: temporary name on the same file system; an existing one is removed.
       contents: bytes of each file by name, in parts.
     """
     try:
@@ -184,7 +184,7 @@ def lock(directory: Path) -> Iterator[None]:
 
 
 def sync_directory(path: Path) -> None:
-    """Makes what was created, renamed or removed in a folder survive a crash."""
+    """Makes creations, renames and removals in a folder survive a crash."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -1,6 +1,6 @@
 """Use of a GPU: devices of the system before jax has started, jax's own answer after.
 
-Only what is asked after the start imports jax.
+Only functions for use after the start import jax.
 """
 
 import importlib.util

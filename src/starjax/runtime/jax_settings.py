@@ -1,7 +1,7 @@
 """Settings of jax that change results or end programs, and their treatment.
 
 Shells set them for other projects. Commands set those of `FIXED` (random numbers and types) and
-`CHECKS` (what they find is an error) to jax's defaults. Those of `RECORDED` and XLA's flags stay
+`CHECKS` (which raise errors) to jax's defaults. Those of `RECORDED` and XLA's flags stay
 the user's: `recorded` lists the ones that differ from the defaults, and saved trials and
 demonstrations are used again only if all of these agree.
 
@@ -30,7 +30,7 @@ FIXED: Mapping[str, Any] = MappingProxyType({
     "jax_threefry_partitionable": True,
 })  # fmt: skip
 
-# Checks and guards, set by commands to jax's defaults: what they find would end the command.
+# Checks and guards, set by commands to jax's defaults: an alarm of theirs would end the command.
 CHECKS: Mapping[str, Any] = MappingProxyType({
     "jax_array_garbage_collection_guard": None,
     "jax_check_static_indices": False,

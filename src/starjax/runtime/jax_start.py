@@ -16,7 +16,7 @@ def require_devices(*modules: str) -> None:
     those that the user's environment sets to others.
 
     Raises:
-      errors.UsageError: jax cannot use what JAX_PLATFORMS asks for.
+      errors.UsageError: jax cannot use the platform of JAX_PLATFORMS.
     """
     import jax
 
@@ -30,7 +30,7 @@ def require_devices(*modules: str) -> None:
     def start() -> None:
         for device in jax.local_devices():
             # A GPU's memory is taken with the first array, the longer part of its start.
-            with contextlib.suppress(RuntimeError):  # a full one will say so where it is used
+            with contextlib.suppress(RuntimeError):  # a full GPU raises at its first real use
                 jax.device_put(0, device)
 
     started = background.run_in_background(start)

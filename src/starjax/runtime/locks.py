@@ -1,4 +1,4 @@
-"""An exclusive lock on a file: the system's, or a marker file if the file system has no locks."""
+"""An exclusive lock on a file: the file system's, or a marker file if that has no locks."""
 
 import contextlib
 import errno
@@ -15,7 +15,7 @@ _ATTEMPT_S = 0.3  # s; the first look at a dead process's marker may only remove
 
 
 class Held(Exception):
-    """Another process has the lock; the message names it, and says how to go on."""
+    """Another process has the lock; the message names it and a remedy."""
 
 
 @contextlib.contextmanager
@@ -27,7 +27,7 @@ def hold(path: Path) -> Iterator[bool]:
     removed by hand, which `Held` says.
 
     Args:
-      path: made if it is missing, and left there. The name of the holder is in a file beside it.
+      path: created if missing, and kept. A file next to it has the name of the holder.
 
     Yields:
       whether the lock is the system's, not a marker.

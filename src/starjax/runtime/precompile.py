@@ -92,13 +92,13 @@ def start(job: Callable[[], T]) -> Callable[[], T | None]:
 
 
 def settle() -> None:
-    """Waits until every queued job has been traced, so the next trace runs alone."""
+    """Waits until every queued job has been traced; the next trace then runs alone."""
     _tracer.submit(lambda: None).result()
 
 
 @contextlib.contextmanager
 def until_end() -> Iterator[None]:
-    """Lets jobs work beside the block.
+    """Lets jobs work during the block.
 
     At its end those not begun are dropped, because the exit of Python would wait for them.
     """

@@ -3,8 +3,8 @@
 Every process runs the same command on a shared folder, with JAX_COORDINATOR_ADDRESS (host:port of
 the first one), JAX_NUM_PROCESSES and JAX_PROCESS_ID set, or as a step of `srun`, whose variables
 say the same. All train together and write the arrays of checkpoints, and each makes its share of
-demonstrations and trials (`rollouts.sharing`); whatever else there is to do, other files above all,
-the first does alone. With one process nothing here does anything.
+demonstrations and trials (`rollouts.sharing`); the first does everything else alone, such as
+writing other files. With one process nothing here does anything.
 """
 
 import functools
@@ -57,12 +57,12 @@ def join() -> None:
 
 
 def _initialize(**given: Any) -> None:
-    """Connects to the others; what is not given, jax finds in the variables of `srun`."""
+    """Connects to the others; jax takes missing arguments from the variables of `srun`."""
     # Its handler of SIGTERM, in C++, would take the signal from Python's.
     if hasattr(jax.config, _PREEMPTION):
         jax.config.update(_PREEMPTION, False)
     jax.distributed.initialize(heartbeat_timeout_seconds=_HEARTBEAT_S, **given)
-    if is_first():  # said now: when a process is lost, jax's C++ code aborts the others
+    if is_first():  # in advance, because jax's C++ code aborts the others when a process is lost
         print(LOST_HINT, file=sys.stderr, flush=True)
 
 

@@ -1,4 +1,4 @@
-"""Progress of long work: fraction, speed and remaining time, as a bar on a terminal, else lines."""
+"""Progress of long work, its rate and remaining time: a bar on a terminal, else lines."""
 
 import contextlib
 import sys
@@ -27,10 +27,10 @@ def track(
       total: units in all.
       unit: their name, as in "episodes".
       done: units that an earlier run finished; they do not count for the throughput.
-      stream: text stream of the output; default: standard error.
+      stream: output; by default the standard error stream.
 
     Yields:
-      `advance(count, note="")`: `count` more units are done; `note` is shown beside the bar.
+      `advance(count, note="")`: `count` more units are done; `note` is shown next to the bar.
     """
     shown = stream or sys.stderr
     show = _terminal if shown.isatty() else _plain
@@ -112,7 +112,7 @@ class _Meter:
         return self.done >= self.total - 1e-6  # shares of a unit rarely add up to the last bit
 
     def per_second(self) -> float:
-        is_past = self._is_past_first() and not self.is_over()  # the last report counts everything
+        is_past = self._is_past_first() and not self.is_over()  # the last rate is of all units
         done, since = self._first if self._first and is_past else self._begun
         return (self.done - done) / max(time.monotonic() - since, 1e-9)
 

@@ -1,4 +1,4 @@
-"""Names the code that runs: a commit of its checkout, or what its installation says of itself."""
+"""Origin of the running code: a commit of its checkout, or the record of its installation."""
 
 import functools
 import importlib.metadata
@@ -18,7 +18,7 @@ class Code(NamedTuple):
     Attributes:
       version: of the package.
       commit: hexadecimal, None where neither a checkout nor the installation says it.
-      dirty: True if the package's tracked files differ from the commit; None without a commit.
+      dirty: True if the package's tracked files differ from the commit, None without one.
     """
 
     version: str
@@ -44,7 +44,10 @@ def of_version(version: str) -> tuple[str, bool] | None:
 
 
 def _of_checkout(package: Path) -> tuple[str, bool] | None:
-    """Asks git if it tracks the package, which may also lie in an unrelated repository."""
+    """Returns commit and dirty flag from git, if it tracks the package.
+
+    The package may also lie untracked in another repository.
+    """
 
     def git(*words: str) -> str:
         command = ["git", "-C", str(package), *words]

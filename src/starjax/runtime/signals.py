@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-# Slurm and LSF warn by the signal that they are asked for, Grid Engine by SIGUSR1 and SIGUSR2. Some
+# Slurm and LSF warn by a signal of the user's choice, Grid Engine by SIGUSR1 and SIGUSR2. Some
 # systems do not have all of them.
 STOPS = tuple(
     getattr(signal, name)
@@ -22,18 +22,18 @@ STOPS = tuple(
     if hasattr(signal, name)
 )
 _AGAIN_S = 0.5  # until a KeyboardInterrupt that was lost is raised again
-_SILENT_S = 1.0  # that may pass until a stop is answered, or a line says that it was heard
+_SILENT_S = 1.0  # maximum delay of a stop before a line confirms it
 _READERS_MS = 200  # in which the readers of our output end with the terminal
 
 _answered = False
 
 
 def interrupt_on_stops() -> None:
-    """Lets every stop raise KeyboardInterrupt in the process's main thread.
+    """Raises KeyboardInterrupt in the main thread for every later stop.
 
-    Python drops what is raised in a callback of its collector, and jax's C++ some of what is raised
-    while it calls Python, at every start for some milliseconds. So it is raised again and again,
-    but not into the cleaning up that the first one began.
+    Python drops exceptions that are raised in a callback of its collector, and jax's C++ code some
+    that are raised while it calls Python, at every start for some milliseconds. It is therefore
+    raised repeatedly, but not during the cleaning up after the first one.
     """
     _announce_unanswered()
     if hasattr(signal, "setitimer"):
@@ -43,7 +43,7 @@ def interrupt_on_stops() -> None:
 
 
 def ignore_stops() -> None:
-    """Lets no stop interrupt what is left of the process."""
+    """Ignores stops for the rest of the process."""
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, 0)
     for number in STOPS:
@@ -100,7 +100,7 @@ def _interrupt_again(number: int, frame: Any) -> None:
 
 
 def _announce_unanswered() -> None:
-    """Says of a stop that it was heard, where the main thread does not answer it.
+    """Prints a line for a stop that the main thread does not handle at once.
 
     That thread does not see a signal while it compiles a program or waits for one. The system
     writes the number of each into a pipe at once, which a thread reads.
@@ -114,7 +114,7 @@ def _announce_unanswered() -> None:
             if number[0] in STOPS:
                 time.sleep(_SILENT_S)
                 if not _answered:
-                    line = "starjax: stop heard; it waits for the program that compiles or runs now"
+                    line = "starjax: stopping after the program that compiles or runs now"
                     print(line, file=sys.stderr, flush=True)
                     return
 
@@ -122,8 +122,10 @@ def _announce_unanswered() -> None:
 
 
 def _drop_dead_outputs(number: int) -> None:
-    """Discards lines after SIGHUP whose terminal or reader is gone: they would end the work
-    before it has saved."""
+    """Redirects outputs without a reader to the null device, after SIGHUP.
+
+    Writing to them would end the work before it has saved.
+    """
     if number != getattr(signal, "SIGHUP", None):
         return
     for output in (1, 2):

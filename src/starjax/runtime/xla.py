@@ -1,6 +1,7 @@
-"""XLA settings for this machine, set before jax starts, and what the machine is.
+"""XLA settings for this machine, set before jax starts, and properties of the machine.
 
-Importing it imports no jax."""
+This module does not import jax.
+"""
 
 import contextlib
 import hashlib
@@ -83,8 +84,10 @@ def options_without_kinematics() -> dict[str, Any]:
 
 
 def cache_directory() -> Path:
-    """Returns the cache folder: STARJAX_CACHE, else the user's cache directory, or the
-    system's temporary one where the user has no home."""
+    """Returns the folder of caches: STARJAX_CACHE, else the user's cache directory.
+
+    A user without a home gets one in the system's temporary directory.
+    """
     if chosen := os.environ.get("STARJAX_CACHE"):
         return Path(chosen)
     if base := os.environ.get("XDG_CACHE_HOME"):
@@ -177,7 +180,7 @@ def _limits() -> Iterator[tuple[int, int]]:
             continue
         place = Path(path.lstrip("/"))
         for group in (place, *place.parents):
-            with contextlib.suppress(OSError, ValueError):  # not there, or "max": no limit
+            with contextlib.suppress(OSError, ValueError):  # missing, or "max": no limit
                 yield _limit(root / group, *names)
 
 

@@ -85,10 +85,10 @@ def save(directory: str | os.PathLike, step: int, state: Any, *, keep: int) -> p
 
 
 def restore(directory: str | os.PathLike, like: Any) -> tuple[int, Any] | None:
-    """Returns the newest undamaged step, None without one.
+    """Returns the newest undamaged step, or None without one.
 
     Args:
-      directory: argument of `save`.
+      directory: the argument of `save`.
       like: a state of the same structure, of arrays or `jax.ShapeDtypeStruct` with shardings.
 
     Returns:
@@ -104,7 +104,7 @@ def restore(directory: str | os.PathLike, like: Any) -> tuple[int, Any] | None:
             manifest = verify(path)
         except DamagedCheckpoint as damage:
             warnings.warn(
-                f"checkpoint of step {step} is damaged: {damage}; training goes on from before it",
+                f"checkpoint of step {step} is damaged: {damage}; an earlier one is used",
                 stacklevel=2,
             )
             continue
@@ -209,7 +209,7 @@ def _remove_leftovers(root: pathlib.Path) -> None:
 
 
 def _remove(path: pathlib.Path) -> None:
-    # hidden before it is emptied, so that a kill in between cannot leave a damaged step
+    # hidden first: a kill while it is emptied must not leave a damaged step
     hidden = path.with_name(f"{_TEMPORARY}old-{path.name}")
     path.rename(hidden)
     shutil.rmtree(hidden, ignore_errors=True)

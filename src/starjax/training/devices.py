@@ -10,8 +10,8 @@ from starjax import errors
 from starjax.runtime import processes, xla
 
 AXIS = "batch"
-# Of a step on several GPUs: matrices are gathered at once beside the encoder's work, gradients are
-# summed in pieces of 128 MB beside the backward pass.
+# XLA's options for a step on several GPUs: all matrices are gathered during the encoder's forward
+# pass, gradients are summed in pieces of 128 MB during the backward pass.
 _OVERLAP: dict[str, Any] = {
     "xla_gpu_enable_latency_hiding_scheduler": True,
     "xla_gpu_all_reduce_combine_threshold_bytes": 128 << 20,

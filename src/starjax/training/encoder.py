@@ -1,4 +1,4 @@
-"""The vision encoder of another policy, from which a new policy's begins or which stays frozen."""
+"""The vision encoder of another policy, as the start of a new policy's or frozen in it."""
 
 import dataclasses
 from pathlib import Path
@@ -33,8 +33,7 @@ def read(policy_config: config.PolicyConfig) -> Encoder | None:
     Returns None for a ResNet-18's ImageNet weights, which fill the ResNet's trunk and nothing else.
 
     Raises:
-      errors.UsageError: the file is missing or damaged, or the encoder in it is not the one
-        that the settings describe.
+      errors.UsageError: the file is missing or damaged, or its encoder differs from the settings.
     """
     name = policy_config.encoder_weights
     path = packaged.find(_WEIGHTS, name)
@@ -59,9 +58,9 @@ def read(policy_config: config.PolicyConfig) -> Encoder | None:
 
 def start(params: Params, policy_config: config.PolicyConfig) -> Params:
     """Returns a policy's first parameters, with the encoder that the settings name."""
-    found = read(policy_config)
-    if found is not None:
-        return {**params, "vision": found.params}
+    encoder = read(policy_config)
+    if encoder is not None:
+        return {**params, "vision": encoder.params}
     vision = params["vision"]["params"]
     trunk = pretrained.load_resnet18(vision["trunk"], policy_config.encoder_weights)
     return {**params, "vision": {"params": {**vision, "trunk": trunk}}}
@@ -70,7 +69,7 @@ def start(params: Params, policy_config: config.PolicyConfig) -> Params:
 def _differing(policy_config: config.PolicyConfig, trained: policy_file.Trained) -> list[str]:
     """Lists settings of the encoder that differ: `policy.vision_dim 64 (here 128)`."""
     names = ["observation", "encoder", "vision_dim"]
-    # An encoder that is trained further may adapt to another image.
+    # An encoder that is trained further may adapt to another image size.
     names += ["image_size"] if policy_config.freeze_encoder else []
     ours, theirs = policy_config, trained.policy
     found = [

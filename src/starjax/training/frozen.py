@@ -2,8 +2,8 @@
 
     <root>/features/<key>/part_<n>.npz    `[PART, d_v]` float32, of consecutive frames
 
-The key is a hash of all that decides the features, so that a resumed run, or another method with
-the same encoder, finds them. Archives have checksums: a damaged part is noticed and made again.
+The key is a hash of all that decides the features: a resumed run, or another method with the same
+encoder, finds them. Archives have checksums: a damaged part is noticed and made again.
 """
 
 import hashlib
@@ -22,9 +22,9 @@ from starjax.rollouts import workers
 from starjax.runtime import files, progress
 from starjax.training.encoder import Encoder
 
-PART = 1024  # frames per file: the most that a kill costs
-# Frames a call: always as many, since the size of a batch may change last bits. With more, what a
-# CPU's core works on leaves its cache.
+PART = 1024  # frames per file, lost at most by a kill
+# Frames per call, a constant because the batch size may change last bits. Larger batches would not
+# fit the cache of a CPU's core.
 BATCH = 16
 
 
@@ -114,7 +114,7 @@ def _key(
     camera: str,
     rows: np.ndarray | None,
 ) -> str:
-    """Returns the features' name, a digest of everything that decides them."""
+    """Returns the key of the features: a hash of all that they depend on."""
     about = {
         "encoder": encoder.fingerprint,
         "trunk": policy_config.encoder,

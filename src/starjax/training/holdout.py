@@ -1,4 +1,4 @@
-"""Action error on demonstrations kept out of training: open loop, against what was commanded."""
+"""Action error on demonstrations kept out of training: open loop, against their commands."""
 
 from collections.abc import Callable
 from typing import Any
@@ -41,7 +41,7 @@ def make(
         return windows.gather(data, frame, policy_config.obs_horizon, policy_config.horizon)
 
     batch = (jax.jit(gather) if windows.on_device(dataset) else gather)(dataset, chosen)
-    # the same noise each time, so that the curve shows the network and not the draw
+    # the same noise each time: the curve shows the network and not the draw
     keys = jax.random.split(jax.random.key(0), count)
 
     def errors(params: Any, stats: Any, batch: windows.Batch) -> dict[str, jax.Array]:

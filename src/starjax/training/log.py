@@ -10,7 +10,7 @@ from starjax.runtime import files
 
 
 def resume(path: str | os.PathLike, step: int) -> None:
-    """Drops what a run wrote after the step that it now goes on from, half lines included."""
+    """Drops lines after the step that a run resumes from, and incomplete ones."""
     file = pathlib.Path(path)
     file.parent.mkdir(parents=True, exist_ok=True)
     lines = file.read_bytes().splitlines(keepends=True) if file.exists() else []
@@ -19,7 +19,7 @@ def resume(path: str | os.PathLike, step: int) -> None:
 
 
 def append(path: str | os.PathLike, step: int, kind: str, values: Mapping[str, Any]) -> None:
-    """Adds a line `{"step", "kind", **values}`; no clock times, so that equal runs log equally.
+    """Adds a line `{"step", "kind", **values}`; without clock times: equal runs log equally.
 
     Raises:
       StorageError: it cannot be written.
@@ -30,7 +30,7 @@ def append(path: str | os.PathLike, step: int, kind: str, values: Mapping[str, A
             stream.write(line + "\n")
     except OSError as error:
         raise files.StorageError(
-            f"cannot write {path}: {error.strerror}; training goes on from its last checkpoint"
+            f"cannot write {path}: {error.strerror}; training resumes from its last checkpoint"
         ) from error
 
 

@@ -23,13 +23,15 @@ from starjax.training.sharding import StateLayout, StepCarry
 from starjax.training.step import Setup
 from starjax.training.stepper import Stepper
 
-_CALL_SECONDS = 1.0  # aim of one compiled call: the wait of Ctrl-C, the period of the bar
+_CALL_SECONDS = (
+    1.0  # target duration of a compiled call: the delay of Ctrl-C and of the progress bar
+)
 
 HoldoutError = Callable[[states.TrainState], dict[str, float]]
 
 
 class Interrupted(KeyboardInterrupt):
-    """Training was asked to stop; its checkpoint is written and the same command goes on."""
+    """Training was stopped after writing a checkpoint; the same command resumes."""
 
 
 class TrainingResult(NamedTuple):
@@ -37,8 +39,8 @@ class TrainingResult(NamedTuple):
 
     Attributes:
       state: after the last step.
-      samples_per_second: of this process, without compilation; 0 if the training was complete.
-      skipped: steps left out because their loss or gradient was not finite.
+      samples_per_second: of this process, compilation aside; 0 if training was complete.
+      skipped: steps without an update, because their loss or gradient was not finite.
       holdout: last errors on demonstrations kept out; empty if none were.
     """
 
@@ -64,7 +66,7 @@ def run(
     description: str = "train",
     step_program: precompile.Program | None = None,
 ) -> TrainingResult:
-    """Trains a method, going on from the newest sound checkpoint in the directory.
+    """Trains a method, resuming from the newest sound checkpoint in the directory.
 
     Interrupted and resumed, or run through: the result is the same to the last bit.
 
@@ -128,7 +130,7 @@ def run(
         state = devices.replicate(state, mesh)
     else:
         _check_same(directory, state, streams.steps, stats, train_config.steps)
-    del drawn  # it holds what was drawn
+    del drawn  # frees the initial parameters
 
     holdout_error = None
     if processes.is_first():
@@ -169,8 +171,8 @@ def _train(
                 if step > saved:
                     _save(directory, stepper.end(carry), train_config)
                 raise Interrupted(
-                    f"stopped after step {step} of {last}; what is done is in {directory}, the "
-                    "same command goes on from there"
+                    f"stopped after step {step} of {last}; its checkpoint is in {directory}, the "
+                    "same command resumes from it"
                 )
             stops = _next(step, train_config.log_every), _next(step, train_config.checkpoint_every)
             count = min(step + calls[0], *stops, last) - step
@@ -197,7 +199,7 @@ def _train(
 def _observed(
     dataset: windows.Dataset, policy_config: config.PolicyConfig, seen: features.Sensors
 ) -> windows.Dataset:
-    """Removes observations that the policy does not use, so no batch gathers them."""
+    """Removes observations that the policy does not use: gathering them would take time."""
     given = dataset.observation
     kept = "images" if policy_config.observation == "image" else "state"
     kept = "features" if policy_config.freeze_encoder else kept
@@ -207,7 +209,7 @@ def _observed(
 
 
 def _restored(checkpoints: pathlib.Path, shapes: Any) -> states.TrainState | None:
-    """Returns the state of the newest undamaged checkpoint, None without one."""
+    """Returns the state of the newest sound checkpoint, None without one."""
     restored = checkpoint.restore(checkpoints, shapes) if checkpoint.steps(checkpoints) else None
     step = -1 if restored is None else restored[0]
     if processes.agree(step) != (step,):

@@ -38,7 +38,7 @@ def means(
       sums: since the last line of the log.
       step: steps so far.
       skipped: of all of them.
-      train_config: settings with the number of steps between two lines.
+      train_config: has the number of steps between two lines.
 
     Raises:
       errors.UsageError: nothing was finite in a whole stretch. A single step says nothing, as where

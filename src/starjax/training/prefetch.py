@@ -58,7 +58,7 @@ def batches(
                     )
                     _put(waiting, devices.shard_batch(batch, mesh), closed)
                 step += _CHUNK
-        except BaseException as error:  # raised where the next batch is asked for
+        except BaseException as error:  # raised by the consumer's next call
             _put(waiting, error, closed)
 
     thread = threading.Thread(target=produce, daemon=True, name="starjax-feed")

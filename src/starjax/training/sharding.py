@@ -2,7 +2,7 @@
 
 Rajbhandari et al., arXiv:1910.02054. A step gathers the matrices where the networks use them, in
 the networks' type, and of the gradients' sum each device gets its own share alone. Reference: one
-device, where nothing here does anything but keep the rounded matrices.
+device, on which this module only keeps the rounded matrices.
 """
 
 import functools
@@ -28,8 +28,8 @@ class StepCarry(NamedTuple):
 
     Attributes:
       state: of the training, as `StateLayout` lays it out.
-      rounded: its matrices in the networks' type, None for other leaves. The optimiser writes both,
-        so that the float32 ones are not read again to round them.
+      rounded: its matrices in the networks' type, None for other leaves. The optimiser writes both:
+        the float32 ones are not read again to round them.
     """
 
     state: TrainState

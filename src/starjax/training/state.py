@@ -1,4 +1,4 @@
-"""The state of a training: the carry from step to step and the content of a checkpoint."""
+"""The state of a training run: the carry of its steps and the content of its checkpoints."""
 
 import functools
 from collections.abc import Callable
@@ -32,7 +32,7 @@ class StepKeys(NamedTuple):
     """Typed keys of one step.
 
     Attributes:
-      batch: key of the draws of frames.
+      batch: draws its frames.
       loss: augmentation, noise and diffusion steps.
     """
 
@@ -145,7 +145,7 @@ def init(policy: Policy, key: jax.Array) -> Init:
 def run_once(fn: Callable[..., Any], *args: Any) -> Any:
     """Calls `fn(*args)` as one program that is not optimised, which would take longer.
 
-    Called as it is, `fn` would compile a program for each of its hundred small arrays.
+    Called as it is, `fn` would compile a hundred programs, one per small array.
     """
     return _quick(fn)(*args)
 
@@ -190,7 +190,7 @@ def shapes(
     key: jax.Array,
     sharding: jax.sharding.Sharding,
 ) -> TrainState:
-    """Returns shapes and sharding of what `create` makes of these, or of their shapes."""
+    """Returns shapes and sharding of the state that `create` makes of these or of their shapes."""
     state = jax.eval_shape(functools.partial(create, policy, optimizer), params, stats, key)
     return jax.tree.map(lambda x: x.update(sharding=sharding), state)
 

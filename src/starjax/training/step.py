@@ -51,7 +51,7 @@ def resident_steps(
       dataset: leaves are jax arrays, on every device of the mesh.
       frames: int32 frames to draw from.
       available: int32 `[]`, number of these; the others fill up the array.
-      count: int32 `[]`, traced, so that logging and checkpoints may stop anywhere without another
+      count: int32 `[]`, traced: logging and checkpoints may stop anywhere without another
         compilation.
     """
     return jax.lax.fori_loop(
@@ -133,11 +133,10 @@ def _update(setup: Setup, carry: StepCarry, prepared: Any) -> StepCarry:
 
 
 def runs_in_a_loop(policy_config: config.PolicyConfig) -> bool:
-    """Returns whether many steps in one program are faster than a program for each.
+    """Returns whether a loop of steps in one program is faster than one program per step.
 
     Not with images. XLA's CPU compiler gives convolutions the layout that its fast kernels need
-    only outside of loops; inside, those of the gradient run 12 times slower. On a GPU a loop asks
-    the host after each step whether to go on, and waits for it, while calls are handed over ahead
-    of time.
+    only outside of loops; inside, those of the gradient run 12 times slower. On a GPU a loop
+    synchronises with the host after each step, while single calls are dispatched ahead of time.
     """
     return policy_config.observation != "image" or policy_config.freeze_encoder

@@ -54,8 +54,8 @@ def resident(
     data = devices.replicate((dataset, *available), layout.mesh, may_alias=None)
     if steps.runs_in_a_loop(setup.policy_config):
         return _looped(setup, data, ahead)
-    # The batch is drawn by a program of its own, so that the large one is the same for any number
-    # of frames, and can be compiled before these are known.
+    # A program of its own draws the batch: the large one is the same for any number of frames, and
+    # can be compiled before these are known.
     split = devices.batch_sharding(layout.mesh)
     draw = jax.jit(functools.partial(steps.drawn_batch, setup), out_shardings=split)
     shapes = jax.eval_shape(draw, *_drawn_by(layout.shapes()), *data)
@@ -119,7 +119,7 @@ def abstract_arguments(setup: Setup, batch: windows.Batch) -> tuple[StepCarry, w
 
 
 def _stepper(layout: StateLayout, run: Callable[[StepCarry, int], StepCarry]) -> Stepper:
-    if layout.mesh.size == 1:  # matrices stay where they are
+    if layout.mesh.size == 1:  # no matrix moves between devices
         return Stepper(layout.to_carry, run, layout.to_state)
     begin = jax.jit(layout.to_carry, out_shardings=layout.shardings())
     end = jax.jit(layout.to_state, out_shardings=devices.replicated(layout.mesh))

@@ -24,7 +24,7 @@ def unet_sample():
     apply, ready = kernels.applied(unet), kernels.packed(kernels.fused_unet(params))
 
     def predict(x, k):
-        rows = jnp.broadcast_to(k[..., None, None], x.shape[:-2]).reshape(-1)
+        rows = jnp.broadcast_to(k[..., None], x.shape[:-2]).reshape(-1)
         tiled = jnp.tile(condition, (len(rows) // 2, 1))
         return apply(ready, x.reshape(-1, 4, 4), rows, tiled).reshape(x.shape)
 

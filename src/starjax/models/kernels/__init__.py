@@ -14,7 +14,7 @@ from flax import struct
 
 Reference = TypeVar("Reference")
 
-# part of a network: "module:name" of its variant, and what it accelerates
+# part of a network: "module:name" of its variant  # use
 VARIANTS = {
     "sum_of_positions": "channel_sums:in_two_steps",  # biases' gradients; training on a GPU
     "convolve": "few_images:convolution",  # products of one or two images; decisions on a GPU
@@ -77,7 +77,7 @@ def applied(module: Any) -> Callable[..., Any]:
     """Returns a network's `apply` that also takes rewritten parameters.
 
     Called within a loop it unpacks parameters there, in the kernels that use them; before the loop
-    a GPU would need a kernel for each.
+    a GPU would need one more kernel per parameter.
     """
 
     def apply(params: Any, *args: Any, **options: Any) -> Any:

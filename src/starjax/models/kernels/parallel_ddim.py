@@ -6,8 +6,8 @@ known (Picard iteration; Shih et al., "Parallel Sampling of Diffusion Models", 2
 evaluation they are put together anew, each step's clean sequence being taken for a linear function
 of its noisy one whose slope is that between the last two evaluations (a secant).
 
-Where the iteration ends is `diffusion.ddim_sample`'s own sequence; after as many evaluations as
-steps it is there whatever the network.
+The fixed point of the iteration is the sequence of `diffusion.ddim_sample`; as many evaluations as
+steps reach it with any network.
 """
 
 import functools
@@ -24,9 +24,9 @@ from starjax.models import schedule as schedules
 # So many evaluations for so many steps, and one more for twice as many, come equally near
 # (benchmarks/bench_ddim.py).
 _EVALUATIONS, _STEPS = 5, 10
-# Sequences whose arithmetic takes a GPU as long as what does not depend on their number, reading
-# the weights above all: half of what an H100 needed with preset `paper`'s networks, where 32 robots
-# took equally long either way and 16 took 15% less, so that there is something to gain.
+# Number of sequences whose arithmetic takes a GPU as long as its constant work, mostly reading the
+# weights: half of the measured one (an H100, preset `paper`: 32 robots took equally long either
+# way, 16 took 15% less).
 _WEIGHTS_IN_SEQUENCES = 128
 _TINY = 1e-12  # squared distance of sequences that count as the same
 
@@ -61,7 +61,7 @@ def ddim_sample(
       steps: n of DDIM.
       evaluations: of the network, with n sequences for each of B; None: `evaluations_for(n)`.
       prepare: maps the int32 steps `[n]` to a pytree with leading axis n, once; `eps_fn` gets it.
-      reach: (lowest, highest) value, each broadcastable against `[B, H, A]`; None: -1 and 1.
+      reach: lowest and highest value, each broadcast against `[B, H, A]`; None: -1 and 1.
 
     Returns:
       Clean sequences `[B, H, A]` within `reach`.
@@ -74,9 +74,10 @@ def ddim_sample(
     )
 
     def through(x0: jax.Array, at: jax.Array, slope: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Returns the end and all noisy sequences, if x0 + slope (x - at) were the clean ones."""
+        """Returns the last and all noisy sequences, for clean ones x0 + slope (x - at)."""
         clipped = within(x0)
-        # what one more of the clean sequence adds to the next noisy one
+        # The clean sequence is affine in x, so each DDIM step is too: x' = factor x + rest. `gain`
+        # is the derivative of x' by the clean sequence; if that is clipped, only through eps.
         gain = jnp.where(clipped == x0, signal_next, 0.0) - spread_next * signal / spread
         factor = spread_next / spread + gain * slope
         rest = signal_next * clipped - spread_next * signal / spread * x0 - gain * slope * at

@@ -3,8 +3,8 @@
 Reference: `unet1d.ResidualBlock` and `unet1d.ConvBlock`. What takes a GPU longest after the matrix
 products is the way from one to the next: adding up the taps, GroupNorm, Mish, FiLM and the skip.
 Here that is two kernels. The products are shifted, not the inputs, and the skip's 1x1 convolution
-is part of the first product. Then each group of a sample lies in one row, because XLA makes one
-kernel of what follows sums over rows (not over other axes), up to the next product.
+is part of the first product. Then each group of a sample lies in one row, because XLA fuses
+sums over rows (not over other axes) with all operations up to the next product.
 """
 
 from collections.abc import Mapping
@@ -104,9 +104,9 @@ def _conv_block(block: Params, skip: Params | None = None) -> dict[str, Any]:
 
 
 def _normalized(params: Params, x: jax.Array, groups: int) -> tuple[jax.Array, jax.Array | None]:
-    """Computes mish of the normalised convolution, `[B, L, groups, features / groups]`, and a skip.
+    """Returns Mish of the normalised convolution, and the skip.
 
-    The skip is `[B, L, more]`, or None without such parameters.
+    The first is `[B, L, groups, features / groups]`, the skip `[B, L, more]`; None without one.
     """
     kernel, bias = params["kernel"], params["bias"]
     features = len(params["gain"])
