@@ -104,7 +104,7 @@ def test_features_are_computed_once(source, dataset, tmp_path):
     said = []
     again = features(source, dataset, tmp_path, frames=never, said=said)
     np.testing.assert_array_equal(again, first)
-    assert len(said) == 1 and "done before" in said[0]
+    assert len(said) == 1 and "reused" in said[0]
 
 
 def test_a_killed_run_goes_on_and_damage_is_mended(source, dataset, tmp_path, monkeypatch):

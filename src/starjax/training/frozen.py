@@ -63,33 +63,33 @@ def features(
     parts: dict[Path, np.ndarray] = {}
     missing = []
     for path, (first, last) in zip(paths, spans):
-        found = _read(path, (last - first, policy_config.vision_dim), report)
-        if found is None:
+        part = _read(path, (last - first, policy_config.vision_dim), report)
+        if part is None:
             missing.append((path, first, last))
         else:
-            parts[path] = found
+            parts[path] = part
     if missing:
         see, pictures = _make_see(encoder, policy_config), frames()
 
         def make(part: tuple[Path, int, int]) -> Generator[int]:
-            """Yields how many frames it has seen in between."""
+            """Yields the number of frames of each batch."""
             path, first, last = part
-            seen = []
+            batches = []
             for start in range(first, last, BATCH):
                 batch = read[np.minimum(np.arange(start, start + BATCH), last - 1)]
-                seen.append(np.asarray(see(pictures[batch]))[: last - start])
-                yield len(seen[-1])
-            parts[path] = np.concatenate(seen)
+                batches.append(np.asarray(see(pictures[batch]))[: last - start])
+                yield len(batches[-1])
+            parts[path] = np.concatenate(batches)
             files.write_npz(path, {"features": parts[path]})
 
         done = sum(map(len, parts.values()))
         with progress.track("Features", len(read), unit="frames", done=done) as advance:
-            for seen in workers.run(missing, make, workers.worker_count()):
-                advance(seen)
+            for count_done in workers.run(missing, make, workers.worker_count()):
+                advance(count_done)
     joined = np.zeros((count, policy_config.vision_dim), np.float32)
     joined[read] = np.concatenate([parts[path] for path in paths])
-    said = "in" if missing else "done before,"
-    report(f"features of {len(read)} frames, {files.size(joined.nbytes)}: {said} {folder}")
+    origin = "in" if missing else "reused from"
+    report(f"features of {len(read)} frames, {files.size(joined.nbytes)}: {origin} {folder}")
     return joined
 
 
@@ -130,14 +130,14 @@ def _key(
 def _read(path: Path, shape: tuple[int, int], report: Callable[[str], None]) -> np.ndarray | None:
     """Returns a finished part, or None if it is missing or damaged."""
     try:
-        found = files.read_npz(path, ["features"])["features"]
+        part = files.read_npz(path, ["features"])["features"]
     except FileNotFoundError:
         return None
     except ValueError as error:
         report(f"{error}; computed again")
         return None
-    if found.shape != shape or found.dtype != np.float32:
-        expected = f"expected float32 {shape}, got {found.dtype} {found.shape}"
+    if part.shape != shape or part.dtype != np.float32:
+        expected = f"expected float32 {shape}, got {part.dtype} {part.shape}"
         report(f"{path} is damaged: {expected}; computed again")
         return None
-    return found
+    return part

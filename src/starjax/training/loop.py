@@ -23,9 +23,7 @@ from starjax.training.sharding import StateLayout, StepCarry
 from starjax.training.step import Setup
 from starjax.training.stepper import Stepper
 
-_CALL_SECONDS = (
-    1.0  # target duration of a compiled call: the delay of Ctrl-C and of the progress bar
-)
+_CALL_SECONDS = 1.0  # target duration of a compiled call, which delays Ctrl-C and the bar
 
 HoldoutError = Callable[[states.TrainState], dict[str, float]]
 
@@ -81,7 +79,7 @@ def run(
       seed: of everything random.
       cameras: that the policy reads, in this order; empty: the task's first one.
       mesh_devices: all of jax's by default.
-      should_stop: asked about once a second; True saves and raises Interrupted.
+      should_stop: polled about once a second; True saves and raises Interrupted.
       description: name of the progress bar.
       step_program: from `training.precompile` with these arguments.
 
@@ -138,8 +136,8 @@ def run(
         alone = shapes if mesh.size == 1 else None
         holdout_error = holdout.make(policy, policy_config, dataset, held_out, alone)
     if int(state.step) == train_config.steps:
-        found = holdout_error(processes.own(state)) if holdout_error else {}
-        return TrainingResult(state, 0.0, int(state.skipped), found)
+        held_out_errors = holdout_error(processes.own(state)) if holdout_error else {}
+        return TrainingResult(state, 0.0, int(state.skipped), held_out_errors)
     if steps is None:
         steps = stepper.streamed(setup, dataset, frames, state)
     step, carry = int(state.step), steps.begin(state)
@@ -159,8 +157,8 @@ def _train(
     should_stop: Callable[[], bool],
     description: str,
 ) -> TrainingResult:
-    """Takes the steps that are left, with a line of the log and a checkpoint every so many."""
-    last, saved, found = train_config.steps, step, {}
+    """Takes the remaining steps, with regular lines of the log and checkpoints."""
+    last, saved, held_out_errors = train_config.steps, step, {}
     pace = _Pace(train_config.batch_size)
     with progress.track(description, last, unit="steps", done=step) as show:
         note, call = "", 1
@@ -186,26 +184,26 @@ def _train(
             if step in (stops[1], last):
                 state = stepper.end(carry)  # by all processes together
                 if holdout_error:
-                    found = holdout_error(processes.own(state))
-                    log.append(directory / "metrics.jsonl", step, "holdout", found)
+                    held_out_errors = holdout_error(processes.own(state))
+                    log.append(directory / "metrics.jsonl", step, "holdout", held_out_errors)
                 _save(directory, state, train_config)
                 saved = step
                 del state
             show(count, note=note)
     state = stepper.end(carry)
-    return TrainingResult(state, pace.samples_per_second, int(state.skipped), found)
+    return TrainingResult(state, pace.samples_per_second, int(state.skipped), held_out_errors)
 
 
 def _observed(
     dataset: windows.Dataset, policy_config: config.PolicyConfig, seen: features.Sensors
 ) -> windows.Dataset:
     """Removes observations that the policy does not use: gathering them would take time."""
-    given = dataset.observation
+    observation = dataset.observation
     kept = "images" if policy_config.observation == "image" else "state"
     kept = "features" if policy_config.freeze_encoder else kept
-    images = {name: (given.images or {}).get(name) for name in seen.cameras}
+    images = {name: (observation.images or {}).get(name) for name in seen.cameras}
     unseen = {name: None for name in ("images", "state", "features", "endoscope") if name != kept}
-    return dataset.replace(observation=given._replace(**{"images": images, **unseen}))
+    return dataset.replace(observation=observation._replace(**{"images": images, **unseen}))
 
 
 def _restored(checkpoints: pathlib.Path, shapes: Any) -> states.TrainState | None:
@@ -239,7 +237,7 @@ def _check_same(
 
 
 def _alike(one: Any, other: Any) -> bool:
-    """Tells whether two statistics are of the same data: another processor has other last bits."""
+    """Returns True for statistics of the same data; last bits vary between processors."""
     return np.shape(one) == np.shape(other) and np.allclose(one, other, rtol=1e-5, atol=1e-6)
 
 
@@ -283,7 +281,7 @@ def _next(step: int, every: int) -> int:
 
 
 class _Pace:
-    """Throughput without the first call, which compiles, and how long the next call should be."""
+    """Throughput without the first call, which compiles, and the steps of the next call."""
 
     def __init__(self, batch_size: int):
         self._batch_size, self._steps, self._seconds, self._calls = batch_size, 0, 0.0, 0
