@@ -166,7 +166,7 @@ def test_a_presets_expert_is_for_its_own_task():
 )
 def test_words_may_stand_before_and_after_flags(typed):
     found = sweep._parse(typed.split())
-    assert (found.source.run, found.trocars) == ("x/stardiff", 3)
+    assert (found.run, found.trocars) == ("x/stardiff", 3)
 
 
 def test_a_word_that_is_empty_is_a_mistake():

@@ -11,7 +11,6 @@ from starjax import config as config_lib
 from starjax import errors, extras, methods
 from starjax.commands import messages, options, policy_args, scenes, session, stage_times
 from starjax.commands.folders import is_under_way
-from starjax.limits import INLINE
 from starjax.runtime import files
 
 DESCRIPTION = """Scores a trained policy on its task's trocars and records a video.
@@ -22,12 +21,9 @@ RUN; their defaults depend on this machine. Rerun the same command to resume."""
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluateArgs:
+class EvaluateArgs(policy_args.PolicyArgs):
     """Flags of the command."""
 
-    source: policy_args.PolicyArgs = dataclasses.field(
-        default=policy_args.PolicyArgs(), metadata=INLINE
-    )
     seed: config_lib.Seed = 0  # random seed of the trials
     out: str = options.AUTO  # directory of the result; auto: one in RUN or in runs/evaluate
     video: bool = True  # write rollout.mp4
@@ -47,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
     config = dataclasses.replace(
         config, method=method, out=str(folder), scene=scene, eval=args.eval
     )
-    name = args.source.policy or args.source.run
+    name = args.policy or args.run
     with started.shared() as share:
         resumes = share.first("same", lambda: _is_same(folder, who.weights, args, scene))
         print(f"{messages.about(config, name, args.seed)}, into {folder}\n", flush=True)
@@ -82,7 +78,7 @@ def _parse(argv: Sequence[str], has_gpu: bool) -> tuple[EvaluateArgs, policy_arg
     args = options.parse("evaluate", EvaluateArgs, argv, DESCRIPTION, default)
     if args.video:
         extras.require("evaluate --video", "report", "video")
-    path = policy_args.resolve(args.source)
+    path = policy_args.resolve(args)
     trials = f"seed{args.seed}-{args.eval.trials}x{args.eval.time_limit_s:g}s"
     parts = [trials, *["ensemble"] * args.eval.ensemble]
     return args, path, path.folder("evaluate", parts, args.out)

@@ -8,7 +8,7 @@ from typing import Any
 from starjax import config as config_lib
 from starjax import errors
 from starjax.commands import checks, messages, options, policy_args, session
-from starjax.limits import INLINE, Count
+from starjax.limits import Count
 
 TASK = "peg_transfer_bimanual"
 
@@ -21,12 +21,9 @@ resume."""
 
 
 @dataclasses.dataclass(frozen=True)
-class SixBlocksArgs:
+class SixBlocksArgs(policy_args.PolicyArgs):
     """Flags of the command."""
 
-    source: policy_args.PolicyArgs = dataclasses.field(
-        default=policy_args.PolicyArgs(), metadata=INLINE
-    )
     trials: Count = 1  # trials for each of the twelve pairs of trocars
     seed: config_lib.Seed = 0  # random seed of the trials
     # directory of the result; auto: one in RUN or in runs/exercise
@@ -36,8 +33,8 @@ class SixBlocksArgs:
 def main(argv: Sequence[str]) -> int:
     """Runs the missing trials; writes exercise.json."""
     args = options.parse("six-blocks", SixBlocksArgs, argv, DESCRIPTION)
-    is_expert = not (args.source.run or args.source.policy)
-    path = None if is_expert else policy_args.resolve(args.source)
+    is_expert = not (args.run or args.policy)
+    path = None if is_expert else policy_args.resolve(args)
     folder = _folder(path, args)
     started = session.start("six-blocks", argv, folder)
 
@@ -66,7 +63,7 @@ def _folder(path: policy_args.PolicyPath | None, args: SixBlocksArgs) -> Path:
     trials = f"seed{args.seed}-{args.trials}"
     if path:
         return path.folder("exercise", [trials], args.out)
-    default = Path("runs/exercise") / "-".join(["expert", *args.source.arm, trials])
+    default = Path("runs/exercise") / "-".join(["expert", *args.arm, trials])
     folder = default if args.out == options.AUTO else Path(args.out)
     checks.expect_folder("--out", args.out and folder)
     return folder
@@ -79,7 +76,7 @@ def _score_expert(folder: Path, args: SixBlocksArgs) -> tuple[Any, Any, dict[str
     from starjax.sim import six_blocks
     from starjax.sim.tasks.peg_transfer_bimanual import six
 
-    env = six_blocks.make(args.source.arm, observation="state")
+    env = six_blocks.make(args.arm, observation="state")
     name = next(iter(six.TASK.experts))
     table = evaluate.evaluate(
         folder,

@@ -10,7 +10,7 @@ from starjax import config as config_lib
 from starjax import errors
 from starjax.commands import messages, options, policy_args, scenes, session
 from starjax.evaluation import disturbances
-from starjax.limits import INLINE, NotNegative
+from starjax.limits import NotNegative
 from starjax.runtime import files
 
 DESCRIPTION = """Scores a trained policy on its task's trocars under disturbances.
@@ -24,12 +24,9 @@ _TRIALS = config_lib.EvalConfig(trials=4, time_limit_s=30.0, video_trials=0)
 
 
 @dataclasses.dataclass(frozen=True)
-class StressArgs:
+class StressArgs(policy_args.PolicyArgs):
     """Flags of the command."""
 
-    source: policy_args.PolicyArgs = dataclasses.field(
-        default=policy_args.PolicyArgs(), metadata=INLINE
-    )
     # disturbances to test; default: all that apply to this policy
     disturbance: tuple[str, ...] = ()
     # levels of a single disturbance, in its unit; default: its own
@@ -43,7 +40,7 @@ class StressArgs:
 def main(argv: Sequence[str]) -> int:
     """Runs the missing trials; writes stress.json, its table and its figure."""
     args = options.parse("stress", StressArgs, argv, DESCRIPTION)
-    path = policy_args.resolve(args.source)
+    path = policy_args.resolve(args)
     folder = path.folder("stress", [f"seed{args.seed}"], args.out)
     if args.levels and (count := len(args.disturbance)) != 1:
         raise errors.UsageError("levels", "exactly one --disturbance", count)

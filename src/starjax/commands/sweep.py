@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from starjax import config as config_lib
 from starjax.commands import checks, folders, messages, options, policy_args, session
-from starjax.limits import INLINE, CountOrZero, Range
+from starjax.limits import CountOrZero, Range
 from starjax.runtime import files
 
 DESCRIPTION = """Scores a trained policy on a random sample (Eq. 19) or a grid of trocars.
@@ -36,12 +36,9 @@ class SweepTrials:
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepArgs:
+class SweepArgs(policy_args.PolicyArgs):
     """Flags of the command."""
 
-    source: policy_args.PolicyArgs = dataclasses.field(
-        default=policy_args.PolicyArgs(), metadata=INLINE
-    )
     trocars: Several = 200  # number of sampled trocars; unused with a grid
     # grid: distances from the nominal trocar in cm, 0 is a single point; default: no grid
     radii_cm: Annotated[tuple[float, ...], Range(0.0, 10.0)] = ()
@@ -55,7 +52,7 @@ class SweepArgs:
 def main(argv: Sequence[str]) -> int:
     """Runs the missing trials; writes sweep.json."""
     args = _parse(argv)
-    path = policy_args.resolve(args.source)
+    path = policy_args.resolve(args)
     if args.eval.time_limit_s is None:
         limit = dataclasses.replace(args.eval, time_limit_s=_time_limit_s(path.run))
         args = dataclasses.replace(args, eval=limit)
@@ -128,7 +125,7 @@ def _trials(folder: Path, args: SweepArgs) -> Path:
     """Returns the directory of a sweep's trials; each sweep has its own."""
     settings = dataclasses.asdict(args)
     # The chunks' size does not change results; file and arms are those of `folder`.
-    del settings["source"], settings["eval"]["chunk"]
+    del settings["run"], settings["policy"], settings["arm"], settings["eval"]["chunk"]
     digest = hashlib.sha256(json.dumps(settings).encode()).hexdigest()
     return folder / "sweep" / f"seed{args.seed}-{digest[:8]}"
 
