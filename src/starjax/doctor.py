@@ -89,8 +89,10 @@ def settings() -> list[Finding]:
         from starjax.runtime import jax_settings
     except (ImportError, RuntimeError):  # `devices` says why
         return []
-    found = jax_settings.recorded() | dict.fromkeys(jax_settings.fix(), "not used")
-    words = (f"{name.upper() if name[0] != '-' else name} {value}" for name, value in found.items())
+    values = jax_settings.recorded() | dict.fromkeys(jax_settings.fix(), "not used")
+    words = (
+        f"{name.upper() if name[0] != '-' else name} {value}" for name, value in values.items()
+    )
     return [Finding("settings", ", ".join(words) or "jax's own")]
 
 

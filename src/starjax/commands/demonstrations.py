@@ -69,7 +69,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
             return False
         return True
 
-    asked = itertools.count()
+    attempts = itertools.count()
     compiled: list[Callable[[], None]] = []
 
     def prepare() -> None:
@@ -78,7 +78,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
             compiled.append(precompile.start(job))
 
     def collect() -> None:
-        if share.first(f"collected {next(asked)}", is_there):
+        if share.first(f"collected {next(attempts)}", is_there):
             messages.stage("collect", f"already complete, {root}")
             return
         messages.stage("collect", f"into {root}")
@@ -87,7 +87,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
         layout = placement.DeviceLayout(devices=placement.devices())
         try:
             with stage_times.timed(out, f"collect {root.name}"):
-                found = demos.collect(
+                counts = demos.collect(
                     root, env, expert, chosen, settings, layout=layout, report=messages.indented
                 )
         except success_quota.ExpertFailed as error:
@@ -98,7 +98,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
                 str(error),
             ) from error
         messages.indented(
-            "{episodes} demonstrations, {trials} trials, {frames} frames".format(**found)
+            "{episodes} demonstrations, {trials} trials, {frames} frames".format(**counts)
         )
 
     return DemosWork(root, collect, prepare)
@@ -155,17 +155,17 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
         expected = f"nominal trocars at {env.p_world_ref.tolist()}"
         raise errors.UsageError(_FROM, expected, reference.tolist())
     size = [policy.image_size, policy.image_size, 3]
-    wanted = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
+    required = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
     if policy.observation == "state":
-        wanted = {"state": [sum(field.size for field in env.task.fields)]}
+        required = {"state": [sum(field.size for field in env.task.fields)]}
     model = schema.model_hash(env.scene)  # empty without a MuJoCo model
     is_drawn = redraw.is_possible(about) and model and about["model"] == model
     if policy.observation == "image" and is_drawn:
-        wanted = {}
-    for name, shape in wanted.items():
-        found = features.get(name, {}).get("shape")
-        if found != shape:
-            got = "none" if found is None else f"one of {found}"
+        required = {}
+    for name, shape in required.items():
+        recorded = features.get(name, {}).get("shape")
+        if recorded != shape:
+            got = "none" if recorded is None else f"one of {recorded}"
             raise errors.UsageError(_FROM, f"a field {name} of {shape}", f"{got} in {root}")
     return root
 
@@ -202,8 +202,8 @@ def load(
     report = messages.indented
     if encoder is None:
         return loading.load(root, verify=False, env=draws, report=report).dataset
-    found = loading.load(root, verify=False, images=False, report=report)
-    return _with_features(config, draws, root, found, encoder)
+    loaded = loading.load(root, verify=False, images=False, report=report)
+    return _with_features(config, draws, root, loaded, encoder)
 
 
 def _with_features(
@@ -235,8 +235,8 @@ def _with_features(
             for camera in config.scene.camera
         ]
     rows = len(dataset.episode)
-    found = np.pad(np.concatenate(parts, axis=-1), ((0, rows - count), (0, 0)))
-    features = jax.device_put(found) if windows.on_device(dataset) else found
+    joined = np.pad(np.concatenate(parts, axis=-1), ((0, rows - count), (0, 0)))
+    features = jax.device_put(joined) if windows.on_device(dataset) else joined
     return dataset.replace(observation=dataset.observation._replace(features=features))
 
 

@@ -45,13 +45,13 @@ def main(argv: Sequence[str]) -> int:
     errors.choice("format", args.format, base.FORMATS.names())
     form, root = base.FORMATS.get(args.format), Path(args.dataset)
     try:
-        found = exchange.source(root, form, args.image_size)
+        source = exchange.source(root, form, args.image_size)
     except ValueError as error:
         raise errors.UsageError("DATASET", "demonstrations that are complete", error) from error
-    with progress.track("Export", len(found.lengths), unit="episodes") as advance:
-        exchange.export(found, out, form, args.video, advance)
+    with progress.track("Export", len(source.lengths), unit="episodes") as advance:
+        exchange.export(source, out, form, args.video, advance)
     inside = [out] if out.is_file() else [path for path in out.rglob("*") if path.is_file()]
     size = files.size(sum(path.stat().st_size for path in inside))
-    counts = f"{len(found.lengths)} episodes, {sum(found.lengths)} frames"
+    counts = f"{len(source.lengths)} episodes, {sum(source.lengths)} frames"
     print(f"{out}: {form.description}, {counts}, {size}")
     return 0

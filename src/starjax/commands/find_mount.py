@@ -44,13 +44,13 @@ def main(argv: Sequence[str]) -> int:
     from starjax.sim import mount_search, mounts, registries
 
     at = mounts.bench(registries.arms.get(args.arm), registries.tools.get(args.tool))
-    found = []
+    are_good = []
     for name, workspace in _workspaces(args.workspace).items():
         print(f"{args.arm} with {args.tool} in {name}", flush=True)
         mount, least = mount_search.search(at, workspace, args.seed, args.tilts, _tell)
         print(f"\n{_record(args.tool, name, mount, least)}\n")
-        found.append(mounts.is_good(least))
-    if all(found):
+        are_good.append(mounts.is_good(least))
+    if all(are_good):
         return 0
     print(
         f"Not every mount may be used. It needs at least {mounts.MIN_MARGIN:g} rad to the limits, "
@@ -91,7 +91,9 @@ def _figures(fit: "Fit") -> str:
 
 def _record(tool: str, workspace: str, mount: "Mount", fit: "Fit") -> str:
     """Returns the row of `Arm.mounts` with its figures in a comment."""
-    usual = mount._field_defaults
-    said = {name: value for name, value in mount._asdict().items() if value != usual.get(name)}
-    inside = "".join(f"\n    {name}={value!r}," for name, value in said.items())
+    defaults = mount._field_defaults
+    changed = {
+        name: value for name, value in mount._asdict().items() if value != defaults.get(name)
+    }
+    inside = "".join(f"\n    {name}={value!r}," for name, value in changed.items())
     return f"# {_figures(fit)}\n({tool!r}, {workspace!r}): Mount({inside}\n),".replace("'", '"')

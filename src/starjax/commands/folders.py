@@ -107,21 +107,21 @@ def claim(
 
     source = sources.digests(LEARNERS.path(config.policy.learner))
     started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
-    found = _recorded(folder) if (folder / "config.json").exists() else {}
-    if started and not found:
+    recorded = _recorded(folder) if (folder / "config.json").exists() else {}
+    if started and not recorded:
         expected = "the config.json that its weights were trained with"
         raise errors.UsageError(str(folder), expected, "none", _remedy(folder))
     if started:
-        before, now = map(config_lib.weight_settings, (_settings(folder, found), config))
+        before, now = map(config_lib.weight_settings, (_settings(folder, recorded), config))
         for name, value in now.items():
             _refuse(folder, name, before[name], value)
-        settings = (record.get("jax_settings", {}) for record in (found, jax_settings.record()))
+        settings = (record.get("jax_settings", {}) for record in (recorded, jax_settings.record()))
         _refuse(folder, "the settings of jax", *settings)
-        _refuse(folder, "the demonstrations", found.get("dataset", dataset), dataset)
-        _refuse(folder, "the learner's code", found.get("learner_source", source), source)
-        encoder_before = found.get("encoder") or encoder
+        _refuse(folder, "the demonstrations", recorded.get("dataset", dataset), dataset)
+        _refuse(folder, "the learner's code", recorded.get("learner_source", source), source)
+        encoder_before = recorded.get("encoder") or encoder
         _refuse(folder, "policy.encoder_weights", encoder_before, encoder or encoder_before)
-    known = found.get("encoder") if started or config.policy.freeze_encoder else None
+    known = recorded.get("encoder") if started or config.policy.freeze_encoder else None
     frozen = encoder or known
     extra = (
         {"dataset": dataset, **({"learner_source": source} if source else {})}
@@ -144,12 +144,12 @@ def _recorded(folder: Path) -> dict[str, Any]:
         expected = "a method's folder such as runs/cpu/stardiff"
         raise errors.UsageError(str(folder), expected, "no config.json", hint)
     try:
-        found = files.read_json(path)
+        content = files.read_json(path)
     except ValueError as error:
         raise errors.UsageError(str(path), "settings", error, _remedy(folder)) from error
-    if not found:
+    if not content:
         raise errors.UsageError(str(path), "settings", "none", _remedy(folder))
-    return found
+    return content
 
 
 def _remedy(folder: Path) -> str:

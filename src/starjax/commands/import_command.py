@@ -57,9 +57,9 @@ def _bring_back(source: Any, path: Path, out: Path) -> int:
             "PATH", "an export of starjax, or a --map", path, "starjax inspect shows its columns"
         )
     with progress.track("Import", len(source.lengths), unit="episodes") as advance:
-        found = exchange.restore_export(source, out, advance)
-    same = "every byte as it was" if found["same"] else "images or an earlier schema changed"
-    print(f"{out}: {found['episodes']} demonstrations, {same}; digest {found['digest'][:12]}")
+        restored = exchange.restore_export(source, out, advance)
+    same = "every byte as it was" if restored["same"] else "images or an earlier schema changed"
+    print(f"{out}: {restored['episodes']} demonstrations, {same}; digest {restored['digest'][:12]}")
     return 0
 
 
@@ -67,20 +67,19 @@ def _mapped(source: Any, map_path: Path, out: Path, accept: bool) -> int:
     from starjax.data import schema
     from starjax.data.formats import foreign, mapping
 
-    given = mapping.load(map_path)
+    columns = mapping.load(map_path)
     with progress.track("Import", 2 * len(source.lengths), unit="episodes read") as advance:
-        found = foreign.import_mapped(source, given, out, map_path.parent, advance)
-    for line in found.notes[:_SHOWN]:
+        imported = foreign.import_mapped(source, columns, out, map_path.parent, advance)
+    for line in imported.notes[:_SHOWN]:
         messages.indented(line)
-    if len(found.notes) > _SHOWN:
-        messages.indented(f"and {len(found.notes) - _SHOWN} more, see {out / schema.IMPORTED}")
-    worst = f"{found.residual_mm.max():.2g} mm or less (root mean square)"
-    print(
-        f"{out}: {found.episodes} demonstrations, {found.frames} frames, {found.left_out} left out"
-    )
+    if len(imported.notes) > _SHOWN:
+        messages.indented(f"and {len(imported.notes) - _SHOWN} more, see {out / schema.IMPORTED}")
+    worst = f"{imported.residual_mm.max():.2g} mm or less (root mean square)"
+    counts = f"{imported.episodes} demonstrations, {imported.frames} frames"
+    print(f"{out}: {counts}, {imported.left_out} left out")
     print(f"shafts pass their trocars at {worst}")
-    print(f"starjax train --demos.from {shlex.quote(str(out))} --task {given.task} trains on it")
-    if found.notes and not accept:
-        print(f"{len(found.notes)} notes: exit code 1 unless --accept")
+    print(f"starjax train --demos.from {shlex.quote(str(out))} --task {columns.task} trains on it")
+    if imported.notes and not accept:
+        print(f"{len(imported.notes)} notes: exit code 1 unless --accept")
         return 1
     return 0

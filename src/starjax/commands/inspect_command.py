@@ -39,15 +39,15 @@ def main(argv: Sequence[str]) -> int:
     """Prints the summary; returns 1 if there are anomalies."""
     args = options.parse("inspect", InspectArgs, argv, DESCRIPTION)
     xla.prepare_xla()
-    found = inspect(args.path)
-    width = max(len(name) for name, _ in found.rows)
-    for name, text in found.rows:
+    summary = inspect(args.path)
+    width = max(len(name) for name, _ in summary.rows)
+    for name, text in summary.rows:
         print(errors.printable(f"{name:{width}}  {text}".rstrip()))
-    for line in found.odd[:_SHOWN]:
+    for line in summary.odd[:_SHOWN]:
         print(errors.printable(f"odd: {line}"))
-    if len(found.odd) > _SHOWN:
-        print(f"odd: {len(found.odd) - _SHOWN} more")
-    return int(bool(found.odd))
+    if len(summary.odd) > _SHOWN:
+        print(f"odd: {len(summary.odd) - _SHOWN} more")
+    return int(bool(summary.odd))
 
 
 def inspect(name: str) -> Found:
@@ -137,26 +137,26 @@ def _result(path: Path) -> Found:
     from starjax.evaluation import result
 
     file = path if path.suffix == ".json" else path / "result.json"
-    found = result.read(file)
-    figures = found.figures
+    scored = result.read(file)
+    figures = scored.figures
     rows = [
-        ("result", f"{found.method}, observes {found.observation}, schema {found.schema}"),
-        ("scene", _scene(found.scene._asdict())),
-        ("trials", str(len(found.trials))),
+        ("result", f"{scored.method}, observes {scored.observation}, schema {scored.schema}"),
+        ("scene", _scene(scored.scene._asdict())),
+        ("trials", str(len(scored.trials))),
         (
             "code",
-            f"starjax {found.version}, commit {found.commit}{' (changed)' * bool(found.dirty)}",
+            f"starjax {scored.version}, commit {scored.commit}{' (changed)' * bool(scored.dirty)}",
         ),
-        ("weights", str(found.weights)),
-        ("dataset", str(found.dataset_digest)),
+        ("weights", str(scored.weights)),
+        ("dataset", str(scored.dataset_digest)),
     ]
     for name in ("seen", "unseen"):
         if rate := figures.get(name):
             low, high = (100 * bound for bound in rate["ci95"] or (0.0, 1.0))
             count = f"{rate['successes']}/{rate['trials']}"
             rows.append((name, f"{count}, 95% interval [{low:.0f}, {high:.0f}] %"))
-    rows += [("note", line) for line in found.about.get("warnings", [])]
-    odd = ["made with code that was changed"] * bool(found.dirty)
+    rows += [("note", line) for line in scored.about.get("warnings", [])]
+    odd = ["made with code that was changed"] * bool(scored.dirty)
     odd += [f"{figures['invalid']} trials diverged"] * bool(figures.get("invalid"))
     return Found(rows, odd)
 

@@ -39,8 +39,8 @@ def main(argv: Sequence[str]) -> int:
         "presets (--preset)": _presets(),
         "policies (--policy, --policy.encoder-weights)": _policies(),
     }
-    for title, found in tables.items():
-        rows = list(found)
+    for title, table in tables.items():
+        rows = list(table)
         width = max(len(name) for name, _ in rows) if rows else 0
         print(f"{title}\n" + "\n".join(f"  {name:{width}}  {text}" for name, text in rows) + "\n")
     return 0
@@ -75,8 +75,8 @@ def _tool(tool: Tool) -> str:
 def _methods() -> Iterator[Row]:
     for name, row in methods.METHODS.items():
         rolls = "; a network for the roll" * row.hierarchical
-        told = "; conditioned on the trocar" * row.sees_trocar + "; projected" * row.projects
-        yield name, f"{row.label}: actions {row.action_space}{rolls}{told}"
+        condition = "; conditioned on the trocar" * row.sees_trocar + "; projected" * row.projects
+        yield name, f"{row.label}: actions {row.action_space}{rolls}{condition}"
     yield "all", f"the {len(methods.TABLE_II)} of the paper's Table II"
 
 

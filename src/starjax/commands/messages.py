@@ -159,11 +159,11 @@ def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
     rows = [methods.METHODS[name] for name in (methods.TABLE_II if method == "all" else [method])]
     sees, yaw = policy.sees_trocar, policy.trocar_yaw
     given = "given" if sees == "always" else "not given"
-    told = sees != "method" and any(row.sees_trocar != (sees == "always") for row in rows)
+    is_conditioned = sees != "method" and any(row.sees_trocar != (sees == "always") for row in rows)
     turned = yaw == "fixed" and any(row.action_space in ("rcm1", "rcm2") for row in rows)
     rolls = any(row.hierarchical for row in rows)
-    found = {
-        f"the learner's model is {given} the trocar (--policy.sees-trocar {sees})": told,
+    active = {
+        f"the learner's model is {given} the trocar (--policy.sees-trocar {sees})": is_conditioned,
         "the frame {T} does not turn with the trocar's azimuth (--policy.trocar-yaw fixed)": turned,
         "the roll network does not read the measured rolls (--policy.no-roll-history)": (
             rolls and not policy.roll_history
@@ -175,26 +175,26 @@ def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
             rolls and policy.roll_observation
         ),
     }
-    return [what for what, holds in found.items() if holds]
+    return [what for what, holds in active.items() if holds]
 
 
 def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[str]:
     """Returns warnings for readers of a result, one sentence per warning."""
-    found = []
+    lines = []
     if config.policy.observation == "state":
-        found.append(
+        lines.append(
             f"The policy observes the task's state ({_fields(config)}), not pixels as in the "
             "paper; --policy.observation image turns the camera on."
         )
     else:
         policy = config.policy
-        found.append(f"Image encoder: {encoder(config)}; {policy.encoder}, {policy.image_size} px.")
-    found += [f"Ablation: {what}." for what in _ablations(figures["method"], config.policy)]
+        lines.append(f"Image encoder: {encoder(config)}; {policy.encoder}, {policy.image_size} px.")
+    lines += [f"Ablation: {what}." for what in _ablations(figures["method"], config.policy)]
     if config.preset == "smoke":
-        found.append("Preset smoke is too short to learn anything: its rates mean nothing.")
+        lines.append("Preset smoke is too short to learn anything: its rates mean nothing.")
     if figures["invalid"]:
-        found.append(f"{figures['invalid']} trial(s) diverged in simulation; they count as failed.")
-    return found
+        lines.append(f"{figures['invalid']} trial(s) diverged in simulation; they count as failed.")
+    return lines
 
 
 def outcome(results: Sequence[Any]) -> str:

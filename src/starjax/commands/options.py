@@ -96,13 +96,13 @@ def typed_value(field: str, argv: Sequence[str]) -> str | None:
 
 def flags(settings: Any) -> list[str]:
     """Returns all flags of a (nested) dataclass, such as `--train.steps`, and `no-` flags."""
-    found = []
+    names = []
     for name, _, hint in limits.fields(settings):
         if tyro.conf.Positional not in getattr(hint, "__metadata__", ()):
-            found += [flag(name)]
+            names += [flag(name)]
             before, dot, last = name.rpartition(".")
-            found += [flag(f"{before}{dot}no_{last}")] if hint is bool else []
-    return found
+            names += [flag(f"{before}{dot}no_{last}")] if hint is bool else []
+    return names
 
 
 def flag(field: str) -> str:
@@ -118,7 +118,7 @@ def spelled(error: errors.UsageError) -> str:
     # Elsewhere in it a field without a dot would be an ordinary word.
     known = [name for name, *_ in limits.fields(config_lib.RunConfig) if "." in name]
     within = rf"(?<![\w./-])({'|'.join(map(re.escape, known))})\b"
-    return re.sub(within, lambda found: flag(found[0]), line)
+    return re.sub(within, lambda match: flag(match[0]), line)
 
 
 def typed(name: str, argv: Sequence[str]) -> str:
@@ -182,9 +182,9 @@ def _with_ranges(
         _busy.pop()
     if not isinstance(spec, tyro.constructors.StructConstructorSpec):
         return None
-    fields, given = [], {field.name: field for field in dataclasses.fields(info.type)}
+    fields, declared = [], {field.name: field for field in dataclasses.fields(info.type)}
     for field in spec.fields:
-        if given[field.name].metadata == limits.INLINE:
+        if declared[field.name].metadata == limits.INLINE:
             inline = Annotated[type(field.default), tyro.conf.arg(name="")]
             fields.append(dataclasses.replace(field, type=inline))
             continue

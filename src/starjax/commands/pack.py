@@ -65,6 +65,6 @@ def main(argv: Sequence[str]) -> int:
     before, after = (files.size(path.stat().st_size) for path in (source, out))
     print(f"{out}: {count:.3g} M parameters, {after} ({source}: {before})")
     temperature = getattr(policy.options, "temperature", None)
-    said = [] if temperature is None else [f"temperature {temperature:g}"]
-    print(", ".join([*said, f"arithmetic in {policy.dtype}"]))
+    parts = [] if temperature is None else [f"temperature {temperature:g}"]
+    print(", ".join([*parts, f"arithmetic in {policy.dtype}"]))
     return 0

@@ -237,13 +237,13 @@ def _was_scored(config: config_lib.RunConfig, folder: Path, weights: Path, env: 
     """
     from starjax.evaluation import result
 
-    found = _scored(folder, files.sha256(weights))
+    scored = _scored(folder, files.sha256(weights))
     source = sources.digests(*result.parts_of(env.names, config.policy.learner))
-    is_current = found and found.about.get("source", source) == source
-    if is_current and _is_of(found, config):
+    is_current = scored and scored.about.get("source", source) == source
+    if is_current and _is_of(scored, config):
         return True
     count = len(env.task.is_seen)
-    if found and (more := len(found.trials)) > count * config.eval.trials:
+    if scored and (more := len(scored.trials)) > count * config.eval.trials:
         raise errors.UsageError(
             "eval.trials",
             f"no fewer than the {more // count} of {folder / 'result.json'}",
@@ -258,21 +258,21 @@ def _scored(folder: Path, weights: str) -> Any:
     from starjax.evaluation import result
 
     try:
-        found = result.read(folder / "result.json")
+        scored = result.read(folder / "result.json")
     except (FileNotFoundError, ValueError):  # damaged: made again
         return None
     # older results do not say whose they are
-    return found if found.trials and found.weights in (None, weights) else None
+    return scored if scored.trials and scored.weights in (None, weights) else None
 
 
-def _is_of(found: Any, config: config_lib.RunConfig) -> bool:
+def _is_of(scored: Any, config: config_lib.RunConfig) -> bool:
     """Returns True if a result has these settings."""
     try:
-        before = config_lib.from_dict(config_lib.RunConfig, found.config)
+        before = config_lib.from_dict(config_lib.RunConfig, scored.config)
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
     alike = config_lib.weight_settings(before) == config_lib.weight_settings(config)
-    return alike and before.eval == config.eval and found.seed in (None, config.seed)
+    return alike and before.eval == config.eval and scored.seed in (None, config.seed)
 
 
 def _timings(out: Path, name: str, demos: str) -> dict[str, float]:

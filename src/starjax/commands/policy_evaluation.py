@@ -115,8 +115,8 @@ def precompile(
     if vision is not None:
         params = {**params, "vision": vision}
     params = jax.eval_shape(policy.prepare_for_inference, params)
-    told = policies.ablated(row, config.policy)
-    stats = normalizer.shapes(told, env.task, config.policy.observation == "state")
+    ablated = policies.ablated(row, config.policy)
+    stats = normalizer.shapes(ablated, env.task, config.policy.observation == "state")
     evaluate.precompile(
         env,
         in_env.batch_agent(name, policy, deciding, config.eval.ensemble),

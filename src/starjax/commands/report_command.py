@@ -29,8 +29,8 @@ def main(argv: Sequence[str]) -> int:
     checks.expect(bool(args.run), "RUN", "at least one directory", "none")
     once: dict[Path, Path] = {}
     for name in args.run:
-        for found in _with_results(name):
-            once.setdefault(found.resolve(), found)
+        for run in _with_results(name):
+            once.setdefault(run.resolve(), run)
     runs = list(once.values())
     first = runs[0].resolve()
     beside = (first.parent if first.name in methods.METHODS else first) / "report"
@@ -52,9 +52,9 @@ def main(argv: Sequence[str]) -> int:
 def _with_results(name: str) -> list[Path]:
     """Returns a directory with a result, or those inside it."""
     path = Path(name)
-    found = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
-    if not (name and found):
+    runs = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
+    if not (name and runs):
         raise errors.UsageError(
             "RUN", "a directory with result.json, or a parent of such directories", name or "none"
         )
-    return [file if file.is_dir() else file.parent for file in found]
+    return [file if file.is_dir() else file.parent for file in runs]

@@ -40,8 +40,8 @@ def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
     # Imported here because it imports jax and MuJoCo.
     from starjax.sim import registries, scene
 
-    asked, demos = config.scene, config.demos
-    full = scene.name(asked.task, asked.arm, asked.tool, asked.camera)
+    scene_config, demos = config.scene, config.demos
+    full = scene.name(scene_config.task, scene_config.arm, scene_config.tool, scene_config.camera)
     task = registries.tasks.get(full.task)
     most = int(task.is_seen.sum())
     is_default = demos.seen_trocars == config_lib.DemosConfig().seen_trocars

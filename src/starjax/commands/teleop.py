@@ -61,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
             page.serve(args.port) as server,
         ):
             print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
-            said = teleop.run(
+            summary = teleop.run(
                 server,
                 recorder.steer(env),
                 kept,
@@ -73,5 +73,5 @@ def main(argv: Sequence[str]) -> int:
     finally:
         if device:
             device.close()
-    print(f"{said}; dataset: {out}")
+    print(f"{summary}; dataset: {out}")
     return 0

@@ -46,9 +46,9 @@ def noised(schedule: Schedule, key: jax.Array, x0: jax.Array) -> Noised:
     return Noised(add_noise(schedule, x0, k, noise), k, noise)
 
 
-def eps_loss(eps_fn: Callable[[jax.Array, jax.Array], jax.Array], given: Noised) -> jax.Array:
+def eps_loss(eps_fn: Callable[[jax.Array, jax.Array], jax.Array], batch: Noised) -> jax.Array:
     """Computes Eq. 9: mean squared error of the noise that `eps_fn(x, k)` `[B, ...]` predicts."""
-    return jnp.mean((eps_fn(given.x, given.k) - given.noise) ** 2)
+    return jnp.mean((eps_fn(batch.x, batch.k) - batch.noise) ** 2)
 
 
 def predict_x0(schedule: Schedule, x: jax.Array, k: jax.Array, eps: jax.Array) -> jax.Array:

@@ -45,10 +45,10 @@ def noised(key: jax.Array, x0: jax.Array) -> NoisedFlow:
 
 
 def velocity_loss(
-    predict: Callable[[jax.Array, jax.Array], jax.Array], given: NoisedFlow
+    predict: Callable[[jax.Array, jax.Array], jax.Array], batch: NoisedFlow
 ) -> jax.Array:
     """Returns the mean squared error of the velocity that `predict(x, time)` returns."""
-    return jnp.mean((predict(given.x, given.time) - given.velocity) ** 2)
+    return jnp.mean((predict(batch.x, batch.time) - batch.velocity) ** 2)
 
 
 def sample(

@@ -80,23 +80,23 @@ def _name(names: tuple[str, ...]) -> str:
     return ".".join(names[:-1]).replace("_", ".") + ".weight"
 
 
-def _prefix(found: Collection[str], wanted: Collection[str], path: str | pathlib.Path) -> str:
+def _prefix(names: Collection[str], wanted: Collection[str], path: str | pathlib.Path) -> str:
     """Returns the prefix of the names of the one ResNet-18 that is found."""
     first = "conv1.weight"
     prefixes = [
-        name.removesuffix(first) for name in found if re.search(r"(^|\.)conv1\.weight$", name)
+        name.removesuffix(first) for name in names if re.search(r"(^|\.)conv1\.weight$", name)
     ]
-    complete = [prefix for prefix in prefixes if all(prefix + name in found for name in wanted)]
+    complete = [prefix for prefix in prefixes if all(prefix + name in names for name in wanted)]
     encoders = [prefix for prefix in complete if not any(copy in prefix for copy in _COPIES)]
     if len(encoders) > 1:
         got, hint = f"several: {_listed(encoders)}", "write one of them into a file of its own"
         raise errors.UsageError(str(path), "one ResNet-18", got, hint)
     if not encoders:
         expected = f"a ResNet-18's names ({_listed(wanted)})"
-        raise errors.UsageError(str(path), expected, _listed(found) or "none")
+        raise errors.UsageError(str(path), expected, _listed(names) or "none")
     (prefix,) = encoders
     blocks = re.compile(re.escape(prefix) + r"(layer\d\.\d+\.conv\d\.weight)$")
-    more = [name for name in found if (block := blocks.match(name)) and block[1] not in wanted]
+    more = [name for name in names if (block := blocks.match(name)) and block[1] not in wanted]
     if more:
         raise errors.UsageError(str(path), "a ResNet-18", f"a larger one, with {_listed(more)}")
     return prefix

@@ -58,22 +58,22 @@ def noised(key: jax.Array, x0: jax.Array) -> NoisedShortcut:
     )
 
 
-def loss(predict: Callable[..., jax.Array], given: NoisedShortcut) -> jax.Array:
+def loss(predict: Callable[..., jax.Array], batch: NoisedShortcut) -> jax.Array:
     """Returns the mean squared error of the velocity, or of a whole path's mean velocity.
 
     `predict(x, time)` returns it `[B, ...]`, `predict(x, time, rows)` for some rows of the batch.
     """
-    target = jax.lax.stop_gradient(targets(predict, given))
-    return jnp.mean((predict(given.x, given.time) - target) ** 2)
+    target = jax.lax.stop_gradient(targets(predict, batch))
+    return jnp.mean((predict(batch.x, batch.time) - target) ** 2)
 
 
-def targets(predict: Callable[..., jax.Array], given: NoisedShortcut) -> jax.Array:
+def targets(predict: Callable[..., jax.Array], batch: NoisedShortcut) -> jax.Array:
     """Returns targets `[B, ...]`: the flow's velocity, or a whole path's mean velocity."""
-    count = len(given.x)
+    count = len(batch.x)
     most = -(-count // EVERY)
-    (rows,) = jnp.nonzero(given.time == WHOLE_WAY, size=most, fill_value=count)
+    (rows,) = jnp.nonzero(batch.time == WHOLE_WAY, size=most, fill_value=count)
     there = jnp.minimum(rows, count - 1)  # a device's part of the batch may have fewer than `most`
-    start = given.x[there]
+    start = batch.x[there]
 
     def step(x: jax.Array, time: jax.Array) -> tuple[jax.Array, None]:
         times = jnp.full(most, time, start.dtype)
@@ -82,7 +82,7 @@ def targets(predict: Callable[..., jax.Array], given: NoisedShortcut) -> jax.Arr
     times = np.arange(TEACHER_STEPS, 0, -1, dtype=np.float32) / TEACHER_STEPS / flow.TIME_UNIT
     # The teacher integrates the flow from t = 1 to 0; the path's mean velocity is start - end.
     end, _ = jax.lax.scan(step, start, jnp.asarray(times))
-    return given.velocity.at[rows].set(start - end, mode="drop")
+    return batch.velocity.at[rows].set(start - end, mode="drop")
 
 
 def sample(

@@ -78,9 +78,9 @@ def bench(folder: Path) -> dict[str, Any]:
     file = folder / "bench.json"
     if not file.is_file():
         return {}
-    found = files.read_json(file)
-    structure.convert(file, found, _Bench)
-    return found
+    content = files.read_json(file)
+    structure.convert(file, content, _Bench)
+    return content
 
 
 def stress(folder: Path, weights: str | None) -> dict[str, Any]:
@@ -89,8 +89,10 @@ def stress(folder: Path, weights: str | None) -> dict[str, Any]:
     Raises:
       ValueError: it is damaged; the message names it.
     """
-    found = sorted(folder.glob("stress-seed*/stress.json"), key=lambda path: path.stat().st_mtime)
-    for file in reversed(found):
+    candidates = sorted(
+        folder.glob("stress-seed*/stress.json"), key=lambda path: path.stat().st_mtime
+    )
+    for file in reversed(candidates):
         content = files.read_json(file)
         structure.convert(file, content, _Stress)
         if weights is None or content["weights"] == weights:
@@ -128,9 +130,9 @@ def _lines(file: Path) -> Lines:
     """Reads the complete lines of a log: a kill may have truncated the last one."""
     lines = file.read_bytes().splitlines(keepends=True) if file.is_file() else []
     try:
-        found = [json.loads(line) for line in lines if line.endswith(b"\n")]
+        values = [json.loads(line) for line in lines if line.endswith(b"\n")]
     except ValueError as error:
         raise ValueError(f"{file} is damaged: {error}") from error
-    for number, line in enumerate(found, 1):
+    for number, line in enumerate(values, 1):
         structure.convert(file, line, _Line, f"line {number}")
-    return found
+    return values

@@ -51,12 +51,12 @@ def read_json(path: Path) -> dict[str, Any]:
       ValueError: the file is damaged; the message names it.
     """
     try:
-        found = json.loads(path.read_bytes())
+        content = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:  # the latter for too deep a nesting
         raise ValueError(f"{path} is damaged: {error}") from error
-    if not isinstance(found, dict):
-        raise ValueError(f"{path} is damaged: expected an object, got {type(found).__name__}")
-    return found
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} is damaged: expected an object, got {type(content).__name__}")
+    return content
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -74,14 +74,14 @@ def read_npz(path: Path, names: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            found = dict(archive)
+            arrays = dict(archive)
     except FileNotFoundError:
         raise
     except Exception as error:  # a damaged archive fails in a dozen ways
         raise ValueError(f"{path} is damaged: {error}") from error
-    if missing := [name for name in names if name not in found]:
+    if missing := [name for name in names if name not in arrays]:
         raise ValueError(f"{path} is damaged: no {missing[0]} in it")
-    return found
+    return arrays
 
 
 def npy(parts: Sequence[np.ndarray]) -> list[bytes | memoryview]:

@@ -79,10 +79,10 @@ _FREE_FLAGS = ("--xla_dump_", "--xla_force_host_platform_device_count", "--xla_g
 
 def fix() -> list[str]:
     """Sets all of `FIXED` and `CHECKS`; returns the names of those that had another value."""
-    usual = {**FIXED, **CHECKS}
-    others = [name for name in usual if _differs(name, usual[name])]
+    defaults = {**FIXED, **CHECKS}
+    others = [name for name in defaults if _differs(name, defaults[name])]
     for name in others:
-        jax.config.update(name, usual[name])
+        jax.config.update(name, defaults[name])
     return others
 
 
@@ -92,22 +92,22 @@ def recorded() -> dict[str, str]:
     Returns:
       name of the setting -> its value; empty where all is as usual, as `xla.prepare_xla` leaves it.
     """
-    usual = {**FIXED, **RECORDED}
-    names = [name for name in usual if _differs(name, usual[name])]
-    found = {name: str(_plain(_value(name))) for name in names}
+    defaults = {**FIXED, **RECORDED}
+    names = [name for name in defaults if _differs(name, defaults[name])]
+    values = {name: str(_plain(_value(name))) for name in names}
     ours = xla.usual_flags()
     for name, value in sorted({**dict.fromkeys(ours, "unset"), **_flags()}.items()):
         if not name.startswith(_FREE_FLAGS) and ours.get(name) != value:
-            found[name] = value
+            values[name] = value
     if _TF32 in os.environ:
-        found[_TF32] = os.environ[_TF32]
-    return found
+        values[_TF32] = os.environ[_TF32]
+    return values
 
 
 def record() -> dict[str, dict[str, str]]:
     """Returns `recorded` as an entry of a JSON object; no entry where all is as usual."""
-    found = recorded()
-    return {"jax_settings": found} if found else {}
+    values = recorded()
+    return {"jax_settings": values} if values else {}
 
 
 def _flags() -> dict[str, str]:
@@ -116,8 +116,8 @@ def _flags() -> dict[str, str]:
     return {name: value.lower() if equals else "true" for name, equals, value in words}
 
 
-def _differs(name: str, usual: Any) -> bool:
-    return name in jax.config.values and _plain(_value(name)) != usual
+def _differs(name: str, default: Any) -> bool:
+    return name in jax.config.values and _plain(_value(name)) != default
 
 
 def _value(name: str) -> Any:

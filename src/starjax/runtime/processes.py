@@ -56,12 +56,12 @@ def join() -> None:
     _initialize(coordinator_address=address, num_processes=count, process_id=index)
 
 
-def _initialize(**given: Any) -> None:
+def _initialize(**options: Any) -> None:
     """Connects to the others; jax takes missing arguments from the variables of `srun`."""
     # Its handler of SIGTERM, in C++, would take the signal from Python's.
     if hasattr(jax.config, _PREEMPTION):
         jax.config.update(_PREEMPTION, False)
-    jax.distributed.initialize(heartbeat_timeout_seconds=_HEARTBEAT_S, **given)
+    jax.distributed.initialize(heartbeat_timeout_seconds=_HEARTBEAT_S, **options)
     if is_first():  # in advance, because jax's C++ code aborts the others when a process is lost
         print(LOST_HINT, file=sys.stderr, flush=True)
 
@@ -84,15 +84,15 @@ def run_number() -> int:
 
 def agree(*values: int) -> tuple[int, ...]:
     """Returns the first process's values, in all of them; each waits here for the others."""
-    return tuple(said[0] for said in gathered(*values))
+    return tuple(values_of_all[0] for values_of_all in gathered(*values))
 
 
 def gathered(*values: int) -> list[list[int]]:
     """Gathers each value from all processes, in their order; each waits here for the others."""
     if is_alone():
         return [[value] for value in values]
-    said = multihost_utils.process_allgather(np.array(values, np.int32))
-    return np.asarray(said).T.tolist()
+    values_of_all = multihost_utils.process_allgather(np.array(values, np.int32))
+    return np.asarray(values_of_all).T.tolist()
 
 
 def spread(x: Any, sharding: NamedSharding, may_alias: bool | None) -> jax.Array:

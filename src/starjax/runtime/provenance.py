@@ -33,14 +33,14 @@ def code() -> Code:
         version = importlib.metadata.version("starjax")
     except importlib.metadata.PackageNotFoundError:
         from starjax import __version__ as version
-    found = _of_checkout(_PACKAGE) or _of_origin() or of_version(version)
-    return Code(version, *(found or (None, None)))
+    commit = _of_checkout(_PACKAGE) or _of_origin() or of_version(version)
+    return Code(version, *(commit or (None, None)))
 
 
 def of_version(version: str) -> tuple[str, bool] | None:
     """Reads commit and dirty flag of a version made from git tags: `1.2.dev3+g0a1b2c3.d2025`."""
-    found = re.search(r"\+g([0-9a-f]{7,40})(\.d\d+)?$", version)
-    return (found[1], bool(found[2])) if found else None
+    match = re.search(r"\+g([0-9a-f]{7,40})(\.d\d+)?$", version)
+    return (match[1], bool(match[2])) if match else None
 
 
 def _of_checkout(package: Path) -> tuple[str, bool] | None:
@@ -66,7 +66,7 @@ def _of_checkout(package: Path) -> tuple[str, bool] | None:
 def _of_origin() -> tuple[str, bool] | None:
     """Returns the commit that an installation from a repository records (PEP 610)."""
     try:
-        said = importlib.metadata.distribution("starjax").read_text("direct_url.json")
-        return str(json.loads(said or "")["vcs_info"]["commit_id"]), False
+        record = importlib.metadata.distribution("starjax").read_text("direct_url.json")
+        return str(json.loads(record or "")["vcs_info"]["commit_id"]), False
     except (importlib.metadata.PackageNotFoundError, ValueError, KeyError, TypeError):
         return None

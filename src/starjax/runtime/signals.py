@@ -56,19 +56,19 @@ def stop_signals() -> Iterator[Callable[[], bool]]:
 
     In a thread, where Python handles no signals, it stays false: they are the main thread's.
     """
-    asked = False
+    is_requested = False
 
     def ask(number: int, frame: Any) -> None:
-        nonlocal asked
+        nonlocal is_requested
         _drop_dead_outputs(number)
-        if asked:
+        if is_requested:
             raise KeyboardInterrupt
-        asked = True
+        is_requested = True
 
     def should_stop() -> bool:
         global _answered
-        _answered = _answered or asked
-        return asked
+        _answered = _answered or is_requested
+        return is_requested
 
     if threading.current_thread() is not threading.main_thread():
         yield should_stop

@@ -108,13 +108,13 @@ def versions() -> dict[str, str]:
     """Returns versions of Python, starjax and the packages that decide numbers."""
     import starjax
 
-    found = {"python": platform.python_version(), "starjax": starjax.__version__}
+    versions_by_name = {"python": platform.python_version(), "starjax": starjax.__version__}
     for name in _PACKAGES:
         try:
-            found[name] = importlib.metadata.version(name)
+            versions_by_name[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return found
+    return versions_by_name
 
 
 def hardware() -> dict[str, Any]:
@@ -210,8 +210,8 @@ def _jaxlib_version() -> tuple[int, ...]:
 def _machine() -> str:
     # A home directory may be shared by machines whose processors differ: code compiled for one
     # can stop another with an illegal instruction.
-    said = f"{platform.machine()} {_cpuinfo('model name')} {_cpuinfo('flags')} {_jaxlib_version()}"
-    return hashlib.sha256(said.encode()).hexdigest()[:12]
+    text = f"{platform.machine()} {_cpuinfo('model name')} {_cpuinfo('flags')} {_jaxlib_version()}"
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _cpuinfo(name: str) -> str:

@@ -170,13 +170,13 @@ def _leaves(tree: Any) -> dict[str, str]:
     return {jax.tree_util.keystr(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
 
 
-def _check_leaves(path: pathlib.Path, found: dict[str, str], wanted: dict[str, str]) -> None:
+def _check_leaves(path: pathlib.Path, saved: dict[str, str], expected: dict[str, str]) -> None:
     # orbax would cast another dtype silently
-    for name in sorted(found.keys() | wanted.keys()):
-        if found.get(name) != wanted.get(name):
+    for name in sorted(saved.keys() | expected.keys()):
+        if saved.get(name) != expected.get(name):
             raise ValueError(
                 f"checkpoint {path} was made with other settings: {name} is "
-                f"{found.get(name, 'absent')} there, expected {wanted.get(name, 'absent')}"
+                f"{saved.get(name, 'absent')} there, expected {expected.get(name, 'absent')}"
             )
 
 

@@ -72,7 +72,7 @@ def _differing(policy_config: config.PolicyConfig, trained: policy_file.Trained)
     # An encoder that is trained further may adapt to another image size.
     names += ["image_size"] if policy_config.freeze_encoder else []
     ours, theirs = policy_config, trained.policy
-    found = [
+    differences = [
         f"policy.{name} {getattr(theirs, name)} (here {getattr(ours, name)})"
         for name in names
         if getattr(ours, name) != getattr(theirs, name)
@@ -80,8 +80,8 @@ def _differing(policy_config: config.PolicyConfig, trained: policy_file.Trained)
     fractions = theirs.crop_fraction, ours.crop_fraction
     cropped = dataclasses.replace(theirs, crop_fraction=ours.crop_fraction)
     if ours.freeze_encoder and features.crop_size(theirs) != features.crop_size(cropped):
-        found.append("policy.crop_fraction {:g} (here {:g})".format(*fractions))
-    return found
+        differences.append("policy.crop_fraction {:g} (here {:g})".format(*fractions))
+    return differences
 
 
 def _check_resnet18(policy_config: config.PolicyConfig, path: Path) -> None:

@@ -59,13 +59,13 @@ def make(
     return evaluate
 
 
-def action_errors(said: Any, wanted: Any) -> dict[str, jax.Array]:
+def action_errors(predicted: Any, demonstrated: Any) -> dict[str, jax.Array]:
     """Returns mean errors of commands `[..., A]`: tip in mm, roll in degrees, gripper."""
-    distance = jnp.linalg.norm(said.pose.p - wanted.pose.p, axis=-1)
-    turn = rcm.roll_of(said.pose.R) - rcm.roll_of(wanted.pose.R)
+    distance = jnp.linalg.norm(predicted.pose.p - demonstrated.pose.p, axis=-1)
+    turn = rcm.roll_of(predicted.pose.R) - rcm.roll_of(demonstrated.pose.R)
     turn = jnp.abs((turn + jnp.pi) % (2.0 * jnp.pi) - jnp.pi)
     return {
         "position_error_mm": 1e3 * jnp.mean(distance),
         "roll_error_deg": jnp.rad2deg(jnp.mean(turn)),
-        "gripper_error": jnp.mean(jnp.abs(said.gripper - wanted.gripper)),
+        "gripper_error": jnp.mean(jnp.abs(predicted.gripper - demonstrated.gripper)),
     }

@@ -16,9 +16,9 @@ def zeros(names: Iterable[str]) -> Sums:
     return {name: jnp.float32(0.0) for name in (*own, *names)}
 
 
-def added(sums: Sums, found: dict[str, jax.Array], finite: jax.Array) -> Sums:
+def added(sums: Sums, values: dict[str, jax.Array], finite: jax.Array) -> Sums:
     """Adds the metrics of one step, which was taken if they are finite."""
-    after = {name: sums[name] + jnp.where(finite, found[name], 0.0) for name in found}
+    after = {name: sums[name] + jnp.where(finite, values[name], 0.0) for name in values}
     after["taken"] = sums["taken"] + jnp.where(finite, 1.0, 0.0)
     after["skipped"] = sums["skipped"] + jnp.where(finite, 0.0, 1.0)
     return after

@@ -77,5 +77,5 @@ def batch_shapes(
     else:
         observation = observation._replace(state=real(looks, task.state_size))
     trocar = rcm.Trocar(*[real(task.arms)] * 3)
-    told = jax.eval_shape(rcm.trocar_frame, trocar, real(task.arms, 3), real(task.arms))
-    return windows.Batch(observation, Command(poses(plans), real(plans, task.arms)), told)
+    frames = jax.eval_shape(rcm.trocar_frame, trocar, real(task.arms, 3), real(task.arms))
+    return windows.Batch(observation, Command(poses(plans), real(plans, task.arms)), frames)

@@ -130,17 +130,17 @@ class StateLayout(NamedTuple):
     def mean_gradients(self, gradients: Params) -> Any:
         """Returns the batch's gradients from each device's, laid out as a carry's parameters."""
         count, shapes = self.mesh.size, self._packed_shapes(self.whole.params)
-        found = self._packed(gradients)
-        if found is not gradients:  # packed: on a GPU
-            found = jax.tree.map(_row_major, found)
+        summed = self._packed(gradients)
+        if summed is not gradients:  # packed: on a GPU
+            summed = jax.tree.map(_row_major, summed)
         if count > 1:  # those of gathered matrices are summed already
-            found = jax.tree.map(
+            summed = jax.tree.map(
                 lambda g, like: jax.lax.psum(g, devices.AXIS) if g.shape == like.shape else g,
-                found,
+                summed,
                 shapes,
             )
-        found = jax.tree.map(lambda g, like: g.astype(like.dtype), found, shapes)
-        return jax.tree.map(lambda g: g / count, found) if count > 1 else found
+        summed = jax.tree.map(lambda g, like: g.astype(like.dtype), summed, shapes)
+        return jax.tree.map(lambda g: g / count, summed) if count > 1 else summed
 
     def norm(self, gradients: Any) -> jax.Array:
         """Returns the Euclidean norm of all gradients."""
@@ -202,9 +202,11 @@ def _squares(leaves: list[jax.Array]) -> jax.Array:
     A GPU needs two kernels for the sum of a large array, and starting them takes longer than most
     of them run: the second is shared, and so are both of small arrays.
     """
-    found = [jnp.square(leaf).ravel() if leaf.size < _SMALL else _by_rows(leaf) for leaf in leaves]
+    squares = [
+        jnp.square(leaf).ravel() if leaf.size < _SMALL else _by_rows(leaf) for leaf in leaves
+    ]
     # Without the barrier XLA takes the concatenation apart again.
-    return jax.lax.optimization_barrier(jnp.concatenate([*found, jnp.zeros(1)])).sum()
+    return jax.lax.optimization_barrier(jnp.concatenate([*squares, jnp.zeros(1)])).sum()
 
 
 def _by_rows(leaf: jax.Array) -> jax.Array:

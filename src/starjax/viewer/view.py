@@ -118,8 +118,8 @@ class Selection:
         return tuple(self._choices[name] for name in ("task", "agent", "compare_with", "arm"))
 
     def _agents(self, task: str) -> dict[str, AgentSpec]:
-        given = {label: spec for label, spec in self._given.items() if spec.task == task}
-        return given | {spec.label: spec for spec in simulation.available(task)}
+        requested = {label: spec for label, spec in self._given.items() if spec.task == task}
+        return requested | {spec.label: spec for spec in simulation.available(task)}
 
 
 class Rollouts:
