@@ -7,10 +7,9 @@ decides from the device and the shapes if it is used, and tests/models/kernels c
 
 import importlib
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
-from flax import struct
 
 Reference = TypeVar("Reference")
 
@@ -25,12 +24,13 @@ VARIANTS = {
 }
 
 
-class RewrittenParams(struct.PyTreeNode):
-    """Parameters in another form; each variant that rewrites them extends this."""
+@runtime_checkable
+class RewrittenParams(Protocol):
+    """Parameters in another form, a pytree node."""
 
     def resolve(self, module: Any) -> tuple[Any, Any]:
         """Returns the module to apply, in place of `module`, and the parameters that it takes."""
-        raise NotImplementedError
+        ...
 
 
 def choose(part: str, reference: Reference, *size: Any) -> Reference:

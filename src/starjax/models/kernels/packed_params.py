@@ -15,12 +15,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from starjax.models.kernels import RewrittenParams
-
 PLATFORMS = {"gpu"}  # a CPU updates a vector as fast by itself
 
 
-class Packed(RewrittenParams):
+class Packed(struct.PyTreeNode):
     """Packed parameters.
 
     Attributes:

@@ -13,6 +13,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from starjax.models import group_norm, kernels, layers
 from starjax.models.unet1d import ConditionalUnet1D
@@ -20,7 +21,7 @@ from starjax.models.unet1d import ConditionalUnet1D
 Params = Mapping[str, Any]
 
 
-class PreparedUnet(kernels.RewrittenParams):
+class PreparedUnet(struct.PyTreeNode):
     """A U-Net's parameters as the blocks below take them."""
 
     params: Any
