@@ -61,7 +61,7 @@ def pack(state: Any, params: Any) -> Any:
         pairs = list(zip(structure.flatten_up_to(params), shapes, strict=True))
         matrices = _turned([x if is_matrix(shape) else None for x, shape in pairs], -1, 0)
         vectors = _concatenated([x for x, shape in pairs if not is_matrix(shape)])
-        return Packed(structure.unflatten(matrices), vectors, (structure, shapes))
+        return Packed(structure.unflatten(matrices), vectors, _same(structure, shapes))
 
     return jax.tree.map(lambda x: packed(x) if are_params(x) else x, state, is_leaf=are_params)
 
@@ -69,6 +69,12 @@ def pack(state: Any, params: Any) -> Any:
 def is_matrix(shape: tuple[int, ...]) -> bool:
     """Returns whether a parameter of this shape stays an array of its own."""
     return len(shape) > 1
+
+
+@functools.cache
+def _same(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Any, Any]:
+    """Returns one object for equal arguments: every call of a program compares them."""
+    return structure, shapes
 
 
 def _turned(matrices: list[Any], old: int, new: int) -> list[Any]:
