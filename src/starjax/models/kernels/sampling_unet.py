@@ -28,8 +28,8 @@ class PreparedUnet(struct.PyTreeNode):
 
     def resolve(self, module: ConditionalUnet1D) -> tuple[ConditionalUnet1D, Any]:
         """Returns the U-Net with the blocks below, and its parameters."""
-        blocks = {"residual_block": SamplingBlock, "conv_block": SamplingConv}
-        return module.clone(**blocks), self.params
+        module = module.clone(residual_block=SamplingBlock, conv_block=SamplingConv)
+        return module, self.params
 
 
 def pays() -> bool:
