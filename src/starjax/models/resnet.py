@@ -79,7 +79,10 @@ class NormReluPool(nn.Module):
         batch, rows, _, columns, _, channels = x.shape
         x = x.reshape(batch, 2 * rows, 2 * columns, channels)[:, : self.size[0], : self.size[1]]
         x = norms.group_norm(x, *norms.scale_and_shift(self, x, self.groups), self.groups)
-        return nn.max_pool(nn.relu(x), (3, 3), (2, 2), ((1, 1), (1, 1)))
+        x = jnp.pad(
+            nn.relu(x), ((0, 0), (1, 1), (1, 1), (0, 0))
+        )  # zeros change no maximum of ReLUs
+        return nn.max_pool(x, (3, 3), (2, 2))
 
 
 class BasicBlock(nn.Module):
