@@ -51,7 +51,7 @@ def main() -> None:
 
 def decisions(policy: deploy.Deployed, address: str, calls: int) -> dict:
     """Returns percentiles, ms, of calls here, over the socket, and of the difference."""
-    request = batching.example(policy)
+    request = batching.example(policy.input_spec)
     seen, trocar = request.observation, request.trocar
     connection = Connection(address, "", 60.0, 60.0)
 
@@ -95,7 +95,7 @@ class Robot:
 
 def loop(policy: deploy.Deployed, address: str, seconds: float) -> dict:
     """Drives a robot in real time and returns the client's counts."""
-    request = batching.example(policy)
+    request = batching.example(policy.input_spec)
     port = rcm.Trocar(*(float(np.ravel(field)[0]) for field in request.trocar))
     robot = Robot(jax.tree.map(lambda x: x[0], request.observation))
     with deploy.Client(address, port, key=jax.random.key(0)) as client:

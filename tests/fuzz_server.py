@@ -27,7 +27,7 @@ EACH = 50  # frames on a connection, at most
 def main(frames, seed):
     rng, counts = np.random.default_rng(seed), collections.Counter()
     policy = deploy.load("compact")
-    asked = batching.example(policy)
+    asked = batching.example(policy.input_spec)
     key = np.asarray(jax.random.key_data(jax.random.key(0)))
     good = wire.pack(wire.encode_request(policy.input_spec, asked.observation, asked.trocar, key))
     command = [sys.executable, "-m", "starjax", "serve", "--port", "0", "--batch", "1"]

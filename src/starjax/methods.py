@@ -60,10 +60,25 @@ METHODS: dict[str, Method] = {
     ),
 }
 
+# Rows of results: the methods, and policies of other programs, see `starjax evaluate --policy ws://`.
+SERVED = "served"
+SCORED: dict[str, Method] = {
+    **METHODS,
+    SERVED: Method(
+        action_space="se3",
+        sees_trocar=True,
+        projects=False,
+        hierarchical=False,
+        weights_of=SERVED,
+        label="Served policy",
+        group="Other programs",
+    ),
+}
+
 # Methods of `--method all`; further rows are selected by name.
 TABLE_II = tuple(name for name, row in METHODS.items() if row.group in (_NAIVE, _RCM, _OURS))
 
 
 def behaviour(name: str) -> Method:
     """Returns a row without its names; methods with equal rows behave identically."""
-    return METHODS[name]._replace(label="", group="")
+    return SCORED[name]._replace(label="", group="")

@@ -12,6 +12,7 @@ from starjax import errors, methods
 from starjax.evaluation import disturbances
 from starjax.learners import LEARNERS
 
+API_KEY = "STARJAX_API_KEY"  # environment variable with the key of a server
 _CELL = {"resnet18": 32, "small": 8}  # pixels that an encoder makes one of its maps' cells
 
 

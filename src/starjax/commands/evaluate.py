@@ -16,7 +16,8 @@ from starjax.runtime import files
 DESCRIPTION = """Scores a trained policy on its task's trocars and records a video.
 
 RUN is the directory of a method, such as runs/cpu/stardiff. --policy takes a policy.safetensors or
-the name of a packaged policy instead. Trials and time limit come from the flags below, not from
+the name of a packaged policy instead, or ws://HOST:PORT of a server (starjax serve,
+or openpi's with a scene in its metadata). Trials and time limit come from the flags below, not from
 RUN; their defaults depend on this machine. Rerun the same command to resume."""
 
 
@@ -46,7 +47,8 @@ def main(argv: Sequence[str]) -> int:
     name = args.policy or args.run
     with started.shared() as share:
         resumes = share.first("same", lambda: _is_same(folder, who.weights, args, scene))
-        print(f"{messages.about(config, name, args.seed)}, into {folder}\n", flush=True)
+        about = messages.about_served if path.address else messages.about
+        print(f"{about(config, name, args.seed)}, into {folder}\n", flush=True)
         with stage_times.timed(folder, "evaluate", resumes or is_under_way(folder)):
             table = policy_evaluation.rollouts(
                 folder / "evaluation", who, who.env.task.trocars, args.eval, args.seed
@@ -142,5 +144,5 @@ def _record_video(folder: Path, method: str) -> str:
         path = video.record([results.load(folder)], folder / "rollout.mp4")
     except (OSError, RuntimeError) as error:  # the encoder is a program of its own
         return f"no video: {error}"
-    label = methods.METHODS[method].label
+    label = methods.SCORED[method].label
     return f"video: {path}" if path else f"no video: no recorded trial of {label}"

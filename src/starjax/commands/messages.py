@@ -32,10 +32,23 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
 def about(config: config_lib.RunConfig, name: str, seed: int) -> str:
     """Returns the plan of an evaluation: the policy `name`, its training, its trials and seed."""
     lines = [
-        f"starjax {starjax.__version__}: {methods.METHODS[config.method].label} of {name}",
+        f"starjax {starjax.__version__}: {methods.SCORED[config.method].label} of {name}",
         *_setting(config),
         _learning_from(config.demos),
         _training(config),
+        f"{_evaluation(config)}, seed {seed}",
+    ]
+    return "\n".join(lines)
+
+
+def about_served(config: config_lib.RunConfig, name: str, seed: int) -> str:
+    """Returns the plan of the evaluation of a served policy."""
+    policy = config.policy
+    plans = f"{policy.horizon} commands, {policy.execute} of them executed"
+    lines = [
+        f"starjax {starjax.__version__}: policy served at {name}",
+        *_setting(config)[:2],
+        f"  observation     {policy.observation}; plans of {plans}",
         f"{_evaluation(config)}, seed {seed}",
     ]
     return "\n".join(lines)
@@ -156,7 +169,7 @@ def _scene_of(encoder_weights: str) -> Any:
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
     """Returns the active ablations: settings that deviate from the method's row."""
-    rows = [methods.METHODS[name] for name in (methods.TABLE_II if method == "all" else [method])]
+    rows = [methods.SCORED[name] for name in (methods.TABLE_II if method == "all" else [method])]
     sees, yaw = policy.sees_trocar, policy.trocar_yaw
     given = "given" if sees == "always" else "not given"
     is_conditioned = sees != "method" and any(row.sees_trocar != (sees == "always") for row in rows)
@@ -192,9 +205,23 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
     lines += [f"Ablation: {what}." for what in _ablations(figures["method"], config.policy)]
     if config.preset == "smoke":
         lines.append("Preset smoke is too short to learn anything: its rates mean nothing.")
-    if figures["invalid"]:
-        lines.append(f"{figures['invalid']} trial(s) diverged in simulation; they count as failed.")
-    return lines
+    return lines + _diverged(figures)
+
+
+def served_warnings(who: Any, figures: Mapping[str, Any]) -> list[str]:
+    """Returns warnings for readers of a served policy's result."""
+    lines = [f"Policy served at {who.origin['address']}; its settings of training are unknown."]
+    if who.remote.refused:
+        lines.append(
+            f"{who.remote.refused} plan(s) were refused by the server or invalid; the robot held "
+            "its pose."
+        )
+    return lines + _diverged(figures)
+
+
+def _diverged(figures: Mapping[str, Any]) -> list[str]:
+    count = figures["invalid"]
+    return [f"{count} trial(s) diverged in simulation; they count as failed."] if count else []
 
 
 def outcome(results: Sequence[Any]) -> str:
@@ -207,7 +234,7 @@ def outcome(results: Sequence[Any]) -> str:
         within = figures["rcm_error_mm"].get("within_steps", error)
         rows.append(
             (
-                methods.METHODS[result.method].label,
+                methods.SCORED[result.method].label,
                 _rate(figures["seen"]),
                 _rate(figures["unseen"]),
                 _rate(figures["safe"]["all"]),

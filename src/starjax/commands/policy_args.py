@@ -1,15 +1,19 @@
 """Flags that name a trained policy, and the file and the results' directory that they mean."""
 
 import dataclasses
+import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from starjax import config as config_lib
-from starjax import errors
+from starjax import errors, extras
 from starjax.commands import checks, folders, options, scenes
 from starjax.policies import packaged
 from starjax.runtime import files
+
+_SCHEMES = ("ws://", "wss://")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,7 +21,8 @@ class PolicyArgs:
     """Flags of commands that run a trained policy."""
 
     run: options.RunOrNone = ""  # directory of a method, such as runs/cpu/stardiff
-    policy: str = ""  # policy.safetensors, or the name of a packaged policy, instead of RUN
+    # policy.safetensors, name of a packaged policy, or ws://HOST:PORT of a server, instead of RUN
+    policy: str = ""
     arm: tuple[str, ...] = ()  # robots to score with; default: those of the training
 
 
@@ -28,11 +33,13 @@ class PolicyPath(NamedTuple):
       file: its weights.
       run: directory of its method, None if the file itself was named.
       arms: robots instead of those of the training.
+      address: of a server instead of a file, else empty.
     """
 
     file: Path
     run: Path | None
     arms: tuple[str, ...] = ()
+    address: str = ""
 
     def folder(self, command: str, parts: Sequence[str], out: str = options.AUTO) -> Path:
         """Returns the directory of a command's results.
@@ -48,7 +55,8 @@ class PolicyPath(NamedTuple):
         if self.run:
             default = self.run / "-".join([command, *self.arms, *parts])
         else:
-            default = Path("runs") / command / "-".join([label(self.file), *self.arms, *parts])
+            name = _address_label(self.address) if self.address else label(self.file)
+            default = Path("runs") / command / "-".join([name, *self.arms, *parts])
         folder = default if out == options.AUTO else Path(out)
         checks.expect_folder("--out", out and folder)
         return folder
@@ -63,11 +71,19 @@ def resolve(args: PolicyArgs) -> PolicyPath:
     if bool(args.run) == bool(args.policy):
         got = "both" if args.run else "none"
         raise errors.UsageError("RUN or --policy", "one of the two", got)
+    if args.policy.startswith(_SCHEMES):
+        extras.require("--policy", "serve")
+        return PolicyPath(Path(), None, args.arm, args.policy)
     if args.policy:
         return PolicyPath(packaged.find("--policy", args.policy), None, args.arm)
     folder = folders.existing(args.run)
     folders.read_config(folder)
     return PolicyPath(folders.weights(folder.parent, folder.name), folder, args.arm)
+
+
+def _address_label(address: str) -> str:
+    """Returns a name for a server's address: its words."""
+    return "-".join(re.findall(r"[\w.]+", address.partition("://")[2]))
 
 
 def label(file: Path) -> str:
@@ -82,11 +98,17 @@ def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
     """Loads a policy in its scene.
 
     Returns:
-      `in_env.PolicyInEnv`, and the settings of the run that it comes from as far as known.
+      `in_env.PolicyInEnv` or `served.ServedPolicy`, and the settings of the run that it
+      comes from as far as known.
     """
     from starjax.commands import policy_evaluation  # it imports jax
     from starjax.policies import in_env
 
+    if path.address:
+        from starjax.deploy import served
+
+        who = served.connect(path.address, os.environ.get(checks.API_KEY, ""), path.arms)
+        return who, _settings(who.trained)
     if path.run is None:
         who = in_env.place_in_own_scene(path.file, in_env.read(path.file), arms=path.arms)
         return who, _settings(who.trained)

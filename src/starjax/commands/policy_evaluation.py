@@ -1,8 +1,10 @@
 """A trained policy in closed loop: rollouts of a method, and the result.json that they become."""
 
+import contextlib
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Union
 
 import jax
 import numpy as np
@@ -21,6 +23,11 @@ from starjax.policies import policy as policies
 from starjax.policies.in_env import PolicyInEnv
 from starjax.rollouts import placement
 from starjax.sim.state import Env
+
+if TYPE_CHECKING:
+    from starjax.deploy.served import ServedPolicy
+
+Who = Union[PolicyInEnv, "ServedPolicy"]
 
 
 def load(method: str, weights: Path, arms: Sequence[str] = ()) -> PolicyInEnv:
@@ -51,7 +58,7 @@ def read(weights: Path) -> policy_file.Trained:
 
 def rollouts(
     directory: Path,
-    who: PolicyInEnv,
+    who: Who,
     trocars: rcm.Trocar,
     settings: config_lib.EvalConfig,
     seed: int,
@@ -72,25 +79,28 @@ def rollouts(
     trained = who.trained
     if score_settings is None and (monitor := monitor_of(who, settings)):
         score_settings = monitor.settings
-    return evaluate.evaluate(
-        directory,
-        who.env,
-        who.agent(settings.ensemble),
-        (trained.params, trained.normalizer),
-        trocars,
-        _settings(settings, seed),
-        layout=placement.DeviceLayout(devices=placement.devices()),
-        identity={
-            **methods.behaviour(who.trained.method)._asdict(),
-            "policy": config_lib.as_json(trained.policy),
-        },
-        levels=levels,
-        score_settings=score_settings,
-        report=messages.indented,
-    )
+    is_file = isinstance(who, PolicyInEnv)
+    with contextlib.nullcontext() if is_file else who.faults():
+        return evaluate.evaluate(
+            directory,
+            who.env,
+            who.agent(settings.ensemble),
+            (trained.params, trained.normalizer),
+            trocars,
+            _settings(settings, seed),
+            layout=placement.DeviceLayout(devices=placement.devices()),
+            identity={
+                **methods.behaviour(trained.method)._asdict(),
+                "policy": config_lib.as_json(trained.policy),
+                **({} if is_file else {"served": who.weights}),
+            },
+            levels=levels,
+            score_settings=score_settings,
+            report=messages.indented,
+        )
 
 
-def monitor_of(who: PolicyInEnv, settings: config_lib.EvalConfig) -> Monitor | None:
+def monitor_of(who: Who, settings: config_lib.EvalConfig) -> Monitor | None:
     """Returns the policy's monitor, None if its plans are averaged: it compares single plans."""
     return None if settings.ensemble else who.trained.monitor
 
@@ -139,7 +149,7 @@ def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.Evaluation
     )
 
 
-def inference_ms(who: PolicyInEnv) -> dict[str, float]:
+def inference_ms(who: Who) -> dict[str, float]:
     """Measures the time of one inference at batch size 1, from observation to commands."""
     trained = who.trained
     return latency.policy_ms(
@@ -154,7 +164,7 @@ def inference_ms(who: PolicyInEnv) -> dict[str, float]:
 
 def write_result(
     folder: Path,
-    who: PolicyInEnv,
+    who: Who,
     trials: table.Table,
     config: config_lib.RunConfig,
     seed: int,
@@ -180,7 +190,7 @@ def write_result(
     figures = statistics.compose(
         trials, is_seen, method=who.trained.method, observation=observation, seed=seed
     )
-    about = {
+    about: dict[str, Any] = {
         "control_hz": who.env.control_hz,
         "inference_ms": inference_ms(who),
         "preset": config.preset,
@@ -194,4 +204,6 @@ def write_result(
     }
     if monitor := monitor_of(who, config.eval):
         about["alarms"] = alarms.compose(trials, monitor)
+    if not isinstance(who, PolicyInEnv):
+        about |= {"server": who.origin, "warnings": messages.served_warnings(who, figures)}
     return results.write(folder / "result.json", who.env.names, figures, about)

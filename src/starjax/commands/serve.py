@@ -11,7 +11,7 @@ from starjax.limits import Count, Range
 from starjax.policies import packaged
 from starjax.runtime import jax_start, signals, xla
 
-KEY = "STARJAX_API_KEY"
+KEY = checks.API_KEY
 DESCRIPTION = f"""Serves a policy over websockets: observations in, commands out.
 
 The protocol is that of openpi: openpi-client and starjax.deploy.Client can connect. Clients send

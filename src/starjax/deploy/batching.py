@@ -35,7 +35,7 @@ class Batches:
     def warm_up(self) -> None:
         """Compiles the programs of all sizes, so no request waits for a compilation."""
         for size in self.sizes:
-            self.infer([example(self.policy)] * size)
+            self.infer([example(self.policy.input_spec)] * size)
 
     @arrays.broadcasting
     def infer(self, requests: Sequence[wire.Request]) -> list[dict[str, Any] | UsageError]:
@@ -78,9 +78,8 @@ class Batches:
         return self._rng.integers(0, 1 << 32, self.key_size, np.uint32)
 
 
-def example(policy: Deployed) -> wire.Request:
+def example(spec: inputs.InputSpec) -> wire.Request:
     """Returns a request of tools at rest in the nominal trocars, straight down."""
-    spec = policy.input_spec
     trocar = rcm.Trocar(*(np.full(spec.arms, x, np.float32) for x in (0.0, np.pi / 2, 0.0)))
     pose = rcm.pose_on_manifold(_DOWN, 0.0, _DEPTH, spec.p_world_ref)
     repeated: list[Any] = [np.broadcast_to(x, (spec.moments, *np.shape(x))) for x in pose]

@@ -13,9 +13,9 @@ import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.deploy import wire
+from starjax.deploy import greeting, wire
 from starjax.deploy.connection import Connection
-from starjax.deploy.inputs import InputSpec, RobotObservation
+from starjax.deploy.inputs import RobotObservation
 from starjax.deploy.plan_executor import LIMITS, Limits, PlanExecutor, Report
 from starjax.errors import UsageError
 from starjax.monitor import calibrate
@@ -96,7 +96,11 @@ class Client:
         self._connection = connect(address, api_key, timeout_s, wait_s)
         try:
             self.metadata = self._connection.metadata
-            self._input_spec = spec = _read_spec(self.metadata)
+            self._input_spec = spec = greeting.read_spec(self.metadata)
+            if not spec.keeps_to_manifold:
+                expected = "a policy that keeps to the RCM manifold"
+                got = f"one of method {self.metadata.get('method')}"
+                raise UsageError("address", expected, got)
             self.control_hz, horizon, execute = _read_timing(self.metadata)
             self._trocar = _trocar(trocar, spec.arms)
             p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)
@@ -203,20 +207,6 @@ class Client:
         if self._key is None:
             return None
         return np.asarray(jax.random.key_data(jax.random.fold_in(self._key, self._requests)))
-
-
-def _read_spec(metadata: dict[str, Any]) -> InputSpec:
-    try:
-        fields: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in metadata["asks"].items()
-        }
-        spec = InputSpec(**fields)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise UsageError("address", "a server of starjax", f"another one: {error!r}") from None
-    if not spec.keeps_to_manifold:
-        expected = "a policy that keeps to the RCM manifold"
-        raise UsageError("address", expected, f"one of method {metadata.get('method')}")
-    return spec
 
 
 def _watch(metadata: dict[str, Any]) -> Watch | None:

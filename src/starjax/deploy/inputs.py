@@ -21,7 +21,7 @@ FARTHEST = 0.5  # m, from the nominal trocar to a trocar or a tip: beyond, the u
 FARTHEST_OFF = 0.02  # m, from the measured axis to the trocar: beyond, the trocar or frame differs
 _MAX_OPENING = 1.1  # of a gripper in [-1, 1]: the rest is the sensor's error
 _REAL = (jnp.floating, jnp.integer, jnp.bool_)
-_MAX_SKEW = 0.05  # of R'R from the identity, far above rounding and calibration errors
+MAX_SKEW = 0.05  # of R'R from the identity, far above rounding and calibration errors
 
 
 @flax.struct.dataclass
@@ -162,7 +162,7 @@ def _check_values(
             raise UsageError(f"observation.{name}", "finite values", f"NaN or inf at {at}")
     if (R := values.get("pose.R")) is not None:
         skew = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max()
-        if skew > _MAX_SKEW or (np.linalg.det(R) < 0).any():
+        if skew > MAX_SKEW or (np.linalg.det(R) < 0).any():
             raise UsageError("observation.pose.R", "rotations", f"one off by {skew:.2g}")
     if (p := values.get("pose.p")) is not None:
         distance = np.linalg.norm(p - spec.p_world_ref, axis=-1).max()

@@ -96,12 +96,12 @@ def run(
     with _bind(settings) as address:
         batches = batching.Batches(policy, settings.batch)
         batches.warm_up()
-        server = _Server(batches, settings, metadata(policy, name), api_key)
+        server = _Server(batches, settings, metadata(policy, name, settings.batch), api_key)
         asyncio.run(server.serve(address, should_stop, listening))
     return server.counts
 
 
-def metadata(policy: Deployed, name: str = "") -> dict[str, Any]:
+def metadata(policy: Deployed, name: str = "", batch: int = 1) -> dict[str, Any]:
     """Describes the policy: the greeting of a connecting client."""
     settings, spec = policy.settings, policy.input_spec
     arrays = wire.request_arrays(spec).items()
@@ -115,6 +115,7 @@ def metadata(policy: Deployed, name: str = "") -> dict[str, Any]:
         "control_hz": CONTROL_HZ,
         "horizon": settings.horizon,
         "execute": settings.execute,
+        "batch": batch,
         "asks": _plain(spec),
         "inputs": {field: _plain(row) for field, row in arrays},
         "actions": list(wire.ACTION),

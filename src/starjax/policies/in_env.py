@@ -54,7 +54,7 @@ def batch_agent(
       average_plans: plan at every control step and execute the mean of all plans, as ACT does.
     """
     if average_plans:
-        keeps = methods.METHODS[method].keeps_to_manifold
+        keeps = methods.SCORED[method].keeps_to_manifold
         return ensemble.from_policy(policy.sample, settings.obs_horizon, keeps)
     return agent.from_policy(policy.sample, settings.obs_horizon, settings.execute)
 

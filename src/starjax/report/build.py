@@ -70,7 +70,7 @@ _NAMES = {_FILM, _PLAYBACK, *(f"{name}.{kind}" for name in _FIGURES for kind in 
 
 
 def _order(run: results.Run) -> int:
-    return list(methods.METHODS).index(run.result.method)
+    return list(methods.SCORED).index(run.result.method)
 
 
 def _named_apart(runs: Sequence[results.Run]) -> list[results.Run]:

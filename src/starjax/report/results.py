@@ -88,9 +88,9 @@ def load(path: Path) -> Run:
     if not file.is_file():
         raise errors.UsageError("path", "a run directory with a result.json", path)
     result = read(file)
-    if result.method not in methods.METHODS:
+    if result.method not in methods.SCORED:
         raise errors.UsageError(f"{file}: method", "one of starjax list", repr(result.method))
-    method = methods.METHODS[result.method]
+    method = methods.SCORED[result.method]
     swept, bench = sidecars.sweep(path), sidecars.bench(path)
     log, curves = sidecars.curves(path, result)
     weights = {"sweep.json": swept.weights if swept else None, "bench.json": bench.get("weights")}

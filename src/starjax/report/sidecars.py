@@ -108,7 +108,7 @@ def curves(folder: Path, scored: result.Result) -> tuple[Path | None, Lines]:
     """
     places = [folder]
     if folder.name == scored.method:
-        places.insert(0, folder.parent / methods.METHODS[scored.method].weights_of)
+        places.insert(0, folder.parent / methods.SCORED[scored.method].weights_of)
     for place in places:
         file = place / "metrics.jsonl"
         if lines := _lines(file):

@@ -96,7 +96,7 @@ def figure(width: float, height: float) -> Any:
 
 def method(name: str) -> tuple[str, str]:
     """Returns colour and marker of a method."""
-    index = list(methods.METHODS).index(name) % len(_METHODS)
+    index = list(methods.SCORED).index(name) % len(_METHODS)
     return _METHODS[index], _MARKERS[index]
 
 

@@ -37,7 +37,7 @@ def draw(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
             ours = sorted((run for run in runs if run.result.method == name), key=trained_at)
             scores = [_score(run, scored_at) for run in ours]
             x = [trained_at(run) * 1.025 ** (i - (len(names) - 1) / 2) for run in ours]
-            style.rates(axis, x, scores, name, methods.METHODS[name].label)
+            style.rates(axis, x, scores, name, methods.SCORED[name].label)
         axis.set_xscale("log", base=2)
         axis.set_xticks(counts, [str(count) for count in counts])
         axis.xaxis.set_minor_locator(ticker.NullLocator())

@@ -1,0 +1,102 @@
+"""Greetings of servers, and the settings of an evaluation in them, all checked."""
+
+from typing import Any, NamedTuple
+
+from starjax import config, limits, methods
+from starjax.deploy import wire
+from starjax.deploy.inputs import InputSpec
+from starjax.errors import UsageError
+from starjax.sim import names, scene
+from starjax.sim.tasks.base import CONTROL_HZ
+
+MAX_CONNECTIONS = 64
+_TASK_HINT = "give openpi's server metadata={'scene': {'task': 'peg_transfer'}}"
+
+
+class Greeting(NamedTuple):
+    """Settings of a served policy.
+
+    Attributes:
+      spec: shapes of its inputs; None if it takes plain frames, see `plain`.
+      scene: names of task, arms, tools and cameras.
+      settings: observation, image size and horizons. The horizon of plain frames is a guess.
+      execute: commands executed before the next plan; 0: all.
+      batch: requests that the server answers together.
+      method: key of `methods.SCORED`.
+    """
+
+    spec: InputSpec | None
+    scene: names.SceneNames
+    settings: config.PolicyConfig
+    execute: int
+    batch: int
+    method: str
+
+
+def read(metadata: Any) -> Greeting:
+    """Reads a greeting of `starjax serve`, or a map of openpi's server with a scene.
+
+    Raises:
+      UsageError: a value is missing, of another type or out of range.
+    """
+    if not isinstance(metadata, dict):
+        raise UsageError("greeting", "a map", type(metadata).__name__)
+    if (hz := metadata.get("control_hz", CONTROL_HZ)) != CONTROL_HZ:
+        raise UsageError("greeting.control_hz", f"{CONTROL_HZ:g} Hz", repr(hz)[:80])
+    spec = read_spec(metadata) if metadata.get("protocol") == wire.PROTOCOL else None
+    values: dict[str, Any] = {"observation": metadata.get("observation", "image"), "obs_horizon": 1}
+    values["image_size"] = metadata.get("image_size", 224)  # that of openpi's models
+    if spec:
+        values = {"observation": "image" if spec.cameras else "state", "obs_horizon": spec.moments}
+        values |= {"image_size": spec.image_size} if spec.cameras else {}
+    values |= {name: metadata[name] for name in ("horizon", "execute") if name in metadata}
+    if spec is None:
+        values.pop("horizon", None)  # measured
+    try:
+        settings = config.from_dict(config.PolicyConfig, values)
+        limits.check(settings)
+    except ValueError as error:
+        raise UsageError("greeting", "settings of a policy", str(error)[:200]) from None
+    execute = settings.execute if spec or "execute" in metadata else 0
+    method = metadata.get("method") if spec else methods.SERVED
+    return Greeting(
+        spec,
+        _scene(metadata.get("scene")),
+        settings,
+        execute,
+        _batch(metadata.get("batch", 1)),
+        method if method in methods.METHODS else methods.SERVED,
+    )
+
+
+def read_spec(metadata: dict[str, Any]) -> InputSpec:
+    """Reads the inputs of a policy of `starjax serve`.
+
+    Raises:
+      UsageError: it is another server.
+    """
+    try:
+        fields: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in metadata["asks"].items()
+        }
+        return InputSpec(**fields)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UsageError("address", "a server of starjax", f"another one: {error!r}") from None
+
+
+def _scene(value: Any) -> names.SceneNames:
+    """Completes the names of a greeting's scene with the task's defaults."""
+    if not isinstance(value, dict) or not isinstance(value.get("task"), str):
+        raise UsageError("greeting.scene.task", "the name of a task", repr(value)[:80], _TASK_HINT)
+    rows = {}
+    for field in ("arms", "tools", "cameras"):
+        row = rows[field] = value.get(field) or []
+        if not isinstance(row, list) or not all(isinstance(name, str) for name in row):
+            raise UsageError(f"greeting.scene.{field}", "a list of names", repr(row)[:80])
+    return scene.name(value["task"], rows["arms"], rows["tools"], rows["cameras"])
+
+
+def _batch(value: Any) -> int:
+    if not isinstance(value, int) or value < 1:
+        raise UsageError("greeting.batch", "1 or more", repr(value)[:80])
+    return min(value, MAX_CONNECTIONS)

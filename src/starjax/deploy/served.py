@@ -1,0 +1,291 @@
+"""A served policy in the environment that it is evaluated in."""
+
+import contextlib
+import functools
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.experimental import io_callback
+
+from starjax import config, rcm, types
+from starjax.deploy import batching, greeting, inputs, link, plain, wire
+from starjax.errors import UsageError
+from starjax.policies import in_env
+from starjax.policies.base import Policy
+from starjax.rollouts import agent
+from starjax.sim import env as sim_env
+from starjax.types import Command, Pose
+
+_NEAR_M = 1e-3  # between nominal trocars of server and task
+
+
+class RemotePolicy:
+    """A server's plans as a policy's `sample`, one request per lane through a host callback.
+
+    Lanes whose episode is over are not requested, and lanes that fill up a batch share the plan of
+    their twin. A refused plan holds the measured pose.
+
+    Attributes:
+      refused: plans that the server refused or that were invalid.
+      fault: the error that ended it, or None.
+    """
+
+    def __init__(
+        self,
+        connections: link.Link,
+        spec: inputs.InputSpec,
+        horizon: int,
+        encode: Callable[..., dict[str, Any]],
+        decode: Callable[[Any], Command],
+    ) -> None:
+        self._link, self._spec, self.horizon = connections, spec, horizon
+        self._encode, self._decode = encode, decode
+        self._pool = ThreadPoolExecutor(greeting.MAX_CONNECTIONS, "starjax-remote")
+        self.refused, self.fault = 0, None
+
+    def sample(
+        self, done: Any, stats: Any, keys: jax.Array, observation: Any, trocar: rcm.TrocarFrame
+    ) -> Command:
+        """Plans as `Policy.sample`; `done` `[B]` bool are the episodes without need of a plan."""
+        batch, arms = observation.gripper.shape[0], observation.gripper.shape[2:]
+        shape = (batch, self.horizon, *arms)
+        f32: Any = functools.partial(jax.ShapeDtypeStruct, dtype=np.float32)
+        result = Command(Pose(f32((*shape, 3, 3)), f32((*shape, 3))), f32(shape))
+        seen = observation._replace(features=None, endoscope=None)
+        data = jax.random.key_data(keys)
+        return io_callback(self._plans, result, done, data, seen, trocar.trocar)
+
+    def _plans(self, done: Any, keys: Any, seen: Any, trocar: Any) -> Command:
+        if self.fault:
+            raise self.fault
+        done, keys, seen, trocar = jax.tree.map(np.asarray, (done, keys, seen, trocar))
+        held = Command(Pose(seen.pose.R[:, -1], seen.pose.p[:, -1]), seen.gripper[:, -1])
+        plans = jax.tree.map(lambda x: np.repeat(x[:, None], self.horizon, 1), held)
+        twins: dict[bytes, list[Any]] = {}
+        for lane in np.flatnonzero(~done):
+            twins.setdefault(keys[lane].tobytes(), []).append(lane)
+
+        def request(lanes: list[Any]) -> Command | None:
+            one = jax.tree.map(lambda x: x[lanes[0]], (seen, trocar))
+            return self._plan(*one, keys[lanes[0]])
+
+        for lanes, plan in zip(
+            twins.values(), self._pool.map(request, twins.values()), strict=True
+        ):
+            for lane in lanes if plan is not None else []:
+                for whole, part in zip(jax.tree.leaves(plans), jax.tree.leaves(plan), strict=True):
+                    whole[lane] = part.reshape(whole[lane].shape)
+        return plans
+
+    def _plan(self, seen: types.Observation, trocar: rcm.Trocar, key: np.ndarray) -> Command | None:
+        """Returns the plan of one lane, None if it is refused."""
+        if not self._spec.arms:
+            pose = Pose(seen.pose.R[:, 0], seen.pose.p[:, 0])
+            seen = seen._replace(pose=pose, gripper=seen.gripper[:, 0])
+            trocar = rcm.Trocar(*(field[0] for field in trocar))
+        moments = inputs.RobotObservation(
+            seen.pose, seen.gripper, images=seen.images, state=seen.state
+        )
+        try:
+            reply = self._link.ask(self._encode(moments, trocar, key))
+            if not isinstance(reply, str):
+                return self.check(self._decode(reply))
+        except link.LostServer as error:
+            self.fault = error
+            raise
+        except UsageError:
+            pass
+        self.refused += 1
+        return None
+
+    def check(self, command: Command) -> Command:
+        """Returns a plan of the right length, of rotations, near the nominal trocars.
+
+        Raises:
+          UsageError: it is another.
+        """
+        R, p = command.pose
+        if len(command.gripper) != self.horizon:
+            raise UsageError("answer", f"{self.horizon} commands", len(command.gripper))
+        if np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max() > inputs.MAX_SKEW:
+            raise UsageError("answer.R", "rotations", "another matrix")
+        if np.linalg.norm(p - self._spec.p_world_ref, axis=-1).max() > inputs.FARTHEST:
+            expected = f"tips within {inputs.FARTHEST} m of the nominal trocar"
+            raise UsageError("answer.p", expected, "one farther away")
+        return command
+
+
+class ServedTraining(NamedTuple):
+    """The fields of `policy_file.Trained` that evaluations read."""
+
+    method: str
+    policy: config.PolicyConfig
+    params: Any
+    normalizer: None
+    scene: Any
+    train: config.TrainConfig = config.TrainConfig()
+    demos: None = None
+    preset: None = None
+    monitor: None = None
+
+
+class ServedPolicy(NamedTuple):
+    """A served policy in its environment, in place of `in_env.PolicyInEnv`.
+
+    Attributes:
+      trained: its settings.
+      policy: `sample` of the server.
+      env: environment with its observation.
+      weights: SHA-256 that identifies it: the digest of its greeting, or that of the greeting.
+      origin: address and greeting, JSON values.
+      remote: the server.
+    """
+
+    trained: ServedTraining
+    policy: Policy
+    env: sim_env.Env
+    weights: str
+    origin: dict[str, Any]
+    remote: RemotePolicy
+
+    def agent(self, average_plans: bool = False) -> agent.BatchAgent:
+        """Returns the agent of a batch of episodes."""
+        trained = self.trained
+        return _agent(trained.method, self.policy, trained.policy, average_plans)
+
+    @contextlib.contextmanager
+    def faults(self) -> Iterator[None]:
+        """Raises the server's fault in place of jax's error of a failed callback."""
+        try:
+            yield
+        except jax.errors.JaxRuntimeError:
+            if self.remote.fault is None:
+                raise
+            raise self.remote.fault from None
+
+
+@functools.lru_cache(maxsize=4)
+def _agent(
+    method: str, policy: Policy, settings: config.PolicyConfig, average_plans: bool
+) -> agent.BatchAgent:
+    """Returns the agent of a policy whose first parameter is the episodes that are over."""
+    base = in_env.batch_agent(method, policy, settings, average_plans)
+
+    def init(params: Any, keys: jax.Array, state: Any, observe: agent.Observe) -> Any:
+        return base.init((state.done, None), keys, state, observe)
+
+    def act(params: Any, memory: Any, state: Any, observe: agent.Observe, t: jax.Array) -> Any:
+        return base.act((state.done, None), memory, state, observe, t)
+
+    return agent.BatchAgent(init, act, base.about)
+
+
+def connect(
+    address: str, api_key: str = "", arms: Sequence[str] = (), timeout_s: float = link.TIMEOUT_S
+) -> ServedPolicy:
+    """Connects to a server and requests one plan as a test.
+
+    Args:
+      address: `ws://HOST:PORT` or `wss://HOST:PORT`.
+      api_key: of the server.
+      arms: robots instead of those of the greeting.
+      timeout_s: of an answer.
+
+    Raises:
+      UsageError: there is no server, its greeting is incomplete, or its plan is invalid.
+    """
+    connections = link.Link(address, api_key, timeout_s)
+    hello = greeting.read(connections.metadata)
+    connections.widen(hello.batch)
+    env = sim_env.for_policy(hello.scene, hello.settings, arms)
+    spec, settings = hello.spec, hello.settings
+    if spec is None:
+        spec = _plain_spec(env, settings)
+        encode = functools.partial(_encode_plain, spec, env.names.task.replace("_", " "))
+        decode = functools.partial(plain.decode, spec)
+    else:
+        _check_trocars(spec, env)
+        encode = functools.partial(wire.encode_request, spec)
+        decode = functools.partial(wire.decode_reply, spec, settings.horizon)
+    first = decode(_first_answer(connections, encode, spec))
+    horizon = len(first.gripper)
+    remote = RemotePolicy(connections, spec, horizon, encode, decode)
+    remote.check(first)
+    execute = hello.execute or horizon
+    if not settings.obs_horizon - 1 <= execute <= horizon:
+        raise UsageError("greeting.execute", f"at most the {horizon} that are planned", execute)
+    settings = config.from_dict(
+        config.PolicyConfig, {**config.as_json(settings), "horizon": horizon, "execute": execute}
+    )
+    origin = {"address": address, "metadata": _as_json(connections.metadata)}
+    trained = ServedTraining(hello.method, settings, np.zeros(1, bool), None, env.names)
+    return ServedPolicy(trained, _policy(remote), env, _identity(origin), origin, remote)
+
+
+def _policy(remote: RemotePolicy) -> Policy:
+    def untrained(*_: Any) -> Any:
+        raise NotImplementedError("a served policy is trained elsewhere")
+
+    return Policy(untrained, untrained, untrained, remote.sample)
+
+
+def _first_answer(
+    connections: link.Link, encode: Callable[..., dict[str, Any]], spec: inputs.InputSpec
+) -> Any:
+    example = batching.example(spec)
+    key = np.asarray(jax.random.key_data(jax.random.key(0)))
+    reply = connections.ask(encode(example.observation, example.trocar, key))
+    if isinstance(reply, str):
+        line = next(reversed([line for line in reply.splitlines() if line.strip()]), "")
+        raise UsageError("--policy", "a plan of the server", f"its error: {line[:200]}")
+    return reply
+
+
+def _encode_plain(
+    spec: inputs.InputSpec, prompt: str, observation: Any, trocar: rcm.Trocar, key: Any
+) -> dict[str, Any]:
+    """Encodes a plain request, which has no random key."""
+    return plain.encode(spec, prompt, observation, trocar)
+
+
+def _plain_spec(env: sim_env.Env, settings: config.PolicyConfig) -> inputs.InputSpec:
+    p_world_ref = np.asarray(env.p_world_ref, np.float32)
+    arms = () if len(p_world_ref) == 1 else (len(p_world_ref),)
+    return inputs.InputSpec(
+        moments=1,
+        arms=arms,
+        p_world_ref=p_world_ref if arms else p_world_ref[0],
+        keeps_to_manifold=False,
+        image_size=settings.image_size,
+        cameras=env.names.cameras if settings.observation == "image" else (),
+        state_size=env.task.state_size,
+    )
+
+
+def _check_trocars(spec: inputs.InputSpec, env: sim_env.Env) -> None:
+    own = np.asarray(env.p_world_ref)
+    served = np.asarray(spec.p_world_ref).reshape(-1, 3)
+    if served.shape != own.shape or np.abs(served - own).max() > _NEAR_M:
+        raise UsageError("greeting.asks.p_world_ref", str(own.tolist()), served.tolist())
+
+
+def _as_json(value: Any) -> Any:
+    """Returns JSON values of a greeting; arrays become lists."""
+    if isinstance(value, dict):
+        return {str(name): _as_json(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_json(part) for part in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return value if isinstance(value, str | int | float | None) else repr(value)
+
+
+def _identity(origin: dict[str, Any]) -> str:
+    digest = origin["metadata"].get("digest")
+    if isinstance(digest, str) and digest:
+        return digest
+    return hashlib.sha256(repr(sorted(origin.items())).encode()).hexdigest()

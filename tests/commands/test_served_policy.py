@@ -1,0 +1,221 @@
+"""A served policy evaluated by its address: the result of the same policy in this process."""
+
+import contextlib
+import functools
+import json
+import queue
+import threading
+
+import jax
+import mistakes
+import numpy as np
+import pytest
+import served
+import stubs
+from websockets.sync import server as sockets
+
+from starjax import config
+from starjax.commands import evaluate, sweep
+from starjax.deploy import approach, batching, inputs, link, wire
+from starjax.deploy import served as serving
+from starjax.evaluation import evaluate as evaluating
+from starjax.policies import in_env
+from starjax.rollouts import agent
+from starjax.sim import names
+from starjax.types import Command, Pose
+
+TRIALS = ["--eval.trials=1", "--eval.time-limit-s=1", "--no-video"]
+SAMPLE, PARAMS = stubs.make_policy()
+PROGRAM = jax.jit(functools.partial(SAMPLE, PARAMS, 1.0))
+
+
+class Stub:
+    """The network of `stubs` as `deploy.Deployed`."""
+
+    method, digest, scene = "dp_ee", "d" * 64, names.SceneNames("reach", (), (), ())
+    settings = config.PolicyConfig(observation="state", obs_horizon=2, horizon=6, execute=4)
+    input_spec = inputs.InputSpec(2, (), stubs.P_WORLD_REF[0], False, 0, (), 12)
+
+    def plan(self, keys, sensors, trocar):
+        pose = Pose(sensors.pose.R[:, :, None], sensors.pose.p[:, :, None])
+        sensors = sensors._replace(pose=pose, gripper=sensors.gripper[:, :, None])
+        plan = jax.tree.map(lambda x: x[:, :, 0], PROGRAM(keys, sensors, None))
+        return plan, approach.StartOffset(*[np.zeros(len(keys))] * 2)
+
+    def check_first(self, offset):
+        pass
+
+
+@pytest.fixture(autouse=True)
+def simulated(tmp_path, monkeypatch):
+    monkeypatch.setattr(in_env.sim_env, "make", lambda *_, **__: stubs.make_env())
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def address(monkeypatch):
+    monkeypatch.setenv("STARJAX_API_KEY", served.KEY)
+    with served.running(batching.Batches(Stub(), 2)) as ((host, port), _):
+        yield f"ws://{host}:{port}"
+
+
+@contextlib.contextmanager
+def openpi(infer, metadata):
+    """A server as openpi's; `infer` maps a request to an answer or a text."""
+
+    opened = []
+
+    def work(connection):
+        opened.append(connection)
+        connection.send(wire.pack(metadata))
+        for frame in connection:
+            reply = infer(wire.unpack(frame))
+            connection.send(reply if isinstance(reply, str) else wire.pack(reply))
+
+    with sockets.serve(work, "127.0.0.1", 0, compression=None) as up:
+        thread = threading.Thread(target=up.serve_forever)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{up.socket.getsockname()[1]}"
+        finally:
+            up.shutdown()
+            for connection in opened:
+                connection.close()
+            thread.join()
+
+
+def stay(request, horizon=5):
+    return {"actions": np.tile(request["observation/state"], (horizon, 1))}
+
+
+PLAIN = {"scene": {"task": "reach"}, "observation": "state"}
+
+
+def result(out):
+    return json.loads((out / "result.json").read_text())
+
+
+def test_it_is_scored_as_in_this_process(address, tmp_path):
+    assert evaluate.main(["--policy", address, "--out", "here", *TRIALS]) == 0
+    found = result(tmp_path / "here")
+    env = stubs.make_env()
+    local = evaluating.evaluate(
+        tmp_path / "local",
+        env,
+        agent.from_policy(SAMPLE, 2, 4),
+        (PARAMS, 1.0),
+        env.task.trocars,
+        evaluating.EvaluationSettings(trials=1, seed=0, time_limit_s=1.0),
+    )
+    assert [row["success"] for row in found["trials"]] == local.success.tolist()
+    assert [row["steps"] for row in found["trials"]] == local.steps.tolist()
+    largest = [row["rcm_max_mm"] for row in found["trials"]]
+    np.testing.assert_allclose(largest, 1e3 * local.rcm_max, atol=1e-3)
+    assert 0 < local.success.sum() < 12
+    assert found["server"]["address"] == address and found["weights"] == Stub.digest
+    assert found["server"]["metadata"]["horizon"] == 6 and found["method"] == "dp_ee"
+
+
+def test_a_sweep_of_a_server(address, tmp_path):
+    assert sweep.main(["--policy", address, "--trocars=2", "--eval.time-limit-s=0.5"]) == 0
+    (file,) = tmp_path.glob("runs/sweep/*/sweep.json")
+    assert json.loads(file.read_text())["weights"] == Stub.digest
+
+
+def test_plain_frames_of_openpi(tmp_path):
+    requests = queue.SimpleQueue()
+
+    def infer(request):
+        requests.put(request)
+        return stay(request)
+
+    with openpi(infer, PLAIN) as address:
+        evaluate.main(["--policy", address, "--out", "here", *TRIALS])
+    found, request = result(tmp_path / "here"), requests.get()
+    assert found["method"] == "served" and found["config"]["policy"]["execute"] == 5
+    assert request["observation/state"].shape == (8,) and request["prompt"] == "reach"
+    assert request["observation/environment_state"].shape == (12,)
+
+
+def test_refused_plans_hold_and_are_counted(tmp_path):
+    asked = []
+
+    def infer(request):
+        asked.append(request)
+        bad = [stay(request), "no plan", {"actions": np.full((5, 8), np.nan)}]
+        return bad[min(len(asked) - 1, 1 + len(asked) % 2)]
+
+    with openpi(infer, PLAIN) as address:
+        who = serving.connect(address)
+        table = in_closed_loop(who, tmp_path)
+    assert who.remote.refused == len(asked) - 1 > 0
+    assert not table.success.any() and table.rcm_max.max() < 1e-6
+
+
+def in_closed_loop(who, folder):
+    settings = evaluating.EvaluationSettings(trials=1, seed=0, time_limit_s=0.5)
+    with who.faults():
+        return evaluating.evaluate(
+            folder / "e", who.env, who.agent(), (np.zeros(1, bool), None),
+            who.env.task.trocars, settings,
+        )  # fmt: skip
+
+
+def test_a_lost_server_ends_it_in_one_line(tmp_path):
+    asked = []
+
+    def infer(request):
+        asked.append(request)
+        if len(asked) > 3:
+            raise RuntimeError
+        return stay(request)
+
+    with openpi(infer, PLAIN) as address:
+        who = serving.connect(address)
+        with mistakes.of(address):
+            in_closed_loop(who, tmp_path)
+    assert isinstance(who.remote.fault, link.LostServer)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"scene": {}}, "greeting.scene.task"),
+        ({"control_hz": 50.0}, "greeting.control_hz"),
+        ({"batch": 0}, "greeting.batch"),
+        ({"observation": "smell"}, "greeting"),
+        ({"execute": 9}, "greeting.execute"),
+    ],
+)
+def test_a_greeting_is_checked(change, field):
+    with openpi(stay, PLAIN | change) as address, mistakes.of(field):
+        serving.connect(address)
+
+
+@pytest.mark.parametrize(
+    ("answer", "field"),
+    [
+        ({}, "answer.actions"),
+        ({"actions": np.zeros((5, 7))}, "answer.actions"),
+        ({"actions": np.zeros((5, 8))}, "answer.actions"),
+        ("Traceback\nKeyError: 'wrist'", "--policy"),
+    ],
+)
+def test_the_first_plan_is_checked(answer, field):
+    with openpi(lambda request: answer, PLAIN) as address, mistakes.of(field):
+        serving.connect(address)
+
+
+def test_no_server():
+    with mistakes.of("--policy"):
+        serving.connect("ws://127.0.0.1:9")
+
+
+def test_an_action_is_position_quaternion_and_gripper():
+    from starjax.deploy import plain
+
+    spec = Stub.input_spec
+    turned = np.float32([[0.1, 0, 0.1, 0, 0, 2 * np.sqrt(0.5), 2 * np.sqrt(0.5), 3.0]])
+    plan = plain.decode(spec, {"actions": turned})
+    assert isinstance(plan, Command) and plan.gripper.tolist() == [1.0]
+    np.testing.assert_allclose(plan.pose.R[0] @ [1, 0, 0], [0, 1, 0], atol=1e-6)
