@@ -32,7 +32,8 @@ PROGRAM = jax.jit(functools.partial(SAMPLE, PARAMS, 1.0))
 class Stub:
     """The network of `stubs` as `deploy.Deployed`."""
 
-    method, digest, scene = "dp_ee", "d" * 64, names.SceneNames("reach", (), (), ())
+    method, digest, monitor = "dp_ee", "d" * 64, None
+    scene = names.SceneNames("reach", (), (), ())
     settings = config.PolicyConfig(observation="state", obs_horizon=2, horizon=6, execute=4)
     input_spec = inputs.InputSpec(2, (), stubs.P_WORLD_REF[0], False, 0, (), 12)
 
