@@ -105,8 +105,9 @@ def _check(
 ) -> None:
     """Raises UsageError for settings that the devices rule out, before demonstrations begin."""
     from starjax.runtime import processes
-    from starjax.training import devices
+    from starjax.training import devices, randomise
 
+    randomise.max_levels(train)
     if policy.freeze_encoder and not processes.is_alone():
         raise errors.UsageError("policy.freeze_encoder", "one process", "several")
     if "train" in stages:

@@ -11,7 +11,7 @@ from starjax import config
 from starjax.data import windows
 from starjax.policies.base import Policy
 from starjax.rcm import arrays
-from starjax.training import devices
+from starjax.training import devices, randomise
 from starjax.training import state as states
 from starjax.training.metrics import added
 from starjax.training.sharding import StateLayout, StepCarry
@@ -92,6 +92,8 @@ def drawn_batch(
 def train_step(setup: Setup, carry: StepCarry, batch: windows.Batch) -> StepCarry:
     """Takes one step of AdamW and of the average; leaves it out, and counts it, if not finite."""
     key = states.step_keys(carry.state.key, carry.state.step).loss
+    observation = randomise.randomise(setup.train_config, key, batch.observation)
+    batch = batch.replace(observation=observation)
     prepared = setup.policy.prepare(carry.state.normalizer, key, batch)
     update = functools.partial(_update, setup)
     return setup.layout.on_each_device(update)(carry, prepared)

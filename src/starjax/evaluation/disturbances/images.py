@@ -65,11 +65,14 @@ def _stain(disturbance: DisturbanceState, image: jax.Array, step: jax.Array) -> 
     # A point stays free with probability (1 - pi r^2)^PATCHES = 1 - level: patches are independent.
     radius = jnp.sqrt((1.0 - (1.0 - disturbance.level) ** (1.0 / PATCHES)) / jnp.pi)
     rows, columns = (jnp.arange(height) + 0.5) / height, (jnp.arange(width) + 0.5) / width
-    points = jnp.stack(jnp.meshgrid(rows, columns, indexing="ij"), -1)
+
+    def squares(points: jax.Array, centres: jax.Array) -> jax.Array:
+        return ((points - centres[:, None] + 0.5) % 1.0 - 0.5) ** 2  # on the torus
 
     def covered(centres: jax.Array, radius: jax.Array) -> jax.Array:
-        offset = (points[:, :, None] - centres + 0.5) % 1.0 - 0.5  # on the torus
-        return jnp.any(jnp.sum(offset**2, -1) < radius**2, -1)[..., None]
+        # Squares along each axis first: a remainder for every pixel would take 30 times as long.
+        down, across = squares(rows, centres[:, 0]), squares(columns, centres[:, 1])
+        return jnp.any(down[:, :, None] + across[:, None] < radius**2, 0)[..., None]
 
     stained = jnp.where(covered(centres, radius), jnp.array(BLOOD_RGB), image)
     shines = covered(centres - SHINE_OFFSET * radius, SHINE * radius)
