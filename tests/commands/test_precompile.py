@@ -79,6 +79,7 @@ def test_an_error_ends_no_run(monkeypatch):
     assert found.step() is None and found.policy() is None
 
 
+@pytest.mark.slow
 def test_it_counts_for_no_stage(tmp_path):
     program = programs.Program(lambda x: x * 3.25)
     with stage_times.timed(tmp_path, "collect"):

@@ -214,6 +214,7 @@ def test_half_a_turn_of_the_roll_turns_the_jaws_by_half(rng, p_world_ref):
     np.testing.assert_allclose(other.p, tip.p, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_rcm6_is_written_and_read(rng, p_world_ref):
     trocar, p = trocars(N, p_world_ref)
     tip = forward(shafts(rng, N, p), angles_of(rng, N))
@@ -297,6 +298,7 @@ def test_maps_are_total(rng, oracle, p_world_ref):
     assert not got.is_feasible[~finite].any()
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite(rng, oracle, p_world_ref):
     n = 5000
     trocar, p = trocars(n, p_world_ref)

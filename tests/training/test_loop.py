@@ -174,6 +174,7 @@ def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
     assert written == (directory / "metrics.jsonl").read_bytes()
 
 
+@pytest.mark.slow
 def test_only_the_state_is_held_while_steps_are_taken(whole, tmp_path):
     """A matrix, its two moments and its average; not what they began with, too."""
     largest = max(leaves(whole[1].state.params), key=np.size).shape

@@ -52,6 +52,7 @@ def test_episodes_load_as_demonstrations(root, steered):
     assert (off < 0.002).all()
 
 
+@pytest.mark.slow
 def test_more_can_be_added_and_numbers_go_on(root, steered):
     with recorder.record_into(root, steered.env, SEED) as kept:
         assert (kept.kept, kept.next_trial(2), kept.next_trial(9), kept.next_trial(0)) == (
@@ -65,6 +66,7 @@ def test_more_can_be_added_and_numbers_go_on(root, steered):
         assert kept.length == 0
 
 
+@pytest.mark.slow
 def test_a_folder_is_one_process_at_a_time_and_one_dataset(root, steered):
     with (
         recorder.record_into(root, steered.env, SEED),
@@ -91,6 +93,7 @@ def test_a_full_disk_loses_no_episode(steered, tmp_path, monkeypatch):
         assert kept.save(0, trial).is_dir() and kept.length == 0
 
 
+@pytest.mark.slow
 def test_recorded_episodes_are_shown_as_they_were(root):
     dataset = browse.open_dataset(root)
     shown = browse.read(dataset, dataset.keys[0])
@@ -105,6 +108,7 @@ def test_recorded_episodes_are_shown_as_they_were(root):
     np.testing.assert_allclose(shown.frames[0].p_world_trocar, expected, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_damaged_episode_is_named(root, tmp_path):
     import shutil
 

@@ -95,6 +95,7 @@ def test_an_episode_begins_with_its_target_in_the_picture(tool):
     assert float(jnp.max(jax.jit(jax.vmap(furthest_aside))(keys))) < 0.5
 
 
+@pytest.mark.slow
 def test_the_expert_records_the_right_distance_from_a_disturbed_one():
     m, measured_trocar = (
         model("endoscope"),
