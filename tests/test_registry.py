@@ -85,8 +85,9 @@ def test_a_broken_format_leaves_the_others(install, tmp_path):
     install("lab_g", "1 / 0", formats="notes")
     (tmp_path / "d" / "meta").mkdir(parents=True)
     (tmp_path / "d" / "meta" / "info.json").touch()
-    with pytest.warns(UserWarning, match="skipped"):
-        assert base.detect(tmp_path / "d") == "lerobot"
+    assert base.detect(tmp_path / "d") == "lerobot"
+    with pytest.warns(UserWarning, match="skipped"), pytest.raises(errors.UsageError):
+        base.detect(tmp_path)  # of no format: the broken ones are asked too
 
 
 def test_broken_mounts_leave_those_of_others(install):
