@@ -29,7 +29,7 @@ _answered = False
 
 
 def interrupt_on_stops() -> None:
-    """Raises KeyboardInterrupt in the main thread for every later stop.
+    """Makes every later stop raise KeyboardInterrupt.
 
     Python drops exceptions that are raised in a callback of its collector, and jax's C++ code some
     that are raised while it calls Python, at every start for some milliseconds. It is therefore
