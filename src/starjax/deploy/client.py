@@ -222,7 +222,7 @@ def _read_timing(metadata: dict[str, Any]) -> tuple[float, int, int]:
     """Reads commands per second, commands per plan and how many of them are executed.
 
     Raises:
-      UsageError: the rate is not that of all policies, or the lengths are none of a plan.
+      UsageError: the rate differs from that of all policies, or a length is out of range.
     """
     hz, *lengths = (metadata.get(name) for name in ("control_hz", "horizon", "execute"))
     if hz != CONTROL_HZ:

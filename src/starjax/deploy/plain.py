@@ -59,5 +59,6 @@ def decode(spec: InputSpec, value: Any) -> Command:
     if (norm := np.linalg.norm(xyzw, axis=-1)).min() < _SHORTEST:
         raise UsageError("answer.actions", "unit quaternions x y z w", f"one of norm {norm.min()}")
     R = Rotation.from_quat(xyzw.reshape(-1, 4)).as_matrix().reshape(*p.shape, 3)
-    pose = Pose(R.astype(np.float32), p.astype(np.float32))
-    return Command(pose, np.clip(gripper, -1.0, 1.0).astype(np.float32))
+    leaves: Any = (R, p, np.clip(gripper, -1.0, 1.0))  # numpy arrays, as a server's answer is
+    R, p, gripper = (leaf.astype(np.float32) for leaf in leaves)
+    return Command(Pose(R, p), gripper)

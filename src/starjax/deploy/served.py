@@ -70,8 +70,8 @@ class RemotePolicy:
             twins.setdefault(keys[lane].tobytes(), []).append(lane)
 
         def request(lanes: list[Any]) -> Command | None:
-            one = jax.tree.map(lambda x: x[lanes[0]], (seen, trocar))
-            return self._plan(*one, keys[lanes[0]])
+            of_lane = functools.partial(jax.tree.map, lambda x: x[lanes[0]])
+            return self._plan(of_lane(seen), of_lane(trocar), keys[lanes[0]])
 
         for lanes, plan in zip(
             twins.values(), self._pool.map(request, twins.values()), strict=True

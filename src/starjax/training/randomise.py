@@ -43,7 +43,7 @@ def randomise(
       observation: of a batch; images are uint8 `[B, O, h, w, 3]`.
     """
     levels = max_levels(train_config)
-    if not levels:
+    if not levels or observation.images is None:
         return observation
 
     def change(key: jax.Array, images: dict[str, jax.Array]) -> dict[str, jax.Array]:
