@@ -150,9 +150,9 @@ def run_config(settings, out):
 def train(source, seen, out, name):
     """What `starjax train` does after the features are there."""
     settings, found = source
-    pipeline._train(
-        run_config(settings, out), name, lambda: seen, fakes.env(), found, sharing.ALONE
-    )
+    work = pipeline.RunContext(run_config(settings, out), found, sharing.ALONE, "")
+    vars(work)["env"] = fakes.env()  # in place of the cached one
+    pipeline._train(work, name, lambda: seen)
     return folders.weights(out, name)
 
 
@@ -227,10 +227,10 @@ def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, 
     monkeypatch.setattr(load, "verify", lambda root: None)
     monkeypatch.setattr(load, "load", without_images)
     images = {"camera": np.asarray(dataset.observation.images["camera"])}
-    monkeypatch.setattr(load, "frames", lambda root: images)
+    monkeypatch.setattr(load, "frames", lambda root, env: images)
     settings, found = source
     loaded = demonstrations.load(
-        run_config(settings, tmp_path), tmp_path, lambda: None, found, sharing.ALONE
+        run_config(settings, tmp_path), None, tmp_path, lambda: None, found, sharing.ALONE
     )
     assert loaded.observation.images is None and windows.on_device(loaded)
     wanted = features(source, dataset, tmp_path / "other")
