@@ -166,11 +166,11 @@ def run_main(out: str, mode: str) -> None:
     from starjax.runtime import processes
 
     policies.make = lambda *_, **__: _quadratic_policy()
-    policy_evaluation.inference_ms = lambda who, decide: {"p50": 1.0, "p95": 1.0, "p99": 1.0}
+    policy_evaluation.inference_ms = lambda *_: {"p50": 1.0, "p95": 1.0, "p99": 1.0}
     training, stages = SETTINGS, ["collect", "train", "evaluate"]
     if mode == "trains":
         training = dataclasses.replace(SETTINGS, steps=10**6, checkpoint_every=10**6)
-        demonstrations.plan = lambda *_: (Path(out) / "demos", lambda: None)
+        demonstrations.plan = lambda *_: demonstrations.DemosWork(Path(out) / "demos", lambda: None)
         demonstrations.load = lambda *_: fakes.dataset(seed=0)
     pipeline._environment = lambda _: fakes.env() if mode == "trains" else stubs.make_env()
     settings = config.RunConfig(

@@ -158,10 +158,9 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
     required = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
     if policy.observation == "state":
         required = {"state": [sum(field.size for field in env.task.fields)]}
-    model = schema.model_hash(env.scene)  # empty without a MuJoCo model
-    is_drawn = redraw.is_possible(about) and model and about["model"] == model
-    if policy.observation == "image" and is_drawn:
-        required = {}
+    elif redraw.is_possible(about):
+        model = schema.model_hash(env.scene)  # empty without a MuJoCo model
+        required = {} if model and about["model"] == model else required
     for name, shape in required.items():
         recorded = features.get(name, {}).get("shape")
         if recorded != shape:
