@@ -152,6 +152,7 @@ class Timing(NamedTuple):
 
 
 TIMINGS = {
+    "cpu": Timing("2 cores of an AMD EPYC", "cpu", 242.6, "cpu_main_job/run.json"),
     "gpu": Timing("an NVIDIA H100 with 16 cores", "gpu", 234.8, "gpu_main_job/flow_again.json"),
 }
 
