@@ -14,7 +14,7 @@ import stubs
 import synthetic
 
 from starjax import config, methods
-from starjax.commands import demonstrations, folders, pipeline, presets, scenes
+from starjax.commands import demonstrations, folders, pipeline, presets, scenes, scored
 from starjax.data import normalizer
 from starjax.policies import in_env, policy_file
 from starjax.rollouts import sharing
@@ -169,8 +169,8 @@ def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
 
     def is_done(found, wanted=smoke, weights="a"):
         file.write_text(found if isinstance(found, str) else json.dumps(found))
-        found = pipeline._scored(file.parent, weights)
-        return bool(found) and pipeline._is_of(found, wanted)
+        found = scored._read(file.parent, weights)
+        return bool(found) and scored._is_of(found, wanted)
 
     assert is_done(result) and not is_done(result, weights="b")
     older = json.loads(json.dumps(result))

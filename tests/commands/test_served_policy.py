@@ -16,7 +16,7 @@ from websockets.sync import server as sockets
 
 from starjax import config
 from starjax.commands import evaluate, sweep
-from starjax.deploy import approach, batching, inputs, link, wire
+from starjax.deploy import approach, batching, connection_pool, inputs, wire
 from starjax.deploy import served as serving
 from starjax.evaluation import evaluate as evaluating
 from starjax.policies import in_env
@@ -175,7 +175,7 @@ def test_a_lost_server_ends_it_in_one_line(tmp_path):
         who = serving.connect(address)
         with mistakes.of(address):
             in_closed_loop(who, tmp_path)
-    assert isinstance(who.remote.fault, link.LostServer)
+    assert isinstance(who.remote.fault, connection_pool.LostServer)
 
 
 @pytest.mark.parametrize(

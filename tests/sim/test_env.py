@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from starjax import errors, rcm
+from starjax.sim import dynamics, physics
 from starjax.sim import env as envs
-from starjax.sim import physics
 from starjax.sim.tasks import scripting
 from starjax.sim.tasks.peg_transfer import expert, task
 from starjax.types import Command, Pose
@@ -106,12 +106,12 @@ def test_success_wants_a_block_let_go_and_at_rest_on_its_peg_five_steps_in_a_row
     held = measurements.replace(touch=jnp.ones((), bool))
     after, successes = good, []
     for _ in range(5):
-        last, after = after, envs.with_status(sim, after)
+        last, after = after, dynamics.with_status(sim, after)
         successes.append(bool(after.success) and bool(after.done))
     assert successes == [False] * 4 + [True]
     assert float(after.reward) == 1.0 and int(after.stage) == len(task.STAGES) - 1
     for bad in (state, good.replace(measurements=fast), good.replace(measurements=held)):
-        again = envs.with_status(sim, bad.replace(settled=last.settled))
+        again = dynamics.with_status(sim, bad.replace(settled=last.settled))
         assert float(again.reward) < 1.0
         assert int(again.settled) == 0 and not again.success and not again.done
 
@@ -327,7 +327,7 @@ def test_the_contact_solver_converges_and_a_step_where_it_does_not_is_invalid(
 ):
     state = reset(3)
     after, _ = drive(state, begin(state, 4))
-    assert float(after.solver_error.max()) < envs.MAX_SOLVER_ERROR and not after.invalid.any()
+    assert float(after.solver_error.max()) < dynamics.MAX_SOLVER_ERROR and not after.invalid.any()
     state = jax.tree.map(lambda leaf: leaf[0], state)
     moved = state.physics.replace(qpos=state.physics.qpos + 1e-3)
     passed = physics.StepResult(
@@ -341,10 +341,10 @@ def test_the_contact_solver_converges_and_a_step_where_it_does_not_is_invalid(
     def step(error):
         left = passed._replace(solver_error=error)
         monkeypatch.setattr(physics, "advance", lambda *_: (moved, left))
-        return envs.step(sim, state, Command(state.pose, state.gripper))
+        return dynamics.step(sim, state, Command(state.pose, state.gripper))
 
     for share in (0.9, 1.1):
-        after, stopped = step(share * envs.MAX_SOLVER_ERROR), share > 1.0
+        after, stopped = step(share * dynamics.MAX_SOLVER_ERROR), share > 1.0
         assert bool(after.invalid) == bool(after.done) == stopped
         kept = state if stopped else after.replace(physics=moved)
         np.testing.assert_array_equal(after.physics.qpos, kept.physics.qpos)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from starjax.commands import (
     messages,
     precompile,
     scenes,
+    scored,
     session,
     stage_times,
 )
@@ -203,7 +203,7 @@ def _evaluate(
 
     config, env, share = work.config, work.env, work.share
     folder, weights = work.out / name, folders.weights(work.out, name)
-    if share.first(f"{name} was scored", lambda: _was_scored(config, folder, weights, env)):
+    if share.first(f"{name} was scored", lambda: scored.is_complete(config, folder, weights, env)):
         messages.stage("evaluate", f"{name}: already complete, {folder / 'result.json'}")
         return
     messages.stage("evaluate", f"{name}, into {folder / 'evaluation'}")
@@ -228,52 +228,6 @@ def _evaluate(
         )
 
     share.first(f"{name} is scored", write)
-
-
-def _was_scored(config: config_lib.RunConfig, folder: Path, weights: Path, env: Any) -> bool:
-    """Returns True if the result of a method is complete.
-
-    Raises:
-      errors.UsageError: fewer trials would replace it.
-    """
-    from starjax.evaluation import result
-
-    scored = _scored(folder, files.sha256(weights))
-    source = sources.digests(*result.parts_of(env.names, config.policy.learner))
-    is_current = scored and scored.about.get("source", source) == source
-    if is_current and _is_of(scored, config):
-        return True
-    count = len(env.task.is_seen)
-    if scored and (more := len(scored.trials)) > count * config.eval.trials:
-        raise errors.UsageError(
-            "eval.trials",
-            f"no fewer than the {more // count} of {folder / 'result.json'}",
-            config.eval.trials,
-            f"starjax evaluate {shlex.quote(str(folder))} keeps them apart",
-        )
-    return False
-
-
-def _scored(folder: Path, weights: str) -> Any:
-    """Returns the result of these weights, None if it is missing or damaged."""
-    from starjax.evaluation import result
-
-    try:
-        scored = result.read(folder / "result.json")
-    except (FileNotFoundError, ValueError):  # damaged: made again
-        return None
-    # older results do not say whose they are
-    return scored if scored.trials and scored.weights in (None, weights) else None
-
-
-def _is_of(scored: Any, config: config_lib.RunConfig) -> bool:
-    """Returns True if a result has these settings."""
-    try:
-        before = config_lib.from_dict(config_lib.RunConfig, scored.config)
-    except (AttributeError, KeyError, TypeError, ValueError):
-        return False
-    alike = config_lib.weight_settings(before) == config_lib.weight_settings(config)
-    return alike and before.eval == config.eval and scored.seed in (None, config.seed)
 
 
 def _timings(out: Path, name: str, demos: str) -> dict[str, float]:

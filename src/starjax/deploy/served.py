@@ -12,7 +12,7 @@ import numpy as np
 from jax.experimental import io_callback
 
 from starjax import config, rcm, types
-from starjax.deploy import batching, greeting, inputs, link, plain, wire
+from starjax.deploy import batching, connection_pool, greeting, inputs, plain, wire
 from starjax.errors import UsageError
 from starjax.policies import in_env
 from starjax.policies.base import Policy
@@ -36,7 +36,7 @@ class RemotePolicy:
 
     def __init__(
         self,
-        connections: link.Link,
+        connections: connection_pool.ConnectionPool,
         spec: inputs.InputSpec,
         horizon: int,
         encode: Callable[..., dict[str, Any]],
@@ -94,7 +94,7 @@ class RemotePolicy:
             reply = self._link.ask(self._encode(moments, trocar, key))
             if not isinstance(reply, str):
                 return self.check(self._decode(reply))
-        except link.LostServer as error:
+        except connection_pool.LostServer as error:
             self.fault = error
             raise
         except UsageError:
@@ -185,7 +185,10 @@ def _agent(
 
 
 def connect(
-    address: str, api_key: str = "", arms: Sequence[str] = (), timeout_s: float = link.TIMEOUT_S
+    address: str,
+    api_key: str = "",
+    arms: Sequence[str] = (),
+    timeout_s: float = connection_pool.TIMEOUT_S,
 ) -> ServedPolicy:
     """Connects to a server and requests one plan as a test.
 
@@ -198,7 +201,7 @@ def connect(
     Raises:
       UsageError: there is no server, its greeting is incomplete, or its plan is invalid.
     """
-    connections = link.Link(address, api_key, timeout_s)
+    connections = connection_pool.ConnectionPool(address, api_key, timeout_s)
     hello = greeting.read(connections.metadata)
     connections.widen(hello.batch)
     env = sim_env.for_policy(hello.scene, hello.settings, arms)
@@ -227,6 +230,8 @@ def connect(
 
 
 def _policy(remote: RemotePolicy) -> Policy:
+    """Returns a policy for inference: its other functions are the server's own business."""
+
     def untrained(*_: Any) -> Any:
         raise NotImplementedError("a served policy is trained elsewhere")
 
@@ -234,7 +239,9 @@ def _policy(remote: RemotePolicy) -> Policy:
 
 
 def _first_answer(
-    connections: link.Link, encode: Callable[..., dict[str, Any]], spec: inputs.InputSpec
+    connections: connection_pool.ConnectionPool,
+    encode: Callable[..., dict[str, Any]],
+    spec: inputs.InputSpec,
 ) -> Any:
     example = batching.example(spec)
     key = np.asarray(jax.random.key_data(jax.random.key(0)))

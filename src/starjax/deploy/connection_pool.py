@@ -22,7 +22,7 @@ class LostServer(UsageError):
     """A server that does not answer, or does not answer in its protocol."""
 
 
-class Link:
+class ConnectionPool:
     """Connections that threads take in turn, one request at a time on each.
 
     Attributes:
