@@ -15,7 +15,7 @@ from starjax import errors, rcm
 from starjax.data import load, schema, store
 from starjax.data.formats import base, exchange, foreign, mapping, motion, trocars
 from starjax.data.formats.base import Column, Source
-from starjax.data.formats.mapping import ArmColumns, CameraColumn, Map
+from starjax.data.formats.mapping import ArmColumns, CameraColumn, Map, ShaftColumns
 
 P_WORLD_REF = np.array([0.0, 0.0, 0.15])
 RNG = np.random.default_rng(0)
@@ -185,6 +185,12 @@ def test_a_robots_joints_give_its_tip(tmp_path):
     p = np.array([0, 0, 0.1]) + first.apply([0.2, 0, 0]) + second.apply([0, 0, 0.1])
     np.testing.assert_allclose(found.pose.p[:, 0], p, atol=1e-12)
     np.testing.assert_allclose(found.pose.R[:, 0], second.as_matrix(), atol=1e-12)
+    on_arm = ShaftColumns(body="arm", turn=wxyz(TIP_TURN))
+    both = structs.replace(MAP, arms=(structs.replace(arm, shaft=on_arm),))
+    shaft = motion.read(arrays, both, 30.0, tmp_path).shaft
+    p = np.array([0, 0, 0.1]) + first.apply([0.2, 0, 0])
+    np.testing.assert_allclose(shaft.p[:, 0], p, atol=1e-12)
+    np.testing.assert_allclose(shaft.R[:, 0], (second * TIP_TURN).as_matrix(), atol=1e-12)
     for changed, argument in (
         ({"body": "tap"}, "body"),
         ({"joint_names": ("b", "c")}, "joint_names"),
@@ -289,6 +295,40 @@ def test_two_arms_have_a_trocar_each(tmp_path):
     expected = [TROCARS, TROCARS, TROCARS[::-1]]
     np.testing.assert_allclose(found.p_world_trocar, expected, atol=5e-6)
     assert loaded(tmp_path / "d").observation.pose.p.shape == (360, 2, 3)
+
+
+def wristed(arrays):
+    """Moves the tip by a wrist on the shaft of the ordinary columns, angles in `wrist`."""
+    times = arrays["time"]
+    angles = np.stack([0.9 * np.sin(1.3 * times), 0.7 * np.cos(0.9 * times)], -1)
+    shaft = rcm.Pose(arrays["R0"], arrays["p0"])
+    tip = rcm.tip_of(rcm.LARGE_NEEDLE_DRIVER, shaft, angles)
+    shaft = {"shaft_R": shaft.R @ TIP_TURN.inv().as_matrix(), "shaft_p": shaft.p}
+    return arrays | shaft | {"R0": np.float64(tip.R), "p0": np.float64(tip.p), "wrist": angles}
+
+
+WRIST_COLUMNS = {
+    "angles": ShaftColumns(angles="wrist", instrument="large_needle_driver"),
+    "poses": ShaftColumns(position="shaft_p", rotation="shaft_R", turn=wxyz(TIP_TURN)),
+}
+
+
+@pytest.mark.parametrize("way", WRIST_COLUMNS)
+@pytest.mark.parametrize("hz", [30.0, 50.0])
+def test_the_trocar_of_an_instrument_with_a_wrist_is_that_of_its_shaft(tmp_path, way, hz):
+    given = source(change=wristed, hz=hz)
+    made = structs.replace(MAP, arms=(structs.replace(ARM, shaft=WRIST_COLUMNS[way]),))
+    got = bring(tmp_path, given, made)
+    np.testing.assert_allclose(got.p_world_trocar[:, 0], TROCARS[[0, 0, 1]], atol=2e-5)
+    assert not got.notes and got.residual_mm.max() < 0.02
+    root = tmp_path / "d"
+    error = np.load(root / "episodes" / store.keys(root)[0] / "rcm_error.npy")
+    assert error.max() < 5e-5  # of the shaft
+
+
+def test_the_tip_of_a_wrist_alone_has_no_trocar(tmp_path):
+    with mistakes.of("PATH", "wrist"):
+        bring(tmp_path, source(change=wristed))
 
 
 def test_images_are_cut_turned_and_resized(tmp_path):
@@ -404,6 +444,10 @@ def test_mappings_are_toml_or_json(tmp_path, kind):
         'task = "reach"\narms = 3',
         'task = "reach"\ncameras = "x"\n[[arms]]\nposition = "p"\nrotation = "q"',
         'task = "reach"\n[cameras.c]\ncolumn="x"\ncrop=[1]\n[[arms]]\nposition="p"\nrotation="q"',
+        *(
+            'task = "reach"\n[[arms]]\nposition = "p"\nrotation = "q"\n[arms.shaft]\n' + columns
+            for columns in ('angles = "w"', 'body = "b"', "", 'position = "p"\nbody = "b"')
+        ),
         "\x00",
         "a = " + "[" * 100_000,
     ],

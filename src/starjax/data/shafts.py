@@ -9,6 +9,7 @@ from starjax import rcm
 
 ROWS = 1024  # poses that an estimate is made of, at most
 _estimate = jax.jit(rcm.trocar_from_poses)
+_shaft_of = jax.jit(rcm.shaft_of, static_argnums=0)
 
 
 def subsample(x: Any) -> np.ndarray:
@@ -34,3 +35,21 @@ def estimate(R: Any, p: Any) -> rcm.TrocarEstimate:
         return padded.swapaxes(0, 1)
 
     return jax.device_get(_estimate(rcm.Pose(*map(jax.device_put, (rows(R), rows(p))))))
+
+
+def of_wrist(R: Any, p: Any, wrist: rcm.Wrist, angles: Any) -> rcm.Pose:
+    """Returns the shafts `[T]` of tips with a wrist, in numpy.
+
+    Args:
+      R: `[T, 3, 3]` R_world_tip. p: `[T, 3]` m.
+      wrist: sizes.
+      angles: `[T, 2]` rad, pitch and yaw.
+    """
+    length = len(p)
+    rows = -length % ROWS  # repetitions of the last one, for few programs
+    R, p, angles = (
+        np.concatenate([x, np.repeat(x[-1:], rows, axis=0)]).astype(np.float32)
+        for x in (R, p, angles)
+    )
+    shaft = jax.device_get(_shaft_of(wrist, rcm.Pose(R, p), angles))
+    return jax.tree.map(lambda x: x[:length].astype(np.float64), shaft)

@@ -213,7 +213,7 @@ def _fields(
     """Reads the fields of an episode."""
     columns = source.read(kept.episode, maps.names(mapping))
     poses = motion.read(columns, mapping, hz, folder)
-    off = np.cross(poses.pose.p - p_world_trocar, poses.pose.R[..., 2])
+    off = np.cross(poses.shaft.p - p_world_trocar, poses.shaft.R[..., 2])
     arrays = {
         "p": poses.pose.p,
         "R": poses.pose.R,

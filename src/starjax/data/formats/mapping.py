@@ -34,6 +34,23 @@ class _MapPart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Part of a mapping file."""
 
 
+class ShaftColumns(_MapPart, frozen=True, kw_only=True):
+    """Columns of the shaft of an instrument with a wrist: one of three ways to write its poses."""
+
+    angles: Columns = ()  # pitch and yaw of the wrist, rad, as `rcm.tip_of` has them
+    instrument: Literal["", "large_needle_driver", "prograsp"] = ""  # whose wrist it is
+    position: Columns = ()  # of a point of the shaft, 3 numbers
+    rotation: Columns = ()  # of the shaft, as the arm's `rotation_as` says
+    body: str = ""  # body or site of the arm's model that is on the shaft
+    turn: Quaternion = (1.0, 0.0, 0.0, 0.0)  # wxyz, to z along the shaft, distal
+
+    def __post_init__(self) -> None:
+        ways = (self.angles, self.instrument), (self.position, self.rotation), (self.body,)
+        used = [way for way in ways if any(way)]
+        if len(used) != 1 or not all(used[0]):
+            raise ValueError("expected angles and instrument, position and rotation, or body")
+
+
 class ArmColumns(_MapPart, frozen=True, kw_only=True):
     """Columns of one arm. Empty ones are not there."""
 
@@ -54,6 +71,9 @@ class ArmColumns(_MapPart, frozen=True, kw_only=True):
     tip: Vector = (0.0, 0.0, 0.0)  # m, the tip in the frame that the poses are of
     # of the tip in that frame: z of the tip is the shaft, distal, y where the jaws open
     tip_turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    # of an instrument with a wrist; absent, the tip's z is the shaft. The record of a mapping
+    # without it stays the same.
+    shaft: ShaftColumns | msgspec.UnsetType = msgspec.UNSET
 
     def __post_init__(self) -> None:
         poses = bool(self.position and self.rotation) and not self.joints
@@ -63,6 +83,8 @@ class ArmColumns(_MapPart, frozen=True, kw_only=True):
         is_whole = bool(self.command_position) == bool(self.command_rotation)
         if not is_whole or (self.joints and self.command_position):
             raise ValueError("expected a whole command, of position and rotation")
+        if isinstance(self.shaft, ShaftColumns) and self.shaft.body and not self.joints:
+            raise ValueError("expected joints and a model for the body of the shaft")
         if self.gripper_open == self.gripper_closed:
             raise ValueError("expected gripper_open other than gripper_closed")
 
@@ -147,6 +169,8 @@ def names(mapping: Map) -> list[str]:
     for arm in mapping.arms:
         columns += [arm.position, arm.rotation, arm.joints, arm.gripper, arm.trocar]
         columns += [arm.command_position, arm.command_rotation, arm.command_gripper]
+        if isinstance(arm.shaft, ShaftColumns):
+            columns += [arm.shaft.angles, arm.shaft.position, arm.shaft.rotation]
     return list(dict.fromkeys(_part(text)[0] for some in columns for text in _listed(some)))
 
 

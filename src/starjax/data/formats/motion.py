@@ -1,6 +1,5 @@
 """Conversion of an episode of another dataset to poses in the task's world at `HZ`."""
 
-import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,21 +9,15 @@ from scipy.spatial import transform
 
 from starjax import errors
 from starjax.data.formats import mapping as maps
+from starjax.data.formats import tip_poses
 from starjax.data.formats.mapping import ArmColumns, Map
+from starjax.data.formats.tip_poses import TipPoses
 
 HZ = 30.0  # of every dataset
 FAST = 1.0  # m/s, faster tips are jumps
 SPINNING = 15.0  # rad/s, faster turns are jumps
 _FARTHEST = 5.0  # m; tips farther from the origin are in other units
 _EVEN = 0.02  # of a period, by which even steps may be off
-_UNIT = 0.1  # by which a quaternion's length may be off
-
-
-class TipPoses(NamedTuple):
-    """Tip poses on the host: rotations `[..., 3, 3]`, positions `[..., 3]` m."""
-
-    R: np.ndarray
-    p: np.ndarray
 
 
 class Motion(NamedTuple):
@@ -32,6 +25,7 @@ class Motion(NamedTuple):
 
     Attributes:
       pose, command: `[T, A]`, world frame.
+      shaft: `[T, A]`, that of the tip for a straight tool.
       gripper, command_gripper: `[T, A]` in [-1, 1].
       p_world_trocar: `[T, A, 3]` m, NaN where it is to be estimated.
       nearest: `[T]` step of the files whose images are shown.
@@ -39,6 +33,7 @@ class Motion(NamedTuple):
     """
 
     pose: TipPoses
+    shaft: TipPoses
     command: TipPoses
     gripper: np.ndarray
     command_gripper: np.ndarray
@@ -72,6 +67,7 @@ def read(arrays: Mapping[str, np.ndarray], mapping: Map, hz: float, folder: Path
     sampled = [_sampled(arm, times, wanted) for arm in arms]
     return Motion(
         pose=_together([arm.pose for arm in sampled]),
+        shaft=_together([arm.shaft for arm in sampled]),
         command=_together([arm.command for arm in sampled]),
         gripper=np.stack([arm.gripper for arm in sampled], 1),
         command_gripper=np.stack([arm.command_gripper for arm in sampled], 1),
@@ -89,6 +85,7 @@ class _Arm(NamedTuple):
     """One arm; None of a command that the files lack."""
 
     pose: TipPoses
+    shaft: TipPoses
     command: Any
     gripper: np.ndarray
     command_gripper: Any
@@ -96,118 +93,24 @@ class _Arm(NamedTuple):
 
 
 def _arm(arrays: Mapping[str, np.ndarray], arm: ArmColumns, mapping: Map, folder: Path) -> _Arm:
-    scale = 1e-3 if mapping.units == "mm" else 1.0
-    turn, origin = _quaternion(mapping.turn, "turn"), np.array(mapping.origin)
-
-    def placed(p: np.ndarray) -> np.ndarray:
-        return origin + scale * p @ turn.T
-
-    def tip(position: maps.Columns, rotation: maps.Columns) -> TipPoses:
-        R = turn @ rotations(maps.pick(arrays, rotation, maps.NUMBERS[arm.rotation_as]), arm)
-        return TipPoses(
-            R @ _quaternion(arm.tip_turn, "tip_turn"),
-            placed(maps.pick(arrays, position, 3)) + R @ np.array(arm.tip),
-        )
-
     def jaws(columns: maps.Columns) -> np.ndarray:
         raw = maps.pick(arrays, columns, 1)[:, 0]
         share = (raw - arm.gripper_closed) / (arm.gripper_open - arm.gripper_closed)
         return np.clip(2.0 * share - 1.0, -1.0, 1.0)
 
-    if arm.joints:
-        R, p = _kinematics(maps.pick(arrays, arm.joints), arm, folder / arm.model)
-        R = turn @ R
-        # A model is in m whatever the columns are.
-        p = origin + p @ turn.T + R @ np.array(arm.tip)
-        pose = TipPoses(R @ _quaternion(arm.tip_turn, "tip_turn"), p)
-    else:
-        pose = tip(arm.position, arm.rotation)
+    pose = tip_poses.tip(arrays, arm, mapping, folder)
     farthest = float(np.abs(pose.p).max())
     if farthest > _FARTHEST:
         raise errors.UsageError("position", f"tips within {_FARTHEST:g} m", f"{farthest:.3g} m")
-    asked = arm.command_position and arm.command_rotation
     unknown = np.full_like(pose.p, np.nan)
     return _Arm(
         pose,
-        tip(arm.command_position, arm.command_rotation) if asked else None,
+        tip_poses.shaft(arrays, arm, mapping, folder, pose),
+        tip_poses.command(arrays, arm, mapping),
         jaws(arm.gripper) if arm.gripper else np.ones(len(pose.p)),
         jaws(arm.command_gripper) if arm.command_gripper else None,
-        placed(maps.pick(arrays, arm.trocar, 3)) if arm.trocar else unknown,
+        tip_poses.placed(maps.pick(arrays, arm.trocar, 3), mapping) if arm.trocar else unknown,
     )
-
-
-def rotations(numbers: np.ndarray, arm: ArmColumns) -> np.ndarray:
-    """Converts rotations of any notation to matrices `[T, 3, 3]`."""
-    kind = arm.rotation_as
-    if kind.startswith("quat"):
-        length = np.linalg.norm(numbers, axis=-1)
-        off = np.abs(length - 1.0) > _UNIT
-        if off.any():
-            got = f"one of length {length[off][0]:.3g} at step {int(np.argmax(off))}"
-            raise errors.UsageError("rotation", "unit quaternions", got)
-        xyzw = numbers if kind == "quat_xyzw" else numbers[:, [1, 2, 3, 0]]
-        return transform.Rotation.from_quat(xyzw).as_matrix()
-    if kind == "rotvec":
-        return transform.Rotation.from_rotvec(numbers).as_matrix()
-    if kind == "euler_xyz":
-        return transform.Rotation.from_euler("xyz", numbers).as_matrix()
-    columns = numbers[:, [0, 3, 6, 1, 4, 7]] if kind == "matrix" else numbers
-    x, y = columns[:, :3], columns[:, 3:]
-    off = np.abs([np.sum(x * x, -1) - 1.0, np.sum(y * y, -1) - 1.0, np.sum(x * y, -1)]).max(0)
-    if (off > _UNIT).any():
-        got = f"columns off by {off.max():.3g} at step {int(np.argmax(off))}"
-        raise errors.UsageError("rotation", "orthonormal columns", got)
-    whole = np.stack([x, y, np.cross(x, y)], -1)
-    if kind == "matrix" and np.abs(whole[:, :, 2] - numbers[:, [2, 5, 8]]).max() > _UNIT:
-        raise errors.UsageError("rotation", "matrices of rotations", "a mirrored one")
-    return transform.Rotation.from_matrix(whole).as_matrix()
-
-
-def _quaternion(wxyz: tuple[float, ...], name: str) -> np.ndarray:
-    length = float(np.linalg.norm(wxyz))
-    if not abs(length - 1.0) <= _UNIT:
-        raise errors.UsageError(name, "a unit quaternion, wxyz", list(wxyz))
-    w, x, y, z = wxyz
-    return transform.Rotation.from_quat([x, y, z, w]).as_matrix()
-
-
-def _kinematics(joints: np.ndarray, arm: ArmColumns, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """TipPoses of the tip in the model's world: `[T, 3, 3]`, `[T, 3]`."""
-    import mujoco
-
-    model, places, site, body = _model(path, arm.joint_names, arm.body, joints.shape[1])
-    data = mujoco.MjData(model)
-    R, p = np.zeros((len(joints), 3, 3)), np.zeros((len(joints), 3))
-    for t, row in enumerate(joints):
-        data.qpos[places] = row
-        mujoco.mj_kinematics(model, data)
-        frame = data.site(site) if site >= 0 else data.body(body)
-        R[t], p[t] = frame.xmat.reshape(3, 3), frame.xpos
-    return R, p
-
-
-@functools.cache
-def _model(path: Path, joints: tuple[str, ...], tip: str, count: int) -> tuple:
-    """Loads a robot's model, its joints' addresses, and the id of the tip's site or body."""
-    import mujoco
-
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise errors.UsageError("model", "an MJCF or URDF", f"{path}: {error}") from error
-    known = [model.joint(i).name for i in range(model.njnt)]
-    for name in joints:
-        errors.choice("joint_names", name, known)
-    chosen = joints or tuple(known[:count])
-    if len(chosen) != count:
-        raise errors.UsageError("joints", f"{len(chosen)} as in the model", count)
-    find = functools.partial(mujoco.mj_name2id, model)
-    site, body = (find(kind, tip) for kind in (mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_BODY))
-    if max(site, body) < 0:
-        bodies = [model.body(i).name for i in range(model.nbody)]
-        errors.choice("body", tip, bodies + [model.site(i).name for i in range(model.nsite)])
-    places = [model.jnt_qposadr[known.index(name)] for name in chosen]
-    return model, np.array(places), site, body
 
 
 def _looked_at(times: np.ndarray, hz: float, mapping: Map) -> list[str]:
@@ -274,8 +177,10 @@ def _sampled(arm: _Arm, times: np.ndarray, wanted: np.ndarray) -> _Arm:
             within = np.clip(wanted, times[0], times[-1])
             return TipPoses(turning(within).as_matrix(), along(pose.p))
 
+        pose = moved(arm.pose)
         arm = _Arm(
-            moved(arm.pose),
+            pose,
+            pose if arm.shaft is arm.pose else moved(arm.shaft),
             arm.command and moved(arm.command),
             along(arm.gripper),
             arm.command_gripper if arm.command_gripper is None else along(arm.command_gripper),

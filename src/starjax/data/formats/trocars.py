@@ -19,10 +19,11 @@ Tips = tuple[np.ndarray, np.ndarray, np.ndarray]  # see `subsample`
 def subsample(found: Motion) -> Tips:
     """Keeps of an episode what tells its trocars.
 
-    Some poses `[T, A, ...]`, and the trocars `[A, 3]` that the files say, NaN where they do not.
+    Some poses of the shafts `[T, A, ...]`, and the trocars `[A, 3]` that the files say, NaN where
+    they do not.
     """
     said = np.median(found.p_world_trocar, axis=0)
-    return shafts.subsample(found.pose.R), shafts.subsample(found.pose.p), said
+    return shafts.subsample(found.shaft.R), shafts.subsample(found.shaft.p), said
 
 
 def locate(
