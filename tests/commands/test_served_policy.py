@@ -136,6 +136,8 @@ def test_plain_frames_of_openpi(tmp_path):
     assert found["method"] == "served" and found["config"]["policy"]["execute"] == 5
     assert request["observation/state"].shape == (8,) and request["prompt"] == "reach"
     assert request["observation/environment_state"].shape == (12,)
+    # A position, as the export has it; the request of the test is in the nominal trocar.
+    np.testing.assert_allclose(request["observation/trocar"], stubs.P_WORLD_REF[0], atol=1e-6)
 
 
 def test_refused_plans_hold_and_are_counted(tmp_path):

@@ -337,7 +337,8 @@ def test_another_policy_at_the_address_is_not_asked(batches, monkeypatch):
     [
         ({"api_key": "wrong"}, "address"),
         ({"trocar": rcm.Trocar(0.01, 80.0, 0.0)}, None),
-        ({"trocar": (0.0, 0.0, 0.15)}, "trocar"),
+        ({"trocar": (0.0, 0.15)}, "trocar"),
+        ({"trocar": (0.02, 1.57, 0.8)}, "trocar"),  # parameters where a position is meant
     ],
 )
 def test_what_cannot_be_served_is_said_at_the_start(batches, about, argument):

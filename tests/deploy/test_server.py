@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import served
 import websockets
+from scipy.spatial.transform import Rotation
 from websockets.sync import client as sockets
 
 from starjax import rcm
@@ -21,6 +22,7 @@ from starjax.runtime import connections
 from starjax.sim import registries
 
 FRAMES = 300  # bad ones
+PLACE = np.asarray(rcm.trocar_position(served.PORT, fakes.P_WORLD_REF[0]))  # m
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -73,8 +75,11 @@ def test_it_answers_what_the_policy_plans(batches, up):
     np.testing.assert_array_equal(answer["actions"][:, :3], answer["p"])
     np.testing.assert_array_equal(answer["actions"][:, -1], answer["gripper"])
     assert about["digest"] == policy.digest and about["policy"] == "tiny"
+    xyzw = Rotation.from_matrix(answer["R"]).as_quat()
+    np.testing.assert_allclose(answer["actions"][:, 3:7], xyzw, atol=1e-6)
+    request = asked(batches) | {"trocar": PLACE}
     for name, said in about["inputs"].items():
-        array = asked(batches)[name]
+        array = request[name]
         assert list(array.shape) == said["shape"] and array.dtype == said["dtype"], name
 
 
@@ -99,6 +104,23 @@ def test_clients_that_share_a_call_get_their_own_plans_and_mistakes(batches):
     assert np.abs(alone[0]["p"] - alone[1]["p"]).max() > 1e-3
     # Of 1, 2 and 3 robots, all of them compiled before.
     assert batches.sizes == [1, 2, 3] and programs == batches.policy._infer._cache_size()
+
+
+def test_a_trocar_is_a_position_in_the_world(batches, up):
+    request = asked(batches)
+    wanted = batches.infer([wire.decode_request(batches.policy.input_spec, request)])[0]["p"]
+    parameters = request.pop(wire.SPHERICAL)
+    with connect(up[0]) as connection:
+        connection.recv()
+        plan = infer(connection, request | {"trocar": PLACE})["p"]
+        np.testing.assert_allclose(plan, wanted, atol=1e-5)
+        both = {"trocar": PLACE, wire.SPHERICAL: parameters}
+        high = {"trocar": PLACE + np.float32([0, 0, 0.05])}
+        for wrong in ({"trocar": parameters}, high, {}, both, {"trocar": PLACE * np.nan}):
+            answer = infer(connection, request | wrong)
+            assert answer.startswith("trocar: ") and "\n" not in answer
+        steep = infer(connection, request | {wire.SPHERICAL: np.float32([0.04, 0.014, 0.15])})
+        assert steep.startswith("trocar: ")
 
 
 def test_a_request_without_a_key_gets_another_noise_each_time(batches, up):

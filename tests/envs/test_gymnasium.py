@@ -11,7 +11,7 @@ from gymnasium.utils import env_checker
 
 import starjax.envs
 from starjax import errors, rcm
-from starjax.envs import registration
+from starjax.envs import registration, settings, trocar_draws
 from starjax.sim import registries
 
 STEPS = 3  # of an episode, so that some end
@@ -123,7 +123,9 @@ def test_every_task_has_an_environment_also_one_of_another_package(monkeypatch):
     [
         ({"trocar": "sen"}, "trocar"),
         ({"trocar": 12}, "trocar"),
-        ({"trocar": (-1.0, 0.0, 0.0)}, "trocar"),
+        ({"trocar": (0.03, np.pi / 2, 0.4)}, "trocar"),  # parameters where a position is meant
+        ({"trocar": (0.0, 0.15)}, "trocar"),
+        ({"trocar": rcm.Trocar(0.2, 1.5, 0.0)}, "trocar"),
         ({"trocar": rcm.Trocar([0.0] * 3, [1.0] * 3, [0.0] * 3)}, "trocar"),
         ({"action_space": "rcm5"}, "action_space"),
         ({"reward": "big"}, "reward"),
@@ -138,6 +140,19 @@ def test_a_mistake_names_its_argument(wrong, argument):
     with pytest.raises(errors.UsageError) as raised:
         gymnasium.make_vec("starjax/Reach-v0", **wrong)
     assert raised.value.argument == argument
+
+
+def test_a_trocar_is_a_position_or_parameters():
+    task = registries.tasks.get("reach")
+    one = rcm.Trocar(0.03, 1.4, 0.4)
+    place = rcm.trocar_position(one, np.float32(task.slots[0].p_world_ref))
+    draws = [
+        trocar_draws.make(task, settings.make(trocar=chosen).trocar)(None)
+        for chosen in (one, tuple(np.asarray(place).tolist()))
+    ]
+    for first, second in zip(*draws, strict=True):
+        assert first.shape == (1,)
+        np.testing.assert_allclose(first, second, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ import numpy as np
 
 KEY = "of a test"
 ANGLE = 0.3  # rad, of the tool's roll
+TROCAR = [0.0, 0.0, 0.15]  # m, the nominal one
 
 
 def asked(image_size):
@@ -27,7 +28,7 @@ def asked(image_size):
         "R": np.stack([R, R]),
         "p": np.full((2, 3), [0.0, 0.0, 0.08]),
         "gripper": np.ones(2),
-        "trocar": np.array([0.0, np.pi / 2, 0.0]),
+        "trocar": np.array(TROCAR),
         "image": rng.integers(0, 256, (2, image_size, image_size, 3), np.uint8),
         "key": np.array([0, 7], np.uint32),
     }
@@ -95,7 +96,9 @@ def compare(said):
     given = asked(policy.settings.image_size)
     pose = deploy.Pose(given["R"], given["p"])
     seen = deploy.Observation(pose=pose, gripper=given["gripper"], image=given["image"])
-    command = policy(jax.numpy.asarray(given["key"]), seen, rcm.Trocar(*given["trocar"]))
+    command = policy(
+        jax.numpy.asarray(given["key"]), seen, rcm.trocar_from_position(TROCAR, TROCAR)
+    )
     actions = np.array(said["actions"])
     tips = 1e3 * np.abs(actions[:, :3] - np.asarray(command.pose.p)).max()
     steps = np.abs(np.array(said["steps"][:-1]) - actions[: len(said["steps"]) - 1]).max()

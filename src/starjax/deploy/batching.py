@@ -13,6 +13,7 @@ from starjax.deploy import inputs, wire
 from starjax.deploy.policy import Deployed
 from starjax.errors import UsageError
 from starjax.rcm import arrays
+from starjax.sim import trocar_region
 
 _DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 _DEPTH = 0.07  # m, of the tool that the programs are compiled with
@@ -79,9 +80,14 @@ class Batches:
 
 
 def example(spec: inputs.InputSpec) -> wire.Request:
-    """Returns a request of tools at rest in the nominal trocars, straight down."""
-    trocar = rcm.Trocar(*(np.full(spec.arms, x, np.float32) for x in (0.0, np.pi / 2, 0.0)))
-    pose = rcm.pose_on_manifold(_DOWN, 0.0, _DEPTH, spec.p_world_ref)
+    """Returns a request of tools at rest in trocars near the nominal ones, straight down."""
+    place = np.array(spec.p_world_ref, np.float32)
+    for arm, region in enumerate(spec.regions):
+        # Several arms' trocars never lie at the nominal one.
+        place.reshape(-1, 3)[arm] += trocar_region.clipped(region, np.zeros(3))
+    trocar = rcm.trocar_from_position(place, spec.p_world_ref)
+    trocar = rcm.Trocar(*(np.asarray(field) for field in trocar))
+    pose = rcm.pose_on_manifold(_DOWN, 0.0, _DEPTH, place)
     repeated: list[Any] = [np.broadcast_to(x, (spec.moments, *np.shape(x))) for x in pose]
     size = (spec.moments, spec.image_size, spec.image_size, 3)
     images = {name: np.zeros(size, np.uint8) for name in spec.cameras}

@@ -15,7 +15,7 @@ import numpy as np
 from starjax import rcm
 from starjax.deploy import greeting, wire
 from starjax.deploy.connection import Connection
-from starjax.deploy.inputs import RobotObservation
+from starjax.deploy.inputs import InputSpec, RobotObservation, check_trocar
 from starjax.deploy.plan_executor import LIMITS, Limits, PlanExecutor, Report
 from starjax.errors import UsageError
 from starjax.monitor import calibrate
@@ -63,7 +63,7 @@ class Client:
     def __init__(
         self,
         address: str,
-        trocar: rcm.Trocar,
+        trocar: Any,
         *,
         key: jax.Array | None = None,
         api_key: str = "",
@@ -78,7 +78,8 @@ class Client:
 
         Args:
           address: `HOST:PORT`, optionally with `ws://` or `wss://` in front.
-          trocar: measured trocars, fields `[*arms]`.
+          trocar: measured trocars: positions `[*arms, 3]` m in the world, or their parameters,
+            fields `[*arms]`.
           key: random key of all inferences; None: the server draws them.
           api_key: of the server.
           ahead: control steps between a request and the end of the present plan; None: the largest
@@ -91,7 +92,7 @@ class Client:
 
         Raises:
           UsageError: there is no server, it refuses the key, its policy does not keep to the RCM
-            manifold, or the trocar is invalid.
+            manifold, or the trocar is invalid or outside the workspace of the policy's task.
         """
         self._connection = connect(address, api_key, timeout_s, wait_s)
         try:
@@ -102,7 +103,7 @@ class Client:
                 got = f"one of method {self.metadata.get('method')}"
                 raise UsageError("address", expected, got)
             self.control_hz, horizon, execute = _read_timing(self.metadata)
-            self._trocar = _trocar(trocar, spec.arms)
+            self._trocar = _trocar(trocar, spec)
             p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)
             self.p_world_trocar = np.asarray(p_world_trocar, np.float32)
             self._watch = _watch(self.metadata) if is_watched else None
@@ -234,11 +235,19 @@ def _read_timing(metadata: dict[str, Any]) -> tuple[float, int, int]:
     return CONTROL_HZ, horizon, execute
 
 
-def _trocar(trocar: rcm.Trocar, arms: tuple[int, ...]) -> rcm.Trocar:
+def _trocar(trocar: Any, spec: InputSpec) -> rcm.Trocar:
+    """Returns trocars of all arms, given as parameters or as positions `[*arms, 3]` m."""
+    arms = spec.arms
     if not isinstance(trocar, rcm.Trocar):
-        raise UsageError("trocar", "an rcm.Trocar", type(trocar).__name__)
+        place = np.asarray(trocar)
+        if place.dtype.kind not in "fiu" or place.shape != (*arms, 3):
+            expected = f"an rcm.Trocar or positions {[*arms, 3]} in m"
+            raise UsageError("trocar", expected, f"{type(trocar).__name__} {list(place.shape)}")
+        trocar = rcm.trocar_from_position(np.asarray(place, np.float32), spec.p_world_ref)
     trocar = rcm.check_trocar(rcm.Trocar(*(np.asarray(x, np.float32) for x in trocar)))
     shapes = [np.shape(x) for x in trocar]
     if np.broadcast_shapes(*shapes) not in {(), arms}:
         raise UsageError("trocar", f"fields of shape {list(arms)}", shapes)
-    return rcm.Trocar(*(np.broadcast_to(x, arms) for x in trocar))
+    trocar = rcm.Trocar(*(np.broadcast_to(x, arms) for x in trocar))
+    check_trocar(spec, trocar)
+    return trocar

@@ -15,6 +15,7 @@ from jax import core
 
 from starjax import rcm, types
 from starjax.errors import UsageError
+from starjax.sim import trocar_region
 from starjax.types import Pose
 
 FARTHEST = 0.5  # m, from the nominal trocar to a trocar or a tip: beyond, the unit is mm
@@ -56,6 +57,7 @@ class InputSpec(NamedTuple):
       image_size: height and width in pixels.
       cameras: names of the observed cameras; empty if the policy observes the state.
       state_size: S.
+      regions: of each arm's trocar, see `trocar_region`; empty: any trocar.
     """
 
     moments: int
@@ -65,6 +67,7 @@ class InputSpec(NamedTuple):
     image_size: int
     cameras: tuple[str, ...]
     state_size: int
+    regions: tuple[Any, ...] = ()
 
 
 def validate(
@@ -96,8 +99,28 @@ def validate(
     robots = _robots(spec, sensors, trocar)
     _check_shapes(spec, sensors, robots)
     trocar = rcm.Trocar(*(_broadcast(field, (*robots, *spec.arms)) for field in trocar))
+    check_trocar(spec, trocar)
     _check_values(spec, sensors, trocar, len(robots))
     return sensors, trocar
+
+
+def check_trocar(spec: InputSpec, trocar: rcm.Trocar) -> None:
+    """Raises UsageError for a trocar outside the region of the policy's task."""
+    if spec.regions and not any(map(is_traced, trocar)):
+        reference = np.reshape(spec.p_world_ref, (-1, 3))
+        shape = np.shape(trocar.radius)
+        arms = (*shape[: len(shape) - len(spec.arms)], len(reference))
+        fields = (np.asarray(field).reshape(arms) for field in trocar)
+        places = trocar_position(rcm.Trocar(*fields), reference)
+        trocar_region.check(spec.regions, reference, places)
+
+
+def trocar_position(trocar: rcm.Trocar, p_world_ref: Any) -> np.ndarray:
+    """Returns trocars `[*robots, *arms, 3]` m on the host, as `rcm.trocar_position`."""
+    radius, polar, azimuth = (np.asarray(field, np.float64) for field in trocar)
+    across = radius * np.sin(polar)
+    offset = [across * np.cos(azimuth), across * np.sin(azimuth), radius * np.cos(polar)]
+    return p_world_ref + np.stack(np.broadcast_arrays(*offset), -1)
 
 
 def image_of(observation: RobotObservation, camera: str) -> Any:

@@ -2,6 +2,7 @@
 
 A row has, for each arm, the tip's x y z in m, its quaternion x y z w and the gripper's opening,
 -1 closed to 1 open, all in the world frame: the columns of `starjax export --format lerobot`.
+`observation/trocar` is the trocar's x y z in m, in the same frame.
 """
 
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starjax import rcm
-from starjax.deploy.inputs import InputSpec, RobotObservation, image_of
+from starjax.deploy.inputs import InputSpec, RobotObservation, image_of, trocar_position
 from starjax.errors import UsageError
 from starjax.types import Command, Pose
 
@@ -28,7 +29,7 @@ def encode(
     row = np.concatenate([p, xyzw, gripper[..., None]], -1).astype(np.float32)
     request = {
         "observation/state": row.reshape(-1),
-        "observation/trocar": np.stack(trocar, -1).astype(np.float32).reshape(-1),
+        "observation/trocar": trocar_position(trocar, spec.p_world_ref).astype(np.float32).ravel(),
         "prompt": prompt,
     }
     for name in spec.cameras:

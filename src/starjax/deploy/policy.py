@@ -23,7 +23,7 @@ from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import files
-from starjax.sim import registries
+from starjax.sim import registries, trocar_region
 from starjax.sim.names import SceneNames
 from starjax.types import Command, Pose
 
@@ -94,11 +94,12 @@ class Deployed:
 
         Raises:
           UsageError: an input is missing, has the wrong shape or type, is not finite or cannot have
-            been measured: `R` is not a rotation, or the tip or the trocar is farther than
-            `FARTHEST` from the nominal trocar. For a policy on the RCM manifold also if the tool's
-            axis passes the trocar by more than `FARTHEST_OFF`, or the tip is not beyond it. Also if
-            the plan begins farther than `max_first_move` or `max_first_turn` from the measured
-            pose. Inside `jit` only shapes and types are checked.
+            been measured: `R` is not a rotation, the tip is farther than `FARTHEST` from the
+            nominal trocar, or the trocar farther than `trocar_region.OUTSIDE` from the task's
+            workspace. For a policy on the RCM manifold also if the tool's axis passes the trocar by
+            more than `FARTHEST_OFF`, or the tip is not beyond it. Also if the plan begins farther
+            than `max_first_move` or `max_first_turn` from the tool. Inside `jit` only shapes and
+            types are checked.
         """
         _check_key(key)
         sensors, trocar = inputs.validate(self.input_spec, observation, trocar)
@@ -219,6 +220,7 @@ def load(
         image_size=settings.image_size,
         cameras=trained.scene.cameras if settings.observation == "image" else (),
         state_size=task.state_size,
+        regions=trocar_region.of_task(task),
     )
     approach_space = row.action_space if row.keeps_to_manifold else None
     infer = _inference(made.sample, trained, p_world_ref, not arms, approach_space)

@@ -16,17 +16,19 @@ from scipy.spatial.transform import Rotation
 from starjax import rcm
 from starjax.deploy.inputs import InputSpec, RobotObservation, image_of
 from starjax.errors import UsageError
+from starjax.sim import trocar_region
 from starjax.types import Command, Pose
 
-PROTOCOL = 1
+PROTOCOL = 2
 _TYPES = ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")
 _MAX_AXES = 8
 # Errors of msgpack and numpy for malformed bytes.
 _BAD = (ValueError, TypeError, OverflowError, RecursionError, msgpack.exceptions.UnpackException)
 _ARRAY, _SCALAR = b"__ndarray__", b"__npgeneric__"
 _OVERHEAD = 1 << 14  # bytes of a request beyond its arrays, generously
+SPHERICAL = "trocar_spherical"  # name of a trocar's parameters, `trocar` is its position
 # Columns of `actions` in a reply, per arm.
-ACTION = ("p.x m", "p.y m", "p.z m", "q.w", "q.x", "q.y", "q.z", "gripper")
+ACTION = ("p.x m", "p.y m", "p.z m", "q.x", "q.y", "q.z", "q.w", "gripper")
 
 
 class ArraySpec(NamedTuple):
@@ -66,7 +68,13 @@ def request_arrays(spec: InputSpec, key_size: int = 2) -> dict[str, ArraySpec]:
         "R": ArraySpec((*moments, 3, 3), "float32", "measured rotations R_world_tip"),
         "p": ArraySpec((*moments, 3), "float32", "measured tips in the world, m"),
         "gripper": ArraySpec(moments, "float32", "openings of the jaws, -1 closed to 1 open"),
-        "trocar": ArraySpec((*spec.arms, 3), "float32", "radius m, polar rad, azimuth rad"),
+        "trocar": ArraySpec((*spec.arms, 3), "float32", "x y z in the world, m", True),
+        SPHERICAL: ArraySpec(
+            (*spec.arms, 3),
+            "float32",
+            "instead: radius m, polar rad, azimuth rad about the nominal trocar",
+            True,
+        ),
         "key": ArraySpec((key_size,), "uint32", "of the decision's noise", is_optional=True),
     }
     for name in spec.cameras:
@@ -126,7 +134,7 @@ def encode_request(
         "R": np.asarray(observation.pose.R, np.float32),
         "p": np.asarray(observation.pose.p, np.float32),
         "gripper": np.asarray(observation.gripper, np.float32),
-        "trocar": np.stack([np.asarray(field, np.float32) for field in trocar], -1),
+        SPHERICAL: np.stack([np.asarray(field, np.float32) for field in trocar], -1),
     }
     for name in spec.cameras:
         arrays[image_field(spec, name)] = np.asarray(image_of(observation, name))
@@ -154,8 +162,24 @@ def decode_request(spec: InputSpec, value: Any, key_size: int = 2) -> Request:
         images={name: arrays[image_field(spec, name)] for name in spec.cameras} or None,
         state=arrays.get("state"),
     )
-    trocar = rcm.Trocar(*np.moveaxis(arrays["trocar"], -1, 0))
+    trocar = _trocar(spec, arrays["trocar"], arrays[SPHERICAL])
     return Request(observation, trocar, arrays["key"])
+
+
+def _trocar(spec: InputSpec, place: Any, parameters: Any) -> rcm.Trocar:
+    """Returns the parameters of a request's trocar, given as position or as parameters."""
+    if (place is None) == (parameters is None):
+        got = "neither" if place is None else "both"
+        raise UsageError("trocar", f"x, y, z in m, or {SPHERICAL}", got)
+    if parameters is not None:
+        return rcm.Trocar(*np.moveaxis(parameters, -1, 0))
+    if not np.isfinite(place).all():
+        raise UsageError("trocar", "finite values", "NaN or inf")
+    if spec.regions:  # before the conversion, so the error has the client's numbers
+        reference = np.reshape(spec.p_world_ref, (-1, 3))
+        trocar_region.check(spec.regions, reference, np.reshape(place, reference.shape))
+    trocar = rcm.trocar_from_position(place, spec.p_world_ref)
+    return rcm.Trocar(*(np.asarray(field) for field in trocar))
 
 
 def encode_reply(command: Command, infer_ms: float) -> dict[str, Any]:
@@ -164,8 +188,8 @@ def encode_reply(command: Command, infer_ms: float) -> dict[str, Any]:
     Every array begins with H. `actions` `[H, A * 8]` has the columns of `ACTION` for each arm.
     """
     R, p, gripper = command.pose.R, command.pose.p, command.gripper
-    wxyz = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(scalar_first=True)
-    parts = [p, wxyz.reshape(*R.shape[:-2], 4), gripper[..., None]]
+    xyzw = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
+    parts = [p, xyzw.reshape(*R.shape[:-2], 4), gripper[..., None]]
     actions = np.concatenate(parts, axis=-1).astype(np.float32).reshape(len(gripper), -1)
     arrays = {"actions": actions, "R": R, "p": p, "gripper": gripper}
     return {**arrays, "server_timing": {"infer_ms": infer_ms}}

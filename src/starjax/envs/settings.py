@@ -13,6 +13,7 @@ REWARDS = ("dense", "sparse")
 OBSERVATIONS = ("state", "image")
 TROCARS = ("seen", "unseen", "all", "random")
 Row = tuple[float, ...]
+Chosen = str | int | rcm.Trocar | tuple[Row, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,8 +26,8 @@ class EnvSettings:
         for all slots, or none for the task's defaults.
       trocar: true trocars. `seen`, `unseen`, `all`: every episode draws one of the task's
         configurations; `random`: uniformly in the workspace's ranges (Eq. 19); a whole number:
-        that configuration of the task; a `rcm.Trocar` or (radius m, polar rad, azimuth rad),
-        fields `[]` or `[A]`: this one.
+        that configuration of the task; a position (x, y, z) in m, `[3]` or `[A, 3]`, or a
+        `rcm.Trocar` with fields `[]` or `[A]`: this one.
       action_space: key of `rcm.ACTION_SPACES`.
       control: actions `relative` to the measured pose, or `absolute`, see `mdp`.
       reward: `dense` or `sparse`, see `mdp`.
@@ -40,7 +41,7 @@ class EnvSettings:
     task: str = DEFAULT_TASK
     arms: tuple[str, ...] = ()
     tools: tuple[str, ...] = ()
-    trocar: str | int | tuple[Row, Row, Row] = "seen"
+    trocar: Chosen = "seen"
     action_space: str = "rcm4"
     control: str = "relative"
     reward: str = "dense"
@@ -76,17 +77,21 @@ def make(**arguments: Any) -> EnvSettings:
     return settings
 
 
-def _trocar(choice: Any) -> str | int | tuple[Row, Row, Row]:
+def _trocar(choice: Any) -> Chosen:
+    """Returns a hashable choice: parameters as a Trocar of tuples, positions as rows."""
     if isinstance(choice, str):
         errors.choice("trocar", choice, TROCARS)
         return choice
     if isinstance(choice, int | np.integer):
         return int(choice)
     try:
-        fields = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in choice))
-        radius, polar, azimuth = (tuple(field.tolist()) for field in fields)
-        rcm.check_trocar(rcm.Trocar(radius, polar, azimuth))
+        if isinstance(choice, rcm.Trocar):
+            rows = np.broadcast_arrays(*(np.atleast_1d(np.asarray(x, float)) for x in choice))
+            return rcm.check_trocar(rcm.Trocar(*(tuple(row.tolist()) for row in rows)))
+        places = np.atleast_2d(np.asarray(choice, float))
+        if places.ndim != 2 or places.shape[1] != 3:
+            raise ValueError(f"positions of shape {list(places.shape)}")
+        return tuple(tuple(row) for row in places.tolist())
     except (TypeError, ValueError) as error:
-        expected = f"{', '.join(TROCARS)}, a number, or (radius m, polar rad, azimuth rad)"
+        expected = f"{', '.join(TROCARS)}, a number, (x, y, z) in m, or an rcm.Trocar"
         raise errors.UsageError("trocar", expected, repr(choice), str(error)) from error
-    return radius, polar, azimuth

@@ -1,31 +1,33 @@
 """Draws of an episode's trocars, as chosen by `EnvSettings.trocar`."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from starjax import errors, rcm
-from starjax.sim import sampling
+from starjax.sim import sampling, trocar_region
 from starjax.sim.tasks.base import Task
 
 Draw = Callable[[jax.Array], rcm.Trocar]
 
 
-def make(task: Task, trocar: str | int | tuple) -> Draw:
+def make(task: Task, trocar: Any) -> Draw:
     """Makes key -> trocars, fields `[A]`.
 
+    Args:
+      trocar: see `EnvSettings.trocar`.
+
     Raises:
-      errors.UsageError: the task has no configuration of that number, or not so many arms.
+      errors.UsageError: the task has no configuration of that number, or not so many arms, or a
+        trocar is outside its workspace.
     """
     if trocar == "random":
         return lambda key: sampling.sample_trocars(key, task)
     if isinstance(trocar, tuple):
-        fields = [np.asarray(field, np.float32) for field in trocar]
-        if fields[0].shape not in ((1,), (task.arms,)):
-            raise errors.UsageError("trocar", f"fields of {task.arms}", f"{len(fields[0])}")
-        fixed = rcm.Trocar(*(np.broadcast_to(field, (task.arms,)) for field in fields))
+        fixed = _fixed(task, trocar)
         return lambda key: jax.tree.map(jnp.asarray, fixed)
     if isinstance(trocar, int):
         if not 0 <= trocar < len(task.is_seen):
@@ -33,6 +35,24 @@ def make(task: Task, trocar: str | int | tuple) -> Draw:
         return _listed(task, np.array([trocar]))
     rows = {"seen": task.is_seen, "unseen": ~task.is_seen, "all": np.ones_like(task.is_seen)}
     return _listed(task, np.flatnonzero(rows[trocar]))
+
+
+def _fixed(task: Task, trocar: Any) -> rcm.Trocar:
+    """Returns a trocar given by parameters or positions, fields `[A]`."""
+    reference = np.array([slot.p_world_ref for slot in task.slots], np.float32)
+    is_parameters = isinstance(trocar, rcm.Trocar)
+    rows = [np.asarray(row, np.float32) for row in trocar]
+    count = len(rows[0]) if is_parameters else len(rows)
+    if count not in (1, task.arms):
+        raise errors.UsageError("trocar", f"those of {task.arms} arms", count)
+    if is_parameters:
+        fixed = rcm.Trocar(*(np.broadcast_to(row, (task.arms,)) for row in rows))
+    else:
+        places = np.broadcast_to(np.stack(rows), reference.shape)
+        fixed = rcm.Trocar(*map(np.asarray, rcm.trocar_from_position(places, reference)))
+    places = rcm.trocar_position(fixed, reference)
+    trocar_region.check(trocar_region.of_task(task), reference, places)
+    return fixed
 
 
 def _listed(task: Task, rows: np.ndarray) -> Draw:

@@ -3,12 +3,9 @@
 import time
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from starjax import rcm
-from starjax.sim import registries
+from starjax.sim import registries, trocar_region
 from starjax.sim.tasks.base import Slot, Task
 
 _SCALE = 0.055  # m, length of the arrows
@@ -59,21 +56,7 @@ class TrocarHandles:
 def within(slot: Slot, p_world_trocar: np.ndarray) -> np.ndarray:
     """Returns the position `[3]` m with radius and angles clipped to the slot's workspace."""
     space = registries.workspaces.get(slot.workspace)
-    ranges = np.array([space.radius, space.polar, space.azimuth], np.float32)
-    return np.asarray(_clipped(p_world_trocar, np.array(slot.p_world_ref, np.float32), ranges))
-
-
-@jax.jit
-def _clipped(p: jax.Array, p_world_ref: jax.Array, ranges: jax.Array) -> jax.Array:
-    trocar = rcm.trocar_from_position(p, p_world_ref)
-    low, high = ranges[2]
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    off = trocar.azimuth - middle
-    # The nearest equivalent angle: azimuths wrap around.
-    off = off - 2.0 * jnp.pi * jnp.round(off / (2.0 * jnp.pi))
-    clipped = rcm.Trocar(
-        jnp.clip(trocar.radius, *ranges[0]),
-        jnp.clip(trocar.polar, *ranges[1]),
-        middle + jnp.clip(off, -half, half),
-    )
-    return rcm.trocar_position(clipped, p_world_ref)
+    reference = np.array(slot.p_world_ref, np.float32)
+    region = (space.radius, space.polar, space.azimuth)
+    clipped = trocar_region.clipped(region, np.asarray(p_world_trocar) - reference)
+    return (reference + clipped).astype(np.float32)
