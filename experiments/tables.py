@@ -5,7 +5,8 @@
 
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
 claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list of claims);
-`presets` (from their values); or of benchmarks/results: `speed`, `learners`, `experts`,
+`presets` (from their values); `leaderboard`, `leaderboard_apart` and `elsewhere` (the trocar
+benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
 `six_blocks`, `scenes`, `stress_compact`, `stress_randomised`, `proposition`, `ppo`, `ppo_gpu`,
 `sb3`, `through_lerobot`.
 """
@@ -20,6 +21,7 @@ ROOT = HERE.parent
 sys.path[:0] = [str(HERE), str(ROOT / "benchmarks")]
 
 import claims  # noqa: E402
+import leaderboard_page  # noqa: E402
 import newest  # noqa: E402
 import preset_table  # noqa: E402
 
@@ -37,6 +39,8 @@ def table(name: str) -> str:
         return claims.index([claims.load(folder) for folder in claims.folders()])
     if name == "presets":
         return preset_table.table()
+    if name in leaderboard_page.TABLES:
+        return leaderboard_page.TABLES[name]()
     if name == "speed":
         return newest.table()
     if (HERE.parent / "benchmarks" / f"{name}.toml").exists():

@@ -52,6 +52,11 @@ _TABLE: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "draw tables, figures, video and page from results",
         ("sim", "report"),
     ),
+    "leaderboard": (
+        "commands.leaderboard",
+        "tabulate results by the trocar benchmark",
+        ("sim", "train"),
+    ),
     "view": ("commands.view", "show a policy, an expert or a dataset in the browser", _VIEWER),
     "teleop": ("commands.teleop", "record demonstrations by hand in the browser", _VIEWER),
     "list": (

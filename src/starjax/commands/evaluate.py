@@ -9,7 +9,15 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors, extras, methods
-from starjax.commands import messages, options, policy_args, scenes, session, stage_times
+from starjax.commands import (
+    benchmark_args,
+    messages,
+    options,
+    policy_args,
+    scenes,
+    session,
+    stage_times,
+)
 from starjax.commands.folders import is_under_way
 from starjax.runtime import files
 
@@ -22,7 +30,7 @@ RUN; their defaults depend on this machine. Rerun the same command to resume."""
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluateArgs(policy_args.PolicyArgs):
+class EvaluateArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
     """Flags of the command."""
 
     seed: config_lib.Seed = 0  # random seed of the trials
@@ -39,6 +47,7 @@ def main(argv: Sequence[str]) -> int:
     from starjax.commands import policy_evaluation
 
     who, config = policy_args.load(path)
+    args = benchmark_args.with_trials(args, "evaluate", who.env.names.task)
     started = session.start("evaluate", argv, folder)
     method, scene = who.trained.method, scenes.settings(who.env.names)
     config = dataclasses.replace(
@@ -80,8 +89,10 @@ def _parse(argv: Sequence[str], has_gpu: bool) -> tuple[EvaluateArgs, policy_arg
     args = options.parse("evaluate", EvaluateArgs, argv, DESCRIPTION, default)
     if args.video:
         extras.require("evaluate --video", "report", "video")
+    benchmark_args.check(args, default)
     path = policy_args.resolve(args)
     trials = f"seed{args.seed}-{args.eval.trials}x{args.eval.time_limit_s:g}s"
+    trials = benchmark_args.label() if args.benchmark else trials
     parts = [trials, *["ensemble"] * args.eval.ensemble]
     return args, path, path.folder("evaluate", parts, args.out)
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import messages, options, policy_args, scenes, session
-from starjax.evaluation import disturbances
+from starjax.commands import benchmark_args, messages, options, policy_args, scenes, session
+from starjax.evaluation import disturbances, protocol
 from starjax.limits import NotNegative
 from starjax.runtime import files
 
@@ -24,7 +24,7 @@ _TRIALS = config_lib.EvalConfig(trials=4, time_limit_s=30.0, video_trials=0)
 
 
 @dataclasses.dataclass(frozen=True)
-class StressArgs(policy_args.PolicyArgs):
+class StressArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
     """Flags of the command."""
 
     # disturbances to test; default: all that apply to this policy
@@ -40,17 +40,21 @@ class StressArgs(policy_args.PolicyArgs):
 def main(argv: Sequence[str]) -> int:
     """Runs the missing trials; writes stress.json, its table and its figure."""
     args = options.parse("stress", StressArgs, argv, DESCRIPTION)
+    benchmark_args.check(args, StressArgs())
     path = policy_args.resolve(args)
-    folder = path.folder("stress", [f"seed{args.seed}"], args.out)
+    trials = benchmark_args.label() if args.benchmark else f"seed{args.seed}"
+    folder = path.folder("stress", [trials], args.out)
     if args.levels and (count := len(args.disturbance)) != 1:
         raise errors.UsageError("levels", "exactly one --disturbance", count)
     names = tuple(disturbances.resolve("disturbance", args.disturbance))
     args = dataclasses.replace(args, disturbance=names)
     started = session.start("stress", argv, folder)
     who, _ = policy_args.load(path)
+    args = benchmark_args.with_trials(args, "stress", who.env.names.task)
     kinds = _kinds(args, who.trained.policy.observation)
     who = _disturbed(who, list(kinds))
     content = {
+        "benchmark_version": protocol.VERSION,
         "scene": who.env.names._asdict(),
         "method": who.trained.method,
         "weights": who.weights,

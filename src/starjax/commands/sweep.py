@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from starjax import config as config_lib
-from starjax.commands import checks, folders, messages, options, policy_args, session
+from starjax.commands import (
+    benchmark_args,
+    checks,
+    folders,
+    messages,
+    options,
+    policy_args,
+    session,
+)
 from starjax.limits import CountOrZero, Range
 from starjax.runtime import files
 
@@ -36,7 +44,7 @@ class SweepTrials:
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepArgs(policy_args.PolicyArgs):
+class SweepArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
     """Flags of the command."""
 
     trocars: Several = 200  # number of sampled trocars; unused with a grid
@@ -66,6 +74,7 @@ def main(argv: Sequence[str]) -> int:
 
     who, config = policy_args.load(path)
     task = who.env.task
+    args = benchmark_args.with_trials(args, "sweep", task.name)
     points = _trocars(args, task)
     trials = config_lib.EvalConfig(**vars(args.eval))
     table = policy_evaluation.rollouts(_trials(folder, args), who, points, trials, args.seed)
@@ -106,6 +115,7 @@ def _time_limit_s(run: Path | None) -> float:
 def _parse(argv: Sequence[str]) -> SweepArgs:
     """Returns the flags; raises UsageError for a grid that is too large or has unused flags."""
     args = options.parse("sweep", SweepArgs, argv, DESCRIPTION)
+    benchmark_args.check(args, SweepArgs(), "trocars", "radii_cm")
     count = len(args.radii_cm) * len(args.polars_deg) * args.azimuths
     checks.expect(count <= MAX_TROCARS, "azimuths", f"at most {MAX_TROCARS} grid points", count)
     is_grid, default = bool(args.radii_cm), SweepArgs()
@@ -124,8 +134,11 @@ def _folder(path: policy_args.PolicyPath) -> Path:
 def _trials(folder: Path, args: SweepArgs) -> Path:
     """Returns the directory of a sweep's trials; each sweep has its own."""
     settings = dataclasses.asdict(args)
-    # The chunks' size does not change results; file and arms are those of `folder`.
-    del settings["run"], settings["policy"], settings["arm"], settings["eval"]["chunk"]
+    # The chunks' size does not change results; file and arms are those of `folder`, and the
+    # benchmark's trials are among the rest.
+    for name in ("run", "policy", "arm", "benchmark"):
+        del settings[name]
+    del settings["eval"]["chunk"]
     digest = hashlib.sha256(json.dumps(settings).encode()).hexdigest()
     return folder / "sweep" / f"seed{args.seed}-{digest[:8]}"
 

@@ -148,6 +148,7 @@ class _Content(msgspec.Struct, kw_only=True):
     method: str
     observation: str
     control_hz: float
+    benchmark_version: int | None = None
     trials: list[_Row] | None = None
     seed: int | None = None
     time_limit_s: float | None = None

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from starjax.evaluation import structure, trial_file
+from starjax.evaluation import protocol, structure, trial_file
 from starjax.evaluation.content import Evaluation, Sweep, Trial
 from starjax.learners import LEARNERS
 from starjax.runtime import files, jax_settings, provenance, sources, xla
@@ -37,8 +37,8 @@ class Result(NamedTuple):
       weights: SHA-256 of the policy's file.
       dataset_digest: of the demonstrations that trained the policy.
       commit, dirty, version: of the code, see `provenance.Code`.
-      about: all other fields: command, preset, versions, hardware, timings_s, warnings,
-        inference_ms and so on.
+      about: all other fields: benchmark_version, command, preset, versions, hardware, timings_s,
+        warnings, inference_ms and so on.
     """
 
     schema: int
@@ -94,6 +94,7 @@ def write(
     parts = parts_of(scene, policy.get("learner", ""))
     content = {
         "schema": SCHEMA,
+        "benchmark_version": protocol.VERSION,
         "scene": scene._asdict(),
         **figures,
         **about,

@@ -43,7 +43,7 @@ def digests(*parts: Any) -> dict[str, str]:
             tasks = _closure(name for name in modules if name.startswith(_TASKS))
             files = tuple(filter(None, map(_file, sorted(tasks))))
         if files:
-            found[package] = _digest(version(package) if package != _OURS else "", files)
+            found[package] = digest(version(package) if package != _OURS else "", files)
     return found
 
 
@@ -106,7 +106,8 @@ def _files_of(package: str) -> tuple[Path, ...]:
     return tuple(sorted(path.parent.rglob("*.py"))) if path.name == "__init__.py" else (path,)
 
 
-def _digest(prefix: str, files: tuple[Path, ...]) -> str:
+def digest(prefix: str, files: Iterable[Path]) -> str:
+    """Returns the digest of a text and of the code in files, without comments and docstrings."""
     total = hashlib.sha256(prefix.encode())
     for path in files:
         total.update(f"\n{path.name}\n{_code(path.read_bytes())}".encode())

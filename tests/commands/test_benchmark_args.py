@@ -1,0 +1,57 @@
+"""--benchmark: the trials of the trocar benchmark, in place of those of the flags."""
+
+import dataclasses
+
+import mistakes
+import pytest
+
+from starjax.commands import benchmark_args, evaluate, stress, sweep
+from starjax.evaluation import protocol
+
+COMMANDS = {
+    "evaluate": evaluate.EvaluateArgs(),
+    "sweep": sweep.SweepArgs(),
+    "stress": stress.StressArgs(),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_runs_the_trials_of_the_protocol(command):
+    args = dataclasses.replace(COMMANDS[command], benchmark=True)
+    after = benchmark_args.with_trials(args, command, "reach")
+    trocars = args.trocars if command == "sweep" else protocol.TROCARS
+    trials = protocol.TrialSet(
+        "reach", after.seed, after.eval.time_limit_s, trocars, after.eval.trials
+    )
+    assert not list(protocol.departures(command, trials))
+    same = dataclasses.replace(after, benchmark=False)
+    assert benchmark_args.with_trials(same, command, "needle_pick") is same
+
+
+@pytest.mark.parametrize(
+    ("main", "typed", "argument", "got"),
+    [
+        (evaluate.main, "--eval.trials 7", "eval.trials", 7),
+        (stress.main, "--seed 2", "seed", 2),
+        (sweep.main, "--trocars 5", "trocars", 5),
+        (sweep.main, "--radii-cm 2", "radii_cm", 2.0),
+    ],
+)
+def test_other_trials_are_refused(main, typed, argument, got):
+    with mistakes.of(argument, got):
+        main(["--policy", "compact", "--benchmark", *typed.split()])
+
+
+def test_a_task_of_another_package_is_not_in_the_benchmark():
+    args = dataclasses.replace(COMMANDS["evaluate"], benchmark=True)
+    with mistakes.of("--benchmark", "knot"):
+        benchmark_args.with_trials(args, "evaluate", "knot")
+
+
+def test_a_sweep_of_the_benchmark_is_the_same_trials_as_by_its_flags(tmp_path):
+    by_flags = dataclasses.replace(COMMANDS["sweep"])
+    limit = dataclasses.replace(by_flags.eval, time_limit_s=60.0)
+    by_flags = dataclasses.replace(by_flags, eval=limit)
+    args = dataclasses.replace(COMMANDS["sweep"], benchmark=True)
+    by_name = benchmark_args.with_trials(args, "sweep", "peg_transfer")
+    assert sweep._trials(tmp_path, by_name) == sweep._trials(tmp_path, by_flags)
