@@ -10,7 +10,7 @@ import pytest
 
 from starjax import config
 from starjax.commands import demonstrations, folders, pipeline, presets
-from starjax.data import load, normalizer, windows
+from starjax.data import load, normalizer, redraw, windows
 from starjax.methods import METHODS
 from starjax.policies import generator, policy_file
 from starjax.policies import policy as policies
@@ -109,7 +109,7 @@ def test_features_are_computed_once(source, dataset, tmp_path):
 
 def test_a_killed_run_goes_on_and_damage_is_mended(source, dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(frozen, "PART", 30)
-    monkeypatch.setattr(frozen, "BATCH", 8)
+    monkeypatch.setattr(redraw, "CPU_BATCH", 8)
     whole = features(source, dataset, tmp_path)
     parts = sorted(tmp_path.glob("features/*/part_*.npz"))
     content = [part.read_bytes() for part in parts]

@@ -47,7 +47,7 @@ class DrawnImages:
     def __getitem__(self, index: Any) -> np.ndarray:
         """Draws the images at `index`, integers `[...]`, as `[..., h, w, 3]` in host memory."""
         index = np.asarray(index)
-        rows, batch = index.reshape(-1), _batch()
+        rows, batch = index.reshape(-1), batch_size()
         parts = []
         for first in range(0, len(rows), batch):
             part = rows[first : first + batch]
@@ -57,7 +57,7 @@ class DrawnImages:
 
     def read(self) -> np.ndarray:
         """Draws all images into host memory, on all cores."""
-        batch, count = _batch(), self.shape[0]
+        batch, count = batch_size(), self.shape[0]
         out = np.zeros(self.shape, self.dtype)
 
         def draw(first: int):
@@ -71,7 +71,7 @@ class DrawnImages:
 
     def on_device(self, rows: int) -> jax.Array:
         """Draws all images into the device's memory, followed by zeros up to so many rows."""
-        batch, count = _batch(), self.shape[0]
+        batch, count = batch_size(), self.shape[0]
         if count < batch or jax.default_backend() == "cpu":
             return jnp.asarray(np.pad(self.read(), ((0, rows - count), *[(0, 0)] * 3)))
         # In place: the buffer is donated. The last batch overlaps the one before it.
@@ -191,7 +191,8 @@ def _keys(seed: int, records: Sequence[Mapping[str, Any]]) -> jax.Array:
     return jax.vmap(one)(*numbers.T)
 
 
-def _batch() -> int:
+def batch_size() -> int:
+    """Returns the number of images per call on this backend."""
     return CPU_BATCH if jax.default_backend() == "cpu" else GPU_BATCH
 
 

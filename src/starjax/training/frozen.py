@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from starjax import config
+from starjax.data import redraw
 from starjax.policies import features as inputs
 from starjax.policies import generator
 from starjax.rollouts import workers
@@ -23,9 +24,6 @@ from starjax.runtime import files, progress
 from starjax.training.encoder import Encoder
 
 PART = 1024  # frames per file, lost at most by a kill
-# Frames per call, a constant because the batch size may change last bits. Larger batches would not
-# fit the cache of a CPU's core.
-BATCH = 16
 
 
 def features(
@@ -70,14 +68,15 @@ def features(
             parts[path] = part
     if missing:
         see, pictures = _make_see(encoder, policy_config), frames()
+        batch = redraw.batch_size()
 
         def make(part: tuple[Path, int, int]) -> Generator[int]:
             """Yields the number of frames of each batch."""
             path, first, last = part
             batches = []
-            for start in range(first, last, BATCH):
-                batch = read[np.minimum(np.arange(start, start + BATCH), last - 1)]
-                batches.append(np.asarray(see(pictures[batch]))[: last - start])
+            for start in range(first, last, batch):
+                index = read[np.minimum(np.arange(start, start + batch), last - 1)]
+                batches.append(np.asarray(see(pictures[index]))[: last - start])
                 yield len(batches[-1])
             parts[path] = np.concatenate(batches)
             files.write_npz(path, {"features": parts[path]})
@@ -96,7 +95,7 @@ def features(
 def _make_see(
     encoder: Encoder, policy_config: config.PolicyConfig
 ) -> Callable[[np.ndarray], jax.Array]:
-    """Makes the function from frames `[BATCH, h, w, 3]` uint8 to features `[BATCH, d_v]`."""
+    """Makes the function from frames `[B, h, w, 3]` uint8 to features `[B, d_v]`."""
     vision = generator.vision_encoder(policy_config)
 
     @jax.jit
