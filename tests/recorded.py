@@ -14,13 +14,15 @@ CAMERAS = ("camera", "wrist")
 
 
 def write(
-    root: Path, arms: int = 1, size: int = 0, demos: int = 4, length: int = 30, cameras: int = 1
+    root: Path, arms: int = 1, size: int = 0, demos: int = 4, length: int = 30, cameras: int = 1,
+    failures: bool = False,
 ) -> dict[str, Any]:
     """Writes it and returns its description.
 
     Args:
       size: pixels a side; 0 for a dataset of task states.
       demos: successful ones; two share a trocar. One more failed, and is not kept.
+      failures: the second one failed, and is kept.
     """
     made = fakes.dataset(0, demos, length, arms=arms)
     seen, given = made.observation, made.command
@@ -74,7 +76,7 @@ def write(
             "seed": 0,
             "length": length,
             **dict.fromkeys(episodes.FLAGS, False),
-            "success": is_kept,
+            "success": is_kept and not (failures and demo == 1),
             "stage": 3,
             "labels": {"source": demo},
         }

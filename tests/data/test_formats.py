@@ -52,7 +52,7 @@ def restore(path, root, **given):
         return exchange.restore_export(source, root, **given)
 
 
-@pytest.mark.parametrize("name", base.FORMATS.names())
+@pytest.mark.parametrize("name", base.writable())
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_export_comes_back_to_the_last_byte(roots, exported, tmp_path, kind, name):
     found = restore(exported(kind, name), tmp_path / "back")
@@ -172,11 +172,11 @@ def test_the_card_has_a_header_and_every_feature(exported):
 
 
 def test_files_of_lerobot_are_split_by_size(roots, tmp_path, monkeypatch):
-    from starjax.data.formats import lerobot_write
+    from starjax.data.formats import lerobot_tables, lerobot_write
 
     monkeypatch.setattr(lerobot_write, "DATA_MB", 0)
     monkeypatch.setattr(lerobot_write, "VIDEO_MB", 0)
-    monkeypatch.setattr(lerobot_write, "CHUNK", 3)
+    monkeypatch.setattr(lerobot_tables, "CHUNK", 3)
     form = base.FORMATS.get("lerobot")
     exchange.export(exchange.source(roots / "images", form), tmp_path / "out", form, True)
     assert (tmp_path / "out/data/chunk-001/file-000.parquet").exists()
@@ -236,7 +236,7 @@ def test_a_stopped_import_goes_on(exported, roots, tmp_path):
     assert kill.tree(tmp_path / "back") == kill.tree(roots / "state")
 
 
-@pytest.mark.parametrize("name", base.FORMATS.names())
+@pytest.mark.parametrize("name", base.writable())
 def test_a_stopped_export_leaves_nothing(roots, tmp_path, name):
     form = base.FORMATS.get(name)
     done = []
@@ -312,3 +312,40 @@ def test_every_field_of_a_demonstration_has_a_column(roots):
     named = source.origin["columns"]
     assert named.keys() >= {"p", "R", "qpos", f"{episodes.IMAGE}wrist"}
     assert set(named.values()) <= set(source.columns)
+
+
+def test_version_2_1_has_a_file_an_episode_and_its_modality(roots, exported):
+    path = exported("two_arms", "lerobot-v2.1")
+    info = json.loads((path / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v2.1" and info["total_chunks"] == 1
+    lines = (path / "meta/episodes_stats.jsonl").read_text().splitlines()
+    assert len(lines) == info["total_episodes"] == len(list(path.glob("data/*/*.parquet")))
+    assert json.loads(lines[1])["stats"]["observation.state"]["count"] == [30]
+    table = pyarrow.parquet.read_table(path / "data/chunk-000/episode_000001.parquet")
+    assert table["instruction.text"].unique().to_pylist() == ["peg transfer"]
+    modality = json.loads((path / "meta/modality.json").read_text())
+    source = exchange.source(roots / "two_arms", base.FORMATS.get("lerobot-v2.1"))
+    names = source.columns["observation.state"].names
+    for kind, parts in (("state", "observation.state"), ("action", "action")):
+        span = modality[kind]["arm1_gripper"]
+        assert span["original_key"] == parts and names[span["start"]] == "arm1_gripper"
+    assert modality["state"]["arm1_trocar"] == {
+        "start": 3,
+        "end": 6,
+        "original_key": "observation.trocar",
+    }
+
+
+@pytest.mark.parametrize("name", base.writable())
+def test_failures_come_last_and_are_restored_in_their_order(tmp_path, name):
+    recorded.write(tmp_path / "d", failures=True)
+    form = base.FORMATS.get(name)
+    source = exchange.source(tmp_path / "d", form)
+    assert source.splits == {"train": range(3), "failure": range(3, 4)}
+    out = tmp_path / f"out{SUFFIX.get(name, '')}"
+    exchange.export(source, out, form)
+    if "lerobot" in name:
+        splits = json.loads((out / "meta/info.json").read_text())["splits"]
+        assert splits == {"train": "0:3", "failure": "3:4"}
+    assert restore(out, tmp_path / "back")["same"]
+    assert kill.tree(tmp_path / "back") == kill.tree(tmp_path / "d")

@@ -42,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     xla.prepare_xla()
     from starjax.data.formats import base, exchange
 
-    errors.choice("format", args.format, base.FORMATS.names())
+    errors.choice("format", args.format, base.writable())
     form, root = base.FORMATS.get(args.format), Path(args.dataset)
     try:
         source = exchange.source(root, form, args.image_size)

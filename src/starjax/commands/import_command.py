@@ -15,8 +15,9 @@ from starjax.runtime import progress, xla
 _SHOWN = 10  # anomalies, the others are in a file
 DESCRIPTION = """Imports demonstrations in another format as a dataset to train on.
 
-PATH is a LeRobot or zarr directory or an HDF5 file, OUT the new dataset. An export of starjax is
-restored exactly. For other datasets, a mapping file describes the columns."""
+PATH is a dataset in one of the formats of starjax list, OUT the new dataset. An export of starjax
+is restored exactly. For other datasets, a mapping describes the columns: a file, or one of the
+package (starjax list), by default the one that fits."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +26,11 @@ class ImportArgs:
 
     path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]  # dataset to import
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]  # new dataset
-    map: str = ""  # mapping file, .toml or .json; only exports of starjax need none
+    map: str = ""  # mapping file, .toml or .json, or a name; empty: the one that fits
+    skip: tuple[int, ...] = ()  # episodes to leave out, by their numbers in the files
+    splits: tuple[str, ...] = ()  # splits to import, e.g. train recovery; empty: all
     accept: bool = False  # exit code 0 in spite of notes
-    format: str = options.AUTO  # format: lerobot, robomimic or zarr; auto: detected
+    format: str = options.AUTO  # format, see starjax list; auto: detected
 
 
 def main(argv: Sequence[str]) -> int:
@@ -44,18 +47,14 @@ def main(argv: Sequence[str]) -> int:
         errors.choice("format", args.format, base.FORMATS.names())
     name = base.detect(path) if args.format == options.AUTO else args.format
     with base.open_dataset(path, name) as source:
-        if not args.map:
-            return _bring_back(source, path, out)
-        return _mapped(source, Path(args.map), out, args.accept)
+        if source.origin is not None and not args.map:
+            return _bring_back(source, out)
+        return _mapped(source, args, out)
 
 
-def _bring_back(source: Any, path: Path, out: Path) -> int:
+def _bring_back(source: Any, out: Path) -> int:
     from starjax.data.formats import exchange
 
-    if source.origin is None:
-        raise errors.UsageError(
-            "PATH", "an export of starjax, or a --map", path, "starjax inspect shows its columns"
-        )
     with progress.track("Import", len(source.lengths), unit="episodes") as advance:
         restored = exchange.restore_export(source, out, advance)
     same = "every byte as it was" if restored["same"] else "images or an earlier schema changed"
@@ -63,23 +62,31 @@ def _bring_back(source: Any, path: Path, out: Path) -> int:
     return 0
 
 
-def _mapped(source: Any, map_path: Path, out: Path, accept: bool) -> int:
-    from starjax.data import schema
-    from starjax.data.formats import foreign, mapping
+def _mapped(source: Any, args: ImportArgs, out: Path) -> int:
+    from msgspec import structs
 
+    from starjax.data import schema
+    from starjax.data.formats import foreign, mapping, ready
+
+    name = args.map or ready.choose(source)
+    map_path = ready.find(name)
     columns = mapping.load(map_path)
+    given = {"skip": args.skip, "splits": args.splits}
+    columns = structs.replace(columns, **{key: value for key, value in given.items() if value})
+    if map_path.parent == ready.FOLDER:
+        print(f"mapping {name}: {columns.about}")
     with progress.track("Import", 2 * len(source.lengths), unit="episodes read") as advance:
         imported = foreign.import_mapped(source, columns, out, map_path.parent, advance)
-    for line in imported.notes[:_SHOWN]:
+    for line in [*source.notes, *imported.notes][:_SHOWN]:
         messages.indented(line)
-    if len(imported.notes) > _SHOWN:
-        messages.indented(f"and {len(imported.notes) - _SHOWN} more, see {out / schema.IMPORTED}")
+    if (more := len(source.notes) + len(imported.notes) - _SHOWN) > 0:
+        messages.indented(f"and {more} more, see {out / schema.IMPORTED}")
     worst = f"{imported.residual_mm.max():.2g} mm or less (root mean square)"
     counts = f"{imported.episodes} demonstrations, {imported.frames} frames"
     print(f"{out}: {counts}, {imported.left_out} left out")
     print(f"shafts pass their trocars at {worst}")
     print(f"starjax train --demos.from {shlex.quote(str(out))} --task {columns.task} trains on it")
-    if imported.notes and not accept:
+    if imported.notes and not args.accept:
         print(f"{len(imported.notes)} notes: exit code 1 unless --accept")
         return 1
     return 0

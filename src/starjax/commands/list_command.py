@@ -35,6 +35,7 @@ def main(argv: Sequence[str]) -> int:
         "methods (--method)": _methods(),
         "learners (--policy.learner)": _parts(LEARNERS, _learner),
         "formats (export --format, import)": _parts(base.FORMATS, _format),
+        "mappings (import --map)": _mappings(),
         "disturbances (stress, --demos.randomise)": _parts(DISTURBANCES, _disturbance),
         "presets (--preset)": _presets(),
         "policies (--policy, --policy.encoder-weights)": _policies(),
@@ -86,6 +87,13 @@ def _learner(learner: Any) -> str:
 
 def _format(form: Any) -> str:
     return form.description
+
+
+def _mappings() -> Iterator[Row]:
+    from starjax.data.formats import mapping, ready
+
+    for name in ready.names():
+        yield name, mapping.load(ready.find(name)).about
 
 
 def _disturbance(disturbance: Any) -> str:

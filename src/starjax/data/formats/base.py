@@ -17,6 +17,7 @@ FORMATS = Registry(
     "format",
     {
         "lerobot": "starjax.data.formats.lerobot:FORMAT",
+        "lerobot-v2.1": "starjax.data.formats.lerobot_v21:FORMAT",
         "robomimic": "starjax.data.formats.robomimic:FORMAT",
         "zarr": "starjax.data.formats.zarr:FORMAT",
     },
@@ -58,6 +59,8 @@ class Source(NamedTuple):
       task: description of the task.
       robot: name of the robot.
       notes: anomalies of the files, one per line.
+      splits: name -> its episodes, e.g. `train`, `test`, `recovery`, `failure`.
+      texts: (episode) -> texts by column: instructions, tools.
     """
 
     hz: float
@@ -68,6 +71,8 @@ class Source(NamedTuple):
     task: str = ""
     robot: str = ""
     notes: Sequence[str] = ()
+    splits: Mapping[str, range] = {}
+    texts: Callable[[int], Mapping[str, Sequence[str]]] = lambda episode: {}
 
 
 class Format(NamedTuple):
@@ -79,14 +84,19 @@ class Format(NamedTuple):
       recognises: path -> True if it holds a dataset of this format, judged by file names alone.
       open: (path) -> context with its `Source`. It may raise anything: `open_dataset` explains it.
       write: (path that is not there, Source, video) writes it; `video` is whether images may lose
-        a little, where the format has such.
+        a little, where the format has such. None for formats that are read only.
     """
 
     description: str
     named: Callable[[str], str]
     recognises: Callable[[Path], bool]
     open: Callable[[Path], contextlib.AbstractContextManager[Source]]
-    write: Callable[[Path, Source, bool], None]
+    write: Callable[[Path, Source, bool], None] | None = None
+
+
+def writable() -> list[str]:
+    """Returns the names of formats that exports can have."""
+    return [name for name in FORMATS.names() if FORMATS.get(name).write is not None]
 
 
 def detect(path: Path) -> str:
@@ -132,13 +142,18 @@ def open_dataset(path: Path, name: str) -> Iterator[Source]:
             for column in names:
                 errors.choice("column", column, source.columns)
             with explained(path, name, episode):
+                require(source.lengths[episode] > 0, "control steps", 0)
                 _require_all_fit(source, episode, names)
                 arrays = source.read(episode, names)
                 for column in names:
                     _check(column, arrays[column], source, episode)
             return arrays
 
-        yield source._replace(read=read)
+        def texts(episode: int) -> Mapping[str, Sequence[str]]:
+            with explained(path, name, episode):
+                return source.texts(episode)
+
+        yield source._replace(read=read, texts=texts)
 
 
 class Damaged(ValueError):

@@ -13,16 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import transform
 
-from starjax import errors, rcm
-from starjax.data import redraw, schema, store
-from starjax.data.formats import base
+from starjax import errors
+from starjax.data import redraw, store
+from starjax.data.formats import base, peer_columns
 from starjax.data.formats.base import Column, Source
 from starjax.rollouts import episodes
 from starjax.runtime import files, provenance
-
-_AXES = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
 
 
 def source(root: Path, form: base.Format, image_size: int = 0) -> Source:
@@ -40,14 +37,17 @@ def source(root: Path, form: base.Format, image_size: int = 0) -> Source:
     description = store.read_description(root)
     sealed = store.read_seal(root)
     records = store.sealed_records(root, sealed)
-    kept = [record for record in records if record["files"]]
+    numbered = [i for i, record in enumerate(records) if record["files"]]
+    # Failures last: a split is a span of episodes.
+    ordered = sorted(numbered, key=lambda i: not records[i]["success"])
+    kept = [records[i] for i in ordered]
     if not kept:
         raise errors.UsageError("DATASET", "episodes", f"{root}: none was kept")
     fields = {
         name: Column(tuple(feature["shape"]), np.dtype(feature["dtype"]).name)
         for name, feature in description["features"].items()
     }
-    named = {name: form.named(_column(name)) for name in fields}
+    named = {name: form.named(peer_columns.name_of(name)) for name in fields}
     scene = description["scene"]
 
     drawn = _drawn(root, description, kept, form, image_size)
@@ -56,13 +56,15 @@ def source(root: Path, form: base.Format, image_size: int = 0) -> Source:
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
         arrays = _arrays(root, description, kept[episode])
         by_column = {named[name]: array for name, array in arrays.items()}
-        derived = _derived(arrays, kept[episode], description)
+        derived = peer_columns.derived(arrays, kept[episode], description)
         by_column |= {form.named(name): array for name, array in derived.items()}
         rows = np.arange(first[episode], first[episode + 1])
         by_column |= {name: drawn[name][rows] for name in drawn if name in names}
         return {name: by_column[name] for name in names}
 
-    columns = {form.named(name): column for name, column in _extra(description).items()}
+    columns = {
+        form.named(name): column for name, column in peer_columns.columns(description).items()
+    }
     columns |= {named[name]: column for name, column in fields.items()}
     columns |= {name: Column(images.shape[1:], "uint8") for name, images in drawn.items()}
     return Source(
@@ -78,7 +80,10 @@ def source(root: Path, form: base.Format, image_size: int = 0) -> Source:
             "stored": [bool(record["files"]) for record in records],
             "columns": named,
             "digest": sealed["digest"],
+            **({"order": ordered} if ordered != numbered else {}),
         },
+        splits=peer_columns.splits(kept),
+        texts=lambda episode: peer_columns.texts(scene),
         task=scene["task"].replace("_", " "),
         robot="_".join(scene["arms"]),
     )
@@ -117,6 +122,7 @@ def export(
         note(1)
         return dataset.read(episode, names)
 
+    assert form.write is not None
     with _staged(out) as staged:
         form.write(staged, dataset._replace(read=read), video)
 
@@ -137,13 +143,13 @@ def restore_export(
     """
     assert dataset.origin is not None
     origin = _checked(dataset.origin, dataset)
-    count = sum(map(bool, origin["stored"]))
-    stored = iter(range(count))
+    ordered = _order(origin)
+    count, place = len(ordered), {number: i for i, number in enumerate(ordered)}
     rows = (
-        (outcome["key"], outcome, functools.partial(_ours, dataset, origin, next(stored)))
-        if is_stored
+        (outcome["key"], outcome, functools.partial(_ours, dataset, origin, place[i]))
+        if i in place
         else (outcome["key"], outcome, dict)
-        for outcome, is_stored in zip(origin["records"], origin["stored"], strict=True)
+        for i, outcome in enumerate(origin["records"])
     )
     digest = store.write(root, origin["description"], rows, note=note)
     return {"digest": digest, "episodes": count, "same": digest == origin["digest"]}
@@ -176,64 +182,16 @@ def _outcome(record: store.Record) -> dict[str, Any]:
     return {name: value for name, value in record.items() if name not in ("files", "digest")}
 
 
-def _column(field: str) -> str:
-    return field if field.startswith(episodes.IMAGE) else f"{base.OURS}.{field}"
-
-
 def _arrays(root: Path, about: dict[str, Any], record: store.Record) -> dict[str, np.ndarray]:
     """Reads the fields of an episode."""
     folder = root / "episodes" / record["key"]
     return {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in about["features"]}
 
 
-def _extra(description: dict[str, Any]) -> dict[str, Column]:
-    """Returns the columns that other tools expect, derived from starjax's fields."""
-    arms = len(description["p_world_ref"])
-    names = [f"arm{i}_{axis}" if arms > 1 else axis for i in range(arms) for axis in _AXES]
-    places = [
-        name.replace("gripper", "") for name in names if name[-1] in "xyz" and "q" not in name
-    ]
-    columns = {
-        "state": Column((8 * arms,), "float32", tuple(names)),
-        "action": Column((8 * arms,), "float32", tuple(names)),
-        "trocar": Column((3 * arms,), "float32", tuple(places)),
-        "reward": Column((), "float32"),
-        "done": Column((), "bool"),
-    }
-    if "state" in description["features"]:
-        count = description["features"]["state"]["shape"]
-        fields = description.get("task", {}).get("fields", [])
-        labels = tuple(f"{name}.{i}" for name, size, *_ in fields for i in range(size))
-        columns["environment_state"] = Column(tuple(count), "float32", labels)
-    return columns
-
-
-def _derived(
-    arrays: dict[str, np.ndarray], record: store.Record, description: dict[str, Any]
-) -> dict[str, np.ndarray]:
-    length, places = record["length"], schema.trocars_of([record])
-    reference = np.asarray(description["p_world_ref"], np.float32)
-    trocar = np.asarray(rcm.trocar_position(places, reference)).reshape(1, -1)
-    last = np.arange(length) == length - 1
-    derived = {
-        "state": _poses(arrays["p"], arrays["R"], arrays["gripper"]),
-        "action": _poses(arrays["command_p"], arrays["command_R"], arrays["command_gripper"]),
-        "trocar": np.repeat(trocar, length, axis=0).astype(np.float32),
-        "reward": (last & record["success"]).astype(np.float32),
-        "done": last,
-    }
-    return derived | ({"environment_state": arrays["state"]} if "state" in arrays else {})
-
-
-def _poses(p: np.ndarray, R: np.ndarray, gripper: np.ndarray) -> np.ndarray:
-    """Packs positions, continuous quaternions xyzw and grippers to `[T, 8 A]`."""
-    turned = transform.Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
-    turned = turned.reshape(*R.shape[:2], 4)
-    # q and -q are one rotation: keep the one nearer to the previous step.
-    ahead = np.where(np.sum(turned[1:] * turned[:-1], -1, keepdims=True) < 0, -1.0, 1.0)
-    turned[1:] *= np.cumprod(ahead, axis=0)
-    rows = np.concatenate([p, turned, gripper[..., None]], -1)
-    return rows.reshape(len(p), -1).astype(np.float32)
+def _order(origin: dict[str, Any]) -> list[int]:
+    """Returns the numbers of the records that the files hold, in the order of the files."""
+    numbered = [i for i, is_stored in enumerate(origin["stored"]) if is_stored]
+    return origin.get("order", numbered)
 
 
 def _checked(origin: dict[str, Any], dataset: Source) -> dict[str, Any]:
@@ -242,8 +200,9 @@ def _checked(origin: dict[str, Any], dataset: Source) -> dict[str, Any]:
         description, records = origin["description"], origin["records"]
         counts = len(records), len(origin["stored"])
         base.require(counts[0] == counts[1], f"{counts[0]} episodes", counts[1])
-        stored = [r for r, kept in zip(records, origin["stored"]) if kept]
-        lengths = [record["length"] for record in stored]
+        ordered, numbered = _order(origin), _order({"stored": origin["stored"]})
+        base.require(sorted(ordered) == numbered, "an order of the episodes", ordered)
+        lengths = [records[i]["length"] for i in ordered]
         base.require(lengths == list(dataset.lengths), f"lengths {lengths}", list(dataset.lengths))
         for record in records:
             base.require(store.is_key(record["key"]), "an episode's key", record["key"])

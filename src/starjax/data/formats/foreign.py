@@ -5,7 +5,6 @@ with images, as `data.demos` would have.
 """
 
 import functools
-import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,11 +14,12 @@ from PIL import Image
 
 from starjax import errors, rcm
 from starjax.data import schema, store
-from starjax.data.formats import doubts, motion, trocars
 from starjax.data.formats import mapping as maps
+from starjax.data.formats import motion, selection, survey
 from starjax.data.formats.base import Source
 from starjax.data.formats.mapping import CameraColumn, Map
 from starjax.data.formats.motion import HZ
+from starjax.data.formats.survey import Kept
 from starjax.rollouts import episodes
 from starjax.runtime import files, xla
 from starjax.sim import registries
@@ -45,13 +45,6 @@ class Imported(NamedTuple):
     notes: list[str]
 
 
-class _Kept(NamedTuple):
-    episode: int
-    length: int
-    trocar: int
-    success: bool
-
-
 def import_mapped(
     source: Source,
     mapping: Map,
@@ -71,49 +64,17 @@ def import_mapped(
     """
     task = registries.tasks.get(mapping.task)
     _fits(source, mapping, task)
-    hz = mapping.hz or source.hz
-    if not hz and not mapping.time:
-        raise errors.UsageError("--map: hz", "steps per second, which the files do not say", "none")
-
-    kept, tips, notes, jaws = [], [], list(source.notes), doubts.Jaws(mapping.arms)
-    for episode in range(len(source.lengths)):
-        arrays = source.read(episode, maps.names(mapping))
-        try:
-            poses = motion.read(arrays, mapping, hz, folder)
-            success = not mapping.success or bool(
-                maps.pick(arrays, mapping.success, 1)[-1, 0] > 0.5
-            )
-        except motion.Gap as gap:
-            notes.append(f"episode {episode}: {gap}; left out")
-        except errors.UsageError as error:
-            line = f"{error.got} in episode {episode}"
-            raise errors.UsageError(error.argument, error.expected, line) from error
-        else:
-            odd = [*poses.notes, *doubts.of_commands(poses, mapping)]
-            notes += [f"episode {episode}: {line}" for line in odd]
-            notes += [] if kept else doubts.of_state(arrays, mapping, task)
-            jaws.add(arrays)
-            tips.append(trocars.subsample(poses))
-            kept.append(_Kept(episode, len(poses.pose.p), -1, success))
-        note(1)
-    places, is_known = trocars.locate(tips, mapping, [k.episode for k in kept], notes)
-    kept, places = (list(itertools.compress(items, is_known)) for items in (kept, places))
-    tips = list(itertools.compress(tips, is_known))
-    if not kept:
-        reason = notes[-1] if notes else "no episode"
-        raise errors.UsageError("PATH", "demonstrations to keep", reason)
-    groups, centres = trocars.group(np.array(places))
-    kept = [k._replace(trocar=int(group)) for k, group in zip(kept, groups)]
-    numbers = [k.episode for k in kept]
-    residual = trocars.residual(tips, centres[groups], numbers, notes)
-    notes += [*jaws.notes(), *doubts.of_dataset(tips, centres[groups], numbers, task)]
-    description = _describe(source, mapping, task, kept, centres, hz)
-    trials = np.zeros(len(centres), int)
+    found = survey.survey(source, mapping, folder, task, note)
+    mapping, hz, kept, notes = found.mapping, found.hz, found.kept, found.notes
+    description = _describe(source, mapping, task, kept, found.centres, hz)
+    trials = np.zeros(len(found.centres), int)
+    present, unread = set(store.keys(root)), set()
 
     def episodes_to_write() -> Iterator[tuple[str, store.Record, Callable[[], Any]]]:
         for k in kept:
             trial = int(trials[k.trocar])
             trials[k.trocar] += 1
+            splits = selection.splits_of(source, k.episode)
             outcome = {
                 "trocar": k.trocar,
                 **dict(zip(rcm.Trocar._fields, zip(*description["trocars"][k.trocar]))),
@@ -126,18 +87,39 @@ def import_mapped(
                 "stage": 0,
                 "labels": dict.fromkeys(task.labels, 0),
                 "episode": k.episode,
+                **({"splits": splits} if splits else {}),
             }
-            read = functools.partial(_fields, source, mapping, k, hz, folder, centres[k.trocar])
-            yield store.key(k.trocar, trial, 0), outcome, read
+            key = store.key(k.trocar, trial, 0)
+            arrays, reason = {}, ""
+            if key in present:
+                reason = "" if store.verify(root, key, arrays=False)["files"] else "see above"
+            else:
+                try:
+                    centre = found.centres[k.trocar]
+                    arrays = _fields(source, mapping, k, hz, folder, centre)
+                except errors.UsageError as error:  # of images, which only this pass reads
+                    reason = str(error)
+            if reason:
+                unread.add(k.episode)
+                notes.append(f"episode {k.episode}: {reason}; left out")
+                outcome |= {"success": False, "loose": False}
+            yield key, outcome, functools.partial(dict, arrays)
+        if len(unread) == len(kept):
+            raise errors.UsageError("PATH", "demonstrations to keep", notes[-1])
         # After the last episode and before the seal.
-        about = {"notes": notes, "residual_mm": np.round(residual, 4).tolist()}
+        about = {"notes": notes, "residual_mm": np.round(found.residual_mm, 4).tolist()}
+        if source.notes:
+            about["columns"] = list(source.notes)
+        if texts := selection.texts(source, [k.episode for k in kept]):
+            about["texts"] = texts
         files.write_json(root / schema.IMPORTED, about)
 
     frames = sum(k.length for k in kept)
     size = schema.frame_bytes(description) * frames
     digest = store.write(root, description, episodes_to_write(), size, note)
-    left_out = len(source.lengths) - len(kept)
-    return Imported(digest, len(kept), left_out, frames, centres[groups], residual, notes)
+    count = len(kept) - len(unread)
+    left_out = len(source.lengths) - count
+    return Imported(digest, count, left_out, frames, found.p_world_trocar, found.residual_mm, notes)
 
 
 def _fits(source: Source, mapping: Map, task: Any) -> None:
@@ -152,7 +134,7 @@ def _fits(source: Source, mapping: Map, task: Any) -> None:
 
 
 def _describe(
-    source: Source, mapping: Map, task: Any, kept: list[_Kept], centres: np.ndarray, hz: float
+    source: Source, mapping: Map, task: Any, kept: list[Kept], centres: np.ndarray, hz: float
 ) -> dict[str, Any]:
     reference = np.array([slot.p_world_ref for slot in task.slots])
     parameters = rcm.trocar_from_position(centres.astype(np.float32), reference.astype(np.float32))
@@ -208,7 +190,7 @@ def _shapes(source: Source, mapping: Map, arms: int) -> dict[str, tuple[tuple[in
 
 
 def _fields(
-    source: Source, mapping: Map, kept: _Kept, hz: float, folder: Path, p_world_trocar: np.ndarray
+    source: Source, mapping: Map, kept: Kept, hz: float, folder: Path, p_world_trocar: np.ndarray
 ) -> dict[str, list[np.ndarray]]:
     """Reads the fields of an episode."""
     columns = source.read(kept.episode, maps.names(mapping))

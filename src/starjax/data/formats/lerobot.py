@@ -13,7 +13,6 @@ Templates of paths in info.json are untrusted and not used.
 
 import contextlib
 import io
-import json
 import math
 import re
 from collections.abc import Callable, Collection, Iterator
@@ -25,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 from PIL import Image
 
-from starjax.data.formats import base, lerobot_write, video
+from starjax.data.formats import base, lerobot_meta, lerobot_write, video
 from starjax.data.formats.base import Column, Source
 from starjax.rollouts import episodes
 from starjax.runtime import files
@@ -70,12 +69,14 @@ def _open(path: Path) -> Iterator[Source]:
     base.require(version[:3] in _READERS, "version v3.0 or v2.1", version)
     hz = float(info["fps"])
     base.require(0.0 < hz < 1e5, "fps above 0", hz)
-    columns, kinds, notes = {}, {}, []
+    columns, kinds, notes, texts = {}, {}, [], []
     for name, feature in info["features"].items():
         base.require(bool(_FEATURE.fullmatch(name)) and ".." not in name, "a name", name)
         if (column := _column(feature)) is not None:
             columns[name], kinds[name] = column, feature["dtype"]
-        elif feature["dtype"] != "string":
+        elif feature["dtype"] == "string":
+            texts.append(name)
+        else:
             notes.append(f"{name}: {feature['dtype']} {feature['shape']} is not read; left out")
     cameras = [name for name, kind in kinds.items() if kind == "video"]
     places = list(_READERS[version[:3]](path, info, cameras))
@@ -99,7 +100,18 @@ def _open(path: Path) -> Iterator[Source]:
     origin = files.read_json(ours) if ours.exists() else None
     robot = str(info.get("robot_type") or "")
     lengths = [place.length for place in places]
-    yield Source(hz, lengths, columns, read, origin, _task(path), robot, notes)
+    tasks = lerobot_meta.tasks(path)
+    task = next(iter(tasks.values())) if len(tasks) == 1 else ""
+
+    def texts_of(episode: int) -> dict[str, list[str]]:
+        wanted = {name: Column((), "str") for name in (*texts, "task_index")}
+        table = _rows(path, places[episode], wanted)
+        found = {name: table[name].unique().to_pylist() for name in texts}
+        numbers = table["task_index"].unique().to_pylist()
+        return found | {"task": [tasks[i] for i in numbers if i in tasks]}
+
+    splits = lerobot_meta.splits(info, len(places))
+    yield Source(hz, lengths, columns, read, origin, task, robot, notes, splits, texts_of)
 
 
 def _column(feature: dict[str, Any]) -> Column | None:
@@ -115,6 +127,8 @@ def _column(feature: dict[str, Any]) -> Column | None:
     base.require(all(n > 0 for n in shape), "sizes above 0", list(shape))
     names = feature.get("names")
     names = next(iter(names.values())) if isinstance(names, dict) and names else names
+    if isinstance(names, list) and len(names) == 1 and isinstance(names[0], list):
+        names = names[0]  # as peers' converters write them
     named = tuple(map(str, names)) if isinstance(names, list) else ()
     return Column(() if shape == (1,) else shape, np.dtype(kind).name, named)
 
@@ -145,7 +159,7 @@ def _file(row: dict[str, Any], kind: str, ending: str) -> str:
 
 def _places_v2(root: Path, info: dict[str, Any], cameras: list[str]) -> Iterator[_Place]:
     size = int(info.get("chunks_size") or _CHUNK)
-    for row in _json_lines(root / "meta/episodes.jsonl"):
+    for row in lerobot_meta.json_lines(root / "meta/episodes.jsonl"):
         number = int(row["episode_index"])
         base.require(number >= 0, "an episode's number", number)
         chunk, name = f"chunk-{number // size:03d}", f"episode_{number:06d}"
@@ -163,7 +177,7 @@ _READERS: dict[str, Callable[[Path, dict[str, Any], list[str]], Iterator[_Place]
 
 
 def _length(value: Any) -> int:
-    base.require(0 < int(value) < 10**8, "control steps", value)
+    base.require(0 <= int(value) < 10**8, "control steps", value)
     return int(value)
 
 
@@ -235,25 +249,10 @@ def _picture(cell: dict[str, Any], shape: tuple[int, ...]) -> np.ndarray:
         return np.asarray(image.convert("RGB"))
 
 
-def _task(path: Path) -> str:
-    """Returns the task's description; empty if there is not exactly one."""
-    modern, old = path / "meta/tasks.parquet", path / "meta/tasks.jsonl"
-    tasks = []
-    if modern.exists():
-        table = parquet.read_table(modern)
-        texts = [name for name in table.column_names if pa.types.is_string(table[name].type)]
-        tasks = table[texts[0]].to_pylist() if texts else []
-    elif old.exists():
-        tasks = [row["task"] for row in _json_lines(old)]
-    return str(tasks[0]) if len(tasks) == 1 else ""
-
-
-def _json_lines(path: Path) -> list[Any]:
-    return [json.loads(line) for line in path.read_text().split("\n") if line.strip()]
-
-
 def _recognises(path: Path) -> bool:
     return (path / "meta/info.json").is_file()
 
 
-FORMAT = base.Format("LeRobotDataset v3.0", named, _recognises, _open, lerobot_write.write)
+FORMAT = base.Format(
+    "LeRobotDataset v3.0; v2.1 is read too", named, _recognises, _open, lerobot_write.write
+)

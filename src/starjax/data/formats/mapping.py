@@ -19,13 +19,16 @@ Columns = str | tuple[str, ...]
 Turned = Literal["quat_xyzw", "quat_wxyz", "matrix", "rot6d", "rotvec", "euler_xyz"]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # wxyz
-Pixels = Annotated[int, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=0)]
 
 # Numbers of each way to write a rotation: a matrix by rows, rot6d by its first two columns, Euler's
 # angles about fixed axes x, y, z in rad.
 NUMBERS = {
     "quat_xyzw": 4, "quat_wxyz": 4, "matrix": 9, "rot6d": 6, "rotvec": 3, "euler_xyz": 3
 }  # fmt: skip
+_NEWER_MAP = {"about": "", "fits": {}, "skip": [], "splits": [], "place": "files"}
+_NEWER_ARM = {"trocar_at": []}
+_NOT_RECORDED = ("about", "fits")
 _PART = re.compile(r"(.+?)(?:\[(\d+)(?:(:)(\d+))?\])?")
 _FILE = "--map"
 
@@ -68,6 +71,7 @@ class ArmColumns(_MapPart, frozen=True, kw_only=True):
     command_rotation: Columns = ()
     command_gripper: Columns = ()
     trocar: Columns = ()  # its position, 3 numbers; left out, estimated from the motion
+    trocar_at: tuple[float, ...] = ()  # m, instead of the column: in the files' frame
     tip: Vector = (0.0, 0.0, 0.0)  # m, the tip in the frame that the poses are of
     # of the tip in that frame: z of the tip is the shaft, distal, y where the jaws open
     tip_turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -85,6 +89,8 @@ class ArmColumns(_MapPart, frozen=True, kw_only=True):
             raise ValueError("expected a whole command, of position and rotation")
         if isinstance(self.shaft, ShaftColumns) and self.shaft.body and not self.joints:
             raise ValueError("expected joints and a model for the body of the shaft")
+        if len(self.trocar_at) not in (0, 3) or (self.trocar_at and self.trocar):
+            raise ValueError("expected trocar_at [x, y, z], or a column trocar")
         if self.gripper_open == self.gripper_closed:
             raise ValueError("expected gripper_open other than gripper_closed")
 
@@ -93,8 +99,8 @@ class CameraColumn(_MapPart, frozen=True, kw_only=True):
     """A camera of the task, and the column of its images."""
 
     column: str
-    crop: tuple[Pixels, ...] = ()  # top, left, height, width in pixels
-    size: Pixels = 0  # pixels per side afterwards; 0: as they are
+    crop: tuple[Count, ...] = ()  # top, left, height, width in pixels
+    size: Count = 0  # pixels per side afterwards; 0: as they are
     bgr: bool = False  # whether blue comes first
 
     def __post_init__(self) -> None:
@@ -105,6 +111,8 @@ class CameraColumn(_MapPart, frozen=True, kw_only=True):
 class Map(_MapPart, frozen=True, kw_only=True):
     """A whole mapping file."""
 
+    about: str = ""  # a line for people
+    fits: dict[str, int | tuple[str, ...]] = {}  # columns it is for: sizes or first names
     task: str  # of starjax, whose nominal trocars and cameras the dataset gets
     units: Literal["m", "mm"] = "m"  # of positions
     hz: float = 0.0  # of the files, where they do not say it, or say it wrong
@@ -115,6 +123,11 @@ class Map(_MapPart, frozen=True, kw_only=True):
     success: Columns = ()  # above 0.5 at the end where an episode succeeded; left out, all did
     trocars: Literal["episode", "dataset"] = "episode"  # what shares a trocar that is estimated
     max_gap_s: float = 0.5  # episodes with a longer gap are left out
+    skip: tuple[Count, ...] = ()  # episodes to leave out
+    splits: tuple[str, ...] = ()  # of the files; only their episodes are imported; default: all
+    # where the tool works: as origin and turn say, or the mean trocar at the task's nominal one and
+    # the mean shaft pointing down
+    place: Literal["files", "trocar"] = "files"
     arms: Annotated[tuple[ArmColumns, ...], msgspec.Meta(min_length=1)]
     cameras: dict[str, CameraColumn] = {}
 
@@ -137,8 +150,16 @@ def load(path: Path) -> Map:
 
 
 def as_json(mapping: Map) -> dict[str, Any]:
-    """Returns the mapping as JSON values, for the record."""
-    return msgspec.json.decode(msgspec.json.encode(mapping))
+    """Returns the mapping as JSON values, for the record.
+
+    Omits fields that older versions lack if they have no effect: digests hold.
+    """
+    values = msgspec.json.decode(msgspec.json.encode(mapping))
+    for part, newer in ((values, _NEWER_MAP), *((arm, _NEWER_ARM) for arm in values["arms"])):
+        for name, unchanged in newer.items():
+            if part[name] == unchanged or name in _NOT_RECORDED:
+                del part[name]
+    return values
 
 
 def pick(arrays: Mapping[str, np.ndarray], columns: Columns, count: int = 0) -> np.ndarray:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import structs
 from scipy.spatial import transform
 
 from starjax import errors
@@ -102,14 +103,20 @@ def _arm(arrays: Mapping[str, np.ndarray], arm: ArmColumns, mapping: Map, folder
     farthest = float(np.abs(pose.p).max())
     if farthest > _FARTHEST:
         raise errors.UsageError("position", f"tips within {_FARTHEST:g} m", f"{farthest:.3g} m")
-    unknown = np.full_like(pose.p, np.nan)
+    if arm.trocar:
+        trocar = tip_poses.placed(maps.pick(arrays, arm.trocar, 3), mapping)
+    elif arm.trocar_at:
+        metres = structs.replace(mapping, units="m")
+        trocar = np.tile(tip_poses.placed(np.array(arm.trocar_at), metres), (len(pose.p), 1))
+    else:
+        trocar = np.full_like(pose.p, np.nan)
     return _Arm(
         pose,
         tip_poses.shaft(arrays, arm, mapping, folder, pose),
         tip_poses.command(arrays, arm, mapping),
         jaws(arm.gripper) if arm.gripper else np.ones(len(pose.p)),
         jaws(arm.command_gripper) if arm.command_gripper else None,
-        tip_poses.placed(maps.pick(arrays, arm.trocar, 3), mapping) if arm.trocar else unknown,
+        trocar,
     )
 
 

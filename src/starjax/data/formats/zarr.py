@@ -5,12 +5,15 @@ meta/episode_ends   [E] int64, first frame after each episode
 """
 
 import contextlib
+import json
 import math
+import zipfile
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numcodecs
+import numcodecs.errors
 import numpy as np
 import zarr
 
@@ -29,36 +32,60 @@ def named(column: str) -> str:
 
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[Source]:
-    for inside in path.rglob("*"):
-        base.require(not inside.is_symlink(), "no links", inside)
-    # One array at a time: a group of which one is damaged may leave zarr's own loop waiting.
-    whole = _array(path / "meta/episode_ends")
-    _require_readable("episode_ends", whole, whole.shape)
-    ends = np.asarray(whole[:], np.int64)
-    rises = ends.ndim == 1 and len(ends) > 0 and bool((np.diff(ends, prepend=0) > 0).all())
-    base.require(rises, "episode_ends that rise", ends.tolist()[:5])
-    starts = np.concatenate([[0], ends[:-1]])
-    arrays = {folder.name: _array(folder) for folder in sorted((path / "data").glob("*/"))}
-    arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf"}
-    for name, array in arrays.items():
-        whole = array.ndim > 0 and array.shape[0] == ends[-1]
-        base.require(whole, f"{ends[-1]} frames of {name}", list(array.shape))
-    columns = {
-        name: Column(tuple(array.shape[1:]), array.dtype.name) for name, array in arrays.items()
-    }
-
-    def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
-        first, last = int(starts[episode]), int(ends[episode])
+    with _storage(path) as (storage, names, about):
+        # One array at a time: a group of which one is damaged may leave zarr's own loop waiting.
+        whole = _array(storage, "meta/episode_ends")
+        _require_readable("episode_ends", whole, whole.shape)
+        ends = np.asarray(whole[:], np.int64)
+        rises = ends.ndim == 1 and len(ends) > 0 and bool((np.diff(ends, prepend=0) >= 0).all())
+        base.require(rises, "episode_ends that rise", ends.tolist()[:5])
+        starts = np.concatenate([[0], ends[:-1]])
+        arrays, notes = {}, []
         for name in names:
-            _require_readable(name, arrays[name], (last - first, *columns[name].shape))
-        return {name: np.asarray(arrays[name][first:last]) for name in names}
+            try:
+                arrays[name] = _array(storage, f"data/{name}")
+            except numcodecs.errors.UnknownCodecError as error:
+                notes.append(f"{name}: {error}; omitted")
+        arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf"}
+        for name, array in arrays.items():
+            whole = array.ndim > 0 and array.shape[0] == ends[-1]
+            base.require(whole, f"{ends[-1]} frames of {name}", list(array.shape))
+        columns = {
+            name: Column(tuple(array.shape[1:]), array.dtype.name) for name, array in arrays.items()
+        }
 
-    attributes = path / ".zattrs"
-    about = files.read_json(attributes) if attributes.exists() else {}
-    origin = about.get(base.OURS)
-    hz = base.origin_hz(origin) or float(about.get("hz", 0.0))
-    lengths = (ends - starts).tolist()
-    yield Source(hz, lengths, columns, read, origin, str(about.get("task", "")))
+        def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
+            first, last = int(starts[episode]), int(ends[episode])
+            for name in names:
+                _require_readable(name, arrays[name], (last - first, *columns[name].shape))
+            return {name: np.asarray(arrays[name][first:last]) for name in names}
+
+        origin = about.get(base.OURS)
+        hz = base.origin_hz(origin) or float(about.get("hz", 0.0))
+        lengths, task = (ends - starts).tolist(), str(about.get("task", ""))
+        yield Source(hz, lengths, columns, read, origin, task, notes=notes)
+
+
+@contextlib.contextmanager
+def _storage(path: Path) -> Iterator[tuple[Any, list[str], dict[str, Any]]]:
+    """Opens a folder or zip: yields the storage, the names of columns, the attributes."""
+    if path.is_dir():
+        for inside in path.rglob("*"):
+            base.require(not inside.is_symlink(), "no links", inside)
+        names = sorted(folder.name for folder in (path / "data").glob("*/"))
+        attributes = path / ".zattrs"
+        yield path, names, files.read_json(attributes) if attributes.exists() else {}
+        return
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():  # a small one may unpack to gigabytes
+            base.require_fits(member.filename, (member.file_size,), np.uint8)
+        parts = [name.split("/") for name in archive.namelist()]
+        names = sorted({part[1] for part in parts if part[0] == "data" and len(part) > 2})
+        has_attributes = ".zattrs" in archive.namelist()
+        about = json.loads(archive.read(".zattrs")) if has_attributes else {}
+        base.require(isinstance(about, dict), "a map of attributes", type(about).__name__)
+    with contextlib.closing(zarr.storage.ZipStore(path, mode="r")) as storage:
+        yield storage, names, about
 
 
 def _write(path: Path, source: Source, video: bool) -> None:
@@ -113,8 +140,10 @@ class _Buffer:
         self._parts, self._held, self._at = [whole[count:]], self._held - count, self._at + count
 
 
-def _array(path: Path) -> Any:
-    return zarr.open_array(str(path), mode="r")
+def _array(storage: Any, name: str) -> Any:
+    if isinstance(storage, Path):
+        return zarr.open_array(str(storage / name), mode="r")
+    return zarr.open_array(storage, path=name, mode="r")
 
 
 def _require_readable(name: str, array: Any, shape: Sequence[int]) -> None:
@@ -127,7 +156,9 @@ def _require_readable(name: str, array: Any, shape: Sequence[int]) -> None:
 
 
 def _recognises(path: Path) -> bool:
+    if path.is_file():
+        return path.name.endswith(".zarr.zip")
     return (path / ".zgroup").is_file() or (path / "zarr.json").is_file()
 
 
-FORMAT = base.Format("zarr of Diffusion Policy", named, _recognises, _open, _write)
+FORMAT = base.Format("zarr of Diffusion Policy, also .zarr.zip", named, _recognises, _open, _write)
