@@ -14,7 +14,12 @@ CAMERAS = ("camera", "wrist")
 
 
 def write(
-    root: Path, arms: int = 1, size: int = 0, demos: int = 4, length: int = 30, cameras: int = 1,
+    root: Path,
+    arms: int = 1,
+    size: int = 0,
+    demos: int = 4,
+    length: int = 30,
+    cameras: int = 1,
     failures: bool = False,
 ) -> dict[str, Any]:
     """Writes it and returns its description.
