@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from typing import Any
 
 import h5py
 import kill
@@ -107,7 +108,8 @@ def test_peers_columns_say_what_ours_say(roots, kind):
 
 
 def test_robomimic_has_its_groups(exported):
-    with h5py.File(exported("images", "robomimic")) as file:
+    opened: Any = h5py.File(exported("images", "robomimic"))
+    with opened as file:
         assert json.loads(file["data"].attrs["env_args"]).keys() >= {"env_name", "env_kwargs"}
         assert file["data"].attrs["total"] == 120 and len(file["data"]) == 4
         demo = file["data/demo_3"]
@@ -132,7 +134,7 @@ def test_robomimic_refuses_actions_that_its_learners_would_clip(roots, tmp_path)
 def test_zarr_is_of_version_2(exported):
     path = exported("images", "zarr")
     assert (path / ".zgroup").exists() and not list(path.rglob("zarr.json"))
-    root = zarr.open_group(str(path), mode="r", zarr_format=2)
+    root: Any = zarr.open_group(str(path), mode="r", zarr_format=2)
     assert root["meta/episode_ends"][:].tolist() == [30, 60, 90, 120]
     assert json.loads((path / "meta/episode_ends/.zarray").read_text())["compressor"] is None
     assert root["data/image_wrist"].shape == (120, 32, 32, 3)

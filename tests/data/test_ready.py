@@ -77,6 +77,7 @@ def test_the_motion_is_the_files_up_to_one_rigid_one(written, name):
                 np.linalg.norm(p[1:] - p[0], axis=-1),
                 atol=1e-4,
             )
+    assert dataset.observation.images is not None
     (images,) = dataset.observation.images.values()
     assert images.shape[1:] == (128, 128, 3)
 
