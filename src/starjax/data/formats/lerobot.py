@@ -77,7 +77,7 @@ def _open(path: Path) -> Iterator[Source]:
         elif feature["dtype"] == "string":
             texts.append(name)
         else:
-            notes.append(f"{name}: {feature['dtype']} {feature['shape']} is not read; left out")
+            notes.append(f"{name}: {feature['dtype']} {feature['shape']} is not read; omitted")
     cameras = [name for name, kind in kinds.items() if kind == "video"]
     places = list(_READERS[version[:3]](path, info, cameras))
 

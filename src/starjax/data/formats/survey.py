@@ -84,12 +84,12 @@ def survey(
             odd = [*poses.notes, *doubts.of_commands(poses, mapping)]
             jaws.add(arrays)
         except motion.Gap as gap:
-            notes.append(f"episode {episode}: {gap}; left out")
+            notes.append(f"episode {episode}: {gap}; omitted")
             continue
         except errors.UsageError as error:
             line = f"{error.got} in episode {episode}"
             first_error = first_error or errors.UsageError(error.argument, error.expected, line)
-            notes.append(f"episode {episode}: {error}; left out")
+            notes.append(f"episode {episode}: {error}; omitted")
             continue
         notes += [f"episode {episode}: {line}" for line in odd]
         notes += [] if kept else doubts.of_state(arrays, mapping, task)
