@@ -468,6 +468,19 @@ def test_a_calibrated_policy_is_scored_with_its_alarms(file, capsys):
     assert "Alarms" in (file.parent / "wrong" / "stress.md").read_text()
 
 
+def test_disturbances_at_once_have_a_row_of_their_own(file):
+    names = ["trocar_offset", "breathing"]
+    at_once = ["--together", "trocar_offset=5", "breathing=2"]
+    assert stressed("--disturbance", *names, *at_once, "--out=both") == 0
+    found = json.loads((file.parent / "both" / "stress.json").read_text())
+    alone = found["disturbances"]["trocar_offset"]["levels"]["5"]
+    both = found["together"]
+    assert both["levels"] == {"trocar_offset": 5.0, "breathing": 2.0}
+    assert both["strict"]["trials"] == 12 and both["rcm_error_mm"] != alone["rcm_error_mm"]
+    with mistakes.of("together", "mass"):
+        stressed("--disturbance", "trocar_offset", "--together", "mass=0.25", "--out=other")
+
+
 def test_too_few_trials_write_no_policy(file):
     few = ["--trials=20", "--alpha=0.05", "--out=watched.safetensors"]
     with mistakes.of("successes", "for the scale"):

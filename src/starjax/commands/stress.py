@@ -31,6 +31,7 @@ class StressArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
     disturbance: tuple[str, ...] = ()
     # levels of a single disturbance, in its unit; default: its own
     levels: tuple[NotNegative, ...] = ()
+    together: tuple[str, ...] = ()  # NAME=LEVEL of disturbances to test at once as well
     seed: config_lib.Seed = 0  # random seed of the trials
     # directory of the result; auto: one in RUN or in runs/stress
     out: str = options.AUTO
@@ -49,9 +50,11 @@ def main(argv: Sequence[str]) -> int:
     names = tuple(disturbances.resolve("disturbance", args.disturbance))
     args = dataclasses.replace(args, disturbance=names)
     started = session.start("stress", argv, folder)
+    together = disturbances.parse_levels("together", args.together)
     who, _ = policy_args.load(path)
     args = benchmark_args.with_trials(args, "stress", who.env.names.task)
     kinds = _kinds(args, who.trained.policy.observation)
+    _check_together(together, list(kinds))
     who = _disturbed(who, list(kinds))
     content = {
         "benchmark_version": protocol.VERSION,
@@ -75,7 +78,13 @@ def main(argv: Sequence[str]) -> int:
                 print(_line(f"{level:g} {kind.unit}", score), flush=True)
                 if share.is_first:
                     started.write("stress.json", content)
+        if together:
+            trials = folder / "-".join(f"{name}-{level:g}" for name, level in together.items())
+            score = _score(trials, who, {**dict.fromkeys(kinds, 0.0), **together}, args)
+            content["together"] = {"levels": together, **score}
+            print(f"{' '.join(args.together)}\n{_line('together', score)}", flush=True)
         if share.is_first:
+            started.write("stress.json", content)
             _draw(folder)
         print(f"\nresult: {folder / 'stress.json'}")
     return 0
@@ -107,6 +116,19 @@ def _kinds(args: StressArgs, observation: str) -> dict[str, Any]:
             raise errors.UsageError("disturbance", "one that applies to states", name)
         base.check_levels("levels", name, args.levels)
     return {n: kind for n, kind in kinds.items() if observation == "image" or not kind.image_only}
+
+
+def _check_together(levels: dict[str, float], tested: list[str]) -> None:
+    """Checks the disturbances that are tested at once.
+
+    Raises:
+      errors.UsageError: one of them is not tested alone, or has no such level.
+    """
+    from starjax.evaluation.disturbances import base
+
+    for name, level in levels.items():
+        errors.choice("together", name, tested)
+        base.check_levels("together", name, [level])
 
 
 def _disturbed(who: Any, names: list[str]) -> Any:

@@ -35,13 +35,20 @@ def table(content: Content) -> formats.Table:
         "alarms" in score for kind in kinds.values() for score in kind["levels"].values()
     )
     rows = [header + ["Alarms on failures", "On successes"] * is_watched]
-    for name, kind in kinds.items():
-        for level, score in kind["levels"].items():
-            error, wall = score["rcm_error_mm"]["executed"], score.get("wall_force_N") or {}
-            values = (error["mean"], error["p99"], wall.get("p99"))
-            cells = ["\u2013" if value is None else f"{value:.2f}" for value in values]
-            rows.append([name, f"{level} {kind['unit']}".strip(), _rate(score), *cells])
-            rows[-1] += _alarms(score) if is_watched else []
+    scores = [
+        (name, f"{level} {kind['unit']}".strip(), score)
+        for name, kind in kinds.items()
+        for level, score in kind["levels"].items()
+    ]
+    if together := content.get("together"):
+        at_once = ", ".join(f"{name} {level:g}" for name, level in together["levels"].items())
+        scores.append(("together", at_once, together))
+    for name, level, score in scores:
+        error, wall = score["rcm_error_mm"]["executed"], score.get("wall_force_N") or {}
+        values = (error["mean"], error["p99"], wall.get("p99"))
+        cells = ["\u2013" if value is None else f"{value:.2f}" for value in values]
+        rows.append([name, level, _rate(score), *cells])
+        rows[-1] += _alarms(score) if is_watched else []
     return rows
 
 
