@@ -15,6 +15,7 @@ from starjax.deploy import server, wire
 from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
+from starjax.runtime import connections
 from starjax.sim import names
 
 SCENE = names.SceneNames("fake", ("fr5",), ("grasper",), ("camera",))
@@ -50,13 +51,13 @@ def observation(height=0.03):
 
 
 @contextlib.contextmanager
-def running(batches, port=0, key=KEY, clients=8):
+def running(batches, port=0, key=KEY, clients=8, log=lambda line: None):
     """A server of compiled `batches`; yields (host, port), its counts."""
     settings = server.ServerSettings(port=port, batch=batches.max_robots, clients=clients)
     stop, heard = threading.Event(), queue.Queue()
-    with server._bind(settings) as address:
+    with connections.bind(settings.host, settings.port) as address:
         about = server.metadata(batches.policy, "tiny")
-        one = server._Server(batches, settings, about, key)
+        one = server._Server(batches, settings, about, key, log)
         work = threading.Thread(
             target=lambda: server.asyncio.run(
                 one.serve(address, stop.is_set, lambda *where: heard.put(where))

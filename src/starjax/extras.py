@@ -12,7 +12,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "video": ("imageio_ffmpeg",),
     "formats": ("PIL", "av", "h5py", "pyarrow", "zarr"),
     "gym": ("gymnasium",),
-    "serve": ("filelock", "flax", "msgpack", "msgspec", "safetensors", "websockets"),
+    "serve": ("PIL", "filelock", "flax", "msgpack", "msgspec", "safetensors", "websockets"),
     "viewer": ("viser",),
 }
 

@@ -281,10 +281,38 @@ def test_the_largest_frame_holds_every_request():
     doubled = {k: v if v.dtype == np.uint8 else v.astype(np.float64) for k, v in request.items()}
     doubled["key"] = request["key"]
     frame = wire.pack(doubled)
-    assert len(frame) <= wire.max_request_bytes(spec) < 2 * len(frame)
+    assert len(frame) <= wire.max_request_bytes(spec)
     again = wire.decode_request(spec, wire.unpack(frame))
     assert set(again.observation.images) == {"a", "b"} and again.observation.state is None
 
 
 def fake_spec():
     return server.wire.InputSpec(2, (), fakes.P_WORLD_REF[0], True, 48, ("a", "b"), 12)
+
+
+def test_a_client_has_lines_in_the_log_and_may_send_one_moment(batches):
+    lines, one = [], asked(batches) | {"prompt": "reach"}
+    with served.running(batches, log=lines.append) as (where, counts):
+        with connect(where) as connection:
+            connection.recv()
+            both = infer(connection, one)["p"]
+            single = {n: x[0] if n in ("R", "p", "gripper", "state") else x for n, x in one.items()}
+            np.testing.assert_allclose(infer(connection, single)["p"], both, atol=1e-5)
+            for _ in range(3):
+                infer(connection, single | {"p": np.full(3, 9.0)})
+            np.testing.assert_allclose(infer(connection, single)["p"], both, atol=1e-5)
+        with pytest.raises(websockets.InvalidStatus):
+            connect(where, key="wrong")
+        deadline = time.monotonic() + 10
+        while len(lines) < 4 and time.monotonic() < deadline:
+            time.sleep(0.02)
+    assert counts.answered == 3 and counts.refused == 3
+    _, refused, left, _ = sorted(lines, key=lambda line: "key" in line)
+    assert "observation.pose.p" in refused and "3 answered, 3 refused" in left
+
+
+def test_a_port_in_use_is_noticed_before_anything_slow(up, monkeypatch):
+    monkeypatch.setattr(serve.jax_start, "require_devices", lambda *_: pytest.fail("too late"))
+    with pytest.raises(UsageError) as caught:
+        serve.main(["--port", str(up[0][1])])
+    assert caught.value.argument == "--port"

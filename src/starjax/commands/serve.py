@@ -3,6 +3,7 @@
 import dataclasses
 import ipaddress
 import os
+import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -35,6 +36,9 @@ def main(argv: Sequence[str]) -> int:
     path, api_key = packaged.find("--policy", args.policy), os.environ.get(KEY, "")
     elsewhere = f"a key for clients of --host {args.host}"
     checks.expect(bool(api_key) or _is_local(args.host), KEY, elsewhere, "none")
+    from starjax.runtime import connections
+
+    address = connections.bind(args.host, args.port)  # before anything slow
     xla.prepare_xla()
     jax_start.require_devices("starjax.deploy.server")
 
@@ -57,6 +61,8 @@ def main(argv: Sequence[str]) -> int:
             api_key=api_key,
             should_stop=should_stop,
             listening=listening,
+            log=lambda line: print(line, file=sys.stderr, flush=True),
+            address=address,
         )
     raise KeyboardInterrupt(_summary(counts))
 

@@ -17,6 +17,7 @@ from starjax.types import Command, Pose
 
 COLUMNS = 8  # of an arm
 MAX_HORIZON = 4096
+MAX_NORM_ERROR = 0.1  # of a measured quaternion: beyond, the columns are others
 _SHORTEST = 0.5  # norm of a quaternion: below, its direction is noise
 
 

@@ -20,7 +20,7 @@ import websockets
 from websockets.asyncio import server as sockets
 
 import starjax
-from starjax.deploy import batching, wire
+from starjax.deploy import batching, client_log, requests, wire
 from starjax.deploy.policy import Deployed
 from starjax.errors import UsageError
 from starjax.monitor import calibrate
@@ -81,6 +81,8 @@ def run(
     api_key: str = "",
     should_stop: Callable[[], bool] = lambda: False,
     listening: Callable[[str, int], Any] = lambda host, port: None,
+    log: Callable[[str], Any] = lambda line: None,
+    address: socket.socket | None = None,
 ) -> Counts:
     """Compiles the programs, then serves until `should_stop()`.
 
@@ -89,14 +91,17 @@ def run(
       name: of the policy, for the greeting.
       api_key: required of clients; empty for none.
       listening: called with address and port as soon as clients can connect.
+      log: called with a line about a client: its coming, refused requests, its leaving.
+      address: bound socket, by default one of the settings' address.
 
     Raises:
       UsageError: the address is not available.
     """
-    with _bind(settings) as address:
+    with address or connections.bind(settings.host, settings.port) as address:
         batches = batching.Batches(policy, settings.batch)
         batches.warm_up()
-        server = _Server(batches, settings, metadata(policy, name, settings.batch), api_key)
+        greeting = metadata(policy, name, settings.batch)
+        server = _Server(batches, settings, greeting, api_key, log)
         asyncio.run(server.serve(address, should_stop, listening))
     return server.counts
 
@@ -128,20 +133,9 @@ def _plain(record: Any) -> dict[str, Any]:
     return {k: list(v) if isinstance(v, tuple) else v for k, v in record._asdict().items()}
 
 
-def _bind(settings: ServerSettings) -> socket.socket:
-    """Binds a socket to the address before the slow compilation; clients cannot connect yet."""
-    host, port = settings.host, settings.port
-    bound = None
-    try:
-        family, *kind, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        bound = socket.socket(family, *kind)
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind(address)
-    except OSError as error:
-        if bound:
-            bound.close()
-        raise UsageError("--port", "a free address", f"{host}:{port}", str(error)) from None
-    return bound
+def _place(connection: sockets.ServerConnection) -> str:
+    """Returns the address of a client."""
+    return ":".join(map(str, (connection.remote_address or ("unknown",))[:2]))
 
 
 class _Server:
@@ -151,7 +145,9 @@ class _Server:
         settings: ServerSettings,
         greeting: dict[str, Any],
         api_key: str,
+        log: Callable[[str], Any] = lambda line: None,
     ) -> None:
+        self.log = log
         self.batches, self.settings, self.counts = batches, settings, Counts()
         self.greeting, self.api_key = wire.pack(greeting), api_key
         self.jobs: asyncio.Queue[_Job] = asyncio.Queue()
@@ -162,7 +158,7 @@ class _Server:
         should_stop: Callable[[], bool],
         listening: Callable[..., Any],
     ) -> None:
-        server = await sockets.serve(
+        serving = sockets.serve(
             self._connected,
             sock=address,
             process_request=self._admit,
@@ -175,6 +171,11 @@ class _Server:
             max_queue=_MAX_QUEUE,
             logger=_SILENT,
         )
+        try:
+            server = await serving
+        except OSError as error:  # as when another server took the port during the compilation
+            place = ":".join(map(str, address.getsockname()[:2]))
+            raise UsageError("--port", "a free address", place, str(error)) from None
         # The server leaves first: closing its connections waits for their pending replies.
         async with self._inference() as inference, server:
             listening(*server.sockets[0].getsockname()[:2])
@@ -208,17 +209,25 @@ class _Server:
 
     async def _connected(self, connection: sockets.ServerConnection) -> None:
         self.counts.clients += 1
+        name = f"client {self.counts.clients} ({_place(connection)})"
+        log = client_log.ClientLog(self.log, name)
+        history = requests.History(self.batches.policy.input_spec)
         try:
             await connection.send(self.greeting)
             async for frame in connection:
-                await connection.send(await self._answer(frame))
+                await connection.send(await self._answer(frame, history, log))
         except websockets.ConnectionClosed:
             pass
+        finally:
+            log.leave(connection.close_reason or "")
 
-    async def _answer(self, frame: str | bytes) -> str | bytes:
+    async def _answer(
+        self, frame: str | bytes, history: requests.History, log: client_log.ClientLog
+    ) -> str | bytes:
         spec, key_size = self.batches.policy.input_spec, self.batches.key_size
         try:
-            request = wire.decode_request(spec, wire.unpack(frame), key_size)
+            value, moment = history.complete(wire.unpack(frame))
+            request = wire.decode_request(spec, value, key_size)
             job = _Job(request, asyncio.get_running_loop().create_future())
             self.jobs.put_nowait(job)
             reply = await job.reply
@@ -226,8 +235,11 @@ class _Server:
                 raise reply
         except UsageError as error:
             self.counts.refused += 1
+            log.refuse(str(error))
             return str(error)[:_MAX_ERROR]
+        history.keep(moment)
         self.counts.answered += 1
+        log.answered += 1
         return wire.pack(reply)
 
     def _admit(self, connection: sockets.ServerConnection, request: Any) -> Any:
@@ -239,7 +251,9 @@ class _Server:
         if self.api_key and not (
             len(sent) == 1 and hmac.compare_digest(sent[0].encode(errors="replace"), expected)
         ):
+            self.log(f"{_place(connection)}: refused, expected the API key")
             return connection.respond(http.HTTPStatus.UNAUTHORIZED, "expected an API key\n")
         if connections.count(connection) > self.settings.clients:
+            self.log(f"{_place(connection)}: refused, more than {self.settings.clients} clients")
             return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "too many clients\n")
         return None

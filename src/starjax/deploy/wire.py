@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starjax import rcm
+from starjax.deploy import images
 from starjax.deploy.inputs import InputSpec, RobotObservation, image_of
 from starjax.errors import UsageError
 from starjax.sim import trocar_region
@@ -92,9 +93,10 @@ def image_field(spec: InputSpec, camera: str) -> str:
 
 
 def max_request_bytes(spec: InputSpec) -> int:
-    """Returns the size of the largest request: all numbers as float64."""
+    """Returns the size of the largest request: numbers as float64, images of `images.LARGEST`."""
+    image = max(4 * math.prod(images.LARGEST), spec.image_size**2) * 3 * spec.moments
     sizes = (
-        math.prod(x.shape) * (1 if x.dtype == "uint8" else 8) + len(name)
+        (image if x.dtype == "uint8" else 8 * math.prod(x.shape)) + len(name)
         for name, x in request_arrays(spec).items()
     )
     return sum(sizes) + _OVERHEAD

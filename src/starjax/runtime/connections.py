@@ -9,6 +9,8 @@ from typing import Any
 
 from websockets.asyncio import server as sockets
 
+from starjax.errors import UsageError
+
 HANDSHAKE_S = 5.0  # time to finish a handshake
 MAX_PAGES = 64  # connections to a page, several per tab
 _SPARE = 8  # connections beyond the maximum that get a response instead of being dropped
@@ -48,6 +50,25 @@ def limited(most: int) -> Any:
         return connection
 
     return create
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """Binds a socket to an address before slow work; clients cannot connect yet.
+
+    Raises:
+      UsageError: the address is not available.
+    """
+    bound = None
+    try:
+        family, *kind, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        bound = socket.socket(family, *kind)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+    except OSError as error:
+        if bound:
+            bound.close()
+        raise UsageError("--port", "a free address", f"{host}:{port}", str(error)) from None
+    return bound
 
 
 def count(connection: sockets.ServerConnection) -> int:
