@@ -1,6 +1,9 @@
 """How a mistake is worded: the argument, what was expected, what came, what to do."""
 
+import pickle
+
 import mistakes
+import numpy as np
 import pytest
 
 from starjax import errors
@@ -42,3 +45,8 @@ def test_a_choice_suggests_the_nearest_name():
 def test_texts_of_others_cannot_steer_the_terminal():
     text = "a\x1b]52;c;eHg=\x07b\u202ec\nä"
     assert errors.printable(text) == "a\\x1b]52;c;eHg=\\x07b\\u202ec\nä"
+
+
+def test_an_error_of_another_process_keeps_its_fields():
+    error = pickle.loads(pickle.dumps(errors.UsageError("image", "uint8", np.float32, "cast it")))
+    assert (error.argument, error.hint) == ("image", "cast it") and "float32" in str(error)

@@ -21,6 +21,10 @@ class UsageError(ValueError):
         ending = f"; {hint}" if hint else ""
         super().__init__(f"{argument}: expected {expected}, got {got}{ending}")
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickles its fields: a worker's error reaches the process that waits for it."""
+        return type(self), (self.argument, self.expected, str(self.got), self.hint)
+
 
 def printable(text: str) -> str:
     """Replaces control characters other than line ends by their escapes.

@@ -8,9 +8,9 @@ import collections
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from starjax.deploy import images, plain, wire
+from starjax.data import pose_rows
+from starjax.deploy import images, wire
 from starjax.deploy.inputs import InputSpec
 from starjax.errors import UsageError
 
@@ -101,15 +101,11 @@ def _from_plain(spec: InputSpec, request: Arrays) -> Arrays:
 
 
 def _from_state(spec: InputSpec, rows: Any) -> Arrays:
-    width = plain.COLUMNS * (spec.arms[0] if spec.arms else 1)
+    width = pose_rows.COLUMNS * (spec.arms[0] if spec.arms else 1)
     shape = np.shape(rows)
     if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "fiu" or shape[-1:] != (width,):
         raise UsageError("observation/state", f"[{width}] numbers", list(shape))
-    rows = rows.astype(np.float64).reshape(*shape[:-1], *spec.arms, plain.COLUMNS)
-    p, xyzw, gripper = rows[..., :3], rows[..., 3:7], rows[..., 7]
-    norm = np.linalg.norm(xyzw, axis=-1)
-    if not (np.abs(norm - 1.0) < plain.MAX_NORM_ERROR).all():  # NaN too
-        expected = "unit quaternions x y z w in columns 3 to 6"
-        raise UsageError("observation/state", expected, f"one of norm {norm.min():.3g}")
-    R = Rotation.from_quat(xyzw.reshape(-1, 4)).as_matrix().reshape(*p.shape, 3)
+    p, R, gripper = pose_rows.unpack("observation/state", rows)
+    if not spec.arms:
+        p, R, gripper = p[..., 0, :], R[..., 0, :, :], gripper[..., 0]
     return {"R": R, "p": p, "gripper": gripper}

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from starjax import rcm
+from starjax.data import pose_rows
 from starjax.deploy import images
 from starjax.deploy.inputs import InputSpec, RobotObservation, image_of
 from starjax.errors import UsageError
@@ -190,9 +190,9 @@ def encode_reply(command: Command, infer_ms: float) -> dict[str, Any]:
     Every array begins with H. `actions` `[H, A * 8]` has the columns of `ACTION` for each arm.
     """
     R, p, gripper = command.pose.R, command.pose.p, command.gripper
-    xyzw = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
-    parts = [p, xyzw.reshape(*R.shape[:-2], 4), gripper[..., None]]
-    actions = np.concatenate(parts, axis=-1).astype(np.float32).reshape(len(gripper), -1)
+    steps = len(gripper)
+    by_arm = p.reshape(steps, -1, 3), R.reshape(steps, -1, 3, 3), gripper.reshape(steps, -1)
+    actions = pose_rows.pack(*by_arm).astype(np.float32)
     arrays = {"actions": actions, "R": R, "p": p, "gripper": gripper}
     return {**arrays, "server_timing": {"infer_ms": infer_ms}}
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import runtime
-from starjax.envs import mdp
+from starjax.envs import forked, mdp
 from starjax.envs.settings import EnvSettings
 
 
@@ -71,9 +71,18 @@ class EpisodeBatch(NamedTuple):
 
 @functools.lru_cache(8)
 def make(settings: EnvSettings, lanes: int) -> EpisodeBatch:
-    """Builds the programs; the same arguments give the same ones, compiled once."""
+    """Builds the programs; the same arguments give the same ones, compiled once.
+
+    Raises:
+      errors.UsageError: a setting is wrong, or this process was forked after jax had started.
+    """
+    forked.refuse()
     runtime.prepare_xla()
-    made = mdp.make(settings)
+    return of_episodes(mdp.make(settings), lanes)
+
+
+def of_episodes(made: mdp.Episodes, lanes: int) -> EpisodeBatch:
+    """Builds the programs of N lanes of some episodes."""
     reset, step, judge = jax.vmap(made.reset), jax.vmap(made.step), jax.vmap(made.judge)
     look = jax.vmap(lambda state: (made.observe(state), made.measure(state)))
 

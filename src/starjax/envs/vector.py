@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from starjax import errors
-from starjax.envs import batch, observing, settings
+from starjax.envs import batch, forked, observing, settings
 
 METADATA = {"render_modes": ["rgb_array"], "render_fps": 30}
 
@@ -55,7 +55,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         self.render_mode = render_mode
         self._mode = AutoresetMode(autoreset_mode)
         self.metadata = {**METADATA, "autoreset_mode": self._mode}
-        self._batch = batch.make(self.settings, num_envs)
+        self._batch = self._programs(num_envs)
         self.episodes = self._batch.episodes
         self.num_envs = num_envs
         self.single_action_space = spaces.Box(-1.0, 1.0, (self.episodes.action_size,), np.float32)
@@ -65,6 +65,10 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         self._shape = (num_envs, self.episodes.action_size)
         self._lanes: batch.Lanes | None = None
         self._over = np.zeros(num_envs, bool)
+
+    def _programs(self, num_envs: int) -> batch.EpisodeBatch:
+        """Returns the compiled batch; subclasses have others."""
+        return batch.make(self.settings, num_envs)
 
     def reset(
         self,
@@ -82,7 +86,13 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
           errors.UsageError: seeds or mask are not of N lanes, or a mask comes before all lanes
             have begun.
+          gymnasium.error.Error: this process was forked after jax had started.
         """
+        try:
+            forked.refuse()
+        except errors.UsageError as error:
+            # A vector environment raises the worker's exception anew, from its text.
+            raise gymnasium.error.Error(str(error)) from None
         super().reset(seed=seed if isinstance(seed, int | None) else None)
         which = np.ones(self.num_envs, bool)
         if options and "reset_mask" in options:
@@ -99,8 +109,12 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         self._lanes, result = self._batch.advance(
             self._lanes, idle, batch.StepMode(which, False, False)
         )
+        return self._begun(result.now, which)
+
+    def _begun(self, now: tuple[Any, Any], which: np.ndarray) -> tuple[Any, dict[str, Any]]:
+        """Returns observations and info of a reset of the lanes `which`."""
         self._over = self._over & ~which
-        observed, measured = _to_host(result.now)
+        observed, measured = _to_host(now)
         return observed, _info(measured, which)
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:

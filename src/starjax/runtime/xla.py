@@ -49,10 +49,14 @@ def prepare_xla() -> None:
     _set_default("jax_compilation_cache_dir", str(cache))
 
 
+def has_started() -> bool:
+    """Returns True if jax has started its backends in this process."""
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    return getattr(bridge, "backends_are_initialized", lambda: False)()
+
+
 def _warn_if_started() -> None:
     """Says that jax has read XLA's flags already, as in a notebook that has used it before."""
-    bridge = sys.modules.get("jax._src.xla_bridge")
-    has_started = getattr(bridge, "backends_are_initialized", lambda: False)
     if has_started():
         line = "jax had started before: physics on a CPU is 300 times slower; in a new program call"
         print(f"starjax: {line} starjax.runtime.prepare_xla() first", file=sys.stderr)
