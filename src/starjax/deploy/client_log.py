@@ -1,4 +1,4 @@
-"""Lines about the clients of a server: who came, what was refused and why, what was answered."""
+"""Lines of a server about its clients: arrivals, reasons of refusals, counts at the end."""
 
 from collections.abc import Callable
 

@@ -57,7 +57,7 @@ class StarjaxEnv(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Returns the arguments of the environment but for its trocars."""
+        """Returns the arguments of the environment without its trocars."""
         return {
             "task": self.task,
             "observation": self.observation,
