@@ -47,7 +47,7 @@ def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, see
     ((_, _, _, trocars, settings),) = given
     np.testing.assert_array_equal(trocars, [field[:seen, None] for field in rcm.TROCARS])
     wanted = {"per_trocar": 3, "seed": 5, "max_steps": max(7, least)}
-    wanted["expert"] = expert or "default"
+    wanted |= {"expert": expert or "default"}
     assert {name: settings._asdict()[name] for name in wanted} == wanted
 
 
@@ -93,6 +93,15 @@ def test_demonstrations_are_recorded_with_what_is_wrong(tmp_path, monkeypatch):
     params = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4)))
     state = given[1][1].reset(jax.random.key(0), params)
     assert set(state.wrapper_state) == {"smoke", "observation_dropout"}
+
+
+def test_recorded_disturbances_and_displaced_cameras_of_training_exclude_each_other(tmp_path):
+    policy = dataclasses.replace(SMOKE.policy, observation="image")
+    demos = dataclasses.replace(SMOKE.demos, randomise=("smoke=0.5",))
+    train = dataclasses.replace(SMOKE.train, randomise=("camera=10",))
+    chosen = dataclasses.replace(SMOKE, demos=demos, policy=policy, train=train, out=str(tmp_path))
+    with mistakes.of("demos.randomise", "smoke=0.5"):
+        demonstrations.plan(chosen, stubs.make_env("image"), sharing.ALONE)
 
 
 @pytest.mark.parametrize(

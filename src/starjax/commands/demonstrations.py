@@ -39,8 +39,12 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
     from starjax.rollouts import agent, placement, success_quota, trocars
     from starjax.runtime import precompile, processes
     from starjax.sim import env as sim_env
+    from starjax.training import randomise
 
     env, max_levels = randomised(config, env)
+    if max_levels and randomise.moves_cameras(config.train):
+        expected = "none with a displaced camera in train.randomise"
+        raise errors.UsageError(_RANDOMISE, expected, " ".join(config.demos.randomise))
     if config.policy.observation == "image" and not max_levels:
         env = sim_env.without_images(env)  # training draws them: collecting waits for no camera
     task, name = env.task, config.demos.expert or next(iter(env.task.experts))
@@ -138,6 +142,7 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
 
     from starjax.data import redraw, schema, store
     from starjax.rollouts import episodes
+    from starjax.training import randomise
 
     root = Path(config.demos.from_)
     try:
@@ -155,6 +160,8 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
         expected = f"nominal trocars at {env.p_world_ref.tolist()}"
         raise errors.UsageError(_FROM, expected, reference.tolist())
     size = [policy.image_size, policy.image_size, 3]
+    if randomise.moves_cameras(config.train):
+        redraw.expect_possible(randomise.ARGUMENT, about)
     required = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
     if policy.observation == "state":
         required = {"state": [sum(field.size for field in env.task.fields)]}
@@ -181,6 +188,7 @@ def load(
     from starjax.data import load as loading
     from starjax.data import store
     from starjax.runtime import precompile
+    from starjax.training import randomise
 
     def is_whole() -> bool:
         try:
@@ -200,7 +208,8 @@ def load(
     draws = env if config.policy.observation == "image" else None
     report = messages.indented
     if encoder is None:
-        return loading.load(root, verify=False, env=draws, report=report).dataset
+        redraws = randomise.moves_cameras(config.train)
+        return loading.load(root, verify=False, env=draws, sources=redraws, report=report).dataset
     loaded = loading.load(root, verify=False, images=False, report=report)
     return _with_features(config, draws, root, loaded, encoder)
 

@@ -107,11 +107,20 @@ def _check(
     from starjax.runtime import processes
     from starjax.training import devices, randomise
 
-    randomise.max_levels(train)
+    randomise.max_levels(train, policy)
     if policy.freeze_encoder and not processes.is_alone():
         raise errors.UsageError("policy.freeze_encoder", "one process", "several")
     if "train" in stages:
         devices.make_mesh(train.batch_size)
+
+
+def _draw_images(config: config_lib.RunConfig, env: Any) -> Any:
+    """Returns the function that draws images of displaced cameras, or None."""
+    from starjax.training import randomise
+
+    names = list(randomise.max_levels(config.train))
+    moves = randomise.moves_cameras(config.train)
+    return scenes.disturbable(env, names, config.policy).draw if moves else None
 
 
 def _environment(config: config_lib.RunConfig) -> Any:
@@ -164,6 +173,7 @@ def _train(
             should_stop=should_stop,
             description=f"Training {name}",
             step_program=program,
+            draw_images=_draw_images(config, env),
         )
     state = processes.own(result.state)
     params = state.ema_params

@@ -50,6 +50,7 @@ def load(
     verify: bool = True,
     images: bool = True,
     env: Any = None,
+    sources: bool = False,
     report: Callable[[str], None] = print,
 ) -> Demos:
     """Loads the successful episodes of a sealed dataset, after checking every byte of them.
@@ -62,17 +63,23 @@ def load(
         that has just run `demos.collect`, which checks all.
       images: without them they stay on disk, whatever the residency; `frames` reads them.
       env: `sim.env.Env` that draws the images that were not recorded at its size.
+      sources: keep the sources of images, for a training that draws some of them anew.
       report: gets one line with the place and the bytes, before any is allocated.
 
     Raises:
       DamagedEpisode: names the file that is not as it was written.
       ValueError: no dataset, or not complete.
+      UsageError: sources of images of others, or of another scene.
     """
     root = Path(root)
     description = store.read_description(root)
     sealed = store.read_seal(root)
     records = _successful(root, sealed, verify)
-    drawn = _drawn(root, description, records, env) if images else {}
+    if sources:
+        redraw.expect_possible("sources", description)
+    is_drawn = images and _is_drawn(description, env)
+    found = redraw.sources(root, description, records, env) if sources or is_drawn else None
+    drawn = redraw.images_of(found, records, env) if found and is_drawn else {}
     fields = _fields(description, records[0], images and not drawn)
     total = sum(r["files"][file]["bytes"] for r in records for file in fields.values())
     total += sum(math.prod(array.shape) for array in drawn.values())
@@ -81,6 +88,11 @@ def load(
     where = _DRAWN if drawn and place == "disk" else _WHERE[place]
     report(f"{len(records)} demonstrations, {files.size(total)}{without}: {where}")
     dataset = _dataset(root, description, records, place, fields, drawn)
+    if found and sources:
+        rows = len(dataset.episode) - len(found.qpos)
+        dataset = dataset.replace(
+            sources=found._replace(qpos=np.pad(found.qpos, ((0, rows), (0, 0))))
+        )
     return Demos(dataset, sealed["digest"], place, total, description)
 
 
@@ -105,8 +117,8 @@ def frames(root: Path, env: Any = None) -> "Mapping[str, EpisodeArray | redraw.D
     root = Path(root)
     description = store.read_description(root)
     records = _successful(root, store.read_seal(root), verify=False)
-    if drawn := _drawn(root, description, records, env):
-        return drawn
+    if _is_drawn(description, env):
+        return redraw.images(root, description, records, env)
     fields = _fields(description, records[0], images=True)
     length, start = _spans(records)
     few = _OPEN_IN_TURN * workers.worker_count()
@@ -149,13 +161,13 @@ def _fields(description: dict[str, Any], record: store.Record, images: bool) -> 
     return {name: file for name, file in found.items() if file in record["files"]}
 
 
-def _drawn(
-    root: Path, description: dict[str, Any], records: list[store.Record], env: Any
-) -> dict[str, redraw.DrawnImages]:
-    """Returns the images that an environment draws, none if they were recorded at its size."""
-    if env is None or redraw.are_recorded(description, env) or not redraw.is_possible(description):
-        return {}
-    return redraw.images(root, description, records, env)
+def _is_drawn(description: dict[str, Any], env: Any) -> bool:
+    """Returns True if an environment draws the images: they were not recorded at its size."""
+    return (
+        env is not None
+        and not redraw.are_recorded(description, env)
+        and redraw.is_possible(description)
+    )
 
 
 def _spans(records: list[store.Record]) -> tuple[np.ndarray, np.ndarray]:

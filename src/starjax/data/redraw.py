@@ -6,7 +6,7 @@ an episode follow from the key of its trial, just like in the recording.
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,23 @@ from starjax.rollouts import episodes, workers
 # Images per call: as many on each device, because the batch size may change last bits. A core's
 # cache holds 16; a GPU needs more to be busy.
 CPU_BATCH, GPU_BATCH = 16, 1024
+
+
+class Sources(NamedTuple):
+    """Data that the images of a dataset are a function of.
+
+    Attributes:
+      qpos: `[F, Q]` of every frame, and perhaps unused rows after them.
+      episodes: `sim.state.ImageSource` of the episodes `[D]`; its `qpos` is empty.
+    """
+
+    qpos: Any
+    episodes: Any
+
+    def at(self, frame: Any, episode: Any) -> Any:
+        """Returns the `ImageSource` `[...]` of frames `[...]` of episodes `[...]`."""
+        sources = jax.tree.map(lambda leaf: leaf[episode], self.episodes)
+        return sources._replace(qpos=self.qpos[frame])
 
 
 class DrawnImages:
@@ -95,6 +112,13 @@ def is_possible(description: Mapping[str, Any]) -> bool:
     return is_ours and is_undisturbed and "qpos" in description["features"]
 
 
+def expect_possible(argument: str, description: Mapping[str, Any]) -> None:
+    """Raises UsageError for a dataset whose images cannot be drawn."""
+    if not is_possible(description):
+        expected = "demonstrations of starjax, recorded without disturbances"
+        raise errors.UsageError(argument, expected, "others, whose images cannot be drawn")
+
+
 def are_recorded(description: Mapping[str, Any], env: Any) -> bool:
     """Returns True if a dataset holds images of an environment's cameras at its image size."""
     recorded = description["features"]
@@ -130,16 +154,16 @@ def scene_env(description: Mapping[str, Any], image_size: int) -> Any:
     )
 
 
-def images(
+def sources(
     root: Path, description: Mapping[str, Any], records: Sequence[Mapping[str, Any]], env: Any
-) -> dict[str, DrawnImages]:
-    """Returns the images of all frames of episodes by camera, none of them drawn yet.
+) -> Sources:
+    """Returns the sources of the images of all frames of episodes.
 
     Args:
       root: folder of the dataset.
       description: dataset.json.
       records: of D episodes.
-      env: `sim.env.Env` of the dataset's scene, with the cameras and their image size.
+      env: `sim.env.Env` of the dataset's scene, with the cameras.
 
     Raises:
       errors.UsageError: the scene is not the recorded one.
@@ -159,22 +183,39 @@ def images(
         return ImageSource(still, state.trocar.p_world_trocar, state.layout, state.cameras)
 
     trocars = schema.trocars_of(records)
-    sources = jax.jit(jax.vmap(start))(_keys(description["seed"], records), trocars)
+    starts = jax.jit(jax.vmap(start))(_keys(description["seed"], records), trocars)
     folders = (root / "episodes" / record["key"] for record in records)
     joints = [np.load(folder / "qpos.npy", allow_pickle=False) for folder in folders]
-    qpos = np.concatenate(joints)
-    episode = np.repeat(np.arange(len(records), dtype=np.int32), [len(part) for part in joints])
+    return Sources(np.concatenate(joints), starts)
+
+
+def images(
+    root: Path, description: Mapping[str, Any], records: Sequence[Mapping[str, Any]], env: Any
+) -> dict[str, DrawnImages]:
+    """Returns the images of all frames of episodes by camera, none of them drawn yet.
+
+    The arguments are those of `sources`; the environment's images have their size.
+    """
+    return images_of(sources(root, description, records, env), records, env)
+
+
+def images_of(
+    found: Sources, records: Sequence[Mapping[str, Any]], env: Any
+) -> dict[str, DrawnImages]:
+    """Returns `images` from their sources."""
+    lengths = [record["length"] for record in records]
+    episode = np.repeat(np.arange(len(records), dtype=np.int32), lengths)
 
     def drawn(camera: str) -> Callable[[Any, Any], jax.Array]:
         @jax.jit
         def draw(qpos: jax.Array, episode: jax.Array) -> jax.Array:
-            source = jax.tree.map(lambda leaf: leaf[episode], sources)._replace(qpos=qpos)
-            return jax.vmap(env.draw)(source)[camera].rgb
+            source = jax.tree.map(lambda leaf: leaf[episode], found.episodes)
+            return jax.vmap(env.draw)(source._replace(qpos=qpos))[camera].rgb
 
         return draw
 
     return {
-        camera: DrawnImages(drawn(camera), qpos, episode, size)
+        camera: DrawnImages(drawn(camera), found.qpos, episode, size)
         for camera, size in image_sizes(env).items()
     }
 

@@ -32,6 +32,8 @@ class Dataset:
       episode: `[F]` int32, which demonstration a frame belongs to.
       start: `[D]` int32, first frame of each demonstration.
       length: `[D]` int32, its number of frames.
+      sources: `redraw.Sources` of the images, on the device or the host; None unless training draws
+        some anew.
     """
 
     observation: Observation
@@ -40,6 +42,7 @@ class Dataset:
     episode: Any
     start: Any
     length: Any
+    sources: Any = None
 
 
 @flax.struct.dataclass
@@ -150,14 +153,29 @@ def window_frames(frame: Any, first: Any, last: Any, obs_horizon: int, horizon: 
     )
 
 
-def gather(dataset: Dataset, frame: Any, obs_horizon: int, horizon: int) -> Batch:
-    """Gathers the windows at frames `[...]`, as arrays of the dataset's kind (numpy or jax)."""
+def places(dataset: Dataset) -> Dataset:
+    """Returns the dataset without its windows: the places of the episodes, and sources."""
+    return dataset.replace(observation=None, command=None, trocar=None)
+
+
+def control_steps(dataset: Dataset, frame: jax.Array) -> jax.Array:
+    """Returns the control step of each frame `[...]` in its episode, from 0."""
+    return frame - dataset.start[dataset.episode[frame]]
+
+
+def gather(dataset: Dataset, frame: Any, obs_horizon: int, horizon: int, seen: Any = None) -> Batch:
+    """Gathers the windows at frames `[...]`, as arrays of the dataset's kind (numpy or jax).
+
+    `seen`, int32 `[..., O]`, are the control steps that are observed instead of the last O.
+    """
     shape = frame.shape
     frame = frame.reshape(-1)
     episode = dataset.episode[frame]
     first = dataset.start[episode]
     last = first + dataset.length[episode] - 1
     observed, commanded = window_frames(frame, first, last, obs_horizon, horizon)
+    if seen is not None:
+        observed = first[:, None] + seen.reshape(-1, obs_horizon)
 
     def take(tree, index):
         flat = index.reshape(-1)

@@ -1,6 +1,6 @@
 """The mesh of devices that the batch is split over; all else has a copy on each device."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -46,6 +46,14 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
 def replicated(mesh: Mesh) -> NamedSharding:
     """Returns the sharding of a full copy on every device."""
     return NamedSharding(mesh, PartitionSpec())
+
+
+def on_shares(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
+    """Runs a function on every device, of its shares of all arguments along their first axes."""
+    if mesh.size == 1:
+        return function
+    spec = batch_sharding(mesh).spec
+    return jax.shard_map(function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
 
 
 def compiler_options(mesh: Mesh) -> dict[str, Any]:

@@ -17,7 +17,16 @@ from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import background, precompile, processes, progress
 from starjax.sim.tasks.base import Task
-from starjax.training import checkpoint, devices, encoder, holdout, log, metrics, stepper
+from starjax.training import (
+    checkpoint,
+    devices,
+    encoder,
+    holdout,
+    log,
+    metrics,
+    redrawing,
+    stepper,
+)
 from starjax.training import state as states
 from starjax.training.sharding import StateLayout, StepCarry
 from starjax.training.step import Setup
@@ -63,6 +72,7 @@ def run(
     should_stop: Callable[[], bool] = lambda: False,
     description: str = "train",
     step_program: precompile.Program | None = None,
+    draw_images: redrawing.Draw | None = None,
 ) -> TrainingResult:
     """Trains a method, resuming from the newest sound checkpoint in the directory.
 
@@ -82,6 +92,8 @@ def run(
       should_stop: polled about once a second; True saves and raises Interrupted.
       description: name of the progress bar.
       step_program: from `training.precompile` with these arguments.
+      draw_images: draws those of displaced cameras, from the dataset's sources; needed if
+        `train_config.randomise` has such a disturbance.
 
     Raises:
       Interrupted: after `should_stop`.
@@ -118,7 +130,7 @@ def run(
     resident = windows.on_device(dataset)
     steps = None
     if resident:
-        steps = stepper.resident(setup, dataset, frames, is_new, step_program)
+        steps = stepper.resident(setup, dataset, frames, is_new, step_program, draw_images)
 
     state = _restored(directory / "checkpoints", shapes)
     if state is None:
@@ -139,7 +151,7 @@ def run(
         held_out_errors = holdout_error(processes.own(state)) if holdout_error else {}
         return TrainingResult(state, 0.0, int(state.skipped), held_out_errors)
     if steps is None:
-        steps = stepper.streamed(setup, dataset, frames, state)
+        steps = stepper.streamed(setup, dataset, frames, state, draw_images)
     step, carry = int(state.step), steps.begin(state)
     del state  # on several devices, memory that the steps may need
     return _train(

@@ -11,8 +11,7 @@ import numpy as np
 from starjax.data import windows
 from starjax.rcm import arrays
 from starjax.training import devices
-from starjax.training import state as states
-from starjax.training.step import Setup
+from starjax.training.step import Setup, choose
 
 _AHEAD = 2  # batches that wait for their steps
 _CHUNK = 64  # steps whose frames are drawn at once
@@ -22,6 +21,8 @@ def batches(
     setup: Setup, dataset: windows.Dataset, frames: np.ndarray, key: jax.Array, first: int
 ) -> Iterator[windows.Batch]:
     """Yields the batches of steps `first`, `first + 1`, .. that `step.resident_step` would gather.
+
+    Their images are undisturbed.
 
     Close the iterator (or let it go) to end its thread.
 
@@ -34,14 +35,15 @@ def batches(
     """
     policy_config, mesh = setup.policy_config, setup.layout.mesh
     on_device = jnp.asarray(frames)
+    places = jax.tree.map(jnp.asarray, windows.places(dataset).replace(sources=None))
     waiting: queue.Queue = queue.Queue(maxsize=_AHEAD)
     closed = threading.Event()
 
     @jax.jit
     def chosen(first_step):
         def of(step):
-            key_batch = states.step_keys(key, step).batch
-            return windows.sample_frames(key_batch, on_device, setup.train_config.batch_size)
+            choice = choose(setup, key, step, places, on_device, jnp.int32(len(frames)))
+            return choice.frame, choice.seen
 
         return jax.vmap(of)(first_step + jnp.arange(_CHUNK))
 
@@ -50,11 +52,16 @@ def batches(
         try:
             step = first
             while not closed.is_set():
-                for frame in np.asarray(chosen(step)):
+                frame, seen = jax.device_get(chosen(step))
+                for i in range(_CHUNK):
                     if closed.is_set():
                         return
                     batch = windows.gather(
-                        dataset, frame, policy_config.obs_horizon, policy_config.horizon
+                        dataset,
+                        frame[i],
+                        policy_config.obs_horizon,
+                        policy_config.horizon,
+                        None if seen is None else seen[i],
                     )
                     _put(waiting, devices.shard_batch(batch, mesh), closed)
                 step += _CHUNK

@@ -72,6 +72,43 @@ def resident_step(
     return train_step(setup, carry, batch)
 
 
+class Choice(NamedTuple):
+    """Draws of a batch of B windows.
+
+    Attributes:
+      frame: int32 `[B]`, frames of the windows.
+      draws: their disturbances, None without any.
+      seen: int32 `[B, O]`, control steps that are observed, None without disturbances.
+    """
+
+    frame: jax.Array
+    draws: randomise.Draws | None = None
+    seen: jax.Array | None = None
+
+
+def choose(
+    setup: Setup,
+    key: jax.Array,
+    step: jax.Array,
+    dataset: windows.Dataset,
+    frames: jax.Array,
+    available: jax.Array,
+) -> Choice:
+    """Chooses the windows of a step; `key` and `step` are the state's.
+
+    It reads the places of the episodes only, see `windows.places`.
+    """
+    count, keys = setup.train_config.batch_size, states.step_keys(key, step)
+    frame = windows.sample_frames(keys.batch, frames, count, available)
+    levels = randomise.max_levels(setup.train_config)
+    if not levels:
+        return Choice(frame)
+    draws = randomise.draw(levels, keys.loss, count, count // setup.layout.mesh.size)
+    at = windows.control_steps(dataset, frame)
+    seen = randomise.seen_steps(list(levels), draws, at, setup.policy_config.obs_horizon)
+    return Choice(frame, draws, seen)
+
+
 def drawn_batch(
     setup: Setup,
     key: jax.Array,
@@ -79,21 +116,50 @@ def drawn_batch(
     dataset: windows.Dataset,
     frames: jax.Array,
     available: jax.Array,
+    displaced: Any = None,
 ) -> windows.Batch:
-    """Returns the batch of a step, split over the devices; `key` and `step` are the state's."""
-    policy_config, train_config = setup.policy_config, setup.train_config
-    key = states.step_keys(key, step).batch
-    frame = windows.sample_frames(key, frames, train_config.batch_size, available)
-    frame = jax.lax.with_sharding_constraint(frame, devices.batch_sharding(setup.layout.mesh))
-    return windows.gather(dataset, frame, policy_config.obs_horizon, policy_config.horizon)
+    """Returns the batch of a step, split over the devices; `key` and `step` are the state's.
+
+    `displaced` is `redrawing.Displaced` if cameras are.
+    """
+    policy_config = setup.policy_config
+    choice = choose(setup, key, step, dataset, frames, available)
+    split = devices.batch_sharding(setup.layout.mesh)
+    choice = jax.tree.map(lambda x: jax.lax.with_sharding_constraint(x, split), choice)
+    batch = windows.gather(
+        dataset, choice.frame, policy_config.obs_horizon, policy_config.horizon, choice.seen
+    )
+    return disturbed(setup, choice, batch, displaced)
+
+
+def disturbed(
+    setup: Setup, choice: Choice, batch: windows.Batch, displaced: Any = None
+) -> windows.Batch:
+    """Disturbs the images of a gathered batch."""
+    if choice.draws is None:
+        return batch
+    if displaced is not None:
+        displaced = jax.tree.map(lambda x: x[:, displaced.index], displaced.images)
+    names = list(randomise.max_levels(setup.train_config))
+
+    def change(draws: Any, seen: Any, observation: Any, displaced: Any) -> Any:
+        if displaced is not None:
+            images = {
+                name: randomise.with_first(image, displaced[name])
+                for name, image in observation.images.items()
+            }
+            observation = observation._replace(images=images)
+        return randomise.disturb(names, draws, seen, observation)
+
+    change = devices.on_shares(change, setup.layout.mesh)
+    observation = change(choice.draws, choice.seen, batch.observation, displaced)
+    return batch.replace(observation=observation)
 
 
 @arrays.broadcasting  # which optax relies on
 def train_step(setup: Setup, carry: StepCarry, batch: windows.Batch) -> StepCarry:
     """Takes one step of AdamW and of the average; leaves it out, and counts it, if not finite."""
     key = states.step_keys(carry.state.key, carry.state.step).loss
-    observation = randomise.randomise(setup.train_config, key, batch.observation)
-    batch = batch.replace(observation=observation)
     prepared = setup.policy.prepare(carry.state.normalizer, key, batch)
     update = functools.partial(_update, setup)
     return setup.layout.on_each_device(update)(carry, prepared)

@@ -1,7 +1,8 @@
 """Compiled training steps, on a dataset that is on the device or one of the host."""
 
 import functools
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 from starjax.data import windows
 from starjax.runtime import processes
 from starjax.runtime.precompile import Program
-from starjax.training import devices, prefetch
+from starjax.training import devices, prefetch, redrawing
 from starjax.training import step as steps
 from starjax.training.sharding import StateLayout, StepCarry
 from starjax.training.state import TrainState
@@ -38,6 +39,7 @@ def resident(
     frames: np.ndarray,
     ahead: bool,
     program: Program | None = None,
+    draw_images: redrawing.Draw | None = None,
 ) -> Stepper:
     """Makes steps on a dataset that is on the device; every device of the mesh gets a copy.
 
@@ -47,11 +49,10 @@ def resident(
       frames: `[n]` frame numbers to draw from.
       ahead: trace the program now, and compile it in the background until the first step.
       program: from `batch_program` of an equal setup, perhaps prepared.
+      draw_images: draws those of displaced cameras; None without any.
     """
     layout = setup.layout
-    rows = windows.padded_count(len(frames))
-    available = np.pad(frames, (0, rows - len(frames))), np.int32(len(frames))
-    data = devices.replicate((dataset, *available), layout.mesh, may_alias=None)
+    data = _on_devices(setup, dataset, frames)
     if steps.runs_in_a_loop(setup.policy_config):
         return _looped(setup, data, ahead)
     # A program of its own draws the batch: the large one is the same for any number of frames, and
@@ -63,27 +64,41 @@ def resident(
     program = program or batch_program(setup)
     if ahead and not program.is_prepared(*arguments):
         program.prepare(*arguments)
+    displaced = _displaced(setup, data, ahead, draw_images)
 
     def run(carry: StepCarry, count: int) -> StepCarry:
         take_step = program.select(*arguments)
-        for _ in range(count):
-            carry = take_step(carry, draw(*_drawn_by(carry), *data))
+        for images in displaced(carry, count):
+            carry = take_step(carry, draw(*_drawn_by(carry), *data, images))
         return carry
 
     return _stepper(layout, run)
 
 
 def streamed(
-    setup: Setup, dataset: windows.Dataset, frames: np.ndarray, state: TrainState
+    setup: Setup,
+    dataset: windows.Dataset,
+    frames: np.ndarray,
+    state: TrainState,
+    draw_images: redrawing.Draw | None = None,
 ) -> Stepper:
     """Makes steps on a dataset of the host, whose batches follow those before `state`."""
     program = batch_program(setup)
     key = jnp.copy(processes.own(state.key))
     batches = prefetch.batches(setup, dataset, frames, key, int(state.step))
+    if not setup.train_config.randomise:
+        disturb, data, displaced = None, (), _displaced(setup, (), False, None)
+    else:
+        data = _on_devices(setup, windows.places(dataset), frames)
+        disturb = jax.jit(functools.partial(_disturbed, setup))
+        displaced = _displaced(setup, data, True, draw_images)
 
     def run(carry: StepCarry, count: int) -> StepCarry:
-        for _ in range(count):
-            carry = program(carry, next(batches))
+        for images in displaced(carry, count):
+            batch = next(batches)
+            if disturb:
+                batch = disturb(*_drawn_by(carry), batch, images, *data)
+            carry = program(carry, batch)
         return carry
 
     return _stepper(setup.layout, run)
@@ -100,6 +115,34 @@ def _looped(setup: Setup, data: tuple[Any, ...], ahead: bool) -> Stepper:
     if ahead:
         program.prepare(layout.shapes(), *data, counted(1))
     return _stepper(layout, lambda carry, count: program(carry, *data, counted(count)))
+
+
+def _on_devices(setup: Setup, dataset: windows.Dataset, frames: np.ndarray) -> tuple[Any, ...]:
+    """Returns a dataset, frames to draw from and their number on every device."""
+    rows = windows.padded_count(len(frames))
+    available = np.pad(frames, (0, rows - len(frames))), np.int32(len(frames))
+    return devices.replicate((dataset, *available), setup.layout.mesh, may_alias=None)
+
+
+def _disturbed(
+    setup: Setup, key: Any, step: Any, batch: windows.Batch, displaced: Any, *data: Any
+) -> windows.Batch:
+    return steps.disturbed(setup, steps.choose(setup, key, step, *data), batch, displaced)
+
+
+def _displaced(
+    setup: Setup, data: tuple[Any, ...], ahead: bool, draw: redrawing.Draw | None
+) -> Callable[[StepCarry, int], Iterator[redrawing.Displaced | None]]:
+    """Returns the function from a carry and a number of steps to the steps' displaced images."""
+    if draw is None:
+        return lambda carry, count: itertools.repeat(None, count)
+    of = redrawing.make(setup, draw, data, ahead)
+
+    def each(carry: StepCarry, count: int) -> Iterator[redrawing.Displaced]:
+        key, first = jnp.copy(carry.state.key), int(carry.state.step)  # a step takes its memory
+        return (of(key, step) for step in range(first, first + count))
+
+    return each
 
 
 def _drawn_by(carry: StepCarry) -> tuple[Any, Any]:

@@ -50,6 +50,8 @@ class Disturbance(NamedTuple):
       on_observe: (Env, DisturbanceState, EnvState) -> Observation.
       on_image: (DisturbanceState, image `[h, w, 3]` in [0, 1], control step) -> image, for every
         image; None for none.
+      seen_step: (DisturbanceState, control step) -> the one whose observation is seen then, the
+        same or an earlier one; None for the same.
       stores_states: the memory holds states, so other disturbances must act first.
       for_demos: demonstrations that are recorded with it teach a policy to withstand it.
     """
@@ -73,6 +75,7 @@ class Disturbance(NamedTuple):
         lambda env, disturbance, state: env.observe(state)
     )
     on_image: Callable[[DisturbanceState, jax.Array, jax.Array], jax.Array] | None = None
+    seen_step: Callable[[DisturbanceState, jax.Array], jax.Array] | None = None
     stores_states: bool = False
     for_demos: bool = True
 

@@ -51,15 +51,23 @@ def _execute_past(
     return after, _pushed(command, disturbance.memory)
 
 
+def _is_lost(disturbance: DisturbanceState, step: jax.Array) -> jax.Array:
+    return jax.random.bernoulli(jax.random.fold_in(disturbance.key, step), disturbance.level)
+
+
 def _drop(
     env: Env, disturbance: DisturbanceState, state: EnvState, command: Command
 ) -> tuple[EnvState, EnvState]:
     """Advances one step; the memory is the last state that was observed."""
     after = env.step(state, command)
-    is_lost = jax.random.bernoulli(
-        jax.random.fold_in(disturbance.key, after.step), disturbance.level
-    )
+    is_lost = _is_lost(disturbance, after.step)
     return after, jax.tree.map(lambda old, x: jnp.where(is_lost, old, x), disturbance.memory, after)
+
+
+def _last_received(disturbance: DisturbanceState, step: jax.Array) -> jax.Array:
+    return jax.lax.while_loop(
+        lambda step: (step > 0) & _is_lost(disturbance, step), lambda step: step - 1, step
+    )
 
 
 OBSERVATION_DELAY = Disturbance(
@@ -71,6 +79,9 @@ OBSERVATION_DELAY = Disturbance(
     on_reset=lambda env, disturbance, state: (state, _repeated(state)),
     on_step=_remember_state,
     on_observe=_observe_past,
+    seen_step=lambda disturbance, step: jnp.maximum(
+        step - jnp.round(disturbance.level).astype(jnp.int32), 0
+    ),
     stores_states=True,
 )
 ACTION_DELAY = Disturbance(
@@ -91,5 +102,6 @@ OBSERVATION_DROPOUT = Disturbance(
     on_reset=lambda env, disturbance, state: (state, state),
     on_step=_drop,
     on_observe=lambda env, disturbance, state: env.observe(disturbance.memory),
+    seen_step=_last_received,
     stores_states=True,
 )
