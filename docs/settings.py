@@ -93,14 +93,16 @@ def commands() -> str:
         "---",
         "# Commands",
         "",
-        "`starjax COMMAND --help` prints the same. Ranges are checked.",
+        "`starjax COMMAND --help-all` prints the same. Ranges are checked.",
     ]
     for name, (module, summary, needed) in cli.COMMANDS.items():
         module, _, function = module.partition(":")
         loaded = importlib.import_module(module)
         description = getattr(loaded, function.upper() or "DESCRIPTION", f"{summary}.")
         flags_of = [kind for kind in vars(loaded).values() if is_flags(kind, module)]
-        parts += ["", f"## starjax {name}", "", description]
+        text, _, examples = description.partition("\n\nExamples:\n")
+        parts += ["", f"## starjax {name}", "", text]
+        parts += ["", "```bash", *map(str.strip, examples.splitlines()), "```"]
         parts += ["", f"Needs the extras {', '.join(f'`{extra}`' for extra in needed)}."]
         if name in ("run", "collect", "train"):
             parts += ["", "Flags: the [settings of a run](config.md)."]

@@ -8,6 +8,7 @@ import pytest
 
 from starjax import errors
 from starjax.commands import options
+from starjax.policies import packaged
 
 
 @pytest.mark.parametrize(
@@ -40,6 +41,34 @@ def test_a_choice_suggests_the_nearest_name():
     with mistakes.of("method", "x") as caught:
         errors.choice("method", "x", ["dp_ee"])
     assert caught.value.hint == ""
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"),
+    [
+        ("peg", "did you mean peg_transfer or peg_transfer_bimanual?"),
+        ("needle_pik", "did you mean needle_pick?"),
+        ("Reach", "did you mean reach?"),
+        ("handover", "did you mean needle_handover?"),
+        ("x", ""),
+    ],
+)
+def test_a_part_of_a_name_is_near_to_it(word, hint):
+    known = ["peg_transfer", "peg_transfer_bimanual", "needle_pick", "needle_handover", "reach"]
+    assert errors.nearest(word, known) == hint
+
+
+def test_a_packaged_policy_is_suggested():
+    with mistakes.of("--policy", "compactt") as caught:
+        packaged.find("--policy", "compactt")
+    assert caught.value.hint == "did you mean compact?"
+
+
+def test_a_mistake_within_a_mistake_is_one():
+    inner = errors.UsageError("root", "a folder", "x/dataset.json: No such file")
+    assert str(errors.UsageError("DATASET", "demonstrations", inner)) == (
+        "DATASET: expected demonstrations, got x/dataset.json: No such file"
+    )
 
 
 def test_texts_of_others_cannot_steer_the_terminal():

@@ -66,6 +66,7 @@ _TABLE: dict[str, tuple[str, str, tuple[str, ...]]] = {
     ),
     "find-mount": ("commands.find_mount", "search the mount of an arm for a task", _LEARNING),
     "doctor": ("doctor", "check the installation and suggest fixes", ("sim",)),
+    "completion": ("commands.completion", "print the completion script of a shell", ("sim",)),
 }
 COMMANDS = {name: (f"starjax.{module}", *rest) for name, (module, *rest) in _TABLE.items()}
 
@@ -163,10 +164,14 @@ def dispatch(argv: Sequence[str]) -> int:
         errors.warn_renamed(name, _RENAMED[name])
         name = _RENAMED[name]
     errors.choice("COMMAND", name, COMMANDS)
-    module, _, needed = COMMANDS[name]
-    extras.require(name, *needed)
-    module, _, function = module.partition(":")
-    return getattr(importlib.import_module(module), function or "main")(argv[1:])
+    extras.require(name, *COMMANDS[name][2])
+    return load(name)(argv[1:])
+
+
+def load(name: str) -> Callable[[Sequence[str]], int]:
+    """Returns the function of a subcommand, `main(argv) -> exit code`."""
+    module, _, function = COMMANDS[name][0].partition(":")
+    return getattr(importlib.import_module(module), function or "main")
 
 
 def _raise_interrupts(ignored: Any) -> None:

@@ -16,7 +16,9 @@ from starjax.runtime import files, gpu, locks, xla
 DESCRIPTION = """Checks this machine and the installation; suggests one remedy per fault.
 
 The exit code is 1 if there is a fault.
-"""
+
+Examples:
+  starjax doctor"""
 NEEDED_MEMORY = 4e9  # bytes free for the preset `cpu`
 NEEDED_DISK = 3e9  # of a run of the preset `cpu`: 2.4 GB
 

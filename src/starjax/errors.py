@@ -5,6 +5,9 @@ import warnings
 from collections.abc import Iterable
 from typing import Any
 
+_LETTERS = 2  # of a word that can stand for those that contain it
+_SUGGESTIONS = 3  # at most
+
 
 class UsageError(ValueError):
     """An error of the user of a command or function, shown as one line.
@@ -17,6 +20,7 @@ class UsageError(ValueError):
     """
 
     def __init__(self, argument: str, expected: str, got: Any, hint: str = "") -> None:
+        got = got.got if isinstance(got, UsageError) else got  # of the part that found it
         self.argument, self.expected, self.got, self.hint = argument, expected, got, hint
         ending = f"; {hint}" if hint else ""
         super().__init__(f"{argument}: expected {expected}, got {got}{ending}")
@@ -44,9 +48,16 @@ def choice(argument: str, value: str, known: Iterable[str]) -> None:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Returns `did you mean ...?` with the nearest known word, empty if all are far."""
-    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return f"did you mean {near[0]}?" if near else ""
+    """Returns `did you mean ...?` with the nearest known word, empty if all are far.
+
+    A word that others begin with or contain, such as `peg`, is near to all of them.
+    """
+    names, low = list(known), word.lower()
+    near = difflib.get_close_matches(low, names, n=1, cutoff=0.6)
+    if not near and len(low) >= _LETTERS:
+        near = [name for name in names if name.startswith(low)]
+        near = near or [name for name in names if low in name.lower()]
+    return f"did you mean {' or '.join(near[:_SUGGESTIONS])}?" if near else ""
 
 
 def warn_renamed(old: str, new: str) -> None:

@@ -17,7 +17,7 @@ NONE_INVALID = {"method": "stardiff", "invalid": 0}
 
 
 def test_the_plan_has_the_scene_the_observation_and_the_numbers():
-    said = messages.plan(SMOKE, messages.STAGES)
+    said = f"{messages.headline(SMOKE)}\n{messages.plan(SMOKE, messages.STAGES)}"
     for fact in ("preset smoke", "peg transfer", "state", "block.p", "8 (1 x 8", "40 steps of 32"):
         assert fact in said
     assert "12 trocars x 1 trials" in said and "--policy.observation image" in said

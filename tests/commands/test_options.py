@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import re
+import shlex
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ import pytest
 from starjax import cli, config
 from starjax.commands import (
     bench,
+    completion,
     evaluate,
     export_command,
     import_command,
@@ -180,10 +182,10 @@ def test_a_word_that_is_empty_is_a_mistake():
             cli.dispatch(command)
 
 
-def helped(command, capsys):
+def helped(command, capsys, kind="--help-all"):
     """What help says: its first line, and of each flag its text."""
     with contextlib.suppress(SystemExit):
-        cli.dispatch([command, "--help"])
+        cli.dispatch([command, kind])
     usage, *lines = capsys.readouterr().out.replace("│", " ").splitlines()
     found, entry = {}, []
     for line in lines:
@@ -218,6 +220,101 @@ def test_help_shows_ranges_and_defaults(capsys, monkeypatch):
         said = helped("evaluate", capsys)[1]
         assert f"default: {trials})" in said["--eval.trials"]
         assert f"default: {limit})" in said["--eval.time-limit-s"]
+
+
+def text_and_flags(command, capsys):
+    """What stands above the flags in the short help, and the lines with the flags."""
+    with contextlib.suppress(SystemExit):
+        cli.dispatch([command, "--help"])
+    page = capsys.readouterr().out
+    # Lines of a box, or of hyphens where the output has no such characters.
+    found = re.search(r"^\W*(positional arguments|options)\b", page, re.MULTILINE)
+    assert found
+    return page[: found.start()], page[found.start() :].splitlines()
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+@pytest.mark.parametrize("columns", [40, 80])
+def test_help_stays_within_the_terminal_and_breaks_no_word(command, columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "1000")
+    text, _ = text_and_flags(command, capsys)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    wrapped, flags = text_and_flags(command, capsys)
+    lines = [line for line in wrapped.splitlines()[1:] if not line.startswith(" ")]
+    assert max(map(len, [*lines, *flags])) <= columns
+    assert wrapped.split() == text.split()
+
+
+@pytest.mark.parametrize("command", ["run", "collect", "train", "evaluate", "stress"])
+def test_short_help_has_the_flags_used_most_and_points_to_the_others(command, capsys):
+    few, every = (helped(command, capsys, kind)[1] for kind in ("--help", "--help-all"))
+    assert {*few} < {*every} and len(few) <= 15
+    with contextlib.suppress(SystemExit):
+        cli.dispatch([command, "-h"])
+    assert f"starjax {command} --help-all" in capsys.readouterr().out
+
+
+def test_sections_of_help_have_titles_of_their_own(capsys):
+    with contextlib.suppress(SystemExit):
+        cli.dispatch(["stress", "--help"])
+    assert capsys.readouterr().out.count("directory of the result") == 1
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_the_examples_of_help_are_command_lines(command, capsys):
+    lines = text_and_flags(command, capsys)[0].splitlines()
+    examples = [re.search(r"starjax (\S+) ?([^>)]*)", line) for line in lines if line[:2] == "  "]
+    assert examples and all(found and found[1] == command for found in examples)
+    with pytest.raises(options.Declared) as declared:
+        cli.load(command)(options.DECLARE)
+    for found in examples:
+        assert found
+        words = shlex.split(found[2])
+        if issubclass(declared.value.settings, config.RunConfig):
+            run_settings._settings(command, words, "", "cpu")
+        else:
+            options.parse(command, declared.value.settings, words, "", declared.value.default)
+
+
+def test_a_command_line_without_words_has_no_flag():
+    assert options.typed_value("preset", []) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("st", ["stress"]),
+        ("run --train.st", ["--train.steps", "--train.steps-per-call", "--train.state-noise"]),
+        ("run --task needle_", ["needle_pick", "needle_handover"]),
+        ("collect --policy.learner o", ["onestep"]),
+        ("evaluate --arm fr5 u", ["ur5e"]),
+        ("view --compare-with e", ["expert"]),
+    ],
+)
+def test_a_shell_completes_commands_flags_and_names(words, offered, completion_bash):
+    typed = " ".join(f"'{word}'" for word in ["starjax", *words.split()])
+    script = f"""
+        source {completion_bash}
+        COMP_WORDS=({typed}); COMP_CWORD=$((${{#COMP_WORDS[@]}} - 1)); _starjax starjax
+        printf '%s\\n' "${{COMPREPLY[@]}}"
+    """
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True)
+    assert sorted(done.stdout.split()) == sorted(offered), done.stderr
+
+
+@pytest.fixture(scope="module")
+def completion_bash(tmp_path_factory):
+    path = tmp_path_factory.mktemp("shell") / "starjax.bash"
+    with path.open("w") as stream, contextlib.redirect_stdout(stream):
+        completion.main(["bash"])
+    return path
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_have_every_command_and_flag_too(shell, capsys):
+    completion.main([shell])
+    script = capsys.readouterr().out
+    assert all(f"'{word}'" in script for word in [*cli.COMMANDS, "--train.steps", "needle_pick"])
 
 
 @pytest.mark.parametrize(

@@ -112,7 +112,7 @@ def flags():
     for name in cli.COMMANDS:
         said = io.StringIO()
         with contextlib.suppress(SystemExit), contextlib.redirect_stdout(said):
-            cli.dispatch([name, "--help"])
+            cli.dispatch([name, "--help-all"])
         text = re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue())
         found[name] = dict(re.findall(r"(--\w[\w.-]+)(?: \{([\w,]+)\})?", text))
     return found

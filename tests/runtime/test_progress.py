@@ -14,15 +14,15 @@ def _shown(stream, monkeypatch, every=0.0, done=0):
 
 
 def test_plain_lines_off_a_terminal(monkeypatch):
-    shown = _shown(io.StringIO(), monkeypatch).splitlines()
-    assert len(shown) == 4
+    begun, *shown = _shown(io.StringIO(), monkeypatch).splitlines()
+    assert begun == "Collect: 0/4 episodes" and len(shown) == 4
     assert shown[0].startswith("Collect: 1/4 episodes") and "ETA" not in shown[0]
     assert "ETA" in shown[1]
     assert "episodes/s" in shown[-1] and "ETA" not in shown[-1] and shown[-1].endswith("succeeded")
 
 
-def test_plain_lines_are_rare_but_the_last_is_shown(monkeypatch):
-    assert len(_shown(io.StringIO(), monkeypatch, every=1e9).splitlines()) == 1
+def test_plain_lines_are_rare_but_the_first_and_the_last_are_shown(monkeypatch):
+    assert len(_shown(io.StringIO(), monkeypatch, every=1e9).splitlines()) == 2
 
 
 def test_the_last_plain_line_is_shown_once():
@@ -30,7 +30,7 @@ def test_the_last_plain_line_is_shown_once():
     with progress.track("Collect", 4, stream=stream) as advance:
         advance(4)
         advance(0)
-    assert len(stream.getvalue().splitlines()) == 1
+    assert len(stream.getvalue().splitlines()) == 2
 
 
 def test_shares_that_add_up_to_a_little_less_reach_the_end():
@@ -38,7 +38,7 @@ def test_shares_that_add_up_to_a_little_less_reach_the_end():
     with progress.track("Evaluation", 1, stream=stream) as advance:
         for _ in range(10):
             advance(0.1)
-    assert len(stream.getvalue().splitlines()) == 1
+    assert len(stream.getvalue().splitlines()) == 2
 
 
 def test_a_bar_on_a_terminal(monkeypatch):

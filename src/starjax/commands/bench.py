@@ -11,7 +11,11 @@ from starjax.limits import MOST, Count, Range
 DESCRIPTION = """Times one inference at batch size 1, from observation to commands, once compiled.
 
 RUN is the directory of a method, such as runs/cpu/stardiff. The report draws Table IV from
-RUN/bench.json."""
+RUN/bench.json.
+
+Examples:
+  starjax bench runs/cpu/stardiff
+  starjax bench runs/paper/stardiff --ddim-steps 5 10 100"""
 
 DDIM_STEPS = (1, 2, 5, 10, 20, 50, 100)  # of Table IV
 

@@ -15,7 +15,10 @@ DESCRIPTION = """Calibrates a runtime monitor and writes the policy with it to a
 
 Undisturbed trials with sampled trocars (Eq. 19) are divided into three parts. Successes of the
 first scale the scores of plans and poses, those of the second set the threshold by conformal
-prediction, and the third tests the false alarm rate. Rerun the same command to resume."""
+prediction, and the third tests the false alarm rate. Rerun the same command to resume.
+
+Examples:
+  starjax calibrate --policy compact --out watched.safetensors"""
 
 # Fractions of the trials for scale and threshold; the rest tests the monitor.
 _FIT, _CALIBRATE = 0.15, 0.425

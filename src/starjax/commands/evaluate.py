@@ -26,7 +26,11 @@ DESCRIPTION = """Scores a trained policy on its task's trocars and records a vid
 RUN is the directory of a method, such as runs/cpu/stardiff. --policy takes a policy.safetensors or
 the name of a packaged policy instead, or ws://HOST:PORT of a server (starjax serve,
 or openpi's with a scene in its metadata). Trials and time limit come from the flags below, not from
-RUN; their defaults depend on this machine. Rerun the same command to resume."""
+RUN; their defaults depend on this machine. Rerun the same command to resume.
+
+Examples:
+  starjax evaluate --policy compact
+  starjax evaluate runs/cpu/stardiff --arm fr5 --eval.trials 10"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,11 @@ from starjax.runtime import files, progress, xla
 DESCRIPTION = """Exports demonstrations in another format, from which they can be restored exactly.
 
 DATASET is a directory of demonstrations such as runs/cpu/demos-0123456789ab, OUT the new file or
-directory."""
+directory.
+
+Examples:
+  starjax export runs/cpu/demos-0123456789ab out/lerobot
+  starjax export runs/cpu/demos-0123456789ab out/demos.hdf5 --format robomimic"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,7 +20,11 @@ DESCRIPTION = """Searches the base pose of an arm, the rotation of its tool, and
 
 WORKSPACE is a region of trocars and targets, or a task for the workspaces of its arms. The arm must
 reach every target through every trocar with every roll. The command prints the mount that is
-farthest from joint limits and singular configurations, as a row of the arm's record."""
+farthest from joint limits and singular configurations, as a row of the arm's record.
+
+Examples:
+  starjax find-mount fr5 grasper peg_transfer
+  starjax find-mount ur5e grasper board --tilts"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,11 @@ DESCRIPTION = """Imports demonstrations in another format as a dataset to train 
 
 PATH is a dataset in one of the formats of starjax list, OUT the new dataset. An export of starjax
 is restored exactly. For other datasets, a mapping describes the columns: a file, or one of the
-package (starjax list), by default the one that fits."""
+package (starjax list), by default the one that fits.
+
+Examples:
+  starjax import out/lerobot runs/restored
+  starjax import recordings runs/recordings --map columns.toml"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,11 @@ from starjax.runtime import files, xla
 DESCRIPTION = """Summarises a dataset, policy or result and flags anomalies.
 
 PATH is a directory of demonstrations, a LeRobot or zarr directory, a robomimic file, a
-policy.safetensors or the name of a packaged policy, a result.json or a directory with one."""
+policy.safetensors or the name of a packaged policy, a result.json or a directory with one.
+
+Examples:
+  starjax inspect runs/cpu/demos-0123456789ab
+  starjax inspect compact"""
 
 _LOOKED_AT = 50  # episodes of a foreign dataset whose values are read
 _SHOWN = 20  # anomalies

@@ -17,7 +17,10 @@ from starjax.sim.tools.base import Tool
 if TYPE_CHECKING:  # it imports jax, which `--help` does without
     from starjax.sim.tasks.base import Task
 
-DESCRIPTION = "Lists tasks, arms, tools, methods, learners, presets and policies by name."
+DESCRIPTION = """Lists tasks, arms, tools, methods, learners, presets and policies by name.
+
+Examples:
+  starjax list"""
 
 Row = tuple[str, str]  # name, description
 
@@ -41,9 +44,10 @@ def main(argv: Sequence[str]) -> int:
         "policies (--policy, --policy.encoder-weights)": _policies(),
     }
     for title, table in tables.items():
+        print(title, flush=True)  # before the tasks, which import jax
         rows = list(table)
         width = max(len(name) for name, _ in rows) if rows else 0
-        print(f"{title}\n" + "\n".join(f"  {name:{width}}  {text}" for name, text in rows) + "\n")
+        print("\n".join(f"  {name:{width}}  {text}" for name, text in rows) + "\n")
     return 0
 
 

@@ -16,14 +16,16 @@ from starjax.runtime import files, xla
 STAGES = ("collect", "train", "evaluate", "report")
 
 
+def headline(config: config_lib.RunConfig) -> str:
+    """Returns the first line of a run's plan; it needs no jax."""
+    return (
+        f"method {config.method}, preset {config.preset}, seed {config.seed}, folder {config.out}"
+    )
+
+
 def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
-    """Returns the plan of a run, for its start."""
-    lines = [
-        f"starjax {starjax.__version__}: method {config.method}, preset {config.preset}, "
-        f"seed {config.seed}, folder {config.out}",
-        *_setting(config),
-        _learning_from(config.demos),
-    ]
+    """Returns the plan of a run, for its start, without the headline."""
+    lines = [*_setting(config), _learning_from(config.demos)]
     lines += [_training(config), *_idle(config.train.batch_size)] if "train" in stages else []
     lines += [_evaluation(config)] if "evaluate" in stages else []
     return "\n".join([*lines, *_time(config, stages)])

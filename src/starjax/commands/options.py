@@ -3,12 +3,15 @@
 Imports neither jax nor numpy.
 """
 
+import contextlib
 import dataclasses
 import functools
+import io
 import re
 import shlex
+import sys
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
@@ -16,6 +19,7 @@ from tyro import _errors as tyro_errors  # private: see _refuse
 
 from starjax import config as config_lib
 from starjax import errors, limits
+from starjax.commands import help_pages
 
 SettingsT = TypeVar("SettingsT")
 
@@ -40,8 +44,22 @@ class NoFlags:
     """Settings of a command without flags."""
 
 
+class Declared(Exception):
+    """The flags of a command, raised by `parse` for the words `DECLARE`.
+
+    Attributes:
+      settings: dataclass of the flags.
+      default: values of its fields, or None.
+    """
+
+    def __init__(self, settings: type, default: Any) -> None:
+        super().__init__()
+        self.settings, self.default = settings, default
+
+
+DECLARE: list[str] = []  # command line that asks a command for its flags instead of running it
+
 _UNNAMED = "scene"  # the part of settings whose flags do not name it
-_registry = tyro.constructors.ConstructorRegistry()
 _FIELD = re.compile(r"[a-z][a-z0-9_.]*")
 
 
@@ -66,18 +84,50 @@ def parse(
     Raises:
       errors.UsageError: a flag is unknown, or its value has the wrong type or range.
     """
+    if argv is DECLARE:
+        raise Declared(settings, default)
     words = [_current(word, renamed) for word in argv]
+    cli = functools.partial(
+        tyro.cli,
+        settings,
+        prog=f"starjax {name}",
+        description="",
+        default=tyro.MISSING_NONPROP if default is None else default,
+    )
+    if kind := help_pages.requested(words):
+        print(_help(cli, kind, name, description))
+        raise SystemExit(0)
     with tyro_errors.on_parse_error(functools.partial(_refuse, default or settings)):
-        parsed = tyro.cli(
-            settings,
-            args=words,
-            prog=f"starjax {name}",
-            description=description,
-            default=tyro.MISSING_NONPROP if default is None else default,
-            registry=_registry,
-        )
+        parsed = cli(args=words, registry=registry(with_ranges))
     limits.check(parsed)
     return parsed
+
+
+def registry(*rules: Any) -> tyro.constructors.ConstructorRegistry:
+    """Makes a registry of tyro with rules for dataclasses; later rules take precedence."""
+    made = tyro.constructors.ConstructorRegistry()
+    for rule in rules:
+        made.struct_rule(rule)
+    return made
+
+
+def _help(cli: Callable[..., Any], kind: str, name: str, description: str) -> str:
+    """Returns the help page of a command, the short or the full one."""
+
+    def flags(*rules: Any) -> str:
+        # tyro breaks a description anywhere in a word, so the page has its own.
+        shown = io.TextIOWrapper(io.BytesIO(), getattr(sys.stdout, "encoding", None) or "utf-8")
+        with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
+            cli(args=["--help"], registry=registry(*rules))
+        shown.seek(0)
+        return shown.read()
+
+    full = flags(with_ranges)
+    text = full if kind == help_pages.FULL else flags(with_ranges, _first_only)
+    hides = text != full
+    return help_pages.page(
+        text, description, f"starjax {name} {help_pages.FULL}: all flags" * hides
+    )
 
 
 def typed_value(field: str, argv: Sequence[str]) -> str | None:
@@ -87,7 +137,7 @@ def typed_value(field: str, argv: Sequence[str]) -> str | None:
     and refuses a wrong one.
     """
     value = None
-    for word, following in zip(argv, [*argv[1:], ""], strict=True):
+    for word, following in zip(argv, [*argv, ""][1:], strict=True):
         name, equals, inner = word.partition("=")
         if name.replace("_", "-") == flag(field):
             value = inner if equals else following
@@ -146,7 +196,8 @@ def _refuse(settings: Any, event: Any) -> NoReturn:
     match event:
         case tyro_errors.UnrecognizedArgs(tokens=[token, *_]):
             near = errors.nearest(token.partition("=")[0], flags(settings))
-            raise errors.UsageError("FLAG", f"one of {event.prog} --help", token, near)
+            expected = f"a flag of {event.prog} (see {event.prog} {help_pages.FULL})"
+            raise errors.UsageError("FLAG", expected, token, near)
         case tyro_errors.MissingArgs(missing_arguments=missing):
             names = " ".join(str(context.arg.lowered.metavar) for context in missing)
             raise errors.UsageError(names, "a value", "none")
@@ -165,22 +216,43 @@ def _name(argument: Any) -> str:
     return argument.lowered.name_or_flags[-1] if argument else "FLAG"
 
 
-_busy: list[type] = []  # dataclasses whose fields tyro is listing
+StructInfo = tyro.constructors.StructTypeInfo
+StructSpec = tyro.constructors.StructConstructorSpec
+_busy: list[tuple[Any, type]] = []  # rules at work, and the dataclasses whose fields they list
 
 
-@_registry.struct_rule
-def _with_ranges(
-    info: tyro.constructors.StructTypeInfo,
-) -> tyro.constructors.StructConstructorSpec | None:
-    """Appends range and default to the help of each field."""
-    if not dataclasses.is_dataclass(info.type) or info.type in _busy:
+def others(rule: Any, info: StructInfo) -> StructSpec | None:
+    """Returns the fields of a dataclass by the rules before `rule`; None for other types."""
+    is_settings = isinstance(info.type, type) and dataclasses.is_dataclass(info.type)
+    if not is_settings or (rule, info.type) in _busy:
         return None
-    _busy.append(info.type)
+    _busy.append((rule, info.type))
     try:
         spec = tyro.constructors.ConstructorRegistry.get_struct_spec(info)
     finally:
         _busy.pop()
-    if not isinstance(spec, tyro.constructors.StructConstructorSpec):
+    return spec if isinstance(spec, StructSpec) else None
+
+
+def _first_only(info: StructInfo) -> StructSpec | None:
+    """Hides the fields that the short help leaves out."""
+    if (spec := others(_first_only, info)) is None:
+        return None
+    if (first := help_pages.first(info.type)) is None:
+        return spec
+    inline = {f.name for f in dataclasses.fields(info.type) if f.metadata == limits.INLINE}
+    fields = []
+    for field in spec.fields:
+        is_section = _section(field.type) and field.name not in inline
+        kind = field.type if field.name in first or is_section else tyro.conf.Suppress[field.type]
+        fields.append(dataclasses.replace(field, type=kind))
+    return dataclasses.replace(spec, fields=tuple(fields))
+
+
+def with_ranges(info: StructInfo) -> StructSpec | None:
+    """Appends range and default to the help of each field."""
+    spec = others(with_ranges, info)
+    if spec is None:
         return None
     fields, declared = [], {field.name: field for field in dataclasses.fields(info.type)}
     for field in spec.fields:
@@ -194,12 +266,21 @@ def _with_ranges(
         aliases = _ALIASES.get((info.type, plain))
         hint = tyro.conf.arg(name=name, aliases=aliases, help_behavior_hint=range_and_default)
         # What stands on the field itself comes later, and wins.
-        kind, *rest = typing.get_args(field.type) if _is_annotated(field.type) else [field.type]
-        fields.append(dataclasses.replace(field, type=Annotated[(kind, hint, *rest)]))
+        kind, *rest = typing.get_args(field.type) if is_annotated(field.type) else [field.type]
+        # By default the title of a section would be the help of the field before it.
+        title = {"helptext": section.__doc__} if (section := _section(kind)) else {}
+        fields.append(dataclasses.replace(field, type=Annotated[(kind, hint, *rest)], **title))
     return dataclasses.replace(spec, fields=tuple(fields))
 
 
-def _is_annotated(hint: Any) -> bool:
+def _section(hint: Any) -> Any:
+    """Returns the dataclass of a field with settings of its own, None for other fields."""
+    kind = typing.get_args(hint)[0] if is_annotated(hint) else hint
+    return kind if dataclasses.is_dataclass(kind) else None
+
+
+def is_annotated(hint: Any) -> bool:
+    """Returns True for `Annotated[...]`."""
     return typing.get_origin(hint) is Annotated
 
 

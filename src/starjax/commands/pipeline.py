@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from starjax.commands import (
     stage_times,
 )
 from starjax.learners import LEARNERS
-from starjax.runtime import files, sources
+from starjax.runtime import files, jax_start, sources
 from starjax.runtime.signals import stop_signals
 from starjax.sim import registries
 
@@ -62,6 +63,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
       stages: some of `STAGES`; each needs those before it.
       command: command line, for results.
     """
+    jax_start.announce(messages.headline(config), sys.stdout)
     session.start_jax(*session.RUN_MODULES)
     from starjax.runtime import precompile as background
 

@@ -10,7 +10,11 @@ from starjax.runtime import jax_start, xla
 
 DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
 
-RUN is the directory of a method, such as runs/cpu/stardiff, or its parent, such as runs/cpu."""
+RUN is the directory of a method, such as runs/cpu/stardiff, or its parent, such as runs/cpu.
+
+Examples:
+  starjax report runs/cpu
+  starjax report runs/cpu/stardiff runs/gpu/stardiff --out report --no-video"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,13 +6,25 @@ from starjax.commands import options, run_settings
 
 DESCRIPTION = """Collects demonstrations, trains, evaluates and writes the report.
 
-Rerun the same command to resume. The defaults below are those of the selected preset."""
+Rerun the same command to resume. The defaults below are those of the selected preset.
+
+Examples:
+  starjax run --preset smoke
+  starjax run --task reach --policy.observation state --seed 1"""
 COLLECT = """Collects the demonstrations of a run; the flags are those of `starjax run`.
 
-Episodes are saved one by one; rerun the same command to resume."""
+Episodes are saved one by one; rerun the same command to resume.
+
+Examples:
+  starjax collect --preset cpu
+  starjax collect --task needle_pick --demos.randomise breathing=0.01 --out runs/needle"""
 TRAIN = """Collects demonstrations and trains; the flags are those of `starjax run`.
 
-Rerun the same command to resume from the last checkpoint."""
+Rerun the same command to resume from the last checkpoint.
+
+Examples:
+  starjax train --preset cpu
+  starjax train --demos.from runs/hand --policy.learner act --out runs/act"""
 
 
 def main(argv: Sequence[str]) -> int:

@@ -16,7 +16,11 @@ KEY = checks.API_KEY
 DESCRIPTION = f"""Serves a policy over websockets: observations in, commands out.
 
 The protocol is that of openpi: openpi-client and starjax.deploy.Client can connect. Clients send
-the key in the environment variable {KEY}, which only local clients can do without."""
+the key in the environment variable {KEY}, which only local clients can do without.
+
+Examples:
+  starjax serve --policy compact
+  STARJAX_API_KEY=secret starjax serve --policy policy.safetensors --host 0.0.0.0"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -59,6 +59,7 @@ class Session(NamedTuple):
 
 def start_jax(*modules: str) -> None:
     """Starts jax in all processes of a run; imports `modules` while the devices start."""
+    jax_start.announce_start()
     xla.prepare_xla()
     from starjax.runtime import processes
 

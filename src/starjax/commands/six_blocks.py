@@ -17,7 +17,11 @@ DESCRIPTION = """Scores the transfer of six blocks, each passed from tool to too
 RUN is the directory of a method trained for peg_transfer_bimanual. --policy takes a
 policy.safetensors or the name of a packaged policy instead. With neither, the task's scripted
 expert acts. A trial ends when a block is dropped, or after 300 s. Rerun the same command to
-resume."""
+resume.
+
+Examples:
+  starjax six-blocks
+  starjax six-blocks runs/gpu/stardiff --trials 5"""
 
 
 @dataclasses.dataclass(frozen=True)

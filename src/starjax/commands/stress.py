@@ -17,7 +17,11 @@ DESCRIPTION = """Scores a trained policy on its task's trocars under disturbance
 
 RUN is the directory of a method, such as runs/cpu/stardiff. --policy takes a policy.safetensors or
 the name of a packaged policy instead. Nothing is retrained. Each disturbance has several levels,
-the first of which is zero; all levels run the same trials. Rerun the same command to resume."""
+the first of which is zero; all levels run the same trials. Rerun the same command to resume.
+
+Examples:
+  starjax stress --policy compact --disturbance breathing smoke
+  starjax stress runs/cpu/stardiff --disturbance trocar_offset --levels 0 0.002 0.005"""
 
 
 _TRIALS = config_lib.EvalConfig(trials=4, time_limit_s=30.0, video_trials=0)

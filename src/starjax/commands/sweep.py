@@ -25,7 +25,11 @@ DESCRIPTION = """Scores a trained policy on a random sample (Eq. 19) or a grid o
 RUN is the directory of a method, such as runs/cpu/stardiff. --policy takes a policy.safetensors or
 the name of a packaged policy instead. The command writes sweep.json to RUN, where the report draws
 it as the success map and Fig. 4; with --arm or --policy, to a directory that it prints. Trials of
-all sweeps are kept next to it: rerun the same command to resume."""
+all sweeps are kept next to it: rerun the same command to resume.
+
+Examples:
+  starjax sweep --policy compact --trocars 500
+  starjax sweep runs/cpu/stardiff --radii-cm 0 1 2 3 --azimuths 8"""
 
 MAX_TROCARS = 1_000_000  # larger values are typos
 Several = Annotated[int, Range(1, MAX_TROCARS)]

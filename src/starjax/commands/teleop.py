@@ -17,7 +17,11 @@ DESCRIPTION = """Opens a page on which a person demonstrates a task.
 The tool follows a handle in the 3D scene, the page's hotkeys, a SpaceMouse or a gamepad. Its shaft
 always passes through the trocar, because these move only roll and tip. Recording begins with the
 first motion. Enter saves an episode, Backspace discards it. Rerun the same command to add
-episodes."""
+episodes.
+
+Examples:
+  starjax teleop --task reach
+  starjax teleop --task needle_pick --device spacemouse --out runs/hand"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,7 +15,11 @@ from starjax.runtime import jax_start, signals, xla
 DESCRIPTION = """Shows a policy, an expert or a dataset on a page in the browser.
 
 The page has the scene in 3D, the camera's image, the RCM error and the plan. Drag a trocar by its
-arrows and the policy continues through it. Ctrl-C closes the page."""
+arrows and the policy continues through it. Ctrl-C closes the page.
+
+Examples:
+  starjax view
+  starjax view --policy compact --compare-with expert --trocar 3"""
 
 _RENAMED = {"--beside": "--compare-with"}  # flags of the previous release
 Port = Annotated[int, Range(0, 65_535)]

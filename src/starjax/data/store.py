@@ -95,8 +95,10 @@ def read_description(root: Path) -> dict[str, Any]:
         description = json.loads(path.read_text())
         schema = description["schema"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        got = f"{path}: {error}"
-        raise errors.UsageError("root", "a folder of demonstrations", got) from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise errors.UsageError(
+            "root", "a folder of demonstrations", f"{path}: {reason}"
+        ) from error
     if schema != SCHEMA:
         raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}; collect it again")
     return description

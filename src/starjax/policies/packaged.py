@@ -33,7 +33,8 @@ def find(argument: str, name_or_path: str) -> Path:
     path = locate(name_or_path)
     if not path.is_file():
         expected = " or one of ".join(filter(None, ["a file", ", ".join(names())]))
-        raise errors.UsageError(argument, expected, name_or_path or "none")
+        near = errors.nearest(name_or_path, names())
+        raise errors.UsageError(argument, expected, name_or_path or "none", near)
     if not os.access(path, os.R_OK):
         raise errors.UsageError(argument, "a file that may be read", path)
     return path

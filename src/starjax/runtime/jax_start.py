@@ -1,12 +1,35 @@
 """The start of jax in a command. Importing it imports no jax."""
 
 import contextlib
+import functools
 import importlib
 import os
 import sys
+from typing import TextIO
 
+import starjax
 from starjax import errors
 from starjax.runtime import background
+
+# Number of this process in a run of several, as jax and srun name it.
+_PROCESS_NUMBERS = ("JAX_PROCESS_ID", "SLURM_PROCID")
+
+
+def announce(text: str, stream: TextIO | None = None) -> None:
+    """Prints the first line of a command, before the seconds that jax takes to start.
+
+    Args:
+      text: what the command is about to do.
+      stream: output; by default the standard error stream.
+    """
+    if all(os.environ.get(name, "") in ("", "0") for name in _PROCESS_NUMBERS):
+        print(f"starjax {starjax.__version__}: {text}", file=stream or sys.stderr, flush=True)
+
+
+@functools.cache
+def announce_start() -> None:
+    """Announces the start of jax, once."""
+    announce("starting jax")
 
 
 def require_devices(*modules: str) -> None:
@@ -18,6 +41,7 @@ def require_devices(*modules: str) -> None:
     Raises:
       errors.UsageError: jax cannot use the platform of JAX_PLATFORMS.
     """
+    announce_start()
     import jax
 
     from starjax.runtime import jax_settings

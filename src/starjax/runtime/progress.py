@@ -74,6 +74,8 @@ def _terminal(
 def _plain(description: str, total: int, unit: str, done: int, stream: TextIO) -> Iterator[Advance]:
     meter = _Meter(total, done)
     shown = time.monotonic()
+    # Programs are compiled before the first unit is done.
+    print(f"{description}: {done}/{total} {unit}", file=stream, flush=True)
 
     def advance(count: float = 1, note: str = "") -> None:
         nonlocal shown
