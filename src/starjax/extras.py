@@ -14,6 +14,8 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "gym": ("gymnasium",),
     "serve": ("PIL", "filelock", "flax", "msgpack", "msgspec", "safetensors", "websockets"),
     "viewer": ("viser",),
+    "tensorboard": ("tensorboardX",),
+    "wandb": ("wandb",),
 }
 
 

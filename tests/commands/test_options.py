@@ -10,7 +10,7 @@ import sys
 import mistakes
 import pytest
 
-from starjax import cli, config
+from starjax import cli, config, extras
 from starjax.commands import (
     bench,
     completion,
@@ -203,7 +203,8 @@ def test_help_says_of_every_flag_something_of_its_own(command, capsys):
     texts = [re.sub(r" ?\([^()]*\)$", "", text) for text in said.values()]
     # A run's are those of the learner of the preset that `auto` is here.
     is_run = OPTIONS[command] is config.RunConfig
-    settings = presets.resolve("auto", False) if is_run else OPTIONS[command]
+    preset = run_settings.RunArgs(**vars(presets.resolve("auto", False)))
+    settings = preset if is_run else OPTIONS[command]
     flags = [flag for flag in options.flags(settings) if not re.search(r"--(.*\.)?no-", flag)]
     assert {*said} == {*flags, "-h"}
     assert all(texts) and len({*texts}) == len(texts)
@@ -274,6 +275,15 @@ def test_the_examples_of_help_are_command_lines(command, capsys):
             run_settings._settings(command, words, "", "cpu")
         else:
             options.parse(command, declared.value.settings, words, "", declared.value.default)
+
+
+def test_a_tracker_is_no_setting_of_a_run_and_needs_its_extra(monkeypatch):
+    monkeypatch.setattr(extras, "require", lambda *needed: asked.append(needed))
+    asked = []
+    assert settings("--preset smoke --track wandb") == settings("--preset smoke")
+    assert asked == [("--track wandb", "wandb")]
+    assert run_settings.tracker(["--track", "wandb"]) == "wandb"
+    assert run_settings.tracker([]) == "none"
 
 
 def test_a_command_line_without_words_has_no_flag():

@@ -68,7 +68,7 @@ def _command(name: str) -> Any:
         cli.load(name)(options.DECLARE)
     except options.Declared as flags:
         default = tyro.MISSING_NONPROP if flags.default is None else flags.default
-        named = tyro.conf.subcommand(name, default=default, description=cli.COMMANDS[name][1])
+        named = tyro.conf.subcommand(name, default=default, description=str(cli.COMMANDS[name][1]))
         return Annotated[flags.settings, named]
     raise TypeError(f"{name} parses no flags")
 

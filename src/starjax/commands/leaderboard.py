@@ -16,7 +16,11 @@ DESCRIPTION = """Tabulates results of evaluate, sweep and stress by task and pol
 
 RESULT is a result.json, sweep.json or stress.json, or a directory with such files. The flag
 --benchmark of these commands runs the trials of the trocar benchmark. Results of other trials are
-listed with the reason; results of another version of the benchmark, or without one, are apart."""
+listed with the reason; results of another version of the benchmark, or without one, are apart.
+
+Examples:
+  starjax leaderboard runs
+  starjax leaderboard runs/evaluate --markdown"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -37,12 +37,14 @@ class RunContext:
       encoder: frozen image encoder, or None.
       share: this process's part in the run's directory.
       command: command line, for results.
+      tracker: name of a tracker, see `training.trackers`.
     """
 
     config: config_lib.RunConfig
     encoder: Any
     share: Any
     command: str
+    tracker: str = ""
 
     @property
     def out(self) -> Path:
@@ -55,13 +57,16 @@ class RunContext:
         return _environment(self.config)
 
 
-def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> None:
+def run(
+    config: config_lib.RunConfig, stages: Sequence[str], command: str, tracker: str = ""
+) -> None:
     """Completes the given stages in the order of `STAGES`.
 
     Args:
       config: settings.
       stages: some of `STAGES`; each needs those before it.
       command: command line, for results.
+      tracker: see `RunContext`.
     """
     jax_start.announce(messages.headline(config), sys.stdout)
     session.start_jax(*session.RUN_MODULES)
@@ -77,7 +82,7 @@ def run(config: config_lib.RunConfig, stages: Sequence[str], command: str) -> No
     files.require_writable(out, MIN_FREE_BYTES)
     with background.until_end(), session.Session(command, out).shared() as share:
         print(messages.plan(config, stages), flush=True)
-        work = RunContext(config, encoder, share, command)
+        work = RunContext(config, encoder, share, command, tracker)
         root, collect, compile_collect = demonstrations.plan(config, work.env, share)
         if untrained or not trains:
             compile_collect()
@@ -151,7 +156,7 @@ def _train(
     """Trains one set of weights; `policy.safetensors` is its last file."""
     from starjax.policies import policy_file
     from starjax.runtime import processes
-    from starjax.training import loop
+    from starjax.training import loop, trackers
 
     config, env, share = work.config, work.env, work.share
     folder, weights = work.out / name, folders.weights(work.out, name)
@@ -162,7 +167,11 @@ def _train(
     messages.stage("train", f"{name}, into {folder}")
     program = step() if step else None
     begun = any((folder / "checkpoints").glob("step_*"))
-    with stage_times.timed(work.out, f"train {name}", begun), stop_signals() as should_stop:
+    with (
+        stage_times.timed(work.out, f"train {name}", begun),
+        trackers.following(work.tracker, folder, config_lib.as_json(config)),
+        stop_signals() as should_stop,
+    ):
         result = loop.run(
             methods.METHODS[name],
             config.policy,

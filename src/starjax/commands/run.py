@@ -46,5 +46,5 @@ def _run(name: str, argv: Sequence[str], description: str, stages: Sequence[str]
     config = run_settings.parse(name, argv, description)
     from starjax.commands import pipeline  # after the settings: mistakes need not wait for jax
 
-    pipeline.run(config, stages, options.typed(name, argv))
+    pipeline.run(config, stages, options.typed(name, argv), run_settings.tracker(argv))
     return 0

@@ -3,11 +3,22 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from starjax import config as config_lib
-from starjax import errors
+from starjax import errors, extras
 from starjax.commands import checks, options, presets, session
 from starjax.learners import LEARNERS
+
+NO_TRACKER = "none"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunArgs(config_lib.RunConfig):
+    """Flags of the command: the settings of a run, and those that no result depends on."""
+
+    # copy the training log to a tracker; needs the extra of the same name
+    track: Literal["none", "tensorboard", "wandb"] = NO_TRACKER
 
 
 def parse(name: str, argv: Sequence[str], description: str) -> config_lib.RunConfig:
@@ -30,12 +41,20 @@ def parse(name: str, argv: Sequence[str], description: str) -> config_lib.RunCon
     return config
 
 
+def tracker(argv: Sequence[str]) -> str:
+    """Returns the tracker that a command line, which `parse` has accepted, names."""
+    return options.typed_value("track", argv) or NO_TRACKER
+
+
 def _settings(
     name: str, argv: Sequence[str], description: str, preset: str
 ) -> config_lib.RunConfig:
     default = _default(argv, preset)
-    config = options.parse(name, config_lib.RunConfig, argv, description, default)
-    config = dataclasses.replace(config, preset=default.preset)
+    args = options.parse(name, RunArgs, argv, description, RunArgs(**vars(default)))
+    if args.track != NO_TRACKER:
+        extras.require(f"--track {args.track}", args.track)
+    fields = {field.name: getattr(args, field.name) for field in dataclasses.fields(default)}
+    config = config_lib.RunConfig(**fields | {"preset": default.preset})
     out = config.out if config.out != options.AUTO else _folder(config)
     config = dataclasses.replace(config, out=out)
     checks.check(config)

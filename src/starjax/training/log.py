@@ -1,12 +1,26 @@
 """The training log: one JSON object a line, the same bytes after a resume as without one."""
 
+import contextlib
 import json
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from starjax.runtime import files
+
+Follower = Callable[[int, str, Mapping[str, Any]], None]  # (step, kind, values)
+_followers: list[Follower] = []
+
+
+@contextlib.contextmanager
+def followed_by(follower: Follower) -> Iterator[None]:
+    """Calls `follower` with every line that is added meanwhile."""
+    _followers.append(follower)
+    try:
+        yield
+    finally:
+        _followers.remove(follower)
 
 
 def resume(path: str | os.PathLike, step: int) -> None:
@@ -32,6 +46,8 @@ def append(path: str | os.PathLike, step: int, kind: str, values: Mapping[str, A
         raise files.StorageError(
             f"cannot write {path}: {error.strerror}; training resumes from its last checkpoint"
         ) from error
+    for follower in _followers:
+        follower(step, kind, values)
 
 
 def read(path: str | os.PathLike) -> list[dict[str, Any]]:
