@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from starjax import config as config_lib
 from starjax import errors, extras
@@ -53,8 +53,10 @@ def _settings(
     args = options.parse(name, RunArgs, argv, description, RunArgs(**vars(default)))
     if args.track != NO_TRACKER:
         extras.require(f"--track {args.track}", args.track)
-    fields = {field.name: getattr(args, field.name) for field in dataclasses.fields(default)}
-    config = config_lib.RunConfig(**fields | {"preset": default.preset})
+    settings: dict[str, Any] = {
+        field.name: getattr(args, field.name) for field in dataclasses.fields(default)
+    }
+    config = dataclasses.replace(config_lib.RunConfig(**settings), preset=default.preset)
     out = config.out if config.out != options.AUTO else _folder(config)
     config = dataclasses.replace(config, out=out)
     checks.check(config)
