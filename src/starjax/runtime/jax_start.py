@@ -19,7 +19,7 @@ def announce(text: str, stream: TextIO | None = None) -> None:
     """Prints the first line of a command, before the seconds that jax takes to start.
 
     Args:
-      text: what the command is about to do.
+      text: next action of the command.
       stream: output; by default the standard error stream.
     """
     if all(os.environ.get(name, "") in ("", "0") for name in _PROCESS_NUMBERS):
