@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from starjax import config
 
 SHORT, FULL = ("-h", "--help"), "--help-all"
-# Settings -> fields in the short help; all fields of other dataclasses are there. Fields that hold
-# settings of their own follow these tables, too.
+# Settings -> fields in the short help, which has all fields of other dataclasses. Fields that hold
+# settings of their own follow this table, too.
 FIRST: dict[type, tuple[str, ...]] = {
     config.RunConfig: ("method", "preset", "seed", "out", "track"),
     config.SceneConfig: ("task", "arm", "camera"),

@@ -14,7 +14,7 @@ from starjax.training import log
 PROJECT = "starjax"  # of Weights & Biases
 
 
-class Writer(NamedTuple):
+class OpenTracker(NamedTuple):
     """An open tracker.
 
     Attributes:
@@ -26,7 +26,7 @@ class Writer(NamedTuple):
     close: Callable[[], None]
 
 
-def tensorboard(folder: Path, settings: Mapping[str, Any], step: int) -> Writer:
+def tensorboard(folder: Path, settings: Mapping[str, Any], step: int) -> OpenTracker:
     """Opens an event file in `folder/tensorboard`, without older values from `step` on."""
     package = importlib.import_module("tensorboardX")
     writer = package.SummaryWriter(str(folder / "tensorboard"), purge_step=step)
@@ -36,20 +36,20 @@ def tensorboard(folder: Path, settings: Mapping[str, Any], step: int) -> Writer:
             writer.add_scalar(name, value, step)
         writer.flush()
 
-    return Writer(add, writer.close)
+    return OpenTracker(add, writer.close)
 
 
-def wandb(folder: Path, settings: Mapping[str, Any], step: int) -> Writer:
+def wandb(folder: Path, settings: Mapping[str, Any], step: int) -> OpenTracker:
     """Opens a run of Weights & Biases, or the interrupted one of this folder."""
     name = "/".join(folder.absolute().parts[-2:])
     run = importlib.import_module("wandb").init(
         project=PROJECT, name=name, dir=str(folder), config=dict(settings), resume="auto"
     )
-    return Writer(lambda step, values: run.log(values, step=step), run.finish)
+    return OpenTracker(lambda step, values: run.log(values, step=step), run.finish)
 
 
 # Name, which is also the extra's -> opens it: (folder, settings, first step).
-TRACKERS: dict[str, Callable[[Path, Mapping[str, Any], int], Writer]] = {
+TRACKERS: dict[str, Callable[[Path, Mapping[str, Any], int], OpenTracker]] = {
     "tensorboard": tensorboard,
     "wandb": wandb,
 }
@@ -68,7 +68,7 @@ def following(name: str, folder: Path, settings: Mapping[str, Any]) -> Iterator[
         yield
         return
     with contextlib.ExitStack() as stack:
-        writers: list[Writer] = []
+        writers: list[OpenTracker] = []
 
         def follow(step: int, kind: str, values: Mapping[str, Any]) -> None:
             if not writers:
