@@ -225,6 +225,9 @@ def _with_features(
 
     dataset = demos.dataset
     count = int(np.sum(dataset.length))
+    # A delayed window may show any frame.
+    stride = 1 if config.train.randomise else config.train.window_stride
+    rows = windows.observed_frames(dataset, config.policy.obs_horizon, stride)
     with stage_times.timed(Path(config.out), "features"):
         parts = [
             frozen.features(
@@ -236,9 +239,7 @@ def _with_features(
                 camera,
                 lambda camera=camera: load.frames(root, env)[camera],
                 messages.indented,
-                windows.observed_frames(
-                    dataset, config.policy.obs_horizon, config.train.window_stride
-                ),
+                rows,
             )
             for camera in config.scene.camera
         ]
