@@ -3,27 +3,23 @@
     python benchmarks/bench_expert.py [--per-trocar 100] [--sampled 500] [--seed 2026] \\
         [--task peg_transfer] [--arm fr5] [--expert default] [--seconds 0]
 
-Demonstrations are worth as much as their expert: this is printed before any figure of a policy.
+Committed figures of the built-in experts; `starjax check TASK` checks any expert.
 """
 
 import argparse
-import time
 
 import _scene
 import _timing
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from starjax import errors, rcm, runtime
-from starjax.evaluation import statistics
+from starjax.evaluation import expert as runs
 from starjax.sim import env as envs
 from starjax.sim import sampling
 from starjax.types import Agent
 
 STEPS = 600  # control steps, 20 s, that demonstrations may take too
-CHUNK = {"cpu": 16}  # episodes at once
-CHUNK_GPU = 600
 
 
 def main() -> None:
@@ -71,57 +67,11 @@ def _score(
     name: str,
 ) -> dict:
     """Outcome of one expert episode at each configuration of trocars `[N, A]`."""
-    count = len(trocars.radius)
-    chunk = min(count, CHUNK.get(jax.default_backend(), CHUNK_GPU))
-    keys = jax.random.split(key, count)
-    run = jax.jit(jax.vmap(lambda key, trocar: _episode(environment, agent, key, trocar, steps)))
-    start, parts = time.perf_counter(), []
-    for first in range(0, count, chunk):
-        # The last chunk is filled up with its first lanes, which are not counted.
-        index = np.resize(np.arange(first, min(first + chunk, count)), chunk)
-        part = run(keys[index], jax.tree.map(lambda leaf, i=index: leaf[i], trocars))
-        parts.append(jax.tree.map(lambda leaf, f=first: np.asarray(leaf)[: count - f], part))
-    outcome = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    success, taken, distances, live = (outcome[k] for k in ("success", "step", "errors", "live"))
-    low, high = statistics.wilson(int(success.sum()), count)
-    executed = distances[live] * 1e3  # of the arm that is farthest off
-    summary = {
-        "episodes": count,
-        "successes": int(success.sum()),
-        "rate": float(success.mean()),
-        "ci95": [low, high],
-        "collided": int(outcome["collided"].sum()),
-        "collided_successes": int((outcome["collided"] & success).sum()),
-        "invalid": int(outcome["invalid"].sum()),
-        "median_transfer_s": float(np.median(taken[success])) / environment.control_hz,
-        "rcm_error_mm": {
-            "mean": float(executed.mean()),
-            "p99": float(np.quantile(executed, 0.99)),
-            "max": float(executed.max()),
-        },
-        "wall_s": time.perf_counter() - start,
-    }
+    summary = runs.summary(
+        runs.run(environment, agent, trocars, key, steps), environment.control_hz
+    )
     print(f"{name}: {summary}", flush=True)
     return summary
-
-
-def _episode(
-    environment: envs.Env, agent: Agent, key: jax.Array, trocar: rcm.Trocar, steps: int
-) -> dict[str, jax.Array]:
-    key_reset, key_expert = jax.random.split(key)
-    state = environment.reset(key_reset, envs.EnvParams(trocar))
-
-    def step(carry):
-        state, memory, largest = carry
-        command, memory, _ = agent.act(memory, state)
-        after = environment.step(state, command)
-        return after, memory, largest.at[state.step].set(jnp.max(after.rcm_error))
-
-    start = (state, agent.init(key_expert, state), jnp.zeros(steps))
-    state, _, largest = jax.lax.while_loop(lambda c: ~c[0].done & (c[0].step < steps), step, start)
-    names = ("success", "step", "collided", "invalid")
-    live = jnp.arange(steps) < state.step
-    return {"errors": largest, "live": live, **{name: getattr(state, name) for name in names}}
 
 
 if __name__ == "__main__":

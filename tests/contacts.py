@@ -5,7 +5,7 @@ import collections
 import mujoco
 import numpy as np
 
-from starjax.sim import scene as scenes
+from starjax.sim import mjcf_parts
 
 TOUCHING = -2e-5  # m: contacts deeper than this are alike in float32 and float64
 
@@ -32,4 +32,4 @@ def asked(scene, qpos, p_world_trocar):
 
 def held(scene):
     """How many the compiled model can hold: pairs of a kind, contacts."""
-    return tuple(int(scene.mj_model.numeric(name).data[0]) for name in scenes.CONTACT_LIMITS)
+    return tuple(int(scene.mj_model.numeric(name).data[0]) for name in mjcf_parts.CONTACT_LIMITS)

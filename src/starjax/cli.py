@@ -64,6 +64,7 @@ _TABLE: dict[str, tuple[str, str, tuple[str, ...]]] = {
         "list tasks, arms, tools, methods, presets and policies",
         ("sim",),
     ),
+    "check": ("commands.check_command", "check a part, such as one of your package", _EXCHANGE),
     "find-mount": ("commands.find_mount", "search the mount of an arm for a task", _LEARNING),
     "doctor": ("doctor", "check the installation and suggest fixes", ("sim",)),
     "completion": ("commands.completion", "print the completion script of a shell", ("sim",)),

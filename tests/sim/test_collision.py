@@ -24,7 +24,10 @@ def is_hit(sim):
         measurements = task.PegMeasurements(there, jnp.zeros(6), jnp.zeros(3), jnp.zeros((), bool))
         obstacles = task.obstacles(sim.bound._replace(pegs=PEG + peg), None, measurements)
         pose = Pose(R[None], jnp.array([p]))
-        return bool(collision.detect(sim.arms, pose, [origins], OUTSIDE[None], obstacles, 0.0))
+        situation = (sim.arms, pose, [origins], OUTSIDE[None], obstacles, 0.0)
+        hit = bool(collision.detect(*situation))
+        assert hit == any(map(bool, collision.pairs(*situation).values()))
+        return hit
 
     return is_hit
 
@@ -76,3 +79,15 @@ def test_links_of_two_arms_keep_apart(sim):
         links = [UP, UP + jnp.array([away, 0.0, 0.0])]
         found = collision.detect(sim.arms * 2, pose, links, trocars, nothing, 0.0)
         assert bool(found) == hit
+
+
+def test_the_pair_of_a_collision_is_named(sim):
+    pose, origins = Pose(DOWN[None], jnp.array([[0.0, 0.0, 0.0]])), [UP.at[3, 2].set(0.04)]
+    peg = task.Capsules(jnp.zeros((2, 3)).at[0].set(9.0), jnp.zeros((2, 3)) + 0.03, jnp.ones(2))
+    hits = collision.pairs(sim.arms, pose, origins, OUTSIDE[None], peg, 0.0)
+    assert sorted(name for name, hit in hits.items() if hit) == [
+        "arm 0: jaws, floor",
+        "arm 0: links, table",
+        "arm 0: shaft, obstacle 0",
+        "arm 0: shaft, obstacle 1",
+    ]

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from starjax import config, methods
-from starjax.learners import LEARNERS
 from starjax.models import encoders, kernels
-from starjax.policies import features, sequences
+from starjax.policies import features, learner_contract, sequences
 from starjax.policies.base import Params
 from starjax.policies.sequences import Condition, SequenceModel, Sizes
 
@@ -68,11 +67,11 @@ def make(
     vision = vision_encoder(policy_config)
     state = encoders.StateEncoder(features=policy_config.state_dim, dtype=dtype)
     of_state, of_vision = map(kernels.applied, (state, vision))
-    learner, size = LEARNERS.get(policy_config.learner), policy_config.image_size
+    size = policy_config.image_size
     dims = sizes(
         policy_config, sensors, action, features.trocar_condition_dim(method, sensors.task)
     )
-    model = learner.make(policy_config.options, policy_config, dims)
+    model = learner_contract.make(policy_config, dims)
     learns_vision = policy_config.observation == "image" and not policy_config.freeze_encoder
     width = features.history_dim(policy_config, sensors.task, action)
 

@@ -6,7 +6,7 @@ shaft is a row of points, and the jaws are the end of their axis. Up to 3 mm of 
 the floor therefore stay undetected with a tool that leans by 30 degrees.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,8 @@ from starjax.types import Pose
 # Overlap that is called a collision (m): more than the soft contacts' own give.
 DEPTH = 0.0005
 SHAFT_POINTS = 7  # looked at along the end of a shaft
+
+Overlaps = Iterable[tuple[str, jax.Array]]  # name of a pair, bool `[]` or `[points, obstacles]`
 
 
 def detect(
@@ -38,19 +40,59 @@ def detect(
       obstacles: of the task.
       floor: m, the lowest height that jaws may reach; the table is at 0.
     """
+    hit = _any(_with_scene(arms, pose, origins, obstacles, floor))
+    return hit | _any(_of_shafts(arms, pose, p_world_trocar)) | _any(_of_links(arms, origins))
+
+
+def pairs(
+    arms: Sequence[BoundArm],
+    pose: Pose,
+    origins: Sequence[jax.Array],
+    p_world_trocar: jax.Array,
+    obstacles: Capsules,
+    floor: float,
+) -> dict[str, jax.Array]:
+    """Returns bool by the name of a pair: True if the pair overlaps; arguments as of `detect`."""
+    found = [
+        *_with_scene(arms, pose, origins, obstacles, floor),
+        *_of_shafts(arms, pose, p_world_trocar),
+        *_of_links(arms, origins),
+    ]
+    overlaps = {}
+    for name, overlap in found:
+        if overlap.ndim:  # points of a shaft by obstacles
+            overlaps |= {f"{name} {k}": hit for k, hit in enumerate(jnp.any(overlap, axis=0))}
+        else:
+            overlaps[name] = overlap
+    return overlaps
+
+
+def _any(overlaps: Overlaps) -> jax.Array:
     hit = jnp.zeros((), bool)
+    for _, overlap in overlaps:
+        hit |= jnp.any(overlap) if overlap.ndim else overlap
+    return hit
+
+
+def _with_scene(
+    arms: Sequence[BoundArm],
+    pose: Pose,
+    origins: Sequence[jax.Array],
+    obstacles: Capsules,
+    floor: float,
+) -> Overlaps:
+    """Yields overlaps of each arm with the table, the floor and the obstacles."""
     for a, bound in enumerate(arms):
         tool, axis = bound.tool, pose.R[a, :, 2]
         along = tool.shaft_end + jnp.linspace(0.0, tool.shaft_reach, SHAFT_POINTS)
         shaft = pose.p[a] - along[:, None] * axis
         watched = origins[a][bound.arm.watched :, 2]
-        hit |= jnp.min(watched, initial=jnp.inf) < bound.arm.link_radius
-        hit |= pose.p[a, 2] + tool.pad_end * axis[2] < floor - DEPTH
-        hit |= jnp.min(shaft[:, 2]) < tool.shaft_radius - DEPTH
+        yield f"arm {a}: links, table", jnp.min(watched, initial=jnp.inf) < bound.arm.link_radius
+        yield f"arm {a}: jaws, floor", pose.p[a, 2] + tool.pad_end * axis[2] < floor - DEPTH
+        yield f"arm {a}: shaft, table", jnp.min(shaft[:, 2]) < tool.shaft_radius - DEPTH
         gap = tool.shaft_radius + obstacles.radius - DEPTH
         apart = distance_sq(shaft[:, None], obstacles.start, obstacles.end)
-        hit |= jnp.any(apart < gap**2)
-    return hit | _shafts_meet(arms, pose, p_world_trocar) | _links_meet(arms, origins)
+        yield f"arm {a}: shaft, obstacle", apart < gap**2
 
 
 def distance_sq(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Array:
@@ -61,9 +103,8 @@ def distance_sq(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Arra
     return jnp.sum((off - fraction[..., None] * way) ** 2, axis=-1)
 
 
-def _shafts_meet(arms: Sequence[BoundArm], pose: Pose, p_world_trocar: jax.Array) -> jax.Array:
-    """Returns True if two shafts overlap between the trocar and the tip."""
-    hit = jnp.zeros((), bool)
+def _of_shafts(arms: Sequence[BoundArm], pose: Pose, p_world_trocar: jax.Array) -> Overlaps:
+    """Yields overlaps of two shafts between the trocar and the tip."""
     fraction = jnp.linspace(0.0, 1.0, 4 * SHAFT_POINTS)[:, None]
     for a, first in enumerate(arms):
         ends = pose.p[a] - first.tool.shaft_end * pose.R[a, :, 2]
@@ -71,16 +112,14 @@ def _shafts_meet(arms: Sequence[BoundArm], pose: Pose, p_world_trocar: jax.Array
         for b, second in list(enumerate(arms))[a + 1 :]:
             end = pose.p[b] - second.tool.shaft_end * pose.R[b, :, 2]
             gap = first.tool.shaft_radius + second.tool.shaft_radius - DEPTH
-            hit |= jnp.min(distance_sq(points, p_world_trocar[b], end)) < gap**2
-    return hit
+            near = jnp.min(distance_sq(points, p_world_trocar[b], end)) < gap**2
+            yield f"shafts of arms {a} and {b}", near
 
 
-def _links_meet(arms: Sequence[BoundArm], origins: Sequence[jax.Array]) -> jax.Array:
-    """Returns True if joints of two arms are closer than the sum of their links' radii."""
-    hit = jnp.zeros((), bool)
+def _of_links(arms: Sequence[BoundArm], origins: Sequence[jax.Array]) -> Overlaps:
+    """Yields True for joints of two arms closer than the sum of their links' radii."""
     for a, first in enumerate(arms):
         for b, second in list(enumerate(arms))[a + 1 :]:
             apart = jnp.sum((origins[a][:, None] - origins[b]) ** 2, axis=-1)
             gap = first.arm.link_radius + second.arm.link_radius
-            hit |= jnp.min(apart) < gap**2
-    return hit
+            yield f"links of arms {a} and {b}", jnp.min(apart) < gap**2

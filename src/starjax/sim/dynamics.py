@@ -75,6 +75,21 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
 
 def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
     """Advances one control period towards `command` `[A]`."""
+    moved, after, solver_error = attempt(scene, state, command)
+    stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
+    sound = physics.is_sound(scene, after) & (solver_error < MAX_SOLVER_ERROR)
+    moved = _select(sound, moved, stopped)
+    return _select(state.done, state, moved)
+
+
+def attempt(
+    scene: scenes.Scene, state: EnvState, command: Command
+) -> tuple[EnvState, physics.PhysicsState, jax.Array]:
+    """Simulates one control period, sound or not.
+
+    Returns:
+      the state after; that of the physics in it; J, the contact solver's largest error.
+    """
     moves = [
         arm_motion.move(scene, a, state, arm_motion.of(command, a)) for a in range(len(scene.arms))
     ]
@@ -107,10 +122,7 @@ def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
         rcm_error_within=arm_motion.largest_within(scene, result.qpos, p_world_trocar),
     )
     moved = with_status(scene, _measure(scene, moved, result.contacts))
-    stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
-    sound = physics.is_sound(scene, after) & (result.solver_error < MAX_SOLVER_ERROR)
-    moved = _select(sound, moved, stopped)
-    return _select(state.done, state, moved)
+    return moved, after, result.solver_error
 
 
 def with_status(scene: scenes.Scene, state: EnvState) -> EnvState:

@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import assets, ik, robot
+from starjax.sim import ik, mjcf_parts, robot
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.tools.base import Tool
 from starjax.sim.workspaces import Workspace
@@ -83,7 +82,7 @@ def bench(arm: Arm, tool: Tool) -> Bench:
       errors.UsageError: its part lacks something, see `robot.read`, or its joints cannot be read,
         see `ik.chain_of`.
     """
-    whole, held = robot.read(arm), mujoco.MjSpec.from_file(str(assets.path(tool.mjcf)))
+    whole, held = robot.read(arm), mjcf_parts.read(f"tool {tool.name}", tool.mjcf)
     whole.attach(held, site=whole.site(robot.FLANGE), prefix="tool/")
     m = whole.compile()
     flange, tip = (

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import mujoco
 
 from starjax import errors
-from starjax.sim import assets
+from starjax.sim import mjcf_parts
 from starjax.sim.arms.base import Arm
 
 FLANGE = "flange"  # the site that holds the tool
@@ -18,17 +18,25 @@ def read(arm: Arm) -> mujoco.MjSpec:
       errors.UsageError: it has no site `flange`, or a joint without a servo of its name or with
         friction loss.
     """
-    spec = mujoco.MjSpec.from_file(str(assets.path(arm.mjcf)))
+    part, count = f"arm {arm.name}", len(arm.joints)
+    if len(arm.max_speed) != count:
+        raise errors.UsageError(f"{part}: max_speed", f"{count} speeds", len(arm.max_speed))
+    for (tool, place), mount in arm.mounts.items():
+        if len(mount.home) != count:
+            where = f"{part}: home with {tool} over the {place}"
+            raise errors.UsageError(where, f"{count} joints", len(mount.home))
+    spec = mjcf_parts.read(part, arm.mjcf)
+    if spec.body(arm.first) is None:
+        bodies = _joined(body.name for body in spec.bodies)
+        raise errors.UsageError(f"{part}: first", f"a body of {arm.mjcf}", f"{arm.first}; {bodies}")
     sites = [site.name for site in spec.sites]
     if FLANGE not in sites:
-        raise errors.UsageError(
-            f"arm {arm.name}", f"the site {FLANGE} at its end", _joined(sites), arm.mjcf
-        )
+        raise errors.UsageError(part, f"the site {FLANGE} at its end", _joined(sites), arm.mjcf)
     servos = {servo.name: servo.target for servo in spec.actuators}
     for joint in arm.joints:
         if servos.get(joint) != joint:
             raise errors.UsageError(
-                f"arm {arm.name}",
+                part,
                 f"a servo named {joint}",
                 _joined(servos),
                 arm.mjcf,
@@ -36,7 +44,7 @@ def read(arm: Arm) -> mujoco.MjSpec:
     for joint in spec.joints:
         if joint.frictionloss:
             raise errors.UsageError(
-                f"arm {arm.name}: joint {joint.name}",
+                f"{part}: joint {joint.name}",
                 "frictionloss 0, since the contact solver does not model it",
                 f"{joint.frictionloss:g}",
             )

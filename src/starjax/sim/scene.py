@@ -14,7 +14,7 @@ import numpy as np
 
 from starjax import errors
 from starjax.config import DEFAULT_TASK
-from starjax.sim import assets, endoscope_camera, ik, registries, robot, solver
+from starjax.sim import contract, endoscope_camera, ik, mjcf_parts, registries, robot, solver
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
@@ -22,8 +22,6 @@ from starjax.sim.quiet_mjx import mjx
 from starjax.sim.tasks.base import Task
 from starjax.sim.tools.base import Tool
 
-# Sizes that MJX compiles in. Each part adds its own; the scene has the sum.
-CONTACT_LIMITS = ("max_geom_pairs", "max_contact_points")
 FIXED = "fixed"  # camera name: the task's first one except the endoscope
 # Numeric of a task's MJCF: the contact solver's largest number of iterations, for light bodies.
 SOLVER_ITERATIONS = "solver_turns"
@@ -128,16 +126,19 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
       errors.UsageError: no mount of an arm with its tool is known for the task's workspace, no part
         has a camera that is observed, or an arm's part lacks something, see `robot.read`.
     """
-    task: Task = variant or registries.tasks.get(names.task)
-    world = _spec(task.mjcf)
-    limits = _taken(world)
+    task, part = variant or registries.tasks.get(names.task), f"task {names.task}"
+    world = mjcf_parts.read(part, task.mjcf)
+    limits = mjcf_parts.take_limits(world)
     for i, (arm, tool, mount) in enumerate(_mounted(task, names)):
-        whole, hand = robot.read(arm), _spec(tool.mjcf)
-        for part in (whole, hand):
-            limits = limits + _taken(part)
+        whole, hand = robot.read(arm), mjcf_parts.read(f"tool {tool.name}", tool.mjcf)
+        for spec in (whole, hand):
+            limits = limits + mjcf_parts.take_limits(spec)
         held = whole.attach(hand, site=whole.site(robot.FLANGE), prefix="tool/")
         held.quat = _about_z(mount.turn)  # from the flange on, however its file turns that
-        parent = world.body(f"trocar{i}") if arm.remote_centre else world.worldbody
+        trocar = world.body(f"trocar{i}")
+        if trocar is None or not trocar.mocap:
+            raise errors.UsageError(part, f"a mocap body trocar{i} in its MJCF", "none")
+        parent = trocar if arm.remote_centre else world.worldbody
         base = parent.add_site(
             name=f"base{i}", pos=mount.position, quat=mount.wxyz_base, group=3, size=[0.003] * 3
         )
@@ -148,9 +149,10 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
     known = [camera.name for camera in world.cameras]
     for camera in names.cameras:
         errors.choice("camera", camera, known)
-    for limit, size in zip(CONTACT_LIMITS, limits):
+    for limit, size in zip(mjcf_parts.CONTACT_LIMITS, limits):
         world.add_numeric(name=limit, data=[float(size)], size=1)
-    return world.compile()
+    with mjcf_parts.explained(part):
+        return world.compile()
 
 
 def load(names: SceneNames, variant: Task | None = None) -> Scene:
@@ -159,13 +161,16 @@ def load(names: SceneNames, variant: Task | None = None) -> Scene:
     Args:
       variant: of the task, with the same slots, in its place.
     """
-    task: Task = variant or registries.tasks.get(names.task)
+    task, part = variant or registries.tasks.get(names.task), f"task {names.task}"
+    if names.task not in registries.tasks.built_in:
+        task = contract.guarded(task)
     m = compose(names, task)
     # XLA's MJX implementation everywhere: the warp one needs CUDA.
     device = jax.local_devices()[0]  # MJX alone takes the first of all, another process's
-    mjx_model = mjx.put_model(m, device=device, impl="jax")
-    mjx_data = mjx.make_data(m, device=device, impl="jax")
-    solver.check(mjx_model, mjx_data)
+    with mjcf_parts.explained(part):
+        mjx_model = mjx.put_model(m, device=device, impl="jax")
+        mjx_data = mjx.make_data(m, device=device, impl="jax")
+        solver.check(mjx_model, mjx_data)
     mounted = _mounted(task, names)
     return Scene(
         names=names,
@@ -179,7 +184,7 @@ def load(names: SceneNames, variant: Task | None = None) -> Scene:
         roll_zero=np.array([slot.roll_zero for slot in task.slots], np.float32),
         trocar_mocap=np.array([m.body(f"trocar{i}").mocapid[0] for i in range(task.arms)]),
         still_mocap=np.array([m.body(f"still{i}").mocapid[0] for i in range(_still(m))], int),
-        graspable=np.array([m.geom(geom).id for geom in task.graspable], int),
+        graspable=mjcf_parts.ids(f"{part}: graspable", m, "geom", list(task.graspable)),
         geom_rgb=geometry.geom_rgb(m),
         max_solver_iterations=_max_solver_iterations(m),
     )
@@ -244,20 +249,6 @@ def _bind(m: mujoco.MjModel, i: int, arm: Arm, tool: Tool, mount: Mount) -> Boun
         jaw_ctrl=None if tool.servo is None else int(m.actuator(f"{at}tool/{tool.servo}").id),
         pads=np.array([m.geom(f"{at}tool/{pad}").id for pad in tool.pads], int),
     )
-
-
-def _spec(mjcf: str) -> mujoco.MjSpec:
-    return mujoco.MjSpec.from_file(str(assets.path(mjcf)))
-
-
-def _taken(part: mujoco.MjSpec) -> np.ndarray:
-    """Removes the contact limits from a part and returns them."""
-    sizes = np.zeros(len(CONTACT_LIMITS))
-    for numeric in list(part.numerics):
-        if numeric.name in CONTACT_LIMITS:
-            sizes[CONTACT_LIMITS.index(numeric.name)] += numeric.data[0]
-            part.delete(numeric)
-    return sizes
 
 
 def _call_by_name(world: mujoco.MjSpec, prefix: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim import assets, registries, scene
+from starjax.sim import assets, mjcf_parts, registries, scene
 from starjax.sim import env as envs
 from starjax.sim.tasks.needle_pick import task as needle
 
@@ -47,7 +47,7 @@ def test_a_task_is_what_it_says(name):
     state = jnp.zeros((2, 5, task.state_size))
     relative = task.relative(state, jnp.zeros((2, 5, task.arms, 3)))
     assert relative.shape[:2] == (2, 5) and bool(jnp.isfinite(relative).all())
-    for limit in scene.CONTACT_LIMITS:
+    for limit in mjcf_parts.CONTACT_LIMITS:
         assert m.numeric(limit).data == sum(said_by_parts(task, limit))
 
 

@@ -1,0 +1,117 @@
+"""Checks of a disturbance: its levels; nothing changes at level 0, and numbers at the highest."""
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import rcm
+from starjax.commands.part_checks.base import NOTE, Check, attempt, verdict
+from starjax.evaluation.disturbances import DISTURBANCES
+from starjax.evaluation.disturbances import base as disturbances
+from starjax.evaluation.disturbances.base import Disturbance
+from starjax.sim import env as envs
+from starjax.types import Command, Observation
+
+TASK = "reach"
+STEPS = 8  # control steps of an episode that moves down
+DOWN = jnp.array([0.0, 0.0, -0.001])  # m a control step
+TOLERANCE = 1e-5  # m, rad: two compiled programs round differently
+SIDE = 32  # pixels
+# Compared of a state.
+FIELDS = (
+    "pose",
+    "gripper",
+    "trocar",
+    "measured_trocar",
+    "cameras",
+    "layout",
+    "success",
+    "collided",
+)
+
+
+def check(name: str, n: int) -> Iterator[Check]:
+    """Yields the checks of a disturbance in the task `reach`; `n` is not used."""
+    fault, kind = attempt("record", lambda: DISTURBANCES.get(name))
+    if fault:
+        yield fault
+        return
+    yield verdict(
+        "levels", _levels(kind), f"{len(kind.levels)} up to {kind.levels[-1]:g} {kind.unit}"
+    )
+    if kind.on_image is not None:
+        yield verdict("images", _images(kind), "as they were at level 0")
+    env = envs.make(TASK, observation="state")
+    fault, other = attempt("functions", lambda: disturbances.with_disturbances(env, [name]))
+    if not fault:
+        fault, runs = attempt("functions", lambda: _run_all(env, other, name, kind))
+    if fault:
+        yield fault
+        return
+    plain, none, most = runs
+    yield verdict("level 0", _differences(plain, none), "changes nothing")
+    yield verdict(f"level {kind.levels[-1]:g}", _not_finite(most), "finite numbers")
+    if not kind.image_only and not any(_differences(plain, most)):
+        yield Check("effect", f"none on {STEPS} steps of {TASK} at the highest level", NOTE)
+
+
+def _levels(kind: Disturbance) -> Iterator[str]:
+    levels = kind.levels
+    if not levels or levels[0] != 0.0:
+        yield f"expected 0 as the first, got {levels}"
+    if any(not a < b for a, b in itertools.pairwise(levels)):
+        yield f"expected them to rise, got {levels}"
+    if levels and levels[-1] > kind.max_level:
+        yield f"{levels[-1]} is above max_level {kind.max_level}"
+
+
+def _images(kind: Disturbance) -> Iterator[str]:
+    image = jax.random.randint(jax.random.key(0), (SIDE, SIDE, 3), 0, 256, jnp.uint8)
+    for level in (0.0, kind.levels[-1]):
+        state = disturbances.DisturbanceState(jnp.float32(level), jax.random.key(1))
+        changed = disturbances.change_image(kind, state, image, jnp.zeros((), jnp.int32))
+        if changed.shape != image.shape:
+            yield f"on_image: expected {list(image.shape)}, got {list(changed.shape)}"
+        elif not level and not np.array_equal(changed, image):
+            yield "on_image changes them at level 0"
+
+
+def _run_all(env: envs.Env, other: envs.Env, name: str, kind: Disturbance) -> tuple[Any, Any, Any]:
+    """Returns an undisturbed episode, one at level 0 and one at the highest level."""
+    disturbed = jax.jit(lambda level: _run(other, {name: level}))
+    plain = jax.jit(lambda: _run(env, None))()
+    return plain, disturbed(jnp.float32(0.0)), disturbed(jnp.float32(kind.levels[-1]))
+
+
+def _run(env: envs.Env, levels: dict[str, jax.Array] | None) -> tuple[dict[str, Any], Observation]:
+    """Returns the state and the observation after `STEPS` control steps down."""
+    trocar = rcm.Trocar(*(jnp.asarray(field[0]) for field in env.task.trocars))
+    state = env.reset(jax.random.key(0), envs.EnvParams(trocar, levels=levels))
+
+    def step(state: Any, _: None) -> tuple[Any, None]:
+        pose = state.pose._replace(p=state.pose.p + DOWN)
+        return env.step(state, Command(pose, state.gripper)), None
+
+    state, _ = jax.lax.scan(step, state, None, STEPS)
+    return {name: getattr(state, name) for name in FIELDS}, env.observe(state)
+
+
+def _differences(a: Any, b: Any) -> Iterator[str]:
+    """Yields the leaves in which two episodes differ."""
+    first, second = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in (a, b))
+    for path, leaf in first.items():
+        name = jax.tree_util.keystr(path)
+        if path not in second or np.shape(second[path]) != np.shape(leaf):
+            yield f"{name} has another shape"
+        elif not np.allclose(leaf, second[path], 0, TOLERANCE, equal_nan=True):
+            yield f"{name} changes"
+
+
+def _not_finite(episode: Any) -> Iterator[str]:
+    for path, leaf in jax.tree_util.tree_leaves_with_path(episode):
+        if np.issubdtype(leaf.dtype, np.floating) and not np.isfinite(leaf).all():
+            yield f"{jax.tree_util.keystr(path)} is not finite"
