@@ -24,7 +24,7 @@ STEPS = 600  # control steps, 20 s, that demonstrations may take too
 
 def main() -> None:
     runtime.prepare_xla()
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--per-trocar", type=int, default=100)
     parser.add_argument("--sampled", type=int, default=500)
     parser.add_argument("--seed", type=int, default=2026)

@@ -1,5 +1,6 @@
 """What is called a collision."""
 
+import jax
 import jax.numpy as jnp
 import pytest
 
@@ -12,6 +13,7 @@ DOWN = jnp.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]])
 LYING = jnp.array([[0, 0, 1.0], [0, 1.0, 0], [-1.0, 0, 0]])  # a tool along x
 BLOCK, PEG = jnp.array([0.02, 0.0, task.RIM_HEIGHT]), jnp.array([[0.02, 0.0]])
 FAR = 1.0  # m
+KEY = jax.random.key(0)
 OUTSIDE = jnp.array([0.0, 0.0, 0.15])
 
 
@@ -22,7 +24,8 @@ def is_hit(sim):
     def is_hit(R, p, origins=UP, block=FAR, peg=FAR):
         there = Pose(jnp.eye(3), BLOCK + block)
         measurements = task.PegMeasurements(there, jnp.zeros(6), jnp.zeros(3), jnp.zeros((), bool))
-        obstacles = task.obstacles(sim.bound._replace(pegs=PEG + peg), None, measurements)
+        bound, layout = sim.bound._replace(pegs=PEG + peg), task.sample(sim.bound, KEY)
+        obstacles = task.obstacles(bound, layout, measurements)
         pose = Pose(R[None], jnp.array([p]))
         situation = (sim.arms, pose, [origins], OUTSIDE[None], obstacles, 0.0)
         hit = bool(collision.detect(*situation))

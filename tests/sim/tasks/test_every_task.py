@@ -60,9 +60,9 @@ def said_by_parts(task, limit):
     while parts:
         part = parts.pop()
         root = ElementTree.parse(part).getroot()
-        parts += [part.parent / other.get("file") for other in root.iter("include")]
+        parts += [part.parent / other.attrib["file"] for other in root.iter("include")]
         found = (row for row in root.iter("numeric") if row.get("name") == limit)
-        yield from (float(row.get("data")) for row in found)
+        yield from (float(row.attrib["data"]) for row in found)
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_the_expert_of_a_task_succeeds(name):
     assert (np.asarray(state.reward)[won] == 1.0).all()
     assert float(state.rcm_error_within[won].max()) < 0.5e-3
     fields = jax.vmap(environment.observe)(state).state
-    assert fields.shape == (LANES, task.state_size)
+    assert fields is not None and fields.shape == (LANES, task.state_size)
     asked = contacts.asked(environment.scene, looks, state.trocar.p_world_trocar)
     fits = np.less_equal(asked, contacts.held(environment.scene))
     assert (not fits[0]) == (name in CROWDED) and (fits[1] or name in CROWDED), asked
