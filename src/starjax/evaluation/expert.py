@@ -1,4 +1,4 @@
-"""Episodes of a scripted expert by themselves: successes, times, and causes of failure.
+"""ExpertEpisodes of a scripted expert by themselves: successes, times, and causes of failure.
 
 Demonstrations are worth as much as their expert: `starjax check` and the benchmark of experts run
 this before anything is trained.
@@ -25,8 +25,8 @@ CHUNK = {"cpu": 16}  # episodes at once
 CHUNK_GPU = 600
 
 
-class Episodes(NamedTuple):
-    """Episodes N of an expert, on the host.
+class ExpertEpisodes(NamedTuple):
+    """ExpertEpisodes N of an expert, on the host.
 
     Attributes:
       last: EnvState at the end; of an invalid episode its last sound state.
@@ -45,7 +45,9 @@ class Episodes(NamedTuple):
     wall_s: float
 
 
-def run(env: envs.Env, agent: Agent, trocars: rcm.Trocar, key: jax.Array, steps: int) -> Episodes:
+def run(
+    env: envs.Env, agent: Agent, trocars: rcm.Trocar, key: jax.Array, steps: int
+) -> ExpertEpisodes:
     """Runs an episode at each configuration of trocars `[N, A]`, of at most `steps` steps."""
     count = len(trocars.radius)
     chunk = min(count, CHUNK.get(jax.default_backend(), CHUNK_GPU))
@@ -58,10 +60,10 @@ def run(env: envs.Env, agent: Agent, trocars: rcm.Trocar, key: jax.Array, steps:
         part = simulate(keys[index], jax.tree.map(lambda leaf, i=index: leaf[i], trocars))
         parts.append(jax.tree.map(lambda leaf, f=first: np.asarray(leaf)[: count - f], part))
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return Episodes(*joined, wall_s=time.perf_counter() - start)
+    return ExpertEpisodes(*joined, wall_s=time.perf_counter() - start)
 
 
-def summary(episodes: Episodes, control_hz: float) -> dict[str, Any]:
+def summary(episodes: ExpertEpisodes, control_hz: float) -> dict[str, Any]:
     """Returns counts, the success rate with its 95 % interval, times and RCM errors."""
     last, steps = episodes.last, episodes.errors.shape[1]
     count, success = len(last.success), np.asarray(last.success)
@@ -85,7 +87,7 @@ def summary(episodes: Episodes, control_hz: float) -> dict[str, Any]:
     }
 
 
-def collisions(scene: scenes.Scene, episodes: Episodes) -> Counter[str]:
+def collisions(scene: scenes.Scene, episodes: ExpertEpisodes) -> Counter[str]:
     """Counts the pairs that overlapped at the first collision of each episode."""
     return _count(
         lambda state: _pairs(scene, state),
@@ -94,7 +96,7 @@ def collisions(scene: scenes.Scene, episodes: Episodes) -> Counter[str]:
     )
 
 
-def faults(scene: scenes.Scene, episodes: Episodes) -> Counter[str]:
+def faults(scene: scenes.Scene, episodes: ExpertEpisodes) -> Counter[str]:
     """Counts the reasons for which episodes ended as invalid."""
 
     def reasons(state: EnvState, command: Command) -> dict[str, jax.Array]:

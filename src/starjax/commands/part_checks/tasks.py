@@ -162,7 +162,7 @@ def _expert(env: envs.Env, variant: str, n: int) -> Iterator[Check]:
     yield from _outcomes(env, subject, ran)
 
 
-def _outcomes(env: envs.Env, subject: str, ran: episodes.Episodes) -> Iterator[Check]:
+def _outcomes(env: envs.Env, subject: str, ran: episodes.ExpertEpisodes) -> Iterator[Check]:
     last, success = ran.last, np.asarray(ran.last.success)
     figures, count = episodes.summary(ran, env.control_hz), len(success)
     text = f"{success.sum()} of {count} succeed"
@@ -199,7 +199,7 @@ def _stages(last: Any, which: np.ndarray) -> dict[int, int]:
     return dict(zip(*np.unique(np.asarray(last.stage)[which], return_counts=True), strict=True))
 
 
-def _fields(env: envs.Env, ran: episodes.Episodes) -> str:
+def _fields(env: envs.Env, ran: episodes.ExpertEpisodes) -> str:
     """Returns the fields of the state that are not finite at the end of an episode."""
     task: Task = env.task
     last = ran.last
