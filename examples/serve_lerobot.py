@@ -43,7 +43,7 @@ class Served:
         if self.camera:
             self.metadata["image_size"] = self.inputs[self.camera].shape[-1]
         if config.output_features["action"].shape[0] % POSE:
-            self.metadata["actions"] = "rcm4"
+            self.metadata["action_space"] = "rcm4"
 
     def infer(self, request: dict) -> dict:
         """Plans; one request has the latest observation."""

@@ -78,8 +78,9 @@ def test_mistakes_are_a_line_each(root, exported, tmp_path):
     plain = shutil.copytree(exported, tmp_path / "plain")
     about = json.loads((plain / ".zattrs").read_text())
     (plain / ".zattrs").write_text(json.dumps(about | {"starjax": None}))
-    with mistakes.of("PATH", "plain"):
-        import_command.main([str(plain), str(tmp_path / "x")])
+    with mistakes.of("--map", "smoke"):
+        import_command.main([str(plain), str(tmp_path / "x"), "--map", "smoke"])
+    assert import_command.main([str(plain), str(tmp_path / "by_columns")]) == 0
     for path in (tmp_path, tmp_path / "nowhere", "nothing.safetensors"):
         with mistakes.of("PATH"):
             inspect_command.main([str(path)])

@@ -14,7 +14,7 @@ import served
 import stubs
 from websockets.sync import server as sockets
 
-from starjax import config
+from starjax import config, rcm
 from starjax.commands import evaluate, sweep
 from starjax.deploy import approach, batching, connection_pool, inputs, wire
 from starjax.deploy import served as serving
@@ -188,6 +188,8 @@ def test_a_lost_server_ends_it_in_one_line(tmp_path):
         ({"batch": 0}, "greeting.batch"),
         ({"observation": "smell"}, "greeting"),
         ({"execute": 9}, "greeting.execute"),
+        ({"action_space": "joints"}, "greeting.action_space"),
+        ({"action_space": "rcm4"}, "answer.actions"),  # and eight columns
     ],
 )
 def test_a_greeting_is_checked(change, field):
@@ -219,6 +221,13 @@ def test_an_action_is_position_quaternion_and_gripper():
 
     spec = Stub.input_spec
     turned = np.float32([[0.1, 0, 0.1, 0, 0, 2 * np.sqrt(0.5), 2 * np.sqrt(0.5), 3.0]])
-    plan = plain.decode(spec, {"actions": turned})
+    task = stubs.make_task()
+    plan = plain.decode(spec, "pose", task, {"actions": turned}, served.PORT)
     assert isinstance(plan, Command) and plan.gripper.tolist() == [1.0]
     np.testing.assert_allclose(plan.pose.R[0] @ [1, 0, 0], [0, 1, 0], atol=1e-6)
+    rolled = np.float32([[0.3, 0.0, 0.01, 0.03, 1.0]] * 2)
+    plan = plain.decode(spec, "rcm4", task, {"actions": rolled}, served.PORT)
+    place = rcm.trocar_position(served.PORT, spec.p_world_ref)
+    assert np.asarray(rcm.rcm_error(plan.pose, place)).max() < 1e-6
+    np.testing.assert_allclose(rcm.roll_of(plan.pose.R), 0.3, atol=1e-6)
+    np.testing.assert_allclose(plan.pose.p, rolled[:, 1:4], atol=1e-7)

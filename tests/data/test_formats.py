@@ -14,9 +14,9 @@ import recorded
 import zarr
 from scipy.spatial import transform
 
-from starjax import errors
-from starjax.data import load, store
-from starjax.data.formats import base, exchange
+from starjax import errors, rcm
+from starjax.data import load, pose_rows, store
+from starjax.data.formats import base, exchange, foreign, own_columns, peer_columns
 from starjax.rollouts import episodes
 
 KINDS = {"state": {}, "images": {"size": 32, "cameras": 2}, "two_arms": {"arms": 2, "demos": 2}}
@@ -105,6 +105,76 @@ def test_peers_columns_say_what_ours_say(roots, kind):
     last = np.arange(record["length"]) == record["length"] - 1
     np.testing.assert_array_equal(found["done"], last)
     np.testing.assert_array_equal(found["reward"], last)
+
+
+@pytest.mark.parametrize("kind", ["state", "two_arms"])
+def test_options_carry_the_trocar_and_the_manifold(roots, kind):
+    """The state ends with the trocar; actions decode through it to the commands that were given."""
+    form = base.FORMATS.get("zarr")
+    plain = exchange.source(roots / kind, form)
+    options = peer_columns.PeerOptions(state_with_trocar=True, actions="rcm4")
+    source = exchange.source(roots / kind, form, options=options)
+    before, after = (x.read(1, ["state", "action", "trocar"]) for x in (plain, source))
+    width = before["state"].shape[1]
+    arms = width // 8
+    np.testing.assert_array_equal(after["state"][:, :width], before["state"])
+    np.testing.assert_array_equal(after["state"][:, width:], before["trocar"])
+    description = store.read_description(roots / kind)
+    reference, roll_zero = (np.float32(description[x]) for x in ("p_world_ref", "roll_zero"))
+    trocar = rcm.trocar_from_position(before["trocar"].reshape(-1, arms, 3), reference)
+    frame = rcm.trocar_frame(trocar, reference, roll_zero)
+    rows = after["action"].reshape(-1, arms, 5)
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(rows[..., :4], frame)
+    wanted = pose_rows.unpack("action", before["action"])
+    np.testing.assert_allclose(pose.p, wanted[0], atol=1e-6)
+    np.testing.assert_allclose(pose.R, wanted[1], atol=1e-4)
+    np.testing.assert_array_equal(rows[..., 4], wanted[2].astype(np.float32))
+    assert np.abs(np.diff(rows[..., 0], axis=0)).max() < np.pi
+    for name in ("state", "action"):
+        assert len(source.columns[name].names) == after[name].shape[1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_edited_export_is_read_by_our_columns(exported, roots, tmp_path, kind):
+    """As LeRobot's tools leave it: fewer episodes, columns flat, meta/starjax.json gone."""
+    form = base.FORMATS.get("lerobot")
+    with base.open_dataset(exported(kind, "lerobot"), "lerobot") as source:
+
+        def read(episode, names):
+            return source.read(episode + 1, names)
+
+        fewer = source._replace(lengths=source.lengths[1:], read=read, origin=None)
+        exchange.export(fewer, tmp_path / "cut", form, False)
+    with base.open_dataset(tmp_path / "cut", "lerobot") as cut:
+        if kind == "two_arms":
+            with mistakes.of("--map: arms"):
+                foreign.import_mapped(cut, own_columns.mapping(cut), tmp_path / "d", tmp_path)
+            cut = cut._replace(task="peg transfer bimanual")
+        mapping = own_columns.mapping(cut)
+        found = foreign.import_mapped(cut, mapping, tmp_path / "d", tmp_path)
+    assert found.episodes == len(store.keys(roots / kind)) - 1 - 1
+    ours, theirs = (
+        load.load(root, residency="host", report=lambda _: None).dataset
+        for root in (roots / kind, tmp_path / "d")
+    )
+    rows = slice(ours.start[1], None)
+    for name in ("p", "R"):
+        np.testing.assert_allclose(
+            getattr(theirs.observation.pose, name), getattr(ours.observation.pose, name)[rows],
+            atol=1e-6,
+        )  # fmt: skip
+    np.testing.assert_allclose(theirs.command.pose.p, ours.command.pose.p[rows], atol=1e-6)
+    np.testing.assert_allclose(
+        theirs.trocar.p_world_trocar, ours.trocar.p_world_trocar[1:], atol=1e-6
+    )
+    assert kind == "two_arms" or not found.notes
+    if kind == "images":  # of the task's cameras
+        roots_of = (roots / kind, tmp_path / "d")
+        one, other = (load.frames(root)[recorded.CAMERAS[0]].read() for root in roots_of)
+        np.testing.assert_array_equal(other, one[rows])
+    unnamed = cut._replace(task="fold a towel")
+    with mistakes.of("PATH", "towel"):
+        own_columns.mapping(unnamed)
 
 
 def test_robomimic_has_its_groups(exported):

@@ -34,6 +34,8 @@ class ExportArgs:
     format: str = "lerobot"  # format: lerobot (LeRobotDataset v3.0), robomimic (HDF5) or zarr
     # image size, pixels per side, for a dataset without recorded images; 0: no images
     image_size: Annotated[int, Range(0, 4_096)] = 256
+    state_with_trocar: bool = False  # append the trocar to the state, for readers of it alone
+    actions: str = "pose"  # pose (8 numbers per arm), or rcm4: roll, tip and gripper
     video: bool = True  # lerobot: store images as lossy video, else as PNG
 
 
@@ -44,12 +46,14 @@ def main(argv: Sequence[str]) -> int:
     checks.expect(bool(args.out) and not out.exists(), "OUT", "a new file or directory", args.out)
     checks.expect_folder("folder of OUT", out.parent)
     xla.prepare_xla()
-    from starjax.data.formats import base, exchange
+    from starjax.data.formats import base, exchange, peer_columns
 
     errors.choice("format", args.format, base.writable())
+    errors.choice("actions", args.actions, peer_columns.ACTIONS)
+    columns = peer_columns.PeerOptions(args.state_with_trocar, args.actions)
     form, root = base.FORMATS.get(args.format), Path(args.dataset)
     try:
-        source = exchange.source(root, form, args.image_size)
+        source = exchange.source(root, form, args.image_size, columns)
     except ValueError as error:
         raise errors.UsageError("DATASET", "demonstrations that are complete", error) from error
     with progress.track("Export", len(source.lengths), unit="episodes") as advance:

@@ -70,16 +70,19 @@ def _mapped(source: Any, args: ImportArgs, out: Path) -> int:
     from msgspec import structs
 
     from starjax.data import schema
-    from starjax.data.formats import foreign, mapping, ready
+    from starjax.data.formats import base, foreign, mapping, own_columns, ready
 
-    name = args.map or ready.choose(source)
-    map_path = ready.find(name)
-    columns = mapping.load(map_path)
+    own = own_columns.mapping(source) if args.map in ("", base.OURS) else None
+    if args.map == base.OURS and own is None:
+        raise errors.UsageError("--map", f"columns {base.OURS}.* of an export", "none of them")
+    name = args.map or (base.OURS if own else ready.choose(source))
+    map_path = ready.FOLDER / name if own else ready.find(name)
+    columns = own or mapping.load(map_path)
     given = {"skip": args.skip, "splits": args.splits}
     columns = structs.replace(columns, **{key: value for key, value in given.items() if value})
     if map_path.parent == ready.FOLDER:
         print(f"mapping {name}: {columns.about}")
-    with progress.track("Import", 2 * len(source.lengths), unit="episodes read") as advance:
+    with progress.track("Import", 2 * len(source.lengths), unit="readings") as advance:
         imported = foreign.import_mapped(source, columns, out, map_path.parent, advance)
     for line in [*source.notes, *imported.notes][:_SHOWN]:
         messages.indented(line)

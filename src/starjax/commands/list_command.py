@@ -94,8 +94,9 @@ def _format(form: Any) -> str:
 
 
 def _mappings() -> Iterator[Row]:
-    from starjax.data.formats import mapping, ready
+    from starjax.data.formats import base, mapping, own_columns, ready
 
+    yield base.OURS, own_columns.ABOUT
     for name in ready.names():
         yield name, mapping.load(ready.find(name)).about
 

@@ -2,7 +2,8 @@
 
 from typing import Any, NamedTuple
 
-from starjax import config, limits, methods
+from starjax import config, errors, limits, methods
+from starjax.data.formats import peer_columns
 from starjax.deploy import wire
 from starjax.deploy.inputs import InputSpec
 from starjax.errors import UsageError
@@ -23,6 +24,7 @@ class Greeting(NamedTuple):
       execute: commands executed before the next plan; 0: all.
       batch: requests that the server answers together.
       method: key of `methods.SCORED`.
+      action_space: of plain frames, `pose` or `rcm4`.
     """
 
     spec: InputSpec | None
@@ -31,6 +33,7 @@ class Greeting(NamedTuple):
     execute: int
     batch: int
     method: str
+    action_space: str = "pose"
 
 
 def read(metadata: Any) -> Greeting:
@@ -59,6 +62,8 @@ def read(metadata: Any) -> Greeting:
         raise UsageError("greeting", "settings of a policy", str(error)[:200]) from None
     execute = settings.execute if spec or "execute" in metadata else 0
     method = metadata.get("method") if spec else methods.SERVED
+    action_space = metadata.get("action_space", "pose")
+    errors.choice("greeting.action_space", str(action_space)[:80], peer_columns.ACTIONS)
     return Greeting(
         spec,
         _scene(metadata.get("scene")),
@@ -66,6 +71,7 @@ def read(metadata: Any) -> Greeting:
         execute,
         _batch(metadata.get("batch", 1)),
         method if method in methods.METHODS else methods.SERVED,
+        action_space,
     )
 
 

@@ -40,7 +40,7 @@ class RemotePolicy:
         spec: inputs.InputSpec,
         horizon: int,
         encode: Callable[..., dict[str, Any]],
-        decode: Callable[[Any], Command],
+        decode: Callable[[Any, rcm.Trocar], Command],
     ) -> None:
         self._link, self._spec, self.horizon = connections, spec, horizon
         self._encode, self._decode = encode, decode
@@ -93,7 +93,7 @@ class RemotePolicy:
         try:
             reply = self._link.ask(self._encode(moments, trocar, key))
             if not isinstance(reply, str):
-                return self.check(self._decode(reply))
+                return self.check(self._decode(reply, trocar))
         except connection_pool.LostServer as error:
             self.fault = error
             raise
@@ -207,14 +207,15 @@ def connect(
     env = sim_env.for_policy(hello.scene, hello.settings, arms)
     spec, settings = hello.spec, hello.settings
     if spec is None:
-        spec = _plain_spec(env, settings)
-        encode = functools.partial(_encode_plain, spec, env.names.task.replace("_", " "))
-        decode = functools.partial(plain.decode, spec)
+        spec = plain.input_spec(env, settings)
+        encode = functools.partial(plain.encode, spec, env.names.task.replace("_", " "))
+        decode = functools.partial(plain.decode, spec, hello.action_space, env.task)
     else:
         _check_trocars(spec, env)
         encode = functools.partial(wire.encode_request, spec)
-        decode = functools.partial(wire.decode_reply, spec, settings.horizon)
-    first = decode(_first_answer(connections, encode, spec))
+        decode = functools.partial(_decode_own, spec, settings.horizon)
+    example = batching.example(spec)
+    first = decode(_first_answer(connections, encode, example), example.trocar)
     horizon = len(first.gripper)
     remote = RemotePolicy(connections, spec, horizon, encode, decode)
     remote.check(first)
@@ -241,9 +242,8 @@ def _policy(remote: RemotePolicy) -> Policy:
 def _first_answer(
     connections: connection_pool.ConnectionPool,
     encode: Callable[..., dict[str, Any]],
-    spec: inputs.InputSpec,
+    example: wire.Request,
 ) -> Any:
-    example = batching.example(spec)
     key = np.asarray(jax.random.key_data(jax.random.key(0)))
     reply = connections.ask(encode(example.observation, example.trocar, key))
     if isinstance(reply, str):
@@ -252,25 +252,9 @@ def _first_answer(
     return reply
 
 
-def _encode_plain(
-    spec: inputs.InputSpec, prompt: str, observation: Any, trocar: rcm.Trocar, key: Any
-) -> dict[str, Any]:
-    """Encodes a plain request, which has no random key."""
-    return plain.encode(spec, prompt, observation, trocar)
-
-
-def _plain_spec(env: sim_env.Env, settings: config.PolicyConfig) -> inputs.InputSpec:
-    p_world_ref = np.asarray(env.p_world_ref, np.float32)
-    arms = () if len(p_world_ref) == 1 else (len(p_world_ref),)
-    return inputs.InputSpec(
-        moments=1,
-        arms=arms,
-        p_world_ref=p_world_ref if arms else p_world_ref[0],
-        keeps_to_manifold=False,
-        image_size=settings.image_size,
-        cameras=env.names.cameras if settings.observation == "image" else (),
-        state_size=env.task.state_size,
-    )
+def _decode_own(spec: inputs.InputSpec, horizon: int, reply: Any, trocar: rcm.Trocar) -> Command:
+    """Decodes a plan of `starjax serve`, whose poses need no trocar."""
+    return wire.decode_reply(spec, horizon, reply)
 
 
 def _check_trocars(spec: inputs.InputSpec, env: sim_env.Env) -> None:

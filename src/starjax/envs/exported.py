@@ -19,11 +19,11 @@ from gymnasium.vector.utils import batch_space
 
 from starjax import errors, rcm
 from starjax.data import pose_rows
+from starjax.data.formats.peer_columns import ACTIONS
 from starjax.envs import batch, forked, mdp, settings, vector
 from starjax.sim.tasks.base import Task
 from starjax.types import Command, Pose
 
-ACTIONS = ("pose", "rcm4")  # as `starjax export --actions`
 _WIDTH = {"pose": pose_rows.COLUMNS, "rcm4": rcm.ACTION_SPACES["rcm4"].dim + 1}
 _MATRIX = 13  # numbers of an arm in the compiled program: p, R, gripper
 IMAGE = "pixels/"

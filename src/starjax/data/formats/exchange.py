@@ -22,7 +22,12 @@ from starjax.rollouts import episodes
 from starjax.runtime import files, provenance
 
 
-def source(root: Path, form: base.Format, image_size: int = 0) -> Source:
+def source(
+    root: Path,
+    form: base.Format,
+    image_size: int = 0,
+    options: peer_columns.PeerOptions = peer_columns.DEFAULT,
+) -> Source:
     """Returns a sealed starjax dataset as the source of an export.
 
     Args:
@@ -30,6 +35,7 @@ def source(root: Path, form: base.Format, image_size: int = 0) -> Source:
       form: format of the export.
       image_size: pixels per side of images that are drawn, for a dataset that recorded none; 0
         leaves them out.
+      options: of the columns for other tools.
 
     Raises:
       ValueError: it is not complete, or damaged.
@@ -56,15 +62,14 @@ def source(root: Path, form: base.Format, image_size: int = 0) -> Source:
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
         arrays = _arrays(root, description, kept[episode])
         by_column = {named[name]: array for name, array in arrays.items()}
-        derived = peer_columns.derived(arrays, kept[episode], description)
+        derived = peer_columns.derived(arrays, kept[episode], description, options)
         by_column |= {form.named(name): array for name, array in derived.items()}
         rows = np.arange(first[episode], first[episode + 1])
         by_column |= {name: drawn[name][rows] for name in drawn if name in names}
         return {name: by_column[name] for name in names}
 
-    columns = {
-        form.named(name): column for name, column in peer_columns.columns(description).items()
-    }
+    derived_columns = peer_columns.columns(description, options)
+    columns = {form.named(name): column for name, column in derived_columns.items()}
     columns |= {named[name]: column for name, column in fields.items()}
     columns |= {name: Column(images.shape[1:], "uint8") for name, images in drawn.items()}
     return Source(

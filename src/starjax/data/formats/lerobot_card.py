@@ -56,10 +56,23 @@ def card(info: dict[str, Any], source: Source) -> str:
             *(f"| {name} | {text} |" for name, text in rows),
             "\n## Features\n\n| name | type | shape | numbers |\n|---|---|---|---|",
             *features,
+            f"\n{_for_readers(info)}\n",
             "\n`observation.trocar` is where the shaft passes through the wall: a remote centre of "
             "motion, fixed within an episode. Columns `starjax.*` and `meta/starjax.json` bring "
             "the dataset back as it was: `starjax import`.\n",
         ]
+    )
+
+
+def _for_readers(info: dict[str, Any]) -> str:
+    """Returns a line about policies that read the state alone."""
+    names = info["features"].get("observation.state", {}).get("names") or []
+    reads = "LeRobot's ACT and diffusion read `observation.state` and the images, "
+    if any("trocar" in str(name) for name in names):
+        return f"{reads}so the state ends with the trocar."
+    return (
+        f"{reads}and never `observation.trocar`: a policy that should be conditioned on the trocar "
+        "needs an export with `--state-with-trocar`."
     )
 
 

@@ -81,14 +81,17 @@ def modality(source: Source) -> dict[str, Any]:
     """Returns the content of modality.json: tip poses, grippers, trocars and cameras by name."""
     state, action, trocar = (lerobot.named(name) for name in ("state", "action", "trocar"))
     # Columns of others are not known by part.
-    count = source.columns[state].shape[0] // _ARM if source.origin else 0
+    count = source.columns[trocar].shape[0] // 3 if source.origin else 0
+    width = source.columns[action].shape[0] // count if count else 0
+    target = "tip_pose" if width == _ARM else "roll_and_tip"
     parts: dict[str, Any] = {"state": {}, "action": {}}
     for i in range(count):
         arm = f"arm{i}_" if count > 1 else ""
-        first = i * _ARM
-        for kind, column in (("state", state), ("action", action)):
-            parts[kind][f"{arm}tip_pose"] = _span(first, first + _POSE, column)
-            parts[kind][f"{arm}gripper"] = _span(first + _POSE, first + _ARM, column)
+        first, last = i * _ARM, (i + 1) * width
+        parts["state"][f"{arm}tip_pose"] = _span(first, first + _POSE, state)
+        parts["state"][f"{arm}gripper"] = _span(first + _POSE, first + _ARM, state)
+        parts["action"][f"{arm}{target}"] = _span(last - width, last - 1, action)
+        parts["action"][f"{arm}gripper"] = _span(last - 1, last, action)
         parts["state"][f"{arm}trocar"] = _span(3 * i, 3 * i + 3, trocar)
     prefix = lerobot.named(episodes.IMAGE)
     parts["video"] = {

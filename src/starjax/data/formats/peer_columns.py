@@ -1,17 +1,33 @@
 """Columns, splits and texts of an export that other tools expect, derived from starjax's fields."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import transform
 
 from starjax import rcm
-from starjax.data import schema, store
+from starjax.data import pose_rows, schema, store
 from starjax.data.formats import base
 from starjax.data.formats.base import Column
 from starjax.rollouts import episodes
 
+ACTIONS = ("pose", "rcm4")  # columns of the actions
 _AXES = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
+_RCM4_AXES = ("roll", "x", "y", "z", "gripper")
+
+
+class PeerOptions(NamedTuple):
+    """Columns for readers that look at `state` and `action` only.
+
+    Attributes:
+      state_with_trocar: append the trocars to `state`.
+      actions: key of `ACTIONS`: poses, or roll in rad and tip on the RCM manifold of the trocar.
+    """
+
+    state_with_trocar: bool = False
+    actions: str = "pose"
+
+
+DEFAULT = PeerOptions()
 
 
 def splits(records: list[store.Record]) -> dict[str, range]:
@@ -35,17 +51,21 @@ def name_of(field: str) -> str:
     return field if field.startswith(episodes.IMAGE) else f"{base.OURS}.{field}"
 
 
-def columns(description: dict[str, Any]) -> dict[str, Column]:
+def columns(description: dict[str, Any], options: PeerOptions = DEFAULT) -> dict[str, Column]:
     """Returns the columns that other tools expect, derived from starjax's fields."""
     arms = len(description["p_world_ref"])
-    names = [f"arm{i}_{axis}" if arms > 1 else axis for i in range(arms) for axis in _AXES]
-    places = [
-        name.replace("gripper", "") for name in names if name[-1] in "xyz" and "q" not in name
-    ]
+
+    def named(axes: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(f"arm{i}_{axis}" if arms > 1 else axis for i in range(arms) for axis in axes)
+
+    states, places = named(_AXES), named(_AXES[:3])
+    if options.state_with_trocar:
+        states += named(tuple(f"trocar_{axis}" for axis in _AXES[:3]))
+    actions = named(_AXES if options.actions == "pose" else _RCM4_AXES)
     found = {
-        "state": Column((8 * arms,), "float32", tuple(names)),
-        "action": Column((8 * arms,), "float32", tuple(names)),
-        "trocar": Column((3 * arms,), "float32", tuple(places)),
+        "state": Column((len(states),), "float32", states),
+        "action": Column((len(actions),), "float32", actions),
+        "trocar": Column((3 * arms,), "float32", places),
         "reward": Column((), "float32"),
         "done": Column((), "bool"),
     }
@@ -58,29 +78,42 @@ def columns(description: dict[str, Any]) -> dict[str, Column]:
 
 
 def derived(
-    arrays: dict[str, np.ndarray], record: store.Record, description: dict[str, Any]
+    arrays: dict[str, np.ndarray],
+    record: store.Record,
+    description: dict[str, Any],
+    options: PeerOptions = DEFAULT,
 ) -> dict[str, np.ndarray]:
     """Returns the columns of an episode."""
     length, places = record["length"], schema.trocars_of([record])
     reference = np.asarray(description["p_world_ref"], np.float32)
     trocar = np.asarray(rcm.trocar_position(places, reference)).reshape(1, -1)
+    trocar = np.repeat(trocar, length, axis=0).astype(np.float32)
     last = np.arange(length) == length - 1
+    state = _poses(arrays["p"], arrays["R"], arrays["gripper"])
+    command = arrays["command_p"], arrays["command_R"], arrays["command_gripper"]
+    frame = rcm.trocar_frame(places, reference, np.float32(description["roll_zero"]))
     rows = {
-        "state": _poses(arrays["p"], arrays["R"], arrays["gripper"]),
-        "action": _poses(arrays["command_p"], arrays["command_R"], arrays["command_gripper"]),
-        "trocar": np.repeat(trocar, length, axis=0).astype(np.float32),
+        "state": np.concatenate([state, trocar], -1) if options.state_with_trocar else state,
+        "action": _poses(*command) if options.actions == "pose" else _rcm4(*command, frame),
+        "trocar": trocar,
         "reward": (last & record["success"]).astype(np.float32),
         "done": last,
     }
     return rows | ({"environment_state": arrays["state"]} if "state" in arrays else {})
 
 
+def _rcm4(p: np.ndarray, R: np.ndarray, gripper: np.ndarray, frame: rcm.TrocarFrame) -> np.ndarray:
+    """Returns continuous rolls, tips and grippers `[T, 5 A]`."""
+    encode = rcm.ACTION_SPACES["rcm4"].encode
+    pose: Any = (R.astype(np.float32), p.astype(np.float32))
+    rows = np.array(encode(rcm.Pose(*pose), frame))
+    rows[..., 0] = np.unwrap(rows[..., 0], axis=0)
+    return np.concatenate([rows, gripper[..., None]], -1).reshape(len(p), -1).astype(np.float32)
+
+
 def _poses(p: np.ndarray, R: np.ndarray, gripper: np.ndarray) -> np.ndarray:
-    """Packs positions, continuous quaternions xyzw and grippers to `[T, 8 A]`."""
-    turned = transform.Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
-    turned = turned.reshape(*R.shape[:2], 4)
-    # q and -q are one rotation: keep the one nearer to the previous step.
-    ahead = np.where(np.sum(turned[1:] * turned[:-1], -1, keepdims=True) < 0, -1.0, 1.0)
-    turned[1:] *= np.cumprod(ahead, axis=0)
-    rows = np.concatenate([p, turned, gripper[..., None]], -1)
-    return rows.reshape(len(p), -1).astype(np.float32)
+    """Packs positions, continuous quaternions and grippers to `[T, 8 A]`."""
+    rows = pose_rows.pack(p, R, gripper)
+    for step in range(1, len(rows)):
+        rows[step] = pose_rows.without_flips(rows[step], rows[step - 1])
+    return rows.astype(np.float32)
