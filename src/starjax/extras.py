@@ -11,6 +11,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "report": ("PIL", "jinja2", "matplotlib", "scipy"),
     "video": ("imageio_ffmpeg",),
     "formats": ("PIL", "av", "h5py", "pyarrow", "zarr"),
+    "ros": ("rosbags",),
     "gym": ("gymnasium",),
     "serve": ("PIL", "filelock", "flax", "msgpack", "msgspec", "safetensors", "websockets"),
     "viewer": ("viser",),

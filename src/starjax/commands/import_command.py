@@ -12,6 +12,7 @@ from starjax import errors
 from starjax.commands import checks, messages, options
 from starjax.runtime import progress, xla
 
+_PIXELS = 128  # pixels a side of images that --cameras names
 _SHOWN = 10  # anomalies, the others are in a file
 DESCRIPTION = """Imports demonstrations in another format as a dataset to train on.
 
@@ -32,6 +33,8 @@ class ImportArgs:
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]  # new dataset
     map: str = ""  # mapping file, .toml or .json, or a name; empty: the one that fits
     skip: tuple[int, ...] = ()  # episodes to leave out, by their numbers in the files
+    # columns of images, as camera=observation.images.left; empty: the mapping's
+    cameras: tuple[str, ...] = ()
     splits: tuple[str, ...] = ()  # splits to import, e.g. train recovery; empty: all
     accept: bool = False  # exit code 0 in spite of notes
     format: str = options.AUTO  # format, see starjax list; auto: detected
@@ -56,6 +59,16 @@ def main(argv: Sequence[str]) -> int:
         return _mapped(source, args, out)
 
 
+def _cameras(given: Sequence[str]) -> dict[str, Any]:
+    """Parses columns of images: a camera of the task, `=`, a column."""
+    from starjax.data.formats.mapping import CameraColumn
+
+    pairs = [text.partition("=") for text in given]
+    for text, (name, _, column) in zip(given, pairs):
+        checks.expect(bool(name and column), "--cameras", "CAMERA=COLUMN", text)
+    return {name: CameraColumn(column=column, size=_PIXELS) for name, _, column in pairs}
+
+
 def _bring_back(source: Any, out: Path) -> int:
     from starjax.data.formats import exchange
 
@@ -78,7 +91,7 @@ def _mapped(source: Any, args: ImportArgs, out: Path) -> int:
     name = args.map or (base.OURS if own else ready.choose(source))
     map_path = ready.FOLDER / name if own else ready.find(name)
     columns = own or mapping.load(map_path)
-    given = {"skip": args.skip, "splits": args.splits}
+    given = {"skip": args.skip, "splits": args.splits, "cameras": _cameras(args.cameras)}
     columns = structs.replace(columns, **{key: value for key, value in given.items() if value})
     if map_path.parent == ready.FOLDER:
         print(f"mapping {name}: {columns.about}")

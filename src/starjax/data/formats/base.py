@@ -18,8 +18,12 @@ FORMATS = Registry(
     {
         "lerobot": "starjax.data.formats.lerobot:FORMAT",
         "lerobot-v2.1": "starjax.data.formats.lerobot_v21:FORMAT",
+        "aloha": "starjax.data.formats.aloha:FORMAT",
         "robomimic": "starjax.data.formats.robomimic:FORMAT",
         "zarr": "starjax.data.formats.zarr:FORMAT",
+        "rosbag": "starjax.data.formats.rosbag:FORMAT",
+        "jigsaws": "starjax.data.formats.jigsaws:FORMAT",
+        "csv": "starjax.data.formats.csv:FORMAT",
     },
     "starjax.data.formats.base:Format",
 )

@@ -44,14 +44,14 @@ def named(column: str) -> str:
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[Source]:
     with h5py.File(path, "r") as file:
-        _refuse_links(file)
+        refuse_links(file)
         data: Any = file.get("data", file)
         base.require(isinstance(data, h5py.Group), "a group of episodes", data)
         names = {int(match[1]): name for name in data if (match := _DEMO.fullmatch(name))}
         demos = [data[names[number]] for number in sorted(names)]
         base.require(bool(demos), "groups data/demo_<i>", sorted(data)[:5])
-        lengths = [_length(demo) for demo in demos]
-        first: dict[str, Any] = _datasets(demos[0])
+        lengths = [episode_length(demo) for demo in demos]
+        first: dict[str, Any] = datasets(demos[0])
         ours: Any = file.get(base.OURS)
         columns = {
             name: Column(dataset.shape[1:], dataset.dtype.name)
@@ -109,7 +109,7 @@ def _recognises(path: Path) -> bool:
     return path.is_file() and path.suffix in SUFFIXES
 
 
-def _refuse_links(file: h5py.File) -> None:
+def refuse_links(file: h5py.File) -> None:
     """Refuses files that lead out of themselves, in circles, or many ways to the same place."""
     addresses = set()
 
@@ -133,25 +133,27 @@ def _refuse_links(file: h5py.File) -> None:
     look(file, 0)
 
 
-def _datasets(group: Any) -> dict[str, Any]:
-    datasets = {}
-    group.visititems(lambda name, item: datasets.update({name: item} if _is_data(item) else {}))
-    return datasets
+def datasets(group: Any) -> dict[str, Any]:
+    """Returns the datasets of a group by their paths."""
+    found = {}
+    group.visititems(lambda name, item: found.update({name: item} if _is_data(item) else {}))
+    return found
 
 
 def _is_data(item: Any) -> bool:
     return isinstance(item, h5py.Dataset) and item.shape is not None
 
 
-def _length(demo: Any) -> int:
+def episode_length(demo: Any) -> int:
     """Returns the control steps of an episode: those of its actions, or the most common length."""
     base.require(isinstance(demo, h5py.Group), "a group an episode", f"a dataset {demo.name}")
-    if "actions" in demo:
-        actions = demo["actions"]
+    name = next((name for name in ("actions", "action") if name in demo), None)
+    if name is not None:
+        actions = demo[name]
         is_steps = _is_data(actions) and bool(actions.shape)
         base.require(is_steps, "a dataset of control steps", actions.name)
         return int(actions.shape[0])
-    counts = [dataset.shape[0] for dataset in _datasets(demo).values() if dataset.shape]
+    counts = [dataset.shape[0] for dataset in datasets(demo).values() if dataset.shape]
     base.require(bool(counts), "datasets of control steps", f"none in {demo.name}")
     return int(max(set(counts), key=counts.count))
 
