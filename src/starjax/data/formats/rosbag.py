@@ -128,8 +128,8 @@ def _messages(reader: Any, name: str, columns: dict[str, Column]) -> tuple[np.nd
 def _seconds(message: Any, logged: int) -> float:
     """Returns the time of a message's header, of its recording where there is none."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    stamped = stamp is not None and (stamp.sec or stamp.nanosec)
-    return stamp.sec + 1e-9 * stamp.nanosec if stamped else 1e-9 * logged
+    seconds = 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
+    return seconds or 1e-9 * logged
 
 
 def _value(reader: Any, connection: Any, raw: bytes) -> np.ndarray:
