@@ -126,7 +126,7 @@ def _messages(reader: Any, name: str, columns: dict[str, Column]) -> tuple[np.nd
 
 
 def _seconds(message: Any, logged: int) -> float:
-    """Returns the time of a message's header, of its recording where there is none."""
+    """Returns the time of a message's header, or that of its recording."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     seconds = 0.0 if stamp is None else stamp.sec + 1e-9 * stamp.nanosec
     return seconds or 1e-9 * logged
