@@ -12,7 +12,7 @@ from starjax import errors
 from starjax.commands import checks, messages, options
 from starjax.runtime import progress, xla
 
-_PIXELS = 128  # pixels a side of images that --cameras names
+_PIXELS = 128  # pixels per side of images that --cameras names
 _SHOWN = 10  # anomalies, the others are in a file
 DESCRIPTION = """Imports demonstrations in another format as a dataset to train on.
 

@@ -1,4 +1,4 @@
-"""JIGSAWS' kinematics: text of 76 numbers a line, 30 lines a second, a file per episode.
+"""JIGSAWS' kinematics: text, 76 numbers per line, 30 Hz, a file per episode.
 
 Four times 19 numbers: both of the operator's handles, then both instruments, each
 
@@ -35,7 +35,7 @@ def _folder(path: Path) -> Path:
 def _read(path: Path) -> dict[str, np.ndarray]:
     base.require_fits(path.name, (path.stat().st_size,), np.uint8)
     rows = np.loadtxt(path, ndmin=2)
-    base.require(rows.shape[1] == len(_ARMS) * _COUNT, "76 numbers a line", rows.shape[1])
+    base.require(rows.shape[1] == len(_ARMS) * _COUNT, "76 numbers per line", rows.shape[1])
     return {name: rows[:, i * _COUNT : (i + 1) * _COUNT] for i, name in enumerate(_ARMS)}
 
 
