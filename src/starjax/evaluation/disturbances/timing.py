@@ -10,6 +10,7 @@ from starjax.sim.state import Env, EnvState
 from starjax.types import Command, Observation
 
 MAX_DELAY = 4  # control steps in memory
+MAX_LOST = 63  # successive lost observations in training; in episodes there may be more
 
 
 def _delayed(disturbance: DisturbanceState, present: Any) -> Any:
@@ -65,9 +66,15 @@ def _drop(
 
 
 def _last_received(disturbance: DisturbanceState, step: jax.Array) -> jax.Array:
-    return jax.lax.while_loop(
-        lambda step: (step > 0) & _is_lost(disturbance, step), lambda step: step - 1, step
-    )
+    """Returns the last step that was not lost, at most `MAX_LOST` steps ago.
+
+    No loop: its condition would make a GPU wait for the host.
+    """
+    past = step - jnp.arange(MAX_LOST + 1)
+    is_lost = jax.vmap(lambda step: _is_lost(disturbance, step))(past)
+    # The first observation is never lost.
+    is_received = (~is_lost | (past <= 0)).at[-1].set(True)
+    return jnp.maximum(past[jnp.argmax(is_received)], 0)
 
 
 OBSERVATION_DELAY = Disturbance(
