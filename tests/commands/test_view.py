@@ -27,7 +27,8 @@ def test_mistakes_are_one_line(words, argument, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert cli.guard(cli.dispatch, words.split()) == 2
     said = capsys.readouterr().err
-    assert argument in said and said.count("\n") == 1
+    (line,) = (line for line in said.splitlines() if line.startswith("starjax: "))
+    assert argument in line
     assert not list(tmp_path.iterdir())
 
 
@@ -38,4 +39,5 @@ def test_a_port_that_is_taken_is_one_line(capsys):
         port = str(taken.getsockname()[1])
         assert cli.guard(cli.dispatch, ["view", "--task", "reach", "--port", port]) == 2
     said = capsys.readouterr().err
-    assert port in said and "--port" in said and said.count("\n") == 1
+    (line,) = (line for line in said.splitlines() if line.startswith("starjax: "))
+    assert port in line and "--port" in line

@@ -65,7 +65,43 @@ def test_a_pause_holds_and_a_step_is_one(page, expert, hurried, monkeypatch):
     asked = view.ViewOptions((simulation.expert("reach"),), seed=SEED)
     presses = {0: lambda: press(page, "Play"), 3: lambda: press(page, "Step")}
     view.run(page, asked, after(8, presses))
-    assert len(taken) == 1
+    assert len(taken) == 2  # the first one compiles, and is dropped
+
+
+def test_the_page_says_that_it_compiles_and_that_it_pauses(page, expert, hurried, monkeypatch):
+    shown, at_first_step = [], []
+    monkeypatch.setattr(pages.Status, "set", lambda self, text: shown.append(text))
+    step = expert.step
+
+    def recorded(*given):
+        at_first_step.append(shown[-1])
+        return step(*given)
+
+    monkeypatch.setattr(simulation, "load", lambda who, arms=(): expert._replace(step=recorded))
+    asked = view.ViewOptions((simulation.expert("reach"),), seed=SEED)
+    view.run(page, asked, after(6, {2: lambda: press(page, "Play")}))
+    assert at_first_step[0].startswith("Compiling") and "Compiling" not in at_first_step[-1]
+    assert ", paused:" in shown[-1]
+
+
+def test_a_dragged_trocar_stays_for_the_next_trial_until_another_is_selected(page, expert):
+    starts = []
+
+    def start(seed, configuration, trial, trocar=None):
+        starts.append(trocar)
+        return expert.start(seed, configuration, trial, trocar)
+
+    rollouts = view.Rollouts(page, [expert._replace(start=start)], pages.Status(page.gui))
+    rollouts.begin(SEED, 8, 0)
+    (handle,), p = rollouts.trocars._handles._handles, (0.01, 0.02, 0.152)
+    handle.position = p  # as the page's message does
+    rollouts.advance()
+    rollouts.begin(SEED, 8, 1)
+    np.testing.assert_allclose(rollouts._frames[0].p_world_trocar, [p], atol=1e-5)
+    rollouts.trocars.release()
+    rollouts.begin(SEED, 8, 1)
+    assert starts[0] is None and starts[1] is not None and starts[2] is None
+    rollouts.remove()
 
 
 def directed(steered, trocar):
@@ -94,13 +130,31 @@ def test_a_person_demonstrates_and_keeps_it(page, steered, hurried, tmp_path):
             trocar=trocar,
             seed=SEED,
         )
-    assert said.startswith("1 episodes kept")
+    assert said.startswith("1 episodes saved, 1 of them successful")
     data = load.load(root, report=lambda line: None).dataset
     told = trocars.select(steered.env.task.trocars, np.array([trocar]))
     np.testing.assert_allclose(np.asarray(data.trocar.trocar), np.asarray(told), rtol=1e-6)
 
     dataset = browse.open_dataset(root)
     assert browse.run(page, dataset, after(20)).startswith("1 of 1")
+
+
+def test_an_episode_can_be_seen_again_before_it_is_saved(page, steered, hurried, tmp_path):
+    shown = []
+    with recorder.record_into(tmp_path / "demos", steered.env, SEED) as kept:
+        episode = teleop.OperatorEpisode(
+            page, steered, teleop_target.Pilot(page, 1, np.eye(3), directed(steered, 3)), SEED
+        )
+        episode.begin(3, 0)
+        far = episode.distances["goal"]
+        for _ in range(10):
+            episode.advance(kept)
+        assert 0 < episode.distances["goal"] < far
+        episode._stage.show = shown.append
+        for _ in episode.replay(kept):
+            assert kept.length == 10
+    steps = [int(frame.step) for frame in shown]
+    assert steps == [*range(1, 11), 10]
 
 
 def test_what_was_discarded_is_nowhere(page, steered, hurried, tmp_path):

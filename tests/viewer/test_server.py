@@ -1,16 +1,20 @@
 """The page's server and its handles, without a client."""
 
 import contextlib
+import pathlib
 import socket
 
 import numpy as np
 import pytest
 
-from starjax import errors
+from starjax import errors, rcm
+from starjax.evaluation import result
 from starjax.runtime import connections
 from starjax.sim import registries
-from starjax.viewer import handles
+from starjax.viewer import handles, success_map, trocar_controls
 from starjax.viewer import page as pages
+
+ROOT = pathlib.Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +54,58 @@ def test_a_dragged_trocar_stays_where_the_arms_reach(page):
     handle.position = (0.01, 0.02, 0.152)
     np.testing.assert_allclose(found.target(), [[0.01, 0.02, 0.152]], atol=1e-6)
     found.remove()
+
+
+@pytest.mark.parametrize("name", ["peg_transfer", "peg_transfer_bimanual"])
+def test_sliders_and_handles_of_trocars_follow_each_other(page, name):
+    task = registries.tasks.get(name)
+    found = trocar_controls.TrocarControls(page, task)
+    start = rcm.Trocar(*(np.asarray(field)[8] for field in task.trocars))
+    ref = np.array([slot.p_world_ref for slot in task.slots])
+    found.place(np.asarray(rcm.trocar_position(start, ref)))
+    assert found.own() is None
+    for arm, rows in enumerate(found._sliders):
+        rows[0].value, rows[1].value = 20.0 + arm, 100.0
+    found._requests.add("slide")
+    p = found.target()
+    np.testing.assert_allclose(
+        np.linalg.norm(p - ref, axis=-1), 0.02 + 0.001 * np.arange(task.arms)
+    )
+    own = found.own()
+    assert own is not None
+    np.testing.assert_allclose(own.polar, np.radians(100.0), rtol=1e-5)
+    found._requests.add("random")
+    drawn = found.target()
+    assert np.abs(drawn - p).max() > 1e-4
+    for slot, one in zip(task.slots, drawn):
+        np.testing.assert_allclose(handles.within(slot, one), one, atol=1e-5)
+    shown = [[row.value for row in rows] for rows in found._sliders]
+    fields = np.stack(rcm.trocar_from_position(drawn, ref), -1) * [1e3, *[180 / np.pi] * 2]
+    np.testing.assert_allclose(shown, fields, atol=0.51)
+    found.release()
+    assert found.own() is None
+    found.remove()
+
+
+def test_a_sweep_is_dots_at_its_trocars(page):
+    sweep = ROOT / "experiments" / "packaged_policy" / "sweep.json"
+    found = success_map.read(sweep)
+    rate = result.read_sweep(sweep).figures["strict"]
+    assert (found.success.sum(), len(found.success)) == (rate["successes"], rate["trials"])
+    (slot,) = registries.tasks.get(found.task).slots
+    for (one,) in found.p_world_trocar[:20]:
+        np.testing.assert_allclose(handles.within(slot, one), one, atol=1e-5)
+    dots = success_map.add(page.scene, found)
+    assert len(dots.points) == len(found.success)
+    dots.remove()
+
+
+def test_pictures_are_enlarged_without_blocks():
+    image = np.arange(64, dtype=np.uint8)[None, :, None].repeat(64, 0).repeat(3, 2)
+    large = pages.enlarged(image, 256)
+    assert large.shape == (256, 256, 3) and large.dtype == np.uint8
+    assert (np.diff(large[0, :, 0].astype(int)) >= 0).all() and large[0, -1, 0] == 63
+    assert pages.enlarged(image, 32) is image
 
 
 @pytest.mark.parametrize("name", ["peg_transfer", "peg_transfer_bimanual"])

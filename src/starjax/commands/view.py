@@ -15,7 +15,8 @@ from starjax.runtime import jax_start, signals, xla
 DESCRIPTION = """Shows a policy, an expert or a dataset on a page in the browser.
 
 The page has the scene in 3D, the camera's image, the RCM error and the plan. Drag a trocar by its
-arrows and the policy continues through it. Ctrl-C closes the page.
+arrows, or set it by sliders, and the policy continues through it, also in the next trials. Ctrl-C
+closes the page.
 
 Examples:
   starjax view
@@ -37,6 +38,8 @@ class ViewArgs:
     dataset: str = ""  # directory of demonstrations: its episodes
     # second agent at the same trial: expert, or a policy as above
     compare_with: str = ""
+    # sweep.json of starjax sweep, whose trials are dots at their trocars; default: the one in --run
+    sweep: str = ""
     task: str = config_lib.DEFAULT_TASK  # task of the expert
     arm: str = ""  # robot instead of those of the training
     trocar: Annotated[int, Range(0, 999)] = 8  # index of the trocar configuration
@@ -95,8 +98,30 @@ def _live(args: ViewArgs) -> Show:
     count = len(registries.tasks.get(agents[0].task).is_seen)
     if args.trocar >= count:
         raise errors.UsageError("--trocar", f"0 to {count - 1}", args.trocar)
-    initial = view.ViewOptions(tuple(agents), args.arm or view.OWN_ARMS, args.trocar, args.seed)
+    initial = view.ViewOptions(
+        tuple(agents),
+        args.arm or view.OWN_ARMS,
+        args.trocar,
+        args.seed,
+        _sweep(args, agents[0].task),
+    )
     return lambda server, should_stop: view.run(server, initial, should_stop)
+
+
+def _sweep(args: ViewArgs, task: str) -> Any:
+    """Returns the trials of --sweep, or of the sweep in --run, if any."""
+    from starjax.viewer import success_map
+
+    file = Path(args.sweep) if args.sweep else Path(args.run or ".") / "sweep.json"
+    if not args.sweep and not (args.run and file.is_file()):
+        return None
+    try:
+        sweep = success_map.read(file)
+    except (OSError, ValueError) as error:
+        raise errors.UsageError("--sweep", "a sweep.json", error) from error
+    if sweep.task != task:
+        raise errors.UsageError("--sweep", f"a sweep of {task}", sweep.task)
+    return sweep
 
 
 def _agent(policy: str, run: str, task: str) -> Any:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import scipy.ndimage
 
 from starjax import errors
 
@@ -23,7 +24,7 @@ NOBODY = "nobody"
 REDRAW_STEPS = 3  # control steps between two pictures, plots and status lines
 PAUSED_S = 0.02  # between two polls of a paused page
 LATE = 1.0  # periods after which a step counts as missed
-_TEAL = (0, 84, 74)
+_TEAL, _TEAL_ON_DARK = (0, 84, 74), (38, 166, 154)
 _PANEL_WIDTH = 300  # pixels
 _NOTE_S = 5.0  # time that a note stays
 _STATUS_STYLE = "font-size:0.85em;line-height:1.5;padding:0 0.9em 0.4em"
@@ -48,13 +49,28 @@ def serve(port: int = PORT, label: str = "starjax", host: str = HOST) -> Iterato
         if port not in (ANY, server.get_port()):
             hint = "is another viewer open? --port 0 takes a free one"
             raise errors.UsageError("port", "a free port", port, hint)
-        server.gui.configure_theme(
-            brand_color=_TEAL, show_logo=False, show_share_button=False, control_width="medium"
-        )
+        _set_theme(server.gui, is_dark=False)
+        server.gui.main_panel.dock_right()  # no handle of the scene lies under it
         yield server
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
+
+
+def _set_theme(gui: Any, is_dark: bool) -> None:
+    gui.configure_theme(
+        brand_color=_TEAL_ON_DARK if is_dark else _TEAL,
+        show_logo=False,
+        show_share_button=False,
+        control_width="medium",
+        dark_mode=is_dark,
+    )
+
+
+def add_dark_mode(gui: Any) -> None:
+    """Adds a box that makes the page dark."""
+    box = gui.add_checkbox("Dark", False)
+    box.on_update(lambda _: _set_theme(gui, is_dark=bool(box.value)))
 
 
 def address(server: Any) -> str:
@@ -184,25 +200,34 @@ class Choices:
             dropdown.value = value
 
 
-def side_panel(gui: Any, label: str) -> tuple[Any, Any]:
-    """Adds a panel at the left; returns it and its tab, to be filled in a `with`."""
+def side_panel(gui: Any, label: str, width: int = _PANEL_WIDTH) -> tuple[Any, Any]:
+    """Adds a panel of so many pixels at the left; returns it and its tab, to fill in a `with`."""
     panel = gui.add_panel()
     panel.dock_left()
-    panel.set_width(_PANEL_WIDTH)
+    panel.set_width(width)
     return panel, panel.add_tab(label)
 
 
 class Pictures:
-    """Camera images, one per label."""
+    """Camera images, one per label, enlarged to a width in pixels."""
 
-    def __init__(self, gui: Any, labels: Sequence[str]):
+    def __init__(self, gui: Any, labels: Sequence[str], width: int = _PANEL_WIDTH):
         blank = np.zeros((2, 2, 3), np.uint8)
         self._images = [gui.add_image(blank, label=label) for label in labels]
+        self._width = width
 
     def show(self, images: Sequence[np.ndarray]) -> None:
-        """Sends images `[h, w, 3]` uint8 at twice their size."""
+        """Sends images `[h, w, 3]` uint8."""
         for handle, image in zip(self._images, images, strict=True):
-            handle.image = image.repeat(2, axis=0).repeat(2, axis=1)
+            handle.image = enlarged(image, self._width)
+
+
+def enlarged(image: np.ndarray, width: int) -> np.ndarray:
+    """Interpolates an image `[h, w, 3]` uint8 linearly to a width, if it is narrower."""
+    factor = width / image.shape[1]
+    if factor <= 1.0:
+        return image
+    return np.asarray(scipy.ndimage.zoom(image, (factor, factor, 1.0), order=1))
 
 
 class Status:

@@ -15,6 +15,7 @@ _SPAN_S = 6.0
 _HEIGHT = 190  # pixels
 _MIN_TOP = 0.1  # mm, smallest top of the error axis
 _X = {"time": False}
+_PADDING = (12, 24, 0, 0)  # pixels; without the first, the top tick's label is cut
 
 
 class Plots:
@@ -25,7 +26,7 @@ class Plots:
         self._frames = [collections.deque[Frame](maxlen=kept) for _ in labels]
         self._top = _MIN_TOP
         self._errors = _plot(gui, "RCM error (mm)", list(zip(labels, COLOURS)), (0.0, _MIN_TOP))
-        self._paths = _plot(gui, "Tip x, y, z (mm), then as planned", list(zip("xyz", _AXES)))
+        self._paths = _plot(gui, "Tip (mm), then as planned", list(zip("xyz", _AXES)))
 
     def clear(self) -> None:
         """Clears the episode."""
@@ -66,7 +67,8 @@ def _plot(
         title=title,
         height=_HEIGHT,
         scales={"x": _X, "y": {"range": y} if y else {"auto": True}},
-        legend={"show": False},
+        legend={"show": True, "live": False},
+        padding=_PADDING,
     )
 
 

@@ -1,7 +1,7 @@
 """Demonstrations by an operator: a steered environment, and a recorder of its episodes."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -117,6 +117,16 @@ class Recorder:
     def kept(self) -> int:
         """Number of successful episodes in the dataset."""
         return sum(record["success"] for record in self._records.values())
+
+    @property
+    def saved(self) -> int:
+        """Number of episodes in the dataset, failed ones included."""
+        return len(self._records)
+
+    @property
+    def moments(self) -> Sequence[Moment]:
+        """The control steps of the unsaved episode."""
+        return self._moments
 
     @property
     def length(self) -> int:

@@ -89,7 +89,8 @@ class Simulation(NamedTuple):
     Attributes:
       label: the agent's, for the page.
       env: the environment.
-      start: (seed, index of the trocar configuration, trial) -> (LiveState, Frame).
+      start: (seed, index of the trocar configuration, trial, another trocar with fields `[A]` or
+        None) -> (LiveState, Frame).
       step: (LiveState, target p_world_trocar `[A, 3]` m) -> (LiveState, Frame on the host).
       look: LiveState -> camera's name -> `[h, w, 3]` uint8.
       monitor: the policy's runtime monitor, if it has one.
@@ -97,7 +98,7 @@ class Simulation(NamedTuple):
 
     label: str
     env: sim_env.Env
-    start: Callable[[int, int, int], tuple[LiveState, Frame]]
+    start: Callable[[int, int, int, Trocar | None], tuple[LiveState, Frame]]
     step: Callable[[LiveState, np.ndarray], tuple[LiveState, Frame]]
     look: Callable[[LiveState], dict[str, jax.Array]]
     monitor: Monitor | None = None
@@ -144,9 +145,11 @@ def make(label: str, env: sim_env.Env, agent: agents.BatchAgent, params: Any = N
         live = LiveState(jax.vmap(env.step)(before, command), memory, live.t + 1, p_planned)
         return live, frame(env, live, execute)
 
-    def begin(seed: int, configuration: int, trial: int) -> tuple[LiveState, Frame]:
+    def begin(
+        seed: int, configuration: int, trial: int, trocar: Trocar | None = None
+    ) -> tuple[LiveState, Frame]:
         key = trial_key(seed, configuration, trial)
-        live, first = start(params, key, task_trocar(env, configuration))
+        live, first = start(params, key, trocar or task_trocar(env, configuration))
         return live, jax.device_get(first)
 
     def advance(live: LiveState, target: np.ndarray) -> tuple[LiveState, Frame]:

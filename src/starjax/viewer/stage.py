@@ -19,6 +19,7 @@ _CELL, _SECTION = 0.01, 0.05  # m, squares of a grid
 # Scale of colours: viser's lights are brighter than the simulator's. Changed lights would flicker
 # whenever an embedded playback begins again.
 _DIM = 0.45
+_FOV = np.radians(60.0)  # vertical field of view of new pages
 _GRID_HEIGHT = 2e-4  # m above its plane
 
 
@@ -86,8 +87,10 @@ def aim(server: Any, rollouts: int) -> None:
     """Points the camera of new pages at all rollouts."""
     others = rollouts - 1
     middle = 0.5 * _SPACING * others
-    server.initial_camera.position = (0.28 + 0.4 * others, middle - 0.22, 0.24 + 0.18 * others)
-    server.initial_camera.look_at = (0.0, middle, 0.07)
+    # One rollout: the board fills a third of the height, and the trocar's handle is below the top.
+    server.initial_camera.position = (0.2 + 0.48 * others, middle - 0.16, 0.21 + 0.21 * others)
+    server.initial_camera.look_at = (0.0, middle, 0.09)
+    server.initial_camera.fov = _FOV
     server.initial_camera.near = 0.005
 
 

@@ -1,19 +1,23 @@
 """Teleoperation: an operator demonstrates on the page in real time and keeps good episodes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from starjax.rollouts import episodes
 from starjax.runtime import files
-from starjax.viewer import page, teleop_target
+from starjax.viewer import goal_distance, page, teleop_target
 from starjax.viewer.devices import Device
 from starjax.viewer.frame import outcome, rcm_error_mm
 from starjax.viewer.recorder import Recorder, Steering
 from starjax.viewer.stage import Stage, aim
 from starjax.viewer.teleop_target import Pilot
 from starjax.viewer.view import trocar_names
+
+_PICTURE_WIDTH = 480  # pixels
+_OVER = object()  # of a replay
 
 
 class OperatorEpisode:
@@ -24,6 +28,7 @@ class OperatorEpisode:
       trial: its number.
       frame: the present frame.
       end: outcome, empty while the trial runs.
+      distances: name of a point of the task -> mm to the nearest tip.
     """
 
     def __init__(self, server: Any, steering: Steering, pilot: Pilot, seed: int):
@@ -32,7 +37,10 @@ class OperatorEpisode:
         self._limit = round(env.task.time_limit_s * env.control_hz)
         self._stage = Stage(server.scene, env.scene.mj_model)
         aim(server, 1)
-        self._picture = page.Pictures(server.gui, ["Camera"])
+        _, tab = page.side_panel(server.gui, "Camera", _PICTURE_WIDTH)
+        with tab:
+            self._picture = page.Pictures(server.gui, [env.names.cameras[0]], _PICTURE_WIDTH)
+        self._distances = goal_distance.make(env)
 
     def begin(self, configuration: int, trial: int) -> None:
         """Sets up a trial that waits for the operator."""
@@ -56,11 +64,23 @@ class OperatorEpisode:
         self.end = outcome(self.frame, recorder.length >= self._limit)
         self._draw(with_image=bool(self.end) or recorder.length % page.REDRAW_STEPS == 0)
 
+    def replay(self, recorder: Recorder) -> Iterator[None]:
+        """Shows the recorded control steps one by one, then the present one again."""
+        self._stage.clear()
+        camera = f"{episodes.IMAGE}{self._steering.env.names.cameras[0]}"
+        for i, moment in enumerate(list(recorder.moments)):
+            self._stage.show(moment.frame)
+            if camera in moment.fields and i % page.REDRAW_STEPS == 0:
+                self._picture.show([moment.fields[camera][0]])
+            yield
+        self._draw(with_image=True)
+
     def _draw(self, with_image: bool) -> None:
         self._stage.show(self.frame)
         if with_image:
             images = self._steering.look(self._state)
             self._picture.show([np.asarray(next(iter(images.values())))])
+            self.distances = self._distances(self._state)
 
 
 def run(
@@ -77,13 +97,16 @@ def run(
     env, gui, requests = steering.env, server.gui, page.UiRequests()
     status = page.Status(gui, "Compiling\nAbout a minute the first time, seconds later.")
     gui.add_markdown(f"Strict success: {env.task.text.strict}.")
-    buttons = gui.add_button_group("", ("Save", "Discard"), hint="Enter, Backspace")
+    hint = "Enter, Backspace, R: shows the episode before it is saved"
+    buttons = gui.add_button_group("", ("Save", "Discard", "Replay"), hint=hint)
     buttons.on_click(lambda event: requests.add(event.target.value.lower()))
     page.add_command(gui, "Save the episode", "enter", lambda: requests.add("save"))
     page.add_command(gui, "Discard the episode", "backspace", lambda: requests.add("discard"))
+    page.add_command(gui, "Replay the episode", "R", lambda: requests.add("replay"))
     names = trocar_names(env.task.name)
     choices = page.Choices(gui, requests, trocar=(names, names[trocar]))
     pilot = Pilot(server, env.task.arms, view_axes(env), device)
+    page.add_dark_mode(gui)
     steering.compile()  # not after the operator's first motion
     episode = OperatorEpisode(server, steering, pilot, seed)
 
@@ -93,7 +116,7 @@ def run(
         episode.begin(configuration, recorder.next_trial(configuration))
 
     begin()
-    clock = page.Clock(env.control_hz)
+    clock, replay = page.Clock(env.control_hz), iter(())
     while not should_stop():
         requested = requests.pop()
         if "save" in requested and recorder.length:
@@ -103,11 +126,18 @@ def run(
         elif requested & {"discard", "choice"}:
             begin()
             clock.pause()
+        if requested & {"save", "discard", "choice"}:
+            replay = iter(())
+        elif "replay" in requested:
+            replay = episode.replay(recorder)
         clock.wait()
-        episode.advance(recorder)
+        is_replay = next(replay, _OVER) is not _OVER
+        if not is_replay:
+            episode.advance(recorder)
         if clock.steps % page.REDRAW_STEPS == 0:
-            status.set(_status(env, episode, recorder, clock))
-    return f"{recorder.kept} episodes kept; {clock.missed} of {clock.steps} control steps late"
+            status.set(_status(env, episode, recorder, clock, is_replay))
+    saved = f"{recorder.saved} episodes saved, {recorder.kept} of them successful"
+    return f"{saved}; {clock.missed} of {clock.steps} control steps late"
 
 
 def _save(server: Any, recorder: Recorder, episode: OperatorEpisode) -> bool:
@@ -122,17 +152,23 @@ def _save(server: Any, recorder: Recorder, episode: OperatorEpisode) -> bool:
     return True
 
 
-def _status(env: Any, episode: OperatorEpisode, recorder: Recorder, clock: page.Clock) -> str:
+def _status(
+    env: Any, episode: OperatorEpisode, recorder: Recorder, clock: page.Clock, is_replay: bool
+) -> str:
     """Returns the status lines of the page."""
     frame = episode.frame
     tips = "; ".join(" ".join(f"{1e3 * x:.1f}" for x in p) for p in frame.p_world_tip)
     progress = episode.end or env.task.stages[int(frame.stage)]
     if not recorder.length:
         progress = "waits for your hand"
+    progress = "replay" if is_replay else progress
+    goals = ", ".join(f"to {name} {mm:.1f}" for name, mm in episode.distances.items())
     return (
         f"{progress}, {recorder.length / env.control_hz:.1f} s recorded\n"
+        f"distance {goals} mm\n"
         f"tip {tips} mm, RCM error {rcm_error_mm(frame):.2f} mm\n"
-        f"{recorder.kept} successful episodes kept; {clock.missed} steps late"
+        f"{recorder.saved} episodes saved, {recorder.kept} of them successful; "
+        f"{clock.missed} steps late"
     )
 
 

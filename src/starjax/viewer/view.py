@@ -8,15 +8,17 @@ import numpy as np
 
 from starjax import errors
 from starjax.sim import registries
-from starjax.viewer import page, simulation
+from starjax.viewer import page, simulation, success_map
 from starjax.viewer.episode_alarm import EpisodeAlarm
 from starjax.viewer.frame import outcome, rcm_error_mm
-from starjax.viewer.handles import TrocarHandles
 from starjax.viewer.plots import Plots
 from starjax.viewer.simulation import AgentSpec, Simulation
 from starjax.viewer.stage import Stage, aim
+from starjax.viewer.success_map import SuccessMap
+from starjax.viewer.trocar_controls import TrocarControls
 
 OWN_ARMS = "their own"
+_COMPILING = "Compiling {}\nAbout a minute the first time, seconds later."
 _REST_S = 1.5  # pause between an episode and the next trial
 
 
@@ -28,12 +30,14 @@ class ViewOptions(NamedTuple):
       arm: robot in place of their own, or `OWN_ARMS`.
       trocar: index of the task's trocar configuration.
       seed: seed of the trials.
+      sweep: trials that are drawn as dots at their trocars, or None.
     """
 
     agents: tuple[AgentSpec, ...]
     arm: str = OWN_ARMS
     trocar: int = 0
     seed: int = 0
+    sweep: SuccessMap | None = None
 
 
 def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> str:
@@ -42,7 +46,8 @@ def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> s
     status = page.Status(server.gui)
     player = page.Player(server.gui, requests)
     selection = Selection(server.gui, requests, options)
-    rollouts = _load(server, selection, status)
+    page.add_dark_mode(server.gui)
+    rollouts = _load(server, selection, status, options.sweep)
     rollouts.begin(options.seed, selection.trocar, 0)
     clock = page.Clock(rollouts.hz)
     while not should_stop():
@@ -51,7 +56,8 @@ def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> s
             clock.pause()
             if selection.is_changed():
                 rollouts.remove()
-                rollouts = _load(server, selection, status)
+                rollouts = _load(server, selection, status, options.sweep)
+            rollouts.trocars.release()
             rollouts.begin(options.seed, selection.trocar, 0)
         elif requested & {"again", "next"}:
             clock.pause()
@@ -128,9 +134,16 @@ class Rollouts:
     Attributes:
       hz: control steps per second.
       trial: number of the present trial.
+      trocars: their handles and sliders.
     """
 
-    def __init__(self, server: Any, simulations: Sequence[Simulation], status: page.Status):
+    def __init__(
+        self,
+        server: Any,
+        simulations: Sequence[Simulation],
+        status: page.Status,
+        sweep: SuccessMap | None = None,
+    ):
         self._server, self._simulations, self._status = server, simulations, status
         env, gui = simulations[0].env, server.gui
         self.hz, self._limit = env.control_hz, round(env.task.time_limit_s * env.control_hz)
@@ -138,34 +151,42 @@ class Rollouts:
         models = [simulation.env.scene.mj_model for simulation in simulations]
         self._stages = [Stage(server.scene, model, i) for i, model in enumerate(models)]
         aim(server, len(simulations))
-        self._handles = TrocarHandles(server.scene, env.task)
+        self.trocars = TrocarControls(server, env.task)
+        self._map = []
+        if sweep and sweep.task == env.task.name:
+            self._map += [success_map.add(server.scene, sweep)]
+            self._map += [gui.add_markdown(success_map.LEGEND)]
         self._panel, tab = page.side_panel(gui, "Measured")
         with tab:
             self._plots = Plots(gui, labels, self.hz)
             self._pictures = page.Pictures(gui, [f"{label} sees" for label in labels])
         self._alarms = [EpisodeAlarm(simulation.monitor) for simulation in simulations]
         self._tally = np.zeros((len(simulations), 2), int)  # succeeded, ended
+        self._is_compiled = self._is_paused = False
 
     def begin(self, seed: int, configuration: int, trial: int) -> None:
-        """Starts a trial through a trocar configuration of the task."""
+        """Starts a trial through a trocar configuration of the task, or the operator's own."""
         self.trial, self._rest = trial, round(_REST_S * self.hz)
-        starts = [one.start(seed, configuration, trial) for one in self._simulations]
+        trocar = self.trocars.own()
+        starts = [one.start(seed, configuration, trial, trocar) for one in self._simulations]
         self._states, self._frames = map(list, zip(*starts))
         self._outcomes = [""] * len(starts)
-        self._handles.place(self._frames[0].p_world_trocar)
+        self.trocars.place(self._frames[0].p_world_trocar)
         self._plots.clear()
         for stage in self._stages:
             stage.clear()
         for alarm in self._alarms:
             alarm.reset()
         self._draw(with_images=True)
+        if not self._is_compiled:
+            self._compile()
 
     def advance(self) -> bool:
         """Runs one control step; returns True once all have ended and rested."""
         if all(self._outcomes):
             self._rest -= 1
             return self._rest <= 0
-        target = self._handles.target()
+        self._is_paused, target = False, self.trocars.target()
         for i in [i for i, end in enumerate(self._outcomes) if not end]:
             self._states[i], frame = self._simulations[i].step(self._states[i], target)
             self._alarms[i].update(self._frames[i], self._states[i])
@@ -177,7 +198,10 @@ class Rollouts:
 
     def idle(self) -> None:
         """Waits while the view is paused; released handles return."""
-        self._handles.target()
+        self.trocars.target()
+        if not self._is_paused:
+            self._is_paused = True
+            self._show_status()
         time.sleep(page.PAUSED_S)
 
     def summary(self) -> str:
@@ -189,7 +213,7 @@ class Rollouts:
 
     def remove(self) -> None:
         """Removes everything from the page."""
-        for part in (*self._stages, self._handles, self._panel):
+        for part in (*self._stages, *self._map, self.trocars, self._panel):
             part.remove()
 
     def _draw(self, with_images: bool) -> None:
@@ -202,13 +226,25 @@ class Rollouts:
             self._plots.draw()
             images = [one.look(state) for one, state in zip(self._simulations, self._states)]
             self._pictures.show([np.asarray(next(iter(image.values()))) for image in images])
-            self._status.set("\n\n".join(map(self._line, range(len(self._stages)))))
+            self._show_status()
+
+    def _compile(self) -> None:
+        """Compiles the control steps by taking one that is dropped."""
+        labels = " and ".join(one.label for one in self._simulations)
+        self._status.set(_COMPILING.format(f"the control step of {labels}"))
+        for one, state, frame in zip(self._simulations, self._states, self._frames):
+            one.step(state, frame.p_world_trocar)
+        self._is_compiled = True
+        self._show_status()
+
+    def _show_status(self) -> None:
+        self._status.set("\n\n".join(map(self._line, range(len(self._stages)))))
 
     def _line(self, i: int) -> str:
         frame, (successes, ended) = self._frames[i], self._tally[i]
         progress = self._outcomes[i] or self._simulations[i].env.task.stages[int(frame.stage)]
         lines = [
-            f"{self._simulations[i].label}, trial {self.trial}: "
+            f"{self._simulations[i].label}, trial {self.trial}{', paused' * self._is_paused}: "
             f"{frame.step / self.hz:.1f} s, {progress}",
             f"RCM error {rcm_error_mm(frame):.2f} mm; success so far: {successes} of {ended}",
             self._alarms[i].text,
@@ -216,17 +252,19 @@ class Rollouts:
         return "\n".join(filter(None, lines))
 
 
-def _load(server: Any, selection: Selection, status: page.Status) -> Rollouts:
+def _load(
+    server: Any, selection: Selection, status: page.Status, sweep: SuccessMap | None
+) -> Rollouts:
     """Loads the selected agents, on their own robots if the selected arm cannot do the task."""
     specs = selection.agents()
     labels = " and ".join(spec.label for spec in specs)
-    status.set(f"Compiling {labels}\nAbout a minute the first time, seconds later.")
+    status.set(_COMPILING.format(labels))
     try:
         loaded = [simulation.load(spec, selection.arms) for spec in specs]
     except errors.UsageError as error:  # an arm without a mount for this task
         page.notify(server, "Not possible", str(error), is_error=True)
         loaded = [simulation.load(spec) for spec in specs]
-    return Rollouts(server, loaded, status)
+    return Rollouts(server, loaded, status, sweep)
 
 
 def trocar_names(task: str) -> list[str]:
