@@ -16,6 +16,7 @@ ROWS = (
     ("policies",),
     ("evaluation",),
     ("training",),
+    ("finetune",),
     ("deploy", "envs"),
     ("viewer",),
     ("report",),

@@ -22,6 +22,7 @@ _TABLE: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "train": ("commands.run:train", "collect demonstrations and train", _LEARNING),
     "evaluate": ("commands.evaluate", "evaluate a policy on its task's trocars", _LEARNING),
     "sweep": ("commands.sweep", "evaluate a policy on a grid or sample of trocars", _LEARNING),
+    "finetune": ("commands.finetune", "improve a trained policy in the simulator", _LEARNING),
     "calibrate": (
         "commands.calibrate",
         "add a runtime monitor to a trained policy",

@@ -211,12 +211,13 @@ def load(
         redraws = randomise.moves_cameras(config.train)
         return loading.load(root, verify=False, env=draws, sources=redraws, report=report).dataset
     loaded = loading.load(root, verify=False, images=False, report=report)
-    return _with_features(config, draws, root, loaded, encoder)
+    return with_features(config, draws, root, loaded, encoder)
 
 
-def _with_features(
+def with_features(
     config: config_lib.RunConfig, env: Any, root: Path, demos: Any, encoder: Any
 ) -> Any:
+    """Returns the frames of `demos`, loaded without images, with features of a frozen encoder."""
     import jax
     import numpy as np
 

@@ -237,9 +237,9 @@ def outcome(results: Sequence[Any]) -> str:
         rows.append(
             (
                 methods.SCORED[result.method].label,
-                _rate(figures["seen"]),
-                _rate(figures["unseen"]),
-                _rate(figures["safe"]["all"]),
+                rate(figures["seen"]),
+                rate(figures["unseen"]),
+                rate(figures["safe"]["all"]),
                 f"{error['mean']:.3f} mm, at most {within['max']:.2f}",
             )
         )
@@ -257,7 +257,7 @@ def alarms(figures: Mapping[str, Any]) -> str:
     return (
         f"alarms: {early['successes']}/{early['trials']} failures before "
         f"{figures['clock_s']:.1f} s{median}; {false['successes']}/{false['trials']} successes; "
-        f"success without alarm {_rate(silent)}"
+        f"success without alarm {rate(silent)}"
     )
 
 
@@ -290,9 +290,10 @@ def indented(text: str) -> None:
     print(errors.printable(f"      {text}"), flush=True)
 
 
-def _rate(rate: Mapping[str, Any]) -> str:
-    if not rate["trials"]:
+def rate(counted: Mapping[str, Any]) -> str:
+    """Returns a rate of `statistics.rate`: its count, percent and 95% interval."""
+    if not counted["trials"]:
         return "-"
-    low, high = (100 * bound for bound in rate["ci95"])
-    count = f"{rate['successes']}/{rate['trials']}"
-    return f"{count} = {100 * rate['rate']:.0f}% [{low:.0f}, {high:.0f}]"
+    low, high = (100 * bound for bound in counted["ci95"])
+    count = f"{counted['successes']}/{counted['trials']}"
+    return f"{count} = {100 * counted['rate']:.0f}% [{low:.0f}, {high:.0f}]"

@@ -121,7 +121,7 @@ def _check(
         devices.make_mesh(train.batch_size)
 
 
-def _draw_images(config: config_lib.RunConfig, env: Any) -> Any:
+def draw_images(config: config_lib.RunConfig, env: Any) -> Any:
     """Returns the function that draws images of displaced cameras, or None."""
     from starjax.training import randomise
 
@@ -184,7 +184,7 @@ def _train(
             should_stop=should_stop,
             description=f"Training {name}",
             step_program=program,
-            draw_images=_draw_images(config, env),
+            draw_images=draw_images(config, env),
         )
     state = processes.own(result.state)
     params = state.ema_params

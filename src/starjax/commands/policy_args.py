@@ -13,7 +13,7 @@ from starjax.commands import checks, folders, options, scenes
 from starjax.policies import packaged
 from starjax.runtime import files
 
-_SCHEMES = ("ws://", "wss://")
+SCHEMES = ("ws://", "wss://")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ def resolve(args: PolicyArgs) -> PolicyPath:
     if bool(args.run) == bool(args.policy):
         got = "both" if args.run else "none"
         raise errors.UsageError("RUN or --policy", "one of the two", got)
-    if args.policy.startswith(_SCHEMES):
+    if args.policy.startswith(SCHEMES):
         extras.require("--policy", "serve")
         return PolicyPath(Path(), None, args.arm, args.policy)
     if args.policy:

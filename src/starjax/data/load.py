@@ -101,6 +101,19 @@ def verify(root: Path) -> None:
     _successful(Path(root), store.read_seal(Path(root)), verify=True)
 
 
+def actors(root: Path) -> np.ndarray:
+    """Returns the agents `[F]` uint8 of a dataset's commands in the order of `load`.
+
+    See `episodes.FIELDS`; a dataset without this field has an expert's. Only the episodes' records
+    are checked.
+    """
+    records = _successful(root, store.read_seal(root), verify=False)
+    length, start = _spans(records)
+    if "actor.npy" not in records[0]["files"]:
+        return np.ones(int(length.sum()), np.uint8)
+    return EpisodeArray(_paths(root, records, "actor.npy"), start, length).read()
+
+
 def frames(root: Path, env: Any = None) -> "Mapping[str, EpisodeArray | redraw.DrawnImages]":
     """Returns the images of the successful episodes by camera, in the order of `load`.
 
@@ -140,7 +153,7 @@ _WHERE = {
     "disk": "memory-mapped from disk (they fit neither the device nor host memory)",
 }
 _DRAWN = "drawn for each batch (they fit neither the device nor host memory)"
-_UNREAD = ("qpos", "rcm_error")  # recorded, but not trained on
+_UNREAD = ("qpos", "rcm_error", "actor")  # recorded, but not trained on
 
 
 def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.Record]:

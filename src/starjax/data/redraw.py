@@ -108,7 +108,7 @@ class DrawnImages:
 def is_possible(description: Mapping[str, Any]) -> bool:
     """Returns True if images of a dataset can be drawn from what it recorded."""
     is_undisturbed = not description.get("randomise")
-    is_ours = description.get("seed_rule") == schema.SEED_RULE
+    is_ours = description.get("seed_rule") == schema.seed_rule(schema.stream(description))
     return is_ours and is_undisturbed and "qpos" in description["features"]
 
 
@@ -183,7 +183,7 @@ def sources(
         return ImageSource(still, state.trocar.p_world_trocar, state.layout, state.cameras)
 
     trocars = schema.trocars_of(records)
-    starts = jax.jit(jax.vmap(start))(_keys(description["seed"], records), trocars)
+    starts = jax.jit(jax.vmap(start))(_keys(description, records), trocars)
     folders = (root / "episodes" / record["key"] for record in records)
     joints = [np.load(folder / "qpos.npy", allow_pickle=False) for folder in folders]
     return Sources(np.concatenate(joints), starts)
@@ -220,9 +220,10 @@ def images_of(
     }
 
 
-def _keys(seed: int, records: Sequence[Mapping[str, Any]]) -> jax.Array:
-    """Returns the environment keys `[D]` of trials, the first halves of `schema.SEED_RULE`'s."""
-    of_dataset = jax.random.fold_in(jax.random.key(seed), schema.STREAM)
+def _keys(description: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) -> jax.Array:
+    """Returns the environment keys `[D]` of trials, the first halves of `schema.seed_rule`'s."""
+    key = jax.random.key(description["seed"])
+    of_dataset = jax.random.fold_in(key, schema.stream(description))
 
     def one(trocar: jax.Array, trial: jax.Array) -> jax.Array:
         key = jax.random.fold_in(jax.random.fold_in(of_dataset, trocar), trial)

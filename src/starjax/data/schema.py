@@ -19,7 +19,14 @@ from starjax.sim import registries
 IMPORTED = "imported.json"  # beside dataset.json: what was odd about the files of others
 # Demonstrations never start from the states that an evaluation with the same seed draws.
 STREAM = 0x64656D6F
-SEED_RULE = f"fold_in(fold_in(fold_in(key(seed), {STREAM}), trocar), trial)"
+
+
+def seed_rule(stream: int) -> str:
+    """Returns the rule that gives the key of a trial, for dataset.json."""
+    return f"fold_in(fold_in(fold_in(key(seed), {stream}), trocar), trial)"
+
+
+SEED_RULE = seed_rule(STREAM)
 
 
 _DISTURBANCES = Registry("disturbance", {})  # of other packages
@@ -89,6 +96,11 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
         "versions": {**xla.versions(), **sources.versions(*parts)},
         **jax_settings.record(),
     }
+
+
+def stream(description: Mapping[str, Any]) -> int:
+    """Returns the stream of a dataset's trials."""
+    return description.get("stream", STREAM)
 
 
 def frame_bytes(description: Mapping[str, Any]) -> int:

@@ -35,6 +35,7 @@ FIELDS = {
     "command_gripper": "-1 squeeze to +1 open",
     "qpos": "generalised coordinates of the model, before the command",
     "rcm_error": "m, executed by the command",
+    "actor": "agent of the command: 0 policy, 1 expert, 2 person",
 }
 
 
@@ -109,6 +110,17 @@ def _demonstrated(step: Step) -> dict[str, jax.Array]:
         "rcm_error": step.after.rcm_error,
     }
     return {name: leaf for name, leaf in found.items() if leaf is not None}
+
+
+def without_images(step: Step) -> dict[str, jax.Array]:
+    """Returns the fields of a demonstration except the images, which follow from them.
+
+    Images are drawn at every step of a record that observes them.
+    """
+    state, seen = step.before, step.observed
+    if seen is None:
+        seen = Observation(state.pose, state.gripper, endoscope=state.endoscope)
+    return _demonstrated(step._replace(observed=seen._replace(images=None)))
 
 
 def _scored(step: Step) -> dict[str, jax.Array]:

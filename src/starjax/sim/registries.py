@@ -2,14 +2,19 @@
 
 An entry point of the group `starjax.tasks`, `starjax.arms`, `starjax.tools` or
 `starjax.workspaces` names a `Task`, an `Arm`, a `Tool` or a `Workspace`; one of `starjax.mounts` a
-dict from (arm, tool, workspace) to `Mount`, for arms of other packages.
+dict from (arm, tool, workspace) to `Mount`, for arms of other packages; one of `starjax.rescuers` a
+`Rescuer`, called as its task's expert is in `rescuer_name`.
 """
 
 import warnings
+from typing import TYPE_CHECKING
 
 from starjax.registry import Registry, entries
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.names import SceneNames
+
+if TYPE_CHECKING:  # importing it takes jax
+    from starjax.sim.tasks.base import Task
 
 tasks = Registry(
     "task",
@@ -45,6 +50,20 @@ workspaces = Registry(
     },
     "starjax.sim.workspaces:Workspace",
 )
+rescuers = Registry(
+    "rescuer",
+    {
+        "peg_transfer": "starjax.sim.tasks.peg_transfer.rescue:RESCUER",
+        "peg_transfer.one_wall": "starjax.sim.tasks.peg_transfer.rescue:WITH_ONE_WALL",
+    },
+    "starjax.sim.tasks.rescue:Rescuer",
+)
+
+
+def rescuer_name(task: "Task", expert: str) -> str:
+    """Returns the name in `rescuers` of a task's expert, the first one if `expert` is empty."""
+    is_first = expert in ("", next(iter(task.experts)))
+    return task.name if is_first else f"{task.name}.{expert}"
 
 
 def paths(names: SceneNames) -> list[str]:

@@ -17,18 +17,10 @@ from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import background, precompile, processes, progress
 from starjax.sim.tasks.base import Task
-from starjax.training import (
-    checkpoint,
-    devices,
-    encoder,
-    holdout,
-    log,
-    metrics,
-    redrawing,
-    stepper,
-)
+from starjax.training import checkpoint, devices, holdout, log, metrics, redrawing, stepper
 from starjax.training import state as states
 from starjax.training.sharding import StateLayout, StepCarry
+from starjax.training.start import Start, first_params, fitted
 from starjax.training.step import Setup
 from starjax.training.stepper import Stepper
 
@@ -73,6 +65,7 @@ def run(
     description: str = "train",
     step_program: precompile.Program | None = None,
     draw_images: redrawing.Draw | None = None,
+    start: Start | None = None,
 ) -> TrainingResult:
     """Trains a method, resuming from the newest sound checkpoint in the directory.
 
@@ -94,6 +87,7 @@ def run(
       step_program: from `training.precompile` with these arguments.
       draw_images: draws those of displaced cameras, from the dataset's sources; needed if
         `train_config.randomise` has such a disturbance.
+      start: of a training that continues another; by default that of a new policy.
 
     Raises:
       Interrupted: after `should_stop`.
@@ -105,14 +99,8 @@ def run(
     directory = pathlib.Path(directory)
     mesh = devices.make_mesh(train_config.batch_size, mesh_devices)
     dataset = _observed(dataset, policy_config, features.select_sensors(task, cameras))
-    frames, held_out = windows.split_holdout(
-        dataset.start, dataset.length, dataset.trocar, train_config.holdout_demos
-    )
-    row = policies.ablated(method, policy_config)
-    stats = normalizer.fit(row, task, dataset, frames)
-    frames, held_out = (
-        windows.strided(dataset, kept, train_config.window_stride) for kept in (frames, held_out)
-    )
+    start = start or fitted(method, policy_config, train_config, dataset, task)
+    stats, frames, held_out, given = start
     policy = policies.make(method, policy_config, task, train_config, cameras)
     optimizer = states.make_optimizer(train_config)
     streams = states.streams(seed)
@@ -121,7 +109,8 @@ def run(
     # restored one may be finished, and then needs neither.
     is_new = not checkpoint.steps(directory / "checkpoints")
     init = states.init(policy, streams.params)
-    drawn = background.run_in_background(init.drawn) if is_new else init.drawn
+    draws = is_new and given is None
+    drawn = background.run_in_background(init.drawn) if draws else init.drawn
     shapes = states.shapes(
         policy, optimizer, init.traced.out_info, stats, streams.steps, devices.replicated(mesh)
     )
@@ -136,11 +125,13 @@ def run(
     if state is None:
         # Arguments, not constants: the program is the same for every seed.
         make = functools.partial(states.create, policy, optimizer)
-        state = states.run_once(make, _first_params(drawn(), policy_config), stats, streams.steps)
+        params = first_params(drawn(), policy_config) if given is None else given
+        state = states.run_once(make, params, stats, streams.steps)
+        del params
         state = devices.replicate(state, mesh)
     else:
         _check_same(directory, state, streams.steps, stats, train_config.steps)
-    del drawn  # frees the initial parameters
+    del drawn, start, given  # frees the initial parameters
 
     holdout_error = None
     if processes.is_first():
@@ -251,15 +242,6 @@ def _check_same(
 def _alike(one: Any, other: Any) -> bool:
     """Returns True for statistics of the same data; last bits vary between processors."""
     return np.shape(one) == np.shape(other) and np.allclose(one, other, rtol=1e-5, atol=1e-6)
-
-
-def _first_params(drawn: policies.Params, policy_config: config.PolicyConfig) -> policies.Params:
-    """Returns a new training's parameters, with the encoder that the settings name."""
-    params = states.on_device(drawn)
-    learns_to_see = policy_config.observation == "image" and not policy_config.freeze_encoder
-    if learns_to_see and policy_config.encoder_weights:
-        params = encoder.start(params, policy_config)
-    return params
 
 
 def _log(

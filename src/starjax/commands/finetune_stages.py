@@ -1,0 +1,179 @@
+"""Stages of a round of fine-tuning: rollouts, their lessons, training.
+
+Complete ones are skipped.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starjax import errors, methods
+from starjax.commands import demonstrations, messages, pipeline, policy_evaluation, stage_times
+from starjax.commands.finetune_work import Work
+from starjax.data import load, store, windows
+from starjax.evaluation import statistics, trials
+from starjax.finetune import dagger, mixing, rounds, self_imitation
+from starjax.policies import in_env, policy_file
+from starjax.policies import policy as policies
+from starjax.policies.in_env import PolicyInEnv
+from starjax.rollouts import placement, progress
+from starjax.runtime import processes
+from starjax.runtime.signals import stop_signals
+from starjax.training import loop, randomise
+from starjax.training.encoder import Encoder
+
+_VALIDATION = 0x76616C69  # added to the seed: its trials are not those of the report
+
+
+def validate(work: Work, number: int, who: PolicyInEnv) -> trials.Table:
+    """Returns the trials that choose a round: at the seen trocars, from starts of their own."""
+    settings = dataclasses.replace(work.settings.eval, trials=work.settings.validation)
+    seed = (work.settings.seed + _VALIDATION) % 2**32
+    with stage_times.timed(work.out, f"round {number} validation"):
+        folder = work.folder(number) / "validation"
+        return policy_evaluation.rollouts(folder, who, work.seen, settings, seed)
+
+
+class Search:
+    """Rollouts of all rounds, with the limits that the policy itself has set."""
+
+    def __init__(self, work: Work, steps: np.ndarray):
+        """Decides the limits from the control steps `[n]` of the policy's successes."""
+        if not len(steps):
+            raise errors.UsageError("RUN", "a policy with some success", "none in validation")
+        self._work = work
+        self._limits, self._max_steps = dagger.limits(steps, work.base.env.control_hz)
+
+    def collect(self, number: int, who: PolicyInEnv) -> dict[str, Any]:
+        """Runs the trials of a round with the policy of the round before; returns their counts."""
+        work, root = self._work, self._work.folder(number) / "rollouts"
+        print(f"\n[round {number}] rollouts: into {root}", flush=True)
+        settings = rounds.RoundSettings(
+            number=number - 1,
+            seed=work.settings.seed,
+            trials=work.settings.trials,
+            max_steps=self._max_steps,
+            expert=work.config.demos.expert,
+            policy=who.weights,
+            about={"limits": self._limits._asdict()},
+        )
+        with stage_times.timed(work.out, f"round {number} rollouts"):
+            outcomes = rounds.collect(
+                root,
+                work.base.env,
+                work.seen,
+                self._way(who),
+                settings,
+                layout=placement.DeviceLayout(devices=placement.devices()),
+                report=messages.indented,
+            )
+        count, learned = len(outcomes.trial), int(outcomes.kept.sum())
+        messages.indented(f"{count} trials, {learned} of them are learned")
+        takeovers = _takeovers(outcomes)
+        for cause, rescued in takeovers.items():
+            messages.indented(f"taken over, {cause}: {messages.rate(rescued)} succeed")
+        won = statistics.rate(outcomes.success[:, 0])
+        return {"trials": count, "learned": learned, "success": won, "takeovers": takeovers}
+
+    def _way(self, who: PolicyInEnv) -> rounds.Way:
+        trained, settings = who.trained, who.trained.policy
+        params = (trained.params, trained.normalizer)
+        if self._work.settings.by == "self":
+            hot, row = self_imitation.noisy(settings), methods.METHODS[trained.method]
+            policy = policies.make(row, hot, who.env.task, cameras=trained.scene.cameras)
+            agent = in_env.batch_agent(trained.method, policy, hot)
+            return self_imitation.way(agent, params, settings.observation)
+        expert = self._work.config.demos.expert
+        return dagger.way(who.agent(), params, who.env.task, expert, settings, self._limits)
+
+
+class Lessons:
+    """Demonstrations and the rollouts of all rounds so far, in memory."""
+
+    def __init__(self, work: Work):
+        """Loads the demonstrations; collects them unless the run has today's."""
+        policy = work.stored.policy
+        self._work, self._encoder = work, None
+        self._rollouts: list[tuple[windows.Dataset, np.ndarray]] = []
+        if policy.observation == "image" and policy.freeze_encoder:
+            vision = work.stored.params["vision"]
+            self._encoder = Encoder(vision, policy_file.fingerprint(vision)[:16])
+        config, env = work.config, work.base.env
+        plan = demonstrations.plan(config, env, work.share)
+        if not store.is_sealed(plan.root):
+            config = dataclasses.replace(config, out=str(work.out))
+            plan = demonstrations.plan(config, env, work.share)
+        self._demonstrations = demonstrations.load(
+            config, env, plan.root, plan.collect, self._encoder, work.share
+        )
+
+    @property
+    def are_new(self) -> bool:
+        """True once some rollout teaches something."""
+        return bool(self._rollouts)
+
+    def add(self, number: int) -> None:
+        """Loads the learned episodes of a round."""
+        work, root = self._work, self._work.folder(number) / "rollouts"
+        if not store.keys(root):
+            return
+        draws = work.base.env if work.stored.policy.observation == "image" else None
+        images = self._encoder is None
+        moves = randomise.moves_cameras(work.config.train)
+        loaded = load.load(root, images=images, env=draws, sources=moves, report=messages.indented)
+        dataset = loaded.dataset
+        if not images:
+            train = dataclasses.replace(work.config.train, window_stride=1)
+            config = dataclasses.replace(work.config, train=train, out=str(work.out))
+            dataset = demonstrations.with_features(config, draws, root, loaded, self._encoder)
+        frames = mixing.learned_frames(load.actors(root), loaded.description["learned"])
+        self._rollouts.append((dataset, frames))
+
+    def train(self, number: int, before: Path) -> Path:
+        """Trains on from the weights of a file; returns the file of the new ones."""
+        work, folder = self._work, self._work.folder(number)
+        file, config = folder / "policy.safetensors", work.config
+        if file.exists():
+            return file
+        old = policy_file.load(before)
+        print(f"\n[round {number}] train: into {folder}", flush=True)
+        with stage_times.timed(work.out, f"round {number} training"), stop_signals() as should_stop:
+            dataset, start = mixing.start(
+                methods.METHODS[old.method],
+                config.policy,
+                config.train,
+                old.params,
+                old.normalizer,
+                self._demonstrations,
+                self._rollouts,
+            )
+            result = loop.run(
+                methods.METHODS[old.method],
+                config.policy,
+                config.train,
+                dataset,
+                work.base.env.task,
+                folder,
+                (work.settings.seed + number) % 2**32,
+                cameras=work.base.env.names.cameras,
+                should_stop=should_stop,
+                description=f"Round {number}",
+                draw_images=pipeline.draw_images(config, work.base.env),
+                start=start,
+            )
+        state = processes.own(result.state)
+        params = state.ema_params
+        if self._encoder is not None:
+            params = {**params, "vision": self._encoder.params}
+        # A monitor belongs to the parameters that it was calibrated with.
+        new = old._replace(params=params, normalizer=state.normalizer, monitor=None)
+        policy_file.save(file, new)
+        return file
+
+
+def _takeovers(outcomes: rounds.Outcomes) -> dict[str, dict[str, Any]]:
+    """Returns the success rate of the takeovers by their cause."""
+    found = sorted(set(outcomes.cause.tolist()) - {progress.CAUSES[0]})
+    return {cause: statistics.rate(outcomes.success[outcomes.cause == cause, 0]) for cause in found}

@@ -1,0 +1,116 @@
+"""Rounds of a fine-tuning in their order, and its outcome."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import starjax
+from starjax import errors, methods
+from starjax.commands import (
+    finetune_stages,
+    messages,
+    policy_args,
+    policy_evaluation,
+    session,
+    stage_times,
+)
+from starjax.commands import finetune_work as works
+from starjax.commands.finetune_work import Work
+from starjax.evaluation import statistics
+from starjax.finetune.settings import FinetuneConfig
+from starjax.runtime import files, precompile, processes
+
+
+def run(
+    settings: FinetuneConfig, path: policy_args.PolicyPath, started: session.Session, share: Any
+) -> None:
+    """Completes a fine-tuning.
+
+    Raises:
+      errors.UsageError: several processes, a directory of other settings, or a setting that does
+        not suit the policy.
+    """
+    if not processes.is_alone():
+        raise errors.UsageError("starjax finetune", "one process", "several")
+    work = works.begin(settings, path, started, share)
+    print(_plan(work), flush=True)
+    with precompile.until_end():
+        lessons = finetune_stages.Lessons(work)
+        print("\n[round 0] validation of the policy itself", flush=True)
+        table = finetune_stages.validate(work, 0, work.base)
+        search = finetune_stages.Search(work, table.steps[table.success])
+        described = [{"round": 0, "validation": statistics.rate(table.success)}]
+        candidates, who = [path.file], work.base
+        for number in range(1, settings.rounds + 1):
+            counts = search.collect(number, who)
+            lessons.add(number)
+            if not lessons.are_new:
+                messages.indented("nothing to learn from")
+                break
+            candidates.append(lessons.train(number, candidates[-1]))
+            who = work.place(candidates[-1])
+            rate = statistics.rate(finetune_stages.validate(work, number, who).success)
+            described.append({"round": number, **counts, "validation": rate})
+            messages.indented(f"validation {messages.rate(rate)}")
+        _finish(work, candidates, described)
+
+
+def _plan(work: Work) -> str:
+    """Returns the plan of a fine-tuning, for its start."""
+    settings, config = work.settings, work.config
+    trocars = len(work.seen.radius)
+    label = methods.SCORED[work.stored.method].label
+    name = os.path.relpath(work.file)
+    half = "demonstrations and rollouts by an even coin"
+    return "\n".join(
+        [
+            f"starjax {starjax.__version__}: {label} of {name}, fine-tuned by {settings.by}, "
+            f"seed {settings.seed}, folder {work.out}",
+            f"  rounds          {settings.rounds}, each of {trocars} seen trocars x "
+            f"{settings.trials} trials",
+            f"  training        {config.train.steps} steps of {config.train.batch_size} per round, "
+            f"rate {config.train.learning_rate:.2g}, {half}",
+            f"  validation      {trocars} seen trocars x {settings.validation} trials",
+            f"  report          {len(work.base.env.task.is_seen)} trocars x {settings.eval.trials} "
+            "trials, before and after",
+        ]
+    )
+
+
+def _finish(work: Work, candidates: list[Path], described: list[dict[str, Any]]) -> None:
+    """Keeps the best round; scores it and the policy itself on all trocars."""
+    best = int(np.argmax([one["validation"]["successes"] for one in described]))
+    files.write_bytes(work.out / "policy.safetensors", candidates[best].read_bytes())
+    rows = {"before": _score(work, "before", work.base)}
+    if best:
+        rows["after"] = _score(work, "after", work.place(candidates[best]))
+    content = {
+        "by": work.settings.by,
+        "weights": work.base.weights,
+        "rounds": described,
+        "best": best,
+        **rows,
+        "timings_s": stage_times.read(work.out),
+    }
+    path = work.started.write("finetune.json", content)
+    print(f"\n  {'success [95% interval]':24}{'seen':26}unseen")
+    for name, row in rows.items():
+        print(f"  {name:24}{messages.rate(row['seen']):26}{messages.rate(row['unseen'])}")
+    kept = f"round {best}" if best else "the policy itself: no round is better in validation"
+    print(f"\npolicy: {work.out / 'policy.safetensors'}, {kept}; figures: {path}", flush=True)
+
+
+def _score(work: Work, name: str, who: Any) -> dict[str, Any]:
+    """Returns the success of a policy at seen and unseen trocars, and its RCM error."""
+    print(f"\n[report] {name}", flush=True)
+    folder, settings = work.out / name, work.settings
+    with stage_times.timed(work.out, name):
+        table = policy_evaluation.rollouts(
+            folder / "evaluation", who, who.env.task.trocars, settings.eval, settings.seed
+        )
+    figures = policy_evaluation.write_result(
+        folder, who, table, work.config, settings.seed, work.started.command
+    ).figures
+    return {part: figures[part] for part in ("seen", "unseen", "rcm_error_mm")}

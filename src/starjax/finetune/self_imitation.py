@@ -1,0 +1,55 @@
+"""Self-imitation: a policy learns its own successes where it also fails.
+
+Every start is tried several times with more noise than in use; where some attempts succeed and some
+fail, a success is learned. It is the control of the other ways: policies mostly repeat
+themselves (SIME, arXiv:2505.01396).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from starjax import config, errors
+from starjax.finetune.rounds import Kept, Way
+from starjax.rollouts import attempts, episodes, progress, takeover
+from starjax.rollouts.agent import BatchAgent
+
+SOURCE = "success"
+ATTEMPTS = 3  # of each start
+TEMPERATURE = 1.0  # of the noise that a sample begins with, that of training
+
+
+def noisy(policy: config.PolicyConfig) -> config.PolicyConfig:
+    """Returns a policy's settings with the noise of training.
+
+    Raises:
+      errors.UsageError: its learner has no such setting.
+    """
+    if not hasattr(policy.options, "temperature"):
+        expected = "a learner with a temperature (diffusion, flow, onestep)"
+        raise errors.UsageError("--by self", expected, policy.learner)
+    return config.with_options(policy, temperature=TEMPERATURE)
+
+
+def way(policy: BatchAgent, params: Any, observation: str) -> Way:
+    """Makes the search for successes; the policy is one with `noisy` settings."""
+    return Way(
+        source=SOURCE,
+        agent=attempts.repeated(policy),
+        params=lambda attempt: (params, np.int32(attempt)),
+        attempts=ATTEMPTS,
+        record=attempts.RECORDS[observation],
+        choose=chosen,
+        cause=lambda found: progress.CAUSES[0],
+    )
+
+
+def chosen(found: Sequence[episodes.Episode]) -> Kept | None:
+    """Returns the first success of a start that was also failed, else None."""
+    won = [episode for episode in found if episode.outcome["success"]]
+    if len(won) in (0, len(found)):
+        return None
+    length = won[0].outcome["length"]
+    actor = {takeover.ACTOR: [np.full(length, takeover.POLICY, np.uint8)]}
+    return Kept(won[0]._replace(arrays={**won[0].arrays, **actor}), 0, {})

@@ -1,0 +1,39 @@
+"""Settings of a fine-tuning. Imports no jax, as `--help` reads them."""
+
+import dataclasses
+from typing import Annotated, Literal
+
+from starjax import config as config_lib
+from starjax.limits import Count, Range
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FinetuneConfig:
+    """Settings of `starjax finetune`, apart from the policy."""
+
+    # dagger: an expert finishes episodes in trouble, the policy learns its part; self: the policy
+    # learns successes of its own noisy rollouts
+    by: Literal["dagger", "self"] = "dagger"
+    rounds: Annotated[int, Range(1, 100)] = 3  # rounds of rollouts and training
+    trials: Count = 1200  # trials per round and seen trocar
+    steps: Count = 8_000  # training steps per round
+    # learning rate as a fraction of that of the policy's training
+    rate: Annotated[float, Range(0.0, 1.0, "(]")] = 0.2
+    # arithmetic of the networks in training; inference always uses float32
+    dtype: Literal["float32", "bfloat16"] = "bfloat16"
+    validation: Count = 60  # trials per seen trocar that choose the best round
+    seed: config_lib.Seed = 0  # random seed of everything that is drawn
+    # trials of the report, before and after, on all trocars of the task
+    eval: config_lib.EvalConfig = dataclasses.field(
+        default_factory=lambda: config_lib.EvalConfig(video_trials=0)
+    )
+
+
+# Two cores take some minutes per round.
+ON_CPU = FinetuneConfig(
+    trials=30,
+    steps=1_500,
+    dtype="float32",
+    validation=12,
+    eval=config_lib.EvalConfig(trials=12, time_limit_s=20.0, video_trials=0),
+)
