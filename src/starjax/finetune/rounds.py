@@ -161,6 +161,8 @@ def collect(
     spans = [slice(first, first + lanes) for first in range(0, len(group), lanes)]
 
     def check(number: int, arrays: chunks.Arrays) -> None:
+        if different := {*Outcomes._fields} ^ arrays.keys():
+            raise ValueError(f"{min(different)} is missing or too much")
         trials = [arrays[name].tolist() for name in ("trocar", "trial")]
         if list(zip(*trials, strict=True)) != group[spans[number]]:
             raise ValueError("it holds other trials")
