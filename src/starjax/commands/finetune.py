@@ -15,7 +15,11 @@ RUN is the directory of a method, such as runs/cpu/stardiff; --policy takes a po
 the name of a packaged policy instead. Every round runs the policy through the seen trocars, adds
 chosen episodes to the demonstrations, and continues the training of the policy's weights. The round
 that is best on separate trials is kept, the policy itself if no round is better. Rerun the same
-command to resume."""
+command to resume.
+
+Examples:
+  starjax finetune runs/cpu/stardiff --by dagger
+  starjax finetune --policy compact --by self"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
