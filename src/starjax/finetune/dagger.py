@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from starjax import config, errors
-from starjax.finetune.rounds import Kept, Way
+from starjax.finetune.rounds import LearnedEpisode, Way
 from starjax.rollouts import episodes, progress, takeover
 from starjax.rollouts.agent import BatchAgent
 from starjax.sim import registries
@@ -65,7 +65,7 @@ def way(
     agent = takeover.from_policy(policy, registries.rescuers.get(name))
     clock, stalled = np.int32(limits.clock), np.int32(limits.stalled)
 
-    def choose(found: Sequence[episodes.Episode]) -> Kept | None:
+    def choose(found: Sequence[episodes.Episode]) -> LearnedEpisode | None:
         return chosen(found[0], settings.obs_horizon)
 
     return Way(
@@ -80,7 +80,7 @@ def way(
     )
 
 
-def chosen(episode: episodes.Episode, obs_horizon: int) -> Kept | None:
+def chosen(episode: episodes.Episode, obs_horizon: int) -> LearnedEpisode | None:
     """Returns the expert's part of an episode that it finished, else None.
 
     Before it are O - 1 frames of the policy, which windows of length O observe.
@@ -90,7 +90,7 @@ def chosen(episode: episodes.Episode, obs_horizon: int) -> Kept | None:
         return None
     step = int(np.argmax(numbers > 0))
     about = {"step": step, "cause": cause([episode])}
-    return Kept(episode, max(step - (obs_horizon - 1), 0), about)
+    return LearnedEpisode(episode, max(step - (obs_horizon - 1), 0), about)
 
 
 def cause(found: Sequence[episodes.Episode]) -> str:

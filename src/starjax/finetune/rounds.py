@@ -28,7 +28,7 @@ from starjax.sim import env as sim_env
 STREAM = 0x66696E65  # the first round's, folded into the seed's key
 
 
-class Kept(NamedTuple):
+class LearnedEpisode(NamedTuple):
     """An episode that is learned.
 
     Attributes:
@@ -61,7 +61,7 @@ class Way(NamedTuple):
     params: Callable[[int], Any]
     attempts: int
     record: episodes.Record
-    choose: Callable[[Sequence[episodes.Episode]], Kept | None]
+    choose: Callable[[Sequence[episodes.Episode]], LearnedEpisode | None]
     cause: Callable[[Sequence[episodes.Episode]], str]
     modules: tuple[str, ...] = ()
 
@@ -203,7 +203,7 @@ def _prepare(root: Path, description: dict[str, Any]) -> None:
     store.clean(root)
 
 
-def _commit(root: Path, key: str, way: Way, settings: RoundSettings, kept: Kept) -> None:
+def _commit(root: Path, key: str, way: Way, settings: RoundSettings, kept: LearnedEpisode) -> None:
     """Writes an episode, unless a killed run has done so."""
     if (root / "episodes" / key).exists():
         return

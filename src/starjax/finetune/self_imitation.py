@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from starjax import config, errors
-from starjax.finetune.rounds import Kept, Way
+from starjax.finetune.rounds import LearnedEpisode, Way
 from starjax.rollouts import attempts, episodes, progress, takeover
 from starjax.rollouts.agent import BatchAgent
 
@@ -45,11 +45,11 @@ def way(policy: BatchAgent, params: Any, observation: str) -> Way:
     )
 
 
-def chosen(found: Sequence[episodes.Episode]) -> Kept | None:
+def chosen(found: Sequence[episodes.Episode]) -> LearnedEpisode | None:
     """Returns the first success of a start that was also failed, else None."""
     won = [episode for episode in found if episode.outcome["success"]]
     if len(won) in (0, len(found)):
         return None
     length = won[0].outcome["length"]
     actor = {takeover.ACTOR: [np.full(length, takeover.POLICY, np.uint8)]}
-    return Kept(won[0]._replace(arrays={**won[0].arrays, **actor}), 0, {})
+    return LearnedEpisode(won[0]._replace(arrays={**won[0].arrays, **actor}), 0, {})
