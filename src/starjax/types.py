@@ -14,8 +14,8 @@ class Pose(NamedTuple):
     """A rigid pose; the frames are in the variable's name, e.g. `pose_world_tip`.
 
     Attributes:
-      R: `[..., 3, 3]` rotation matrix; its third column is the tool's axis, distal, its second the
-        direction in which the jaws open.
+      R: `[..., 3, 3]` rotation matrix; its third column is the axis of the tool, distal (with a
+        wrist that of the jaws), its second the direction in which the jaws open.
       p: `[..., 3]` position of the tip (jaw centre) in m.
     """
 
@@ -29,10 +29,13 @@ class Command(NamedTuple):
     Attributes:
       pose: tip poses in the world frame, `[..., A]`.
       gripper: `[..., A]` in [-1, 1]: -1 squeezes, +1 is fully open.
+      wrist: `[..., A, 2]` rad, pitch and yaw; None for straight tools and straight wrists. They say
+        how the commanded shaft lies: the agent finds them through the trocar that it was given.
     """
 
     pose: Pose
     gripper: jax.Array
+    wrist: jax.Array | None = None
 
 
 class Observation(NamedTuple):
@@ -45,6 +48,7 @@ class Observation(NamedTuple):
       state: the task's fields instead of pixels, `[..., S]`, or None.
       features: outputs of a frozen image encoder, `[..., d_v]` float32, in place of the images;
         only in training data.
+      wrist: measured pitch and yaw, `[..., A, 2]` rad; None in a scene without a wrist.
       endoscope: pose_world_camera `[...]` of an endoscope that is elsewhere in every episode, x to
         the right, y up, looking along -z; None where the scene is not seen through one.
     """
@@ -55,6 +59,7 @@ class Observation(NamedTuple):
     state: jax.Array | None = None
     features: jax.Array | None = None
     endoscope: Pose | None = None
+    wrist: jax.Array | None = None
 
 
 class Agent(NamedTuple):

@@ -2,6 +2,7 @@
 
 import types
 
+import mistakes
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -92,3 +93,17 @@ def test_jaws_open_and_close():
 def test_an_arm_is_moved_only_where_it_says_that_it_may(state, homed, busy, ready):
     said = types.SimpleNamespace(state=state, is_homed=homed, is_busy=busy)
     assert crtk.is_ready(said) is ready
+
+
+def test_joints_are_read_by_name_and_written_in_order():
+    names = ("outer_yaw", "outer_pitch", "outer_insertion")
+    sent = types.SimpleNamespace(name=["jaw", *names[::-1]], position=[0.5, 0.1, -0.2, 0.3])
+    q = crtk.joints_of(sent, names)
+    np.testing.assert_array_equal(q, [0.3, -0.2, 0.1])
+    again = crtk.fill_joints(types.SimpleNamespace(name=[], position=[]), q, names)
+    assert again.name == list(names) and again.position == q.tolist()
+    with mistakes.of("measured_js.name", "outer_yaw"):
+        crtk.joints_of(types.SimpleNamespace(name=["outer_yaw"], position=[0.0]), names)
+    sent.position[1] = np.nan
+    with mistakes.of("measured_js.position", "nan"):
+        crtk.joints_of(sent, names)

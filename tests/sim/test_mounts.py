@@ -18,12 +18,12 @@ MOUNTS = [
 
 def worst(arm, mount, workspace, tool="grasper"):
     at = mounts.bench(registries.arms.get(arm), registries.tools.get(tool))
-    return mounts.worst(mounts.fit(at, mount, targets(workspace)))
+    return mounts.worst(mounts.fit(at, mount, targets(workspace, at.wrist)))
 
 
 @functools.cache
-def targets(workspace):
-    return mounts.targets(registries.workspaces.get(workspace))
+def targets(workspace, wrist):
+    return mounts.targets(registries.workspaces.get(workspace), wrist)
 
 
 @pytest.mark.parametrize(("arm", "tool", "workspace"), MOUNTS)

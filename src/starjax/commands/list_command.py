@@ -1,6 +1,7 @@
 """`starjax list`: lists the names that flags take."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -73,7 +74,11 @@ def _arm(arm: Arm) -> str:
 
 
 def _tool(tool: Tool) -> str:
-    jaws = f"jaws that open {2e3 * (tool.open - tool.closed):.1f} mm" if tool.jaw else "no jaws"
+    if tool.wrist is not None:
+        pitch, yaw = (math.degrees(limit) for limit in (tool.wrist.pitch, tool.wrist.yaw))
+        jaws = f"wrist of {pitch:.0f} and {yaw:.0f} degrees"
+    else:
+        jaws = f"jaws that open {2e3 * (tool.open - tool.closed):.1f} mm" if tool.jaw else "no jaws"
     return f"{jaws}; shaft of {2e3 * tool.shaft_radius:g} mm"
 
 

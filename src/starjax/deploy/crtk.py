@@ -8,15 +8,19 @@ ROS path is untested. CRTK uses SI units and quaternions x y z w.
     operating_state   permission to move           `is_ready`
     servo_cp          target tip                   `fill_pose`   <- Command.pose
     jaw/servo_jp      target angle of the jaws     `fill_jaw`    <- Command.gripper
+    measured_js       measured joints              `joints_of`   -> as `deploy.psm` has them
+    servo_jp          target joints                `fill_joints` <- as `deploy.psm` has them
 
 `setpoint_cp`, the robot's last target tip, has the form of `measured_cp`.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from starjax import rcm
 from starjax.errors import UsageError
 from starjax.types import Pose
 
@@ -95,6 +99,36 @@ def fill_jaw(message: Any, gripper: float, jaw: Jaw) -> Any:
     """Fills `jaw/servo_jp`, a JointState, and returns it."""
     fraction = (np.clip(gripper, -1.0, 1.0) + 1.0) / 2.0
     message.position = [float(jaw.closed + fraction * _range(jaw))]
+    return message
+
+
+def tool_tip(wrist: rcm.Wrist) -> Pose:
+    """Returns pose_tool_tip of a dVRK's instrument for `Frames`.
+
+    The dVRK's own frame lies on the yaw axis, half a turn about z from ours.
+    """
+    return _pose(np.diag([-1.0, -1.0, 1.0]), np.array([0.0, 0.0, wrist.jaws]))
+
+
+def joints_of(message: Any, names: Sequence[str]) -> np.ndarray:
+    """Returns the positions `[J]` (rad, m) of `measured_js`, a JointState, in the order of names.
+
+    Raises:
+      UsageError: a joint is missing, or a position is not finite.
+    """
+    positions = dict(zip(message.name, message.position, strict=False))
+    missing = [name for name in names if name not in positions]
+    if missing:
+        raise UsageError("measured_js.name", ", ".join(names), ", ".join(message.name) or "none")
+    q = np.array([positions[name] for name in names], np.float64)
+    if not np.isfinite(q).all():
+        raise UsageError("measured_js.position", "finite values", q.tolist())
+    return q
+
+
+def fill_joints(message: Any, q: Any, names: Sequence[str]) -> Any:
+    """Fills `servo_jp`, a JointState, with positions `[J]` (rad, m), and returns it."""
+    message.name, message.position = list(names), [float(x) for x in q]
     return message
 
 

@@ -134,7 +134,7 @@ def _pairs(scene: scenes.Scene, state: EnvState) -> dict[str, jax.Array]:
     ]
     obstacles = scene.task.obstacles(scene.bound, state.layout, state.measurements)
     return collision.pairs(
-        scene.arms, state.pose, origins, p_world_trocar, obstacles, scene.task.floor
+        scene.arms, state.pose, origins, p_world_trocar, obstacles, scene.task.floor, state.shaft
     )
 
 

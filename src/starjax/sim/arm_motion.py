@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
-from starjax.sim import control, ik
+from starjax.sim import control, ik, wrist_motion
 from starjax.sim import scene as scenes
 from starjax.sim.state import EnvState
 from starjax.sim.tasks.base import CONTROL_HZ
@@ -22,17 +22,33 @@ def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
     chain = scenes.chain_at(bound, p_trocar)
     reference, _, _ = ik.forward(chain, q_target)
     present = control.corrected(reference, p_trocar, -last_correction)
-    correction = control.correct(last_correction, of(state.pose, a), present, p_trocar)
-    target, velocity = control.toward(
-        present, state.velocity[a], command.pose, p_trocar, 1.0 / CONTROL_HZ
-    )
-    ik_target = control.corrected(target, p_trocar, correction)
-    q, _ = solve(bound, p_trocar, ik_target, q_target, STEP_IK_ITERATIONS)
+    measured = state.pose if state.shaft is None else state.shaft
+    correction = control.correct(last_correction, of(measured, a), present, p_trocar)
+    wanted = command.pose  # of the frame that the arm carries
+    if bound.tool.wrist is None:
+        target, velocity = control.toward(
+            present, state.velocity[a], wanted, p_trocar, 1.0 / CONTROL_HZ
+        )
+        ik_target = control.corrected(target, p_trocar, correction)
+        q, _ = solve(bound, p_trocar, ik_target, q_target, STEP_IK_ITERATIONS)
+    else:
+        wanted = wrist_motion.shaft_of(bound, command.pose, command.wrist)
+        tip, point, velocity = wrist_motion.toward(
+            wrist_motion.tip_of(bound, reference, q_target),
+            control.nearest(present, p_trocar),
+            state.velocity[a],
+            command.pose,
+            control.nearest(wanted, p_trocar),
+            1.0 / CONTROL_HZ,
+        )
+        ik_target, angles = wrist_motion.carried(bound.tool.wrist, tip, point + correction)
+        q, _ = solve(bound, p_trocar, ik_target, q_target[: bound.joints], STEP_IK_ITERATIONS)
+        q = jnp.concatenate([q, angles])
     usable = _is_usable(command) & jnp.all(jnp.isfinite(q))
     dq = jnp.where(usable, q - q_target, 0.0)
     fastest = jnp.maximum(jnp.max(jnp.abs(dq) / bound.max_speed), 1e-9)
     dq = dq * jnp.minimum(1.0, 1.0 / CONTROL_HZ / fastest)
-    goal = control.corrected(command.pose, p_trocar, correction)
+    goal = control.corrected(wanted, p_trocar, correction)
     return (
         dq,
         jnp.where(usable, velocity, 0.0),
@@ -49,11 +65,43 @@ def solve(
     q: jax.Array | None,
     iterations: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """Solves the inverse kinematics of one arm from `q` `[J]`, or from its home."""
-    home = jnp.asarray(bound.home)
+    """Solves the inverse kinematics of one arm without its wrist, from `q` or from its home."""
+    home = jnp.asarray(bound.home)[: bound.joints]
     chain = scenes.chain_at(bound, p_world_trocar)
     start = home if q is None else q
     return ik.solve(chain, target, start, iterations, home, bound.arm.rest_gain)
+
+
+def reach(
+    bound: scenes.BoundArm, p_world_trocar: jax.Array, tip: Pose, iterations: int
+) -> tuple[jax.Array, jax.Array]:
+    """Solves for all joints `[J]` of a tip pose from the home, the wrist straight."""
+    if bound.tool.wrist is None:
+        return solve(bound, p_world_trocar, tip, None, iterations)
+    q, residual = solve(
+        bound, p_world_trocar, wrist_motion.shaft_of(bound, tip, None), None, iterations
+    )
+    return jnp.concatenate([q, jnp.zeros(2)]), residual
+
+
+def has_wrist(scene: scenes.Scene) -> bool:
+    """Returns True if a tool of the scene has a wrist."""
+    return any(bound.tool.wrist is not None for bound in scene.arms)
+
+
+def velocity_size(scene: scenes.Scene) -> int:
+    """Returns the size of a reference's velocity."""
+    return wrist_motion.VELOCITY if has_wrist(scene) else control.VELOCITY
+
+
+def angles_of(bound: scenes.BoundArm, q: jax.Array) -> jax.Array:
+    """Returns the angles `[2]` rad of an arm's wrist, zeros for a straight tool."""
+    return jnp.zeros(2) if bound.tool.wrist is None else q[bound.joints :]
+
+
+def tip_of(bound: scenes.BoundArm, carried: Pose, q: jax.Array) -> Pose:
+    """Returns pose_world_tip for the pose at the end of an arm's chain and its joints `[J]`."""
+    return carried if bound.tool.wrist is None else wrist_motion.tip_of(bound, carried, q)
 
 
 def largest_within(scene: scenes.Scene, qpos: jax.Array, p_world_trocar: jax.Array) -> jax.Array:

@@ -2,8 +2,9 @@
 
 The physics models contacts of geoms with contact bits in the MJCF. All others are detected here, as
 a diagnostic flag that does not affect success. Approximations: obstacles are the task's capsules, a
-shaft is a row of points, and the jaws are the end of their axis. Up to 3 mm of a pad's corner below
-the floor therefore stay undetected with a tool that leans by 30 degrees.
+shaft and the part between a shaft and its jaws are rows of points, and the jaws are the end of
+their axis. Up to 3 mm of a pad's corner below the floor therefore stay undetected with a tool that
+leans by 30 degrees.
 """
 
 from collections.abc import Iterable, Sequence
@@ -11,6 +12,7 @@ from collections.abc import Iterable, Sequence
 import jax
 import jax.numpy as jnp
 
+from starjax import rcm
 from starjax.sim.scene import BoundArm
 from starjax.sim.tasks.base import Capsules
 from starjax.types import Pose
@@ -18,6 +20,7 @@ from starjax.types import Pose
 # Overlap that is called a collision (m): more than the soft contacts' own give.
 DEPTH = 0.0005
 SHAFT_POINTS = 7  # looked at along the end of a shaft
+PALM_POINTS = 3  # looked at between a shaft and its jaws
 
 Overlaps = Iterable[tuple[str, jax.Array]]  # name of a pair, bool `[]` or `[points, obstacles]`
 
@@ -29,6 +32,7 @@ def detect(
     p_world_trocar: jax.Array,
     obstacles: Capsules,
     floor: float,
+    carried: Pose | None = None,
 ) -> jax.Array:
     """Returns True if any pair overlaps by more than `DEPTH`.
 
@@ -39,9 +43,13 @@ def detect(
       p_world_trocar: `[A, 3]` m, the upper ends of the shafts that are inside.
       obstacles: of the task.
       floor: m, the lowest height that jaws may reach; the table is at 0.
+      carried: `[A]`, of the frame at the end of each arm: the shaft before a wrist, else the tip.
+        Needed in a scene with a wrist.
     """
-    hit = _any(_with_scene(arms, pose, origins, obstacles, floor))
-    return hit | _any(_of_shafts(arms, pose, p_world_trocar)) | _any(_of_links(arms, origins))
+    shaft = pose if carried is None else carried
+    hit = _any(_with_scene(arms, pose, shaft, origins, obstacles, floor))
+    hit |= _any(_of_shafts(arms, shaft, p_world_trocar)) | _any(_of_links(arms, origins))
+    return hit | _any(_of_palms(arms, pose, shaft, p_world_trocar, obstacles))
 
 
 def pairs(
@@ -51,12 +59,15 @@ def pairs(
     p_world_trocar: jax.Array,
     obstacles: Capsules,
     floor: float,
+    carried: Pose | None = None,
 ) -> dict[str, jax.Array]:
     """Returns bool by the name of a pair: True if the pair overlaps; arguments as of `detect`."""
+    shaft = pose if carried is None else carried
     found = [
-        *_with_scene(arms, pose, origins, obstacles, floor),
-        *_of_shafts(arms, pose, p_world_trocar),
+        *_with_scene(arms, pose, shaft, origins, obstacles, floor),
+        *_of_shafts(arms, shaft, p_world_trocar),
         *_of_links(arms, origins),
+        *_of_palms(arms, pose, shaft, p_world_trocar, obstacles),
     ]
     overlaps = {}
     for name, overlap in found:
@@ -77,18 +88,20 @@ def _any(overlaps: Overlaps) -> jax.Array:
 def _with_scene(
     arms: Sequence[BoundArm],
     pose: Pose,
+    carried: Pose,
     origins: Sequence[jax.Array],
     obstacles: Capsules,
     floor: float,
 ) -> Overlaps:
     """Yields overlaps of each arm with the table, the floor and the obstacles."""
     for a, bound in enumerate(arms):
-        tool, axis = bound.tool, pose.R[a, :, 2]
+        tool, axis = bound.tool, carried.R[a, :, 2]
         along = tool.shaft_end + jnp.linspace(0.0, tool.shaft_reach, SHAFT_POINTS)
-        shaft = pose.p[a] - along[:, None] * axis
+        shaft = carried.p[a] - along[:, None] * axis
         watched = origins[a][bound.arm.watched :, 2]
+        end = pose.p[a, 2] + tool.pad_end * pose.R[a, :, 2][2]
         yield f"arm {a}: links, table", jnp.min(watched, initial=jnp.inf) < bound.arm.link_radius
-        yield f"arm {a}: jaws, floor", pose.p[a, 2] + tool.pad_end * axis[2] < floor - DEPTH
+        yield f"arm {a}: jaws, floor", end < floor - DEPTH
         yield f"arm {a}: shaft, table", jnp.min(shaft[:, 2]) < tool.shaft_radius - DEPTH
         gap = tool.shaft_radius + obstacles.radius - DEPTH
         apart = distance_sq(shaft[:, None], obstacles.start, obstacles.end)
@@ -103,14 +116,55 @@ def distance_sq(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Arra
     return jnp.sum((off - fraction[..., None] * way) ** 2, axis=-1)
 
 
-def _of_shafts(arms: Sequence[BoundArm], pose: Pose, p_world_trocar: jax.Array) -> Overlaps:
-    """Yields overlaps of two shafts between the trocar and the tip."""
+def _of_palms(
+    arms: Sequence[BoundArm],
+    pose: Pose,
+    carried: Pose,
+    p_world_trocar: jax.Array,
+    obstacles: Capsules,
+) -> Overlaps:
+    """Yields overlaps of the parts between shafts and jaws with the scene and other arms."""
+    palms = {
+        a: _palm(bound.tool.wrist, _of(pose, a), _of(carried, a))
+        for a, bound in enumerate(arms)
+        if bound.tool.wrist is not None
+    }
+    for a, points in palms.items():
+        radius = arms[a].tool.palm_radius
+        yield f"arm {a}: palm, table", jnp.min(points[:, 2]) < radius - DEPTH
+        apart = distance_sq(points[:, None], obstacles.start, obstacles.end)
+        yield f"arm {a}: palm, obstacle", apart < (radius + obstacles.radius - DEPTH) ** 2
+        for b, bound in enumerate(arms):
+            if a == b:
+                continue
+            end = carried.p[b] - bound.tool.shaft_end * carried.R[b, :, 2]
+            gap = radius + bound.tool.shaft_radius - DEPTH
+            near = jnp.min(distance_sq(points, p_world_trocar[b], end)) < gap**2
+            yield f"palm of arm {a} and shaft of arm {b}", near
+            if a < b and b in palms:
+                gap = radius + bound.tool.palm_radius - DEPTH
+                near = jnp.min(distance_sq(points, palms[b][0], palms[b][-1])) < gap**2
+                yield f"palms of arms {a} and {b}", near
+
+
+def _palm(wrist: rcm.Wrist, tip: Pose, shaft: Pose) -> jax.Array:
+    """Returns points `[K, 3]` m from the pitch axis to the yaw axis."""
+    end = tip.p - wrist.jaws * tip.R[:, 2]
+    return shaft.p + jnp.linspace(0.0, 1.0, PALM_POINTS)[:, None] * (end - shaft.p)
+
+
+def _of(pose: Pose, a: int) -> Pose:
+    return Pose(pose.R[a], pose.p[a])
+
+
+def _of_shafts(arms: Sequence[BoundArm], carried: Pose, p_world_trocar: jax.Array) -> Overlaps:
+    """Yields overlaps of two shafts between the trocar and their lower ends."""
     fraction = jnp.linspace(0.0, 1.0, 4 * SHAFT_POINTS)[:, None]
     for a, first in enumerate(arms):
-        ends = pose.p[a] - first.tool.shaft_end * pose.R[a, :, 2]
+        ends = carried.p[a] - first.tool.shaft_end * carried.R[a, :, 2]
         points = p_world_trocar[a] + fraction * (ends - p_world_trocar[a])
         for b, second in list(enumerate(arms))[a + 1 :]:
-            end = pose.p[b] - second.tool.shaft_end * pose.R[b, :, 2]
+            end = carried.p[b] - second.tool.shaft_end * carried.R[b, :, 2]
             gap = first.tool.shaft_radius + second.tool.shaft_radius - DEPTH
             near = jnp.min(distance_sq(points, p_world_trocar[b], end)) < gap**2
             yield f"shafts of arms {a} and {b}", near

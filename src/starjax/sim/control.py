@@ -39,6 +39,7 @@ MAX_DEVIATION = 1e-3
 # m from the tip to the trocar within which the axis keeps its direction: there it is ill-defined.
 # Well below the least depth of an action (`rcm.MIN_DEPTH`).
 NO_DIRECTION = 1e-3
+VELOCITY = 7  # size of a reference's velocity
 
 
 def toward(
@@ -55,22 +56,12 @@ def toward(
     Returns:
       the next reference pose, equal to `target` if that is near enough; its velocity `[7]`.
     """
-    speed = MAX_SPEED * period
-    step = _step(target.p - present.p, velocity[:3] * period, speed, MAX_ACCELERATION * period**2)
+    step, fraction = step_tip(present.p, target.p, velocity[:3], period)
     p = present.p + step
-    length = jnp.sum((target.p - present.p) ** 2)
-    fraction = jnp.sum(step * (target.p - present.p)) / jnp.where(length > 0, length, 1.0)
-    fraction = jnp.where(length > 0, jnp.clip(fraction, 0.0, 1.0), 1.0)
 
-    # The axis's point at the trocar moves by the tip's fraction of its own way, or slower if that
-    # would exceed the tip's limits there.
     z_present, z_target = present.R[:, 2], target.R[:, 2]
-    here, there = _nearest(present, p_trocar), _nearest(target, p_trocar)
-    shift, change = fraction * (there - here), MAX_ACCELERATION * period**2
-    slower = _step(there - here, velocity[4:] * period, speed, change)
-    is_slowed = jnp.sum(slower**2) < jnp.sum(shift**2)  # never on the manifold, where both are 0
-    shift = jnp.where(is_slowed, slower, shift)
-    through = jnp.where(is_slowed, here + slower, (1.0 - fraction) * here + fraction * there)
+    here, there = nearest(present, p_trocar), nearest(target, p_trocar)
+    shift, through, is_slowed = step_point(here, there, fraction, velocity[4:VELOCITY], period)
     axis = p - through
     axis = axis * jnp.where(axis @ z_present < 0, -1.0, 1.0)  # the tip is above the trocar
     axis = jnp.where(jnp.linalg.norm(axis) < NO_DIRECTION, z_present, axis)
@@ -78,7 +69,7 @@ def toward(
     # The rest of the rotation, once the axes are aligned, is a roll about the axis.
     carried = rcm.rotation_align(z_present, z_target) @ present.R
     twist = jnp.arctan2(carried[:, 1] @ target.R[:, 0], carried[:, 0] @ target.R[:, 0])
-    spin = _step(
+    spin = bounded_step(
         twist[None], velocity[3:4] * period, MAX_SPIN * period, MAX_SPIN_ACCELERATION * period**2
     )
     R = rcm.rotation_align(z_present, z) @ present.R @ rcm.rotation_z(spin[0])
@@ -88,11 +79,41 @@ def toward(
     return pose, jnp.concatenate([step, spin, shift]) / period
 
 
+def step_tip(
+    p: jax.Array, target: jax.Array, velocity: jax.Array, period: float
+) -> tuple[jax.Array, jax.Array]:
+    """Returns the tip's displacement `[3]` m in one period, and its fraction of the way."""
+    step = bounded_step(
+        target - p, velocity * period, MAX_SPEED * period, MAX_ACCELERATION * period**2
+    )
+    length = jnp.sum((target - p) ** 2)
+    fraction = jnp.sum(step * (target - p)) / jnp.where(length > 0, length, 1.0)
+    return step, jnp.where(length > 0, jnp.clip(fraction, 0.0, 1.0), 1.0)
+
+
+def step_point(
+    here: jax.Array, there: jax.Array, fraction: jax.Array, velocity: jax.Array, period: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Moves the axis's point at the trocar by the tip's fraction of its own way.
+
+    It moves slower if that would exceed the tip's limits there.
+
+    Returns:
+      its displacement `[3]` m, its next position `[3]` m, and True if it is slower.
+    """
+    shift, change = fraction * (there - here), MAX_ACCELERATION * period**2
+    slower = bounded_step(there - here, velocity * period, MAX_SPEED * period, change)
+    is_slowed = jnp.sum(slower**2) < jnp.sum(shift**2)  # never on the manifold, where both are 0
+    shift = jnp.where(is_slowed, slower, shift)
+    through = jnp.where(is_slowed, here + slower, (1.0 - fraction) * here + fraction * there)
+    return shift, through, is_slowed
+
+
 def correct(
     correction: jax.Array, measured: Pose, reference: Pose, p_trocar: jax.Array
 ) -> jax.Array:
     """Integrates the measured deviation into the axis's correction `[3]` m at the trocar."""
-    deviation = _nearest(measured, p_trocar) - _nearest(reference, p_trocar)
+    deviation = nearest(measured, p_trocar) - nearest(reference, p_trocar)
     far = jnp.maximum(jnp.linalg.norm(deviation), MAX_DEVIATION)
     lever = jnp.abs((reference.p - p_trocar) @ reference.R[:, 2])
     gain = HOLD_GAIN * jnp.minimum(1.0, lever / FIRM_DEPTH) ** 2
@@ -110,7 +131,9 @@ def corrected(pose: Pose, p_trocar: jax.Array, correction: jax.Array) -> Pose:
     return Pose(rcm.rotation_align(z, lever * z - correction) @ pose.R, pose.p)
 
 
-def _step(way: jax.Array, last: jax.Array, largest: float, change: jax.Array | float) -> jax.Array:
+def bounded_step(
+    way: jax.Array, last: jax.Array, largest: float, change: jax.Array | float
+) -> jax.Array:
     """Returns the displacement in one period towards `way`, after the `last` one.
 
     It is at most `largest` long, differs from the last by at most `change`, and can stop in time.
@@ -127,7 +150,7 @@ def _step(way: jax.Array, last: jax.Array, largest: float, change: jax.Array | f
     return jnp.where(size <= change, target, last + bend * (change / size))
 
 
-def _nearest(pose: Pose, p_trocar: jax.Array) -> jax.Array:
+def nearest(pose: Pose, p_trocar: jax.Array) -> jax.Array:
     """Returns the point `[3]` of the tool's axis nearest to the trocar."""
     z = pose.R[:, 2]
     return pose.p + ((p_trocar - pose.p) @ z) * z

@@ -1,5 +1,7 @@
 """Dynamics of an episode: its first state, and one control period, as pure functions of a scene."""
 
+from collections.abc import Callable, Sequence
+
 import jax
 import jax.numpy as jnp
 
@@ -28,8 +30,8 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     start = jnp.concatenate([jnp.zeros((count, 1)), tips], axis=-1)
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, trocar)
     solved = [
-        arm_motion.solve(
-            bound, trocar.p_world_trocar[a], arm_motion.of(pose, a), None, RESET_IK_ITERATIONS
+        arm_motion.reach(
+            bound, trocar.p_world_trocar[a], arm_motion.of(pose, a), RESET_IK_ITERATIONS
         )
         for a, bound in enumerate(scene.arms)
     ]
@@ -44,7 +46,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
         physics=state,
         q_target=q,
         q_velocity=tuple(jnp.zeros_like(x) for x in q),
-        velocity=jnp.zeros((count, 7)),
+        velocity=jnp.zeros((count, arm_motion.velocity_size(scene))),
         correction=jnp.zeros((count, 3)),
         gripper_target=jnp.ones(count),
         trocar=trocar,
@@ -73,9 +75,14 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     return _measure(scene, first, contacts)
 
 
-def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
-    """Advances one control period towards `command` `[A]`."""
-    moved, after, solver_error = attempt(scene, state, command)
+Advance = Callable[..., tuple[physics.PhysicsState, physics.StepResult]]
+
+
+def step(
+    scene: scenes.Scene, state: EnvState, command: Command, advance: Advance = physics.advance
+) -> EnvState:
+    """Advances one control period towards `command` `[A]`, with the physics `advance`."""
+    moved, after, solver_error = attempt(scene, state, command, advance)
     stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
     sound = physics.is_sound(scene, after) & (solver_error < MAX_SOLVER_ERROR)
     moved = _select(sound, moved, stopped)
@@ -83,7 +90,7 @@ def step(scene: scenes.Scene, state: EnvState, command: Command) -> EnvState:
 
 
 def attempt(
-    scene: scenes.Scene, state: EnvState, command: Command
+    scene: scenes.Scene, state: EnvState, command: Command, advance: Advance = physics.advance
 ) -> tuple[EnvState, physics.PhysicsState, jax.Array]:
     """Simulates one control period, sound or not.
 
@@ -95,7 +102,7 @@ def attempt(
     ]
     dq, velocity, correction, gripper, ik_error = zip(*moves, strict=True)
     p_world_trocar, period = state.trocar.p_world_trocar, 1.0 / CONTROL_HZ
-    after, result = physics.advance(
+    after, result = advance(
         scene,
         state.physics,
         state.q_target,
@@ -112,7 +119,7 @@ def attempt(
         physics=after,
         q_target=tuple(q + d for q, d in zip(state.q_target, dq, strict=True)),
         q_velocity=tuple(CONTROL_HZ * d for d in dq),
-        velocity=jnp.stack(velocity),
+        velocity=jnp.stack([_padded(v, state.velocity.shape[-1]) for v in velocity]),
         correction=jnp.stack(correction),
         gripper_target=jnp.stack(gripper),
         step=state.step + 1,
@@ -147,7 +154,18 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
         ik.forward(scenes.chain_at(bound, p_world_trocar[a]), qpos[bound.q])
         for a, bound in enumerate(scene.arms)
     ]
-    pose = jax.tree.map(lambda *x: jnp.stack(x), *(pose for pose, _, _ in kinematics))
+    carried = _stacked([pose for pose, _, _ in kinematics])
+    pose, shaft, wrist = carried, None, None
+    if arm_motion.has_wrist(scene):
+        q = [qpos[bound.q] for bound in scene.arms]
+        tips = [
+            arm_motion.tip_of(bound, at, q_arm)
+            for bound, (at, _, _), q_arm in zip(scene.arms, kinematics, q)
+        ]
+        pose, shaft = _stacked(tips), carried
+        wrist = jnp.stack(
+            [arm_motion.angles_of(bound, q_arm) for bound, q_arm in zip(scene.arms, q)]
+        )
     opening = physics.openings(scene, qpos)
     velocity = CONTROL_HZ * (pose.p - state.pose.p)
     readings = SimReadings(qpos, state.physics.qvel, pose, velocity, opening, state.touch, contacts)
@@ -159,16 +177,29 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
         p_world_trocar,
         scene.task.obstacles(scene.bound, state.layout, measurements),
         scene.task.floor,
+        carried,
     )
-    rcm_error = rcm.rcm_error(pose, p_world_trocar)
+    rcm_error = rcm.rcm_error(carried, p_world_trocar)
     return state.replace(
         pose=pose,
+        shaft=shaft,
+        wrist=wrist,
         gripper=opening,
         measurements=measurements,
         rcm_error=rcm_error,
         rcm_error_within=jnp.maximum(state.rcm_error_within, rcm_error),
         collided=state.collided | hit,
     )
+
+
+def _padded(velocity: jax.Array, size: int) -> jax.Array:
+    """Returns the velocity of a reference `[size]`: a straight tool's is shorter than a wrist's."""
+    missing = size - velocity.shape[-1]
+    return jnp.pad(velocity, (0, missing)) if missing else velocity
+
+
+def _stacked(poses: Sequence[Pose]) -> Pose:
+    return jax.tree.map(lambda *x: jnp.stack(x), *poses)
 
 
 def _select(which: jax.Array, a: EnvState, b: EnvState) -> EnvState:

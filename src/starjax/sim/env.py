@@ -100,7 +100,9 @@ def make(
             images = {name: frame.rgb for name, frame in camera(state).items()}
         else:
             fields = scene.task.state(scene.bound, state.layout, state.measurements)
-        return Observation(state.pose, state.gripper, images, fields, endoscope=state.endoscope)
+        return Observation(
+            state.pose, state.gripper, images, fields, None, state.endoscope, state.wrist
+        )
 
     return Env(
         reset=_precisely(start),
@@ -121,7 +123,9 @@ def without_images(env: Env) -> Env:
     """Returns the environment with observations that lack images and the task's fields."""
 
     def observe(state: EnvState) -> Observation:
-        return Observation(state.pose, state.gripper, None, None, endoscope=state.endoscope)
+        return Observation(
+            state.pose, state.gripper, None, None, None, state.endoscope, state.wrist
+        )
 
     return env._replace(observe=observe)
 

@@ -117,7 +117,7 @@ def _least_squares(J: jax.Array, missing: jax.Array) -> jax.Array:
     return J.T @ linear.solve_positive(J @ J.T + DAMPING**2 * jnp.eye(POSE_SIZE), missing)
 
 
-def _rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
+def rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
     """Returns the rotation vector `[3]` rad, in the world, from `R` to `R_target`."""
     E = R_target @ R.T
     # v = sin(angle) axis, and trace E = 1 + 2 cos(angle).
@@ -135,5 +135,5 @@ def _rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
 
 def _error(pose: Pose, target: Pose) -> jax.Array:
     """Returns the difference `[6]` m from `pose` to `target`, rotation weighed."""
-    turn = _rotation_between(pose.R, target.R)
+    turn = rotation_between(pose.R, target.R)
     return jnp.concatenate([target.p - pose.p, ROTATION_WEIGHT * turn])

@@ -39,8 +39,8 @@ def search(
       seed: the same one gives the same mount on the same machine.
       on_round: called with the worst figures after each round.
     """
-    every = mounts.targets(workspace)
-    middle = mounts.middle(workspace)
+    every = mounts.targets(workspace, at.wrist)
+    middle = mounts.middle(workspace, at.wrist)
     low, high = _bounds(at, workspace, tilts)
     free = low < high
     chosen = np.random.default_rng(seed).choice(len(every.p_world_trocar), POSES, replace=False)

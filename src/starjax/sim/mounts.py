@@ -17,6 +17,8 @@ from starjax.sim.tools.base import Tool
 from starjax.sim.workspaces import Workspace
 from starjax.types import Pose
 
+# Angles (rad) of a wrist that targets have in turn: a mount must serve a bent tool as well.
+BENDS = np.deg2rad([(0, 0), (30, 0), (0, 30), (-30, 0), (0, -30)])
 # Requirements of a usable mount (a test checks every one).
 MIN_MARGIN = 0.1  # rad to the nearest limit
 MIN_SINGULAR = 0.03  # m, of [Jv; LEVER Jw]
@@ -38,12 +40,15 @@ class Bench(NamedTuple):
     """An arm alone, its base at the world's origin.
 
     Attributes:
-      flange, tip: chains to its flange and to the tool's tip, the tool not turned.
+      flange, tip: chains to its flange and to the tool's tip, or to the shaft before a wrist, the
+        tool not turned.
+      wrist: of the tool, or None.
       settings: see there.
     """
 
     flange: ik.Chain
     tip: ik.Chain
+    wrist: rcm.Wrist | None
     settings: ArmSettings
 
 
@@ -51,7 +56,8 @@ class Targets(NamedTuple):
     """Poses P of a workspace.
 
     Attributes:
-      pose: pose_world_tip `[P]`, each on the RCM manifold of its trocar.
+      pose: pose_world_tip `[P]`, or of the shaft before a wrist, each on the RCM manifold of its
+        trocar.
       p_world_trocar: `[P, 3]` m.
     """
 
@@ -86,13 +92,13 @@ def bench(arm: Arm, tool: Tool) -> Bench:
     whole.attach(held, site=whole.site(robot.FLANGE), prefix="tool/")
     m = whole.compile()
     flange, tip = (
-        ik.chain_of(m, arm.first, site, arm.joints) for site in (robot.FLANGE, f"tool/{tool.tcp}")
+        ik.chain_of(m, arm.first, site, arm.joints) for site in (robot.FLANGE, f"tool/{tool.base}")
     )
     settings = ArmSettings(arm.rest_gain, arm.remote_centre, arm.watched, arm.link_radius)
-    return Bench(flange, tip, settings)
+    return Bench(flange, tip, tool.wrist, settings)
 
 
-def targets(workspace: Workspace) -> Targets:
+def targets(workspace: Workspace, wrist: rcm.Wrist | None = None) -> Targets:
     """Returns a grid over the trocars, the tip's box and the rolls of a workspace.
 
     With azimuths all round it includes the paper's twelve trocars.
@@ -109,18 +115,28 @@ def targets(workspace: Workspace) -> Targets:
     pairs = np.repeat(trocars, len(actions), axis=0), np.tile(actions, (len(trocars), 1))
     fields, actions = (np.asarray(x, np.float32) for x in pairs)
     frame = frame_of(rcm.Trocar(*fields.T), workspace)
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(actions, frame)
-    return Targets(pose, frame.p_world_trocar)
+    return Targets(_carried(actions, frame, wrist), frame.p_world_trocar)
 
 
-def middle(workspace: Workspace) -> Targets:
+def middle(workspace: Workspace, wrist: rcm.Wrist | None = None) -> Targets:
     """Returns the pose in the middle of the workspace."""
     radius = 0.0 if np.ptp(workspace.azimuth) > np.pi else np.mean(workspace.radius)
     trocar = rcm.Trocar(radius, np.mean(workspace.polar), np.mean(workspace.azimuth))
     frame = frame_of(trocar, workspace)
     box = np.mean([workspace.low, workspace.high], axis=0)
-    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(np.append(np.mean(workspace.rolls), box), frame)
-    return Targets(pose, frame.p_world_trocar)
+    action = np.append(np.mean(workspace.rolls), box)
+    return Targets(_carried(action, frame, wrist), frame.p_world_trocar)
+
+
+def _carried(actions: np.ndarray, frame: rcm.TrocarFrame, wrist: rcm.Wrist | None) -> Pose:
+    """Returns the poses `[P]` of rolls and tips `[P, 4]` that the arm carries, bent by `BENDS`."""
+    if wrist is None:
+        return rcm.ACTION_SPACES["rcm4"].decode(actions, frame)[0]
+    rows = np.arange(actions.size // 4).reshape(actions.shape[:-1])
+    angles = BENDS[rows % len(BENDS)].astype(np.float32)
+    bent = np.concatenate([actions[..., :1], angles, actions[..., 1:]], axis=-1)
+    tip, _ = rcm.rcm6(wrist).decode(bent, frame)
+    return rcm.shaft_of(wrist, tip, angles)
 
 
 def fit(at: Bench, mount: Mount, poses: Targets) -> Fit:

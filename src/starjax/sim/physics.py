@@ -1,7 +1,7 @@
 """MJX under the environment: the state between steps, and one control period."""
 
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import flax.struct
@@ -96,23 +96,7 @@ def advance(
     substeps = round(period / scene.mj_model.opt.timestep)
     mjx_model = _model(scene, p_world_trocar).replace(**own)
     mocap_pos = scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(p_world_trocar)
-    turn = [period * v - d for v, d in zip(velocity, dq, strict=True)]
-
-    def target(i: jax.Array) -> jax.Array:
-        """Returns all servos' targets `[nu]` of substep i."""
-        s = (i + 1) / substeps
-        ctrl = jnp.zeros(scene.mj_model.nu)
-        for a, bound in enumerate(scene.arms):
-            # Cubic Hermite spline of s in [0, 1]: a straight line plus a term for the first slope.
-            x = q[a] + s * dq[a] + s * (1 - s) ** 2 * turn[a]
-            v = (dq[a] + (1 - s) * (1 - 3 * s) * turn[a]) / period
-            # A critically damped servo lags its input by 2/w v + a/w^2: added in advance.
-            acceleration = (6 * s - 4) * turn[a] / period**2
-            w = bound.arm.servo_frequency
-            ctrl = ctrl.at[bound.ctrl].set(x + 2.0 / w * v + acceleration / w**2)
-            if bound.jaw_ctrl is not None:
-                ctrl = ctrl.at[bound.jaw_ctrl].set(_jaw_target(bound, gripper[a]))
-        return scene.task.drive(scene.bound, layout, ctrl, time + s * period)
+    target = servo_targets(scene, q, dq, velocity, gripper, period, layout, time)
 
     def substep(i, carry):
         state, result = carry
@@ -139,11 +123,44 @@ def advance(
     return jax.lax.fori_loop(0, substeps, substep, (state, blank))
 
 
+def servo_targets(
+    scene: Scene,
+    q: Sequence[jax.Array],
+    dq: Sequence[jax.Array],
+    velocity: Sequence[jax.Array],
+    gripper: jax.Array,
+    period: float,
+    layout: object,
+    time: jax.Array,
+) -> Callable[[jax.Array], jax.Array]:
+    """Returns the function from a substep to all servos' targets `[nu]`; arguments as `advance`."""
+    substeps = round(period / scene.mj_model.opt.timestep)
+    turn = [period * v - d for v, d in zip(velocity, dq, strict=True)]
+
+    def target(i: jax.Array) -> jax.Array:
+        s = (i + 1) / substeps
+        ctrl = jnp.zeros(scene.mj_model.nu)
+        for a, bound in enumerate(scene.arms):
+            # Cubic Hermite spline of s in [0, 1]: a straight line plus a term for the first slope.
+            x = q[a] + s * dq[a] + s * (1 - s) ** 2 * turn[a]
+            v = (dq[a] + (1 - s) * (1 - 3 * s) * turn[a]) / period
+            # A critically damped servo lags its input by 2/w v + a/w^2: added in advance.
+            acceleration = (6 * s - 4) * turn[a] / period**2
+            w = bound.arm.servo_frequency
+            ctrl = ctrl.at[bound.ctrl].set(x + 2.0 / w * v + acceleration / w**2)
+            if bound.jaw_ctrl is not None:
+                ctrl = ctrl.at[bound.jaw_ctrl].set(_jaw_target(bound, gripper[a]))
+        return scene.task.drive(scene.bound, layout, ctrl, time + s * period)
+
+    return target
+
+
 def is_sound(scene: Scene, state: PhysicsState) -> jax.Array:
     """Returns False once the simulation has diverged (not finite, or implausibly fast)."""
     sound = jax.tree.reduce(lambda ok, x: ok & jnp.all(jnp.isfinite(x)), state, jnp.ones((), bool))
     for bound in scene.arms:
-        sound &= jnp.max(jnp.abs(state.qvel[bound.dof])) < MAX_ARM_SPEED
+        arm = bound.dof[: bound.joints]  # a wrist may be faster
+        sound &= jnp.max(jnp.abs(state.qvel[arm])) < MAX_ARM_SPEED
     return sound & scene.task.is_sound(scene.bound, state.qpos, state.qvel)
 
 

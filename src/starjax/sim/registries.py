@@ -31,14 +31,24 @@ tasks = Registry(
 )
 arms = Registry(
     "arm",
-    {name: f"starjax.sim.arms.{name}:ARM" for name in ("fr5", "ur5e", "panda", "iiwa14", "rcm4")},
+    {
+        name: f"starjax.sim.arms.{name}:ARM"
+        for name in ("fr5", "ur5e", "panda", "iiwa14", "rcm4", "psm", "psm_si")
+    },
     "starjax.sim.arms.base:Arm",
 )
 tools = Registry(
     "tool",
     {
         name: f"starjax.sim.tools.{name}:TOOL"
-        for name in ("grasper", "grasper_wide", "endoscope", "endoscope30")
+        for name in (
+            "grasper",
+            "grasper_wide",
+            "endoscope",
+            "endoscope30",
+            "needle_driver",
+            "prograsp",
+        )
     },
     "starjax.sim.tools.base:Tool",
 )

@@ -32,11 +32,13 @@ class BoundArm(NamedTuple):
 
     Attributes:
       arm, tool, mount: its records.
-      chain: from the world to the tcp, its trocar at the nominal place; see `chain_at`.
+      chain: from the world to the tcp, or to the shaft before a wrist, its trocar at the nominal
+        place; see `chain_at`.
       base_offset: `[3]` m, from the trocar to the base of an arm that stands there.
+      joints: number of the chain's joints; the J of the following fields has those of a wrist too.
       home: `[J]` rad. max_speed: `[J]` rad/s.
       q, dof, ctrl: `[J]` indices of its joints in qpos, qvel and ctrl.
-      jaws: indices of all joints of the tool in qpos.
+      jaws: indices of the jaws' joints in qpos.
       jaw: index of the joint that measures the opening, or None.
       jaw_ctrl: of the jaws' servo, or None.
       pads: geom ids.
@@ -47,6 +49,7 @@ class BoundArm(NamedTuple):
     mount: Mount
     chain: ik.Chain
     base_offset: np.ndarray
+    joints: int
     home: np.ndarray
     max_speed: np.ndarray
     q: np.ndarray
@@ -230,21 +233,24 @@ def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
 def _bind(m: mujoco.MjModel, i: int, arm: Arm, tool: Tool, mount: Mount) -> BoundArm:
     at = f"arm{i}/"
     names = tuple(at + joint for joint in arm.joints)
-    chain = ik.chain_of(m, first=at + arm.first, site=at + f"tool/{tool.tcp}", joints=names)
-    joints = [m.joint(name) for name in names]
+    chain = ik.chain_of(m, first=at + arm.first, site=at + f"tool/{tool.base}", joints=names)
+    wrist = tuple(f"{at}tool/{joint}" for joint in tool.wrist_joints)
+    joints = [m.joint(name) for name in names + wrist]
     held = [m.joint(j) for j in range(m.njnt) if m.joint(j).name.startswith(f"{at}tool/")]
+    jaws = [joint for joint in held if joint.name not in wrist]
     return BoundArm(
         arm=arm,
         tool=tool,
         mount=mount,
         chain=chain,
         base_offset=np.array(chain.p_base - m.body(f"trocar{i}").pos, np.float32),
-        home=np.array(mount.home, np.float32),
-        max_speed=np.array(arm.max_speed, np.float32),
+        joints=len(names),
+        home=np.array(mount.home + (0.0,) * len(wrist), np.float32),
+        max_speed=np.array(arm.max_speed + (tool.wrist_speed,) * len(wrist), np.float32),
         q=np.array([joint.qposadr[0] for joint in joints]),
         dof=np.array([joint.dofadr[0] for joint in joints]),
-        ctrl=np.array([m.actuator(name).id for name in names]),
-        jaws=np.array([joint.qposadr[0] for joint in held], int),
+        ctrl=np.array([m.actuator(name).id for name in names + wrist]),
+        jaws=np.array([joint.qposadr[0] for joint in jaws], int),
         jaw=None if tool.jaw is None else int(m.joint(f"{at}tool/{tool.jaw}").qposadr[0]),
         jaw_ctrl=None if tool.servo is None else int(m.actuator(f"{at}tool/{tool.servo}").id),
         pads=np.array([m.geom(f"{at}tool/{pad}").id for pad in tool.pads], int),

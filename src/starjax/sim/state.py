@@ -54,9 +54,10 @@ class EnvState:
 
     Attributes:
       physics: joint positions, velocities, warm start.
-      q_target: `[J]` rad of each arm, joint target of the last command.
+      q_target: `[J]` rad of each arm with its wrist, joint target of the last command.
       q_velocity: `[J]` rad/s of each arm, its velocity.
-      velocity: `[A, 7]` of the reference poses, see `control`.
+      velocity: `[A, 7]` of the reference poses, see `control`; `[A, 9]` in a scene with a wrist,
+        see `wrist_motion`.
       correction: `[A, 3]` m, feedback correction of the tools' axes at their trocars.
       gripper_target: `[A]` in [-1, 1].
       trocar: true trocars, `[A]`.
@@ -75,7 +76,7 @@ class EnvState:
       invalid: the simulation diverged or its contact solver did not converge (the last sound state
         is kept), or a trocar is not finite.
       collided: an arm, shaft or jaw overlapped something without modelled contact.
-      rcm_error: `[A]` m, executed: distance of the trocar from the measured tool axis.
+      rcm_error: `[A]` m, executed: distance of the trocar from the measured axis of the shaft.
       rcm_error_within: `[A]` m, its maximum over the physics steps of the last control step.
       ik_error: `[A]` m, residual of the inverse kinematics, rotations weighed; inf after an invalid
         command (not finite, or R not a rotation), during which the arm holds.
@@ -83,6 +84,9 @@ class EnvState:
       touch: `[A]` bool, the jaws touch something graspable.
       pose: `[A]` measured tips in the world.
       gripper: `[A]` measured openings in [-1, 1].
+      shaft: `[A]` measured shafts in the world, that of a straight tool at its tip; None in a scene
+        without a wrist.
+      wrist: `[A, 2]` rad, measured angles, zero for a straight tool; None as `shaft`.
       model: this episode's own fields of the MJX model, by name.
       wrapper_state: memories of wrappers of the environment, by name.
       endoscope: measured pose_world_camera of the endoscope, see `sim.endoscope_camera`; None for a
@@ -117,6 +121,8 @@ class EnvState:
     touch: jax.Array
     pose: Pose
     gripper: jax.Array
+    shaft: Pose | None = None
+    wrist: jax.Array | None = None
     model: dict[str, jax.Array] = flax.struct.field(default_factory=dict)
     wrapper_state: dict[str, Any] = flax.struct.field(default_factory=dict)
     endoscope: Pose | None = None

@@ -16,7 +16,6 @@ _TISSUE = Mount(
     turn=-1.587,
     home=(-1.55, -1.491, 1.572, -1.582, -1.624, -0.628),
 )
-
 ARM = Arm(
     name="fr5",
     mjcf="arms/fr5/fr5.xml",
@@ -26,6 +25,8 @@ ARM = Arm(
     servo_frequency=100.0,
     mounts={
         ("grasper", "board"): _BOARD,
+        ("needle_driver", "board"): _BOARD,
+        ("prograsp", "board"): _BOARD,
         ("grasper_wide", "wire"): _BOARD,
         # Two arms at either side of the board.
         ("grasper", "left"): _BOARD,

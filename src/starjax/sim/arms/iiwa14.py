@@ -31,6 +31,8 @@ ARM = Arm(
     servo_frequency=100.0,
     mounts={
         ("grasper", "board"): _MOUNT,
+        ("needle_driver", "board"): _MOUNT,
+        ("prograsp", "board"): _MOUNT,
         ("grasper_wide", "wire"): _MOUNT,
         ("grasper", "left"): _MOUNT,
         ("grasper", "right"): opposite(_MOUNT),

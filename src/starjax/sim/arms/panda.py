@@ -22,6 +22,13 @@ _TISSUE = Mount(
     home=(-0.812, -0.446, -0.089, -1.841, -0.08, 1.319, 0.723),
 )
 
+_BOARD = Mount(
+    position=(-0.363, -0.085, -0.333),
+    yaw=-0.277,
+    turn=-0.221,
+    home=(0.499, -0.513, 0.005, -1.939, 0.002, 1.426, 0.448),
+)
+
 ARM = Arm(
     name="panda",
     mjcf="arms/panda/panda.xml",
@@ -30,12 +37,9 @@ ARM = Arm(
     max_speed=(2.175,) * 4 + (2.61,) * 3,
     servo_frequency=100.0,
     mounts={
-        ("grasper", "board"): Mount(
-            position=(-0.363, -0.085, -0.333),
-            yaw=-0.277,
-            turn=-0.221,
-            home=(0.499, -0.513, 0.005, -1.939, 0.002, 1.426, 0.448),
-        ),
+        ("grasper", "board"): _BOARD,
+        ("needle_driver", "board"): _BOARD,
+        ("prograsp", "board"): _BOARD,
         ("grasper_wide", "wire"): _WIRE,
         ("grasper", "left"): _LEFT,
         ("grasper", "right"): opposite(_LEFT),

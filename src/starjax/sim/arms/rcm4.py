@@ -10,6 +10,7 @@ from starjax.sim.arms.base import Arm, Mount, opposite
 
 # Yaw turns about the world's y axis, where the shaft leans furthest.
 _BOARD = Mount(position=(0.0, 0.0, 0.0), yaw=-math.pi / 2, turn=0.0, home=(0.0, 0.0, 0.11, 0.0))
+_WRIST = _BOARD._replace(yaw=_BOARD.yaw - 0.2)  # bent tools lean further
 _LEFT = Mount(position=(0.0, 0.0, 0.0), yaw=-1.522, turn=0.044, home=(0.432, 0.02, 0.122, 0.0))
 
 _WIRE = Mount(
@@ -34,6 +35,8 @@ ARM = Arm(
     servo_frequency=100.0,
     mounts={
         ("grasper", "board"): _BOARD,
+        ("needle_driver", "board"): _WRIST,
+        ("prograsp", "board"): _WRIST,
         ("grasper_wide", "wire"): _WIRE,
         ("grasper", "left"): _LEFT,
         ("grasper", "right"): opposite(_LEFT),

@@ -17,7 +17,6 @@ _TISSUE = Mount(
     turn=-1.711,
     home=(-1.006, 1.98, 1.975, -2.471, 1.554, -0.046),
 )
-
 ARM = Arm(
     name="ur5e",
     mjcf="arms/ur5e/ur5e.xml",
@@ -27,6 +26,8 @@ ARM = Arm(
     servo_frequency=100.0,
     mounts={
         ("grasper", "board"): _MOUNT,
+        ("needle_driver", "board"): _MOUNT,
+        ("prograsp", "board"): _MOUNT,
         ("grasper_wide", "wire"): _MOUNT,
         ("grasper", "left"): _MOUNT,
         ("grasper", "right"): opposite(_MOUNT),
