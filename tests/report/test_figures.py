@@ -42,9 +42,10 @@ def test_success_is_pooled_by_distance_and_drawn_with_its_interval(one):
     style.rates(axis, range(len(scores)), scores, "stardiff", "")
     whiskers = [segment[:, 1] for segment in axis.collections[0].get_segments()]
     np.testing.assert_allclose(whiskers, ends)
-    (band,) = figures.distance([one], one).axes[0].collections
-    edges = np.unique(band.get_paths()[0].vertices[:, 1])
-    np.testing.assert_allclose(edges, np.unique(ends))
+    axis = figures.distance([one], one).axes[0]
+    (intervals,) = axis.collections  # a line each, and no band between them
+    np.testing.assert_allclose([part[:, 1] for part in intervals.get_segments()], ends)
+    assert {line.get_linestyle() for line in axis.lines} == {"None"}
     limits = (one.limit_s, 7.0)  # a sweep with another limit is not pooled
     swept = [one._replace(sweep=one.result._replace(time_limit_s=limit)) for limit in limits]
     both, alone = (sum(rate.trials for _, rate in figures._pooled(run)) for run in swept)

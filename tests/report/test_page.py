@@ -52,7 +52,7 @@ def test_tables_are_the_golden_ones(kept, name):
 def rows(text):
     """Tables of a page: lists of rows of cells' text; a bar's cell holds its label."""
     found = []
-    for table in re.findall(r'<div class="scroll"><table>(.*?)</table></div>', text, re.DOTALL):
+    for table in re.findall(r'<div class="scroll[^>]*><table>(.*?)</table></div>', text, re.DOTALL):
         cells = [re.findall(r"<t[hd]\b.*?</t[hd]>", row, re.DOTALL) for row in table.split("<tr>")]
         labelled = [
             [re.sub(r'<span[^>]*title="([^"]*)".*', r"\1", c) for c in row] for row in cells
@@ -142,7 +142,7 @@ def test_a_stage_that_did_not_run_leaves_no_trace(one):
 
 @pytest.mark.parametrize(
     ("seen", "unseen", "said"),
-    [(45, 15, "60.0"), (15, 45, "60.0"), (44, 36, "0.2"), (25, 24, "chance"), (25, 25, "as well")],
+    [(45, 15, "60.0"), (15, 45, "60.0"), (44, 36, "0.2"), (25, 24, "chance"), (50, 50, "as well")],
 )
 def test_the_verdict_says_what_is_sure_of_the_gap(one, seen, unseen, said):
     trials = [
@@ -155,6 +155,37 @@ def test_the_verdict_says_what_is_sure_of_the_gap(one, seen, unseen, said):
     assert said in text and text.index(f"{seen} of 50") < text.rindex(f"{unseen} of 50")
     _, low, high = stats.gap(*map(outcomes.tally, outcomes.split(trials)))
     assert ("new trocar costs" in text, "better" in text) == (low > 0, high < 0)
+
+
+@pytest.mark.parametrize("counts", [(8, 4), (12, 12), (40, 40)])
+def test_equal_rates_of_few_trials_are_not_said_to_be_alike(one, counts):
+    trials = [
+        one.trials[0]._replace(seen=part, success=i < count // 2, trial=i)
+        for part, count in zip((True, False), counts)
+        for i in range(count)
+    ]
+    run = edited(one, trials)
+    text = captions.verdict([run], run)
+    _, low, high = stats.gap(*map(outcomes.tally, outcomes.split(trials)))
+    assert "as well" not in text and f"{100 * low:+.1f} to {100 * high:+.1f}" in text
+    assert ("few trials" in text) == (high - low > 0.4)
+
+
+def test_captions_name_what_is_drawn(one, several):
+    assert "sweep" not in captions.distance([one], one)
+    assert "sweep" in captions.distance(several, several[-1])
+    assert "n is" in captions.distance([one], one) and "n is" not in captions.distance(several, one)
+    errors = [line for line in one.curves if captions.HELD_OUT[0] in line]
+    losses = [line for line in one.curves if captions.HELD_OUT[0] not in line]
+    assert errors and "kept out" in captions.training([one])
+    assert "kept out" not in captions.training([one._replace(curves=losses)])
+
+
+def test_worst_and_percentile_of_a_card_are_of_one_measure(one):
+    errors = {"executed": {"p99": 0.1, "max": 0.2}, "within_steps": {"p99": 0.3, "max": 0.9}}
+    cards = sections.cards(edited(one, figures={**one.result.figures, "rcm_error_mm": errors}))
+    (card,) = (card for card in cards if card.unit == " mm")
+    assert card.value.startswith("0.1") and "0.2" in card.more and "0.9" not in card.more
 
 
 def test_notes_name_the_runs_that_they_are_about(one):

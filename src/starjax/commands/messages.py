@@ -232,15 +232,13 @@ def outcome(results: Sequence[Any]) -> str:
     for result in results:
         figures = result.figures
         error = figures["rcm_error_mm"]["executed"]
-        # results of earlier versions do not have it
-        within = figures["rcm_error_mm"].get("within_steps", error)
         rows.append(
             (
                 methods.SCORED[result.method].label,
                 rate(figures["seen"]),
                 rate(figures["unseen"]),
                 rate(figures["safe"]["all"]),
-                f"{error['mean']:.3f} mm, at most {within['max']:.2f}",
+                f"{error['mean']:.3f} mm, at most {error['max']:.3f}",
             )
         )
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]

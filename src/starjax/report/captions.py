@@ -4,6 +4,10 @@ from collections.abc import Sequence
 
 from starjax.report import compare, formats, outcomes, results, stats
 
+_ALIKE = 10.0  # points; an interval of the gap within them shows that success is alike
+_WIDE = 40.0  # points; a wider interval says nothing
+HELD_OUT = ("position_error_mm", "roll_error_deg")  # keys of metrics.jsonl
+
 
 def title(runs: Sequence[results.Run]) -> str:
     """Returns the page's heading."""
@@ -44,10 +48,12 @@ def _gap(seen: stats.Rate, unseen: stats.Rate) -> str:
     if high < 0:
         gained = f"{-middle:.1f} points (95% interval {-high:.1f} to {-low:.1f})"
         return f"It does better on the new ones, by {gained}."
-    bounds = f"{low:+.1f} to {high:+.1f} points"
-    if middle == 0:
-        return f"It does as well on the new ones (95% interval of the difference {bounds})."
-    return f"The difference between the two may be chance (95% interval {bounds})."
+    bounds = f"95% interval of the difference {low:+.1f} to {high:+.1f} points"
+    if max(-low, high) <= _ALIKE:
+        return f"It does as well on the new ones ({bounds})."
+    if high - low > _WIDE:
+        return f"So few trials cannot tell whether new trocars cost it anything ({bounds})."
+    return f"The difference between the two may be chance ({bounds})."
 
 
 def _rank(runs: Sequence[results.Run], focus: results.Run) -> str:
@@ -56,11 +62,40 @@ def _rank(runs: Sequence[results.Run], focus: results.Run) -> str:
     for run in runs:
         unseen = outcomes.rates(run.trials)[1]
         if run is not focus and unseen:
-            scores.append((unseen.rate, run.label))
+            scores.append((unseen, run.label))
     if not scores:
         return ""
-    best, label = max(scores)
-    return f"The best of the others on new trocars, {label}, reached {100 * best:.0f}%."
+    best, label = max(scores, key=lambda score: (score[0].rate, score[1]))
+    reached = f"{100 * best.rate:.0f}% ({best.successes} of {best.trials})"
+    return f"The best of the others on new trocars, {label}, reached {reached}."
+
+
+def distance(runs: Sequence[results.Run], focus: results.Run) -> str:
+    """Returns the caption of Fig. 4."""
+    several_, swept = len(runs) > 1, focus.sweep is not None
+    left = (
+        "Left: trials pooled by distance of their trocar to the nearest one in the demonstrations"
+    )
+    left += ", a line per run" if several_ else ""
+    left += ", with 95% Wilson intervals"
+    left += "." if several_ else "; n is the number of trials."
+    if not (several_ or swept):
+        left += " Faint dots are single trocars."
+    right = (
+        "Right: trocars of the sweep from above as dots, and the mean success over 8 mm about them."
+        if swept
+        else "Right: trocars from above, with the success in percent."
+    )
+    return f"{left} {right}"
+
+
+def training(runs: Sequence[results.Run]) -> str:
+    """Returns the caption of the training curves."""
+    has_errors = any(name in line for run in runs for line in run.curves for name in HELD_OUT)
+    errors = (
+        ", and the error of predicted commands on demonstrations kept out of training (open loop)"
+    )
+    return f"Loss on the training batches{errors * has_errors}."
 
 
 def notes(runs: Sequence[results.Run]) -> list[str]:

@@ -12,6 +12,7 @@ _BIN = 0.005  # m of distance pooled in one point
 _SMOOTH = 0.008  # m, kernel width of the heat map
 _FAR = 2.0  # kernel widths from the nearest trocar beyond which the map is blank
 _DISC = 0.05  # m, radius of Eq. 19's disc
+_LABEL_OFFSET = (5, 4)  # points from a dot to its label
 _MIN_PANELS = 2  # panels across the page: a single one would fill it
 
 
@@ -23,7 +24,7 @@ def distance(runs: Sequence[results.Run], focus: results.Run, dark: bool = False
         strokes = style.strokes([run.result.method for run in runs])
         for i, run in enumerate(runs):
             if len(runs) == 1:
-                _band(left, run, shades)
+                _dots(left, run, shades)
             else:
                 _whiskers(left, run, (i - (len(runs) - 1) / 2) * 0.35, strokes[i])
         left.set_xlabel("distance to the nearest training trocar (mm)")
@@ -103,8 +104,8 @@ def _pooled(run: results.Run) -> list[tuple[float, stats.Rate]]:
     return [(1e3 * apart[i].mean(), outcomes.tally(trials[j] for j in i)) for i in inside]
 
 
-def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
-    """Draws one method: pooled rates with their band and counts, single trocars as dots."""
+def _dots(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
+    """Draws one method: pooled rates as dots with intervals and counts, single trocars faintly."""
     points, color = _pooled(run), style.SUCCESS
     x, scores = [at for at, _ in points], [score for _, score in points]
     if not run.sweep:
@@ -112,12 +113,14 @@ def _band(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
         apart = outcomes.distances([g[0] for g in groups], results.training_trocars(run))
         rates = [outcomes.tally(g).rate for g in groups]
         axis.plot(1e3 * apart, rates, "o", color=color, alpha=0.35, markersize=4)
-    low, high = [s.low for s in scores], [s.high for s in scores]
-    axis.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
-    axis.plot(x, [s.rate for s in scores], "o-", color=color, markersize=5)
+    ends = [[s.rate - s.low for s in scores], [s.high - s.rate for s in scores]]
+    rates = [score.rate for score in scores]
+    axis.errorbar(x, rates, ends, fmt="o", color=color, markersize=5, linewidth=1.0)
     for at, score in points:
-        text, place = f"n {score.trials}", -0.01 if score.rate > 0.1 else score.high + 0.02
-        axis.text(at, place, text, ha="center", va="bottom", fontsize=6.5, color=shades["muted"])
+        offset = {"xytext": _LABEL_OFFSET, "textcoords": "offset points"}
+        axis.annotate(
+            f"n {score.trials}", (at, score.rate), fontsize=6.5, color=shades["muted"], **offset
+        )
 
 
 def _whiskers(axis: Any, run: results.Run, offset: float, stroke: str) -> None:
@@ -128,7 +131,7 @@ def _whiskers(axis: Any, run: results.Run, offset: float, stroke: str) -> None:
 
 
 def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> None:
-    """Ports from above: a smoothed map where a sweep filled the disc, else a dot a trocar."""
+    """Draws trocars from above: a smoothed map of a sweep, else a dot per trocar."""
     groups = outcomes.by_trocar(run.sweep.trials if run.sweep else run.trials)
     arms = len(groups[0][0].radius)
     at = _from_above([group[0] for group in groups])

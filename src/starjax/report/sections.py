@@ -83,9 +83,8 @@ def cards(run: results.Run) -> Iterator[Card]:
         yield Card("Generalization gap", f"{middle:+.0f}", " points", more)
     executed = run.rcm_error_mm.get("executed") or {}
     if executed.get("p99") is not None:
-        within = run.rcm_error_mm.get("within_steps") or {}
-        worst = formats.millimetres(max(executed["max"], within.get("max", 0.0)))
-        more = f"99th percentile of steps' ends; {worst} mm at worst"
+        worst = formats.millimetres(executed["max"])
+        more = f"99th percentile; {worst} mm at worst, both at the ends of control steps"
         yield Card("Shaft off the trocar", formats.millimetres(executed["p99"]), " mm", more)
     if seconds := outcomes.times(run.trials, run.result.control_hz):
         more = f"median of {len(seconds)} successes"
