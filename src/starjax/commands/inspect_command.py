@@ -9,16 +9,18 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from starjax import errors
-from starjax.commands import options
+from starjax.commands import checks, inspect_page, options
 from starjax.runtime import files, xla
 
 DESCRIPTION = """Summarises a dataset, policy or result and flags anomalies.
 
-PATH is a directory of demonstrations, a LeRobot or zarr directory, a robomimic file, a
-policy.safetensors or the name of a packaged policy, a result.json or a directory with one.
+PATH is a directory of demonstrations, a dataset in a format of starjax list, a policy.safetensors
+or the name of a packaged policy, a result.json or a directory with one. --page writes a page with
+figures of a dataset: trocars and their wander, RCM error, reach, speed, jaws.
 
 Examples:
   starjax inspect runs/cpu/demos-0123456789ab
+  starjax inspect their-dataset --page their-dataset.html
   starjax inspect compact"""
 
 _LOOKED_AT = 50  # episodes of a foreign dataset whose values are read
@@ -30,6 +32,8 @@ class InspectArgs:
     """Flags of the command."""
 
     path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    page: str = ""  # HTML file to write, with figures of a dataset's motions
+    map: str = ""  # mapping of another dataset, as of starjax import; empty: the one that fits
 
 
 class Found(NamedTuple):
@@ -43,7 +47,14 @@ def main(argv: Sequence[str]) -> int:
     """Prints the summary; returns 1 if there are anomalies."""
     args = options.parse("inspect", InspectArgs, argv, DESCRIPTION)
     xla.prepare_xla()
+    if args.page:
+        checks.expect_folder("folder of --page", Path(args.page).parent)
     summary = inspect(args.path)
+    if args.page:
+        odd = inspect_page.write(
+            Path(args.path), args.map, Path(args.page), summary.rows, summary.odd
+        )
+        summary = Found([*summary.rows, ("page", args.page)], odd)
     width = max(len(name) for name, _ in summary.rows)
     for name, text in summary.rows:
         print(errors.printable(f"{name:{width}}  {text}".rstrip()))
@@ -183,14 +194,20 @@ def _others(path: Path) -> Found:
         ]
         low = [column for column, about in source.columns.items() if not about.is_image]
         ranges = {column: _Numbers() for column in low}
+        unread = []
         for episode in range(min(len(lengths), _LOOKED_AT)):  # one at a time in memory
-            for column, values in source.read(episode, low).items():
+            try:
+                arrays = source.read(episode, low)
+            except errors.UsageError as error:
+                unread.append(str(error))
+                continue
+            for column, values in arrays.items():
                 ranges[column].add(episode, values)
         rows += [
             (f"  {column}", _said(about, ranges.get(column)))
             for column, about in source.columns.items()
         ]
-        return Found(rows, [*source.notes, *_odd(ranges)])
+        return Found(rows, [*source.notes, *unread, *_odd(ranges)])
 
 
 @dataclasses.dataclass
@@ -205,6 +222,7 @@ class _Numbers:
         """Takes the values of an episode."""
         import numpy as np
 
+        values = np.asarray(values, np.float64)  # integers have no infinite start of a minimum
         is_finite = np.isfinite(values)
         if not is_finite.all():
             self.bad.append(episode)

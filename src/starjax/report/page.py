@@ -35,7 +35,24 @@ def render(
     playback: playback_3d.Playback | None = None,
 ) -> str:
     """Renders the page of `runs`, whose headline numbers are those of `focus`."""
-    environment = jinja2.Environment(
+    return (
+        environment()
+        .get_template("page.html")
+        .render(
+            runs=runs,
+            focus=focus,
+            several=len(runs) > 1,
+            text=compare.task_text(runs),
+            figures=figures,
+            video=video,
+            playback=playback,
+        )
+    )
+
+
+def environment() -> jinja2.Environment:
+    """Returns the templates' environment."""
+    made = jinja2.Environment(
         loader=jinja2.PackageLoader("starjax.report"),
         autoescape=True,  # labels, commands and settings come from files
         trim_blocks=True,
@@ -43,7 +60,7 @@ def render(
         undefined=jinja2.StrictUndefined,
     )
     filters = {"data_uri": _data_uri, "median": statistics.median}
-    environment.filters |= {**filters, "worst_rcm_mm": outcomes.worst_rcm_mm}
+    made.filters |= {**filters, "worst_rcm_mm": outcomes.worst_rcm_mm}
     modules = (
         captions,
         compare,
@@ -56,16 +73,8 @@ def render(
         stress,
         tables,
     )
-    environment.globals |= {module.__name__.split(".")[-1]: module for module in modules}
-    return environment.get_template("page.html").render(
-        runs=runs,
-        focus=focus,
-        several=len(runs) > 1,
-        text=compare.task_text(runs),
-        figures=figures,
-        video=video,
-        playback=playback,
-    )
+    made.globals |= {module.__name__.split(".")[-1]: module for module in modules}
+    return made
 
 
 def _data_uri(data: bytes, kind: str) -> str:

@@ -1,0 +1,53 @@
+"""The page of `starjax inspect DATASET --page`: motions of any dataset with figures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starjax import errors, extras
+from starjax.runtime import files, progress
+
+if TYPE_CHECKING:  # it imports jax
+    from starjax.data.recordings import Recording
+
+
+def write(
+    path: Path, map_name: str, page: Path, rows: Sequence[tuple[str, str]], odd: Sequence[str]
+) -> list[str]:
+    """Writes the page; returns all anomalies, those of the mapping too.
+
+    Args:
+      path: a dataset of starjax, or one of another format.
+      map_name: mapping of the other format, as of `starjax import`; empty for the one that fits.
+      page: the file.
+      rows: summary of the dataset.
+      odd: its anomalies.
+
+    Raises:
+      errors.UsageError: no mapping fits, or no motion is left.
+    """
+    extras.require("inspect --page", "report")
+    from starjax.data import recordings
+    from starjax.report import recording_page
+
+    notes: list[str] = []
+    if (path / "dataset.json").is_file():
+        found = list(recordings.of_dataset(path))
+    else:
+        found, notes = _mapped(path, map_name)
+    if not found:
+        raise errors.UsageError("PATH", "episodes with motions", f"none in {path}")
+    text = recording_page.render(path.name, rows, found, [*odd, *notes])
+    files.write_bytes(page, text.encode())
+    return [*odd, *notes]
+
+
+def _mapped(path: Path, map_name: str) -> "tuple[list[Recording], list[str]]":
+    from starjax.data.formats import base, mapping, own_columns, ready, recorded
+
+    with base.open_dataset(path, base.detect(path)) as source:
+        own = None if map_name else own_columns.mapping(source)
+        file = ready.FOLDER if own else ready.find(map_name or ready.choose(source))
+        columns = own or mapping.load(file)
+        with progress.track("Inspect", len(source.lengths), unit="episodes") as advance:
+            return recorded.recordings(source, columns, file.parent, advance)
