@@ -27,7 +27,7 @@ def recording(moves=0.0, bend=0.0, seconds=20.0, number=0):
     R = np.stack([x, np.cross(z, x), z], -1)
     tips = trocar + 0.1 * z + bend * x
     jaws = np.where(times % 4.0 < 2.0, 1.0, -1.0)
-    return recordings.Recording(
+    return recordings.EpisodeMotion(
         number,
         HZ,
         R[:, None],

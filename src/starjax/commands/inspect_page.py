@@ -8,7 +8,7 @@ from starjax import errors, extras
 from starjax.runtime import files, progress
 
 if TYPE_CHECKING:  # it imports jax
-    from starjax.data.recordings import Recording
+    from starjax.data.recordings import EpisodeMotion
 
 
 def write(
@@ -42,7 +42,7 @@ def write(
     return [*odd, *notes]
 
 
-def _mapped(path: Path, map_name: str) -> "tuple[list[Recording], list[str]]":
+def _mapped(path: Path, map_name: str) -> "tuple[list[EpisodeMotion], list[str]]":
     from starjax.data.formats import base, mapping, own_columns, ready, recorded
 
     with base.open_dataset(path, base.detect(path)) as source:

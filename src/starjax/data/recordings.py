@@ -16,7 +16,7 @@ _MAX_WINDOWS = 6  # of an episode, evenly spaced
 _CLOSED = 0.0  # of a gripper in [-1, 1], below which it counts as closed
 
 
-class Recording(NamedTuple):
+class EpisodeMotion(NamedTuple):
     """The motion of one episode with A arms.
 
     Attributes:
@@ -42,8 +42,8 @@ class Recording(NamedTuple):
     split: str
 
 
-class Figures(NamedTuple):
-    """Figures of one arm in one episode.
+class MotionFigures(NamedTuple):
+    """MotionFigures of one arm in one episode.
 
     Attributes:
       rcm_mm: `[T]` distance of the shaft from the trocar.
@@ -63,13 +63,13 @@ class Figures(NamedTuple):
     closings: int
 
 
-def figures(recording: Recording, arm: int) -> Figures:
+def figures(recording: EpisodeMotion, arm: int) -> MotionFigures:
     """Computes the figures of an arm."""
     R, trocar = recording.R[:, arm], recording.p_world_trocar[arm]
     off = np.cross(recording.p_shaft[:, arm] - trocar, R[..., 2])
     tips = recording.p[:, arm]
     is_closed = recording.gripper[:, arm] < _CLOSED
-    return Figures(
+    return MotionFigures(
         rcm_mm=1e3 * np.linalg.norm(off, axis=-1),
         depth_mm=1e3 * np.sum((tips - trocar) * R[..., 2], -1),
         speed_mm_s=1e3 * np.linalg.norm(np.diff(tips, axis=0), axis=-1) * recording.hz,
@@ -79,7 +79,7 @@ def figures(recording: Recording, arm: int) -> Figures:
     )
 
 
-def _wander(recording: Recording, arm: int) -> np.ndarray:
+def _wander(recording: EpisodeMotion, arm: int) -> np.ndarray:
     rows = round(_WINDOW_S * recording.hz)
     count = min(_MAX_WINDOWS, len(recording.p) // max(rows, 1))
     found = []
@@ -92,7 +92,7 @@ def _wander(recording: Recording, arm: int) -> np.ndarray:
     return np.array(found)
 
 
-def of_dataset(root: Path) -> Iterator[Recording]:
+def of_dataset(root: Path) -> Iterator[EpisodeMotion]:
     """Reads the first episodes of a starjax dataset that have files."""
     about = store.read_description(root)
     reference = np.array(about["p_world_ref"], np.float32)
@@ -104,7 +104,7 @@ def of_dataset(root: Path) -> Iterator[Recording]:
             np.load(folder / f"{name}.npy", allow_pickle=False).astype(np.float64)
             for name in ("R", "p", "gripper")
         )
-        yield Recording(
+        yield EpisodeMotion(
             record.get("episode", i),
             about["control_hz"],
             R,

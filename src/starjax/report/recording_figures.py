@@ -1,11 +1,11 @@
-"""Figures of recordings: paths about the trocar, one episode over time, spreads over episodes."""
+"""MotionFigures of recordings: paths about the trocar, one episode over time, spreads over episodes."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from starjax.data.recordings import Figures, Recording
+from starjax.data.recordings import EpisodeMotion, MotionFigures
 from starjax.report import style
 
 _PATHS = 12  # episodes whose paths are drawn
@@ -13,7 +13,7 @@ _LEAST_MM = 0.01  # range of an axis of distances: rounding errors do not fill i
 _COLOURS = ("#2083C5", "#D55E00", "#009E73", "#CC79A7")  # of the arms
 
 
-def paths(found: Sequence[Recording], dark: bool = False) -> Any:
+def paths(found: Sequence[EpisodeMotion], dark: bool = False) -> Any:
     """Draws tips and trocars from above and from the side, in mm from the mean trocar."""
     centre = np.mean([r.p_world_trocar for r in found], axis=(0, 1))
     with style.use(dark) as shades:
@@ -34,7 +34,7 @@ def paths(found: Sequence[Recording], dark: bool = False) -> Any:
     return figure
 
 
-def over_time(recording: Recording, arms: Sequence[Figures], dark: bool = False) -> Any:
+def over_time(recording: EpisodeMotion, arms: Sequence[MotionFigures], dark: bool = False) -> Any:
     """Draws depth, RCM error, speed and jaws of one episode."""
     rows = (
         ("depth of the tip (mm)", lambda f: f.depth_mm),
@@ -57,7 +57,7 @@ def over_time(recording: Recording, arms: Sequence[Figures], dark: bool = False)
 
 
 def spreads(
-    found: Sequence[Recording], arms: Sequence[Sequence[Figures]], dark: bool = False
+    found: Sequence[EpisodeMotion], arms: Sequence[Sequence[MotionFigures]], dark: bool = False
 ) -> Any:
     """Draws the distance of shafts from their trocars and the trocars' wander, by episode."""
     numbers = [recording.number for recording in found]

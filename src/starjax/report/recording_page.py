@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from starjax.data import recordings
-from starjax.data.recordings import Figures, Recording
+from starjax.data.recordings import EpisodeMotion, MotionFigures
 from starjax.report import formats, page, recording_figures, style
 from starjax.report.formats import Table
 from starjax.report.sections import Card
@@ -16,7 +16,7 @@ _ROWS = 30  # episodes in the table
 
 
 def render(
-    title: str, rows: Sequence[tuple[str, str]], found: Sequence[Recording], odd: Sequence[str]
+    title: str, rows: Sequence[tuple[str, str]], found: Sequence[EpisodeMotion], odd: Sequence[str]
 ) -> str:
     """Renders the page.
 
@@ -55,7 +55,7 @@ def render(
     )
 
 
-def cards(found: Sequence[Recording], arms: Sequence[Sequence[Figures]]) -> list[Card]:
+def cards(found: Sequence[EpisodeMotion], arms: Sequence[Sequence[MotionFigures]]) -> list[Card]:
     """Returns the headline numbers over all episodes and arms."""
     every = [one for of_episode in arms for one in of_episode]
     rcm, speed = (
@@ -82,7 +82,7 @@ def cards(found: Sequence[Recording], arms: Sequence[Sequence[Figures]]) -> list
     return texts
 
 
-def table(found: Sequence[Recording], arms: Sequence[Sequence[Figures]]) -> Table:
+def table(found: Sequence[EpisodeMotion], arms: Sequence[Sequence[MotionFigures]]) -> Table:
     """Returns a row per episode and arm."""
     header = ("episode", "arm", "split", "s", "trocar (mm)", "off, p99 (mm)", "wander (mm)")
     rows: Table = [[*header, "depth (mm)", "speed, max (mm/s)", "closings"]]

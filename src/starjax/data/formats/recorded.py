@@ -7,13 +7,13 @@ from starjax.data.formats import mapping as maps
 from starjax.data.formats import motion, selection, survey
 from starjax.data.formats.base import Source
 from starjax.data.formats.mapping import Map
-from starjax.data.recordings import MAX_EPISODES, Recording
+from starjax.data.recordings import MAX_EPISODES, EpisodeMotion
 from starjax.sim import registries
 
 
 def recordings(
     source: Source, mapping: Map, folder: Path, note: Callable[[int], None] = lambda count: None
-) -> tuple[list[Recording], list[str]]:
+) -> tuple[list[EpisodeMotion], list[str]]:
     """Returns the motions of the first episodes that an import would keep, and its notes.
 
     Args:
@@ -26,7 +26,7 @@ def recordings(
         arrays = source.read(kept.episode, maps.names(found.mapping))
         poses = motion.read(arrays, found.mapping, found.hz, folder)
         made.append(
-            Recording(
+            EpisodeMotion(
                 kept.episode,
                 motion.HZ,
                 poses.shaft.R,
