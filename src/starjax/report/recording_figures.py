@@ -1,4 +1,4 @@
-"""MotionFigures of recordings: paths about the trocar, one episode over time, spreads over episodes."""
+"""Figures of recordings: paths about the trocar, one episode over time, spreads over episodes."""
 
 from collections.abc import Sequence
 from typing import Any
