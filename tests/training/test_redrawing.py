@@ -176,7 +176,23 @@ def test_a_resumed_training_meets_the_same_images(dataset, monkeypatch, tmp_path
     assert float(whole) != float(train(tmp_path / "c", names=NAMES[1:]))
 
 
-def test_a_dataset_of_others_has_no_displaced_cameras():
+def test_a_dataset_of_others_has_its_images_disturbed(dataset):
+    setup = make_setup("smoke=0.5", "observation_delay=4")
+    data = (dataset.replace(sources=None), jnp.arange(40), jnp.int32(40))
+    batch, chosen = step.drawn_batch(setup, KEY, jnp.int32(5), *data), choice(setup, data, 5)
+    plain = windows.gather(dataset, chosen.frame, 2, POLICY.horizon, chosen.seen)
+    images, usual = ((it.observation.images or {})["camera"] for it in (batch, plain))
+    clouded = np.asarray(images != usual).any(axis=(1, 2, 3, 4))
+    np.testing.assert_array_equal(clouded, chosen.draws.level[:, 0] > 0)
+    assert clouded.any()
+
+
+def test_a_dataset_of_others_has_no_displaced_cameras(dataset):
+    setup, frames = make_setup(*NAMES), np.arange(40)
+    for given, function in ((dataset, None), (dataset.replace(sources=None), draw)):
+        data = (given, frames, np.int32(40))
+        with mistakes.of("train.randomise"):
+            stepper._displaced(setup, data, False, function)
     assert randomise.moves_cameras(config.TrainConfig(randomise=NAMES))
     assert not randomise.moves_cameras(config.TrainConfig(randomise=NAMES[1:]))
     others = {"features": {"image_camera": {}}, "seed_rule": None}

@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from starjax import errors
 from starjax.data import windows
 from starjax.runtime import processes
 from starjax.runtime.precompile import Program
-from starjax.training import devices, prefetch, redrawing
+from starjax.training import devices, prefetch, randomise, redrawing
 from starjax.training import step as steps
 from starjax.training.sharding import StateLayout, StepCarry
 from starjax.training.state import TrainState
@@ -134,8 +135,11 @@ def _displaced(
     setup: Setup, data: tuple[Any, ...], ahead: bool, draw: redrawing.Draw | None
 ) -> Callable[[StepCarry, int], Iterator[redrawing.Displaced | None]]:
     """Returns the function from a carry and a number of steps to the steps' displaced images."""
-    if draw is None:
+    if not randomise.moves_cameras(setup.train_config):
         return lambda carry, count: itertools.repeat(None, count)
+    if draw is None or data[0].sources is None:
+        expected = "no displaced camera without sources of images and a function that draws them"
+        raise errors.UsageError(randomise.ARGUMENT, expected, "a displaced camera")
     of = redrawing.make(setup, draw, data, ahead)
 
     def each(carry: StepCarry, count: int) -> Iterator[redrawing.Displaced]:

@@ -45,6 +45,8 @@ def check(name: str, n: int) -> Iterator[Check]:
     )
     if kind.on_image is not None:
         yield verdict("images", _images(kind), "as they were at level 0")
+    if kind.seen_step is not None:
+        yield verdict("seen steps", _seen_steps(kind), "the same at level 0, never later ones")
     env = envs.make(TASK, observation="state")
     fault, other = attempt("functions", lambda: disturbances.with_disturbances(env, [name]))
     if not fault:
@@ -78,6 +80,16 @@ def _images(kind: Disturbance) -> Iterator[str]:
             yield f"on_image: expected {list(image.shape)}, got {list(changed.shape)}"
         elif not level and not np.array_equal(changed, image):
             yield "on_image changes them at level 0"
+
+
+def _seen_steps(kind: Disturbance) -> Iterator[str]:
+    assert kind.seen_step is not None
+    for level in (0.0, kind.levels[-1]):
+        state = disturbances.DisturbanceState(jnp.float32(level), jax.random.key(1))
+        for step in range(STEPS):
+            seen = int(kind.seen_step(state, jnp.int32(step)))
+            if not 0 <= seen <= step or (not level and seen != step):
+                yield f"seen_step shows step {seen} at step {step}, level {level:g}"
 
 
 def _run_all(env: envs.Env, other: envs.Env, name: str, kind: Disturbance) -> tuple[Any, Any, Any]:
