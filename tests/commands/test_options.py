@@ -329,7 +329,12 @@ def test_other_shells_have_every_command_and_flag_too(shell, capsys):
 
 @pytest.mark.parametrize(
     ("command", "words"),
-    [("bench", "RUN"), ("evaluate", "[RUN]"), ("pack", "POLICY OUT"), ("report", "RUN [RUN ...]")],
+    [
+        ("bench", "[RUN]"),
+        ("evaluate", "[RUN]"),
+        ("pack", "POLICY OUT"),
+        ("report", "RUN [RUN ...]"),
+    ],
 )
 def test_help_names_the_words_before_the_flags(command, words, capsys):
     assert f" {words} " in f"{helped(command, capsys)[0]} "

@@ -118,7 +118,7 @@ def demonstrate(out):
             strokes = steer(page, goal_mm())
             waited(page, "success, ")
             page.keyboard.press("Enter")
-            waited(page, "1 successful episodes kept")
+            waited(page, "1 episodes saved, 1 of them successful")
             browser.close()
         process.send_signal(signal.SIGINT)
         said = process.communicate(timeout=60)[0].strip().splitlines()[-1]

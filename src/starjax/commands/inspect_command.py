@@ -109,7 +109,7 @@ def _dataset(path: Path) -> Found:
         ("episodes", f"{len(records)}: {sum(bool(r['success']) for r in records)} successful"),
         ("kept", f"{len(kept)}, {sum(lengths)} frames, {files.size(size)}"),
         ("lengths", _spread(lengths, " control steps")),
-        ("trocars", str(len(about["trocars"]))),
+        ("trocars", f"{len({r['trocar'] for r in kept})} used of {len(about['trocars'])}"),
         ("from", "import" if "imported" in about else f"expert {about['expert']}"),
     ]
     rows += [
