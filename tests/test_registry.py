@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from starjax import cli, errors, registry
+from starjax import cli, errors, methods, rcm, registry
+from starjax.commands import policy_args, presets, run_settings
 from starjax.data.formats import base
 from starjax.sim import registries
 
@@ -96,3 +97,62 @@ def test_broken_mounts_leave_those_of_others(install):
     with pytest.warns(UserWarning, match="lab_h"):
         assert registries.mount(arm, "hook", "board") is None
     assert registry.entries("starjax.mounts")
+
+
+PARTS = """
+import dataclasses
+from starjax import methods
+from starjax.commands import presets
+from starjax.models.encoders import SMALL
+from starjax.policies.external import ExternalPolicy
+from starjax.rcm import ACTION_SPACES
+
+BLIND = methods.Method("rcm4_again")
+RCM4_AGAIN = ACTION_SPACES["rcm4"]._replace(name="rcm4_again")
+BRIEF = dataclasses.replace(presets.PRESETS["smoke"], seed=3)
+TINY = SMALL._replace(width=4)
+DOWN = ExternalPolicy("goes down", "reach", object, observation="state")
+"""
+GROUPS = {
+    "methods": "blind",
+    "action_spaces": "rcm4_again",
+    "presets": "brief",
+    "encoders": "tiny",
+    "policies": "down",
+}
+
+
+def test_methods_spaces_presets_encoders_and_policies_are_parts_too(install, capsys, tmp_path):
+    install("lab_i", PARTS, **GROUPS)
+    row = methods.METHODS["blind"]
+    assert (row.weights_of, row.label, row.keeps_to_manifold) == ("blind", "blind", True)
+    assert list(methods.METHODS)[-1] == "blind" and "blind" not in methods.TABLE_II
+    assert list(methods.SCORED).index(methods.SERVED) < list(methods.SCORED).index("blind")
+    assert methods.paths("blind") == ["lab_i:BLIND", "lab_i:RCM4_AGAIN"]
+    assert not any(methods.paths("stardiff"))
+    argv = ["--preset", "brief", "--method", "blind", "--policy.encoder", "tiny"]
+    config = run_settings.parse("run", [*argv, "--out", str(tmp_path / "out")], "")
+    assert (config.preset, config.seed, config.method) == ("brief", 3, "blind")
+    args = policy_args.PolicyArgs(policy="down")
+    assert policy_args.resolve(args).address == "policy://down"
+    assert cli.dispatch(["list"]) == 0
+    listed = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line}
+    assert listed >= {*GROUPS.values()}
+
+
+def test_a_broken_method_is_a_line_and_leaves_the_others(install):
+    install("lab_j", "BLIND = 3\n", methods="blind")
+    with pytest.warns(UserWarning, match="lab_j"):
+        assert list(methods.METHODS) == list(methods.METHODS.registry.built_in)
+    with pytest.raises(errors.UsageError, match="lab_j"):
+        methods.METHODS["blind"]
+
+
+@pytest.mark.parametrize("group", ["methods", "presets", "action_spaces"])
+def test_a_row_of_starjax_has_one_owner(install, group):
+    name = {"methods": "dp_ee", "presets": "cpu", "action_spaces": "rcm1"}[group]
+    rows = {"methods": methods.METHODS, "presets": presets.PRESETS}.get(group, rcm.ACTION_SPACES)
+    install("lab_k", f"{name.upper()} = None\n", **{group: name})
+    with pytest.raises(errors.UsageError) as caught:
+        rows[name]
+    assert caught.value.got == "starjax, lab_k"

@@ -19,7 +19,6 @@ SettingsT = TypeVar("SettingsT")
 
 # A key of jax has 32 bits: larger seeds would alias smaller ones.
 Seed = Annotated[int, Range(0, 2**32 - 1)]
-Preset = Literal["auto", "smoke", "cpu", "gpu", "resnet", "compact", "paper"]
 TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
 DEFAULT_TASK = "peg_transfer"
 
@@ -69,7 +68,7 @@ class PolicyConfig:
     obs_horizon: Count = 2  # observation horizon T_o, in control steps
     horizon: Annotated[int, Range(1, 4_096)] = 16  # prediction horizon H: commands t+1 .. t+H
     execute: Count = 8  # commands executed before re-planning
-    encoder: Literal["resnet18", "small"] = "resnet18"  # image encoder
+    encoder: str = "resnet18"  # image encoder: resnet18, small, or another package's
     # initial weights of the encoder: name of a packaged policy, a policy.safetensors, or a
     # .safetensors of a ResNet-18 (ImageNet); empty: random
     encoder_weights: str = ""
@@ -155,8 +154,8 @@ class RunConfig:
     """Settings of `starjax run`."""
 
     method: str = "stardiff"  # method (see starjax list), or all for Table II
-    # default values of the other settings; auto: gpu if jax can use one, else cpu
-    preset: Preset = "auto"
+    # default values of the other settings (see starjax list); auto: gpu if jax uses one, else cpu
+    preset: str = "auto"
     seed: Seed = 0  # random seed
     # output directory; auto: runs/PRESET, with a suffix for other scenes and seeds
     out: str = "auto"

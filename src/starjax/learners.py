@@ -2,12 +2,14 @@
 
 A method (`methods`) defines the action space, the conditioning and whether a separate network
 predicts the roll; every method works with every learner. Others add theirs by an entry point
-of the group `starjax.learners` that names a `Learner`.
+of the group `starjax.learners` that names a `Learner`, and trunks of image encoders by one of the
+group `starjax.encoders` that names a `models.encoders.Trunk`.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from starjax import methods
 from starjax.registry import Registry
 
 
@@ -38,3 +40,16 @@ LEARNERS = Registry(
     },
     "starjax.learners:Learner",
 )
+ENCODERS = Registry(
+    "encoder",
+    {
+        "resnet18": "starjax.models.encoders:RESNET18",
+        "small": "starjax.models.encoders:SMALL",
+    },
+    "starjax.models.encoders:Trunk",
+)
+
+
+def parts(method: str, learner: str, encoder: str) -> list[str]:
+    """Returns the `module:object` of each part of a policy, for `runtime.sources`."""
+    return [LEARNERS.path(learner), ENCODERS.path(encoder), *methods.paths(method)]

@@ -1,6 +1,12 @@
-"""Methods as data: the eight of Table II and further rows. Standard library only."""
+"""Methods as data: the eight of Table II and further rows. Standard library only.
 
+Other packages add theirs by an entry point of the group `starjax.methods` that names a `Method`.
+"""
+
+from collections.abc import Mapping
 from typing import NamedTuple
+
+from starjax.registry import Registry, Rows
 
 
 class Method(NamedTuple):
@@ -11,8 +17,9 @@ class Method(NamedTuple):
       sees_trocar: the learner's model is conditioned on the trocar; the roll network always is.
       projects: poses are projected onto the RCM manifold at execution.
       hierarchical: the learner for (position, gripper) and a network for the roll, else one model.
-      weights_of: the method whose weights it shares (its own name if it trains its own).
-      label: name in tables.
+      weights_of: the method whose weights it shares (its own name if it trains its own, which an
+        empty one of another package means).
+      label: name in tables; empty for its name.
       group: group in Tables II and III; further rows have another.
     """
 
@@ -31,9 +38,9 @@ class Method(NamedTuple):
 
 
 _NAIVE, _RCM, _OURS = "Naive", "RCM action spaces", "Ours"
-_BESIDE = "Ours (ablation)"
+_BESIDE, _OTHERS = "Ours (ablation)", "Other packages"
 
-METHODS: dict[str, Method] = {
+_BUILT_IN: dict[str, Method] = {
     "dp_ee": Method("se3", weights_of="dp_ee", label="DP-EE", group=_NAIVE),
     "dp_ee_proj": Method(
         "se3", projects=True, weights_of="dp_ee", label="DP-EE-Proj", group=_NAIVE
@@ -60,25 +67,45 @@ METHODS: dict[str, Method] = {
     ),
 }
 
+
+def _complete(name: str, row: Method) -> Method:
+    weights, label = row.weights_of or name, row.label or name
+    return row._replace(weights_of=weights, label=label, group=row.group or _OTHERS)
+
+
+def _rows(built_in: Mapping[str, Method]) -> Rows:
+    return Rows(Registry("method", built_in, "starjax.methods:Method"), _complete)
+
+
+METHODS: Rows = _rows(_BUILT_IN)
 # Rows of results: the methods, and policies of other programs, see `starjax evaluate --policy ws://`.
 SERVED = "served"
-SCORED: dict[str, Method] = {
-    **METHODS,
-    SERVED: Method(
-        action_space="se3",
-        sees_trocar=True,
-        projects=False,
-        hierarchical=False,
-        weights_of=SERVED,
-        label="Served policy",
-        group="Other programs",
-    ),
-}
+SCORED: Rows = _rows(
+    {
+        **_BUILT_IN,
+        SERVED: Method(
+            action_space="se3",
+            sees_trocar=True,
+            projects=False,
+            hierarchical=False,
+            weights_of=SERVED,
+            label="Served policy",
+            group="Other programs",
+        ),
+    }
+)
 
 # Methods of `--method all`; further rows are selected by name.
-TABLE_II = tuple(name for name, row in METHODS.items() if row.group in (_NAIVE, _RCM, _OURS))
+TABLE_II = tuple(name for name, row in _BUILT_IN.items() if row.group in (_NAIVE, _RCM, _OURS))
 
 
 def behaviour(name: str) -> Method:
     """Returns a row without its names; methods with equal rows behave identically."""
     return SCORED[name]._replace(label="", group="")
+
+
+def paths(name: str) -> list[str]:
+    """Returns the `module:object` of a method and its action space, empty for those of starjax."""
+    row = SCORED.get(name)
+    space = Registry("action_space", {}).path(row.action_space) if row else ""
+    return [Registry("method", {}).path(name), space]

@@ -4,7 +4,8 @@ import functools
 import importlib
 import importlib.metadata
 import sys
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import EntryPoint
 from typing import Any, NamedTuple
 
@@ -21,13 +22,14 @@ class Registry(NamedTuple):
     """One kind of part.
 
     Attributes:
-      kind: its name, e.g. `task`; entry points are those of the group `starjax.<kind>s`.
-      built_in: name -> `module:object`.
+      kind: its name, e.g. `task`; entry points are those of the group with its plural, e.g.
+        `starjax.tasks`.
+      built_in: name -> `module:object`, or the part itself.
       record: type of a part, as `module:object`; empty for any.
     """
 
     kind: str
-    built_in: Mapping[str, str]
+    built_in: Mapping[str, Any]
     record: str = ""
 
     def names(self) -> list[str]:
@@ -48,7 +50,8 @@ class Registry(NamedTuple):
         if len(owners) > 1:
             raise errors.UsageError(self.kind, expected, ", ".join(owners))
         if not entries:
-            return load(self.built_in[name])
+            part = self.built_in[name]
+            return load(part) if isinstance(part, str) else part
         where = f"{entries[0].value} of {owners[0]}"
         try:
             part = entries[0].load()
@@ -65,13 +68,52 @@ class Registry(NamedTuple):
         return part
 
     def path(self, name: str) -> str:
-        """Returns the `module:object` that a name stands for; empty for an unknown name."""
+        """Returns the `module:object` that a name stands for; empty if it is unknown or data."""
         if name in self.built_in:
-            return self.built_in[name]
+            part = self.built_in[name]
+            return part if isinstance(part, str) else ""
         return next((entry.value for entry in self._entries() if entry.name == name), "")
 
     def _entries(self) -> tuple[EntryPoint, ...]:
-        return entries(f"starjax.{self.kind}s")
+        plural = f"{self.kind[:-1]}ies" if self.kind.endswith("y") else f"{self.kind}s"
+        return entries(f"starjax.{plural}")
+
+
+class Rows(Mapping[str, Any]):
+    """Parts of a registry as a mapping, which leaves out those that cannot be used.
+
+    Attributes:
+      registry: of the parts.
+    """
+
+    def __init__(
+        self, registry: Registry, complete: Callable[[str, Any], Any] = lambda name, row: row
+    ) -> None:
+        """Wraps a registry.
+
+        Args:
+          complete: (name, part of another package) -> part with defaults that depend on the name.
+        """
+        self.registry, self._complete = registry, complete
+
+    def __getitem__(self, name: str) -> Any:
+        """Returns a part; raises KeyError for an unknown name, UsageError for a broken part."""
+        if name not in self.registry.names():
+            raise KeyError(name)
+        part = self.registry.get(name)
+        return part if name in self.registry.built_in else self._complete(name, part)
+
+    def __iter__(self) -> Iterator[str]:
+        for name in self.registry.names():
+            try:
+                self[name]
+            except errors.UsageError as error:
+                warnings.warn(f"{self.registry.kind} {name} is skipped: {error}", stacklevel=2)
+                continue
+            yield name
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
 
 def entries(group: str) -> tuple[EntryPoint, ...]:

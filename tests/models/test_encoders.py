@@ -1,10 +1,12 @@
 """Encoders: keypoints in the uncropped picture, per-frame independence, shapes, gradients."""
+# pyright: reportArgumentType=false, reportCallIssue=false, reportOperatorIssue=false
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from starjax.learners import ENCODERS
 from starjax.models import encoders, layers, resnet, spatial_softmax
 from starjax.models.group_norm import GroupNorm
 
@@ -51,7 +53,7 @@ def test_a_crop_does_not_move_a_keypoint():
     np.testing.assert_allclose(seen[0], [(3 * 8 + 4 - 32) / 16, (4 * 8 + 4 - 32) / 16], atol=1e-5)
 
 
-@pytest.fixture(scope="module", params=sorted(encoders.TRUNKS))
+@pytest.fixture(scope="module", params=sorted(ENCODERS.built_in))
 def encoder(request):
     """An encoder's parameters, its output and the gradient of its first frame's output."""
     module = make(request.param)

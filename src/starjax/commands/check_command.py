@@ -18,7 +18,11 @@ from starjax.sim import registries
 DESCRIPTION = """Checks a part by its name in starjax list, such as one of another package.
 
 Each line is one check: `ok`, `note` for something to look at, or `failed`. The exit code is 1 if
-one failed. Where two kinds of parts share a name, KIND comes before it."""
+one failed. Where two kinds of parts share a name, KIND comes before it.
+
+Examples:
+  starjax check reach --n 100
+  starjax check disturbance camera"""
 _HERE = "starjax.commands.part_checks"
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from starjax import config as config_lib
 from starjax import errors, methods
 from starjax.evaluation import disturbances
-from starjax.learners import LEARNERS
+from starjax.learners import ENCODERS, LEARNERS
 
 API_KEY = "STARJAX_API_KEY"  # environment variable with the key of a server
 _CELL = {"resnet18": 32, "small": 8}  # pixels that an encoder makes one of its maps' cells
@@ -20,6 +20,7 @@ def check(config: config_lib.RunConfig) -> None:
     """Raises UsageError for the first setting that does not go with another."""
     errors.choice("method", config.method, [*methods.METHODS, "all"])
     policy = config.policy
+    errors.choice("policy.encoder", policy.encoder, ENCODERS.names())
     LEARNERS.get(policy.learner).check(policy.options, policy)
     for name, most, of in (
         ("execute", policy.horizon, "policy.horizon"),
@@ -30,7 +31,8 @@ def check(config: config_lib.RunConfig) -> None:
     planned = not config.eval.ensemble or policy.obs_horizon <= 2
     expect(planned, "policy.obs_horizon", "at most 2 with eval.ensemble", policy.obs_horizon)
     if policy.observation == "image":
-        fraction, cell = policy.crop_fraction, _CELL[policy.encoder]
+        encoder, fraction = policy.encoder, policy.crop_fraction
+        cell = _CELL.get(encoder) or ENCODERS.get(encoder).cell  # imports jax
         crop = round(policy.image_size * fraction)
         left = f"more than {cell} pixels left by policy.crop_fraction = {fraction:g}"
         expect(crop > cell, "policy.image_size", left, crop)

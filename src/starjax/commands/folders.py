@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import errors, methods
-from starjax.learners import LEARNERS
+from starjax import errors, learners, methods
 from starjax.runtime import files, sources
 
 _BESIDE = (
@@ -105,7 +104,8 @@ def claim(
     # Imported here because it imports jax.
     from starjax.runtime import jax_settings
 
-    source = sources.digests(LEARNERS.path(config.policy.learner))
+    policy = config.policy
+    source = sources.digests(*learners.parts(folder.name, policy.learner, policy.encoder))
     started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
     recorded = _recorded(folder) if (folder / "config.json").exists() else {}
     if started and not recorded:

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from starjax import errors, methods
 from starjax.commands import options, presets
-from starjax.learners import LEARNERS
+from starjax.config import RunConfig
+from starjax.learners import ENCODERS, LEARNERS
 from starjax.policies import packaged
+from starjax.policies.external import POLICIES
 from starjax.runtime import files
 from starjax.sim import registries
 from starjax.sim.arms.base import Arm
@@ -31,16 +33,19 @@ def main(argv: Sequence[str]) -> int:
     options.parse("list", options.NoFlags, argv, DESCRIPTION)
     from starjax.data.formats import base
     from starjax.evaluation.disturbances import DISTURBANCES
+    from starjax.rcm import ACTION_SPACES
 
     tables = {
         "tasks (--task, --camera, --demos.expert)": _parts(registries.tasks, _task),
         "arms (--arm)": _parts(registries.arms, _arm),
         "tools (--tool)": _parts(registries.tools, _tool),
         "methods (--method)": _methods(),
+        "action spaces (of methods, Gymnasium)": _parts(ACTION_SPACES.registry, _space),
         "learners (--policy.learner)": _parts(LEARNERS, _learner),
         "formats (export --format, import)": _parts(base.FORMATS, _format),
         "mappings (import --map)": _mappings(),
         "disturbances (stress, --demos.randomise)": _parts(DISTURBANCES, _disturbance),
+        "encoders (--policy.encoder)": _parts(ENCODERS, _encoder),
         "presets (--preset)": _presets(),
         "policies (--policy, --policy.encoder-weights)": _policies(),
     }
@@ -83,11 +88,22 @@ def _tool(tool: Tool) -> str:
 
 
 def _methods() -> Iterator[Row]:
-    for name, row in methods.METHODS.items():
-        rolls = "; a network for the roll" * row.hierarchical
-        condition = "; conditioned on the trocar" * row.sees_trocar + "; projected" * row.projects
-        yield name, f"{row.label}: actions {row.action_space}{rolls}{condition}"
+    yield from _parts(methods.METHODS.registry, _method)
     yield "all", f"the {len(methods.TABLE_II)} of the paper's Table II"
+
+
+def _method(row: methods.Method) -> str:
+    rolls = "; a network for the roll" * row.hierarchical
+    condition = "; conditioned on the trocar" * row.sees_trocar + "; projected" * row.projects
+    return f"{row.label}: actions {row.action_space}{rolls}{condition}"
+
+
+def _space(space: Any) -> str:
+    return f"{space.dim} numbers: {', '.join(space.slices)}"
+
+
+def _encoder(trunk: Any) -> str:
+    return f"{trunk.width} channels, cells of {trunk.cell} pixels"
 
 
 def _learner(learner: Any) -> str:
@@ -112,11 +128,14 @@ def _disturbance(disturbance: Any) -> str:
 
 def _presets() -> Iterator[Row]:
     yield "auto", "gpu where jax runs on one, else cpu"
-    for name, preset in presets.PRESETS.items():
-        policy, train, demos = preset.policy, preset.train, preset.demos
-        seen = f"images of {policy.image_size} px" if policy.observation == "image" else "the state"
-        count = f"{demos.per_trocar * demos.seen_trocars} demonstrations"
-        yield name, f"{count} of {seen}, {train.steps} steps of {train.batch_size}"
+    yield from _parts(presets.PRESETS.registry, _preset)
+
+
+def _preset(preset: RunConfig) -> str:
+    policy, train, demos = preset.policy, preset.train, preset.demos
+    seen = f"images of {policy.image_size} px" if policy.observation == "image" else "the state"
+    count = f"{demos.per_trocar * demos.seen_trocars} demonstrations"
+    return f"{count} of {seen}, {train.steps} steps of {train.batch_size}"
 
 
 def _policies() -> Iterator[Row]:
@@ -129,3 +148,4 @@ def _policies() -> Iterator[Row]:
         )
         task = about["scene"]["task"]
         yield name, f"{label} for {task}; successes at trocars: {scores}"
+    yield from _parts(POLICIES, lambda policy: f"{policy.description}, for {policy.task}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import errors, methods
+from starjax import errors, learners, methods
 from starjax.commands import (
     demonstrations,
     folders,
@@ -19,7 +19,6 @@ from starjax.commands import (
     session,
     stage_times,
 )
-from starjax.learners import LEARNERS
 from starjax.runtime import files, jax_start, sources
 from starjax.runtime.signals import stop_signals
 from starjax.sim import registries
@@ -200,7 +199,8 @@ def _train(
         demos=config.demos,
         preset=config.preset,
         packages=sources.versions(
-            *registries.paths(env.names), LEARNERS.path(config.policy.learner)
+            *registries.paths(env.names),
+            *learners.parts(name, config.policy.learner, config.policy.encoder),
         ),
     )
     share.first(f"{name} is saved", lambda: policy_file.save(weights, trained))

@@ -11,9 +11,11 @@ from starjax import config as config_lib
 from starjax import errors, extras
 from starjax.commands import checks, folders, options, scenes
 from starjax.policies import packaged
+from starjax.policies.external import POLICIES
 from starjax.runtime import files
 
 SCHEMES = ("ws://", "wss://")
+_IN_PROCESS = "policy://"  # address of a policy of another package
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +23,8 @@ class PolicyArgs:
     """Flags of commands that run a trained policy."""
 
     run: options.RunOrNone = ""  # directory of a method, such as runs/cpu/stardiff
-    # policy.safetensors, name of a packaged policy, or ws://HOST:PORT of a server, instead of RUN
+    # policy.safetensors, name of a packaged policy or of another package's, or ws://HOST:PORT of a
+    # server, instead of RUN
     policy: str = ""
     arm: tuple[str, ...] = ()  # robots to score with; default: those of the training
 
@@ -74,6 +77,9 @@ def resolve(args: PolicyArgs) -> PolicyPath:
     if args.policy.startswith(SCHEMES):
         extras.require("--policy", "serve")
         return PolicyPath(Path(), None, args.arm, args.policy)
+    if args.policy in POLICIES.names():
+        extras.require("--policy", "serve")
+        return PolicyPath(Path(), None, args.arm, f"{_IN_PROCESS}{args.policy}")
     if args.policy:
         return PolicyPath(packaged.find("--policy", args.policy), None, args.arm)
     folder = folders.existing(args.run)
@@ -104,6 +110,11 @@ def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
     from starjax.commands import policy_evaluation  # it imports jax
     from starjax.policies import in_env
 
+    if path.address.startswith(_IN_PROCESS):
+        from starjax.deploy import external
+
+        who = external.connect(path.address.removeprefix(_IN_PROCESS), path.arms)
+        return who, _settings(who.trained)
     if path.address:
         from starjax.deploy import served
 

@@ -2,16 +2,19 @@
 
 Each preset is a literal with its changes of `config.RunConfig()`, the paper's settings.
 Other learners keep the options that they share with the preset's (`config.with_learner`).
+Other packages add theirs by an entry point of the group `starjax.presets` that names a `RunConfig`.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 from starjax.config import DemosConfig, EvalConfig, PolicyConfig, RunConfig, TrainConfig
 from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.policies.learners.flow import FlowConfig
+from starjax.registry import Registry, Rows
 from starjax.runtime import gpu
 
-PRESETS: dict[str, RunConfig] = {
+_BUILT_IN: dict[str, RunConfig] = {
     # Every stage once, too short to learn anything.
     "smoke": RunConfig(
         preset="smoke",
@@ -133,6 +136,10 @@ PRESETS: dict[str, RunConfig] = {
     # The paper: 100k iterations, batch 256, 256 x 256 pixels.
     "paper": RunConfig(preset="paper"),
 }
+PRESETS = Rows(
+    Registry("preset", _BUILT_IN, "starjax.config:RunConfig"),
+    lambda name, row: dataclasses.replace(row, preset=name),
+)
 
 
 class Timing(NamedTuple):

@@ -66,8 +66,8 @@ def _settings(
 
 def _default(argv: Sequence[str], preset: str) -> config_lib.RunConfig:
     """Returns the values of a preset, without those that the typed flags rule out."""
-    # The parser refuses an unknown preset.
-    default = presets.PRESETS.get(preset, presets.PRESETS["cpu"])
+    errors.choice("--preset", preset, ["auto", *presets.PRESETS])
+    default = presets.PRESETS[preset]
     policy, demos = default.policy, default.demos
     if learner := options.typed_value("policy.learner", argv):
         errors.choice("policy.learner", learner, LEARNERS.names())

@@ -18,7 +18,7 @@ def is_complete(config: config_lib.RunConfig, folder: Path, weights: Path, env: 
     from starjax.evaluation import result
 
     scored = _read(folder, files.sha256(weights))
-    source = sources.digests(*result.parts_of(env.names, config.policy.learner))
+    source = sources.digests(*result.parts_of(env.names, config_lib.as_json(config)))
     is_current = scored and scored.about.get("source", source) == source
     if is_current and _is_of(scored, config):
         return True

@@ -1,6 +1,9 @@
 """Greetings of servers, and the settings of an evaluation in them, all checked."""
 
+import hashlib
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from starjax import config, errors, limits, methods
 from starjax.data.formats import peer_columns
@@ -61,7 +64,7 @@ def read(metadata: Any) -> Greeting:
     except ValueError as error:
         raise UsageError("greeting", "settings of a policy", str(error)[:200]) from None
     execute = settings.execute if spec or "execute" in metadata else 0
-    method = metadata.get("method") if spec else methods.SERVED
+    method = str(metadata.get("method")) if spec else methods.SERVED
     action_space = metadata.get("action_space", "pose")
     errors.choice("greeting.action_space", str(action_space)[:80], peer_columns.ACTIONS)
     return Greeting(
@@ -106,3 +109,22 @@ def _batch(value: Any) -> int:
     if not isinstance(value, int) or value < 1:
         raise UsageError("greeting.batch", "1 or more", repr(value)[:80])
     return min(value, MAX_CONNECTIONS)
+
+
+def as_json(value: Any) -> Any:
+    """Returns JSON values of a greeting; arrays become lists."""
+    if isinstance(value, dict):
+        return {str(name): as_json(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_json(part) for part in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return value if isinstance(value, str | int | float | None) else repr(value)
+
+
+def identity(origin: dict[str, Any]) -> str:
+    """Returns the digest of a greeting, that of the policy if it has one."""
+    digest = origin["metadata"].get("digest")
+    if isinstance(digest, str) and digest:
+        return digest
+    return hashlib.sha256(repr(sorted(origin.items())).encode()).hexdigest()

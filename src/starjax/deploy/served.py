@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -201,7 +200,11 @@ def connect(
     Raises:
       UsageError: there is no server, its greeting is incomplete, or its plan is invalid.
     """
-    connections = connection_pool.ConnectionPool(address, api_key, timeout_s)
+    return attach(connection_pool.ConnectionPool(address, api_key, timeout_s), arms)
+
+
+def attach(connections: Any, arms: Sequence[str] = ()) -> ServedPolicy:
+    """Returns the policy behind connections, see `connect`, after one plan as a test."""
     hello = greeting.read(connections.metadata)
     connections.widen(hello.batch)
     env = sim_env.for_policy(hello.scene, hello.settings, arms)
@@ -225,9 +228,9 @@ def connect(
     settings = config.from_dict(
         config.PolicyConfig, {**config.as_json(settings), "horizon": horizon, "execute": execute}
     )
-    origin = {"address": address, "metadata": _as_json(connections.metadata)}
+    origin = {"address": connections.address, "metadata": greeting.as_json(connections.metadata)}
     trained = ServedTraining(hello.method, settings, np.zeros(1, bool), None, env.names)
-    return ServedPolicy(trained, _policy(remote), env, _identity(origin), origin, remote)
+    return ServedPolicy(trained, _policy(remote), env, greeting.identity(origin), origin, remote)
 
 
 def _policy(remote: RemotePolicy) -> Policy:
@@ -262,21 +265,3 @@ def _check_trocars(spec: inputs.InputSpec, env: sim_env.Env) -> None:
     served = np.asarray(spec.p_world_ref).reshape(-1, 3)
     if served.shape != own.shape or np.abs(served - own).max() > _NEAR_M:
         raise UsageError("greeting.asks.p_world_ref", str(own.tolist()), served.tolist())
-
-
-def _as_json(value: Any) -> Any:
-    """Returns JSON values of a greeting; arrays become lists."""
-    if isinstance(value, dict):
-        return {str(name): _as_json(part) for name, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_as_json(part) for part in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return value if isinstance(value, str | int | float | None) else repr(value)
-
-
-def _identity(origin: dict[str, Any]) -> str:
-    digest = origin["metadata"].get("digest")
-    if isinstance(digest, str) and digest:
-        return digest
-    return hashlib.sha256(repr(sorted(origin.items())).encode()).hexdigest()

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from starjax import learners
 from starjax.evaluation import protocol, structure, trial_file
 from starjax.evaluation.content import Evaluation, Sweep, Trial
-from starjax.learners import LEARNERS
 from starjax.runtime import files, jax_settings, provenance, sources, xla
 from starjax.sim import names, registries
 
@@ -90,8 +90,7 @@ def write(
       about: JSON values by name: control_hz, seed, weights, dataset_digest and command; of an
         evaluation config, preset, inference_ms, timings_s and warnings; of a sweep time_limit_s.
     """
-    policy = about.get("config", {}).get("policy", {})
-    parts = parts_of(scene, policy.get("learner", ""))
+    parts = parts_of(scene, about.get("config", {}))
     content = {
         "schema": SCHEMA,
         "benchmark_version": protocol.VERSION,
@@ -110,9 +109,15 @@ def write(
     return result
 
 
-def parts_of(scene: names.SceneNames, learner: str) -> list[str]:
-    """Returns the `module:object` of each part that a result depends on, for `runtime.sources`."""
-    return [*registries.paths(scene), LEARNERS.path(learner)]
+def parts_of(scene: names.SceneNames, settings: Mapping[str, Any]) -> list[str]:
+    """Returns the `module:object` of each part that a result depends on, for `runtime.sources`.
+
+    Args:
+      settings: of the run, JSON values as far as known.
+    """
+    policy = settings.get("policy", {})
+    of_policy = (settings.get("method", ""), policy.get("learner", ""), policy.get("encoder", ""))
+    return [*registries.paths(scene), *learners.parts(*of_policy)]
 
 
 def _parse(file: Path, values: dict[str, Any], kind: type[Evaluation] | type[Sweep]) -> Result:

@@ -4,12 +4,31 @@ Both image encoders are a trunk, one map per keypoint, spatial softmax and a lin
 called alike. They see one image at a time.
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from starjax.learners import ENCODERS
 from starjax.models import layers, resnet, spatial_softmax
 from starjax.models.group_norm import GroupNorm
+
+
+class Trunk(NamedTuple):
+    """Trunk of an image encoder.
+
+    Attributes:
+      make: (width, dtype, name=) -> flax module that maps `[N, h, w, 3]` normalised images to maps
+        `[N, h', w', C]`.
+      width: default channels of its first layer.
+      cell: pixels per cell of its maps, along one side.
+    """
+
+    make: Callable[..., nn.Module]
+    width: int
+    cell: int
 
 
 class ImageEncoder(nn.Module):
@@ -19,7 +38,8 @@ class ImageEncoder(nn.Module):
     convolution, and a linear layer after it, which Diffusion Policy has too.
 
     Attributes:
-      trunk: "resnet18" (GroupNorm) or "small" (8 layers with the keypoints', for CPU).
+      trunk: "resnet18" (GroupNorm), "small" (8 layers with the keypoints', for CPU), or that of
+        another package.
       features: d_v, even.
       width: channels of the trunk's first layer, divisible by 16; 0: 64 for resnet18, 16 for small.
       dtype: of the trunk; spatial softmax, parameters and the output are float32.
@@ -37,10 +57,8 @@ class ImageEncoder(nn.Module):
         `offset` `[N, 2]` (row, column) is the crop's displacement from the centre crop in pixels,
         from `data.augment`; None means centre crops.
         """
-        if self.trunk not in TRUNKS:
-            raise ValueError(f"trunk: expected one of {sorted(TRUNKS)}, got {self.trunk!r}")
-        make, default_width = TRUNKS[self.trunk]
-        maps = make(self.width or default_width, self.dtype, name="trunk")(image)
+        trunk = ENCODERS.get(self.trunk)
+        maps = trunk.make(self.width or trunk.width, self.dtype, name="trunk")(image)
         if maps.shape[1] * maps.shape[2] == 1:
             raise ValueError(
                 f"image: expected more than one cell after {self.trunk}, "
@@ -90,4 +108,5 @@ class StateEncoder(nn.Module):
         return x[:, 0].astype(jnp.float32)
 
 
-TRUNKS = {"resnet18": (resnet.ResNet18, 64), "small": (SmallTrunk, 16)}
+RESNET18 = Trunk(resnet.ResNet18, 64, 32)
+SMALL = Trunk(SmallTrunk, 16, 8)

@@ -27,6 +27,7 @@ from jax.typing import ArrayLike
 from starjax import types
 from starjax.rcm import arrays, manifold, rotations
 from starjax.rcm import trocar as trocars
+from starjax.registry import Registry, Rows
 
 MAX_REACH = 10.0  # m; bound of a decoded SE(3) position's coordinates
 
@@ -219,7 +220,7 @@ def _hold_pose(p_world_trocar: jax.Array) -> types.Pose:
     return manifold.pose_at_depth(R, jnp.asarray(manifold.HOLD_DEPTH), p_world_trocar)
 
 
-ACTION_SPACES: dict[str, ActionSpace] = {
+_BUILT_IN = {
     "se3": make_space("se3", _encode_se3, _decode_se3, p=3, R=6),
     "rcm1": make_space("rcm1", _encode_rcm1, _decode_rcm1, depth=1, R=6),
     "rcm2": make_space("rcm2", _encode_rcm2, _decode_rcm2, roll=1, p=3),
@@ -232,3 +233,5 @@ ACTION_SPACES: dict[str, ActionSpace] = {
         "rcm2_fixed_yaw", _fixed_yaw(_encode_rcm2), _fixed_yaw(_decode_rcm2), roll=1, p=3
     ),
 }
+# Other packages add theirs by an entry point of the group `starjax.action_spaces`.
+ACTION_SPACES = Rows(Registry("action_space", _BUILT_IN, "starjax.rcm.actions:ActionSpace"))
