@@ -1,4 +1,4 @@
-"""Policies of other packages that are no sequence model of starjax, by name. Imports no jax.
+"""Policies of other packages instead of sequence models of starjax, by name. Imports no jax.
 
 An entry point of the group `starjax.policies` names an `ExternalPolicy`: any program that turns an
 observation into commands, such as a vision-language-action model or a scripted controller.
