@@ -8,18 +8,20 @@ from starjax.sim import names, scene
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
-    """`--task` and `--arm`."""
+    """`--task`, `--arm` and `--tool`."""
     parser.add_argument("--task", default="peg_transfer", help="of the registry")
     parser.add_argument("--arm", nargs="+", default=[], help="one for each slot, or one for all")
+    parser.add_argument("--tool", nargs="+", default=[], help="one for each slot, or one for all")
 
 
 def make(asked: argparse.Namespace, **settings: Any) -> envs.Env:
     """The environment that the flags ask for; `settings` are those of `env.make`."""
-    return envs.make(asked.task, asked.arm, **settings)
+    return envs.make(asked.task, asked.arm, asked.tool, **settings)
 
 
 def result_name(benchmark: str, found: names.SceneNames) -> str:
     """Name of a benchmark's result file; other scenes than the usual one have their own."""
     if found == scene.name():
         return benchmark
-    return "_".join([benchmark, found.task, *found.arms])
+    tools = () if found.tools == scene.name(found.task, found.arms).tools else found.tools
+    return "_".join([benchmark, found.task, *found.arms, *tools])

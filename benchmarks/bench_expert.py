@@ -1,7 +1,7 @@
 """Success of the scripted expert: the task's trocars, and others drawn from Eq. 19.
 
     python benchmarks/bench_expert.py [--per-trocar 100] [--sampled 500] [--seed 2026] \\
-        [--task peg_transfer] [--arm fr5] [--expert default] [--seconds 0]
+        [--task peg_transfer] [--arm fr5] [--tool grasper] [--expert default] [--seconds 0]
 
 Committed figures of the built-in experts; `starjax check TASK` checks any expert.
 """
