@@ -53,6 +53,8 @@ class State:
     model: Any = flax.struct.field(default_factory=dict)
     wrapper_state: Any = flax.struct.field(default_factory=dict)
     endoscope: Any = None
+    shaft: Any = None
+    wrist: Any = None
 
 
 class Layout(NamedTuple):

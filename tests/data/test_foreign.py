@@ -12,7 +12,7 @@ from msgspec import structs
 from scipy.spatial import transform
 
 from starjax import errors, rcm
-from starjax.data import load, schema, store
+from starjax.data import anomalies, load, schema, store
 from starjax.data.formats import base, exchange, foreign, mapping, motion, trocars
 from starjax.data.formats.base import Column, Source
 from starjax.data.formats.mapping import ArmColumns, CameraColumn, Map, ShaftColumns
@@ -324,6 +324,10 @@ def test_the_trocar_of_an_instrument_with_a_wrist_is_that_of_its_shaft(tmp_path,
     root = tmp_path / "d"
     error = np.load(root / "episodes" / store.keys(root)[0] / "rcm_error.npy")
     assert error.max() < 5e-5  # of the shaft
+    shaft = np.load(root / "episodes" / store.keys(root)[0] / "shaft_p.npy")[:, 0]
+    _, p, _ = moved(np.arange(len(shaft)) / 30, TROCARS[0], 0)
+    np.testing.assert_allclose(shaft, p, atol=3e-5)
+    assert not [line for line in anomalies.find(root) if "trocar" in line]
 
 
 def test_the_tip_of_a_wrist_alone_has_no_trocar(tmp_path):

@@ -69,7 +69,8 @@ def _of_episode(
             yield f"{name} is of one colour", ""
     R: Any = arrays["R"]
     p: Any = arrays["p"]
-    pose = rcm.Pose(R, p)
+    # Tips of an instrument with a wrist say nothing about the trocar; its shafts do.
+    pose = rcm.Pose(arrays.get("shaft_R", R), arrays.get("shaft_p", p))
     speed = np.linalg.norm(np.diff(arrays["p"], axis=0), axis=-1) * about["control_hz"]
     if speed.size and speed.max() > FAST:
         yield f"tips faster than {FAST:g} m/s", f"{speed.max():.2g} m/s"

@@ -153,7 +153,8 @@ _WHERE = {
     "disk": "memory-mapped from disk (they fit neither the device nor host memory)",
 }
 _DRAWN = "drawn for each batch (they fit neither the device nor host memory)"
-_UNREAD = ("qpos", "rcm_error", "actor")  # recorded, but not trained on
+# Recorded, but not trained on.
+_UNREAD = ("qpos", "rcm_error", "actor", "wrist", "shaft_p", "shaft_R", "command_wrist")
 
 
 def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.Record]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
@@ -35,6 +36,10 @@ FIELDS = {
     "command_gripper": "-1 squeeze to +1 open",
     "qpos": "generalised coordinates of the model, before the command",
     "rcm_error": "m, executed by the command",
+    "wrist": "rad, measured pitch and yaw of the wrists, 0 for a straight tool",
+    "shaft_p": "m, measured positions of the shafts on their pitch axes, world frame",
+    "shaft_R": "measured rotations R_world_shaft",
+    "command_wrist": "rad, commanded pitch and yaw of the wrists",
     "actor": "agent of the command: 0 policy, 1 expert, 2 person",
 }
 
@@ -103,6 +108,7 @@ def _demonstrated(step: Step) -> dict[str, jax.Array]:
         **{f"{IMAGE}{camera}": image for camera, image in (seen.images or {}).items()},
         "state": seen.state,
         **_of_endoscope(seen.endoscope),
+        **_of_wrist(step),
         "command_p": label.pose.p,
         "command_R": label.pose.R,
         "command_gripper": label.gripper,
@@ -133,6 +139,20 @@ def _scored(step: Step) -> dict[str, jax.Array]:
         "reached_p": after.pose.p,
         "reached_qpos": after.physics.qpos,
         **_of_endoscope(after.endoscope),
+    }
+
+
+def _of_wrist(step: Step) -> dict[str, jax.Array]:
+    """Returns the fields of a scene with a wrist; a command without angles has a straight one."""
+    shaft, angles = step.before.shaft, step.before.wrist
+    if shaft is None:
+        return {}
+    wanted = step.label.wrist
+    return {
+        "wrist": angles,
+        "shaft_p": shaft.p,
+        "shaft_R": shaft.R,
+        "command_wrist": jnp.zeros_like(angles) if wanted is None else wanted,
     }
 
 
