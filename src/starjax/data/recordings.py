@@ -43,7 +43,7 @@ class EpisodeMotion(NamedTuple):
 
 
 class MotionFigures(NamedTuple):
-    """MotionFigures of one arm in one episode.
+    """Figures of one arm in one episode.
 
     Attributes:
       rcm_mm: `[T]` distance of the shaft from the trocar.

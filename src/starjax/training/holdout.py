@@ -46,7 +46,7 @@ def make(
 
     def errors(params: Any, stats: Any, batch: windows.Batch) -> dict[str, jax.Array]:
         predicted = policy.sample(params, stats, keys, batch.observation, batch.trocar)
-        return action_errors(predicted, batch.command)
+        return action_errors(predicted, batch.command, batch.trocar.p_world_trocar[:, None])
 
     program = Program(errors)
     if shapes is not None:
@@ -59,8 +59,13 @@ def make(
     return evaluate
 
 
-def action_errors(predicted: Any, demonstrated: Any) -> dict[str, jax.Array]:
-    """Returns mean errors of commands `[..., A]`: tip in mm, roll in degrees, gripper."""
+def action_errors(predicted: Any, demonstrated: Any, p_world_trocar: Any) -> dict[str, jax.Array]:
+    """Returns mean errors of commands `[..., A]`: tip in mm, roll in degrees, gripper, RCM in mm.
+
+    Args:
+      predicted, demonstrated: `[..., A]`.
+      p_world_trocar: `[..., A, 3]` m; the RCM error is that of the predicted poses.
+    """
     distance = jnp.linalg.norm(predicted.pose.p - demonstrated.pose.p, axis=-1)
     turn = rcm.roll_of(predicted.pose.R) - rcm.roll_of(demonstrated.pose.R)
     turn = jnp.abs((turn + jnp.pi) % (2.0 * jnp.pi) - jnp.pi)
@@ -68,4 +73,5 @@ def action_errors(predicted: Any, demonstrated: Any) -> dict[str, jax.Array]:
         "position_error_mm": 1e3 * jnp.mean(distance),
         "roll_error_deg": jnp.rad2deg(jnp.mean(turn)),
         "gripper_error": jnp.mean(jnp.abs(predicted.gripper - demonstrated.gripper)),
+        "rcm_error_mm": 1e3 * jnp.mean(rcm.rcm_error(predicted.pose, p_world_trocar)),
     }
