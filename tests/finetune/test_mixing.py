@@ -59,6 +59,11 @@ def test_half_of_a_batch_is_rollouts_and_none_is_held_out_or_a_policys(begun, pa
     assert not set(episodes[demonstrated]) & set(episodes[start.held_out])
 
 
+def test_few_frames_are_not_learned_by_heart():
+    frames = mixing.evenly(np.arange(1000), np.array([2000, 2001]))
+    assert (frames < 2000).sum() == 1000 and (frames >= 2000).sum() == 2 * mixing.MAX_REPEATS
+
+
 def test_a_normaliser_keeps_its_scale_and_reaches_the_rollouts(begun, parts):
     stats, dataset, start = begun
     before, after = stats.action, start.stats.action

@@ -1,7 +1,7 @@
 """Demonstrations and rollouts as one dataset, and the start of a training on both.
 
 Batches are drawn from both parts by an even coin: the frames of the smaller part are repeated. So
-steps, losses and learners are those of any training.
+steps, losses and learners are those of any training. A few rollouts count for less.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,8 @@ from starjax.data import normalizer, redraw, windows
 from starjax.policies import policy as policies
 from starjax.rollouts import takeover
 from starjax.training.start import Start
+
+MAX_REPEATS = 20  # of a frame for one of the larger part: more would be remembered, not learned
 
 
 def joined(datasets: Sequence[windows.Dataset]) -> windows.Dataset:
@@ -67,9 +69,13 @@ def learned_frames(actor: np.ndarray, source: str) -> np.ndarray:
 
 
 def evenly(demonstrated: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Returns frames of which one half, `demonstrated`, and the other are drawn equally often."""
+    """Returns frames of which `demonstrated` and others are drawn equally often.
+
+    Unless that repeats a frame more than `MAX_REPEATS` times.
+    """
     count = max(len(demonstrated), len(others))
-    return np.concatenate([np.resize(part, count) for part in (demonstrated, others)])
+    parts = (np.resize(x, min(count, MAX_REPEATS * len(x))) for x in (demonstrated, others))
+    return np.concatenate(list(parts))
 
 
 def with_reach(stats: normalizer.Normalizer) -> normalizer.Normalizer:

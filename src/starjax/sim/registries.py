@@ -63,7 +63,10 @@ workspaces = Registry(
 rescuers = Registry(
     "rescuer",
     {
-        "peg_transfer": "starjax.sim.tasks.peg_transfer.rescue:RESCUER",
+        **{
+            name: f"starjax.sim.tasks.{name}.rescue:RESCUER"
+            for name in ("peg_transfer", "needle_pick")
+        },
         "peg_transfer.one_wall": "starjax.sim.tasks.peg_transfer.rescue:WITH_ONE_WALL",
     },
     "starjax.sim.tasks.rescue:Rescuer",
