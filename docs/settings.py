@@ -93,7 +93,9 @@ def commands() -> str:
         "---",
         "# Commands",
         "",
-        "`starjax COMMAND --help-all` prints the same. Ranges are checked.",
+        "`starjax COMMAND --help` prints the flags used most, `--help-all` those below. Ranges are "
+        "checked. `source <(starjax completion bash)` completes commands, flags and names; `zsh` "
+        "and `fish` likewise.",
     ]
     for name, (module, summary, needed) in cli.COMMANDS.items():
         module, _, function = module.partition(":")
