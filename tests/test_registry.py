@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from starjax import cli, errors, methods, rcm, registry
+from starjax import cli, config, errors, methods, rcm, registry
 from starjax.commands import policy_args, presets, run_settings
 from starjax.data.formats import base
 from starjax.sim import registries
@@ -156,3 +156,33 @@ def test_a_row_of_starjax_has_one_owner(install, group):
     with pytest.raises(errors.UsageError) as caught:
         rows[name]
     assert caught.value.got == "starjax, lab_k"
+
+
+WIDE = """
+import dataclasses
+from starjax.learners import Learner
+@dataclasses.dataclass(frozen=True)
+class Wide:
+    horizon: int = 3
+WIDE = Learner(Wide, print, print)
+"""
+
+
+def test_an_option_of_a_learner_that_the_policy_has_is_named(install):
+    install("lab_l", WIDE, learners="wide")
+    with pytest.raises(errors.UsageError) as caught:
+        config.PolicyConfig(learner="wide")
+    assert "wide" in caught.value.argument and caught.value.got == "horizon"
+
+
+def test_a_traceback_is_shown_only_when_asked_for(capsys):
+    def fails(argv):
+        raise errors.UsageError("ARG", "a", "b")
+
+    assert (
+        cli.guard(fails, [])
+        == cli.guard(lambda argv: fails(argv) if not argv else 0, ["--traceback"])
+        == 2
+    )
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == lines[-1] and lines[1].startswith("Traceback")

@@ -4,6 +4,7 @@ import errno
 import importlib
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
@@ -82,6 +83,7 @@ _STOPPED = 130  # exit code after a stop, see `signals`
 _BROKEN_PIPE = 141  # exit code if the output pipe is closed (128 + SIGPIPE), as by `| head`
 _OURS = os.path.join(os.path.dirname(os.path.abspath(__file__)), "")
 _format_with_location = warnings.formatwarning
+_TRACEBACK = "--traceback"
 _CACHE_ENTRY = "persistent compilation cache entry"  # in jax's warnings
 _shown: set[str] = set()  # warnings that are printed once
 
@@ -116,13 +118,18 @@ def run(command: Callable[[Sequence[str]], int]) -> NoReturn:
 def guard(command: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
     """Runs a command; turns errors that its user can fix into one line and an exit code.
 
+    The word `--traceback` anywhere in `argv` prints the traceback of such an error first.
+
     Returns 2 for an error on the command line, 71 for too little memory, 74 for a full or unusable
     disk, 130 after a stop such as Ctrl-C or SIGTERM (the command has saved its work and says how to
     resume), 141 if the output pipe is closed.
     """
+    words = [word for word in argv if word != _TRACEBACK]
     try:
-        return command(argv)
+        return command(words)
     except errors.UsageError as error:
+        if len(words) < len(argv):
+            traceback.print_exception(error)
         return _fail(_with_flags(error), 2)
     except KeyboardInterrupt as stop:
         return _fail(str(stop) or "stopped; rerun the same command to resume", _STOPPED)
@@ -156,7 +163,8 @@ def dispatch(argv: Sequence[str]) -> int:
     name = argv[0] if argv else "--help"
     if name in ("-h", "--help"):
         width = max(map(len, COMMANDS))
-        print("usage: starjax COMMAND [OPTIONS]      (starjax COMMAND --help for its options)\n")
+        print("usage: starjax COMMAND [OPTIONS]      (starjax COMMAND --help for its options)")
+        print("--traceback shows where a mistake was noticed\n")
         print("\n".join(f"  {name:{width}}  {text}" for name, (_, text, _) in COMMANDS.items()))
         return 0
     if name == "--version":

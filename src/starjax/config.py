@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
+from starjax import errors
 from starjax.learners import LEARNERS
 from starjax.limits import INLINE, Count, CountOrZero, NotNegative, Positive, Range
 
@@ -97,6 +98,10 @@ class PolicyConfig:
 
     def __post_init__(self) -> None:
         settings = LEARNERS.get(self.learner).settings
+        own = {field.name for field in dataclasses.fields(PolicyConfig)}
+        if taken := sorted(own & {field.name for field in dataclasses.fields(settings)}):
+            argument = f"learner {self.learner}: options of {settings.__name__}"
+            raise errors.UsageError(argument, "names that PolicyConfig lacks", ", ".join(taken))
         if self.options is None:
             object.__setattr__(self, "options", settings())
         elif not isinstance(self.options, settings):

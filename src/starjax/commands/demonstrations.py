@@ -99,7 +99,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
                 "demos.max_steps",
                 "enough control steps for the expert",
                 settings.max_steps,
-                str(error),
+                f"{error}; starjax check {task.name} shows the causes",
             ) from error
         messages.indented(
             "{episodes} demonstrations, {trials} trials, {frames} frames".format(**counts)

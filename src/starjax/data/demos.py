@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from starjax import errors
 from starjax.data import schema, store
@@ -84,6 +85,7 @@ def collect(
         def commit(episode: episodes.Episode) -> store.Record:
             outcome = episode.outcome
             key = store.key(*episode.trial, settings.seed)
+            _require_finite(env.task, episode)
             kept = outcome["success"] or settings.keep_failures
             return store.commit(root, key, outcome, episode.arrays if kept else {})
 
@@ -169,6 +171,21 @@ def _shown(
         return contextlib.nullcontext(lambda count: None)
     done = sum(record["success"] for record in records.values())
     return progress.track("Demonstrations", total, unit="episodes", done=done)
+
+
+def _require_finite(task: Any, episode: episodes.Episode) -> None:
+    """Raises UsageError for a task's state that is not finite; it names the field."""
+    if "state" not in episode.arrays or np.isfinite(state := episode.joined("state")).all():
+        return
+    parts = np.split(state, np.cumsum([field.size for field in task.fields])[:-1], axis=1)
+    names = [f.name for f, part in zip(task.fields, parts) if not np.isfinite(part).all()]
+    trocar, trial = episode.trial
+    raise errors.UsageError(
+        f"task {task.name}: state",
+        "finite numbers",
+        f"others in {', '.join(names)} of trial {trial} at trocar {trocar}",
+        f"starjax check {task.name}",
+    )
 
 
 def _simulator(

@@ -19,7 +19,7 @@ from starjax.data import redraw, store
 from starjax.data.formats import base, peer_columns
 from starjax.data.formats.base import Column, Source
 from starjax.rollouts import episodes
-from starjax.runtime import files, provenance
+from starjax.runtime import files, provenance, user_code
 
 
 def source(
@@ -130,6 +130,9 @@ def export(
     assert form.write is not None
     with _staged(out) as staged:
         form.write(staged, dataset._replace(read=read), video)
+        if not staged.exists():
+            subject = user_code.subject(f"format {form.description}", "write", form.write)
+            raise errors.UsageError(subject, f"a file or folder {staged}", "nothing")
 
 
 def restore_export(
