@@ -1,5 +1,7 @@
 """The contact solver on problems whose answer is known otherwise."""
 
+import pathlib
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -7,12 +9,13 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from starjax.sim import linear, scene, solver
+from starjax.sim import assets, dynamics, linear, registries, scene, solver
 from starjax.sim.quiet_mjx import mjx
 
+GOLDEN = pathlib.Path(__file__).parents[1] / "golden"
 VELOCITIES, LIMITS, CONTACTS = 6, 3, 4
 TIMESTEP = 1 / 240
-solve = jax.jit(solver.solve)
+solve = jax.jit(solver.solve, static_argnums=3)
 pull = jax.jit(solver.pull)
 
 
@@ -121,9 +124,9 @@ def test_the_line_search_goes_no_further_than_its_last_share():
 
 def test_small_systems_are_solved_as_by_lapack():
     rng = np.random.default_rng(5)
-    for stiffness in (1.0, 1e4):
-        half = rng.normal(size=(14, 14)) * np.sqrt(np.geomspace(1.0, stiffness, 14))
-        H, g = half.T @ half + np.eye(14), rng.normal(size=14)
+    for order, stiffness in ((14, 1.0), (14, 1e4), (linear.LOOP_FROM, 1e2)):
+        half = rng.normal(size=(order, order)) * np.sqrt(np.geomspace(1.0, stiffness, order))
+        H, g = half.T @ half + np.eye(order), rng.normal(size=order)
         x = linear.solve_positive(jnp.asarray(H, jnp.float32), jnp.asarray(g, jnp.float32))
         np.testing.assert_allclose(H @ np.asarray(x, float), g, atol=2e-3)
         np.testing.assert_allclose(x, np.linalg.solve(H, g), atol=2e-3 * np.abs(x).max())
@@ -155,3 +158,44 @@ def test_a_model_that_the_solver_does_not_know_is_refused(change, names):
     change(m)
     with pytest.raises(ValueError, match=f"model: expected.*{names}"):
         solver.check(mjx.put_model(m, impl="jax"), mjx.make_data(m, impl="jax"))
+
+
+def test_pads_that_close_on_a_needle_need_the_iterations_of_their_scene():
+    """The substep of a grasp that ended as `invalid` with the default number."""
+    arrays = np.load(GOLDEN / "needle_grasp.npz")
+    parts = (jnp.asarray(arrays[name]) for name in ("M", "f", "A", "b", "mu"))
+    problem, start = solver.Problem(*parts, equalities=1), jnp.asarray(arrays["x"])
+    _, _, error = solve(problem, start, TIMESTEP)
+    assert error > dynamics.MAX_SOLVER_ERROR
+    iterations = scene._max_solver_iterations(scene.compose(scene.name("needle_pick")))
+    x, force, error = solve(problem, start, TIMESTEP, iterations)
+    assert error <= solver.MAX_ERROR_ENERGY
+    np.testing.assert_allclose(problem.M @ x, problem.f + force, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory):
+    """The scene of reach with nine loose balls: 62 velocities."""
+    balls = "".join(
+        f'<body name="ball{i}" pos="{i / 50} 0 0.01"><freejoint/><geom size="0.004"/></body>'
+        for i in range(9)
+    )
+    file = tmp_path_factory.mktemp("large") / "balls.xml"
+    reach = f'<include file="{assets.path("tasks/reach/reach.xml")}"/>'
+    file.write_text(f"<mujoco>{reach}<worldbody>{balls}</worldbody></mujoco>")
+    task = registries.tasks.get("reach")._replace(mjcf=str(file))
+    return scene.compose(scene.name("reach"), task)
+
+
+def test_a_scene_of_many_velocities_has_dense_matrices(large):
+    assert large.nv == 62 >= scene.SPARSE_FROM
+    solver.check(mjx.put_model(large, impl="jax"), mjx.make_data(large, impl="jax"))
+    large.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    with pytest.raises(ValueError, match=r"model: expected dense.*62 velocities"):
+        solver.check(mjx.put_model(large, impl="jax"), mjx.make_data(large, impl="jax"))
+
+
+def test_the_limit_on_the_error_is_that_of_every_task_and_grows_beyond_them():
+    sizes = [scene.compose(scene.name(name)).nv for name in registries.tasks.built_in]
+    assert {solver.size_factor(size) for size in sizes} == {1.0}
+    assert solver.size_factor(2 * max(sizes)) == 2.0

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
-from starjax.sim import arm_motion, collision, ik, physics
+from starjax.sim import arm_motion, collision, ik, physics, solver
 from starjax.sim import scene as scenes
 from starjax.sim.state import EnvParams, EnvState
 from starjax.sim.tasks.base import CONTROL_HZ, SimReadings
@@ -84,7 +84,8 @@ def step(
     """Advances one control period towards `command` `[A]`, with the physics `advance`."""
     moved, after, solver_error = attempt(scene, state, command, advance)
     stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
-    sound = physics.is_sound(scene, after) & (solver_error < MAX_SOLVER_ERROR)
+    limit = MAX_SOLVER_ERROR * solver.size_factor(scene.mj_model.nv)
+    sound = physics.is_sound(scene, after) & (solver_error < limit)
     moved = _select(sound, moved, stopped)
     return _select(state.done, state, moved)
 

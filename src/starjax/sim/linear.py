@@ -9,6 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+# Order from which the elimination is a loop: unrolled, it takes a minute to compile at 62.
+LOOP_FROM = 60
+
 
 def solve_positive(H: jax.Array, g: jax.Array) -> jax.Array:
     """Solves H x = g `[N]` for a symmetric positive definite H `[N, N]`, single-sample.
@@ -17,6 +20,14 @@ def solve_positive(H: jax.Array, g: jax.Array) -> jax.Array:
     """
     rows = jnp.concatenate([H, g[:, None]], axis=1)
     index = np.arange(len(g))[:, None]
+    if len(g) >= LOOP_FROM:
+
+        def eliminate(i: jax.Array, rows: jax.Array) -> jax.Array:
+            column = jax.lax.dynamic_slice_in_dim(rows, i, 1, axis=1)
+            pivot = rows[i] / rows[i, i]
+            return jnp.where(index == i, pivot, rows - column * pivot)
+
+        return jax.lax.fori_loop(0, len(g), eliminate, rows)[:, -1]
     for i in range(len(g)):
         pivot = rows[i] / rows[i, i]
         rows = jnp.where(index == i, pivot, rows - rows[:, i : i + 1] * pivot)

@@ -22,6 +22,8 @@ from starjax.sim.quiet_mjx import mjx
 from starjax.sim.tasks.base import Task
 from starjax.sim.tools.base import Tool
 
+# Velocities from which MuJoCo and MJX choose sparse matrices; the contact solver has dense ones.
+SPARSE_FROM = 60
 FIXED = "fixed"  # camera name: the task's first one except the endoscope
 # Numeric of a task's MJCF: the contact solver's largest number of iterations, for light bodies.
 SOLVER_ITERATIONS = "solver_turns"
@@ -155,7 +157,10 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
     for limit, size in zip(mjcf_parts.CONTACT_LIMITS, limits):
         world.add_numeric(name=limit, data=[float(size)], size=1)
     with mjcf_parts.explained(part):
-        return world.compile()
+        model = world.compile()
+    if model.nv >= SPARSE_FROM:
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    return model
 
 
 def load(names: SceneNames, variant: Task | None = None) -> Scene:
