@@ -21,8 +21,9 @@ GOLDEN = ROOT / "tests" / "golden" / "benchmark.json"
 # A change of their code may change what a policy's commands do.
 PHYSICS = (
     *("sim/arm_motion.py", "sim/chain.py", "sim/control.py", "sim/dynamics.py", "sim/ik.py"),
-    *("sim/linear.py", "sim/mounts.py", "sim/physics.py", "sim/robot.py", "sim/sampling.py"),
-    *("sim/scene.py", "sim/solver.py", "sim/arms/*.py", "sim/tools/*.py"),
+    *("sim/linear.py", "sim/mjcf_parts.py", "sim/mounts.py", "sim/physics.py", "sim/robot.py"),
+    *("sim/sampling.py", "sim/scene.py", "sim/solver.py", "sim/wrist_motion.py"),
+    *("sim/arms/*.py", "sim/tools/*.py"),
     *("rcm/trocar.py", "rcm/rotations.py"),
 )
 # What is drawn, measured and called a success. Experts and phrases are not part of it.

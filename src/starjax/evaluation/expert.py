@@ -108,7 +108,7 @@ def faults(scene: scenes.Scene, episodes: ExpertEpisodes) -> Counter[str]:
             f"a joint above {physics.MAX_ARM_SPEED:g} rad/s": jnp.max(jnp.stack(speeds))
             > physics.MAX_ARM_SPEED,
             "the task's is_sound": ~scene.task.is_sound(scene.bound, after.qpos, after.qvel),
-            "the contact solver did not converge": ~(error < dynamics.MAX_SOLVER_ERROR),
+            "the contact solver did not converge": ~(error < dynamics.max_solver_error(scene)),
         }
 
     is_invalid = np.asarray(episodes.last.invalid)

@@ -84,10 +84,14 @@ def step(
     """Advances one control period towards `command` `[A]`, with the physics `advance`."""
     moved, after, solver_error = attempt(scene, state, command, advance)
     stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
-    limit = MAX_SOLVER_ERROR * solver.size_factor(scene.mj_model.nv)
-    sound = physics.is_sound(scene, after) & (solver_error < limit)
+    sound = physics.is_sound(scene, after) & (solver_error < max_solver_error(scene))
     moved = _select(sound, moved, stopped)
     return _select(state.done, state, moved)
+
+
+def max_solver_error(scene: scenes.Scene) -> float:
+    """Returns the energy (J) of the contact solver's error from which a step is invalid."""
+    return MAX_SOLVER_ERROR * solver.size_factor(scene.mj_model.nv)
 
 
 def attempt(
