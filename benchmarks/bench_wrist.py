@@ -51,8 +51,8 @@ def main() -> None:
     for arm, tool in itertools.product(registries.arms.names(), TOOLS):
         name = f"{arm}/{tool}"
         if not only or name in only:
-            rows[name] = reach(arm, tool) | arc(arm, tool)
-            print(name, rows[name], flush=True)
+            row = rows[f"{arm} {tool}"] = reach(arm, tool) | arc(arm, tool)
+            print(name, row, flush=True)
     sizes = {
         "poses": POSES,
         "trocars": 12,
