@@ -1,6 +1,5 @@
 """Reads collected demonstrations: checked, and placed where they fit (device, host, or disk)."""
 
-import functools
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,7 +10,8 @@ import numpy as np
 
 from starjax import errors, rcm
 from starjax.data import redraw, schema, store, windows
-from starjax.rollouts import episodes, workers
+from starjax.data.episode_array import EpisodeArray
+from starjax.rollouts import episodes
 from starjax.runtime import files, xla
 from starjax.types import Command, Observation, Pose
 
@@ -19,10 +19,6 @@ Residency = Literal["auto", "device", "host", "disk"]
 
 DEVICE_SHARE = 0.5  # of the device's free memory that demonstrations may take
 HOST_SHARE = 0.6  # of the host's
-_MOST_OPEN = 256  # files of a field at once; systems allow a process about 1,000
-# Files per core that reads one episode after another: pages read from an open file count as the
-# process's memory.
-_OPEN_IN_TURN = 2
 
 
 class Demos(NamedTuple):
@@ -58,7 +54,7 @@ def load(
     Args:
       root: folder of the dataset.
       residency: "auto" takes the device if the frames fit there, else the host, else leaves
-        images on disk, memory-mapped.
+        images on disk.
       verify: without it only the episodes' records are checked, not their arrays: for a caller
         that has just run `demos.collect`, which checks all.
       images: without them they stay on disk, whatever the residency; `frames` reads them.
@@ -117,8 +113,7 @@ def actors(root: Path) -> np.ndarray:
 def frames(root: Path, env: Any = None) -> "Mapping[str, EpisodeArray | redraw.DrawnImages]":
     """Returns the images of the successful episodes by camera, in the order of `load`.
 
-    Recorded ones are memory-mapped, for reading in that order: few files stay open. Others are
-    drawn when they are indexed. Only the episodes' records are checked.
+    They are read or drawn when they are indexed. Only the episodes' records are checked.
 
     Args:
       root: folder of the dataset.
@@ -134,11 +129,8 @@ def frames(root: Path, env: Any = None) -> "Mapping[str, EpisodeArray | redraw.D
         return redraw.images(root, description, records, env)
     fields = _fields(description, records[0], images=True)
     length, start = _spans(records)
-    few = _OPEN_IN_TURN * workers.worker_count()
     found = {
-        name.removeprefix(episodes.IMAGE): EpisodeArray(
-            _paths(root, records, file), start, length, few
-        )
+        name.removeprefix(episodes.IMAGE): EpisodeArray(_paths(root, records, file), start, length)
         for name, file in fields.items()
         if name.startswith(episodes.IMAGE)
     }
@@ -150,7 +142,7 @@ def frames(root: Path, env: Any = None) -> "Mapping[str, EpisodeArray | redraw.D
 _WHERE = {
     "device": "resident on the device",
     "host": "in host memory (they do not fit the device)",
-    "disk": "memory-mapped from disk (they fit neither the device nor host memory)",
+    "disk": "read from disk (they fit neither the device nor host memory)",
 }
 _DRAWN = "drawn for each batch (they fit neither the device nor host memory)"
 # Recorded, but not trained on.
@@ -260,38 +252,3 @@ def _dataset(
 def _endoscope(fields: dict[str, Any]) -> Pose | None:
     known = [fields[name] for name in episodes.ENDOSCOPE if name in fields]
     return Pose(*known) if known else None
-
-
-class EpisodeArray:
-    """One field of all episodes as if it were one array `[F, ...]`, read from disk when indexed."""
-
-    def __init__(
-        self, paths: list[Path], start: np.ndarray, length: np.ndarray, most_open: int = _MOST_OPEN
-    ):
-        self._paths, self._start = paths, start
-        self._mapped = functools.lru_cache(most_open)(_map)
-        first = self._mapped(paths[0])
-        self.shape = (int(length.sum()), *first.shape[1:])
-        self.dtype = first.dtype
-
-    def __getitem__(self, index: Any) -> np.ndarray:
-        """Returns the frames at `index` `[N]` as `[N, ...]` in memory."""
-        index = np.asarray(index)
-        out = np.zeros((*index.shape, *self.shape[1:]), self.dtype)
-        episode = np.searchsorted(self._start, index, side="right") - 1
-        for i in np.ndindex(index.shape):
-            array = self._mapped(self._paths[episode[i]])
-            out[i] = array[index[i] - self._start[episode[i]]]
-        return out
-
-    def read(self, rows: int = 0) -> np.ndarray:
-        """Returns all frames in memory, followed by zeros up to so many rows."""
-        out = np.zeros((max(rows, self.shape[0]), *self.shape[1:]), self.dtype)
-        for path, first in zip(self._paths, self._start, strict=True):
-            array = _map(path)
-            out[first : first + len(array)] = array
-        return out
-
-
-def _map(path: Path) -> np.ndarray:
-    return np.load(path, mmap_mode="r", allow_pickle=False)
