@@ -28,7 +28,7 @@ class _OpenFile:
         self.shape, self.dtype = mapped.shape, mapped.dtype
         self._descriptor = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._descriptor)
-        if hasattr(os, "posix_fadvise"):  # reads ahead would fetch frames that nobody asked for
+        if hasattr(os, "posix_fadvise"):  # reading ahead fetches unused frames
             os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_RANDOM)
 
     def fill(self, row: int, out: Any) -> None:
@@ -46,7 +46,7 @@ class _OpenFile:
 
 
 class EpisodeArray:
-    """Frames `[F, ...]` of .npy files, an episode each.
+    """Frames `[F, ...]` of .npy files, one per episode.
 
     Attributes:
       shape, dtype: of the whole.
