@@ -2,8 +2,8 @@
 
     python benchmarks/bench_redraw.py [--tiny]
 
-The policy and batch are those of preset `gpu`. "images" has the disturbances that are functions of
-an image, "all" also displaced cameras, delays and lost observations. The cases alternate.
+The policy and batch are those of preset `compact`. "images" has the disturbances that are functions
+of an image, "all" also displaced cameras, delays and lost observations. The cases alternate.
 """
 
 import argparse
@@ -39,8 +39,8 @@ def main() -> None:
     parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
     asked = parser.parse_args()
     runtime.prepare_xla()
-    gpu = presets.PRESETS["gpu"]
-    case = _setup.miniature() if asked.tiny else _setup.Case(gpu.policy, gpu.train)
+    preset = presets.PRESETS["compact"]
+    case = _setup.miniature() if asked.tiny else _setup.Case(preset.policy, preset.train)
     steps, rounds = (2, 1) if asked.tiny else (asked.steps, asked.rounds)
     env = envs.make("peg_transfer", image_size=case.policy.image_size, moving_cameras=True)
     dataset = _setup.made_up(case.policy, 64 if asked.tiny else 16_384)

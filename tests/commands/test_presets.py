@@ -44,7 +44,7 @@ def test_a_presets_time_is_that_of_a_committed_result(name):
     timing, preset = presets.TIMINGS[name], presets.PRESETS[name]
     found = json.loads((RESULTS / timing.source).read_text())
     stages = sum(seconds for stage, seconds in found["timings_s"].items() if ":" not in stage)
-    assert stages < timing.seconds < stages + 60
+    assert stages < timing.seconds < stages + 90  # start, compilers, report
     run = config.from_dict(config.RunConfig, found["config"])
     same = dataclasses.replace(preset, scene=run.scene)
     assert config.weight_settings(run) == config.weight_settings(same) and run.eval == preset.eval

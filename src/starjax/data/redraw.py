@@ -4,6 +4,7 @@ A dataset keeps joint positions and the numbers of its trials. The layout and th
 an episode follow from the key of its trial, just like in the recording.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,7 +69,7 @@ class DrawnImages:
         parts = []
         for first in range(0, len(rows), batch):
             part = rows[first : first + batch]
-            parts.append(np.asarray(self._at(_padded(part, batch)))[: len(part)])
+            parts.append(np.asarray(self.draw_batch(_padded(part, batch)))[: len(part)])
         shape = (*index.shape, *self.shape[1:])
         return np.concatenate(parts).reshape(shape) if parts else np.zeros(shape, self.dtype)
 
@@ -79,7 +80,7 @@ class DrawnImages:
 
         def draw(first: int):
             rows = np.arange(first, min(first + batch, count))
-            out[rows] = np.asarray(self._at(_padded(rows, batch)))[: len(rows)]
+            out[rows] = np.asarray(self.draw_batch(_padded(rows, batch)))[: len(rows)]
             yield len(rows)
 
         for _ in workers.run(range(0, count, batch), draw, workers.worker_count()):
@@ -98,10 +99,11 @@ class DrawnImages:
         )
         out = jnp.zeros((rows, *self.shape[1:]), self.dtype)
         for first in [*range(0, count - batch, batch), count - batch]:
-            out = put(out, self._at(np.arange(first, first + batch)), first)
+            out = put(out, self.draw_batch(np.arange(first, first + batch)), first)
         return out
 
-    def _at(self, rows: np.ndarray) -> jax.Array:
+    def draw_batch(self, rows: np.ndarray) -> jax.Array:
+        """Draws the images of `batch_size()` frames on the device."""
         return self._draw(self._qpos[rows], self._episode[rows])
 
 
@@ -207,12 +209,13 @@ def images_of(
     episode = np.repeat(np.arange(len(records), dtype=np.int32), lengths)
 
     def drawn(camera: str) -> Callable[[Any, Any], jax.Array]:
+        # An argument: as a constant it would make a program of its own for each seed.
         @jax.jit
-        def draw(qpos: jax.Array, episode: jax.Array) -> jax.Array:
-            source = jax.tree.map(lambda leaf: leaf[episode], found.episodes)
+        def draw(episodes: Any, qpos: jax.Array, episode: jax.Array) -> jax.Array:
+            source = jax.tree.map(lambda leaf: leaf[episode], episodes)
             return jax.vmap(env.draw)(source._replace(qpos=qpos))[camera].rgb
 
-        return draw
+        return functools.partial(draw, found.episodes)
 
     return {
         camera: DrawnImages(drawn(camera), found.qpos, episode, size)

@@ -69,6 +69,8 @@ def features(
     if missing:
         see, pictures = _make_see(encoder, policy_config), frames()
         batch = redraw.batch_size()
+        is_drawn = isinstance(pictures, redraw.DrawnImages)
+        look = pictures.draw_batch if is_drawn else pictures.__getitem__
 
         def make(part: tuple[Path, int, int]) -> Generator[int]:
             """Yields the number of frames of each batch."""
@@ -76,7 +78,7 @@ def features(
             batches = []
             for start in range(first, last, batch):
                 index = read[np.minimum(np.arange(start, start + batch), last - 1)]
-                batches.append(np.asarray(see(pictures[index]))[: last - start])
+                batches.append(np.asarray(see(look(index)))[: last - start])
                 yield len(batches[-1])
             parts[path] = np.concatenate(batches)
             files.write_npz(path, {"features": parts[path]})
@@ -92,9 +94,7 @@ def features(
     return joined
 
 
-def _make_see(
-    encoder: Encoder, policy_config: config.PolicyConfig
-) -> Callable[[np.ndarray], jax.Array]:
+def _make_see(encoder: Encoder, policy_config: config.PolicyConfig) -> Callable[[Any], jax.Array]:
     """Makes the function from frames `[B, h, w, 3]` uint8 to features `[B, d_v]`."""
     vision = generator.vision_encoder(policy_config)
 
