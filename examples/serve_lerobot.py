@@ -8,9 +8,11 @@ not, which camera, which size) and what it commands (poses or rcm4) is read off 
 """
 
 import argparse
+import contextlib
 
 import numpy as np
 import torch
+import websockets
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from websockets.sync import server
@@ -73,8 +75,9 @@ def main() -> None:
 
     def answer(connection: server.ServerConnection) -> None:
         connection.send(wire.pack(served.metadata))
-        for frame in connection:
-            connection.send(wire.pack(served.infer(wire.unpack(frame))))
+        with contextlib.suppress(websockets.ConnectionClosed):  # clients may just leave
+            for frame in connection:
+                connection.send(wire.pack(served.infer(wire.unpack(frame))))
 
     with server.serve(answer, "127.0.0.1", args.port, compression=None, max_size=None) as running:
         print(f"serving at ws://127.0.0.1:{running.socket.getsockname()[1]}", flush=True)
