@@ -15,6 +15,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "gym": ("gymnasium",),
     "serve": ("PIL", "filelock", "flax", "msgpack", "msgspec", "safetensors", "websockets"),
     "viewer": ("viser",),
+    "hub": ("huggingface_hub",),
     "tensorboard": ("tensorboardX",),
     "wandb": ("wandb",),
 }

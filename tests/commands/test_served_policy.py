@@ -15,7 +15,7 @@ import stubs
 from websockets.sync import server as sockets
 
 from starjax import config, rcm
-from starjax.commands import evaluate, sweep
+from starjax.commands import evaluate, stress, sweep
 from starjax.deploy import approach, batching, connection_pool, inputs, wire
 from starjax.deploy import served as serving
 from starjax.evaluation import evaluate as evaluating
@@ -138,6 +138,51 @@ def test_plain_frames_of_openpi(tmp_path):
     assert request["observation/environment_state"].shape == (12,)
     # A position, as the export has it; the request of the test is in the nominal trocar.
     np.testing.assert_allclose(request["observation/trocar"], stubs.P_WORLD_REF[0], atol=1e-6)
+
+
+def test_images_reach_a_server_and_its_pictures_are_the_environments(tmp_path, monkeypatch):
+    """Through the callback: one picture per request, that of the lane's own state."""
+    made = stubs.make_env("image")
+    monkeypatch.setattr(in_env.sim_env, "make", lambda *_, **__: made)
+    requests = queue.SimpleQueue()
+
+    def infer(request):
+        requests.put(request)
+        return stay(request)
+
+    about = {"scene": {"task": "reach"}, "image_size": 32}
+    with openpi(infer, about) as address:
+        who = serving.connect(address)
+        in_closed_loop(who, tmp_path)
+    requests.get()  # the request of the test
+    seen = [requests.get() for _ in range(requests.qsize())]
+    assert len(seen) >= 12 and who.remote.refused == 0
+    for request in seen:
+        tip, image = request["observation/state"][:3], request["observation/image"]
+        assert image.dtype == np.uint8 and image.shape == (6, 6, 3)  # the stub's size
+        shade = np.float32(tip) * 1000 + 128  # the stub's first three rows
+        np.testing.assert_allclose(image[:3, 0, 0], shade, atol=1.5)
+    assert len({request["observation/image"].tobytes() for request in seen}) >= 12
+
+
+def test_disturbances_of_a_stress_test_reach_the_server(tmp_path):
+    """The measured trocar is off by the level; the tool rests in the true one."""
+    requests = queue.SimpleQueue()
+
+    def infer(request):
+        requests.put(request)
+        return stay(request)
+
+    argv = "--disturbance trocar_offset --levels 0 5 --eval.trials 1 --eval.time-limit-s 0.3"
+    with openpi(infer, PLAIN) as address:
+        stress.main(["--policy", address, "--out", "here", *argv.split()])
+    found = json.loads((tmp_path / "here" / "stress.json").read_text())
+    assert found["weights"] and found["server"]["address"] == address
+    requests.get()
+    places = np.array([requests.get()["observation/trocar"] for _ in range(requests.qsize())])
+    true = np.asarray(rcm.trocar_position(stubs.trocars(*range(12)), stubs.P_WORLD_REF[:1]))[:, 0]
+    off = np.linalg.norm(places[:, None] - true, axis=-1).min(axis=1)
+    assert {round(1e3 * distance) for distance in off} == {0, 5}
 
 
 def test_refused_plans_hold_and_are_counted(tmp_path):

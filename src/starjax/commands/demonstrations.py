@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from starjax import config as config_lib
 from starjax import errors
 from starjax.commands import messages, scenes, stage_times
+from starjax.runtime import hub
 
 _FROM, _RANDOMISE = "demos.from_", "demos.randomise"
 
@@ -144,7 +145,7 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
     from starjax.rollouts import episodes
     from starjax.training import randomise
 
-    root = Path(config.demos.from_)
+    root = hub.dataset("demos.from", config.demos.from_)
     try:
         about = store.read_description(root)
         store.read_seal(root)

@@ -10,7 +10,7 @@ import tyro
 from starjax import errors
 from starjax.commands import checks, options
 from starjax.config import Range
-from starjax.runtime import files, progress, xla
+from starjax.runtime import files, hub, progress, xla
 
 DESCRIPTION = """Exports demonstrations in another format, from which they can be restored exactly.
 
@@ -51,7 +51,7 @@ def main(argv: Sequence[str]) -> int:
     errors.choice("format", args.format, base.writable())
     errors.choice("actions", args.actions, peer_columns.ACTIONS)
     columns = peer_columns.PeerOptions(args.state_with_trocar, args.actions)
-    form, root = base.FORMATS.get(args.format), Path(args.dataset)
+    form, root = base.FORMATS.get(args.format), hub.dataset("DATASET", args.dataset)
     try:
         source = exchange.source(root, form, args.image_size, columns)
     except ValueError as error:

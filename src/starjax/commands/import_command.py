@@ -10,7 +10,7 @@ import tyro
 
 from starjax import errors
 from starjax.commands import checks, messages, options
-from starjax.runtime import progress, xla
+from starjax.runtime import hub, progress, xla
 
 _PIXELS = 128  # pixels per side of images that --cameras names
 _SHOWN = 10  # anomalies, the others are in a file
@@ -48,7 +48,7 @@ def main(argv: Sequence[str]) -> int:
     from starjax.data import store
     from starjax.data.formats import base
 
-    path, out = Path(args.path), Path(args.out)
+    path, out = hub.dataset("PATH", args.path), Path(args.out)
     checks.expect(not store.is_sealed(out), "OUT", "a directory without a dataset", out)
     if args.format != options.AUTO:
         errors.choice("format", args.format, base.FORMATS.names())

@@ -10,7 +10,7 @@ import tyro
 
 from starjax import errors
 from starjax.commands import checks, inspect_page, options
-from starjax.runtime import files, xla
+from starjax.runtime import files, hub, xla
 
 DESCRIPTION = """Summarises a dataset, policy or result and flags anomalies.
 
@@ -51,9 +51,8 @@ def main(argv: Sequence[str]) -> int:
         checks.expect_folder("folder of --page", Path(args.page).parent)
     summary = inspect(args.path)
     if args.page:
-        odd = inspect_page.write(
-            Path(args.path), args.map, Path(args.page), summary.rows, summary.odd
-        )
+        path = hub.dataset("PATH", args.path)
+        odd = inspect_page.write(path, args.map, Path(args.page), summary.rows, summary.odd)
         summary = Found([*summary.rows, ("page", args.page)], odd)
     width = max(len(name) for name, _ in summary.rows)
     for name, text in summary.rows:
@@ -73,9 +72,10 @@ def inspect(name: str) -> Found:
     """
     from starjax.policies import packaged
 
-    path = Path(name)
+    is_policy = hub.is_name(name) and not hub.parse("PATH", name).is_dataset
+    path = Path(name) if is_policy else hub.dataset("PATH", name)
     look: Callable[[Path], Found]
-    if packaged.locate(name).suffix == ".safetensors":
+    if is_policy or packaged.locate(name).suffix == ".safetensors":
         path, look = packaged.find("PATH", name), _policy
     elif (path / "dataset.json").is_file():
         look = _dataset

@@ -65,6 +65,7 @@ def main(argv: Sequence[str]) -> int:
         "scene": who.env.names._asdict(),
         "method": who.trained.method,
         "weights": who.weights,
+        **({"server": who.origin} if path.address else {}),
         "seed": args.seed,
         "trials_at_each_trocar": args.eval.trials,
         "time_limit_s": args.eval.time_limit_s,

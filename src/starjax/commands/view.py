@@ -10,7 +10,7 @@ from starjax import errors
 from starjax.commands import folders, options
 from starjax.limits import Range
 from starjax.policies import packaged
-from starjax.runtime import jax_start, signals, xla
+from starjax.runtime import hub, jax_start, signals, xla
 
 DESCRIPTION = """Shows a policy, an expert or a dataset on a page in the browser.
 
@@ -74,7 +74,7 @@ def _dataset(folder: str) -> Show:
     from starjax.viewer import browse
 
     try:
-        dataset = browse.open_dataset(Path(folder))
+        dataset = browse.open_dataset(hub.dataset("--dataset", folder))
     except ValueError as error:  # of a damaged file, which it names
         raise errors.UsageError("--dataset", "a folder of demonstrations", error) from error
     return lambda server, should_stop: browse.run(server, dataset, should_stop)

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 from starjax import errors
+from starjax.runtime import hub
 
 FOLDER = Path(__file__).with_name("weights")
 _SUFFIX = ".safetensors"
@@ -25,11 +26,13 @@ def locate(name_or_path: str) -> Path:
 
 
 def find(argument: str, name_or_path: str) -> Path:
-    """Returns the file that `locate` names; `./name` is never a packaged one.
+    """Returns the file that `locate` names, or one of the Hub; `./name` is never a packaged one.
 
     Raises:
       errors.UsageError: the file of `argument` is missing or not readable.
     """
+    if hub.is_name(name_or_path):
+        return hub.policy(argument, name_or_path)
     path = locate(name_or_path)
     if not path.is_file():
         expected = " or one of ".join(filter(None, ["a file", ", ".join(names())]))

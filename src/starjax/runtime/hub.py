@@ -1,0 +1,82 @@
+"""Datasets and policies of the Hugging Face Hub by name: `hf://user/repo[@revision][/file]`.
+
+The Hub's library downloads into its cache, so a name is fetched once; HF_TOKEN, HF_HOME and
+HF_HUB_OFFLINE are its own variables. Nothing of a repository is executed.
+"""
+
+import importlib
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from starjax import errors, extras
+
+SCHEME = "hf://"
+POLICY_FILE = "policy.safetensors"  # of a repository whose name ends without a file
+_PART = r"[\w][\w.\-]*"
+_NAME = re.compile(rf"hf://(datasets/)?({_PART}/{_PART})(?:@([\w.\-]+))?(?:/(.+))?")
+_MAX_TEXT = 200  # characters of the library's error
+_EXPECTED = "hf://user/repo, optionally with @revision and /file"
+
+
+class HubName(NamedTuple):
+    """Parts of a name: repository, revision (empty: main), file within it (may be empty)."""
+
+    repo: str
+    revision: str
+    file: str
+    is_dataset: bool
+
+
+def is_name(text: str) -> bool:
+    """Returns True for a name of the Hub."""
+    return text.startswith(SCHEME)
+
+
+def parse(argument: str, text: str) -> HubName:
+    """Parses a name.
+
+    Raises:
+      errors.UsageError: it has another form.
+    """
+    match = _NAME.fullmatch(text)
+    parts = (match[4] or "").split("/") if match else []
+    if match is None or ".." in parts:
+        raise errors.UsageError(argument, _EXPECTED, text)
+    return HubName(match[2], match[3] or "", match[4] or "", bool(match[1]))
+
+
+def policy(argument: str, text: str) -> Path:
+    """Returns the local file of a policy, `POLICY_FILE` unless the name ends with a file.
+
+    Raises:
+      errors.UsageError: a wrong name, no such repository or file, or no connection.
+    """
+    name = parse(argument, text)
+    kind = "dataset" if name.is_dataset else "model"
+    return _fetched(argument, text, "hf_hub_download", name, kind, name.file or POLICY_FILE)
+
+
+def dataset(argument: str, text: str) -> Path:
+    """Returns the local directory (or file of it) of a dataset; plain paths are returned as such.
+
+    Raises:
+      errors.UsageError: as of `policy`.
+    """
+    if not is_name(text):
+        return Path(text)
+    name = parse(argument, text)
+    return _fetched(argument, text, "snapshot_download", name, "dataset") / name.file
+
+
+def _fetched(argument: str, text: str, function: str, name: HubName, kind: str, *file: str) -> Path:
+    extras.require(argument, "hub")
+    download = getattr(importlib.import_module("huggingface_hub"), function)
+    try:
+        path = download(name.repo, *file, repo_type=kind, revision=name.revision or None)
+    # The library and those beneath it raise dozens of types: no repository, no access, no network.
+    except Exception as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        got = f"{text}: {errors.printable(lines[0])[:_MAX_TEXT]}"
+        raise errors.UsageError(argument, f"a {kind} of the Hub", got) from error
+    return Path(path)

@@ -1,0 +1,86 @@
+"""Names of the Hub: the fetched file, and each mistake in one line. The library is a fake."""
+
+import pathlib
+import shutil
+import sys
+import types
+
+import mistakes
+import pytest
+import recorded
+
+from starjax.commands import export_command, import_command, inspect_command
+from starjax.data import store
+from starjax.policies import packaged
+from starjax.runtime import hub
+
+
+@pytest.fixture
+def repositories(tmp_path, monkeypatch):
+    """Makes a folder of repositories, `model/user/repo` and `dataset/user/repo`."""
+    asked = []
+
+    def snapshot_download(repo, *, repo_type, revision):
+        asked.append((repo_type, repo, revision))
+        if not (path := tmp_path / repo_type / repo).exists():
+            raise OSError(f"404 Client Error\x1b[2J\nRepository Not Found for {repo}")
+        return str(path)
+
+    def hf_hub_download(repo, file, **given):
+        path = pathlib.Path(snapshot_download(repo, **given)) / file
+        if not path.exists():
+            raise OSError("Entry Not Found")
+        return str(path)
+
+    fake = types.ModuleType("huggingface_hub")
+    fake.snapshot_download, fake.hf_hub_download = snapshot_download, hf_hub_download
+    fake.__spec__ = types.SimpleNamespace(name="huggingface_hub")
+    monkeypatch.setitem(sys.modules, "huggingface_hub", fake)
+    return tmp_path, asked
+
+
+def test_a_policy_is_its_file(repositories):
+    folder, asked = repositories
+    repo = folder / "model" / "me" / "compact"
+    repo.mkdir(parents=True)
+    shutil.copy(packaged.locate("compact"), repo / "policy.safetensors")
+    shutil.copy(packaged.locate("compact"), repo / "other.safetensors")
+    assert packaged.find("--policy", "hf://me/compact") == repo / "policy.safetensors"
+    found = packaged.find("--policy", "hf://me/compact@v1.0/other.safetensors")
+    assert found == repo / "other.safetensors"
+    assert asked == [("model", "me/compact", None), ("model", "me/compact", "v1.0")]
+    assert "stardiff" in inspect_command.inspect("hf://me/compact").rows[0][1]
+
+
+def test_a_dataset_goes_out_and_comes_back_by_name(repositories):
+    folder, _ = repositories
+    (folder / "dataset" / "me").mkdir(parents=True)
+    recorded.write(folder / "dataset" / "me" / "ours")
+    out = folder / "dataset" / "me" / "shared"
+    assert export_command.main(["hf://datasets/me/ours", str(out)]) == 0
+    assert import_command.main(["hf://me/shared", str(folder / "back")]) == 0
+    assert store.read_seal(folder / "back") == store.read_seal(folder / "dataset" / "me" / "ours")
+
+
+@pytest.mark.parametrize(
+    "name", ["hf://me", "hf://me/repo/../../key", "hf:///etc/passwd", "hf://me/re po", "hf://"]
+)
+def test_another_form_of_name_asks_nothing(repositories, name):
+    with mistakes.of("--policy", name):
+        packaged.find("--policy", name)
+    assert not repositories[1]
+
+
+def test_what_the_library_raises_is_one_line(repositories):
+    with mistakes.of("--policy", "404") as caught:
+        packaged.find("--policy", "hf://me/nothing")
+    assert str(caught.value).isprintable()
+    with mistakes.of("PATH", "404"):
+        hub.dataset("PATH", "hf://datasets/me/nothing")
+
+
+def test_without_the_library_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr(hub.extras.importlib.util, "find_spec", lambda name: None)
+    with mistakes.of("--policy") as caught:
+        packaged.find("--policy", "hf://me/compact")
+    assert "hub" in caught.value.hint
