@@ -80,7 +80,7 @@ def test_what_the_library_raises_is_one_line(repositories):
 
 
 def test_without_the_library_the_extra_is_named(monkeypatch):
-    monkeypatch.setattr(hub.extras.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(hub.importlib.util, "find_spec", lambda name: None)
     with mistakes.of("--policy") as caught:
         packaged.find("--policy", "hf://me/compact")
     assert "hub" in caught.value.hint

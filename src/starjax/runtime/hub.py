@@ -5,13 +5,15 @@ HF_HUB_OFFLINE are its own variables. Nothing of a repository is executed.
 """
 
 import importlib
+import importlib.util
 import re
 from pathlib import Path
 from typing import NamedTuple
 
-from starjax import errors, extras
+from starjax import errors
 
 SCHEME = "hf://"
+_LIBRARY = "huggingface_hub"
 POLICY_FILE = "policy.safetensors"  # of a repository whose name ends without a file
 _PART = r"[\w][\w.\-]*"
 _NAME = re.compile(rf"hf://(datasets/)?({_PART}/{_PART})(?:@([\w.\-]+))?(?:/(.+))?")
@@ -70,8 +72,10 @@ def dataset(argument: str, text: str) -> Path:
 
 
 def _fetched(argument: str, text: str, function: str, name: HubName, kind: str, *file: str) -> Path:
-    extras.require(argument, "hub")
-    download = getattr(importlib.import_module("huggingface_hub"), function)
+    if importlib.util.find_spec(_LIBRARY) is None:
+        hint = "pip install 'starjax[hub]'"
+        raise errors.UsageError(argument, f"{_LIBRARY} to be installed", "no such package", hint)
+    download = getattr(importlib.import_module(_LIBRARY), function)
     try:
         path = download(name.repo, *file, repo_type=kind, revision=name.revision or None)
     # The library and those beneath it raise dozens of types: no repository, no access, no network.
