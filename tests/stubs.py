@@ -12,7 +12,7 @@ import numpy as np
 from starjax import rcm
 from starjax.sim import names, render
 from starjax.sim.state import ImageSource
-from starjax.sim.tasks import base
+from starjax.sim.tasks import base, rescue
 from starjax.types import Agent, Command, Observation, Pose
 
 P_WORLD_REF = np.array([[0.0, 0.0, 0.15], [0.02, 0.1, 0.16]], np.float32)
@@ -221,6 +221,7 @@ def _act(key, state):
 
 # Walks to the goals, with noise from its key.
 EXPERT = Agent(lambda key, state: key, _act)
+RESCUER = rescue.Rescuer(EXPERT.init, EXPERT.act)
 
 
 def make_policy(horizon: int = 6, width: int = 64) -> tuple[Any, Any]:

@@ -11,11 +11,9 @@ from starjax.data import load, redraw, store
 from starjax.finetune import dagger, mixing, rounds, self_imitation
 from starjax.rollouts import agent, attempts, takeover
 from starjax.rollouts.placement import DeviceLayout
-from starjax.sim.tasks.rescue import Rescuer
 from starjax.types import Command, Pose
 
 TROCARS = stubs.trocars(0, 8)
-RESCUER = Rescuer(stubs.EXPERT.init, stubs.EXPERT.act)
 LIMITS = takeover.TakeoverLimits(20, 9)
 IDLE = 8  # commands of a policy that stays, starting from the next plan
 SETTINGS = rounds.RoundSettings(0, 3, 6, 60, "", "digest", {"limits": LIMITS._asdict()})
@@ -33,7 +31,7 @@ POLICY = agent.from_policy(stay, 2, 4)
 def way(observation="state"):
     return rounds.Way(
         source=dagger.SOURCE,
-        agent=takeover.from_policy(POLICY, RESCUER),
+        agent=takeover.from_policy(POLICY, stubs.RESCUER),
         params=lambda attempt: ((None, None), jax.tree.map(np.int32, LIMITS)),
         attempts=1,
         record=takeover.RECORDS[observation],

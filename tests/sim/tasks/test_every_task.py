@@ -75,6 +75,7 @@ def test_the_expert_of_a_task_succeeds(name):
     keys = jax.random.split(jax.random.key(7), LANES)
     state = jax.jit(jax.vmap(environment.reset))(keys, envs.EnvParams(trocars))
     memory = jax.jit(jax.vmap(agent.init))(keys, state)
+    enters_like_the_expert(agent, registries.rescuers.get(name), keys, state)
 
     @jax.jit
     @jax.vmap
@@ -99,6 +100,19 @@ def test_the_expert_of_a_task_succeeds(name):
     asked = contacts.asked(environment.scene, looks, state.trocar.p_world_trocar)
     fits = np.less_equal(asked, contacts.held(environment.scene))
     assert (not fits[0]) == (name in CROWDED) and (fits[1] or name in CROWDED), asked
+
+
+def enters_like_the_expert(agent, rescuer, keys, state):
+    """At reset an expert that starts in any state does what the demonstrator does."""
+
+    @jax.jit
+    @jax.vmap
+    def first(key, state):
+        ours = rescuer.act(rescuer.resume(key, state), state)[0]
+        return ours, agent.act(agent.init(key, state), state)[0]
+
+    ours, theirs = first(keys, state)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=5e-6), ours, theirs)
 
 
 def test_the_needle_is_that_of_the_model():

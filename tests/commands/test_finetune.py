@@ -1,0 +1,125 @@
+"""`starjax finetune` as a whole, with stubs of the simulator and of the networks."""
+
+import json
+from pathlib import Path
+
+import fakes
+import jax
+import jax.numpy as jnp
+import mistakes
+import numpy as np
+import pytest
+import stubs
+
+from starjax import config
+from starjax.commands import finetune, finetune_stages, policy_evaluation
+from starjax.data import normalizer
+from starjax.monitor import calibrate, scores
+from starjax.policies import in_env, policy_file
+from starjax.policies.base import Policy
+from starjax.registry import Registry
+from starjax.sim import registries
+from starjax.types import Command, Pose
+
+HORIZON = fakes.TINY.horizon
+TRAIN = config.TrainConfig(batch_size=8, learning_rate=0.5, holdout_demos=1, log_every=6)
+DEMOS = config.DemosConfig(per_trocar=2, seen_trocars=4, max_steps=100)
+TOO_SHORT = 0.93  # of the way to a goal: near ones are reached
+
+
+def goes(params, observation):
+    goal = observation.state[:, -1, :3] * params["learner"]["scale"]
+    return jnp.broadcast_to(goal[:, None, None], (len(goal), HORIZON, 1, 3))
+
+
+def sample(params, stats, keys, observation, trocar):
+    p = goes(params, observation)
+    return Command(Pose(jnp.broadcast_to(jnp.eye(3), (*p.shape, 3)), p), jnp.ones(p.shape[:-1]))
+
+
+def loss(params, prepared):
+    observation, command = prepared
+    return jnp.mean((goes(params, observation)[:, -1] - command.pose.p[:, -1]) ** 2), {}
+
+
+def start():
+    return {"learner": {"scale": jnp.full(3, TOO_SHORT)}}
+
+
+POLICY = Policy(lambda key: start(), lambda stats, key, batch: (batch.observation, batch.command),
+                loss, sample)  # fmt: skip
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """A policy that stops short of its goals, with a monitor."""
+    monkeypatch.setattr(in_env.sim_env, "make", lambda *_, **__: stubs.make_env(unlucky=0.1))
+    monkeypatch.setattr(in_env.policies, "make", lambda *_, **__: POLICY)
+    times = {"p50": 1.0, "p95": 1.0, "p99": 1.0}
+    monkeypatch.setattr(policy_evaluation, "inference_ms", lambda *_: times)
+    rescuers = Registry("rescuer", {"reach": "stubs:RESCUER"})
+    monkeypatch.setattr(registries, "rescuers", rescuers)
+    monkeypatch.chdir(tmp_path)
+    params = start()
+    monitor = calibrate.Monitor(
+        settings=scores.ScoreSettings(8, 30.0, 6),
+        alpha=0.05,
+        count=100,
+        threshold=2.0,
+        center=np.zeros(3),
+        width=np.ones(3),
+        clock_s=7.9,
+        digest=policy_file.monitor_digest(params),
+    )
+    box = normalizer.MinMax(-0.1 * jnp.ones(5), 0.1 * jnp.ones(5))
+    made = fakes.trained(
+        params=params,
+        normalizer=normalizer.Normalizer(box, None),
+        train=TRAIN,
+        demos=DEMOS,
+        monitor=monitor,
+    )
+    policy_file.save(tmp_path / "mine.safetensors", made)
+    return tmp_path / "mine.safetensors"
+
+
+def tune():
+    flags = "--trials 6 --validation 6 --rounds 1 --steps 60 --eval.trials 2 --dtype float32"
+    limit = ["--eval.time-limit-s", "4", "--out", "tuned"]
+    return finetune.main(["--policy", "mine.safetensors", *flags.split(), *limit])
+
+
+@pytest.mark.slow
+def test_a_policy_that_stops_short_learns_to_arrive(file, monkeypatch):
+    assert tune() == 0
+    out = Path("tuned")
+    told = json.loads((out / "finetune.json").read_text())
+    before, after = told["before"]["seen"], told["after"]["seen"]
+    assert 0 < before["successes"] < after["successes"] and after["trials"] == 8
+    assert [one["round"] for one in told["rounds"]] == [0, 1] and told["best"] == 1
+    stored, new = (policy_file.load(path) for path in (file, out / "policy.safetensors"))
+    assert stored.monitor is not None and new.monitor is None
+    np.testing.assert_array_equal(new.normalizer.action.low, stored.normalizer.action.low)
+    np.testing.assert_array_equal(new.normalizer.action.high, stored.normalizer.action.high)
+    assert (new.params["learner"]["scale"] > TOO_SHORT).all()
+    # The same command finds everything complete.
+    monkeypatch.setattr(finetune_stages.loop, "run", lambda *_, **__: pytest.fail("trained again"))
+    assert tune() == 0
+    assert jax.tree.all(
+        jax.tree.map(
+            np.array_equal, policy_file.load(out / "policy.safetensors").params, new.params
+        )
+    )
+
+
+def test_a_folder_of_other_settings_is_refused(file):
+    Path("tuned").mkdir()
+    Path("tuned/plan.json").write_text(json.dumps({"steps": 61}))
+    with mistakes.of("steps", 60):
+        tune()
+
+
+def test_a_task_without_such_an_expert_is_refused(file, monkeypatch):
+    monkeypatch.setattr(registries, "rescuers", Registry("rescuer", {"other": "stubs:RESCUER"}))
+    with mistakes.of("--by dagger", "reach"):
+        tune()
