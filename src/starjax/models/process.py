@@ -1,5 +1,6 @@
 """Generative processes: noise is added to sequences, and a network learns to remove it."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
@@ -80,6 +81,10 @@ def flow(steps: int) -> Process:
     return Process(flow_matching.noised, flow_matching.velocity_loss, sample)
 
 
-def shortcut() -> Process:
-    """Makes flow matching whose network also learns to take the whole path in one step."""
-    return Process(shortcuts.noised, shortcuts.loss, shortcuts.sample)
+def shortcut(correct_at: float = 0.0) -> Process:
+    """Makes flow matching whose network also learns to take the whole path in one step.
+
+    `correct_at`: see `shortcut.sample`.
+    """
+    sample = functools.partial(shortcuts.sample, correct_at=correct_at)
+    return Process(shortcuts.noised, shortcuts.loss, sample)

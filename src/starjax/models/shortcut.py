@@ -89,6 +89,7 @@ def sample(
     predict: Callable[[jax.Array, Any], jax.Array],
     noise: jax.Array,
     *,
+    correct_at: float = 0.0,
     prepare: Callable[[jax.Array], Any] = lambda time: time,
     reach: Any = None,
 ) -> jax.Array:
@@ -97,11 +98,19 @@ def sample(
     Args:
       predict: `(x [B, ...], prepared) -> velocity [B, ...]`.
       noise: the start, standard normal or scaled by the temperature.
-      prepare: maps the time `[1]` to a pytree with leading axis 1; `predict` gets its slice.
+      correct_at: time t at which a second evaluation corrects the sequence: the straight path from
+        noise to it, at t, is the start of one step of the flow. 0 for a single evaluation.
+      prepare: maps times `[n]` to a pytree with leading axis n; `predict` gets its slices.
       reach: lowest and highest value, each broadcast against `[B, ...]`; None: -1 and 1.
     """
-    prepared = jax.tree.map(lambda leaf: leaf[0], prepare(jnp.array([WHOLE_WAY])))
-    return within(noise - predict(noise, prepared), reach)
+    times = [WHOLE_WAY, correct_at / flow.TIME_UNIT] if correct_at else [WHOLE_WAY]
+    prepared = prepare(jnp.array(times))
+    whole_way, at = (jax.tree.map(lambda leaf, i=i: leaf[i], prepared) for i in (0, -1))
+    clean = within(noise - predict(noise, whole_way), reach)
+    if not correct_at:
+        return clean
+    x = clean + correct_at * (noise - clean)
+    return within(x - correct_at * predict(x, at), reach)
 
 
 def _expand(numbers: jax.Array, x: jax.Array) -> jax.Array:

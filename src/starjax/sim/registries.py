@@ -65,7 +65,7 @@ rescuers = Registry(
     {
         **{
             name: f"starjax.sim.tasks.{name}.rescue:RESCUER"
-            for name in ("peg_transfer", "needle_pick")
+            for name in ("peg_transfer", "needle_pick", "ring_on_wire", "reach", "endoscope_track")
         },
         "peg_transfer.one_wall": "starjax.sim.tasks.peg_transfer.rescue:WITH_ONE_WALL",
     },

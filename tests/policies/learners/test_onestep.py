@@ -29,6 +29,23 @@ def test_one_step_ends_where_the_way_does():
     np.testing.assert_allclose(found, MEAN + SPREAD * noise, atol=1e-6)
 
 
+def test_a_second_evaluation_corrects_errors_of_the_first():
+    noise, error, t = jax.random.normal(jax.random.key(0), (64, 2)), 0.4, 0.3
+
+    def wrong(x, told):
+        return velocity(x, told) - error * (told == shortcut.WHOLE_WAY)
+
+    once, twice, right = (
+        shortcut.sample(predict, noise, correct_at=at, reach=FAR)
+        for predict, at in ((wrong, 0.0), (wrong, t), (velocity, t))
+    )
+    np.testing.assert_allclose(once, MEAN + SPREAD * noise + error, atol=1e-6)
+    # The mean of clean sequences given one at t moves with it by this factor.
+    gain = (1 - t) * SPREAD**2 / ((1 - t) ** 2 * SPREAD**2 + t**2)
+    np.testing.assert_allclose(twice - right, (1 - t) * gain * error, atol=1e-6)
+    assert abs(float(twice.mean()) - MEAN) < 0.1 < abs(float(once.mean()) - MEAN)
+
+
 @pytest.mark.parametrize("count", [400, 401, 3])
 def test_the_flow_teaches_the_whole_way(count):
     x0 = MEAN + SPREAD * jax.random.normal(jax.random.key(1), (count, 1))

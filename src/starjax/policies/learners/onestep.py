@@ -4,10 +4,11 @@ Not in the paper. Sources: `models.shortcut`.
 """
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from starjax import config
 from starjax.learners import Learner
+from starjax.limits import Range
 from starjax.policies.learners import unet
 
 if TYPE_CHECKING:  # it imports jax, which `--help` does without
@@ -18,6 +19,9 @@ if TYPE_CHECKING:  # it imports jax, which `--help` does without
 class OnestepConfig(unet.UnetConfig):
     """Options of the learner `onestep`."""
 
+    # time, from 1 (noise) to 0, at which a second evaluation corrects a sample; 0: one evaluation
+    correct_at: Annotated[float, Range(0.0, 1.0, "[)")] = 0.0
+
 
 def make(
     options: OnestepConfig, policy_config: config.PolicyConfig, sizes: "Sizes"
@@ -25,7 +29,7 @@ def make(
     """Builds the model of these options."""
     from starjax.models import process
 
-    return unet.make(options, policy_config, sizes, process.shortcut())
+    return unet.make(options, policy_config, sizes, process.shortcut(options.correct_at))
 
 
 LEARNER = Learner(OnestepConfig, unet.check, make)
