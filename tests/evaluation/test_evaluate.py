@@ -297,6 +297,23 @@ def test_recorded_trajectories_are_the_golden_ones(whole):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-7)
 
 
+def test_every_trial_that_diverged_is_kept_to_its_last_sound_state(whole):
+    directory, found = whole
+    kept = recorded.read(directory / "invalid.npz")
+    rows = np.flatnonzero(found.invalid)
+    assert len(rows) and [(x.trocar, x.trial) for x in kept] == [
+        (found.trocar[row], found.trial[row]) for row in rows
+    ]
+    for row, track in zip(rows, kept, strict=True):
+        assert len(track.qpos) == found.steps[row] and np.isfinite(track.qpos).all()
+        assert track.labels["source"] == found.labels["source"][row]
+
+
+def test_an_evaluation_without_diverged_trials_has_no_file_of_them(tmp_path):
+    found = run(tmp_path, trials=1, chunk=6)
+    assert (tmp_path / "invalid.npz").exists() == found.invalid.any()
+
+
 def recorded_max(kept, row):
     return 1e3 * np.nanmax(kept["rcm_error"][row])
 

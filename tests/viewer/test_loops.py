@@ -136,7 +136,8 @@ def test_a_person_demonstrates_and_keeps_it(page, steered, hurried, tmp_path):
     np.testing.assert_allclose(np.asarray(data.trocar.trocar), np.asarray(told), rtol=1e-6)
 
     dataset = browse.open_dataset(root)
-    assert browse.run(page, dataset, after(20)).startswith("1 of 1")
+    episodes = browse.of_dataset(dataset)
+    assert browse.run(page, episodes, after(20)).startswith("1 of 1")
 
 
 def test_an_episode_can_be_seen_again_before_it_is_saved(page, steered, hurried, tmp_path):

@@ -12,7 +12,7 @@ from starjax.limits import Range
 from starjax.policies import packaged
 from starjax.runtime import hub, jax_start, signals, xla
 
-DESCRIPTION = """Shows a policy, an expert or a dataset on a page in the browser.
+DESCRIPTION = """Shows a policy, an expert, a dataset or recorded trials on a page in the browser.
 
 The page has the scene in 3D, the camera's image, the RCM error and the plan. Drag a trocar by its
 arrows, or set it by sliders, and the policy continues through it, also in the next trials. Ctrl-C
@@ -36,6 +36,8 @@ class ViewArgs:
     run: str = ""  # directory of a method, such as runs/cpu/stardiff: its policy
     expert: bool = False  # the task's scripted demonstrator, the default
     dataset: str = ""  # directory of demonstrations: its episodes
+    # recorded.npz or invalid.npz of an evaluation: its trials
+    trials: str = ""
     # second agent at the same trial: expert, or a policy as above
     compare_with: str = ""
     # sweep.json of starjax sweep, whose trials are dots at their trocars; default: the one in --run
@@ -50,19 +52,22 @@ class ViewArgs:
 def main(argv: Sequence[str]) -> int:
     """Serves the page until a stop."""
     args = options.parse("view", ViewArgs, argv, DESCRIPTION, renamed=_RENAMED)
-    named = [name for name in ("policy", "run", "dataset") if getattr(args, name)]
+    named = [name for name in ("policy", "run", "dataset", "trials") if getattr(args, name)]
     named += ["expert"] if args.expert else []
     if len(named) > 1:
         got = " and ".join(f"--{name}" for name in named)
         raise errors.UsageError(
-            "--policy, --run, --expert or --dataset", "at most one of them", got
+            "--policy, --run, --expert, --dataset or --trials", "at most one of them", got
         )
     xla.prepare_xla()
     jax_start.require_devices("starjax.viewer.view")
 
     from starjax.viewer import page
 
-    show = _dataset(args.dataset) if args.dataset else _live(args)
+    if args.trials:
+        show = _trials(args.trials)
+    else:
+        show = _dataset(args.dataset) if args.dataset else _live(args)
     with signals.stop_signals() as should_stop, page.serve(args.port) as server:
         print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
         print(show(server, should_stop))
@@ -77,7 +82,21 @@ def _dataset(folder: str) -> Show:
         dataset = browse.open_dataset(hub.dataset("--dataset", folder))
     except ValueError as error:  # of a damaged file, which it names
         raise errors.UsageError("--dataset", "a folder of demonstrations", error) from error
-    return lambda server, should_stop: browse.run(server, dataset, should_stop)
+    episodes = browse.of_dataset(dataset)
+    return lambda server, should_stop: browse.run(server, episodes, should_stop)
+
+
+def _trials(file: str) -> Show:
+    """Returns the viewer of an evaluation's recorded trials."""
+    from starjax.viewer import browse, trials
+
+    try:
+        recordings = trials.load(Path(file))
+    except (FileNotFoundError, ValueError) as error:  # it names the file
+        if isinstance(error, errors.UsageError):
+            raise
+        raise errors.UsageError("--trials", "trials of an evaluation", error) from error
+    return lambda server, should_stop: browse.run(server, recordings, should_stop)
 
 
 def _live(args: ViewArgs) -> Show:

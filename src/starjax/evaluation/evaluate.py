@@ -6,6 +6,7 @@ Chunks are split over the processes of a run; each process has all trials at the
                                versions replace the chunks
 <directory>/chunk_<n>.npz      a `trials.Table` of the chunk's trials; its recorded trials
 <directory>/recorded.npz       trajectories of a few trials, for figures and the video
+<directory>/invalid.npz        those of all trials whose simulation diverged, if any, to replay
 """
 
 import functools
@@ -35,7 +36,8 @@ from starjax.sim import endoscope_camera, registries
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
 GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
 
-_RECORDED = "recorded."
+_RECORDED, _INVALID = "recorded.", "invalid."  # before columns of trajectories in a chunk
+_FILES = {_RECORDED: "recorded.npz", _INVALID: "invalid.npz"}
 
 
 class EvaluationSettings(NamedTuple):
@@ -137,8 +139,8 @@ def evaluate(
         simulate = lambda trials: run(params, trials)  # noqa: E731
         parts = _parts(directory, env, simulate, group, spans, chosen, score)
         made = chunks.complete(share, parts, "Evaluation", "trials", report)
-        if share.is_first and chosen.any():
-            files.write_npz(directory / "recorded.npz", recorded.join([*map(_recorded, made)]))
+        if share.is_first:
+            _write_trajectories(directory, made)
     return tables.join([*map(tables.from_columns, made)])
 
 
@@ -225,7 +227,7 @@ def _resume(
     if old:
         report(f"{directory}: {old} chunks of another evaluation are replaced")
     # The plan goes first: chunks without one belong to nothing.
-    for file in [path, directory / "recorded.npz", *directory.glob("chunk_*.npz")]:
+    for file in [path, *map(directory.joinpath, _FILES.values()), *directory.glob("chunk_*.npz")]:
         file.unlink(missing_ok=True)
     files.write_json(path, {**plan, **sizes})
     return list(sizes.values())
@@ -240,15 +242,17 @@ def _parts(
     chosen: np.ndarray,
     score: Callable[[list[episodes.Episode]], np.ndarray] | None = None,
 ) -> chunks.Parts:
-    """Describes the chunks: tables of trials, and trajectories of the `chosen` `[M]` ones."""
+    """Describes the chunks: tables, trajectories of the `chosen` `[M]` and the invalid trials."""
     names = tables.names(env.task.labels, has_scores=score is not None)
     labels = env.task.labels
     has_endoscope = endoscope_camera.of(env.task, env.names.cameras) is not None
-    beside = {f"{_RECORDED}{name}" for name in recorded.names(labels, has_endoscope)}
+    of_trajectories = recorded.names(labels, has_endoscope)
 
     def check(number: int, arrays: chunks.Arrays) -> None:
         rows = spans[number]
-        wanted = {*names, *(beside if chosen[rows].any() else ())}
+        which = {_RECORDED: chosen[rows], _INVALID: arrays.get("invalid", np.zeros(0, bool))}
+        prefixes = [prefix for prefix, of in which.items() if of.any()]
+        wanted = {*names, *(f"{prefix}{name}" for prefix in prefixes for name in of_trajectories)}
         if different := wanted ^ arrays.keys():
             raise ValueError(f"{min(different)} is missing or too much")
         trials = [arrays[name].tolist() for name in ("trocar", "trial")]
@@ -262,20 +266,24 @@ def _parts(
             yield (segment.passed - passed) * len(group[rows])
             passed = segment.passed
         ended.sort(key=lambda episode: episode.trial)
-        kept = [e for e, keep in zip(ended, chosen[rows], strict=True) if keep]
-        found = recorded.take(kept, env.p_world_ref)
-        trajectories = {f"{_RECORDED}{name}": values for name, values in found.items()}
         table = tables.from_episodes(ended)._replace(scores=score and score(ended))
-        return tables.columns(table) | trajectories
+        columns = tables.columns(table)
+        for prefix, of in ((_RECORDED, chosen[rows]), (_INVALID, table.invalid)):
+            kept = [episode for episode, keep in zip(ended, of, strict=True) if keep]
+            found = recorded.take(kept, env.p_world_ref)
+            columns |= {f"{prefix}{name}": values for name, values in found.items()}
+        return columns
 
     paths = [directory / f"chunk_{number:04d}.npz" for number in range(len(spans))]
     return chunks.Parts(paths, [len(group[rows]) for rows in spans], check, make)
 
 
-def _recorded(arrays: chunks.Arrays) -> chunks.Arrays:
-    """Returns the trajectories of a chunk."""
-    return {
-        name.removeprefix(_RECORDED): values
-        for name, values in arrays.items()
-        if name.startswith(_RECORDED)
-    }
+def _write_trajectories(directory: Path, made: list[chunks.Arrays]) -> None:
+    """Writes the trajectories in all chunks to their files, none without trials."""
+    for prefix, name in _FILES.items():
+        parts = [
+            {key.removeprefix(prefix): x for key, x in arrays.items() if key.startswith(prefix)}
+            for arrays in made
+        ]
+        if any(parts):
+            files.write_npz(directory / name, recorded.join(parts))

@@ -1,5 +1,6 @@
 """A dataset's episodes on the page one by one, played, stepped or dragged through."""
 
+import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -42,6 +43,24 @@ class RecordedDataset(NamedTuple):
     keys: Sequence[str]
     drawn: redraw.DrawnImages | None
     first: np.ndarray
+
+
+class Recordings(NamedTuple):
+    """Recorded episodes of a scene.
+
+    Attributes:
+      names: the scene's names.
+      model: its C model.
+      hz: control steps per second.
+      keys: names of the episodes, in order.
+      read: name -> Recording; raises `store.DamagedEpisode`.
+    """
+
+    names: SceneNames
+    model: mujoco.MjModel
+    hz: float
+    keys: Sequence[str]
+    read: Callable[[str], "Recording"]
 
 
 class Recording(NamedTuple):
@@ -114,6 +133,14 @@ def read(dataset: RecordedDataset, key: str) -> Recording:
     return Recording([*steps[:-1], last], images, "success" if record["success"] else "failed")
 
 
+def of_dataset(dataset: RecordedDataset) -> Recordings:
+    """Returns the episodes of a dataset."""
+    hz = float(dataset.description["control_hz"])
+    return Recordings(
+        dataset.names, dataset.model, hz, dataset.keys, functools.partial(read, dataset)
+    )
+
+
 class EpisodePlayer:
     """The episode on the page.
 
@@ -123,16 +150,16 @@ class EpisodePlayer:
       t: the displayed control step.
     """
 
-    def __init__(self, server: Any, dataset: RecordedDataset):
-        self._server, self._dataset = server, dataset
-        self.hz = float(dataset.description["control_hz"])
+    def __init__(self, server: Any, recordings: Recordings):
+        self._server, self._recordings = server, recordings
+        self.hz = recordings.hz
         self._status = page.Status(server.gui)
-        self._stage = Stage(server.scene, dataset.model)
+        self._stage = Stage(server.scene, recordings.model)
         aim(server, 1)
         _, tab = page.side_panel(server.gui, "Recorded")
         with tab:
             self._plots = Plots(server.gui, ["recorded"], self.hz)
-            self._pictures = page.Pictures(server.gui, [f"{dataset.names.cameras[0]} sees"])
+            self._pictures = page.Pictures(server.gui, [f"{recordings.names.cameras[0]} sees"])
 
     @property
     def last(self) -> int:
@@ -142,7 +169,7 @@ class EpisodePlayer:
     def open(self, key: str) -> None:
         """Reads another episode; if it is damaged, notifies the user and keeps the present one."""
         try:
-            self._recording = read(self._dataset, key)
+            self._recording = self._recordings.read(key)
         except store.DamagedEpisode as error:
             page.notify(self._server, "Damaged", str(error), is_error=True)
             if not hasattr(self, "_recording"):
@@ -173,10 +200,10 @@ class EpisodePlayer:
             )
 
 
-def run(server: Any, dataset: RecordedDataset, should_stop: Callable[[], bool]) -> str:
+def run(server: Any, recordings: Recordings, should_stop: Callable[[], bool]) -> str:
     """Shows episodes until `should_stop()`; returns a summary line."""
-    gui, requests, keys = server.gui, page.UiRequests(), list(dataset.keys)
-    episode = EpisodePlayer(server, dataset)
+    gui, requests, keys = server.gui, page.UiRequests(), list(recordings.keys)
+    episode = EpisodePlayer(server, recordings)
     player = page.Player(gui, requests)
     choices = page.Choices(gui, requests, episode=(keys, keys[0]))
     slider = gui.add_slider("Time (%)", 0.0, 100.0, 0.1, 0.0)
