@@ -107,7 +107,10 @@ def commands() -> str:
         parts += ["", "```bash", *map(str.strip, examples.splitlines()), "```"]
         parts += ["", f"Needs the extras {', '.join(f'`{extra}`' for extra in needed)}."]
         if name in ("run", "collect", "train"):
-            parts += ["", "Flags: the [settings of a run](config.md)."]
+            parts += [
+                "",
+                "Flags: the [settings of a run](config.md), and `--track tensorboard` or `wandb`.",
+            ]
         elif flags_of:
             lines = rows(flags_of[0], flags_of[0])
             lines = [(f"`{flag}`", *rest) for flag, *rest in lines]
