@@ -2,11 +2,17 @@
 
 import types
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import stubs
 
-from starjax.rollouts import progress
+from starjax import rcm
+from starjax.rollouts import agent, progress, takeover
+from starjax.sim import env as sim_env
+from starjax.sim.tasks.rescue import Rescuer
+from starjax.types import Command, Pose
 
 
 def stalls(rewards, steps=4):
@@ -39,3 +45,48 @@ def test_an_episode_stalls_once_its_best_reward_is_old():
 def test_the_most_urgent_cause_counts(signals, cause):
     number = progress.cause(*map(jnp.bool_, signals))
     assert progress.CAUSES[int(number)] == cause and number.dtype == np.int32
+
+
+def spells(state, first):
+    """A command that says when its agent began, and the present step."""
+    p = jnp.stack([first, state.step.astype(jnp.float32), 0.0])[None]
+    return Command(Pose(state.pose.R, p), jnp.ones(1))
+
+
+def spy(lost_at):
+    def act(first, state):
+        command = spells(state, first)
+        return command, first, command
+
+    def resume(key, state):
+        return state.step.astype(jnp.float32)
+
+    return Rescuer(resume, act, lambda state: state.step >= lost_at)
+
+
+@pytest.mark.parametrize(
+    ("lost_at", "limits", "begins", "cause"),
+    [(99, (20, 6), 6, "stalled"), (99, (4, 6), 4, "clock"), (3, (20, 6), 3, "nearly lost")],
+)
+def test_the_expert_begins_at_the_state_of_the_signal_and_stays(lost_at, limits, begins, cause):
+    def policy_act(params, memory, state, observe, t):
+        command = Command(state.pose, -jnp.ones((2, 1)))
+        return command, memory + 1, command
+
+    policy = agent.BatchAgent(lambda params, keys, state, observe: jnp.zeros(2), policy_act, {})
+    both = takeover.from_policy(policy, spy(lost_at))
+    env = stubs.make_env(unlucky=0.0)
+    trocar = rcm.Trocar(*(jnp.asarray(x) for x in stubs.trocars(0, 1)))
+    keys = jax.random.split(jax.random.key(0), 2)
+    state = jax.vmap(env.reset)(keys, sim_env.EnvParams(trocar))
+    params = (None, takeover.TakeoverLimits(*map(np.int32, limits)))
+    memory = both.init(params, keys, state, None)
+    for step in range(9):
+        state = state.replace(step=jnp.full(2, step))
+        executed, memory, label = both.act(params, memory, state, None, step)
+        np.testing.assert_array_equal(executed.gripper, 1.0 if step >= begins else -1.0)
+        jax.tree.map(np.testing.assert_array_equal, executed, label)
+        if step >= begins:
+            np.testing.assert_array_equal(executed.pose.p[:, 0, 0], begins)
+            np.testing.assert_array_equal(executed.pose.p[:, 0, 1], step)
+    assert {progress.CAUSES[number] for number in memory.cause.tolist()} == {cause}

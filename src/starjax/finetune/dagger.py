@@ -20,7 +20,7 @@ from starjax.sim.tasks.base import Task
 
 SOURCE = "intervention"
 CLOCK_QUANTILE = 0.95  # of the control steps of the policy's successes
-LEAST_RESCUE_S = 10.0  # s, the least that the expert has
+LEAST_RESCUE_S = 15.0  # s, the least that the expert has
 
 
 def limits(steps: np.ndarray, control_hz: float) -> tuple[takeover.TakeoverLimits, int]:
