@@ -56,8 +56,8 @@ class Kind(NamedTuple):
 def main(argv: Sequence[str]) -> int:
     """Prints the checks; returns 1 if one failed."""
     args = options.parse("check", CheckArgs, argv, DESCRIPTION)
+    xla.prepare_xla()  # before the module of a part starts jax
     kind, name = resolve(args.part)
-    xla.prepare_xla()
     jax_start.require_devices("starjax.commands.part_checks.base")
     from starjax.commands.part_checks.base import FAILED
 

@@ -1,0 +1,1 @@
+"""Parts of starjax in a package of their own, one of each kind."""
