@@ -1,5 +1,7 @@
 """Training jobs for tests that run them in processes of their own. Runs nothing on import."""
 
+# pyright: reportArgumentType=false
+
 import dataclasses
 import signal
 import sys
@@ -154,6 +156,34 @@ def processes_main(out: str, asks: int) -> None:
     save(Path(out) / f"found-{jax.process_index()}.npz", processes.own(result.state))
 
 
+def feed_main(out: str) -> None:
+    """Saves the rows of a streamed batch that one process of several gathers, and their places."""
+    import jax
+    import numpy as np
+
+    from starjax.runtime import processes
+
+    processes.join()  # before the modules that make a mesh
+    import test_prefetch
+
+    from starjax.training import devices, prefetch
+    from starjax.training.sharding import StateLayout
+
+    mesh = devices.make_mesh(16)
+    layout = StateLayout(mesh, lambda params: params, test_prefetch.NOTHING)
+    setup = test_prefetch.SETUP._replace(layout=layout)
+    dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
+    gathered, gather = [], prefetch.windows.gather
+    prefetch.windows.gather = lambda d, f, *a: gathered.append(len(f)) or gather(d, f, *a)
+    stream = prefetch.batches(setup, dataset, np.arange(40), jax.random.key(3), 0)
+    found = next(stream).observation.pose.p
+    stream.close()
+    parts = sorted(found.addressable_shards, key=lambda shard: shard.index[0].start)
+    tips = np.concatenate([np.asarray(shard.data) for shard in parts])
+    path = Path(out) / f"feed-{jax.process_index()}.npz"
+    np.savez(path, tips=tips, rows=devices.own_rows(mesh, 16), gathered=gathered[0])
+
+
 def run_main(out: str, mode: str) -> None:
     """Is one process of several of `starjax run`: `waits` before it, `trains` without an end until
     it is told to stop, or does the `whole` of a run with a stub of the simulator."""
@@ -209,6 +239,8 @@ if __name__ == "__main__":
     runtime.prepare_xla()
     if sys.argv[1] == "process":
         processes_main(sys.argv[2], int(sys.argv[3]))
+    elif sys.argv[1] == "feed":
+        feed_main(sys.argv[2])
     elif sys.argv[1] in ("trains", "waits", "whole"):
         run_main(sys.argv[2], sys.argv[1])
     else:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import fakes
 import jax
 import mistakes
 import numpy as np
@@ -18,10 +19,11 @@ from starjax.commands import pipeline
 from starjax.data import store
 from starjax.evaluation import result
 from starjax.runtime import processes
-from starjax.training import checkpoint, log, loop
+from starjax.training import checkpoint, log, loop, prefetch
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
+import test_prefetch
 
 
 def start_two(*words: str) -> list[subprocess.Popen]:
@@ -53,6 +55,19 @@ def test_two_processes_are_one_run(tmp_path, monkeypatch):
     logs = [log.read(tmp_path / name / "metrics.jsonl") for name in ("run", "alone")]
     ours, theirs = ([(line["step"], line["kind"]) for line in lines] for lines in logs)
     assert ours == theirs  # the log of the first process alone
+
+
+def test_a_process_reads_its_share_of_a_streamed_batch(tmp_path):
+    several.finish(start_two("feed", str(tmp_path)))
+    own = [dict(np.load(tmp_path / f"feed-{i}.npz")) for i in range(2)]
+    assert [int(one["gathered"]) for one in own] == [8, 8]
+    np.testing.assert_array_equal(np.concatenate([one["rows"] for one in own]), np.arange(16))
+    dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
+    stream = prefetch.batches(test_prefetch.SETUP, dataset, np.arange(40), jax.random.key(3), 0)
+    alone = np.asarray(next(stream).observation.pose.p)
+    stream.close()
+    # The demonstrations of the two processes differ in last bits.
+    np.testing.assert_allclose(np.concatenate([one["tips"] for one in own]), alone, atol=1e-7)
 
 
 def test_the_whole_of_a_run_is_done_together(tmp_path):

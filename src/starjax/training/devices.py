@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from starjax import errors
@@ -69,9 +70,23 @@ def replicate(tree: Any, mesh: Mesh, may_alias: bool | None = False) -> Any:
     return _put(tree, replicated(mesh), may_alias)
 
 
-def shard_batch(tree: Any, mesh: Mesh) -> Any:
-    """Splits the leading axis of every array over the devices."""
-    return _put(tree, batch_sharding(mesh), None)
+def own_rows(mesh: Mesh, count: int) -> np.ndarray:
+    """Returns the rows of a batch of `count` that the devices of this process hold."""
+    sharding = batch_sharding(mesh)
+    spans: Any = sharding.addressable_devices_indices_map((count,)).values()
+    return np.unique(np.concatenate([np.arange(count)[span] for (span,) in spans]))
+
+
+def shard_own(tree: Any, mesh: Mesh, count: int) -> Any:
+    """Splits a batch of `count`, of which every process has its `own_rows`, over the devices."""
+    sharding = batch_sharding(mesh)
+    if sharding.is_fully_addressable:
+        return _put(tree, sharding, None)
+
+    def join(x: Any) -> jax.Array:
+        return jax.make_array_from_process_local_data(sharding, x, (count, *x.shape[1:]))
+
+    return jax.tree.map(join, tree)
 
 
 def _put(tree: Any, sharding: NamedSharding, may_alias: bool | None) -> Any:

@@ -47,6 +47,9 @@ def batches(
 
         return jax.vmap(of)(first_step + jnp.arange(_CHUNK))
 
+    batch_size = setup.train_config.batch_size
+    rows = devices.own_rows(mesh, batch_size)  # others are read by other processes
+
     @arrays.broadcasting
     def produce() -> None:
         try:
@@ -58,12 +61,12 @@ def batches(
                         return
                     batch = windows.gather(
                         dataset,
-                        frame[i],
+                        frame[i][rows],
                         policy_config.obs_horizon,
                         policy_config.horizon,
-                        None if seen is None else seen[i],
+                        None if seen is None else seen[i][rows],
                     )
-                    _put(waiting, devices.shard_batch(batch, mesh), closed)
+                    _put(waiting, devices.shard_own(batch, mesh, batch_size), closed)
                 step += _CHUNK
         except BaseException as error:  # raised by the consumer's next call
             _put(waiting, error, closed)
