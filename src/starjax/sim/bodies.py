@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 
 from starjax.sim.tasks.base import Contacts
 from starjax.types import Pose
@@ -26,6 +27,12 @@ def upright_coords(pose: Pose) -> jax.Array:
     """Returns the 7 coordinates of a free body that is turned about the world's z axis only."""
     half, zero = 0.5 * jnp.arctan2(pose.R[1, 0], pose.R[0, 0]), jnp.zeros(())
     return jnp.concatenate([pose.p, jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])])
+
+
+def free_coords(pose: Pose) -> jax.Array:
+    """Returns the 7 coordinates of a free body."""
+    wxyz = jnp.roll(Rotation.from_matrix(pose.R).as_quat(), 1)
+    return jnp.concatenate([pose.p, wxyz])
 
 
 def is_sound(

@@ -26,6 +26,7 @@ tasks = Registry(
         "needle_handover": "starjax.sim.tasks.needle_handover.task:TASK",
         "ring_on_wire": "starjax.sim.tasks.ring_on_wire.task:TASK",
         "endoscope_track": "starjax.sim.tasks.endoscope_track.task:TASK",
+        "needle_regrasp": "starjax.sim.tasks.needle_regrasp.task:TASK",
     },
     "starjax.sim.tasks.base:Task",
 )
