@@ -1,13 +1,17 @@
 """Playground's shape: a proportional controller, as a scan over a batch, solves reach."""
 
+import abc
 import inspect
+import pathlib
+import sys
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.envs import playground
+from starjax.envs import playground, playground_registry, settings
 from starjax.types import Command
 
 LANES, STEPS = 4, 120
@@ -27,6 +31,15 @@ def test_it_has_what_playgrounds_learners_read(env):
     assert env.action_size == 5 and env.observation_size == 22 and env.unwrapped is env
     assert env.n_substeps * env.sim_dt == pytest.approx(env.dt) == pytest.approx(1 / 30)
     assert env.mj_model.nq == env.mjx_model.nq and env.episode_length == STEPS
+    assert len(repr(env)) < 100 and pathlib.Path(env.xml_path).is_file()
+
+
+def test_a_trajectory_is_rendered_state_by_state():
+    episodes = types.SimpleNamespace(camera=lambda shade: jnp.full((4, 6, 3), shade, jnp.uint8))
+    env = playground.Environment(*[None] * 10, episodes=episodes)
+    states = [playground.State(shade, *[None] * 5) for shade in (3, 200)]
+    assert env.render(states[1]).shape == (4, 6, 3)
+    assert [image.max() for image in env.render(states)] == [3, 200]
 
 
 @pytest.mark.slow
@@ -54,3 +67,26 @@ def test_a_proportional_controller_reaches_and_rests(env):
     assert (reward[live] <= 0).all() and (reward[live] >= -1).all()
     assert float(reward[0].mean()) < -0.5 and not reward[-1].any()
     assert reward.dtype == done.dtype == jnp.float32
+
+
+def test_tasks_are_in_playgrounds_registry(monkeypatch):
+    """A fake of Playground: its registry's signature, and its abstract class."""
+    rows, made = {}, []
+    fake = types.ModuleType("mujoco_playground")
+    fake.MjxEnv = type("MjxEnv", (abc.ABC,), {})
+    register = lambda name, cls, config: rows.update({name: (cls, config)})  # noqa: E731
+    fake.manipulation = types.SimpleNamespace(register_environment=register)
+    collections = types.ModuleType("ml_collections")
+    collections.ConfigDict = type("ConfigDict", (dict,), {"to_dict": lambda self: dict(self)})
+    monkeypatch.setitem(sys.modules, "mujoco_playground", fake)
+    monkeypatch.setitem(sys.modules, "ml_collections", collections)
+    names = playground_registry.register()
+    assert "StarjaxPegTransferBimanual" in names and list(rows) == names
+    assert issubclass(playground.Environment, fake.MjxEnv)
+    make, default = rows["StarjaxReach"]
+    monkeypatch.setattr(playground, "make", lambda task, **given: made.append((task, given)))
+    make(config=default(), config_overrides={"trocar": "unseen"})
+    ((task, given),) = made
+    assert task == "reach" and given["trocar"] == "unseen"
+    assert given["max_episode_steps"] == default()["episode_length"] > 0
+    settings.make(task=task, **given)  # every entry is a setting

@@ -8,6 +8,7 @@ One environment, for `vmap`, `jit` and `scan`. As in Playground, wrappers start 
 apply the time limit `episode_length`.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,8 +16,10 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from starjax.envs import mdp, settings
+from starjax.sim import assets
 
 
 @flax.struct.dataclass
@@ -69,6 +72,32 @@ class Environment(NamedTuple):
     def unwrapped(self) -> "Environment":
         """Itself."""
         return self
+
+    @property
+    def xml_path(self) -> str:
+        """The task's MJCF; arms and tools are composed with it, see `mj_model`."""
+        return str(assets.path(self.episodes.env.task.mjcf))
+
+    def render(self, trajectory: Any) -> Any:
+        """Renders the first camera: `[h, w, 3]` uint8 of a state, a list for a list of states.
+
+        Its size is the argument `image_size` of `make`.
+        """
+        camera = _compiled(self.episodes.camera)
+        if isinstance(trajectory, list):
+            return [np.asarray(camera(state.data)) for state in trajectory]
+        return np.asarray(camera(trajectory.data))
+
+    def __repr__(self) -> str:
+        """Returns a line with the task, instead of all its models' arrays."""
+        task, sizes = self.episodes.env.names.task, self.observation_size
+        return f"Environment({task!r}, actions {self.action_size}, observations {sizes})"
+
+
+@functools.lru_cache(8)
+def _compiled(camera: Callable[[Any], jax.Array]) -> Callable[[Any], jax.Array]:
+    """Returns the camera of some episodes, compiled once."""
+    return jax.jit(camera)
 
 
 def make(task: str, **arguments: Any) -> Environment:

@@ -10,8 +10,12 @@ VERSION = 0
 
 def name(task: str) -> str:
     """Returns Gymnasium's name of a task: `starjax/PegTransfer-v0` of `peg_transfer`."""
-    words = re.split(r"[_\W]+", task)
-    return f"starjax/{''.join(word[:1].upper() + word[1:] for word in words)}-v{VERSION}"
+    return f"starjax/{words(task)}-v{VERSION}"
+
+
+def words(task: str) -> str:
+    """Returns a task's name in camel case: `PegTransfer` of `peg_transfer`."""
+    return "".join(word[:1].upper() + word[1:] for word in re.split(r"[_\W]+", task))
 
 
 def register() -> None:
