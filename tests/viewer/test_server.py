@@ -79,9 +79,16 @@ def test_sliders_and_handles_of_trocars_follow_each_other(page, name):
     assert np.abs(drawn - p).max() > 1e-4
     for slot, one in zip(task.slots, drawn):
         np.testing.assert_allclose(handles.within(slot, one), one, atol=1e-5)
-    shown = [[row.value for row in rows] for rows in found._sliders]
-    fields = np.stack(rcm.trocar_from_position(drawn, ref), -1) * [1e3, *[180 / np.pi] * 2]
-    np.testing.assert_allclose(shown, fields, atol=0.51)
+    # Sliders are at the trocar, whichever turn its azimuth counts from.
+    for azimuth in (-10.0, 0.0, 10.0, 350.0):
+        angle = np.full(task.arms, np.radians(azimuth))
+        wide = rcm.Trocar(np.full(task.arms, 0.03), np.full(task.arms, 1.5), angle)
+        p = np.asarray(rcm.trocar_position(wide, ref))
+        p = np.stack([handles.within(slot, one) for slot, one in zip(task.slots, p)])
+        found.place(p)
+        values = np.array([[row.value for row in rows] for rows in found._sliders])
+        shown = rcm.Trocar(*(values / [1e3, *[180 / np.pi] * 2]).T)
+        np.testing.assert_allclose(rcm.trocar_position(shown, ref), p, atol=1e-3)
     found.release()
     assert found.own() is None
     found.remove()

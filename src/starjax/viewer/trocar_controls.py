@@ -101,5 +101,7 @@ class TrocarControls:
         self._shown = np.array(p_world_trocar, np.float32)
         trocar = np.stack(_spherical(self._shown, self._p_world_ref), -1) * _UNITS
         for rows, values in zip(self._sliders, trocar):
+            middle = 0.5 * (rows[2].min + rows[2].max)  # azimuths wrap around
+            values[2] = middle + (values[2] - middle + 180.0) % 360.0 - 180.0
             for row, value, step in zip(rows, values, _STEPS):
                 row.value = float(np.clip(round(value / step) * step, row.min, row.max))
