@@ -1,13 +1,14 @@
 """Success of the scripted expert: the task's trocars, and others drawn from Eq. 19.
 
     python benchmarks/bench_expert.py [--per-trocar 100] [--sampled 500] [--seed 2026] \\
-        [--task peg_transfer] [--arm fr5] [--tool grasper] [--expert default] [--seconds 0]
+        [--task peg_transfer] [--arm fr5] [--tool grasper] [--expert default] [--seconds 0] [--c]
 
 Committed figures of the built-in experts; `starjax check TASK` checks any expert.
 """
 
 import argparse
 
+import _c_env
 import _scene
 import _timing
 import jax
@@ -30,9 +31,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--expert", default="", help="by default the task's first one")
     parser.add_argument("--seconds", type=float, default=0.0, help="of an episode; 0: enough")
+    parser.add_argument("--c", action="store_true", help="C MuJoCo's physics instead of ours")
     _scene.add_flags(parser)
     arguments = parser.parse_args()
     environment = _scene.make(arguments, observation="state")
+    if arguments.c:
+        environment = _c_env.with_c_physics(environment)
     experts = environment.task.experts
     expert = arguments.expert or next(iter(experts))
     errors.choice("expert", expert, experts)
@@ -54,7 +58,7 @@ def main() -> None:
         ),
         "eq19": _score(environment, agent, drawn, jax.random.fold_in(key, 3), steps, "from Eq. 19"),
     }
-    name = _scene.result_name("expert", environment.names)
+    name = _scene.result_name("expert_c" if arguments.c else "expert", environment.names)
     print("written to", _timing.write(name, results))
 
 
