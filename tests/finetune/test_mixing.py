@@ -4,6 +4,7 @@ import dataclasses
 
 import fakes
 import jax
+import mistakes
 import numpy as np
 import pytest
 
@@ -27,7 +28,9 @@ def parts():
 @pytest.fixture(scope="module")
 def begun(parts):
     demonstrations, rollouts, frames = parts
-    stats = normalizer.fit(ROW, fakes.TASK, demonstrations, np.arange(30))
+    fitted = normalizer.fit(ROW, fakes.TASK, demonstrations, np.arange(240))
+    half = normalizer.MinMax(0.5 * fitted.action.low, 0.5 * fitted.action.high)
+    stats = fitted.replace(action=half)
     params = {"learner": np.ones(2), "vision": np.ones(2)}
     given = (params, stats, demonstrations, [(rollouts, frames)])
     return stats, *mixing.start(ROW, fakes.TINY, SETTINGS, *given)
@@ -57,6 +60,14 @@ def test_half_of_a_batch_is_rollouts_and_none_is_held_out_or_a_policys(begun, pa
     assert (demonstrated % 30 % 3 == 0).all() and not set(demonstrated) & set(start.held_out)
     episodes = np.asarray(dataset.episode)
     assert not set(episodes[demonstrated]) & set(episodes[start.held_out])
+
+
+def test_images_that_stay_on_disk_are_refused(parts):
+    on_disk = parts[0].replace(
+        observation=parts[0].observation._replace(images={"camera": object()})
+    )
+    with mistakes.of("the demonstrations"):
+        mixing.joined([on_disk, parts[1]])
 
 
 def test_few_frames_are_not_learned_by_heart():

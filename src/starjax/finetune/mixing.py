@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, methods
+from starjax import config, errors, methods
 from starjax.data import normalizer, redraw, windows
 from starjax.policies import policy as policies
 from starjax.rollouts import takeover
@@ -20,7 +20,14 @@ MAX_REPEATS = 20  # of a frame for one of the larger part: more would be remembe
 
 
 def joined(datasets: Sequence[windows.Dataset]) -> windows.Dataset:
-    """Returns the frames of several datasets, which lie in one place, one after another."""
+    """Returns the frames of several datasets, one after another.
+
+    Raises:
+      errors.UsageError: images of some do not fit the memory, and are read or drawn when indexed.
+    """
+    if not all(isinstance(x, np.ndarray | jax.Array) for x in jax.tree.leaves(list(datasets))):
+        expected = "frames that fit the device's or the host's memory"
+        raise errors.UsageError("the demonstrations", expected, "more")
     counts = [int(np.sum(dataset.length)) for dataset in datasets]
     resident = all(map(windows.on_device, datasets))
     rows = windows.padded_count(sum(counts)) if resident else sum(counts)

@@ -11,8 +11,8 @@ from starjax.limits import Count, Range
 class FinetuneConfig:
     """Settings of `starjax finetune`, apart from the policy."""
 
-    # dagger: an expert finishes episodes in trouble, the policy learns its part; self: the policy
-    # learns successes of its own noisy rollouts
+    # dagger: an expert finishes episodes in trouble, and the policy learns the expert's part; self:
+    # the policy learns successes of its own noisy rollouts
     by: Literal["dagger", "self"] = "dagger"
     rounds: Annotated[int, Range(1, 100)] = 3  # rounds of rollouts and training
     trials: Count = 1200  # trials per round and seen trocar

@@ -66,7 +66,15 @@ rescuers = Registry(
     {
         **{
             name: f"starjax.sim.tasks.{name}.rescue:RESCUER"
-            for name in ("peg_transfer", "needle_pick", "ring_on_wire", "reach", "endoscope_track")
+            for name in (
+                "peg_transfer",
+                "needle_pick",
+                "ring_on_wire",
+                "reach",
+                "endoscope_track",
+                "needle_handover",
+                "peg_transfer_bimanual",
+            )
         },
         "peg_transfer.one_wall": "starjax.sim.tasks.peg_transfer.rescue:WITH_ONE_WALL",
     },
