@@ -153,9 +153,11 @@ def _episode(
         largest = largest.at[state.step].set(jnp.max(after.rcm_error))
         return after, memory, command, hit, largest, finite & _is_finite(env, after)
 
-    hold = Command(first.pose, first.gripper)
+    memory = agent.init(key_expert, first)
+    has_angles = jax.eval_shape(agent.act, memory, first)[0].wrist is not None
+    hold = Command(first.pose, first.gripper, first.wrist if has_angles else None)
     start = (
-        *(first, agent.init(key_expert, first), hold, first),
+        *(first, memory, hold, first),
         *(jnp.zeros(steps), _is_finite(env, first)),
     )
     state, _, command, hit, largest, finite = jax.lax.while_loop(
