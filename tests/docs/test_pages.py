@@ -10,7 +10,8 @@ import tomllib
 
 import pytest
 
-from starjax import cli, errors
+from starjax import cli, errors, methods, rcm
+from starjax.commands import presets
 from starjax.data.formats import base, mapping
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.learners import LEARNERS
@@ -19,6 +20,7 @@ from starjax.sim import registries
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 HEADER = re.compile(r"\A---\n(.*?)\n---\n", re.DOTALL)
 SNIPPET = re.compile(r'^--8<-- "([^":]+)"$', re.MULTILINE)
+INCLUDED = re.compile(r"^<!-- (\S+\.\w+) -->\n```\w+\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)\s]*)?\)")
 
 
@@ -74,11 +76,13 @@ def test_programs_run(page, tmp_path, monkeypatch):
             exec(compile("\n" * line + block[2], str(page), "exec"), names)
 
 
-def test_configurations_are_read(page, root, tmp_path):
+def test_configurations_are_read(page, tmp_path):
     """Entry points are of groups that are looked at; anything else is a mapping of a dataset."""
     kinds = (registries.tasks, registries.arms, registries.tools, registries.workspaces, LEARNERS)
     groups = {f"starjax.{one.kind}s" for one in (*kinds, base.FORMATS, DISTURBANCES)}
-    for block in blocks(page, root, "toml"):
+    rows = (methods.METHODS, rcm.ACTION_SPACES, presets.PRESETS)
+    groups |= {f"starjax.{one.registry.kind}s" for one in rows} | {"starjax.policies"}
+    for block in blocks(page, "toml"):
         found = tomllib.loads(block)
         if "project" in found:
             assert found["project"]["entry-points"].keys() <= groups
@@ -87,16 +91,16 @@ def test_configurations_are_read(page, root, tmp_path):
             assert mapping.load(tmp_path / "map.toml").task in registries.tasks.names()
 
 
-def blocks(page, root, language):
-    """Blocks of a page in a language, the files that they include in them."""
+def blocks(page, language):
+    """Blocks of a page in a language."""
     for found, block in FENCE.findall(page.read_text()):
         if found == language:
-            yield SNIPPET.sub(lambda said: (root / said[1]).read_text(), block)
+            yield block
 
 
 def commands(page, root):
     """(command, flags and their values) of all `starjax` lines of a page's shell blocks."""
-    for block in blocks(page, root, "bash"):
+    for block in blocks(page, "bash"):
         for line in block.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
             for i, word in enumerate(words):
@@ -143,12 +147,12 @@ def test_links_lead_somewhere(page, root):
             assert path.exists() or path.stem in made or path.suffix in (".png", ".gif"), target
 
 
-def test_snippets_are_there(page, root):
-    """A formatter that takes such a line for Python would spoil it."""
-    lines = [line for line in page.read_text().splitlines() if line.startswith("--8")]
-    for line in lines:
-        path = re.fullmatch(r'--8<-- "([^":]+)"', line)
-        assert path and (root / path[1]).exists(), line
+def test_included_files_are_as_they_are(page, root):
+    """A page has the text of a file, which the repository's own view shows too."""
+    text = page.read_text()
+    assert not SNIPPET.search(text)
+    for path, block in INCLUDED.findall(text):
+        assert block.strip() == (root / path).read_text().strip(), path
 
 
 def test_readme_is_short(root):
