@@ -9,6 +9,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from starjax.runtime import hashing
 
@@ -23,7 +24,7 @@ def augment(
     images: jax.Array,
     *,
     crop: int,
-    jitter: float = 0.1,
+    jitter: float | np.ndarray = 0.1,
     noise: float = 0.02,
     dtype: jnp.dtype = jnp.float32,
 ) -> tuple[jax.Array, jax.Array]:
@@ -36,7 +37,8 @@ def augment(
       key: one typed key for the whole batch.
       images: uint8 `[..., h, w, 3]`.
       crop: side of the crop in pixels.
-      jitter: brightness, contrast and saturation factors are uniform within 1 +- this.
+      jitter: brightness, contrast and saturation factors are uniform within 1 +- this; `[K]` for
+        images `[..., K, h, w, 3]` of K cameras.
       noise: standard deviation, of values in [0, 1].
       dtype: of the result.
 
@@ -50,6 +52,8 @@ def augment(
     bits = jax.random.bits(key, (len(frames), 6), jnp.uint32)
     spans = jnp.array([height - crop + 1, width - crop + 1], jnp.uint32)
     corner = (bits[:, :2] % spans).astype(jnp.int32)
+    if np.ndim(jitter):
+        jitter = np.broadcast_to(jitter, lead).reshape(-1, 1)
     factors = 1.0 + jitter * ((bits[:, 2:5] >> 8).astype(jnp.float32) * 2.0**-23 - 1.0)
     x = jax.vmap(lambda f, c: jax.lax.dynamic_slice(f, (c[0], c[1], 0), (crop, crop, 3)))(
         frames, corner

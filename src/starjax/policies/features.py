@@ -5,9 +5,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from starjax import config, methods, rcm
 from starjax.data import augment, normalizer, windows
+from starjax.sim import names
 from starjax.sim.tasks.base import Task
 from starjax.types import Observation
 
@@ -152,7 +154,7 @@ def training_inputs(
         key_image,
         _images(sensors, observation),
         crop=crop_size(policy_config),
-        jitter=train_config.jitter,
+        jitter=_jitter(train_config.jitter, sensors.cameras),
         noise=train_config.image_noise,
         dtype=jnp.dtype(policy_config.dtype),
     )
@@ -188,6 +190,12 @@ def _history(
     state = jnp.asarray(observation.state)
     relative = task.relative(state, observation.pose.p)
     return jnp.concatenate([proprioception, stats.state.normalize(state), relative], axis=-1)
+
+
+def _jitter(jitter: float, cameras: Sequence[str]) -> float | np.ndarray:
+    """Returns the jitter of all images, or `[K]` with none for views of depth."""
+    is_depth = np.array([names.is_depth(camera) for camera in cameras])
+    return np.where(is_depth, 0.0, jitter).astype(np.float32) if is_depth.any() else jitter
 
 
 def _images(sensors: Sensors, observation: Observation) -> jax.Array:

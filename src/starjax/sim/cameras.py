@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax.sim import endoscope_camera, render
+from starjax.sim import derived_views, endoscope_camera, render
 from starjax.sim.quiet_mjx import mjx
 from starjax.types import Pose
 
@@ -21,11 +21,12 @@ class SceneCamera(NamedTuple):
     """One camera of a scene.
 
     Attributes:
-      name: in the MJCF.
+      name: in the MJCF, or of a view derived from it, see `derived_views`.
       body: that it rides on, 0 for the world.
       R, p: `[3, 3]` and `[3]` m, pose in that body's frame: x to the right, y up, looking along -z.
       moves: True if its pose comes with every image.
       draw: see `render.make`.
+      is_depth: True if its images are depth.
     """
 
     name: str
@@ -34,6 +35,7 @@ class SceneCamera(NamedTuple):
     p: np.ndarray
     moves: bool
     draw: render.Render
+    is_depth: bool = False
 
 
 def make(
@@ -50,16 +52,18 @@ def make(
     `scope` is where the endoscope may be, if a trocar of its own holds it.
     """
     made = []
+    known = [mj_model.camera(i).name for i in range(mj_model.ncam)]
     for name in names:
-        camera = mj_model.camera(name)
+        view = derived_views.parse(name, known)
+        model = derived_views.displaced(mj_model, view)
+        camera = model.camera(view.camera)
         body, R = int(camera.bodyid[0]), np.zeros(9)
         mujoco.mju_quat2Mat(R, camera.quat)
         R, p = R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32)
         moves = moving or body != 0 or (scope is not None and name == endoscope_camera.NAME)
-        draw = render.make(
-            mj_model, name, image_size, image_size, shadow, samples=samples, moves=moves
-        )
-        made.append(SceneCamera(name, body, R, p, moves, draw))
+        sizes, more = (image_size, image_size), {"samples": samples, "depth": view.is_depth}
+        draw = render.make(model, view.camera, *sizes, shadow, moves=moves, **more)
+        made.append(SceneCamera(name, body, R, p, moves, draw, view.is_depth))
     return tuple(made)
 
 
@@ -99,9 +103,16 @@ def images(
         draw: Callable[..., render.CameraImage] = camera.draw
         inputs = (data.geom_xpos, data.geom_xmat, rgb)
         if not camera.moves:
-            frames[camera.name] = draw(*inputs)
+            frames[camera.name] = _as_image(camera, draw(*inputs))
             continue
         R_world_body, p_world_body = data.xmat[camera.body], data.xpos[camera.body]
         pose = Pose(R_world_body @ poses.R[i], p_world_body + R_world_body @ poses.p[i])
-        frames[camera.name] = draw(*inputs, pose)
+        frames[camera.name] = _as_image(camera, draw(*inputs, pose))
     return frames
+
+
+def _as_image(camera: SceneCamera, frame: render.CameraImage) -> render.CameraImage:
+    """Returns the image with its depth in place of colours, if the view is one of depth."""
+    if frame.depth is None or not camera.is_depth:
+        return frame
+    return frame.replace(rgb=derived_views.encode(frame.depth))

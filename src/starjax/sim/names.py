@@ -16,3 +16,11 @@ class SceneNames(NamedTuple):
     arms: tuple[str, ...]
     tools: tuple[str, ...]
     cameras: tuple[str, ...]
+
+
+DEPTH = "_depth"  # ends the name of a view of depth, see `derived_views`
+
+
+def is_depth(camera: str) -> bool:
+    """Returns True if the images of a camera's name hold depth instead of colours."""
+    return camera.endswith(DEPTH)

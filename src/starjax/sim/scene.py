@@ -14,7 +14,16 @@ import numpy as np
 
 from starjax import errors
 from starjax.config import DEFAULT_TASK
-from starjax.sim import contract, endoscope_camera, ik, mjcf_parts, registries, robot, solver
+from starjax.sim import (
+    contract,
+    derived_views,
+    endoscope_camera,
+    ik,
+    mjcf_parts,
+    registries,
+    robot,
+    solver,
+)
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
@@ -119,8 +128,11 @@ def name(
         chosen[kind] = names
     still = next((one for one in record.cameras if one != endoscope_camera.NAME), FIXED)
     cameras = tuple(still if one == FIXED else one for one in cameras) or record.cameras[:1]
+    observed = [one for one in record.cameras if one != endoscope_camera.NAME]
     for one in cameras:
-        errors.choice("camera", one, record.cameras)
+        errors.choice(
+            "camera", one, dict.fromkeys([*record.cameras, *derived_views.names(observed)])
+        )
     return SceneNames(task, chosen["arm"], chosen["tool"], cameras)
 
 
@@ -153,7 +165,7 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
         _add_endoscope(world, scope)
     known = [camera.name for camera in world.cameras]
     for camera in names.cameras:
-        errors.choice("camera", camera, known)
+        errors.choice("camera", derived_views.parse(camera, known).camera, known)
     for limit, size in zip(mjcf_parts.CONTACT_LIMITS, limits):
         world.add_numeric(name=limit, data=[float(size)], size=1)
     with mjcf_parts.explained(part):

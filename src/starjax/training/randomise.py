@@ -167,7 +167,10 @@ def disturb_images(
     """
     for name, start in _started(names, draws):
         change = functools.partial(base.change_image, DISTURBANCES.get(name), start)
-        images = {camera: jax.vmap(change)(frames, steps) for camera, frames in images.items()}
+        images = {
+            camera: jax.vmap(functools.partial(change, camera=camera))(frames, steps)
+            for camera, frames in images.items()
+        }
     return images
 
 

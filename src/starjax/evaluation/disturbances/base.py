@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from starjax import errors
 from starjax.evaluation.disturbances import DISTURBANCES
+from starjax.sim.names import is_depth
 from starjax.sim.state import Env, EnvParams, EnvState
 from starjax.types import Command, Observation, Pose
 
@@ -121,10 +122,14 @@ def start(name: str, level: jax.typing.ArrayLike, key: jax.Array) -> Disturbance
 
 
 def change_image(
-    kind: Disturbance, disturbance: DisturbanceState, image: jax.Array, step: jax.Array
+    kind: Disturbance,
+    disturbance: DisturbanceState,
+    image: jax.Array,
+    step: jax.Array,
+    camera: str = "",
 ) -> jax.Array:
-    """Applies `on_image` to an image `[h, w, 3]` uint8 at a control step."""
-    if kind.on_image is None:
+    """Applies `on_image` to an image `[h, w, 3]` uint8 at a control step; depth stays as it is."""
+    if kind.on_image is None or is_depth(camera):
         return image
     changed = kind.on_image(disturbance, image.astype(jnp.float32) / 255.0, step)
     return jnp.round(255.0 * jnp.clip(changed, 0.0, 1.0)).astype(jnp.uint8)
@@ -159,10 +164,11 @@ def _with(env: Env, name: str, kind: Disturbance) -> Env:
         observation = kind.on_observe(env, disturbance, inner)
         if kind.on_image is None:
             return observation
-        images = jax.tree.map(
-            lambda image: change_image(kind, disturbance, image, inner.step), observation.images
-        )
-        return observation._replace(images=images)
+        images = {
+            camera: change_image(kind, disturbance, image, inner.step, camera)
+            for camera, image in (observation.images or {}).items()
+        }
+        return observation._replace(images=images or None)
 
     return env._replace(reset=reset, step=step, observe=observe)
 
