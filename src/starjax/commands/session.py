@@ -43,13 +43,19 @@ class Session(NamedTuple):
             yield share
 
     def write(self, name: str, content: dict[str, Any]) -> Path:
-        """Writes a JSON file with the command, code, versions and machine that made it."""
-        from starjax.runtime import files, jax_settings, provenance
+        """Writes a JSON file with the command, code, versions and machine that made it.
 
+        The `scene` of the content names the packages whose parts took part.
+        """
+        from starjax.runtime import files, jax_settings, provenance, sources
+        from starjax.sim import names, registries
+
+        scene = content.get("scene")
+        parts = registries.paths(names.SceneNames(**scene)) if scene else []
         made_by = {
             "command": self.command,
             **provenance.code()._asdict(),
-            "versions": xla.versions(),
+            "versions": {**xla.versions(), **sources.versions(*parts)},
             "hardware": xla.hardware(),
             **jax_settings.record(),
         }

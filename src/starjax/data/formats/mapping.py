@@ -69,6 +69,10 @@ class ArmColumns(_MapPart, frozen=True, kw_only=True):
     gripper_open: float = 1.0  # what it is when they are open
     command_position: Columns = ()  # what was asked for; left out, the next tip
     command_rotation: Columns = ()
+    # `delta`: relative to the measured position and rotation, in the files' frame; the rotation
+    # comes after the measured one. The record of a mapping without it stays the same.
+    command_as: Literal["delta"] | msgspec.UnsetType = msgspec.UNSET
+    command_rotation_as: Turned | msgspec.UnsetType = msgspec.UNSET  # left out, `rotation_as`
     command_gripper: Columns = ()
     trocar: Columns = ()  # its position, 3 numbers; left out, estimated from the motion
     trocar_at: tuple[float, ...] = ()  # m, instead of the column: in the files' frame

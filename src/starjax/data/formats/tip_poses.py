@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from scipy.spatial import transform
 
@@ -37,12 +38,15 @@ def tip(arrays: Arrays, arm: ArmColumns, mapping: Map, folder: Path) -> TipPoses
 
 def command(arrays: Arrays, arm: ArmColumns, mapping: Map) -> TipPoses | None:
     """Returns the commanded poses of the tip `[T]`, None if the files lack them."""
-    columns = arm.command_position, arm.command_rotation
-    return (
-        _of_columns(arrays, arm, columns, (arm.tip, arm.tip_turn), mapping)
-        if all(columns)
-        else None
-    )
+    if not (arm.command_position and arm.command_rotation):
+        return None
+    kind = arm.command_rotation_as
+    kind = arm.rotation_as if isinstance(kind, msgspec.UnsetType) else kind
+    R, p = _raw(arrays, arm.command_position, arm.command_rotation, kind)
+    if arm.command_as == "delta":
+        R_now, p_now = _raw(arrays, arm.position, arm.rotation, arm.rotation_as)
+        R, p = R @ R_now, p_now + p
+    return _in_world(R, p, (arm.tip, arm.tip_turn), mapping)
 
 
 def shaft(
@@ -75,11 +79,22 @@ def _of_columns(
     offset: tuple[Vector, Quaternion],
     mapping: Map,
 ) -> TipPoses:
-    position, rotation = columns
-    numbers = maps.pick(arrays, rotation, maps.NUMBERS[arm.rotation_as])
-    R = _quaternion(mapping.turn, "turn") @ rotations(numbers, arm)
-    p = placed(maps.pick(arrays, position, 3), mapping)
-    return _moved(R, p, offset)
+    R, p = _raw(arrays, *columns, arm.rotation_as)
+    return _in_world(R, p, offset, mapping)
+
+
+def _raw(
+    arrays: Arrays, position: Columns, rotation: Columns, kind: maps.Turned
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns rotations `[T, 3, 3]` and positions `[T, 3]` in the files' frame and unit."""
+    numbers = maps.pick(arrays, rotation, maps.NUMBERS[kind])
+    return rotations(numbers, kind), maps.pick(arrays, position, 3)
+
+
+def _in_world(
+    R: np.ndarray, p: np.ndarray, offset: tuple[Vector, Quaternion], mapping: Map
+) -> TipPoses:
+    return _moved(_quaternion(mapping.turn, "turn") @ R, placed(p, mapping), offset)
 
 
 def _of_joints(
@@ -102,9 +117,8 @@ def _moved(R: np.ndarray, p: np.ndarray, offset: tuple[Vector, Quaternion]) -> T
     return TipPoses(R @ _quaternion(turn, "tip_turn"), p + R @ np.array(position))
 
 
-def rotations(numbers: np.ndarray, arm: ArmColumns) -> np.ndarray:
+def rotations(numbers: np.ndarray, kind: maps.Turned) -> np.ndarray:
     """Converts rotations of any notation to matrices `[T, 3, 3]`."""
-    kind = arm.rotation_as
     if kind.startswith("quat"):
         length = np.linalg.norm(numbers, axis=-1)
         off = np.abs(length - 1.0) > _UNIT
