@@ -84,6 +84,11 @@ def test_other_types_and_orders_of_an_image_are_the_same_image(given):
     np.testing.assert_array_equal(seen.images["scope"], np.stack([IMAGE, IMAGE]))
 
 
+def test_floats_are_rounded_not_cut():
+    given = np.full((32, 32, 3), 199.7 / 255, np.float32)
+    assert (images.adapt("image", given, 32, 2) == 200).all()
+
+
 def test_an_image_of_another_size_keeps_its_ratio_between_black_bars():
     wide = np.full((48, 96, 3), 200, np.uint8)
     (seen, _) = decoded(single(image=wide)).observation.images["scope"]
