@@ -242,4 +242,5 @@ def test_a_cache_that_takes_no_program_is_one_line_and_work_goes_on():
     )
     said, warned = process.communicate(timeout=60)
     assert process.returncode == 0 and said.split() == ["3.0", "8.0", "15.0"]
-    assert warned.count("\n") == 1 and "/proc/self/task" in warned and "doctor" in warned
+    (warning,) = [line for line in warned.splitlines() if "/proc/self/task" in line]
+    assert "doctor" in warning and len(warned.splitlines()) <= 2  # the other: jax starts
