@@ -28,7 +28,7 @@ EXPERTS = {  # control steps
 # The script with two arms has no second try, and drops a block now and then.
 DROPS = {"peg_transfer_bimanual": 1}
 # A pad that lies across the arc touches more of its segments than are kept, the nearest.
-CROWDED = {"needle_pick", "needle_handover"}
+CROWDED = {"needle_pick", "needle_handover", "needle_regrasp"}
 LOOKS = 10  # control steps between two looks at all contacts
 
 
@@ -76,7 +76,8 @@ def test_the_expert_of_a_task_succeeds(name):
     keys = jax.random.split(jax.random.key(7), LANES)
     state = jax.jit(jax.vmap(environment.reset))(keys, envs.EnvParams(trocars))
     memory = jax.jit(jax.vmap(agent.init))(keys, state)
-    enters_like_the_expert(agent, registries.rescuers.get(name), keys, state)
+    if name in registries.rescuers.names():
+        enters_like_the_expert(agent, registries.rescuers.get(name), keys, state)
 
     @jax.jit
     @jax.vmap
