@@ -8,12 +8,14 @@ import pytest
 
 SHORT = {"ppo": ["--envs", "4", "--iterations", "2"]}
 SLOW = {"closed_loop", "far_robot", "ppo"}  # compile the simulation, a server
+PEERS = {"serve_lerobot"}  # needs LeRobot: tests/peers/lerobot_closed_loop.py runs it
 
 
 def pytest_generate_tests(metafunc):
     if "file" not in metafunc.fixturenames:
         return
-    files = sorted(metafunc.config.rootpath.glob("examples/*.py"))
+    examples = metafunc.config.rootpath.glob("examples/*.py")
+    files = sorted(file for file in examples if file.stem not in PEERS)
     marks = {name: [pytest.mark.slow] for name in SLOW}
     metafunc.parametrize(
         "file", [pytest.param(file, id=file.stem, marks=marks.get(file.stem, [])) for file in files]
