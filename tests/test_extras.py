@@ -34,7 +34,9 @@ def test_extras_bring_what_their_names_say(extra):
     imported = importlib.metadata.packages_distributions()
     wanted = [re.split(r"[<>=\[]", text)[0] for text in PROJECT["optional-dependencies"][extra]]
     brought = {
-        name for name, dists in imported.items() if set(wanted) & {dist.lower() for dist in dists}
+        name
+        for name, dists in imported.items()
+        if set(wanted) & {dist.lower().replace("_", "-") for dist in dists}
     }
     missing = set(extras.PACKAGES[extra]) - brought
     assert {name for name in missing if name in imported} == set()
