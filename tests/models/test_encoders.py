@@ -114,7 +114,7 @@ def test_the_gradient_of_a_blocks_end_is_jaxs():
 
 
 def test_unknown_trunk_is_named():
-    with pytest.raises(ValueError, match=r"trunk: expected one of .*'small'.*got 'vit'"):
+    with pytest.raises(ValueError, match=r"encoder: expected one of .*small.*got 'vit'"):
         make("vit").init(KEY, frames())
 
 

@@ -128,7 +128,7 @@ def test_samples_are_finite_with_broken_weights(made, name):
 def test_samples_reach_as_far_as_the_normaliser_says(dataset, hierarchical, monkeypatch):
     """A position that counts from the port may be farther than any demonstration's was."""
     row = METHODS["stardiff" if hierarchical else "dp_rcm2"]._replace(action_space="rcm2")
-    monkeypatch.setitem(METHODS, "row", row)
+    monkeypatch.setitem(METHODS.registry.built_in, "row", row)
     it = Made("row", dataset)
     part = rcm.ACTION_SPACES["rcm2"].slices["p"]
     lifted = it.stats.replace(action=it.stats.action.replace(reach=it.stats.action.reach + 3.0))
