@@ -17,7 +17,6 @@ from starjax.limits import INLINE, Count, CountOrZero, NotNegative, Positive, Ra
 
 SettingsT = TypeVar("SettingsT")
 
-
 # A key of jax has 32 bits: larger seeds would alias smaller ones.
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s

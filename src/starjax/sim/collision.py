@@ -7,7 +7,9 @@ their axis. Up to 3 mm of a pad's corner below the floor therefore stay undetect
 leans by 30 degrees.
 """
 
+import functools
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -46,31 +48,15 @@ def detect(
       carried: `[A]`, of the frame at the end of each arm: the shaft before a wrist, else the tip.
         Needed in a scene with a wrist.
     """
-    shaft = pose if carried is None else carried
-    hit = _any(_with_scene(arms, pose, shaft, origins, obstacles, floor))
-    hit |= _any(_of_shafts(arms, shaft, p_world_trocar)) | _any(_of_links(arms, origins))
-    return hit | _any(_of_palms(arms, pose, shaft, p_world_trocar, obstacles))
+    overlaps = _all(arms, pose, origins, p_world_trocar, obstacles, floor, carried)
+    hits = (jnp.any(overlap) if overlap.ndim else overlap for _, overlap in overlaps)
+    return functools.reduce(jnp.logical_or, hits, jnp.zeros((), bool))
 
 
-def pairs(
-    arms: Sequence[BoundArm],
-    pose: Pose,
-    origins: Sequence[jax.Array],
-    p_world_trocar: jax.Array,
-    obstacles: Capsules,
-    floor: float,
-    carried: Pose | None = None,
-) -> dict[str, jax.Array]:
+def pairs(*args: Any) -> dict[str, jax.Array]:
     """Returns bool by the name of a pair: True if the pair overlaps; arguments as of `detect`."""
-    shaft = pose if carried is None else carried
-    found = [
-        *_with_scene(arms, pose, shaft, origins, obstacles, floor),
-        *_of_shafts(arms, shaft, p_world_trocar),
-        *_of_links(arms, origins),
-        *_of_palms(arms, pose, shaft, p_world_trocar, obstacles),
-    ]
     overlaps = {}
-    for name, overlap in found:
+    for name, overlap in _all(*args):
         if overlap.ndim:  # points of a shaft by obstacles
             overlaps |= {f"{name} {k}": hit for k, hit in enumerate(jnp.any(overlap, axis=0))}
         else:
@@ -78,11 +64,21 @@ def pairs(
     return overlaps
 
 
-def _any(overlaps: Overlaps) -> jax.Array:
-    hit = jnp.zeros((), bool)
-    for _, overlap in overlaps:
-        hit |= jnp.any(overlap) if overlap.ndim else overlap
-    return hit
+def _all(
+    arms: Sequence[BoundArm],
+    pose: Pose,
+    origins: Sequence[jax.Array],
+    p_world_trocar: jax.Array,
+    obstacles: Capsules,
+    floor: float,
+    carried: Pose | None = None,
+) -> Overlaps:
+    """Yields the overlaps of all pairs; arguments as of `detect`."""
+    shaft = pose if carried is None else carried
+    yield from _with_scene(arms, pose, shaft, origins, obstacles, floor)
+    yield from _of_shafts(arms, shaft, p_world_trocar)
+    yield from _of_links(arms, origins)
+    yield from _of_palms(arms, pose, shaft, p_world_trocar, obstacles)
 
 
 def _with_scene(

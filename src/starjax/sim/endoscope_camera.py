@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from starjax.rcm import trocar as trocars
@@ -70,6 +71,14 @@ def nominal(endoscope: Endoscope) -> Pose:
     work, p_trocar = np.array(endoscope.work), np.array(endoscope.p_world_ref)
     with jax.ensure_compile_time_eval(), jax.default_matmul_precision("highest"):
         return looking_at(work, p_trocar, np.mean(endoscope.distance), endoscope.up)
+
+
+def add(world: mujoco.MjSpec, endoscope: Endoscope) -> None:
+    """Adds the camera at its nominal pose to a model's world."""
+    pose, wxyz = nominal(endoscope), np.zeros(4)
+    mujoco.mju_mat2Quat(wxyz, np.asarray(pose.R, float).ravel())
+    p = np.asarray(pose.p, float)
+    world.worldbody.add_camera(name=NAME, pos=p, quat=wxyz, fovy=endoscope.fovy)
 
 
 def looking_at(

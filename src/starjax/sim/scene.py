@@ -162,7 +162,7 @@ def compose(names: SceneNames, variant: Task | None = None) -> mujoco.MjModel:
         world.attach(whole, site=base, prefix=f"arm{i}/")
         _call_by_name(world, f"arm{i}/tool/")
     if scope := endoscope_camera.of(task, names.cameras):
-        _add_endoscope(world, scope)
+        endoscope_camera.add(world, scope)
     known = [camera.name for camera in world.cameras]
     for camera in names.cameras:
         errors.choice("camera", derived_views.parse(camera, known).camera, known)
@@ -281,13 +281,6 @@ def _call_by_name(world: mujoco.MjSpec, prefix: str) -> None:
         own = camera.name.removeprefix(prefix)
         if own not in taken:
             camera.name = own
-
-
-def _add_endoscope(world: mujoco.MjSpec, scope: endoscope_camera.Endoscope) -> None:
-    pose, wxyz = endoscope_camera.nominal(scope), np.zeros(4)
-    mujoco.mju_mat2Quat(wxyz, np.asarray(pose.R, float).ravel())
-    p = np.asarray(pose.p, float)
-    world.worldbody.add_camera(name=endoscope_camera.NAME, pos=p, quat=wxyz, fovy=scope.fovy)
 
 
 def _max_solver_iterations(m: mujoco.MjModel) -> int | None:
