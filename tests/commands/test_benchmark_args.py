@@ -5,7 +5,7 @@ import dataclasses
 import mistakes
 import pytest
 
-from starjax.commands import benchmark_args, evaluate, stress, sweep
+from starjax.commands import benchmark_args, evaluate, run_settings, stress, sweep
 from starjax.evaluation import protocol
 
 COMMANDS = {
@@ -55,3 +55,14 @@ def test_a_sweep_of_the_benchmark_is_the_same_trials_as_by_its_flags(tmp_path):
     args = dataclasses.replace(COMMANDS["sweep"], benchmark=True)
     by_name = benchmark_args.with_trials(args, "sweep", "peg_transfer")
     assert sweep._trials(tmp_path, by_name) == sweep._trials(tmp_path, by_flags)
+
+
+def test_a_run_of_the_benchmark_trains_as_its_preset_and_is_scored_by_the_protocol():
+    typed = ["--preset", "cpu", "--task", "reach"]
+    plain = run_settings.parse("run", typed, "")
+    config = run_settings.parse("run", [*typed, "--benchmark"], "")
+    trials = protocol.settings("evaluate", "reach", plain.eval)
+    assert trials != plain.eval
+    assert config == dataclasses.replace(plain, eval=trials)
+    with mistakes.of("seed", 1):
+        run_settings.parse("run", [*typed, "--benchmark", "--seed", "1"], "")

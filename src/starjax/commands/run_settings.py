@@ -7,14 +7,14 @@ from typing import Any, Literal
 
 from starjax import config as config_lib
 from starjax import errors, extras
-from starjax.commands import checks, options, presets, session
+from starjax.commands import benchmark_args, checks, options, presets, session
 from starjax.learners import LEARNERS
 
 NO_TRACKER = "none"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunArgs(config_lib.RunConfig):
+class RunArgs(benchmark_args.BenchmarkArgs, config_lib.RunConfig):
     """Flags of the command: the settings of a run, and those that no result depends on."""
 
     # copy the training log to a tracker; needs the extra of the same name
@@ -51,6 +51,8 @@ def _settings(
 ) -> config_lib.RunConfig:
     default = _default(argv, preset)
     args = options.parse(name, RunArgs, argv, description, RunArgs(**vars(default)))
+    benchmark_args.check(args, default)
+    args = benchmark_args.with_trials(args, "evaluate", args.scene.task)
     if args.track != NO_TRACKER:
         extras.require(f"--track {args.track}", args.track)
     settings: dict[str, Any] = {
