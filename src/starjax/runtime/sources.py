@@ -19,8 +19,13 @@ _OURS = "starjax"
 _TASKS = "starjax.sim.tasks."
 _SHARED = frozenset({"starjax.sim.tasks.base"})  # the interface
 _DIGITS = 16
-_SKIPPED = (tokenize.COMMENT, tokenize.NL, tokenize.ENCODING)
+_SKIPPED = (tokenize.COMMENT, tokenize.NL)
 _STATEMENT_ENDS = (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+# A string with expressions is several tokens from Python 3.12 on, one before.
+_STRING_STARTS, _STRING_ENDS = (
+    tuple(getattr(tokenize, f"{kind}STRING_{end}", None) for kind in "FT")
+    for end in ("START", "END")
+)
 
 
 def digests(*parts: Any) -> dict[str, str]:
@@ -118,9 +123,7 @@ def digest(prefix: str, files: Iterable[Path]) -> str:
 def _code(content: bytes) -> str:
     """Returns the tokens of a module without comments and docstrings."""
     try:
-        tokens = [
-            t for t in tokenize.tokenize(io.BytesIO(content).readline) if t.type not in _SKIPPED
-        ]
+        tokens = [token for token in _tokens(content) if token.type not in _SKIPPED]
     except (tokenize.TokenError, SyntaxError):
         return content.decode(errors="replace")
     kept, is_docstring = [], False
@@ -135,3 +138,29 @@ def _code(content: bytes) -> str:
             # An indentation's string is its blanks, which do not count.
             kept.append(token.string.strip() or tokenize.tok_name[token.type])
     return " ".join(kept)
+
+
+def _tokens(content: bytes) -> Iterator[tokenize.TokenInfo]:
+    """Yields the tokens of a module, every string as one, in any version of Python and line end."""
+    encoding, _ = tokenize.detect_encoding(io.BytesIO(content).readline)
+    lines = list(io.StringIO(content.decode(encoding), newline=None))
+    depth, start = 0, (1, 0)
+    for token in tokenize.generate_tokens(iter(lines).__next__):
+        if token.type in _STRING_STARTS:
+            start = start if depth else token.start
+            depth += 1
+        elif token.type in _STRING_ENDS:
+            depth -= 1
+            token = token._replace(
+                type=tokenize.STRING, string=_between(lines, start, token.end), start=start
+            )
+        if not depth:
+            yield token
+
+
+def _between(lines: list[str], start: tuple[int, int], end: tuple[int, int]) -> str:
+    """Returns the text between two positions: row, from 1, and column."""
+    part = lines[start[0] - 1 : end[0]]
+    part[-1] = part[-1][: end[1]]
+    part[0] = part[0][start[1] :]
+    return "".join(part)
