@@ -79,7 +79,8 @@ def test_the_expert_begins_at_the_state_of_the_signal_and_stays(lost_at, limits,
     trocar = rcm.Trocar(*(jnp.asarray(x) for x in stubs.trocars(0, 1)))
     keys = jax.random.split(jax.random.key(0), 2)
     state = jax.vmap(env.reset)(keys, sim_env.EnvParams(trocar))
-    params = (None, takeover.TakeoverLimits(*map(np.int32, limits)))
+    clock, stalled = limits
+    params = (None, takeover.TakeoverLimits(np.full(2, clock), np.int32(stalled)))
     memory = both.init(params, keys, state, None)
     for step in range(9):
         state = state.replace(step=jnp.full(2, step))

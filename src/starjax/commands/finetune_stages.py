@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 
 from starjax import errors, methods
-from starjax.commands import demonstrations, messages, pipeline, policy_evaluation, stage_times
+from starjax.commands import (
+    demonstrations,
+    finetune_counts,
+    messages,
+    pipeline,
+    policy_evaluation,
+    stage_times,
+)
 from starjax.commands.finetune_work import Work
 from starjax.data import load, store, windows
 from starjax.evaluation import statistics, trials
@@ -18,7 +25,7 @@ from starjax.finetune import dagger, mixing, rounds, self_imitation
 from starjax.policies import in_env, policy_file
 from starjax.policies import policy as policies
 from starjax.policies.in_env import PolicyInEnv
-from starjax.rollouts import placement, progress
+from starjax.rollouts import placement
 from starjax.runtime import processes
 from starjax.runtime.signals import stop_signals
 from starjax.training import loop, randomise
@@ -57,7 +64,7 @@ class Search:
             max_steps=self._max_steps,
             expert=work.config.demos.expert,
             policy=who.weights,
-            about={"limits": self._limits._asdict()},
+            about={"limits": self._limits._asdict(), "rewinds_s": dagger.REWINDS_S},
         )
         with stage_times.timed(work.out, f"round {number} rollouts"):
             outcomes = rounds.collect(
@@ -71,11 +78,9 @@ class Search:
             )
         count, learned = len(outcomes.trial), int(outcomes.kept.sum())
         messages.indented(f"{count} trials, {learned} of them are learned")
-        takeovers = _takeovers(outcomes)
-        for cause, rescued in takeovers.items():
-            messages.indented(f"taken over, {cause}: {messages.rate(rescued)} succeed")
         won = statistics.rate(outcomes.success[:, 0])
-        return {"trials": count, "learned": learned, "success": won, "takeovers": takeovers}
+        takeovers = {} if work.settings.by == "self" else finetune_counts.report(outcomes)
+        return {"trials": count, "learned": learned, "success": won, **takeovers}
 
     def _way(self, who: PolicyInEnv) -> rounds.Way:
         trained, settings = who.trained, who.trained.policy
@@ -86,7 +91,8 @@ class Search:
             agent = in_env.batch_agent(trained.method, policy, hot)
             return self_imitation.way(agent, params, settings.observation)
         expert = self._work.config.demos.expert
-        return dagger.way(who.agent(), params, who.env.task, expert, settings, self._limits)
+        hz = who.env.control_hz
+        return dagger.way(who.agent(), params, who.env.task, expert, settings, self._limits, hz)
 
 
 class Lessons:
@@ -171,9 +177,3 @@ class Lessons:
         new = old._replace(params=params, normalizer=state.normalizer, monitor=None)
         policy_file.save(file, new)
         return file
-
-
-def _takeovers(outcomes: rounds.Outcomes) -> dict[str, dict[str, Any]]:
-    """Returns the success rate of the takeovers by their cause."""
-    found = sorted(set(outcomes.cause.tolist()) - {progress.CAUSES[0]})
-    return {cause: statistics.rate(outcomes.success[outcomes.cause == cause, 0]) for cause in found}

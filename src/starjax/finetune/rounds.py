@@ -25,6 +25,8 @@ from starjax.rollouts.takeover import ACTOR
 from starjax.runtime import sources
 from starjax.sim import env as sim_env
 
+Job = tuple[episodes.Trial, int]  # a trial and the number of its run, see `Way`
+
 STREAM = 0x66696E65  # the first round's, folded into the seed's key
 
 
@@ -34,36 +36,42 @@ class LearnedEpisode(NamedTuple):
     Attributes:
       episode: its fields include `actor`.
       first: first control step that is stored.
+      run: position of the episode among the runs of its trial.
       about: further entries of its record.
     """
 
     episode: episodes.Episode
     first: int
+    run: int
     about: Mapping[str, Any]
 
 
 class Way(NamedTuple):
     """Search for episodes to learn.
 
+    A run of a trial is its start with a number, which the agent's parameters depend on.
+
     Attributes:
       source: `source` of the episodes' records.
       agent: acts in the trials.
-      params: (number of the attempt) -> parameters of the agent.
-      attempts: runs of each trial.
+      params: (numbers `[N]` int32 of the runs) -> parameters of the agent.
+      runs: numbers of each trial's first runs.
+      again: episodes of these -> numbers of its further runs.
       record: of the trials.
-      choose: episodes of a trial, one per attempt -> the one that is learned, or None.
+      choose: episodes of a trial, one per run -> the one that is learned, or None.
       cause: the same -> a word that the outcomes count.
       modules: `module:object` of the code that decides it, for the description.
     """
 
     source: str
     agent: BatchAgent
-    params: Callable[[int], Any]
-    attempts: int
+    params: Callable[[np.ndarray], Any]
+    runs: tuple[int, ...]
     record: episodes.Record
     choose: Callable[[Sequence[episodes.Episode]], LearnedEpisode | None]
     cause: Callable[[Sequence[episodes.Episode]], str]
     modules: tuple[str, ...] = ()
+    again: Callable[[Sequence[episodes.Episode]], Sequence[int]] = lambda found: ()
 
 
 class RoundSettings(NamedTuple):
@@ -93,8 +101,9 @@ class Outcomes(NamedTuple):
 
     Attributes:
       trocar, trial: `[M]` int32.
-      success: `[M, attempts]` bool.
+      success: `[M, R]` bool, of the first runs.
       kept: `[M]` bool, True for those in the dataset.
+      run: `[M]` int32, position of the kept run, -1 if none is.
       cause: `[M]` str, see `Way`.
     """
 
@@ -102,6 +111,7 @@ class Outcomes(NamedTuple):
     trial: np.ndarray
     success: np.ndarray
     kept: np.ndarray
+    run: np.ndarray
     cause: np.ndarray
 
 
@@ -169,24 +179,38 @@ def collect(
 
     def make(number: int) -> Generator[float, None, chunks.Arrays]:
         trials = group[spans[number]]
-        ended: dict[episodes.Trial, list[episodes.Episode]] = {trial: [] for trial in trials}
-        for attempt in range(way.attempts):
-            passed = 0.0
-            for segment in run(way.params(attempt), trials):
-                for episode in segment.ended:
-                    ended[episode.trial].append(episode)
-                yield (segment.passed - passed) * len(trials) / way.attempts
+
+        def play(jobs: Sequence[Job], units: float) -> Generator[float, None, list[Any]]:
+            """Runs at most `lanes` jobs; yields parts of `units`, returns their episodes."""
+            numbers = np.array([n for _, n in jobs] + [jobs[0][1]] * (lanes - len(jobs)), np.int32)
+            passed, ended = 0.0, []
+            for segment in run(way.params(numbers), [trial for trial, _ in jobs]):
+                ended += segment.ended
+                yield (segment.passed - passed) * units
                 passed = segment.passed
-        kept = {trial: way.choose(found) for trial, found in ended.items()}
+            return sorted(ended, key=lambda episode: episode.lane)
+
+        first = []
+        for n in way.runs:
+            part = yield from play([(trial, n) for trial in trials], len(trials) / len(way.runs))
+            first.append(part)
+        found = {trial: [part[i] for part in first] for i, trial in enumerate(trials)}
+        won = [[episode.outcome["success"] for episode in runs] for runs in found.values()]
+        jobs = [(trial, n) for trial, runs in found.items() for n in way.again(runs)]
+        for start in range(0, len(jobs), lanes):
+            for episode in (yield from play(jobs[start : start + lanes], 0.0)):
+                found[episode.trial].append(episode)
+        kept = {trial: way.choose(runs) for trial, runs in found.items()}
         for trial, one in kept.items():
             if one is not None:
                 _commit(root, store.key(*trial, settings.seed), way, settings, one)
         return {
             "trocar": np.array([trial[0] for trial in trials], np.int32),
             "trial": np.array([trial[1] for trial in trials], np.int32),
-            "success": np.array([[e.outcome["success"] for e in ended[t]] for t in trials]),
-            "kept": np.array([kept[trial] is not None for trial in trials]),
-            "cause": np.array([way.cause(ended[trial]) for trial in trials]),
+            "success": np.array(won),
+            "kept": np.array([one is not None for one in kept.values()]),
+            "run": np.array([-1 if one is None else one.run for one in kept.values()], np.int32),
+            "cause": np.array([way.cause(runs) for runs in found.values()]),
         }
 
     with sharing.shared(root) as share:

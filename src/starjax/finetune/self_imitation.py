@@ -37,8 +37,8 @@ def way(policy: BatchAgent, params: Any, observation: str) -> Way:
     return Way(
         source=SOURCE,
         agent=attempts.repeated(policy),
-        params=lambda attempt: (params, np.int32(attempt)),
-        attempts=ATTEMPTS,
+        params=lambda numbers: (params, numbers),
+        runs=tuple(range(ATTEMPTS)),
         record=attempts.RECORDS[observation],
         choose=chosen,
         cause=lambda found: progress.CAUSES[0],
@@ -47,9 +47,10 @@ def way(policy: BatchAgent, params: Any, observation: str) -> Way:
 
 def chosen(found: Sequence[episodes.Episode]) -> LearnedEpisode | None:
     """Returns the first success of a start that was also failed, else None."""
-    won = [episode for episode in found if episode.outcome["success"]]
+    won = [run for run, episode in enumerate(found) if episode.outcome["success"]]
     if len(won) in (0, len(found)):
         return None
-    length = won[0].outcome["length"]
-    actor = {takeover.ACTOR: [np.full(length, takeover.POLICY, np.uint8)]}
-    return LearnedEpisode(won[0]._replace(arrays={**won[0].arrays, **actor}), 0, {})
+    episode = found[won[0]]
+    actor = {takeover.ACTOR: [np.full(episode.outcome["length"], takeover.POLICY, np.uint8)]}
+    kept = episode._replace(arrays={**episode.arrays, **actor})
+    return LearnedEpisode(kept, 0, won[0], {})

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import errors
+from starjax.rollouts import placement
 from starjax.types import Agent, Command, Observation
 
 Observe = Callable[[], Observation]
@@ -26,11 +27,13 @@ class BatchAgent(NamedTuple):
         Command `[N, A]` to record). `observe() -> Observation [N]` looks at the state; `t` int32
         is the number of the control step, the same in all episodes.
       about: JSON values that identify it.
+      split: of `params` over devices, `placement.SHARED` or a prefix of their tree.
     """
 
     init: Callable[..., Any]
     act: Callable[..., tuple[Command, Any, Command]]
     about: dict[str, Any]
+    split: Any = placement.SHARED
 
 
 def from_single(agent: Agent) -> BatchAgent:

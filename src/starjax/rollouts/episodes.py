@@ -50,10 +50,12 @@ class Episode(NamedTuple):
     Attributes:
       outcome: JSON values: which trial it is, and how it ended.
       arrays: of each field, parts that make `[length, ...]` along the first axis.
+      lane: position in its batch.
     """
 
     outcome: dict[str, Any]
     arrays: dict[str, list[np.ndarray]]
+    lane: int = 0
 
     @property
     def trial(self) -> Trial:
@@ -203,4 +205,4 @@ def assemble(
     # It ends in the last segment.
     for parts in fields.values():
         parts[-1] = parts[-1][: length - sum(map(len, parts[:-1]))]
-    return Episode(outcome, {name: fields[name] for name in sorted(fields)})
+    return Episode(outcome, {name: fields[name] for name in sorted(fields)}, lane)

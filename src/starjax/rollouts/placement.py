@@ -39,7 +39,7 @@ def devices() -> list[jax.Device] | None:
 def split(
     fn: Callable[..., Any],
     devices: Sequence[jax.Device] | None,
-    in_specs: Sequence[PartitionSpec],
+    in_specs: Sequence[Any],
     out_specs: Any,
     donate: tuple[int, ...] = (),
 ) -> Callable[..., Any]:
@@ -48,7 +48,7 @@ def split(
     Args:
       fn: acts on lanes independently; shapes inside are those of one device's share.
       devices: None for the default one.
-      in_specs: SHARED or LANE (leading axis) for each argument.
+      in_specs: SHARED or LANE (leading axis) for each argument, or for its parts.
       out_specs: the same for the result, or for its parts.
       donate: arguments whose memory may be reused.
     """
@@ -59,7 +59,9 @@ def split(
     # into every loop's condition, the solver's included; under shard_map it would not, but there
     # XLA's compiler for GPUs dies with a segmentation fault (jaxlib 0.11.2).
     mesh = Mesh(np.array(devices), ("lane",))
-    shardings = [NamedSharding(mesh, spec) for spec in in_specs]
+    shardings = jax.tree.map(
+        lambda spec: NamedSharding(mesh, spec), list(in_specs), is_leaf=_is_spec
+    )
 
     def call(*arguments: Any) -> Any:
         placed = [jax.device_put(*pair) for pair in zip(arguments, shardings, strict=True)]

@@ -63,7 +63,7 @@ def make(
       devices: that lanes are split over; None for one that jax chooses.
     """
     world = _EnvFns(env.reset, env.step, env.observe, env.labels)
-    mind = _AgentFns(agent.init, agent.act)
+    mind = _AgentFns(agent.init, agent.act, agent.split)
     return _programs(world, mind, max_steps, record, None if devices is None else tuple(devices))
 
 
@@ -81,6 +81,7 @@ class _AgentFns(NamedTuple):
 
     init: Callable[..., Any]
     act: Callable[..., Any]
+    split: Any
 
 
 @functools.lru_cache(maxsize=4)
@@ -93,9 +94,15 @@ def _programs(
 ) -> tuple[Callable[..., RolloutState], Callable[..., Any]]:
     """Makes the programs from the functions alone: other environments may share them."""
     shared, lane = placement.SHARED, placement.LANE
-    start = placement.split(_starter(env, agent), devices, (shared, shared, lane, shared), lane)
+    start = placement.split(
+        _starter(env, agent), devices, (shared, agent.split, lane, shared), lane
+    )
     advance = placement.split(
-        _advancer(env, agent, max_steps, record), devices, (shared, lane, shared), lane, donate=(1,)
+        _advancer(env, agent, max_steps, record),
+        devices,
+        (agent.split, lane, shared),
+        lane,
+        donate=(1,),
     )
     return start, advance
 

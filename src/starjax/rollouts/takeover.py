@@ -11,19 +11,20 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax.rollouts import episodes, progress
+from starjax.rollouts import episodes, placement, progress
 from starjax.rollouts.agent import BatchAgent, Observe
 from starjax.sim.tasks.rescue import Rescuer
 
 POLICY, EXPERT, PERSON = range(3)  # values of the field `actor`, see `episodes.FIELDS`
 ACTOR, CAUSE = "actor", "cause"  # recorded fields, `[N]` uint8
+PROGRESSED = "progressed"  # the same, int32: step of the latest progress
 
 
 class TakeoverLimits(NamedTuple):
     """Control steps; data, not part of a program.
 
     Attributes:
-      clock: int32, step at which the expert takes over in any case.
+      clock: `[N]` int32, step at which the expert takes over in any case.
       stalled: int32, steps without progress.
     """
 
@@ -51,7 +52,9 @@ class Takeover(NamedTuple):
 
 def from_policy(policy: BatchAgent, rescuer: Rescuer) -> BatchAgent:
     """Makes the agent; its parameters are (those of the policy, TakeoverLimits)."""
-    return BatchAgent(*_functions(policy.init, policy.act, rescuer), {"policy": policy.about})
+    functions = _functions(policy.init, policy.act, rescuer)
+    split = (policy.split, TakeoverLimits(placement.LANE, placement.SHARED))
+    return BatchAgent(*functions, {"policy": policy.about}, split)
 
 
 @functools.lru_cache(maxsize=4)  # programs belong to the functions that they were made of
@@ -105,7 +108,8 @@ def _where(which: jax.Array, a: Any, b: Any) -> Any:
 def _fields(step: episodes.Step) -> dict[str, jax.Array]:
     number = step.memory.cause.astype(jnp.uint8)
     actor = jnp.where(number > 0, EXPERT, POLICY).astype(jnp.uint8)
-    return {**episodes.without_images(step), ACTOR: actor, CAUSE: number}
+    numbers = {ACTOR: actor, CAUSE: number, PROGRESSED: step.memory.progress.step}
+    return {**episodes.without_images(step), **numbers}
 
 
 # By the environment's observation.
