@@ -21,6 +21,11 @@ def of_task(task: Task) -> tuple[Region, ...]:
     return tuple((space.radius, space.polar, space.azimuth) for space in spaces)
 
 
+def ball(region: Region) -> Region:
+    """Returns the ball about the nominal trocar that contains a region."""
+    return ((0.0, region[0][1]), (0.0, np.pi), (-np.pi, np.pi))
+
+
 def clipped(region: Region, offset: np.ndarray) -> np.ndarray:
     """Returns offsets `[..., 3]` m from the nominal trocar with clipped radius and angles."""
     x, y, z = np.moveaxis(np.asarray(offset, np.float64), -1, 0)

@@ -4,11 +4,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy import spatial
 
+from starjax.data import shafts
 from starjax.data.formats import mapping as maps
 from starjax.data.formats.mapping import ArmColumns, Map
 from starjax.data.formats.motion import Motion
-from starjax.sim import registries
+from starjax.data.formats.trocars import MISSED
+from starjax.sim import trocar_region
 
 _LEAST_MOTION = 5e-3  # m; the tips of a demonstration move farther
 _STEPS_AWAY = 10.0  # typical steps between a command and the next tip
@@ -16,6 +19,8 @@ _LEAST_AWAY = 5e-3  # m; a command nearer to the next tip follows it
 _BEYOND = 0.05  # of a gripper's range, by which values may leave it
 _LEAST_USED = 0.5  # of a gripper's range, which a dataset uses
 _OUTSIDE = 0.02  # m, from the region of a task's trocars
+_ELSEWHERE = 0.01  # m; estimates of one trocar in several episodes are nearer to each other
+_FEW = 2  # episodes, which may well have a trocar each
 
 
 class Jaws:
@@ -71,13 +76,16 @@ def of_dataset(
     places: np.ndarray,
     numbers: Sequence[int],
     task: Any,
+    is_placed: bool = False,
 ) -> Iterator[str]:
-    """Yields notes on the motion's extent, the shafts' direction and the trocars' region.
+    """Yields notes on the motion's extent, the shafts' direction and the trocars' places.
 
     Args:
-      tips: of each episode rotations `[T, A, 3, 3]`, positions `[T, A, 3]` m, and anything.
+      tips: of each episode rotations `[T, A, 3, 3]`, positions `[T, A, 3]` m, and the trocars
+        `[A, 3]` that the files give, NaN for estimated ones.
       places: `[E, A, 3]` m, trocars.
       numbers: of the episodes.
+      is_placed: True if the import moved their mean to the task's, so only distances count.
     """
     extent = max(float(np.ptp(p, axis=0).max()) for _, p, _ in tips)
     if extent < _LEAST_MOTION:
@@ -89,14 +97,45 @@ def of_dataset(
                 f"episode {number}: tips of arm {i} lie {-1e3 * depth[i]:.0f} mm before the "
                 "trocar: is z of tip_turn distal?"
             )
-    for i, slot in enumerate(task.slots):
-        reference = np.array(slot.p_world_ref)
-        most = registries.workspaces.get(slot.workspace).radius[1] + _OUTSIDE
-        away = np.linalg.norm(places[:, i] - reference, axis=-1)
-        if (far := away > most).any():
+    for (R, p, trocar), number in zip(tips, numbers):
+        if not np.isfinite(trocar).all():
+            yield from (f"episode {number}: {line}" for line in _wandering(R, p))
+    for i, (slot, region) in enumerate(zip(task.slots, trocar_region.of_task(task))):
+        offset = places[:, i] - np.array(slot.p_world_ref)
+        within = trocar_region.ball(region) if is_placed else region
+        away = np.linalg.norm(offset - trocar_region.clipped(within, offset), axis=-1)
+        if (far := away > _OUTSIDE).any():
             yield (
-                f"{int(far.sum())} trocars of arm {i} lie up to {1e3 * away.max():.0f} mm from the "
-                f"task's nominal one, at most {1e3 * most:.0f} mm: are origin and turn right?"
+                f"{int(far.sum())} trocars of arm {i} lie up to {1e3 * away.max():.0f} mm outside "
+                "the region of the task's: are origin and turn right?"
+            )
+        is_estimated = [not np.isfinite(trocar[i]).all() for *_, trocar in tips]
+        yield from _scattered(places[is_estimated, i], i)
+
+
+def _wandering(R: np.ndarray, p: np.ndarray) -> Iterator[str]:
+    """Yields notes on trocars that differ between an episode's halves."""
+    middle = len(p) // 2
+    halves = [shafts.estimate(R[rows], p[rows]) for rows in (slice(middle), slice(middle, None))]
+    moved = np.linalg.norm(halves[1].p_world_trocar - halves[0].p_world_trocar, axis=-1)
+    known = halves[0].is_determined & halves[1].is_determined
+    for i in np.flatnonzero(known & (moved > MISSED)).tolist():
+        yield (
+            f"the trocar of arm {i} differs by {1e3 * moved[i]:.0f} mm between the halves: does "
+            "the wall move so far, or is it a wrist that does?"
+        )
+
+
+def _scattered(places: np.ndarray, arm: int) -> Iterator[str]:
+    """Yields a note if most episodes have an estimated trocar `[E, 3]` of their own."""
+    if len(places) > _FEW:
+        distances, _ = spatial.KDTree(places).query(places, k=2)
+        alone = distances[:, 1] > _ELSEWHERE
+        if 2 * alone.sum() > len(places):
+            yield (
+                f"the trocar of arm {arm} is elsewhere in {alone.sum()} of {len(places)} episodes, "
+                f"over {1e3 * np.ptp(places, axis=0).max():.0f} mm: was it moved between all of "
+                "them, or their frame?"
             )
 
 

@@ -104,13 +104,14 @@ def survey(
     if not kept:
         reason = notes[-1] if notes else "no episode"
         raise errors.UsageError("PATH", "demonstrations to keep", reason)
-    if mapping.place == "trocar":
+    is_placed = mapping.place == "trocar"
+    if is_placed:
         mapping, tips, places = _placed(mapping, tips, np.array(places), task)
     groups, centres = trocars.group(np.array(places))
     kept = [k._replace(trocar=int(group)) for k, group in zip(kept, groups)]
     numbers = [k.episode for k in kept]
     residual = trocars.residual(tips, centres[groups], numbers, notes)
-    notes += [*jaws.notes(), *doubts.of_dataset(tips, centres[groups], numbers, task)]
+    notes += [*jaws.notes(), *doubts.of_dataset(tips, centres[groups], numbers, task, is_placed)]
     return Survey(kept, tips, centres[groups], centres, residual, mapping, hz, notes)
 
 
