@@ -17,7 +17,7 @@ import _far_robots
 import numpy as np
 from _far_robots import Network
 
-from starjax import config, runtime
+from starjax import config, config_json, runtime
 
 IMAGE_SIZE = 128  # of the policy that ships
 GROUP = 12  # trials that are simulated together
@@ -126,7 +126,7 @@ def write(asked, env, driven, told: dict, name: str, spent: float) -> dict:
         "seed": asked.seed,
         "weights": files.sha256(path),
         "dataset_digest": None,
-        "config": config.as_json(settings),
+        "config": config_json.as_json(settings),
         "command": shlex.join(["python", "benchmarks/far_robots.py", *sys.argv[1:]]),
         "timings_s": {"evaluate": spent},
         "warnings": [],

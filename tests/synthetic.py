@@ -7,7 +7,7 @@ import fakes
 import numpy as np
 import stubs
 
-from starjax import config, rcm
+from starjax import config, config_json, rcm
 from starjax.evaluation import result, statistics, sweep
 from starjax.evaluation import trials as table
 from starjax.rollouts import trocars
@@ -88,7 +88,7 @@ def about(method, seed=0):
         "weights": WEIGHTS,
         "preset": "cpu",
         "inference_ms": {"p50": 18.4, "p95": 21.0, "p99": 24.9},
-        "config": config.as_json(settings),
+        "config": config_json.as_json(settings),
         "timings_s": {"collect": 142.0, "collect: compile": 31.0, "train": 421.5, "evaluate": 133},
         "command": f"python -m starjax.experiments.run --method {method}",
         "warnings": ["The policy observes the simulator's state, not pixels as in the paper."],

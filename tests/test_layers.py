@@ -11,6 +11,7 @@ ROWS = (
     ("methods",),
     ("learners",),
     ("config", "rcm"),
+    ("config_json",),
     ("models", "monitor", "sim"),
     ("rollouts",),
     ("data",),

@@ -12,7 +12,7 @@ import pytest
 import safetensors.numpy
 import stubs
 
-from starjax import config, rcm
+from starjax import config, config_json, rcm
 from starjax.commands import (
     calibrate,
     evaluate,
@@ -80,7 +80,7 @@ def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
     assert result["method"] == "dp_rcm2" and len(result["trials"]) == 24
     assert (result["seen"]["trials"], result["unseen"]["trials"]) == (8, 16)
     assert result["config"]["train"]["steps"] == 77 and result["preset"] == "smoke"
-    assert result["config"]["policy"] == config.as_json(POLICY)
+    assert result["config"]["policy"] == config_json.as_json(POLICY)
     assert result["timings_s"]["evaluate"] > 0
     assert any("Preset smoke" in text for text in result["warnings"])
     said = capsys.readouterr().out

@@ -12,7 +12,7 @@ import mistakes
 import numpy as np
 import pytest
 
-from starjax import config, errors, methods
+from starjax import config, config_json, errors, methods
 from starjax.commands import folders, presets, stage_times
 from starjax.runtime import files
 
@@ -56,7 +56,7 @@ def test_every_setting_but_three_decides_the_weights(tmp_path, part):
     claimed(tmp_path)
     settings = getattr(SMOKE, part)
     free = {"keep_checkpoints", "checkpoint_every", "steps_per_call", "learner"}
-    for name in config.as_json(settings).keys() - free:
+    for name in config_json.as_json(settings).keys() - free:
         if hasattr(settings, name):
             now = dataclasses.replace(settings, **{name: another(getattr(settings, name))})
         else:  # of the learner's
@@ -136,7 +136,7 @@ def test_weights_whose_settings_are_gone_are_refused(tmp_path, text):
 )
 def test_settings_of_other_types_are_named(values, name):
     with pytest.raises(ValueError, match=f"^{name}: "):
-        config.from_dict(config.RunConfig, values)
+        config_json.from_dict(config.RunConfig, values)
 
 
 def test_an_evaluation_is_under_way_until_its_result_is_there(tmp_path):
@@ -156,17 +156,21 @@ def test_an_evaluation_is_under_way_until_its_result_is_there(tmp_path):
 
 def test_settings_that_runs_differ_in_are_named():
     def values(**parts):
-        return config.as_json(changed(**parts))
+        return config_json.as_json(changed(**parts))
 
     old = values()
     del old["policy"]["trocar_yaw"]
     same = values(seed=5, train={"keep_checkpoints": 9}, eval={"trials": 9})
-    assert config.differing_settings([]) == config.differing_settings([values(), old, same]) == []
+    assert (
+        config_json.differing_settings([])
+        == config_json.differing_settings([values(), old, same])
+        == []
+    )
     newer = values(policy={"trocar_yaw": "fixed"}, demos={"per_trocar": 9})
     newer["policy"]["unheard_of"] = 1
-    found = config.differing_settings([old, newer])
+    found = config_json.differing_settings([old, newer])
     names = ["demos.per_trocar", "policy.trocar_yaw", "policy.unheard_of"]
-    assert found == config.differing_settings([newer, old, newer]) == names
+    assert found == config_json.differing_settings([newer, old, newer]) == names
 
 
 def test_a_methods_folder_is_found_from_within_and_told_from_others(tmp_path, monkeypatch):

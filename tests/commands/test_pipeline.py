@@ -13,7 +13,7 @@ import pytest
 import stubs
 import synthetic
 
-from starjax import config, methods
+from starjax import config, config_json, methods
 from starjax.commands import demonstrations, folders, pipeline, presets, scenes, scored
 from starjax.data import normalizer
 from starjax.policies import in_env, policy_file
@@ -226,7 +226,7 @@ def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
 
 
 def _json(settings):
-    return config.as_json(settings)
+    return config_json.as_json(settings)
 
 
 def test_a_policy_says_what_it_learned_from(tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import pathlib
 
 import pytest
 
-from starjax import config, errors
+from starjax import config, config_json, errors
 from starjax.commands import presets, run_settings
 from starjax.runtime import gpu
 
@@ -45,26 +45,29 @@ def test_a_presets_time_is_that_of_a_committed_result(name):
     found = json.loads((RESULTS / timing.source).read_text())
     stages = sum(seconds for stage, seconds in found["timings_s"].items() if ":" not in stage)
     assert stages < timing.seconds < stages + 90  # start, compilers, report
-    run = config.from_dict(config.RunConfig, found["config"])
+    run = config_json.from_dict(config.RunConfig, found["config"])
     same = dataclasses.replace(preset, scene=run.scene)
-    assert config.weight_settings(run) == config.weight_settings(same) and run.eval == preset.eval
+    assert (
+        config_json.weight_settings(run) == config_json.weight_settings(same)
+        and run.eval == preset.eval
+    )
     assert found["hardware"]["backend"] == timing.backend
 
 
 @pytest.mark.parametrize("name", presets.PRESETS)
 def test_configuration_survives_json(name):
-    values = config.as_json(presets.PRESETS[name])
-    assert config.from_dict(config.RunConfig, values) == presets.PRESETS[name]
+    values = config_json.as_json(presets.PRESETS[name])
+    assert config_json.from_dict(config.RunConfig, values) == presets.PRESETS[name]
     with pytest.raises(ValueError, match="stepps"):
-        config.from_dict(config.TrainConfig, {"stepps": 1})
+        config_json.from_dict(config.TrainConfig, {"stepps": 1})
 
 
 def test_only_policies_of_the_world_frame_are_read():
-    now = config.as_json(config.RunConfig())
+    now = config_json.as_json(config.RunConfig())
     old = now | {"policy": now["policy"] | {"frame": "world"}}
-    assert config.from_dict(config.RunConfig, old) == config.RunConfig()
-    assert config.differing_settings([old, now]) == []
+    assert config_json.from_dict(config.RunConfig, old) == config.RunConfig()
+    assert config_json.differing_settings([old, now]) == []
     other = now | {"policy": now["policy"] | {"frame": "camera"}}
-    assert config.differing_settings([other, now]) == ["policy.frame"]
+    assert config_json.differing_settings([other, now]) == ["policy.frame"]
     with pytest.raises(ValueError, match="frame"):
-        config.from_dict(config.RunConfig, other)
+        config_json.from_dict(config.RunConfig, other)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import toy_learner
 
-from starjax import config, deploy, errors, learners, rcm
+from starjax import config, config_json, deploy, errors, learners, rcm
 from starjax.commands import options, run_settings
 from starjax.data import normalizer, windows
 from starjax.methods import METHODS
@@ -106,10 +106,10 @@ def test_its_options_are_flags_and_stand_in_the_settings_of_a_run():
     found = settings("--preset", "smoke", "--policy.learner", "toy", "--policy.gain", "3")
     # what both learners have begins as the preset says
     assert found.policy.options == toy_learner.ToyConfig(gain=3.0, time_dim=32)
-    values = config.as_json(found)
+    values = config_json.as_json(found)
     assert values["policy"]["gain"] == 3.0 and values["policy"]["learner"] == "toy"
-    assert config.from_dict(config.RunConfig, values) == found
-    assert "policy.gain" in config.weight_settings(found)
+    assert config_json.from_dict(config.RunConfig, values) == found
+    assert "policy.gain" in config_json.weight_settings(found)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_options_of_another_learner_are_refused():
     with pytest.raises(ValueError, match="options: expected ToyConfig, got DiffusionConfig"):
         dataclasses.replace(toy(), options=fakes.TINY.options)
     with pytest.raises(ValueError, match="gain"):
-        config.from_dict(config.PolicyConfig, {"gain": 1.0})
+        config_json.from_dict(config.PolicyConfig, {"gain": 1.0})
 
 
 def test_no_learner_calls_an_option_as_policies_call_a_setting():

@@ -147,8 +147,8 @@ def random(largest=4.0, size=(100, 300)):
 
 
 def test_a_setting_of_a_newer_version_is_named_with_its_file(tmp_path, monkeypatch):
-    as_json = policy_file.config.as_json
-    monkeypatch.setattr(policy_file.config, "as_json", lambda x: {**as_json(x), "future": 1})
+    as_json = policy_file.config_json.as_json
+    monkeypatch.setattr(policy_file.config_json, "as_json", lambda x: {**as_json(x), "future": 1})
     policy_file.save(tmp_path / "p", trained())
     with pytest.raises(ValueError, match=r"p: made by another version of starjax: .*'future'"):
         policy_file.load(tmp_path / "p")

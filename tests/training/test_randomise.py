@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import config
+from starjax import config, config_json
 from starjax.commands import pipeline
 from starjax.data import windows
 from starjax.evaluation.disturbances import base, parse_levels
@@ -184,9 +184,9 @@ def test_policies_whose_training_reads_no_images_refuse_those_of_images(changes)
 
 def test_it_determines_the_weights_and_survives_json():
     plain, other = config.RunConfig(), config.RunConfig(train=SETTINGS)
-    before, now = map(config.weight_settings, (plain, other))
+    before, now = map(config_json.weight_settings, (plain, other))
     assert before["train.randomise"] == [] and now["train.randomise"] == list(ALL)
-    assert config.from_dict(config.RunConfig, config.as_json(other)) == other
-    old = config.as_json(plain)
+    assert config_json.from_dict(config.RunConfig, config_json.as_json(other)) == other
+    old = config_json.as_json(plain)
     del old["train"]["randomise"]  # a file of an earlier version
-    assert config.from_dict(config.RunConfig, old) == plain
+    assert config_json.from_dict(config.RunConfig, old) == plain

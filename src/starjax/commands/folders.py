@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import errors, learners, methods
+from starjax import config_json, errors, learners, methods
 from starjax.runtime import files, sources
 
 _BESIDE = (
@@ -112,7 +112,7 @@ def claim(
         expected = "the config.json that its weights were trained with"
         raise errors.UsageError(str(folder), expected, "none", _remedy(folder))
     if started:
-        before, now = map(config_lib.weight_settings, (_settings(folder, recorded), config))
+        before, now = map(config_json.weight_settings, (_settings(folder, recorded), config))
         for name, value in now.items():
             _refuse(folder, name, before[name], value)
         settings = (record.get("jax_settings", {}) for record in (recorded, jax_settings.record()))
@@ -128,7 +128,7 @@ def claim(
         | ({"encoder": frozen} if frozen else {})
         | jax_settings.record()
     )
-    files.write_json(folder / "config.json", {**config_lib.as_json(config), **extra})
+    files.write_json(folder / "config.json", {**config_json.as_json(config), **extra})
 
 
 def read_config(folder: Path) -> config_lib.RunConfig:
@@ -161,7 +161,7 @@ def _remedy(folder: Path) -> str:
 
 def _settings(folder: Path, values: dict[str, Any]) -> config_lib.RunConfig:
     try:
-        return config_lib.from_dict(config_lib.RunConfig, _without_extra(values))
+        return config_json.from_dict(config_lib.RunConfig, _without_extra(values))
     except (TypeError, ValueError) as error:
         file = str(folder / "config.json")
         raise errors.UsageError(file, "settings of a run", error, _remedy(folder)) from error

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import errors, learners, methods
+from starjax import config_json, errors, learners, methods
 from starjax.commands import (
     demonstrations,
     folders,
@@ -168,7 +168,7 @@ def _train(
     begun = any((folder / "checkpoints").glob("step_*"))
     with (
         stage_times.timed(work.out, f"train {name}", begun),
-        trackers.following(work.tracker, folder, config_lib.as_json(config)),
+        trackers.following(work.tracker, folder, config_json.as_json(config)),
         stop_signals() as should_stop,
     ):
         result = loop.run(

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from starjax import config as config_lib
-from starjax import errors, methods, rcm
+from starjax import config_json, errors, methods, rcm
 from starjax.commands import messages
 from starjax.data import normalizer
 from starjax.evaluation import alarms, evaluate, latency, statistics
@@ -91,7 +91,7 @@ def rollouts(
             layout=placement.DeviceLayout(devices=placement.devices()),
             identity={
                 **methods.behaviour(trained.method)._asdict(),
-                "policy": config_lib.as_json(trained.policy),
+                "policy": config_json.as_json(trained.policy),
                 **({} if is_file else {"served": who.weights}),
             },
             levels=levels,
@@ -197,7 +197,7 @@ def write_result(
         "seed": seed,
         "weights": who.weights,
         "dataset_digest": dataset_digest,
-        "config": config_lib.as_json(config),
+        "config": config_json.as_json(config),
         "command": command,
         "timings_s": timings_s or {},
         "warnings": messages.warnings(config, figures),

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import errors
+from starjax import config_json, errors
 from starjax.runtime import files, sources
 
 
@@ -18,7 +18,7 @@ def is_complete(config: config_lib.RunConfig, folder: Path, weights: Path, env: 
     from starjax.evaluation import result
 
     scored = _read(folder, files.sha256(weights))
-    source = sources.digests(*result.parts_of(env.names, config_lib.as_json(config)))
+    source = sources.digests(*result.parts_of(env.names, config_json.as_json(config)))
     is_current = scored and scored.about.get("source", source) == source
     if is_current and _is_of(scored, config):
         return True
@@ -48,8 +48,8 @@ def _read(folder: Path, weights: str) -> Any:
 def _is_of(scored: Any, config: config_lib.RunConfig) -> bool:
     """Returns True if a result has these settings."""
     try:
-        before = config_lib.from_dict(config_lib.RunConfig, scored.config)
+        before = config_json.from_dict(config_lib.RunConfig, scored.config)
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
-    alike = config_lib.weight_settings(before) == config_lib.weight_settings(config)
+    alike = config_json.weight_settings(before) == config_json.weight_settings(config)
     return alike and before.eval == config.eval and scored.seed in (None, config.seed)

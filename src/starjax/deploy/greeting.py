@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import config, errors, limits, methods
+from starjax import config, config_json, errors, limits, methods
 from starjax.data.formats import peer_columns
 from starjax.deploy import wire
 from starjax.deploy.inputs import InputSpec
@@ -59,7 +59,7 @@ def read(metadata: Any) -> Greeting:
     if spec is None:
         values.pop("horizon", None)  # measured
     try:
-        settings = config.from_dict(config.PolicyConfig, values)
+        settings = config_json.from_dict(config.PolicyConfig, values)
         limits.check(settings)
     except ValueError as error:
         raise UsageError("greeting", "settings of a policy", str(error)[:200]) from None

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, errors, limits, methods, rcm, types
+from starjax import config, config_json, errors, limits, methods, rcm, types
 from starjax.deploy import approach, inputs
 from starjax.deploy.inputs import RobotObservation
 from starjax.learners import LEARNERS
@@ -254,7 +254,9 @@ def _with_options(settings: config.PolicyConfig, options: dict[str, Any]) -> con
     for name, value in options.items():
         errors.choice("option", name, names)
         values[name] = value.item() if isinstance(value, np.generic) else value
-    changed = config.from_dict(config.PolicyConfig, {**config.as_json(settings), **values})
+    changed = config_json.from_dict(
+        config.PolicyConfig, {**config_json.as_json(settings), **values}
+    )
     limits.check(changed)
     LEARNERS.get(changed.learner).check(changed.options, changed)
     return changed

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.experimental import io_callback
 
-from starjax import config, rcm, types
+from starjax import config, config_json, rcm, types
 from starjax.deploy import batching, connection_pool, greeting, inputs, plain, wire
 from starjax.errors import UsageError
 from starjax.policies import in_env
@@ -225,8 +225,9 @@ def attach(connections: Any, arms: Sequence[str] = ()) -> ServedPolicy:
     execute = hello.execute or horizon
     if not settings.obs_horizon - 1 <= execute <= horizon:
         raise UsageError("greeting.execute", f"at most the {horizon} that are planned", execute)
-    settings = config.from_dict(
-        config.PolicyConfig, {**config.as_json(settings), "horizon": horizon, "execute": execute}
+    settings = config_json.from_dict(
+        config.PolicyConfig,
+        {**config_json.as_json(settings), "horizon": horizon, "execute": execute},
     )
     origin = {"address": connections.address, "metadata": greeting.as_json(connections.metadata)}
     trained = ServedTraining(hello.method, settings, np.zeros(1, bool), None, env.names)

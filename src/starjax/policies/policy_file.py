@@ -16,7 +16,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from starjax import config
+from starjax import config, config_json
 from starjax.data import normalizer
 from starjax.monitor import calibrate
 from starjax.policies.base import Params
@@ -89,12 +89,12 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
     about = {
         "schema": SCHEMA,
         "method": trained.method,
-        "policy": config.as_json(trained.policy),
-        "train": config.as_json(trained.train),
+        "policy": config_json.as_json(trained.policy),
+        "train": config_json.as_json(trained.train),
         "scene": trained.scene._asdict(),
         "p_world_ref": _floats(trained.p_world_ref),
         "roll_zero": _floats(trained.roll_zero),
-        "demos": None if trained.demos is None else config.as_json(trained.demos),
+        "demos": None if trained.demos is None else config_json.as_json(trained.demos),
         "preset": trained.preset,
         # Omitted if empty, so files of starjax's own parts keep their bytes.
         **({"packages": dict(trained.packages)} if trained.packages else {}),
@@ -201,8 +201,8 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
     places, demos, scene = about["p_world_ref"], about.get("demos"), about["scene"]
     return Trained(
         method=about["method"],
-        policy=config.from_dict(config.PolicyConfig, about["policy"]),
-        train=config.from_dict(config.TrainConfig, about["train"]),
+        policy=config_json.from_dict(config.PolicyConfig, about["policy"]),
+        train=config_json.from_dict(config.TrainConfig, about["train"]),
         params=tree["params"],
         normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
         scene=names.SceneNames(
@@ -210,7 +210,7 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
         ),
         p_world_ref=None if places is None else tuple(map(tuple, places)),
         roll_zero=tuple(about["roll_zero"]),
-        demos=None if demos is None else config.from_dict(config.DemosConfig, demos),
+        demos=None if demos is None else config_json.from_dict(config.DemosConfig, demos),
         preset=about.get("preset"),
         packages=about.get("packages", {}),
     )

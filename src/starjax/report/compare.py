@@ -3,7 +3,7 @@
 import collections
 from collections.abc import Iterable, Sequence
 
-from starjax import config, errors
+from starjax import config_json, errors
 from starjax.evaluation.result import Trial
 from starjax.report import outcomes, results, stats
 from starjax.report.results import Run
@@ -50,7 +50,7 @@ def most_shared(trials: Iterable[Trial]) -> tuple[int, int, int]:
 
 def differing(runs: Sequence[Run]) -> list[str]:
     """Lists the training settings, except the seed, that differ between the runs."""
-    return config.differing_settings([run.result.config for run in runs if run.result.config])
+    return config_json.differing_settings([run.result.config for run in runs if run.result.config])
 
 
 def pair(a: Run, b: Run) -> stats.Paired | None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from starjax import config, methods
+from starjax import config_json, methods
 from starjax.evaluation import result, structure
 from starjax.evaluation.content import Hardware, Milliseconds
 from starjax.runtime import files
@@ -121,7 +121,7 @@ def _is_of(folder: Path, scored: result.Result) -> bool:
     try:
         trained = files.read_json(folder / "config.json")
         same_seed = trained["seed"] == scored.config.get("seed", trained["seed"])
-        return same_seed and not config.differing_settings([trained, scored.config])
+        return same_seed and not config_json.differing_settings([trained, scored.config])
     except (FileNotFoundError, AttributeError, KeyError, TypeError, ValueError):
         return True  # missing, damaged or of another version: unknown
 
