@@ -481,6 +481,20 @@ def test_disturbances_at_once_have_a_row_of_their_own(file):
         stressed("--disturbance", "trocar_offset", "--together", "mass=0.25", "--out=other")
 
 
+def test_a_disturbance_may_name_its_levels(file):
+    chosen = ["trocar_offset=5", "trocar_offset=1", "breathing=2"]
+    assert stressed("--disturbance", *chosen, "--out=levels") == 0
+    found = json.loads((file.parent / "levels" / "stress.json").read_text())["disturbances"]
+    levels = {name: list(kind["levels"]) for name, kind in found.items()}
+    assert levels == {"trocar_offset": ["0", "5", "1"], "breathing": ["0", "2"]}
+    with mistakes.of("levels", "trocar_offset=5"):
+        stressed("--disturbance", "trocar_offset=5", "--levels", "2")
+    with mistakes.of("disturbance", "trocar_offset=fast"):
+        stressed("--disturbance", "trocar_offset=fast")
+    with mistakes.of("disturbance", 5.0):
+        stressed("--disturbance", "observation_delay=5")
+
+
 def test_too_few_trials_write_no_policy(file):
     few = ["--trials=20", "--alpha=0.05", "--out=watched.safetensors"]
     with mistakes.of("successes", "for the scale"):

@@ -34,7 +34,7 @@ def run(directory, score_settings=SETTINGS, **changed):
 
 def monitor(threshold=np.inf, clock_s=0.5):
     return calibrate.Monitor(
-        np.zeros(3), np.ones(3), threshold, clock_s, 0.05, 100, SETTINGS, "weights"
+        np.zeros(4), np.ones(4), threshold, clock_s, 0.05, 100, SETTINGS, "weights"
     )
 
 
@@ -60,8 +60,11 @@ def test_recorded_plans_are_those_that_a_watch_would_meet():
     live = watch.Watch(monitor())
     measured = episode.joined(plans.MEASURED)[::EXECUTE]
     assert len(met) == len(measured) >= 4
-    for row, plan, tip in zip(found[:-1], met, measured):  # the last plan may be cut off
-        live.update(plan, tip)
+    opening = episode.joined(plans.OPENING)[::EXECUTE]
+    for row, plan, tip, gripper in zip(
+        found[:-1], met, measured, opening
+    ):  # the last plan may be cut off
+        live.update(plan, tip, gripper=gripper)
         np.testing.assert_allclose(row, live.scores, rtol=1e-4, atol=1e-7)
     assert np.isfinite(found[3]).all()
 
@@ -73,7 +76,7 @@ def test_scores_change_no_trial_and_survive_a_restart(tmp_path):
     assert ours.keys() - theirs.keys() == {"scores"}
     for name, column in theirs.items():
         np.testing.assert_array_equal(ours[name], column, name)
-    assert scored.scores.shape == (6, -(-30 // EXECUTE), 3)
+    assert scored.scores.shape == (6, -(-30 // EXECUTE), 4)
     ends = np.isfinite(scored.scores[..., 2]).sum(axis=1)
     np.testing.assert_array_equal(ends, -(-scored.steps // EXECUTE))
     again = run(tmp_path / "scored", chunk=2)
@@ -86,7 +89,7 @@ def test_scores_change_no_trial_and_survive_a_restart(tmp_path):
 
 def test_figures_by_hand(tmp_path):
     table = run(tmp_path)
-    values = np.full((6, 8, 3), np.nan, np.float32)
+    values = np.full((6, 8, 4), np.nan, np.float32)
     values[..., 2] = 0.0
     success = np.array([1, 1, 1, 0, 0, 0], bool)
     values[0, 2, 0] = 2.0  # a false alarm
@@ -99,7 +102,7 @@ def test_figures_by_hand(tmp_path):
     assert (found["false_alarms"]["successes"], found["false_alarms"]["trials"]) == (1, 3)
     assert (found["silent"]["successes"], found["silent"]["trials"]) == (2, 3)
     assert found["median_s"] == pytest.approx(16 / 30)
-    assert found["by_score"] == {"disagreement": 1, "stillness": 1, "clock": 0}
+    assert found["by_score"] == {"disagreement": 1, "stillness": 1, "clock": 0, "closure": 0}
     silent = alarms.compose(table, monitor())
     assert silent["median_s"] is None and silent["silent"]["trials"] == 6
 

@@ -13,10 +13,10 @@ SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=6)
 
 
 def trials(rng: np.random.Generator, count: int, longest: int = 30) -> np.ndarray:
-    """Scores `[count, longest, 3]`, dependent in time, of trials that end anywhere."""
-    walks = rng.normal(size=(count, longest, 2)).cumsum(axis=1) * [1e-3, 5.0]
+    """Scores `[count, longest, 4]`, dependent in time, of trials that end anywhere."""
+    walks = rng.normal(size=(count, longest, 3)).cumsum(axis=1) * [1e-3, 5.0, 0.1]
     clock = np.broadcast_to(np.arange(longest) * SETTINGS.period_s, (count, longest))
-    values = np.concatenate([walks, clock[..., None]], axis=-1)
+    values = np.insert(walks, scores.NAMES.index("clock"), clock, axis=-1)
     values[:, : SETTINGS.still, 1] = np.nan
     length = rng.integers(2, longest + 1, count)
     values[np.arange(longest) >= length[:, None]] = np.nan
@@ -68,15 +68,15 @@ def test_bands_are_one_sided():
     rng = np.random.default_rng(3)
     monitor, fresh = made(rng), trials(rng, 300)
     before, _ = calibrate.first_alarms(monitor, fresh)
-    lower, _ = calibrate.first_alarms(monitor, fresh - np.array([1.0, 1e6, 10.0]))
+    lower, _ = calibrate.first_alarms(monitor, fresh - np.array([1.0, 1e6, 10.0, 1e3]))
     assert np.isinf(lower).all()
-    higher, _ = calibrate.first_alarms(monitor, fresh + np.array([1e-3, 1.0, 0.0]))
+    higher, _ = calibrate.first_alarms(monitor, fresh + np.array([1e-3, 1.0, 0.0, 0.1]))
     assert (higher <= before).all()
 
 
 def test_units_do_not_matter():
     first, second, fresh = (trials(np.random.default_rng(i), 300) for i in range(3))
-    unit, zero = np.array([1e3, 0.2, 1.0]), np.array([5.0, -2.0, 0.0])
+    unit, zero = np.array([1e3, 0.2, 1.0, 3.0]), np.array([5.0, -2.0, 0.0, 1.0])
     one = calibrate.calibrate(first, second, 0.05, SETTINGS)
     two = calibrate.calibrate(unit * first + zero, unit * second + zero, 0.05, SETTINGS)
     for a, b in zip(
@@ -87,7 +87,7 @@ def test_units_do_not_matter():
 
 def test_nan_neither_alarms_nor_hides_another_score():
     monitor = made(np.random.default_rng(4))
-    blank = np.full((1, 5, 3), np.nan)
+    blank = np.full((1, 5, 4), np.nan)
     assert np.isinf(calibrate.first_alarms(monitor, blank)[0]).all()
     for score, limit in enumerate(monitor.limits):
         over = blank.copy()
@@ -111,7 +111,7 @@ def test_an_undefined_score_leaves_the_others():
 
 def test_the_clock_alone_is_a_quantile_of_durations():
     durations = np.arange(1, 101)
-    values = np.full((100, 100, 3), np.nan)
+    values = np.full((100, 100, 4), np.nan)
     for trial, length in enumerate(durations):
         values[trial, :length, 2] = np.arange(length)
     monitor = calibrate.calibrate(values, values, 0.05, SETTINGS)
@@ -124,9 +124,32 @@ def test_json_round_trip_and_refusals():
     again = calibrate.from_json(values)
     np.testing.assert_array_equal(again.limits, monitor.limits)
     assert again[2:] == monitor[2:]
-    for change in ({"scores": ["clock"]}, {"width": [1.0]}, {"width": [0.0] * 3}, {"count": None}):
+    unknown = ["clock", "temper"]
+    for change in (
+        {"scores": unknown}, {"scores": ["clock", "stillness"]}, {"width": [1.0]},
+        {"width": [0.0] * 4}, {"count": None},
+    ):  # fmt: skip
         broken = {**values, **change}
         if broken["count"] is None:
             del broken["count"]
         with pytest.raises(ValueError):
             calibrate.from_json(broken)
+
+
+def test_a_monitor_of_fewer_scores_alarms_on_these_alone():
+    monitor = made(np.random.default_rng(9))
+    values = calibrate.to_json(monitor)
+    first = scores.NAMES[:3]
+    older = {**values, "scores": [*first], **{k: values[k][:3] for k in ("center", "width")}}
+    found = calibrate.from_json(older)
+    assert calibrate.to_json(found) == older
+    fresh = trials(np.random.default_rng(10), 300)
+    blind = fresh.copy()
+    blind[..., 3] = np.nan
+    for a, b in zip(calibrate.first_alarms(found, fresh), calibrate.first_alarms(monitor, blind)):
+        np.testing.assert_array_equal(a, b)
+    loud = fresh.copy()
+    loud[..., 3] = 1e9
+    np.testing.assert_array_equal(
+        calibrate.first_alarms(found, loud)[0], calibrate.first_alarms(found, fresh)[0]
+    )

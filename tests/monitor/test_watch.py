@@ -26,7 +26,7 @@ def recorded(made: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 def monitor(**fields) -> calibrate.Monitor:
     default = {
-        "center": np.zeros(3), "width": np.ones(3), "threshold": np.inf, "clock_s": 1.0,
+        "center": np.zeros(4), "width": np.ones(4), "threshold": np.inf, "clock_s": 1.0,
         "alpha": 0.05, "count": 100, "settings": SETTINGS, "digest": "",
     }  # fmt: skip
     return calibrate.Monitor(**{**default, **fields})
@@ -42,18 +42,20 @@ def test_equal_plans_do_not_disagree_and_a_shift_is_its_length():
     assert np.isnan(scores.gap(plan, later, HORIZON, 8))
 
 
-def test_the_arm_that_disagrees_most_and_the_one_that_moves_most_count():
+def test_the_arm_that_disagrees_most_moves_most_or_closes_most_counts():
     plan = np.zeros((HORIZON, 2, 3))
     assert scores.gap(
         plan, plan + np.eye(3)[[0, 0]] * np.array([[0.0], [1.0]]), 8, 8
     ) == pytest.approx(1.0)
     tips = np.zeros((20, 2, 3))
     tips[:, 1, 0] = np.arange(20)
-    rows = scores.series(np.zeros(20), tips, np.arange(20.0), 6)
+    openings = np.stack([np.linspace(1, -1, 20), np.zeros(20)], -1)
+    rows = scores.series(np.zeros(20), tips, openings, np.arange(20.0), 6)
     assert np.isnan(rows[:6, 1]).all()
     np.testing.assert_allclose(rows[6:, 1], -6.0)
     assert np.isnan(rows[:2, 0]).all()
     np.testing.assert_allclose(rows[:, 2], np.arange(20.0))
+    np.testing.assert_allclose(rows[[0, 9, 10, 19], 3], [0, 0, 1 / 19, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize("arms", [1, 2])
@@ -62,31 +64,35 @@ def test_a_watch_equals_the_scores_of_a_recording(arms):
     decisions = 20
     made, steps = plans(rng, decisions, arms), 8 * decisions
     tip = rng.normal(size=(steps, arms, 3)).cumsum(axis=0) * 1e-3
-    whole = scores.of_trial(*recorded(made, steps), tip, SETTINGS)
-    assert whole.shape == (decisions, 3)
+    opening = rng.uniform(-1, 1, (steps, arms))
+    whole = scores.of_trial(*recorded(made, steps), tip, opening, SETTINGS)
+    assert whole.shape == (decisions, 4)
     live = watch.Watch(monitor())
     for decision in range(decisions):
         plan, measured = made[decision], tip[8 * decision]
-        assert live.update(*((x[..., 0, :] if arms == 1 else x) for x in (plan, measured))) is None
+        inputs = ((x[..., 0, :] if arms == 1 else x) for x in (plan, measured))
+        assert live.update(*inputs, gripper=opening[8 * decision].squeeze()) is None
         np.testing.assert_allclose(live.scores, whole[decision], rtol=1e-12)
 
 
 def test_plans_without_a_common_step_have_no_disagreement():
     planned = np.zeros((64, 1, 3))
-    rows = scores.of_trial(planned, np.full((64, 1, 3), np.nan), planned, SETTINGS)
+    rows = scores.of_trial(
+        planned, np.full((64, 1, 3), np.nan), planned, np.ones((64, 1)), SETTINGS
+    )
     assert np.isnan(rows[:, 0]).all()
     assert np.isfinite(rows[6:, 1:]).all()
 
 
 @pytest.mark.parametrize("steps", [1, 7, 8, 9, 50, 64])
 def test_trials_of_any_length_have_a_row_per_decision(steps):
-    rows = scores.of_trial(*np.zeros((3, steps, 1, 3)), SETTINGS)
-    assert rows.shape == (-(-steps // 8), 3)
+    rows = scores.of_trial(*np.zeros((3, steps, 1, 3)), np.zeros((steps, 1)), SETTINGS)
+    assert rows.shape == (-(-steps // 8), 4)
 
 
 def test_an_alarm_says_which_score_its_value_and_its_threshold():
     far = np.zeros((HORIZON, 3))
-    live = watch.Watch(monitor(threshold=0.5, width=np.array([0.01, 0.01, 1e9])))
+    live = watch.Watch(monitor(threshold=0.5, width=np.array([0.01, 0.01, 1e9, 1.0])))
     alarm = None
     for i in range(10):
         alarm = alarm or live.update(far + 0.1 * i, i * np.ones(3))

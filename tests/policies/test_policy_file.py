@@ -39,8 +39,8 @@ def trained(scale=1.0):
 
 def with_monitor(policy, digest=None):
     monitor = calibrate.Monitor(
-        center=np.array([1e-3, -2e-3, 6.7]),
-        width=np.array([0.1, 0.2, 1.0]) / 3,
+        center=np.array([1e-3, -2e-3, 6.7, np.nan]),
+        width=np.array([0.1, 0.2, 1.0, np.nan]) / 3,
         threshold=1.25,
         clock_s=7.9,
         alpha=0.05,

@@ -32,7 +32,7 @@ class CalibrateArgs:
     out: str = ""  # policy file to write
     alpha: Annotated[float, Range(0.001, 0.5)] = 0.05  # false alarm rate on successes
     # simulated trials, one per sampled trocar configuration
-    trials: Annotated[int, Range(20, 1_000_000)] = 2400
+    trials: Annotated[int, Range(20, 1_000_000)] = 2600
     # time limit of a trial in simulated seconds
     time_limit_s: Annotated[float, config_lib.TIME_LIMIT] = 60.0
     # seconds over which stillness is measured; longer than the rest that a task's success needs
@@ -117,13 +117,14 @@ def _divide(table: Any) -> tuple[Any, Any, Any]:
 
 def _outcome(monitor: Any, figures: dict[str, Any]) -> str:
     """Returns the thresholds, and the realised false alarm rate with its interval."""
-    disagreement, stillness, clock = monitor.limits
+    disagreement, stillness, clock, closure = monitor.limits
     false, still_s = figures["false_alarms"], monitor.settings.still_s
     lines = [
         f"\n  threshold from {monitor.count} successes at alpha {monitor.alpha:g}:",
         f"    successive plans     more than {1e3 * disagreement:.2f} mm apart",
         f"    tip                  less than {-1e3 * stillness:.2f} mm in {still_s:.1f} s",
         f"    clock                {clock:.1f} s (alone {monitor.clock_s:.1f} s)",
+        f"    jaws                 closed to less than {-closure:.2f} of -1 to 1",
     ]
     if false["trials"]:
         low, high = (100 * bound for bound in false["ci95"])

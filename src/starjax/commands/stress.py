@@ -2,7 +2,7 @@
 
 import dataclasses
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ the first of which is zero; all levels run the same trials. Rerun the same comma
 
 Examples:
   starjax stress --policy compact --disturbance breathing smoke
+  starjax stress --policy compact --disturbance camera=5 blood=0.05
   starjax stress runs/cpu/stardiff --disturbance trocar_offset --levels 0 0.002 0.005"""
 
 
@@ -31,7 +32,8 @@ _TRIALS = config_lib.EvalConfig(trials=4, time_limit_s=30.0, video_trials=0)
 class StressArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
     """Flags of the command."""
 
-    # disturbances to test; default: all that apply to this policy
+    # disturbances to test, NAME or NAME=LEVEL for 0 and that level; default: all that apply to this
+    # policy
     disturbance: tuple[str, ...] = ()
     # levels of a single disturbance, in its unit; default: its own
     levels: tuple[NotNegative, ...] = ()
@@ -49,15 +51,16 @@ def main(argv: Sequence[str]) -> int:
     path = policy_args.resolve(args)
     trials = benchmark_args.label() if args.benchmark else f"seed{args.seed}"
     folder = path.folder("stress", [trials], args.out)
-    if args.levels and (count := len(args.disturbance)) != 1:
-        raise errors.UsageError("levels", "exactly one --disturbance", count)
-    names = tuple(disturbances.resolve("disturbance", args.disturbance))
-    args = dataclasses.replace(args, disturbance=names)
+    chosen = disturbances.chosen_levels("disturbance", args.disturbance)
+    if args.levels and (len(chosen) != 1 or any(chosen.values())):
+        got = ", ".join(args.disturbance) or "none"
+        raise errors.UsageError("levels", "exactly one --disturbance, without a level", got)
+    args = dataclasses.replace(args, disturbance=tuple(chosen))
     started = session.start("stress", argv, folder)
     together = disturbances.parse_levels("together", args.together)
     who, _ = policy_args.load(path)
     args = benchmark_args.with_trials(args, "stress", who.env.names.task)
-    kinds = _kinds(args, who.trained.policy.observation)
+    kinds = _kinds(args, chosen, who.trained.policy.observation)
     _check_together(together, list(kinds))
     who = _disturbed(who, list(kinds))
     content = {
@@ -76,7 +79,7 @@ def main(argv: Sequence[str]) -> int:
             print(f"{name}: {kind.description}", flush=True)
             rows = {"what": kind.description, "unit": kind.unit, "levels": {}}
             content["disturbances"][name] = rows
-            for level in args.levels or kind.levels:
+            for level in args.levels or chosen.get(name) or kind.levels:
                 trials = folder / (f"{name}-{level:g}" if level else "0")
                 levels = {**dict.fromkeys(kinds, 0.0), name: level}
                 score = rows["levels"][f"{level:g}"] = _score(trials, who, levels, args)
@@ -105,7 +108,9 @@ def _draw(folder: Path) -> None:
         files.write_bytes(folder / name, data)
 
 
-def _kinds(args: StressArgs, observation: str) -> dict[str, Any]:
+def _kinds(
+    args: StressArgs, chosen: Mapping[str, Sequence[float]], observation: str
+) -> dict[str, Any]:
     """Returns the requested disturbances, by default all that apply to this observation.
 
     Raises:
@@ -120,6 +125,7 @@ def _kinds(args: StressArgs, observation: str) -> dict[str, Any]:
         if observation != "image" and kinds[name].image_only:
             raise errors.UsageError("disturbance", "one that applies to states", name)
         base.check_levels("levels", name, args.levels)
+        base.check_levels("disturbance", name, chosen[name])
     return {n: kind for n, kind in kinds.items() if observation == "image" or not kind.image_only}
 
 

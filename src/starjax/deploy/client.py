@@ -111,7 +111,7 @@ class Client:
         except BaseException:
             self._connection.close()
             raise
-        self._tip = np.zeros(3, np.float32)  # m, measured at the latest request
+        self._asked: RobotObservation | None = None  # measured at the latest request
         self._moved = self._watched = 0  # control steps executed at the latest request, and scored
         self._key, self._requests = key, 0
         self._next_key()  # compiles it
@@ -144,7 +144,7 @@ class Client:
             self._moments.append(moment)
         self._receive()
         if executor.needs_plan and self._connection.is_up:
-            self._tip, self._moved = moment.pose.p, self.report.steps - self.report.held
+            self._asked, self._moved = moment, self.report.steps - self.report.held
             self._connection.send(self._request())
             executor.on_request()
             self._receive()
@@ -195,7 +195,9 @@ class Client:
             return self._executor.on_failure(str(error))
         if self._executor.on_plan(plan) and self._watch:
             steps, self._watched = self._moved - self._watched, self._moved
-            if alarm := self._watch.update(np.asarray(plan.pose.p), self._tip, steps):
+            p, asked = np.asarray(plan.pose.p), self._asked
+            assert asked is not None
+            if alarm := self._watch.update(p, asked.pose.p, steps, asked.gripper):
                 self._executor.on_alarm(str(alarm))
 
     def _request(self) -> dict[str, Any]:

@@ -33,9 +33,9 @@ def of_episodes(
     decisions = math.ceil(max_steps / settings.execute)
     found = np.full((len(episodes), decisions, len(scores.NAMES)), np.nan, np.float32)
     for row, episode in zip(found, episodes, strict=True):
-        names = (plans.PLANNED, plans.AHEAD, plans.MEASURED)
-        planned, ahead, measured = map(episode.joined, names)
-        values = scores.of_trial(planned, ahead, measured, settings)
+        names = (plans.PLANNED, plans.AHEAD, plans.MEASURED, plans.OPENING)
+        planned, ahead, measured, opening = map(episode.joined, names)
+        values = scores.of_trial(planned, ahead, measured, opening, settings)
         row[: len(values)] = values
     return found
 

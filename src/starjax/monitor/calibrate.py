@@ -27,8 +27,8 @@ class Monitor(NamedTuple):
     """A calibrated monitor.
 
     Attributes:
-      center: `[S]`, of the scores, in their units.
-      width: `[S]`, of the scores, in their units.
+      center: `[S]`, of the scores, in their units; NaN of a score that raises no alarms.
+      width: `[S]`, of the scores, in their units, NaN as the center.
       threshold: of the scaled scores.
       clock_s: s, threshold of the clock if it were the only score; a monitor counts only where it
         beats this.
@@ -49,7 +49,7 @@ class Monitor(NamedTuple):
 
     @property
     def limits(self) -> np.ndarray:
-        """Returns the thresholds `[S]` in the units of the scores."""
+        """Returns the thresholds `[S]` in the units of the scores, NaN of scores without alarms."""
         return self.center + self.threshold * self.width
 
 
@@ -140,9 +140,11 @@ def first_alarms(monitor: Monitor, scores: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def to_json(monitor: Monitor) -> dict[str, Any]:
-    """Returns the monitor as JSON values."""
+    """Returns the monitor as JSON values, without scores that raise no alarms."""
+    raises = np.isfinite(monitor.center)
     values = {**monitor._asdict(), "settings": monitor.settings._asdict()}
-    values["scores"] = list(scores_lib.NAMES)
+    values["scores"] = [name for name, is_raised in zip(scores_lib.NAMES, raises) if is_raised]
+    values |= {"center": monitor.center[raises], "width": monitor.width[raises]}
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
 
 
@@ -150,15 +152,25 @@ def from_json(values: dict[str, Any]) -> Monitor:
     """Reads the values of `to_json`.
 
     Raises:
-      ValueError: a field is missing or malformed, or its scores are others than this version's.
+      ValueError: a field is missing or malformed, or a score is unknown to this version.
     """
-    if (names := values.get("scores")) != list(scores_lib.NAMES):
-        raise ValueError(f"monitor: expected the scores {_listed(scores_lib.NAMES)}, got {names}")
-    shape = (len(scores_lib.NAMES),)
+    names = values.get("scores")
+    known = [name for name in scores_lib.NAMES if name in (names or ())]
+    if not known or known != names:
+        raise ValueError(
+            f"monitor: expected of {_listed(scores_lib.NAMES)}, in this order, got {names}"
+        )
+    places = [scores_lib.NAMES.index(name) for name in known]
+
+    def filled(name: str) -> np.ndarray:
+        whole = np.full(len(scores_lib.NAMES), np.nan)
+        whole[places] = np.asarray(values[name], float).reshape(len(known))
+        return whole
+
     try:
         monitor = Monitor(
-            center=np.asarray(values["center"], float).reshape(shape),
-            width=np.asarray(values["width"], float).reshape(shape),
+            center=filled("center"),
+            width=filled("width"),
             threshold=float(values["threshold"]),
             clock_s=float(values["clock_s"]),
             alpha=float(values["alpha"]),
@@ -168,7 +180,8 @@ def from_json(values: dict[str, Any]) -> Monitor:
         )
     except (KeyError, TypeError) as error:
         raise ValueError(f"monitor: malformed: {error}") from error
-    if not np.isfinite([*monitor.limits, monitor.clock_s]).all() or not (monitor.width > 0).all():
+    finite = np.isfinite([*monitor.limits[places], monitor.clock_s]).all()
+    if not finite or not (monitor.width[places] > 0).all():
         raise ValueError("monitor: expected finite thresholds and positive widths")
     return monitor
 

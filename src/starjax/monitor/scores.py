@@ -1,8 +1,9 @@
-"""Scores of a running policy from its plans and measured tips alone; higher is more suspicious.
+"""Scores of a running policy from its plans and measurements alone; higher is more suspicious.
 
 disagreement   m, between successive plans at the control steps that both describe
 stillness      m, negative path of the measured tip over a window: it rises to 0 as the tools stop
 clock          s, time since the episode began
+closure        negative measured opening of the jaws: it rises to 1 as they close on nothing
 
 The first is the temporal consistency of STAC (Agia et al., 2024, arXiv 2410.04640) with one sample,
 which needs neither a second inference nor a second network.
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-NAMES = ("disagreement", "stillness", "clock")
+NAMES = ("disagreement", "stillness", "clock", "closure")
 SMOOTHED = 3  # decisions whose disagreement is averaged: single plans jump at a grasp
 
 
@@ -61,12 +62,15 @@ def gap(last: np.ndarray, plan: np.ndarray, shift: int, execute: int) -> float:
     return float(apart.mean(axis=0).max())
 
 
-def series(gaps: np.ndarray, tips: np.ndarray, times: np.ndarray, still: int) -> np.ndarray:
+def series(
+    gaps: np.ndarray, tips: np.ndarray, openings: np.ndarray, times: np.ndarray, still: int
+) -> np.ndarray:
     """Returns the scores `[D, S]` of successive decisions, NaN where a window is not full yet.
 
     Args:
       gaps: `[D]` m, see `gap`; NaN for the first decision.
       tips: `[D, A, 3]` m, measured tips at the decisions.
+      openings: `[D, A]` in [-1 closed, +1 open], measured at the decisions; NaN where unknown.
       times: `[D]` s, of the decisions.
       still: see `ScoreSettings`.
     """
@@ -76,11 +80,16 @@ def series(gaps: np.ndarray, tips: np.ndarray, times: np.ndarray, still: int) ->
     # One arm may rest while another works: the longest path of all arms counts.
     scores[still:, 1] = -_windows(moves, still).sum(axis=-1).max(axis=-1, initial=0.0)
     scores[:, 2] = times
+    scores[:, 3] = -openings.min(axis=-1)
     return scores
 
 
 def of_trial(
-    planned: np.ndarray, ahead: np.ndarray, tip: np.ndarray, settings: ScoreSettings
+    planned: np.ndarray,
+    ahead: np.ndarray,
+    tip: np.ndarray,
+    opening: np.ndarray,
+    settings: ScoreSettings,
 ) -> np.ndarray:
     """Returns the scores `[D, S]` of a recorded episode.
 
@@ -90,6 +99,7 @@ def of_trial(
       planned: `[T, A, 3]` m, planned tip of each control step.
       ahead: `[T, A, 3]` m, the same plan's tip `execute` control steps later, NaN beyond its end.
       tip: `[T, A, 3]` m, measured before each control step.
+      opening: `[T, A]` in [-1 closed, +1 open], measured before each control step.
       settings: of the scores.
     """
     first = np.arange(0, len(planned), settings.execute)
@@ -99,7 +109,8 @@ def of_trial(
         common = apart[start : start + settings.execute]
         common = common[np.isfinite(common).all(axis=-1)]
         gaps[decision] = common.mean(axis=0).max() if len(common) else np.nan
-    return series(gaps, tip[first], first / settings.control_hz, settings.still)
+    times = first / settings.control_hz
+    return series(gaps, tip[first], opening[first], times, settings.still)
 
 
 def _windows(values: np.ndarray, size: int) -> np.ndarray:

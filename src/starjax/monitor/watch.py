@@ -30,6 +30,8 @@ class Alarm(NamedTuple):
         value, limit = f"{self.value:.2f} s", f"{self.threshold:.2f} s"
         if self.score == "clock":
             return f"clock: {value} exceed {limit}"
+        if self.score == "closure":
+            return f"closure: the jaws closed to {-self.value:.2f}, less than {-self.threshold:.2f}"
         if self.score == "stillness":
             value, limit = (f"{-1e3 * x:.2f} mm" for x in (self.value, self.threshold))
             return f"stillness: the tip moved {value} in {self.still_s:.1f} s, less than {limit}"
@@ -57,7 +59,13 @@ class Watch:
         self._gaps: list[float] = []
         self._tips: list[np.ndarray] = []
 
-    def update(self, plan: np.ndarray, tip: np.ndarray, steps: int | None = None) -> Alarm | None:
+    def update(
+        self,
+        plan: np.ndarray,
+        tip: np.ndarray,
+        steps: int | None = None,
+        gripper: np.ndarray | None = None,
+    ) -> Alarm | None:
         """Scores a decision; returns an alarm if a score exceeds its threshold.
 
         Args:
@@ -65,6 +73,7 @@ class Watch:
           tip: measured tips `[3]` or `[A, 3]` m, of the observation that the plan was made from.
           steps: control steps executed since the previous plan's observation; holds do not count.
             By default the policy's `execute`.
+          gripper: measured openings `[]` or `[A]` of that observation; None: closure is undefined.
         """
         settings = self.monitor.settings
         plan = np.asarray(plan, float).reshape(len(plan), -1, 3)
@@ -78,9 +87,11 @@ class Watch:
         # Only the windows of the latest decision are kept.
         self._gaps = [*self._gaps, distance][-max(scores.SMOOTHED, settings.still + 1) :]
         self._tips = [*self._tips, np.asarray(tip, float).reshape(-1, 3)][-len(self._gaps) :]
+        opening = np.asarray(np.nan if gripper is None else gripper, float).reshape(-1)
         times = np.full(len(self._gaps), self._steps / settings.control_hz)
         gaps, tips = np.array(self._gaps), np.stack(self._tips)
-        self.scores = scores.series(gaps, tips, times, settings.still)[-1]
+        openings = np.broadcast_to(opening, (len(gaps), len(opening)))  # only the last row counts
+        self.scores = scores.series(gaps, tips, openings, times, settings.still)[-1]
         return self._alarm(times[-1])
 
     def _alarm(self, time_s: float) -> Alarm | None:

@@ -1,4 +1,4 @@
-"""Recording of plans and measured tips next to the scores of a trial, for the runtime monitor."""
+"""Recording of plans and measurements next to the scores of a trial, for the runtime monitor."""
 
 import functools
 
@@ -8,11 +8,12 @@ import jax.numpy as jnp
 from starjax.rollouts import episodes
 
 PLANNED, AHEAD, MEASURED = "planned_p", "ahead_p", "measured_p"  # m, `[N, A, 3]`
+OPENING = "measured_gripper"  # `[N, A]` in [-1 closed, +1 open]
 
 
 @functools.lru_cache(maxsize=4)  # programs belong to the record that they were made of
 def record(execute: int) -> episodes.Record:
-    """Returns `episodes.SCORE` with the tips that `monitor.scores.of_trial` takes.
+    """Returns `episodes.SCORE` with the fields that `monitor.scores.of_trial` takes.
 
     The agent's memory must be an `agent.Plan`.
 
@@ -30,6 +31,7 @@ def record(execute: int) -> episodes.Record:
             PLANNED: _at(plan, index),
             AHEAD: jnp.where(has_later, _at(plan, later), jnp.nan),
             MEASURED: step.before.pose.p,
+            OPENING: step.before.gripper,
         }
 
     return episodes.SCORE._replace(fields=fields)

@@ -30,6 +30,6 @@ class EpisodeAlarm:
         if self._watch is None or before.step % self._watch.monitor.settings.execute:
             return
         plan = np.asarray(live.memory.command.pose.p[0])
-        alarm = self._watch.update(plan, np.asarray(before.p_world_tip))
+        alarm = self._watch.update(plan, np.asarray(before.p_world_tip), gripper=before.gripper)
         if alarm and not self.text:
             self.text = f"alarm at {alarm.time_s:.1f} s: {alarm}"

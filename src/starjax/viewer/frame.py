@@ -29,6 +29,7 @@ class Frame(NamedTuple):
       success: strict success.
       invalid: true if the simulation diverged.
       collided: true after a collision.
+      gripper: `[A]` measured openings in [-1, 1], None in a recording without them.
     """
 
     step: Any
@@ -44,6 +45,7 @@ class Frame(NamedTuple):
     success: Any
     invalid: Any
     collided: Any
+    gripper: Any = None
 
 
 def outcome(frame: Frame, is_late: bool = False) -> str:

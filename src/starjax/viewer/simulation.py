@@ -206,4 +206,5 @@ def frame(env: sim_env.Env, live: LiveState, execute: int = 0) -> Frame:
         success=state.success & ~state.invalid,
         invalid=state.invalid,
         collided=state.collided,
+        gripper=state.gripper,
     )

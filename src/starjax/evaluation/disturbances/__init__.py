@@ -65,6 +65,25 @@ def resolve(argument: str, names: Sequence[str]) -> list[str]:
     return [current_name(name) for name in names]
 
 
+def chosen_levels(argument: str, texts: Sequence[str]) -> dict[str, tuple[float, ...]]:
+    """Parses disturbances of the form `NAME` or `NAME=LEVEL`, which may come several times.
+
+    Returns:
+      name -> 0 and the chosen levels, nothing where no level is chosen.
+
+    Raises:
+      errors.UsageError: a text has another form, or names no disturbance.
+    """
+    chosen: dict[str, tuple[float, ...]] = {}
+    for text in texts:
+        if "=" not in text:
+            chosen.setdefault(*resolve(argument, [text]), ())
+            continue
+        ((name, level),) = parse_levels(argument, [text]).items()
+        chosen[name] = (*(chosen.get(name) or (0.0,)), level)
+    return chosen
+
+
 def parse_levels(argument: str, texts: Sequence[str]) -> dict[str, float]:
     """Parses levels of the form `NAME=LEVEL`.
 
