@@ -69,7 +69,7 @@ def chosen_levels(argument: str, texts: Sequence[str]) -> dict[str, tuple[float,
     """Parses disturbances of the form `NAME` or `NAME=LEVEL`, which may come several times.
 
     Returns:
-      name -> 0 and the chosen levels, nothing where no level is chosen.
+      name -> 0 and the chosen levels, empty without a chosen level.
 
     Raises:
       errors.UsageError: a text has another form, or names no disturbance.
@@ -77,7 +77,7 @@ def chosen_levels(argument: str, texts: Sequence[str]) -> dict[str, tuple[float,
     chosen: dict[str, tuple[float, ...]] = {}
     for text in texts:
         if "=" not in text:
-            chosen.setdefault(*resolve(argument, [text]), ())
+            chosen.setdefault(resolve(argument, [text])[0], ())
             continue
         ((name, level),) = parse_levels(argument, [text]).items()
         chosen[name] = (*(chosen.get(name) or (0.0,)), level)
