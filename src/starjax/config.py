@@ -61,12 +61,14 @@ class PolicyConfig:
     obs_horizon: Count = 2  # observation horizon T_o, in control steps
     horizon: Annotated[int, Range(1, 4_096)] = 16  # prediction horizon H: commands t+1 .. t+H
     execute: Count = 8  # commands executed before re-planning
-    encoder: str = "resnet18"  # image encoder: resnet18, small, or another package's
+    encoder: str = "resnet18"  # image encoder (see starjax list)
     # initial weights of the encoder: name of a packaged policy, a policy.safetensors, or a
     # .safetensors of a ResNet-18 (ImageNet); empty: random
     encoder_weights: str = ""
     # train the other networks only, on features computed once per frame
     freeze_encoder: bool = False
+    # encoder of views of depth, e.g. points; default: the network of the other images
+    depth_encoder: str = ""
     vision_dim: Annotated[int, Range(2, 65_536)] = 512  # image feature size d_v
     # feature size d_s of the low-dimensional history (Eq. 11)
     state_dim: Annotated[int, Range(4, 65_536)] = 256

@@ -45,11 +45,16 @@ ENCODERS = Registry(
     {
         "resnet18": "starjax.models.encoders:RESNET18",
         "small": "starjax.models.encoders:SMALL",
+        "points": "starjax.policies.point_encoder:POINTS",
     },
     "starjax.models.encoders:Trunk",
 )
 
 
-def parts(method: str, learner: str, encoder: str) -> list[str]:
-    """Returns the `module:object` of each part of a policy, for `runtime.sources`."""
-    return [LEARNERS.path(learner), ENCODERS.path(encoder), *methods.paths(method)]
+def parts(method: str, learner: str, *encoders: str) -> list[str]:
+    """Returns the `module:object` of each part of a policy, for `runtime.sources`.
+
+    Empty names of encoders are those that it lacks.
+    """
+    used = [ENCODERS.path(name) for name in encoders if name]
+    return [LEARNERS.path(learner), *used, *methods.paths(method)]

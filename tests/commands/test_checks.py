@@ -21,6 +21,12 @@ from starjax.commands import checks, presets, report_command
         ("policy.freeze_encoder", {"freeze_encoder": True}),
         ("policy.freeze_encoder", {"freeze_encoder": True, "observation": "state"}),
         ("policy.encoder_weights", {"encoder_weights": "compact", "observation": "state"}),
+        ("policy.depth_encoder", {"depth_encoder": "point"}),
+        ("policy.depth_encoder", {"depth_encoder": "points", "observation": "state"}),
+        (
+            "policy.depth_encoder",
+            {"depth_encoder": "points", "encoder_weights": "compact", "freeze_encoder": True},
+        ),
     ],
 )
 def test_settings_that_do_not_go_together_name_the_field(field, changes):

@@ -15,7 +15,7 @@ KEY = jax.random.key(0)
 
 def make(trunk, **changes):
     settings = {"features": 8, "width": 16}
-    return encoders.ImageEncoder(trunk, **{**settings, **changes})
+    return encoders.make(trunk, **{**settings, **changes})
 
 
 def normal(*shape):

@@ -31,7 +31,7 @@ def unet(dtype):
 
 
 def encoder(trunk):
-    return lambda dtype: encoders.ImageEncoder(trunk, features=16, width=16, dtype=dtype)
+    return lambda dtype: encoders.make(trunk, features=16, width=16, dtype=dtype)
 
 
 COND = np.ones((3, 10), np.float32)

@@ -6,6 +6,7 @@ import mistakes
 import pytest
 import synthetic
 
+from starjax import config
 from starjax.commands import leaderboard as command
 from starjax.evaluation import protocol
 from starjax.report import leaderboard, leaderboard_tables
@@ -55,6 +56,22 @@ def test_results_of_one_policy_are_one_row_and_the_best_comes_first(folder):
     assert (worst.stressed.successes, worst.stressed.trials) == (108, 216)
     (result,) = others
     assert result.file.endswith("few/result.json") and len(result.reasons) == 2
+
+
+def test_a_row_names_its_views(folder, tmp_path):
+    content = files.read_json(folder / "stardiff" / "result.json")
+    (before,) = leaderboard.read([files_of(tmp_path / "plain.json", content)])[0]
+    content["scene"]["cameras"], content["observation"] = ["camera", "camera_depth"], "image"
+    policy = config.PolicyConfig(depth_encoder="points")
+    content["config"] = config.as_json(config.RunConfig(policy=policy))
+    (row,) = leaderboard.read([files_of(tmp_path / "views.json", content)])[0]
+    assert "camera + camera_depth, depth by points" in row.policy
+    assert "camera" not in before.policy
+
+
+def files_of(path, content):
+    files.write_json(path, content)
+    return path
 
 
 def test_only_the_first_trials_at_each_trocar_count(folder):

@@ -49,14 +49,14 @@ def test_depth_is_neither_jittered_nor_disturbed():
     rng = np.random.default_rng(0)
     images = rng.integers(60, 200, (1, 2, 2, SIZE, SIZE, 3), np.uint8)  # two steps, two cameras
     sensors = features.Sensors(None, ("camera", "camera_depth"))
-    jitter = features._jitter(0.5, sensors.cameras)
+    strength = features._of_colours(0.5, sensors.cameras)
     changed, _ = augment.augment(
-        jax.random.key(0), jnp.asarray(images), crop=SIZE, jitter=jitter, noise=0.0
+        jax.random.key(0), jnp.asarray(images), crop=SIZE, jitter=strength, noise=strength
     )
     plain = augment.center(jnp.asarray(images), crop=SIZE)
     np.testing.assert_allclose(changed[:, :, 1], plain[:, :, 1], atol=1e-6)
     assert np.abs(changed[:, :, 0] - plain[:, :, 0]).max() > 0.1
-    assert features._jitter(0.5, ("camera", "camera_right")) == 0.5
+    assert features._of_colours(0.5, ("camera", "camera_right")) == 0.5
 
     dark, image = DISTURBANCES.get("darkness"), jnp.asarray(images[0, 0, 0])
     state = base.start("darkness", 0.4, jax.random.key(0))

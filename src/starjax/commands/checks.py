@@ -13,7 +13,8 @@ from starjax.evaluation import disturbances
 from starjax.learners import ENCODERS, LEARNERS
 
 API_KEY = "STARJAX_API_KEY"  # environment variable with the key of a server
-_CELL = {"resnet18": 32, "small": 8}  # pixels that an encoder makes one of its maps' cells
+# Pixels that an encoder makes one of its maps' cells.
+_CELL = {"resnet18": 32, "small": 8, "points": 2}
 
 
 def check(config: config_lib.RunConfig) -> None:
@@ -21,6 +22,8 @@ def check(config: config_lib.RunConfig) -> None:
     errors.choice("method", config.method, [*methods.METHODS, "all"])
     policy = config.policy
     errors.choice("policy.encoder", policy.encoder, ENCODERS.names())
+    if policy.depth_encoder:
+        errors.choice("policy.depth_encoder", policy.depth_encoder, ENCODERS.names())
     LEARNERS.get(policy.learner).check(policy.options, policy)
     for name, most, of in (
         ("execute", policy.horizon, "policy.horizon"),
@@ -36,13 +39,15 @@ def check(config: config_lib.RunConfig) -> None:
         crop = round(policy.image_size * fraction)
         left = f"more than {cell} pixels left by policy.crop_fraction = {fraction:g}"
         expect(crop > cell, "policy.image_size", left, crop)
-    for name in ("encoder_weights", "freeze_encoder"):
+    for name in ("encoder_weights", "freeze_encoder", "depth_encoder"):
         sees = policy.observation == "image" or not getattr(policy, name)
         expect(sees, f"policy.{name}", "policy.observation image", policy.observation)
     levels = disturbances.parse_levels("demos.randomise", config.demos.randomise)
     ours = not (levels and config.demos.from_)
     expect(ours, "demos.randomise", "the expert's demonstrations", config.demos.from_)
     disturbances.parse_levels("train.randomise", config.train.randomise)
+    learns = not (policy.freeze_encoder and policy.depth_encoder)
+    expect(learns, "policy.depth_encoder", "none with policy.freeze_encoder", policy.depth_encoder)
     trained = bool(policy.encoder_weights) or not policy.freeze_encoder
     expect(trained, "policy.freeze_encoder", "policy.encoder_weights of a trained policy", "none")
 

@@ -105,7 +105,8 @@ def claim(
     from starjax.runtime import jax_settings
 
     policy = config.policy
-    source = sources.digests(*learners.parts(folder.name, policy.learner, policy.encoder))
+    networks = policy.learner, policy.encoder, policy.depth_encoder
+    source = sources.digests(*learners.parts(folder.name, *networks))
     started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
     recorded = _recorded(folder) if (folder / "config.json").exists() else {}
     if started and not recorded:

@@ -138,8 +138,13 @@ def _seeing(config: config_lib.RunConfig) -> list[str]:
         ]
     return [
         f"  observation     image, {policy.image_size} px",
-        f"  encoder         {encoder(config)}; {policy.encoder}",
+        f"  encoder         {encoder(config)}; {_encoders(policy)}",
     ]
+
+
+def _encoders(policy: config_lib.PolicyConfig) -> str:
+    depth = policy.depth_encoder
+    return f"{policy.encoder}, of depth {depth}" if depth else policy.encoder
 
 
 def _fields(config: config_lib.RunConfig) -> str:
@@ -203,7 +208,8 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
         )
     else:
         policy = config.policy
-        lines.append(f"Image encoder: {encoder(config)}; {policy.encoder}, {policy.image_size} px.")
+        networks = f"{_encoders(policy)}, {policy.image_size} px"
+        lines.append(f"Image encoder: {encoder(config)}; {networks}.")
     lines += [f"Ablation: {what}." for what in _ablations(figures["method"], config.policy)]
     if config.preset == "smoke":
         lines.append("Preset smoke is too short to learn anything: its rates mean nothing.")

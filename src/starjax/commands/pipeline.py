@@ -200,7 +200,10 @@ def _train(
         preset=config.preset,
         packages=sources.versions(
             *registries.paths(env.names),
-            *learners.parts(name, config.policy.learner, config.policy.encoder),
+            *learners.parts(
+                *(name, config.policy.learner, config.policy.encoder),
+                config.policy.depth_encoder,
+            ),
         ),
     )
     share.first(f"{name} is saved", lambda: policy_file.save(weights, trained))

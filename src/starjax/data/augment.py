@@ -25,7 +25,7 @@ def augment(
     *,
     crop: int,
     jitter: float | np.ndarray = 0.1,
-    noise: float = 0.02,
+    noise: float | np.ndarray = 0.02,
     dtype: jnp.dtype = jnp.float32,
 ) -> tuple[jax.Array, jax.Array]:
     """Applies random crop, colour jitter and Gaussian noise, drawn anew for each frame.
@@ -39,7 +39,7 @@ def augment(
       crop: side of the crop in pixels.
       jitter: brightness, contrast and saturation factors are uniform within 1 +- this; `[K]` for
         images `[..., K, h, w, 3]` of K cameras.
-      noise: standard deviation, of values in [0, 1].
+      noise: standard deviation, of values in [0, 1]; one or `[K]`, as `jitter`.
       dtype: of the result.
 
     Returns:
@@ -54,6 +54,8 @@ def augment(
     corner = (bits[:, :2] % spans).astype(jnp.int32)
     if np.ndim(jitter):
         jitter = np.broadcast_to(jitter, lead).reshape(-1, 1)
+    if np.ndim(noise):
+        noise = np.broadcast_to(noise, lead).reshape(-1, 1, 1, 1)
     factors = 1.0 + jitter * ((bits[:, 2:5] >> 8).astype(jnp.float32) * 2.0**-23 - 1.0)
     x = jax.vmap(lambda f, c: jax.lax.dynamic_slice(f, (c[0], c[1], 0), (crop, crop, 3)))(
         frames, corner

@@ -116,8 +116,9 @@ def parts_of(scene: names.SceneNames, settings: Mapping[str, Any]) -> list[str]:
       settings: of the run, JSON values as far as known.
     """
     policy = settings.get("policy", {})
-    of_policy = (settings.get("method", ""), policy.get("learner", ""), policy.get("encoder", ""))
-    return [*registries.paths(scene), *learners.parts(*of_policy)]
+    names = ("learner", "encoder", "depth_encoder")
+    of_policy = [policy.get(name, "") for name in names]
+    return [*registries.paths(scene), *learners.parts(settings.get("method", ""), *of_policy)]
 
 
 def _parse(file: Path, values: dict[str, Any], kind: type[Evaluation] | type[Sweep]) -> Result:

@@ -5,7 +5,7 @@ called alike. They see one image at a time.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -24,11 +24,15 @@ class Trunk(NamedTuple):
         `[N, h', w', C]`.
       width: default channels of its first layer.
       cell: pixels per cell of its maps, along one side.
+      encoder: flax module of the whole encoder, called as `ImageEncoder`, which None means.
+      reads_depth: True if it reads views of depth, and nothing else.
     """
 
     make: Callable[..., nn.Module]
     width: int
     cell: int
+    encoder: Callable[..., nn.Module] | None = None
+    reads_depth: bool = False
 
 
 class ImageEncoder(nn.Module):
@@ -71,6 +75,11 @@ class ImageEncoder(nn.Module):
         logits = jnp.matmul(maps, kernel.astype(maps.dtype), preferred_element_type=jnp.float32)
         points = spatial_softmax.spatial_softmax(logits, (image.shape[1], image.shape[2]), offset)
         return layers.Dense(self.features, name="out")(points.reshape(len(points), -1))
+
+
+def make(name: str, **settings: Any) -> nn.Module:
+    """Makes the encoder of a name, with attributes of `ImageEncoder`."""
+    return (ENCODERS.get(name).encoder or ImageEncoder)(trunk=name, **settings)
 
 
 class SmallTrunk(nn.Module):

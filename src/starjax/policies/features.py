@@ -154,8 +154,8 @@ def training_inputs(
         key_image,
         _images(sensors, observation),
         crop=crop_size(policy_config),
-        jitter=_jitter(train_config.jitter, sensors.cameras),
-        noise=train_config.image_noise,
+        jitter=_of_colours(train_config.jitter, sensors.cameras),
+        noise=_of_colours(train_config.image_noise, sensors.cameras),
         dtype=jnp.dtype(policy_config.dtype),
     )
     return Inputs(history, images, offset)
@@ -192,10 +192,10 @@ def _history(
     return jnp.concatenate([proprioception, stats.state.normalize(state), relative], axis=-1)
 
 
-def _jitter(jitter: float, cameras: Sequence[str]) -> float | np.ndarray:
-    """Returns the jitter of all images, or `[K]` with none for views of depth."""
+def _of_colours(strength: float, cameras: Sequence[str]) -> float | np.ndarray:
+    """Returns a strength of augmentation, or `[K]` with none for views of depth."""
     is_depth = np.array([names.is_depth(camera) for camera in cameras])
-    return np.where(is_depth, 0.0, jitter).astype(np.float32) if is_depth.any() else jitter
+    return np.where(is_depth, 0.0, strength).astype(np.float32) if is_depth.any() else strength
 
 
 def _images(sensors: Sensors, observation: Observation) -> jax.Array:

@@ -12,6 +12,7 @@ from starjax.evaluation import protocol, result, structure
 from starjax.evaluation.disturbances import current_name
 from starjax.report import formats, outcomes, stats
 from starjax.runtime import files
+from starjax.sim import registries
 
 _DIGITS = 8  # of a digest
 _SEEN = [True] * protocol.SEEN + [False] * (protocol.TROCARS - protocol.SEEN)
@@ -202,6 +203,17 @@ def _method(name: str) -> str:
     return methods.SCORED[name].label if name in methods.SCORED else name
 
 
+def _observes(scored: result.Result) -> Iterator[str]:
+    """Yields the observation if it is not the first camera of the task."""
+    cameras = scored.scene.cameras
+    if scored.observation != "image":
+        yield scored.observation
+    elif cameras != registries.tasks.get(scored.scene.task).cameras[:1]:
+        yield " + ".join(cameras)
+    if depth := (scored.config.get("policy") or {}).get("depth_encoder"):
+        yield f"depth by {depth}"
+
+
 def _is_ensemble(scored: result.Result) -> bool:
     """Returns True if a result's plans were averaged."""
     return bool((scored.config.get("eval") or {}).get("ensemble"))
@@ -217,8 +229,7 @@ def _described(scored: result.Result) -> Iterator[str]:
         yield from filter(None, [config.get("preset")])
         if steps := (config.get("train") or {}).get("steps"):
             yield f"{steps:,} steps"
-        if scored.observation != "image":
-            yield scored.observation
+        yield from _observes(scored)
         if _is_ensemble(scored):
             yield "ensembled"
         if seed := config.get("seed"):

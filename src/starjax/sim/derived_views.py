@@ -8,7 +8,7 @@ to a tenth of a millimetre without jumps.
 
 import copy
 from collections.abc import Collection, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -73,10 +73,18 @@ def encode(depth: jax.Array) -> jax.Array:
 
 def decode(image: np.ndarray) -> np.ndarray:
     """Returns the depth `[..., h, w]` in m of images `[..., h, w, 3]` uint8, to 0.1 mm."""
-    coarse, green, blue = np.moveaxis(np.asarray(image, np.float32) / 255.0, -1, 0)
+    return decode_scaled(np.asarray(image, np.float32) / 255.0, np)
+
+
+def decode_scaled(image: Any, np_: Any) -> Any:
+    """Returns the depth `[..., h, w]` in m of images `[..., h, w, 3]` in [0, 1].
+
+    `np_` is the module of the array, numpy or jax.numpy.
+    """
+    coarse, green, blue = np_.moveaxis(image, -1, 0)
     # Green has each value twice in a period; blue is low in the half where green rises.
-    phase = np.where(blue < 0.5, 0.5 * green, 1.0 - 0.5 * green)
-    whole = np.round(_PERIODS * coarse - phase)
+    phase = np_.where(blue < 0.5, 0.5 * green, 1.0 - 0.5 * green)
+    whole = np_.round(_PERIODS * coarse - phase)
     return NEAR + (FAR - NEAR) * (whole + phase) / _PERIODS
 
 

@@ -161,14 +161,14 @@ class StateLayout(NamedTuple):
         return jax.eval_shape(self._packed, shapes)
 
     def _is_shared_out(self, path: tuple[Any, ...], x: Any) -> bool:
-        """Returns whether a leaf is shared out: a large matrix outside the vision encoder.
+        """Returns whether a leaf is shared out: a large matrix outside the image encoders.
 
-        The encoder is used first, and its gradient known last: nothing could run meanwhile.
+        They are used first, and their gradients known last: nothing could run meanwhile.
         """
         count = self.mesh.size
         names = {getattr(key, "key", None) for key in path}
         large = x.ndim > 1 and x.size >= LARGE and x.size % count == 0
-        return count > 1 and large and "vision" not in names
+        return count > 1 and large and not names & {"vision", "depth"}
 
 
 @functools.partial(jax.jit, static_argnums=1)  # called outside of any, one program for all of them
