@@ -3,119 +3,21 @@
 import contextlib
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.experimental import io_callback
 
-from starjax import config, config_json, rcm, types
-from starjax.deploy import batching, connection_pool, greeting, inputs, plain, wire
+from starjax import config, config_json, rcm
+from starjax.deploy import batching, connection_pool, greeting, inputs, plain, remote_policy, wire
 from starjax.errors import UsageError
 from starjax.policies import in_env
 from starjax.policies.base import Policy
 from starjax.rollouts import agent
 from starjax.sim import env as sim_env
-from starjax.types import Command, Pose
+from starjax.types import Command
 
 _NEAR_M = 1e-3  # between nominal trocars of server and task
-
-
-class RemotePolicy:
-    """A server's plans as a policy's `sample`, one request per lane through a host callback.
-
-    Lanes whose episode is over are not requested, and lanes that fill up a batch share the plan of
-    their twin. A refused plan holds the measured pose.
-
-    Attributes:
-      refused: plans that the server refused or that were invalid.
-      fault: the error that ended it, or None.
-    """
-
-    def __init__(
-        self,
-        connections: connection_pool.ConnectionPool,
-        spec: inputs.InputSpec,
-        horizon: int,
-        encode: Callable[..., dict[str, Any]],
-        decode: Callable[[Any, rcm.Trocar], Command],
-    ) -> None:
-        self._link, self._spec, self.horizon = connections, spec, horizon
-        self._encode, self._decode = encode, decode
-        self._pool = ThreadPoolExecutor(greeting.MAX_CONNECTIONS, "starjax-remote")
-        self.refused, self.fault = 0, None
-
-    def sample(
-        self, done: Any, stats: Any, keys: jax.Array, observation: Any, trocar: rcm.TrocarFrame
-    ) -> Command:
-        """Plans as `Policy.sample`; `done` `[B]` bool are the episodes without need of a plan."""
-        batch, arms = observation.gripper.shape[0], observation.gripper.shape[2:]
-        shape = (batch, self.horizon, *arms)
-        f32: Any = functools.partial(jax.ShapeDtypeStruct, dtype=np.float32)
-        result = Command(Pose(f32((*shape, 3, 3)), f32((*shape, 3))), f32(shape))
-        seen = observation._replace(features=None, endoscope=None)
-        data = jax.random.key_data(keys)
-        return io_callback(self._plans, result, done, data, seen, trocar.trocar)
-
-    def _plans(self, done: Any, keys: Any, seen: Any, trocar: Any) -> Command:
-        if self.fault:
-            raise self.fault
-        done, keys, seen, trocar = jax.tree.map(np.asarray, (done, keys, seen, trocar))
-        held = Command(Pose(seen.pose.R[:, -1], seen.pose.p[:, -1]), seen.gripper[:, -1])
-        plans = jax.tree.map(lambda x: np.repeat(x[:, None], self.horizon, 1), held)
-        twins: dict[bytes, list[Any]] = {}
-        for lane in np.flatnonzero(~done):
-            twins.setdefault(keys[lane].tobytes(), []).append(lane)
-
-        def request(lanes: list[Any]) -> Command | None:
-            of_lane = functools.partial(jax.tree.map, lambda x: x[lanes[0]])
-            return self._plan(of_lane(seen), of_lane(trocar), keys[lanes[0]])
-
-        for lanes, plan in zip(
-            twins.values(), self._pool.map(request, twins.values()), strict=True
-        ):
-            for lane in lanes if plan is not None else []:
-                for whole, part in zip(jax.tree.leaves(plans), jax.tree.leaves(plan), strict=True):
-                    whole[lane] = part.reshape(whole[lane].shape)
-        return plans
-
-    def _plan(self, seen: types.Observation, trocar: rcm.Trocar, key: np.ndarray) -> Command | None:
-        """Returns the plan of one lane, None if it is refused."""
-        if not self._spec.arms:
-            pose = Pose(seen.pose.R[:, 0], seen.pose.p[:, 0])
-            seen = seen._replace(pose=pose, gripper=seen.gripper[:, 0])
-            trocar = rcm.Trocar(*(field[0] for field in trocar))
-        moments = inputs.RobotObservation(
-            seen.pose, seen.gripper, images=seen.images, state=seen.state
-        )
-        try:
-            reply = self._link.ask(self._encode(moments, trocar, key))
-            if not isinstance(reply, str):
-                return self.check(self._decode(reply, trocar))
-        except connection_pool.LostServer as error:
-            self.fault = error
-            raise
-        except UsageError:
-            pass
-        self.refused += 1
-        return None
-
-    def check(self, command: Command) -> Command:
-        """Returns a plan of the right length, of rotations, near the nominal trocars.
-
-        Raises:
-          UsageError: it is another.
-        """
-        R, p = command.pose
-        if len(command.gripper) != self.horizon:
-            raise UsageError("answer", f"{self.horizon} commands", len(command.gripper))
-        if np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max() > inputs.MAX_SKEW:
-            raise UsageError("answer.R", "rotations", "another matrix")
-        if np.linalg.norm(p - self._spec.p_world_ref, axis=-1).max() > inputs.FARTHEST:
-            expected = f"tips within {inputs.FARTHEST} m of the nominal trocar"
-            raise UsageError("answer.p", expected, "one farther away")
-        return command
 
 
 class ServedTraining(NamedTuple):
@@ -149,7 +51,7 @@ class ServedPolicy(NamedTuple):
     env: sim_env.Env
     weights: str
     origin: dict[str, Any]
-    remote: RemotePolicy
+    remote: remote_policy.RemotePolicy
 
     def agent(self, average_plans: bool = False) -> agent.BatchAgent:
         """Returns the agent of a batch of episodes."""
@@ -220,7 +122,7 @@ def attach(connections: Any, arms: Sequence[str] = ()) -> ServedPolicy:
     example = batching.example(spec)
     first = decode(_first_answer(connections, encode, example), example.trocar)
     horizon = len(first.gripper)
-    remote = RemotePolicy(connections, spec, horizon, encode, decode)
+    remote = remote_policy.RemotePolicy(connections, spec, horizon, encode, decode)
     remote.check(first)
     execute = hello.execute or horizon
     if not settings.obs_horizon - 1 <= execute <= horizon:
@@ -234,7 +136,7 @@ def attach(connections: Any, arms: Sequence[str] = ()) -> ServedPolicy:
     return ServedPolicy(trained, _policy(remote), env, greeting.identity(origin), origin, remote)
 
 
-def _policy(remote: RemotePolicy) -> Policy:
+def _policy(remote: remote_policy.RemotePolicy) -> Policy:
     """Returns a policy for inference: its other functions are the server's own business."""
 
     def untrained(*_: Any) -> Any:
