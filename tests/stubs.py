@@ -55,6 +55,7 @@ class State:
     endoscope: Any = None
     shaft: Any = None
     wrist: Any = None
+    commanded_shaft: Any = None
 
 
 class Layout(NamedTuple):

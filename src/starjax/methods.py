@@ -13,10 +13,11 @@ class Method(NamedTuple):
     """A row of Table II, or a further one.
 
     Attributes:
-      action_space: key of `starjax.rcm.ACTION_SPACES`.
+      action_space: key of `starjax.rcm.ACTION_SPACES`, or of `WRIST_SPACES`.
       sees_trocar: the learner's model is conditioned on the trocar; the roll network always is.
       projects: poses are projected onto the RCM manifold at execution.
-      hierarchical: the learner for (position, gripper) and a network for the roll, else one model.
+      hierarchical: the learner for (position, gripper), or (pose, gripper), and a network beside
+        it for the rest, such as the roll; else one model.
       weights_of: the method whose weights it shares (its own name if it trains its own, which an
         empty one of another package means).
       label: name in tables; empty for its name.
@@ -34,11 +35,20 @@ class Method(NamedTuple):
     @property
     def keeps_to_manifold(self) -> bool:
         """True if executed poses are on the RCM manifold."""
-        return self.projects or self.action_space != "se3"
+        return self.projects or self.action_space not in _FREE_SHAFTS
 
+    @property
+    def has_wrist(self) -> bool:
+        """True if it commands wrist angles, which a tool with a wrist is needed for."""
+        return self.action_space in WRIST_SPACES
+
+
+# Action spaces of instruments with a wrist, see `rcm.action_space`.
+WRIST_SPACES = ("rcm6", "se3_wrist", "se3_through")
+_FREE_SHAFTS = ("se3", "se3_wrist")  # spaces whose poses ignore the trocar
 
 _NAIVE, _RCM, _OURS = "Naive", "RCM action spaces", "Ours"
-_BESIDE, _OTHERS = "Ours (ablation)", "Other packages"
+_BESIDE, _OTHERS, _WRIST = "Ours (ablation)", "Other packages", "With a wrist"
 
 _BUILT_IN: dict[str, Method] = {
     "dp_ee": Method("se3", weights_of="dp_ee", label="DP-EE", group=_NAIVE),
@@ -64,6 +74,33 @@ _BUILT_IN: dict[str, Method] = {
         weights_of="stardiff_told",
         label="STAR-Diff-Told",
         group=_BESIDE,
+    ),
+    "dp_ee_wrist": Method("se3_wrist", weights_of="dp_ee_wrist", label="DP-EE-Wrist", group=_WRIST),
+    "dp_ee_proj_wrist": Method(
+        "se3_wrist",
+        projects=True,
+        weights_of="dp_ee_wrist",
+        label="DP-EE-Proj-Wrist",
+        group=_WRIST,
+    ),
+    "dp_rcm6": Method(
+        "rcm6", sees_trocar=True, weights_of="dp_rcm6", label="DP-RCM-6", group=_WRIST
+    ),
+    # Two heirs of STAR-Diff. By position: the network gives roll and wrist. By pose: the wrist
+    # follows exactly, and the network only turns the jaws about their own axis of yaw.
+    "stardiff_wrist": Method(
+        "rcm6",
+        hierarchical=True,
+        weights_of="stardiff_wrist",
+        label="STAR-Diff-Wrist",
+        group=_WRIST,
+    ),
+    "stardiff_pose": Method(
+        "se3_through",
+        hierarchical=True,
+        weights_of="stardiff_pose",
+        label="STAR-Diff-Pose",
+        group=_WRIST,
     ),
 }
 

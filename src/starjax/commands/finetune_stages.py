@@ -19,7 +19,7 @@ from starjax.commands import (
     stage_times,
 )
 from starjax.commands.finetune_work import Work
-from starjax.data import load, store, windows
+from starjax.data import load, normalizer, store, windows
 from starjax.evaluation import statistics, trials
 from starjax.finetune import dagger, mixing, rounds, self_imitation
 from starjax.policies import in_env, policy_file
@@ -146,21 +146,23 @@ class Lessons:
         old = policy_file.load(before)
         print(f"\n[round {number}] train: into {folder}", flush=True)
         with stage_times.timed(work.out, f"round {number} training"), stop_signals() as should_stop:
+            row, task = methods.METHODS[old.method], work.base.env.task
             dataset, start = mixing.start(
-                methods.METHODS[old.method],
+                row,
                 config.policy,
                 config.train,
                 old.params,
                 old.normalizer,
                 self._demonstrations,
                 self._rollouts,
+                normalizer.wrist_of(row, task),
             )
             result = loop.run(
-                methods.METHODS[old.method],
+                row,
                 config.policy,
                 config.train,
                 dataset,
-                work.base.env.task,
+                task,
                 folder,
                 (work.settings.seed + number) % 2**32,
                 cameras=work.base.env.names.cameras,

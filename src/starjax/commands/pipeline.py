@@ -74,6 +74,8 @@ def run(
     config = scenes.resolved(config)
     _check(config.policy, config.train, stages)
     names = folders.selected(config)
+    if "train" in stages:
+        scenes.check_wrists(config.scene, names)
     out, trains = Path(config.out), "train" in stages
     trained = list(dict.fromkeys(methods.METHODS[name].weights_of for name in names))
     untrained = [name for name in trained if not folders.weights(out, name).exists()]

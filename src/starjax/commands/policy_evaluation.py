@@ -129,7 +129,9 @@ def precompile(
     stats = normalizer.shapes(ablated, env.task, config.policy.observation == "state")
     evaluate.precompile(
         env,
-        in_env.batch_agent(name, policy, deciding, config.eval.ensemble),
+        in_env.batch_agent(
+            name, policy, deciding, config.eval.ensemble, normalizer.wrist_of(row, env.task)
+        ),
         (params, stats),
         env.task.trocars,
         _settings(config.eval, config.seed),

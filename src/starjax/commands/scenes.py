@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import errors
+from starjax import errors, methods
 from starjax.sim.names import SceneNames
 
 
@@ -51,3 +51,24 @@ def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:
     return dataclasses.replace(
         config, scene=settings(full), demos=dataclasses.replace(demos, seen_trocars=seen)
     )
+
+
+def check_wrists(scene: config_lib.SceneConfig, selected: Sequence[str]) -> None:
+    """Checks that the tools of a complete scene are those that methods can move.
+
+    Raises:
+      errors.UsageError: a method needs a wrist that the tools lack, or a task needs one that the
+        method keeps straight.
+    """
+    from starjax.data import normalizer
+    from starjax.sim import registries, wrists
+
+    task = registries.tasks.get(scene.task)
+    needs_wrist = any(wrists.per_arm(task))
+    for name in selected:
+        row = methods.METHODS[name]
+        normalizer.wrist_of(row, wrists.holding(task, names(scene)))
+        if needs_wrist and not row.has_wrist:
+            known = ", ".join(name for name, one in methods.METHODS.items() if one.has_wrist)
+            expected = f"one that moves a wrist, for task {scene.task}"
+            raise errors.UsageError("method", expected, name, known)

@@ -146,7 +146,7 @@ _WHERE = {
 }
 _DRAWN = "drawn for each batch (they fit neither the device nor host memory)"
 # Recorded, but not trained on.
-_UNREAD = ("qpos", "rcm_error", "actor", "wrist", "shaft_p", "shaft_R", "command_wrist")
+_UNREAD = ("qpos", "rcm_error", "actor", "shaft_p", "shaft_R")
 
 
 def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.Record]:
@@ -237,9 +237,12 @@ def _dataset(
             images=images or None,
             state=fields.get("state"),
             endoscope=_endoscope(fields),
+            wrist=fields.get("wrist"),
         ),
         command=Command(
-            pose=Pose(fields["command_R"], fields["command_p"]), gripper=fields["command_gripper"]
+            pose=Pose(fields["command_R"], fields["command_p"]),
+            gripper=fields["command_gripper"],
+            wrist=fields.get("command_wrist"),
         ),
         trocar=jax.tree.map(np.asarray, told),
         episode=np.pad(episode, (0, rows - count)),

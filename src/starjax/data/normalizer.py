@@ -18,12 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import methods, rcm
+from starjax import errors, methods, rcm
 from starjax.data import windows
+from starjax.sim import wrists
 from starjax.sim.tasks.base import Field, Task
 
 _SMALLEST_RANGE = 1e-4  # m or rad: below it an entry counts as constant, and is only centred
-_ABSOLUTE = ("se3", "rcm4")  # action spaces whose positions are the world's, whatever the trocar
+# Action spaces whose positions are the world's, whatever the trocar.
+_ABSOLUTE = ("se3", "rcm4", *methods.WRIST_SPACES)
 _EDGE_AZIMUTHS = 16  # of trocars on the edge of Eq. 19: between two of them up to 1 mm is missing
 
 
@@ -61,16 +63,29 @@ class Normalizer:
     state: MinMax | None
 
 
-def encode(action_space: str, pose: Any, gripper: Any, trocar: rcm.TrocarFrame) -> jax.Array:
+def encode(
+    action_space: str,
+    pose: Any,
+    gripper: Any,
+    trocar: rcm.TrocarFrame,
+    wrist: rcm.Wrist | None = None,
+    angles: Any = None,
+) -> jax.Array:
     """Encodes poses and grippers `[..., A]` as one vector `[..., A * (dim + 1)]`, unscaled.
 
     Args:
-      action_space: key of `rcm.ACTION_SPACES`, whose vectors have `dim` entries.
+      action_space: name for `rcm.action_space`, whose vectors have `dim` entries.
       pose: of the tips, `[..., A]`.
       gripper: `[..., A]`.
       trocar: frames, broadcastable against the poses.
+      wrist: of the tools, for a space of `methods.WRIST_SPACES`.
+      angles: `[..., A, 2]` rad of the wrist, for `se3_wrist`; without them the shaft is taken to
+        pass through the trocar.
     """
-    encoded = rcm.ACTION_SPACES[action_space].encode(pose, trocar)
+    space = rcm.action_space(action_space, wrist)
+    encoded = space.encode(pose, trocar)
+    if angles is not None and action_space == "se3_wrist":
+        encoded = encoded.at[..., space.slices["wrist"]].set(angles)
     vector = jnp.concatenate([encoded, jnp.asarray(gripper)[..., None]], axis=-1)
     return vector.reshape(*vector.shape[:-2], -1)
 
@@ -90,12 +105,15 @@ def fit(
       frames: `[n]` frame numbers, those trained on.
     """
 
+    wrist = wrist_of(method, task)
+
     @jax.jit
     def encode_commands(command, trocar):
-        return encode(method.action_space, command.pose, command.gripper, trocar)
+        pose, gripper, angles = command
+        return encode(method.action_space, pose, gripper, trocar, wrist, angles)
 
     actions = windows.over_frames(dataset, frames, lambda _, *rest: encode_commands(*rest))
-    space = rcm.ACTION_SPACES[method.action_space]
+    space = rcm.action_space(method.action_space, wrist)
     action = _min_max(actions, _entries_but(space, task.arms, "R"))
     if method.action_space not in _ABSOLUTE:
         action = action.replace(reach=_reach(action, space, task, dataset, frames))
@@ -108,11 +126,28 @@ def fit(
 
 def shapes(method: methods.Method, task: Task, state: bool) -> Normalizer:
     """Returns the structure of `fit`'s result, with or without the task state."""
-    size = task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
+    space = rcm.action_space(method.action_space, wrist_of(method, task))
+    size = task.arms * (space.dim + 1)
     ends = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (size, task.state_size)]
     reach = jax.ShapeDtypeStruct((2, size), jnp.float32)
     action = MinMax(ends[0], ends[0], None if method.action_space in _ABSOLUTE else reach)
     return Normalizer(action, MinMax(ends[1], ends[1]) if state else None)
+
+
+def wrist_of(method: methods.Method, task: Task) -> rcm.Wrist | None:
+    """Returns the wrist that a method commands, None for a method of straight wrists.
+
+    Raises:
+      errors.UsageError: it commands angles, and the task's tools have no wrist or different ones.
+    """
+    if not method.has_wrist:
+        return None
+    wrist = wrists.common(task)
+    if wrist is None:
+        tools = " ".join(slot.tool for slot in task.slots)
+        expected = f"with one kind of wrist, for a method of {method.label or 'wrists'}"
+        raise errors.UsageError("tool", f"tools {expected}", tools)
+    return wrist
 
 
 def _reach(

@@ -14,6 +14,7 @@ from starjax.models import roll_net
 from starjax.policies import features, generator
 from starjax.policies import policy as policies
 from starjax.runtime import precompile as precompile_lib
+from starjax.sim import wrists
 from starjax.sim.tasks.base import Field
 from starjax.types import Observation
 
@@ -128,7 +129,9 @@ def example(
     action = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 0.02]), (*shape, sensors.task.arms, 4))
     frame = features.per_step(_frame(_slots(sensors), trocar))
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, frame)
-    observation = Observation(pose, jnp.ones((*shape, sensors.task.arms)))
+    arms = (*shape, sensors.task.arms)
+    bends = any(wrists.per_arm(sensors.task))
+    observation = Observation(pose, jnp.ones(arms), wrist=jnp.zeros((*arms, 2)) if bends else None)
     if policy_config.observation == "state":
         state = jnp.concatenate([_plausible(field) for field in sensors.task.fields])
         return observation._replace(state=jnp.broadcast_to(state, (*shape, len(state)))), trocar

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, errors, methods
+from starjax import config, errors, methods, rcm
 from starjax.data import normalizer, redraw, windows
 from starjax.policies import policy as policies
 from starjax.rollouts import takeover
@@ -98,6 +98,7 @@ def widened(
     method: methods.Method,
     dataset: windows.Dataset,
     frames: np.ndarray,
+    wrist: rcm.Wrist | None = None,
 ) -> normalizer.Normalizer:
     """Returns the normaliser with a `reach` that includes the commands at `frames`.
 
@@ -108,8 +109,9 @@ def widened(
 
     @jax.jit
     def ends(command, trocar):
+        pose, gripper, angles = command
         scaled = box.normalize(
-            normalizer.encode(method.action_space, command.pose, command.gripper, trocar)
+            normalizer.encode(method.action_space, pose, gripper, trocar, wrist, angles)
         )
         return jnp.stack([scaled.min(axis=0), scaled.max(axis=0)])
 
@@ -126,6 +128,7 @@ def start(
     stats: normalizer.Normalizer,
     demonstrations: windows.Dataset,
     rollouts: Sequence[tuple[windows.Dataset, np.ndarray]],
+    wrist: rcm.Wrist | None = None,
 ) -> tuple[windows.Dataset, Start]:
     """Returns the dataset of a round and the start of its training.
 
@@ -137,6 +140,7 @@ def start(
       stats: its normaliser.
       demonstrations: of its training.
       rollouts: datasets of the rounds so far, and the frames `[n]` of each that are learned.
+      wrist: that the policy commands, see `normalizer.wrist_of`.
     """
     demonstrated, held_out = windows.split_holdout(
         demonstrations.start,
@@ -154,5 +158,5 @@ def start(
     if policy_config.freeze_encoder:
         params = {name: part for name, part in params.items() if name != "vision"}
     dataset = joined(parts)
-    stats = widened(stats, policies.ablated(method, policy_config), dataset, others)
+    stats = widened(stats, policies.ablated(method, policy_config), dataset, others, wrist)
     return dataset, Start(stats, evenly(demonstrated, others), held_out, params)

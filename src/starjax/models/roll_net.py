@@ -18,12 +18,14 @@ class RollNet(nn.Module):
       width: of the hidden layers.
       blocks: residual blocks (LayerNorm, Linear, GELU, Linear).
       embed_dim: width of the trocar's embedding.
+      outputs: N, numbers per future position; 1 is the roll alone.
       dtype: of the arithmetic; parameters, LayerNorm statistics and the output are float32.
     """
 
     width: int = 256
     blocks: int = 3
     embed_dim: int = 64
+    outputs: int = 1
     dtype: jnp.dtype = jnp.float32
 
     @nn.compact
@@ -40,13 +42,13 @@ class RollNet(nn.Module):
         of embeddings could not serve an unseen one.
 
         Args:
-          p: `[B, H, 3]` future tip positions, normalised.
+          p: `[B, H, n]` future tip positions (n = 3) or poses, normalised.
           trocar: `[B, F]` features of the trocar.
-          roll_history: `[B, O]` measured rolls, in the unit of the output.
+          roll_history: `[B, O * N]` measured rolls, in the unit of the output.
           observed: `[B, C]` features of the observation, an ablation; None in the paper.
 
         Returns:
-          Rolls float32 `[B, H]`.
+          Rolls float32 `[B, H * N]`.
         """
         batch, horizon = p.shape[:2]
         embedded = nn.gelu(layers.Dense(self.embed_dim, name="embed")(trocar.astype(self.dtype)))
@@ -55,4 +57,5 @@ class RollNet(nn.Module):
             inputs.append(observed)
         x = jnp.concatenate([part.astype(self.dtype) for part in inputs], -1)
         x = layers.residual_mlp(x, self.width, self.blocks, self.dtype)
-        return layers.Dense(horizon, zero=True, name="out")(x).astype(jnp.float32)
+        size = horizon * self.outputs
+        return layers.Dense(size, zero=True, name="out")(x).astype(jnp.float32)

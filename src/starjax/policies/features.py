@@ -96,20 +96,23 @@ def encode_proprioception(
     action_space: str,
     observation: Observation,
     trocar: rcm.TrocarFrame,
+    wrist: rcm.Wrist | None = None,
 ) -> jax.Array:
     """Encodes measured poses and grippers as normalised actions `[B, O, D]`."""
-    encoded = normalizer.encode(
-        action_space, observation.pose, observation.gripper, per_step(trocar)
-    )
+    pose, gripper, angles = observation.pose, observation.gripper, observation.wrist
+    encoded = normalizer.encode(action_space, pose, gripper, per_step(trocar), wrist, angles)
     return stats.action.normalize(encoded)
 
 
 def encode_commands(
-    stats: normalizer.Normalizer, action_space: str, batch: windows.Batch
+    stats: normalizer.Normalizer,
+    action_space: str,
+    batch: windows.Batch,
+    wrist: rcm.Wrist | None = None,
 ) -> jax.Array:
     """Encodes the commands of a batch as normalised actions `[B, H, D]`."""
-    command = batch.command
-    encoded = normalizer.encode(action_space, command.pose, command.gripper, per_step(batch.trocar))
+    pose, gripper, angles = batch.command
+    encoded = normalizer.encode(action_space, pose, gripper, per_step(batch.trocar), wrist, angles)
     return stats.action.normalize(encoded)
 
 

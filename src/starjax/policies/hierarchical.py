@@ -1,7 +1,8 @@
 """STAR-Diff: a trocar-agnostic model of (position, gripper), and a network for the roll.
 
 Positions and grippers of several arms are generated together; one roll network serves every arm,
-with that arm's path, trocar and measured rolls.
+with that arm's path, trocar and measured rolls. With a wrist it predicts roll, pitch and yaw, the
+turns N of an action.
 """
 
 from typing import Any, NamedTuple
@@ -32,8 +33,8 @@ class PreparedHierarchy(NamedTuple):
       model_inputs: prepared inputs of the position model's loss.
       p: `[B, H, A, 3]` demonstrated positions with noise, for the roll network.
       trocar: `[B, A, 7]` features.
-      history: `[B, O, A]` measured rolls with noise.
-      roll: `[B, H, A]` demonstrated ones.
+      history: `[B, O, A, N]` measured turns with noise.
+      roll: `[B, H, A, N]` demonstrated ones.
     """
 
     inputs: features.Inputs
@@ -51,19 +52,22 @@ def make(
     sensors: features.Sensors,
     train_config: config.TrainConfig,
 ) -> Policy:
-    """Builds the hierarchical policy in an action space of (roll, position)."""
-    space = rcm.ACTION_SPACES[method.action_space]
-    if set(space.slices) != {"roll", "p"}:
+    """Builds the hierarchical policy in an action space of (turns, position)."""
+    wrist = normalizer.wrist_of(method, sensors.task)
+    space = rcm.action_space(method.action_space, wrist)
+    if set(space.slices) not in ({"roll", "p"}, {"roll", "wrist", "p"}):
         raise ValueError(
             f"method.action_space: expected one of roll and position, got {method.action_space!r}"
         )
-    arms, position, roll = sensors.task.arms, space.slices["p"], space.slices["roll"].start
+    arms, position, turns = sensors.task.arms, space.slices["p"], slice(space.slices["p"].start)
+    outputs = turns.stop  # N: the position is the last part
     dim = 4 * arms  # of what is generated, see `generated`
     networks = generator.make(method, policy_config, sensors, dim)
     model = networks.model
     rolls = roll_net.RollNet(
         width=policy_config.roll_width,
         blocks=policy_config.roll_blocks,
+        outputs=outputs,
         dtype=jnp.dtype(policy_config.dtype),
     )
     history_weight = float(policy_config.roll_history)
@@ -74,7 +78,7 @@ def make(
         key_model, key_roll = jax.random.split(key)
         p = jnp.zeros((1, policy_config.horizon, 3))
         trocar = jnp.zeros((1, features.TROCAR_FEATURES))
-        history = jnp.zeros((1, policy_config.obs_horizon))
+        history = jnp.zeros((1, policy_config.obs_horizon * outputs))
         observed = generator.sizes(policy_config, sensors, dim).observed
         more = jnp.zeros((1, observed)) if policy_config.roll_observation else None
         return {
@@ -89,7 +93,7 @@ def make(
         history: jax.Array,
         condition: sequences.Condition,
     ) -> jax.Array:
-        """Predicts the rolls `[B, H, A]` along a path (Eq. 13, with the inputs of ablations)."""
+        """Predicts the turns `[B, H, A, N]` along a path (Eq. 13, and inputs of ablations)."""
         batch, horizon = p.shape[:2]
         more = None
         if policy_config.roll_observation:
@@ -101,13 +105,13 @@ def make(
             history_weight * history.swapaxes(1, 2).reshape(batch * arms, -1),
             more,
         )
-        return found.reshape(batch, arms, horizon).swapaxes(1, 2)
+        return found.reshape(batch, arms, horizon, outputs).swapaxes(1, 2)
 
     def prepare(
         stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
     ) -> PreparedHierarchy:
         key_inputs, key_model, key_p, key_roll = jax.random.split(key, 4)
-        action = features.encode_commands(stats, method.action_space, batch)
+        action = features.encode_commands(stats, method.action_space, batch, wrist)
         measured = _measured(stats, batch.observation, batch.trocar)
         inputs = features.training_inputs(
             policy_config,
@@ -119,7 +123,7 @@ def make(
             generated(measured),
         )
         wanted = by_arm(action)
-        p, history = wanted[..., position], by_arm(measured)[..., roll]
+        p, history = wanted[..., position], by_arm(measured)[..., turns]
         return PreparedHierarchy(
             inputs=inputs,
             trocar_condition=features.trocar_condition(method, batch.trocar),
@@ -127,7 +131,7 @@ def make(
             p=p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
             trocar=features.trocar_features(batch.trocar.trocar),
             history=history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
-            roll=wanted[..., roll],
+            roll=wanted[..., turns],
         )
 
     def loss(params: Params, prepared: PreparedHierarchy) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -157,16 +161,14 @@ def make(
         reach = None if reach is None else generated(reach)
         x0 = model.sample(params["learner"], keys, condition, reach)
         p, gripper = jnp.split(by_arm(x0), [3], axis=-1)
-        # 2. rolls along the sampled path (Eq. 13), clipped to the demonstrated range
+        # 2. turns along the sampled path (Eq. 13), clipped to the demonstrated range
         about = features.trocar_features(trocar.trocar)
-        gamma = rolls_along(params, p, about, by_arm(measured)[..., roll], condition)
-        gamma = jnp.clip(gamma, -1.0, 1.0)[..., None]
+        gamma = rolls_along(params, p, about, by_arm(measured)[..., turns], condition)
+        gamma = jnp.clip(gamma, -1.0, 1.0)
         # 3. action vector in the order of the space, decoded on the RCM manifold (Alg. 1)
-        parts = {"roll": gamma, "p": p}
-        ordered = sorted(parts, key=lambda name: space.slices[name].start)
-        action = jnp.concatenate([*(parts[name] for name in ordered), gripper], axis=-1)
+        action = jnp.concatenate([gamma, p, gripper], axis=-1)
         action = action.reshape(*x0.shape[:-1], -1)
-        return execution.command(method, stats, action, trocar)
+        return execution.command(method, stats, action, trocar, wrist)
 
     def by_arm(vector: jax.Array) -> jax.Array:
         """Splits `[..., A * n]` by arm into `[..., A, n]`."""
@@ -179,7 +181,8 @@ def make(
         return kept.reshape(*vector.shape[:-1], -1)
 
     def _measured(stats, observation, trocar):
-        return features.encode_proprioception(stats, method.action_space, observation, trocar)
+        space = method.action_space
+        return features.encode_proprioception(stats, space, observation, trocar, wrist)
 
     def prepare_for_inference(params: Params) -> Params:
         return {**networks.prepare_for_inference(params), "roll": kernels.packed(params["roll"])}

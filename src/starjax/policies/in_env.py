@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from starjax import config, errors, methods
+from starjax import config, errors, methods, rcm
+from starjax.data import normalizer
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.rollouts import agent, ensemble
@@ -35,7 +36,8 @@ class PolicyInEnv(NamedTuple):
     def agent(self, average_plans: bool = False) -> agent.BatchAgent:
         """Returns the agent of a batch of episodes; see `batch_agent`."""
         trained = self.trained
-        return batch_agent(trained.method, self.policy, trained.policy, average_plans)
+        wrist = normalizer.wrist_of(methods.METHODS[trained.method], self.env.task)
+        return batch_agent(trained.method, self.policy, trained.policy, average_plans, wrist)
 
 
 @functools.lru_cache(maxsize=4)  # programs belong to the functions that they were made of
@@ -44,6 +46,7 @@ def batch_agent(
     policy: policies.Policy,
     settings: config.PolicyConfig,
     average_plans: bool = False,
+    wrist: rcm.Wrist | None = None,
 ) -> agent.BatchAgent:
     """Returns the agent of a batch of episodes, whose parameters are (weights, normaliser).
 
@@ -52,10 +55,11 @@ def batch_agent(
       policy: its functions.
       settings: its observation horizon and number of executed commands.
       average_plans: plan at every control step and execute the mean of all plans, as ACT does.
+      wrist: that it commands, see `normalizer.wrist_of`.
     """
     if average_plans:
         keeps = methods.SCORED[method].keeps_to_manifold
-        return ensemble.from_policy(policy.sample, settings.obs_horizon, keeps)
+        return ensemble.from_policy(policy.sample, settings.obs_horizon, keeps, wrist)
     return agent.from_policy(policy.sample, settings.obs_horizon, settings.execute)
 
 

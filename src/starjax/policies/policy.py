@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from starjax import config, methods, rcm
-from starjax.policies import features, hierarchical, single
+from starjax.policies import features, hierarchical, pose_hierarchy, single
 from starjax.policies.base import Params, Policy
 from starjax.sim.tasks.base import Task
 
@@ -37,6 +37,9 @@ def make(
       cameras: observed cameras in the networks' order; by default the task's first one.
     """
     method = ablated(method, policy_config)
-    build = hierarchical.make if method.hierarchical else single.make
+    build = single.make
+    if method.hierarchical:
+        by_pose = method.action_space == "se3_through"
+        build = pose_hierarchy.make if by_pose else hierarchical.make
     sensors = features.select_sensors(task, cameras)
     return build(method, policy_config, sensors, train_config or config.TrainConfig())

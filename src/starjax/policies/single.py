@@ -26,7 +26,8 @@ def make(
     train_config: config.TrainConfig,
 ) -> Policy:
     """Builds the policy that generates poses in the action space and grippers of all arms."""
-    dim = sensors.task.arms * (rcm.ACTION_SPACES[method.action_space].dim + 1)
+    wrist = normalizer.wrist_of(method, sensors.task)
+    dim = sensors.task.arms * (rcm.action_space(method.action_space, wrist).dim + 1)
     networks = generator.make(method, policy_config, sensors, dim)
     model = networks.model
 
@@ -34,7 +35,7 @@ def make(
         stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
     ) -> PreparedActions:
         key_inputs, key_model = jax.random.split(key)
-        x0 = features.encode_commands(stats, method.action_space, batch)
+        x0 = features.encode_commands(stats, method.action_space, batch, wrist)
         inputs = features.training_inputs(
             policy_config,
             train_config,
@@ -64,10 +65,11 @@ def make(
         )
         condition = networks.observe(params, inputs, features.trocar_condition(method, trocar))
         action = model.sample(params["learner"], keys, condition, stats.action.reach)
-        return execution.command(method, stats, action, trocar)
+        return execution.command(method, stats, action, trocar, wrist)
 
     def _proprioception(stats, observation, trocar):
-        return features.encode_proprioception(stats, method.action_space, observation, trocar)
+        space = method.action_space
+        return features.encode_proprioception(stats, space, observation, trocar, wrist)
 
     return Policy(
         networks.init,

@@ -56,7 +56,7 @@ from starjax.rcm.wrist import (
     through,
     tip_of,
 )
-from starjax.rcm.wrist_actions import rcm6
+from starjax.rcm.wrist_actions import action_space, rcm6, se3_through, se3_wrist
 from starjax.types import Pose
 
 __all__ = [
@@ -82,6 +82,7 @@ __all__ = [
     "TrocarFrame",
     "Wrist",
     "WristPose",
+    "action_space",
     "angles_through",
     "check_trocar",
     "insertion_depth",
@@ -97,6 +98,8 @@ __all__ = [
     "rotation_from_axis_roll",
     "rotation_z",
     "sample_trocar",
+    "se3_through",
+    "se3_wrist",
     "shaft_of",
     "through",
     "tip_of",

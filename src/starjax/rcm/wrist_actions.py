@@ -1,4 +1,10 @@
-"""The action space of instruments with a wrist, `rcm6`: roll, wrist angles and tip."""
+"""Action spaces of instruments with a wrist.
+
+`rcm6` is (roll, wrist angles, tip), `se3_through` a tip pose with the shaft through the trocar, and
+`se3_wrist` a tip pose and wrist angles, whose shaft may be anywhere.
+"""
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +50,67 @@ def rcm6(wrist: wrists.Wrist) -> actions.ActionSpace:
         return wrists.tip_of(wrist, wrists.shaft_at(R, depth, bend, frame.p), angles)
 
     return actions.make_space("rcm6", encode, decode, roll=1, wrist=2, p=3)
+
+
+def se3_through(wrist: wrists.Wrist) -> actions.ActionSpace:
+    """Returns the space of tip poses in the world, decoded by `through`: on the manifold.
+
+    Args:
+      wrist: sizes and limits.
+    """
+
+    def encode(pose: Pose, frame: actions.SpaceFrame) -> list[jax.Array]:
+        return [pose.p, rotations.rot6d_encode(pose.R)]
+
+    def decode(parts: dict[str, jax.Array], frame: actions.SpaceFrame) -> Pose:
+        return wrists.through(wrist, _free_pose(parts), frame.p).pose
+
+    return actions.make_space("se3_through", encode, decode, p=3, R=6)
+
+
+def se3_wrist(wrist: wrists.Wrist) -> actions.ActionSpace:
+    """Returns the space of tip poses in the world with wrist angles: the trocar is ignored.
+
+    `encode` gives the angles of a shaft through the trocar; measured ones may replace them.
+
+    Args:
+      wrist: sizes.
+    """
+
+    def encode(pose: Pose, frame: actions.SpaceFrame) -> list[jax.Array]:
+        angles = wrists.angles_through(wrist, pose, frame.p)
+        return [pose.p, rotations.rot6d_encode(pose.R), angles]
+
+    def decode(parts: dict[str, jax.Array], frame: actions.SpaceFrame) -> Pose:
+        return _free_pose(parts)
+
+    return actions.make_space("se3_wrist", encode, decode, p=3, R=6, wrist=2)
+
+
+_WITH_WRIST = {"rcm6": rcm6, "se3_through": se3_through, "se3_wrist": se3_wrist}
+
+
+@functools.lru_cache
+def action_space(name: str, wrist: wrists.Wrist | None = None) -> actions.ActionSpace:
+    """Returns an action space by name.
+
+    Args:
+      name: key of `ACTION_SPACES`, or `rcm6`, `se3_through` or `se3_wrist`.
+      wrist: of the instrument, for the last three.
+
+    Raises:
+      ValueError: one of these without a wrist.
+    """
+    if name not in _WITH_WRIST:
+        return actions.ACTION_SPACES[name]
+    if wrist is None:
+        raise ValueError(f"wrist: expected that of a tool for the action space {name}, got None")
+    return _WITH_WRIST[name](wrist)
+
+
+def _free_pose(parts: dict[str, jax.Array]) -> Pose:
+    p = jnp.clip(parts["p"], -actions.MAX_REACH, actions.MAX_REACH)
+    return Pose(rotations.rot6d_decode(parts["R"]), p)
 
 
 def _turned_z(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -33,7 +33,10 @@ class Memory(NamedTuple):
 
 @functools.lru_cache(maxsize=4)
 def from_policy(
-    sample: Callable[..., Command], obs_horizon: int, keeps_to_manifold: bool
+    sample: Callable[..., Command],
+    obs_horizon: int,
+    keeps_to_manifold: bool,
+    wrist: rcm.Wrist | None = None,
 ) -> agent.BatchAgent:
     """Makes a batch of a policy that averages its plans; `params` are (weights, statistics).
 
@@ -41,6 +44,7 @@ def from_policy(
       sample: as `Policy.sample`.
       obs_horizon: O, observation horizon, at most 2 because it plans at every control step.
       keeps_to_manifold: True if its poses are on the RCM manifold.
+      wrist: that it commands, None for straight ones.
     """
     planner = agent.from_policy(sample, obs_horizon, 1)
 
@@ -61,9 +65,12 @@ def from_policy(
         total = jax.tree.map(added, memory.total, planned.command)
         mean = jax.tree.map(lambda x: x[:, 0] / whole, total)
         pose = Pose(rcm.rot6d_decode(rcm.rot6d_encode(mean.pose.R)), mean.pose.p)
-        if keeps_to_manifold:
-            pose = rcm.project(pose, state.measured_trocar.p_world_trocar)
-        now = Command(pose, mean.gripper)
+        angles, p_world_trocar = mean.wrist, state.measured_trocar.p_world_trocar
+        if keeps_to_manifold and wrist is not None:
+            pose, angles, _ = rcm.through(wrist, pose, p_world_trocar)
+        elif keeps_to_manifold:
+            pose = rcm.project(pose, p_world_trocar)
+        now = Command(pose, mean.gripper, angles)
         return now, Memory(planned, total), now
 
     return agent.BatchAgent(init, act, {**planner.about, "ensemble": DECAY})

@@ -133,7 +133,8 @@ def without_images(step: Step) -> dict[str, jax.Array]:
 
 def _scored(step: Step) -> dict[str, jax.Array]:
     after = step.after
-    commanded = rcm.rcm_error(step.executed.pose, after.trocar.p_world_trocar)
+    shaft = step.executed.pose if after.commanded_shaft is None else after.commanded_shaft
+    commanded = rcm.rcm_error(shaft, after.trocar.p_world_trocar)
     return {
         "rcm_error": after.rcm_error,
         "rcm_error_within": after.rcm_error_within,

@@ -24,7 +24,7 @@ def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
     present = control.corrected(reference, p_trocar, -last_correction)
     measured = state.pose if state.shaft is None else state.shaft
     correction = control.correct(last_correction, of(measured, a), present, p_trocar)
-    wanted = command.pose  # of the frame that the arm carries
+    wanted = carried_by(bound, command)
     if bound.tool.wrist is None:
         target, velocity = control.toward(
             present, state.velocity[a], wanted, p_trocar, 1.0 / CONTROL_HZ
@@ -32,7 +32,6 @@ def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
         ik_target = control.corrected(target, p_trocar, correction)
         q, _ = solve(bound, p_trocar, ik_target, q_target, STEP_IK_ITERATIONS)
     else:
-        wanted = wrist_motion.shaft_of(bound, command.pose, command.wrist)
         tip, point, velocity = wrist_motion.toward(
             wrist_motion.tip_of(bound, reference, q_target),
             control.nearest(present, p_trocar),
@@ -56,6 +55,13 @@ def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
         jnp.where(usable, jnp.clip(command.gripper, -1.0, 1.0), state.gripper_target[a]),
         jnp.where(usable, ik.residual(chain, goal, q_target + dq), jnp.inf),
     )
+
+
+def carried_by(bound: scenes.BoundArm, command: Command) -> Pose:
+    """Returns the commanded pose of the frame that the arm carries: shaft, or tip."""
+    if bound.tool.wrist is None:
+        return command.pose
+    return wrist_motion.shaft_of(bound, command.pose, command.wrist)
 
 
 def solve(

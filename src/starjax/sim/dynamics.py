@@ -72,7 +72,8 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
         pose=pose,
         gripper=opening,
     )
-    return _measure(scene, first, contacts)
+    first = _measure(scene, first, contacts)
+    return first.replace(commanded_shaft=first.shaft)
 
 
 Advance = Callable[..., tuple[physics.PhysicsState, physics.StepResult]]
@@ -132,6 +133,7 @@ def attempt(
         solver_error=result.solver_error,
         touch=result.touch,
         rcm_error_within=arm_motion.largest_within(scene, result.qpos, p_world_trocar),
+        commanded_shaft=_commanded_shafts(scene, command),
     )
     moved = with_status(scene, _measure(scene, moved, result.contacts))
     return moved, after, result.solver_error
@@ -195,6 +197,14 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
         rcm_error_within=jnp.maximum(state.rcm_error_within, rcm_error),
         collided=state.collided | hit,
     )
+
+
+def _commanded_shafts(scene: scenes.Scene, command: Command) -> Pose | None:
+    """Returns the shafts `[A]` of a command, None in a scene without a wrist."""
+    if not arm_motion.has_wrist(scene):
+        return None
+    commands = [arm_motion.of(command, a) for a in range(len(scene.arms))]
+    return _stacked([arm_motion.carried_by(bound, one) for bound, one in zip(scene.arms, commands)])
 
 
 def _padded(velocity: jax.Array, size: int) -> jax.Array:

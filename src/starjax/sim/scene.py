@@ -23,6 +23,7 @@ from starjax.sim import (
     registries,
     robot,
     solver,
+    wrists,
 )
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
@@ -184,6 +185,7 @@ def load(names: SceneNames, variant: Task | None = None) -> Scene:
     task, part = variant or registries.tasks.get(names.task), f"task {names.task}"
     if names.task not in registries.tasks.built_in:
         task = contract.guarded(task)
+    task = wrists.holding(task, names)
     m = compose(names, task)
     # XLA's MJX implementation everywhere: the warp one needs CUDA.
     device = jax.local_devices()[0]  # MJX alone takes the first of all, another process's

@@ -87,6 +87,8 @@ class EnvState:
       shaft: `[A]` measured shafts in the world, that of a straight tool at its tip; None in a scene
         without a wrist.
       wrist: `[A, 2]` rad, measured angles, zero for a straight tool; None as `shaft`.
+      commanded_shaft: `[A]` shafts of the last command, the tip's pose for a straight tool; None as
+        `shaft`.
       model: this episode's own fields of the MJX model, by name.
       wrapper_state: memories of wrappers of the environment, by name.
       endoscope: measured pose_world_camera of the endoscope, see `sim.endoscope_camera`; None for a
@@ -123,6 +125,7 @@ class EnvState:
     gripper: jax.Array
     shaft: Pose | None = None
     wrist: jax.Array | None = None
+    commanded_shaft: Pose | None = None
     model: dict[str, jax.Array] = flax.struct.field(default_factory=dict)
     wrapper_state: dict[str, Any] = flax.struct.field(default_factory=dict)
     endoscope: Pose | None = None

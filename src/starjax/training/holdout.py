@@ -22,6 +22,7 @@ def make(
     dataset: windows.Dataset,
     frames: np.ndarray,
     shapes: TrainState | None = None,
+    wrist: rcm.Wrist | None = None,
 ) -> Callable[[TrainState], dict[str, float]] | None:
     """Makes the function from a state to the errors of its average; None without such frames.
 
@@ -31,6 +32,7 @@ def make(
       dataset: the demonstrations, wherever they are.
       frames: `[n]` frame numbers kept out of training; 64 of them, evenly spaced, are used.
       shapes: of the state on one device, for which the function is compiled in the background.
+      wrist: that the policy commands, None for straight ones.
     """
     if len(frames) == 0:
         return None
@@ -46,7 +48,8 @@ def make(
 
     def errors(params: Any, stats: Any, batch: windows.Batch) -> dict[str, jax.Array]:
         predicted = policy.sample(params, stats, keys, batch.observation, batch.trocar)
-        return action_errors(predicted, batch.command, batch.trocar.p_world_trocar[:, None])
+        p_world_trocar = batch.trocar.p_world_trocar[:, None]
+        return action_errors(predicted, batch.command, p_world_trocar, wrist)
 
     program = Program(errors)
     if shapes is not None:
@@ -59,19 +62,40 @@ def make(
     return evaluate
 
 
-def action_errors(predicted: Any, demonstrated: Any, p_world_trocar: Any) -> dict[str, jax.Array]:
+def action_errors(
+    predicted: Any, demonstrated: Any, p_world_trocar: Any, wrist: rcm.Wrist | None = None
+) -> dict[str, jax.Array]:
     """Returns mean errors of commands `[..., A]`: tip in mm, roll in degrees, gripper, RCM in mm.
+
+    With a wrist, roll and RCM error are those of the commanded shafts, and the rotation's is added.
 
     Args:
       predicted, demonstrated: `[..., A]`.
       p_world_trocar: `[..., A, 3]` m; the RCM error is that of the predicted poses.
+      wrist: of commands with angles.
     """
     distance = jnp.linalg.norm(predicted.pose.p - demonstrated.pose.p, axis=-1)
-    turn = rcm.roll_of(predicted.pose.R) - rcm.roll_of(demonstrated.pose.R)
+    shafts = [predicted.pose, demonstrated.pose]
+    more = {}
+    if wrist is not None:
+        shafts = [_shaft(wrist, command, p_world_trocar) for command in (predicted, demonstrated)]
+        trace = jnp.sum(predicted.pose.R * demonstrated.pose.R, axis=(-2, -1))
+        angle = jnp.arccos(jnp.clip((trace - 1.0) / 2.0, -1.0, 1.0))
+        more = {"rotation_error_deg": jnp.rad2deg(jnp.mean(angle))}
+    turn = rcm.roll_of(shafts[0].R) - rcm.roll_of(shafts[1].R)
     turn = jnp.abs((turn + jnp.pi) % (2.0 * jnp.pi) - jnp.pi)
     return {
         "position_error_mm": 1e3 * jnp.mean(distance),
         "roll_error_deg": jnp.rad2deg(jnp.mean(turn)),
         "gripper_error": jnp.mean(jnp.abs(predicted.gripper - demonstrated.gripper)),
-        "rcm_error_mm": 1e3 * jnp.mean(rcm.rcm_error(predicted.pose, p_world_trocar)),
+        "rcm_error_mm": 1e3 * jnp.mean(rcm.rcm_error(shafts[0], p_world_trocar)),
+        **more,
     }
+
+
+def _shaft(wrist: rcm.Wrist, command: Any, p_world_trocar: Any) -> rcm.Pose:
+    """Returns the shaft of a command; without recorded angles it passes through the trocar."""
+    angles = command.wrist
+    if angles is None:
+        angles = rcm.angles_through(wrist, command.pose, p_world_trocar)
+    return rcm.shaft_of(wrist, command.pose, angles)

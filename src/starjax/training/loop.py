@@ -137,7 +137,8 @@ def run(
     if processes.is_first():
         log.resume(directory / "metrics.jsonl", int(state.step))
         alone = shapes if mesh.size == 1 else None
-        holdout_error = holdout.make(policy, policy_config, dataset, held_out, alone)
+        wrist = normalizer.wrist_of(method, task)
+        holdout_error = holdout.make(policy, policy_config, dataset, held_out, alone, wrist)
     if int(state.step) == train_config.steps:
         held_out_errors = holdout_error(processes.own(state)) if holdout_error else {}
         return TrainingResult(state, 0.0, int(state.skipped), held_out_errors)

@@ -12,6 +12,7 @@ from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import precompile
+from starjax.sim import wrists
 from starjax.sim.tasks.base import Task
 from starjax.training import devices, stepper
 from starjax.training import state as states
@@ -69,6 +70,7 @@ def batch_shapes(
         return Pose(real(count, task.arms, 3, 3), real(count, task.arms, 3))
 
     looks, plans = policy_config.obs_horizon, policy_config.horizon
+    bends = any(wrists.per_arm(seen.task))
     observation = Observation(poses(looks), real(looks, task.arms))
     if policy_config.observation == "image":
         picture: Any = jax.ShapeDtypeStruct((batch_size, looks, size, size, 3), jnp.uint8)
@@ -76,6 +78,10 @@ def batch_shapes(
         observation = observation._replace(images=images)
     else:
         observation = observation._replace(state=real(looks, task.state_size))
+    if bends:
+        observation = observation._replace(wrist=real(looks, task.arms, 2))
     trocar = rcm.Trocar(*[real(task.arms)] * 3)
     frames = jax.eval_shape(rcm.trocar_frame, trocar, real(task.arms, 3), real(task.arms))
-    return windows.Batch(observation, Command(poses(plans), real(plans, task.arms)), frames)
+    angles = real(plans, task.arms, 2) if bends else None
+    command = Command(poses(plans), real(plans, task.arms), angles)
+    return windows.Batch(observation, command, frames)
