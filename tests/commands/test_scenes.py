@@ -1,5 +1,7 @@
 """The scene of a run, by name: what is left out is the task's, what is wrong names its flag."""
 
+import contextlib
+
 import fakes
 import mistakes
 import pytest
@@ -85,3 +87,20 @@ def test_a_package_that_cannot_be_imported_is_a_line_of_the_list(monkeypatch, ca
     assert cli.dispatch(["list"]) == 0
     (line,) = [x for x in capsys.readouterr().out.splitlines() if x.split()[:1] == ["sew"]]
     assert "cannot be used" in line and "nowhere_at_all" in line
+
+
+@pytest.mark.parametrize(
+    ("task", "tool", "method", "argument"),
+    [
+        ("reach", "grasper", "stardiff_pose", "tool"),
+        ("peg_transfer", "needle_driver", "dp_ee_wrist", ""),
+        ("peg_transfer", "needle_driver", "stardiff", ""),
+        ("needle_regrasp", "needle_driver", "stardiff", "method"),
+        ("needle_regrasp", "needle_driver", "dp_rcm6", ""),
+    ],
+)
+def test_methods_go_with_tools_that_they_can_move(task, tool, method, argument):
+    scene = config.SceneConfig(task=task, tool=(tool,))
+    scene = scenes.resolved(config.RunConfig(scene=scene)).scene
+    with mistakes.of(argument) if argument else contextlib.nullcontext():
+        scenes.check_wrists(scene, [method])
