@@ -16,8 +16,8 @@ class Method(NamedTuple):
       action_space: key of `starjax.rcm.ACTION_SPACES`, or of `WRIST_SPACES`.
       sees_trocar: the learner's model is conditioned on the trocar; the roll network always is.
       projects: poses are projected onto the RCM manifold at execution.
-      hierarchical: the learner for (position, gripper), or (pose, gripper), and a network beside
-        it for the rest, such as the roll; else one model.
+      hierarchical: the learner for (position, gripper), or (pose, gripper), and a network for the
+        rest, such as the roll; else one model.
       weights_of: the method whose weights it shares (its own name if it trains its own, which an
         empty one of another package means).
       label: name in tables; empty for its name.

@@ -1,10 +1,10 @@
 """STAR-Diff by pose: a trocar-agnostic model of (tip pose, gripper), and a network for one turn.
 
 With a wrist the tip's rotation, too, can be the same at every trocar: the model generates it with
-the position, and `rcm.through` finds shaft and wrist exactly. The trocar decides what a task leaves
-free, the turn about the wire that the jaws hold, which is the tip's x axis. A small network that is
-given the trocar corrects that turn, arm by arm. It learns to remove a random turn from demonstrated
-poses.
+the position, and `rcm.through` finds shaft and wrist exactly. The trocar decides the freedom of a
+task alone: the turn about the wire that the jaws hold, which is the tip's x axis. A small network
+that is given the trocar corrects that turn, arm by arm. It learns to remove a random turn from
+demonstrated poses.
 """
 
 from typing import Any, NamedTuple
