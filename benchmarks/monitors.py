@@ -1,9 +1,11 @@
-"""Trials of a calibration and of a stress test in one file, for the runtime monitor's results.
+"""Trials with the runtime monitor's scores, of the packaged policies.
 
-    python benchmarks/monitors.py gather CALIBRATION STRESS OUT.npz
+    python benchmarks/monitors.py silent POLICY STILL_S OUT.safetensors
+    python benchmarks/monitors.py gather OUT.npz CALIBRATION STRESS
 
-`gather` joins the directories of `starjax calibrate` and `starjax stress`: of every evaluation
-the columns below, as `<evaluation>/<column>`, and both commands' JSON files as bytes.
+`silent` writes a policy whose monitor never raises an alarm: its evaluations record scores before
+a calibration has ended. `gather` joins directories of `starjax calibrate` and `starjax stress`: of
+every evaluation the columns below, as `<evaluation>/<column>`, and the commands' JSON files.
 """
 
 import sys
@@ -12,21 +14,44 @@ from pathlib import Path
 import numpy as np
 
 from starjax.evaluation import trials
+from starjax.monitor import calibrate, scores
+from starjax.policies import packaged, policy_file
 from starjax.runtime import files
+from starjax.sim.tasks.base import CONTROL_HZ
 
 COLUMNS = ("success", "lost", "invalid", "steps", "scores")
-FILES = ("monitor.json", "stress.json")
+_NEVER = 1e9  # a threshold beyond any score
 
 
-def gather(calibration: Path, stress: Path, out: Path) -> None:
-    """Writes the columns of all evaluations in two directories, and their JSON files."""
+def silent(policy: str, still_s: str, out: str) -> None:
+    """Writes a policy with a monitor that never raises an alarm."""
+    trained = policy_file.load(packaged.find("policy", policy))
+    execute = trained.policy.execute
+    still = max(1, round(float(still_s) * CONTROL_HZ / execute))
+    monitor = calibrate.Monitor(
+        center=np.zeros(len(scores.NAMES)),
+        width=np.ones(len(scores.NAMES)),
+        threshold=_NEVER,
+        clock_s=_NEVER,
+        alpha=0.0,
+        count=0,
+        settings=scores.ScoreSettings(execute, CONTROL_HZ, still),
+        digest=policy_file.monitor_digest(trained.params),
+    )
+    half = policy_file.is_half(trained.params)
+    policy_file.save(out, trained._replace(monitor=monitor), half=half)
+
+
+def gather(out: str, *folders: str) -> None:
+    """Writes the columns of all evaluations in the directories, and their JSON files."""
     arrays = {}
-    for name, folder in zip(FILES, (calibration, stress), strict=True):
-        arrays[name] = np.frombuffer((folder / name).read_bytes(), np.uint8)
+    for folder in map(Path, folders):
+        for file in folder.glob("*.json"):
+            arrays[file.name] = np.frombuffer(file.read_bytes(), np.uint8)
         for plan in sorted(folder.glob("*/plan.json")):
             for column, values in _columns(plan.parent).items():
                 arrays[f"{plan.parent.name}/{column}"] = values
-    files.write_npz(out, arrays)
+    files.write_npz(Path(out), arrays)
 
 
 def _columns(folder: Path) -> dict[str, np.ndarray]:
@@ -36,6 +61,7 @@ def _columns(folder: Path) -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 5 or sys.argv[1] != "gather":
+    commands = {"silent": silent, "gather": gather}
+    if len(sys.argv) < 4 or sys.argv[1] not in commands:
         sys.exit(__doc__)
-    gather(*map(Path, sys.argv[2:]))
+    commands[sys.argv[1]](*sys.argv[2:])
