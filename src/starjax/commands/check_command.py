@@ -8,9 +8,10 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from starjax import config as config_lib
-from starjax import errors
-from starjax.commands import options
-from starjax.learners import LEARNERS
+from starjax import errors, methods
+from starjax.commands import options, presets
+from starjax.learners import ENCODERS, LEARNERS
+from starjax.policies.external import POLICIES
 from starjax.registry import Registry
 from starjax.runtime import jax_start, sources, xla
 from starjax.sim import registries
@@ -30,7 +31,7 @@ _HERE = "starjax.commands.part_checks"
 class CheckArgs:
     """Flags of the command."""
 
-    # task, arm, tool, camera, learner, format or disturbance, then its name
+    # kind, one of starjax list such as task or learner, then the name
     part: Annotated[
         tuple[str, ...],
         tyro.conf.Positional,
@@ -99,6 +100,7 @@ def resolve(words: Sequence[str]) -> tuple[str, str]:
 def _kinds() -> dict[str, Kind]:
     from starjax.data.formats.base import FORMATS
     from starjax.evaluation.disturbances import DISTURBANCES
+    from starjax.rcm.actions import ACTION_SPACES
 
     def row(registry: Registry, module: str) -> Kind:
         return Kind(lambda: registry, registry.names, module)
@@ -111,6 +113,11 @@ def _kinds() -> dict[str, Kind]:
         "learner": row(LEARNERS, "learners"),
         "format": row(FORMATS, "formats"),
         "disturbance": row(DISTURBANCES, "disturbances"),
+        "method": row(methods.METHODS.registry, "methods"),
+        "action_space": row(ACTION_SPACES.registry, "action_spaces"),
+        "preset": row(presets.PRESETS.registry, "presets"),
+        "encoder": row(ENCODERS, "encoders"),
+        "policy": row(POLICIES, "policies"),
     }
 
 

@@ -1,0 +1,94 @@
+"""Checks of an image encoder's trunk: its maps, their cells, numbers, gradients."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax.commands.part_checks.base import FAILED, NOTE, Check, attempt, failed, verdict
+from starjax.learners import ENCODERS
+from starjax.models.encoders import ImageEncoder, Trunk
+from starjax.runtime import user_code
+
+CELLS = 4  # along a side of the images
+BATCH = 2
+FEATURES = 16
+WIDTH_UNIT = 16  # widths are multiples of it
+TOLERANCE = 1e-4  # between an image in one batch and alone
+
+
+def check(name: str, n: int) -> Iterator[Check]:
+    """Yields the checks of an encoder; `n` is not used."""
+    fault, trunk = attempt("record", lambda: ENCODERS.get(name))
+    if fault:
+        yield fault
+        return
+    yield verdict("record", _record(trunk), f"width {trunk.width}, cells of {trunk.cell} pixels")
+    images = jax.random.normal(jax.random.key(0), (BATCH, *2 * (CELLS * trunk.cell,), 3))
+    make = user_code.guarded(f"encoder {name}", "make", trunk.make)
+    fault, module = attempt("maps", lambda: make(WIDTH_UNIT, jnp.float32, name="trunk"))
+    if not fault:
+        apply = user_code.guarded(f"encoder {name}", "maps", module.init_with_output)
+        fault, traced = attempt("maps", lambda: jax.eval_shape(apply, jax.random.key(0), images))
+    if fault:
+        yield fault
+        return
+    maps, params = traced
+    size = sum(leaf.size for leaf in jax.tree.leaves(params))
+    shape = f"{list(maps.shape)} of images {list(images.shape)}, {size:,} parameters"
+    result = verdict("maps", _maps(maps), shape)
+    yield result
+    if result.status == FAILED:
+        return
+    yield from _values(ImageEncoder(trunk=name, features=FEATURES, width=WIDTH_UNIT), images)
+    half, _ = jax.eval_shape(
+        make(WIDTH_UNIT, jnp.bfloat16, name="trunk").init_with_output, jax.random.key(0), images
+    )
+    if half.dtype != jnp.bfloat16:
+        yield Check("dtype", f"{half.dtype} instead of bfloat16", NOTE)
+
+
+def _record(trunk: Trunk) -> Iterator[str]:
+    for field in ("width", "cell"):
+        value = getattr(trunk, field)
+        if not isinstance(value, int) or value < 1:
+            yield f"{field}: expected a number of 1 or more, got {value!r}"
+
+
+def _maps(maps: Any) -> Iterator[str]:
+    if maps.ndim != 4 or maps.shape[0] != BATCH:
+        yield f"expected {[BATCH, CELLS, CELLS]} and channels, got {list(maps.shape)}"
+    elif maps.shape[1:3] != (CELLS, CELLS):
+        yield f"expected {CELLS} x {CELLS} cells, got {maps.shape[1]} x {maps.shape[2]}"
+
+
+def _values(encoder: ImageEncoder, images: jax.Array) -> Iterator[Check]:
+    """Yields checks of numbers: features, each image for itself, gradients."""
+    fault, params = attempt("features", lambda: jax.jit(encoder.init)(jax.random.key(1), images))
+    if fault:
+        yield fault
+        return
+    apply = jax.jit(encoder.apply)
+    both, alone = apply(params, images), apply(params, images[:1])
+    if not np.isfinite(both).all():
+        yield failed("features", "not finite")
+        return
+    apart = float(np.abs(both[:1] - alone).max())
+    mixed = [f"an image's features depend on its batch, by {apart:.2g}"] * (apart > TOLERANCE)
+    yield verdict("features", mixed, f"{FEATURES} finite numbers per image, from it alone")
+
+    def loss(p: Any) -> jax.Array:
+        features: Any = encoder.apply(p, images)
+        return jnp.mean(features**2)
+
+    gradient = jax.jit(jax.grad(loss))(params)
+    leaves = jax.tree_util.tree_leaves_with_path(gradient)
+    faults = [
+        f"not finite at {jax.tree_util.keystr(path)}"
+        for path, leaf in leaves
+        if not np.isfinite(leaf).all()
+    ]
+    flat = not any(np.any(leaf) for _, leaf in leaves)
+    yield verdict("gradient", faults + ["0 everywhere"] * flat, "finite")

@@ -1,0 +1,96 @@
+"""Checks of a policy of another package: its scene, its plans, whether calls are independent."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from starjax.commands.part_checks.base import FAILED, NOTE, Check, attempt, verdict
+from starjax.deploy import external, served
+from starjax.policies.external import POLICIES
+
+FAR = 0.05  # m from the tip to the first command, beyond a step of any tool
+IMAGE, STATE = "observation/image", "observation/state"
+
+
+class Recorded:
+    """A connection that keeps its requests.
+
+    Attributes:
+      connection: of the policy.
+      requests: in their order.
+    """
+
+    def __init__(self, connection: external.LocalConnection) -> None:
+        """Wraps a connection."""
+        self.connection, self.requests = connection, []
+        self.address, self.metadata = connection.address, connection.metadata
+
+    def widen(self, count: int) -> None:
+        """Widens the connection."""
+        self.connection.widen(count)
+
+    def ask(self, request: dict[str, Any]) -> dict[str, np.ndarray]:
+        """Returns the answer of the policy."""
+        self.requests.append(request)
+        return self.connection.ask(request)
+
+
+def check(name: str, n: int) -> Iterator[Check]:
+    """Yields the checks of a policy in its task; `n` is not used."""
+    fault, record = attempt("record", lambda: POLICIES.get(name))
+    if not fault:
+        yield Check("record", f"{record.description}; {record.observation} of {record.task}")
+        fault, made = attempt("make", lambda: external.LocalConnection(name, record))
+    if not fault:
+        link = Recorded(made)
+        fault, policy = attempt("plan", lambda: served.attach(link))
+    if fault:
+        yield fault
+        return
+    settings = policy.trained.policy
+    yield Check("plan", f"{settings.horizon} commands, {settings.execute} of them executed")
+    (request,) = link.requests
+    fault, plans = attempt("calls", lambda: _plans(made, request))
+    if fault:
+        yield fault
+        return
+    result = verdict("calls", _faults(plans), "the same length with other observations")
+    yield result
+    if result.status == FAILED:
+        return
+    first, *_, again = plans
+    if not np.array_equal(first, again):
+        text = "one observation has several plans: draws or memory, which episodes share"
+        yield Check("repeatable", text, NOTE)
+    tip = np.reshape(request[STATE], (-1, 8))[:, :3]
+    away = float(np.linalg.norm(first[0].reshape(-1, 8)[:, :3] - tip, axis=-1).max())
+    if away > FAR:
+        yield Check("first command", f"{1e3 * away:.0f} mm from the tip", NOTE)
+
+
+def _plans(connection: external.LocalConnection, request: dict[str, Any]) -> list[np.ndarray]:
+    """Returns plans of an observation, of two others, and of the first again."""
+    rng = np.random.default_rng(0)
+    moved = {name: _changed(rng, name, value) for name, value in request.items()}
+    dark = {**request, IMAGE: np.zeros_like(request[IMAGE])} if IMAGE in request else moved
+    return [connection.ask(each)["actions"] for each in (request, moved, dark, request)]
+
+
+def _changed(rng: np.random.Generator, name: str, value: Any) -> Any:
+    """Returns an entry of another observation: tips some mm away, another image."""
+    if name == STATE:
+        rows = np.array(value).reshape(-1, 8)
+        rows[:, :3] += rng.uniform(-0.01, 0.01, (len(rows), 3))
+        return rows.reshape(np.shape(value)).astype(np.float32)
+    if name == IMAGE:
+        return rng.integers(0, 256, np.shape(value), np.uint8)
+    return value
+
+
+def _faults(plans: list[np.ndarray]) -> Iterator[str]:
+    shapes = {plan.shape for plan in plans}
+    if len(shapes) > 1:
+        yield f"lengths differ: {', '.join(str(list(shape)) for shape in sorted(shapes))}"
+    if not all(np.isfinite(plan).all() for plan in plans):
+        yield "not finite"
