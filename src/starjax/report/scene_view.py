@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from starjax.sim import registries, scene
+from starjax.sim import registries, scene, thread_geoms
 from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
 from starjax.sim.tasks.base import Outline
@@ -155,6 +155,8 @@ def _kinematics(
     data = mujoco.MjData(model)
     trocars = [model.body(f"trocar{i}").mocapid[0] for i in range(len(p_world_trocar))]
     data.mocap_pos[trocars] = p_world_trocar
-    for data.qpos[:] in qpos:
+    for row in qpos:
+        data.qpos[:], points = thread_geoms.split(model, row)
         mujoco.mj_kinematics(model, data)
+        thread_geoms.place(model, data, points)
         yield data

@@ -114,7 +114,7 @@ def _demonstrated(step: Step) -> dict[str, jax.Array]:
         "command_p": label.pose.p,
         "command_R": label.pose.R,
         "command_gripper": label.gripper,
-        "qpos": step.before.physics.qpos,
+        "qpos": step.before.coordinates,
         "rcm_error": step.after.rcm_error,
     }
     return {name: leaf for name, leaf in found.items() if leaf is not None}
@@ -140,7 +140,7 @@ def _scored(step: Step) -> dict[str, jax.Array]:
         "rcm_error_within": after.rcm_error_within,
         "rcm_error_commanded": commanded,
         "reached_p": after.pose.p,
-        "reached_qpos": after.physics.qpos,
+        "reached_qpos": after.coordinates,
         **_of_endoscope(after.endoscope),
     }
 

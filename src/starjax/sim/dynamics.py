@@ -193,6 +193,7 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
         wrist=wrist,
         gripper=opening,
         measurements=measurements,
+        thread=None if scene.task.thread is None else scene.task.thread(measurements),
         rcm_error=rcm_error,
         rcm_error_within=jnp.maximum(state.rcm_error_within, rcm_error),
         collided=state.collided | hit,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from starjax import errors
 from starjax.config import DEFAULT_TASK, PolicyConfig
 from starjax.sim import cameras as views
-from starjax.sim import dynamics, endoscope_camera, physics, render
+from starjax.sim import dynamics, endoscope_camera, physics, render, thread_geoms
 from starjax.sim import scene as scenes
 from starjax.sim.names import SceneNames
 from starjax.sim.state import Env, EnvParams, EnvState, ImageSource
@@ -86,13 +86,15 @@ def make(
         return state.replace(endoscope=jax.tree.map(lambda leaf: leaf[here], poses))
 
     def draw(source: ImageSource) -> dict[str, render.CameraImage]:
-        data = physics.kinematics(scene, source.qpos, source.p_world_trocar, source.layout)
+        qpos, points = thread_geoms.split(scene.mj_model, source.qpos)
+        data = physics.kinematics(scene, qpos, source.p_world_trocar, source.layout)
+        data = thread_geoms.placed(scene.mj_model, data, points)
         rgb = scene.task.colours(scene.bound, source.layout, jnp.asarray(scene.geom_rgb))
         return views.images(scene_cameras, source.cameras, data, rgb)
 
     def camera(state: EnvState) -> dict[str, render.CameraImage]:
         p_world_trocar = state.trocar.p_world_trocar
-        return draw(ImageSource(state.physics.qpos, p_world_trocar, state.layout, state.cameras))
+        return draw(ImageSource(state.coordinates, p_world_trocar, state.layout, state.cameras))
 
     def observe(state: EnvState) -> Observation:
         images = fields = None

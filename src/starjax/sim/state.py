@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
@@ -36,7 +37,7 @@ class ImageSource(NamedTuple):
     """Everything that the images of one moment are a function of.
 
     Attributes:
-      qpos: `[Q]` generalised coordinates of the model.
+      qpos: `[Q]` coordinates, see `EnvState.coordinates`.
       p_world_trocar: `[A, 3]` m.
       layout: the task's draws at reset.
       cameras: poses `[C]` of the cameras in their bodies' frames.
@@ -93,6 +94,7 @@ class EnvState:
       wrapper_state: memories of wrappers of the environment, by name.
       endoscope: measured pose_world_camera of the endoscope, see `sim.endoscope_camera`; None for a
         scene without one.
+      thread: `[N, 3]` m, points of the task's thread; None for a task without one.
     """
 
     physics: physics.PhysicsState
@@ -129,6 +131,13 @@ class EnvState:
     model: dict[str, jax.Array] = flax.struct.field(default_factory=dict)
     wrapper_state: dict[str, Any] = flax.struct.field(default_factory=dict)
     endoscope: Pose | None = None
+    thread: jax.Array | None = None
+
+    @property
+    def coordinates(self) -> jax.Array:
+        """Generalised coordinates `[Q]`, then those of the thread's points `[3 N]`, if any."""
+        qpos = self.physics.qpos
+        return qpos if self.thread is None else jnp.append(qpos, self.thread)
 
 
 class Env(NamedTuple):

@@ -194,7 +194,7 @@ def frame(env: sim_env.Env, live: LiveState, execute: int = 0) -> Frame:
         plan = plan[jnp.minimum(ahead, len(plan) - 1)]
     return Frame(
         step=live.t,
-        qpos=state.physics.qpos,
+        qpos=state.coordinates,
         p_world_trocar=state.trocar.p_world_trocar,
         p_world_tip=state.pose.p,
         rcm_error=state.rcm_error,

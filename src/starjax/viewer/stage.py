@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from starjax.sim import thread_geoms
 from starjax.sim.camera import geometry
 from starjax.viewer import meshes
 from starjax.viewer.frame import Frame
@@ -115,9 +116,10 @@ def kinematics(m: mujoco.MjModel) -> Callable[[np.ndarray, np.ndarray], GeomPose
     trocars = [int(b.mocapid[0]) for b in bodies if b.mocapid[0] >= 0]
 
     def poses(qpos: np.ndarray, p_world_trocar: np.ndarray) -> GeomPoses:
-        data.qpos[:] = qpos
+        data.qpos[:], points = thread_geoms.split(m, qpos)
         data.mocap_pos[trocars[: len(p_world_trocar)]] = p_world_trocar
         mujoco.mj_kinematics(m, data)
+        thread_geoms.place(m, data, points)
         wxyz = np.zeros((m.ngeom, 4))
         for g in range(m.ngeom):
             mujoco.mju_mat2Quat(wxyz[g], data.geom_xmat[g])

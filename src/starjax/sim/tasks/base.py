@@ -197,6 +197,8 @@ class Task(NamedTuple):
       still: (Layout) -> Pose `[K]` of the MJCF's mocap bodies `still0`, .., visible without
         contacts, or None.
       least_steps: least control steps of a success, a lower bound of demonstrations' limit.
+      thread: (Measurements) -> `[N, 3]` m, points of a thread, whose links are the MJCF's geoms
+        `thread0`, ..; or None. See `sim.thread`.
       endoscope: ranges of the camera `endoscope` in a trocar of its own, or None if `cameras` has
         no such one or a tool carries it.
     """
@@ -232,6 +234,7 @@ class Task(NamedTuple):
     drive: Callable[..., jax.Array] = lambda bound, layout, ctrl, time: ctrl
     still: Callable[..., Pose] | None = None
     least_steps: int = 0
+    thread: Callable[..., jax.Array] | None = None
     endoscope: Endoscope | None = None
 
     @property
