@@ -1,6 +1,8 @@
 """A frozen encoder: what it saw is what inference sees, and nothing ever changes it."""
 
 import dataclasses
+import threading
+import time
 
 import fakes
 import jax
@@ -67,6 +69,26 @@ def features(source, dataset, root, digest="demos", camera="camera", frames=None
 
 def never():
     raise AssertionError("the pictures were asked for")
+
+
+def test_a_run_waits_for_the_features_that_another_one_computes(source, dataset, tmp_path):
+    computed, begun = [], threading.Event()
+    pictures = np.asarray(dataset.observation.images["camera"])
+
+    def slow():
+        begun.set()
+        computed.append(time.sleep(0.5))
+        return pictures
+
+    first = threading.Thread(
+        target=features, args=(source, dataset, tmp_path), kwargs={"frames": slow}
+    )
+    first.start()
+    begun.wait()
+    second = features(source, dataset, tmp_path, frames=never)
+    first.join()
+    assert len(computed) == 1
+    np.testing.assert_array_equal(second, features(source, dataset, tmp_path, frames=never))
 
 
 @pytest.fixture(scope="module")

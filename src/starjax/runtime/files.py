@@ -161,16 +161,17 @@ def require_writable(directory: Path, free_bytes: int = 0) -> None:
 
 
 @contextlib.contextmanager
-def lock(directory: Path) -> Iterator[None]:
+def lock(directory: Path, waits: bool = False) -> Iterator[None]:
     """Holds `directory` for this process, however that ends (see `locks.hold`).
 
     Raises:
-      StorageError: another process holds it, or the folder cannot be written or locked.
+      StorageError: another process holds it, unless this one `waits`; or the folder cannot be
+        written or locked.
     """
     require_writable(directory)
     with contextlib.ExitStack() as held:
         try:
-            held.enter_context(locks.hold(directory / ".lock"))
+            held.enter_context(locks.hold(directory / ".lock", waits))
         except locks.Held as holder:
             raise StorageError(
                 f"{directory} is in use by {holder}: wait for it, or choose another folder"

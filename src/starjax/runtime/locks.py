@@ -19,7 +19,7 @@ class Held(Exception):
 
 
 @contextlib.contextmanager
-def hold(path: Path) -> Iterator[bool]:
+def hold(path: Path, waits: bool = False) -> Iterator[bool]:
     """Holds the lock of the file `path`.
 
     The system lets go of a file's lock however its process ends. A marker of a process that was
@@ -28,6 +28,7 @@ def hold(path: Path) -> Iterator[bool]:
 
     Args:
       path: created if missing, and kept. A file next to it has the name of the holder.
+      waits: until another process lets go of it, instead of raising `Held`.
 
     Yields:
       whether the lock is the system's, not a marker.
@@ -41,7 +42,7 @@ def hold(path: Path) -> Iterator[bool]:
 
     marker, note = path.with_name(f"{path.name}-marker"), path.with_name(f"{path.name}-holder")
     try:
-        lock = filelock.FileLock(path, blocking=False, fallback_to_soft=False)
+        lock = filelock.FileLock(path, blocking=waits, fallback_to_soft=False)
         lock.acquire()
         is_systems = True
     except filelock.Timeout:
@@ -49,7 +50,7 @@ def hold(path: Path) -> Iterator[bool]:
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise
-        lock = filelock.SoftFileLock(marker, timeout=_ATTEMPT_S)
+        lock = filelock.SoftFileLock(marker, timeout=-1 if waits else _ATTEMPT_S)
         try:
             lock.acquire()
         except filelock.Timeout:

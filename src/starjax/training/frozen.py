@@ -8,7 +8,7 @@ encoder, finds them. Archives have checksums: a damaged part is noticed and made
 
 import hashlib
 import json
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -58,40 +58,63 @@ def features(
     folder = root / "features" / _key(encoder, policy_config, digest, camera, rows)
     spans = [(first, min(first + PART, len(read))) for first in range(0, len(read), PART)]
     paths = [folder / f"part_{number:04d}.npz" for number in range(len(spans))]
-    parts: dict[Path, np.ndarray] = {}
-    missing = []
-    for path, (first, last) in zip(paths, spans):
-        part = _read(path, (last - first, policy_config.vision_dim), report)
-        if part is None:
-            missing.append((path, first, last))
-        else:
-            parts[path] = part
-    if missing:
-        see, pictures = _make_see(encoder, policy_config), frames()
-        batch = redraw.batch_size()
-        is_drawn = isinstance(pictures, redraw.DrawnImages)
-        look = pictures.draw_batch if is_drawn else pictures.__getitem__
-
-        def make(part: tuple[Path, int, int]) -> Generator[int]:
-            """Yields the number of frames of each batch."""
-            path, first, last = part
-            batches = []
-            for start in range(first, last, batch):
-                index = read[np.minimum(np.arange(start, start + batch), last - 1)]
-                batches.append(np.asarray(see(look(index)))[: last - start])
-                yield len(batches[-1])
-            parts[path] = np.concatenate(batches)
-            files.write_npz(path, {"features": parts[path]})
-
-        done = sum(map(len, parts.values()))
-        with progress.track("Features", len(read), unit="frames", done=done) as advance:
-            for count_done in workers.run(missing, make, workers.worker_count()):
-                advance(count_done)
+    spans_of = dict(zip(paths, spans, strict=True))
+    parts = _stored(spans_of, policy_config.vision_dim, report)
+    if missing := len(paths) - len(parts):
+        # Other runs may train on the same demonstrations: the first one computes, the others wait.
+        with files.lock(folder, waits=True):
+            parts = _stored(spans_of, policy_config.vision_dim, lambda line: None)
+            if missing := len(paths) - len(parts):
+                parts |= _computed(encoder, policy_config, frames(), read, spans_of, parts)
     joined = np.zeros((count, policy_config.vision_dim), np.float32)
     joined[read] = np.concatenate([parts[path] for path in paths])
     origin = "in" if missing else "reused from"
     report(f"features of {len(read)} frames, {files.size(joined.nbytes)}: {origin} {folder}")
     return joined
+
+
+def _stored(
+    spans: Mapping[Path, tuple[int, int]], width: int, report: Callable[[str], None]
+) -> dict[Path, np.ndarray]:
+    """Returns the finished parts among `spans`."""
+    found = {
+        path: _read(path, (last - first, width), report) for path, (first, last) in spans.items()
+    }
+    return {path: part for path, part in found.items() if part is not None}
+
+
+def _computed(
+    encoder: Encoder,
+    policy_config: config.PolicyConfig,
+    pictures: Any,
+    read: np.ndarray,
+    spans: Mapping[Path, tuple[int, int]],
+    known: Mapping[Path, np.ndarray],
+) -> dict[Path, np.ndarray]:
+    """Computes and writes the parts of `spans` that are not `known`; `read` are their frames."""
+    see = _make_see(encoder, policy_config)
+    batch = redraw.batch_size()
+    is_drawn = isinstance(pictures, redraw.DrawnImages)
+    look = pictures.draw_batch if is_drawn else pictures.__getitem__
+    parts: dict[Path, np.ndarray] = {}
+
+    def make(path: Path) -> Generator[int]:
+        """Yields the number of frames of each batch."""
+        first, last = spans[path]
+        batches = []
+        for start in range(first, last, batch):
+            index = read[np.minimum(np.arange(start, start + batch), last - 1)]
+            batches.append(np.asarray(see(look(index)))[: last - start])
+            yield len(batches[-1])
+        parts[path] = np.concatenate(batches)
+        files.write_npz(path, {"features": parts[path]})
+
+    done = sum(map(len, known.values()))
+    missing = [path for path in spans if path not in known]
+    with progress.track("Features", len(read), unit="frames", done=done) as advance:
+        for count_done in workers.run(missing, make, workers.worker_count()):
+            advance(count_done)
+    return parts
 
 
 def _make_see(encoder: Encoder, policy_config: config.PolicyConfig) -> Callable[[Any], jax.Array]:
