@@ -19,6 +19,9 @@ and beside the share, which a phase with nearly one place for all scenes makes l
 in all scenes. A task's own figures average the variances over its phases, weighted by their time.
 Of two arms each is looked at alone, and their trocars change together. Intervals draw scenes anew.
 
+With a wrist two more points of each tool are compared: its yaw axis, which shows the direction of
+the jaws, and its pitch axis, the end of the shaft.
+
 What is given is the start of a scene. A policy that sees how an object lies in its jaws by now
 knows more, so the share bounds from above what is lost by not telling it the trocar.
 """
@@ -37,12 +40,15 @@ import numpy as np
 
 from starjax import rcm, runtime
 from starjax.sim import env as envs
-from starjax.types import Agent
+from starjax.sim import wrists
+from starjax.sim.tasks.base import Task
+from starjax.types import Agent, Command
 
 # Names of the phases of scripts that only number them, in order.
 PHASES = {
     "peg_transfer": "raise approach descend close lift carry lower open retreat wait",
     "needle_pick": "raise approach descend close lift hold",
+    "needle_regrasp": "raise approach descend close lift hold",
     "ring_on_wire": "raise approach descend close lift carry lower open leave wait",
     "reach": "move rest",
     "endoscope_track": "find follow",
@@ -67,7 +73,7 @@ def main() -> None:
         "trocars": len(trials[0]),
         "episodes": sum(map(len, trials)),
         "successes": successes,
-        **decomposed(trials, names(task.name), task.arms),
+        **decomposed(trials, names(task.name), points(task)),
     }
     for name, arm in found["arms"].items():
         print(f"{task.name}, {name}: {summary(arm)}")
@@ -80,6 +86,26 @@ def names(task: str) -> list[str]:
     """Names of the expert's phases."""
     known = importlib.import_module(f"starjax.sim.tasks.{task}.expert")
     return list(getattr(known, "PHASES", PHASES.get(task, "").split()))
+
+
+def points(task: Task) -> list[str]:
+    """Names of the compared points, in the order of `wanted`."""
+    held = wrists.per_arm(task)
+    found = [f"arm{arm}" for arm in range(task.arms)]
+    bent = [arm for arm, wrist in enumerate(held) if wrist is not None]
+    return found + [f"arm{arm} {axis} axis" for arm in bent for axis in ("yaw", "pitch")]
+
+
+def wanted(task: Task, label: Command) -> jax.Array:
+    """Positions `[K, 3]` m of a command: the tips, and the axes of the wrists."""
+    found = [label.pose.p]
+    for arm, wrist in enumerate(wrists.per_arm(task)):
+        if wrist is not None:
+            assert label.wrist is not None
+            tip = jax.tree.map(lambda x, arm=arm: x[arm], label.pose)
+            yaw = tip.p - wrist.jaws * tip.R[:, 2]
+            found += [yaw[None], rcm.shaft_of(wrist, tip, label.wrist[arm]).p[None]]
+    return jnp.concatenate(found)
 
 
 def play(
@@ -108,12 +134,14 @@ def _episode(environment: envs.Env, agent: Agent, steps: int) -> Callable[..., A
         key_reset, key_expert = jax.random.split(key)
         state = environment.reset(key_reset, envs.EnvParams(trocar))
         carry = (state, agent.init(key_expert, state))
-        blank = jax.tree.map(lambda s: jnp.zeros((steps, *s.shape), s.dtype), _shapes(agent, carry))
+        task = environment.task
+        shapes = _shapes(task, agent, carry)
+        blank = jax.tree.map(lambda s: jnp.zeros((steps, *s.shape), s.dtype), shapes)
 
         def step(loop):
             (state, memory), rows = loop
             command, memory, label = agent.act(memory, state)
-            row = (jnp.ones((), bool), *where(memory), label.pose.p)
+            row = (jnp.ones((), bool), *where(memory), wanted(task, label))
             rows = jax.tree.map(lambda all_, one: all_.at[state.step].set(one), rows, row)
             return (environment.step(state, command), memory), rows
 
@@ -126,10 +154,10 @@ def _episode(environment: envs.Env, agent: Agent, steps: int) -> Callable[..., A
     return run
 
 
-def _shapes(agent: Agent, carry: Any) -> Any:
+def _shapes(task: Task, agent: Agent, carry: Any) -> Any:
     def row(state, memory):
         _, memory, label = agent.act(memory, state)
-        return (jnp.ones((), bool), *where(memory), label.pose.p)
+        return (jnp.ones((), bool), *where(memory), wanted(task, label))
 
     return jax.eval_shape(row, *carry)
 
@@ -149,16 +177,16 @@ def where(memory: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 
 def decomposed(
-    trials: list[list[list[_decomposition.Segment]]], phases: list[str], arms: int
+    trials: list[list[list[_decomposition.Segment]]], phases: list[str], points: list[str]
 ) -> dict[str, Any]:
-    """`arms`: name -> figures of the task and of its `phases`."""
+    """`arms`: name of a point -> figures of the task and of its `phases`."""
     crossed = _decomposition.crossed(trials)
     spent = {
         phase: np.mean([sum(len(s.p) for s in x if s.phase == phase) for y in trials for x in y])
         for phase in crossed
     }
     found: dict[str, Any] = {}
-    for arm in range(arms):
+    for arm, point in enumerate(points):
         rows: dict[str, Any] = {}
         every: list[np.ndarray] = []
         weights: list[float] = []
@@ -170,7 +198,7 @@ def decomposed(
             every += mine
             weights += [float(spent[phase]) / len(mine)] * len(mine)
         most = max(rows, key=lambda name: rows[name]["trocar_mm"])
-        found[f"arm{arm}"] = {
+        found[point] = {
             **_figures(every, weights),
             "most": {"phase": most, **rows[most]},
             "phases": rows,
