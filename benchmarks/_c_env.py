@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax.sim import dynamics, physics
+from starjax.sim import coupling, dynamics, physics
 from starjax.sim.env import Env
 from starjax.sim.scene import Scene
 from starjax.sim.tasks.base import Contacts
@@ -54,25 +54,40 @@ def _advance(
     target = physics.servo_targets(scene, q, dq, velocity, gripper, period, layout, time)
     ctrl = jax.vmap(target)(jnp.arange(substeps))
     blank = physics.no_contacts(scene)
-    shapes = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype),
-        (state, jnp.zeros((substeps, scene.mj_model.nq)), blank),
-    )
-    run = functools.partial(_run, scene, substeps, len(blank.dist), memory)
-    after, qpos, contacts = jax.pure_callback(
-        run, shapes, state, ctrl, p_world_trocar, vmap_method="sequential"
-    )
+    m, run = scene.mj_model, functools.partial(_run, scene, len(blank.dist), memory)
+
+    def steps(state: physics.PhysicsState, ctrl: jax.Array, applied: jax.Array) -> Any:
+        bare = state.replace(memory=None)
+        shapes = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype),
+            (bare, jnp.zeros((len(ctrl), m.nq)), blank),
+        )
+        return jax.pure_callback(
+            run, shapes, bare, ctrl, applied, p_world_trocar, vmap_method="sequential"
+        )
+
+    if scene.task.coupling is None:
+        after, qpos, contacts = steps(state, ctrl, jnp.zeros(m.nv))
+    else:  # with forces that are computed before every step
+
+        def substep(carry: tuple[physics.PhysicsState, Contacts], ctrl: jax.Array) -> Any:
+            state, _ = carry
+            forces, own = coupling.forces(scene, layout, state, gripper, p_world_trocar)
+            after, qpos, contacts = steps(state, ctrl[None], forces)
+            return (after.replace(memory=own), contacts), qpos[0]
+
+        (after, contacts), qpos = jax.lax.scan(substep, (state, blank), ctrl)
     touch = physics.touching(scene, contacts)
     return after, physics.StepResult(touch, contacts, qpos, jnp.zeros(()))
 
 
 def _run(
     scene: Scene,
-    substeps: int,
     most: int,
     memory: dict[str, Any],
     state: physics.PhysicsState,
     ctrl: np.ndarray,
+    applied: np.ndarray,
     p_world_trocar: np.ndarray,
 ) -> tuple[physics.PhysicsState, np.ndarray, Contacts]:
     if "data" not in memory:
@@ -83,8 +98,9 @@ def _run(
     data.mocap_pos[scene.trocar_mocap] = p_world_trocar
     data.qpos[:], data.qvel[:] = state.qpos, state.qvel
     data.qacc_warmstart[:] = state.qacc_warmstart
-    before = np.zeros((substeps, m.nq), np.float32)
-    for i in range(substeps):
+    data.qfrc_applied[:] = applied
+    before = np.zeros((len(ctrl), m.nq), np.float32)
+    for i in range(len(ctrl)):
         before[i] = data.qpos
         data.ctrl[:] = ctrl[i]
         mujoco.mj_step(m, data)

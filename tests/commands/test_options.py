@@ -295,7 +295,16 @@ def test_a_command_line_without_words_has_no_flag():
     [
         ("st", ["stress"]),
         ("run --train.st", ["--train.steps", "--train.steps-per-call", "--train.state-noise"]),
-        ("run --task needle_", ["needle_pick", "needle_handover", "needle_regrasp"]),
+        (
+            "run --task needle_",
+            [
+                "needle_pick",
+                "needle_handover",
+                "needle_regrasp",
+                "needle_drive",
+                "needle_drive_sh",
+            ],
+        ),
         ("collect --policy.learner o", ["onestep"]),
         ("evaluate --arm fr5 u", ["ur5e"]),
         ("view --compare-with e", ["expert"]),

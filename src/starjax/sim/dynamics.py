@@ -38,17 +38,22 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     q = tuple(q for q, _ in solved)
     no = jnp.zeros((), bool)
     is_lost = ~jnp.all(jnp.isfinite(trocar.p_world_trocar))
-    state = physics.initial(scene, q, layout)
-    opening, touch = jnp.ones(count), jnp.zeros(count, bool)
+    state = physics.initial(scene, q, layout, trocar.p_world_trocar)
+    # Jaws are open unless the task's objects begin between them.
+    is_coupled = scene.task.coupling is not None
+    opening = physics.openings(scene, state.qpos) if is_coupled else jnp.ones(count)
+    touch = jnp.zeros(count, bool)
     still, contacts = jnp.zeros((count, 3)), physics.no_contacts(scene)
-    readings = SimReadings(state.qpos, state.qvel, pose, still, opening, touch, contacts)
+    readings = SimReadings(
+        state.qpos, state.qvel, pose, still, opening, touch, contacts, state.memory, no
+    )
     first = EnvState(
         physics=state,
         q_target=q,
         q_velocity=tuple(jnp.zeros_like(x) for x in q),
         velocity=jnp.zeros((count, arm_motion.velocity_size(scene))),
         correction=jnp.zeros((count, 3)),
-        gripper_target=jnp.ones(count),
+        gripper_target=opening,
         trocar=trocar,
         measured_trocar=measured_trocar,
         cameras=cameras,
@@ -175,7 +180,17 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
         )
     opening = physics.openings(scene, qpos)
     velocity = CONTROL_HZ * (pose.p - state.pose.p)
-    readings = SimReadings(qpos, state.physics.qvel, pose, velocity, opening, state.touch, contacts)
+    readings = SimReadings(
+        qpos,
+        state.physics.qvel,
+        pose,
+        velocity,
+        opening,
+        state.touch,
+        contacts,
+        state.physics.memory,
+        state.collided,
+    )
     measurements = scene.task.measure(scene.bound, state.layout, readings, state.measurements)
     hit = collision.detect(
         scene.arms,

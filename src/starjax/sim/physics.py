@@ -2,7 +2,7 @@
 
 import types
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
-from starjax.sim import solver
+from starjax.sim import coupling, solver
 from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import BoundArm, Scene
 from starjax.sim.tasks.base import Contacts
@@ -25,11 +25,13 @@ class PhysicsState:
 
     Attributes:
       qpos: `[Q]`. qvel, qacc_warmstart: `[V]`.
+      memory: of `Task.coupling`, None without one.
     """
 
     qpos: jax.Array
     qvel: jax.Array
     qacc_warmstart: jax.Array
+    memory: Any = None
 
 
 class StepResult(NamedTuple):
@@ -48,16 +50,26 @@ class StepResult(NamedTuple):
     solver_error: jax.Array
 
 
-def initial(scene: Scene, q: Sequence[jax.Array], layout: object) -> PhysicsState:
-    """Returns the state at rest: arms at `q` (`[J]` rad), jaws open, objects placed."""
+def initial(
+    scene: Scene,
+    q: Sequence[jax.Array],
+    layout: object,
+    p_world_trocar: jax.Array | None = None,
+) -> PhysicsState:
+    """Returns the state at rest: arms at `q` (`[J]` rad), jaws open, objects placed.
+
+    Objects that tools hold need the trocars `[A, 3]` m; by default these are the nominal ones.
+    """
     qpos = jnp.asarray(scene.mj_model.qpos0, jnp.float32)
     for bound, q_arm in zip(scene.arms, q, strict=True):
         qpos = qpos.at[bound.q].set(q_arm)
         if bound.jaws.size:
             qpos = qpos.at[bound.jaws].set(bound.tool.open)
     qpos = scene.task.place_objects(scene.bound, qpos, layout)
+    at = jnp.asarray(scene.p_world_ref) if p_world_trocar is None else p_world_trocar
+    qpos, memory = coupling.begin(scene, layout, qpos, at)
     still = jnp.zeros(scene.mj_model.nv)
-    return PhysicsState(qpos=qpos, qvel=still, qacc_warmstart=still)
+    return PhysicsState(qpos=qpos, qvel=still, qacc_warmstart=still, memory=memory)
 
 
 def no_contacts(scene: Scene) -> Contacts:
@@ -108,10 +120,11 @@ def advance(
             ctrl=target(i),
             mocap_pos=mocap_pos,
         )
-        data, error = solver.step(mjx_model, data, scene.max_solver_iterations)
+        forces, memory = coupling.forces(scene, layout, state, gripper, p_world_trocar)
+        data, error = solver.step(mjx_model, data, scene.max_solver_iterations, forces)
         contacts = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
         error = jnp.maximum(result.solver_error, error)
-        state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+        state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, memory)
         return state, StepResult(touching(scene, contacts), contacts, before, error)
 
     blank = StepResult(

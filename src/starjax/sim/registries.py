@@ -27,6 +27,8 @@ tasks = Registry(
         "ring_on_wire": "starjax.sim.tasks.ring_on_wire.task:TASK",
         "endoscope_track": "starjax.sim.tasks.endoscope_track.task:TASK",
         "needle_regrasp": "starjax.sim.tasks.needle_regrasp.task:TASK",
+        "needle_drive": "starjax.sim.tasks.needle_drive.task:TASK",
+        "needle_drive_sh": "starjax.sim.tasks.needle_drive.task:SMALL",
     },
     "starjax.sim.tasks.base:Task",
 )

@@ -66,14 +66,18 @@ class Iterate(NamedTuple):
 
 
 def step(
-    m: mjx.Model, d: mjx.Data, max_iterations: int | None = None
+    m: mjx.Model,
+    d: mjx.Data,
+    max_iterations: int | None = None,
+    applied: jax.Array | None = None,
 ) -> tuple[mjx.Data, jax.Array]:
     """Does `mjx.step`: kinematics, contacts, forces and the implicit integrator.
 
-    For models that pass `check`, without external forces (`qfrc_applied`, `xfrc_applied`).
+    For models that pass `check`. The state's own `qfrc_applied` and `xfrc_applied` are ignored.
 
     Args:
       max_iterations: of Newton's method; `MAX_ITERATIONS` by default.
+      applied: `[V]`, generalised forces from outside, or None.
 
     Returns:
       the state after; J `[]`, the energy that the error left in the solution may hold.
@@ -81,7 +85,8 @@ def step(
     d = mjx.fwd_position(m, d)
     d = mjx.fwd_velocity(m, d)
     d = mjx.fwd_actuation(m, d)
-    d = d.replace(qfrc_smooth=d.qfrc_passive - d.qfrc_bias + d.qfrc_actuator)
+    smooth = d.qfrc_passive - d.qfrc_bias + d.qfrc_actuator
+    d = d.replace(qfrc_smooth=smooth if applied is None else smooth + applied)
     x, force, error = solve(problem(m, d), d.qacc_warmstart, m.opt.timestep, max_iterations)
     # As `mjx.implicit`: servos and dampers at the velocity after the step. `mjx.euler` then only
     # integrates, since the model lets it do nothing about damping (flag eulerdamp).

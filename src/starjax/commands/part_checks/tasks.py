@@ -60,7 +60,10 @@ def _functions(scene: Scene) -> Iterator[Check]:
         still, no = jnp.zeros((arms, 3)), jnp.zeros(arms, bool)
         touched = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), contacts)
         q, v = jnp.zeros(m.nq), jnp.zeros(m.nv)
-        return SimReadings(q, v, pose, still, jnp.zeros(arms), no, touched)
+        memory = None
+        if task.coupling is not None:
+            _, memory = task.coupling.begin(bound, layout(), q, pose)
+        return SimReadings(q, v, pose, still, jnp.zeros(arms), no, touched, memory)
 
     def layout() -> Any:
         return task.sample(bound, jax.random.key(0))

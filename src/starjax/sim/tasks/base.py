@@ -131,6 +131,38 @@ class Capsules(NamedTuple):
     radius: jax.Array
 
 
+class StepReadings(NamedTuple):
+    """Moving parts at the start of a physics step, for `Coupling.forces`.
+
+    Attributes:
+      qpos, qvel: generalised coordinates of the whole model, V velocities.
+      pose: Pose `[A]`, the tips in the world.
+      jacobian: `[A, 6, V]`, of the tips' velocity (m/s) and turn (rad/s) in the world.
+      gripper: `[A]` in [-1, 1], commanded.
+      timestep: s.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    pose: Pose
+    jacobian: jax.Array
+    gripper: jax.Array
+    timestep: float
+
+
+class Coupling(NamedTuple):
+    """Forces that a task computes itself in every physics step, added to those of contacts.
+
+    Attributes:
+      begin: (Bound, Layout, qpos, tips Pose `[A]`) -> qpos with objects that the tools hold, and
+        the memory at reset, a pytree.
+      forces: (Bound, Layout, memory, StepReadings) -> generalised forces `[V]`, memory.
+    """
+
+    begin: Callable[..., tuple[jax.Array, Any]]
+    forces: Callable[..., tuple[jax.Array, Any]]
+
+
 class SimReadings(NamedTuple):
     """Quantities of the simulation at one moment, for `Task.measure`.
 
@@ -141,6 +173,8 @@ class SimReadings(NamedTuple):
       opening: `[A]` in [-1, 1], of the jaws.
       touch: `[A]` bool, True if the jaws touch something graspable.
       contacts: of the last physics step.
+      memory: of `Task.coupling`, None without one.
+      collided: bool, a collision was found before; None in a check of the functions.
     """
 
     qpos: jax.Array
@@ -150,6 +184,8 @@ class SimReadings(NamedTuple):
     opening: jax.Array
     touch: jax.Array
     contacts: Contacts
+    memory: Any = None
+    collided: jax.Array | None = None
 
 
 def _no_obstacles(bound: Any, layout: Any, measurements: Any) -> Capsules:
@@ -199,6 +235,7 @@ class Task(NamedTuple):
       least_steps: least control steps of a success, a lower bound of demonstrations' limit.
       thread: (Measurements) -> `[N, 3]` m, points of a thread, whose links are the MJCF's geoms
         `thread0`, ..; or None. See `sim.thread`.
+      coupling: forces of the task's own, or None.
       endoscope: ranges of the camera `endoscope` in a trocar of its own, or None if `cameras` has
         no such one or a tool carries it.
     """
@@ -235,6 +272,7 @@ class Task(NamedTuple):
     still: Callable[..., Pose] | None = None
     least_steps: int = 0
     thread: Callable[..., jax.Array] | None = None
+    coupling: Coupling | None = None
     endoscope: Endoscope | None = None
 
     @property

@@ -1,0 +1,152 @@
+"""Scripted expert of needle drive: above the entry, down, along the needle's arc, hold.
+
+It commands the needle's poses on the bite's path; the tip follows from the grasp as it is measured
+when a phase begins, and the wrist's angles from the measured trocar. It is disturbed on purpose on
+its way to the pad.
+"""
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.spatial.transform import Rotation
+
+from starjax import rcm
+from starjax.sim import ik
+from starjax.sim.state import EnvState
+from starjax.sim.tasks import phases, scripting
+from starjax.sim.tasks.needle_drive import task
+from starjax.sim.tissue import needle as needles
+from starjax.sim.tissue.needle import Needle
+from starjax.types import Agent, Command, Pose
+
+APPROACH, DESCEND, DRIVE, HOLD = range(4)
+TIMING = phases.PhaseTable(
+    duration=(1.8, 1.0, 0.0, 1.0),
+    speed=(0.03, 0.02, 1.0, 1.0),
+    jaws=(-1.0, -1.0, -1.0, -1.0),
+    tempo=(0.85, 1.2),
+)
+WRIST = rcm.LARGE_NEEDLE_DRIVER  # of the task's tool
+DISTURBANCE = (1.0, 0.5, 0.0, 0.0)  # its weight in each phase
+DEVIATION = (0.0012, 0.0012, 0.0012, 0.0)  # m, of the position
+HOVER = 0.015  # m above the start of the arc
+BEFORE = float(np.deg2rad(10.0))  # rad on the arc from there to the entry
+EMERGE = 1.2 * task.EMERGED  # m of wire past the exit
+TURN_SPEED = float(np.deg2rad(22.0))  # rad/s on the arc, the mean
+
+
+@flax.struct.dataclass
+class DriveScript(phases.PhaseScript):
+    """Progress of the script in one episode.
+
+    Attributes:
+      R_from, R_goal, R: `[3, 3]`, the tip's rotations at the phase's ends and now.
+      turn: rad, the needle's on the path at the start of the drive.
+      held: pose_tip_needle at the phase's start.
+    """
+
+    R_from: jax.Array
+    R_goal: jax.Array
+    R: jax.Array
+    turn: jax.Array
+    held: Pose
+
+
+def agent(size: Needle) -> Agent:
+    """Makes the demonstrator for a needle."""
+
+    def init(key: jax.Array, state: EnvState) -> DriveScript:
+        R = state.pose.R[0]
+        own = {"R_from": R, "R_goal": R, "R": R, "turn": jnp.zeros(()), "held": _held(state)}
+        script = phases.begin(DriveScript, TIMING, key, state.pose.p[0], **own)
+        script = script.replace(jaws=-jnp.ones(()), jaws_from=-jnp.ones(()))
+        return enter(size, script, jnp.asarray(APPROACH, jnp.int32), state)
+
+    def act(script: DriveScript, state: EnvState) -> tuple[Command, DriveScript, Command]:
+        """Returns the disturbed command, the script a step later, and the command to record."""
+        after = enter(size, script, _following(script, state), state)
+        script, s = phases.advance(script, TIMING, after)
+        share = scripting.minimum_jerk(s)
+        way = share * ik.rotation_between(script.R_from, script.R_goal)
+        straight = Pose(
+            Rotation.from_rotvec(way).as_matrix() @ script.R_from,
+            script.start + share * (script.goal - script.start),
+        )
+        turn = script.turn + share * (_end(size, state) - script.turn)
+        on_arc = _tip(needles.pose_on(size, state.layout.bite, turn), script.held)
+        drives = script.phase == DRIVE
+        tip = jax.tree.map(lambda a, b: jnp.where(drives, a, b), on_arc, straight)
+        noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
+        script = script.replace(at=tip.p, R=tip.R, noise=noise)
+        weight = jnp.asarray(DISTURBANCE)[script.phase]
+        moved = weight * noise[1, :3] * jnp.where(script.phase == DESCEND, 1.0 - s, 1.0)
+        rough = _command(script, script.at + moved, state)
+        return rough, script, _command(script, script.at, state)
+
+    return Agent(init, act)
+
+
+def enter(size: Needle, script: DriveScript, phase: jax.Array, state: EnvState) -> DriveScript:
+    """Begins `phase`: sets its goal, rotation and duration."""
+    bite, held = state.layout.bite, _held(state)
+    half = needles.entry_angle(size, bite)
+    start = _tip(needles.pose_on(size, bite, -half - BEFORE), held)
+    stays = Pose(script.R, script.at)
+    above = start.p + jnp.array([0.0, 0.0, HOVER])
+    goals = [above, start.p, stays.p, stays.p]
+    is_free = (phase == APPROACH) | (phase == DESCEND)
+    turn = needles.turn_on(size, bite, state.measurements.needle)
+    script = phases.enter(
+        script,
+        TIMING,
+        phase,
+        goals,
+        attempt=script.attempt + (phase == APPROACH),
+        R_from=script.R,
+        R_goal=jnp.where(is_free, start.R, script.R),
+        turn=turn,
+        held=held,
+    )
+    sweep = jnp.abs(_end(size, state) - turn) / TURN_SPEED / script.tempo
+    return script.replace(duration=jnp.where(phase == DRIVE, sweep, script.duration))
+
+
+def _end(size: Needle, state: EnvState) -> jax.Array:
+    """Returns the needle's turn (rad) at the end of the drive."""
+    return needles.entry_angle(size, state.layout.bite) + EMERGE / size.radius
+
+
+def _held(state: EnvState) -> Pose:
+    """Returns pose_tip_needle as measured."""
+    tip, needle = jax.tree.map(lambda leaf: leaf[0], state.pose), state.measurements.needle
+    return Pose(tip.R.T @ needle.R, tip.R.T @ (needle.p - tip.p))
+
+
+def _tip(needle: Pose, held: Pose) -> Pose:
+    """Returns pose_world_tip of a needle's pose."""
+    R = needle.R @ held.R.T
+    return Pose(R, needle.p - R @ held.p)
+
+
+def _following(script: DriveScript, state: EnvState) -> jax.Array:
+    """Returns the next phase: a needle that is not through is driven again."""
+    found = state.measurements
+    again = jnp.where(found.is_inside, DRIVE, APPROACH)
+    is_short = (script.phase >= DRIVE) & (found.emerged < task.EMERGED)
+    following = jnp.where(is_short, again, jnp.minimum(script.phase + 1, HOLD))
+    return following.astype(jnp.int32)
+
+
+def _command(script: DriveScript, p: jax.Array, state: EnvState) -> Command:
+    """Returns the command `[1]` of the script's rotation at a tip `[3]` m."""
+    p_trocar: Any = state.measured_trocar.p_world_trocar[0]
+    found = rcm.through(WRIST, Pose(script.R, p), p_trocar)
+    pose = Pose(found.pose.R[None], found.pose.p[None])
+    return Command(pose, script.jaws[None], found.wrist[None])
+
+
+AGENT = agent(needles.CT1)
+SMALL = agent(needles.SH)

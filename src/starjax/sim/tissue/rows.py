@@ -1,0 +1,130 @@
+"""Springs, dampers and dry friction on one light body, integrated implicitly.
+
+A row is a direction in the velocities of the body, u `[6]`: its centre's in the world (m/s) and its
+turn in its own frame (rad/s), as MuJoCo's free joint has them. A row with stretch r, stiffness k,
+damping c and the other side's velocity w has, at the end of a step h, the force
+
+    -(k (r + h v) + c v),   v = J u - w,
+
+clipped to its bounds. The velocity after the step minimises a convex function, as accelerations do
+in `sim.solver`; a body of 0.07 g on springs of 20 kN/m is stable at 1/240 s.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.spatial.transform import Rotation
+
+from starjax.sim import linear, solver
+from starjax.types import Pose
+
+MAX_ITERATIONS = 12
+ACCURACY = 1e-5  # relative, of the impulses
+
+
+class ForceRows(NamedTuple):
+    """ForceRows E; one with neither stiffness nor damping is absent.
+
+    Attributes:
+      J: `[E, 6]`.
+      stretch: `[E]` m (rad). stiffness, damping: `[E]` N/m and N s/m (N m/rad, N m s/rad).
+      low, high: `[E]` N (N m), bounds of the force.
+      drift: `[E]` m/s (rad/s), of the other side along J.
+    """
+
+    J: jax.Array
+    stretch: jax.Array
+    stiffness: jax.Array
+    damping: jax.Array
+    low: jax.Array
+    high: jax.Array
+    drift: jax.Array
+
+
+def row(
+    J: jax.Array,
+    stretch: jax.Array | float,
+    stiffness: jax.Array | float,
+    damping: jax.Array | float,
+    bound: jax.Array | float = jnp.inf,
+    drift: jax.Array | float = 0.0,
+) -> ForceRows:
+    """Returns one row with a bound either way, as `ForceRows` `[]`."""
+    values = (stretch, stiffness, damping, -jnp.asarray(bound), bound, drift)
+    return ForceRows(J, *(jnp.asarray(x, jnp.float32) for x in values))
+
+
+def stacked(rows: list[ForceRows]) -> ForceRows:
+    """Stacks single rows."""
+    return jax.tree.map(lambda *x: jnp.stack(x), *rows)
+
+
+def present(rows: ForceRows, is_present: jax.Array) -> ForceRows:
+    """Returns the rows, absent unless `is_present` `[E]`."""
+    return rows._replace(
+        stiffness=jnp.where(is_present, rows.stiffness, 0.0),
+        damping=jnp.where(is_present, rows.damping, 0.0),
+    )
+
+
+def at_point(pose: Pose, p: jax.Array, direction: jax.Array) -> jax.Array:
+    """Returns J `[6]` of the body's material at `p` `[3]` m along a direction `[3]`."""
+    return jnp.concatenate([direction, pose.R.T @ jnp.cross(p - pose.p, direction)])
+
+
+def about(pose: Pose, axis: jax.Array) -> jax.Array:
+    """Returns J `[6]` of the body's turn about a world axis `[3]`."""
+    return jnp.concatenate([jnp.zeros(3), pose.R.T @ axis])
+
+
+def solve(
+    rows: ForceRows, inertia: jax.Array, free: jax.Array, start: jax.Array, h: float
+) -> tuple[jax.Array, jax.Array]:
+    """Finds the body's velocity after a step, single-sample.
+
+    Args:
+      inertia: `[6]` kg, kg m^2, diagonal.
+      free: `[6]`, the velocity after the step without the rows. start: `[6]`, a guess.
+      h: s.
+
+    Returns:
+      the velocity `[6]`; the rows' forces `[E]` N (N m).
+    """
+    slope = h * (rows.stiffness * h + rows.damping)
+    rest = h * rows.stiffness * rows.stretch - slope * rows.drift
+    low, high = (jnp.where(slope > 0, h * bound, 0.0) for bound in (rows.low, rows.high))
+
+    def impulses(x: jax.Array) -> jax.Array:
+        return jnp.clip(-(rest + slope * x), low, high)
+
+    def gradient(u: jax.Array) -> jax.Array:
+        return inertia * (u - free) - impulses(rows.J @ u) @ rows.J
+
+    def is_coarse(loop: tuple[jax.Array, jax.Array]) -> jax.Array:
+        count, u = loop
+        p = impulses(rows.J @ u)
+        size = jnp.abs(inertia * (u - free)) + jnp.abs(p) @ jnp.abs(rows.J)
+        return (count < MAX_ITERATIONS) & jnp.any(jnp.abs(gradient(u)) > ACCURACY * size)
+
+    def improve(loop: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        count, u = loop
+        x, g = rows.J @ u, gradient(u)
+        wanted = -(rest + slope * x)
+        is_free = (wanted > low) & (wanted < high)
+        H = jnp.diag(inertia) + (rows.J.T * jnp.where(is_free, slope, 0.0)) @ rows.J
+        step = -linear.solve_positive(H, g)
+        first, bend, move = inertia * (u - free) @ step, inertia * step @ step, rows.J @ step
+
+        def slope_at(fraction: jax.Array) -> jax.Array:
+            return first + fraction * bend - impulses(x + fraction * move) @ move
+
+        return count + 1, u + solver.line_search(slope_at, g @ step) * step
+
+    _, u = jax.lax.while_loop(is_coarse, improve, (jnp.zeros((), jnp.int32), start))
+    return u, impulses(rows.J @ u) / h
+
+
+def rotation(turn: jax.Array) -> jax.Array:
+    """Returns the rotation `[3, 3]` of a rotation vector `[3]` rad, also of zero."""
+    return Rotation.from_rotvec(turn).as_matrix()

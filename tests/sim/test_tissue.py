@@ -1,0 +1,150 @@
+"""A needle driven by jaws on a given path: events, forces, energies; and the rows by themselves."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax.sim.tasks.needle_drive import task
+from starjax.sim.tissue import driving, hole, patch, rows
+from starjax.sim.tissue import needle as needles
+from starjax.sim.tissue.needle import Bite
+from starjax.types import Pose
+
+H = 1.0 / 240
+SIZE = needles.CT1
+BODY = driving.Body(np.array([1.83e-4] * 3 + [4.01e-6] * 3), 1.79e-4)
+BITE = Bite(jnp.array([0.005, 0.001, 0.0]), jnp.array([-0.006, 0.001, 0.0]))
+
+
+@pytest.mark.parametrize("size", [needles.SH, needles.CT1])
+def test_the_path_of_a_bite_passes_both_marks(size):
+    half = needles.entry_angle(size, BITE)
+    for turn, mark in ((-half, BITE.entry), (half, BITE.exit)):
+        pose = needles.pose_on(size, BITE, turn)
+        np.testing.assert_allclose(pose.R @ pose.R.T, np.eye(3), atol=1e-6)
+        np.testing.assert_allclose(needles.point_at(size, pose, size.end), mark, atol=1e-7)
+        np.testing.assert_allclose(needles.turn_on(size, BITE, pose), turn, atol=1e-6)
+    pose = needles.pose_on(size, BITE, 0.4)
+    p = needles.point_at(size, pose, jnp.asarray(-0.7))
+    angle, distance, height = needles.coordinates(size, pose, p)
+    np.testing.assert_allclose([angle, distance, height], [-0.7, size.radius, 0.0], atol=1e-6)
+    step = needles.point_at(size, pose, jnp.asarray(-0.699)) - p
+    np.testing.assert_allclose(
+        step / 0.001 / size.radius, needles.tangent_at(pose, -0.7), atol=1e-3
+    )
+
+
+def test_the_velocity_after_a_step_minimises_the_cost():
+    key = jax.random.split(jax.random.key(3), 5)
+    count = 14
+    J = jax.random.normal(key[0], (count, 6))
+    stretch = 1e-3 * jax.random.normal(key[1], (count,))
+    bound = 0.02 * jnp.where(jnp.arange(count) % 2 == 0, 1.0, jnp.inf)
+    some = rows.ForceRows(
+        J, stretch, jnp.full(count, 300.0), jnp.ones(count), -bound, bound, stretch
+    )
+    inertia = jnp.array([1e-3, 1e-3, 1e-3, 2e-3, 2e-3, 2e-3])
+    free = jax.random.normal(key[2], (6,))
+    u, forces = rows.solve(some, inertia, free, jnp.zeros(6), H)
+    np.testing.assert_allclose(inertia * (u - free) / H, forces @ J, atol=2e-3)
+    wanted = -(
+        some.stiffness * (stretch + H * (J @ u - stretch)) + some.damping * (J @ u - stretch)
+    )
+    np.testing.assert_allclose(forces, np.clip(wanted, -bound, bound), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(np.max(np.abs(forces)[::2]), 0.02, rtol=1e-5)
+
+
+def test_a_spring_alone_is_the_implicit_one():
+    J = jnp.eye(6)[:1]
+    one = rows.stacked([rows.row(J[0], 1e-3, 400.0, 1.0)])
+    m = 1e-4
+    u, force = rows.solve(one, jnp.full(6, m), jnp.zeros(6).at[0].set(0.1), jnp.zeros(6), H)
+    v = (m * 0.1 - H * 400.0 * 1e-3) / (m + H * (400.0 * H + 1.0))
+    np.testing.assert_allclose(u[0], v, rtol=1e-5)
+    np.testing.assert_allclose(force[0], m * (v - 0.1) / H, rtol=1e-4)
+
+
+@jax.jit
+def driven(aside=0.0, gripper=-1.0):
+    """Moves the jaws on the bite's path, at its end `aside` m of it: states, work and forces."""
+    half = needles.entry_angle(SIZE, BITE)
+    held = task.grasp(SIZE)
+    seconds = 4.0
+
+    def tip_at(t):
+        s = jnp.clip(t / seconds, 0.0, 1.0)
+        s = s**3 * (10.0 + s * (-15.0 + 6.0 * s))
+        needle = needles.pose_on(SIZE, BITE, -half - 0.2 + s * (2 * half + 0.5))
+        R = needle.R @ held.R.T
+        return Pose(R, needle.p - R @ held.p + s * jnp.array([0.0, aside, 0.0]))
+
+    def one(carry, t):
+        pose, u, tissue = carry
+        tip, after = tip_at(t), tip_at(t + H)
+        turn = patch.ik.rotation_between(tip.R, after.R)
+        twist = jnp.concatenate([after.p - tip.p, turn]) / H
+        tips = driving.Tips(Pose(tip.R[None], tip.p[None]), twist[None], jnp.full((1,), gripper))
+        forces, tissue = driving.step(SIZE, BODY, tissue, pose, u, tips, H)
+        weight = jnp.zeros(6).at[2].set(-driving.GRAVITY * BODY.mass)
+        u = u + H * (forces.needle + weight) / jnp.asarray(BODY.inertia)
+        pose = Pose(pose.R @ rows.rotation(H * u[3:]), pose.p + H * u[:3])
+        work = -H * (forces.tips[0] @ twist)
+        return (pose, u, tissue), (tissue, work, u, forces.tips[0])
+
+    start = needles.pose_on(SIZE, BITE, -half - 0.2)
+    tip = tip_at(0.0)
+    tissue = driving.begin(SIZE, Pose(tip.R[None], tip.p[None]), start, jnp.ones(1, bool))
+    times = H * jnp.arange(round(seconds / H) + 48)
+    (pose, _, tissue), history = jax.lax.scan(one, (start, jnp.zeros(6), tissue), times)
+    return pose, tissue, history
+
+
+@pytest.fixture(scope="module")
+def straight():
+    return driven()
+
+
+def test_a_needle_on_its_arc_enters_and_leaves_at_the_marks(straight):
+    pose, tissue, (history, *_) = straight
+    made = tissue.hole
+    assert made.has_exited and made.is_inside and not made.is_through
+    assert np.linalg.norm(made.entry - BITE.entry) < 0.1e-3
+    assert np.linalg.norm(made.exit - BITE.exit) < 0.2e-3
+    assert float(made.max_force) < 0.25 * task.MAX_FORCE
+    assert float(hole.emerged(SIZE, pose, made)) > task.EMERGED
+    held = np.asarray(history.patches.is_held)
+    assert held.all()
+    # In order: touched, pierced, left.
+    touches, inside, out = (
+        np.asarray(x)
+        for x in (history.hole.touches, history.hole.is_inside, history.hole.has_exited)
+    )
+    assert touches.any() and touches.argmax() < inside.argmax() < out.argmax()
+
+
+def test_jaws_aside_of_the_arc_strain_the_hole():
+    _, tissue, *_ = driven(aside=0.002)
+    assert float(tissue.hole.max_force) > 2.0 * 0.25 * task.MAX_FORCE
+    assert np.linalg.norm(tissue.hole.exit - BITE.exit) > task.ON_MARK
+
+
+def test_the_jaws_do_work_and_the_pad_only_takes_it(straight):
+    work, u, forces = (np.asarray(x) for x in straight[2][1:])
+    kinetic = 0.5 * np.sum(BODY.inertia * u**2, axis=1)
+    lift = 2.0 * BODY.mass * 9.81 * SIZE.radius
+    stored = 0.7**2 / hole.DIMPLE + 4 * 0.1**2 / hole.ACROSS
+    done = np.cumsum(work)
+    assert (done + lift + stored > kinetic).all()
+    # At least the friction and the cut along the path: lengths and forces of the module.
+    half = float(needles.entry_angle(SIZE, BITE))
+    path = 2.0 * half * SIZE.radius
+    least = hole.CUT * path + 0.5 * hole.FRICTION * path**2
+    assert 0.8 * least < done[-1] < 1.6 * least
+    np.testing.assert_allclose(np.linalg.norm(forces[-1, :3]), 0.0, atol=0.5)
+
+
+def test_open_jaws_drop_a_needle_that_is_in_the_air():
+    _, tissue, (_, _, _, forces) = driven(gripper=1.0)
+    assert not tissue.patches.is_held.any()
+    np.testing.assert_array_equal(forces, 0.0)
