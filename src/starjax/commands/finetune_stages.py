@@ -31,6 +31,8 @@ from starjax.runtime.signals import stop_signals
 from starjax.training import loop, randomise
 from starjax.training.encoder import Encoder
 
+Round = tuple[Path, dict[str, Any]]  # its policy's file and its counts
+
 _VALIDATION = 0x76616C69  # added to the seed: its trials are not those of the report
 
 
@@ -41,6 +43,23 @@ def validate(work: Work, number: int, who: PolicyInEnv) -> trials.Table:
     with stage_times.timed(work.out, f"round {number} validation"):
         folder = work.folder(number) / "validation"
         return policy_evaluation.rollouts(folder, who, work.seen, settings, seed)
+
+
+class Imitation:
+    """Rounds that learn from rollouts like from demonstrations."""
+
+    def __init__(self, work: Work, steps: np.ndarray):
+        """Loads the demonstrations; `steps` as in `Search`."""
+        self._search, self._lessons = Search(work, steps), Lessons(work)
+
+    def round(self, number: int, who: PolicyInEnv, before: Path) -> Round | None:
+        """Runs and learns a round, from a policy and its file; returns None without lessons."""
+        counts = self._search.collect(number, who)
+        self._lessons.add(number)
+        if not self._lessons.are_new:
+            messages.indented("nothing to learn from")
+            return None
+        return self._lessons.train(number, before), counts
 
 
 class Search:
@@ -100,7 +119,7 @@ class Lessons:
 
     def __init__(self, work: Work):
         """Loads the demonstrations; collects them unless the run has today's."""
-        policy = work.stored.policy
+        policy = work.config.policy
         self._work, self._encoder = work, None
         self._rollouts: list[tuple[windows.Dataset, np.ndarray]] = []
         if policy.observation == "image" and policy.freeze_encoder:
@@ -111,9 +130,14 @@ class Lessons:
         if not store.is_sealed(plan.root):
             config = dataclasses.replace(config, out=str(work.out))
             plan = demonstrations.plan(config, env, work.share)
-        self._demonstrations = demonstrations.load(
+        self._demonstrations: windows.Dataset = demonstrations.load(
             config, env, plan.root, plan.collect, self._encoder, work.share
         )
+
+    @property
+    def demonstrations(self) -> windows.Dataset:
+        """Those of the policy's training."""
+        return self._demonstrations
 
     @property
     def are_new(self) -> bool:

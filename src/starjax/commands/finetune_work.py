@@ -26,6 +26,7 @@ from starjax.rollouts import trocars
 from starjax.runtime import files
 
 _WARMUP = 500  # training steps, in which the new optimiser's averages settle
+_WITH_DENSITY = ("onestep",)  # learners whose samples with noise have a density of one step
 _MAY_CHANGE = ("rounds", "eval")  # settings that may change when a fine-tuning resumes
 
 
@@ -79,6 +80,9 @@ def begin(
     if stored.method != base.trained.method:
         got = f"{base.trained.method}, which runs those of {stored.method}"
         raise errors.UsageError("RUN", "a method with weights of its own", got)
+    if settings.by == "rl" and stored.policy.learner not in _WITH_DENSITY:
+        expected = f"a policy of the learner {' or '.join(_WITH_DENSITY)}"
+        raise errors.UsageError("--by rl", expected, stored.policy.learner)
     share.first("claimed", lambda: _claim(started.folder, settings, base.weights))
     stats = mixing.with_reach(base.trained.normalizer)
     return Work(
@@ -112,10 +116,18 @@ def _round_config(
         config,
         seed=settings.seed if run is None else config.seed,  # no policy file has its seed
         out=str(out if run is None else run.parent),
-        policy=dataclasses.replace(stored.policy, dtype=settings.dtype),
+        policy=_round_policy(settings, stored.policy),
         train=train,
         eval=settings.eval,
     )
+
+
+def _round_policy(settings: FinetuneConfig, policy: config_lib.PolicyConfig) -> Any:
+    """Returns a policy's settings in a round: `rl` leaves the encoder and computes exactly."""
+    if settings.by != "rl":
+        return dataclasses.replace(policy, dtype=settings.dtype)
+    is_frozen = policy.observation == "image"
+    return dataclasses.replace(policy, dtype="float32", freeze_encoder=is_frozen)
 
 
 def _claim(folder: Path, settings: FinetuneConfig, weights: str) -> None:

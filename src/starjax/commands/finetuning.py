@@ -9,6 +9,7 @@ import numpy as np
 import starjax
 from starjax import errors, methods
 from starjax.commands import (
+    finetune_rl,
     finetune_stages,
     messages,
     policy_args,
@@ -37,19 +38,18 @@ def run(
     work = works.begin(settings, path, started, share)
     print(_plan(work), flush=True)
     with precompile.until_end():
-        lessons = finetune_stages.Lessons(work)
         print("\n[round 0] validation of the policy itself", flush=True)
         table = finetune_stages.validate(work, 0, work.base)
-        search = finetune_stages.Search(work, table.steps[table.success])
+        way = finetune_rl.PolicyGradient if settings.by == "rl" else finetune_stages.Imitation
+        improve = way(work, table.steps[table.success]).round
         described = [{"round": 0, "validation": statistics.rate(table.success)}]
         candidates, who = [path.file], work.base
         for number in range(1, settings.rounds + 1):
-            counts = search.collect(number, who)
-            lessons.add(number)
-            if not lessons.are_new:
-                messages.indented("nothing to learn from")
+            made = improve(number, who, candidates[-1])
+            if made is None:
                 break
-            candidates.append(lessons.train(number, candidates[-1]))
+            file, counts = made
+            candidates.append(file)
             who = work.place(candidates[-1])
             rate = statistics.rate(finetune_stages.validate(work, number, who).success)
             described.append({"round": number, **counts, "validation": rate})

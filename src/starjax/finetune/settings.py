@@ -12,11 +12,16 @@ class FinetuneConfig:
     """Settings of `starjax finetune`, apart from the policy."""
 
     # dagger: an expert finishes episodes in trouble, and the policy learns the expert's part; self:
-    # the policy learns successes of its own noisy rollouts
-    by: Literal["dagger", "self"] = "dagger"
+    # the policy learns successes of its own noisy rollouts; rl: a policy gradient raises the chance
+    # of strict success
+    by: Literal["dagger", "self", "rl"] = "dagger"
     rounds: Annotated[int, Range(1, 100)] = 3  # rounds of rollouts and training
-    trials: Count = 1200  # trials per round and seen trocar
-    steps: Count = 8_000  # training steps per round
+    trials: Count = 1200  # trials per round and seen trocar; not of rl
+    steps: Count = 8_000  # training steps per round; not of rl
+    iterations: Count = 30  # iterations of rl per round
+    # learning rate of rl
+    gradient_rate: Annotated[float, Range(0.0, 1.0, "(]")] = 1e-5
+    episodes: Count = 1024  # episodes per iteration of rl, over all seen trocars
     # learning rate as a fraction of that of the policy's training
     rate: Annotated[float, Range(0.0, 1.0, "(]")] = 0.2
     # arithmetic of the networks in training; inference always uses float32
@@ -33,6 +38,8 @@ class FinetuneConfig:
 ON_CPU = FinetuneConfig(
     trials=30,
     steps=1_500,
+    iterations=10,
+    episodes=32,
     dtype="float32",
     validation=12,
     eval=config_lib.EvalConfig(trials=12, time_limit_s=20.0, video_trials=0),

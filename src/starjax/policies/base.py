@@ -31,6 +31,9 @@ class Policy(NamedTuple):
       cast_params: `params -> params` with large matrices in the networks' dtype.
       prepare_for_inference: `params -> params` in the form that `sample` uses fastest, for
         inference only.
+      generate: the learner's part of `sample` without its limits, with the same arguments ->
+        normalised actions `[B, H, D]`.
+      execute: the rest, `(params, stats, actions, observation, trocar) -> Command [B, H, A]`.
     """
 
     init: Callable[[jax.Array], Params]
@@ -43,3 +46,5 @@ class Policy(NamedTuple):
     metrics: tuple[str, ...] = ()
     cast_params: Callable[[Params], Params] = lambda params: params
     prepare_for_inference: Callable[[Params], Params] = lambda params: params
+    generate: Callable[..., jax.Array] | None = None
+    execute: Callable[..., Command] | None = None

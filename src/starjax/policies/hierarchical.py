@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
 from starjax.models import kernels, roll_net
+from starjax.models.diffusion import within
 from starjax.policies import execution, features, generator, sequences
 from starjax.policies.base import Params, Policy
 from starjax.types import Command, Observation
@@ -152,14 +153,31 @@ def make(
         trocar: rcm.TrocarFrame,
     ) -> Command:
         # 1. positions and grippers (Eq. 12), conditioned on the trocar by some methods only
+        measured, condition = _condition(params, stats, observation, trocar)
+        x0 = model.sample(params["learner"], keys, condition, _reach(stats))
+        return _decoded(params, stats, x0, measured, condition, trocar)
+
+    def generate(params, stats, keys, observation, trocar):
+        _, condition = _condition(params, stats, observation, trocar)
+        return model.sample(params["learner"], keys, condition, sequences.UNLIMITED)
+
+    def execute(params, stats, actions, observation, trocar):
+        measured, condition = _condition(params, stats, observation, trocar)
+        x0 = within(actions, _reach(stats))
+        return _decoded(params, stats, x0, measured, condition, trocar)
+
+    def _condition(params, stats, observation, trocar):
         measured = _measured(stats, observation, trocar)
         inputs = features.inference_inputs(
             policy_config, sensors, stats, observation, generated(measured)
         )
-        condition = networks.observe(params, inputs, features.trocar_condition(method, trocar))
-        reach = stats.action.reach
-        reach = None if reach is None else generated(reach)
-        x0 = model.sample(params["learner"], keys, condition, reach)
+        found = networks.observe(params, inputs, features.trocar_condition(method, trocar))
+        return measured, found
+
+    def _reach(stats):
+        return None if stats.action.reach is None else generated(stats.action.reach)
+
+    def _decoded(params, stats, x0, measured, condition, trocar):
         p, gripper = jnp.split(by_arm(x0), [3], axis=-1)
         # 2. turns along the sampled path (Eq. 13), clipped to the demonstrated range
         about = features.trocar_features(trocar.trocar)
@@ -188,4 +206,14 @@ def make(
         return {**networks.prepare_for_inference(params), "roll": kernels.packed(params["roll"])}
 
     metrics = ("position_loss", "roll_loss", *model.metrics)
-    return Policy(init, prepare, loss, sample, metrics, networks.cast_params, prepare_for_inference)
+    return Policy(
+        init,
+        prepare,
+        loss,
+        sample,
+        metrics,
+        networks.cast_params,
+        prepare_for_inference,
+        generate,
+        execute,
+    )

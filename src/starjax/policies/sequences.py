@@ -8,6 +8,8 @@ import jax.numpy as jnp
 
 Params = dict[str, Any]
 
+UNLIMITED: Any = (-jnp.inf, jnp.inf)  # a `reach`
+
 
 class Sizes(NamedTuple):
     """Sizes of a model's arrays.

@@ -6,7 +6,8 @@ import jax
 
 from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
-from starjax.policies import execution, features, generator
+from starjax.models.diffusion import within
+from starjax.policies import execution, features, generator, sequences
 from starjax.policies.base import Params, Policy
 from starjax.types import Command, Observation
 
@@ -59,13 +60,23 @@ def make(
         observation: Observation,
         trocar: rcm.TrocarFrame,
     ) -> Command:
+        condition = _condition(params, stats, observation, trocar)
+        action = model.sample(params["learner"], keys, condition, stats.action.reach)
+        return execution.command(method, stats, action, trocar, wrist)
+
+    def generate(params, stats, keys, observation, trocar):
+        condition = _condition(params, stats, observation, trocar)
+        return model.sample(params["learner"], keys, condition, sequences.UNLIMITED)
+
+    def execute(params, stats, actions, observation, trocar):
+        return execution.command(method, stats, within(actions, stats.action.reach), trocar, wrist)
+
+    def _condition(params, stats, observation, trocar):
         proprioception = _proprioception(stats, observation, trocar)
         inputs = features.inference_inputs(
             policy_config, sensors, stats, observation, proprioception
         )
-        condition = networks.observe(params, inputs, features.trocar_condition(method, trocar))
-        action = model.sample(params["learner"], keys, condition, stats.action.reach)
-        return execution.command(method, stats, action, trocar, wrist)
+        return networks.observe(params, inputs, features.trocar_condition(method, trocar))
 
     def _proprioception(stats, observation, trocar):
         space = method.action_space
@@ -79,4 +90,6 @@ def make(
         model.metrics,
         networks.cast_params,
         networks.prepare_for_inference,
+        generate,
+        execute,
     )

@@ -1,0 +1,169 @@
+"""Steps of a policy gradient with clipped ratios, and demonstrations that hold the policy.
+
+PPO (Schulman et al., arXiv:1707.06347). Given the learner's own noise, a decision is normal about
+the action that the policy generates, with the deviation `explore.NOISE`; its executed commands
+alone have a density, because the others never act.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from starjax.data import windows
+from starjax.finetune import advantages, critic
+from starjax.finetune.explore import NOISE, Experience
+from starjax.policies.base import Params, Policy
+
+CLIP = 0.2  # of the ratio of densities of all executed commands
+EPOCHS = 4  # over the decisions of an iteration
+BATCH = 4096  # decisions per step
+MAX_KL = 0.02  # at which the policy's steps of an iteration end
+ANCHOR = 0.3  # weight of the loss on demonstrations
+ANCHOR_BATCH = 256  # windows
+_ALL = 2**31 - 1
+
+
+class Learning(NamedTuple):
+    """State of the learning.
+
+    Attributes:
+      params: of the policy, without a vision encoder.
+      optimizer: their optimiser's state.
+      critic: of the values.
+    """
+
+    params: Params
+    optimizer: Any
+    critic: critic.Critic
+
+
+class Demonstrations(NamedTuple):
+    """Windows that hold the policy: a dataset on the device and its frames `[F]`."""
+
+    dataset: windows.Dataset
+    frames: Any
+
+
+def optimizer(rate: float) -> optax.GradientTransformation:
+    """Returns Adam that leaves out steps whose gradient is not finite."""
+    return optax.apply_if_finite(optax.adam(rate), max_consecutive_errors=_ALL)
+
+
+def begin(
+    adam: optax.GradientTransformation, params: Params, key: jax.Array, experience: Experience
+) -> Learning:
+    """Returns the state before the first iteration, whose experience scales the critic's inputs."""
+    values = critic.begin(key, experience.seen, experience.alive)
+    return Learning(params, adam.init(params), values)
+
+
+def log_density(action: jax.Array, mean: jax.Array) -> jax.Array:
+    """Returns the log of the normal density of actions `[B, E, D]`, without its constant."""
+    return -0.5 * jnp.sum(((action - mean) / NOISE) ** 2, axis=(-2, -1))
+
+
+def surrogate(log_ratio: jax.Array, advantage: jax.Array) -> jax.Array:
+    """Returns the clipped objective `[B]`, Eq. 7, to be maximised."""
+    ratio = jnp.exp(log_ratio)
+    clipped = jnp.clip(ratio, 1.0 - CLIP, 1.0 + CLIP)
+    return jnp.minimum(ratio * advantage, clipped * advantage)
+
+
+def make(
+    policy: Policy, adam: optax.GradientTransformation, obs_horizon: int, horizon: int
+) -> Callable[..., tuple[Learning, dict[str, jax.Array]]]:
+    """Builds the program of an iteration's steps.
+
+    Args:
+      adam: see `optimizer`.
+      policy: its `prepare` reads features instead of images.
+      obs_horizon, horizon: of a demonstration's window.
+
+    Returns:
+      learn(learning, stats, Experience, Demonstrations, key, trains_policy) -> Learning, metrics:
+      `kl` and `clipped` of the last step, `steps` of the policy. `trains_policy` False trains the
+      critic alone.
+    """
+    generate = policy.generate
+    assert generate is not None
+
+    def rows_of(experience: Experience) -> tuple[Any, ...]:
+        """Returns what the density depends on, with one leading axis `[N R]`."""
+        count, decisions = experience.alive.shape
+        trocar = jax.tree.map(lambda x: jnp.repeat(x, decisions, 0), experience.trocar)
+        parts = experience.observation, experience.key, experience.action
+        flat = jax.tree.map(lambda x: x.reshape(count * decisions, *x.shape[2:]), parts)
+        return (*flat, trocar)
+
+    def log_density_of(params: Params, stats: Any, row: tuple[Any, ...]) -> jax.Array:
+        observation, keys, action, trocar = row
+        mean = generate(params, stats, keys, observation, trocar)
+        return log_density(action, mean[:, : action.shape[1]])
+
+    def anchor(params: Params, stats: Any, demonstrations: Demonstrations, key: jax.Array):
+        key_rows, key_loss = jax.random.split(key)
+        frames = jax.random.choice(key_rows, demonstrations.frames, (ANCHOR_BATCH,))
+        batch = windows.gather(demonstrations.dataset, frames, obs_horizon, horizon)
+        return policy.loss(params, policy.prepare(stats, key_loss, batch))[0]
+
+    @jax.jit
+    def learn(learning, stats, experience, demonstrations, key, trains_policy):
+        with jax.default_matmul_precision("highest"):  # the density is sharp: NOISE is small
+            return steps(learning, stats, experience, demonstrations, key, trains_policy)
+
+    def steps(learning, stats, experience, demonstrations, key, trains_policy):
+        alive = experience.alive
+        value = critic.values(learning.critic, experience.seen)
+        estimates = advantages.estimate(experience.reward, value, alive)
+        advantage = advantages.standardised(estimates.advantage, alive).reshape(-1)
+        returns, seen = estimates.returns.reshape(-1), experience.seen.reshape(alive.size, -1)
+        rows = rows_of(experience)
+        batch = min(BATCH, alive.size)
+        whole = jnp.arange(-(-alive.size // batch) * batch).reshape(-1, batch) % alive.size
+        old = jax.lax.map(
+            lambda index: log_density_of(learning.params, stats, _taken(rows, index)), whole
+        ).reshape(-1)
+        (order,) = jnp.nonzero(alive.reshape(-1), size=alive.size, fill_value=0)
+        count = jnp.sum(alive)
+
+        def step(i, carry):
+            learning, metrics = carry
+            key_rows, key_anchor = jax.random.split(jax.random.fold_in(key, i))
+            index = order[jax.random.randint(key_rows, (batch,), 0, count)]
+
+            def loss(params):
+                log_ratio = log_density_of(params, stats, _taken(rows, index)) - old[index]
+                gain = jnp.mean(surrogate(log_ratio, advantage[index]))
+                held = anchor(params, stats, demonstrations, key_anchor)
+                # In units of NOISE**2 the gradient of the density is one of an action's error.
+                return ANCHOR * held - NOISE**2 * gain, log_ratio
+
+            gradient, log_ratio = jax.grad(loss, has_aux=True)(learning.params)
+            kl = jnp.mean(jnp.expm1(log_ratio) - log_ratio)
+            goes_on = trains_policy & (metrics["kl"] <= MAX_KL) & (kl <= MAX_KL)
+            change, optimizer = adam.update(gradient, learning.optimizer, learning.params)
+            moved = optax.apply_updates(learning.params, change), optimizer
+            kept = learning.params, learning.optimizer
+            params, optimizer = jax.tree.map(
+                lambda new, old: jnp.where(goes_on, new, old), moved, kept
+            )
+            values = critic.step(learning.critic, seen[index], returns[index])
+            metrics = {
+                "kl": jnp.maximum(metrics["kl"], kl),
+                "clipped": jnp.mean(jnp.abs(jnp.expm1(log_ratio)) > CLIP),
+                "steps": metrics["steps"] + goes_on,
+            }
+            return Learning(params, optimizer, values), metrics
+
+        first = {"kl": jnp.zeros(()), "clipped": jnp.zeros(()), "steps": jnp.zeros((), jnp.int32)}
+        total = jnp.maximum(EPOCHS * count // batch, EPOCHS)
+        return jax.lax.fori_loop(0, total, step, (learning, first))
+
+    return learn
+
+
+def _taken(tree: Any, index: jax.Array) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
