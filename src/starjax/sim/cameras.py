@@ -60,8 +60,9 @@ def make(
         body, R = int(camera.bodyid[0]), np.zeros(9)
         mujoco.mju_quat2Mat(R, camera.quat)
         R, p = R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32)
-        moves = moving or body != 0 or (scope is not None and name == endoscope_camera.NAME)
-        sizes, more = (image_size, image_size), {"samples": samples, "depth": view.is_depth}
+        moves = moving or body != 0 or (scope is not None and endoscope_camera.is_endoscope(name))
+        sizes = image_size, image_size
+        more = {"samples": samples, "depth": view.is_depth, "look": view.look}
         draw = render.make(model, view.camera, *sizes, shadow, moves=moves, **more)
         made.append(SceneCamera(name, body, R, p, moves, draw, view.is_depth))
     return tuple(made)
@@ -79,7 +80,7 @@ def at_reset(
     poses = nominal(cameras)
     if scope is None:
         return poses
-    is_drawn = jnp.array([camera.name == endoscope_camera.NAME for camera in cameras])
+    is_drawn = jnp.array([endoscope_camera.is_endoscope(camera.name) for camera in cameras])
     drawn = endoscope_camera.draw(scope, key)
     return Pose(
         jnp.where(is_drawn[:, None, None], drawn.R, poses.R),

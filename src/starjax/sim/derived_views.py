@@ -1,9 +1,10 @@
-"""Views derived from a camera, by its name: `NAME_right`, `NAME_depth` and `NAME_right_depth`.
+"""Views derived from a camera, by its name: `_right`, `_depth`, `_tissue` and two of them at once.
 
 The right view is that of a second lens, as in a stereo endoscope. A depth image is an ordinary
 image of three channels, which policies, datasets and exports take like any other: red is the depth
 from `NEAR` to `FAR`; green and blue are triangle waves of it, a quarter period apart, which hold it
-to a tenth of a millimetre without jumps.
+to a tenth of a millimetre without jumps. A view of tissue shows a body cavity around the task's
+objects, see `camera.tissue`.
 """
 
 import copy
@@ -15,8 +16,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax.sim.camera import geometry
-from starjax.sim.names import DEPTH
+from starjax.sim.camera import geometry, tissue
+from starjax.sim.names import DEPTH, TISSUE
 from starjax.types import Pose
 
 RIGHT = "_right"
@@ -32,18 +33,22 @@ class DerivedView(NamedTuple):
       camera: name in the MJCF.
       offset: m to the right of the camera.
       is_depth: True for depth instead of colours.
+      look: of the surroundings, see `render.make`.
     """
 
     camera: str
     offset: float
     is_depth: bool
+    look: str = ""
 
 
 def parse(name: str, cameras: Collection[str]) -> DerivedView:
     """Returns the view of a name; a name among `cameras` is the camera itself."""
     plain = name if name in cameras else name.removesuffix(DEPTH)
-    camera = plain if plain in cameras else plain.removesuffix(RIGHT)
-    return DerivedView(camera, BASELINE if camera != plain else 0.0, plain != name)
+    lit = plain if plain in cameras else plain.removesuffix(TISSUE)
+    camera = lit if lit in cameras else lit.removesuffix(RIGHT)
+    look = tissue.NAME if lit != plain else ""
+    return DerivedView(camera, BASELINE if camera != lit else 0.0, plain != name, look)
 
 
 def names(cameras: Collection[str]) -> Iterator[str]:
@@ -51,6 +56,7 @@ def names(cameras: Collection[str]) -> Iterator[str]:
     yield from cameras
     for camera in cameras:
         yield from (f"{camera}{RIGHT}", f"{camera}{DEPTH}", f"{camera}{RIGHT}{DEPTH}")
+        yield from (f"{camera}{TISSUE}", f"{camera}{RIGHT}{TISSUE}")
 
 
 def displaced(mj_model: mujoco.MjModel, view: DerivedView) -> mujoco.MjModel:

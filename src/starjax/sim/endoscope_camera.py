@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from starjax.rcm import trocar as trocars
+from starjax.sim.names import TISSUE
 from starjax.types import Pose
 
 NAME = "endoscope"  # of the camera
@@ -44,7 +45,12 @@ class Endoscope(NamedTuple):
 
 def of(task: Any, cameras: Sequence[str]) -> Endoscope | None:
     """Returns the task's endoscope, or None unless it is among the observed cameras."""
-    return task.endoscope if NAME in cameras else None
+    return task.endoscope if any(map(is_endoscope, cameras)) else None
+
+
+def is_endoscope(camera: str) -> bool:
+    """Returns True for the name of the endoscope, with any look."""
+    return camera.removesuffix(TISSUE) == NAME
 
 
 def draw(endoscope: Endoscope, key: jax.Array) -> Pose:

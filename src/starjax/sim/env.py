@@ -82,7 +82,7 @@ def make(
         state = dynamics.reset(scene, key, params, poses)
         if scope is None:
             return state
-        here = names.index(endoscope_camera.NAME)
+        here = next(i for i, name in enumerate(names) if endoscope_camera.is_endoscope(name))
         return state.replace(endoscope=jax.tree.map(lambda leaf: leaf[here], poses))
 
     def draw(source: ImageSource) -> dict[str, render.CameraImage]:

@@ -19,6 +19,7 @@ class SceneNames(NamedTuple):
 
 
 DEPTH = "_depth"  # ends the name of a view of depth, see `derived_views`
+TISSUE = "_tissue"  # ends the name of a view with the look of a body cavity, see `camera.tissue`
 
 
 def is_depth(camera: str) -> bool:

@@ -48,6 +48,7 @@ def make(
     segmentation: bool = False,
     samples: int = 1,
     moves: bool = False,
+    look: str = "",
 ) -> Render:
     """Makes `render(geom_xpos, geom_xmat, geom_rgb) -> CameraImage` of a fixed camera.
 
@@ -67,6 +68,7 @@ def make(
       depth, segmentation: True to return these too (of a pixel's last sample).
       samples: rays along each side of a pixel: 1, 2 or 4; 2 smooths outlines at 4 times the cost.
       moves: True if the camera's pose comes with every image.
+      look: of the ground and the light, `tissue.NAME`; empty: the MJCF's.
     """
     for name, value in (("height", height), ("width", width)):
         if value < 1:
@@ -74,10 +76,12 @@ def make(
     if samples not in (1, 2, 4):
         raise ValueError(f"samples: expected 1, 2 or 4 rays a pixel side, got {samples}")
     scene = scenes.read(mj_model, camera, width / height, moves)
+    if look and not scene.textures:
+        raise errors.UsageError("camera", f"a ground with a texture for {look}", "none")
     grid = tiles.grid(scene, height * samples, width * samples)
     if moves and not all(map(texture.is_checker, scene.textures.values())):
         raise errors.UsageError("mj_model", "checkers as textures for a moving camera", "others")
-    still = None if moves else views.fixed(scene, grid)
+    still = None if moves else views.fixed(scene, grid, look)
 
     def render(
         geom_xpos: jax.Array,
@@ -93,7 +97,9 @@ def make(
                 f"got {shape}"
             )
         inputs = [jnp.asarray(v, jnp.float32) for v in (geom_xpos, geom_xmat, geom_rgb)]
-        view = still if pose_world_cam is None else views.moving(scene, grid, pose_world_cam)
+        view = still
+        if pose_world_cam is not None:
+            view = views.moving(scene, grid, pose_world_cam, look)
         if view is None or (still is not None and pose_world_cam is not None):
             got = "none" if pose_world_cam is None else "one"
             raise errors.UsageError("pose_world_cam", "one" if moves else "none", got)

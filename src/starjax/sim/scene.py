@@ -27,7 +27,7 @@ from starjax.sim import (
 )
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
-from starjax.sim.names import SceneNames
+from starjax.sim.names import TISSUE, SceneNames
 from starjax.sim.quiet_mjx import mjx
 from starjax.sim.tasks.base import Task
 from starjax.sim.tools.base import Tool
@@ -131,9 +131,9 @@ def name(
     cameras = tuple(still if one == FIXED else one for one in cameras) or record.cameras[:1]
     observed = [one for one in record.cameras if one != endoscope_camera.NAME]
     for one in cameras:
-        errors.choice(
-            "camera", one, dict.fromkeys([*record.cameras, *derived_views.names(observed)])
-        )
+        scopes = [f"{scope}{TISSUE}" for scope in record.cameras if scope not in observed]
+        views = [*record.cameras, *derived_views.names(observed), *scopes]
+        errors.choice("camera", one, dict.fromkeys(views))
     return SceneNames(task, chosen["arm"], chosen["tool"], cameras)
 
 

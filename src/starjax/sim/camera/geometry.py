@@ -87,6 +87,11 @@ class RenderScene(NamedTuple):
     headlight: Light
     background: np.ndarray
 
+    @property
+    def ground(self) -> int:
+        """Returns the last row with a texture: planes follow the other kinds."""
+        return max(self.textures)
+
     def rows(self, kind: int) -> slice:
         """Returns the rows of one kind."""
         start, stop = np.searchsorted(self.kind, (kind, kind + 1))

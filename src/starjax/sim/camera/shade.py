@@ -45,6 +45,11 @@ def light(
     at, terms = jax.lax.optimization_barrier((at, terms))
 
     textures = {r: look(p) for r, look in view.textures.items()}
+    look, background = view.look, scene.background
+    if look is not None:
+        ground = _between(face, np.flatnonzero(row == scene.ground))
+        background = look.background
+        painted, lamp = jax.lax.optimization_barrier((look.paint(p, shaded), look.lamp(p)))
     word = jnp.zeros_like(face)
     for k in range(3):
         base = _pick(rgb[row, k], at)
@@ -58,7 +63,9 @@ def light(
             lit = jnp.minimum(lit + part, 1.0)  # light by light, as GL's passes clip
         for r, texture in textures.items():
             lit = jnp.where(on[r], lit * texture[k], lit)
-        lit = jnp.where(face < 0, float(scene.background[k]), lit)
+        if look is not None:
+            lit = jnp.where(ground, painted[k], jnp.minimum(lit * lamp, 1.0))
+        lit = jnp.where(face < 0, float(background[k]), lit)
         word |= (lit * 255 + 0.5).astype(jnp.int32) << (8 * k)
     return word
 

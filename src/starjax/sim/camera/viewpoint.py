@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.sim.camera import geometry, texture, tiles
+from starjax.sim.camera import geometry, texture, tiles, tissue
 from starjax.types import Pose
 
 # A texture: visible points x, y, z in the camera frame, `[T, Q]` m each, to red, green and blue.
@@ -25,6 +25,7 @@ class View(NamedTuple):
       R_light_cam: `[3, 3]`, to a frame whose z axis points to the sun, or None without a sun.
       to_sun: x, y, z in the camera frame, or None.
       textures: by row.
+      look: of the textured ground and of the light, or None.
     """
 
     R_cam_world: Any
@@ -32,9 +33,10 @@ class View(NamedTuple):
     R_light_cam: Any
     to_sun: Sequence[Any] | None
     textures: dict[int, Look]
+    look: tissue.Look | None = None
 
 
-def fixed(scene: geometry.RenderScene, grid: tiles.Grid) -> View:
+def fixed(scene: geometry.RenderScene, grid: tiles.Grid, look: str = "") -> View:
     """Makes the view of a camera fixed in the world, for a scene read in its frame."""
     drawn = texture.draw(scene, grid)
     direction = None if scene.sun is None else scene.sun.direction
@@ -43,11 +45,18 @@ def fixed(scene: geometry.RenderScene, grid: tiles.Grid) -> View:
         p_world_cam=jnp.asarray(scene.p_world_cam, jnp.float32),
         R_light_cam=None if direction is None else _frame(-direction),
         to_sun=None if direction is None else [-float(v) for v in direction],
-        textures={row: lambda p, rgb=rgb: rgb for row, rgb in drawn.items()},
+        textures={
+            row: lambda p, rgb=rgb: rgb
+            for row, rgb in drawn.items()
+            if not look or row != scene.ground
+        },
+        look=_look(scene, grid, look, np.eye(3), np.zeros(3)),
     )
 
 
-def moving(scene: geometry.RenderScene, grid: tiles.Grid, pose_world_cam: Pose) -> View:
+def moving(
+    scene: geometry.RenderScene, grid: tiles.Grid, pose_world_cam: Pose, look: str = ""
+) -> View:
     """Makes the view from a pose, for a scene read in the world's frame."""
     R_world_cam, p_world_cam = (jnp.asarray(x, jnp.float32) for x in pose_world_cam)
     R_light_cam = to_sun = None
@@ -64,8 +73,25 @@ def moving(scene: geometry.RenderScene, grid: tiles.Grid, pose_world_cam: Pose) 
         textures={
             row: texture.looker(checker, step, R_world_cam, p_world_cam)
             for row, checker in scene.textures.items()
+            if not look or row != scene.ground
         },
+        look=_look(scene, grid, look, R_world_cam, p_world_cam),
     )
+
+
+def _look(
+    scene: geometry.RenderScene, grid: tiles.Grid, look: str, R_scene_cam: Any, p_scene_cam: Any
+) -> tissue.Look | None:
+    """Makes a look of the ground from the camera's pose in the frame of the scene."""
+    if not look:
+        return None
+    ground = scene.textures[scene.ground]
+    R_geom_scene = jnp.asarray(ground.R_cam_geom.T, jnp.float32)
+    offset = jnp.asarray(p_scene_cam - ground.p_cam_top, jnp.float32)
+    R_geom_cam = jnp.matmul(R_geom_scene, R_scene_cam, precision="highest")
+    p_geom_lens = jnp.matmul(R_geom_scene, offset, precision="highest")
+    step = abs(scene.right - scene.left) / grid.width
+    return tissue.look(step, R_geom_cam, p_geom_lens)
 
 
 def _frame(z: np.ndarray) -> np.ndarray:
