@@ -1,7 +1,7 @@
 """Look of a body cavity: wet tissue with vessels and fat instead of the checkered ground.
 
 Textures are functions of the point on the ground, without a stored image: sums of sines for its
-relief, and bands about the zeros of warped sines for vessels. The lamp sits beside the lens and
+relief, and bands about the zeros of warped sines for vessels. The lamp sits next to the lens and
 moves with it; its light falls off with the distance and towards the edge of its cone.
 """
 
@@ -26,7 +26,7 @@ _VESSELS = (
 _WARP = ((1.1, 37.0, 7.0, 0.9), (2.7, 23.0, 4.0, 2.4), (0.4, 9.0, 0.6, 4.4))  # as folds, mm aside
 _FLESH, _DEEP, _FAT = (0.84, 0.42, 0.38), (0.60, 0.20, 0.20), (0.92, 0.72, 0.45)
 _INK = 0.65  # of a vessel over the flesh
-_CAVITY = (0.13, 0.03, 0.03)  # RGB where no ground is
+_CAVITY = (0.13, 0.03, 0.03)  # RGB of rays that miss the ground
 _FAT_FROM, _FAT_TO = 0.45, 0.8  # of the sum of the slow waves, -1 to 1: edge of fat
 _LAMP = (0.004, 0.002, 0.0)  # m from the lens: right, up, back
 _AMBIENT, _DIFFUSE, _WET = 0.22, 0.85, 0.55
@@ -81,7 +81,7 @@ def look(step: float, R_geom_cam: Any, p_geom_lens: Any) -> Look:
         ground = [sum(R_geom_cam[k, i] * way[i] for i in range(3)) for k in range(3)]
         steep = 1.0 / jnp.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
         facing = jnp.maximum((ground[2] - slope_x * ground[0] - slope_y * ground[1]) * steep, 0.0)
-        # The lamp is beside the lens: the half vector of a reflection is the way to the lamp.
+        # The lamp is next to the lens: the half vector of a reflection is the way to the lamp.
         shine = _WET * facing**_WET_EXPONENT
         diffuse = _AMBIENT + _DIFFUSE * facing * jnp.where(shaded, _SHADE, 1.0)
         rgb = _colours(at, footprint, height)
