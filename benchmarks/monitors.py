@@ -1,26 +1,36 @@
-"""Trials with the runtime monitor's scores, of the packaged policies.
+"""Runtime monitors of the packaged policies: their trials, their results, their place in the files.
 
     python benchmarks/monitors.py silent POLICY STILL_S OUT.safetensors
     python benchmarks/monitors.py gather OUT.npz CALIBRATION STRESS
+    python benchmarks/monitors.py score POLICY TRIALS.npz
+    python benchmarks/monitors.py insert POLICY
 
 `silent` writes a policy whose monitor never raises an alarm: its evaluations record scores before
 a calibration has ended. `gather` joins directories of `starjax calibrate` and `starjax stress`: of
 every evaluation the columns below, as `<evaluation>/<column>`, and the commands' JSON files.
+`score` calibrates a monitor from such a file and writes results/monitor_<POLICY>_gpu.json; `insert`
+puts the monitor of these results into the packaged file. Neither needs a GPU.
 """
 
+import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import _timing
 import numpy as np
 
-from starjax.evaluation import trials
+from starjax.evaluation import alarms, statistics, trials
 from starjax.monitor import calibrate, scores
 from starjax.policies import packaged, policy_file
 from starjax.runtime import files
 from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.tasks.peg_transfer_bimanual.task import DROPPED_STEPS
 
 COLUMNS = ("success", "lost", "invalid", "steps", "scores")
 _NEVER = 1e9  # a threshold beyond any score
+_ALPHA = 0.05
 
 
 def silent(policy: str, still_s: str, out: str) -> None:
@@ -54,6 +64,73 @@ def gather(out: str, *folders: str) -> None:
     files.write_npz(Path(out), arrays)
 
 
+def score(policy: str, file: str) -> None:
+    """Calibrates a monitor; writes its figures in the test's trials and under disturbances."""
+    arrays = files.read_npz(Path(file))
+    made, stress = (json.loads(arrays[f"{name}.json"].tobytes()) for name in ("monitor", "stress"))
+    whole = evaluation(arrays, "trials")
+    fits, calibrates, tests = calibrate.parts(len(whole.success))
+    settings = scores.ScoreSettings(**made["monitor"]["settings"])
+    monitor = calibrate.calibrate(
+        whole.scores[whole.success & fits],
+        whole.scores[whole.success & calibrates],
+        _ALPHA,
+        settings,
+        made["monitor"]["digest"],
+    )
+    rows = {"nothing, trocars of the test": figures(_only(whole, tests), monitor)}
+    for name, kind in stress["disturbances"].items():
+        for level in kind["levels"]:
+            is_zero = float(level) == 0
+            trials_of = evaluation(arrays, "0" if is_zero else f"{name}-{level}")
+            label = "nothing, the twelve trocars" if is_zero else f"{name} {level} {kind['unit']}"
+            rows.setdefault(label.strip(), figures(trials_of, monitor))
+    kept = ("version", "commit", "dirty", "source", "versions", "hardware")
+    content = {
+        "policy": policy,
+        "commands": [made["command"], stress["command"]],
+        **{name: made[name] for name in kept if name in made},
+        "monitor": calibrate.to_json(monitor),
+        "rows": rows,
+    }
+    files.write_json(_timing.RESULTS / f"monitor_{policy}_gpu.json", content)
+    for label, row in rows.items():
+        print(label, json.dumps({k: v for k, v in row.items() if k != "alarm_s"}))
+
+
+def figures(table: Any, monitor: calibrate.Monitor) -> dict[str, Any]:
+    """Returns success, alarms, and the times of alarms on failures, null without one."""
+    times, _ = calibrate.first_alarms(monitor, table.scores)
+    raised = [round(float(x), 2) if np.isfinite(x) else None for x in times[~table.success]]
+    # A trial is lost some control steps after the object left the last tool.
+    drop_s = (table.steps - DROPPED_STEPS) / CONTROL_HZ
+    return {
+        "strict": statistics.rate(table.success),
+        "alarms": alarms.compose(table, monitor),
+        "before_drop": statistics.rate((times < drop_s)[table.lost]),
+        "alarm_s": raised,
+    }
+
+
+def insert(policy: str) -> None:
+    """Puts the monitor of the committed results into the packaged file."""
+    result = files.read_json(_timing.RESULTS / f"monitor_{policy}_gpu.json")
+    path = packaged.find("policy", policy)
+    trained = policy_file.load(path)
+    monitor = calibrate.from_json(result["monitor"])
+    half = policy_file.is_half(trained.params)
+    policy_file.save(path, trained._replace(monitor=monitor), half=half)
+
+
+def evaluation(arrays: dict[str, np.ndarray], name: str) -> Any:
+    """Returns the columns of one gathered evaluation."""
+    return SimpleNamespace(**{column: arrays[f"{name}/{column}"] for column in COLUMNS})
+
+
+def _only(table: Any, rows: np.ndarray) -> Any:
+    return SimpleNamespace(**{name: column[rows] for name, column in vars(table).items()})
+
+
 def _columns(folder: Path) -> dict[str, np.ndarray]:
     chunks = [files.read_npz(chunk) for chunk in sorted(folder.glob("chunk_*.npz"))]
     table = trials.join([trials.from_columns(chunk) for chunk in chunks])
@@ -61,7 +138,7 @@ def _columns(folder: Path) -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
-    commands = {"silent": silent, "gather": gather}
-    if len(sys.argv) < 4 or sys.argv[1] not in commands:
+    commands = {"silent": silent, "gather": gather, "score": score, "insert": insert}
+    if len(sys.argv) < 3 or sys.argv[1] not in commands:
         sys.exit(__doc__)
     commands[sys.argv[1]](*sys.argv[2:])

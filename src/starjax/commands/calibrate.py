@@ -20,9 +20,6 @@ prediction, and the third tests the false alarm rate. Rerun the same command to 
 Examples:
   starjax calibrate --policy compact --out watched.safetensors"""
 
-# Fractions of the trials for scale and threshold; the rest tests the monitor.
-_FIT, _CALIBRATE = 0.15, 0.425
-
 
 @dataclasses.dataclass(frozen=True)
 class CalibrateArgs:
@@ -48,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
     started = session.start("calibrate", argv, folder)
 
     from starjax.commands import policy_evaluation
-    from starjax.evaluation import alarms, sweep
+    from starjax.evaluation import alarms, sweep, trials
     from starjax.monitor import calibrate
     from starjax.policies import policy_file
 
@@ -65,7 +62,9 @@ def main(argv: Sequence[str]) -> int:
         )
         if share.is_first:
             stored = policy_file.load(path.file)
-            fitted, successes, test = _divide(table)
+            fits, calibrates, tests = calibrate.parts(len(table.trial))
+            fitted, successes = (table.scores[table.success & part] for part in (fits, calibrates))
+            test = trials.select(table, tests)
             digest = policy_file.monitor_digest(stored.params)
             monitor = calibrate.calibrate(fitted, successes, args.alpha, settings, digest)
             out, is_half = Path(args.out), policy_file.is_half(stored.params)
@@ -100,19 +99,6 @@ def _score_settings(args: CalibrateArgs, who: Any) -> Any:
 
     execute, control_hz = who.trained.policy.execute, who.env.control_hz
     return ScoreSettings(execute, control_hz, max(1, round(args.still_s * control_hz / execute)))
-
-
-def _divide(table: Any) -> tuple[Any, Any, Any]:
-    """Returns the scores of the successes for scale and threshold, and the table of the test."""
-    import numpy as np
-
-    from starjax.evaluation import trials
-
-    place = np.arange(len(table.trial)) / len(table.trial)
-    fits = table.success & (place < _FIT)
-    calibrates = table.success & (place >= _FIT) & (place < _FIT + _CALIBRATE)
-    test = trials.select(table, place >= _FIT + _CALIBRATE)
-    return table.scores[fits], table.scores[calibrates], test
 
 
 def _outcome(monitor: Any, figures: dict[str, Any]) -> str:

@@ -18,6 +18,8 @@ from starjax import errors
 from starjax.monitor import scores as scores_lib
 from starjax.monitor.scores import ScoreSettings
 
+# Fractions of the trials for scale and threshold; the rest tests the monitor.
+_FIT, _CALIBRATE = 0.15, 0.425
 _SPREAD = (0.1, 0.9)  # quantiles whose distance is a score's width
 _TINY = 1e-9  # m and s, the least width: against a division by zero
 _ROUNDING = 1e-9  # of a rank: (n + 1)(1 - alpha) may exceed an integer by rounding
@@ -78,6 +80,13 @@ def threshold(values: np.ndarray, alpha: float) -> float:
     """Returns the ceil((n + 1)(1 - alpha))-th smallest of n values, infinity if n is too small."""
     rank = math.ceil((len(values) + 1) * (1.0 - alpha) - _ROUNDING)
     return float(np.sort(values)[rank - 1]) if rank <= len(values) else math.inf
+
+
+def parts(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Divides trials, `[count]` bool each: for the scale, for the threshold, for the test."""
+    place = np.arange(count) / count
+    for_scale, is_test = place < _FIT, place >= _FIT + _CALIBRATE
+    return for_scale, ~for_scale & ~is_test, is_test
 
 
 def required(alpha: float) -> int:

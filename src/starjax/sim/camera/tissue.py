@@ -37,7 +37,7 @@ _BRIGHTEST = 1.25  # of the light at the middle, nearer to the lamp
 
 
 class Look(NamedTuple):
-    """What a look changes in one image.
+    """The changes of a look in one image.
 
     Attributes:
       paint: (points x, y, z in the camera frame, in shadow) `[T, Q]` each -> red, green and blue
