@@ -62,6 +62,7 @@ def main(argv: Sequence[str]) -> int:
         )
         if share.is_first:
             stored = policy_file.load(path.file)
+            assert table.scores is not None
             fits, calibrates, tests = calibrate.parts(len(table.trial))
             fitted, successes = (table.scores[table.success & part] for part in (fits, calibrates))
             test = trials.select(table, tests)
