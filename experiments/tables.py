@@ -7,8 +7,9 @@ A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<cl
 claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list of claims);
 `presets` (from their values); `leaderboard`, `leaderboard_apart` and `elsewhere` (the trocar
 benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
-`six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_randomised`, `proposition`,
-`finetune`, `ppo`, `ppo_gpu`, `sb3`, `through_lerobot`, `held_out`, `larger_than_memory`.
+`six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`, `stress_randomised`,
+`proposition`, `finetune`, `ppo`, `ppo_gpu`, `sb3`, `through_lerobot`, `held_out`,
+`larger_than_memory`.
 """
 
 import re
