@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import config
+from starjax import config, errors
 from starjax.commands import demonstrations, presets
 from starjax.rollouts import sharing
 from starjax.runtime import sources
+from starjax.sim import registries
 
 SMOKE = presets.PRESETS["smoke"]
 
@@ -29,6 +30,28 @@ def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
     with mistakes.of("demos.max_steps", 1) as caught:
         missing()
     assert "0 of 10" in caught.value.hint
+
+
+def test_an_expert_that_fails_for_its_tasks_draws_is_a_mistake_of_the_draws(tmp_path, monkeypatch):
+    from starjax.data import demos
+    from starjax.rollouts import success_quota
+    from starjax.sim import task_draws
+
+    def collect(*_, **settings):
+        raise success_quota.ExpertFailed("got 0 of 10 at trocar 0")
+
+    monkeypatch.setattr(demos, "collect", collect)
+    draws = iter([task_draws.DrawFault("label", "is not finite at [0]")])
+    monkeypatch.setattr(task_draws, "faults", lambda scene: draws)
+    monkeypatch.delitem(registries.tasks.built_in, "reach")  # as of another package
+    env = stubs.make_env()
+    env.scene.task = env.task
+    _, missing, _ = demonstrations.plan(
+        dataclasses.replace(SMOKE, out=str(tmp_path)), env, sharing.ALONE
+    )
+    with pytest.raises(errors.UsageError) as caught:
+        missing()
+    assert caught.value.argument.startswith("task reach: label (stubs.py:")
 
 
 @pytest.mark.parametrize(("seen", "expert", "least"), [(1, "one_wall", 0), (8, "", 6), (2, "", 9)])

@@ -13,7 +13,7 @@ import pytest
 from starjax import errors, rcm
 from starjax.commands import check_command
 from starjax.commands.part_checks import tasks as checks
-from starjax.sim import contract, scene
+from starjax.sim import contract, scene, task_draws
 from starjax.sim.tasks.base import Capsules
 from starjax.types import Agent, Pose
 
@@ -137,8 +137,13 @@ def test_draws_that_are_not_of_the_key_or_not_finite_are_faults(made):
     task = made.task._replace(tips=lambda *_: jnp.full((1, 3), float(next(count))))
     assert any(fault.startswith("tips") for fault in checks._draws(made._replace(task=task)))
     nan = made.task._replace(place_objects=lambda bound, qpos, layout: qpos * jnp.nan)
-    assert [f.split()[0] for f in checks._draws(made._replace(task=nan))] == ["place_objects"]
-    assert not list(checks._draws(made))
+    scene = made._replace(task=nan)
+    assert [f.split()[0] for f in checks._draws(scene)] == ["place_objects"]
+    with pytest.raises(errors.UsageError) as caught:
+        task_draws.require_finite(scene)
+    assert f"task touch: place_objects ({HERE}:" in caught.value.argument
+    assert not checks._draws(made)
+    task_draws.require_finite(made)
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
     from starjax.rollouts import agent, placement, success_quota, trocars
     from starjax.runtime import precompile, processes
     from starjax.sim import env as sim_env
+    from starjax.sim import registries, task_draws
     from starjax.training import randomise
 
     env, max_levels = randomised(config, env)
@@ -96,6 +97,8 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
                     root, env, expert, chosen, settings, layout=layout, report=messages.indented
                 )
         except success_quota.ExpertFailed as error:
+            if task.name not in registries.tasks.built_in:
+                task_draws.require_finite(env.scene)
             raise errors.UsageError(
                 "demos.max_steps",
                 "enough control steps for the expert",

@@ -12,7 +12,7 @@ from starjax import config, rcm
 from starjax.commands.part_checks.base import FAILED, NOTE, Check, attempt, counted, failed, verdict
 from starjax.evaluation import expert as episodes
 from starjax.rollouts.success_quota import MIN_SUCCESS_RATE
-from starjax.sim import contract, physics, registries, sampling
+from starjax.sim import contract, physics, registries, sampling, task_draws
 from starjax.sim import env as envs
 from starjax.sim.scene import Scene
 from starjax.sim.tasks.base import CONTROL_HZ, SimReadings, Task
@@ -120,28 +120,9 @@ def _collide(m: mujoco.MjModel, a: int, b: int) -> bool:
     )
 
 
-def _draws(scene: Scene) -> Iterator[str]:
-    """Yields draws that differ between two resets with one key, or are not finite."""
-    task, key = scene.task, jax.random.key(SEED)
-
-    def reset() -> dict[str, Any]:
-        layout = task.sample(scene.bound, key)
-        qpos = jnp.asarray(scene.mj_model.qpos0, jnp.float32)
-        return {
-            "sample": layout,
-            "tips": task.tips(scene.bound, layout, jnp.asarray(scene.p_world_ref)),
-            "place_objects": task.place_objects(scene.bound, qpos, layout),
-            "label": task.label(layout),
-        }
-
-    rows = (jax.tree_util.tree_leaves_with_path(reset()) for _ in range(2))
-    for (path, first), (_, second) in zip(*rows, strict=True):
-        name, same = path[0].key, np.array_equal(first, second, equal_nan=True)
-        where = f"{name}{jax.tree_util.keystr(path[1:])}"
-        if not same:
-            yield f"{where} differs between two resets with one key"
-        elif not np.isfinite(np.asarray(first)).all():
-            yield f"{where} is not finite"
+def _draws(scene: Scene) -> list[str]:
+    """Returns draws that differ between two resets with one key, or are not finite."""
+    return [f"{function} {text}" for function, text in task_draws.faults(scene)]
 
 
 def _expert(env: envs.Env, variant: str, n: int) -> Iterator[Check]:
