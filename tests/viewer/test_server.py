@@ -102,9 +102,32 @@ def test_a_sweep_is_dots_at_its_trocars(page):
     (slot,) = registries.tasks.get(found.task).slots
     for (one,) in found.p_world_trocar[:20]:
         np.testing.assert_allclose(handles.within(slot, one), one, atol=1e-5)
-    dots = success_map.add(page.scene, found)
+    dots, floor = success_map.add(page.scene, found)
     assert len(dots.points) == len(found.success)
+    assert floor.position[2] > 0.0
     dots.remove()
+    floor.remove()
+
+
+def test_the_floor_of_a_sweep_is_the_rate_nearby():
+    """Failures at positive x and y, successes elsewhere: orange in that corner, teal in others."""
+    x, y = np.meshgrid(*2 * [np.linspace(-0.03, 0.03, 13)])
+    p = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.15)], -1)[:, None]
+    has_failed = (p[:, 0, :2] > 0).all(-1)
+    image, bounds = success_map.floor(success_map.SuccessMap("reach", p, ~has_failed))
+
+    def at(place):
+        column, row = ((place - bounds[0]) / (bounds[1] - bounds[0]) * image.shape[1::-1]).astype(
+            int
+        )
+        return image[row, column].astype(int)
+
+    failed, *kept = (at(np.array(xy)) for xy in [(0.02, 0.02), (-0.02, 0.02), (0.02, -0.02)])
+    assert failed[0] > failed[2] and failed[3] > 200
+    for pixel in kept:
+        assert pixel[1] > pixel[0] and 60 < pixel[3] < 100
+    assert image[0, 0, 3] < 20  # far from all trials
+    assert abs(bounds + bounds[::-1]).max() < 1e-9
 
 
 def test_pictures_are_enlarged_without_blocks():

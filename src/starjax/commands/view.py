@@ -40,7 +40,7 @@ class ViewArgs:
     trials: str = ""
     # second agent at the same trial: expert, or a policy as above
     compare_with: str = ""
-    # sweep.json of starjax sweep, whose trials are dots at their trocars; default: the one in --run
+    # sweep.json of starjax sweep, whose trials are dots above a map; default: the one in --run
     sweep: str = ""
     task: str = config_lib.DEFAULT_TASK  # task of the expert
     arm: str = ""  # robot instead of those of the training

@@ -5,12 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from starjax.evaluation import rate_map
 from starjax.evaluation.result import Trial
 from starjax.report import captions, compare, outcomes, results, stats, style
 
 _BIN = 0.005  # m of distance pooled in one point
-_SMOOTH = 0.008  # m, kernel width of the heat map
-_FAR = 2.0  # kernel widths from the nearest trocar beyond which the map is blank
 _DISC = 0.05  # m, radius of Eq. 19's disc
 _LABEL_OFFSET = (5, 4)  # points from a dot to its label
 _MIN_PANELS = 2  # panels across the page: a single one would fill it
@@ -171,12 +170,8 @@ def _from_above(trials: Sequence[Trial]) -> np.ndarray:
 
 def _heat(axis: Any, at: np.ndarray, rates: np.ndarray, weights: np.ndarray) -> Any:
     """Draws the kernel mean of `rates [N]` at `at [N, 2]` mm, weighted by trials."""
-    line = 1e3 * np.linspace(-_DISC, _DISC, 161)
-    x, y = np.meshgrid(line, line)
-    near = ((x[..., None] - at[:, 0]) ** 2 + (y[..., None] - at[:, 1]) ** 2) / (1e3 * _SMOOTH) ** 2
-    kernel = np.exp(-near / 2) * weights
-    mean = (kernel @ rates) / np.maximum(kernel.sum(-1), 1e-12)
-    far = near.min(-1) > _FAR**2
-    mean[far | (np.hypot(x, y) > 1e3 * _DISC)] = np.nan
-    edges = (line[0], line[-1], line[0], line[-1])
+    line = np.linspace(-_DISC, _DISC, 161)
+    mean = rate_map.around(line, line, 1e-3 * at, rates, weights)
+    mean[np.hypot(*np.meshgrid(line, line)) > _DISC] = np.nan
+    edges = tuple(1e3 * line[i] for i in (0, -1, 0, -1))
     return axis.imshow(mean, extent=edges, origin="lower", cmap=style.MAP, vmin=0, vmax=1)

@@ -154,7 +154,7 @@ class Rollouts:
         self.trocars = TrocarControls(server, env.task)
         self._map = []
         if sweep and sweep.task == env.task.name:
-            self._map += [success_map.add(server.scene, sweep)]
+            self._map += success_map.add(server.scene, sweep)
             self._map += [gui.add_markdown(success_map.LEGEND)]
         self._panel, tab = page.side_panel(gui, "Measured")
         with tab:
