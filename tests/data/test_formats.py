@@ -324,6 +324,13 @@ def test_a_stopped_export_leaves_nothing(roots, tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_format_that_writes_nothing_is_named(roots, tmp_path):
+    form = base.FORMATS.get("zarr")._replace(write=lambda path, source, video: None)
+    with pytest.raises(errors.UsageError) as caught:
+        exchange.export(exchange.source(roots / "state", form), tmp_path / "out", form)
+    assert "write (test_formats.py:" in caught.value.argument and not list(tmp_path.iterdir())
+
+
 def _key(origin):
     origin["records"][0]["key"] = "../../escaped"
 
