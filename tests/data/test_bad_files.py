@@ -281,6 +281,20 @@ def test_links_into_the_cache_of_the_hub_are_followed(copy, tmp_path):
     assert "a link to" in refused(snapshot, "lerobot")
 
 
+def test_a_video_that_starts_off_the_frames_before_is_noted(copy):
+    """As after merges that add up durations instead of frames: the neighbour's images."""
+    path = copy("lerobot")
+    with base.open_dataset(path, "lerobot") as source:
+        assert not source.notes
+        hz, length = source.hz, source.lengths[0]
+    name = "videos/observation.images.camera/from_timestamp"
+    off = [0.0, (length + 1) / hz]
+    rewritten(path / EPISODES, name, lambda cells: pa.array(off, cells.type))
+    with base.open_dataset(path, "lerobot") as source:
+        (note,) = source.notes
+    assert f"frame {length + 1}" in note and "file-000.mp4" in note
+
+
 def test_other_kinds_of_columns_are_left_out_with_a_note(copy):
     path = copy("lerobot")
     features = info(path)["features"]

@@ -28,7 +28,7 @@ from strangers import (
 
 from starjax import errors, rcm
 from starjax.data import anomalies, load, schema, store
-from starjax.data.formats import base, exchange, foreign, mapping, motion, trocars
+from starjax.data.formats import base, exchange, foreign, mapping, motion, tip_poses, trocars
 from starjax.data.formats.mapping import ArmColumns, CameraColumn, Map, ShaftColumns
 
 
@@ -158,6 +158,39 @@ def test_a_robots_joints_give_its_tip(tmp_path):
         bad = structs.replace(MAP, arms=(structs.replace(arm, **changed),))
         with mistakes.of(argument):
             motion.read(arrays, bad, 30.0, tmp_path)
+
+
+URDF = """
+<robot name="r">
+  <link name="base"/>
+  <link name="l1"><inertial><mass value="0"/>
+    <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial></link>
+  <link name="tool"/>
+  <joint name="j1" type="revolute"><parent link="base"/><child link="l1"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="end" type="fixed"><parent link="l1"/><child link="tool"/><origin xyz="0.1 0 0.2"/>
+  </joint>
+</robot>
+"""
+
+
+def test_a_urdfs_tip_may_be_at_a_fixed_joint_and_its_links_without_mass(tmp_path):
+    (tmp_path / "r.urdf").write_text(URDF)
+    angles = np.linspace(0.0, 1.0, 9)[:, None]
+    arm = ArmColumns(joints="q", model="r.urdf", body="tool")
+    _, p = tip_poses._kinematics(angles, arm, arm.body, tmp_path / arm.model)
+    c, s = np.cos(angles), np.sin(angles)
+    np.testing.assert_allclose(p, np.hstack([0.1 * c, 0.1 * s, 0.2 + 0 * c]), atol=1e-9)
+
+
+def test_images_that_lose_their_ratio_of_sides_are_named():
+    given = source(images=True)  # 12 x 16
+    cameras = {"camera": CameraColumn(column="image", size=8)}
+    (line,) = foreign.squeezed(given, structs.replace(MAP, cameras=cameras))
+    assert "camera" in line and "12 x 16" in line
+    for kept in ({"crop": (0, 2, 12, 12)}, {"size": 0}):
+        camera = structs.replace(cameras["camera"], **kept)
+        assert not list(foreign.squeezed(given, structs.replace(MAP, cameras={"camera": camera})))
 
 
 def test_uneven_times_with_small_gaps_are_filled_in_and_said(tmp_path):

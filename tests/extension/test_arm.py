@@ -52,6 +52,17 @@ def test_an_arm_of_another_package_stands_in_a_scene_and_holds_its_tool(package)
     np.testing.assert_allclose(data.site("arm0/tool/tcp").xpos, before, atol=1e-4)
 
 
+def test_a_record_whose_lengths_differ_from_the_joints_names_the_field(package):
+    arm = registries.arms.get(package)
+    with pytest.raises(errors.UsageError) as caught:
+        robot.read(arm._replace(max_speed=arm.max_speed[1:]))
+    assert caught.value.argument == f"arm {package}: max_speed"
+    mounted = {key: mount._replace(home=mount.home[1:]) for key, mount in arm.mounts.items()}
+    with pytest.raises(errors.UsageError) as caught:
+        robot.read(arm._replace(mounts=mounted))
+    assert caught.value.argument.startswith(f"arm {package}: home with ")
+
+
 @pytest.mark.parametrize("flange", [EULER, 'quat="0 1 0 0"', 'zaxis="0 0.6 -0.8"', ""])
 def test_a_scene_turns_the_tool_on_the_flange_as_the_search_did(package, tmp_path, flange):
     edit(tmp_path / "my_arms" / "gantry.xml", EULER, flange)

@@ -95,6 +95,8 @@ def _mapped(source: Any, args: ImportArgs, out: Path) -> int:
     columns = structs.replace(columns, **{key: value for key, value in given.items() if value})
     if map_path.parent == ready.FOLDER:
         print(f"mapping {name}: {columns.about}")
+    mapping.check(columns, source)
+    source = source._replace(notes=[*source.notes, *foreign.squeezed(source, columns)])
     with progress.track("Import", 2 * len(source.lengths), unit="readings") as advance:
         imported = foreign.import_mapped(source, columns, out, map_path.parent, advance)
     for line in [*source.notes, *imported.notes][:_SHOWN]:

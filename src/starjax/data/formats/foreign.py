@@ -133,6 +133,17 @@ def _fits(source: Source, mapping: Map, task: Any) -> None:
         raise errors.UsageError("--map", "cameras or a state, to learn from", "neither")
 
 
+def squeezed(source: Source, mapping: Map) -> Iterator[str]:
+    """Yields a line for every camera whose images change their ratio of sides."""
+    for name, camera in mapping.cameras.items():
+        height, width = camera.crop[2:] or source.columns[camera.column].shape[:2]
+        if camera.size and height != width:
+            yield (
+                f"images of camera {name} are squeezed from {height} x {width} to a square: crop "
+                "keeps their shape"
+            )
+
+
 def _describe(
     source: Source, mapping: Map, task: Any, kept: list[Kept], centres: np.ndarray, hz: float
 ) -> dict[str, Any]:

@@ -80,6 +80,7 @@ def _open(path: Path) -> Iterator[Source]:
             notes.append(f"{name}: {feature['dtype']} {feature['shape']} is not read; omitted")
     cameras = [name for name, kind in kinds.items() if kind == "video"]
     places = list(_READERS[version[:3]](path, info, cameras))
+    notes += _shifted(places, hz)
 
     def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
         place = places[episode]
@@ -112,6 +113,22 @@ def _open(path: Path) -> Iterator[Source]:
 
     splits = lerobot_meta.splits(info, len(places))
     yield Source(hz, lengths, columns, read, origin, task, robot, notes, splits, texts_of)
+
+
+def _shifted(places: list[_Place], hz: float) -> Iterator[str]:
+    """Yields notes on videos in which an episode begins where the one before does not end."""
+    files_of: dict[Path, list[tuple[float, int, int]]] = {}
+    for place in places:
+        for file, first in place.videos.values():
+            files_of.setdefault(file, []).append((first, place.length, place.number))
+    for file, rows in files_of.items():
+        frame = 0
+        for first, length, number in sorted(rows):
+            if (at := round(first * hz)) != frame:
+                where = "/".join(file.parts[-4:])
+                yield f"{where}: episode {number} begins at frame {at}, where {frame} is expected"
+                break
+            frame = at + length
 
 
 def _column(feature: dict[str, Any]) -> Column | None:

@@ -15,6 +15,7 @@ from starjax.data.formats import mapping as maps
 from starjax.data.formats.mapping import ArmColumns, Columns, Map, Quaternion, Vector
 
 INSTRUMENTS = {"large_needle_driver": rcm.LARGE_NEEDLE_DRIVER, "prograsp": rcm.PROGRASP}
+_TINY = 1e-6  # kg and kg m^2 of a model's bodies, at least
 _UNIT = 0.1  # by which a quaternion's length may be off
 
 
@@ -174,7 +175,11 @@ def _model(path: Path, joints: tuple[str, ...], tip: str, count: int) -> tuple:
     import mujoco
 
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
+        # Kinematics alone: links at fixed joints stay, masses and inertias are of no account.
+        spec.compiler.fusestatic, spec.compiler.balanceinertia = False, True
+        spec.compiler.boundmass = spec.compiler.boundinertia = _TINY
+        model = spec.compile()
     except ValueError as error:
         raise errors.UsageError("model", "an MJCF or URDF", f"{path}: {error}") from error
     known = [model.joint(i).name for i in range(model.njnt)]
