@@ -50,6 +50,7 @@ def test_a_choice_suggests_the_nearest_name():
         ("needle_pik", "did you mean needle_pick?"),
         ("Reach", "did you mean reach?"),
         ("handover", "did you mean needle_handover?"),
+        ("bimanual", "did you mean peg_transfer_bimanual?"),
         ("x", ""),
     ],
 )

@@ -1,5 +1,7 @@
 """Environments with an export's columns, and those whose arrays stay on the device."""
 
+import os
+
 import jax
 import mistakes
 import numpy as np
@@ -133,3 +135,12 @@ def test_a_forked_process_says_to_spawn(monkeypatch):
     with pytest.raises(Exception, match="spawn") as caught:
         lanes.reset(seed=0)
     assert type(caught.value)(caught.value)  # as Gymnasium raises a worker's error anew
+
+
+def test_a_fork_after_jax_has_started_is_noticed():
+    jax.devices()
+    pid = os.fork()
+    if not pid:
+        os._exit(int(forked._was_started))
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 1
+    forked.refuse()  # this one was not forked

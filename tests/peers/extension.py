@@ -7,6 +7,7 @@ a disturbance, a method, a preset, and a policy that is a program. The arm is th
 docs/howto/add-arm.md.
 """
 
+import json
 import os
 import pathlib
 import subprocess
@@ -34,11 +35,15 @@ COMMANDS = {
     "check learner": ["check", "scaled"],
     "check format": ["check", "arrays"],
     "check disturbance": ["check", "tremor"],
+    "check method": ["check", "blind"],
+    "check preset": ["check", "brief"],
+    "check policy": ["check", "opener"],
 }
 
 
 def main(folder: pathlib.Path) -> int:
     """Runs every command; returns 1 if one failed."""
+    begun = time.monotonic()
     site = folder / "site"
     site.mkdir(parents=True)
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps"]
@@ -49,13 +54,13 @@ def main(folder: pathlib.Path) -> int:
     failed = []
 
     def call(name: str, words: list[str]) -> None:
-        begun = time.monotonic()
+        start = time.monotonic()
         done = subprocess.run(
             [sys.executable, "-m", "starjax", *words],
             cwd=folder, env=environment, capture_output=True, text=True, check=False,
         )  # fmt: skip
         lines = [*done.stdout.splitlines(), *done.stderr.splitlines()]
-        print(f"{name}: code {done.returncode}, {time.monotonic() - begun:.0f} s", flush=True)
+        print(f"{name}: code {done.returncode}, {time.monotonic() - start:.0f} s", flush=True)
         print("\n".join(f"    {line}" for line in lines if line.strip()), flush=True)
         failed.extend([name] * (done.returncode != 0))
 
@@ -64,7 +69,15 @@ def main(folder: pathlib.Path) -> int:
     for dataset in (folder / "run").glob("demos-*"):
         call("export", ["export", str(dataset), "tables", "--format", "arrays"])
         call("import", ["import", "tables", "back"])
-    print(f"failed: {', '.join(failed)}" if failed else "all passed")
+    # An edit of the package makes other demonstrations, which name its version.
+    task = site / "lab" / "lid.py"
+    task.write_text(task.read_text().replace("OPEN = 1.0", "OPEN = 0.9"))
+    call("collect edited", ["collect", *TRAIN[1:5], "--out", "run"])
+    datasets = [json.loads(file.read_text()) for file in folder.glob("run/demos-*/dataset.json")]
+    failed += ["other demonstrations"] * (len(datasets) != 2)
+    failed += ["version"] * any(about["versions"].get("lab") != "0.1" for about in datasets)
+    verdict = f"failed: {', '.join(failed)}" if failed else "all passed"
+    print(f"{verdict}, {time.monotonic() - begun:.0f} s")
     return int(bool(failed))
 
 

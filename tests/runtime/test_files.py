@@ -63,6 +63,13 @@ def test_objects_and_nan_are_refused(tmp_path):
         files.write_json(tmp_path / "x.json", float("nan"))
 
 
+@pytest.mark.parametrize("text", ["[" * 100_000, "{", "[1"])
+def test_a_file_that_is_no_json_is_named(tmp_path, text):
+    (tmp_path / "x.json").write_text(text)
+    with pytest.raises(ValueError, match=r"x\.json"):
+        files.read_json(tmp_path / "x.json")
+
+
 def test_space_is_checked_before_it_is_needed(tmp_path):
     with pytest.raises(files.StorageError, match="the disk has"):
         files.require_writable(tmp_path, free_bytes=1 << 60)

@@ -22,7 +22,7 @@ the first of which is zero; all levels run the same trials. Rerun the same comma
 Examples:
   starjax stress --policy compact --disturbance breathing smoke
   starjax stress --policy compact --disturbance camera=5 blood=0.05
-  starjax stress runs/cpu/stardiff --disturbance trocar_offset --levels 0 0.002 0.005"""
+  starjax stress runs/cpu/stardiff --disturbance trocar_offset --levels 0 0.005"""
 
 
 _TRIALS = config_lib.EvalConfig(trials=4, time_limit_s=30.0, video_trials=0)
