@@ -19,7 +19,7 @@ class DrawFault(NamedTuple):
 
     Attributes:
       function: its name in the task's record.
-      text: the part of its result, and what is wrong.
+      text: the part of its result, and the fault.
     """
 
     function: str
