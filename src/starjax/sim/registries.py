@@ -78,6 +78,8 @@ rescuers = Registry(
                 "peg_transfer_bimanual",
             )
         },
+        "needle_drive": "starjax.sim.tasks.needle_drive.rescue:RESCUER",
+        "needle_drive_sh": "starjax.sim.tasks.needle_drive.rescue:SMALL",
         "peg_transfer.one_wall": "starjax.sim.tasks.peg_transfer.rescue:WITH_ONE_WALL",
     },
     "starjax.sim.tasks.rescue:Rescuer",

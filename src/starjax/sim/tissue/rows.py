@@ -24,7 +24,7 @@ ACCURACY = 1e-5  # relative, of the impulses
 
 
 class ForceRows(NamedTuple):
-    """ForceRows E; one with neither stiffness nor damping is absent.
+    """Rows E of forces; one with neither stiffness nor damping is absent.
 
     Attributes:
       J: `[E, 6]`.

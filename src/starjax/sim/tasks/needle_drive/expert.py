@@ -2,7 +2,7 @@
 
 It commands the needle's poses on the bite's path; the tip follows from the grasp as it is measured
 when a phase begins, and the wrist's angles from the measured trocar. It is disturbed on purpose on
-its way to the pad.
+its way to the pad. A needle that is off its path returns to it on the arc.
 """
 
 from typing import Any
@@ -18,20 +18,22 @@ from starjax.sim import ik
 from starjax.sim.state import EnvState
 from starjax.sim.tasks import phases, scripting
 from starjax.sim.tasks.needle_drive import task
+from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE
 from starjax.sim.tissue import needle as needles
 from starjax.sim.tissue.needle import Needle
 from starjax.types import Agent, Command, Pose
 
-APPROACH, DESCEND, DRIVE, HOLD = range(4)
+DRIVE, HOLD = range(3, 5)
 TIMING = phases.PhaseTable(
-    duration=(1.8, 1.0, 0.0, 1.0),
-    speed=(0.03, 0.02, 1.0, 1.0),
-    jaws=(-1.0, -1.0, -1.0, -1.0),
+    duration=(0.5, 1.8, 1.0, 0.0, 1.0),
+    speed=(0.04, 0.03, 0.02, 1.0, 1.0),
+    jaws=(-1.0, -1.0, -1.0, -1.0, -1.0),
     tempo=(0.85, 1.2),
 )
 WRIST = rcm.LARGE_NEEDLE_DRIVER  # of the task's tool
-DISTURBANCE = (1.0, 0.5, 0.0, 0.0)  # its weight in each phase
+DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.0)  # its weight in each phase
 DEVIATION = (0.0012, 0.0012, 0.0012, 0.0)  # m, of the position
+HIGH = 0.04  # m, of the tip: there the needle may turn
 HOVER = 0.015  # m above the start of the arc
 BEFORE = float(np.deg2rad(10.0))  # rad on the arc from there to the entry
 EMERGE = 1.2 * task.EMERGED  # m of wire past the exit
@@ -75,9 +77,8 @@ def agent(size: Needle) -> Agent:
             Rotation.from_rotvec(way).as_matrix() @ script.R_from,
             script.start + share * (script.goal - script.start),
         )
-        turn = script.turn + share * (_end(size, state) - script.turn)
-        on_arc = _tip(needles.pose_on(size, state.layout.bite, turn), script.held)
         drives = script.phase == DRIVE
+        on_arc = _on_arc(size, script, share, state)
         tip = jax.tree.map(lambda a, b: jnp.where(drives, a, b), on_arc, straight)
         noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
         script = script.replace(at=tip.p, R=tip.R, noise=noise)
@@ -96,7 +97,8 @@ def enter(size: Needle, script: DriveScript, phase: jax.Array, state: EnvState) 
     start = _tip(needles.pose_on(size, bite, -half - BEFORE), held)
     stays = Pose(script.R, script.at)
     above = start.p + jnp.array([0.0, 0.0, HOVER])
-    goals = [above, start.p, stays.p, stays.p]
+    high = stays.p.at[2].set(jnp.maximum(stays.p[2], HIGH))
+    goals = [high, above, start.p, stays.p, stays.p]
     is_free = (phase == APPROACH) | (phase == DESCEND)
     turn = needles.turn_on(size, bite, state.measurements.needle)
     script = phases.enter(
@@ -112,6 +114,21 @@ def enter(size: Needle, script: DriveScript, phase: jax.Array, state: EnvState) 
     )
     sweep = jnp.abs(_end(size, state) - turn) / TURN_SPEED / script.tempo
     return script.replace(duration=jnp.where(phase == DRIVE, sweep, script.duration))
+
+
+def _on_arc(size: Needle, script: DriveScript, share: jax.Array, state: EnvState) -> Pose:
+    """Returns pose_world_tip at a fraction of the drive; it begins where the phase did."""
+    bite = state.layout.bite
+    first, now = (
+        _tip(
+            needles.pose_on(size, bite, script.turn + part * (_end(size, state) - script.turn)),
+            script.held,
+        )
+        for part in (0.0, share)
+    )
+    left = (1.0 - share) * ik.rotation_between(first.R, script.R_from)
+    R = Rotation.from_rotvec(left).as_matrix() @ now.R
+    return Pose(R, now.p + (1.0 - share) * (script.start - first.p))
 
 
 def _end(size: Needle, state: EnvState) -> jax.Array:
@@ -134,7 +151,7 @@ def _tip(needle: Pose, held: Pose) -> Pose:
 def _following(script: DriveScript, state: EnvState) -> jax.Array:
     """Returns the next phase: a needle that is not through is driven again."""
     found = state.measurements
-    again = jnp.where(found.is_inside, DRIVE, APPROACH)
+    again = jnp.where(found.is_inside, DRIVE, RAISE)
     is_short = (script.phase >= DRIVE) & (found.emerged < task.EMERGED)
     following = jnp.where(is_short, again, jnp.minimum(script.phase + 1, HOLD))
     return following.astype(jnp.int32)

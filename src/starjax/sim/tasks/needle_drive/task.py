@@ -288,4 +288,4 @@ def make(name: str, size: Needle, bites: tuple[float, float], expert: str) -> Ta
 
 
 TASK = make("needle_drive", needles.CT1, (0.008, 0.014), "AGENT")
-SMALL = make("needle_drive_sh", needles.SH, (0.008, 0.010), "SMALL")
+SMALL = make("needle_drive_sh", needles.SH, (0.008, 0.009), "SMALL")

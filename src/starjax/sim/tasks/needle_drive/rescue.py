@@ -1,0 +1,39 @@
+"""Expert of needle drive from any state: a needle in the pad is driven on, else taken to its entry.
+
+Beyond rescue: a dropped needle, and one that has left the pad off the mark.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from starjax.sim.state import EnvState
+from starjax.sim.tasks.needle_drive import expert, task
+from starjax.sim.tasks.phases import APPROACH, RAISE
+from starjax.sim.tasks.rescue import Rescuer
+from starjax.sim.tissue import needle as needles
+from starjax.sim.tissue.needle import Needle
+from starjax.types import Agent
+
+LOW = 0.025  # m, of the tip: below it a needle that turns could touch the pad
+
+
+def make(size: Needle, agent: Agent) -> Rescuer:
+    """Makes the rescuer for a needle and its demonstrator."""
+
+    def resume(key: jax.Array, state: EnvState) -> Any:
+        """Starts the script at this state."""
+        script, found = agent.init(key, state), state.measurements
+        is_out = found.emerged > task.EMERGED
+        driven = jnp.where(is_out, expert.HOLD, expert.DRIVE)
+        above = jnp.where(found.tip[2] < LOW, RAISE, APPROACH)
+        phase = jnp.where(found.is_inside, driven, above)
+        script = script.replace(attempt=jnp.zeros((), jnp.int32))
+        return expert.enter(size, script, phase.astype(jnp.int32), state)
+
+    return Rescuer(resume, agent.act)
+
+
+RESCUER = make(needles.CT1, expert.AGENT)
+SMALL = make(needles.SH, expert.SMALL)
