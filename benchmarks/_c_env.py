@@ -5,7 +5,7 @@ Everything else is the environment's own: controller, inverse kinematics, measur
 
 import copy
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -55,6 +55,7 @@ def _advance(
     ctrl = jax.vmap(target)(jnp.arange(substeps))
     blank = physics.no_contacts(scene)
     m, run = scene.mj_model, functools.partial(_run, scene, len(blank.dist), memory)
+    run = functools.partial(_each, run)
 
     def steps(state: physics.PhysicsState, ctrl: jax.Array, applied: jax.Array) -> Any:
         bare = state.replace(memory=None)
@@ -63,7 +64,7 @@ def _advance(
             (bare, jnp.zeros((len(ctrl), m.nq)), blank),
         )
         return jax.pure_callback(
-            run, shapes, bare, ctrl, applied, p_world_trocar, vmap_method="sequential"
+            run, shapes, bare, ctrl, applied, p_world_trocar, vmap_method="broadcast_all"
         )
 
     if scene.task.coupling is None:
@@ -79,6 +80,15 @@ def _advance(
         (after, contacts), qpos = jax.lax.scan(substep, (state, blank), ctrl)
     touch = physics.touching(scene, contacts)
     return after, physics.StepResult(touch, contacts, qpos, jnp.zeros(()))
+
+
+def _each(run: Callable[..., Any], state: Any, ctrl: np.ndarray, *others: np.ndarray) -> Any:
+    """Runs the episodes of a batch one after another: one call of Python for all of them."""
+    if ctrl.ndim == 2:
+        return run(state, ctrl, *others)
+    batch = jax.tree.map(np.asarray, (state, ctrl, *others))
+    rows = (jax.tree.map(lambda x, i=i: x[i], batch) for i in range(len(ctrl)))
+    return jax.tree.map(lambda *x: np.stack(x), *(_each(run, *row) for row in rows))
 
 
 def _run(
