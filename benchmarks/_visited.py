@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from starjax.sim import coupling, physics, solver
 from starjax.sim import env as envs
-from starjax.sim import physics, solver
 from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import Scene
 from starjax.types import Agent
@@ -73,14 +73,17 @@ def moments(env: envs.Env, episodes: int) -> Moment:
 
 def starjax_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """One step with our contact solver."""
-    return solver.step(model, data)[0]
+    return solver.step(model, data, applied=data.qfrc_applied)[0]
 
 
 def stepper(scene: Scene, step: Step) -> Callable[[Moment], Moment]:
-    """One `step` of the scene's model, single-sample; targets and trocars stay."""
+    """One `step` of the scene's model, single-sample; targets and trocars stay, jaws are closed."""
+    closed = -jnp.ones(len(scene.arms))
 
     def one(now: Moment) -> Moment:
         state = now.state
+        layout = scene.task.sample(scene.bound, jax.random.key(0))  # that of `at_rest`
+        forces, memory = coupling.forces(scene, layout, state, closed, now.p_world_trocar)
         data = scene.mjx_data.replace(
             qpos=state.qpos,
             qvel=state.qvel,
@@ -88,8 +91,11 @@ def stepper(scene: Scene, step: Step) -> Callable[[Moment], Moment]:
             ctrl=now.ctrl,
             mocap_pos=scene.mjx_data.mocap_pos.at[scene.trocar_mocap].set(now.p_world_trocar),
         )
+        if forces is not None:
+            data = data.replace(qfrc_applied=forces)
         with jax.default_matmul_precision("highest"):  # as in `sim.env`
             data = step(scene.mjx_model, data)
-        return now._replace(state=physics.PhysicsState(data.qpos, data.qvel, data.qacc_warmstart))
+        after = physics.PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, memory)
+        return now._replace(state=after)
 
     return one

@@ -84,7 +84,7 @@ def repeated(scene: scenes.Scene, batch: int) -> _visited.Moment:
 
 
 def _ours(model: mjx.Model, data: mjx.Data, max_iterations: int | None) -> mjx.Data:
-    return solver.step(model, data, max_iterations)[0]
+    return solver.step(model, data, max_iterations, data.qfrc_applied)[0]
 
 
 if __name__ == "__main__":
