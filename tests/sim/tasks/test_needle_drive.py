@@ -61,7 +61,6 @@ def test_marks_are_as_far_apart_as_the_task_says(name):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_one_grasp_is_within_the_wrist_at_every_trocar(name):
-    """From the start of the arc to 3 mm past the exit, at the twelve trocars in turn."""
     found = layouts(name)
     _, bound = compiled(name)
     p_trocar = np.asarray(rcm.trocar_position(rcm.TROCARS, np.array([0.0, 0.0, 0.15])))

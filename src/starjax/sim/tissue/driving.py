@@ -58,6 +58,11 @@ class Forces(NamedTuple):
     tips: jax.Array
 
 
+def weight(body: Body) -> jax.Array:
+    """Returns the needle's weight `[6]` N, N m, like its velocity."""
+    return jnp.zeros(6).at[2].set(-GRAVITY * body.mass)
+
+
 def begin(needle: Needle, tips: Pose, pose: Pose, is_held: jax.Array) -> Tissue:
     """Returns the state of a needle outside tissue, held by the tools `is_held` `[A]`."""
     patches = jax.vmap(lambda tip, held: patch.grasped(needle, tip, pose, held))(tips, is_held)
@@ -83,8 +88,7 @@ def step(
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), held)
     rows = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), hole.rows(needle, pose, now), flat)
     inertia = jnp.asarray(body.inertia, jnp.float32)
-    weight = jnp.zeros(6).at[2].set(-GRAVITY * body.mass)
-    _, forces = bodies.solve(rows, inertia, u + h * weight / inertia, u, h)
+    _, forces = bodies.solve(rows, inertia, u + h * weight(body) / inertia, u, h)
     on_patches = forces[hole.ROWS :].reshape(len(tips.gripper), 6)
     axes = tips.pose.R @ patches.R_tip_patch
     on_tips = -jnp.concatenate(
