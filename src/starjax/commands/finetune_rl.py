@@ -1,6 +1,5 @@
 """Rounds of a policy gradient: episodes with noise and steps by turns, then the round's policy."""
 
-import dataclasses
 import functools
 import math
 from pathlib import Path
@@ -13,7 +12,6 @@ import numpy as np
 from starjax import errors, methods
 from starjax.commands import finetune_stages, messages, stage_times
 from starjax.commands.finetune_work import Work
-from starjax.data import windows
 from starjax.finetune import dagger, explore, mixing, policy_gradient
 from starjax.policies import features, generator, policy_file
 from starjax.policies import policy as policies
@@ -48,13 +46,8 @@ class PolicyGradient:
         self._learn = policy_gradient.make(
             policy, self._adam, static.obs_horizon, config.policy.horizon
         )
-        dataset = finetune_stages.Lessons(work).demonstrations
-        train = dataclasses.replace(config.train, window_stride=1)
-        frames, _ = windows.split_holdout(
-            dataset.start, dataset.length, dataset.trocar, train.holdout_demos
-        )
-        self._demonstrations = policy_gradient.Demonstrations(
-            jax.tree.map(jnp.asarray, dataset), jnp.asarray(frames)
+        self._demonstrations = policy_gradient.demonstrated(
+            finetune_stages.Lessons(work).demonstrations, config.train.holdout_demos
         )
         self._trocars = configurations.listed(work.seen, len(env.p_world_ref))
 

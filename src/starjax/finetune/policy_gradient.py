@@ -21,6 +21,9 @@ CLIP = 0.2  # of the ratio of densities of all executed commands
 EPOCHS = 4  # over the decisions of an iteration
 BATCH = 4096  # decisions per step
 MAX_KL = 0.02  # at which the policy's steps of an iteration end
+# Largest divergence of one step, which is shortened to it: NOISE is so small that a step of Adam's
+# length alone had 3.5.
+STEP_KL = 1e-3
 ANCHOR = 0.3  # weight of the loss on demonstrations
 ANCHOR_BATCH = 256  # windows
 _ALL = 2**31 - 1
@@ -47,6 +50,12 @@ class Demonstrations(NamedTuple):
     frames: Any
 
 
+def demonstrated(dataset: windows.Dataset, held_out: int) -> Demonstrations:
+    """Returns a dataset on the device and its frames without those of held-out demonstrations."""
+    frames, _ = windows.split_holdout(dataset.start, dataset.length, dataset.trocar, held_out)
+    return Demonstrations(jax.tree.map(jnp.asarray, dataset), jnp.asarray(frames))
+
+
 def optimizer(rate: float) -> optax.GradientTransformation:
     """Returns Adam that leaves out steps whose gradient is not finite."""
     return optax.apply_if_finite(optax.adam(rate), max_consecutive_errors=_ALL)
@@ -63,6 +72,17 @@ def begin(
 def log_density(action: jax.Array, mean: jax.Array) -> jax.Array:
     """Returns the log of the normal density of actions `[B, E, D]`, without its constant."""
     return -0.5 * jnp.sum(((action - mean) / NOISE) ** 2, axis=(-2, -1))
+
+
+def divergence(mean: jax.Array, other: jax.Array) -> jax.Array:
+    """Returns the KL divergence of the densities about two means `[B, E, D]`, averaged over B."""
+    return -jnp.mean(log_density(mean, other))
+
+
+def _share(kl: jax.Array) -> jax.Array:
+    """Returns the share of a step of this divergence that has STEP_KL, at most 1: it is square."""
+    share = jnp.sqrt(STEP_KL / jnp.maximum(kl, STEP_KL))
+    return jnp.where(jnp.isfinite(share), share, 0.0)
 
 
 def surrogate(log_ratio: jax.Array, advantage: jax.Array) -> jax.Array:
@@ -91,17 +111,19 @@ def make(
     assert generate is not None
 
     def rows_of(experience: Experience) -> tuple[Any, ...]:
-        """Returns what the density depends on, with one leading axis `[N R]`."""
+        """Returns the inputs of the density, with one leading axis `[N R]`."""
         count, decisions = experience.alive.shape
         trocar = jax.tree.map(lambda x: jnp.repeat(x, decisions, 0), experience.trocar)
         parts = experience.observation, experience.key, experience.action
         flat = jax.tree.map(lambda x: x.reshape(count * decisions, *x.shape[2:]), parts)
         return (*flat, trocar)
 
-    def log_density_of(params: Params, stats: Any, row: tuple[Any, ...]) -> jax.Array:
+    def mean_of(params: Any, stats: Any, row: tuple[Any, ...]) -> jax.Array:
         observation, keys, action, trocar = row
-        mean = generate(params, stats, keys, observation, trocar)
-        return log_density(action, mean[:, : action.shape[1]])
+        return generate(params, stats, keys, observation, trocar)[:, : action.shape[1]]
+
+    def log_density_of(params: Any, stats: Any, row: tuple[Any, ...]) -> jax.Array:
+        return log_density(row[2], mean_of(params, stats, row))
 
     def anchor(params: Params, stats: Any, demonstrations: Demonstrations, key: jax.Array):
         key_rows, key_loss = jax.random.split(key)
@@ -134,17 +156,23 @@ def make(
             key_rows, key_anchor = jax.random.split(jax.random.fold_in(key, i))
             index = order[jax.random.randint(key_rows, (batch,), 0, count)]
 
+            row = _taken(rows, index)
+
             def loss(params):
-                log_ratio = log_density_of(params, stats, _taken(rows, index)) - old[index]
+                mean = mean_of(params, stats, row)
+                log_ratio = log_density(row[2], mean) - old[index]
                 gain = jnp.mean(surrogate(log_ratio, advantage[index]))
                 held = anchor(params, stats, demonstrations, key_anchor)
                 # In units of NOISE**2 the gradient of the density is one of an action's error.
-                return ANCHOR * held - NOISE**2 * gain, log_ratio
+                return ANCHOR * held - NOISE**2 * gain, (log_ratio, mean)
 
-            gradient, log_ratio = jax.grad(loss, has_aux=True)(learning.params)
+            gradient, (log_ratio, mean) = jax.grad(loss, has_aux=True)(learning.params)
             kl = jnp.mean(jnp.expm1(log_ratio) - log_ratio)
             goes_on = trains_policy & (metrics["kl"] <= MAX_KL) & (kl <= MAX_KL)
             change, optimizer = adam.update(gradient, learning.optimizer, learning.params)
+            there = mean_of(optax.apply_updates(learning.params, change), stats, row)
+            share = _share(divergence(mean, there))
+            change = jax.tree.map(lambda leaf: share * leaf, change)
             moved = optax.apply_updates(learning.params, change), optimizer
             kept = learning.params, learning.optimizer
             params, optimizer = jax.tree.map(
