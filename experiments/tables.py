@@ -8,8 +8,8 @@ claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list 
 `presets` (from their values); `leaderboard`, `leaderboard_apart` and `elsewhere` (the trocar
 benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
 `six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`, `stress_randomised`,
-`proposition`, `finetune`, `ppo`, `ppo_gpu`, `sb3`, `through_lerobot`, `held_out`,
-`larger_than_memory`.
+`proposition`, `finetune`, `finetune_ways`, `finetune_branches`, `ppo`, `ppo_gpu`, `sb3`,
+`through_lerobot`, `held_out`, `larger_than_memory`.
 """
 
 import re
@@ -22,6 +22,7 @@ ROOT = HERE.parent
 sys.path[:0] = [str(HERE), str(ROOT / "benchmarks")]
 
 import claims  # noqa: E402
+import finetuned  # noqa: E402
 import leaderboard_page  # noqa: E402
 import newest  # noqa: E402
 import preset_table  # noqa: E402
@@ -42,6 +43,10 @@ def table(name: str) -> str:
         return preset_table.table()
     if name in leaderboard_page.TABLES:
         return leaderboard_page.TABLES[name]()
+    if name == "finetune_ways":
+        return finetuned.ways()
+    if name == "finetune_branches":
+        return finetuned.branches()
     if name == "speed":
         return newest.table()
     if (HERE.parent / "benchmarks" / f"{name}.toml").exists():

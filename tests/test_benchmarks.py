@@ -62,3 +62,35 @@ def test_a_row_of_a_result_keeps_the_code_and_command_that_made_it(
     assert set(found["results"]) == {"one", "two"}
     assert [found["made"][row]["commit"][0] for row in ("one", "two")] == ["c", "b"]
     assert found["made"]["two"]["command"] == "python benchmarks/bench_x.py --only two"
+
+
+def test_tables_of_fine_tunings_say_when_no_round_is_better(tmp_path, monkeypatch, pytestconfig):
+    monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
+    import finetuned
+
+    def rate(won):
+        return {"successes": won, "trials": 10, "rate": won / 10, "ci95": [0.0, 1.0]}
+
+    found = {
+        "by": "dagger",
+        "command": "starjax finetune runs/a --by dagger --out runs/b",
+        "rounds": [
+            {"round": 0},
+            {
+                "round": 1,
+                "branches": {"takeover": 3, "1 s": 2},
+                "not_rescued": {"lost": [[0, 1]], "stalled": [[0, 2], [1, 3]]},
+            },
+        ],
+        "best": 0,
+        "before": {"seen": rate(8), "unseen": rate(7)},
+        "timings_s": {"before": 60.0, "before: compile": 40.0},
+        "hardware": {"backend": "cpu", "cpu": "a CPU", "cores": 2},
+    }
+    (tmp_path / "finetune_a.json").write_text(json.dumps(found))
+    better = {**found, "best": 1, "after": {"seen": rate(9), "unseen": rate(10)}}
+    (tmp_path / "finetune_b.json").write_text(json.dumps(better))
+    _, _, kept, improved = finetuned.ways(tmp_path).splitlines()
+    assert "`runs/a --by dagger`" in kept and "none is better" in kept
+    assert kept.count("8/10") == 2 and "9/10" in improved and "10/10" in improved
+    assert "| 3 | 2 | 3 |" in finetuned.branches(tmp_path)

@@ -107,7 +107,7 @@ def test_a_dragged_trocar_stays_for_the_next_trial_until_another_is_selected(pag
 def directed(steered, trocar):
     """A device that goes straight to the mark and rests there."""
     state, _, action, _ = steered.start(SEED, trocar, 0)
-    way = np.asarray(state.layout.p[0]) - action[0, 1:]
+    way = np.asarray(state.env.layout.p[0]) - action[0, 1:]
     count = int(np.ceil(np.linalg.norm(way) * 30 / (0.8 * teleop_target.SPEED)))
     axes = teleop.view_axes(steered.env)
     deflection = axes.T @ way * 30 / (count * teleop_target.SPEED)

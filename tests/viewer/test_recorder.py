@@ -15,7 +15,7 @@ def demonstrated(steered, kept, trocar, limit=200):
     """Goes straight to the mark; one episode, not saved yet."""
     trial = kept.next_trial(trocar)
     state, frame, action, opening = steered.start(SEED, trocar, trial)
-    goal = np.asarray(state.layout.p[0])
+    goal = np.asarray(state.env.layout.p[0])
     while not frame.done and kept.length < limit:
         way = goal - action[0, 1:]
         action = action.copy()

@@ -13,6 +13,7 @@ from starjax import errors, methods
 from starjax.commands import (
     demonstrations,
     finetune_counts,
+    interventions,
     messages,
     pipeline,
     policy_evaluation,
@@ -133,6 +134,8 @@ class Lessons:
         self._demonstrations: windows.Dataset = demonstrations.load(
             config, env, plan.root, plan.collect, self._encoder, work.share
         )
+        if work.settings.interventions:
+            self._add(interventions.find(work.settings, work.base.env, work.seen))
 
     @property
     def demonstrations(self) -> windows.Dataset:
@@ -146,9 +149,12 @@ class Lessons:
 
     def add(self, number: int) -> None:
         """Loads the learned episodes of a round."""
-        work, root = self._work, self._work.folder(number) / "rollouts"
-        if not store.keys(root):
-            return
+        root = self._work.folder(number) / "rollouts"
+        if store.keys(root):
+            self._add(root)
+
+    def _add(self, root: Path) -> None:
+        work = self._work
         draws = work.base.env if work.stored.policy.observation == "image" else None
         images = self._encoder is None
         moves = randomise.moves_cameras(work.config.train)

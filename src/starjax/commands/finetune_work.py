@@ -26,7 +26,8 @@ from starjax.rollouts import trocars
 from starjax.runtime import files
 
 _WARMUP = 500  # training steps, in which the new optimiser's averages settle
-_WITH_DENSITY = ("onestep",)  # learners whose samples with noise have a density of one step
+_OF_ONE_STEP = ("rl", "distill")  # ways that need a learner of one evaluation
+_ONE_STEP = "onestep"  # that learner
 _MAY_CHANGE = ("rounds", "eval")  # settings that may change when a fine-tuning resumes
 
 
@@ -80,9 +81,9 @@ def begin(
     if stored.method != base.trained.method:
         got = f"{base.trained.method}, which runs those of {stored.method}"
         raise errors.UsageError("RUN", "a method with weights of its own", got)
-    if settings.by == "rl" and stored.policy.learner not in _WITH_DENSITY:
-        expected = f"a policy of the learner {' or '.join(_WITH_DENSITY)}"
-        raise errors.UsageError("--by rl", expected, stored.policy.learner)
+    if settings.by in _OF_ONE_STEP and stored.policy.learner != _ONE_STEP:
+        expected = f"a policy of the learner {_ONE_STEP}"
+        raise errors.UsageError(f"--by {settings.by}", expected, stored.policy.learner)
     share.first("claimed", lambda: _claim(started.folder, settings, base.weights))
     stats = mixing.with_reach(base.trained.normalizer)
     return Work(
@@ -123,8 +124,8 @@ def _round_config(
 
 
 def _round_policy(settings: FinetuneConfig, policy: config_lib.PolicyConfig) -> Any:
-    """Returns a policy's settings in a round: `rl` leaves the encoder and computes exactly."""
-    if settings.by != "rl":
+    """Returns a policy's settings in a round; some ways freeze the encoder and use float32."""
+    if settings.by not in _OF_ONE_STEP:
         return dataclasses.replace(policy, dtype=settings.dtype)
     is_frozen = policy.observation == "image"
     return dataclasses.replace(policy, dtype="float32", freeze_encoder=is_frozen)

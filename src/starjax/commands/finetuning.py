@@ -9,6 +9,7 @@ import numpy as np
 import starjax
 from starjax import errors, methods
 from starjax.commands import (
+    finetune_distill,
     finetune_rl,
     finetune_stages,
     messages,
@@ -22,6 +23,13 @@ from starjax.commands.finetune_work import Work
 from starjax.evaluation import statistics
 from starjax.finetune.settings import FinetuneConfig
 from starjax.runtime import files, precompile, processes
+
+_WAYS = {
+    "dagger": finetune_stages.Imitation,
+    "self": finetune_stages.Imitation,
+    "rl": finetune_rl.PolicyGradient,
+    "distill": finetune_distill.Distillation,
+}
 
 
 def run(
@@ -40,8 +48,7 @@ def run(
     with precompile.until_end():
         print("\n[round 0] validation of the policy itself", flush=True)
         table = finetune_stages.validate(work, 0, work.base)
-        way = finetune_rl.PolicyGradient if settings.by == "rl" else finetune_stages.Imitation
-        improve = way(work, table.steps[table.success]).round
+        improve = _WAYS[settings.by](work, table.steps[table.success]).round
         described = [{"round": 0, "validation": statistics.rate(table.success)}]
         candidates, who = [path.file], work.base
         for number in range(1, settings.rounds + 1):
@@ -63,15 +70,24 @@ def _plan(work: Work) -> str:
     trocars = len(work.seen.radius)
     label = methods.SCORED[work.stored.method].label
     name = os.path.relpath(work.file)
-    half = "demonstrations and rollouts by an even coin"
+    rate = f"rate {config.train.learning_rate:.2g}"
+    steps = f"{config.train.steps} steps of {config.train.batch_size} per round, {rate}"
+    rollouts = f"{trocars} seen trocars x {settings.trials} trials"
+    work_of_round = {
+        "dagger": (rollouts, f"{steps}, demonstrations and rollouts by an even coin"),
+        "rl": (
+            f"{settings.iterations} iterations of {settings.episodes} episodes",
+            f"in every iteration, rate {settings.gradient_rate:.2g}",
+        ),
+        "distill": ("no rollouts", f"{steps}, demonstrations"),
+    }
+    played, trained = work_of_round.get(settings.by, work_of_round["dagger"])
     return "\n".join(
         [
             f"starjax {starjax.__version__}: {label} of {name}, fine-tuned by {settings.by}, "
             f"seed {settings.seed}, folder {work.out}",
-            f"  rounds          {settings.rounds}, each of {trocars} seen trocars x "
-            f"{settings.trials} trials",
-            f"  training        {config.train.steps} steps of {config.train.batch_size} per round, "
-            f"rate {config.train.learning_rate:.2g}, {half}",
+            f"  rounds          {settings.rounds}, each of {played}",
+            f"  training        {trained}",
             f"  validation      {trocars} seen trocars x {settings.validation} trials",
             f"  report          {len(work.base.env.task.is_seen)} trocars x {settings.eval.trials} "
             "trials, before and after",

@@ -3,13 +3,14 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import checks, options
+from starjax.commands import checks, options, policy_args
 from starjax.commands.view import Port
 from starjax.limits import Range
+from starjax.policies import packaged
 from starjax.runtime import jax_start, signals, xla
 
 DESCRIPTION = """Opens a page on which a person demonstrates a task.
@@ -19,16 +20,24 @@ always passes through the trocar, because these move only roll and tip. Recordin
 first motion. Enter saves an episode, Backspace discards it. Rerun the same command to add
 episodes.
 
+With --policy, the policy acts and T passes control to your hand and back. Saved are the episodes in
+which your hand acted; starjax finetune --interventions learns the successful ones.
+
 Examples:
   starjax teleop --task reach
-  starjax teleop --task needle_pick --device spacemouse --out runs/hand"""
+  starjax teleop --task needle_pick --device spacemouse --out runs/hand
+  starjax teleop --policy compact --out runs/interventions"""
 
 
 @dataclasses.dataclass(frozen=True)
 class TeleopArgs:
     """Flags of the command."""
 
-    out: str = options.AUTO  # directory of the dataset; auto: runs/teleop-TASK
+    # directory of the dataset; auto: runs/teleop-TASK or runs/interventions-POLICY
+    out: str = options.AUTO
+    # policy.safetensors or the name of a packaged policy that you relieve, in its own scene; its
+    # task, robot and observation replace the flags
+    policy: str = ""
     task: str = config_lib.DEFAULT_TASK  # task (see starjax list)
     arm: tuple[str, ...] = ()  # robots; default: the task's
     # recorded observation: pixels or the state of the task
@@ -44,30 +53,29 @@ class TeleopArgs:
 def main(argv: Sequence[str]) -> int:
     """Serves the page until a stop."""
     args = options.parse("teleop", TeleopArgs, argv, DESCRIPTION)
-    out = f"runs/teleop-{args.task}" if args.out == options.AUTO else args.out
+    file = packaged.find("--policy", args.policy) if args.policy else None
+    default = f"teleop-{args.task}" if file is None else f"interventions-{policy_args.label(file)}"
+    out = f"runs/{default}" if args.out == options.AUTO else args.out
     checks.expect_folder("--out", out)
     xla.prepare_xla()
     jax_start.require_devices("starjax.viewer.teleop")
 
-    from starjax.sim import env as sim_env
     from starjax.viewer import devices, page, recorder, teleop
 
-    env = sim_env.make(
-        args.task, args.arm, observation=args.observation, image_size=args.image_size
-    )
+    env, policy = _scene(args, file)
     if args.trocar >= (count := len(env.task.is_seen)):
         raise errors.UsageError("--trocar", f"0 to {count - 1}", args.trocar)
     device = None if args.device == "none" else devices.open_device(args.device)
     try:
         with (
             signals.stop_signals() as should_stop,
-            recorder.record_into(Path(out), env, args.seed) as kept,
+            recorder.record_into(Path(out), env, args.seed, policy) as kept,
             page.serve(args.port) as server,
         ):
             print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
             summary = teleop.run(
                 server,
-                recorder.steer(env),
+                recorder.steer(env, policy),
                 kept,
                 should_stop,
                 device=device,
@@ -79,3 +87,26 @@ def main(argv: Sequence[str]) -> int:
             device.close()
     print(f"{summary}; dataset: {out}")
     return 0
+
+
+def _scene(args: TeleopArgs, file: Path | None) -> tuple[Any, Any]:
+    """Returns the environment, and the policy of a file as `recorder.Relieved`, or None."""
+    from starjax.policies import in_env
+    from starjax.sim import env as sim_env
+    from starjax.viewer import recorder
+
+    if file is None:
+        made = sim_env.make(
+            args.task, args.arm, observation=args.observation, image_size=args.image_size
+        )
+        return made, None
+    who = in_env.place_in_own_scene(file, in_env.read(file), arms=args.arm)
+    trained = who.trained
+    policy = recorder.Relieved(
+        who.agent(),
+        (trained.params, trained.normalizer),
+        who.weights,
+        trained.policy.obs_horizon,
+        trained.policy.execute,
+    )
+    return who.env, policy

@@ -19,7 +19,7 @@ from starjax.rollouts.agent import BatchAgent
 from starjax.sim import registries
 from starjax.sim.tasks.base import Task
 
-SOURCE = "intervention"
+NAME, SOURCE = "dagger", "intervention"
 CLOCK_QUANTILE = 0.95  # of the control steps of the policy's successes
 LEAST_RESCUE_S = 15.0  # s, the least that the expert has
 REWINDS_S = (1.0, 2.0, 4.0)  # s before progress ended, at which the expert takes over instead

@@ -123,17 +123,26 @@ def describe(env: Any, trocars: Trocar, way: Way, settings: RoundSettings) -> di
     )
     description = schema.describe(recorded, trocars, plain)
     stream = STREAM + settings.number
-    actor = {"shape": [], "dtype": "|u1", "what": episodes.what(ACTOR)}
     return {
-        **description,
+        **with_actor(description, way.source, settings.policy),
         "source": {**description["source"], **sources.digests(*way.modules)},
-        "features": {**description["features"], ACTOR: actor},
         "stream": stream,
         "seed_rule": schema.seed_rule(stream),
-        "learned": way.source,
-        "policy": settings.policy,
         **settings.about,
     }
+
+
+def with_actor(description: dict[str, Any], source: str, policy: str) -> dict[str, Any]:
+    """Returns the description of a dataset whose commands come from several agents.
+
+    Args:
+      description: see `schema.describe`.
+      source: of the episodes' records.
+      policy: digest of the policy.
+    """
+    actor = {"shape": [], "dtype": "|u1", "what": episodes.what(ACTOR)}
+    features = {**description["features"], ACTOR: actor}
+    return {**description, "features": features, "learned": source, "policy": policy}
 
 
 def collect(

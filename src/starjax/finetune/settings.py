@@ -13,8 +13,10 @@ class FinetuneConfig:
 
     # dagger: an expert finishes episodes in trouble, and the policy learns the expert's part; self:
     # the policy learns successes of its own noisy rollouts; rl: a policy gradient raises the chance
-    # of strict success
-    by: Literal["dagger", "self", "rl"] = "dagger"
+    # of strict success; distill: the frozen flow of a policy of onestep teaches it the one step
+    by: Literal["dagger", "self", "rl", "distill"] = "dagger"
+    # directory of a person's interventions, see starjax teleop --policy; dagger learns them too
+    interventions: str = ""
     rounds: Annotated[int, Range(1, 100)] = 3  # rounds of rollouts and training
     trials: Count = 1200  # trials per round and seen trocar; not of rl
     steps: Count = 8_000  # training steps per round; not of rl

@@ -31,8 +31,8 @@ class Policy(NamedTuple):
       cast_params: `params -> params` with large matrices in the networks' dtype.
       prepare_for_inference: `params -> params` in the form that `sample` uses fastest, for
         inference only.
-      generate: the learner's part of `sample` without its limits, with the same arguments ->
-        normalised actions `[B, H, D]`.
+      generate: the learner's part of `sample`, with the same arguments -> normalised actions
+        `[B, H, D]`; within the limits only with a further argument True.
       execute: the rest, `(params, stats, actions, observation, trocar) -> Command [B, H, A]`.
     """
 

@@ -157,9 +157,10 @@ def make(
         x0 = model.sample(params["learner"], keys, condition, _reach(stats))
         return _decoded(params, stats, x0, measured, condition, trocar)
 
-    def generate(params, stats, keys, observation, trocar):
+    def generate(params, stats, keys, observation, trocar, is_limited=False):
         _, condition = _condition(params, stats, observation, trocar)
-        return model.sample(params["learner"], keys, condition, sequences.UNLIMITED)
+        reach = _reach(stats) if is_limited else sequences.UNLIMITED
+        return model.sample(params["learner"], keys, condition, reach)
 
     def execute(params, stats, actions, observation, trocar):
         measured, condition = _condition(params, stats, observation, trocar)

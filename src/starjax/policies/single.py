@@ -64,9 +64,10 @@ def make(
         action = model.sample(params["learner"], keys, condition, stats.action.reach)
         return execution.command(method, stats, action, trocar, wrist)
 
-    def generate(params, stats, keys, observation, trocar):
+    def generate(params, stats, keys, observation, trocar, is_limited=False):
         condition = _condition(params, stats, observation, trocar)
-        return model.sample(params["learner"], keys, condition, sequences.UNLIMITED)
+        reach = stats.action.reach if is_limited else sequences.UNLIMITED
+        return model.sample(params["learner"], keys, condition, reach)
 
     def execute(params, stats, actions, observation, trocar):
         return execution.command(method, stats, within(actions, stats.action.reach), trocar, wrist)

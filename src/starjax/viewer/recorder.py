@@ -1,4 +1,7 @@
-"""Demonstrations by an operator: a steered environment, and a recorder of its episodes."""
+"""Demonstrations by an operator: a steered environment, and a recorder of its episodes.
+
+With a policy, the operator relieves it: episodes that the operator took part in are interventions.
+"""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -11,8 +14,9 @@ import numpy as np
 
 from starjax import rcm
 from starjax.data import schema, store
+from starjax.finetune import dagger, rounds
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import episodes, programs
+from starjax.rollouts import episodes, programs, takeover
 from starjax.rollouts import trocars as configurations
 from starjax.runtime import files
 from starjax.sim import env as sim_env
@@ -28,13 +32,35 @@ class Moment(NamedTuple):
 
     Attributes:
       frame: for the page.
-      fields: those of `episodes.DEMONSTRATION`, `[1, ...]` each.
+      fields: those of `episodes.DEMONSTRATION`, and with a policy `actor`, `[1, ...]` each.
       status: that of `programs.status`, `[1]` each.
+      action: `[A, 4]` of `rcm4`, the command.
+      opening: `[A]`, the commanded openings.
     """
 
     frame: Frame
     fields: dict[str, Any]
     status: dict[str, Any]
+    action: Any
+    opening: Any
+
+
+class Relieved(NamedTuple):
+    """A policy that an operator relieves.
+
+    Attributes:
+      agent: `rollouts.agent.BatchAgent` of the policy.
+      params: its parameters.
+      digest: of its file.
+      obs_horizon: O, moments that it observes.
+      execute: commands of a plan that it executes.
+    """
+
+    agent: Any
+    params: Any
+    digest: str
+    obs_horizon: int
+    execute: int
 
 
 class Steering(NamedTuple):
@@ -42,72 +68,96 @@ class Steering(NamedTuple):
 
     Attributes:
       env: the environment.
-      start: (seed, index of the trocar configuration, trial) -> (EnvState `[1]`, Frame, present
-        actions `[A, 4]` of `rcm4`, present openings `[A]`). Never a trial of an evaluation.
-      step: (EnvState `[1]`, actions `[A, 4]`, openings `[A]`) -> (EnvState `[1]`, Moment).
-      look: EnvState `[1]` -> camera's name -> `[h, w, 3]` uint8.
+      start: (seed, index of the trocar configuration, trial) -> (LiveState, Frame, present actions
+        `[A, 4]` of `rcm4`, present openings `[A]`). Never a trial of an evaluation.
+      step: (LiveState, actions `[A, 4]`, openings `[A]`, True if the operator acts) -> (LiveState,
+        Moment).
+      look: LiveState -> camera's name -> `[h, w, 3]` uint8.
       compile: () -> None, compiles the other three; without it, their first calls do.
+      policy: that the operator relieves, or None.
     """
 
     env: sim_env.Env
     start: Callable[[int, int, int], tuple[Any, Frame, np.ndarray, np.ndarray]]
-    step: Callable[[Any, np.ndarray, np.ndarray], tuple[Any, Moment]]
+    step: Callable[[Any, np.ndarray, np.ndarray, bool], tuple[Any, Moment]]
     look: Callable[[Any], dict[str, jax.Array]]
     compile: Callable[[], None]
+    policy: Relieved | None = None
 
 
-def steer(env: sim_env.Env) -> Steering:
+def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
     """Makes the functions of a Steering."""
     space = rcm.ACTION_SPACES["rcm4"]
-    look = simulation.camera(env)
-
-    def frame(state: Any) -> Frame:
-        return simulation.frame(env, simulation.LiveState(state, (), state.step[0]))
+    camera, observe = simulation.camera(env), jax.vmap(env.observe)
+    params = None if policy is None else policy.params
 
     @jax.jit
-    def start(key: jax.Array, trocar: Trocar) -> Any:
-        state = env.reset(jax.random.split(key)[0], sim_env.EnvParams(trocar))
+    def start(params: Any, key: jax.Array, trocar: Trocar) -> Any:
+        key_env, key_agent = jax.random.split(key)
+        state = env.reset(key_env, sim_env.EnvParams(trocar))
         action, opening = space.encode(state.pose, state.measured_trocar), state.gripper
-        state = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
-        return state, frame(state), action, opening
+        state, memory = jax.tree.map(lambda x: jnp.asarray(x)[None], state), ()
+        if policy is not None:
+            memory = policy.agent.init(params, key_agent[None], state, lambda: observe(state))
+        live = simulation.LiveState(state, memory, jnp.zeros((), jnp.int32))
+        return live, simulation.frame(env, live), action, opening
 
     @jax.jit
-    def step(before: Any, action: jax.Array, opening: jax.Array) -> tuple[Any, Moment]:
+    def step(
+        params: Any, live: simulation.LiveState, action: jax.Array, opening: jax.Array, acts: Any
+    ) -> tuple[simulation.LiveState, Moment]:
+        before, memory, actor = live.env, live.memory, {}
         pose, _ = space.decode(action[None], before.measured_trocar)
         command = Command(pose, opening[None])
+        if policy is not None:
+            # Also while the operator acts: its observations and its plan stay up to date.
+            look = lambda: observe(before)  # noqa: E731
+            planned, memory, _ = policy.agent.act(params, memory, before, look, live.t)
+            command = jax.tree.map(lambda x, y: jnp.where(acts, x, y), command, planned)
+            who = jnp.where(acts, takeover.PERSON, takeover.POLICY).astype(jnp.uint8)
+            actor = {takeover.ACTOR: who[None]}
         after = jax.vmap(env.step)(before, command)
-        observation = jax.vmap(env.observe)(before)
         fields = episodes.DEMONSTRATION.fields(
-            episodes.Step(observation, command, command, before, after)
+            episodes.Step(observe(before), command, command, before, after)
         )
         carry = programs.RolloutState(after, (), after.step, jnp.ones(1, bool))
-        return after, Moment(frame(after), fields, programs.status(env, carry))
+        live = simulation.LiveState(after, memory, live.t + 1)
+        now = space.encode(command.pose, before.measured_trocar)[0], command.gripper[0]
+        status = programs.status(env, carry)
+        return live, Moment(simulation.frame(env, live), {**fields, **actor}, status, *now)
 
     def begin(seed: int, configuration: int, trial: int) -> tuple[Any, Frame, Any, Any]:
         key = simulation.trial_key(seed, configuration, trial, schema.STREAM)
-        state, *host = start(key, simulation.task_trocar(env, configuration))
+        state, *host = start(params, key, simulation.task_trocar(env, configuration))
         return state, *jax.device_get(host)
 
-    def advance(state: Any, action: np.ndarray, opening: np.ndarray) -> tuple[Any, Moment]:
-        state, moment = step(state, np.float32(action), np.float32(opening))
+    def advance(
+        state: Any, action: np.ndarray, opening: np.ndarray, acts: bool = True
+    ) -> tuple[Any, Moment]:
+        state, moment = step(params, state, np.float32(action), np.float32(opening), acts)
         return state, jax.device_get(moment)
+
+    def look(state: Any) -> dict[str, jax.Array]:
+        return camera(state.env)
 
     def compile_all() -> None:
         state, _, actions, openings = begin(0, 0, 0)
         look(advance(state, actions, openings)[0])
 
-    return Steering(env, begin, advance, look, compile_all)
+    return Steering(env, begin, advance, look, compile_all, policy)
 
 
 class Recorder:
     """A recorder of one episode after another into the folder `root`."""
 
-    def __init__(self, root: Path, env: Any, seed: int):
-        self._root, self._seed = root, seed
+    def __init__(self, root: Path, env: Any, seed: int, policy: Relieved | None = None):
+        self._root, self._seed, self._policy = root, seed, policy
         self._trocars = configurations.listed(env.task.trocars, len(env.p_world_ref))
         steps = round(env.task.time_limit_s * env.control_hz)
         settings = schema.DemoSettings(per_trocar=0, seed=seed, max_steps=steps, keep_failures=True)
         description = schema.describe(env, self._trocars, settings)
+        if policy is not None:
+            description = rounds.with_actor(description, dagger.SOURCE, policy.digest)
         store.create(root, {**description, "expert": OPERATOR})
         store.clean(root)
         self._records = {key: store.verify(root, key, arrays=False) for key in store.keys(root)}
@@ -133,6 +183,13 @@ class Recorder:
         """Control steps of the episode so far."""
         return len(self._moments)
 
+    @property
+    def is_worth_saving(self) -> bool:
+        """True once something was recorded, with a policy something by the operator."""
+        if self._policy is None:
+            return bool(self._moments)
+        return any(moment.fields[takeover.ACTOR][0] for moment in self._moments)
+
     def next_trial(self, configuration: int) -> int:
         """Returns the number of the next trial through a trocar configuration."""
         trials = [r["trial"] for r in self._records.values() if r["trocar"] == configuration]
@@ -152,29 +209,39 @@ class Recorder:
         Raises:
           files.StorageError: the disk is full or cannot be written; the episode stays in memory.
         """
+        moments, about = self._moments, {}
+        if self._policy is not None:
+            acted = (i for i, x in enumerate(moments) if x.fields[takeover.ACTOR][0])
+            first = max(next(acted) - (self._policy.obs_horizon - 1), 0)
+            digest = self._policy.digest
+            moments = moments[first:]
+            about = {"source": dagger.SOURCE, "policy": digest, "first": first}
         fields = {
-            name: np.stack([moment.fields[name][0] for moment in self._moments])
-            for name in self._moments[0].fields
+            name: np.stack([moment.fields[name][0] for moment in moments])
+            for name in moments[0].fields
         }
         images = {n: [x] for n, x in fields.items() if n.startswith(episodes.IMAGE)}
         others = {n: x[None] for n, x in fields.items() if n not in images}
-        status = {**self._moments[-1].status, "length": np.array([self.length])}
+        status = {**moments[-1].status, "length": np.array([len(moments)])}
         episode = episodes.assemble(
             0, (configuration, trial), self._trocars, self._seed, status, [others], images
         )
         key = store.key(configuration, trial, self._seed)
-        self._records[key] = store.commit(self._root, key, episode.outcome, episode.arrays)
+        outcome = {**episode.outcome, **about}
+        self._records[key] = store.commit(self._root, key, outcome, episode.arrays)
         store.seal(self._root, self._records)
         self.discard()
         return self._root / "episodes" / key
 
 
 @contextlib.contextmanager
-def record_into(root: Path, env: Any, seed: int) -> Iterator[Recorder]:
+def record_into(
+    root: Path, env: Any, seed: int, policy: Relieved | None = None
+) -> Iterator[Recorder]:
     """Yields a recorder into a folder, which stays locked until the end.
 
     Raises:
       files.StorageError: another process holds the folder, or it has another dataset.
     """
     with files.lock(root):
-        yield Recorder(root, env, seed)
+        yield Recorder(root, env, seed, policy)

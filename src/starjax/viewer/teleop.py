@@ -1,4 +1,7 @@
-"""Teleoperation: an operator demonstrates on the page in real time and keeps good episodes."""
+"""Teleoperation: an operator demonstrates on the page in real time and keeps good episodes.
+
+With a policy at work, a key passes control to the hand and back.
+"""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -29,6 +32,7 @@ class OperatorEpisode:
       frame: the present frame.
       end: outcome, empty while the trial runs.
       distances: name of a point of the task -> mm to the nearest tip.
+      hand_acts: True while the operator has control.
     """
 
     def __init__(self, server: Any, steering: Steering, pilot: Pilot, seed: int):
@@ -42,27 +46,48 @@ class OperatorEpisode:
             self._picture = page.Pictures(server.gui, [env.names.cameras[0]], _PICTURE_WIDTH)
         self._distances = goal_distance.make(env)
 
+    @property
+    def is_shared(self) -> bool:
+        """True with a policy that the operator relieves."""
+        return self._steering.policy is not None
+
     def begin(self, configuration: int, trial: int) -> None:
         """Sets up a trial that waits for the operator."""
         self.configuration, self.trial, self.end = configuration, trial, ""
+        self.hand_acts = self._keeps = self._steering.policy is None
         start = self._steering.start(self._seed, configuration, trial)
-        self._state, self.frame, actions, openings = start
-        slots = self._steering.env.task.slots
-        limits = [teleop_target.bounds(slot, a[1:]) for slot, a in zip(slots, actions, strict=True)]
-        self._pilot.rest(actions, openings, limits)
+        self._state, self.frame, *now = start
+        self._rest(*now)
         self._stage.clear()
         self._draw(with_image=True)
 
     def advance(self, recorder: Recorder) -> None:
         """Runs one control step; records from the first motion to the end of the trial."""
         action, opening = self._pilot.read(1.0 / self._steering.env.control_hz)
-        if self.end or not self._pilot.has_moved:
+        policy = self._steering.policy
+        if self.end or (policy is None and not self._pilot.has_moved):
             return
-        self._state, moment = self._steering.step(self._state, action, opening)
+        if policy is not None and not self._keeps and recorder.length % policy.execute == 0:
+            self.hand_acts = False  # a new plan begins
+        self._state, moment = self._steering.step(self._state, action, opening, self.hand_acts)
+        if not self.hand_acts:
+            self._rest(moment.action, moment.opening)
         self.frame = moment.frame
         recorder.add(moment)
         self.end = outcome(self.frame, recorder.length >= self._limit)
         self._draw(with_image=bool(self.end) or recorder.length % page.REDRAW_STEPS == 0)
+
+    def pass_control(self) -> None:
+        """Gives control to the hand at once, or back to the policy at its next plan."""
+        if self._steering.policy is not None:
+            self._keeps = not self._keeps
+            self.hand_acts |= self._keeps
+
+    def _rest(self, actions: np.ndarray, openings: np.ndarray) -> None:
+        """Lets the hand begin at actions `[A, 4]` of `rcm4` and openings `[A]`."""
+        slots = self._steering.env.task.slots
+        limits = [teleop_target.bounds(slot, a[1:]) for slot, a in zip(slots, actions, strict=True)]
+        self._pilot.rest(actions, openings, limits)
 
     def replay(self, recorder: Recorder) -> Iterator[None]:
         """Shows the recorded control steps one by one, then the present one again."""
@@ -80,7 +105,7 @@ class OperatorEpisode:
         if with_image:
             images = self._steering.look(self._state)
             self._picture.show([np.asarray(next(iter(images.values())))])
-            self.distances = self._distances(self._state)
+            self.distances = self._distances(self._state.env)
 
 
 def run(
@@ -103,6 +128,9 @@ def run(
     page.add_command(gui, "Save the episode", "enter", lambda: requests.add("save"))
     page.add_command(gui, "Discard the episode", "backspace", lambda: requests.add("discard"))
     page.add_command(gui, "Replay the episode", "R", lambda: requests.add("replay"))
+    if steering.policy is not None:
+        gui.add_markdown("T: control to your hand, and back to the policy")
+        page.add_command(gui, "Pass control", "T", lambda: requests.add("pass"))
     names = trocar_names(env.task.name)
     choices = page.Choices(gui, requests, trocar=(names, names[trocar]))
     pilot = Pilot(server, env.task.arms, view_axes(env), device)
@@ -119,7 +147,9 @@ def run(
     clock, replay = page.Clock(env.control_hz), iter(())
     while not should_stop():
         requested = requests.pop()
-        if "save" in requested and recorder.length:
+        if "pass" in requested:
+            episode.pass_control()
+        if "save" in requested and recorder.is_worth_saving:
             if _save(server, recorder, episode):
                 begin()
             clock.pause()
@@ -161,6 +191,8 @@ def _status(
     progress = episode.end or env.task.stages[int(frame.stage)]
     if not recorder.length:
         progress = "waits for your hand"
+    if episode.is_shared:
+        progress += ", your hand acts" if episode.hand_acts else ", the policy acts"
     progress = "replay" if is_replay else progress
     goals = ", ".join(f"to {name} {mm:.1f}" for name, mm in episode.distances.items())
     return (
