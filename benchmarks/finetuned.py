@@ -11,10 +11,10 @@ COMMAND = "starjax finetune "
 
 
 def ways(folder: Path = RESULTS) -> str:
-    """Returns success before and after each fine-tuning as markdown."""
+    """Returns success before and after each complete fine-tuning as markdown."""
     header = ["Fine-tuning", "Best round", "Seen before", "Seen after", "Unseen before"]
     rows = [[*header, "Unseen after", "Minutes", "On"]]
-    for found in _results(folder):
+    for found in (found for found in _results(folder) if "best" in found):
         before, best = found["before"], found["best"]
         after = found["after"] if best else before
         rows.append(

@@ -90,7 +90,9 @@ def test_tables_of_fine_tunings_say_when_no_round_is_better(tmp_path, monkeypatc
     (tmp_path / "finetune_a.json").write_text(json.dumps(found))
     better = {**found, "best": 1, "after": {"seen": rate(9), "unseen": rate(10)}}
     (tmp_path / "finetune_b.json").write_text(json.dumps(better))
+    begun = {name: found[name] for name in ("command", "rounds")}
+    (tmp_path / "finetune_c.json").write_text(json.dumps(begun))
     _, _, kept, improved = finetuned.ways(tmp_path).splitlines()
     assert "`runs/a --by dagger`" in kept and "none is better" in kept
     assert kept.count("8/10") == 2 and "9/10" in improved and "10/10" in improved
-    assert "| 3 | 2 | 3 |" in finetuned.branches(tmp_path)
+    assert finetuned.branches(tmp_path).count("| 3 | 2 | 3 |") == 3
