@@ -21,7 +21,7 @@ from typing import Any
 import _timing
 import numpy as np
 
-from starjax.evaluation import alarms, statistics, trials
+from starjax.evaluation import alarms, statistics
 from starjax.monitor import calibrate, scores
 from starjax.policies import packaged, policy_file
 from starjax.runtime import files
@@ -30,7 +30,6 @@ from starjax.sim.tasks.peg_transfer_bimanual.task import DROPPED_STEPS
 
 COLUMNS = ("success", "lost", "invalid", "steps", "scores")
 _NEVER = 1e9  # a threshold beyond any score
-_ALPHA = 0.05
 
 
 def silent(policy: str, still_s: str, out: str) -> None:
@@ -69,45 +68,55 @@ def score(policy: str, file: str) -> None:
     arrays = files.read_npz(Path(file))
     made, stress = (json.loads(arrays[f"{name}.json"].tobytes()) for name in ("monitor", "stress"))
     whole = evaluation(arrays, "trials")
-    fits, calibrates, tests = calibrate.parts(len(whole.success))
-    settings = scores.ScoreSettings(**made["monitor"]["settings"])
-    monitor = calibrate.calibrate(
-        whole.scores[whole.success & fits],
-        whole.scores[whole.success & calibrates],
-        _ALPHA,
-        settings,
-        made["monitor"]["digest"],
-    )
-    rows = {"nothing, trocars of the test": figures(_only(whole, tests), monitor)}
+    monitor, fewer = (calibrated(x, made["monitor"]) for x in (whole, without_closure(whole)))
+    tests = calibrate.parts(len(whole.success))[2]
+    labels = {"nothing, trocars of the test": SimpleNamespace(**_at(whole, tests))}
+    labels["nothing, the task's trocars"] = evaluation(arrays, "0")
     for name, kind in stress["disturbances"].items():
         for level in kind["levels"]:
-            is_zero = float(level) == 0
-            trials_of = evaluation(arrays, "0" if is_zero else f"{name}-{level}")
-            label = "nothing, the twelve trocars" if is_zero else f"{name} {level} {kind['unit']}"
-            rows.setdefault(label.strip(), figures(trials_of, monitor))
-    kept = ("version", "commit", "dirty", "source", "versions", "hardware")
+            if float(level):
+                label = f"{name} {level} {kind['unit']}".strip()
+                labels[label] = evaluation(arrays, f"{name}-{level}")
+    rows = {label: figures(table, monitor, fewer) for label, table in labels.items()}
+    kept = ("version", "commit", "dirty", "versions", "hardware")
     content = {
         "policy": policy,
+        "weights": made["weights"],
         "commands": [made["command"], stress["command"]],
-        **{name: made[name] for name in kept if name in made},
+        **{name: made[name] for name in kept},
         "monitor": calibrate.to_json(monitor),
         "rows": rows,
     }
     files.write_json(_timing.RESULTS / f"monitor_{policy}_gpu.json", content)
-    for label, row in rows.items():
-        print(label, json.dumps({k: v for k, v in row.items() if k != "alarm_s"}))
 
 
-def figures(table: Any, monitor: calibrate.Monitor) -> dict[str, Any]:
+def calibrated(table: Any, made: dict[str, Any]) -> calibrate.Monitor:
+    """Calibrates a monitor with the successes of a table, as `starjax calibrate` does."""
+    fits, calibrates, _ = calibrate.parts(len(table.success))
+    settings = scores.ScoreSettings(**made["settings"])
+    parts = [table.scores[table.success & part] for part in (fits, calibrates)]
+    return calibrate.calibrate(*parts, made["alpha"], settings, made["digest"])
+
+
+def without_closure(table: Any) -> Any:
+    """Returns the table with this score undefined."""
+    values = table.scores.copy()
+    values[..., scores.NAMES.index("closure")] = np.nan
+    return SimpleNamespace(**{**vars(table), "scores": values})
+
+
+def figures(table: Any, monitor: calibrate.Monitor, fewer: calibrate.Monitor) -> dict[str, Any]:
     """Returns success, alarms, and the times of alarms on failures, null without one."""
     times, _ = calibrate.first_alarms(monitor, table.scores)
     raised = [round(float(x), 2) if np.isfinite(x) else None for x in times[~table.success]]
     # A trial is lost some control steps after the object left the last tool.
     drop_s = (table.steps - DROPPED_STEPS) / CONTROL_HZ
+    less = alarms.compose(without_closure(table), fewer)
     return {
         "strict": statistics.rate(table.success),
         "alarms": alarms.compose(table, monitor),
         "before_drop": statistics.rate((times < drop_s)[table.lost]),
+        "without_closure": {name: less[name] for name in ("before_clock", "false_alarms")},
         "alarm_s": raised,
     }
 
@@ -127,14 +136,13 @@ def evaluation(arrays: dict[str, np.ndarray], name: str) -> Any:
     return SimpleNamespace(**{column: arrays[f"{name}/{column}"] for column in COLUMNS})
 
 
-def _only(table: Any, rows: np.ndarray) -> Any:
-    return SimpleNamespace(**{name: column[rows] for name, column in vars(table).items()})
+def _at(table: Any, rows: np.ndarray) -> dict[str, np.ndarray]:
+    return {name: column[rows] for name, column in vars(table).items()}
 
 
 def _columns(folder: Path) -> dict[str, np.ndarray]:
     chunks = [files.read_npz(chunk) for chunk in sorted(folder.glob("chunk_*.npz"))]
-    table = trials.join([trials.from_columns(chunk) for chunk in chunks])
-    return {name: trials.columns(table)[name] for name in COLUMNS}
+    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in COLUMNS}
 
 
 if __name__ == "__main__":

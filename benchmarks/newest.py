@@ -39,6 +39,34 @@ def stress(name: str) -> str:
     return formats.render(broken.table(_results(f"{name}_gpu")), names=2)
 
 
+def monitor(name: str) -> str:
+    """Returns the alarms of a packaged policy's monitor, of results/<name>_gpu.json."""
+    found = _results(f"{name}_gpu")
+    header = ["Disturbance", "Success", "Failures announced before the clock", "Median time"]
+    header += ["without `closure`", "False alarms on successes", "Success without alarm"]
+    body = [[label, *_alarm_cells(row)] for label, row in found["rows"].items()]
+    if any(row["before_drop"]["trials"] for row in found["rows"].values()):
+        header.append("Drops announced before the fall")
+        for cells, row in zip(body, found["rows"].values(), strict=True):
+            cells.append(_counted(row["before_drop"]))
+    return formats.render([header, *body], names=1)
+
+
+def _alarm_cells(row: dict[str, Any]) -> list[str]:
+    alarms, fewer = row["alarms"], row["without_closure"]
+    median = "\u2013" if alarms["median_s"] is None else f"{alarms['median_s']:.1f} s"
+    rates = [row["strict"], alarms["before_clock"], fewer["before_clock"]]
+    rates += [alarms["false_alarms"], alarms["silent"]]
+    success, early, less, false, silent = map(_counted, rates)
+    return [success, early, median, less, false, silent]
+
+
+def _counted(rate: dict[str, Any]) -> str:
+    if not rate["trials"]:
+        return "\u2013"
+    return f"{rate['successes']:,}/{rate['trials']:,} = {100 * rate['rate']:.0f}%"
+
+
 def _results(file: str) -> dict[str, Any]:
     return json.loads((HERE / "results" / f"{file}.json").read_text())
 

@@ -9,6 +9,7 @@ claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list 
 benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
 `six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`, `stress_randomised`,
 `proposition`, `finetune`, `finetune_ways`, `finetune_branches`, `ppo`, `ppo_gpu`, `sb3`,
+`monitor_<policy>`, `monitor_cost`,
 `through_lerobot`, `held_out`, `larger_than_memory`.
 """
 
@@ -53,6 +54,8 @@ def table(name: str) -> str:
         return newest.other(name)
     if name.startswith("stress"):
         return newest.stress(name)
+    if name.startswith("monitor"):
+        return newest.monitor(name)
     folder, _, rest = name.partition("/")
     name, _, rows = rest.partition(":")
     return claims.table(claims.load(HERE / folder), name, rows.split(",") if rows else None)
