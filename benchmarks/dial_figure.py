@@ -28,7 +28,7 @@ def draw(found: dict[str, dict[str, Any]]) -> Any:
         best = [100 * max(row["by_trocar"]) for _, row in rows]
         axis.fill_between(turns, worst, best, color=shades["line"], alpha=0.3, lw=0)
         for name, label, colour, marker in (
-            ("own_grasp", "a grasp of each trocar's own", shades["line"], "o"),
+            ("own_grasp", "a grasp of each trocar's own", shades["muted"], "o"),
             ("one_for_seen", "one for the eight seen trocars", style.SUCCESS, "s"),
             ("one_for_all", "one for all twelve", style.FAILURE, "^"),
         ):

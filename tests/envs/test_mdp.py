@@ -1,7 +1,10 @@
 """Actions, rewards and observations of one episode, without simulating much."""
 
+import types
+
 import jax
 import jax.numpy as jnp
+import mistakes
 import numpy as np
 import pytest
 
@@ -35,7 +38,7 @@ def frame(task):
 def test_the_workspace_lies_within_the_bounds_of_actions(task, space):
     """Poses whose tip and roll are the workspace's, seen through a trocar that nobody tried."""
     task = registries.tasks.get(task)
-    low, high = ranges.actions(task, space)
+    low, high = ranges.actions(task, rcm.ACTION_SPACES[space])
     assert low.shape == high.shape == (task.arms, rcm.ACTION_SPACES[space].dim)
     assert (high - low > 0.05).all() and np.isfinite(high - low).all()
     work = registries.workspaces.get(task.slots[0].workspace)
@@ -70,6 +73,34 @@ def test_whatever_the_action_the_shaft_goes_through_the_trocar(start, space):
     command = jax.vmap(made.decode, (None, 0))(start.data, actions)
     error = rcm.rcm_error(command.pose, start.data.trocar.p_world_trocar)
     assert float(error.max()) < 1e-6
+
+
+@pytest.mark.parametrize("space", ["rcm6", "se3_through"])
+@pytest.mark.parametrize("control", settings.CONTROLS)
+def test_actions_of_a_wrist_bend_it_and_keep_its_shaft_in_the_trocar(space, control):
+    made = mdp.make(
+        settings.make(task="reach", tools="needle_driver", action_space=space, control=control)
+    )
+    wrist, trocar = rcm.LARGE_NEEDLE_DRIVER, frame(made.env.task)
+    bent = jnp.array([[0.2, 0.6, -0.5, 0.01, 0.0, 0.02]])
+    pose, _ = rcm.rcm6(wrist).decode(bent, trocar)
+    state = types.SimpleNamespace(pose=Pose(pose.R, pose.p + 0.002), measured_trocar=trocar)
+    command = Command(pose, jnp.array([0.5]))
+    again = made.decode(state, made.encode(state, command))
+    np.testing.assert_allclose(again.pose.p, pose.p, atol=3e-6)
+    np.testing.assert_allclose(again.pose.R, pose.R, atol=3e-4)
+    np.testing.assert_allclose(again.wrist, bent[:, 1:3], atol=3e-4)
+
+    actions = jax.random.uniform(jax.random.key(2), (200, made.action_size), minval=-3, maxval=3)
+    drawn = jax.vmap(made.decode, (None, 0))(state, actions)
+    shaft = rcm.shaft_of(wrist, drawn.pose, drawn.wrist)
+    assert float(rcm.rcm_error(shaft, trocar.p_world_trocar).max()) < 1e-6
+    assert float(jnp.abs(drawn.wrist).max()) > 0.5
+
+
+def test_a_straight_tool_has_no_actions_of_a_wrist():
+    with mistakes.of("tools", "grasper"):
+        mdp.make(settings.make(task="reach", action_space="rcm6"))
 
 
 def outcome(start, reward="dense", **changed):

@@ -4,7 +4,8 @@
 >>> observed, _ = env.reset(seed=0)
 >>> observed, *_ = env.step(actions)  # absolute poses: x y z, quaternion x y z w, gripper
 
-Observations and actions are those of the exported files, in m in the world frame. Trials are those
+Observations and actions are those of the exported files, in m in the world frame; a wrist follows
+from the tip's pose through the measured trocar. Trials are those
 of an evaluation: commands are executed as they are, without the ranges of `ranges.actions`.
 """
 
@@ -21,6 +22,7 @@ from starjax import errors, rcm
 from starjax.data import pose_rows
 from starjax.data.formats.peer_columns import ACTIONS
 from starjax.envs import batch, forked, mdp, settings, vector
+from starjax.sim import wrists
 from starjax.sim.tasks.base import Task
 from starjax.types import Command, Pose
 
@@ -151,6 +153,7 @@ def _episodes(chosen: settings.EnvSettings, actions: str) -> mdp.Episodes:
             pose = Pose(rows[:, 3:12].reshape(arms, 3, 3), rows[:, :3])
         is_over = mdp.is_terminated(state) | (state.step >= made.max_steps)
         command = Command(pose, jnp.clip(rows[:, -1], -1.0, 1.0))
+        command = wrists.through(env.task, command, state.measured_trocar.p_world_trocar)
         return env.step(state.replace(done=is_over), command)
 
     def observe(state: Any) -> dict[str, jax.Array]:

@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import extras, rcm
+from starjax import errors, extras, rcm
 from starjax.envs import ranges, trocar_draws
-from starjax.envs.settings import EnvSettings
+from starjax.envs.settings import WRIST_SPACES, EnvSettings
 from starjax.types import Command, Pose
 
 SHARE = 0.1  # of half an action's range, in a control step: of a tip 0.15 m/s, as the arms can
@@ -78,6 +78,7 @@ def make(settings: EnvSettings) -> Episodes:
     extras.require("starjax.envs", "sim")
     from starjax.envs import observing
     from starjax.sim import env as envs
+    from starjax.sim import wrists
 
     env = envs.make(
         settings.task,
@@ -87,8 +88,9 @@ def make(settings: EnvSettings) -> Episodes:
         image_size=settings.image_size,
         cameras=settings.cameras,
     )
-    task, space = env.task, rcm.ACTION_SPACES[settings.action_space]
-    low, high = (jnp.asarray(end) for end in ranges.actions(task, space.name))
+    task, space = env.task, _space(settings, env.task)
+    bends = space.name in WRIST_SPACES
+    low, high = (jnp.asarray(end) for end in ranges.actions(task, space))
     is_relative = settings.control == "relative"
     draw = trocar_draws.make(task, settings.trocar)
     max_steps = round(task.time_limit_s * env.control_hz)
@@ -107,7 +109,9 @@ def make(settings: EnvSettings) -> Episodes:
         if is_relative:
             target = jnp.clip(scaled(state, state.pose) + SHARE * target, -1.0, 1.0)
         pose, _ = space.decode(0.5 * (high + low + (high - low) * target), state.measured_trocar)
-        return Command(pose, jaws)
+        command = Command(pose, jaws)
+        p_world_trocar = state.measured_trocar.p_world_trocar
+        return wrists.through(task, command, p_world_trocar) if bends else command
 
     def encode(state: Any, command: Command) -> jax.Array:
         target = scaled(state, command.pose)
@@ -146,6 +150,23 @@ def make(settings: EnvSettings) -> Episodes:
         max_steps=max_steps,
         env=env,
     )
+
+
+def _space(settings: EnvSettings, task: Any) -> rcm.ActionSpace:
+    """Returns the action space of the settings for a task with its tools.
+
+    Raises:
+      errors.UsageError: it is one of a wrist, which the tools lack.
+    """
+    from starjax.sim import registries, wrists
+
+    needs_wrist = any(wrists.per_arm(registries.tasks.get(settings.task)))
+    name = settings.action_space or ("rcm6" if needs_wrist else "rcm4")
+    wrist = wrists.common(task)
+    if name in WRIST_SPACES and wrist is None:
+        tools = " ".join(slot.tool for slot in task.slots)
+        raise errors.UsageError("tools", f"one kind of wrist, for actions {name}", tools)
+    return rcm.action_space(name, wrist)
 
 
 def is_terminated(state: Any) -> jax.Array:

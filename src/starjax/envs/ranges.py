@@ -1,9 +1,12 @@
 """Ranges that actions in [-1, 1] span in a task's action space."""
 
+from typing import Any
+
 import jax
 import numpy as np
 
 from starjax import rcm
+from starjax.envs.settings import WRIST_SPACES
 from starjax.sim import registries
 from starjax.sim.tasks.base import Task
 
@@ -24,14 +27,15 @@ def tips(task: Task) -> tuple[np.ndarray, np.ndarray]:
     return low - MARGIN * [1, 1, 0], high + MARGIN
 
 
-def actions(task: Task, action_space: str) -> tuple[np.ndarray, np.ndarray]:
+def actions(task: Task, space: rcm.ActionSpace) -> tuple[np.ndarray, np.ndarray]:
     """Returns the lowest and highest encodings `[A, dim]` of poses with the tip in its box.
 
     All poses are on the RCM manifold, through trocars at the edge of the workspace's ranges, with
     rolls of the workspace and ROLL_MARGIN. So the task bounds positions, depths and rolls, and the
     middle of the box is near a tool that points down.
+
+    In a space of a wrist angles span its limits, rolls half a turn, and rotations are free.
     """
-    space = rcm.ACTION_SPACES[action_space]
     encode = jax.jit(space.encode)
     bounds = []
     for slot, low, high in zip(task.slots, *tips(task), strict=True):
@@ -45,6 +49,23 @@ def actions(task: Task, action_space: str) -> tuple[np.ndarray, np.ndarray]:
         poses = np.stack([x.ravel() for x in np.meshgrid(*axes)], axis=-1)
         pose, _ = rcm.ACTION_SPACES["rcm4"].decode(poses[None], frame)
         encoded = np.asarray(encode(pose, frame)).reshape(-1, space.dim)
-        bounds.append((encoded.min(axis=0), encoded.max(axis=0)))
+        lowest, highest = encoded.min(axis=0), encoded.max(axis=0)
+        bounds.append((lowest, highest))
+        if space.name in WRIST_SPACES:
+            _widen(space, lowest, highest, registries.tools.get(slot.tool).wrist)
     low, high = (np.stack(ends).astype(np.float32) for ends in zip(*bounds, strict=True))
     return low, high
+
+
+def _widen(space: rcm.ActionSpace, low: np.ndarray, high: np.ndarray, wrist: Any) -> None:
+    """Widens the bounds `[dim]` of straight tools, in place, to those of a wrist."""
+    most = {
+        "R": 1.0,
+        "roll": 0.5 * np.pi + ROLL_MARGIN,
+        "wrist": np.array([wrist.pitch, wrist.yaw]),
+    }
+    for part, limit in most.items():
+        if part in space.slices:
+            where = space.slices[part]
+            low[where] = np.minimum(low[where], -limit)
+            high[where] = np.maximum(high[where], limit)

@@ -9,6 +9,7 @@ from starjax import errors, rcm
 from starjax.config import DEFAULT_TASK
 
 CONTROLS = ("relative", "absolute")
+WRIST_SPACES = ("rcm6", "se3_through")  # on the manifold, for tools with a wrist
 REWARDS = ("dense", "sparse")
 OBSERVATIONS = ("state", "image")
 TROCARS = ("seen", "unseen", "all", "random")
@@ -28,7 +29,8 @@ class EnvSettings:
         configurations; `random`: uniformly in the workspace's ranges (Eq. 19); a whole number:
         that configuration of the task; a position (x, y, z) in m, `[3]` or `[A, 3]`, or a
         `rcm.Trocar` with fields `[]` or `[A]`: this one.
-      action_space: key of `rcm.ACTION_SPACES`.
+      action_space: key of `rcm.ACTION_SPACES`; for tools with a wrist also `rcm6` or `se3_through`.
+        Empty for `rcm4`, and for `rcm6` in a task that needs a wrist.
       control: actions `relative` to the measured pose, or `absolute`, see `mdp`.
       reward: `dense` or `sparse`, see `mdp`.
       observation: `state` (numbers) or `image` (pixels, and numbers of the tool).
@@ -42,7 +44,7 @@ class EnvSettings:
     arms: tuple[str, ...] = ()
     tools: tuple[str, ...] = ()
     trocar: Chosen = "seen"
-    action_space: str = "rcm4"
+    action_space: str = ""
     control: str = "relative"
     reward: str = "dense"
     observation: str = "state"
@@ -67,7 +69,8 @@ def make(**arguments: Any) -> EnvSettings:
     if "trocar" in arguments:
         arguments["trocar"] = _trocar(arguments["trocar"])
     settings = EnvSettings(**arguments)
-    errors.choice("action_space", settings.action_space, rcm.ACTION_SPACES)
+    if settings.action_space:
+        errors.choice("action_space", settings.action_space, [*rcm.ACTION_SPACES, *WRIST_SPACES])
     errors.choice("control", settings.control, CONTROLS)
     errors.choice("reward", settings.reward, REWARDS)
     errors.choice("observation", settings.observation, OBSERVATIONS)
