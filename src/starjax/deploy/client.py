@@ -107,7 +107,9 @@ class Client:
             p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)
             self.p_world_trocar = np.asarray(p_world_trocar, np.float32)
             self._watch = _watch(self.metadata) if is_watched else None
-            self._executor = PlanExecutor(self.p_world_trocar, horizon, execute, ahead, limits)
+            self._executor = PlanExecutor(
+                self.p_world_trocar, horizon, execute, ahead, limits, spec.held_wrist
+            )
         except BaseException:
             self._connection.close()
             raise

@@ -20,6 +20,7 @@ from starjax.types import Pose
 
 FARTHEST = 0.5  # m, from the nominal trocar to a trocar or a tip: beyond, the unit is mm
 FARTHEST_OFF = 0.02  # m, from the measured axis to the trocar: beyond, the trocar or frame differs
+MAX_BEND = 0.2  # rad beyond the limits of a wrist: the error of a measured trocar is less
 _MAX_OPENING = 1.1  # of a gripper in [-1, 1]: the rest is the sensor's error
 _REAL = (jnp.floating, jnp.integer, jnp.bool_)
 MAX_SKEW = 0.05  # of R'R from the identity, far above rounding and calibration errors
@@ -58,6 +59,7 @@ class InputSpec(NamedTuple):
       cameras: names of the observed cameras; empty if the policy observes the state.
       state_size: S.
       regions: of each arm's trocar, see `trocar_region`; empty: any trocar.
+      wrist: fields of the `rcm.Wrist` of all tools; empty: straight tools, or straight wrists.
     """
 
     moments: int
@@ -68,6 +70,12 @@ class InputSpec(NamedTuple):
     cameras: tuple[str, ...]
     state_size: int
     regions: tuple[Any, ...] = ()
+    wrist: tuple[float, ...] = ()
+
+    @property
+    def held_wrist(self) -> rcm.Wrist | None:
+        """Returns the wrist that a policy commands, None for a straight one."""
+        return rcm.Wrist(*self.wrist) if self.wrist else None
 
 
 def validate(
@@ -196,7 +204,15 @@ def _check_values(
         worst = gripper.flat[np.abs(gripper).argmax()]
         expected = "values from -1 (closed) to 1 (open)"
         raise UsageError("observation.gripper", expected, f"{worst:.3g}")
-    if spec.keeps_to_manifold and not any(map(is_traced, (*pose, *trocar))):
+    if any(map(is_traced, (*pose, *trocar))):
+        return
+    if spec.held_wrist:
+        bend = float(_bend(spec.held_wrist, pose, trocar, spec.p_world_ref, leading))
+        if bend > MAX_BEND:
+            expected = "tools through the trocar within the limits of the wrist"
+            got = f"one that would bend it by {np.rad2deg(bend):.0f} degrees more"
+            raise UsageError("observation.pose", expected, got)
+    elif spec.keeps_to_manifold:
         off, depth = map(float, _through(pose, trocar, spec.p_world_ref, leading))
         if off > FARTHEST_OFF:
             got = f"an axis that misses it by {1e3 * off:.0f} mm"
@@ -220,6 +236,16 @@ def _through(
     p_world_trocar = jnp.expand_dims(rcm.trocar_position(trocar, p_world_ref), leading)
     errors = rcm.rcm_error(pose, p_world_trocar)
     return jnp.max(errors), jnp.min(rcm.insertion_depth(pose, p_world_trocar))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def _bend(
+    wrist: rcm.Wrist, pose: Pose, trocar: rcm.Trocar, p_world_ref: Any, leading: int
+) -> jax.Array:
+    """Returns the largest angle (rad) beyond the limits of tools `[*robots, O, *arms]`."""
+    p_world_trocar = jnp.expand_dims(rcm.trocar_position(trocar, p_world_ref), leading)
+    angles = rcm.angles_through(wrist, pose, p_world_trocar)
+    return jnp.max(jnp.abs(angles) - jnp.array([wrist.pitch, wrist.yaw]))
 
 
 def _array(value: Any) -> Any:

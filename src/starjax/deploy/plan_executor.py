@@ -16,13 +16,11 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.deploy import turns
+from starjax.deploy import plan_motion
 from starjax.errors import UsageError
-from starjax.rcm import arrays
 from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Command, Pose
 
@@ -102,6 +100,7 @@ class PlanExecutor:
         execute: int,
         ahead: int | None,
         limits: Limits,
+        wrist: rcm.Wrist | None = None,
     ) -> None:
         """Compiles its programs.
 
@@ -111,6 +110,7 @@ class PlanExecutor:
           ahead: control steps between a request and the end of the present plan; None for the
             largest recent latency plus one.
           limits: of the commands' speeds.
+          wrist: of all tools, None for straight ones.
         """
         self._max_ahead = horizon - execute
         if ahead is not None and not 0 <= ahead <= self._max_ahead:
@@ -129,10 +129,12 @@ class PlanExecutor:
         self._moved = self._waited = 0  # control steps since the request, without and with holds
         self._latencies: collections.deque[int] = collections.deque(maxlen=_REMEMBERED)
         still = rcm.pose_on_manifold(_DOWN, 0.0, _DEPTH, self._p_world_trocar)
-        still = jax.device_get(_through(jax.device_get(still), self._p_world_trocar))
+        self._motion = plan_motion.of(wrist)
+        still = jax.device_get(self._motion.hold(jax.device_get(still), self._p_world_trocar))
         self._toward(still, still)
         plan: list[Any] = [np.broadcast_to(x, (horizon, *x.shape)) for x in still]
-        _worst(Pose(*plan), self._p_world_trocar)
+        self._motion.worst(Pose(*plan), self._p_world_trocar)
+        self._command(still, np.zeros(0))
 
     @property
     def ahead(self) -> int:
@@ -171,7 +173,7 @@ class PlanExecutor:
 
     def on_plan(self, plan: Command) -> bool:
         """Stores the requested plan `[H, *arms]`; returns False for one off the RCM manifold."""
-        off, depth, skew = map(float, _worst(plan.pose, self._p_world_trocar))
+        off, depth, skew = map(float, self._motion.worst(plan.pose, self._p_world_trocar))
         if not (off <= MAX_OFF and depth > 0.0 and skew <= MAX_SKEW):
             got = f"{1e3 * off:.3g} mm from the trocar, {1e3 * depth:.3g} mm beyond it"
             self.on_failure(f"plan: expected one on the RCM manifold, got axes {got}")
@@ -189,13 +191,13 @@ class PlanExecutor:
         """
         sensors: list[Any] = [np.asarray(x, np.float32) for x in pose]
         pose = Pose(*sensors)
-        held = jax.device_get(_through(pose, self._p_world_trocar))
+        held = jax.device_get(self._motion.hold(pose, self._p_world_trocar))
         _, move, turn = self._toward(pose, held)
         if self._exceeds(move, turn):
             got = f"one that must turn by {turn:.2g} rad"
             raise UsageError("observation.pose", "a tool through the trocar", got)
         opening: Any = np.clip(np.asarray(gripper, np.float32), -1.0, 1.0)
-        self.last = Command(held, opening)
+        self.last = self._command(held, opening)
 
     def step(self) -> Command:
         """Returns the next command `[*arms]`."""
@@ -225,64 +227,19 @@ class PlanExecutor:
         self.report.stretched += is_stretched
         self._index += 1
         self._moved += 1
-        self.last = Command(pose, np.clip(target.gripper, -1.0, 1.0))
+        self.last = self._command(pose, np.clip(target.gripper, -1.0, 1.0))
         return self.last
 
     def _toward(self, last: Pose, target: Pose) -> tuple[Pose, np.ndarray, np.ndarray]:
-        return jax.device_get(_toward(last, target, self._p_world_trocar, *self._limits.per_step))
+        limits = self._limits.per_step
+        return jax.device_get(self._motion.toward(last, target, self._p_world_trocar, *limits))
+
+    def _command(self, pose: Pose, gripper: Any) -> Command:
+        return Command(
+            pose, gripper, jax.device_get(self._motion.angles(pose, self._p_world_trocar))
+        )
 
     def _exceeds(self, move: np.ndarray, turn: np.ndarray) -> bool:
         # A negated comparison: NaN exceeds the limits.
         max_move, max_turn = self._limits.per_step
         return not (move <= max_move and turn <= max_turn)
-
-
-@jax.jit
-@arrays.broadcasting
-def _toward(
-    last: Pose, target: Pose, p_world_trocar: jax.Array, max_move: float, max_turn: float
-) -> tuple[Pose, jax.Array, jax.Array]:
-    """Moves from `last` toward `target` `[*arms]` on the RCM manifold, at most by the limits.
-
-    Rotation and depth are interpolated linearly, so the axis' turn moves the tip sideways.
-
-    Returns:
-      the pose; m and rad, the largest distances from `last` to `target`.
-    """
-    begin, end = (turns.orthonormal(x.R) for x in (last, target))
-    depth, end_depth = (rcm.insertion_depth(x, p_world_trocar) for x in (last, target))
-    turn = turns.between(begin, end)
-    angle = arrays.norm(turn)
-    across = jnp.maximum(depth, end_depth) * arrays.norm(turn[..., :2])  # roll moves no tip
-    move = arrays.norm(jnp.stack([across, end_depth - depth], -1))
-    tiny = 1e-9  # m and rad, against a division by zero
-    fraction = jnp.minimum(max_move / jnp.maximum(move, tiny), max_turn / jnp.maximum(angle, tiny))
-    fraction = jnp.minimum(fraction, 1.0)
-    R = jnp.where((fraction < 1.0)[..., None, None], turns.part(begin, turn, fraction), end)
-    pose = rcm.pose_at_depth(R, depth + fraction * (end_depth - depth), p_world_trocar)
-    return pose, jnp.max(move), jnp.max(angle)
-
-
-@jax.jit
-@arrays.broadcasting
-def _through(pose: Pose, p_world_trocar: jax.Array) -> Pose:
-    """Turns the tool's axis through the trocar; the tip stays (`rcm.project`)."""
-    projected = rcm.project(pose, p_world_trocar)
-    depth = rcm.insertion_depth(projected, p_world_trocar)
-    return rcm.pose_at_depth(turns.orthonormal(projected.R), depth, p_world_trocar)
-
-
-@jax.jit
-@arrays.broadcasting
-def _worst(pose: Pose, p_world_trocar: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Measures the worst of the poses `[H, *arms]`.
-
-    Returns:
-      m, the largest RCM error; m, the least depth; the largest distance of a matrix from a
-      rotation.
-    """
-    x, y, z = (pose.R[..., :, i] for i in range(3))
-    mirrored = jnp.abs(jnp.cross(x, y) - z).max()
-    skew = jnp.maximum(jnp.abs(arrays.matmul(pose.R.mT, pose.R) - jnp.eye(3)).max(), mirrored)
-    off = rcm.rcm_error(pose, p_world_trocar).max()
-    return off, rcm.insertion_depth(pose, p_world_trocar).min(), skew

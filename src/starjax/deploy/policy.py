@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import config, config_json, errors, limits, methods, rcm, types
+from starjax.data import normalizer
 from starjax.deploy import approach, inputs
 from starjax.deploy.inputs import RobotObservation
 from starjax.learners import LEARNERS
@@ -23,7 +24,7 @@ from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import files
-from starjax.sim import registries, trocar_region
+from starjax.sim import registries, trocar_region, wrists
 from starjax.sim.names import SceneNames
 from starjax.types import Command, Pose
 
@@ -90,7 +91,7 @@ class Deployed:
 
         Returns:
           Command `[H]` or `[B, H]`: tip poses in the world frame, on the RCM manifold except for
-          `dp_ee`, and the gripper's openings.
+          `dp_ee`, the gripper's openings, and the angles of a wrist that the policy moves.
 
         Raises:
           UsageError: an input is missing, has the wrong shape or type, is not finite or cannot have
@@ -207,7 +208,11 @@ def load(
     sharing = [name for name, row in methods.METHODS.items() if row.weights_of == trained.method]
     errors.choice("method", method, sharing)
     row = methods.METHODS[method]
-    task = registries.tasks.get(trained.scene.task)
+    task = wrists.holding(registries.tasks.get(trained.scene.task), trained.scene)
+    wrist = normalizer.wrist_of(row, task)
+    if wrist is not None and not row.keeps_to_manifold:
+        expected = "one whose shaft passes the trocar"
+        raise errors.UsageError("method", expected, method, "dp_ee_proj_wrist has these weights")
     made = policies.make(row, settings, task, cameras=trained.scene.cameras)
     params = made.prepare_for_inference(trained.params)
     p_world_ref = np.asarray(trained.p_world_ref, np.float32)
@@ -221,9 +226,11 @@ def load(
         cameras=trained.scene.cameras if settings.observation == "image" else (),
         state_size=task.state_size,
         regions=trocar_region.of_task(task),
+        wrist=() if wrist is None else tuple(wrist),
     )
-    approach_space = row.action_space if row.keeps_to_manifold else None
-    infer = _inference(made.sample, trained, p_world_ref, not arms, approach_space)
+    is_straight = row.keeps_to_manifold and wrist is None
+    approach_space = row.action_space if is_straight else None
+    infer = _inference(made.sample, trained, p_world_ref, not arms, approach_space, wrist)
     return Deployed(
         method=method,
         settings=settings,
@@ -268,11 +275,13 @@ def _inference(
     p_world_ref: np.ndarray,
     is_one_arm: bool,
     approach_space: str | None,
+    wrist: rcm.Wrist | None,
 ) -> Callable[..., tuple[Command, approach.StartOffset]]:
     """Wraps `sample` for measured inputs: arm axis, trocar frames, half turns, slow approach.
 
     `approach_space` is the action space of a policy on the manifold, whose plans get
-    `approach.with_approach`; None for others.
+    `approach.with_approach`; None for others. With a `wrist` half a turn is one of the shaft, with
+    both angles negated.
     """
     roll_zero = np.asarray(trained.roll_zero, np.float32)
     tools = [registries.tools.get(name) for name in trained.scene.tools]
@@ -283,20 +292,26 @@ def _inference(
             pose = Pose(sensors.pose.R[..., None, :, :], sensors.pose.p[..., None, :])
             sensors = sensors._replace(pose=pose, gripper=sensors.gripper[..., None])
             trocar = rcm.Trocar(*(field[..., None] for field in trocar))
+        frame = rcm.trocar_frame(trocar, p_world_ref, roll_zero)
         # Half a turn about the tool's z axis negates the x and y columns of R.
-        roll = rcm.roll_of(sensors.pose.R[:, -1]) - roll_zero
+        shaft = Pose(sensors.pose.R[:, -1], sensors.pose.p[:, -1])
+        if wrist is not None:
+            angles = rcm.angles_through(wrist, shaft, frame.p_world_trocar)
+            shaft = rcm.shaft_of(wrist, shaft, angles)
+        roll = rcm.roll_of(shaft.R) - roll_zero
         sign = jnp.where((jnp.cos(roll) < 0.0) & is_symmetric, -1.0, 1.0)[:, None, :, None, None]
         half_turn = jnp.concatenate([sign, sign, jnp.ones_like(sign)], axis=-1)
         sensors = sensors._replace(pose=sensors.pose._replace(R=sensors.pose.R * half_turn))
-        frame = rcm.trocar_frame(trocar, p_world_ref, roll_zero)
         command = sample(params, stats, keys, sensors, frame)
         measured = Pose(*(x[:, -1].astype(jnp.float32) for x in sensors.pose))
         if approach_space:
             command = approach.with_approach(approach_space, stats, measured, command, frame)
         offset = approach.start_offset(measured, Pose(*(x[:, 0] for x in command.pose)))
         R, p, gripper = command.pose.R * half_turn, command.pose.p, command.gripper
+        angles = None if command.wrist is None else command.wrist * sign[..., 0]
         if is_one_arm:
             R, p, gripper = R[..., 0, :, :], p[..., 0, :], gripper[..., 0]
-        return Command(Pose(R, p), gripper), offset
+            angles = None if angles is None else angles[..., 0, :]
+        return Command(Pose(R, p), gripper, angles), offset
 
     return infer

@@ -15,6 +15,8 @@ from starjax.policies import in_env
 from starjax.policies.base import Policy
 from starjax.rollouts import agent
 from starjax.sim import env as sim_env
+from starjax.sim import wrists
+from starjax.sim.tasks.base import Task
 from starjax.types import Command
 
 _NEAR_M = 1e-3  # between nominal trocars of server and task
@@ -133,16 +135,26 @@ def attach(connections: Any, arms: Sequence[str] = ()) -> ServedPolicy:
     )
     origin = {"address": connections.address, "metadata": greeting.as_json(connections.metadata)}
     trained = ServedTraining(hello.method, settings, np.zeros(1, bool), None, env.names)
-    return ServedPolicy(trained, _policy(remote), env, greeting.identity(origin), origin, remote)
+    policy = _policy(remote, env.task)
+    return ServedPolicy(trained, policy, env, greeting.identity(origin), origin, remote)
 
 
-def _policy(remote: remote_policy.RemotePolicy) -> Policy:
-    """Returns a policy for inference: its other functions are the server's own business."""
+def _policy(remote: remote_policy.RemotePolicy, task: Task) -> Policy:
+    """Returns a policy for inference: its other functions are the server's own business.
+
+    A wrist follows from the tips of the plans, through the measured trocars.
+    """
 
     def untrained(*_: Any) -> Any:
         raise NotImplementedError("a served policy is trained elsewhere")
 
-    return Policy(untrained, untrained, untrained, remote.sample)
+    def sample(
+        done: Any, stats: Any, keys: jax.Array, observation: Any, trocar: rcm.TrocarFrame
+    ) -> Command:
+        plan = remote.sample(done, stats, keys, observation, trocar)
+        return wrists.through(task, plan, trocar.p_world_trocar[:, None])
+
+    return Policy(untrained, untrained, untrained, sample)
 
 
 def _first_answer(

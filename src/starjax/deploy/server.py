@@ -121,7 +121,7 @@ def metadata(policy: Deployed, name: str = "", batch: int = 1) -> dict[str, Any]
         "horizon": settings.horizon,
         "execute": settings.execute,
         "batch": batch,
-        "asks": _plain(spec),
+        "asks": {name: value for name, value in _plain(spec).items() if name != "wrist" or value},
         "inputs": {field: _plain(row) for field, row in arrays},
         "actions": list(wire.ACTION),
         **({"monitor": calibrate.to_json(policy.monitor)} if policy.monitor else {}),

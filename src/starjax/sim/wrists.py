@@ -7,7 +7,7 @@ from starjax import rcm
 from starjax.sim import registries
 from starjax.sim.names import SceneNames
 from starjax.sim.tasks.base import Task
-from starjax.types import Command
+from starjax.types import Command, Pose
 
 
 def per_arm(task: Task) -> tuple[rcm.Wrist | None, ...]:
@@ -30,27 +30,25 @@ def holding(task: Task, names: SceneNames) -> Task:
 
 
 def through(task: Task, command: Command, p_world_trocar: jax.Array) -> Command:
-    """Returns the command `[A]` with the wrist angles of shafts through their trocars.
+    """Returns the command `[..., A]` with the wrist angles of shafts through their trocars.
 
     Tips keep their pose within the limits of their wrist, see `rcm.through`; straight tools keep
     theirs. Without a wrist the command is returned unchanged.
 
     Args:
       task: whose slots name the tools.
-      command: `[A]`; its own angles are ignored.
-      p_world_trocar: `[A, 3]` m.
+      command: `[..., A]`; its own angles are ignored.
+      p_world_trocar: `[..., A, 3]` m.
     """
     held = per_arm(task)
     if not any(held):
         return command
-    poses, angles = [], []
+    (R, p), angles = command.pose, []
     for arm, wrist in enumerate(held):
-        pose = jax.tree.map(lambda leaf, arm=arm: leaf[arm], command.pose)
-        if wrist is None:
-            found = rcm.WristPose(pose, jnp.zeros(2), jnp.ones((), bool))
-        else:
-            found = rcm.through(wrist, pose, p_world_trocar[arm])
-        poses.append(found.pose)
-        angles.append(found.wrist)
-    pose = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    return command._replace(pose=pose, wrist=jnp.stack(angles))
+        found = jnp.zeros((*command.gripper.shape[:-1], 2))
+        if wrist is not None:
+            pose = Pose(R[..., arm, :, :], p[..., arm, :])
+            pose, found, _ = rcm.through(wrist, pose, p_world_trocar[..., arm, :])
+            R, p = R.at[..., arm, :, :].set(pose.R), p.at[..., arm, :].set(pose.p)
+        angles.append(found)
+    return Command(Pose(R, p), command.gripper, jnp.stack(angles, -2))
