@@ -48,6 +48,20 @@ def test_a_gamepad(monkeypatch):
         device.read()
 
 
+def test_a_spacemouse_bends_a_wrist_with_its_other_two_axes(monkeypatch):
+    state = types.SimpleNamespace(
+        t=1, x=0.1, y=0.2, z=0.3, roll=0.4, pitch=0.5, yaw=0.6, buttons=[1, 0]
+    )
+    mouse = types.SimpleNamespace(read=lambda: state, close=lambda: None)
+    convention = types.SimpleNamespace(HID_Z_UP=0)
+    library = types.SimpleNamespace(open=lambda **_: mouse, AxisConvention=convention)
+    monkeypatch.setitem(sys.modules, "pyspacemouse", library)
+    monkeypatch.setitem(sys.modules, "easyhid", types.SimpleNamespace(HIDException=OSError))
+    reading = devices.open_device("spacemouse").read()
+    np.testing.assert_allclose(reading.deflection, [0.6, 0.1, 0.2, 0.3])
+    assert reading.bend == (0.5, 0.4) and reading.buttons == (True, False)
+
+
 def test_no_gamepad_is_a_mistake(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", pygame(count=0)[0])
     with pytest.raises(errors.UsageError):

@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import pytest
 
+from starjax import rcm
 from starjax.data import load
 from starjax.rollouts import trocars
 from starjax.viewer import browse, devices, recorder, simulation, teleop, teleop_target, view
@@ -168,6 +169,25 @@ def test_what_was_discarded_is_nowhere(page, steered, hurried, tmp_path):
         teleop.run(page, steered, kept, after(40, presses), device=directed(steered, 0), seed=SEED)
         assert kept.kept == 0
     assert len(list(root.glob("episodes/*"))) <= 1  # motion after it
+
+
+def test_keys_bend_a_wrist(page, steered):
+    pilot = teleop_target.Pilot(page, 1, np.eye(3), None, has_wrist=True)
+    start = np.array([[0.0, 0.0, 0.0, 0.06, 0.0, 0.0]])
+    slot, wrist = steered.env.task.slots[0], rcm.LARGE_NEEDLE_DRIVER
+    bounds = [teleop_target.bounds(slot, start[0, 1:4], wrist)]
+    pilot.rest(start, np.ones(1), bounds)
+    turn = teleop_target.KEY_TURN
+    for key in ("Pitch up", "Pitch up", "Yaw right", "Up"):
+        press(page, key)
+    pilot.read(1 / 30)
+    moved = pilot.targets[0].goal - start[0]
+    up = teleop_target.KEY_STEP
+    np.testing.assert_allclose(moved, [0, 0, 0, up, 2 * turn, -turn], atol=1e-12)
+    for _ in range(60):
+        press(page, "Pitch up")
+    pilot.read(1 / 30)
+    assert pilot.targets[0].goal[4] == pytest.approx(wrist.pitch)
 
 
 def test_the_hands_of_the_page(page, steered, hurried, tmp_path):

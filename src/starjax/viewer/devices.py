@@ -17,10 +17,12 @@ class Reading(NamedTuple):
     Attributes:
       deflection: `[4]` in [-1, 1]: roll, right, away, up.
       buttons: pressed states of the first (jaws) and the second (clutch).
+      bend: `[2]` in [-1, 1]: pitch and yaw of a wrist; 0 of a device with fewer axes.
     """
 
     deflection: np.ndarray
     buttons: tuple[bool, bool]
+    bend: tuple[float, float] = (0.0, 0.0)
 
 
 class DeviceLost(OSError):
@@ -59,7 +61,8 @@ def _spacemouse() -> Device:
             raise DeviceLost(str(error)) from error
         pressed = [*map(bool, state.buttons), False, False]
         deflection = np.array([state.yaw, state.x, state.y, state.z])
-        return Reading(np.clip(deflection, -1.0, 1.0), (pressed[0], pressed[1]))
+        pitch, yaw = np.clip([state.pitch, state.roll], -1.0, 1.0).tolist()
+        return Reading(np.clip(deflection, -1.0, 1.0), (pressed[0], pressed[1]), (pitch, yaw))
 
     return Device(read, mouse.close)
 

@@ -20,6 +20,7 @@ from starjax.rollouts import episodes, programs, takeover
 from starjax.rollouts import trocars as configurations
 from starjax.runtime import files
 from starjax.sim import env as sim_env
+from starjax.sim import wrists
 from starjax.types import Command
 from starjax.viewer import simulation
 from starjax.viewer.frame import Frame
@@ -34,7 +35,7 @@ class Moment(NamedTuple):
       frame: for the page.
       fields: those of `episodes.DEMONSTRATION`, and with a policy `actor`, `[1, ...]` each.
       status: that of `programs.status`, `[1]` each.
-      action: `[A, 4]` of `rcm4`, the command.
+      action: `[A, D]`, see `Steering`, the command.
       opening: `[A]`, the commanded openings.
     """
 
@@ -69,8 +70,9 @@ class Steering(NamedTuple):
     Attributes:
       env: the environment.
       start: (seed, index of the trocar configuration, trial) -> (LiveState, Frame, present actions
-        `[A, 4]` of `rcm4`, present openings `[A]`). Never a trial of an evaluation.
-      step: (LiveState, actions `[A, 4]`, openings `[A]`, True if the operator acts) -> (LiveState,
+        `[A, D]`, present openings `[A]`). Never a trial of an evaluation. Actions have roll and
+        tip, D = 4, and with a wrist pitch and yaw, D = 6.
+      step: (LiveState, actions `[A, D]`, openings `[A]`, True if the operator acts) -> (LiveState,
         Moment).
       look: LiveState -> camera's name -> `[h, w, 3]` uint8.
       compile: () -> None, compiles the other three; without it, their first calls do.
@@ -87,7 +89,11 @@ class Steering(NamedTuple):
 
 def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
     """Makes the functions of a Steering."""
-    space = rcm.ACTION_SPACES["rcm4"]
+    wrist = wrists.common(env.task)
+    space = rcm.action_space("rcm4" if wrist is None else "rcm6", wrist)
+    # Actions are roll, tip, angles; `rcm6` is roll, angles, tip.
+    to_action = slice(None) if wrist is None else np.array([0, 3, 4, 5, 1, 2])
+    from_action = slice(None) if wrist is None else np.array([0, 4, 5, 1, 2, 3])
     camera, observe = simulation.camera(env), jax.vmap(env.observe)
     params = None if policy is None else policy.params
 
@@ -95,7 +101,8 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
     def start(params: Any, key: jax.Array, trocar: Trocar) -> Any:
         key_env, key_agent = jax.random.split(key)
         state = env.reset(key_env, sim_env.EnvParams(trocar))
-        action, opening = space.encode(state.pose, state.measured_trocar), state.gripper
+        action = space.encode(state.pose, state.measured_trocar)[..., to_action]
+        opening = state.gripper
         state, memory = jax.tree.map(lambda x: jnp.asarray(x)[None], state), ()
         if policy is not None:
             memory = policy.agent.init(params, key_agent[None], state, lambda: observe(state))
@@ -107,12 +114,15 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
         params: Any, live: simulation.LiveState, action: jax.Array, opening: jax.Array, acts: Any
     ) -> tuple[simulation.LiveState, Moment]:
         before, memory, actor = live.env, live.memory, {}
-        pose, _ = space.decode(action[None], before.measured_trocar)
-        command = Command(pose, opening[None])
+        p_world_trocar = before.measured_trocar.p_world_trocar
+        pose, _ = space.decode(action[None, :, from_action], before.measured_trocar)
+        command = wrists.through(env.task, Command(pose, opening[None]), p_world_trocar)
         if policy is not None:
             # Also while the operator acts: its observations and its plan stay up to date.
             look = lambda: observe(before)  # noqa: E731
             planned, memory, _ = policy.agent.act(params, memory, before, look, live.t)
+            if planned.wrist is None:  # a straight one
+                planned = wrists.through(env.task, planned, p_world_trocar)
             command = jax.tree.map(lambda x, y: jnp.where(acts, x, y), command, planned)
             who = jnp.where(acts, takeover.PERSON, takeover.POLICY).astype(jnp.uint8)
             actor = {takeover.ACTOR: who[None]}
@@ -122,7 +132,8 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
         )
         carry = programs.RolloutState(after, (), after.step, jnp.ones(1, bool))
         live = simulation.LiveState(after, memory, live.t + 1)
-        now = space.encode(command.pose, before.measured_trocar)[0], command.gripper[0]
+        now = space.encode(command.pose, before.measured_trocar)[0, :, to_action]
+        now = now, command.gripper[0]
         status = programs.status(env, carry)
         return live, Moment(simulation.frame(env, live), {**fields, **actor}, status, *now)
 

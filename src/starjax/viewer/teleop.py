@@ -11,6 +11,7 @@ import numpy as np
 
 from starjax.rollouts import episodes
 from starjax.runtime import files
+from starjax.sim import wrists
 from starjax.viewer import goal_distance, page, teleop_target
 from starjax.viewer.devices import Device
 from starjax.viewer.frame import outcome, rcm_error_mm
@@ -84,9 +85,13 @@ class OperatorEpisode:
             self.hand_acts |= self._keeps
 
     def _rest(self, actions: np.ndarray, openings: np.ndarray) -> None:
-        """Lets the hand begin at actions `[A, 4]` of `rcm4` and openings `[A]`."""
-        slots = self._steering.env.task.slots
-        limits = [teleop_target.bounds(slot, a[1:]) for slot, a in zip(slots, actions, strict=True)]
+        """Lets the hand begin at actions `[A, D]`, see `Steering`, and openings `[A]`."""
+        task = self._steering.env.task
+        wrist = wrists.common(task)
+        limits = [
+            teleop_target.bounds(slot, action[1:4], wrist)
+            for slot, action in zip(task.slots, actions, strict=True)
+        ]
         self._pilot.rest(actions, openings, limits)
 
     def replay(self, recorder: Recorder) -> Iterator[None]:
@@ -133,7 +138,8 @@ def run(
         page.add_command(gui, "Pass control", "T", lambda: requests.add("pass"))
     names = trocar_names(env.task.name)
     choices = page.Choices(gui, requests, trocar=(names, names[trocar]))
-    pilot = Pilot(server, env.task.arms, view_axes(env), device)
+    has_wrist = wrists.common(env.task) is not None
+    pilot = Pilot(server, env.task.arms, view_axes(env), device, has_wrist)
     page.add_dark_mode(gui)
     steering.compile()  # not after the operator's first motion
     episode = OperatorEpisode(server, steering, pilot, seed)

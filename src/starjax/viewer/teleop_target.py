@@ -1,8 +1,8 @@
 """The target of an operator: a point of the RCM manifold that handle, keys and device move.
 
-A target has roll and tip, the coordinates of action space `rcm4`; the shaft follows from them and
-therefore always passes the trocar. Plain functions on a few numbers, 30 times a second: nothing
-here is compiled.
+A target has roll and tip, the coordinates of action space `rcm4`, and with a wrist pitch and yaw as
+well, those of `rcm6`. The shaft follows from them and therefore always passes the trocar. Plain
+functions on a few numbers, 30 times a second: nothing here is compiled.
 """
 
 import queue
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from starjax import rcm
 from starjax.sim import registries
 from starjax.sim.tasks.base import Slot
 from starjax.viewer import page
@@ -35,6 +36,14 @@ _MOVES = {
     "Q": ("roll left", (1, 0, 0, 0)),
     "E": ("roll right", (-1, 0, 0, 0)),
 }
+# The same with a wrist, whose increments are of pitch and yaw.
+_BENDS = {
+    "I": ("pitch up", (1, 0)),
+    "K": ("pitch down", (-1, 0)),
+    "J": ("yaw left", (0, 1)),
+    "L": ("yaw right", (0, -1)),
+}
+_BEND_HELP = " I, K (pitch) and J, L (yaw) bend the wrist."
 _HELP = (
     "Drag the arrows at the tip, or press arrows, Page Up and Page Down, Q and E (roll), "
     "G (jaws), C (clutch)."
@@ -45,8 +54,9 @@ class TeleopTarget(NamedTuple):
     """Target of one arm.
 
     Attributes:
-      goal: `[4]` roll (rad) and tip (m, world frame) after all increments.
-      action: `[4]` the same, smoothed: the command.
+      goal: `[D]` roll (rad) and tip (m, world frame) after all increments, D = 4; with a wrist also
+        pitch and yaw (rad), D = 6.
+      action: `[D]` the same, smoothed: the command.
       gripper: -1 squeezes, +1 is fully open.
     """
 
@@ -59,29 +69,33 @@ class Bounds(NamedTuple):
     """Limits of a target.
 
     Attributes:
-      low: `[4]` roll (rad) and tip (m).
-      high: `[4]` likewise.
+      low: `[D]` roll (rad), tip (m), angles (rad).
+      high: `[D]` likewise.
     """
 
     low: np.ndarray
     high: np.ndarray
 
 
-def bounds(slot: Slot, tip: np.ndarray) -> Bounds:
+def bounds(slot: Slot, tip: np.ndarray, wrist: rcm.Wrist | None = None) -> Bounds:
     """Returns the range of a slot's arm, widened to include the initial tip `[3]` m."""
     space = registries.workspaces.get(slot.workspace)
     low, high = np.minimum(space.low, tip) - MARGIN, np.maximum(space.high, tip) + MARGIN
     low[2] = min(space.low[2], tip[2])  # no margin below, towards the table
-    return Bounds(np.array([space.rolls[0], *low]), np.array([space.rolls[1], *high]))
+    bend = () if wrist is None else (wrist.pitch, wrist.yaw)
+    return Bounds(
+        np.array([space.rolls[0], *low, *(-limit for limit in bend)]),
+        np.array([space.rolls[1], *high, *bend]),
+    )
 
 
 def at_rest(action: np.ndarray, gripper: float) -> TeleopTarget:
-    """Makes a target that holds an action `[4]`."""
+    """Makes a target that holds an action `[D]`."""
     return TeleopTarget(np.array(action), np.array(action), gripper)
 
 
 def moved(target: TeleopTarget, by: np.ndarray, within: Bounds) -> TeleopTarget:
-    """Adds an increment `[4]` (rad, m) within bounds."""
+    """Adds an increment `[D]` (rad, m) within bounds."""
     return target._replace(goal=np.clip(target.goal + by, within.low, within.high))
 
 
@@ -129,12 +143,20 @@ class Pilot:
       has_moved: true after the first motion since `rest`.
     """
 
-    def __init__(self, server: Any, arms: int, axes: np.ndarray, device: Device | None):
+    def __init__(
+        self,
+        server: Any,
+        arms: int,
+        axes: np.ndarray,
+        device: Device | None,
+        has_wrist: bool = False,
+    ):
+        self._size = 6 if has_wrist else 4
         self._server, self._axes, self._device = server, axes, device
         self._buttons = (False, False)
         self._presses: queue.SimpleQueue[tuple[np.ndarray, bool]] = queue.SimpleQueue()
         gui = server.gui
-        gui.add_markdown(_HELP)
+        gui.add_markdown(_HELP + _BEND_HELP * has_wrist)
         names = tuple(str(i) for i in range(arms))
         self._arm = gui.add_dropdown("Arm", names, visible=arms > 1)
         self._clutch = gui.add_checkbox("Clutch", True, hint="C: off, the hand moves freely")
@@ -145,16 +167,18 @@ class Pilot:
         self._before = np.zeros(3)
 
         def bind(key: str, label: str, by: tuple[int, ...], toggles: bool = False) -> None:
-            press = (np.array(by), toggles)
+            press = (np.array([*by, 0, 0][: self._size]), toggles)
             page.add_command(gui, label, key, lambda: self._presses.put(press))
 
         for key, (label, by) in _MOVES.items():
             bind(key, label.capitalize(), by)
+        for key, (label, bend) in _BENDS.items() if has_wrist else ():
+            bind(key, label.capitalize(), (0, 0, 0, 0, *bend))
         bind("G", "Open or close the jaws", (0, 0, 0, 0), toggles=True)
         page.add_command(gui, "Clutch", "C", self._toggle_clutch)
 
     def rest(self, actions: np.ndarray, openings: np.ndarray, limits: list[Bounds]) -> None:
-        """Holds actions `[A, 4]` of `rcm4` and openings `[A]`, and forgets pending keys."""
+        """Holds actions `[A, D]` and openings `[A]`, and forgets pending keys."""
         self.targets = [at_rest(a, float(o)) for a, o in zip(actions, openings, strict=True)]
         self._limits, self.has_moved = limits, False
         while not self._presses.empty():
@@ -162,7 +186,7 @@ class Pilot:
         self._settle()
 
     def read(self, period: float) -> tuple[np.ndarray, np.ndarray]:
-        """Advances by one period (s); returns actions `[A, 4]` and openings `[A]`."""
+        """Advances by one period (s); returns actions `[A, D]` and openings `[A]`."""
         arm = int(self._arm.value)
         by, toggles = self._input(period)
         if self._clutch.value and by.any():
@@ -180,17 +204,19 @@ class Pilot:
         )
 
     def _input(self, period: float) -> tuple[np.ndarray, bool]:
-        """Returns the increment `[4]` (rad, m in the world frame) and a toggle of the jaws."""
-        by, toggles, scale = np.zeros(4), False, float(self._scale.value)
+        """Returns the increment `[D]` (rad, m in the world frame) and a toggle of the jaws."""
+        by, toggles, scale = np.zeros(self._size), False, float(self._scale.value)
         position = np.array(self._handle.position)
-        by[1:], self._before = scale * (position - self._before), position
+        by[1:4], self._before = scale * (position - self._before), position
         steps = scale * np.array([KEY_TURN, KEY_STEP, KEY_STEP, KEY_STEP])
         while not self._presses.empty():
             press, is_toggle = self._presses.get()
-            by += steps * np.array([press[0], *(self._axes @ press[1:])])
+            by[:4] += steps * np.array([press[0], *(self._axes @ press[1:4])])
+            by[4:] += scale * KEY_TURN * press[4:]
             toggles ^= is_toggle
         if reading := self._reading():
-            by += increment(reading.deflection, self._axes, scale, period)
+            by[:4] += increment(reading.deflection, self._axes, scale, period)
+            by[4:] += scale * period * SPIN * np.array(reading.bend)[: self._size - 4]
             # A button acts when it goes down.
             jaws, clutch = (on and not was for on, was in zip(reading.buttons, self._buttons))
             self._buttons = reading.buttons
@@ -210,7 +236,7 @@ class Pilot:
 
     def _settle(self) -> None:
         """Returns the handle to the target's tip."""
-        tip = self.targets[int(self._arm.value)].goal[1:]
+        tip = self.targets[int(self._arm.value)].goal[1:4]
         if not np.array_equal(self._before, tip):
             self._handle.position = tip
             self._before = np.array(self._handle.position)
