@@ -25,12 +25,13 @@ class SceneView(NamedTuple):
 
     Attributes:
       outline: the task's outline.
-      tips: (qpos `[T, Q]`, p_world_trocar `[A, 3]` m) -> positions of the tips in m, and
-        directions of their shafts, away from the arm: `[T, A, 3]` each.
+      shafts: (qpos `[T, Q]`, p_world_trocar `[A, 3]` m) -> positions of the tips and of the shafts'
+        ends in m, the same without a wrist, and directions of the shafts, away from the arm:
+        `[T, A, 3]` each.
     """
 
     outline: Outline
-    tips: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    shafts: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 def load(names: SceneNames) -> SceneView:
@@ -40,17 +41,23 @@ def load(names: SceneNames) -> SceneView:
       errors.UsageError: one of the names is unknown here.
     """
     model = scene.compose(names)
-    sites = [scene.tcp(i, registries.tools.get(tool)) for i, tool in enumerate(names.tools)]
+    tools = [registries.tools.get(tool) for tool in names.tools]
+    sites = [(scene.tcp(i, tool), f"arm{i}/tool/{tool.base}") for i, tool in enumerate(tools)]
 
-    def tips(qpos: np.ndarray, p_world_trocar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def shafts(
+        qpos: np.ndarray, p_world_trocar: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rows = [
-            [np.stack([data.site(s).xpos, data.site(s).xmat[2::3]]) for s in sites]
+            [
+                np.stack([data.site(tip).xpos, data.site(end).xpos, data.site(end).xmat[2::3]])
+                for tip, end in sites
+            ]
             for data in _kinematics(model, qpos, p_world_trocar)
         ]
-        p, axis = np.moveaxis(np.array(rows), 2, 0)
-        return p, axis
+        p, end, axis = np.moveaxis(np.array(rows), 2, 0)
+        return p, end, axis
 
-    return SceneView(registries.tasks.get(names.task).outline(model), tips)
+    return SceneView(registries.tasks.get(names.task).outline(model), shafts)
 
 
 # (qpos `[T, Q]`, p_world_trocar `[A, 3]` m, labels, first, endoscope's Pose `[T]` or None) ->

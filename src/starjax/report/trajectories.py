@@ -139,13 +139,18 @@ def _path(
 
 
 def _shafts(axis: Any, rollout: results.TrialTrajectory, color: str, scene: SceneView) -> None:
-    """Draws the shafts along a rollout, from the tips to beyond the trocars."""
+    """Draws the shafts along a rollout, from the tips to beyond the trocars.
+
+    A wrist is drawn as a line from the shaft's end to the tip.
+    """
     assert rollout.qpos is not None
     rows = np.linspace(0, len(rollout.qpos) - 1, _FAN).round().astype(int)
-    p, axis_of_shaft = scene.tips(rollout.qpos[rows], rollout.p_world_trocar)
-    length = np.linalg.norm(rollout.p_world_trocar - p, axis=-1) + _BEYOND  # [T, A]
-    ends = np.stack([p - length[..., None] * axis_of_shaft, p])
-    for shaft in ends.reshape(2, -1, 3).swapaxes(0, 1):
+    p, end, axis_of_shaft = scene.shafts(rollout.qpos[rows], rollout.p_world_trocar)
+    length = np.linalg.norm(rollout.p_world_trocar - end, axis=-1) + _BEYOND  # [T, A]
+    lines = [end - length[..., None] * axis_of_shaft, end]
+    if not np.array_equal(p, end):
+        lines.append(p)
+    for shaft in np.stack(lines).reshape(len(lines), -1, 3).swapaxes(0, 1):
         axis.plot(*_flat(shaft).T, color=color, linewidth=0.6, alpha=0.34)
 
 
