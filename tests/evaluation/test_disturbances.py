@@ -238,6 +238,20 @@ def test_what_is_seen_is_so_many_steps_old(env, steps):
     np.testing.assert_array_equal(seen[:steps], np.tile(true[0], (steps, 1)))
 
 
+def test_late_commands_of_a_wrist_are_late_with_its_angles(env):
+    """Straight ones too, whose command has none."""
+    state = env.reset(KEY, EnvParams(stubs.trocars(0), levels=None))
+    state = state.replace(wrist=jnp.full((1, 2), 0.1))
+    executed = []
+    fake = env._replace(step=lambda state, command: executed.append(command) or state)
+    _, memory = timing._hold_pose(fake, base.DisturbanceState(jnp.float32(2), KEY), state)
+    for wrist in (jnp.full((1, 2), 0.5), None, None):
+        command = Command(state.pose, state.gripper, wrist)
+        late = base.DisturbanceState(jnp.float32(2), KEY, memory)
+        _, memory = timing._execute_past(fake, late, state, command)
+    np.testing.assert_allclose([c.wrist[0, 0] for c in executed], [0.1, 0.1, 0.5])
+
+
 def test_lost_observations_are_replaced_by_the_last_one_that_came(env):
     seen, true = went(env, "observation_dropout", 0.3, steps=200)
     is_new = np.all(seen == true, -1)

@@ -42,12 +42,14 @@ def _observe_past(env: Env, disturbance: DisturbanceState, state: EnvState) -> O
 def _hold_pose(
     env: Env, disturbance: DisturbanceState, state: EnvState
 ) -> tuple[EnvState, Command]:
-    return state, _repeated(Command(state.pose, state.gripper))
+    return state, _repeated(Command(state.pose, state.gripper, state.wrist))
 
 
 def _execute_past(
     env: Env, disturbance: DisturbanceState, state: EnvState, command: Command
 ) -> tuple[EnvState, Command]:
+    if command.wrist is None and state.wrist is not None:  # a straight wrist
+        command = command._replace(wrist=jnp.zeros_like(state.wrist))
     after = env.step(state, _delayed(disturbance, command))
     return after, _pushed(command, disturbance.memory)
 
