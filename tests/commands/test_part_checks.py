@@ -13,10 +13,12 @@ from starjax.commands.part_checks import action_spaces, base, encoders
 from starjax.commands.part_checks import methods as method_checks
 from starjax.commands.part_checks import policies as policy_checks
 from starjax.commands.part_checks import presets as preset_checks
+from starjax.commands.part_checks import tools as tool_checks
 from starjax.learners import ENCODERS
 from starjax.models.encoders import Trunk
 from starjax.policies.external import POLICIES, ExternalPolicy
 from starjax.rcm import actions
+from starjax.sim import registries
 
 
 def faults(found):
@@ -40,11 +42,32 @@ ROW = methods.METHODS["dp_rcm4"]
             ROW._replace(weights_of="mine", action_space="rcm1", hierarchical=True),
             [f"policy in {task}" for task in method_checks.TASKS],
         ),
+        (methods.METHODS["stardiff_pose"]._replace(weights_of="mine"), []),
+        (methods.METHODS["stardiff_wrist"]._replace(weights_of="mine"), []),
     ],
 )
 def test_methods(monkeypatch, row, expected):
     monkeypatch.setitem(methods._BUILT_IN, "mine", row)
     assert faults(method_checks.check("mine", 1)) == expected
+
+
+LONGER = rcm.LARGE_NEEDLE_DRIVER._replace(clevis=0.0092)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, []),
+        ({"wrist": LONGER}, ["wrist"]),
+        ({"wrist_joints": ("yaw", "pitch")}, ["wrist"]),
+        ({"shaft": "stem"}, ["record"]),
+    ],
+)
+def test_a_tool_with_a_wrist(monkeypatch, changes, expected):
+    tool = registries.tools.get("needle_driver")._replace(**changes)
+    model = tool_checks._compile("needle_driver")[1]
+    monkeypatch.setattr(tool_checks, "_compile", lambda name: (tool, model))
+    assert faults(tool_checks.check("needle_driver", 1)) == expected
 
 
 RCM4 = rcm.ACTION_SPACES["rcm4"]

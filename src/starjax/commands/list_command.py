@@ -93,7 +93,9 @@ def _methods() -> Iterator[Row]:
 
 
 def _method(row: methods.Method) -> str:
-    rolls = "; a network for the roll" * row.hierarchical
+    given = {"rcm6": "roll and wrist", "se3_through": "the turn about a held wire"}
+    rolls = f"; a network for {given.get(row.action_space, 'the roll')}" * row.hierarchical
+    rolls += "; moves a wrist" * row.has_wrist
     condition = "; conditioned on the trocar" * row.sees_trocar + "; projected" * row.projects
     return f"{row.label}: actions {row.action_space}{rolls}{condition}"
 

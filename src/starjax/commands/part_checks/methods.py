@@ -10,9 +10,10 @@ from starjax.commands.part_checks.base import NOTE, Check, attempt, verdict
 from starjax.methods import METHODS, Method
 from starjax.policies import policy
 from starjax.runtime import user_code
-from starjax.sim import registries
+from starjax.sim import registries, scene, wrists
 
 TASKS = ("reach", "peg_transfer_bimanual")  # of one arm and of two
+WRISTED = "needle_driver"  # tool of methods that move a wrist
 # Fields that training depends on: methods with the same weights have the same.
 TRAINED = ("action_space", "sees_trocar", "hierarchical")
 
@@ -20,14 +21,14 @@ TRAINED = ("action_space", "sees_trocar", "hierarchical")
 def check(name: str, n: int) -> Iterator[Check]:
     """Yields the checks of a method; `n` is not used."""
     fault, row = attempt("record", lambda: METHODS[name])
-    if not fault:
+    if not fault and not row.has_wrist:
         fault, _ = attempt("action space", lambda: rcm.ACTION_SPACES.registry.get(row.action_space))
     if fault:
         yield fault
         return
     yield Check("record", f"{row.label}: {row.action_space}, {_conditioning(row)}")
     yield verdict("weights", _weights(name, row), f"those of {row.weights_of}")
-    if row.projects and row.action_space != "se3":
+    if row.projects and row._replace(projects=False).keeps_to_manifold:
         yield Check("projects", f"{row.action_space} is on the manifold without it", NOTE)
     for task in TASKS:
         fault, size = attempt(f"policy in {task}", lambda t=task: _size(name, row, t))
@@ -58,7 +59,11 @@ def _size(name: str, row: Method, task: str) -> int:
     small = presets.PRESETS["smoke"].policy
 
     def make() -> int:
-        made = policy.make(row, small, registries.tasks.get(task))
+        found = registries.tasks.get(task)
+        if row.has_wrist:
+            held = scene.name(task, tools=[WRISTED])
+            found = wrists.holding(found, held)
+        made = policy.make(row, small, found)
         shapes = jax.eval_shape(made.init, jax.random.key(0))
         return sum(leaf.size for leaf in jax.tree.leaves(shapes))
 

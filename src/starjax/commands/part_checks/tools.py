@@ -2,13 +2,17 @@
 
 from collections.abc import Iterator
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from starjax import rcm
 from starjax.commands.part_checks.base import Check, attempt, verdict
 from starjax.sim import mjcf_parts, registries
 from starjax.sim.tools.base import Tool
 
+BEND = (0.5, -0.4)  # rad, pitch and yaw of a bent wrist
+NEAR, NEAR_TURN = 1e-5, 1e-4  # m, and of a rotation's entries
 OBJECT_BITS = 4  # contype of objects that can be grasped, see mjcf/README.md
 
 
@@ -19,10 +23,13 @@ def check(name: str, n: int) -> Iterator[Check]:
         yield fault
         return
     tool, m = read
-    yield verdict("record", _names(tool, m), f"{m.ngeom} geoms, site {tool.tcp}")
+    missing = list(_names(tool, m))
+    yield verdict("record", iter(missing), f"{m.ngeom} geoms, site {tool.tcp}")
     fault, _ = attempt("names", lambda: mjcf_parts.ids(f"tool {name}", m, "site", [tool.tcp]))
     if not fault:
         yield verdict("tip frame", _axis(tool, m), "z points away from the robot")
+        if tool.wrist is not None and not missing:
+            yield verdict("wrist", _wrist(tool, m), "its lengths and turns are those of the record")
     yield verdict("jaws", _jaws(tool, m), "none" if tool.jaw is None else "closed < open")
     yield verdict("pads", _pads(tool, m), f"{len(tool.pads)} touch contype {OBJECT_BITS}")
 
@@ -37,6 +44,10 @@ def _compile(name: str) -> tuple[Tool, mujoco.MjModel]:
 def _names(tool: Tool, m: mujoco.MjModel) -> Iterator[str]:
     named = {"site": [tool.tcp], "geom": [*tool.pads], "joint": [tool.jaw] if tool.jaw else []}
     named["actuator"] = [tool.servo] if tool.servo else []
+    if tool.wrist is not None:
+        named["site"].append(tool.shaft)
+        named["joint"] += tool.wrist_joints
+        named["actuator"] += tool.wrist_joints
     for kind, names in named.items():
         for name in names:
             fault, _ = attempt("", lambda k=kind, n=name: mjcf_parts.ids("MJCF", m, k, [n]))
@@ -45,6 +56,22 @@ def _names(tool: Tool, m: mujoco.MjModel) -> Iterator[str]:
     for field in ("shaft_radius", "shaft_reach"):
         if not getattr(tool, field) > 0:
             yield f"{field}: expected more than 0, got {getattr(tool, field)}"
+
+
+def _wrist(tool: Tool, m: mujoco.MjModel) -> Iterator[str]:
+    """Yields a fault if the bent tool's tip is not where `rcm.tip_of` has it."""
+    assert tool.wrist is not None
+    data = mujoco.MjData(m)
+    for joint, angle in zip(tool.wrist_joints, BEND, strict=True):
+        data.joint(joint).qpos = angle
+    mujoco.mj_forward(m, data)
+    shaft, tip = (data.site(name) for name in (tool.shaft, tool.tcp))
+    R = shaft.xmat.reshape(3, 3)
+    there = rcm.tip_of(tool.wrist, rcm.Pose(jnp.eye(3), jnp.zeros(3)), np.array(BEND))
+    away = np.linalg.norm(R.T @ (tip.xpos - shaft.xpos) - there.p)
+    turned = np.abs(R.T @ tip.xmat.reshape(3, 3) - there.R).max()
+    if away > NEAR or turned > NEAR_TURN:
+        yield f"bent, the tip is {1e3 * away:.2g} mm and {turned:.2g} (rotation) off"
 
 
 def _axis(tool: Tool, m: mujoco.MjModel) -> Iterator[str]:
