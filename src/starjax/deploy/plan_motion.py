@@ -78,8 +78,8 @@ def of(wrist: rcm.Wrist | None) -> Motion:
     """Returns the motion of tools with a wrist, or of straight ones.
 
     With a wrist the tip moves straight, its rotation along the shortest turn, and `rcm.through`
-    gives the shaft. A turn is the larger one of the tip and the shaft. Off the manifold are poses beyond
-    the wrist's limits, by the way from there to the nearest feasible one.
+    gives the shaft. A turn is the larger one of the tip and the shaft. Off the manifold are poses
+    beyond the wrist's limits, by the way from there to the nearest feasible one.
     """
     if wrist is None:
         return STRAIGHT
