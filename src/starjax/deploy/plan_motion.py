@@ -1,4 +1,4 @@
-"""Motion of one command towards another on the RCM manifold: straight tools, and with a wrist."""
+"""ToolMotion of one command towards another on the RCM manifold: straight tools, and with a wrist."""
 
 import functools
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from starjax.types import Pose
 _TINY = 1e-9  # m and rad, against a division by zero
 
 
-class Motion(NamedTuple):
+class ToolMotion(NamedTuple):
     """Compiled functions of poses `[*arms]` and trocars `[*arms, 3]` m.
 
     Attributes:
@@ -70,11 +70,11 @@ def _worst(pose: Pose, p_world_trocar: jax.Array) -> tuple[jax.Array, jax.Array,
     return off, rcm.insertion_depth(pose, p_world_trocar).min(), _skew(pose.R)
 
 
-STRAIGHT = Motion(_hold, _toward, _worst, lambda pose, p_world_trocar: None)
+STRAIGHT = ToolMotion(_hold, _toward, _worst, lambda pose, p_world_trocar: None)
 
 
 @functools.lru_cache
-def of(wrist: rcm.Wrist | None) -> Motion:
+def of(wrist: rcm.Wrist | None) -> ToolMotion:
     """Returns the motion of tools with a wrist, or of straight ones.
 
     With a wrist the tip moves straight, its rotation along the shortest turn, and `rcm.through`
@@ -125,7 +125,7 @@ def of(wrist: rcm.Wrist | None) -> Motion:
     def angles(pose: Pose, p_world_trocar: jax.Array) -> jax.Array:
         return rcm.angles_through(wrist, pose, p_world_trocar)
 
-    return Motion(hold, toward, worst, angles)
+    return ToolMotion(hold, toward, worst, angles)
 
 
 def _skew(R: jax.Array) -> jax.Array:
