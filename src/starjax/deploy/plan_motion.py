@@ -1,4 +1,4 @@
-"""ToolMotion of one command towards another on the RCM manifold: straight tools, and with a wrist."""
+"""Motion of one command towards another on the RCM manifold: straight tools, and with a wrist."""
 
 import functools
 from collections.abc import Callable
