@@ -47,7 +47,7 @@ class Layout:
 
 
 class Script(NamedTuple):
-    """Memory of the expert: its pace, the tip and the angle at the start."""
+    """Memory of the expert: its pace, the tip at the start, the angle at the grasp."""
 
     pace: jax.Array
     start: jax.Array
@@ -92,9 +92,11 @@ def init(key: jax.Array, state: Any) -> Script:
 
 
 def act(script: Script, state: Any) -> tuple[Command, Script, Command]:
-    """Follows the way to the knob, and the knob's arc, by the clock."""
+    """Follows the knob, which falls with the lid, then the knob's arc, by the clock."""
     time = script.pace * (state.step + 1) / CONTROL_HZ
     hover, down, close, arc = TIMES
+    measured = state.measurements.angle
+    script = script._replace(angle=jnp.where(time > close, script.angle, measured))
     knob = knob_at(script.angle)
     above = knob + jnp.array([0.0, 0.0, HOVER])
 
