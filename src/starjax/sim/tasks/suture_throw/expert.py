@@ -1,0 +1,196 @@
+"""Scripted expert of suture throw: pick, drive, let go, take the point, turn out, pull.
+
+It commands tip poses: straight ways between them, and the needle's path of the bite while the
+needle is in the pad. The point is taken twice, since no grasp turns the needle out at once with
+room for the wrist; both grasps are the best of a search, see `far_grasp`. The script is disturbed
+on purpose while the pad holds nothing.
+"""
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.scipy.spatial.transform import Rotation
+
+from starjax import rcm
+from starjax.sim import ik
+from starjax.sim.state import EnvState
+from starjax.sim.tasks import phases, scripting
+from starjax.sim.tasks.needle_drive import task as driven
+from starjax.sim.tasks.suture_throw import far_grasp, task
+from starjax.sim.tissue import needle as needles
+from starjax.types import Agent, Command, Pose
+
+(
+    APPROACH, DESCEND, CLOSE, LIFT, OVER, DOWN, DRIVE, OPEN, BACK, AROUND, REACH, TAKE, OUT, PULL,
+    HOLD,
+) = range(15)  # fmt: skip
+TIMING = phases.PhaseTable(
+    duration=(1.2, 0.8, 0.4, 0.8, 1.8, 1.0, 0.0, 0.4, 0.6, 2.5, 0.9, 0.4, 0.0, 1.5, 1.0),
+    speed=(0.03, 0.02, 1.0, 0.02, 0.03, 0.02, 1.0, 1.0, 0.02, 0.02, 0.02, 1.0, 1.0, 0.03, 1.0),
+    jaws=(1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0),
+    tempo=(0.9, 1.2),
+)
+DISTURBANCE = (1.0, 1.0, 0.0, 0.3, 1.0, 0.5, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.3, 0.1)
+SETTLES = (DESCEND, DOWN, REACH)  # phases whose disturbance fades
+DEVIATION = (0.0012, 0.0012, 0.0012, 0.0)  # m, of the position
+HOVER = 0.015  # m above a grasp, along the jaws, and above the start of the arc
+LIFT_HEIGHT = 0.02  # m
+BEFORE = 0.17  # rad on the arc to the entry
+EMERGE = 0.006  # m of wire past the exit, to be taken
+MIDDLE = 0.55  # of the turn out of the pad, where the point is taken again
+PAST = 0.35  # rad that the needle turns on behind the exit
+TURN_SPEED = 0.4  # rad/s on the arc, the mean
+END = (0.0, 0.0, 0.088)  # m, of the tip
+
+
+@flax.struct.dataclass
+class ThrowScript(phases.PhaseScript):
+    """Progress of the script in one episode.
+
+    Attributes:
+      R_from, R_goal, R: `[3, 3]`, the tip's rotations at the phase's ends and now.
+      turn, turn_end: rad, the needle's on the path at the phase's ends.
+      held: pose_tip_needle at the phase's start.
+      far: pose_tip_needle `[2]` of both grasps of the point.
+      leg: int32, number of the present one.
+    """
+
+    R_from: jax.Array
+    R_goal: jax.Array
+    R: jax.Array
+    turn: jax.Array
+    turn_end: jax.Array
+    held: Pose
+    far: Pose
+    leg: jax.Array
+
+
+def init(key: jax.Array, state: EnvState) -> ThrowScript:
+    """Starts the script of an episode."""
+    R, zero, bite = state.pose.R[0], jnp.zeros(()), state.layout.bite
+    trocar = state.measured_trocar
+    out, middle, end = _turns(bite)
+    far = jax.vmap(
+        lambda first, last: far_grasp.search(
+            task.SIZE, bite, first, last, trocar.p_world_trocar[0], trocar.roll_zero[0]
+        )
+    )(jnp.stack([out, middle]), jnp.stack([middle, end]))
+    script = phases.begin(
+        ThrowScript, TIMING, key, state.pose.p[0], R_from=R, R_goal=R, R=R, turn=zero,
+        turn_end=zero, held=_held(state), far=far, leg=jnp.zeros((), jnp.int32),
+    )  # fmt: skip
+    return _enter(script, jnp.asarray(APPROACH, jnp.int32), state)
+
+
+def _turns(bite: needles.Bite) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns turns (rad) of the needle: its point is taken, taken again, and its tail is out."""
+    half = needles.entry_angle(task.SIZE, bite)
+    out, end = half + EMERGE / task.SIZE.radius, half + task.SIZE.sweep
+    return out, out + MIDDLE * (end - out), end
+
+
+def _held(state: EnvState) -> Pose:
+    """Returns pose_tip_needle as measured."""
+    tip = jax.tree.map(lambda leaf: leaf[0], state.pose)
+    needle = state.measurements.drive.needle
+    return Pose(tip.R.T @ needle.R, tip.R.T @ (needle.p - tip.p))
+
+
+def _tip(needle: Pose, held: Pose) -> Pose:
+    """Returns pose_world_tip of a needle's pose."""
+    R = needle.R @ held.R.T
+    return Pose(R, needle.p - R @ held.p)
+
+
+def _enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScript:
+    """Begins `phase`: sets its goal, rotation and duration."""
+    bite, held, needle = state.layout.bite, _held(state), state.measurements.drive.needle
+    out, middle, end = _turns(bite)
+    # From the middle on, the grasp is let go for the second.
+    again = (phase == OPEN) & (script.phase == OUT)
+    leg = jnp.where(again, 1, script.leg).astype(jnp.int32)
+    half = needles.entry_angle(task.SIZE, bite)
+    first = _tip(needle, driven.grasp(task.SIZE))
+    start = _tip(needles.pose_on(task.SIZE, bite, -half - BEFORE), held)
+    far = _tip(needle, jax.tree.map(lambda leaf: leaf[leg], script.far))
+    up = jnp.array([0.0, 0.0, 1.0])
+    stays = Pose(script.R, script.at)
+    goals = {
+        APPROACH: Pose(first.R, first.p - HOVER * first.R[:, 2]),
+        DESCEND: first,
+        LIFT: Pose(stays.R, stays.p + LIFT_HEIGHT * up),
+        OVER: Pose(start.R, start.p + HOVER * up),
+        DOWN: start,
+        BACK: Pose(stays.R, stays.p - HOVER * stays.R[:, 2]),
+        AROUND: Pose(far.R, far.p - HOVER * far.R[:, 2]),
+        REACH: far,
+        PULL: Pose(stays.R, jnp.array(END)),
+    }
+    chosen = [goals.get(number, stays) for number in range(HOLD + 1)]
+    turn = needles.turn_on(task.SIZE, bite, needle)
+    # The tail is past half a turn: angles count on from the way out.
+    turn = jnp.where((phase == OUT) & (turn < 0.0), turn + 2.0 * jnp.pi, turn)
+    script = phases.enter(
+        script,
+        TIMING,
+        phase,
+        [goal.p for goal in chosen],
+        attempt=script.attempt + (phase == APPROACH),
+        R_from=script.R,
+        R_goal=jnp.stack([goal.R for goal in chosen])[phase],
+        turn=turn,
+        turn_end=jnp.where(phase == OUT, jnp.where(leg == 0, middle, end + PAST), out),
+        held=held,
+        leg=leg,
+    )
+    sweep = jnp.abs(script.turn_end - turn) / TURN_SPEED / script.tempo
+    is_arc = (phase == DRIVE) | (phase == OUT)
+    return script.replace(duration=jnp.where(is_arc, sweep, script.duration))
+
+
+def _following(script: ThrowScript, state: EnvState) -> jax.Array:
+    """Returns the next phase: a grasp or a turn that failed is done again."""
+    now, phase = state.measurements, script.phase
+    following = jnp.minimum(phase + 1, HOLD)
+    is_short = now.drive.is_inside & (now.drive.emerged < 0.8 * EMERGE)
+    following = jnp.where((phase == DRIVE) & is_short, DRIVE, following)
+    following = jnp.where((phase == OUT) & ~now.is_through, OPEN, following)
+    misses = (phase == TAKE) | (phase == OUT)
+    following = jnp.where(misses & ~now.drive.held, BACK, following)
+    following = jnp.where((phase == CLOSE) & ~now.drive.held, APPROACH, following)
+    return following.astype(jnp.int32)
+
+
+def act(script: ThrowScript, state: EnvState) -> tuple[Command, ThrowScript, Command]:
+    """Returns the disturbed command, the script a step later, and the command to record."""
+    after = _enter(script, _following(script, state), state)
+    script, s = phases.advance(script, TIMING, after)
+    share = scripting.minimum_jerk(s)
+    way = share * ik.rotation_between(script.R_from, script.R_goal)
+    straight = Pose(
+        Rotation.from_rotvec(way).as_matrix() @ script.R_from,
+        script.start + share * (script.goal - script.start),
+    )
+    turn = script.turn + share * (script.turn_end - script.turn)
+    on_arc = _tip(needles.pose_on(task.SIZE, state.layout.bite, turn), script.held)
+    is_arc = (script.phase == DRIVE) | (script.phase == OUT)
+    tip = jax.tree.map(lambda a, b: jnp.where(is_arc, a, b), on_arc, straight)
+    noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
+    script = script.replace(at=tip.p, R=tip.R, noise=noise)
+    settles = jnp.any(script.phase == jnp.array(SETTLES))
+    weight = jnp.asarray(DISTURBANCE)[script.phase] * jnp.where(settles, 1.0 - s, 1.0)
+    rough = _command(script, script.at + weight * noise[1, :3], state)
+    return rough, script, _command(script, script.at, state)
+
+
+def _command(script: ThrowScript, p: jax.Array, state: EnvState) -> Command:
+    """Returns the command `[1]` of the script's rotation at a tip `[3]` m."""
+    p_trocar: Any = state.measured_trocar.p_world_trocar[0]
+    found = rcm.through(far_grasp.WRIST, Pose(script.R, p), p_trocar)
+    pose = Pose(found.pose.R[None], found.pose.p[None])
+    return Command(pose, script.jaws[None], found.wrist[None])
+
+
+AGENT = Agent(init, act)

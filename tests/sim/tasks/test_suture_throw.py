@@ -1,0 +1,99 @@
+"""Suture throw: its start, its judge, and the grasp of the point at every trocar."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import rcm
+from starjax.sim import physics, scene, thread
+from starjax.sim.tasks.base import SimReadings
+from starjax.sim.tasks.needle_drive import task as driven
+from starjax.sim.tasks.suture_throw import expert, far_grasp, task
+from starjax.sim.tissue import needle as needles
+from starjax.types import Pose
+
+TASK = task.TASK
+
+
+@pytest.fixture(scope="module")
+def start():
+    """Returns bound, layout, readings and measurements at reset."""
+    m = scene.compose(scene.name("suture_throw"))
+    bound = TASK.bind(m)
+    layout = task.sample(bound, jax.random.key(3))
+    tips = Pose(jnp.asarray(task.R_BLOCK)[None], layout.tip[None])
+    qpos, memory = task.begin(bound, layout, jnp.asarray(m.qpos0, jnp.float32), tips)
+    no, still = jnp.zeros(1, bool), jnp.zeros((1, 3))
+    contacts = physics.Contacts(jnp.zeros((1, 2), int), jnp.ones(1))
+    readings = SimReadings(
+        qpos, jnp.zeros(m.nv), tips, still, jnp.ones(1), no, contacts, memory, no[0]
+    )
+    return bound, layout, readings, task.measure(bound, layout, readings, None)
+
+
+def test_needle_begins_in_the_block_and_leads_the_thread(start):
+    bound, layout, readings, now = start
+    assert bool(now.in_block) and not bool(now.drive.held)
+    tail = needles.point_at(task.SIZE, now.drive.needle, jnp.asarray(-task.SIZE.end))
+    np.testing.assert_allclose(now.thread.p[0], tail, atol=1e-6)
+    np.testing.assert_allclose(thread.lengths(now.thread.p), thread.LINK, rtol=1e-4)
+    p = np.asarray(now.thread.p)
+    assert (p[:, 2] >= task.GROUND).all()
+    assert (np.abs(p[:, :2]) < [0.036, 0.03]).all()  # the pad's half sizes
+    point = needles.point_at(task.SIZE, now.drive.needle, jnp.asarray(task.SIZE.end))
+    assert np.abs(point - np.array([0.0212, 0.0033, 0.005])).max() < 0.005  # in the block
+    after = task.measure(bound, layout, readings, now)
+    moved = np.abs(np.asarray(after.thread.p) - p).max(1)
+    assert moved[0] == 0.0 and moved.max() < 0.005 and moved[-1] < 1e-4  # it hangs from the tail
+
+
+def test_success_needs_every_condition(start):
+    bound, layout, _, now = start
+    yes = jnp.ones((), bool)
+    drive = now.drive.replace(held=yes, has_exited=yes, exit_off=jnp.asarray(5e-4))
+    done = now.replace(
+        drive=drive, in_block=~yes, is_through=yes, by_point=yes, pulled=jnp.asarray(0.06)
+    )
+    found = task.status(bound, layout, done)
+    assert bool(found.success_now) and float(found.reward) == 1.0
+    assert TASK.stages[int(found.stage)] == "done"
+    for worse in (
+        done.replace(pulled=jnp.asarray(0.04)),
+        done.replace(is_through=~yes),
+        done.replace(drive=drive.replace(held=~yes)),
+        done.replace(drive=drive.replace(collided=yes)),
+        done.replace(drive=drive.replace(entry_off=jnp.asarray(2e-3))),
+        done.replace(drive=drive.replace(exit_off=jnp.asarray(2e-3))),
+        done.replace(drive=drive.replace(max_force=jnp.asarray(driven.MAX_FORCE))),
+    ):
+        assert not bool(task.status(bound, layout, worse).success_now)
+    dropped = task.status(bound, layout, done.replace(drive=drive.replace(held=~yes)))
+    assert bool(dropped.lost) and bool(dropped.loose)
+    assert not bool(task.status(bound, layout, now).lost)
+
+
+def test_the_point_is_turned_out_at_every_trocar_with_room_for_the_wrist():
+    ref = np.array([slot.p_world_ref for slot in TASK.slots], np.float32)
+    zero = np.zeros(1, np.float32)
+    at = jax.vmap(lambda one: rcm.trocar_frame(one, ref, zero).p_world_trocar[0])(TASK.trocars)
+    ways = np.linspace(*driven.DIRECTION, 4)
+
+    def worst(p_trocar, way, length, leg):
+        along = 0.5 * length * jnp.stack([jnp.cos(way), jnp.sin(way), 0.0])
+        bite = needles.Bite(-along, along)
+        turns = jnp.stack(expert._turns(bite))
+        first, last = turns[leg], turns[leg + 1]
+        held = far_grasp.search(task.SIZE, bite, first, last, p_trocar, jnp.zeros(()))
+
+        def angles(turn):
+            tip = expert._tip(needles.pose_on(task.SIZE, bite, turn), held)
+            return rcm.angles_through(far_grasp.WRIST, tip, p_trocar)
+
+        return jnp.max(jnp.abs(jax.vmap(angles)(jnp.linspace(first, last, 20))))
+
+    rows = [x.ravel() for x in np.meshgrid(range(len(at)), ways, task.BITES, range(2))]
+    found = jax.jit(jax.vmap(worst))(
+        at[rows[0]], *(jnp.asarray(x, jnp.float32) for x in rows[1:3]), jnp.asarray(rows[3])
+    )
+    assert np.rad2deg(found).max() < 72.0  # of 80
