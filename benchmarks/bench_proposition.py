@@ -1,6 +1,6 @@
 """Where Proposition 1 holds: the share of the expert's wanted tip position that the trocar decides.
 
-    python benchmarks/bench_proposition.py --task needle_pick [--scenes 16] [--seed 2026]
+    python benchmarks/bench_proposition.py --task needle_pick [--scenes 16] [--seed 2026] [--c]
 
 The proposition says that the wanted position does not depend on the trocar. So each of some scenes
 is played at every trocar of the task, with the same objects, the same choices of the expert and the
@@ -31,6 +31,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
+import _c_env
 import _decomposition
 import _scene
 import _timing
@@ -60,9 +61,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=16)
     parser.add_argument("--seed", type=int, default=2026)
+    parser.add_argument("--c", action="store_true", help="C MuJoCo's physics instead of ours")
     _scene.add_flags(parser)
     arguments = parser.parse_args()
     environment = _scene.make(arguments, observation="state")
+    if arguments.c:
+        environment = _c_env.with_c_physics(environment)
     task = environment.task
     agent = task.expert()
     trials, successes = play(environment, agent, arguments.scenes, arguments.seed)
