@@ -83,7 +83,8 @@ def main() -> None:
         print(f"{task.name}, {name}: {summary(arm)}")
         for phase, row in arm["phases"].items():
             print(f"  {phase:9} {summary(row)}, {row['scenes']} scenes")
-    print("written to", _timing.write("proposition", {"results": {task.name: found}}))
+    name = "proposition_c" if arguments.c else "proposition"
+    print("written to", _timing.write(name, {"results": {task.name: found}}))
 
 
 def names(task: str) -> list[str]:
