@@ -60,7 +60,6 @@ def shares(turn_deg: float, directions: int) -> dict[str, Any]:
         "bite_mm": float(2e3 * pick.RADIUS * np.sin(sweep)),
         "by_trocar": own.tolist(),
         "own_grasp": float(own.mean()),
-        "worst_trocar": float(own.min()),
         "one_for_seen": float(served[rcm.IS_SEEN].all(0).any((1, 2)).mean()),
         "one_for_all": float(served.all(0).any((1, 2)).mean()),
     }
