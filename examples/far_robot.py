@@ -38,7 +38,7 @@ def drive(address: str, seconds: float) -> None:
         off = 1e3 * float(rcm.rcm_error(robot.pose, client.p_world_trocar))
     print(
         f"{report.steps} commands of {report.plans} plans, {report.missed} of them late; "
-        f"{report.held} held; RCM error {off:.1e} mm"
+        f"{report.held} held; RCM error {off:.1e} mm; {report.alarm or 'no alarm'}"
     )
 
 
