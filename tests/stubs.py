@@ -57,6 +57,11 @@ class State:
     wrist: Any = None
     commanded_shaft: Any = None
 
+    @property
+    def coordinates(self) -> jax.Array:
+        """Generalised coordinates, those of a scene without a thread."""
+        return self.physics.qpos
+
 
 class Layout(NamedTuple):
     """What is drawn at reset: goals `[A, 3]` m, and labels."""
