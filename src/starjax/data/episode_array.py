@@ -7,7 +7,9 @@ the frames counts as the process's memory.
 
 import concurrent.futures
 import functools
+import math
 import os
+import threading
 import weakref
 from pathlib import Path
 from typing import Any
@@ -17,24 +19,26 @@ import numpy as np
 _MOST_OPEN = 256  # files of a field at once; systems allow a process about 1,000
 _THREADS = 16  # reads at once; they mostly wait for the disk
 _ROWS = 8  # of a thread's share at least
+_HEADERS = threading.Lock()
 
 
 class _OpenFile:
     """A .npy file open for random reads, closed when nothing refers to it."""
 
-    def __init__(self, path: Path):
-        mapped = np.load(path, mmap_mode="r", allow_pickle=False)
-        self.path, self.offset = path, mapped.offset
-        self.shape, self.dtype = mapped.shape, mapped.dtype
+    def __init__(self, path: Path, rows: int, row_bytes: int, offset: int):
+        """Opens a file of `rows` rows, which begin at `offset` unless its size tells otherwise."""
+        self.path, self.rows = path, rows
         self._descriptor = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._descriptor)
+        is_usual = os.fstat(self._descriptor).st_size == offset + rows * row_bytes
+        self.offset = offset if is_usual else _first_row(path)
         if hasattr(os, "posix_fadvise"):  # reading ahead fetches unused frames
             os.posix_fadvise(self._descriptor, 0, 0, os.POSIX_FADV_RANDOM)
 
     def fill(self, row: int, out: Any) -> None:
         """Reads a row into `out`, an array of its size."""
-        if not 0 <= row < self.shape[0]:
-            raise IndexError(f"{self.path}: row {row} of {self.shape[0]}")
+        if not 0 <= row < self.rows:
+            raise IndexError(f"{self.path}: row {row} of {self.rows}")
         view = memoryview(out).cast("B")
         place = self.offset + row * len(view)
         while view:
@@ -61,10 +65,16 @@ class EpisodeArray:
           length: `[D]` frames of each.
         """
         self._paths, self._start = paths, np.asarray(start)
-        self._opened = functools.lru_cache(_MOST_OPEN)(_OpenFile)
-        first = self._opened(paths[0])
+        first = np.load(paths[0], mmap_mode="r", allow_pickle=False)
         self.shape = (int(np.sum(length)), *first.shape[1:])
-        self.dtype = first.dtype
+        self.dtype, lengths, offset = first.dtype, np.asarray(length), first.offset
+        row_bytes = math.prod(first.shape[1:]) * first.dtype.itemsize
+
+        @functools.lru_cache(_MOST_OPEN)
+        def opened(episode: int) -> _OpenFile:
+            return _OpenFile(paths[episode], int(lengths[episode]), row_bytes, offset)
+
+        self._opened = opened
 
     def __getitem__(self, index: Any) -> np.ndarray:
         """Returns the frames at `index` `[N]` as `[N, ...]` in memory."""
@@ -80,7 +90,7 @@ class EpisodeArray:
         def fill(share: np.ndarray) -> None:
             for i in share:
                 row = int(frames[i] - self._start[episode[i]])
-                self._opened(self._paths[episode[i]]).fill(row, rows[i])
+                self._opened(int(episode[i])).fill(row, rows[i])
 
         if len(shares) == 1:
             fill(shares[0])
@@ -96,6 +106,16 @@ class EpisodeArray:
             array = np.load(path, mmap_mode="r", allow_pickle=False)
             out[first : first + len(array)] = array
         return out
+
+
+def _first_row(path: Path) -> int:
+    """Returns the place of the first row in a .npy file, from its header.
+
+    One thread at a time: numpy reads headers by `ast`, which several threads at once crash in
+    Python 3.11 (gh-106905).
+    """
+    with _HEADERS:
+        return np.load(path, mmap_mode="r", allow_pickle=False).offset
 
 
 @functools.cache
