@@ -5,15 +5,18 @@
 Start it under a memory limit, for example `systemd-run --user --scope -p MemoryMax=1500M`. It
 imports invented recordings of OUT/demos' size through the import's own code, trains a small image
 policy on them with `starjax train`, and samples the memory of that process. Without a limit, the
-same command has the dataset resident: the peer.
+same command has the dataset resident: the peer. `--processes 2` trains one policy in two processes.
 """
 
 import argparse
+import collections
+import contextlib
 import json
 import os
 import pathlib
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -66,6 +69,7 @@ def main() -> None:
     parser.add_argument("out", type=pathlib.Path)
     parser.add_argument("--gb", type=float, default=4.0, help="images of the dataset")
     parser.add_argument("--seconds", type=float, default=300.0, help="of training")
+    parser.add_argument("--processes", type=int, default=1, help="of one training, on this machine")
     asked = parser.parse_args()
     demos = asked.out / f"demos-{asked.gb:g}gb"
     if not (demos / "SEALED.json").exists():
@@ -73,43 +77,71 @@ def main() -> None:
         foreign.import_mapped(source(asked.gb), MAPPING, demos, asked.out)
         print(f"imported {asked.gb:g} GB in {time.monotonic() - start:.0f} s", flush=True)
     run = asked.out / f"run-{os.getpid()}"
-    rows, lines = trained(demos, run, asked.seconds)
+    rows, lines = trained(demos, run, asked.seconds, asked.processes)
     result = {
         "images_gb": asked.gb,
+        "processes": asked.processes,
         "memory_limit_gb": round(xla.memory_bytes() / 1e9, 2),
         "residency": next((line for line in lines if "demonstrations," in line), ""),
         "steps_per_s": steps_per_second(rows),
         "memory_mb": rows,
     }
     print(json.dumps({**result, "memory_mb": rows[:: max(1, len(rows) // 12)]}, indent=1))
-    name = f"larger_than_memory_{'limited' if 'disk' in result['residency'] else 'resident'}"
-    _timing.write(name, result)
+    place = "limited" if "disk" in result["residency"] else "resident"
+    several = f"_{asked.processes}" if asked.processes > 1 else ""
+    print(f"wrote {_timing.write(f'larger_than_memory_{place}{several}', result)}")
 
 
-def trained(demos: pathlib.Path, run: pathlib.Path, seconds: float) -> tuple[list, list[str]]:
-    """Trains for a time; returns samples of the process's memory, and its output."""
+def trained(
+    demos: pathlib.Path, run: pathlib.Path, seconds: float, processes: int
+) -> tuple[list, list[str]]:
+    """Trains for a time; returns samples of the processes' memory, and the first one's output."""
     command = [sys.executable, "-m", "starjax", "train", "--preset", "smoke", "--out", str(run)]
     command += ["--demos.from", str(demos), "--policy.observation", "image", "--method", "stardiff"]
     command += ["--policy.image-size", str(SIZE), "--train.steps", "1000000"]
     command += ["--train.log-every", "20", "--train.checkpoint-every", "1000000"]
-    log = run.with_suffix(".log")
-    with open(log, "w") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=output)
+    logs = [run.with_suffix(f".{number}.log") for number in range(processes)]
+    with contextlib.ExitStack() as stack:
+        started = []
+        for number, environment in enumerate(environments(processes)):
+            output = stack.enter_context(open(logs[number], "w"))
+            started.append(subprocess.Popen(command, stdout=output, stderr=output, env=environment))
         start, rows, first = time.monotonic(), [], None
-        while process.poll() is None:
+        while all(process.poll() is None for process in started):
             time.sleep(SAMPLE_S)
-            status = pathlib.Path(f"/proc/{process.pid}/status").read_text()
-            memory = {name: int(kb) // 1024 for name, kb in _LINE.findall(status)}
             metrics = next(run.rglob("metrics.jsonl"), None)
             steps = [row["step"] for row in training_log.read(metrics)] if metrics else []
             first = first or (time.monotonic() if steps else None)
             step = steps[-1] if steps else 0
+            memory = sum(map(memory_mb, started), collections.Counter())
             rows.append({"s": round(time.monotonic() - start), "step": step, **memory})
             if first and time.monotonic() - first > seconds:
-                process.send_signal(signal.SIGINT)
+                for process in started:
+                    process.send_signal(signal.SIGINT)
                 break
-        process.wait()
-    return rows, log.read_text().splitlines()
+        for process in started:
+            process.wait()
+    return rows, logs[0].read_text().splitlines()
+
+
+def environments(processes: int) -> list[dict[str, str]]:
+    """Returns the variables of each process of one training."""
+    if processes == 1:
+        return [dict(os.environ)]
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    shared = {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": str(processes)}
+    return [{**os.environ, **shared, "JAX_PROCESS_ID": str(i)} for i in range(processes)]
+
+
+def memory_mb(process: subprocess.Popen) -> collections.Counter:
+    """Returns the process's memory by kind, as /proc calls them; none once it has ended."""
+    try:
+        status = pathlib.Path(f"/proc/{process.pid}/status").read_text()
+    except OSError:
+        status = ""
+    return collections.Counter({name: int(kb) // 1024 for name, kb in _LINE.findall(status)})
 
 
 def steps_per_second(rows: list[dict]) -> float | None:

@@ -79,8 +79,14 @@ def spreads(
                 top = [float(np.percentile(v, high)) for _, v in drawn]
                 axis.vlines(x, low, top, color=_COLOURS[i], lw=1.2)
                 axis.plot(x, low, "o", color=_COLOURS[i], markersize=3.5)
+            if not axis.has_data():
+                axis.text(
+                    0.5, 0.5, "no window determines a trocar", transform=axis.transAxes, ha="center"
+                )
+                axis.set_xticks([])
             axis.set_title(title)
             axis.set_xlabel("episode")
             axis.set_ylim(0, max(_LEAST_MM, axis.get_ylim()[1]))
-            axis.xaxis.set_major_locator(ticker.MaxNLocator(integer=True))
+            if axis.has_data():
+                axis.xaxis.set_major_locator(ticker.MaxNLocator(integer=True))
     return figure

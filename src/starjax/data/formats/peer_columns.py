@@ -13,6 +13,7 @@ from starjax.rollouts import episodes
 ACTIONS = ("pose", "rcm4")  # columns of the actions
 _AXES = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
 _RCM4_AXES = ("roll", "x", "y", "z", "gripper")
+_LENGTHS = 64  # episodes are filled up to a multiple of it
 
 
 class PeerOptions(NamedTuple):
@@ -105,8 +106,10 @@ def derived(
 def _rcm4(p: np.ndarray, R: np.ndarray, gripper: np.ndarray, frame: rcm.TrocarFrame) -> np.ndarray:
     """Returns continuous rolls, tips and grippers `[T, 5 A]`."""
     encode = rcm.ACTION_SPACES["rcm4"].encode
-    pose: Any = (R.astype(np.float32), p.astype(np.float32))
-    rows = np.array(encode(rcm.Pose(*pose), frame))
+    # Programs are compiled for a length: episodes of similar ones share them.
+    filled = np.minimum(np.arange(-(-len(p) // _LENGTHS) * _LENGTHS), len(p) - 1)
+    pose: Any = (R.astype(np.float32)[filled], p.astype(np.float32)[filled])
+    rows = np.array(encode(rcm.Pose(*pose), frame))[: len(p)]
     rows[..., 0] = np.unwrap(rows[..., 0], axis=0)
     return np.concatenate([rows, gripper[..., None]], -1).reshape(len(p), -1).astype(np.float32)
 
