@@ -117,7 +117,7 @@ def trained(
             rows.append({"s": round(time.monotonic() - start), "step": step, **memory})
             if first and time.monotonic() - first > seconds:
                 for process in started:
-                    process.send_signal(signal.SIGINT)
+                    process.send_signal(signal.SIGTERM)
                 break
         for process in started:
             process.wait()
