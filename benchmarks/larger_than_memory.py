@@ -114,7 +114,8 @@ def trained(
             first = first or (time.monotonic() if steps else None)
             step = steps[-1] if steps else 0
             memory = sum(map(memory_mb, started), collections.Counter())
-            rows.append({"s": round(time.monotonic() - start), "step": step, **memory})
+            if memory:  # none of processes that have just ended
+                rows.append({"s": round(time.monotonic() - start), "step": step, **memory})
             if first and time.monotonic() - first > seconds:
                 for process in started:
                     process.send_signal(signal.SIGTERM)

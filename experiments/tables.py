@@ -10,7 +10,7 @@ benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
 `six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`, `stress_randomised`,
 `proposition`, `finetune`, `finetune_ways`, `finetune_branches`, `ppo`, `ppo_gpu`, `sb3`,
 `monitor_<policy>`, `monitor_cost`,
-`through_lerobot`, `held_out`, `larger_than_memory`.
+`through_lerobot`, `held_out`, `larger_than_memory`, `loaders`.
 """
 
 import re
