@@ -26,7 +26,7 @@ class _OpenFile:
     """A .npy file open for random reads, closed when nothing refers to it."""
 
     def __init__(self, path: Path, rows: int, row_bytes: int, offset: int):
-        """Opens a file of `rows` rows, which begin at `offset` unless its size tells otherwise."""
+        """Opens a file of `rows` rows, which begin at `offset` if its size fits."""
         self.path, self.rows = path, rows
         self._descriptor = os.open(path, os.O_RDONLY)
         weakref.finalize(self, os.close, self._descriptor)
