@@ -127,6 +127,7 @@ def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, f
         sees = config.policy.observation == "image" or not kind.image_only
         if not (kind.for_demos and sees):
             raise errors.UsageError(_RANDOMISE, "a disturbance of demonstrations", name)
+        base.check_tools(_RANDOMISE, name, env.names.tools)
         base.check_levels(_RANDOMISE, name, [level])
     if not max_levels:
         return env, {}

@@ -60,7 +60,7 @@ def main(argv: Sequence[str]) -> int:
     together = disturbances.parse_levels("together", args.together)
     who, _ = policy_args.load(path)
     args = benchmark_args.with_trials(args, "stress", who.env.names.task)
-    kinds = _kinds(args, chosen, who.trained.policy.observation)
+    kinds = _kinds(args, chosen, who.trained.policy.observation, who.env.names.tools)
     _check_together(together, list(kinds))
     who = _disturbed(who, list(kinds))
     content = {
@@ -109,13 +109,16 @@ def _draw(folder: Path) -> None:
 
 
 def _kinds(
-    args: StressArgs, chosen: Mapping[str, Sequence[float]], observation: str
+    args: StressArgs,
+    chosen: Mapping[str, Sequence[float]],
+    observation: str,
+    tools: Sequence[str],
 ) -> dict[str, Any]:
-    """Returns the requested disturbances, by default all that apply to this observation.
+    """Returns the requested disturbances, by default all that apply to observation and tools.
 
     Raises:
-      errors.UsageError: a disturbance of images is requested for a policy without images, or a
-        level that a disturbance does not have.
+      errors.UsageError: a disturbance of images is requested for a policy without images, one of
+        wrists for tools without any, or a level that a disturbance does not have.
     """
     from starjax.evaluation.disturbances import base
 
@@ -124,8 +127,10 @@ def _kinds(
     for name in args.disturbance:
         if observation != "image" and kinds[name].image_only:
             raise errors.UsageError("disturbance", "one that applies to states", name)
+        base.check_tools("disturbance", name, tools)
         base.check_levels("levels", name, args.levels)
         base.check_levels("disturbance", name, chosen[name])
+    kinds = {name: kind for name, kind in kinds.items() if base.suits(kind, tools)}
     return {n: kind for n, kind in kinds.items() if observation == "image" or not kind.image_only}
 
 

@@ -31,6 +31,7 @@ DISTURBANCES = Registry(
         "weak_servos": f"{_HERE}.physics:WEAK_SERVOS",
         "friction": f"{_HERE}.physics:FRICTION",
         "mass": f"{_HERE}.physics:MASS",
+        "cable_slack": f"{_HERE}.wrists:CABLE_SLACK",
     },
     f"{_HERE}.base:Disturbance",
 )

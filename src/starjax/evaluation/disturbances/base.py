@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from starjax import errors
 from starjax.evaluation.disturbances import DISTURBANCES
+from starjax.sim import registries
 from starjax.sim.names import is_depth
 from starjax.sim.state import Env, EnvParams, EnvState
 from starjax.types import Command, Observation, Pose
@@ -55,6 +56,7 @@ class Disturbance(NamedTuple):
         same or an earlier one; None for the same.
       stores_states: the memory holds states, so other disturbances must act first.
       for_demos: demonstrations that are recorded with it teach a policy to withstand it.
+      wrist_only: tools without a wrist never meet it.
     """
 
     description: str
@@ -79,11 +81,26 @@ class Disturbance(NamedTuple):
     seen_step: Callable[[DisturbanceState, jax.Array], jax.Array] | None = None
     stores_states: bool = False
     for_demos: bool = True
+    wrist_only: bool = False
 
     @property
     def image_only(self) -> bool:
         """True if policies without images never meet it."""
         return bool(self.on_camera or self.on_image)
+
+
+def check_tools(argument: str, name: str, tools: Sequence[str]) -> None:
+    """Raises errors.UsageError for a disturbance of wrists and tools without any."""
+    if not suits(DISTURBANCES.get(name), tools):
+        raise errors.UsageError(
+            argument, f"a tool with a wrist for {name}", " ".join(dict.fromkeys(tools))
+        )
+
+
+def suits(kind: Disturbance, tools: Sequence[str]) -> bool:
+    """Returns True if one of the tools can meet the disturbance."""
+    wrists = [registries.tools.get(tool).wrist for tool in tools]
+    return not kind.wrist_only or any(wrist is not None for wrist in wrists)
 
 
 def with_disturbances(env: Env, names: Sequence[str]) -> Env:
