@@ -21,6 +21,7 @@ def write(
     length: int = 30,
     cameras: int = 1,
     failures: bool = False,
+    wrist: bool = False,
 ) -> dict[str, Any]:
     """Writes it and returns its description.
 
@@ -28,6 +29,7 @@ def write(
       size: pixels a side; 0 for a dataset of task states.
       demos: successful ones; two share a trocar. One more failed, and is not kept.
       failures: the second one failed, and is kept.
+      wrist: the tools are needle drivers, straight but for the fields of their wrists.
     """
     made = fakes.dataset(0, demos, length, arms=arms)
     seen, given = made.observation, made.command
@@ -41,6 +43,10 @@ def write(
         "qpos": np.random.default_rng(0).normal(size=(demos * length, 9)),
         "rcm_error": np.zeros((demos * length, arms)),
     }
+    if wrist:
+        angles = np.zeros((demos * length, arms, 2))
+        fields |= {"wrist": angles, "command_wrist": angles}
+        fields |= {"shaft_p": seen.pose.p, "shaft_R": seen.pose.R}
     fields = {name: np.asarray(field, np.float32) for name, field in fields.items()}
     if size:
         for camera in CAMERAS[:cameras]:
@@ -49,7 +55,8 @@ def write(
         fields["state"] = np.asarray(seen.state, np.float32)
     trocar = [np.asarray(field, np.float64) for field in made.trocar.trocar]
     shown = CAMERAS[:cameras] if size else ()
-    scene = names.SceneNames("peg_transfer", ("fr5",) * arms, ("grasper",) * arms, shown)
+    tool = "needle_driver" if wrist else "grasper"
+    scene = names.SceneNames("peg_transfer", ("fr5",) * arms, (tool,) * arms, shown)
     slots = fakes.task(arms).slots
     description = {
         "schema": store.SCHEMA,

@@ -19,7 +19,12 @@ from starjax.data import load, pose_rows, store
 from starjax.data.formats import base, exchange, foreign, own_columns, peer_columns
 from starjax.rollouts import episodes
 
-KINDS = {"state": {}, "images": {"size": 32, "cameras": 2}, "two_arms": {"arms": 2, "demos": 2}}
+KINDS = {
+    "state": {},
+    "images": {"size": 32, "cameras": 2},
+    "two_arms": {"arms": 2, "demos": 2},
+    "wrist": {"demos": 2, "wrist": True},
+}
 EXACT = {"robomimic": True, "zarr": True, "lerobot": False}  # and whether images go into videos
 SUFFIX = {"robomimic": ".hdf5"}
 
@@ -78,6 +83,18 @@ def test_videos_lose_little_and_nothing_else(roots, exported, tmp_path):
             for root in (roots / "images", tmp_path / "back")
         )
         assert 10 * np.log10(255**2 / np.mean((one - other) ** 2)) >= 35.0
+
+
+def test_columns_of_a_wrist_are_those_of_a_tool_that_has_one(roots):
+    form = base.FORMATS.get("zarr")
+    of_wrist = {form.named(f"{base.OURS}.{name}") for name in ("wrist", "command_wrist", "shaft_R")}
+    columns = {kind: set(exchange.source(roots / kind, form).columns) for kind in KINDS}
+    assert of_wrist <= columns["wrist"] and not of_wrist & (columns["state"] | columns["two_arms"])
+    loaded = load.load(roots / "wrist").dataset
+    assert loaded.observation.wrist.shape == loaded.command.wrist.shape
+    assert load.load(roots / "state").dataset.command.wrist is None
+    with mistakes.of("actions", "rcm4"):
+        exchange.source(roots / "wrist", form, options=peer_columns.PeerOptions(actions="rcm4"))
 
 
 @pytest.mark.parametrize("kind", ["state", "two_arms"])

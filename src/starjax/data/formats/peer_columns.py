@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import rcm
+from starjax import errors, rcm
 from starjax.data import pose_rows, schema, store
 from starjax.data.formats import base
 from starjax.data.formats.base import Column
@@ -53,7 +53,15 @@ def name_of(field: str) -> str:
 
 
 def columns(description: dict[str, Any], options: PeerOptions = DEFAULT) -> dict[str, Column]:
-    """Returns the columns that other tools expect, derived from starjax's fields."""
+    """Returns the columns that other tools expect, derived from starjax's fields.
+
+    Raises:
+      errors.UsageError: actions of straight tools for a dataset with a wrist.
+    """
+    if options.actions != "pose" and "wrist" in description["features"]:
+        tools = " ".join(description["scene"]["tools"])
+        hint = "a wrist follows from the pose and the trocar"
+        raise errors.UsageError("actions", f"pose, for {tools}", options.actions, hint)
     arms = len(description["p_world_ref"])
 
     def named(axes: tuple[str, ...]) -> tuple[str, ...]:
