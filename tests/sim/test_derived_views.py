@@ -16,7 +16,7 @@ from starjax.sim.state import EnvParams
 from starjax.types import Pose
 
 SIZE = 32
-VIEWS = ("camera", "camera_right", "camera_depth")
+VIEWS = ("camera", "camera_right", "camera_depth", "endoscope_tissue")
 
 
 def test_names_of_views():
@@ -81,6 +81,8 @@ def test_views_of_a_scene_are_those_of_the_camera_and_of_one_beside_it():
         VIEWS, (SIZE, SIZE, 3)
     )
     assert np.any(images["camera"] != images["camera_right"])
+    red, green, _ = images["endoscope_tissue"].reshape(-1, 3).mean(0)
+    assert red > 1.3 * green and state.endoscope is not None
 
     m = made.scene.mj_model
     depth = derived_views.decode(np.asarray(images["camera_depth"]))
