@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 
-from starjax import config, limits
+from starjax import config, config_json, limits
 from starjax.commands import checks, presets, scenes
 from starjax.commands.part_checks.base import NOTE, Check, attempt, verdict
 from starjax.methods import TABLE_II
@@ -17,14 +17,14 @@ def check(name: str, n: int) -> Iterator[Check]:
     if fault:
         yield fault
         return
-    both = [config.as_json(config.RunConfig()), config.as_json(preset)]
-    count = len(config.differing_settings(both))
+    both = [config_json.as_json(config.RunConfig()), config_json.as_json(preset)]
+    count = len(config_json.differing_settings(both))
     yield Check("record", f"{count} settings of weights other than the paper's")
     fault, full = attempt("scene", lambda: scenes.resolved(preset))
     yield fault or Check("scene", f"task {full.scene.task}, arms {', '.join(full.scene.arm)}")
     yield verdict("methods", _unfit(preset), f"all {len(TABLE_II)} of Table II")
     fault, again = attempt(
-        "settings", lambda: config.from_dict(config.RunConfig, config.as_json(preset))
+        "settings", lambda: config_json.from_dict(config.RunConfig, config_json.as_json(preset))
     )
     yield fault or verdict(
         "settings", ["another preset"] * (again != preset), "come back from a result"
