@@ -6,7 +6,7 @@ import mistakes
 import pytest
 import synthetic
 
-from starjax import config
+from starjax import config, config_json
 from starjax.commands import leaderboard as command
 from starjax.evaluation import protocol
 from starjax.report import leaderboard, leaderboard_tables
@@ -63,7 +63,7 @@ def test_a_row_names_its_views(folder, tmp_path):
     (before,) = leaderboard.read([files_of(tmp_path / "plain.json", content)])[0]
     content["scene"]["cameras"], content["observation"] = ["camera", "camera_depth"], "image"
     policy = config.PolicyConfig(depth_encoder="points")
-    content["config"] = config.as_json(config.RunConfig(policy=policy))
+    content["config"] = config_json.as_json(config.RunConfig(policy=policy))
     (row,) = leaderboard.read([files_of(tmp_path / "views.json", content)])[0]
     assert "camera + camera_depth, depth by points" in row.policy
     assert "camera" not in before.policy
