@@ -10,6 +10,9 @@ from msgspec import structs
 from scipy.spatial import transform
 from strangers import ARM, MAP, P_WORLD_REF, TROCARS, bring, source
 
+from starjax.data.formats import doubts
+from starjax.data.formats.mapping import ArmColumns
+
 PAGE = pathlib.Path(__file__).parents[2] / "docs/howto/other-peoples-data.md"
 COMMANDS = {"command_position": "cp", "command_rotation": "R0"}
 
@@ -41,6 +44,7 @@ def slow(arrays):
 
 UP = P_WORLD_REF + np.array([0.0, 0.0, 0.04]) - TROCARS[0]  # within the radius, not the angles
 REVERSED = (0.0, 1.0, 0.0, 0.0)
+LEANING = transform.Rotation.from_euler("x", 10, degrees=True).as_matrix()
 # Name -> (row of the table, mapping, change of an episode, a word of the note).
 SLIPS = {
     "rate": (
@@ -51,6 +55,12 @@ SLIPS = {
     ),
     "relative commands": (
         "commands, next tips", changed_arm(**COMMANDS), added(cp=relative), "relative"
+    ),
+    "commands in another frame": (
+        "commands, trocars",
+        changed_arm(**COMMANDS | {"command_rotation": "cR"}),
+        added(cp=lambda a: a["p0"], cR=lambda a: a["R0"] @ LEANING),
+        "miss the trocar",
     ),
     "gripper 0 to 1": (
         "gripper values, `gripper_closed` to `gripper_open`",
@@ -135,6 +145,20 @@ REFUSED = {
 }
 
 
+def test_a_joint_that_moves_the_tip_without_a_column_is_noted(tmp_path):
+    """As of a URDF that says `mimic`, whose joint would stand still."""
+    body = '<body name="{0}" pos="0 0 .1"><joint name="j{0}"/><geom size=".01"/>{1}</body>'
+    chain = body.format("a", body.format("b", body.format("c", "")) + body.format("side", ""))
+    (tmp_path / "r.xml").write_text(f"<mujoco><worldbody>{chain}</worldbody></mujoco>")
+    arm = ArmColumns(joints="q", model="r.xml", joint_names=("ja", "jc"), body="c")
+    made = structs.replace(MAP, arms=(arm,))
+    (note,) = doubts.of_models({"q": np.zeros((3, 2))}, made, tmp_path)
+    assert "joints jb of r.xml" in note
+    whole = structs.replace(arm, joint_names=("ja", "jb", "jc"))
+    made = structs.replace(MAP, arms=(whole,))
+    assert not list(doubts.of_models({"q": np.zeros((3, 3))}, made, tmp_path))
+
+
 @pytest.mark.parametrize("name", REFUSED)
 def test_values_that_nothing_can_be_made_of_are_refused(tmp_path, name):
     _, made, change, argument, got = REFUSED[name]
@@ -147,5 +171,6 @@ def test_values_that_nothing_can_be_made_of_are_refused(tmp_path, name):
 def test_the_pages_tables_have_a_row_for_each(header, cases):
     table = PAGE.read_text().partition(f"| Compared | {header} |\n")[2].partition("\n\n")[0]
     rows = set(re.findall(r"^\| (.+?) \| ", table, re.MULTILINE)) - {"|---|---|"}
-    sizes = {"sizes in headers, memory"}  # of files: see test_bad_files.py
-    assert rows - sizes == {case[0] for case in cases.values()}
+    # Of files, see test_bad_files.py, and of models, see above.
+    others = {"sizes in headers, memory", "joints of a model, columns"}
+    assert rows - others == {case[0] for case in cases.values()}

@@ -1,6 +1,7 @@
 """Facts of an import that contradict each other: units, frames, commands, grippers, trocars."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy import spatial
 
 from starjax.data import shafts
 from starjax.data.formats import mapping as maps
+from starjax.data.formats import tip_poses
 from starjax.data.formats.mapping import ArmColumns, Map
 from starjax.data.formats.motion import Motion
 from starjax.data.formats.trocars import MISSED
@@ -69,6 +71,30 @@ def of_commands(found: Motion, mapping: Map) -> Iterator[str]:
             is_relative = np.median(added[:, i]) < 0.5 * distance
             why = "; they look relative to the tip" if is_relative else ""
             yield f"commands of arm {i} are {1e3 * distance:.0f} mm from the next tip{why}"
+
+
+def off_trocar(
+    R: np.ndarray, p: np.ndarray, p_world_trocar: np.ndarray, mapping: Map
+) -> Iterator[str]:
+    """Yields notes on commands whose straight shafts miss the trocars of the motion.
+
+    Args:
+      R, p: `[T, A, 3, 3]` and `[T, A, 3]` m, commands of an episode.
+      p_world_trocar: `[A, 3]` m.
+    """
+    rms = np.sqrt(np.mean(np.sum(np.cross(p - p_world_trocar, R[..., 2]) ** 2, -1), axis=0))
+    for i, arm in enumerate(mapping.arms):
+        is_straight = not isinstance(arm.shaft, maps.ShaftColumns)
+        if arm.command_position and is_straight and rms[i] > MISSED:
+            yield f"commands of arm {i} miss the trocar by {1e3 * rms[i]:.0f} mm: another frame?"
+
+
+def of_models(arrays: Mapping[str, np.ndarray], mapping: Map, folder: Path) -> Iterator[str]:
+    """Yields notes on joints that move a tip and that no column moves, as those that follow."""
+    for i, arm in enumerate(mapping.arms):
+        if arm.joints and (still := tip_poses.unmoved(arrays, arm, folder)):
+            names = ", ".join(still)
+            yield f"joints {names} of {arm.model} move the tip of arm {i}: no column gives them"
 
 
 def of_dataset(

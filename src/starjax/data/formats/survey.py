@@ -10,6 +10,7 @@ from msgspec import structs
 from scipy.spatial import transform
 
 from starjax import errors
+from starjax.data import shafts
 from starjax.data.formats import doubts, motion, selection, trocars
 from starjax.data.formats import mapping as maps
 from starjax.data.formats.base import Source
@@ -71,7 +72,7 @@ def survey(
     hz = mapping.hz or source.hz
     if not hz and not mapping.time:
         raise errors.UsageError("--map: hz", "steps per second, which the files do not say", "none")
-    kept, tips, notes, jaws = [], [], [], doubts.Jaws(mapping.arms)
+    kept, tips, commands, notes, jaws = [], [], [], [], doubts.Jaws(mapping.arms)
     first_error: errors.UsageError | None = None
     for episode in selection.chosen(source, mapping):
         note(1)
@@ -92,8 +93,12 @@ def survey(
             notes.append(f"episode {episode}: {error}; omitted")
             continue
         notes += [f"episode {episode}: {line}" for line in odd]
-        notes += [] if kept else doubts.of_state(arrays, mapping, task)
+        if not kept:
+            notes += doubts.of_state(arrays, mapping, task)
+            notes += doubts.of_models(arrays, mapping, folder)
         tips.append(trocars.subsample(poses))
+        R, p = poses.command.R, poses.command.p
+        commands.append((shafts.subsample(R), shafts.subsample(p)))
         is_success = success and not selection.is_failure(source, episode)
         kept.append(Kept(episode, len(poses.pose.p), -1, is_success))
     if not kept and first_error is not None:
@@ -101,9 +106,12 @@ def survey(
     places, is_known = trocars.locate(tips, mapping, [k.episode for k in kept], notes)
     kept, places = (list(itertools.compress(items, is_known)) for items in (kept, places))
     tips = list(itertools.compress(tips, is_known))
+    commands = list(itertools.compress(commands, is_known))
     if not kept:
         reason = notes[-1] if notes else "no episode"
         raise errors.UsageError("PATH", "demonstrations to keep", reason)
+    for k, (R, p), place in zip(kept, commands, places):
+        notes += [f"episode {k.episode}: {x}" for x in doubts.off_trocar(R, p, place, mapping)]
     is_placed = mapping.place == "trocar"
     if is_placed:
         mapping, tips, places = _placed(mapping, tips, np.array(places), task)

@@ -169,6 +169,18 @@ def _kinematics(
     return R, p
 
 
+def unmoved(arrays: Arrays, arm: ArmColumns, folder: Path) -> list[str]:
+    """Returns the joints between a model's base and the arm's tip that no column gives."""
+    count = maps.pick(arrays, arm.joints).shape[1]
+    model, places, site, body = _model(folder / arm.model, arm.joint_names, arm.body, count)
+    body, found = model.site_bodyid[site] if site >= 0 else body, []
+    while body:
+        first = model.body_jntadr[body]
+        found += [model.joint(i) for i in range(first, first + model.body_jntnum[body])]
+        body = model.body_parentid[body]
+    return [joint.name for joint in found if joint.qposadr[0] not in places]
+
+
 @functools.cache
 def _model(path: Path, joints: tuple[str, ...], tip: str, count: int) -> tuple:
     """Loads a robot's model, its joints' addresses, and the id of the tip's site or body."""
