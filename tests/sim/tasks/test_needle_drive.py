@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import types
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import pytest
 from starjax import rcm
 from starjax.sim import scene
 from starjax.sim.tasks.base import Contacts, SimReadings
-from starjax.sim.tasks.needle_drive import expert, task
+from starjax.sim.tasks.needle_drive import expert, rescue, task
 from starjax.sim.tissue import driving, hole
 from starjax.sim.tissue import needle as needles
 from starjax.types import Pose
@@ -128,3 +129,58 @@ def test_strict_is_on_both_marks_gently_and_out(case, is_strict):
     status = task.status(bound, layout, measured(bound, layout, **case))
     assert bool(status.success_now) == is_strict and bool(status.loose) and not status.lost
     assert (float(status.reward) == 1.0) == is_strict
+
+
+def at(bound, layout, turn, height=0.0, **events):
+    """A state of a needle on its path at `turn` rad, lifted by `height` m, its tip where it is."""
+    pose = needles.pose_on(bound.size, layout.bite, jnp.asarray(turn))
+    pose = pose._replace(p=pose.p.at[2].add(height))
+    tip = expert._tip(pose, task.grasp(bound.size))
+    now = measured(bound, layout).replace(needle=pose, tip=tip.p, **events)
+    trocar = types.SimpleNamespace(p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]))
+    return types.SimpleNamespace(
+        pose=Pose(tip.R[None], tip.p[None]),
+        measurements=now,
+        layout=layout,
+        measured_trocar=trocar,
+        step=jnp.asarray(50),
+    )
+
+
+NO, YES, FAR = jnp.zeros((), bool), jnp.ones((), bool), jnp.asarray(0.004)
+
+
+@pytest.mark.parametrize(
+    ("turn", "height", "events", "phase"),
+    [
+        (-1.0, 0.0, {"is_inside": NO, "has_exited": NO, "emerged": 0 * FAR}, expert.RAISE),
+        (-1.0, 0.03, {"is_inside": NO, "has_exited": NO, "emerged": 0 * FAR}, expert.APPROACH),
+        (0.1, 0.0, {"is_inside": YES, "has_exited": NO, "emerged": 0 * FAR}, expert.DRIVE),
+        (0.1, 0.001, {"is_inside": YES, "has_exited": NO, "emerged": 0 * FAR}, expert.DRIVE),
+        (0.9, 0.0, {"is_inside": YES, "has_exited": YES, "emerged": FAR}, expert.HOLD),
+    ],
+)
+def test_the_expert_enters_anywhere_without_a_jolt(turn, height, events, phase):
+    _, bound = compiled("needle_drive")
+    layout = jax.tree.map(lambda x: x[3], layouts("needle_drive"))
+    state = at(bound, layout, turn, height, **events)
+    script = rescue.RESCUER.resume(jax.random.key(0), state)
+    assert int(script.phase) == phase and float(script.jaws) == -1.0
+    command, _, _ = rescue.RESCUER.act(script, state)
+    assert float(jnp.linalg.norm(command.pose.p[0] - state.pose.p[0])) < 0.5e-3
+    assert float(jnp.abs(command.pose.R[0] - state.pose.R[0]).max()) < 0.02
+    np.testing.assert_array_equal(command.gripper, -1.0)
+
+
+def test_a_needle_off_its_path_is_back_on_it_at_the_end_of_the_drive():
+    _, bound = compiled("needle_drive")
+    layout = jax.tree.map(lambda x: x[3], layouts("needle_drive"))
+    events = {"is_inside": YES, "has_exited": NO, "emerged": 0 * FAR}
+    state = at(bound, layout, 0.1, 0.001, **events)
+    script = rescue.RESCUER.resume(jax.random.key(0), state)
+    first, end = (
+        expert._on_arc(bound.size, script, jnp.asarray(share), state) for share in (0.0, 1.0)
+    )
+    np.testing.assert_allclose(first.p, state.pose.p[0], atol=1e-6)
+    path = needles.pose_on(bound.size, layout.bite, expert._end(bound.size, state))
+    np.testing.assert_allclose(end.p, expert._tip(path, script.held).p, atol=1e-6)

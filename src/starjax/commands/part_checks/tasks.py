@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax import config, rcm
+from starjax import config, errors, rcm
 from starjax.commands.part_checks.base import FAILED, NOTE, Check, attempt, counted, failed, verdict
 from starjax.evaluation import expert as episodes
 from starjax.rollouts.success_quota import MIN_SUCCESS_RATE
-from starjax.sim import contract, physics, registries, sampling, task_draws
+from starjax.sim import contract, coupling, physics, registries, sampling, task_draws
 from starjax.sim import env as envs
 from starjax.sim.scene import Scene
 from starjax.sim.tasks.base import CONTROL_HZ, SimReadings, Task
@@ -88,6 +88,8 @@ def _functions(scene: Scene) -> Iterator[Check]:
     }
     if task.still is not None:
         calls["still"] = lambda: task.still and task.still(layout())
+    if task.coupling is not None:
+        calls["coupling"] = lambda: _forces(scene, layout())
     faults = set()
     for name, call in calls.items():
         fault, _ = attempt(name, lambda call=call: jax.eval_shape(call))
@@ -99,6 +101,20 @@ def _functions(scene: Scene) -> Iterator[Check]:
         yield fault
     elif not faults:
         yield Check("functions", f"{len(calls) + 1} return their types and shapes")
+
+
+def _forces(scene: Scene, layout: Any) -> jax.Array:
+    """Returns the forces `[V]` of a task's own at reset; raises for another shape."""
+    state = physics.initial(scene, [bound.home for bound in scene.arms], layout)
+    p_world_trocar, gripper = jnp.asarray(scene.p_world_ref), -jnp.ones(len(scene.arms))
+    forces, _ = coupling.forces(scene, layout, state, gripper, p_world_trocar)
+    if jnp.shape(forces) != (scene.mj_model.nv,):
+        raise errors.UsageError(
+            f"task {scene.task.name}: coupling.forces",
+            f"an array [{scene.mj_model.nv}]",
+            str(list(jnp.shape(forces))),
+        )
+    return jnp.asarray(forces)
 
 
 def _untouchable(scene: Scene) -> Iterator[str]:
