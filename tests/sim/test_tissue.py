@@ -60,7 +60,7 @@ def test_the_velocity_after_a_step_minimises_the_cost():
 
 def test_a_spring_alone_is_the_implicit_one():
     J = jnp.eye(6)[:1]
-    one = rows.stacked([rows.row(J[0], 1e-3, 400.0, 1.0)])
+    one = rows.made(J, 1e-3, 400.0, 1.0)
     m = 1e-4
     u, force = rows.solve(one, jnp.full(6, m), jnp.zeros(6).at[0].set(0.1), jnp.zeros(6), H)
     v = (m * 0.1 - H * 400.0 * 1e-3) / (m + H * (400.0 * H + 1.0))

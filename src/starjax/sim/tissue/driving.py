@@ -86,7 +86,7 @@ def step(
         patches, tips.pose, tips.twist, pose, tips.gripper
     )
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), held)
-    rows = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), hole.rows(needle, pose, now), flat)
+    rows = bodies.joined([hole.rows(needle, pose, now), flat])
     inertia = jnp.asarray(body.inertia, jnp.float32)
     _, forces = bodies.solve(rows, inertia, u + h * weight(body) / inertia, u, h)
     on_patches = forces[hole.ROWS :].reshape(len(tips.gripper), 6)

@@ -116,31 +116,39 @@ def rows(needle: Needle, pose: Pose, hole: NeedleHole) -> bodies.ForceRows:
     """Returns the rows of the hole: 3 per point, 1 of the cut, 3 of the dimple."""
     length = needle.radius * inside(needle, pose, hole)
     rub = FRICTION * length / jnp.maximum(hole.count, 1)
-    found, is_present = [], []
-    for i in range(POINTS):
-        p = hole.points[i]
-        angle, distance, height = needles.coordinates(needle, pose, p)
-        cos, sin, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros(())
-        out, along = (pose.R @ jnp.stack(x) for x in ((cos, sin, zero), (-sin, cos, zero)))
-        for direction, stretch, stiffness, damping, bound in (
-            (out, needle.radius - distance, ACROSS, ACROSS_DAMPING, jnp.inf),
-            (pose.R[:, 2], -height, ACROSS, ACROSS_DAMPING, jnp.inf),
-            (along, 0.0, 0.0, DRAG, rub),
-        ):
-            J = bodies.at_point(pose, p, direction)
-            found.append(bodies.row(J, stretch, stiffness, damping, bound))
-            is_on_wire = jnp.abs(angle) <= needle.end
-            is_present.append(hole.is_inside & (i < hole.count) & is_on_wire)
+    points, is_on_wire = jax.vmap(lambda p: _of_point(needle, pose, p, rub))(hole.points)
+    is_kept = hole.is_inside & (jnp.arange(POINTS) < hole.count) & is_on_wire
     tip = needles.point_at(needle, pose, jnp.asarray(needle.end))
-    ahead = bodies.at_point(pose, tip, needles.tangent_at(pose, jnp.asarray(needle.end)))
-    found.append(bodies.row(ahead, 0.0, 0.0, DRAG, CUT)._replace(high=jnp.zeros(())))
-    is_present.append(hole.is_inside & ~hole.has_exited)
-    for axis in range(3):
-        J = bodies.at_point(pose, tip, jnp.eye(3)[axis])
-        caught = bodies.row(J, tip[axis] - hole.entry[axis], DIMPLE, DIMPLE_DAMPING)
-        found.append(caught._replace(low=jnp.zeros(())) if axis == 2 else caught)
-        is_present.append(hole.touches)
-    return bodies.present(bodies.stacked(found), jnp.stack(is_present))
+    ahead = needles.tangent_at(pose, jnp.asarray(needle.end))
+    zero = jnp.zeros(1)
+    cut = bodies.made(bodies.at_point(pose, tip, ahead[None]), zero, 0.0, DRAG, CUT)
+    J = bodies.at_point(pose, tip, jnp.eye(3))
+    dimple = bodies.made(J, tip - hole.entry, DIMPLE, DIMPLE_DAMPING)
+    # The surface pushes up only, and the cut resists only the way ahead.
+    dimple = dimple._replace(low=dimple.low.at[2].set(0.0))
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), points)
+    is_present = [
+        jnp.repeat(is_kept, 3),
+        (hole.is_inside & ~hole.has_exited)[None],
+        jnp.repeat(hole.touches, 3),
+    ]
+    found = bodies.joined([flat, cut._replace(high=zero), dimple])
+    return bodies.present(found, jnp.concatenate(is_present))
+
+
+def _of_point(
+    needle: Needle, pose: Pose, p: jax.Array, rub: jax.Array
+) -> tuple[bodies.ForceRows, jax.Array]:
+    """Returns the 3 rows of a point: out, along the normal and along the wire; True on the wire."""
+    angle, distance, height = needles.coordinates(needle, pose, p)
+    cos, sin, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros(())
+    own = jnp.stack([cos, sin, zero, zero, zero, 1.0 + zero, -sin, cos, zero]).reshape(3, 3)
+    J = bodies.at_point(pose, p, own @ pose.R.T)
+    stretch = jnp.stack([needle.radius - distance, -height, zero])
+    across = jnp.array([1.0, 1.0, 0.0])
+    damping = ACROSS_DAMPING * across + DRAG * (1.0 - across)
+    bound = jnp.where(across > 0, jnp.inf, rub)
+    return bodies.made(J, stretch, ACROSS * across, damping, bound), jnp.abs(angle) <= needle.end
 
 
 ROWS = 3 * POINTS + 4

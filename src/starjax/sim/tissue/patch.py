@@ -87,16 +87,16 @@ def rows(
     """
     off, turn = _stretch(patch, tip, pose)
     most = bounds(gripper)
-    axes = tip.R @ patch.R_tip_patch
-    found = []
-    for i in range(3):
-        J = bodies.at_point(pose, tip.p, axes[:, i])
-        found.append(bodies.row(J, off[i], STIFFNESS, DAMPING, most[i], axes[:, i] @ twist[:3]))
-    for i in range(3):
-        J = bodies.about(pose, axes[:, i])
-        drift = axes[:, i] @ twist[3:]
-        found.append(bodies.row(J, turn[i], TURN_STIFFNESS, TURN_DAMPING, most[3 + i], drift))
-    held = bodies.present(bodies.stacked(found), patch.is_held)
+    axes = (tip.R @ patch.R_tip_patch).T
+    moves, turns = bodies.at_point(pose, tip.p, axes), bodies.about(pose, axes)
+    drift = jnp.concatenate([axes @ twist[:3], axes @ twist[3:]])
+    found = bodies.joined(
+        [
+            bodies.made(moves, off, STIFFNESS, DAMPING, most[:3], drift[:3]),
+            bodies.made(turns, turn, TURN_STIFFNESS, TURN_DAMPING, most[3:], drift[3:]),
+        ]
+    )
+    held = bodies.present(found, patch.is_held)
     return held, _slipped(patch, off, turn, most)
 
 

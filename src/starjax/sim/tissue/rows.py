@@ -42,22 +42,22 @@ class ForceRows(NamedTuple):
     drift: jax.Array
 
 
-def row(
+def made(
     J: jax.Array,
-    stretch: jax.Array | float,
+    stretch: jax.Array,
     stiffness: jax.Array | float,
     damping: jax.Array | float,
     bound: jax.Array | float = jnp.inf,
     drift: jax.Array | float = 0.0,
 ) -> ForceRows:
-    """Returns one row with a bound either way, as `ForceRows` `[]`."""
+    """Returns rows with a bound either way; all but `J` broadcast to `[E]`."""
     values = (stretch, stiffness, damping, -jnp.asarray(bound), bound, drift)
-    return ForceRows(J, *(jnp.asarray(x, jnp.float32) for x in values))
+    return ForceRows(J, *(jnp.broadcast_to(jnp.float32(x), J.shape[:-1]) for x in values))
 
 
-def stacked(rows: list[ForceRows]) -> ForceRows:
-    """Stacks single rows."""
-    return jax.tree.map(lambda *x: jnp.stack(x), *rows)
+def joined(parts: list[ForceRows]) -> ForceRows:
+    """Returns the rows of all parts."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
 def present(rows: ForceRows, is_present: jax.Array) -> ForceRows:
@@ -68,14 +68,14 @@ def present(rows: ForceRows, is_present: jax.Array) -> ForceRows:
     )
 
 
-def at_point(pose: Pose, p: jax.Array, direction: jax.Array) -> jax.Array:
-    """Returns J `[6]` of the body's material at `p` `[3]` m along a direction `[3]`."""
-    return jnp.concatenate([direction, pose.R.T @ jnp.cross(p - pose.p, direction)])
+def at_point(pose: Pose, p: jax.Array, directions: jax.Array) -> jax.Array:
+    """Returns J `[..., 6]` of the body's material at `p` `[3]` m along directions `[..., 3]`."""
+    return jnp.concatenate([directions, jnp.cross(p - pose.p, directions) @ pose.R], -1)
 
 
-def about(pose: Pose, axis: jax.Array) -> jax.Array:
-    """Returns J `[6]` of the body's turn about a world axis `[3]`."""
-    return jnp.concatenate([jnp.zeros(3), pose.R.T @ axis])
+def about(pose: Pose, axes: jax.Array) -> jax.Array:
+    """Returns J `[..., 6]` of the body's turn about world axes `[..., 3]`."""
+    return jnp.concatenate([jnp.zeros_like(axes), axes @ pose.R], -1)
 
 
 def solve(
