@@ -105,16 +105,17 @@ def _functions(scene: Scene) -> Iterator[Check]:
 
 def _forces(scene: Scene, layout: Any) -> jax.Array:
     """Returns the forces `[V]` of a task's own at reset; raises for another shape."""
-    state = physics.initial(scene, [bound.home for bound in scene.arms], layout)
+    state = physics.initial(scene, [jnp.asarray(bound.home) for bound in scene.arms], layout)
     p_world_trocar, gripper = jnp.asarray(scene.p_world_ref), -jnp.ones(len(scene.arms))
     forces, _ = coupling.forces(scene, layout, state, gripper, p_world_trocar)
+    assert forces is not None, "a task without forces of its own"
     if jnp.shape(forces) != (scene.mj_model.nv,):
         raise errors.UsageError(
             f"task {scene.task.name}: coupling.forces",
             f"an array [{scene.mj_model.nv}]",
             str(list(jnp.shape(forces))),
         )
-    return jnp.asarray(forces)
+    return forces
 
 
 def _untouchable(scene: Scene) -> Iterator[str]:
