@@ -5,11 +5,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from starjax import methods
 from starjax.commands import finetune_stages, messages, stage_times
 from starjax.commands.finetune_work import Work
 from starjax.finetune import distill, mixing, policy_gradient
-from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.policies.in_env import PolicyInEnv
 
@@ -22,10 +20,9 @@ class Distillation:
 
     def __init__(self, work: Work, steps: np.ndarray):
         """Builds them; `steps` are not used."""
-        self._work, config, env = work, work.config, work.base.env
-        row, cameras = methods.METHODS[work.stored.method], env.names.cameras
+        self._work, config = work, work.config
         policy, flow = (
-            policies.make(row, settings, env.task, config.train, cameras)
+            finetune_stages.one_step_policy(work, settings)
             for settings in (config.policy, distill.flow_settings(config.policy))
         )
         self._learn = distill.make(policy, flow, config.policy, config.train)

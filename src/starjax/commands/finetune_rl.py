@@ -9,12 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import errors, methods
+from starjax import errors
 from starjax.commands import finetune_stages, messages, stage_times
 from starjax.commands.finetune_work import Work
 from starjax.finetune import dagger, explore, mixing, policy_gradient
 from starjax.policies import features, generator, policy_file
-from starjax.policies import policy as policies
 from starjax.policies.in_env import PolicyInEnv
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import trocars as configurations
@@ -33,15 +32,14 @@ class PolicyGradient:
         if not len(steps):
             raise errors.UsageError("RUN", "a policy with some success", "none in validation")
         self._work, config, env = work, work.config, work.base.env
-        row, cameras = methods.METHODS[work.stored.method], env.names.cameras
-        policy = policies.make(row, config.policy, env.task, config.train, cameras)
+        policy = finetune_stages.one_step_policy(work, config.policy)
         limits, _ = dagger.limits(steps, env.control_hz)
         commands = config.policy.execute
         static = explore.ExploreSettings(
             config.policy.obs_horizon, commands, math.ceil(2 * limits.clock / commands)
         )
         see = _make_see(config.policy) if config.policy.observation == "image" else None
-        self._play = explore.make(env, policy, see, cameras, static)
+        self._play = explore.make(env, policy, see, env.names.cameras, static)
         self._adam = policy_gradient.optimizer(work.settings.gradient_rate)
         self._learn = policy_gradient.make(
             policy, self._adam, static.obs_horizon, config.policy.horizon

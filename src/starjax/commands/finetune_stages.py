@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from starjax import config as config_lib
 from starjax import errors, methods
 from starjax.commands import (
     demonstrations,
@@ -113,6 +114,20 @@ class Search:
         expert = self._work.config.demos.expert
         hz = who.env.control_hz
         return dagger.way(who.agent(), params, who.env.task, expert, settings, self._limits, hz)
+
+
+def one_step_policy(work: Work, settings: config_lib.PolicyConfig) -> policies.Policy:
+    """Returns the policy of a round with other settings, whose samples have two parts.
+
+    Raises:
+      errors.UsageError: those of its method have not.
+    """
+    env, method = work.base.env, work.stored.method
+    cameras = env.names.cameras
+    made = policies.make(methods.METHODS[method], settings, env.task, work.config.train, cameras)
+    if made.generate is None:
+        raise errors.UsageError(f"--by {work.settings.by}", "a method without a wrist", method)
+    return made
 
 
 class Lessons:
