@@ -72,7 +72,7 @@ def settings(typed: str) -> config.RunConfig:
         ("sweep", "--trocars 1", "RUN or --policy", "none"),
         ("sweep", "x --eval.time-limit-s soon", "--eval.time-limit-s", "'soon'"),
         ("stress", "", "RUN or --policy", "none"),
-        ("stress", "--policy compact --levels 1", "levels", 0),
+        ("stress", "--policy compact --levels 1", "levels", "none"),
         ("six-blocks", "x --policy y", "RUN or --policy", "both"),
         ("stress", "--policy compact --disturbance rain", "disturbance", "'rain'"),
         ("run", "--demos.randomise rain=1", "demos.randomise", "'rain'"),
