@@ -16,7 +16,7 @@ import numpy as np
 
 from starjax import config, config_json, errors, limits, methods, rcm, types
 from starjax.data import normalizer
-from starjax.deploy import approach, inputs
+from starjax.deploy import approach, inputs, random_keys
 from starjax.deploy.inputs import RobotObservation
 from starjax.learners import LEARNERS
 from starjax.monitor.calibrate import Monitor
@@ -102,7 +102,7 @@ class Deployed:
             than `max_first_move` or `max_first_turn` from the tool. Inside `jit` only shapes and
             types are checked.
         """
-        _check_key(key)
+        random_keys.check(key)
         sensors, trocar = inputs.validate(self.input_spec, observation, trocar)
         robots = np.shape(trocar.radius)[: np.ndim(trocar.radius) - len(self.input_spec.arms)]
         keys = jax.random.split(key, robots[0]) if robots else key[None]
@@ -146,24 +146,6 @@ class Deployed:
         if not turn <= self.max_first_turn:
             expected = f"a plan that begins within {self.max_first_turn:g} rad of the tool"
             raise errors.UsageError("max_first_turn", expected, f"{turn:.2g} rad", hint)
-
-
-def _check_key(key: Any) -> None:
-    if not isinstance(key, jax.Array | np.ndarray):
-        got = type(key).__name__
-    elif not _is_key(key):
-        got = f"{key.dtype}{list(key.shape)}"
-    else:
-        return
-    raise errors.UsageError("key", "one jax.random.key for all robots", got)
-
-
-def _is_key(array: jax.Array | np.ndarray) -> bool:
-    """Returns True for one key, typed or in jax's older form."""
-    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
-        return array.ndim == 0
-    old = jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
-    return (array.dtype, array.shape) == (old.dtype, old.shape)
 
 
 @arrays.broadcasting

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 
 from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
-from starjax.models import kernels, roll_net
+from starjax.models import kernels
 from starjax.models.diffusion import within
-from starjax.policies import execution, features, generator, sequences
+from starjax.policies import execution, features, generator, path_network, sequences
 from starjax.policies.base import Params, Policy
 from starjax.types import Command, Observation
 
@@ -65,48 +65,12 @@ def make(
     dim = 4 * arms  # of what is generated, see `generated`
     networks = generator.make(method, policy_config, sensors, dim)
     model = networks.model
-    rolls = roll_net.RollNet(
-        width=policy_config.roll_width,
-        blocks=policy_config.roll_blocks,
-        outputs=outputs,
-        dtype=jnp.dtype(policy_config.dtype),
-    )
-    history_weight = float(policy_config.roll_history)
-    trocar_weight = float(policy_config.roll_trocar)
-    predict = kernels.applied(rolls)
+    observed = generator.sizes(policy_config, sensors, dim).observed
+    rolls = path_network.make(policy_config, arms, observed, history=outputs, outputs=outputs)
 
     def init(key: jax.Array) -> Params:
         key_model, key_roll = jax.random.split(key)
-        p = jnp.zeros((1, policy_config.horizon, 3))
-        trocar = jnp.zeros((1, features.TROCAR_FEATURES))
-        history = jnp.zeros((1, policy_config.obs_horizon * outputs))
-        observed = generator.sizes(policy_config, sensors, dim).observed
-        more = jnp.zeros((1, observed)) if policy_config.roll_observation else None
-        return {
-            **networks.init(key_model),
-            "roll": rolls.init(key_roll, p, trocar, history, more),
-        }
-
-    def rolls_along(
-        params: Params,
-        p: jax.Array,
-        trocar: jax.Array,
-        history: jax.Array,
-        condition: sequences.Condition,
-    ) -> jax.Array:
-        """Predicts the turns `[B, H, A, N]` along a path (Eq. 13, and inputs of ablations)."""
-        batch, horizon = p.shape[:2]
-        more = None
-        if policy_config.roll_observation:
-            more = jnp.repeat(sequences.observation_vector(condition), arms, axis=0)
-        found = predict(
-            params["roll"],
-            p.swapaxes(1, 2).reshape(batch * arms, horizon, 3),
-            trocar_weight * trocar.reshape(batch * arms, -1),
-            history_weight * history.swapaxes(1, 2).reshape(batch * arms, -1),
-            more,
-        )
-        return found.reshape(batch, arms, horizon, outputs).swapaxes(1, 2)
+        return {**networks.init(key_model), "roll": rolls.init(key_roll)}
 
     def prepare(
         stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
@@ -140,7 +104,7 @@ def make(
         condition = networks.observe(params, prepared.inputs, prepared.trocar_condition)
         position_loss, metrics = model.loss(params["learner"], condition, prepared.model_inputs)
         path = prepared.p, prepared.trocar, prepared.history
-        predicted = rolls_along(params, *path, condition)
+        predicted = rolls.along(params["roll"], *path, condition)
         roll_loss = jnp.mean((prepared.roll - predicted) ** 2)  # Eq. 14
         total = position_loss + policy_config.roll_loss_weight * roll_loss
         return total, {"position_loss": position_loss, "roll_loss": roll_loss, **metrics}
@@ -182,7 +146,7 @@ def make(
         p, gripper = jnp.split(by_arm(x0), [3], axis=-1)
         # 2. turns along the sampled path (Eq. 13), clipped to the demonstrated range
         about = features.trocar_features(trocar.trocar)
-        gamma = rolls_along(params, p, about, by_arm(measured)[..., turns], condition)
+        gamma = rolls.along(params["roll"], p, about, by_arm(measured)[..., turns], condition)
         gamma = jnp.clip(gamma, -1.0, 1.0)
         # 3. action vector in the order of the space, decoded on the RCM manifold (Alg. 1)
         action = jnp.concatenate([gamma, p, gripper], axis=-1)

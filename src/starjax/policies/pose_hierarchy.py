@@ -14,8 +14,9 @@ import jax.numpy as jnp
 
 from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
-from starjax.models import kernels, roll_net
-from starjax.policies import execution, features, generator, sequences
+from starjax.models import kernels
+from starjax.models.diffusion import within
+from starjax.policies import execution, features, generator, path_network, sequences
 from starjax.policies.base import Params, Policy
 from starjax.types import Command, Observation
 
@@ -67,47 +68,12 @@ def make(
     dim = arms * (space.dim + 1)
     networks = generator.make(method, policy_config, sensors, dim)
     model = networks.model
-    network = roll_net.RollNet(
-        width=policy_config.roll_width,
-        blocks=policy_config.roll_blocks,
-        dtype=jnp.dtype(policy_config.dtype),
-    )
-    history_weight = float(policy_config.roll_history)
-    trocar_weight = float(policy_config.roll_trocar)
-    predict = kernels.applied(network)
+    observed = generator.sizes(policy_config, sensors, dim).observed
+    turns = path_network.make(policy_config, arms, observed, path=space.dim, history=6)
 
     def init(key: jax.Array) -> Params:
         key_model, key_turn = jax.random.split(key)
-        path = jnp.zeros((1, policy_config.horizon, space.dim))
-        trocar = jnp.zeros((1, features.TROCAR_FEATURES))
-        history = jnp.zeros((1, 6 * policy_config.obs_horizon))
-        observed = generator.sizes(policy_config, sensors, dim).observed
-        more = jnp.zeros((1, observed)) if policy_config.roll_observation else None
-        return {
-            **networks.init(key_model),
-            "turn": network.init(key_turn, path, trocar, history, more),
-        }
-
-    def turns_along(
-        params: Params,
-        path: jax.Array,
-        trocar: jax.Array,
-        history: jax.Array,
-        condition: sequences.Condition,
-    ) -> jax.Array:
-        """Predicts the turns `[B, H, A]`, in units, that are missing along a path of poses."""
-        batch, horizon = path.shape[:2]
-        more = None
-        if policy_config.roll_observation:
-            more = jnp.repeat(sequences.observation_vector(condition), arms, axis=0)
-        found = predict(
-            params["turn"],
-            path.swapaxes(1, 2).reshape(batch * arms, horizon, -1),
-            trocar_weight * trocar.reshape(batch * arms, -1),
-            history_weight * history.swapaxes(1, 2).reshape(batch * arms, -1),
-            more,
-        )
-        return found.reshape(batch, arms, horizon).swapaxes(1, 2)
+        return {**networks.init(key_model), "turn": turns.init(key_turn)}
 
     def prepare(
         stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
@@ -137,7 +103,7 @@ def make(
         condition = networks.observe(params, prepared.inputs, prepared.trocar_condition)
         pose_loss, metrics = model.loss(params["learner"], condition, prepared.model_inputs)
         path = prepared.path, prepared.trocar, prepared.history
-        predicted = turns_along(params, *path, condition)
+        predicted = turns.along(params["turn"], *path, condition)[..., 0]
         turn_loss = jnp.mean((prepared.turn[:, None] - predicted) ** 2)
         total = pose_loss + policy_config.roll_loss_weight * turn_loss
         return total, {"pose_loss": pose_loss, "turn_loss": turn_loss, **metrics}
@@ -150,16 +116,33 @@ def make(
         trocar: rcm.TrocarFrame,
     ) -> Command:
         # 1. poses and grippers (as Eq. 12), conditioned on the trocar by some methods only
+        measured, condition = _condition(params, stats, observation, trocar)
+        x0 = model.sample(params["learner"], keys, condition, stats.action.reach)
+        return _decoded(params, stats, x0, measured, condition, trocar)
+
+    def generate(params, stats, keys, observation, trocar, is_limited=False):
+        _, condition = _condition(params, stats, observation, trocar)
+        reach = stats.action.reach if is_limited else sequences.UNLIMITED
+        return model.sample(params["learner"], keys, condition, reach)
+
+    def execute(params, stats, actions, observation, trocar):
+        measured, condition = _condition(params, stats, observation, trocar)
+        x0 = within(actions, stats.action.reach)
+        return _decoded(params, stats, x0, measured, condition, trocar)
+
+    def _condition(params, stats, observation, trocar):
         measured = _measured(stats, observation, trocar)
         inputs = features.inference_inputs(policy_config, sensors, stats, observation, measured)
-        condition = networks.observe(params, inputs, features.trocar_condition(method, trocar))
-        x0 = model.sample(params["learner"], keys, condition, stats.action.reach)
+        found = networks.observe(params, inputs, features.trocar_condition(method, trocar))
+        return measured, found
+
+    def _decoded(params, stats, x0, measured, condition, trocar):
         path = by_arm(x0)
         # 2. turns about the wire, for this trocar
         about = features.trocar_features(trocar.trocar)
         history = by_arm(measured)[..., rotation]
-        turn = turns_along(params, path[..., : space.dim], about, history, condition)
-        turn = TURN * jnp.clip(turn, -MAX_TURN, MAX_TURN)
+        turn = turns.along(params["turn"], path[..., : space.dim], about, history, condition)
+        turn = TURN * jnp.clip(turn[..., 0], -MAX_TURN, MAX_TURN)
         path = path.at[..., rotation].set(turned(path[..., rotation], turn))
         # 3. shaft and wrist through the trocar, in closed form
         return execution.command(method, stats, path.reshape(x0.shape), trocar, wrist)
@@ -176,4 +159,14 @@ def make(
         return {**networks.prepare_for_inference(params), "turn": kernels.packed(params["turn"])}
 
     metrics = ("pose_loss", "turn_loss", *model.metrics)
-    return Policy(init, prepare, loss, sample, metrics, networks.cast_params, prepare_for_inference)
+    return Policy(
+        init,
+        prepare,
+        loss,
+        sample,
+        metrics,
+        networks.cast_params,
+        prepare_for_inference,
+        generate,
+        execute,
+    )

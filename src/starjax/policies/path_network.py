@@ -1,0 +1,81 @@
+"""The small network of a hierarchy: one for all arms, along each arm's path, told its trocar."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from starjax import config
+from starjax.models import kernels, roll_net
+from starjax.policies import features, sequences
+
+
+class PathNetwork(NamedTuple):
+    """Pure functions of one network's parameters.
+
+    Attributes:
+      init: key -> parameters.
+      along: (parameters, path `[B, H, A, n]`, trocar features `[B, A, 7]`, history `[B, O, A, m]`,
+        Condition) -> `[B, H, A, N]` (Eq. 13, and inputs of ablations).
+    """
+
+    init: Callable[[jax.Array], Any]
+    along: Callable[..., jax.Array]
+
+
+def make(
+    policy_config: config.PolicyConfig,
+    arms: int,
+    observed: int,
+    path: int = 3,
+    history: int = 1,
+    outputs: int = 1,
+) -> PathNetwork:
+    """Builds the network.
+
+    Args:
+      policy_config: its width and blocks, and the ablations of its inputs.
+      arms: A.
+      observed: size of `sequences.observation_vector`.
+      path, history: n and m, numbers per arm and moment.
+      outputs: N.
+    """
+    network = roll_net.RollNet(
+        width=policy_config.roll_width,
+        blocks=policy_config.roll_blocks,
+        outputs=outputs,
+        dtype=jnp.dtype(policy_config.dtype),
+    )
+    history_weight = float(policy_config.roll_history)
+    trocar_weight = float(policy_config.roll_trocar)
+    predict = kernels.applied(network)
+
+    def init(key: jax.Array) -> Any:
+        p = jnp.zeros((1, policy_config.horizon, path))
+        trocar = jnp.zeros((1, features.TROCAR_FEATURES))
+        past = jnp.zeros((1, policy_config.obs_horizon * history))
+        more = jnp.zeros((1, observed)) if policy_config.roll_observation else None
+        return network.init(key, p, trocar, past, more)
+
+    def along(
+        params: Any,
+        path: jax.Array,
+        trocar: jax.Array,
+        history: jax.Array,
+        condition: sequences.Condition,
+    ) -> jax.Array:
+        batch, horizon = path.shape[:2]
+        more = None
+        if policy_config.roll_observation:
+            more = jnp.repeat(sequences.observation_vector(condition), arms, axis=0)
+        found = predict(
+            params,
+            path.swapaxes(1, 2).reshape(batch * arms, horizon, -1),
+            trocar_weight * trocar.reshape(batch * arms, -1),
+            history_weight * history.swapaxes(1, 2).reshape(batch * arms, -1),
+            more,
+        )
+        return found.reshape(batch, arms, horizon, outputs).swapaxes(1, 2)
+
+    return PathNetwork(init, along)
