@@ -1,4 +1,4 @@
-"""The small network of a hierarchy: one for all arms, along each arm's path, told its trocar."""
+"""The small network of a hierarchy: one for all arms, given each arm's path and trocar."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
