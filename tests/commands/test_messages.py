@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from starjax import config, methods
-from starjax.commands import messages, presets
+from starjax.commands import messages, plan_text, presets
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 
@@ -17,12 +17,12 @@ NONE_INVALID = {"method": "stardiff", "invalid": 0}
 
 
 def test_the_plan_has_the_scene_the_observation_and_the_numbers():
-    said = f"{messages.headline(SMOKE)}\n{messages.plan(SMOKE, messages.STAGES)}"
+    said = f"{plan_text.headline(SMOKE)}\n{plan_text.plan(SMOKE, messages.STAGES)}"
     for fact in ("preset smoke", "peg transfer", "state", "block.p", "8 (1 x 8", "40 steps of 32"):
         assert fact in said
     assert "12 trocars x 1 trials" in said and "--policy.observation image" in said
     policy = dataclasses.replace(SMOKE.policy, observation="image")
-    said = messages.plan(dataclasses.replace(SMOKE, policy=policy), messages.STAGES)
+    said = plan_text.plan(dataclasses.replace(SMOKE, policy=policy), messages.STAGES)
     assert "image, 64 px" in said and "from scratch" in said and "state" not in said
 
 
@@ -31,44 +31,44 @@ def test_the_plan_has_the_measured_time_of_an_unchanged_preset(monkeypatch):
     timing = presets.Timing("2 cores of a test", "cpu", 431.0, "result.json")
     monkeypatch.setitem(presets.TIMINGS, "cpu", timing)
     time = "7 min on 2 cores of a test"
-    assert time in messages.plan(cpu, messages.STAGES)
-    assert time in messages.plan(dataclasses.replace(cpu, seed=3, out="x"), messages.STAGES)
+    assert time in plan_text.plan(cpu, messages.STAGES)
+    assert time in plan_text.plan(dataclasses.replace(cpu, seed=3, out="x"), messages.STAGES)
     steps = dataclasses.replace(cpu, train=dataclasses.replace(cpu.train, steps=7))
-    assert time not in messages.plan(steps, messages.STAGES)
-    assert time not in messages.plan(cpu, ("collect", "train"))
+    assert time not in plan_text.plan(steps, messages.STAGES)
+    assert time not in plan_text.plan(cpu, ("collect", "train"))
 
 
 def test_the_plan_says_where_devices_cannot_share_a_batch(monkeypatch):
-    assert "devices" not in messages.plan(SMOKE, messages.STAGES)
+    assert "devices" not in plan_text.plan(SMOKE, messages.STAGES)
     monkeypatch.setattr("jax.device_count", lambda: 8)
     five = types.SimpleNamespace(size=5)
     monkeypatch.setattr("starjax.training.devices.make_mesh", lambda _: five)
-    assert "on 5 of 8 devices" in messages.plan(SMOKE, messages.STAGES)
-    assert "on 5 of 8 devices" not in messages.plan(SMOKE, ("collect",))
+    assert "on 5 of 8 devices" in plan_text.plan(SMOKE, messages.STAGES)
+    assert "on 5 of 8 devices" not in plan_text.plan(SMOKE, ("collect",))
 
 
 def test_an_encoder_says_where_it_began_and_for_which_task(tmp_path, monkeypatch):
-    assert messages.encoder(presets.PRESETS["cpu"]).startswith("frozen, from compact (pretrained")
+    assert plan_text.encoder(presets.PRESETS["cpu"]).startswith("frozen, from compact (pretrained")
     settings = config.RunConfig(policy=config.PolicyConfig(encoder_weights="compact"))
     monkeypatch.setattr(packaged, "FOLDER", tmp_path)
-    assert messages.encoder(settings) == "trained further, from compact"  # as of torchvision's
+    assert plan_text.encoder(settings) == "trained further, from compact"  # as of torchvision's
     made = fakes.trained(policy=settings.policy, params={"unet": np.ones(3)})
     policy_file.save(tmp_path / "compact.safetensors", made)
-    assert "this task" in messages.encoder(settings)
+    assert "this task" in plan_text.encoder(settings)
     elsewhere = dataclasses.replace(settings, scene=config.SceneConfig(task="reach"))
-    assert "peg_transfer" in messages.encoder(elsewhere)
+    assert "peg_transfer" in plan_text.encoder(elsewhere)
     seen = config.SceneConfig(camera=("endoscope",))
     through = [
-        messages.encoder(dataclasses.replace(settings, scene=scene))
+        plan_text.encoder(dataclasses.replace(settings, scene=scene))
         for scene in (seen, config.SceneConfig(camera=("camera",)))
     ]
     assert ["through camera" in text for text in through] == [True, False]
 
 
 def test_warnings_name_what_a_reader_must_know():
-    said = messages.warnings(SMOKE, {"method": "stardiff", "invalid": 2})
+    said = plan_text.warnings(SMOKE, {"method": "stardiff", "invalid": 2})
     assert [fact in text for fact, text in zip(("block.p", "smoke", "2 trial"), said)] == [True] * 3
-    (paper,) = messages.warnings(config.RunConfig(), NONE_INVALID)
+    (paper,) = plan_text.warnings(config.RunConfig(), NONE_INVALID)
     assert "from scratch" in paper and "resnet18" in paper and "256 px" in paper
 
 
@@ -87,9 +87,9 @@ def test_an_ablation_is_named_where_it_changes_the_method(switch, flag, changes,
     policy = config.PolicyConfig(**switch)
     for method, count in ((changes, 1), (leaves, 0), ("all", 1)):
         settings = config.RunConfig(method=method, policy=policy)
-        assert messages.plan(settings, ()).count(f"(--policy.{flag})") == count
+        assert plan_text.plan(settings, ()).count(f"(--policy.{flag})") == count
     for method, count in ((changes, 1), (leaves, 0)):
-        _, *found = messages.warnings(
+        _, *found = plan_text.warnings(
             config.RunConfig(policy=policy), {"method": method, "invalid": 0}
         )
         assert len(found) == count and all(f"(--policy.{flag})" in text for text in found)
@@ -97,7 +97,7 @@ def test_an_ablation_is_named_where_it_changes_the_method(switch, flag, changes,
 
 def test_the_ablation_of_the_frame_is_named_for_those_that_have_one():
     policy = config.PolicyConfig(trocar_yaw="fixed")
-    named = {name for name in methods.METHODS if messages._ablations(name, policy)}
+    named = {name for name in methods.METHODS if plan_text._ablations(name, policy)}
     rows = methods.METHODS.items()
     assert named == {name for name, row in rows if policies.ablated(row, policy) != row}
 

@@ -13,6 +13,7 @@ from starjax.commands import (
     benchmark_args,
     messages,
     options,
+    plan_text,
     policy_args,
     scenes,
     session,
@@ -60,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     name = args.policy or args.run
     with started.shared() as share:
         resumes = share.first("same", lambda: _is_same(folder, who.weights, args, scene))
-        about = messages.about_served if path.address else messages.about
+        about = plan_text.about_served if path.address else plan_text.about
         print(f"{about(config, name, args.seed)}, into {folder}\n", flush=True)
         with stage_times.timed(folder, "evaluate", resumes or is_under_way(folder)):
             table = policy_evaluation.rollouts(

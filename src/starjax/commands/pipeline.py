@@ -13,6 +13,7 @@ from starjax.commands import (
     demonstrations,
     folders,
     messages,
+    plan_text,
     precompile,
     scenes,
     scored,
@@ -67,7 +68,7 @@ def run(
       command: command line, for results.
       tracker: see `RunContext`.
     """
-    jax_start.announce(messages.headline(config), sys.stdout)
+    jax_start.announce(plan_text.headline(config), sys.stdout)
     session.start_jax(*session.RUN_MODULES)
     from starjax.runtime import precompile as background
 
@@ -82,7 +83,7 @@ def run(
     encoder = demonstrations.frozen_encoder(config.policy) if trains and untrained else None
     files.require_writable(out, MIN_FREE_BYTES)
     with background.until_end(), session.Session(command, out).shared() as share:
-        print(messages.plan(config, stages), flush=True)
+        print(plan_text.plan(config, stages), flush=True)
         work = RunContext(config, encoder, share, command, tracker)
         root, collect, compile_collect = demonstrations.plan(config, work.env, share)
         if untrained or not trains:

@@ -11,7 +11,7 @@ import numpy as np
 
 from starjax import config as config_lib
 from starjax import config_json, errors, methods, rcm
-from starjax.commands import messages
+from starjax.commands import messages, plan_text
 from starjax.data import normalizer
 from starjax.evaluation import alarms, evaluate, latency, statistics
 from starjax.evaluation import result as results
@@ -202,10 +202,10 @@ def write_result(
         "config": config_json.as_json(config),
         "command": command,
         "timings_s": timings_s or {},
-        "warnings": messages.warnings(config, figures),
+        "warnings": plan_text.warnings(config, figures),
     }
     if monitor := monitor_of(who, config.eval):
         about["alarms"] = alarms.compose(trials, monitor)
     if not isinstance(who, PolicyInEnv):
-        about |= {"server": who.origin, "warnings": messages.served_warnings(who, figures)}
+        about |= {"server": who.origin, "warnings": plan_text.served_warnings(who, figures)}
     return results.write(folder / "result.json", who.env.names, figures, about)
