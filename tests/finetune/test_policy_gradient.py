@@ -145,7 +145,7 @@ def test_commands_stay_on_the_manifold_at_every_step_of_learning(demonstrations)
     worst = [float(played.rcm_commanded) for played, _ in found]
     assert max(worst) < 1e-6, worst
     moved = jax.tree.map(lambda x, y: float(jnp.abs(x - y).max()), params, after)
-    assert max(jax.tree.leaves(moved)) > 1e-3
+    assert max(jax.tree.leaves(moved)) > 1e-5  # steps of Adam, shortened to the divergence
     assert sum(int(metrics["steps"]) for _, metrics in found) > 0
 
 

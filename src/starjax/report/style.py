@@ -95,9 +95,9 @@ def figure(width: float, height: float) -> Any:
 
 
 def method(name: str) -> tuple[str, str]:
-    """Returns colour and marker of a method."""
-    index = list(methods.SCORED).index(name) % len(_METHODS)
-    return _METHODS[index], _MARKERS[index]
+    """Returns colour and marker of a method; colours repeat with another marker."""
+    turn, index = divmod(list(methods.SCORED).index(name), len(_METHODS))
+    return _METHODS[index], _MARKERS[(index + turn) % len(_MARKERS)]
 
 
 def strokes(names: Sequence[str]) -> list[str]:
