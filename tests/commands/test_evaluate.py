@@ -232,7 +232,7 @@ def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
     policy = dataclasses.replace(POLICY, obs_horizon=3, crop_fraction=0.5)
     trained = fakes.trained(method="stardiff", policy=policy, params=None, normalizer=None)
     policy = Policy(_unused, _unused, _unused, _unused)
-    who = in_env.PolicyInEnv(trained, policy, None, "")
+    who = in_env.PolicyInEnv(trained, policy, stubs.make_env(), "")
     flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
     policy_evaluation.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
     _, _, planner, _, _, settings = said["args"]

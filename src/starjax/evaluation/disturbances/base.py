@@ -99,8 +99,9 @@ def check_tools(argument: str, name: str, tools: Sequence[str]) -> None:
 
 def suits(kind: Disturbance, tools: Sequence[str]) -> bool:
     """Returns True if one of the tools can meet the disturbance."""
-    wrists = [registries.tools.get(tool).wrist for tool in tools]
-    return not kind.wrist_only or any(wrist is not None for wrist in wrists)
+    if not kind.wrist_only:
+        return True
+    return any(registries.tools.get(tool).wrist is not None for tool in tools)
 
 
 def with_disturbances(env: Env, names: Sequence[str]) -> Env:
