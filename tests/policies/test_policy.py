@@ -506,7 +506,8 @@ def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
     policy = policies.make(it.method, it.settings, fakes.TASK, TRAIN)
     given, _ = prepared(it)
     _, parts = jit(policy.loss)(it.params, given)
-    expected = jnp.mean((given.roll - given.history[:, -1:] - given.p[..., 0]) ** 2)
+    rolls, history = given.roll[..., 0], given.history[..., 0]
+    expected = jnp.mean((rolls - history[:, -1:] - given.p[..., 0]) ** 2)
     assert float(parts["roll_loss"]) == pytest.approx(float(expected), rel=1e-5)
     seen, trocar = it.batch.observation, it.batch.trocar
     keys = jax.random.split(jax.random.key(1), B)

@@ -16,7 +16,7 @@ ANGLES = np.full((2, 1, 2), 0.3)
 
 def fields(shaft, measured, commanded):
     state = types.SimpleNamespace(
-        physics=types.SimpleNamespace(qpos=np.zeros((2, 4))),
+        coordinates=np.zeros((2, 4)),
         rcm_error=np.zeros((2, 1)),
         shaft=shaft,
         wrist=measured,
