@@ -402,11 +402,11 @@ def test_the_roll_network_learns_from_inexact_inputs_what_is_exact(made):
         batch
     )
     p = np.ravel(given.p[:, :, 0] - exact[..., 1:4])
-    roll = np.ravel(given.history - seen[..., :1])
+    roll = np.ravel(given.history[:, :, 0] - seen[..., :1])
     assert p.std() == pytest.approx(hierarchical.POSITION_NOISE, rel=0.1)
     assert roll.std() == pytest.approx(hierarchical.ROLL_NOISE, rel=0.2)
     assert abs(np.corrcoef(p[: roll.size], roll)[0, 1]) < 0.4
-    np.testing.assert_allclose(given.roll, exact[..., :1], atol=1e-6)
+    np.testing.assert_allclose(given.roll[:, :, 0], exact[..., :1], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
