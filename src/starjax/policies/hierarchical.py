@@ -13,10 +13,8 @@ import jax.numpy as jnp
 from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
 from starjax.models import kernels
-from starjax.models.diffusion import within
-from starjax.policies import execution, features, generator, path_network, sequences
+from starjax.policies import execution, features, generator, hierarchy, path_network
 from starjax.policies.base import Params, Policy
-from starjax.types import Command, Observation
 
 # Noise on the roll network's inputs (standard deviation, normalised units): demonstrated positions
 # and rolls are exact, sampled and measured ones are not. It keeps small errors from accumulating,
@@ -109,40 +107,8 @@ def make(
         total = position_loss + policy_config.roll_loss_weight * roll_loss
         return total, {"position_loss": position_loss, "roll_loss": roll_loss, **metrics}
 
-    def sample(
-        params: Params,
-        stats: normalizer.Normalizer,
-        keys: jax.Array,
-        observation: Observation,
-        trocar: rcm.TrocarFrame,
-    ) -> Command:
-        # 1. positions and grippers (Eq. 12), conditioned on the trocar by some methods only
-        measured, condition = _condition(params, stats, observation, trocar)
-        x0 = model.sample(params["learner"], keys, condition, _reach(stats))
-        return _decoded(params, stats, x0, measured, condition, trocar)
-
-    def generate(params, stats, keys, observation, trocar, is_limited=False):
-        _, condition = _condition(params, stats, observation, trocar)
-        reach = _reach(stats) if is_limited else sequences.UNLIMITED
-        return model.sample(params["learner"], keys, condition, reach)
-
-    def execute(params, stats, actions, observation, trocar):
-        measured, condition = _condition(params, stats, observation, trocar)
-        x0 = within(actions, _reach(stats))
-        return _decoded(params, stats, x0, measured, condition, trocar)
-
-    def _condition(params, stats, observation, trocar):
-        measured = _measured(stats, observation, trocar)
-        inputs = features.inference_inputs(
-            policy_config, sensors, stats, observation, generated(measured)
-        )
-        found = networks.observe(params, inputs, features.trocar_condition(method, trocar))
-        return measured, found
-
-    def _reach(stats):
-        return None if stats.action.reach is None else generated(stats.action.reach)
-
     def _decoded(params, stats, x0, measured, condition, trocar):
+        # 1. positions and grippers come from the model (Eq. 12)
         p, gripper = jnp.split(by_arm(x0), [3], axis=-1)
         # 2. turns along the sampled path (Eq. 13), clipped to the demonstrated range
         about = features.trocar_features(trocar.trocar)
@@ -171,14 +137,17 @@ def make(
         return {**networks.prepare_for_inference(params), "roll": kernels.packed(params["roll"])}
 
     metrics = ("position_loss", "roll_loss", *model.metrics)
+    acting = hierarchy.make(
+        method, policy_config, sensors, networks, _measured, generated, _decoded
+    )
     return Policy(
         init,
         prepare,
         loss,
-        sample,
+        acting.sample,
         metrics,
         networks.cast_params,
         prepare_for_inference,
-        generate,
-        execute,
+        acting.generate,
+        acting.execute,
     )

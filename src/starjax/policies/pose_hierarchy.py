@@ -15,10 +15,8 @@ import jax.numpy as jnp
 from starjax import config, methods, rcm
 from starjax.data import normalizer, windows
 from starjax.models import kernels
-from starjax.models.diffusion import within
-from starjax.policies import execution, features, generator, path_network, sequences
+from starjax.policies import execution, features, generator, hierarchy, path_network
 from starjax.policies.base import Params, Policy
-from starjax.types import Command, Observation
 
 TURN = 0.3  # rad, standard deviation of the random turns, and the unit of the network's output
 MAX_TURN = 3.0  # units, of a correction
@@ -108,35 +106,8 @@ def make(
         total = pose_loss + policy_config.roll_loss_weight * turn_loss
         return total, {"pose_loss": pose_loss, "turn_loss": turn_loss, **metrics}
 
-    def sample(
-        params: Params,
-        stats: normalizer.Normalizer,
-        keys: jax.Array,
-        observation: Observation,
-        trocar: rcm.TrocarFrame,
-    ) -> Command:
-        # 1. poses and grippers (as Eq. 12), conditioned on the trocar by some methods only
-        measured, condition = _condition(params, stats, observation, trocar)
-        x0 = model.sample(params["learner"], keys, condition, stats.action.reach)
-        return _decoded(params, stats, x0, measured, condition, trocar)
-
-    def generate(params, stats, keys, observation, trocar, is_limited=False):
-        _, condition = _condition(params, stats, observation, trocar)
-        reach = stats.action.reach if is_limited else sequences.UNLIMITED
-        return model.sample(params["learner"], keys, condition, reach)
-
-    def execute(params, stats, actions, observation, trocar):
-        measured, condition = _condition(params, stats, observation, trocar)
-        x0 = within(actions, stats.action.reach)
-        return _decoded(params, stats, x0, measured, condition, trocar)
-
-    def _condition(params, stats, observation, trocar):
-        measured = _measured(stats, observation, trocar)
-        inputs = features.inference_inputs(policy_config, sensors, stats, observation, measured)
-        found = networks.observe(params, inputs, features.trocar_condition(method, trocar))
-        return measured, found
-
     def _decoded(params, stats, x0, measured, condition, trocar):
+        # 1. poses and grippers come from the model (as Eq. 12)
         path = by_arm(x0)
         # 2. turns about the wire, for this trocar
         about = features.trocar_features(trocar.trocar)
@@ -159,14 +130,17 @@ def make(
         return {**networks.prepare_for_inference(params), "turn": kernels.packed(params["turn"])}
 
     metrics = ("pose_loss", "turn_loss", *model.metrics)
+    acting = hierarchy.make(
+        method, policy_config, sensors, networks, _measured, lambda vector: vector, _decoded
+    )
     return Policy(
         init,
         prepare,
         loss,
-        sample,
+        acting.sample,
         metrics,
         networks.cast_params,
         prepare_for_inference,
-        generate,
-        execute,
+        acting.generate,
+        acting.execute,
     )

@@ -53,8 +53,8 @@ class Row(NamedTuple):
 
     @property
     def stressed(self) -> stats.Rate | None:
-        """Strict success over all disturbances together, None without any."""
-        if not self.stress:
+        """Strict success over the protocol's disturbances together, None if one is missing."""
+        if self.stress.keys() != protocol.STRESS.keys():
             return None
         scores = self.stress.values()
         return stats.rate(sum(s.successes for s in scores), sum(s.trials for s in scores))
