@@ -130,6 +130,34 @@ def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
     assert "chunks of another evaluation are replaced" in capsys.readouterr().out
 
 
+def test_options_of_the_learner_make_another_evaluation(file):
+    for _ in range(2):
+        score("--sampling", "temperature=0.25", "ddim_steps=2", "--out", "here")
+    changed = json.loads((file.parent / "here" / "result.json").read_text())
+    made = policy_file.load(file)
+    policy_file.save(file, made._replace(policy=config.with_options(POLICY, temperature=0.25)))
+    assert changed["config"]["policy"]["temperature"] == 0.25
+    assert changed["config"]["policy"]["ddim_steps"] == 2
+    score("--sampling", "ddim_steps=2")
+    (folder,) = (file.parent / "runs" / "evaluate").glob("mine-*-ddim_steps2-seed0-2x1s")
+    assert json.loads((folder / "result.json").read_text())["seen"] == changed["seen"]
+
+
+@pytest.mark.parametrize(
+    ("words", "argument", "got"),
+    [
+        (["temperature"], "--sampling", "temperature"),
+        (["temperature=warm"], "--sampling", "temperature=warm"),
+        (["temperature=0.1", "temperature=0.2"], "--sampling", "temperature=0.2"),
+        (["temperatur=0.1"], "option", "temperatur"),
+        (["temperature=2"], "temperature", "2"),
+    ],
+)
+def test_a_wrong_option_of_the_learner_is_one_line(file, words, argument, got):
+    with mistakes.of(argument, got):
+        score("--sampling", *words)
+
+
 @pytest.mark.parametrize("damaged", ["{", "[]"])
 def test_a_damaged_result_is_put_together_again(file, damaged):
     score("--out", "here")

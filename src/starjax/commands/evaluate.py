@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import config as config_lib
-from starjax import errors, extras, methods
+from starjax import config_json, errors, extras, methods
 from starjax.commands import (
     benchmark_args,
     messages,
@@ -39,6 +39,9 @@ class EvaluateArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
     """Flags of the command."""
 
     seed: config_lib.Seed = 0  # random seed of the trials
+    # options of the learner instead of those of the training, such as temperature=0.1 or onestep's
+    # correct_at=0.3
+    sampling: tuple[str, ...] = ()
     out: str = options.AUTO  # directory of the result; auto: one in RUN or in runs/evaluate
     video: bool = True  # write rollout.mp4
     eval: config_lib.EvalConfig = dataclasses.field(default_factory=config_lib.EvalConfig)
@@ -60,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
     )
     name = args.policy or args.run
     with started.shared() as share:
-        resumes = share.first("same", lambda: _is_same(folder, who.weights, args, scene))
+        resumes = share.first("same", lambda: _is_same(folder, who, args, scene))
         about = plan_text.about_served if path.address else plan_text.about
         print(f"{about(config, name, args.seed)}, into {folder}\n", flush=True)
         with stage_times.timed(folder, "evaluate", resumes or is_under_way(folder)):
@@ -95,24 +98,30 @@ def _parse(argv: Sequence[str], has_gpu: bool) -> tuple[EvaluateArgs, policy_arg
     if args.video:
         extras.require("evaluate --video", "report", "video")
     benchmark_args.check(args, default)
-    path = policy_args.resolve(args)
+    path = policy_args.resolve(args)._replace(sampling=policy_args.sampling(args.sampling))
+    if path.address and args.sampling:
+        raise errors.UsageError(policy_args.SAMPLING, "a file's policy", path.address)
     trials = f"seed{args.seed}-{args.eval.trials}x{args.eval.time_limit_s:g}s"
     trials = benchmark_args.label() if args.benchmark else trials
-    parts = [trials, *["ensemble"] * args.eval.ensemble]
+    samples = [word.replace("=", "") for word in args.sampling]
+    parts = [*samples, trials, *["ensemble"] * args.eval.ensemble]
     return args, path, path.folder("evaluate", parts, args.out)
 
 
-def _is_same(folder: Path, weights: str, args: EvaluateArgs, scene: config_lib.SceneConfig) -> bool:
-    """Returns True if the directory's result has these weights and trials.
+def _is_same(folder: Path, who: Any, args: EvaluateArgs, scene: config_lib.SceneConfig) -> bool:
+    """Returns True if the directory's result has this policy and these trials.
 
     Raises:
       errors.UsageError: the directory of --out holds results that would be lost.
     """
-    before = _previous(folder)
+    before, weights = _previous(folder), who.weights
     if args.out != options.AUTO:
         _refuse_foreign(folder, before.get("weights", weights) == weights)
     trials = dataclasses.asdict(args.eval)
-    return _identity(before) == (weights, args.seed, list(scene.arm), trials)
+    policy = config_json.as_json(who.trained.policy)
+    # Older results lack settings that were added later.
+    has_same_policy = policy == policy | (before.get("config") or {}).get("policy", {})
+    return has_same_policy and _identity(before) == (weights, args.seed, list(scene.arm), trials)
 
 
 def _previous(folder: Path) -> dict[str, Any]:

@@ -1,10 +1,12 @@
 """Flags that name a trained policy, and the file and the results' directory that they mean."""
 
 import dataclasses
+import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from starjax import config as config_lib
@@ -15,6 +17,7 @@ from starjax.policies.external import POLICIES
 from starjax.runtime import files
 
 SCHEMES = ("ws://", "wss://")
+SAMPLING = "--sampling"  # flag of evaluate
 _IN_PROCESS = "policy://"  # address of a policy of another package
 
 
@@ -37,12 +40,14 @@ class PolicyPath(NamedTuple):
       run: directory of its method, None if the file itself was named.
       arms: robots instead of those of the training.
       address: of a server instead of a file, else empty.
+      sampling: option of the policy's learner -> value instead of that of the training.
     """
 
     file: Path
     run: Path | None
     arms: tuple[str, ...] = ()
     address: str = ""
+    sampling: Mapping[str, Any] = MappingProxyType({})
 
     def folder(self, command: str, parts: Sequence[str], out: str = options.AUTO) -> Path:
         """Returns the directory of a command's results.
@@ -87,6 +92,25 @@ def resolve(args: PolicyArgs) -> PolicyPath:
     return PolicyPath(folders.weights(folder.parent, folder.name), folder, args.arm)
 
 
+def sampling(texts: Sequence[str]) -> dict[str, Any]:
+    """Parses options of the form `NAME=NUMBER`.
+
+    Raises:
+      errors.UsageError: a text has another form, or a name is repeated.
+    """
+    options: dict[str, Any] = {}
+    for text in texts:
+        name, _, number = text.partition("=")
+        try:
+            value = json.loads(number)
+        except ValueError:
+            value = None
+        if isinstance(value, bool) or not isinstance(value, int | float) or name in options:
+            raise errors.UsageError(SAMPLING, "NAME=NUMBER, each name once", text)
+        options[name] = value
+    return options
+
+
 def _address_label(address: str) -> str:
     """Returns a name for a server's address: its words."""
     return "-".join(re.findall(r"[\w.]+", address.partition("://")[2]))
@@ -109,6 +133,7 @@ def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
     """
     from starjax.commands import policy_evaluation  # it imports jax
     from starjax.policies import in_env
+    from starjax.policies import sampling as samples
 
     if path.address.startswith(_IN_PROCESS):
         from starjax.deploy import external
@@ -120,11 +145,13 @@ def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
 
         who = served.connect(path.address, os.environ.get(checks.API_KEY, ""), path.arms)
         return who, _settings(who.trained)
+    read = in_env.read if path.run is None else policy_evaluation.read
+    trained = samples.applied(SAMPLING, read(path.file), path.sampling)
+    method = path.run.name if path.run else ""
+    who = in_env.place_in_own_scene(path.file, trained, method=method, arms=path.arms)
     if path.run is None:
-        who = in_env.place_in_own_scene(path.file, in_env.read(path.file), arms=path.arms)
         return who, _settings(who.trained)
     config = folders.read_config(path.run)
-    who = policy_evaluation.load(path.run.name, path.file, arms=path.arms)
     trained = who.trained  # another method may have trained these weights, with other settings
     demos = trained.demos or config.demos
     return who, dataclasses.replace(config, policy=trained.policy, train=trained.train, demos=demos)

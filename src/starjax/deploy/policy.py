@@ -14,13 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, config_json, errors, limits, methods, rcm, types
+from starjax import config, errors, methods, rcm, types
 from starjax.data import normalizer
 from starjax.deploy import approach, inputs, random_keys
 from starjax.deploy.inputs import RobotObservation
-from starjax.learners import LEARNERS
 from starjax.monitor.calibrate import Monitor
-from starjax.policies import packaged, policy_file
+from starjax.policies import packaged, policy_file, sampling
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import files
@@ -184,7 +183,7 @@ def load(
     trained = policy_file.load(path)
     if trained.p_world_ref is None:
         raise errors.UsageError("policy", "one with its nominal trocar", path)
-    settings = _with_options(trained.policy, options)
+    settings = sampling.changed(trained.policy, options)
     errors.choice(f"{path}: method", trained.method, methods.METHODS)
     method = method or trained.method
     sharing = [name for name, row in methods.METHODS.items() if row.weights_of == trained.method]
@@ -234,21 +233,6 @@ def _load_again(path: str, digest: str, settings: dict[str, Any]) -> Deployed:
     if loaded._source[1] != digest:
         raise errors.UsageError("policy", "the file as it was when the policy was pickled", path)
     return loaded
-
-
-def _with_options(settings: config.PolicyConfig, options: dict[str, Any]) -> config.PolicyConfig:
-    """Replaces options of the learner; raises UsageError for unknown ones or invalid values."""
-    names = [field.name for field in dataclasses.fields(settings.options)]
-    values = {}
-    for name, value in options.items():
-        errors.choice("option", name, names)
-        values[name] = value.item() if isinstance(value, np.generic) else value
-    changed = config_json.from_dict(
-        config.PolicyConfig, {**config_json.as_json(settings), **values}
-    )
-    limits.check(changed)
-    LEARNERS.get(changed.learner).check(changed.options, changed)
-    return changed
 
 
 def _inference(
