@@ -4,6 +4,7 @@
 
 The policy and batch are those of preset `compact`. "images" has the disturbances that are functions
 of an image, "all" also displaced cameras, delays and lost observations. The cases alternate.
+Memory is the device's highest use in a case's first steps, without the dataset and other cases.
 """
 
 import argparse
@@ -44,11 +45,16 @@ def main() -> None:
     steps, rounds = (2, 1) if asked.tiny else (asked.steps, asked.rounds)
     env = envs.make("peg_transfer", image_size=case.policy.image_size, moving_cameras=True)
     dataset = _setup.made_up(case.policy, 64 if asked.tiny else 16_384)
-    dataset = dataset.replace(sources=sources(env, len(dataset.episode)))
-    runs = {name: make(case, names, dataset, env.draw) for name, names in CASES.items()}
+    dataset = jax.device_put(dataset.replace(sources=sources(env, len(dataset.episode))))
+    runs: dict[str, Callable] = {}
+    bytes_used = {}
+    for name, names in CASES.items():
+        before = memory("bytes_in_use")
+        runs[name] = make(case, names, dataset, env.draw)
+        runs[name](steps)  # compiles
+        # The cases grow, and each starts from what the others hold: its peak is the highest.
+        bytes_used[name] = memory("peak_bytes_in_use") - before
     seconds: dict[str, list[float]] = {name: [] for name in runs}
-    for run in runs.values():
-        run(steps)  # compiles
     for _ in range(rounds):
         for name, run in runs.items():
             start = time.perf_counter()
@@ -56,12 +62,21 @@ def main() -> None:
             seconds[name].append((time.perf_counter() - start) / steps)
     plain = statistics.median(seconds["none"])
     results = {}
-    print("disturbances  steps/s  of plain")
+    print("disturbances  steps/s  of plain  memory (MB)")
     for name, times in seconds.items():
-        pace = 1.0 / statistics.median(times)
+        pace, memory_mb = 1.0 / statistics.median(times), bytes_used[name] / 1e6
         results[name] = {"steps_per_s": pace, "fastest": 1.0 / min(times), "of_plain": pace * plain}
-        print(f"{name:13} {pace:7.1f} {pace * plain:9.2f}", flush=True)
-    facts = {"batch": case.train.batch_size, "device": str(jax.devices()[0].device_kind)}
+        results[name]["memory_mb"] = memory_mb
+        print(f"{name:13} {pace:7.1f} {pace * plain:9.2f} {memory_mb:12.0f}", flush=True)
+    held = {"images": dataset.observation.images, "others": dataset.replace(observation=None)}
+    facts = {
+        "batch": case.train.batch_size,
+        "device": str(jax.devices()[0].device_kind),
+        "bytes_per_frame": {
+            name: sum(leaf.nbytes for leaf in jax.tree.leaves(part)) / len(dataset.episode)
+            for name, part in held.items()
+        },
+    }
     _timing.report("redraw", {**facts, "results": results}, asked.tiny)
 
 
@@ -86,6 +101,11 @@ def make(case: _setup.Case, names: tuple[str, ...], dataset: Any, draw: Any) -> 
         carry = jax.block_until_ready(steps.run(carry, count))
 
     return run
+
+
+def memory(name: str) -> int:
+    """Returns a number of the device's memory statistics, 0 on a CPU, which has none."""
+    return (jax.devices()[0].memory_stats() or {}).get(name, 0)
 
 
 def sources(env: envs.Env, count: int) -> redraw.Sources:
