@@ -102,6 +102,26 @@ _BUILT_IN: dict[str, Method] = {
         label="STAR-Diff-Pose",
         group=_WRIST,
     ),
+    # Controls: generators with the trocar as input, and one model without it.
+    "stardiff_wrist_told": Method(
+        "rcm6",
+        sees_trocar=True,
+        hierarchical=True,
+        weights_of="stardiff_wrist_told",
+        label="STAR-Diff-Wrist-Told",
+        group=_WRIST,
+    ),
+    "stardiff_pose_told": Method(
+        "se3_through",
+        sees_trocar=True,
+        hierarchical=True,
+        weights_of="stardiff_pose_told",
+        label="STAR-Diff-Pose-Told",
+        group=_WRIST,
+    ),
+    "dp_rcm6_untold": Method(
+        "rcm6", weights_of="dp_rcm6_untold", label="DP-RCM-6-Untold", group=_WRIST
+    ),
 }
 
 

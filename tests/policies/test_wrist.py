@@ -93,7 +93,10 @@ def test_shafts_pass_the_given_trocar_but_those_of_free_poses(name):
     assert (np.abs(command.wrist) <= limits).all() and np.isfinite(command.pose.R).all()
 
 
-@pytest.mark.parametrize("name", ["stardiff_wrist", "stardiff_pose", "dp_rcm6"])
+TELLING = ["stardiff_wrist", "stardiff_pose", "stardiff_pose_told", "dp_rcm6"]
+
+
+@pytest.mark.parametrize("name", TELLING)
 def test_tips_depend_on_the_trocar_only_if_it_conditions_the_model(name):
     *_, batch = made(name)
     first = batch.trocar.trocar
@@ -101,6 +104,18 @@ def test_tips_depend_on_the_trocar_only_if_it_conditions_the_model(name):
     here, there = sampled(name), sampled(name, moved)
     apart = np.linalg.norm(here.pose.p - there.pose.p, axis=-1).max()
     assert (apart > 1e-5) if METHODS[name].sees_trocar else (apart < 2e-6)
+
+
+def test_controls_differ_in_the_trocar_alone():
+    for name, control in (
+        ("stardiff_wrist", "stardiff_wrist_told"),
+        ("stardiff_pose", "stardiff_pose_told"),
+        ("dp_rcm6_untold", "dp_rcm6"),
+    ):
+        told, row = METHODS[control], METHODS[name]
+        assert told.sees_trocar and not row.sees_trocar
+        same = {"sees_trocar": False, "weights_of": "", "label": ""}
+        assert told._replace(**same) == row._replace(**same)
 
 
 def test_the_heir_by_pose_keeps_the_generated_pose_but_for_a_turn_about_x():
