@@ -4,11 +4,21 @@ import functools
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from starjax import rcm
 from starjax.data import load
 from starjax.rollouts import trocars
-from starjax.viewer import browse, devices, recorder, simulation, teleop, teleop_target, view
+from starjax.viewer import (
+    browse,
+    devices,
+    recorder,
+    simulation,
+    teleop,
+    teleop_target,
+    tip_handle,
+    view,
+)
 from starjax.viewer import page as pages
 
 pytestmark = pytest.mark.slow
@@ -171,12 +181,55 @@ def test_what_was_discarded_is_nowhere(page, steered, hurried, tmp_path):
     assert len(list(root.glob("episodes/*"))) <= 1  # motion after it
 
 
+def wristed(page, steered, start):
+    """Returns a pilot of an arm with a wrist that rests, and its trocar."""
+    pilot = teleop_target.Pilot(page, 1, np.eye(3), None, rcm.LARGE_NEEDLE_DRIVER)
+    slot = steered.env.task.slots[0]
+    bounds = [teleop_target.bounds(slot, start[0, 1:4], rcm.LARGE_NEEDLE_DRIVER)]
+    reference = np.float32(slot.p_world_ref)
+    trocar = rcm.trocar_frame(rcm.trocar_from_position([0.02, 0.01, 0.15], reference), reference)
+    trocar = trocar._replace(roll_zero=np.float32(0.0))
+    pilot.rest(start, np.ones(1), bounds, [trocar])
+    return pilot, trocar
+
+
+def test_the_handle_turns_a_wrist_and_moves_its_tip(page, steered):
+    pilot, trocar = wristed(page, steered, np.array([[0.1, 0.0, 0.0, 0.06, 0.3, -0.2]]))
+    space = rcm.rcm6(rcm.LARGE_NEEDLE_DRIVER)
+    handle = pilot._handle._handle
+
+    def tip():
+        action = np.float32(pilot.targets[0].goal[tip_handle.TO_RCM6])
+        return space.decode(action, trocar)[0]
+
+    def at(pose):
+        turned = Rotation.from_quat(np.array(handle.wxyz), scalar_first=True)
+        np.testing.assert_allclose(turned.as_matrix(), pose.R, atol=1e-5)
+        np.testing.assert_allclose(handle.position, pose.p, atol=1e-6)
+
+    start = tip()
+    at(start)
+    pilot.read(1 / 30)
+    assert not pilot.has_moved
+    by = Rotation.from_euler("xyz", [0.3, -0.2, 0.4]).as_matrix()
+    for R, p in ((by @ start.R, start.p), (by @ start.R, start.p + np.float32([0.01, 0, -0.02]))):
+        turned = Rotation.from_matrix(np.asarray(R, np.float64))  # as a drag does
+        handle.wxyz, handle.position = turned.as_quat(scalar_first=True), p
+        pilot.read(1 / 30)
+        pose = tip()
+        np.testing.assert_allclose(pose.R, R, atol=1e-5)
+        np.testing.assert_allclose(pose.p, p, atol=1e-6)
+    # Beyond the limits the target stays within them, and the released handle returns to it.
+    handle.wxyz = Rotation.from_euler("xyz", [2.5, 0.0, 0.0]).as_quat(scalar_first=True)
+    pilot.read(1 / 30)
+    limits = [rcm.LARGE_NEEDLE_DRIVER.pitch, rcm.LARGE_NEEDLE_DRIVER.yaw]
+    assert (np.abs(pilot.targets[0].goal[4:]) <= limits).all()
+    at(tip())
+
+
 def test_keys_bend_a_wrist(page, steered):
-    pilot = teleop_target.Pilot(page, 1, np.eye(3), None, has_wrist=True)
-    start = np.array([[0.0, 0.0, 0.0, 0.06, 0.0, 0.0]])
-    slot, wrist = steered.env.task.slots[0], rcm.LARGE_NEEDLE_DRIVER
-    bounds = [teleop_target.bounds(slot, start[0, 1:4], wrist)]
-    pilot.rest(start, np.ones(1), bounds)
+    start, wrist = np.array([[0.0, 0.0, 0.0, 0.06, 0.0, 0.0]]), rcm.LARGE_NEEDLE_DRIVER
+    pilot, _ = wristed(page, steered, start)
     turn = teleop_target.KEY_TURN
     for key in ("Pitch up", "Pitch up", "Yaw right", "Up"):
         press(page, key)
@@ -208,7 +261,8 @@ def test_the_hands_of_the_page(page, steered, hurried, tmp_path):
     np.testing.assert_allclose(asked(), 0)
     assert not pilot.has_moved
     np.testing.assert_allclose(asked("To the right", "Up", "Up"), [0, KEY_STEP, 0, 2 * KEY_STEP])
-    pilot._handle.position = pilot._before + np.array([0.0, 0.01, 0.0])  # as a drag does
+    handle = pilot._handle._handle
+    handle.position = handle.position + np.array([0.0, 0.01, 0.0])  # as a drag does
     np.testing.assert_allclose(asked()[2], 0.01)
     press(page, "Clutch")
     np.testing.assert_allclose(asked("To the left"), [0, KEY_STEP, 0.01, 2 * KEY_STEP])

@@ -16,9 +16,9 @@ from starjax.runtime import jax_start, signals, xla
 DESCRIPTION = """Opens a page on which a person demonstrates a task.
 
 The tool follows a handle in the 3D scene, the page's hotkeys, a SpaceMouse or a gamepad. Its shaft
-always passes through the trocar, because these move only roll and tip. Recording begins with the
-first motion. Enter saves an episode, Backspace discards it. Rerun the same command to add
-episodes.
+always passes through the trocar, because these move only roll and tip, and the angles of a wrist.
+Recording begins with the first motion. Enter saves an episode, Backspace discards it. Rerun the
+same command to add episodes.
 
 With --policy, the policy acts and T passes control to your hand and back. Saved are the episodes in
 which your hand acted; starjax finetune --interventions learns the successful ones.
@@ -26,6 +26,7 @@ which your hand acted; starjax finetune --interventions learns the successful on
 Examples:
   starjax teleop --task reach
   starjax teleop --task needle_pick --device spacemouse --out runs/hand
+  starjax teleop --task peg_transfer --arm psm --tool needle_driver
   starjax teleop --policy compact --out runs/interventions"""
 
 
@@ -40,6 +41,7 @@ class TeleopArgs:
     policy: str = ""
     task: str = config_lib.DEFAULT_TASK  # task (see starjax list)
     arm: tuple[str, ...] = ()  # robots; default: the task's
+    tool: tuple[str, ...] = ()  # instruments of the arms; default: the task's
     # recorded observation: pixels or the state of the task
     observation: Literal["image", "state"] = "image"
     image_size: Annotated[int, Range(32, 1_024)] = 128  # width and height of the images in pixels
@@ -97,7 +99,11 @@ def _scene(args: TeleopArgs, file: Path | None) -> tuple[Any, Any]:
 
     if file is None:
         made = sim_env.make(
-            args.task, args.arm, observation=args.observation, image_size=args.image_size
+            args.task,
+            args.arm,
+            args.tool,
+            observation=args.observation,
+            image_size=args.image_size,
         )
         return made, None
     who = in_env.place_in_own_scene(file, in_env.read(file), arms=args.arm)

@@ -22,7 +22,7 @@ from starjax.runtime import files
 from starjax.sim import env as sim_env
 from starjax.sim import wrists
 from starjax.types import Command
-from starjax.viewer import simulation
+from starjax.viewer import simulation, tip_handle
 from starjax.viewer.frame import Frame
 
 OPERATOR = "operator"  # in dataset.json, in place of a scripted expert's name
@@ -91,9 +91,8 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
     """Makes the functions of a Steering."""
     wrist = wrists.common(env.task)
     space = rcm.action_space("rcm4" if wrist is None else "rcm6", wrist)
-    # Actions are roll, tip, angles; `rcm6` is roll, angles, tip.
-    to_action = slice(None) if wrist is None else np.array([0, 3, 4, 5, 1, 2])
-    from_action = slice(None) if wrist is None else np.array([0, 4, 5, 1, 2, 3])
+    to_action = slice(None) if wrist is None else tip_handle.FROM_RCM6
+    from_action = slice(None) if wrist is None else tip_handle.TO_RCM6
     camera, observe = simulation.camera(env), jax.vmap(env.observe)
     params = None if policy is None else policy.params
 

@@ -6,6 +6,7 @@ With a policy at work, a key passes control to the hand and back.
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 
@@ -58,6 +59,9 @@ class OperatorEpisode:
         self.hand_acts = self._keeps = self._steering.policy is None
         start = self._steering.start(self._seed, configuration, trial)
         self._state, self.frame, *now = start
+        frames = jax.device_get(self._state.env.measured_trocar)
+        arms = range(self._steering.env.task.arms)
+        self._trocars = [jax.tree.map(lambda x, i=i: x[0, i], frames) for i in arms]
         self._rest(*now)
         self._stage.clear()
         self._draw(with_image=True)
@@ -92,7 +96,7 @@ class OperatorEpisode:
             teleop_target.bounds(slot, action[1:4], wrist)
             for slot, action in zip(task.slots, actions, strict=True)
         ]
-        self._pilot.rest(actions, openings, limits)
+        self._pilot.rest(actions, openings, limits, self._trocars)
 
     def replay(self, recorder: Recorder) -> Iterator[None]:
         """Shows the recorded control steps one by one, then the present one again."""
@@ -138,8 +142,7 @@ def run(
         page.add_command(gui, "Pass control", "T", lambda: requests.add("pass"))
     names = trocar_names(env.task.name)
     choices = page.Choices(gui, requests, trocar=(names, names[trocar]))
-    has_wrist = wrists.common(env.task) is not None
-    pilot = Pilot(server, env.task.arms, view_axes(env), device, has_wrist)
+    pilot = Pilot(server, env.task.arms, view_axes(env), device, wrists.common(env.task))
     page.add_dark_mode(gui)
     steering.compile()  # not after the operator's first motion
     episode = OperatorEpisode(server, steering, pilot, seed)

@@ -2,11 +2,11 @@
 
 A target has roll and tip, the coordinates of action space `rcm4`, and with a wrist pitch and yaw as
 well, those of `rcm6`. The shaft follows from them and therefore always passes the trocar. Plain
-functions on a few numbers, 30 times a second: nothing here is compiled.
+functions on a few numbers, 30 times a second.
 """
 
 import queue
-import time
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from starjax.sim import registries
 from starjax.sim.tasks.base import Slot
 from starjax.viewer import page
 from starjax.viewer.devices import Device, DeviceLost, Reading
-from starjax.viewer.handles import RELEASE_S
+from starjax.viewer.tip_handle import TipHandle
 
 SPEED = 0.05  # m/s at full deflection of a device
 SPIN = 1.5  # rad/s at full deflection
@@ -24,7 +24,6 @@ SMOOTHING_S = 0.1  # time constant that removes key steps and tremor from the co
 MARGIN = 0.01  # m about the workspace's tips
 KEY_STEP = 0.0015  # m per key press at scale 1; holding a key repeats it
 KEY_TURN = 0.05  # rad per key press
-_HANDLE = 0.045  # m, length of the handle's arrows
 # key -> (label, increment: roll, right, away, up)
 _MOVES = {
     "arrowright": ("to the right", (0, 1, 0, 0)),
@@ -43,7 +42,7 @@ _BENDS = {
     "J": ("yaw left", (0, 1)),
     "L": ("yaw right", (0, -1)),
 }
-_BEND_HELP = " I, K (pitch) and J, L (yaw) bend the wrist."
+_BEND_HELP = " I, K (pitch) and J, L (yaw) bend the wrist; the rings at the tip turn it."
 _HELP = (
     "Drag the arrows at the tip, or press arrows, Page Up and Page Down, Q and E (roll), "
     "G (jaws), C (clutch)."
@@ -149,8 +148,9 @@ class Pilot:
         arms: int,
         axes: np.ndarray,
         device: Device | None,
-        has_wrist: bool = False,
+        wrist: rcm.Wrist | None = None,
     ):
+        has_wrist = wrist is not None
         self._size = 6 if has_wrist else 4
         self._server, self._axes, self._device = server, axes, device
         self._buttons = (False, False)
@@ -161,10 +161,7 @@ class Pilot:
         self._arm = gui.add_dropdown("Arm", names, visible=arms > 1)
         self._clutch = gui.add_checkbox("Clutch", True, hint="C: off, the hand moves freely")
         self._scale = gui.add_slider("Scale", 0.1, 2.0, 0.1, 1.0, hint="tool over hand")
-        self._handle = server.scene.add_transform_controls(
-            "/hand", scale=_HANDLE, disable_rotations=True, depth_test=False
-        )
-        self._before = np.zeros(3)
+        self._handle = TipHandle(server.scene, wrist)
 
         def bind(key: str, label: str, by: tuple[int, ...], toggles: bool = False) -> None:
             press = (np.array([*by, 0, 0][: self._size]), toggles)
@@ -177,10 +174,23 @@ class Pilot:
         bind("G", "Open or close the jaws", (0, 0, 0, 0), toggles=True)
         page.add_command(gui, "Clutch", "C", self._toggle_clutch)
 
-    def rest(self, actions: np.ndarray, openings: np.ndarray, limits: list[Bounds]) -> None:
-        """Holds actions `[A, D]` and openings `[A]`, and forgets pending keys."""
+    def rest(
+        self,
+        actions: np.ndarray,
+        openings: np.ndarray,
+        limits: list[Bounds],
+        trocars: Sequence[rcm.TrocarFrame] = (),
+    ) -> None:
+        """Holds actions `[A, D]` and openings `[A]`, and forgets pending keys.
+
+        Args:
+          actions: `[A, D]`, see `TeleopTarget`.
+          openings: `[A]` of the jaws.
+          limits: one per arm.
+          trocars: one per arm; needed with a wrist only.
+        """
         self.targets = [at_rest(a, float(o)) for a, o in zip(actions, openings, strict=True)]
-        self._limits, self.has_moved = limits, False
+        self._limits, self._trocars, self.has_moved = limits, trocars or [None] * len(limits), False
         while not self._presses.empty():
             self._presses.get()
         self._settle()
@@ -196,7 +206,7 @@ class Pilot:
             self.targets[arm] = toggle_jaws(self.targets[arm])
             self.has_moved = True
         self.targets = [smoothed(target, period) for target in self.targets]
-        if time.time() - self._handle.update_timestamp > RELEASE_S:
+        if self._handle.is_released:
             self._settle()
         return (
             np.stack([target.action for target in self.targets]),
@@ -205,9 +215,8 @@ class Pilot:
 
     def _input(self, period: float) -> tuple[np.ndarray, bool]:
         """Returns the increment `[D]` (rad, m in the world frame) and a toggle of the jaws."""
-        by, toggles, scale = np.zeros(self._size), False, float(self._scale.value)
-        position = np.array(self._handle.position)
-        by[1:4], self._before = scale * (position - self._before), position
+        arm, toggles, scale = int(self._arm.value), False, float(self._scale.value)
+        by = self._handle.increment(self.targets[arm].goal, self._trocars[arm], scale)
         steps = scale * np.array([KEY_TURN, KEY_STEP, KEY_STEP, KEY_STEP])
         while not self._presses.empty():
             press, is_toggle = self._presses.get()
@@ -236,10 +245,8 @@ class Pilot:
 
     def _settle(self) -> None:
         """Returns the handle to the target's tip."""
-        tip = self.targets[int(self._arm.value)].goal[1:4]
-        if not np.array_equal(self._before, tip):
-            self._handle.position = tip
-            self._before = np.array(self._handle.position)
+        arm = int(self._arm.value)
+        self._handle.settle(self.targets[arm].goal, self._trocars[arm])
 
     def _toggle_clutch(self) -> None:
         self._clutch.value = not self._clutch.value
