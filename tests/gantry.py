@@ -1,4 +1,4 @@
-"""The arm of docs/howto/add-arm.md as an installed package, built from that page's blocks."""
+"""The arm and the tool of docs/howto as installed packages, built from their pages' blocks."""
 
 import pathlib
 import re
@@ -8,19 +8,21 @@ _FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _GROUP = re.compile(r'entry-points\."([\w.]+)"\]\n(\w+) = "([\w.]+):(\w+)"')
 
 
-def install(site: pathlib.Path) -> str:
-    """Writes the package into `site`; returns the arm's name."""
-    blocks = dict(_FENCE.findall((ROOT / "docs" / "howto" / "add-arm.md").read_text()))
-    found = _GROUP.search(blocks["toml"])
-    assert found
-    group, name, module, attribute = found.groups()
-    folder = site / module.partition(".")[0]
+def install(site: pathlib.Path, page: str = "add-arm") -> str:
+    """Writes a page's package into `site`; returns the name of its part."""
+    blocks = dict(_FENCE.findall((ROOT / "docs" / "howto" / f"{page}.md").read_text()))
+    entries = _GROUP.findall(blocks["toml"])
+    _, name, module, _ = entries[0]
+    package = module.partition(".")[0]
+    folder = site / package
     folder.mkdir()
     (folder / "__init__.py").touch()
-    (folder / "gantry.py").write_text(blocks["py"])
-    (folder / "gantry.xml").write_text(blocks["xml"])
-    info = site / "my_arms-1.0.dist-info"
+    (folder / f"{name}.py").write_text(blocks["py"])
+    (folder / f"{name}.xml").write_text(blocks["xml"])
+    info = site / f"{package}-1.0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-arms\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {module}:{attribute}\n")
+    about = f"Metadata-Version: 2.1\nName: {package.replace('_', '-')}\nVersion: 1.0\n"
+    (info / "METADATA").write_text(about)
+    groups = (f"[{group}]\n{row} = {module}:{found}\n" for group, row, module, found in entries)
+    (info / "entry_points.txt").write_text("".join(groups))
     return name

@@ -81,7 +81,10 @@ def test_configurations_are_read(page, tmp_path):
     kinds = (registries.tasks, registries.arms, registries.tools, registries.workspaces, LEARNERS)
     groups = {f"starjax.{one.kind}s" for one in (*kinds, base.FORMATS, DISTURBANCES)}
     rows = (methods.METHODS, rcm.ACTION_SPACES, presets.PRESETS)
-    groups |= {f"starjax.{one.registry.kind}s" for one in rows} | {"starjax.policies"}
+    groups |= {f"starjax.{one.registry.kind}s" for one in rows} | {
+        "starjax.policies",
+        "starjax.mounts",
+    }
     for block in blocks(page, "toml"):
         found = tomllib.loads(block)
         if "project" in found:
