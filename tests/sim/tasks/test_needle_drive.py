@@ -61,6 +61,18 @@ def test_marks_are_as_far_apart_as_the_task_says(name):
 
 
 @pytest.mark.parametrize("name", TASKS)
+def test_the_near_camera_has_both_marks_in_every_crop_at_three_pixels_per_millimetre(name):
+    camera, bite = compiled(name)[0].camera("camera_near"), layouts(name).bite
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, camera.quat)
+    seen = (np.concatenate([bite.entry, bite.exit]) - camera.pos) @ R.reshape(3, 3)
+    half = np.tan(np.deg2rad(camera.fovy[0]) / 2)
+    assert np.abs(seen[:, :2] / seen[:, 2:]).max() < 0.8 * half  # in crops of 90%
+    pixel = 2 * half * np.abs(seen[:, 2]) / 128
+    assert pixel.max() < 0.001 / 3
+
+
+@pytest.mark.parametrize("name", TASKS)
 def test_one_grasp_is_within_the_wrist_at_every_trocar(name):
     found = layouts(name)
     _, bound = compiled(name)

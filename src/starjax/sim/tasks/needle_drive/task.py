@@ -258,7 +258,7 @@ def make(name: str, size: Needle, bites: tuple[float, float], expert: str) -> Ta
         slots=(
             Slot(workspace="board", p_world_ref=(0.0, 0.0, 0.15), arm="psm", tool="needle_driver"),
         ),
-        cameras=("camera", endoscope_camera.NAME),
+        cameras=("camera", "camera_near", endoscope_camera.NAME),
         time_limit_s=30.0,
         settle_steps=SETTLE_STEPS,
         fields=(
