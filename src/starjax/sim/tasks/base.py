@@ -232,7 +232,7 @@ class Task(NamedTuple):
         actuators, for objects that move by themselves.
       still: (Layout) -> Pose `[K]` of the MJCF's mocap bodies `still0`, .., visible without
         contacts, or None.
-      least_steps: least control steps of a success, a lower bound of demonstrations' limit.
+      least_steps: lower bound of the limit of a demonstration's control steps.
       thread: (Measurements) -> `[N, 3]` m, points of a thread, whose links are the MJCF's geoms
         `thread0`, ..; or None. See `sim.thread`.
       coupling: forces of the task's own, or None.

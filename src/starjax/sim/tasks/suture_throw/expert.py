@@ -2,8 +2,8 @@
 
 It commands tip poses: straight ways between them, and the needle's path of the bite while the
 needle is in the pad. The point is taken twice, since no grasp turns the needle out at once with
-room for the wrist; both grasps are the best of a search, see `far_grasp`. The script is disturbed
-on purpose while the pad holds nothing.
+room for the wrist; both grasps are the same at every trocar, see `far_grasp`. The script is
+disturbed on purpose while the pad holds nothing.
 """
 
 from typing import Any
@@ -53,7 +53,6 @@ class ThrowScript(phases.PhaseScript):
       R_from, R_goal, R: `[3, 3]`, the tip's rotations at the phase's ends and now.
       turn, turn_end: rad, the needle's on the path at the phase's ends.
       held: pose_tip_needle at the phase's start.
-      far: pose_tip_needle `[2]` of both grasps of the point.
       leg: int32, number of the present one.
     """
 
@@ -63,23 +62,15 @@ class ThrowScript(phases.PhaseScript):
     turn: jax.Array
     turn_end: jax.Array
     held: Pose
-    far: Pose
     leg: jax.Array
 
 
 def init(key: jax.Array, state: EnvState) -> ThrowScript:
     """Starts the script of an episode."""
-    R, zero, bite = state.pose.R[0], jnp.zeros(()), state.layout.bite
-    trocar = state.measured_trocar
-    out, middle, end = _turns(bite)
-    far = jax.vmap(
-        lambda first, last: far_grasp.search(
-            task.SIZE, bite, first, last, trocar.p_world_trocar[0], trocar.roll_zero[0]
-        )
-    )(jnp.stack([out, middle]), jnp.stack([middle, end]))
+    R, zero = state.pose.R[0], jnp.zeros(())
     script = phases.begin(
         ThrowScript, TIMING, key, state.pose.p[0], R_from=R, R_goal=R, R=R, turn=zero,
-        turn_end=zero, held=_held(state), far=far, leg=jnp.zeros((), jnp.int32),
+        turn_end=zero, held=_held(state), leg=jnp.zeros((), jnp.int32),
     )  # fmt: skip
     return _enter(script, jnp.asarray(APPROACH, jnp.int32), state)
 
@@ -114,7 +105,7 @@ def _enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScrip
     half = needles.entry_angle(task.SIZE, bite)
     first = _tip(needle, driven.grasp(task.SIZE))
     start = _tip(needles.pose_on(task.SIZE, bite, -half - BEFORE), held)
-    far = _tip(needle, jax.tree.map(lambda leaf: leaf[leg], script.far))
+    far = _tip(needle, jax.tree.map(lambda leaf: leaf[leg], far_grasp.grasps(task.SIZE)))
     up = jnp.array([0.0, 0.0, 1.0])
     stays = Pose(script.R, script.at)
     goals = {

@@ -41,6 +41,7 @@ HEADING_SPREAD = float(np.deg2rad(20.0))
 PULLED = 0.050  # m of thread out of the exit
 ON_POINT = 0.5  # of the arc from its middle to the point: beyond it jaws hold the point's half
 SETTLE_STEPS = 15
+DEMO_STEPS = round(50 * CONTROL_HZ)  # enough for the expert and a few second attempts
 STAGES = ("approach", "picked", "inside", "out", "taken", "through", "done")
 
 
@@ -203,4 +204,5 @@ TASK = driven.TASK._replace(
     state=state,
     coupling=Coupling(begin, forces),
     thread=lambda measurements: measurements.thread.p,
+    least_steps=DEMO_STEPS,
 )
