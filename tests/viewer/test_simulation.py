@@ -2,6 +2,7 @@
 
 import types
 
+import fakes
 import jax
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from starjax import rcm
 from starjax.evaluation import alarms
 from starjax.monitor import calibrate, scores
 from starjax.rollouts import agent, engine, episodes, plans
-from starjax.sim import moving_trocars
+from starjax.sim import moving_trocars, registries
 from starjax.types import Command
 from starjax.viewer import episode_alarm, simulation
 from starjax.viewer.frame import outcome
@@ -84,21 +85,41 @@ def test_what_stays_keeps_its_bits_and_what_moves_is_told(env):
 
 def test_what_was_planned_is_carried_to_where_the_trocar_is():
     random = np.random.default_rng(0)
-    before, now = np.float32(0.02 * random.normal(size=(2, 50, 3)) + [0, 0, 0.15])
-    action = np.float32(random.normal(size=(50, 4)) * [1, 0.03, 0.03, 0.02] + [0, 0, 0, 0.03])
+    before, now = np.float32(0.02 * random.normal(size=(2, 50, 1, 3)) + [0, 0, 0.15])
+    action = np.float32(random.normal(size=(50, 1, 4)) * [1, 0.03, 0.03, 0.02] + [0, 0, 0, 0.03])
     place = rcm.trocar_from_position(before, [0.0, 0.0, 0.15])
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, place, [0.0, 0.0, 0.15])
-    command = Command(pose, np.ones(50, np.float32))
-    found = moving_trocars.carried(command, before, now)
+    command = Command(pose, np.ones((50, 1), np.float32))
+    found = moving_trocars.carried(fakes.TASK, command, before, now)
     assert np.max(rcm.rcm_error(found.pose, now)) < 1e-6
     np.testing.assert_array_equal(found.pose.p, pose.p)
-    stays = moving_trocars.carried(command, before, before)
+    stays = moving_trocars.carried(fakes.TASK, command, before, before)
     np.testing.assert_array_equal(stays.pose.R, pose.R)
     missed = command._replace(pose=pose._replace(p=pose.p + np.float32([0.0, 0.001, 0.001])))
     free = np.asarray(rcm.rcm_error(missed.pose, before)) > moving_trocars.HELD
-    left = moving_trocars.carried(missed, before, now).pose
+    left = moving_trocars.carried(fakes.TASK, missed, before, now).pose
     np.testing.assert_array_equal(left.R[free], missed.pose.R[free])
     assert free.sum() > 40
+
+
+def test_a_planned_wrist_is_bent_anew_and_its_tip_stays():
+    random, wrist = np.random.default_rng(0), rcm.LARGE_NEEDLE_DRIVER
+    task = registries.tasks.get("needle_drive")
+    before, now = np.float32(0.02 * random.normal(size=(2, 50, 1, 3)) + [0, 0, 0.15])
+    tip = rcm.Pose(np.float32(np.diag([1, -1, -1])), np.float32([0, 0, 0.01]))
+    found = rcm.through(wrist, tip, before)
+    command = Command(found.pose, np.ones((50, 1), np.float32), found.wrist)
+    moved = moving_trocars.carried(task, command, before, now)
+    shafts = rcm.shaft_of(wrist, moved.pose, moved.wrist)
+    assert np.max(rcm.rcm_error(shafts, now)) < 1e-6
+    np.testing.assert_allclose(moved.pose.p, command.pose.p, atol=1e-6)
+    np.testing.assert_allclose(moved.pose.R, command.pose.R, atol=1e-5)
+    stays = moving_trocars.carried(task, command, before, before)
+    jax.tree.map(np.testing.assert_array_equal, stays, command)
+    free = command._replace(wrist=command.wrist + 0.1)
+    jax.tree.map(
+        np.testing.assert_array_equal, moving_trocars.carried(task, free, before, now), free
+    )
 
 
 def test_a_dragged_trocar_is_followed_and_the_task_is_done_through_it(expert):

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.sim import wrists
 from starjax.sim.state import Env, EnvState
-from starjax.types import Command, Pose
+from starjax.sim.tasks.base import Task
+from starjax.types import Command
 
 HELD = 1e-5  # m; a commanded shaft this near to its trocar counts as passing it
 
@@ -36,25 +38,36 @@ def frame_at(env: Env, p_world_trocar: jax.Array) -> rcm.TrocarFrame:
     return rcm.trocar_frame(parameters, env.p_world_ref, roll_zero)
 
 
-def carried(command: Command, p_before: jax.Array, p_now: jax.Array) -> Command:
+def carried(task: Task, command: Command, p_before: jax.Array, p_now: jax.Array) -> Command:
     """Turns a command that was planned for other trocars, so its shaft passes the present ones.
 
-    The tip is kept, see `rcm.project`. Commands that missed their trocar when planned, as free
-    poses do, and those whose trocar has not moved are returned unchanged.
+    The tip is kept, see `rcm.project`; a wrist keeps its rotation too, see `rcm.through`. Commands
+    that missed their trocar when planned, as free poses do, and those whose trocar has not moved
+    are returned unchanged.
 
     Args:
+      task: whose slots name the tools.
       command: `[..., A]`.
       p_before, p_now: `[..., A, 3]` m, trocars at the time of the plan and now.
     """
-    held = rcm.rcm_error(command.pose, p_before) < HELD
-    is_other = (held & jnp.any(p_before != p_now, axis=-1))[..., None]
-    turned = rcm.project(command.pose, p_now)
-    return command._replace(
-        pose=Pose(
-            jnp.where(is_other[..., None], turned.R, command.pose.R),
-            jnp.where(is_other, turned.p, command.pose.p),
-        )
-    )
+    held = rcm.rcm_error(wrists.shafts(task, command), p_before) < HELD
+    is_other = held & jnp.any(p_before != p_now, axis=-1)
+    turned = command._replace(pose=rcm.project(command.pose, p_now))
+    if command.wrist is not None:
+        bends = jnp.array([wrist is not None for wrist in wrists.per_arm(task)])
+        turned = _chosen(bends, wrists.through(task, command, p_now), turned)
+    return _chosen(is_other, turned, command)
+
+
+def _chosen(which: jax.Array, first: Command, second: Command) -> Command:
+    """Returns the first command of the arms `[..., A]` that `which` has, the second of others."""
+    axes = first.gripper.ndim
+
+    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
+        ones = (1,) * (a.ndim - axes)
+        return jnp.where(which.reshape(*which.shape, *ones), a, b)
+
+    return jax.tree.map(choose, first, second)
 
 
 def toward(here: jax.Array, there: jax.Array, largest: float) -> jax.Array:

@@ -52,3 +52,16 @@ def through(task: Task, command: Command, p_world_trocar: jax.Array) -> Command:
             R, p = R.at[..., arm, :, :].set(pose.R), p.at[..., arm, :].set(pose.p)
         angles.append(found)
     return Command(Pose(R, p), command.gripper, jnp.stack(angles, -2))
+
+
+def shafts(task: Task, command: Command) -> Pose:
+    """Returns the commanded shafts `[..., A]`; that of a straight tool is its tip's pose."""
+    (R, p), angles = command.pose, command.wrist
+    if angles is None:
+        return command.pose
+    for arm, wrist in enumerate(per_arm(task)):
+        if wrist is not None:
+            pose = Pose(R[..., arm, :, :], p[..., arm, :])
+            pose = rcm.shaft_of(wrist, pose, angles[..., arm, :])
+            R, p = R.at[..., arm, :, :].set(pose.R), p.at[..., arm, :].set(pose.p)
+    return Pose(R, p)

@@ -141,7 +141,7 @@ def make(label: str, env: sim_env.Env, agent: agents.BatchAgent, params: Any = N
         # A plan was made for the trocars of its first step: carry its commands to the present ones.
         p = before.trocar.p_world_trocar
         p_planned = jnp.where(live.t % max(execute, 1) == 0, p, live.p_planned)
-        command = moving_trocars.carried(command, p_planned, p)
+        command = moving_trocars.carried(env.task, command, p_planned, p)
         live = LiveState(jax.vmap(env.step)(before, command), memory, live.t + 1, p_planned)
         return live, frame(env, live, execute)
 
