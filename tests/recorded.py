@@ -6,6 +6,7 @@ from typing import Any
 import fakes
 import numpy as np
 
+from starjax import rcm
 from starjax.data import store
 from starjax.rollouts import episodes
 from starjax.sim import names
@@ -29,7 +30,7 @@ def write(
       size: pixels a side; 0 for a dataset of task states.
       demos: successful ones; two share a trocar. One more failed, and is not kept.
       failures: the second one failed, and is kept.
-      wrist: the tools are needle drivers, straight but for the fields of their wrists.
+      wrist: the tools are needle drivers, whose shafts move as a straight tool would.
     """
     made = fakes.dataset(0, demos, length, arms=arms)
     seen, given = made.observation, made.command
@@ -44,9 +45,13 @@ def write(
         "rcm_error": np.zeros((demos * length, arms)),
     }
     if wrist:
-        angles = np.zeros((demos * length, arms, 2))
+        time = np.arange(demos * length)[:, None, None]
+        angles = np.broadcast_to([0.5, -0.3] * np.sin(0.1 * time), (demos * length, arms, 2))
         fields |= {"wrist": angles, "command_wrist": angles}
         fields |= {"shaft_p": seen.pose.p, "shaft_R": seen.pose.R}
+        for before, shaft in (("", seen.pose), ("command_", given.pose)):
+            tip = rcm.tip_of(rcm.LARGE_NEEDLE_DRIVER, shaft, angles)
+            fields |= {f"{before}p": tip.p, f"{before}R": tip.R}
     fields = {name: np.asarray(field, np.float32) for name, field in fields.items()}
     if size:
         for camera in CAMERAS[:cameras]:

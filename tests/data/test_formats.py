@@ -185,6 +185,8 @@ def test_an_edited_export_is_read_by_our_columns(exported, roots, tmp_path, kind
         theirs.trocar.p_world_trocar, ours.trocar.p_world_trocar[1:], atol=1e-6
     )
     assert kind == "two_arms" or not found.notes
+    has_shaft = "shaft_p" in store.read_description(tmp_path / "d")["features"]
+    assert has_shaft == (kind == "wrist")
     if kind == "images":  # of the task's cameras
         roots_of = (roots / kind, tmp_path / "d")
         one, other = (load.frames(root)[recorded.CAMERAS[0]].read() for root in roots_of)

@@ -48,6 +48,20 @@ def test_figures_are_the_motions():
     assert recordings.figures(recording(bend=0.002), 0).rcm_mm == pytest.approx(2.0, abs=1e-6)
 
 
+def test_the_shaft_of_a_wrist_counts_and_its_angles_are_shown(tmp_path):
+    recorded.write(tmp_path / "wrist", wrist=True)
+    (first, *_) = recordings.of_dataset(tmp_path / "wrist")
+    found = recordings.figures(first, 0)
+    assert found.rcm_mm.max() < 1e-3
+    folder = tmp_path / "wrist/episodes/0000-0000-0"
+    angles = np.rad2deg(np.load(folder / "wrist.npy")[:, 0])
+    np.testing.assert_allclose(found.bend_deg, angles, atol=1e-3)
+    cards = recording_page.cards([first], [[found]])
+    assert "Wrist" in {card.name for card in cards}
+    straight = recordings.figures(recording(), 0)
+    assert straight.bend_deg is None
+
+
 def test_a_trocar_that_moves_wanders():
     """By 6 mm in 20 s: the middles of windows of 5 s are up to 2.25 mm from the mean.
 

@@ -1,4 +1,4 @@
-"""Motions of a dataset's episodes, and figures of each: trocar, RCM error, reach, speed, jaws."""
+"""Motions of a dataset's episodes, with figures: trocar, RCM error, reach, speed, wrist, jaws."""
 
 import math
 from collections.abc import Iterator
@@ -25,6 +25,7 @@ class EpisodeMotion(NamedTuple):
       R: `[T, A, 3, 3]` R_world_shaft; that of the tip for a straight tool.
       p_shaft: `[T, A, 3]` m, a point on the shaft.
       p: `[T, A, 3]` m, tips.
+      R_tip: `[T, A, 3, 3]` R_world_tip, or None for straight tools.
       gripper: `[T, A]` in [-1, 1].
       p_world_trocar: `[A, 3]` m.
       success: False for failures.
@@ -40,6 +41,7 @@ class EpisodeMotion(NamedTuple):
     p_world_trocar: np.ndarray
     success: bool
     split: str
+    R_tip: np.ndarray | None = None
 
 
 class MotionFigures(NamedTuple):
@@ -53,6 +55,7 @@ class MotionFigures(NamedTuple):
       wander_mm: `[W]` distances of the trocars of single windows from that of the episode; only
         windows that determine theirs.
       closings: of the jaws.
+      bend_deg: `[T, 2]` pitch and yaw of the wrist, or None for a straight tool.
     """
 
     rcm_mm: np.ndarray
@@ -61,6 +64,7 @@ class MotionFigures(NamedTuple):
     gripper: np.ndarray
     wander_mm: np.ndarray
     closings: int
+    bend_deg: np.ndarray | None = None
 
 
 def figures(recording: EpisodeMotion, arm: int) -> MotionFigures:
@@ -76,7 +80,15 @@ def figures(recording: EpisodeMotion, arm: int) -> MotionFigures:
         gripper=recording.gripper[:, arm],
         wander_mm=_wander(recording, arm),
         closings=int(np.sum(is_closed[1:] & ~is_closed[:-1])),
+        bend_deg=None if recording.R_tip is None else _bend(R, recording.R_tip[:, arm]),
     )
+
+
+def _bend(R_world_shaft: np.ndarray, R_world_tip: np.ndarray) -> np.ndarray:
+    """Returns pitch and yaw `[T, 2]` degrees of R_shaft_tip `[T, 3, 3]` = Ry(pitch) Rx(yaw)."""
+    R = np.swapaxes(R_world_shaft, -1, -2) @ R_world_tip
+    pitch = np.arctan2(-R[:, 2, 0], R[:, 0, 0])
+    return np.rad2deg(np.stack([pitch, np.arctan2(-R[:, 1, 2], R[:, 1, 1])], -1))
 
 
 def _wander(recording: EpisodeMotion, arm: int) -> np.ndarray:
@@ -100,20 +112,23 @@ def of_dataset(root: Path) -> Iterator[EpisodeMotion]:
     kept = [r for r in records if isinstance(r, dict) and r["files"]]
     for i, record in enumerate(kept[:MAX_EPISODES]):
         folder = root / "episodes" / record["key"]
-        R, p, gripper = (
+        has_wrist = "shaft_R.npy" in record["files"]
+        shaft = ("shaft_R", "shaft_p") if has_wrist else ("R", "p")
+        R, p, gripper, R_shaft, p_shaft = (
             np.load(folder / f"{name}.npy", allow_pickle=False).astype(np.float64)
-            for name in ("R", "p", "gripper")
+            for name in ("R", "p", "gripper", *shaft)
         )
         yield EpisodeMotion(
             record.get("episode", i),
             about["control_hz"],
-            R,
-            p,
+            R_shaft,
+            p_shaft,
             p,
             gripper,
             np.asarray(trocar_position(schema.trocars_of([record]), reference)[0], np.float64),
             bool(record["success"]),
             ", ".join(record.get("splits", [])),
+            R if has_wrist else None,
         )
 
 

@@ -35,20 +35,24 @@ def paths(found: Sequence[EpisodeMotion], dark: bool = False) -> Any:
 
 
 def over_time(recording: EpisodeMotion, arms: Sequence[MotionFigures], dark: bool = False) -> Any:
-    """Draws depth, RCM error, speed and jaws of one episode."""
-    rows = (
+    """Draws depth, RCM error, speed, a wrist and jaws of one episode."""
+    rows = [
         ("depth of the tip (mm)", lambda f: f.depth_mm),
         ("shaft off the trocar (mm)", lambda f: f.rcm_mm),
         ("speed of the tip (mm/s)", lambda f: f.speed_mm_s),
         ("jaws, -1 closed", lambda f: f.gripper),
-    )
+    ]
+    if arms[0].bend_deg is not None:
+        rows.insert(3, ("wrist: pitch, yaw dashed (degrees)", lambda f: f.bend_deg))
     with style.use(dark):
-        figure = style.figure(7.4, 5.2)
+        figure = style.figure(7.4, 1.3 * len(rows))
         axes = figure.subplots(len(rows), 1, sharex=True)
         for axis, (title, values) in zip(axes, rows):
             for i, one in enumerate(arms):
                 y = values(one)
-                axis.plot(np.arange(len(y)) / recording.hz, y, color=_COLOURS[i], lw=1.2)
+                t = np.arange(len(y)) / recording.hz
+                for column, dashes in zip(y.reshape(len(y), -1).T, ("-", "--")):
+                    axis.plot(t, column, dashes, color=_COLOURS[i], lw=1.2)
             axis.set_title(title)
             if "trocar" in title:
                 axis.set_ylim(0, max(_LEAST_MM, axis.get_ylim()[1]))

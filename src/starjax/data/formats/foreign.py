@@ -190,7 +190,7 @@ def _shapes(source: Source, mapping: Map, arms: int) -> dict[str, tuple[tuple[in
         for name, shape in (("p", (3,)), ("R", (3, 3)), ("gripper", ()))
     }
     shapes["rcm_error"] = ((arms,), real)
-    if _has_shaft(mapping):
+    if maps.has_shaft(mapping):
         shapes |= {"shaft_p": ((arms, 3), real), "shaft_R": ((arms, 3, 3), real)}
     if mapping.state:
         rows = maps.pick(source.read(0, maps.names(mapping)), mapping.state)
@@ -218,7 +218,7 @@ def _fields(
         "command_gripper": poses.command_gripper,
         "rcm_error": np.linalg.norm(off, axis=-1),
     }
-    if _has_shaft(mapping):
+    if maps.has_shaft(mapping):
         arrays |= {"shaft_p": poses.shaft.p, "shaft_R": poses.shaft.R}
     if mapping.state:
         arrays["state"] = maps.pick(columns, mapping.state)[poses.nearest]
@@ -229,10 +229,6 @@ def _fields(
         shown = images[camera.column][poses.nearest]
         arrays[f"{episodes.IMAGE}{name}"] = pictures(shown, camera)
     return {name: [arrays[name]] for name in sorted(arrays)}
-
-
-def _has_shaft(mapping: Map) -> bool:
-    return any(isinstance(arm.shaft, maps.ShaftColumns) for arm in mapping.arms)
 
 
 def pictures(images: np.ndarray, camera: CameraColumn) -> np.ndarray:

@@ -199,6 +199,11 @@ def names(mapping: Map) -> list[str]:
     return list(dict.fromkeys(_part(text)[0] for some in columns for text in _listed(some)))
 
 
+def has_shaft(mapping: Map) -> bool:
+    """Returns True if an arm has an instrument with a wrist."""
+    return any(isinstance(arm.shaft, ShaftColumns) for arm in mapping.arms)
+
+
 def check(mapping: Map, source: Source) -> None:
     """Raises UsageError for what the mapping names and the dataset lacks."""
     for name in names(mapping):

@@ -6,12 +6,13 @@ mapping reads the columns, so nothing but trials' numbers and seeds is lost.
 
 import re
 
+import msgspec
 import numpy as np
 
 from starjax import errors
 from starjax.data.formats import base
 from starjax.data.formats.base import Source
-from starjax.data.formats.mapping import ArmColumns, CameraColumn, Map
+from starjax.data.formats.mapping import ArmColumns, CameraColumn, Map, ShaftColumns
 from starjax.rollouts import episodes
 from starjax.sim import registries
 
@@ -35,11 +36,12 @@ def mapping(source: Source) -> Map | None:
     task = registries.tasks.get(name)
     state, success = _own("state"), _ending(source, "reward") or _ending(source, "rewards")
     arms = int(np.prod(source.columns[tips].shape)) // 3
+    has_wrist = _own("shaft_p") in source.columns
     cameras = {camera: _image(source, camera) for camera in task.cameras}
     return Map(
         about=ABOUT,
         task=name,
-        arms=tuple(_arm(i, trocar) for i in range(arms)),
+        arms=tuple(_arm(i, trocar, has_wrist) for i in range(arms)),
         cameras={
             camera: CameraColumn(column=column) for camera, column in cameras.items() if column
         },
@@ -48,7 +50,7 @@ def mapping(source: Source) -> Map | None:
     )
 
 
-def _arm(arm: int, trocar: str) -> ArmColumns:
+def _arm(arm: int, trocar: str, has_wrist: bool) -> ArmColumns:
     p, R = (f"[{size * arm}:{size * (arm + 1)}]" for size in (3, 9))
     return ArmColumns(
         position=_own("p") + p,
@@ -59,6 +61,9 @@ def _arm(arm: int, trocar: str) -> ArmColumns:
         command_rotation=_own("command_R") + R,
         command_gripper=f"{_own('command_gripper')}[{arm}]",
         trocar=trocar + p,
+        shaft=ShaftColumns(position=_own("shaft_p") + p, rotation=_own("shaft_R") + R)
+        if has_wrist
+        else msgspec.UNSET,
     )
 
 

@@ -36,6 +36,7 @@ def recordings(
                 trocar,
                 kept.success,
                 ", ".join(selection.splits_of(source, kept.episode)),
+                poses.pose.R if maps.has_shaft(mapping) else None,
             )
         )
     return made, found.notes
