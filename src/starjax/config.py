@@ -41,8 +41,8 @@ class DemosConfig:
     keep_failures: bool = False  # also store failed episodes, which training ignores
     expert: str = ""  # scripted demonstrator; default: the task's first
     max_steps: Count = 600  # maximum control steps per episode, at 30 Hz
-    # disturbances while recording, NAME=MAX_LEVEL as in starjax stress; levels are uniform per
-    # episode
+    # disturbances of the motion while recording, NAME=MAX_LEVEL as in starjax stress; levels are
+    # uniform per episode
     randomise: tuple[str, ...] = ()
 
 

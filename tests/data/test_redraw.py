@@ -89,3 +89,26 @@ def test_another_scene_is_refused(scene, recorded):
     description = store.read_description(recorded) | {"model": "another"}
     with pytest.raises(errors.UsageError, match="reach"):
         redraw.images(recorded, description, records, scene)
+
+
+def test_images_follow_from_the_state_unless_recorded_observations_were_disturbed(recorded):
+    about = store.read_description(recorded)
+    without = about | {"features": {"qpos": about["features"]["qpos"]}}
+    assert redraw.is_possible(about) and redraw.is_possible(without)
+    moved = {"randomise": {"friction": 0.5, "late_commands": 2.0}}
+    assert redraw.is_possible(without | moved)
+    assert not redraw.is_possible(about | moved)  # an older version's, perhaps with smoke
+    assert not redraw.is_possible(without | {"randomise": {"late_view": 2.0}})
+
+
+def test_motions_recorded_with_disturbances_have_the_layout_that_images_are_drawn_from(scene):
+    from starjax.evaluation.disturbances import base
+    from starjax.sim.state import EnvParams
+
+    params = EnvParams(jax.tree.map(lambda x: x[1], scene.task.trocars))
+    for key in jax.random.split(jax.random.key(2), 3):
+        wrong = base.with_random_levels(scene, {"action_delay": 3.0, "friction": 0.5, "mass": 0.5})
+        plain, disturbed = scene.reset(key, params), wrong.reset(key, params)
+        same = (plain.layout, plain.cameras), (disturbed.layout, disturbed.cameras)
+        jax.tree.map(np.testing.assert_array_equal, *same)
+        assert disturbed.wrapper_state

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import messages, scenes, stage_times
+from starjax.commands import messages, stage_times
 from starjax.runtime import hub
 
 _FROM, _RANDOMISE = "demos.from_", "demos.randomise"
@@ -41,13 +41,9 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
     from starjax.runtime import precompile, processes
     from starjax.sim import env as sim_env
     from starjax.sim import registries, task_draws
-    from starjax.training import randomise
 
     env, max_levels = randomised(config, env)
-    if max_levels and randomise.moves_cameras(config.train):
-        expected = "none with a displaced camera in train.randomise"
-        raise errors.UsageError(_RANDOMISE, expected, " ".join(config.demos.randomise))
-    if config.policy.observation == "image" and not max_levels:
+    if config.policy.observation == "image":
         env = sim_env.without_images(env)  # training draws them: collecting waits for no camera
     task, name = env.task, config.demos.expert or next(iter(env.task.experts))
     errors.choice("demos.expert", name, task.experts)
@@ -117,24 +113,29 @@ def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, f
     disturbances as datasets hold them.
 
     Raises:
-      errors.UsageError: something that these demonstrations would not show, or no such level.
+      errors.UsageError: a disturbance of observations or of measured trocars, or no such level.
     """
     from starjax.evaluation.disturbances import DISTURBANCES, base, parse_levels
 
     max_levels = parse_levels(_RANDOMISE, config.demos.randomise)
     for name, level in max_levels.items():
-        kind: base.Disturbance = DISTURBANCES.get(name)
-        sees = config.policy.observation == "image" or not kind.image_only
-        if not (kind.for_demos and sees):
-            raise errors.UsageError(_RANDOMISE, "a disturbance of demonstrations", name)
+        if not _changes_demos(kind := DISTURBANCES.get(name)):
+            known = DISTURBANCES.built_in
+            works = [other for other in known if _changes_demos(DISTURBANCES.get(other))]
+            hint = "" if kind.is_of_motion else f"--train.randomise {name}={level:g} draws it anew"
+            raise errors.UsageError(_RANDOMISE, f"one of {', '.join(works)}", name, hint)
         base.check_tools(_RANDOMISE, name, env.names.tools)
         base.check_levels(_RANDOMISE, name, [level])
     if not max_levels:
         return env, {}
-    env = scenes.disturbable(env, list(max_levels), config.policy)
     # Datasets hold the names that seed the draws: renamed disturbances leave their digests alone.
     recorded = {base.stream(name): level for name, level in max_levels.items()}
     return base.with_random_levels(env, max_levels), recorded
+
+
+def _changes_demos(kind: Any) -> bool:
+    """Returns True if recorded motions differ by it in a way that a policy can learn from."""
+    return kind.for_demos and kind.is_of_motion
 
 
 def given(config: config_lib.RunConfig, env: Any) -> Path:

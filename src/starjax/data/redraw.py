@@ -22,6 +22,8 @@ from starjax.rollouts import episodes, workers
 # cache holds 16; a GPU needs more to be busy.
 CPU_BATCH, GPU_BATCH = 16, 1024
 
+_LATE = {"late_view", "dropped"}  # streams of observation_delay and observation_dropout
+
 
 class Sources(NamedTuple):
     """Data that the images of a dataset are a function of.
@@ -109,15 +111,19 @@ class DrawnImages:
 
 def is_possible(description: Mapping[str, Any]) -> bool:
     """Returns True if images of a dataset can be drawn from what it recorded."""
-    is_undisturbed = not description.get("randomise")
+    # Disturbances of the motion leave images a function of the state; older versions recorded
+    # images with others, and observed an earlier state with those of `_LATE`.
+    features, levels = description["features"], description.get("randomise", {})
+    has_images = any(name.startswith(episodes.IMAGE) for name in features)
+    is_undisturbed = not levels or not (has_images or _LATE & levels.keys())
     is_ours = description.get("seed_rule") == schema.seed_rule(schema.stream(description))
-    return is_ours and is_undisturbed and "qpos" in description["features"]
+    return is_ours and is_undisturbed and "qpos" in features
 
 
 def expect_possible(argument: str, description: Mapping[str, Any]) -> None:
     """Raises UsageError for a dataset whose images cannot be drawn."""
     if not is_possible(description):
-        expected = "demonstrations of starjax, recorded without disturbances"
+        expected = "demonstrations of starjax, without recorded disturbances of observations"
         raise errors.UsageError(argument, expected, "others, whose images cannot be drawn")
 
 

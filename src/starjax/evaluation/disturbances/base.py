@@ -88,6 +88,12 @@ class Disturbance(NamedTuple):
         """True if policies without images never meet it."""
         return bool(self.on_camera or self.on_image)
 
+    @property
+    def is_of_motion(self) -> bool:
+        """True if it leaves observations as they are, so images remain a function of the state."""
+        observes = self.on_observe is not Disturbance._field_defaults["on_observe"]
+        return not (observes or self.image_only or self.seen_step)
+
 
 def check_tools(argument: str, name: str, tools: Sequence[str]) -> None:
     """Raises errors.UsageError for a disturbance of wrists and tools without any."""
