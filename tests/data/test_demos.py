@@ -414,10 +414,10 @@ def test_demonstrations_without_images_have_no_frames(sealed):
 def test_place_depends_on_what_is_free(monkeypatch):
     monkeypatch.setattr(load.xla, "available_bytes", lambda: 1000)
     # on a CPU there are two copies for a moment, in the same memory
-    assert [load._place(n) for n in (299, 599, 700)] == ["device", "host", "disk"]
+    assert [load.place_for(n) for n in (299, 599, 700)] == ["device", "host", "disk"]
     # and each of several devices has one
     monkeypatch.setattr(load.jax, "local_device_count", lambda: 2)
-    assert [load._place(n) for n in (149, 151)] == ["device", "host"]
+    assert [load.place_for(n) for n in (149, 151)] == ["device", "host"]
 
 
 def test_what_does_not_fit_the_host_does_not_pass_through_it(monkeypatch):
@@ -425,7 +425,7 @@ def test_what_does_not_fit_the_host_does_not_pass_through_it(monkeypatch):
     gpu = types.SimpleNamespace(platform="gpu", memory_stats=lambda: stats)
     monkeypatch.setattr(load.jax, "local_devices", lambda: [gpu])
     monkeypatch.setattr(load.xla, "available_bytes", lambda: 1000)
-    assert [load._place(n) for n in (599, 601)] == ["device", "disk"]
+    assert [load.place_for(n) for n in (599, 601)] == ["device", "disk"]
 
 
 def test_nothing_is_unpickled(images, tmp_path):

@@ -9,6 +9,7 @@ import pytest
 
 from starjax import errors
 from starjax.data import demos, load, redraw, schema, store
+from starjax.data.placed_images import JoinedImages
 from starjax.rollouts import agent
 from starjax.sim import env as envs
 from starjax.training import randomise
@@ -46,7 +47,7 @@ def test_drawn_images_are_the_recorded_ones(scene, recorded):
     for camera, redrawn in drawn(recorded, scene).items():
         images = load.frames(recorded)[camera].read()
         assert images.std() > 10 and redrawn.shape == images.shape
-        np.testing.assert_array_equal(redrawn.read(), images)
+        np.testing.assert_array_equal(JoinedImages([redrawn]).read(), images)
         rows = np.array([[5, 0], [len(images) - 1, 40]])
         np.testing.assert_array_equal(redrawn[rows], images[rows])
 

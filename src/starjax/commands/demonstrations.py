@@ -192,9 +192,29 @@ def load(
 ) -> Any:
     """Returns the dataset to train on, with the features of a frozen encoder instead of images."""
     from starjax.data import load as loading
+    from starjax.training import randomise
+
+    complete(config, root, collect, share)
+    draws = env if config.policy.observation == "image" else None
+    report = messages.indented
+    if encoder is None:
+        redraws = randomise.moves_cameras(config.train)
+        return loading.load(root, verify=False, env=draws, sources=redraws, report=report).dataset
+    loaded = loading.load(root, verify=False, images=False, report=report)
+    return with_features(config, draws, root, loaded, encoder)
+
+
+def complete(
+    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], share: Any
+) -> None:
+    """Collects missing and damaged demonstrations.
+
+    Raises:
+      errors.UsageError: those of --demos.from are damaged.
+    """
+    from starjax.data import load as loading
     from starjax.data import store
     from starjax.runtime import precompile
-    from starjax.training import randomise
 
     def is_whole() -> bool:
         try:
@@ -211,13 +231,6 @@ def load(
     precompile.settle()  # what reads and trains traces programs too
     if not share.first("whole", is_whole):
         collect()
-    draws = env if config.policy.observation == "image" else None
-    report = messages.indented
-    if encoder is None:
-        redraws = randomise.moves_cameras(config.train)
-        return loading.load(root, verify=False, env=draws, sources=redraws, report=report).dataset
-    loaded = loading.load(root, verify=False, images=False, report=report)
-    return with_features(config, draws, root, loaded, encoder)
 
 
 def with_features(

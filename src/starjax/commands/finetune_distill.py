@@ -27,7 +27,7 @@ class Distillation:
         )
         self._learn = distill.make(policy, flow, config.policy, config.train)
         self._demonstrations = policy_gradient.demonstrated(
-            finetune_stages.Lessons(work).demonstrations, config.train.holdout_demos
+            finetune_stages.Lessons(work).demonstrations(), config.train.holdout_demos
         )
 
     def round(self, number: int, who: PolicyInEnv, before: Path) -> finetune_stages.Round:

@@ -45,7 +45,7 @@ class PolicyGradient:
             policy, self._adam, static.obs_horizon, config.policy.horizon
         )
         self._demonstrations = policy_gradient.demonstrated(
-            finetune_stages.Lessons(work).demonstrations, config.train.holdout_demos
+            finetune_stages.Lessons(work).demonstrations(), config.train.holdout_demos
         )
         self._trocars = configurations.listed(work.seen, len(env.p_world_ref))
 

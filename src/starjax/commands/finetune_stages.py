@@ -131,13 +131,13 @@ def one_step_policy(work: Work, settings: config_lib.PolicyConfig) -> policies.P
 
 
 class Lessons:
-    """Demonstrations and the rollouts of all rounds so far, in memory."""
+    """Demonstrations and the rollouts of all rounds so far; images wait until they are learned."""
 
     def __init__(self, work: Work):
         """Loads the demonstrations; collects them unless the run has today's."""
         policy = work.config.policy
         self._work, self._encoder = work, None
-        self._rollouts: list[tuple[windows.Dataset, np.ndarray]] = []
+        self._rollouts: list[tuple[mixing.Part, np.ndarray]] = []
         if policy.observation == "image" and policy.freeze_encoder:
             vision = work.stored.params["vision"]
             self._encoder = Encoder(vision, policy_file.fingerprint(vision)[:16])
@@ -146,16 +146,14 @@ class Lessons:
         if not store.is_sealed(plan.root):
             config = dataclasses.replace(config, out=str(work.out))
             plan = demonstrations.plan(config, env, work.share)
-        self._demonstrations: windows.Dataset = demonstrations.load(
-            config, env, plan.root, plan.collect, self._encoder, work.share
-        )
+        demonstrations.complete(config, plan.root, plan.collect, work.share)
+        self._demonstrations = self._part(plan.root, config, verify=False)
         if work.settings.interventions:
             self._add(interventions.find(work.settings, work.base.env, work.seen))
 
-    @property
     def demonstrations(self) -> windows.Dataset:
-        """Those of the policy's training."""
-        return self._demonstrations
+        """Returns those of the policy's training, on the device if they fit."""
+        return mixing.joined([self._demonstrations])
 
     @property
     def are_new(self) -> bool:
@@ -170,17 +168,30 @@ class Lessons:
 
     def _add(self, root: Path) -> None:
         work = self._work
-        draws = work.base.env if work.stored.policy.observation == "image" else None
-        images = self._encoder is None
-        moves = randomise.moves_cameras(work.config.train)
-        loaded = load.load(root, images=images, env=draws, sources=moves, report=messages.indented)
-        dataset = loaded.dataset
-        if not images:
-            train = dataclasses.replace(work.config.train, window_stride=1)
-            config = dataclasses.replace(work.config, train=train, out=str(work.out))
-            dataset = demonstrations.with_features(config, draws, root, loaded, self._encoder)
-        frames = mixing.learned_frames(load.actors(root), loaded.description["learned"])
-        self._rollouts.append((dataset, frames))
+        # Every frame of a rollout may be learned.
+        train = dataclasses.replace(work.config.train, window_stride=1)
+        config = dataclasses.replace(work.config, train=train, out=str(work.out))
+        part = self._part(root, config, verify=True)
+        learned = store.read_description(root)["learned"]
+        self._rollouts.append((part, mixing.learned_frames(load.actors(root), learned)))
+
+    def _part(self, root: Path, config: config_lib.RunConfig, verify: bool) -> mixing.Part:
+        """Loads a dataset without its images."""
+        env = self._work.base.env if config.policy.observation == "image" else None
+        loaded = load.load(
+            root,
+            residency="host",
+            verify=verify,
+            images=False,
+            env=env,
+            sources=randomise.moves_cameras(config.train),
+            report=lambda line: None,  # the whole is reported once it is placed
+        )
+        if self._encoder is not None:
+            dataset = demonstrations.with_features(config, env, root, loaded, self._encoder)
+            return mixing.Part(dataset)
+        images = load.frames(root, env) if env is not None else {}
+        return mixing.Part(loaded.dataset, images)
 
     def train(self, number: int, before: Path) -> Path:
         """Trains on from the weights of a file; returns the file of the new ones."""
@@ -201,6 +212,7 @@ class Lessons:
                 self._demonstrations,
                 self._rollouts,
                 normalizer.wrist_of(row, task),
+                messages.indented,
             )
             result = loop.run(
                 row,

@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 import starjax
@@ -24,6 +25,7 @@ from starjax.evaluation import statistics
 from starjax.finetune.settings import FinetuneConfig
 from starjax.runtime import files, precompile, processes
 
+_PEAK = "peak_bytes_in_use"  # of a device's statistics, which a CPU does not have
 _WAYS = {
     "dagger": finetune_stages.Imitation,
     "self": finetune_stages.Imitation,
@@ -109,6 +111,7 @@ def _finish(work: Work, candidates: list[Path], described: list[dict[str, Any]])
         "best": best,
         **rows,
         "timings_s": stage_times.read(work.out),
+        "peak_device_bytes": (jax.local_devices()[0].memory_stats() or {}).get(_PEAK),
     }
     path = work.started.write("finetune.json", content)
     print(f"\n  {'success [95% interval]':24}{'seen':26}unseen")

@@ -102,10 +102,14 @@ class EpisodeArray:
     def read(self, rows: int = 0) -> np.ndarray:
         """Returns all frames in memory, followed by zeros up to so many rows."""
         out = np.zeros((max(rows, self.shape[0]), *self.shape[1:]), self.dtype)
+        self.read_into(out[: self.shape[0]])
+        return out
+
+    def read_into(self, out: np.ndarray) -> None:
+        """Reads all frames into memory `[F, ...]`."""
         for path, first in zip(self._paths, self._start, strict=True):
             array = np.load(path, mmap_mode="r", allow_pickle=False)
             out[first : first + len(array)] = array
-        return out
 
 
 def _first_row(path: Path) -> int:

@@ -11,6 +11,7 @@ import numpy as np
 from starjax import errors, rcm
 from starjax.data import redraw, schema, store, windows
 from starjax.data.episode_array import EpisodeArray
+from starjax.data.placed_images import JoinedImages
 from starjax.rollouts import episodes
 from starjax.runtime import files, xla
 from starjax.types import Command, Observation, Pose
@@ -79,9 +80,9 @@ def load(
     fields = _fields(description, records[0], images and not drawn)
     total = sum(r["files"][file]["bytes"] for r in records for file in fields.values())
     total += sum(math.prod(array.shape) for array in drawn.values())
-    place = _place(total) if residency == "auto" else residency
+    place = place_for(total) if residency == "auto" else residency
     without = "" if images else " without images"
-    where = _DRAWN if drawn and place == "disk" else _WHERE[place]
+    where = whereabouts(place, bool(drawn))
     report(f"{len(records)} demonstrations, {files.size(total)}{without}: {where}")
     dataset = _dataset(root, description, records, place, fields, drawn)
     if found and sources:
@@ -145,6 +146,13 @@ _WHERE = {
     "disk": "read from disk (they fit neither the device nor host memory)",
 }
 _DRAWN = "drawn for each batch (they fit neither the device nor host memory)"
+
+
+def whereabouts(place: str, is_drawn: bool) -> str:
+    """Returns a place in words; `is_drawn` says whether images are drawn, not read."""
+    return _DRAWN if is_drawn and place == "disk" else _WHERE[place]
+
+
 # Recorded, but not trained on.
 _UNREAD = ("qpos", "rcm_error", "actor", "shaft_p", "shaft_R")
 
@@ -186,7 +194,8 @@ def _paths(root: Path, records: list[store.Record], file: str) -> list[Path]:
     return [root / "episodes" / record["key"] / file for record in records]
 
 
-def _place(total: int) -> str:
+def place_for(total: int) -> Residency:
+    """Returns the place of so many bytes: the device if they fit, else the host, else the disk."""
     device = jax.local_devices()[0]
     host = xla.available_bytes()
     stats = device.memory_stats() or {}
@@ -221,10 +230,7 @@ def _dataset(
         else:
             fields[name] = joined.read(rows)
     for camera, array in drawn.items():
-        if place == "device":
-            images[camera] = array.on_device(rows)
-        else:
-            images[camera] = array.read() if place == "host" else array
+        images[camera] = JoinedImages([array]).at(place, rows)
     told = rcm.trocar_frame(
         schema.trocars_of(records),
         np.array(description["p_world_ref"], np.float32),

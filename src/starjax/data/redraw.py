@@ -75,10 +75,9 @@ class DrawnImages:
         shape = (*index.shape, *self.shape[1:])
         return np.concatenate(parts).reshape(shape) if parts else np.zeros(shape, self.dtype)
 
-    def read(self) -> np.ndarray:
-        """Draws all images into host memory, on all cores."""
+    def read_into(self, out: np.ndarray) -> None:
+        """Draws all images into host memory `[F, h, w, 3]`, on all cores."""
         batch, count = batch_size(), self.shape[0]
-        out = np.zeros(self.shape, self.dtype)
 
         def draw(first: int):
             rows = np.arange(first, min(first + batch, count))
@@ -87,22 +86,6 @@ class DrawnImages:
 
         for _ in workers.run(range(0, count, batch), draw, workers.worker_count()):
             pass
-        return out
-
-    def on_device(self, rows: int) -> jax.Array:
-        """Draws all images into the device's memory, followed by zeros up to so many rows."""
-        batch, count = batch_size(), self.shape[0]
-        if count < batch or jax.default_backend() == "cpu":
-            return jnp.asarray(np.pad(self.read(), ((0, rows - count), *[(0, 0)] * 3)))
-        # In place: the buffer is donated. The last batch overlaps the one before it.
-        put = jax.jit(
-            lambda out, part, first: jax.lax.dynamic_update_slice_in_dim(out, part, first, 0),
-            donate_argnums=0,
-        )
-        out = jnp.zeros((rows, *self.shape[1:]), self.dtype)
-        for first in [*range(0, count - batch, batch), count - batch]:
-            out = put(out, self.draw_batch(np.arange(first, first + batch)), first)
-        return out
 
     def draw_batch(self, rows: np.ndarray) -> jax.Array:
         """Draws the images of `batch_size()` frames on the device."""

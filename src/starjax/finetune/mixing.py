@@ -4,62 +4,91 @@ Batches are drawn from both parts by an even coin: the frames of the smaller par
 steps, losses and learners are those of any training. A few rollouts count for less.
 """
 
-from collections.abc import Sequence
+import functools
+import math
+import types
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, errors, methods, rcm
-from starjax.data import normalizer, redraw, windows
+from starjax import config, methods, rcm
+from starjax.data import load, normalizer, placed_images, redraw, windows
 from starjax.policies import policy as policies
 from starjax.rollouts import takeover
+from starjax.runtime import files
 from starjax.training.start import Start
 
 MAX_REPEATS = 20  # of a frame for one of the larger part: more would be remembered, not learned
 
 
-def joined(datasets: Sequence[windows.Dataset]) -> windows.Dataset:
-    """Returns the frames of several datasets, one after another.
+class Part(NamedTuple):
+    """Demonstrations, or the rollouts of a round.
 
-    Raises:
-      errors.UsageError: images of some do not fit the memory, and are read or drawn when indexed.
+    Attributes:
+      dataset: in host memory, without images.
+      images: by camera, read or drawn when indexed; empty for a policy that reads none.
     """
-    if not all(isinstance(x, np.ndarray | jax.Array) for x in jax.tree.leaves(list(datasets))):
-        expected = "frames that fit the device's or the host's memory"
-        raise errors.UsageError("the demonstrations", expected, "more")
+
+    dataset: windows.Dataset
+    images: Mapping[str, placed_images.Images] = types.MappingProxyType({})
+
+
+def joined(
+    parts: Sequence[Part], report: Callable[[str], None] = lambda line: None
+) -> windows.Dataset:
+    """Returns the frames of all parts, one after another, on the device if they fit.
+
+    Images exist once: those of all parts are read or drawn into one array.
+
+    Args:
+      parts: with images of the same cameras.
+      report: gets a line with the place and the bytes, before any is allocated.
+    """
+    datasets = [part.dataset for part in parts]
     counts = [int(np.sum(dataset.length)) for dataset in datasets]
-    resident = all(map(windows.on_device, datasets))
-    rows = windows.padded_count(sum(counts)) if resident else sum(counts)
-    concatenate, pad = (jnp.concatenate, jnp.pad) if resident else (np.concatenate, np.pad)
-
-    def of_frames(*leaves):
-        whole = concatenate([leaf[:count] for leaf, count in zip(leaves, counts)])
-        return pad(whole, [(0, rows - len(whole)), *[(0, 0)] * (whole.ndim - 1)])
-
     demos = [len(dataset.start) for dataset in datasets]
     first_frame, first_demo = (
         np.cumsum(x, dtype=np.int32) - np.asarray(x, np.int32) for x in (counts, demos)
     )
-    return windows.Dataset(
-        observation=jax.tree.map(of_frames, *(dataset.observation for dataset in datasets)),
+    images = {
+        camera: placed_images.JoinedImages([part.images[camera] for part in parts])
+        for camera in parts[0].images
+    }
+    total = sum(math.prod(image.shape) for image in images.values())
+    total += sum(leaf.nbytes for leaf in jax.tree.leaves(datasets))
+    place = load.place_for(total)
+    rows = windows.padded_count(sum(counts)) if place == "device" else sum(counts)
+    is_drawn = any(isinstance(x, redraw.DrawnImages) for x in parts[0].images.values())
+    report(f"{sum(demos)} episodes, {files.size(total)}: {load.whereabouts(place, is_drawn)}")
+
+    def of_frames(*leaves):
+        whole = np.concatenate(leaves)
+        return np.pad(whole, [(0, rows - len(whole)), *[(0, 0)] * (whole.ndim - 1)])
+
+    of_demos = functools.partial(jax.tree.map, lambda *x: np.concatenate(x))
+    observation = jax.tree.map(of_frames, *(dataset.observation for dataset in datasets))
+    shown = {camera: image.at(place, rows) for camera, image in images.items()}
+    dataset = windows.Dataset(
+        observation=observation._replace(images=shown or None),
         command=jax.tree.map(of_frames, *(dataset.command for dataset in datasets)),
-        trocar=jax.tree.map(lambda *x: concatenate(x), *(dataset.trocar for dataset in datasets)),
+        trocar=of_demos(*(dataset.trocar for dataset in datasets)),
         episode=of_frames(*(d.episode + shift for d, shift in zip(datasets, first_demo))),
-        start=concatenate([d.start + shift for d, shift in zip(datasets, first_frame)]),
-        length=concatenate([dataset.length for dataset in datasets]),
-        sources=_joined_sources(datasets, counts, rows),
+        start=np.concatenate([d.start + shift for d, shift in zip(datasets, first_frame)]),
+        length=np.concatenate([dataset.length for dataset in datasets]),
+        sources=_joined_sources(datasets, rows),
     )
+    return jax.device_put(dataset) if place == "device" else dataset
 
 
-def _joined_sources(
-    datasets: Sequence[windows.Dataset], counts: Sequence[int], rows: int
-) -> redraw.Sources | None:
+def _joined_sources(datasets: Sequence[windows.Dataset], rows: int) -> redraw.Sources | None:
     """Returns the sources of the images of all frames, or None if a dataset lacks them."""
     found = [dataset.sources for dataset in datasets]
     if any(sources is None for sources in found):
         return None
-    qpos = np.concatenate([np.asarray(s.qpos[:count]) for s, count in zip(found, counts)])
+    qpos = np.concatenate([np.asarray(sources.qpos) for sources in found])
     episodes = jax.tree.map(lambda *x: jnp.concatenate(x), *(s.episodes for s in found))
     return redraw.Sources(np.pad(qpos, ((0, rows - len(qpos)), (0, 0))), episodes)
 
@@ -126,9 +155,10 @@ def start(
     train_config: config.TrainConfig,
     params: policies.Params,
     stats: normalizer.Normalizer,
-    demonstrations: windows.Dataset,
-    rollouts: Sequence[tuple[windows.Dataset, np.ndarray]],
+    demonstrations: Part,
+    rollouts: Sequence[tuple[Part, np.ndarray]],
     wrist: rcm.Wrist | None = None,
+    report: Callable[[str], None] = lambda line: None,
 ) -> tuple[windows.Dataset, Start]:
     """Returns the dataset of a round and the start of its training.
 
@@ -139,24 +169,23 @@ def start(
       params: averaged ones of the policy.
       stats: its normaliser.
       demonstrations: of its training.
-      rollouts: datasets of the rounds so far, and the frames `[n]` of each that are learned.
+      rollouts: of the rounds so far, and the frames `[n]` of each that are learned.
       wrist: that the policy commands, see `normalizer.wrist_of`.
+      report: gets a line about the dataset.
     """
+    demos = demonstrations.dataset
     demonstrated, held_out = windows.split_holdout(
-        demonstrations.start,
-        demonstrations.length,
-        demonstrations.trocar,
-        train_config.holdout_demos,
+        demos.start, demos.length, demos.trocar, train_config.holdout_demos
     )
     parts = [demonstrations, *(part for part, _ in rollouts)]
-    first = np.cumsum([int(np.sum(part.length)) for part in parts], dtype=np.int32)
+    first = np.cumsum([int(np.sum(part.dataset.length)) for part in parts], dtype=np.int32)
     others = np.concatenate([frames + at for (_, frames), at in zip(rollouts, first)])
     demonstrated, held_out = (
-        windows.strided(demonstrations, part, train_config.window_stride)
+        windows.strided(demos, part, train_config.window_stride)
         for part in (demonstrated, held_out)
     )
     if policy_config.freeze_encoder:
         params = {name: part for name, part in params.items() if name != "vision"}
-    dataset = joined(parts)
+    dataset = joined(parts, report)
     stats = widened(stats, policies.ablated(method, policy_config), dataset, others, wrist)
     return dataset, Start(stats, evenly(demonstrated, others), held_out, params)
