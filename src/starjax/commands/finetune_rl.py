@@ -20,7 +20,7 @@ from starjax.rollouts import trocars as configurations
 from starjax.runtime import files
 
 STREAM = 0x726C  # of its starts, folded into the seed's key, then the number of the round
-ALONE = 3  # first iterations of a round, in which the critic learns alone
+ALONE = 1  # first iterations of a round, in which the critic learns alone
 AGAIN = 0.5  # share of an iteration's episodes whose starts failed in the one before
 
 
@@ -36,14 +36,15 @@ class PolicyGradient:
         limits, _ = dagger.limits(steps, env.control_hz)
         commands = config.policy.execute
         static = explore.ExploreSettings(
-            config.policy.obs_horizon, commands, math.ceil(2 * limits.clock / commands)
+            config.policy.obs_horizon,
+            commands,
+            math.ceil(2 * limits.clock / commands),
+            work.settings.noise,
         )
         see = _make_see(config.policy) if config.policy.observation == "image" else None
         self._play = explore.make(env, policy, see, env.names.cameras, static)
         self._adam = policy_gradient.optimizer(work.settings.gradient_rate)
-        self._learn = policy_gradient.make(
-            policy, self._adam, static.obs_horizon, config.policy.horizon
-        )
+        self._learn = policy_gradient.make(policy, self._adam, static, config.policy.horizon)
         self._demonstrations = policy_gradient.demonstrated(
             finetune_stages.Lessons(work).demonstrations(), config.train.holdout_demos
         )

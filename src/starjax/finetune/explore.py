@@ -1,4 +1,7 @@
-"""Episodes of a policy with noise on its actions, recorded as policy gradients need them.
+"""Episodes of a policy with noise on its plans, recorded as policy gradients need them.
+
+The noise of a decision moves its whole plan. The controller filters noise that differs from
+command to command: it explores little, and its density has E times as many dimensions.
 
 All decisions of a batch stay on the device; images become features of the frozen encoder.
 """
@@ -17,8 +20,6 @@ from starjax.rcm.trocar import Trocar
 from starjax.sim import env as sim_env
 from starjax.types import Observation
 
-NOISE = 0.01  # deviation of normalised actions: 0.02 already costs successes
-
 See = Callable[[Any, jax.Array], jax.Array]
 
 
@@ -29,11 +30,13 @@ class ExploreSettings(NamedTuple):
       obs_horizon: O.
       execute: E, commands per decision.
       decisions: R, of an episode.
+      noise: standard deviation of a plan's displacement in normalised actions.
     """
 
     obs_horizon: int
     execute: int
     decisions: int
+    noise: float
 
 
 class Starts(NamedTuple):
@@ -89,7 +92,7 @@ def make(
     """
     generate, execute = policy.generate, policy.execute
     assert generate is not None and execute is not None
-    horizon, commands, decisions = settings
+    horizon, commands, decisions, deviation = settings
     observe, step, inputs = jax.vmap(env.observe), jax.vmap(env.step), critic.inputs(env)
 
     def start(key: jax.Array, starts: Starts) -> Any:
@@ -123,9 +126,9 @@ def make(
             key_own, key_noise = jnp.moveaxis(jax.vmap(jax.random.split)(keys[:, r]), 1, 0)
             with jax.default_matmul_precision("highest"):
                 action = generate(params, stats, key_own, observation, trocar)
-            shape = action.shape[1:]
-            noise = jax.vmap(lambda k: jax.random.normal(k, (commands, shape[-1])))(key_noise)
-            action = action.at[:, :commands].add(NOISE * noise)
+            size = action.shape[-1]
+            noise = jax.vmap(lambda k: jax.random.normal(k, (1, size)))(key_noise)
+            action = action + deviation * noise
             plan = execute(params, stats, action, observation, trocar)
 
             def act(carry, command):

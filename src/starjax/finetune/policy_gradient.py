@@ -1,8 +1,9 @@
 """Steps of a policy gradient with clipped ratios, and demonstrations that hold the policy.
 
-PPO (Schulman et al., arXiv:1707.06347). Given the learner's own noise, a decision is normal about
-the action that the policy generates, with the deviation `explore.NOISE`; its executed commands
-alone have a density, because the others never act.
+PPO (Schulman et al., arXiv:1707.06347). Given the learner's own noise, a decision is a plan that is
+displaced as a whole (`explore`). The mean of its executed commands is normal about that of the plan
+that the policy generates; the other commands never act. The shape of a plan is not explored: the
+loss on demonstrations holds it.
 """
 
 from collections.abc import Callable
@@ -14,15 +15,16 @@ import optax
 
 from starjax.data import windows
 from starjax.finetune import advantages, critic
-from starjax.finetune.explore import NOISE, Experience
+from starjax.finetune.explore import Experience, ExploreSettings
 from starjax.policies.base import Params, Policy
 
 CLIP = 0.2  # of the ratio of densities of all executed commands
 EPOCHS = 4  # over the decisions of an iteration
+VALUE_EPOCHS = 12  # further ones, of the critic alone
 BATCH = 4096  # decisions per step
 MAX_KL = 0.02  # at which the policy's steps of an iteration end
-# Largest divergence of one step, which is shortened to it: NOISE is so small that a step of Adam's
-# length alone had 3.5.
+# Largest divergence of one step, which is shortened to it: the noise is so small that a step of
+# Adam's length alone had 3.5.
 STEP_KL = 1e-3
 ANCHOR = 0.3  # weight of the loss on demonstrations
 ANCHOR_BATCH = 256  # windows
@@ -69,14 +71,20 @@ def begin(
     return Learning(params, adam.init(params), values)
 
 
-def log_density(action: jax.Array, mean: jax.Array) -> jax.Array:
-    """Returns the log of the normal density of actions `[B, E, D]`, without its constant."""
-    return -0.5 * jnp.sum(((action - mean) / NOISE) ** 2, axis=(-2, -1))
+def log_density(action: jax.Array, plan: jax.Array, noise: float) -> jax.Array:
+    """Returns the log of the density of displaced plans `[B, E, D]`, without its constant."""
+    moved = jnp.mean(action - plan, axis=-2)
+    return -0.5 * jnp.sum((moved / noise) ** 2, axis=-1)
 
 
-def divergence(mean: jax.Array, other: jax.Array) -> jax.Array:
-    """Returns the KL divergence of the densities about two means `[B, E, D]`, averaged over B."""
-    return -jnp.mean(log_density(mean, other))
+def divergence(plan: jax.Array, other: jax.Array, noise: float) -> jax.Array:
+    """Returns a bound of the KL divergence of the densities about two plans `[B, E, D]`.
+
+    It is the divergence of single commands, averaged over B and E: that of their mean is smaller,
+    and a change of the plan's shape counts too.
+    """
+    squared = jnp.sum(((plan - other) / noise) ** 2, axis=-1)
+    return 0.5 * jnp.mean(squared)
 
 
 def _share(kl: jax.Array) -> jax.Array:
@@ -93,21 +101,22 @@ def surrogate(log_ratio: jax.Array, advantage: jax.Array) -> jax.Array:
 
 
 def make(
-    policy: Policy, adam: optax.GradientTransformation, obs_horizon: int, horizon: int
+    policy: Policy, adam: optax.GradientTransformation, settings: ExploreSettings, horizon: int
 ) -> Callable[..., tuple[Learning, dict[str, jax.Array]]]:
     """Builds the program of an iteration's steps.
 
     Args:
       adam: see `optimizer`.
       policy: its `prepare` reads features instead of images.
-      obs_horizon, horizon: of a demonstration's window.
+      settings: of the episodes.
+      horizon: of a demonstration's window.
 
     Returns:
       learn(learning, stats, Experience, Demonstrations, key, trains_policy) -> Learning, metrics:
-      `kl` and `clipped` of the last step, `steps` of the policy. `trains_policy` False trains the
-      critic alone.
+      `kl` and `clipped` of the last step, `steps` of the policy, `explained`, the share of the
+      returns' variance that the critic foresaw. `trains_policy` False trains the critic alone.
     """
-    generate = policy.generate
+    generate, noise = policy.generate, settings.noise
     assert generate is not None
 
     def rows_of(experience: Experience) -> tuple[Any, ...]:
@@ -123,17 +132,17 @@ def make(
         return generate(params, stats, keys, observation, trocar)[:, : action.shape[1]]
 
     def log_density_of(params: Any, stats: Any, row: tuple[Any, ...]) -> jax.Array:
-        return log_density(row[2], mean_of(params, stats, row))
+        return log_density(row[2], mean_of(params, stats, row), noise)
 
     def anchor(params: Params, stats: Any, demonstrations: Demonstrations, key: jax.Array):
         key_rows, key_loss = jax.random.split(key)
         frames = jax.random.choice(key_rows, demonstrations.frames, (ANCHOR_BATCH,))
-        batch = windows.gather(demonstrations.dataset, frames, obs_horizon, horizon)
+        batch = windows.gather(demonstrations.dataset, frames, settings.obs_horizon, horizon)
         return policy.loss(params, policy.prepare(stats, key_loss, batch))[0]
 
     @jax.jit
     def learn(learning, stats, experience, demonstrations, key, trains_policy):
-        with jax.default_matmul_precision("highest"):  # the density is sharp: NOISE is small
+        with jax.default_matmul_precision("highest"):  # the density is sharp: the noise is small
             return steps(learning, stats, experience, demonstrations, key, trains_policy)
 
     def steps(learning, stats, experience, demonstrations, key, trains_policy):
@@ -160,18 +169,19 @@ def make(
 
             def loss(params):
                 mean = mean_of(params, stats, row)
-                log_ratio = log_density(row[2], mean) - old[index]
+                log_ratio = log_density(row[2], mean, noise) - old[index]
                 gain = jnp.mean(surrogate(log_ratio, advantage[index]))
                 held = anchor(params, stats, demonstrations, key_anchor)
-                # In units of NOISE**2 the gradient of the density is one of an action's error.
-                return ANCHOR * held - NOISE**2 * gain, (log_ratio, mean)
+                # In these units the gradient of the density is that of the commands' squared error,
+                # which the loss on demonstrations is too.
+                return ANCHOR * held - mean.shape[1] * noise**2 * gain, (log_ratio, mean)
 
             gradient, (log_ratio, mean) = jax.grad(loss, has_aux=True)(learning.params)
             kl = jnp.mean(jnp.expm1(log_ratio) - log_ratio)
             goes_on = trains_policy & (metrics["kl"] <= MAX_KL) & (kl <= MAX_KL)
             change, optimizer = adam.update(gradient, learning.optimizer, learning.params)
             there = mean_of(optax.apply_updates(learning.params, change), stats, row)
-            share = _share(divergence(mean, there))
+            share = _share(divergence(mean, there, noise))
             change = jax.tree.map(lambda leaf: share * leaf, change)
             moved = optax.apply_updates(learning.params, change), optimizer
             kept = learning.params, learning.optimizer
@@ -186,9 +196,20 @@ def make(
             }
             return Learning(params, optimizer, values), metrics
 
+        def value_step(i, values):
+            index = order[
+                jax.random.randint(jax.random.fold_in(key, total + i), (batch,), 0, count)
+            ]
+            return critic.step(values, seen[index], returns[index])
+
         first = {"kl": jnp.zeros(()), "clipped": jnp.zeros(()), "steps": jnp.zeros((), jnp.int32)}
         total = jnp.maximum(EPOCHS * count // batch, EPOCHS)
-        return jax.lax.fori_loop(0, total, step, (learning, first))
+        further = VALUE_EPOCHS // EPOCHS * total
+        learning, metrics = jax.lax.fori_loop(0, total, step, (learning, first))
+        values = jax.lax.fori_loop(0, further, value_step, learning.critic)
+        missed = jnp.var(estimates.returns - value, where=alive)
+        explained = 1.0 - missed / jnp.maximum(jnp.var(estimates.returns, where=alive), 1e-8)
+        return learning._replace(critic=values), {**metrics, "explained": explained}
 
     return learn
 

@@ -23,6 +23,8 @@ class FinetuneConfig:
     iterations: Count = 30  # iterations of rl per round
     # learning rate of rl
     gradient_rate: Annotated[float, Range(0.0, 1.0, "(]")] = 1e-5
+    # standard deviation of the displacement of plans in episodes of rl, in normalised actions
+    noise: Annotated[float, Range(0.0, 1.0, "(]")] = 0.01
     episodes: Count = 1024  # episodes per iteration of rl, over all seen trocars
     # learning rate as a fraction of that of the policy's training
     rate: Annotated[float, Range(0.0, 1.0, "(]")] = 0.2
