@@ -3,7 +3,8 @@
     python benchmarks/bench_redraw.py [--tiny]
 
 The policy and batch are those of preset `compact`. "images" has the disturbances that are functions
-of an image, "all" also displaced cameras, delays and lost observations. The cases alternate.
+of an image, "all" also displaced cameras, delays and lost observations, "look" also that of a body
+cavity. The cases alternate.
 Memory is the device's highest use in a case's first steps, without the dataset and other cases.
 """
 
@@ -30,7 +31,8 @@ from starjax.training.sharding import StateLayout
 
 IMAGES = ("darkness=0.5", "tint=0.4", "smoke=0.5", "blood=0.2", "blur=2", "noise=0.1")
 OTHERS = ("camera=10", "observation_delay=4", "observation_dropout=0.5")
-CASES = {"none": (), "images": IMAGES, "all": (*OTHERS, *IMAGES)}
+ALL = (*OTHERS, *IMAGES)
+CASES = {"none": (), "images": IMAGES, "all": ALL, "look": (*ALL, "look=1")}
 
 
 def main() -> None:
@@ -43,14 +45,23 @@ def main() -> None:
     preset = presets.PRESETS["compact"]
     case = _setup.miniature() if asked.tiny else _setup.Case(preset.policy, preset.train)
     steps, rounds = (2, 1) if asked.tiny else (asked.steps, asked.rounds)
-    env = envs.make("peg_transfer", image_size=case.policy.image_size, moving_cameras=True)
+    env, both = (
+        envs.make(
+            "peg_transfer",
+            image_size=case.policy.image_size,
+            moving_cameras=True,
+            varying_look=varies,
+        )
+        for varies in (False, True)
+    )
     dataset = _setup.made_up(case.policy, 64 if asked.tiny else 16_384)
     dataset = jax.device_put(dataset.replace(sources=sources(env, len(dataset.episode))))
     runs: dict[str, Callable] = {}
     bytes_used = {}
     for name, names in CASES.items():
         before = memory("bytes_in_use")
-        runs[name] = make(case, names, dataset, env.draw)
+        draw = both.draw if name == "look" else env.draw
+        runs[name] = make(case, names, dataset, draw)
         runs[name](steps)  # compiles
         # The cases grow, and each starts from what the others hold: its peak is the highest.
         bytes_used[name] = memory("peak_bytes_in_use") - before

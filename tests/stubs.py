@@ -56,6 +56,7 @@ class State:
     shaft: Any = None
     wrist: Any = None
     commanded_shaft: Any = None
+    has_look: Any = None
 
     @property
     def coordinates(self) -> jax.Array:

@@ -117,20 +117,26 @@ BOARD = """
 """
 
 
-def drawn(look, lower=None):
-    """A board's image and geoms by a fixed camera, or by one that is moved down by some m."""
+def drawn(look, lower=None, has_look=None):
+    """A board's image and geoms by a fixed camera, or by one that is moved down by some m.
+
+    With `has_look` it is an image of a look that varies.
+    """
     m = mujoco.MjModel.from_xml_string(BOARD)
     data = mujoco.MjData(m)
     mujoco.mj_kinematics(m, data)
     mujoco.mj_camlight(m, data)
     moves = lower is not None
-    draw = render.make(m, "camera", 64, 64, segmentation=True, moves=moves, look=look)
+    varies = has_look is not None
+    draw = render.make(
+        m, "camera", 64, 64, segmentation=True, moves=moves, look=look, look_varies=varies
+    )
     inputs = [np.float32(x) for x in (data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3))]
     inputs.append(render.geom_rgb(m))
     if lower is not None:
         down = data.cam_xpos[0] - [0.0, 0.0, lower]
         inputs.append(Pose(*map(np.float32, (data.cam_xmat[0].reshape(3, 3), down))))
-    image = jax.jit(draw)(*inputs)
+    image = jax.jit(draw)(*inputs, *([jnp.array(has_look)] if varies else []))
     return np.asarray(image.rgb, int), np.asarray(image.segmentation)
 
 
@@ -157,3 +163,10 @@ def test_tissue_stays_on_the_ground_and_the_lamp_follows_the_camera():
     lower, seen = drawn(tissue.NAME, 0.02)
     assert np.abs(lower[seen == 0].mean(0) / fixed[geoms == 0].mean(0) - 1.0).max() < 0.4
     assert (np.abs(lower - fixed).max(-1) > 5).mean() > 0.5
+
+
+@pytest.mark.parametrize("has_look", [False, True])
+def test_each_image_of_a_varying_look_is_plain_or_of_tissue(has_look):
+    found, _ = drawn(tissue.NAME, 0.0, has_look)
+    wanted, _ = drawn(tissue.NAME if has_look else "", 0.0)
+    np.testing.assert_array_equal(found, wanted)

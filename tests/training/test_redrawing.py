@@ -193,8 +193,30 @@ def test_a_dataset_of_others_has_no_displaced_cameras(dataset):
         data = (given, frames, np.int32(40))
         with mistakes.of("train.randomise"):
             stepper._displaced(setup, data, False, function)
-    assert randomise.moves_cameras(config.TrainConfig(randomise=NAMES))
-    assert not randomise.moves_cameras(config.TrainConfig(randomise=NAMES[1:]))
+    assert randomise.redraws(config.TrainConfig(randomise=NAMES))
+    assert not randomise.redraws(config.TrainConfig(randomise=NAMES[1:]))
     others = {"features": {"image_camera": {}}, "seed_rule": None}
     with mistakes.of("train.randomise"):
         redraw.expect_possible(randomise.ARGUMENT, others)
+
+
+def test_both_images_of_a_sample_have_one_look_and_level_0_has_none(dataset):
+    def show(source):
+        image = jnp.broadcast_to(jnp.uint8(200) * source.has_look, (SIZE, SIZE, 3))
+        return {"camera": CameraImage(image)}
+
+    setup, data = make_setup("look=1"), (dataset, jnp.arange(40), jnp.int32(40))
+    of, kind = redrawing.make(setup, show, data, ahead=False), base.DISTURBANCES.get("look")
+    shown, stressed = [], []
+    for number in range(24):
+        drawn, draws = of(KEY, number), choice(setup, data, number).draws
+        shown.append(np.asarray(drawn.images["camera"][:, drawn.index]))
+        state = [base.start("look", draws.level[i, 0], draws.key[i]) for i in range(MOVED)]
+        stressed.append([kind.on_look(it) for it in state])
+        assert not draws.level[MOVED:].any()
+    assert np.ptp(shown, axis=(2, 3, 4, 5)).max() == 0  # both images, all pixels
+    np.testing.assert_array_equal(np.max(shown, axis=(2, 3, 4, 5)) > 0, stressed)
+    assert 0.35 < np.mean(stressed) < 0.65  # levels are uniform up to 1
+    none = randomise.Draws(jnp.zeros(1), KEY)
+    assert not randomise.has_look(["look"], none)
+    assert randomise.has_look(["smoke"], none) is None

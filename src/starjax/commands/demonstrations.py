@@ -166,7 +166,7 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
         expected = f"nominal trocars at {env.p_world_ref.tolist()}"
         raise errors.UsageError(_FROM, expected, reference.tolist())
     size = [policy.image_size, policy.image_size, 3]
-    if randomise.moves_cameras(config.train):
+    if randomise.redraws(config.train):
         redraw.expect_possible(randomise.ARGUMENT, about)
     required = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
     if policy.observation == "state":
@@ -198,7 +198,7 @@ def load(
     draws = env if config.policy.observation == "image" else None
     report = messages.indented
     if encoder is None:
-        redraws = randomise.moves_cameras(config.train)
+        redraws = randomise.redraws(config.train)
         return loading.load(root, verify=False, env=draws, sources=redraws, report=report).dataset
     loaded = loading.load(root, verify=False, images=False, report=report)
     return with_features(config, draws, root, loaded, encoder)

@@ -184,7 +184,7 @@ class Lessons:
             verify=verify,
             images=False,
             env=env,
-            sources=randomise.moves_cameras(config.train),
+            sources=randomise.redraws(config.train),
             report=lambda line: None,  # the whole is reported once it is placed
         )
         if self._encoder is not None:

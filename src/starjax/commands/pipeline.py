@@ -124,11 +124,11 @@ def _check(
 
 
 def draw_images(config: config_lib.RunConfig, env: Any) -> Any:
-    """Returns the function that draws images of displaced cameras, or None."""
+    """Returns the function that draws images anew in training, or None."""
     from starjax.training import randomise
 
     names = list(randomise.max_levels(config.train))
-    moves = randomise.moves_cameras(config.train)
+    moves = randomise.redraws(config.train)
     return scenes.disturbable(env, names, config.policy).draw if moves else None
 
 

@@ -22,13 +22,15 @@ def names(scene: config_lib.SceneConfig) -> SceneNames:
 
 
 def disturbable(env: Any, disturbances: Sequence[str], policy: config_lib.PolicyConfig) -> Any:
-    """Returns the environment, with movable cameras if a disturbance moves them."""
+    """Returns the environment, with cameras that move and a look that varies as they must."""
     from starjax.evaluation.disturbances import DISTURBANCES
     from starjax.sim import env as sim_env
 
-    if not any(DISTURBANCES.get(name).on_camera for name in disturbances):
+    kinds = [DISTURBANCES.get(name) for name in disturbances]
+    if not any(kind.redraws for kind in kinds):
         return env
-    return sim_env.for_policy(env.names, policy, moving_cameras=True)
+    varying_look = any(kind.on_look for kind in kinds)
+    return sim_env.for_policy(env.names, policy, moving_cameras=True, varying_look=varying_look)
 
 
 def resolved(config: config_lib.RunConfig) -> config_lib.RunConfig:

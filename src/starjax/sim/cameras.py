@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from starjax.sim import derived_views, endoscope_camera, render
+from starjax.sim.camera import tissue
 from starjax.sim.quiet_mjx import mjx
 from starjax.types import Pose
 
@@ -46,10 +47,12 @@ def make(
     moving: bool = False,
     scope: endoscope_camera.Endoscope | None = None,
     samples: int = 1,
+    varying_look: bool = False,
 ) -> tuple[SceneCamera, ...]:
     """Makes the named cameras, for square images; with `moving` all of them may move.
 
-    `scope` is where the endoscope may be, if a trocar of its own holds it.
+    `scope` is where the endoscope may be, if a trocar of its own holds it. With `varying_look`,
+    views of colours without a look by their name may have that of tissue in some images.
     """
     made = []
     known = [mj_model.camera(i).name for i in range(mj_model.ncam)]
@@ -62,8 +65,10 @@ def make(
         R, p = R.reshape(3, 3).astype(np.float32), camera.pos.astype(np.float32)
         moves = moving or body != 0 or (scope is not None and endoscope_camera.is_endoscope(name))
         sizes = image_size, image_size
-        more = {"samples": samples, "depth": view.is_depth, "look": view.look}
-        draw = render.make(model, view.camera, *sizes, shadow, moves=moves, **more)
+        varies = varying_look and not (view.look or view.is_depth)
+        more = {"samples": samples, "depth": view.is_depth, "look_varies": varies}
+        look = tissue.NAME if varies else view.look
+        draw = render.make(model, view.camera, *sizes, shadow, moves=moves, look=look, **more)
         made.append(SceneCamera(name, body, R, p, moves, draw, view.is_depth))
     return tuple(made)
 
@@ -89,7 +94,11 @@ def at_reset(
 
 
 def images(
-    cameras: Sequence[SceneCamera], poses: Pose, data: mjx.Data, rgb: jax.Array
+    cameras: Sequence[SceneCamera],
+    poses: Pose,
+    data: mjx.Data,
+    rgb: jax.Array,
+    has_look: jax.Array | None = None,
 ) -> dict[str, render.CameraImage]:
     """Renders every camera.
 
@@ -98,6 +107,7 @@ def images(
       poses: `[C]` in their bodies' frames; ignored for cameras that do not move.
       data: with the poses of bodies and geoms.
       rgb: `[G, 3]` colours in [0, 1].
+      has_look: see `state.ImageSource`.
     """
     frames: dict[str, render.CameraImage] = {}
     for i, camera in enumerate(cameras):
@@ -108,7 +118,7 @@ def images(
             continue
         R_world_body, p_world_body = data.xmat[camera.body], data.xpos[camera.body]
         pose = Pose(R_world_body @ poses.R[i], p_world_body + R_world_body @ poses.p[i])
-        frames[camera.name] = _as_image(camera, draw(*inputs, pose))
+        frames[camera.name] = _as_image(camera, draw(*inputs, pose, has_look))
     return frames
 
 

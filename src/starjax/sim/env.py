@@ -46,6 +46,7 @@ def make(
     cameras: Sequence[str] = (),
     shadow: bool = True,
     moving_cameras: bool = False,
+    varying_look: bool = False,
     variant: Task | None = None,
 ) -> Env:
     """Builds an environment.
@@ -60,6 +61,8 @@ def make(
       shadow: True for shadows of the sun.
       moving_cameras: True if `EnvParams.cameras` may move the cameras of an episode; else cameras
         fixed in the world are drawn faster, with identical pixels.
+      varying_look: True if the images of an episode may have the look of a body cavity, see
+        `EnvState.has_look`; its cameras are moving ones.
       variant: of the task, see `scene.load`.
 
     Raises:
@@ -73,13 +76,18 @@ def make(
         raise errors.UsageError("image_size", expected, repr(image_size))
     scene = scenes.load(scenes.name(task, arms, tools, cameras), variant)
     names, scope = scene.names.cameras, endoscope_camera.of(scene.task, scene.names.cameras)
-    scene_cameras = views.make(scene.mj_model, names, image_size, shadow, moving_cameras, scope)
+    moves = moving_cameras or varying_look
+    scene_cameras = views.make(
+        scene.mj_model, names, image_size, shadow, moves, scope, varying_look=varying_look
+    )
 
     def start(key: jax.Array, params: EnvParams) -> EnvState:
         poses = (
             views.at_reset(scene_cameras, scope, key) if params.cameras is None else params.cameras
         )
         state = dynamics.reset(scene, key, params, poses)
+        if varying_look:
+            state = state.replace(has_look=jnp.zeros((), bool))
         if scope is None:
             return state
         here = next(i for i, name in enumerate(names) if endoscope_camera.is_endoscope(name))
@@ -90,11 +98,12 @@ def make(
         data = physics.kinematics(scene, qpos, source.p_world_trocar, source.layout)
         data = thread_geoms.placed(scene.mj_model, data, points)
         rgb = scene.task.colours(scene.bound, source.layout, jnp.asarray(scene.geom_rgb))
-        return views.images(scene_cameras, source.cameras, data, rgb)
+        return views.images(scene_cameras, source.cameras, data, rgb, source.has_look)
 
     def camera(state: EnvState) -> dict[str, render.CameraImage]:
         p_world_trocar = state.trocar.p_world_trocar
-        return draw(ImageSource(state.coordinates, p_world_trocar, state.layout, state.cameras))
+        place = state.coordinates, p_world_trocar, state.layout, state.cameras
+        return draw(ImageSource(*place, state.has_look))
 
     def observe(state: EnvState) -> Observation:
         images = fields = None

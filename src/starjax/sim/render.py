@@ -49,12 +49,14 @@ def make(
     samples: int = 1,
     moves: bool = False,
     look: str = "",
+    look_varies: bool = False,
 ) -> Render:
     """Makes `render(geom_xpos, geom_xmat, geom_rgb) -> CameraImage` of a fixed camera.
 
     For a camera that `moves` it is `render(geom_xpos, geom_xmat, geom_rgb, pose_world_cam)`: x to
     the right, y up, the camera looks along -z. Textures are then checkers only, and their edges
-    differ from the fixed camera's by the way they are smoothed.
+    differ from the fixed camera's by the way they are smoothed. If its look varies, a fifth
+    argument `has_look`, `[]` bool, is true for an image that has it.
 
     Geoms of group 3 and above, fully transparent ones and sites are not drawn. `geom_xpos [G, 3]`
     m and `geom_xmat [G, 3, 3]` are the simulation's; `geom_rgb [G, 3]` in [0, 1] starts from
@@ -69,6 +71,8 @@ def make(
       samples: rays along each side of a pixel: 1, 2 or 4; 2 smooths outlines at 4 times the cost.
       moves: True if the camera's pose comes with every image.
       look: of the ground and the light, `tissue.NAME`; empty: the MJCF's.
+      look_varies: True if each image of a moving camera has the look or not; a scene without a
+        textured ground then never has it.
     """
     for name, value in (("height", height), ("width", width)):
         if value < 1:
@@ -76,7 +80,9 @@ def make(
     if samples not in (1, 2, 4):
         raise ValueError(f"samples: expected 1, 2 or 4 rays a pixel side, got {samples}")
     scene = scenes.read(mj_model, camera, width / height, moves)
-    if look and not scene.textures:
+    if look_varies and not scene.textures:
+        look = ""
+    elif look and not scene.textures:
         raise errors.UsageError("camera", f"a ground with a texture for {look}", "none")
     grid = tiles.grid(scene, height * samples, width * samples)
     if moves and not all(map(texture.is_checker, scene.textures.values())):
@@ -88,6 +94,7 @@ def make(
         geom_xmat: jax.Array,
         geom_rgb: jax.Array,
         pose_world_cam: Pose | None = None,
+        has_look: jax.Array | None = None,
     ) -> CameraImage:
         shape = geom_xpos.shape, geom_xmat.shape, geom_rgb.shape
         n = mj_model.ngeom
@@ -99,7 +106,8 @@ def make(
         inputs = [jnp.asarray(v, jnp.float32) for v in (geom_xpos, geom_xmat, geom_rgb)]
         view = still
         if pose_world_cam is not None:
-            view = views.moving(scene, grid, pose_world_cam, look)
+            varying = has_look if look_varies else None
+            view = views.moving(scene, grid, pose_world_cam, look, varying)
         if view is None or (still is not None and pose_world_cam is not None):
             got = "none" if pose_world_cam is None else "one"
             raise errors.UsageError("pose_world_cam", "one" if moves else "none", got)

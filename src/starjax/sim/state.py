@@ -41,12 +41,14 @@ class ImageSource(NamedTuple):
       p_world_trocar: `[A, 3]` m.
       layout: the task's draws at reset.
       cameras: poses `[C]` of the cameras in their bodies' frames.
+      has_look: see `EnvState`.
     """
 
     qpos: jax.Array
     p_world_trocar: jax.Array
     layout: Any
     cameras: Pose
+    has_look: jax.Array | None = None
 
 
 @flax.struct.dataclass
@@ -95,6 +97,8 @@ class EnvState:
       endoscope: measured pose_world_camera of the endoscope, see `sim.endoscope_camera`; None for a
         scene without one.
       thread: `[N, 3]` m, points of the task's thread; None for a task without one.
+      has_look: bool, True if the images have the look of a body cavity; None in an environment
+        whose look does not vary.
     """
 
     physics: physics.PhysicsState
@@ -132,6 +136,7 @@ class EnvState:
     wrapper_state: dict[str, Any] = flax.struct.field(default_factory=dict)
     endoscope: Pose | None = None
     thread: jax.Array | None = None
+    has_look: jax.Array | None = None
 
     @property
     def coordinates(self) -> jax.Array:

@@ -85,7 +85,7 @@ def run(
       should_stop: polled about once a second; True saves and raises Interrupted.
       description: name of the progress bar.
       step_program: from `training.precompile` with these arguments.
-      draw_images: draws those of displaced cameras, from the dataset's sources; needed if
+      draw_images: draws those that training draws anew, from the dataset's sources; needed if
         `train_config.randomise` has such a disturbance.
       start: of a training that continues another; by default that of a new policy.
 

@@ -59,9 +59,9 @@ def max_levels(
     return levels
 
 
-def moves_cameras(train_config: config.TrainConfig) -> bool:
-    """Returns True if images of displaced cameras are drawn in training."""
-    return any(DISTURBANCES.get(name).on_camera for name in max_levels(train_config))
+def redraws(train_config: config.TrainConfig) -> bool:
+    """Returns True if training draws images anew: of displaced cameras, or with another look."""
+    return any(DISTURBANCES.get(name).redraws for name in max_levels(train_config))
 
 
 def disturbed_count(samples: int) -> int:
@@ -69,8 +69,8 @@ def disturbed_count(samples: int) -> int:
     return -(-samples // 2)
 
 
-def displaced_count(samples: int) -> int:
-    """Returns how many of a device's samples, the first ones, have displaced cameras.
+def redrawn_count(samples: int) -> int:
+    """Returns how many of a device's samples, the first ones, have images that are drawn anew.
 
     Half of the disturbed ones: a fixed number of images to draw.
     """
@@ -103,8 +103,8 @@ def draw_levels(
     `number` is the sample's among the `share` of its device.
     """
     is_on, fraction = jax.random.uniform(key, (2, len(highest)))
-    moves = jnp.array([DISTURBANCES.get(name).on_camera is not None for name in highest])
-    is_on = jnp.where(moves, number < displaced_count(share), is_on < PROBABILITY)
+    redrawn = jnp.array([DISTURBANCES.get(name).redraws for name in highest])
+    is_on = jnp.where(redrawn, number < redrawn_count(share), is_on < PROBABILITY)
     is_on &= number < disturbed_count(share)
     return jnp.where(is_on, fraction, 0.0) * jnp.array(list(highest.values()))
 
@@ -130,6 +130,15 @@ def displace(names: Sequence[str], draws: Draws, cameras: Pose) -> Pose:
         on_camera = DISTURBANCES.get(name).on_camera
         cameras = cameras if on_camera is None else on_camera(start, cameras)
     return cameras
+
+
+def has_look(names: Sequence[str], draws: Draws) -> jax.Array | None:
+    """Returns `ImageSource.has_look` of one sample, None without a disturbance of the look."""
+    found = None
+    for name, start in _started(names, draws):
+        on_look = DISTURBANCES.get(name).on_look
+        found = found if on_look is None else on_look(start)
+    return found
 
 
 def disturb(
@@ -180,7 +189,7 @@ def _started(names: Sequence[str], draws: Draws) -> list[tuple[str, base.Disturb
 
 
 def _is_possible(kind: base.Disturbance) -> bool:
-    return bool(kind.on_image or kind.on_camera or kind.seen_step)
+    return bool(kind.image_only or kind.seen_step)
 
 
 def _expect_images(policy_config: config.PolicyConfig, name: str) -> None:

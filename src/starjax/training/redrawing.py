@@ -1,4 +1,4 @@
-"""Images of displaced cameras, drawn for several steps at once.
+"""Images of displaced cameras or with another look, drawn for several steps at once.
 
 A camera needs as long for a few images as for hundreds, so a program of its own draws those of
 several steps, which then follow one another as usual. A chunk is a function of the training's key
@@ -50,7 +50,7 @@ def make(
       ahead: compile the program in the background.
     """
     mesh, train_config = setup.layout.mesh, setup.train_config
-    share = randomise.displaced_count(train_config.batch_size // mesh.size)
+    share = randomise.redrawn_count(train_config.batch_size // mesh.size)
     at_once = AT_ONCE.get(mesh.devices.flat[0].platform, AT_ONCE["gpu"])
     count = max(1, at_once // (share * setup.policy_config.obs_horizon))
     body = functools.partial(draw_images, setup, draw, count)
@@ -92,12 +92,13 @@ def draw_images(
     source = dataset.sources.at(start + choice.seen, episode)
 
     def draw_share(draws: randomise.Draws, source: ImageSource) -> dict[str, jax.Array]:
-        samples = randomise.displaced_count(len(draws.key))
+        samples = randomise.redrawn_count(len(draws.key))
         draws, source = jax.tree.map(lambda x: x[:samples], (draws, source))
         displace = functools.partial(randomise.displace, names)
         cameras: Pose = jax.vmap(jax.vmap(displace))(draws, source.cameras)
+        look = jax.vmap(jax.vmap(functools.partial(randomise.has_look, names)))(draws)
         lead = source.qpos.shape[:3]  # of samples, steps and the observations of each
-        of_sample = source._replace(qpos=None, cameras=cameras)
+        of_sample = source._replace(qpos=None, cameras=cameras, has_look=look)
         of_sample = jax.tree.map(
             lambda x: jnp.broadcast_to(x[:, :, None], (*lead, *x.shape[2:])), of_sample
         )

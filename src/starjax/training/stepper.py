@@ -50,7 +50,7 @@ def resident(
       frames: `[n]` frame numbers to draw from.
       ahead: trace the program now, and compile it in the background until the first step.
       program: from `batch_program` of an equal setup, perhaps prepared.
-      draw_images: draws those of displaced cameras; None without any.
+      draw_images: draws those that training draws anew; None without any.
     """
     layout = setup.layout
     data = _on_devices(setup, dataset, frames)
@@ -135,11 +135,13 @@ def _displaced(
     setup: Setup, data: tuple[Any, ...], ahead: bool, draw: redrawing.Draw | None
 ) -> Callable[[StepCarry, int], Iterator[redrawing.Displaced | None]]:
     """Returns the function from a carry and a number of steps to the steps' displaced images."""
-    if not randomise.moves_cameras(setup.train_config):
+    if not randomise.redraws(setup.train_config):
         return lambda carry, count: itertools.repeat(None, count)
     if draw is None or data[0].sources is None:
-        expected = "no displaced camera without sources of images and a function that draws them"
-        raise errors.UsageError(randomise.ARGUMENT, expected, "a displaced camera")
+        expected = (
+            "neither camera nor look without sources of images and a function that draws them"
+        )
+        raise errors.UsageError(randomise.ARGUMENT, expected, "one of them")
     of = redrawing.make(setup, draw, data, ahead)
 
     def each(carry: StepCarry, count: int) -> Iterator[redrawing.Displaced]:

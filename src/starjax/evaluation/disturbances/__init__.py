@@ -32,6 +32,7 @@ DISTURBANCES = Registry(
         "friction": f"{_HERE}.physics:FRICTION",
         "mass": f"{_HERE}.physics:MASS",
         "cable_slack": f"{_HERE}.wrists:CABLE_SLACK",
+        "look": f"{_HERE}.images:LOOK",
     },
     f"{_HERE}.base:Disturbance",
 )

@@ -48,6 +48,8 @@ class Disturbance(NamedTuple):
       on_reset: (Env, DisturbanceState, EnvState) -> EnvState and memory, after a reset.
       on_camera: (DisturbanceState, Pose `[C]` of the cameras) -> Pose, after a reset; None for
         none.
+      on_look: DisturbanceState -> `[]` bool, True for images with the look of a body cavity, after
+        a reset; None for none.
       on_step: (Env, DisturbanceState, EnvState, Command) -> EnvState and memory.
       on_observe: (Env, DisturbanceState, EnvState) -> Observation.
       on_image: (DisturbanceState, image `[h, w, 3]` in [0, 1], control step) -> image, for every
@@ -71,6 +73,7 @@ class Disturbance(NamedTuple):
         lambda env, disturbance, state: (state, ())
     )
     on_camera: Callable[[DisturbanceState, Pose], Pose] | None = None
+    on_look: Callable[[DisturbanceState], jax.Array] | None = None
     on_step: Callable[[Env, DisturbanceState, EnvState, Command], tuple[EnvState, Any]] = (
         lambda env, disturbance, state, command: (env.step(state, command), disturbance.memory)
     )
@@ -86,7 +89,12 @@ class Disturbance(NamedTuple):
     @property
     def image_only(self) -> bool:
         """True if policies without images never meet it."""
-        return bool(self.on_camera or self.on_image)
+        return bool(self.redraws or self.on_image)
+
+    @property
+    def redraws(self) -> bool:
+        """True if images under it are drawn from another camera's pose or with another look."""
+        return bool(self.on_camera or self.on_look)
 
     @property
     def is_of_motion(self) -> bool:
@@ -174,6 +182,8 @@ def _with(env: Env, name: str, kind: Disturbance) -> Env:
         state = env.reset(key, kind.on_params(env, disturbance, params))
         if kind.on_camera is not None:
             state = state.replace(cameras=kind.on_camera(disturbance, state.cameras))
+        if kind.on_look is not None:
+            state = state.replace(has_look=kind.on_look(disturbance))
         state, memory = kind.on_reset(env, disturbance, state)
         return _put(state, name, disturbance._replace(memory=memory))
 

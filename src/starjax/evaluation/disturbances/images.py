@@ -24,6 +24,10 @@ def _displace(disturbance: DisturbanceState, cameras: Pose) -> Pose:
     return Pose(R, cameras.p + 1e-3 * disturbance.level * direction)
 
 
+def _shows_tissue(disturbance: DisturbanceState) -> jax.Array:
+    return jax.random.uniform(disturbance.key) < disturbance.level
+
+
 def _tint(disturbance: DisturbanceState, image: jax.Array, step: jax.Array) -> jax.Array:
     cast = jax.random.uniform(disturbance.key, (3,), minval=-1.0)
     # The most affected colour changes by `level`.
@@ -84,6 +88,13 @@ CAMERA = Disturbance(
     unit="mm",
     levels=(0.0, 2.0, 5.0, 10.0),
     on_camera=_displace,
+)
+LOOK = Disturbance(
+    description="this fraction of the episodes shows a body cavity, by the lamp of an endoscope",
+    unit="",
+    levels=(0.0, 1.0),
+    max_level=1.0,
+    on_look=_shows_tissue,
 )
 DARKNESS = Disturbance(
     description="the light is dimmed by this fraction",

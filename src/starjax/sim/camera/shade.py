@@ -45,10 +45,12 @@ def light(
     at, terms = jax.lax.optimization_barrier((at, terms))
 
     textures = {r: look(p) for r, look in view.textures.items()}
-    look, background = view.look, scene.background
+    look, background = view.look, [float(c) for c in scene.background]
     if look is not None:
         ground = _between(face, np.flatnonzero(row == scene.ground))
         background = look.background
+        if view.has_look is not None:
+            background = jnp.where(view.has_look, jnp.array(background), scene.background)
         painted, lamp = jax.lax.optimization_barrier((look.paint(p, shaded), look.lamp(p)))
     word = jnp.zeros_like(face)
     for k in range(3):
@@ -64,8 +66,10 @@ def light(
         for r, texture in textures.items():
             lit = jnp.where(on[r], lit * texture[k], lit)
         if look is not None:
-            lit = jnp.where(ground, painted[k], jnp.minimum(lit * lamp, 1.0))
-        lit = jnp.where(face < 0, float(background[k]), lit)
+            with_look = jnp.where(ground, painted[k], jnp.minimum(lit * lamp, 1.0))
+            has_look = view.has_look
+            lit = with_look if has_look is None else jnp.where(has_look, with_look, lit)
+        lit = jnp.where(face < 0, background[k], lit)
         word |= (lit * 255 + 0.5).astype(jnp.int32) << (8 * k)
     return word
 

@@ -26,6 +26,7 @@ class View(NamedTuple):
       to_sun: x, y, z in the camera frame, or None.
       textures: by row.
       look: of the textured ground and of the light, or None.
+      has_look: `[]` bool, False for an image without the look; None: every image has it.
     """
 
     R_cam_world: Any
@@ -34,6 +35,7 @@ class View(NamedTuple):
     to_sun: Sequence[Any] | None
     textures: dict[int, Look]
     look: tissue.Look | None = None
+    has_look: Any = None
 
 
 def fixed(scene: geometry.RenderScene, grid: tiles.Grid, look: str = "") -> View:
@@ -55,7 +57,11 @@ def fixed(scene: geometry.RenderScene, grid: tiles.Grid, look: str = "") -> View
 
 
 def moving(
-    scene: geometry.RenderScene, grid: tiles.Grid, pose_world_cam: Pose, look: str = ""
+    scene: geometry.RenderScene,
+    grid: tiles.Grid,
+    pose_world_cam: Pose,
+    look: str = "",
+    has_look: Any = None,
 ) -> View:
     """Makes the view from a pose, for a scene read in the world's frame."""
     R_world_cam, p_world_cam = (jnp.asarray(x, jnp.float32) for x in pose_world_cam)
@@ -73,9 +79,10 @@ def moving(
         textures={
             row: texture.looker(checker, step, R_world_cam, p_world_cam)
             for row, checker in scene.textures.items()
-            if not look or row != scene.ground
+            if not look or has_look is not None or row != scene.ground
         },
         look=_look(scene, grid, look, R_world_cam, p_world_cam),
+        has_look=has_look,
     )
 
 
