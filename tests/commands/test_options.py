@@ -303,6 +303,7 @@ def test_a_command_line_without_words_has_no_flag():
                 "needle_regrasp",
                 "needle_drive",
                 "needle_drive_sh",
+                "needle_drive_dial",
             ],
         ),
         ("collect --policy.learner o", ["onestep"]),

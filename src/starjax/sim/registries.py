@@ -29,6 +29,7 @@ tasks = Registry(
         "needle_regrasp": "starjax.sim.tasks.needle_regrasp.task:TASK",
         "needle_drive": "starjax.sim.tasks.needle_drive.task:TASK",
         "needle_drive_sh": "starjax.sim.tasks.needle_drive.task:SMALL",
+        "needle_drive_dial": "starjax.sim.tasks.needle_drive.dial:TASK",
         "suture_throw": "starjax.sim.tasks.suture_throw.task:TASK",
     },
     "starjax.sim.tasks.base:Task",

@@ -9,11 +9,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax.types import Pose
 
 STEEL = 7900.0  # kg/m^3
 SEGMENTS = 7  # straight parts of the drawn and weighed wire
+VERTICAL = np.array([0.0, 0.0, 1.0], np.float32)
 
 
 class Needle(NamedTuple):
@@ -85,13 +87,14 @@ def entry_angle(needle: Needle, bite: Bite) -> jax.Array:
     return jnp.arcsin(jnp.minimum(half / needle.radius, 1.0))
 
 
-def pose_on(needle: Needle, bite: Bite, turn: jax.Array) -> Pose:
+def pose_on(needle: Needle, bite: Bite, turn: jax.Array, up: ArrayLike = VERTICAL) -> Pose:
     """Returns pose_world_needle on the path of a bite.
 
     Args:
       turn: rad, of the point about the arc's centre, 0 at its lowest place.
+      up: `[3]`, unit vector in the arc's plane, across the line from entry to exit.
     """
-    along, up = bite.exit - bite.entry, jnp.array([0.0, 0.0, 1.0])
+    along, up = bite.exit - bite.entry, jnp.asarray(up)
     half = 0.5 * jnp.linalg.norm(along)
     f = along / (2.0 * half)
     height = jnp.sqrt(jnp.maximum(needle.radius**2 - half**2, 0.0))
@@ -102,8 +105,8 @@ def pose_on(needle: Needle, bite: Bite, turn: jax.Array) -> Pose:
     return Pose(R, centre - R @ jnp.array([needle.centre, 0.0, 0.0]))
 
 
-def turn_on(needle: Needle, bite: Bite, pose: Pose) -> jax.Array:
-    """Returns the turn (rad) of a needle about the bite's horizontal axis, as of `pose_on`."""
+def turn_on(needle: Needle, bite: Bite, pose: Pose, up: ArrayLike = VERTICAL) -> jax.Array:
+    """Returns the turn (rad) of a needle about the axis of the bite's arc, as of `pose_on`."""
     f = bite.exit - bite.entry
     y = pose.R[:, 1]
-    return jnp.arctan2(y @ f / jnp.linalg.norm(f), -y[2])
+    return jnp.arctan2(y @ f / jnp.linalg.norm(f), -(y @ jnp.asarray(up)))

@@ -5,6 +5,7 @@ when a phase begins, and the wrist's angles from the measured trocar. It is dist
 its way to the pad. A needle that is off its path returns to it on the arc.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.spatial.transform import Rotation
+from jax.typing import ArrayLike
 
 from starjax import rcm
 from starjax.sim import ik
@@ -57,19 +59,27 @@ class DriveScript(phases.PhaseScript):
     held: Pose
 
 
-def agent(size: Needle) -> Agent:
-    """Makes the demonstrator for a needle."""
+Plane = Callable[[EnvState], ArrayLike]
+
+
+def vertical(state: EnvState) -> ArrayLike:
+    """Returns the direction `[3]` up in a vertical plane of the needle's arc."""
+    return needles.VERTICAL
+
+
+def agent(size: Needle, plane: Plane = vertical) -> Agent:
+    """Makes the demonstrator for a needle, whose arc is driven in a plane with `plane(state)`."""
 
     def init(key: jax.Array, state: EnvState) -> DriveScript:
         R = state.pose.R[0]
         own = {"R_from": R, "R_goal": R, "R": R, "turn": jnp.zeros(()), "held": _held(state)}
         script = phases.begin(DriveScript, TIMING, key, state.pose.p[0], **own)
         script = script.replace(jaws=-jnp.ones(()), jaws_from=-jnp.ones(()))
-        return enter(size, script, jnp.asarray(APPROACH, jnp.int32), state)
+        return enter(size, script, jnp.asarray(APPROACH, jnp.int32), state, plane)
 
     def act(script: DriveScript, state: EnvState) -> tuple[Command, DriveScript, Command]:
         """Returns the disturbed command, the script a step later, and the command to record."""
-        after = enter(size, script, _following(script, state), state)
+        after = enter(size, script, _following(script, state), state, plane)
         script, s = phases.advance(script, TIMING, after)
         share = scripting.minimum_jerk(s)
         way = share * ik.rotation_between(script.R_from, script.R_goal)
@@ -78,7 +88,7 @@ def agent(size: Needle) -> Agent:
             script.start + share * (script.goal - script.start),
         )
         drives = script.phase == DRIVE
-        on_arc = _on_arc(size, script, share, state)
+        on_arc = _on_arc(size, script, share, state, plane)
         tip = jax.tree.map(lambda a, b: jnp.where(drives, a, b), on_arc, straight)
         noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
         script = script.replace(at=tip.p, R=tip.R, noise=noise)
@@ -90,17 +100,19 @@ def agent(size: Needle) -> Agent:
     return Agent(init, act)
 
 
-def enter(size: Needle, script: DriveScript, phase: jax.Array, state: EnvState) -> DriveScript:
+def enter(
+    size: Needle, script: DriveScript, phase: jax.Array, state: EnvState, plane: Plane = vertical
+) -> DriveScript:
     """Begins `phase`: sets its goal, rotation and duration."""
-    bite, held = state.layout.bite, _held(state)
+    bite, held, up = state.layout.bite, _held(state), plane(state)
     half = needles.entry_angle(size, bite)
-    start = _tip(needles.pose_on(size, bite, -half - BEFORE), held)
+    start = tip_of(needles.pose_on(size, bite, -half - BEFORE, up), held)
     stays = Pose(script.R, script.at)
     above = start.p + jnp.array([0.0, 0.0, HOVER])
     high = stays.p.at[2].set(jnp.maximum(stays.p[2], HIGH))
     goals = [high, above, start.p, stays.p, stays.p]
     is_free = (phase == APPROACH) | (phase == DESCEND)
-    turn = needles.turn_on(size, bite, state.measurements.needle)
+    turn = needles.turn_on(size, bite, state.measurements.needle, up)
     script = phases.enter(
         script,
         TIMING,
@@ -116,14 +128,13 @@ def enter(size: Needle, script: DriveScript, phase: jax.Array, state: EnvState) 
     return script.replace(duration=jnp.where(phase == DRIVE, sweep, script.duration))
 
 
-def _on_arc(size: Needle, script: DriveScript, share: jax.Array, state: EnvState) -> Pose:
+def _on_arc(
+    size: Needle, script: DriveScript, share: jax.Array, state: EnvState, plane: Plane = vertical
+) -> Pose:
     """Returns pose_world_tip at a fraction of the drive; it begins where the phase did."""
-    bite = state.layout.bite
+    bite, whole, up = state.layout.bite, _end(size, state) - script.turn, plane(state)
     first, now = (
-        _tip(
-            needles.pose_on(size, bite, script.turn + part * (_end(size, state) - script.turn)),
-            script.held,
-        )
+        tip_of(needles.pose_on(size, bite, script.turn + part * whole, up), script.held)
         for part in (0.0, share)
     )
     left = (1.0 - share) * ik.rotation_between(first.R, script.R_from)
@@ -142,7 +153,7 @@ def _held(state: EnvState) -> Pose:
     return Pose(tip.R.T @ needle.R, tip.R.T @ (needle.p - tip.p))
 
 
-def _tip(needle: Pose, held: Pose) -> Pose:
+def tip_of(needle: Pose, held: Pose) -> Pose:
     """Returns pose_world_tip of a needle's pose."""
     R = needle.R @ held.R.T
     return Pose(R, needle.p - R @ held.p)

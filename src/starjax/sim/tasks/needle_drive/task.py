@@ -5,7 +5,8 @@ model of `sim.tissue`. The needle's path is an arc, so the point comes out at th
 jaws turn it about the arc's centre: this needs a tool with a wrist.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -136,9 +137,10 @@ def sample(bites: tuple[float, float], bound: DriveBound, key: jax.Array) -> Dri
     return DriveLayout(Bite(jnp.append(middle - along, 0.0), jnp.append(middle + along, 0.0)), tip)
 
 
-def grasp(size: Needle) -> Pose:
-    """Returns pose_tip_needle of the grasp."""
-    a, turn, lean = GRASP_ANGLE, GRASP_TURN, GRASP_LEAN
+def grasp(
+    size: Needle, a: float = GRASP_ANGLE, turn: float = GRASP_TURN, lean: float = GRASP_LEAN
+) -> Pose:
+    """Returns pose_tip_needle of a grasp at the angle `a` on the arc (all rad)."""
     out = np.array([np.cos(a), np.sin(a), 0.0])
     along = np.array([-np.sin(a), np.cos(a), 0.0])
     z = np.cos(turn) * np.array([0.0, 0.0, -1.0]) - np.sin(turn) * out
@@ -151,10 +153,10 @@ def grasp(size: Needle) -> Pose:
 
 
 def begin(
-    bound: DriveBound, layout: DriveLayout, qpos: jax.Array, tips: Pose
+    held: Pose, bound: DriveBound, qpos: jax.Array, tips: Pose
 ) -> tuple[jax.Array, driving.Tissue]:
-    """Puts the needle between the closed jaws."""
-    tip, held = jax.tree.map(lambda leaf: leaf[0], tips), grasp(bound.size)
+    """Puts the needle between the closed jaws, with pose_tip_needle `held`."""
+    tip = jax.tree.map(lambda leaf: leaf[0], tips)
     pose = Pose(tip.R @ held.R, tip.p + tip.R @ held.p)
     start = bound.needle
     qpos = qpos.at[start : start + 7].set(bodies.free_coords(pose)).at[bound.jaws].set(0.0)
@@ -250,8 +252,27 @@ def is_sound(bound: DriveBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     return bodies.is_sound(qpos, qvel, bound.needle, bound.dof, MAX_SPEED, MAX_DISTANCE)
 
 
-def make(name: str, size: Needle, bites: tuple[float, float], expert: str) -> Task:
-    """Returns the task with a needle, a range of distances (m) between the marks, and an expert."""
+def _grasp(bound: DriveBound, bite: Bite) -> Pose:
+    """Returns pose_tip_needle, the same for all bites."""
+    return grasp(bound.size)
+
+
+def make(
+    name: str,
+    size: Needle,
+    bites: tuple[float, float],
+    experts: Mapping[str, str],
+    held: Callable[[DriveBound, Bite], Pose] = _grasp,
+    **more: Any,
+) -> Task:
+    """Returns a task with a needle.
+
+    Args:
+      bites: m, range of distances between the marks.
+      experts: variant -> `module:object`.
+      held: pose_tip_needle at the start.
+      more: further fields of the task.
+    """
     return Task(
         name=name,
         mjcf=f"tasks/needle_drive/{name}.xml",
@@ -270,7 +291,7 @@ def make(name: str, size: Needle, bites: tuple[float, float], expert: str) -> Ta
         ),
         stages=STAGES,
         text=text.TEXT,
-        experts={"default": f"starjax.sim.tasks.needle_drive.expert:{expert}"},
+        experts=experts,
         graspable=(),
         bind=lambda m: bind(size, m),
         sample=lambda bound, key: sample(bites, bound, key),
@@ -281,11 +302,16 @@ def make(name: str, size: Needle, bites: tuple[float, float], expert: str) -> Ta
         relative=relative,
         is_sound=is_sound,
         still=still,
-        coupling=Coupling(begin, forces),
+        coupling=Coupling(
+            lambda bound, layout, qpos, tips: begin(held(bound, layout.bite), bound, qpos, tips),
+            forces,
+        ),
         outline=text.outline,
         endoscope=workspaces.BOARD_ENDOSCOPE,
+        **more,
     )
 
 
-TASK = make("needle_drive", needles.CT1, (0.008, 0.014), "AGENT")
-SMALL = make("needle_drive_sh", needles.SH, (0.008, 0.009), "SMALL")
+EXPERT = "starjax.sim.tasks.needle_drive.expert"
+TASK = make("needle_drive", needles.CT1, (0.008, 0.014), {"default": f"{EXPERT}:AGENT"})
+SMALL = make("needle_drive_sh", needles.SH, (0.008, 0.009), {"default": f"{EXPERT}:SMALL"})
