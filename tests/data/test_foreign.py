@@ -57,6 +57,14 @@ def test_it_is_a_dataset_like_any_other(plain):
     assert description["imported"]["mapping"]["arms"][0]["position"] == "p0"
 
 
+@pytest.mark.parametrize(("share", "doubts"), [(0.0, 0), (1.0, 0), (0.3, 1)])
+def test_jaws_that_stay_closed_or_open_are_no_doubt(tmp_path, share, doubts):
+    value = ARM.gripper_closed + share * (ARM.gripper_open - ARM.gripper_closed)
+    given = source(change=lambda arrays: arrays | {"jaws0": np.full_like(arrays["jaws0"], value)})
+    found = bring(tmp_path, given)
+    assert sum("gripper" in note for note in found.notes) == doubts
+
+
 def written_as(kind):
     """The first arm's rotations as numbers of that kind."""
 

@@ -78,7 +78,7 @@ def cards(found: Sequence[EpisodeMotion], arms: Sequence[Sequence[MotionFigures]
     bends = [one.bend_deg for one in every if one.bend_deg is not None]
     if bends:
         low, high = np.min([b.min() for b in bends]), np.max([b.max() for b in bends])
-        texts.append(Card("Wrist", f"{low:.0f} to {high:.0f}", "°", "pitch and yaw"))
+        texts.append(Card("Wrist", f"{low:.0f} to {high:.0f}", " degrees", "pitch and yaw"))
     if len(wander):
         middle, most = map(formats.millimetres, (statistics.median(wander), wander.max()))
         more = f"median of {len(wander)} windows of 5 s; {most} mm at most"

@@ -20,6 +20,7 @@ _STEPS_AWAY = 10.0  # typical steps between a command and the next tip
 _LEAST_AWAY = 5e-3  # m; a command nearer to the next tip follows it
 _BEYOND = 0.05  # of a gripper's range, by which values may leave it
 _LEAST_USED = 0.5  # of a gripper's range, which a dataset uses
+_STILL = 1e-3  # of a gripper's range, by which jaws that stay closed, or open, move
 _OUTSIDE = 0.02  # m, from the region of a task's trocars
 _ELSEWHERE = 0.01  # m; estimates of one trocar in several episodes are nearer to each other
 _FEW = 2  # episodes, which may well have a trocar each
@@ -42,10 +43,15 @@ class Jaws:
                 self._high[i] = max(self._high[i], share.max())
 
     def notes(self) -> Iterator[str]:
-        """Yields a note for each gripper that leaves its range or uses little of it."""
+        """Yields a note for each gripper that leaves its range or uses little of it.
+
+        Jaws that stay closed, or open, are no doubt: a task may begin with a held needle.
+        """
         for i, (arm, low, high) in enumerate(zip(self._arms, self._low, self._high)):
             is_outside = low < -_BEYOND or high > 1.0 + _BEYOND
-            if np.isfinite(low) and (is_outside or high - low < _LEAST_USED):
+            is_still = high < _STILL or low > 1.0 - _STILL
+            is_small = high - low < _LEAST_USED and not is_still
+            if np.isfinite(low) and (is_outside or is_small):
                 width = arm.gripper_open - arm.gripper_closed
                 first, last = (arm.gripper_closed + width * x for x in (low, high))
                 yield (
