@@ -1,31 +1,56 @@
-"""Tables of fine-tunings, from results/finetune_*.json: success before and after, and branches."""
+"""Tables of fine-tunings, from results/finetune_*.json: success, goals, and branches."""
 
+import itertools
 import json
+import tomllib
 from pathlib import Path
 from typing import Any
 
 from starjax.report import formats
 
-RESULTS = Path(__file__).parent / "results"
+HERE = Path(__file__).parent
+RESULTS = HERE / "results"
 COMMAND = "starjax finetune "
+PARTS = ("seen", "unseen")
 
 
-def ways(folder: Path = RESULTS) -> str:
-    """Returns success before and after each complete fine-tuning as markdown."""
-    header = ["Fine-tuning", "Best round", "Seen before", "Seen after", "Unseen before"]
-    rows = [[*header, "Unseen after", "Minutes", "On"]]
-    for found in (found for found in _results(folder) if "best" in found):
-        before, best = found["before"], found["best"]
-        after = found["after"] if best else before
+def goals(folder: Path = RESULTS) -> str:
+    """Returns the goal of each policy, the way that came nearest, and the others, as markdown."""
+    known = tomllib.loads((HERE / "finetune_goals.toml").read_text())["goals"]
+    header = ["Task, policy", "Goal", "Way", "Seen before", "Seen after", "Unseen before"]
+    header += ["Unseen after", "Goal met", "RCM p99 (mm)", "Rollouts", "Minutes", "Other ways"]
+    rows = [header]
+    found = sorted((x for x in complete(folder) if "task" in x), key=_policy)
+    for (task, weights), results in itertools.groupby(found, key=_policy):
+        # The first result of the most successes at all trocars.
+        won, *others = sorted(results, key=lambda x: -sum(_after(x)[p]["rate"] for p in PARTS))
+        goal = known.get(task, known["others"])
+        after, rounds = _after(won), won["rounds"][1:]
+        missed = [g - 100 * after[part]["rate"] for g, part in zip(goal, PARTS, strict=True)]
+        left = [f"{by:.1f} {part}" for by, part in zip(missed, PARTS, strict=True) if by > 1e-9]
         rows.append(
             [
-                f"`{found['command'].removeprefix(COMMAND).partition(' --out')[0]}`",
-                f"{best} of {len(found['rounds']) - 1}" if best else "none is better",
-                *(_rate(x[part]) for part in ("seen", "unseen") for x in (before, after)),
-                f"{_seconds(found) / 60:.0f}",
-                formats.machine(found["hardware"]),
+                f"{task}, {_base(won)} ({weights[:8]})",
+                " / ".join(f"{x:.0f}" for x in goal),
+                won["by"] if won["best"] else f"{won['by']}: no round is better",
+                *(_rate(x[part]) for part in PARTS for x in (won["before"], after)),
+                "missed by " + ", ".join(left) if left else "yes",
+                formats.millimetres(after["rcm_error_mm"]["executed"]["p99"]),
+                f"{sum(row.get('trials', 0) for row in rounds):,}",
+                f"{_seconds(won) / 60:.0f}",
+                "; ".join(_brief(x) for x in others) or "–",
             ]
         )
+    return formats.render(rows, names=1)
+
+
+def runs(folder: Path = RESULTS) -> str:
+    """Returns the origin of every complete fine-tuning as markdown."""
+    rows = [["Command", "Seed", "Commit", "On"]]
+    for found in complete(folder):
+        seed = str(found.get("seed", "0"))
+        on = formats.machine(found["hardware"])
+        rows.append([f"`{found['command']}`", seed, found["commit"][:10], on])
     return formats.render(rows, names=1)
 
 
@@ -38,13 +63,61 @@ def branches(folder: Path = RESULTS) -> str:
         for row in found["rounds"][1:]:
             left = sum(map(len, row["not_rescued"].values()))
             cells = [str(row["branches"][name]) for name in names]
-            command = found["command"].removeprefix(COMMAND).partition(" --out")[0]
-            rows.append([f"`{command}`", str(row["round"]), *cells, str(left)])
+            rows.append([f"`{_flags(found)}`", str(row["round"]), *cells, str(left)])
     return formats.render(rows, names=1) if told else "No result has branches yet."
+
+
+def complete(folder: Path = RESULTS) -> list[dict[str, Any]]:
+    """Returns the results of fine-tunings that ended."""
+    return [found for found in _results(folder) if "best" in found]
+
+
+def learning_seconds(found: dict[str, Any]) -> list[float]:
+    """Returns the seconds after which each round had its policy, from 0 for the policy itself.
+
+    Validations and reports do not count; compilation, demonstrations and features do.
+    """
+    stages = {
+        name: seconds
+        for name, seconds in found["timings_s"].items()
+        if not name.endswith(": compile") and not name.endswith("validation")
+    }
+    first = sum(s for name, s in stages.items() if name.startswith(("collect", "features")))
+    total = [0.0]
+    for row in found["rounds"][1:]:
+        mine = [s for name, s in stages.items() if name.startswith(f"round {row['round']} ")]
+        total.append((total[-1] or first) + sum(mine))
+    return total
 
 
 def _results(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in sorted(folder.glob("finetune_*.json"))]
+
+
+def _policy(found: dict[str, Any]) -> tuple[str, str]:
+    return found["task"], found["weights"]
+
+
+def _after(found: dict[str, Any]) -> dict[str, Any]:
+    return found["after"] if found["best"] else found["before"]
+
+
+def _flags(found: dict[str, Any]) -> str:
+    """Returns a command without its first words and its directory."""
+    return found["command"].removeprefix(COMMAND).partition(" --out")[0]
+
+
+def _base(found: dict[str, Any]) -> str:
+    """Returns the name of the policy that a command fine-tunes."""
+    words = found["command"].removeprefix(COMMAND).split()
+    name = words[words.index("--policy") + 1] if "--policy" in words else words[0]
+    return name.removeprefix("runs/")
+
+
+def _brief(found: dict[str, Any]) -> str:
+    after = _after(found)
+    rates = " and ".join(f"{100 * after[part]['rate']:.1f}" for part in PARTS)
+    return f"{found['by']} {rates}, {_seconds(found) / 60:.0f} min"
 
 
 def _rate(found: dict[str, Any]) -> str:

@@ -8,7 +8,8 @@ claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list 
 `presets` (from their values); `leaderboard`, `leaderboard_apart` and `elsewhere` (the trocar
 benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
 `six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`, `stress_randomised`,
-`proposition`, `finetune`, `finetune_ways`, `finetune_branches`, `ppo`, `ppo_gpu`, `sb3`,
+`proposition`, `finetune`, `finetune_goals`, `finetune_runs`, `finetune_branches`, `ppo`, `ppo_gpu`,
+`sb3`,
 `monitor_<policy>`, `monitor_cost`,
 `through_lerobot`, `held_out`, `larger_than_memory`, `loaders`.
 """
@@ -28,6 +29,11 @@ import leaderboard_page  # noqa: E402
 import newest  # noqa: E402
 import preset_table  # noqa: E402
 
+FINETUNED = {
+    "finetune_goals": finetuned.goals,
+    "finetune_runs": finetuned.runs,
+    "finetune_branches": finetuned.branches,
+}
 _BLOCK = re.compile(r"(<!-- table:(\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
 
 
@@ -44,10 +50,8 @@ def table(name: str) -> str:
         return preset_table.table()
     if name in leaderboard_page.TABLES:
         return leaderboard_page.TABLES[name]()
-    if name == "finetune_ways":
-        return finetuned.ways()
-    if name == "finetune_branches":
-        return finetuned.branches()
+    if name in FINETUNED:
+        return FINETUNED[name]()
     if name == "speed":
         return newest.table()
     if (HERE.parent / "benchmarks" / f"{name}.toml").exists():

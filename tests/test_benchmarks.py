@@ -64,35 +64,74 @@ def test_a_row_of_a_result_keeps_the_code_and_command_that_made_it(
     assert found["made"]["two"]["command"] == "python benchmarks/bench_x.py --only two"
 
 
-def test_tables_of_fine_tunings_say_when_no_round_is_better(tmp_path, monkeypatch, pytestconfig):
+def rate(won, trials=100):
+    return {"successes": won, "trials": trials, "rate": won / trials, "ci95": [0.0, 1.0]}
+
+
+def report(seen, unseen):
+    return {
+        "seen": rate(seen),
+        "unseen": rate(unseen),
+        "rcm_error_mm": {"executed": {"p99": 0.05}},
+    }
+
+
+def test_a_goal_is_met_by_the_best_way_and_missed_by_points(tmp_path, finetunings):
+    found, finetuned = finetunings
+    best = {**found, "by": "self", "best": 1, "after": report(99, 95)}
+    other = {**found, "weights": "f" * 64, "task": "reach"}
+    for name, content in {"a": found, "b": best, "c": other}.items():
+        (tmp_path / f"finetune_{name}.json").write_text(json.dumps(content))
+    _, _, needle, reach = finetuned.goals(tmp_path).splitlines()
+    cells = [cell.strip() for cell in needle.strip("|").split("|")]
+    assert cells[0] == "needle_pick, a (eeeeeeee)" and cells[1] == "98 / 95" and cells[2] == "self"
+    assert cells[4].startswith("99/100") and cells[6].startswith("95/100") and cells[7] == "yes"
+    assert cells[9] == "800" and "dagger 80.0 and 70.0" in cells[11]
+    assert "no round is better" in reach and "missed by 19.0 seen, 27.0 unseen" in reach
+
+
+def test_the_time_of_a_round_is_that_of_learning(finetunings):
+    found, finetuned = finetunings
+    assert finetuned.learning_seconds(found) == [0.0, 5.0 + 20.0 + 30.0]
+
+
+def test_branches_of_all_fine_tunings_are_counted(tmp_path, finetunings):
+    found, finetuned = finetunings
+    begun = {name: found[name] for name in ("command", "rounds")}
+    for name, content in {"a": found, "b": begun}.items():
+        (tmp_path / f"finetune_{name}.json").write_text(json.dumps(content))
+    assert finetuned.branches(tmp_path).count("| 3 | 2 | 3 |") == 2
+
+
+@pytest.fixture
+def finetunings(monkeypatch, pytestconfig):
     monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
     import finetuned
 
-    def rate(won):
-        return {"successes": won, "trials": 10, "rate": won / 10, "ci95": [0.0, 1.0]}
-
     found = {
         "by": "dagger",
+        "task": "needle_pick",
+        "weights": "e" * 64,
         "command": "starjax finetune runs/a --by dagger --out runs/b",
         "rounds": [
             {"round": 0},
             {
                 "round": 1,
+                "trials": 800,
                 "branches": {"takeover": 3, "1 s": 2},
                 "not_rescued": {"lost": [[0, 1]], "stalled": [[0, 2], [1, 3]]},
             },
         ],
         "best": 0,
-        "before": {"seen": rate(8), "unseen": rate(7)},
-        "timings_s": {"before": 60.0, "before: compile": 40.0},
+        "before": report(80, 70),
+        "timings_s": {
+            "round 0 validation": 60.0,
+            "round 0 validation: compile": 40.0,
+            "collect demos-1": 5.0,
+            "round 1 rollouts": 20.0,
+            "round 1 training": 30.0,
+            "round 1 validation": 10.0,
+        },
         "hardware": {"backend": "cpu", "cpu": "a CPU", "cores": 2},
     }
-    (tmp_path / "finetune_a.json").write_text(json.dumps(found))
-    better = {**found, "best": 1, "after": {"seen": rate(9), "unseen": rate(10)}}
-    (tmp_path / "finetune_b.json").write_text(json.dumps(better))
-    begun = {name: found[name] for name in ("command", "rounds")}
-    (tmp_path / "finetune_c.json").write_text(json.dumps(begun))
-    _, _, kept, improved = finetuned.ways(tmp_path).splitlines()
-    assert "`runs/a --by dagger`" in kept and "none is better" in kept
-    assert kept.count("8/10") == 2 and "9/10" in improved and "10/10" in improved
-    assert finetuned.branches(tmp_path).count("| 3 | 2 | 3 |") == 3
+    return found, finetuned

@@ -106,6 +106,9 @@ def _finish(work: Work, candidates: list[Path], described: list[dict[str, Any]])
         rows["after"] = _score(work, "after", work.place(candidates[best]))
     content = {
         "by": work.settings.by,
+        "task": work.base.env.task.name,
+        "method": work.stored.method,
+        "seed": work.settings.seed,
         "weights": work.base.weights,
         "rounds": described,
         "best": best,

@@ -1,0 +1,53 @@
+"""Draws success in validation against the time of fine-tuning, a panel per task.
+
+python benchmarks/finetune_figure.py FIGURE.png
+"""
+
+import itertools
+import sys
+from pathlib import Path
+from typing import Any
+
+import finetuned
+
+from starjax.report import style
+
+WAYS = {"dagger": "#2083C5", "self": "#D55E00", "rl": "#009E73", "distill": "#CC79A7"}
+
+
+def main(file: Path) -> None:
+    """Writes the figure: a line per fine-tuning, with the 95% interval of every round."""
+    found = sorted((x for x in finetuned.complete() if "task" in x), key=lambda x: x["task"])
+    tasks = {task: list(group) for task, group in itertools.groupby(found, key=lambda x: x["task"])}
+    with style.use():
+        figure = style.figure(3.2 * len(tasks), 3.0)
+        axes = figure.subplots(1, len(tasks), squeeze=False)[0]
+        for axis, (task, results) in zip(axes, tasks.items(), strict=True):
+            draw(axis, task, results)
+        data = style.save(figure, "png")
+    file.write_bytes(data)
+
+
+def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
+    """Draws the fine-tunings of one task."""
+    for found in results:
+        minutes = [seconds / 60 for seconds in finetuned.learning_seconds(found)]
+        rates = [row["validation"] for row in found["rounds"]]
+        middle = [100 * rate["rate"] for rate in rates]
+        low, high = (
+            [abs(100 * rate["ci95"][end] - y) for rate, y in zip(rates, middle, strict=True)]
+            for end in (0, 1)
+        )
+        label = f"{found['by']}, {found['weights'][:4]}"
+        colour = WAYS[found["by"]]
+        axis.errorbar(
+            minutes, middle, (low, high), marker="o", ms=4, capsize=2, color=colour, label=label
+        )
+    axis.set(title=task, xlabel="rollouts and training (min)", ylabel="validation success (%)")
+    axis.legend(fontsize=7, loc="lower right")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    main(Path(sys.argv[1]))
