@@ -1,6 +1,9 @@
 """Images of displaced cameras: those of `starjax stress`, in any order of steps, resumed or not."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 from typing import Any
 
 import fakes
@@ -36,9 +39,7 @@ def draw(source):
 
 def make_setup(*names) -> step.Setup:
     settings = config.TrainConfig(batch_size=BATCH, randomise=names)
-    layout = StateLayout(
-        devices.make_mesh(BATCH, jax.devices()[:1]), lambda params: params, NOTHING
-    )
+    layout = StateLayout(devices.make_mesh(BATCH), lambda params: params, NOTHING)
     return step.Setup(NOTHING, NOTHING, POLICY, settings, layout)
 
 
@@ -63,25 +64,33 @@ def resident(dataset):
     return setup, data, gather, redrawing.make(setup, draw, data, ahead=False)
 
 
+def displaced_rows(setup) -> np.ndarray:
+    """Samples with displaced cameras: the first ones of every device."""
+    shares = np.arange(BATCH).reshape(setup.layout.mesh.size, -1)
+    return shares[:, : randomise.displaced_count(shares.shape[1])].ravel()
+
+
 def choice(setup, data, number) -> Any:
     return step.choose(setup, KEY, jnp.int32(number), *data)
 
 
 def test_a_displaced_camera_is_that_of_a_stressed_episode_with_the_same_key(dataset, resident):
-    _, data, _, displaced = resident
+    setup, data, _, displaced = resident
     found = displaced(KEY, 3)
+    parts = [part.data.shape[0] for part in found.images["camera"].addressable_shards]
+    assert parts == [MOVED // setup.layout.mesh.size] * setup.layout.mesh.size
     images = np.asarray(found.images["camera"][:, found.index])
     assert images.shape == (MOVED, 2, SIZE, SIZE, 5)
     chosen = choice(resident[0], data, 3)
     episode = np.asarray(dataset.episode)[chosen.frame]
-    for i in range(MOVED):
+    for image, i in zip(images, displaced_rows(setup), strict=True):
         start = base.start("camera", chosen.draws.level[i, 0], chosen.draws.key[i])
         cameras = jax.tree.map(lambda x, i=i: x[episode[i]], dataset.sources.episodes.cameras)
         stressed = base.DISTURBANCES.get("camera").on_camera(start, cameras)
         for at, seen in enumerate(np.asarray(chosen.seen)[i]):
             source = dataset.sources.at(20 * episode[i] + seen, episode[i])
             wanted = draw(source._replace(cameras=stressed))["camera"].rgb
-            np.testing.assert_allclose(images[i, at].astype(int), wanted.astype(int), atol=1)
+            np.testing.assert_allclose(image[at].astype(int), wanted.astype(int), atol=1)
     assert len(np.unique(images[:, :, 0, 0, 2:].reshape(MOVED * 2, -1), axis=0)) == MOVED
 
 
@@ -90,9 +99,19 @@ def test_the_other_samples_have_their_recorded_bytes(dataset, resident):
     chosen, batch = choice(setup, data, 3), gather(jnp.int32(3), *data, displaced(KEY, 3))
     plain = windows.gather(dataset, chosen.frame, 2, POLICY.horizon, chosen.seen)
     images, usual = ((it.observation.images or {})["camera"] for it in (batch, plain))
-    np.testing.assert_array_equal(images[BATCH // 2 :], usual[BATCH // 2 :])
-    assert not np.array_equal(images[:MOVED], usual[:MOVED])
+    undisturbed = ~np.asarray(chosen.draws.level).any(axis=1)
+    assert undisturbed.sum() >= BATCH // 2
+    np.testing.assert_array_equal(images[undisturbed], usual[undisturbed])
+    moved = displaced_rows(setup)
+    assert not np.array_equal(images[moved], usual[moved])
     jax.tree.map(np.testing.assert_array_equal, batch.command, plain.command)
+
+
+def test_two_devices_draw_their_shares():
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    names = "displaced_camera_is_that or other_samples_have"
+    command = [sys.executable, "-m", "pytest", "-q", __file__, "-k", names]
+    subprocess.run(command, env={**os.environ, "XLA_FLAGS": flags}, check=True)
 
 
 def test_images_depend_on_the_step_alone(resident, monkeypatch):
