@@ -10,6 +10,7 @@ _BOARD = Mount(
     turn=-1.75,  # j6 stays far from its limits over all trocars
     home=(-0.18, -1.10, 1.90, -2.36, -1.571, 0.0),
 )
+_RIGHT = _BOARD._replace(position=(0.58, 0.0, 0.20), yaw=0.0)
 _TISSUE = Mount(
     position=(-0.456, 0.237, -0.04),
     yaw=-2.238,
@@ -30,7 +31,9 @@ ARM = Arm(
         ("grasper_wide", "wire"): _BOARD,
         # Two arms at either side of the board.
         ("grasper", "left"): _BOARD,
-        ("grasper", "right"): _BOARD._replace(position=(0.58, 0.0, 0.20), yaw=0.0),
+        ("needle_driver", "left"): _BOARD,
+        ("grasper", "right"): _RIGHT,
+        ("needle_driver", "right"): _RIGHT,
         **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
     },
 )

@@ -6,7 +6,7 @@ description (a test). `deploy.psm` has its closed forms, `deploy.crtk` its messa
 
 import math
 
-from starjax.sim.arms.base import Arm, Mount
+from starjax.sim.arms.base import Arm, Mount, opposite
 
 _BOARD = Mount(position=(0.0, 0.0, 0.0), yaw=-0.2, turn=0.0, home=(0.0, 0.0, 0.11, 0.0))
 
@@ -22,6 +22,8 @@ ARM = Arm(
         ("grasper", "board"): _BOARD,
         ("needle_driver", "board"): _BOARD,
         ("prograsp", "board"): _BOARD,
+        ("needle_driver", "left"): _BOARD,
+        ("needle_driver", "right"): opposite(_BOARD),
     },
     link_radius=0.02,
     remote_centre=True,

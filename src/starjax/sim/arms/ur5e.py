@@ -30,7 +30,9 @@ ARM = Arm(
         ("prograsp", "board"): _MOUNT,
         ("grasper_wide", "wire"): _MOUNT,
         ("grasper", "left"): _MOUNT,
+        ("needle_driver", "left"): _MOUNT,
         ("grasper", "right"): opposite(_MOUNT),
+        ("needle_driver", "right"): opposite(_MOUNT),
         **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
     },
 )

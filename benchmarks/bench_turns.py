@@ -1,0 +1,69 @@
+"""Success of the dial's two experts by the turn of the needle, at the task's trocars and others.
+
+    python benchmarks/bench_turns.py [--per-trocar 60] [--sampled 600] [--seed 2026] [--c] [--tiny]
+
+The task is needle drive along the dial. One expert drives each needle in a plane that suits the
+trocar, the other in one plane for all: no policy that is not told the trocar can do more.
+"""
+
+import argparse
+from typing import Any
+
+import _c_env
+import _timing
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import rcm, runtime
+from starjax.evaluation import expert as runs
+from starjax.sim import env as envs
+from starjax.sim import sampling
+from starjax.sim.tasks.needle_drive import dial
+
+STEPS = 600  # control steps, 20 s
+
+
+def main() -> None:
+    runtime.prepare_xla()
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--per-trocar", type=int, default=60)
+    parser.add_argument("--sampled", type=int, default=600)
+    parser.add_argument("--seed", type=int, default=2026)
+    parser.add_argument("--c", action="store_true", help="C MuJoCo's physics instead of ours")
+    parser.add_argument("--tiny", action="store_true", help="an episode each, nothing written")
+    asked = parser.parse_args()
+    environment = envs.make(dial.TASK.name, observation="state")
+    if asked.c:
+        environment = _c_env.with_c_physics(environment)
+    each, drawn = (1, 2) if asked.tiny else (asked.per_trocar, asked.sampled)
+    task, key = environment.task, jax.random.key(asked.seed)
+    twelve = rcm.Trocar(*(jnp.repeat(jnp.asarray(f), each, axis=0) for f in task.trocars))
+    is_seen = np.repeat(task.is_seen, each)
+    others = sampling.sample_trocars(jax.random.fold_in(key, 1), task, (drawn,))
+    found: dict[str, Any] = {}
+    for name in task.experts:
+        at_twelve, at_others = (
+            runs.run(environment, task.expert(name), trocars, jax.random.fold_in(key, k), STEPS)
+            for k, trocars in ((2, twelve), (3, others))
+        )
+        found[name] = {
+            "seen": _by_turn(at_twelve, is_seen),
+            "unseen": _by_turn(at_twelve, ~is_seen),
+            "others": _by_turn(at_others, np.ones(drawn, bool)),
+        }
+        print(name, found[name], flush=True)
+    sizes = {"seed": asked.seed, "physics": "C MuJoCo" if asked.c else "ours"}
+    _timing.report("turns_c" if asked.c else "turns", {**sizes, "experts": found}, asked.tiny)
+
+
+def _by_turn(episodes: runs.ExpertEpisodes, chosen: np.ndarray) -> list[list[int]]:
+    """Returns (successes, episodes) of each bin of the dial."""
+    turn = np.asarray(jax.vmap(dial.label)(episodes.last.layout)["turn"])
+    success = np.asarray(episodes.last.success)
+    bins = [chosen & (turn == k) for k in range(dial.BINS)]
+    return [[int(success[rows].sum()), int(rows.sum())] for rows in bins]
+
+
+if __name__ == "__main__":
+    main()
