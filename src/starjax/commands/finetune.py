@@ -14,8 +14,9 @@ DESCRIPTION = """Improves a trained policy in the simulator and writes policy.sa
 RUN is the directory of a method, such as runs/cpu/stardiff; --policy takes a policy.safetensors or
 the name of a packaged policy instead. Every round runs the policy through the seen trocars, adds
 chosen episodes to the demonstrations, and continues the training of the policy's weights; rl and
-distill train a policy of the learner onestep without such episodes. The round that is best on
-separate trials is kept, the policy itself if no round is better. Rerun the same command to resume.
+distill train a policy of the learner onestep from decisions of all episodes. The round that is best
+on separate trials is kept, the policy itself if no round is better. Rerun the same command to
+resume.
 
 Examples:
   starjax finetune runs/cpu/stardiff --by dagger

@@ -81,7 +81,10 @@ def _plan(work: Work) -> str:
             f"{settings.iterations} iterations of {settings.episodes} episodes",
             f"in every iteration, rate {settings.gradient_rate:.2g}",
         ),
-        "distill": ("no rollouts", f"{steps}, demonstrations"),
+        "distill": (
+            f"{settings.episodes} episodes",
+            f"{steps}, demonstrations, and as many states of the episodes",
+        ),
     }
     played, trained = work_of_round.get(settings.by, work_of_round["dagger"])
     return "\n".join(

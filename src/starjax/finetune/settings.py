@@ -23,9 +23,10 @@ class FinetuneConfig:
     iterations: Count = 30  # iterations of rl per round
     # learning rate of rl
     gradient_rate: Annotated[float, Range(0.0, 1.0, "(]")] = 1e-5
-    # standard deviation of the displacement of plans in episodes of rl, in normalised actions
+    # standard deviation of the displacement of plans in episodes of rl and distill, in normalised
+    # actions
     noise: Annotated[float, Range(0.0, 1.0, "(]")] = 0.01
-    episodes: Count = 1024  # episodes per iteration of rl, over all seen trocars
+    episodes: Count = 1024  # per iteration of rl or round of distill, over all seen trocars
     # learning rate as a fraction of that of the policy's training
     rate: Annotated[float, Range(0.0, 1.0, "(]")] = 0.2
     # arithmetic of the networks in training; inference always uses float32

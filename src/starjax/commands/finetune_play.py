@@ -1,0 +1,61 @@
+"""Episodes of a policy of `onestep` at the seen trocars, from new starts and from failed ones."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import errors
+from starjax.commands.finetune_work import Work
+from starjax.finetune import dagger, explore
+from starjax.policies import features, generator
+from starjax.policies.base import Policy
+from starjax.rcm.trocar import Trocar
+from starjax.rollouts import trocars as configurations
+
+LIMIT = 1.5  # of the time of the slowest 5% of successes, after which an episode has failed
+AGAIN = 0.5  # share of a batch's episodes whose starts failed in the one before
+
+
+class NoisyEpisodes:
+    """The program of a batch of episodes, and its starts."""
+
+    def __init__(self, work: Work, policy: Policy, steps: np.ndarray):
+        """Builds it; `steps` `[n]` are the control steps of the policy's successes."""
+        if not len(steps):
+            raise errors.UsageError("RUN", "a policy with some success", "none in validation")
+        env, settings = work.base.env, work.config.policy
+        limits, _ = dagger.limits(steps, env.control_hz)
+        self.settings = explore.ExploreSettings(
+            settings.obs_horizon,
+            settings.execute,
+            math.ceil(LIMIT * limits.clock / settings.execute),
+            work.settings.noise,
+        )
+        see = _make_see(settings) if settings.observation == "image" else None
+        self.play = explore.make(env, policy, see, env.names.cameras, self.settings)
+        self._count = work.settings.episodes
+        self._trocars = configurations.listed(work.seen, len(env.p_world_ref))
+
+    def starts(self, number: int, failed: np.ndarray, draws: np.random.Generator) -> explore.Starts:
+        """Returns the starts of batch `number`, some of them of those `[M, 2]` that failed."""
+        count = self._count
+        index = np.arange(count, dtype=np.int32) % len(self._trocars.radius)
+        trial = number * count + np.arange(count, dtype=np.int32)
+        if len(failed):
+            old = np.arange(int(AGAIN * count))
+            index[old], trial[old] = failed[draws.integers(len(failed), size=len(old))].T
+        fields = Trocar(*(np.asarray(field)[index] for field in self._trocars))
+        return explore.Starts(fields, index, trial)
+
+
+def _make_see(policy_config: Any) -> explore.See:
+    """Returns the encoder on centre crops, as inference sees them."""
+    vision = generator.vision_encoder(policy_config)
+
+    def see(params: Any, images: jax.Array) -> jax.Array:
+        return jnp.asarray(vision.apply(params, features.centre_crop(policy_config, images)))
+
+    return see
