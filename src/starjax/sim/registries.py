@@ -78,6 +78,8 @@ rescuers = Registry(
                 "endoscope_track",
                 "needle_handover",
                 "peg_transfer_bimanual",
+                "needle_regrasp",
+                "suture_throw",
             )
         },
         "needle_drive": "starjax.sim.tasks.needle_drive.rescue:RESCUER",

@@ -12,6 +12,7 @@ import pytest
 
 from starjax import rcm
 from starjax.sim import scene
+from starjax.sim.tasks import wrist_script
 from starjax.sim.tasks.base import Contacts, SimReadings
 from starjax.sim.tasks.needle_drive import expert, rescue, task
 from starjax.sim.tissue import driving, hole
@@ -88,8 +89,8 @@ def test_one_grasp_is_within_the_wrist_at_every_trocar(name):
 
         def at(share):
             turn = -half - expert.BEFORE + share * (end + half + expert.BEFORE)
-            tip = expert.tip_of(needles.pose_on(bound.size, bite, turn), held)
-            return rcm.angles_through(expert.WRIST, tip, o)
+            tip = wrist_script.tip_of(needles.pose_on(bound.size, bite, turn), held)
+            return rcm.angles_through(wrist_script.WRIST, tip, o)
 
         return jax.vmap(at)(jnp.linspace(0.0, 1.0, 9))
 
@@ -109,7 +110,7 @@ def measured(bound, layout, entry=0.0, out=0.0, force=0.1, emerged=0.004, collid
         exit=bite.exit + out * aside,
         max_force=jnp.asarray(force),
     )
-    tip = expert.tip_of(pose, task.grasp(size))
+    tip = wrist_script.tip_of(pose, task.grasp(size))
     tips = Pose(tip.R[None], tip.p[None])
     tissue = driving.begin(size, tips, pose, jnp.ones(1, bool)).replace(hole=made)
     qpos = jnp.zeros(40)
@@ -147,7 +148,7 @@ def at(bound, layout, turn, height=0.0, **events):
     """A state of a needle on its path at `turn` rad, lifted by `height` m, its tip where it is."""
     pose = needles.pose_on(bound.size, layout.bite, jnp.asarray(turn))
     pose = pose._replace(p=pose.p.at[2].add(height))
-    tip = expert.tip_of(pose, task.grasp(bound.size))
+    tip = wrist_script.tip_of(pose, task.grasp(bound.size))
     now = measured(bound, layout).replace(needle=pose, tip=tip.p, **events)
     trocar = types.SimpleNamespace(p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]))
     return types.SimpleNamespace(
@@ -195,4 +196,4 @@ def test_a_needle_off_its_path_is_back_on_it_at_the_end_of_the_drive():
     )
     np.testing.assert_allclose(first.p, state.pose.p[0], atol=1e-6)
     path = needles.pose_on(bound.size, layout.bite, expert._end(bound.size, state))
-    np.testing.assert_allclose(end.p, expert.tip_of(path, script.held).p, atol=1e-6)
+    np.testing.assert_allclose(end.p, wrist_script.tip_of(path, script.held).p, atol=1e-6)

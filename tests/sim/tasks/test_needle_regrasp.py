@@ -10,9 +10,10 @@ import pytest
 
 from starjax import rcm
 from starjax.sim import scene
+from starjax.sim.tasks import wrist_script
 from starjax.sim.tasks.base import Contacts, SimReadings
 from starjax.sim.tasks.needle_pick import task as pick
-from starjax.sim.tasks.needle_regrasp import expert, task
+from starjax.sim.tasks.needle_regrasp import expert, rescue, task
 from starjax.types import Pose
 
 
@@ -114,10 +115,64 @@ def test_the_grasp_is_within_the_wrist_at_every_trocar(layouts):
         measurements = types.SimpleNamespace(pick=types.SimpleNamespace(needle=needle))
         state = types.SimpleNamespace(measured_trocar=frame, measurements=measurements)
         pose = expert._grasp(state)
-        found = rcm.through(expert.WRIST, pose, o)
+        found = rcm.through(wrist_script.WRIST, pose, o)
         along = jnp.arccos(pose.R[:, 2] @ (pose.p - o) / jnp.linalg.norm(pose.p - o))
         return found.is_feasible, jnp.abs(found.wrist), along
 
     feasible, angles, straight = grasp(layouts.needle, p_trocar)
     assert feasible.all() and np.rad2deg(angles.max()) < 75.0
     assert np.rad2deg(np.median(straight)) > 15.0
+
+
+@pytest.mark.parametrize(
+    ("angle", "turn", "height", "phase"),
+    [
+        (expert.GRASP_ANGLE, 0.0, 0.0, expert.LIFT),
+        (expert.GRASP_ANGLE, 0.0, 0.03, expert.HOLD),
+        (expert.GRASP_ANGLE, 0.4, 0.0, expert.RAISE),
+        (0.5, 0.0, 0.03, expert.APPROACH),
+    ],
+)
+def test_the_expert_lifts_a_needle_that_is_held_for_driving_and_lets_any_other_go(
+    bound, layouts, angle, turn, height, phase
+):
+    layout = jax.tree.map(lambda x: x[3], layouts)
+    p = task.wire_point(layout.needle, jnp.asarray(angle))
+    x, z = task.wire_tangent(layout.needle, jnp.asarray(angle)), -layout.needle.R[:, 2]
+    R = jnp.stack([x, jnp.cross(z, x), z], -1) @ rcm.rotation_z(jnp.asarray(turn))
+    tip = Pose(R, p)
+    now = measured(bound, layout, tip, height)
+    tip = tip._replace(p=p.at[2].add(height))
+    frame = types.SimpleNamespace(
+        p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]), roll_zero=jnp.zeros(1)
+    )
+    state = types.SimpleNamespace(
+        pose=Pose(tip.R[None], tip.p[None]),
+        measurements=now,
+        layout=layout,
+        measured_trocar=frame,
+        gripper_target=-jnp.ones(1),
+        touch=jnp.ones(1, bool),
+        step=jnp.asarray(50),
+    )
+    script = rescue.RESCUER.resume(jax.random.key(0), state)
+    assert int(script.phase) == phase and float(script.jaws) == -1.0
+    command, _, _ = rescue.RESCUER.act(script, state)
+    assert float(jnp.linalg.norm(command.pose.p[0] - tip.p)) < 0.5e-3
+    is_kept = phase in (expert.LIFT, expert.HOLD)
+    assert (float(command.gripper[0]) == -1.0) == is_kept
+
+
+def test_a_needle_on_its_other_side_is_taken_from_above(layouts):
+    needle = jax.tree.map(lambda x: x[3], layouts.needle)
+    over = needle._replace(R=needle.R @ jnp.diag(jnp.array([1.0, -1.0, -1.0])))
+    frame = types.SimpleNamespace(
+        p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]), roll_zero=jnp.zeros(1)
+    )
+    for pose in (needle, over):
+        measurements = types.SimpleNamespace(pick=types.SimpleNamespace(needle=pose))
+        state = types.SimpleNamespace(measured_trocar=frame, measurements=measurements)
+        grasp = expert._grasp(state)
+        np.testing.assert_allclose(grasp.R[:, 2], -needle.R[:, 2], atol=1e-6)
+        along = task.wire_tangent(pose, jnp.asarray(expert.GRASP_ANGLE))
+        np.testing.assert_allclose(abs(grasp.R[:, 0] @ along), 1.0, atol=1e-6)

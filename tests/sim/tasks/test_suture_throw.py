@@ -1,4 +1,6 @@
-"""Suture throw: its start, its judge, and the grasp of the point at every trocar."""
+"""Suture throw: its start, its judge, the grasps of the point, and a rescuer that carries on."""
+
+import types
 
 import jax
 import jax.numpy as jnp
@@ -7,9 +9,10 @@ import pytest
 
 from starjax import rcm
 from starjax.sim import physics, scene, thread
+from starjax.sim.tasks import wrist_script
 from starjax.sim.tasks.base import SimReadings
 from starjax.sim.tasks.needle_drive import task as driven
-from starjax.sim.tasks.suture_throw import expert, far_grasp, task
+from starjax.sim.tasks.suture_throw import expert, far_grasp, rescue, task
 from starjax.sim.tissue import needle as needles
 from starjax.types import Pose
 
@@ -82,13 +85,13 @@ def test_the_point_is_turned_out_at_every_trocar_with_room_for_the_wrist():
     def worst(p_trocar, way, length, leg):
         along = 0.5 * length * jnp.stack([jnp.cos(way), jnp.sin(way), 0.0])
         bite = needles.Bite(-along, along)
-        turns = jnp.stack(expert._turns(bite))
+        turns = jnp.stack(expert.turns(bite))
         first, last = turns[leg], turns[leg + 1]
         held = jax.tree.map(lambda leaf: leaf[leg], far_grasp.grasps(task.SIZE))
 
         def angles(turn):
-            tip = expert._tip(needles.pose_on(task.SIZE, bite, turn), held)
-            return rcm.angles_through(far_grasp.WRIST, tip, p_trocar)
+            tip = expert.tip_of(needles.pose_on(task.SIZE, bite, turn), held)
+            return rcm.angles_through(wrist_script.WRIST, tip, p_trocar)
 
         return jnp.max(jnp.abs(jax.vmap(angles)(jnp.linspace(first, last, 20))))
 
@@ -97,3 +100,83 @@ def test_the_point_is_turned_out_at_every_trocar_with_room_for_the_wrist():
         at[rows[0]], *(jnp.asarray(x, jnp.float32) for x in rows[1:3]), jnp.asarray(rows[3])
     )
     assert np.rad2deg(found).max() < 77.0  # of 80
+
+
+NEAR, FIRST, SECOND, FREE = "as for driving", "first", "second", ""
+BLOCK = {"in_block": True}
+PICKED, INSIDE = {"held": True}, {"held": True, "is_inside": True}
+OUT = {"is_inside": True, "has_exited": True, "emerged": expert.EMERGE}
+TAKEN = {**OUT, "held": True, "by_point": True}
+THROUGH = {"held": True, "by_point": True, "has_exited": True, "is_through": True}
+
+
+@pytest.mark.parametrize(
+    ("grip", "share", "height", "events", "phase", "leg"),
+    [
+        (FREE, -1.0, 0.06, BLOCK, expert.APPROACH, 0),
+        (FREE, -1.0, 0.0, BLOCK, expert.BACK, 0),
+        (NEAR, -2.0, 0.05, PICKED, expert.OVER, 0),
+        (NEAR, -2.0, 0.0, PICKED, expert.LIFT, 0),
+        (NEAR, -0.5, 0.0, INSIDE, expert.DRIVE, 0),
+        (NEAR, 0.0, 0.0, {**OUT, "held": True}, expert.OPEN, 0),
+        (FREE, 0.0, 0.0, OUT, expert.BACK, 0),
+        (FREE, 0.0, 0.06, OUT, expert.AROUND, 0),
+        (FREE, 1.0, 0.06, OUT, expert.AROUND, 1),
+        (FIRST, 0.5, 0.0, TAKEN, expert.OUT, 0),
+        (FIRST, 1.0, 0.0, TAKEN, expert.OPEN, 1),
+        (SECOND, 1.0, 0.0, TAKEN, expert.OUT, 1),
+        (SECOND, 1.8, 0.0, THROUGH, expert.PULL, 1),
+    ],
+)
+def test_the_expert_carries_on_wherever_the_needle_is(
+    start, grip, share, height, events, phase, leg
+):
+    """`share`: of the turn from the drive's end, 0, to the second grasp, 1."""
+    _, layout, _, now = start
+    out, middle, _ = expert.turns(layout.bite)
+    needle = needles.pose_on(task.SIZE, layout.bite, out + share * (middle - out))
+    far = far_grasp.grasps(task.SIZE)
+    first, second = (jax.tree.map(lambda leaf, k=k: leaf[k], far) for k in range(2))
+    held = {FIRST: first, SECOND: second}.get(grip, driven.grasp(task.SIZE))
+    tip = expert.tip_of(needle, held)
+    tip = tip._replace(p=tip.p.at[2].add(height))
+    # A needle in the jaws goes with them.
+    needle = needle if grip == FREE else needle._replace(p=needle.p.at[2].add(height))
+    events = {"in_block": False} | events
+    ours = {name: jnp.asarray(x) for name, x in events.items() if hasattr(now, name)}
+    drives = {name: jnp.asarray(x) for name, x in events.items() if name not in ours}
+    now = now.replace(drive=now.drive.replace(needle=needle, tip=tip.p, **drives), **ours)
+    frame = types.SimpleNamespace(p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]), roll_zero=0.0)
+    state = types.SimpleNamespace(
+        pose=Pose(tip.R[None], tip.p[None]),
+        measurements=now,
+        layout=layout,
+        measured_trocar=frame,
+        gripper_target=-jnp.ones(1),
+        touch=jnp.zeros(1, bool),
+        step=jnp.asarray(50),
+    )
+    script = rescue.RESCUER.resume(jax.random.key(0), state)
+    assert (int(script.phase), int(script.leg)) == (phase, leg)
+    command, script, _ = rescue.RESCUER.act(script, state)
+    assert float(jnp.linalg.norm(script.at - tip.p)) < 0.5e-3
+    assert float(jnp.abs(script.R - tip.R).max()) < 0.02
+    keeps = grip != FREE and phase != expert.OPEN
+    assert (float(command.gripper[0]) == -1.0) == keeps
+
+
+def test_a_needle_that_was_let_go_inside_is_taken_as_for_driving_and_driven_on(start):
+    _, _, _, now = start
+    yes, no = jnp.ones((), bool), jnp.zeros((), bool)
+
+    def following(phase, held):
+        drive = now.drive.replace(is_inside=yes, held=held, emerged=jnp.zeros(()))
+        measurements = now.replace(drive=drive, in_block=no)
+        script = types.SimpleNamespace(phase=jnp.asarray(phase))
+        return int(expert._following(script, types.SimpleNamespace(measurements=measurements)))
+
+    assert following(expert.DRIVE, yes) == expert.DRIVE
+    assert following(expert.DRIVE, no) == expert.BACK
+    assert following(expert.BACK, no) == expert.APPROACH
+    assert following(expert.CLOSE, yes) == expert.DRIVE
+    assert following(expert.CLOSE, no) == expert.APPROACH

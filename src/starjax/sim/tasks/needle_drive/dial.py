@@ -15,6 +15,7 @@ import numpy as np
 from starjax import rcm
 from starjax.sim.state import EnvState
 from starjax.sim.tasks.needle_drive import expert, task
+from starjax.sim.tasks.wrist_script import WRIST, tip_of
 from starjax.sim.tissue import needle as needles
 from starjax.sim.tissue.needle import Bite
 from starjax.sim.tools import needle_driver
@@ -66,11 +67,11 @@ def margin(bite: Bite, p_trocar: jax.Array, lean: jax.Array) -> jax.Array:
     half, up, held = needles.entry_angle(SIZE, bite), up_of(bite, lean), grasp(bite)
     end = half + expert.EMERGE / SIZE.radius
     turns = jnp.linspace(-half - expert.BEFORE, end, STEPS)
-    tip = jax.vmap(lambda turn: expert.tip_of(needles.pose_on(SIZE, bite, turn, up), held))(turns)
-    angles = rcm.angles_through(expert.WRIST, tip, p_trocar)
-    limits = jnp.array([expert.WRIST.pitch, expert.WRIST.yaw])
-    palm = tip.p[:, 2] - expert.WRIST.jaws * tip.R[:, 2, 2]
-    shaft = rcm.shaft_of(expert.WRIST, tip, angles).p[:, 2]
+    tip = jax.vmap(lambda turn: tip_of(needles.pose_on(SIZE, bite, turn, up), held))(turns)
+    angles = rcm.angles_through(WRIST, tip, p_trocar)
+    limits = jnp.array([WRIST.pitch, WRIST.yaw])
+    palm = tip.p[:, 2] - WRIST.jaws * tip.R[:, 2, 2]
+    shaft = rcm.shaft_of(WRIST, tip, angles).p[:, 2]
     is_clear = (palm >= TOOL.palm_radius).all() & (shaft >= TOOL.shaft_radius).all()
     return jnp.where(is_clear, jnp.min(limits - jnp.abs(angles)), -1.0)
 

@@ -6,21 +6,18 @@ its way to the pad. A needle that is off its path returns to it on the arc.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.spatial.transform import Rotation
 from jax.typing import ArrayLike
 
-from starjax import rcm
-from starjax.sim import ik
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import phases, scripting
+from starjax.sim.tasks import phases, scripting, wrist_script
 from starjax.sim.tasks.needle_drive import task
 from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE
+from starjax.sim.tasks.wrist_script import tip_of
 from starjax.sim.tissue import needle as needles
 from starjax.sim.tissue.needle import Needle
 from starjax.types import Agent, Command, Pose
@@ -32,9 +29,7 @@ TIMING = phases.PhaseTable(
     jaws=(-1.0, -1.0, -1.0, -1.0, -1.0),
     tempo=(0.85, 1.2),
 )
-WRIST = rcm.LARGE_NEEDLE_DRIVER  # of the task's tool
 DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.0)  # its weight in each phase
-DEVIATION = (0.0012, 0.0012, 0.0012, 0.0)  # m, of the position
 HIGH = 0.04  # m, of the tip: there the needle may turn
 HOVER = 0.015  # m above the start of the arc
 BEFORE = float(np.deg2rad(10.0))  # rad on the arc from there to the entry
@@ -43,18 +38,14 @@ TURN_SPEED = float(np.deg2rad(22.0))  # rad/s on the arc, the mean
 
 
 @flax.struct.dataclass
-class DriveScript(phases.PhaseScript):
+class DriveScript(wrist_script.WristScript):
     """Progress of the script in one episode.
 
     Attributes:
-      R_from, R_goal, R: `[3, 3]`, the tip's rotations at the phase's ends and now.
       turn: rad, the needle's on the path at the start of the drive.
       held: pose_tip_needle at the phase's start.
     """
 
-    R_from: jax.Array
-    R_goal: jax.Array
-    R: jax.Array
     turn: jax.Array
     held: Pose
 
@@ -71,8 +62,8 @@ def agent(size: Needle, plane: Plane = vertical) -> Agent:
     """Makes the demonstrator for a needle, whose arc is driven in a plane with `plane(state)`."""
 
     def init(key: jax.Array, state: EnvState) -> DriveScript:
-        R = state.pose.R[0]
-        own = {"R_from": R, "R_goal": R, "R": R, "turn": jnp.zeros(()), "held": _held(state)}
+        own = {"turn": jnp.zeros(()), "held": _held(state)}
+        own |= wrist_script.rotations(state.pose.R[0])
         script = phases.begin(DriveScript, TIMING, key, state.pose.p[0], **own)
         script = script.replace(jaws=-jnp.ones(()), jaws_from=-jnp.ones(()))
         return enter(size, script, jnp.asarray(APPROACH, jnp.int32), state, plane)
@@ -82,20 +73,13 @@ def agent(size: Needle, plane: Plane = vertical) -> Agent:
         after = enter(size, script, _following(script, state), state, plane)
         script, s = phases.advance(script, TIMING, after)
         share = scripting.minimum_jerk(s)
-        way = share * ik.rotation_between(script.R_from, script.R_goal)
-        straight = Pose(
-            Rotation.from_rotvec(way).as_matrix() @ script.R_from,
-            script.start + share * (script.goal - script.start),
-        )
-        drives = script.phase == DRIVE
+        straight = wrist_script.straight(script, share)
         on_arc = _on_arc(size, script, share, state, plane)
+        drives = script.phase == DRIVE
         tip = jax.tree.map(lambda a, b: jnp.where(drives, a, b), on_arc, straight)
-        noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
-        script = script.replace(at=tip.p, R=tip.R, noise=noise)
         weight = jnp.asarray(DISTURBANCE)[script.phase]
-        moved = weight * noise[1, :3] * jnp.where(script.phase == DESCEND, 1.0 - s, 1.0)
-        rough = _command(script, script.at + moved, state)
-        return rough, script, _command(script, script.at, state)
+        fade = jnp.where(script.phase == DESCEND, 1.0 - s, 1.0)
+        return wrist_script.commands(script, tip, weight, fade, state)
 
     return Agent(init, act)
 
@@ -137,9 +121,7 @@ def _on_arc(
         tip_of(needles.pose_on(size, bite, script.turn + part * whole, up), script.held)
         for part in (0.0, share)
     )
-    left = (1.0 - share) * ik.rotation_between(first.R, script.R_from)
-    R = Rotation.from_rotvec(left).as_matrix() @ now.R
-    return Pose(R, now.p + (1.0 - share) * (script.start - first.p))
+    return wrist_script.from_start(script, first, now, share)
 
 
 def _end(size: Needle, state: EnvState) -> jax.Array:
@@ -149,14 +131,7 @@ def _end(size: Needle, state: EnvState) -> jax.Array:
 
 def _held(state: EnvState) -> Pose:
     """Returns pose_tip_needle as measured."""
-    tip, needle = jax.tree.map(lambda leaf: leaf[0], state.pose), state.measurements.needle
-    return Pose(tip.R.T @ needle.R, tip.R.T @ (needle.p - tip.p))
-
-
-def tip_of(needle: Pose, held: Pose) -> Pose:
-    """Returns pose_world_tip of a needle's pose."""
-    R = needle.R @ held.R.T
-    return Pose(R, needle.p - R @ held.p)
+    return wrist_script.held(state, state.measurements.needle)
 
 
 def _following(script: DriveScript, state: EnvState) -> jax.Array:
@@ -166,14 +141,6 @@ def _following(script: DriveScript, state: EnvState) -> jax.Array:
     is_short = (script.phase >= DRIVE) & (found.emerged < task.EMERGED)
     following = jnp.where(is_short, again, jnp.minimum(script.phase + 1, HOLD))
     return following.astype(jnp.int32)
-
-
-def _command(script: DriveScript, p: jax.Array, state: EnvState) -> Command:
-    """Returns the command `[1]` of the script's rotation at a tip `[3]` m."""
-    p_trocar: Any = state.measured_trocar.p_world_trocar[0]
-    found = rcm.through(WRIST, Pose(script.R, p), p_trocar)
-    pose = Pose(found.pose.R[None], found.pose.p[None])
-    return Command(pose, script.jaws[None], found.wrist[None])
 
 
 AGENT = agent(needles.CT1)

@@ -178,14 +178,19 @@ def status(
 ) -> TaskStatus:
     """Tests strict success (needle pick's, and the grasp as for driving) and loose (lifted)."""
     held = pick.status(_on_plate(bound, layout), _layout(layout), measurements.pick)
-    is_placed = jnp.abs(measurements.fraction - FRACTION) < FRACTION_OFF
-    is_driving = is_placed & (measurements.skew < MAX_SKEW)
-    success_now = held.success_now & is_driving
-    stage = jnp.where(is_driving, held.stage, jnp.minimum(held.stage, 2))
+    as_driving = is_as_for_driving(measurements)
+    success_now = held.success_now & as_driving
+    stage = jnp.where(as_driving, held.stage, jnp.minimum(held.stage, 2))
     share = held.reward * (len(STAGES) - 1) - held.stage  # of the stage that is reached
     reward = (stage + jnp.clip(share, 0.0, 1.0)) / (len(STAGES) - 1)
     reward = jnp.where(success_now, 1.0, jnp.minimum(reward, 1.0))
     return held._replace(success_now=success_now, stage=stage, reward=reward)
+
+
+def is_as_for_driving(measurements: RegraspMeasurements) -> jax.Array:
+    """Returns True if the jaws are where a needle is held for driving, and square to it."""
+    is_placed = jnp.abs(measurements.fraction - FRACTION) < FRACTION_OFF
+    return is_placed & (measurements.skew < MAX_SKEW)
 
 
 def state(

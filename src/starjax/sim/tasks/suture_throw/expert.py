@@ -6,19 +6,15 @@ room for the wrist; both grasps are the same at every trocar, see `far_grasp`. T
 disturbed on purpose while the pad holds nothing.
 """
 
-from typing import Any
-
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jax.scipy.spatial.transform import Rotation
 
-from starjax import rcm
-from starjax.sim import ik
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import phases, scripting
+from starjax.sim.tasks import phases, scripting, wrist_script
 from starjax.sim.tasks.needle_drive import task as driven
 from starjax.sim.tasks.suture_throw import far_grasp, task
+from starjax.sim.tasks.wrist_script import tip_of
 from starjax.sim.tissue import needle as needles
 from starjax.types import Agent, Command, Pose
 
@@ -34,11 +30,11 @@ TIMING = phases.PhaseTable(
 )
 DISTURBANCE = (1.0, 1.0, 0.0, 0.3, 1.0, 0.5, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.3, 0.1)
 SETTLES = (DESCEND, DOWN, REACH)  # phases whose disturbance fades
-DEVIATION = (0.0012, 0.0012, 0.0012, 0.0)  # m, of the position
 HOVER = 0.015  # m above a grasp, along the jaws, and above the start of the arc
 LIFT_HEIGHT = 0.02  # m
 BEFORE = 0.17  # rad on the arc to the entry
 EMERGE = 0.006  # m of wire past the exit, to be taken
+OUT_ENOUGH = 0.8 * EMERGE
 MIDDLE = 0.55  # of the turn out of the pad, where the point is taken again
 PAST = 0.35  # rad that the needle turns on behind the exit
 TURN_SPEED = 0.4  # rad/s on the arc, the mean
@@ -46,19 +42,15 @@ END = (0.0, 0.0, 0.088)  # m, of the tip
 
 
 @flax.struct.dataclass
-class ThrowScript(phases.PhaseScript):
+class ThrowScript(wrist_script.WristScript):
     """Progress of the script in one episode.
 
     Attributes:
-      R_from, R_goal, R: `[3, 3]`, the tip's rotations at the phase's ends and now.
       turn, turn_end: rad, the needle's on the path at the phase's ends.
       held: pose_tip_needle at the phase's start.
       leg: int32, number of the present one.
     """
 
-    R_from: jax.Array
-    R_goal: jax.Array
-    R: jax.Array
     turn: jax.Array
     turn_end: jax.Array
     held: Pose
@@ -67,45 +59,41 @@ class ThrowScript(phases.PhaseScript):
 
 def init(key: jax.Array, state: EnvState) -> ThrowScript:
     """Starts the script of an episode."""
-    R, zero = state.pose.R[0], jnp.zeros(())
-    script = phases.begin(
-        ThrowScript, TIMING, key, state.pose.p[0], R_from=R, R_goal=R, R=R, turn=zero,
-        turn_end=zero, held=_held(state), leg=jnp.zeros((), jnp.int32),
-    )  # fmt: skip
-    return _enter(script, jnp.asarray(APPROACH, jnp.int32), state)
+    zero, first = jnp.zeros(()), jnp.zeros((), jnp.int32)
+    own = {"turn": zero, "turn_end": zero, "held": held(state), "leg": first}
+    own |= wrist_script.rotations(state.pose.R[0])
+    script = phases.begin(ThrowScript, TIMING, key, state.pose.p[0], **own)
+    return enter(script, jnp.asarray(APPROACH, jnp.int32), state)
 
 
-def _turns(bite: needles.Bite) -> tuple[jax.Array, jax.Array, jax.Array]:
+def turns(bite: needles.Bite) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Returns turns (rad) of the needle: its point is taken, taken again, and its tail is out."""
     half = needles.entry_angle(task.SIZE, bite)
     out, end = half + EMERGE / task.SIZE.radius, half + task.SIZE.sweep
     return out, out + MIDDLE * (end - out), end
 
 
-def _held(state: EnvState) -> Pose:
+def turn_out(turn: jax.Array) -> jax.Array:
+    """Returns a turn (rad) on the way out: the tail is past half a turn, and angles count on."""
+    return jnp.where(turn < 0.0, turn + 2.0 * jnp.pi, turn)
+
+
+def held(state: EnvState) -> Pose:
     """Returns pose_tip_needle as measured."""
-    tip = jax.tree.map(lambda leaf: leaf[0], state.pose)
-    needle = state.measurements.drive.needle
-    return Pose(tip.R.T @ needle.R, tip.R.T @ (needle.p - tip.p))
+    return wrist_script.held(state, state.measurements.drive.needle)
 
 
-def _tip(needle: Pose, held: Pose) -> Pose:
-    """Returns pose_world_tip of a needle's pose."""
-    R = needle.R @ held.R.T
-    return Pose(R, needle.p - R @ held.p)
-
-
-def _enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScript:
+def enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScript:
     """Begins `phase`: sets its goal, rotation and duration."""
-    bite, held, needle = state.layout.bite, _held(state), state.measurements.drive.needle
-    out, middle, end = _turns(bite)
+    bite, grip, needle = state.layout.bite, held(state), state.measurements.drive.needle
+    out, middle, end = turns(bite)
     # From the middle on, the grasp is let go for the second.
     again = (phase == OPEN) & (script.phase == OUT)
     leg = jnp.where(again, 1, script.leg).astype(jnp.int32)
     half = needles.entry_angle(task.SIZE, bite)
-    first = _tip(needle, driven.grasp(task.SIZE))
-    start = _tip(needles.pose_on(task.SIZE, bite, -half - BEFORE), held)
-    far = _tip(needle, jax.tree.map(lambda leaf: leaf[leg], far_grasp.grasps(task.SIZE)))
+    first = tip_of(needle, driven.grasp(task.SIZE))
+    start = tip_of(needles.pose_on(task.SIZE, bite, -half - BEFORE), grip)
+    far = tip_of(needle, jax.tree.map(lambda leaf: leaf[leg], far_grasp.grasps(task.SIZE)))
     up = jnp.array([0.0, 0.0, 1.0])
     stays = Pose(script.R, script.at)
     goals = {
@@ -121,8 +109,7 @@ def _enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScrip
     }
     chosen = [goals.get(number, stays) for number in range(HOLD + 1)]
     turn = needles.turn_on(task.SIZE, bite, needle)
-    # The tail is past half a turn: angles count on from the way out.
-    turn = jnp.where((phase == OUT) & (turn < 0.0), turn + 2.0 * jnp.pi, turn)
+    turn = jnp.where(phase == OUT, turn_out(turn), turn)
     script = phases.enter(
         script,
         TIMING,
@@ -133,7 +120,7 @@ def _enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScrip
         R_goal=jnp.stack([goal.R for goal in chosen])[phase],
         turn=turn,
         turn_end=jnp.where(phase == OUT, jnp.where(leg == 0, middle, end + PAST), out),
-        held=held,
+        held=grip,
         leg=leg,
     )
     sweep = jnp.abs(script.turn_end - turn) / TURN_SPEED / script.tempo
@@ -144,44 +131,40 @@ def _enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScrip
 def _following(script: ThrowScript, state: EnvState) -> jax.Array:
     """Returns the next phase: a grasp or a turn that failed is done again."""
     now, phase = state.measurements, script.phase
+    is_held, is_inside = now.drive.held, now.drive.is_inside
+    is_out = is_inside & (now.drive.emerged >= OUT_ENOUGH)
     following = jnp.minimum(phase + 1, HOLD)
-    is_short = now.drive.is_inside & (now.drive.emerged < 0.8 * EMERGE)
-    following = jnp.where((phase == DRIVE) & is_short, DRIVE, following)
+    again = jnp.where(is_inside, jnp.where(is_held, DRIVE, BACK), OVER)
+    following = jnp.where((phase == DRIVE) & ~is_out, again, following)
     following = jnp.where((phase == OUT) & ~now.is_through, OPEN, following)
+    following = jnp.where((phase == BACK) & ~is_out, APPROACH, following)
     misses = (phase == TAKE) | (phase == OUT)
-    following = jnp.where(misses & ~now.drive.held, BACK, following)
-    following = jnp.where((phase == CLOSE) & ~now.drive.held, APPROACH, following)
+    following = jnp.where(misses & ~is_held, BACK, following)
+    taken = jnp.where(is_held, jnp.where(is_inside, DRIVE, LIFT), APPROACH)
+    following = jnp.where(phase == CLOSE, taken, following)
     return following.astype(jnp.int32)
 
 
 def act(script: ThrowScript, state: EnvState) -> tuple[Command, ThrowScript, Command]:
     """Returns the disturbed command, the script a step later, and the command to record."""
-    after = _enter(script, _following(script, state), state)
+    after = enter(script, _following(script, state), state)
     script, s = phases.advance(script, TIMING, after)
     share = scripting.minimum_jerk(s)
-    way = share * ik.rotation_between(script.R_from, script.R_goal)
-    straight = Pose(
-        Rotation.from_rotvec(way).as_matrix() @ script.R_from,
-        script.start + share * (script.goal - script.start),
-    )
-    turn = script.turn + share * (script.turn_end - script.turn)
-    on_arc = _tip(needles.pose_on(task.SIZE, state.layout.bite, turn), script.held)
     is_arc = (script.phase == DRIVE) | (script.phase == OUT)
+    on_arc, straight = _on_arc(script, share, state), wrist_script.straight(script, share)
     tip = jax.tree.map(lambda a, b: jnp.where(is_arc, a, b), on_arc, straight)
-    noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
-    script = script.replace(at=tip.p, R=tip.R, noise=noise)
     settles = jnp.any(script.phase == jnp.array(SETTLES))
-    weight = jnp.asarray(DISTURBANCE)[script.phase] * jnp.where(settles, 1.0 - s, 1.0)
-    rough = _command(script, script.at + weight * noise[1, :3], state)
-    return rough, script, _command(script, script.at, state)
+    weight, fade = jnp.asarray(DISTURBANCE)[script.phase], jnp.where(settles, 1.0 - s, 1.0)
+    return wrist_script.commands(script, tip, weight, fade, state)
 
 
-def _command(script: ThrowScript, p: jax.Array, state: EnvState) -> Command:
-    """Returns the command `[1]` of the script's rotation at a tip `[3]` m."""
-    p_trocar: Any = state.measured_trocar.p_world_trocar[0]
-    found = rcm.through(far_grasp.WRIST, Pose(script.R, p), p_trocar)
-    pose = Pose(found.pose.R[None], found.pose.p[None])
-    return Command(pose, script.jaws[None], found.wrist[None])
+def _on_arc(script: ThrowScript, share: jax.Array, state: EnvState) -> Pose:
+    """Returns pose_world_tip at a fraction of a turn; it begins where the phase did."""
+    first, now = (
+        tip_of(needles.pose_on(task.SIZE, state.layout.bite, turn), script.held)
+        for turn in (script.turn, script.turn + share * (script.turn_end - script.turn))
+    )
+    return wrist_script.from_start(script, first, now, share)
 
 
 AGENT = Agent(init, act)

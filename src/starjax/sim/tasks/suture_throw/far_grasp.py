@@ -9,12 +9,10 @@ pads 1 mm clear of the pad, the roll within 116 degrees of its zero.
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import rcm
 from starjax.sim.tissue import needle as needles
 from starjax.sim.tissue.needle import Needle
 from starjax.types import Pose
 
-WRIST = rcm.LARGE_NEEDLE_DRIVER
 FROM_POINT = 0.002  # m of wire from the point to the jaws' middle
 # Turns of the jaws about the wire, and their leans in the pads' plane, rad, of both grasps.
 TURNS = (float(np.deg2rad(210.0)), float(np.deg2rad(90.0)))
