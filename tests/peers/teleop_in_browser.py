@@ -38,14 +38,13 @@ SEED, TROCAR = 3, 1
 
 def goal_mm():
     """Where the mark of the first episode is: the dataset's own rule."""
-    import jax
 
     from starjax.data import schema
+    from starjax.rollouts import trial_key
     from starjax.sim import registries, scene
-    from starjax.viewer import simulation
 
     task = registries.tasks.get("reach")
-    key = jax.random.split(simulation.trial_key(SEED, TROCAR, 0, schema.STREAM))[0]
+    key = trial_key.of_reset(SEED, TROCAR, 0, schema.STREAM)
     bound = task.bind(scene.compose(scene.name("reach")))
     return [1e3 * float(x) for x in task.sample(bound, key).p]
 

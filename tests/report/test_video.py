@@ -20,7 +20,7 @@ def with_qpos(run):
     return run._replace(rollouts=rollouts)
 
 
-def counting(qpos, trocars, labels, first, endoscope=None, size=64):
+def counting(qpos, trocars, labels, first, endoscope=None, still=None, size=64):
     """A camera that draws the number of the step."""
     steps = np.minimum(np.arange(first, first + scene_view.BATCH), len(qpos) - 1).astype(np.uint8)
     return np.broadcast_to(steps[:, None, None, None], (scene_view.BATCH, size, size, 3))

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from starjax.sim import registries, scene, thread_geoms
+from starjax.sim import registries, scene, still_bodies, thread_geoms
 from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
 from starjax.sim.tasks.base import Outline
@@ -60,8 +60,9 @@ def load(names: SceneNames) -> SceneView:
     return SceneView(registries.tasks.get(names.task).outline(model), shafts)
 
 
-# (qpos `[T, Q]`, p_world_trocar `[A, 3]` m, labels, first, endoscope's Pose `[T]` or None) ->
-# `[BATCH, size, size, 3]` uint8 of the steps from `first` on, the last one repeated.
+# (qpos `[T, Q]`, p_world_trocar `[A, 3]` m, labels, first, endoscope's Pose `[T]` or None, Pose
+# `[K]` of bodies at rest or None) -> `[BATCH, size, size, 3]` uint8 of the steps from `first` on,
+# the last one repeated.
 Draw = Callable[..., np.ndarray]
 
 
@@ -142,12 +143,13 @@ def camera(names: SceneNames, size: int) -> Draw:
         labels: dict[str, int],
         first: int,
         endoscope: Pose | None = None,
+        still: Pose | None = None,
     ) -> np.ndarray:
         rows = np.minimum(np.arange(first, first + BATCH), len(qpos) - 1)
         held = endoscope if scope else None
         steps = [
             poses(data, None if held is None else Pose(held.R[row], held.p[row]))
-            for row, data in zip(rows, _kinematics(model, qpos[rows], p_world_trocar))
+            for row, data in zip(rows, _kinematics(model, qpos[rows], p_world_trocar, still))
         ]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves).astype(np.float32), *steps)
         return np.asarray(program(stacked, {name: np.int32(x) for name, x in labels.items()}))
@@ -156,12 +158,13 @@ def camera(names: SceneNames, size: int) -> Draw:
 
 
 def _kinematics(
-    model: mujoco.MjModel, qpos: np.ndarray, p_world_trocar: np.ndarray
+    model: mujoco.MjModel, qpos: np.ndarray, p_world_trocar: np.ndarray, still: Pose | None = None
 ) -> Iterator[mujoco.MjData]:
-    """Yields the data at each of the coordinates `[T, Q]`, with the trocars `[A, 3]` m in place."""
+    """Yields the data at each of the coordinates `[T, Q]`, all else in place."""
     data = mujoco.MjData(model)
     trocars = [model.body(f"trocar{i}").mocapid[0] for i in range(len(p_world_trocar))]
     data.mocap_pos[trocars] = p_world_trocar
+    still_bodies.place(model, data, still)
     for row in qpos:
         data.qpos[:], points = thread_geoms.split(model, row)
         mujoco.mj_kinematics(model, data)

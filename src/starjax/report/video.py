@@ -10,6 +10,7 @@ import numpy as np
 
 from starjax.evaluation.result import Result
 from starjax.report import compare, encode, outcomes, results, scene_view, style
+from starjax.rollouts import trial_key
 from starjax.sim.names import SceneNames
 
 SIZE = 384  # pixels, side of one rollout's images
@@ -126,8 +127,12 @@ def _clip(draw: scene_view.Draw, clip: Clip, note: str) -> Iterator[np.ndarray]:
     cut = "" if steps == total else f"first {steps / hz:.0f} s shown"
     text = f"{kind} trocar {rollout.trial.trocar}" + (f", {note}" if note else "")
     about = (text, _MUTED), (cut, _MUTED)
+    trial = rollout.trial.trocar, rollout.trial.trial
+    still = trial_key.bodies_at_rest(clip.result.scene, clip.result.seed, *trial)
     for first in range(0, steps, scene_view.BATCH):
-        drawn = draw(rollout.qpos, rollout.p_world_trocar, rollout.labels, first, rollout.endoscope)
+        drawn = draw(
+            rollout.qpos, rollout.p_world_trocar, rollout.labels, first, rollout.endoscope, still
+        )
         for step, image in enumerate(drawn[: steps - first], start=first):
             now = outcome if step == steps - 1 else (f"{step / hz:.0f} s", _MUTED)
             bar = caption([[(clip.label, "#e6e9ec"), now], about], image.shape[1])

@@ -11,9 +11,10 @@ import numpy as np
 
 from starjax import errors, rcm
 from starjax.data import redraw, schema, store
-from starjax.rollouts import episodes
+from starjax.rollouts import episodes, trial_key
 from starjax.sim import registries, scene
 from starjax.sim.names import SceneNames
+from starjax.types import Pose
 from starjax.viewer import frame as frames
 from starjax.viewer import page
 from starjax.viewer.frame import Frame
@@ -123,6 +124,7 @@ def read(dataset: RecordedDataset, key: str) -> Recording:
         field("p"),
         field("rcm_error"),
         frames.colours(dataset.names, dataset.model, record["labels"]),
+        _still(dataset, record),
     )
     camera = f"{episodes.IMAGE}{dataset.names.cameras[0]}"
     images = field(camera) if f"{camera}.npy" in record["files"] else None
@@ -131,6 +133,15 @@ def read(dataset: RecordedDataset, key: str) -> Recording:
         images = dataset.drawn[np.arange(dataset.first[episode], dataset.first[episode + 1])]
     last = steps[-1]._replace(done=True, success=record["success"], invalid=record["invalid"])
     return Recording([*steps[:-1], last], images, "success" if record["success"] else "failed")
+
+
+def _still(dataset: RecordedDataset, record: dict[str, Any]) -> Pose | None:
+    """Returns the bodies at rest of an episode, None of one whose draws are unknown."""
+    if not redraw.is_possible(dataset.description):
+        return None
+    seed, stream = dataset.description["seed"], schema.stream(dataset.description)
+    trial = record["trocar"], record["trial"]
+    return trial_key.bodies_at_rest(dataset.names, seed, *trial, stream)
 
 
 def of_dataset(dataset: RecordedDataset) -> Recordings:

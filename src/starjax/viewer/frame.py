@@ -10,6 +10,7 @@ import numpy as np
 from starjax.sim import registries, scene
 from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
+from starjax.types import Pose
 
 
 class Frame(NamedTuple):
@@ -30,6 +31,7 @@ class Frame(NamedTuple):
       invalid: true if the simulation diverged.
       collided: true after a collision.
       gripper: `[A]` measured openings in [-1, 1], None in a recording without them.
+      still: Pose `[K]` of the task's bodies at rest, see `sim.still_bodies`, or None.
     """
 
     step: Any
@@ -46,6 +48,7 @@ class Frame(NamedTuple):
     invalid: Any
     collided: Any
     gripper: Any = None
+    still: Any = None
 
 
 def outcome(frame: Frame, is_late: bool = False) -> str:
@@ -76,6 +79,7 @@ def from_arrays(
     p_world_tip: np.ndarray,
     rcm_error: np.ndarray | None,
     rgb: np.ndarray,
+    still: Pose | None = None,
 ) -> list[Frame]:
     """Makes frames of T recorded control steps.
 
@@ -85,10 +89,13 @@ def from_arrays(
       p_world_tip: `[T, A, 3]` in m.
       rcm_error: `[T, A]` in m, zeros if unknown.
       rgb: `[G, 3]` in [0, 1].
+      still: see `Frame`.
     """
     error = np.zeros(p_world_tip.shape[:2]) if rcm_error is None else rcm_error
     plan = np.zeros((0, *p_world_tip.shape[1:]))
     return [
-        Frame(t, qpos[t], p_world_trocar, tip, error[t], rgb, plan, 0, 0.0, *[False] * 4)
+        Frame(
+            t, qpos[t], p_world_trocar, tip, error[t], rgb, plan, 0, 0.0, *[False] * 4, still=still
+        )
         for t, tip in enumerate(p_world_tip)
     ]

@@ -16,7 +16,7 @@ from starjax import rcm
 from starjax.data import schema, store
 from starjax.finetune import dagger, rounds
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import episodes, programs, takeover
+from starjax.rollouts import episodes, programs, takeover, trial_key
 from starjax.rollouts import trocars as configurations
 from starjax.runtime import files
 from starjax.sim import env as sim_env
@@ -137,7 +137,7 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
         return live, Moment(simulation.frame(env, live), {**fields, **actor}, status, *now)
 
     def begin(seed: int, configuration: int, trial: int) -> tuple[Any, Frame, Any, Any]:
-        key = simulation.trial_key(seed, configuration, trial, schema.STREAM)
+        key = trial_key.of_trial(seed, configuration, trial, schema.STREAM)
         state, *host = start(params, key, simulation.task_trocar(env, configuration))
         return state, *jax.device_get(host)
 

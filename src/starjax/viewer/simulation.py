@@ -17,6 +17,7 @@ from starjax.monitor.calibrate import Monitor
 from starjax.policies import in_env, packaged
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import agent as agents
+from starjax.rollouts import trial_key
 from starjax.sim import env as sim_env
 from starjax.sim import moving_trocars, registries
 from starjax.viewer.frame import Frame
@@ -148,7 +149,7 @@ def make(label: str, env: sim_env.Env, agent: agents.BatchAgent, params: Any = N
     def begin(
         seed: int, configuration: int, trial: int, trocar: Trocar | None = None
     ) -> tuple[LiveState, Frame]:
-        key = trial_key(seed, configuration, trial)
+        key = trial_key.of_trial(seed, configuration, trial)
         live, first = start(params, key, trocar or task_trocar(env, configuration))
         return live, jax.device_get(first)
 
@@ -176,13 +177,6 @@ def task_trocar(env: sim_env.Env, configuration: int) -> Trocar:
     return Trocar(*(np.asarray(field[configuration]) for field in env.task.trocars))
 
 
-def trial_key(seed: int, configuration: int, trial: int, stream: int | None = None) -> jax.Array:
-    """Returns the key that a trial has in `rollouts.engine`."""
-    key = jax.random.key(seed)
-    key = key if stream is None else jax.random.fold_in(key, stream)
-    return jax.random.fold_in(jax.random.fold_in(key, configuration), trial)
-
-
 def frame(env: sim_env.Env, live: LiveState, execute: int = 0) -> Frame:
     """Makes the frame of an episode, with the plan of an agent that executes `execute` commands."""
     state = jax.tree.map(lambda x: x[0], live.env)
@@ -207,4 +201,5 @@ def frame(env: sim_env.Env, live: LiveState, execute: int = 0) -> Frame:
         invalid=state.invalid,
         collided=state.collided,
         gripper=state.gripper,
+        still=None if env.task.still is None else env.task.still(state.layout),
     )

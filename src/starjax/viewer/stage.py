@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from starjax.sim import thread_geoms
+from starjax.sim import still_bodies, thread_geoms
 from starjax.sim.camera import geometry
+from starjax.types import Pose
 from starjax.viewer import meshes
 from starjax.viewer.frame import Frame
 
@@ -65,7 +66,7 @@ class Stage:
 
     def show(self, frame: Frame) -> None:
         """Draws a frame."""
-        poses = self._poses(frame.qpos, frame.p_world_trocar)
+        poses = self._poses(frame.qpos, frame.p_world_trocar, frame.still)
         is_recoloured = not np.array_equal(frame.rgb, self._rgb)
         self._rgb = frame.rgb
         for name, part in self._parts.items():
@@ -109,15 +110,16 @@ class GeomPoses(NamedTuple):
     wxyz: np.ndarray
 
 
-def kinematics(m: mujoco.MjModel) -> Callable[[np.ndarray, np.ndarray], GeomPoses]:
-    """Makes (qpos `[Q]`, p_world_trocar `[A, 3]` m) -> GeomPoses."""
+def kinematics(m: mujoco.MjModel) -> Callable[..., GeomPoses]:
+    """Makes (qpos `[Q]`, p_world_trocar `[A, 3]` m, bodies at rest or None) -> GeomPoses."""
     data = mujoco.MjData(m)
     bodies = [m.body(b) for b in range(m.nbody)]
     trocars = [int(b.mocapid[0]) for b in bodies if b.mocapid[0] >= 0]
 
-    def poses(qpos: np.ndarray, p_world_trocar: np.ndarray) -> GeomPoses:
+    def poses(qpos: np.ndarray, p_world_trocar: np.ndarray, still: Pose | None = None) -> GeomPoses:
         data.qpos[:], points = thread_geoms.split(m, qpos)
         data.mocap_pos[trocars[: len(p_world_trocar)]] = p_world_trocar
+        still_bodies.place(m, data, still)
         mujoco.mj_kinematics(m, data)
         thread_geoms.place(m, data, points)
         wxyz = np.zeros((m.ngeom, 4))

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from starjax import errors
 from starjax.evaluation import recorded
+from starjax.rollouts import trial_key
 from starjax.runtime import files
 from starjax.sim import registries, scene
 from starjax.sim.names import SceneNames
@@ -21,7 +22,8 @@ def load(file: Path) -> Recordings:
       errors.UsageError: the trials lack joint positions, or their task is unknown here.
       FileNotFoundError, ValueError: a file is missing or damaged; the message names it.
     """
-    spec = files.read_json(file.parent / "plan.json")["scene"]
+    plan = files.read_json(file.parent / "plan.json")
+    spec = plan["scene"]
     names = SceneNames(spec["task"], *(tuple(spec[part]) for part in ("arms", "tools", "cameras")))
     errors.choice("task of the trials", names.task, registries.tasks.names())
     tracks = {
@@ -36,8 +38,9 @@ def load(file: Path) -> Recordings:
     def read(key: str) -> Recording:
         track, qpos = tracks[key]
         rgb = frames.colours(names, model, track.labels)
+        still = trial_key.bodies_at_rest(names, plan.get("seed"), track.trocar, track.trial)
         steps = frames.from_arrays(
-            qpos, track.p_world_trocar, track.p_world_tip, track.rcm_error, rgb
+            qpos, track.p_world_trocar, track.p_world_tip, track.rcm_error, rgb, still
         )
         is_invalid = file.name == INVALID
         last = steps[-1]._replace(done=True, invalid=is_invalid)
