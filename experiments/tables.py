@@ -11,7 +11,8 @@ benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
 `proposition`, `finetune`, `finetune_goals`, `finetune_runs`, `finetune_branches`, `ppo`, `ppo_gpu`,
 `sb3`,
 `monitor_<policy>`, `monitor_cost`,
-`through_lerobot`, `held_out`, `larger_than_memory`, `loaders`.
+`through_lerobot`, `held_out`, `larger_than_memory`, `loaders`,
+`redraw`.
 """
 
 import re
