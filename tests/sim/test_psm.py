@@ -12,6 +12,20 @@ N = 10_000
 OFFSETS = {"needle_driver": 0.4162, "prograsp": 0.4670}
 
 
+# Ranges and largest torques of kinematic/psm.json, psm-si.json, and of both tools' descriptions:
+# outer yaw, pitch, insertion; roll, wrist pitch and yaw. The yaw of psm.json has whole turns: that
+# of the user guide, +-91 degrees, in its place.
+RANGES = {
+    "psm": [(-1.5882, 1.5882), (-0.925025, 0.925025), (0.0, 0.24)],
+    "psm_si": [(-2.964, 2.964), (-1.265, 1.301), (0.0, 0.29)],
+}
+TORQUES = {"psm": [4.97, 4.97, 14.81], "psm_si": [17.0845, 17.0845, 40.9063]}
+TOOL_RANGES = [(-4.53786, 4.53786), (-1.39626, 1.39626), (-1.39626, 1.39626)]
+TOOL_TORQUES = [0.33, 0.25, 0.20]
+# Largest speeds of the dVRK's own trajectories (mtsIntuitiveResearchKitPSM): rad/s, m/s.
+SPEEDS = [np.pi, np.pi, 0.2, 6.0 * np.pi, 6.0 * np.pi, 6.0 * np.pi]
+
+
 def modified(alpha, a, theta, d):
     """Transforms `[N, 4, 4]` of modified Denavit-Hartenberg parameters."""
     c, s, zero = np.cos(theta), np.sin(theta), np.zeros_like(theta)
@@ -57,16 +71,34 @@ def tool(request):
     return request.param
 
 
-@pytest.mark.parametrize("arm", ["psm", "psm_si"])
-def test_the_model_has_the_frames_of_the_public_description(arm):
-    q, tool = drawn(arm), "needle_driver"
+def compiled(arm, tool):
+    """Returns the model of an arm with its tool, and the names of its six joints."""
     record, held = registries.arms.get(arm), registries.tools.get(tool)
     part = robot.read(record)
     hand = mujoco.MjSpec.from_file(str(assets.path(held.mjcf)))
     part.attach(hand, site=part.site(robot.FLANGE), prefix="tool/")
-    m = part.compile()
+    return part.compile(), (*record.joints, *(f"tool/{joint}" for joint in held.wrist_joints))
+
+
+@pytest.mark.parametrize("arm", ["psm", "psm_si"])
+def test_ranges_torques_and_speeds_are_those_of_the_public_description(arm, tool):
+    m, names = compiled(arm, tool)
+    ranges = [m.joint(name).range for name in names]
+    np.testing.assert_allclose(ranges, RANGES[arm] + TOOL_RANGES, atol=1e-5)
+    torques = [m.actuator(name).forcerange for name in names]
+    expected = np.array(TORQUES[arm] + TOOL_TORQUES)
+    np.testing.assert_allclose(torques, np.stack([-expected, expected], -1), rtol=5e-4)
+    record, held = registries.arms.get(arm), registries.tools.get(tool)
+    speeds = [*record.max_speed, *[held.wrist_speed] * len(held.wrist_joints)]
+    np.testing.assert_allclose(speeds, SPEEDS)
+
+
+@pytest.mark.parametrize("arm", ["psm", "psm_si"])
+def test_the_model_has_the_frames_of_the_public_description(arm):
+    q, tool = drawn(arm), "needle_driver"
+    held = registries.tools.get(tool)
+    m, names = compiled(arm, tool)
     data = mujoco.MjData(m)
-    names = (*record.joints, *(f"tool/{joint}" for joint in held.wrist_joints))
     index = [m.joint(name).qposadr[0] for name in names]
     sites = [data.site(f"tool/{name}") for name in ("shaft", "tcp")]
     frames = np.zeros((N, 2, 4, 3))
