@@ -83,8 +83,10 @@ def file(tmp_path, monkeypatch):
     return tmp_path / "mine.safetensors"
 
 
-def tune():
-    flags = "--trials 6 --validation 6 --rounds 1 --steps 60 --eval.trials 2 --dtype float32"
+def tune(rounds=1):
+    flags = (
+        f"--trials 6 --validation 6 --rounds {rounds} --steps 60 --eval.trials 2 --dtype float32"
+    )
     limit = ["--eval.time-limit-s", "4", "--out", "tuned"]
     return finetune.main(["--policy", "mine.safetensors", *flags.split(), *limit])
 
@@ -110,6 +112,24 @@ def test_a_policy_that_stops_short_learns_to_arrive(file, monkeypatch):
             np.array_equal, policy_file.load(out / "policy.safetensors").params, new.params
         )
     )
+
+
+@pytest.mark.slow
+def test_a_fine_tuning_that_is_stopped_has_the_outcome_of_its_rounds(file, monkeypatch):
+    run = finetune_stages.loop.run
+
+    def stopped(*args, **kwargs):
+        if "Round 2" in kwargs["description"]:
+            raise finetune_stages.loop.Interrupted("stopped")
+        return run(*args, **kwargs)
+
+    monkeypatch.setattr(finetune_stages.loop, "run", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        tune(rounds=2)
+    told = json.loads(Path("tuned/finetune.json").read_text())
+    assert [one["round"] for one in told["rounds"]] == [0, 1] and told["best"] == 1
+    assert told["after"]["seen"]["successes"] > told["before"]["seen"]["successes"]
+    assert policy_file.load("tuned/policy.safetensors").monitor is None
 
 
 def test_a_folder_of_other_settings_is_refused(file):

@@ -63,6 +63,10 @@ class Work(NamedTuple):
         """Returns the directory of a round; 0 is the policy itself."""
         return self.out / f"round_{number}"
 
+    def is_trained(self, number: int) -> bool:
+        """Returns True if a round has its policy."""
+        return (self.folder(number) / "policy.safetensors").exists()
+
     def place(self, file: Path) -> PolicyInEnv:
         """Returns the policy of a round in the environment; all rounds share their programs."""
         return in_env.place(file, in_env.read(file), self.base.env, policy=self.base.policy)

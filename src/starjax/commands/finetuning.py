@@ -53,6 +53,7 @@ def run(
         improve = _WAYS[settings.by](work, table.steps[table.success]).round
         described = [{"round": 0, "validation": statistics.rate(table.success)}]
         candidates, who = [path.file], work.base
+        reports: dict[int, dict[str, Any]] = {}
         for number in range(1, settings.rounds + 1):
             made = improve(number, who, candidates[-1])
             if made is None:
@@ -63,7 +64,9 @@ def run(
             rate = statistics.rate(finetune_stages.validate(work, number, who).success)
             described.append({"round": number, **counts, "validation": rate})
             messages.indented(f"validation {messages.rate(rate)}")
-        _finish(work, candidates, described)
+            if number < settings.rounds and not work.is_trained(number + 1):
+                _keep(work, candidates, described, reports)
+        _keep(work, candidates, described, reports)
 
 
 def _plan(work: Work) -> str:
@@ -100,13 +103,24 @@ def _plan(work: Work) -> str:
     )
 
 
-def _finish(work: Work, candidates: list[Path], described: list[dict[str, Any]]) -> None:
-    """Keeps the best round; scores it and the policy itself on all trocars."""
+def _keep(
+    work: Work,
+    candidates: list[Path],
+    described: list[dict[str, Any]],
+    reports: dict[int, dict[str, Any]],
+) -> None:
+    """Keeps the best round so far; scores it and the policy itself on all trocars.
+
+    Every round ends with it: a fine-tuning that is stopped later has an outcome. `reports` has the
+    figures by round, and gets the new ones.
+    """
     best = int(np.argmax([one["validation"]["successes"] for one in described]))
     files.write_bytes(work.out / "policy.safetensors", candidates[best].read_bytes())
-    rows = {"before": _score(work, "before", work.base)}
-    if best:
-        rows["after"] = _score(work, "after", work.place(candidates[best]))
+    for name, number in {"before": 0, **({"after": best} if best else {})}.items():
+        if number not in reports:
+            who = work.place(candidates[number]) if number else work.base
+            reports[number] = _score(work, name, who)
+    rows = {"before": reports[0], **({"after": reports[best]} if best else {})}
     content = {
         "by": work.settings.by,
         "task": work.base.env.task.name,
