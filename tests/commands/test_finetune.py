@@ -66,8 +66,8 @@ def file(tmp_path, monkeypatch):
         alpha=0.05,
         count=100,
         threshold=2.0,
-        center=np.zeros(4),
-        width=np.ones(4),
+        center=np.zeros(len(scores.NAMES)),
+        width=np.ones(len(scores.NAMES)),
         clock_s=7.9,
         digest=policy_file.monitor_digest(params),
     )

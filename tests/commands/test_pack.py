@@ -91,7 +91,8 @@ def test_a_mistake_names_what_was_wrong(made, tmp_path, argv, argument, got):
 @pytest.mark.parametrize("argv", [[], ["--temperature", "0.5"], ["--temperature", "0"]])
 def test_a_monitor_is_kept_unless_samples_change(made, argv):
     monitor = calibrate.Monitor(
-        np.zeros(4), np.ones(4), 1.0, 7.9, 0.05, 20, scores.ScoreSettings(8, 30.0, 6),
+        np.zeros(len(scores.NAMES)), np.ones(len(scores.NAMES)),
+        1.0, 7.9, 0.05, 20, scores.ScoreSettings(8, 30.0, 6),
         policy_file.monitor_digest(made.params),
     )  # fmt: skip
     policy_file.save("monitored.safetensors", made._replace(monitor=monitor))

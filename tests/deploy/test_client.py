@@ -243,8 +243,8 @@ def test_a_loop_over_the_socket_is_the_loop_in_the_process(batches):
 def clock_monitor(seconds):
     """A monitor with an alarm after so many seconds, and no other."""
     return calibrate.Monitor(
-        center=np.zeros(4),
-        width=np.array([1e9, 1e9, 1.0, 1e9]),
+        center=np.zeros(len(scores.NAMES)),
+        width=np.array([1e9, 1e9, 1.0, 1e9, 1e9, 1e9]),
         threshold=seconds,
         clock_s=seconds,
         alpha=0.05,

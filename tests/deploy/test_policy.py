@@ -523,7 +523,8 @@ def test_a_monitor_is_loaded_unless_an_option_changes_the_plans(made, tmp_path):
     path, trained, _ = made
     assert load(path).monitor is None
     monitor = calibrate.Monitor(
-        np.zeros(4), np.ones(4), 1.0, 7.9, 0.05, 20, scores.ScoreSettings(8, 30.0, 6),
+        np.zeros(len(scores.NAMES)), np.ones(len(scores.NAMES)),
+        1.0, 7.9, 0.05, 20, scores.ScoreSettings(8, 30.0, 6),
         policy_file.monitor_digest(trained.params),
     )  # fmt: skip
     policy_file.save(tmp_path / "watched.safetensors", trained._replace(monitor=monitor))

@@ -34,7 +34,14 @@ def run(directory, score_settings=SETTINGS, **changed):
 
 def monitor(threshold=np.inf, clock_s=0.5):
     return calibrate.Monitor(
-        np.zeros(4), np.ones(4), threshold, clock_s, 0.05, 100, SETTINGS, "weights"
+        np.zeros(len(scores.NAMES)),
+        np.ones(len(scores.NAMES)),
+        threshold,
+        clock_s,
+        0.05,
+        100,
+        SETTINGS,
+        "weights",
     )
 
 
@@ -76,7 +83,7 @@ def test_scores_change_no_trial_and_survive_a_restart(tmp_path):
     assert ours.keys() - theirs.keys() == {"scores"}
     for name, column in theirs.items():
         np.testing.assert_array_equal(ours[name], column, name)
-    assert scored.scores.shape == (6, -(-30 // EXECUTE), 4)
+    assert scored.scores.shape == (6, -(-30 // EXECUTE), len(scores.NAMES))
     ends = np.isfinite(scored.scores[..., 2]).sum(axis=1)
     np.testing.assert_array_equal(ends, -(-scored.steps // EXECUTE))
     again = run(tmp_path / "scored", chunk=2)
@@ -89,7 +96,7 @@ def test_scores_change_no_trial_and_survive_a_restart(tmp_path):
 
 def test_figures_by_hand(tmp_path):
     table = run(tmp_path)
-    values = np.full((6, 8, 4), np.nan, np.float32)
+    values = np.full((6, 8, len(scores.NAMES)), np.nan, np.float32)
     values[..., 2] = 0.0
     success = np.array([1, 1, 1, 0, 0, 0], bool)
     values[0, 2, 0] = 2.0  # a false alarm
@@ -102,7 +109,8 @@ def test_figures_by_hand(tmp_path):
     assert (found["false_alarms"]["successes"], found["false_alarms"]["trials"]) == (1, 3)
     assert (found["silent"]["successes"], found["silent"]["trials"]) == (2, 3)
     assert found["median_s"] == pytest.approx(16 / 30)
-    assert found["by_score"] == {"disagreement": 1, "stillness": 1, "clock": 0, "closure": 0}
+    none = dict.fromkeys(scores.NAMES, 0)
+    assert found["by_score"] == none | {"disagreement": 1, "stillness": 1}
     silent = alarms.compose(table, monitor())
     assert silent["median_s"] is None and silent["silent"]["trials"] == 6
 

@@ -10,13 +10,15 @@ from starjax import errors
 from starjax.monitor import calibrate, scores
 
 SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=6)
+S, CLOCK = len(scores.NAMES), scores.NAMES.index("clock")
+UNITS = np.array([1e-3, 5.0, 0.1, 1e-3, 0.5])  # of the scores without the clock
 
 
 def trials(rng: np.random.Generator, count: int, longest: int = 30) -> np.ndarray:
-    """Scores `[count, longest, 4]`, dependent in time, of trials that end anywhere."""
-    walks = rng.normal(size=(count, longest, 3)).cumsum(axis=1) * [1e-3, 5.0, 0.1]
+    """Scores `[count, longest, S]`, dependent in time, of trials that end anywhere."""
+    walks = rng.normal(size=(count, longest, S - 1)).cumsum(axis=1) * UNITS
     clock = np.broadcast_to(np.arange(longest) * SETTINGS.period_s, (count, longest))
-    values = np.insert(walks, scores.NAMES.index("clock"), clock, axis=-1)
+    values = np.insert(walks, CLOCK, clock, axis=-1)
     values[:, : SETTINGS.still, 1] = np.nan
     length = rng.integers(2, longest + 1, count)
     values[np.arange(longest) >= length[:, None]] = np.nan
@@ -68,15 +70,15 @@ def test_bands_are_one_sided():
     rng = np.random.default_rng(3)
     monitor, fresh = made(rng), trials(rng, 300)
     before, _ = calibrate.first_alarms(monitor, fresh)
-    lower, _ = calibrate.first_alarms(monitor, fresh - np.array([1.0, 1e6, 10.0, 1e3]))
+    lower, _ = calibrate.first_alarms(monitor, fresh - 1e6)
     assert np.isinf(lower).all()
-    higher, _ = calibrate.first_alarms(monitor, fresh + np.array([1e-3, 1.0, 0.0, 0.1]))
+    higher, _ = calibrate.first_alarms(monitor, fresh + np.insert(UNITS, CLOCK, 0.0))
     assert (higher <= before).all()
 
 
 def test_units_do_not_matter():
     first, second, fresh = (trials(np.random.default_rng(i), 300) for i in range(3))
-    unit, zero = np.array([1e3, 0.2, 1.0, 3.0]), np.array([5.0, -2.0, 0.0, 1.0])
+    unit, zero = np.array([1e3, 0.2, 1.0, 3.0, 0.5, 7.0]), np.array([5.0, -2.0, 0, 1, 4, -3])
     one = calibrate.calibrate(first, second, 0.05, SETTINGS)
     two = calibrate.calibrate(unit * first + zero, unit * second + zero, 0.05, SETTINGS)
     for a, b in zip(
@@ -87,9 +89,11 @@ def test_units_do_not_matter():
 
 def test_nan_neither_alarms_nor_hides_another_score():
     monitor = made(np.random.default_rng(4))
-    blank = np.full((1, 5, 4), np.nan)
+    blank = np.full((1, 5, S), np.nan)
     assert np.isinf(calibrate.first_alarms(monitor, blank)[0]).all()
-    for score, limit in enumerate(monitor.limits):
+    for name in scores.CALIBRATED:
+        score = scores.NAMES.index(name)
+        limit = monitor.limits[score]
         over = blank.copy()
         over[0, 3, score] = limit + monitor.width[score]
         time, which = calibrate.first_alarms(monitor, over)
@@ -111,7 +115,7 @@ def test_an_undefined_score_leaves_the_others():
 
 def test_the_clock_alone_is_a_quantile_of_durations():
     durations = np.arange(1, 101)
-    values = np.full((100, 100, 4), np.nan)
+    values = np.full((100, 100, S), np.nan)
     for trial, length in enumerate(durations):
         values[trial, :length, 2] = np.arange(length)
     monitor = calibrate.calibrate(values, values, 0.05, SETTINGS)
@@ -127,7 +131,7 @@ def test_json_round_trip_and_refusals():
     unknown = ["clock", "temper"]
     for change in (
         {"scores": unknown}, {"scores": ["clock", "stillness"]}, {"width": [1.0]},
-        {"width": [0.0] * 4}, {"count": None},
+        {"width": [0.0] * len(scores.CALIBRATED)}, {"count": None},
     ):  # fmt: skip
         broken = {**values, **change}
         if broken["count"] is None:
@@ -136,20 +140,27 @@ def test_json_round_trip_and_refusals():
             calibrate.from_json(broken)
 
 
-def test_a_monitor_of_fewer_scores_alarms_on_these_alone():
-    monitor = made(np.random.default_rng(9))
-    values = calibrate.to_json(monitor)
-    first = scores.NAMES[:3]
-    older = {**values, "scores": [*first], **{k: values[k][:3] for k in ("center", "width")}}
-    found = calibrate.from_json(older)
-    assert calibrate.to_json(found) == older
+def test_a_monitor_of_other_scores_alarms_on_these_alone():
+    rng = np.random.default_rng(9)
+    center, width = calibrate.fit(trials(rng, 200))
+    names = ["disagreement", "stillness", "clock"]  # of the first version
+    values = calibrate.to_json(made(rng)) | {"scores": names, "threshold": 0.0}
+    values |= {"center": center[:3].tolist(), "width": width[:3].tolist()}
+    found = calibrate.from_json(values)
+    assert calibrate.to_json(found) == values
     fresh = trials(np.random.default_rng(10), 300)
-    blind = fresh.copy()
-    blind[..., 3] = np.nan
-    for a, b in zip(calibrate.first_alarms(found, fresh), calibrate.first_alarms(monitor, blind)):
-        np.testing.assert_array_equal(a, b)
+    times, score = calibrate.first_alarms(found, fresh)
+    assert set(score[np.isfinite(times)]) <= {0, 1, 2} and np.isfinite(times).mean() > 0.05
     loud = fresh.copy()
-    loud[..., 3] = 1e9
-    np.testing.assert_array_equal(
-        calibrate.first_alarms(found, loud)[0], calibrate.first_alarms(found, fresh)[0]
-    )
+    loud[..., 3:] = 1e9
+    np.testing.assert_array_equal(calibrate.first_alarms(found, loud)[0], times)
+
+
+def test_a_new_monitor_alarms_on_the_scores_that_delays_leave_alone():
+    monitor = made(np.random.default_rng(11))
+    assert calibrate.to_json(monitor)["scores"] == list(scores.CALIBRATED)
+    loud = trials(np.random.default_rng(12), 100)
+    times, _ = calibrate.first_alarms(monitor, loud)
+    for name in set(scores.NAMES) - set(scores.CALIBRATED):
+        loud[..., scores.NAMES.index(name)] = 1e9
+    np.testing.assert_array_equal(calibrate.first_alarms(monitor, loud)[0], times)

@@ -6,7 +6,7 @@ import pytest
 from starjax.monitor import calibrate, scores, watch
 
 SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=6)
-HORIZON = 16
+HORIZON, S = 16, len(scores.NAMES)
 
 
 def plans(rng: np.random.Generator, decisions: int, arms: int = 1) -> np.ndarray:
@@ -26,7 +26,7 @@ def recorded(made: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 def monitor(**fields) -> calibrate.Monitor:
     default = {
-        "center": np.zeros(4), "width": np.ones(4), "threshold": np.inf, "clock_s": 1.0,
+        "center": np.zeros(S), "width": np.ones(S), "threshold": np.inf, "clock_s": 1.0,
         "alpha": 0.05, "count": 100, "settings": SETTINGS, "digest": "",
     }  # fmt: skip
     return calibrate.Monitor(**{**default, **fields})
@@ -50,7 +50,8 @@ def test_the_arm_that_disagrees_most_moves_most_or_closes_most_counts():
     tips = np.zeros((20, 2, 3))
     tips[:, 1, 0] = np.arange(20)
     openings = np.stack([np.linspace(1, -1, 20), np.zeros(20)], -1)
-    rows = scores.series(np.zeros(20), tips, openings, np.arange(20.0), 6)
+    zeros = np.zeros(20)
+    rows = scores.series(zeros, zeros, tips, openings, np.arange(20.0), zeros, 6)
     assert np.isnan(rows[:6, 1]).all()
     np.testing.assert_allclose(rows[6:, 1], -6.0)
     assert np.isnan(rows[:2, 0]).all()
@@ -66,7 +67,7 @@ def test_a_watch_equals_the_scores_of_a_recording(arms):
     tip = rng.normal(size=(steps, arms, 3)).cumsum(axis=0) * 1e-3
     opening = rng.uniform(-1, 1, (steps, arms))
     whole = scores.of_trial(*recorded(made, steps), tip, opening, SETTINGS)
-    assert whole.shape == (decisions, 4)
+    assert whole.shape == (decisions, S)
     live = watch.Watch(monitor())
     for decision in range(decisions):
         plan, measured = made[decision], tip[8 * decision]
@@ -87,12 +88,12 @@ def test_plans_without_a_common_step_have_no_disagreement():
 @pytest.mark.parametrize("steps", [1, 7, 8, 9, 50, 64])
 def test_trials_of_any_length_have_a_row_per_decision(steps):
     rows = scores.of_trial(*np.zeros((3, steps, 1, 3)), np.zeros((steps, 1)), SETTINGS)
-    assert rows.shape == (-(-steps // 8), 4)
+    assert rows.shape == (-(-steps // 8), S)
 
 
 def test_an_alarm_says_which_score_its_value_and_its_threshold():
     far = np.zeros((HORIZON, 3))
-    live = watch.Watch(monitor(threshold=0.5, width=np.array([0.01, 0.01, 1e9, 1.0])))
+    live = watch.Watch(monitor(threshold=0.5, width=np.array([0.01, 0.01, 1e9, 1.0, 0.1, 1e9])))
     alarm = None
     for i in range(10):
         alarm = alarm or live.update(far + 0.1 * i, i * np.ones(3))
@@ -112,3 +113,33 @@ def test_holds_do_not_count_and_reset_begins_anew():
     live.reset()
     live.update(plan, np.zeros(3), steps=3)
     assert live.scores[2] == 0.0
+
+
+def test_late_plans_do_not_conflict_and_advance_less():
+    """A path at 1 mm per control step; with a delay each plan begins four steps back."""
+    path = np.zeros((400, 1, 3))
+    path[:, 0, 0] = 1e-3 * np.arange(400)
+    for late in (0, 4):
+        starts = (SETTINGS.execute - late) * np.arange(20)
+        made = np.stack([path[start : start + HORIZON] for start in starts])
+        planned, ahead = recorded(made, 8 * 20)
+        rows = scores.of_trial(planned, ahead, planned, np.ones((160, 1)), SETTINGS)
+        np.testing.assert_allclose(rows[3:, 0], late * 1e-3, atol=1e-9)
+        np.testing.assert_allclose(rows[3:, 4], 0, atol=1e-9)
+        np.testing.assert_allclose(rows[:, 5], starts / 30.0)
+        np.testing.assert_allclose(rows[:, 2], 8 * np.arange(20) / 30.0)
+
+
+def test_plans_of_a_tip_at_rest_advance_as_the_clock():
+    made = np.random.default_rng(5).normal(size=(20, HORIZON, 1, 3)) * 1e-5
+    planned, ahead = recorded(made, 160)
+    rows = scores.of_trial(planned, ahead, planned, np.ones((160, 1)), SETTINGS)
+    np.testing.assert_allclose(rows[:, 5], rows[:, 2])
+
+
+def test_a_plan_of_another_aim_conflicts_at_every_shift():
+    path = np.zeros((HORIZON, 1, 3))
+    path[:, 0, 0] = 1e-3 * np.arange(HORIZON)
+    other = path + np.array([0.0, 0.02, 0.0])
+    found = scores.overlap(path, other, 8, 8)
+    assert found.conflict == pytest.approx(0.02) and found.gap > found.conflict

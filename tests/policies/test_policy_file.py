@@ -78,6 +78,21 @@ def test_a_monitor_of_other_weights_is_refused(tmp_path):
         policy_file.load(path)
 
 
+def test_a_file_beside_the_weights_has_a_newer_monitor(tmp_path):
+    path, made = tmp_path / "policy.safetensors", with_monitor(trained())
+    policy_file.save(path, made)
+    before, beside = path.read_bytes(), policy_file.monitor_path(path)
+    newer = calibrate.to_json(made.monitor) | {"threshold": 0.5}
+    beside.write_text(json.dumps(newer))
+    assert calibrate.to_json(policy_file.load(path).monitor) == newer
+    assert path.read_bytes() == before
+    other = {"digest": policy_file.monitor_digest(trained(2.0).params)}
+    for content in (json.dumps(newer | other), json.dumps(newer | {"scores": ["temper"]}), "{"):
+        beside.write_text(content)
+        with pytest.raises(ValueError, match="monitor"):
+            policy_file.load(path)
+
+
 def about_of(path):
     with safetensors.safe_open(path, framework="numpy") as file:
         return json.loads(file.metadata()["starjax"])["about"]

@@ -149,8 +149,8 @@ def test_a_live_episode_has_the_alarm_of_its_evaluation():
     (episode,) = [e for p in run(params, [(3, 2)]) for e in p.ended]
     values = alarms.of_episodes([episode], ALARM_SETTINGS, 60)
     limit = np.nanmax(values[0, :4, 0]) * 0.999
-    width = np.array([1.0, 1e9, 1e9, 1e9])
-    monitor = calibrate.Monitor(np.zeros(4), width, limit, 1.0, 0.05, 20, ALARM_SETTINGS, "")
+    width = np.array([1.0, 1e9, 1e9, 1e9, 1e9, 1e9])
+    monitor = calibrate.Monitor(np.zeros(6), width, limit, 1.0, 0.05, 20, ALARM_SETTINGS, "")
     times, _ = calibrate.first_alarms(monitor, values)
     for watched, text in ((None, ""), (monitor, f"alarm at {times[0]:.1f} s: disagreement")):
         live = simulation.make("policy", env, batch, params)

@@ -104,14 +104,16 @@ def _score_settings(args: CalibrateArgs, who: Any) -> Any:
 
 def _outcome(monitor: Any, figures: dict[str, Any]) -> str:
     """Returns the thresholds, and the realised false alarm rate with its interval."""
-    disagreement, stillness, clock, closure = monitor.limits
+    from starjax.monitor.scores import NAMES
+
+    limit = dict(zip(NAMES, monitor.limits))
     false, still_s = figures["false_alarms"], monitor.settings.still_s
     lines = [
         f"\n  threshold from {monitor.count} successes at alpha {monitor.alpha:g}:",
-        f"    successive plans     more than {1e3 * disagreement:.2f} mm apart",
-        f"    tip                  less than {-1e3 * stillness:.2f} mm in {still_s:.1f} s",
-        f"    clock                {clock:.1f} s (alone {monitor.clock_s:.1f} s)",
-        f"    jaws                 closed to less than {-closure:.2f} of -1 to 1",
+        f"    successive plans     more than {1e3 * limit['conflict']:.2f} mm apart",
+        f"    tip                  less than {-1e3 * limit['stillness']:.2f} mm in {still_s:.1f} s",
+        f"    progress             {limit['progress']:.1f} s (clock alone {monitor.clock_s:.1f} s)",
+        f"    jaws                 closed to less than {-limit['closure']:.2f} of -1 to 1",
     ]
     if false["trials"]:
         low, high = (100 * bound for bound in false["ci95"])

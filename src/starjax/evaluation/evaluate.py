@@ -24,7 +24,7 @@ from starjax import errors
 from starjax.data import schema
 from starjax.evaluation import alarms, recorded
 from starjax.evaluation import trials as tables
-from starjax.monitor.scores import ScoreSettings
+from starjax.monitor.scores import NAMES, ScoreSettings
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import chunks, engine, episodes, plans, sharing, workers
 from starjax.rollouts import trocars as configurations
@@ -111,7 +111,7 @@ def evaluate(
             "identity": dict(identity or {}),
             # Levels of 0 are omitted: they leave the trials unchanged.
             **({"levels": wrong} if wrong else {}),
-            **({"scores": score_settings._asdict()} if score_settings else {}),
+            **({"scores": {**score_settings._asdict(), "names": NAMES}} if score_settings else {}),
             "scene": env.names._asdict(),
             "model": schema.model_hash(env.scene),
             "platform": device.platform,

@@ -118,6 +118,8 @@ def calibrate(
         hint = "run more trials, or choose a larger alpha"
         raise errors.UsageError("successes", f"at least {least} for alpha {alpha:g}", got, hint)
     center, width = fit(fitted)
+    older = [name not in scores_lib.CALIBRATED for name in scores_lib.NAMES]
+    center[older] = width[older] = np.nan
     clock = scores_lib.NAMES.index("clock")
     return Monitor(
         center=center,

@@ -28,15 +28,15 @@ class Alarm(NamedTuple):
     def __str__(self) -> str:
         """Describes it in one line."""
         value, limit = f"{self.value:.2f} s", f"{self.threshold:.2f} s"
-        if self.score == "clock":
-            return f"clock: {value} exceed {limit}"
+        if self.score in ("clock", "progress"):
+            return f"{self.score}: {value} exceed {limit}"
         if self.score == "closure":
             return f"closure: the jaws closed to {-self.value:.2f}, less than {-self.threshold:.2f}"
         if self.score == "stillness":
             value, limit = (f"{-1e3 * x:.2f} mm" for x in (self.value, self.threshold))
             return f"stillness: the tip moved {value} in {self.still_s:.1f} s, less than {limit}"
         value, limit = (f"{1e3 * x:.2f} mm" for x in (self.value, self.threshold))
-        return f"disagreement: successive plans are {value} apart, more than {limit}"
+        return f"{self.score}: successive plans are {value} apart, more than {limit}"
 
 
 class Watch:
@@ -55,8 +55,8 @@ class Watch:
         """Begins another episode."""
         self.scores = np.full(len(scores.NAMES), np.nan)
         self._last: np.ndarray | None = None
-        self._steps = 0
-        self._gaps: list[float] = []
+        self._steps = self._advanced = 0
+        self._overlaps: list[scores.Overlap] = []
         self._tips: list[np.ndarray] = []
 
     def update(
@@ -77,21 +77,28 @@ class Watch:
         """
         settings = self.monitor.settings
         plan = np.asarray(plan, float).reshape(len(plan), -1, 3)
-        if self._last is None:
-            distance = np.nan
-        else:
+        overlap = scores.Overlap()
+        if self._last is not None:
             steps = settings.execute if steps is None else steps
             self._steps += steps
-            distance = scores.gap(self._last, plan, steps, settings.execute)
+            overlap = scores.overlap(self._last, plan, steps, settings.execute)
+            self._advanced += overlap.advanced
         self._last = plan
         # Only the windows of the latest decision are kept.
-        self._gaps = [*self._gaps, distance][-max(scores.SMOOTHED, settings.still + 1) :]
-        self._tips = [*self._tips, np.asarray(tip, float).reshape(-1, 3)][-len(self._gaps) :]
+        most = max(scores.SMOOTHED, settings.still + 1)
+        self._overlaps = [*self._overlaps, overlap][-most:]
+        self._tips = [*self._tips, np.asarray(tip, float).reshape(-1, 3)][-most:]
         opening = np.asarray(np.nan if gripper is None else gripper, float).reshape(-1)
-        times = np.full(len(self._gaps), self._steps / settings.control_hz)
-        gaps, tips = np.array(self._gaps), np.stack(self._tips)
-        openings = np.broadcast_to(opening, (len(gaps), len(opening)))  # only the last row counts
-        self.scores = scores.series(gaps, tips, openings, times, settings.still)[-1]
+        gaps, conflicts, _ = np.array(self._overlaps).T
+        # Only the last row of the others counts.
+        openings = np.broadcast_to(opening, (len(gaps), len(opening)))
+        times, progress = (
+            np.full(len(gaps), count / settings.control_hz)
+            for count in (self._steps, self._advanced)
+        )
+        tips = np.stack(self._tips)
+        rows = scores.series(gaps, conflicts, tips, openings, times, progress, settings.still)
+        self.scores = rows[-1]
         return self._alarm(times[-1])
 
     def _alarm(self, time_s: float) -> Alarm | None:

@@ -1,6 +1,7 @@
 """Trained policies that ship with the package, found by name.
 
 weights/<name>.safetensors    in half precision, by `starjax pack`
+weights/<name>.monitor.json   its runtime monitor, in place of the one in the weights
 weights/<name>.json           result.json of its evaluation without the trials: nothing reads it
 """
 

@@ -139,7 +139,7 @@ def load(path: pathlib.Path | str) -> Trained:
     if _hash(about, arrays) != expected:
         raise ValueError(f"{path}: damaged, its content has another sha256")
     try:
-        monitor = _monitor(about, arrays)
+        monitor = _separate_monitor(path) or _monitor(about, arrays)
         trained = _trained(about, _unflatten(arrays))._replace(monitor=monitor)
         _check_monitor(trained)
         return trained
@@ -186,6 +186,24 @@ def _check_monitor(trained: Trained) -> None:
     monitor = trained.monitor
     if monitor is not None and monitor.digest != (digest := monitor_digest(trained.params)):
         raise ValueError(f"monitor: expected one of weights {digest[:8]}, got {monitor.digest[:8]}")
+
+
+def monitor_path(path: pathlib.Path) -> pathlib.Path:
+    """Returns the file next to a policy's that may hold its monitor instead, as JSON.
+
+    A new monitor then changes neither the weights' file nor its digest.
+    """
+    return path.with_suffix(".monitor.json")
+
+
+def _separate_monitor(path: pathlib.Path) -> calibrate.Monitor | None:
+    file = monitor_path(path)
+    if not file.exists():
+        return None
+    try:
+        return calibrate.from_json(files.read_json(file))
+    except ValueError as error:
+        raise ValueError(f"{file.name}: {error}") from error
 
 
 def _monitor(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> calibrate.Monitor | None:
