@@ -60,6 +60,22 @@ def test_led_thread_stays_on_the_pad_and_keeps_its_length():
     assert np.asarray(run.p)[..., 2].min() >= 0.0
 
 
+def test_slack_thread_lies_in_loops():
+    up, over, down = (
+        np.linspace(a, b, 40)
+        for a, b in (
+            ([0.0, 0.0, 0.001], [0.0, 0.0, 0.05]),
+            ([0.0, 0.0, 0.05], [0.03, 0.01, 0.05]),
+            ([0.03, 0.01, 0.05], [0.03, 0.01, 0.01]),
+        )
+    )
+    way = np.concatenate([up, over, down, np.tile(down[-1:], (60, 1))])
+    p = np.asarray(led(thread.laid(jnp.asarray(TAIL), 0.3, 40.0, 0.0), way).p[-1])
+    links = np.diff(p, axis=0) / thread.LINK
+    bends = np.arccos(np.clip(np.sum(links[1:] * links[:-1], -1), -1.0, 1.0))
+    assert bends.max() < 2.0 * thread.MAX_BEND
+
+
 def test_thread_runs_through_the_hole():
     s = np.linspace(0.0, np.pi, 60)
     under = np.stack([0.005 - 0.005 * np.cos(s), 0 * s, -1e-4 - 0.002 * np.sin(s)], -1)

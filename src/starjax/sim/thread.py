@@ -24,6 +24,7 @@ FRICTION = 0.5  # on the pad; assumed
 STEPS = 4  # per control period
 TOLERANCE = 1e-3  # relative, of links
 ITERATIONS = 6  # of Newton's method, at most
+MAX_BEND = 0.7  # rad between links, a radius of 7 mm: a thread is stiff; assumed
 # Relative: a taut thread between two fixed points has one link more than it needs.
 COMPLIANCE = 1e-3
 DIP = 0.002  # m below the pad's surface, of the thread half way through the hole
@@ -97,7 +98,7 @@ def step(thread: Thread, tail: jax.Array, hole: Hole, ground: float, h: float) -
     thread = _pulled(thread, tail, hole, ground)
     fixed, at = _fixed(thread, tail, hole)
     v = (thread.v - jnp.array([0.0, 0.0, GRAVITY * h])) / (1.0 + DRAG * h)
-    p = jnp.where(fixed, at, _on_pad(thread.p, thread.p + h * v, ground))
+    p = jnp.where(fixed, at, _on_pad(thread.p, _unbent(thread.p + h * v), ground))
     floor = jnp.where(fixed, -jnp.inf, ground)
     free = jnp.where(fixed[:, 0], 0.0, 1.0)
 
@@ -148,6 +149,15 @@ def _fixed(thread: Thread, tail: jax.Array, hole: Hole) -> tuple[jax.Array, jax.
     at = hole.entry + share * (hole.exit - hole.entry) - depth * jnp.array([0.0, 0.0, 1.0])
     is_tail = np.arange(POINTS)[:, None] == 0
     return is_tail | is_inside, jnp.where(is_tail, tail, at)
+
+
+def _unbent(p: jax.Array) -> jax.Array:
+    """Returns points `[POINTS, 3]` with a quarter of each bend beyond the largest undone."""
+    bend = 0.5 * (p[:-2] + p[2:]) - p[1:-1]
+    size = jnp.sqrt(jnp.sum(bend**2, -1, keepdims=True))
+    beyond = jnp.maximum(1.0 - LINK * np.sin(MAX_BEND / 2) / jnp.maximum(size, 1e-9), 0.0)
+    move = 0.125 * beyond * bend  # of the neighbours, twice that of the middle: the mean stays
+    return p.at[1:-1].add(2.0 * move).at[:-2].add(-move).at[2:].add(-move)
 
 
 def _on_pad(before: jax.Array, p: jax.Array, ground: float) -> jax.Array:
