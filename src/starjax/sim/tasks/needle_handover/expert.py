@@ -5,6 +5,8 @@ drawn among those that need little roll of both tools; positions are independent
 tool that has missed the wire tries again; a dropped needle is a failure.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,14 +74,21 @@ def _weight(phase: jax.Array, fraction: jax.Array) -> jax.Array:
     return before + fraction * (weight - before)
 
 
-def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array, jax.Array]:
-    """Returns the tips' goals of every phase from the present state, and the wire's normals."""
+def _goals(
+    above: float, script: handover.HandoverScript, state: EnvState
+) -> tuple[jax.Array, jax.Array]:
+    """Returns the tips' goals of every phase from the present state, and the wire's normals.
+
+    Args:
+      above: m of the tips above the wire.
+      script, state: as of a `Play`.
+    """
     needle, tips = state.measurements.needle, script.p
     across = jnp.cross(jnp.asarray(TANGENTS)[script.held] @ needle.R.T, jnp.array([0.0, 0.0, 1.0]))
     across = across / jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), 1e-6)
     normal = across * jnp.where(across[:, 1:2] > 0, -1.0, 1.0)
     wire = needle.p + jnp.asarray(MIDDLES)[script.held] @ needle.R.T
-    give, take = wire + jnp.array([0.0, 0.0, GRASP_ABOVE])
+    give, take = wire + jnp.array([0.0, 0.0, above])
     out = handover.OUT * across
     park, up = jnp.array(PARK), jnp.array([0.0, 0.0, HOVER])
     goals = jnp.stack(
@@ -111,6 +120,8 @@ PLAY = handover.Play(
     looks=LOOKS,
     weight=_weight,
     following=_following,
-    goals=_goals,
+    goals=functools.partial(_goals, GRASP_ABOVE),
 )
 AGENT = handover.agent(PLAY)
+# For pads that end nearer to the tip, as those of the needle driver.
+DEEP = handover.agent(PLAY._replace(goals=functools.partial(_goals, 0.0)))

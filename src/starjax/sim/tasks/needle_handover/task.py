@@ -136,7 +136,10 @@ TASK = single.TASK._replace(
     time_limit_s=60.0,
     stages=STAGES,
     text=text.TEXT,
-    experts={"default": "starjax.sim.tasks.needle_handover.expert:AGENT"},
+    experts={
+        "default": "starjax.sim.tasks.needle_handover.expert:AGENT",
+        "deep": "starjax.sim.tasks.needle_handover.expert:DEEP",
+    },
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tips,
     measure=measure,
