@@ -5,8 +5,8 @@
 
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
 claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list of claims);
-`presets` (from their values); `leaderboard`, `leaderboard_apart` and `elsewhere` (the trocar
-benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
+`presets` (from their values); `goals_...` (of goals_page.py); `leaderboard`, `leaderboard_apart`
+and `elsewhere` (the trocar benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
 `six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`, `stress_randomised`,
 `proposition`, `finetune`, `finetune_goals`, `finetune_runs`, `finetune_branches`, `ppo`, `ppo_gpu`,
 `sb3`,
@@ -26,6 +26,7 @@ sys.path[:0] = [str(HERE), str(ROOT / "benchmarks")]
 
 import claims  # noqa: E402
 import finetuned  # noqa: E402
+import goals_page  # noqa: E402
 import leaderboard_page  # noqa: E402
 import newest  # noqa: E402
 import preset_table  # noqa: E402
@@ -51,6 +52,8 @@ def table(name: str) -> str:
         return preset_table.table()
     if name in leaderboard_page.TABLES:
         return leaderboard_page.TABLES[name]()
+    if name in goals_page.TABLES:
+        return goals_page.TABLES[name]()
     if name in FINETUNED:
         return FINETUNED[name]()
     if name == "speed":
@@ -71,6 +74,7 @@ def pages() -> Iterator[tuple[Path, str]]:
     for folder in claims.folders():
         yield folder / "README.md", claims.readme(claims.load(folder))
     marked = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", HERE / "README.md"]
+    marked.append(HERE / "goals" / "README.md")
     for page in [*marked, *sorted((ROOT / "docs").rglob("*.md"))]:
         yield page, redraw(page.read_text(), table)
 

@@ -1,0 +1,121 @@
+"""Goals of robust policies against figures, as tables of goals/README.md.
+
+goals/goals.toml lists them. A figure is `[file, key, ...]`: a rate in a result, its path from the
+repository's root and the keys that lead to it.
+"""
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from starjax.report import formats
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+POLICIES = ("compact", "needle_pick", "peg_transfer_bimanual")
+# Goals: failures announced before the clock, false alarms under a disturbance and without one.
+EARLY, FALSE, ALPHA = 0.9, 0.1, 0.05
+
+
+def stress() -> str:
+    """Returns success of the earlier and the robust policy on the same trials."""
+    rows = [["Disturbance", "`compact`", "`peg_transfer_robust`", "Goal (%)", "Met"]]
+    for row in _goals()["stress"]:
+        new, old = _figure(row["new"]), "\u2013"
+        if "old" in row:
+            earlier = _figure(row["old"])
+            assert earlier["trials"] == new["trials"]
+            old = _rate(earlier)
+        rows.append([row["name"], old, _rate(new), f"{row['goal']}", _met(new, row["goal"])])
+    return formats.render(rows, names=1)
+
+
+def others() -> str:
+    """Returns the goals that are single figures."""
+    rows = [["Goal", "Wanted (%)", "Measured", "Met"]]
+    for row in _goals()["others"]:
+        found = _figure(row["figure"])
+        rows.append([row["name"], f"{row['goal']}", _rate(found), _met(found, row["goal"])])
+    return formats.render(rows, names=1)
+
+
+def monitor() -> str:
+    """Returns, by disturbance and policy, failures announced before the clock and false alarms."""
+    found = [_read(f"benchmarks/results/monitor_{policy}_gpu.json")["rows"] for policy in POLICIES]
+    rows = [["Disturbance"]]
+    for policy in POLICIES:
+        rows[0] += [f"`{policy}`: announced", "false alarms"]
+    for label in dict.fromkeys(label for table in found for label in table):
+        most = ALPHA if label.startswith("nothing") else FALSE
+        cells = []
+        for table in found:
+            missing = ["\u2013", "\u2013"]
+            cells += _alarms(table[label]["alarms"], most) if label in table else missing
+        rows.append([label, *cells])
+    return formats.render(rows, names=1)
+
+
+def runs() -> str:
+    """Returns the origin of every file of the tables above."""
+    goals = _goals()
+    files = [row[name][0] for row in goals["stress"] for name in ("old", "new") if name in row]
+    files += [row["figure"][0] for row in goals["others"]]
+    files += [f"benchmarks/results/monitor_{policy}_gpu.json" for policy in POLICIES]
+    rows = [["Result", "Command", "Seed", "Commit", "On"]]
+    for file in dict.fromkeys(files):
+        result = _read(file)
+        commands = result.get("commands") or [result["command"]]
+        text = "<br>".join(f"`{command}`" for command in commands)
+        commit = formats.code(result["commit"], result["dirty"])
+        on = formats.machine(result["hardware"])
+        seed = str(result.get("seed", 0))
+        rows.append([f"[{Path(file).name}](../../{file})", text, seed, commit, on])
+    return formats.render(rows, names=len(rows[0]))
+
+
+TABLES = {
+    "goals_stress": stress,
+    "goals_others": others,
+    "goals_monitor": monitor,
+    "goals_runs": runs,
+}
+
+
+def _goals() -> dict[str, Any]:
+    return tomllib.loads((HERE / "goals" / "goals.toml").read_text())
+
+
+def _read(file: str) -> dict[str, Any]:
+    return json.loads((ROOT / file).read_text())
+
+
+def _figure(path: list[str]) -> dict[str, Any]:
+    found = _read(path[0])
+    for key in path[1:]:
+        found = found[key]
+    return found
+
+
+def _rate(found: dict[str, Any]) -> str:
+    low, high = (100 * bound for bound in found["ci95"])
+    count = f"{found['successes']:,}/{found['trials']:,}"
+    return f"{count}: {100 * found['rate']:.1f}% ({low:.1f}-{high:.1f})"
+
+
+def _met(found: dict[str, Any], goal: float) -> str:
+    missed = goal - 100 * found["rate"]
+    return f"missed by {missed:.1f}" if missed > 1e-9 else "yes"
+
+
+def _alarms(found: dict[str, Any], most: float) -> list[str]:
+    """Renders both rates, bold where the goal is met; `most` is that of false alarms."""
+    cells = []
+    for name in ("before_clock", "false_alarms"):
+        rate = found[name]
+        text = f"{rate['successes']:,}/{rate['trials']:,} = {100 * (rate['rate'] or 0):.0f}%"
+        value = rate["rate"] or 0.0
+        is_met = value <= most if name == "false_alarms" else value >= EARLY
+        text = f"**{text}**" if is_met else text
+        cells.append(text if rate["trials"] else "\u2013")
+    return cells
