@@ -9,11 +9,13 @@ the distance of the resulting force and torque on the needle from those of all c
 nearest    the contacts of the four nearest pairs of a capsule and a pad, as our physics keeps them
 ends       of each pad the deepest contact, and the outermost two along the wire
 tips       of each pad the outermost two
+moments    of each pad four weighted points of its face in place of all contacts, with the sums of
+           their stiffnesses, depths, and first and second moments
 """
 
 import argparse
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import _c_env
 import _timing
@@ -28,8 +30,19 @@ from starjax.sim.scene import Scene
 
 PAIRS = 4  # of the broad phase: `max_geom_pairs` of the needle's MJCF
 NEEDLE = "needle"
+POINTS = 4  # of a pad, in place of all its contacts
 
-Keep = Callable[[Any, list[tuple[int, int]]], np.ndarray]
+
+class Point(NamedTuple):
+    """A contact in place of several: `p` `[3]` m, `dist` m, `weight` of its stiffness."""
+
+    p: np.ndarray
+    dist: float
+    weight: float
+
+
+# (data, contacts of the pads) -> the kept ones, or the points in place of some of them.
+Keep = Callable[[Any, list[tuple[int, int]]], np.ndarray | dict[int, Point]]
 
 
 def main() -> None:
@@ -107,8 +120,8 @@ def compare(scene: Scene, state: Any, found: dict, counts: dict) -> None:
     if not contacts:
         return
     counts["all"].append(len(contacts))
-    for name, keep in KEEPS.items():
-        kept = keep(data, contacts)
+    reduced = {name: keep(data, contacts) for name, keep in KEEPS.items()}
+    for name, kept in reduced.items():
         part, _ = wrench(m, data, state, kept)
         error = part - whole
         sizes = [np.linalg.norm(x) for x in (error[:3], error[3:], whole[:3], whole[3:])]
@@ -122,7 +135,8 @@ def wrench(m: Any, data: Any, state: Any, kept: Any) -> tuple[np.ndarray, list[t
     Args:
       m, data: of C MuJoCo.
       state: see `episode`.
-      kept: contacts of the pads with the wire that take part; None for all.
+      kept: contacts of the pads with the wire that take part, and perhaps their changed points;
+        None for all.
     """
     for target, value in zip(
         (data.qpos, data.qvel, data.ctrl, data.mocap_pos, data.qacc_warmstart), state
@@ -141,7 +155,15 @@ def wrench(m: Any, data: Any, state: Any, kept: Any) -> tuple[np.ndarray, list[t
             contacts.append((i, pads[0]))
             if kept is not None and i not in kept:
                 data.contact[i].exclude = 1
-    for stage in (mujoco.mj_makeConstraint, mujoco.mj_projectConstraint, mujoco.mj_transmission):
+    points = kept if isinstance(kept, dict) else {}
+    for i, point in points.items():
+        data.contact[i].pos[:], data.contact[i].dist = point.p, point.dist
+    mujoco.mj_makeConstraint(m, data)
+    for i, point in points.items():
+        rows = slice(data.contact[i].efc_address, data.contact[i].efc_address + 3)
+        data.efc_D[rows] *= point.weight
+        data.efc_R[rows] /= point.weight
+    for stage in (mujoco.mj_projectConstraint, mujoco.mj_transmission):
         stage(m, data)
     mujoco.mj_fwdVelocity(m, data)
     mujoco.mj_fwdActuation(m, data)
@@ -181,7 +203,27 @@ def _ends(data: Any, contacts: list[tuple[int, int]]) -> np.ndarray:
     return np.unique([*_tips(data, contacts), *deepest])
 
 
-KEEPS: dict[str, Keep] = {"nearest": _nearest, "ends": _ends, "tips": _tips}
+def _moments(data: Any, contacts: list[tuple[int, int]]) -> dict[int, Point]:
+    kept: dict[int, Point] = {}
+    for rows in _by_pad(contacts):
+        points, dist = data.contact.pos[rows], data.contact.dist[rows]
+        if len(rows) <= POINTS:
+            kept |= {int(i): Point(p, d, 1.0) for i, p, d in zip(rows, points.copy(), dist.copy())}
+            continue
+        middle = points.mean(0)
+        _, spread, axes = np.linalg.svd(points - middle, full_matrices=False)
+        # Depth as an affine function of the place in the face: same sums and first moments.
+        inside = np.column_stack([np.ones(len(rows)), (points - middle) @ axes[:2].T])
+        depth, *_ = np.linalg.lstsq(inside, dist, rcond=None)
+        sigma = spread[:2] * np.sqrt(2.0 / len(rows))  # of four points: two along each axis
+        for k, (x, y) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1))):
+            place = np.array([x * sigma[0], y * sigma[1]])
+            at = float(depth @ [1.0, *place])
+            kept[int(rows[k])] = Point(middle + place @ axes[:2], at, len(rows) / POINTS)
+    return kept
+
+
+KEEPS: dict[str, Keep] = {"nearest": _nearest, "ends": _ends, "tips": _tips, "moments": _moments}
 
 
 if __name__ == "__main__":
