@@ -1,12 +1,13 @@
-"""Draws each task as its camera sees it, while its expert is at work.
+"""Draws each task as its camera sees it, while its expert is at work in C MuJoCo.
 
-python benchmarks/task_pictures.py FIGURE.png
+python benchmarks/task_pictures.py FIGURE.png [TITLE ...]
 """
 
 import sys
 from pathlib import Path
 from typing import Any
 
+import _c_env
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,14 +30,18 @@ MOMENTS = {
     "needle_handover": (235, "side"),
     "endoscope_track": (120, "camera"),
     "endoscope_track: what it sees": (120, "endoscope"),
+    "needle_regrasp": (120, "camera"),
+    "needle_drive": (160, "camera"),
+    "needle_drive: its near camera": (160, "camera_near"),
+    "suture_throw": (420, "camera"),
 }
 TROCAR = 1  # of the task's twelve
 
 
-def main(file: Path) -> None:
+def main(file: Path, *titles: str) -> None:
     runtime.prepare_xla()
     pictures = {
-        title: picture(title.partition(":")[0], *moment) for title, moment in MOMENTS.items()
+        title: picture(title.partition(":")[0], *MOMENTS[title]) for title in titles or MOMENTS
     }
     file.write_bytes(style.save(draw(pictures), "png"))
 
@@ -44,6 +49,7 @@ def main(file: Path) -> None:
 def picture(task: str, steps: int, camera: str) -> np.ndarray:
     """`[PIXELS, PIXELS, 3]` uint8, after `steps` of the task's first expert."""
     environment = envs.make(task, image_size=PIXELS, cameras=[camera])
+    environment = _c_env.with_c_physics(environment)
     expert = registries.tasks.get(task).expert()
     trocar = jax.tree.map(lambda leaf: jnp.asarray(leaf)[TROCAR], environment.task.trocars)
 
@@ -79,4 +85,4 @@ def draw(pictures: dict[str, np.ndarray]) -> Any:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), *sys.argv[2:])

@@ -11,6 +11,7 @@ import zstandard
 
 from starjax.report import page, playback_3d, video
 from starjax.sim import scene
+from starjax.viewer import playback
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,23 @@ def test_the_page_holds_it_in_a_frame_that_reaches_nothing_else(one, solid):
     assert frame and html.unescape(frame[1]) == solid.html
     assert "<script" not in text  # except the frame's
     assert "<iframe" not in page.render([one], one, {}, None)
+
+
+def test_bodies_at_rest_are_where_the_trial_has_them(recorded, monkeypatch):
+    (clip, *_) = video.choose([recorded])
+    names = scene.name("needle_drive")
+    nq, marks = scene.compose(names).nq, []
+    rollout = clip.rollout._replace(qpos=np.zeros((len(clip.rollout.p_world_tip), nq)))
+    result = clip.result._replace(scene=names)
+    monkeypatch.setattr(
+        video, "choose", lambda runs: [clip._replace(result=result, rollout=rollout)]
+    )
+    monkeypatch.setattr(
+        playback, "html", lambda model, rollouts, *rest: marks.append(rollouts[0][0].still) or ""
+    )
+    playback_3d.record([recorded])
+    entry, leaves = marks[0].p
+    assert 0.007 < np.linalg.norm(entry - leaves) < 0.015
 
 
 def test_nothing_is_drawn_without_joint_positions(one):

@@ -48,6 +48,7 @@ def record(runs: Sequence[results.Run]) -> Playback | None:
             clip.rollout.p_world_tip,
             None,
             frame.colours(names, model, clip.rollout.labels),
+            clip.still,
         )
         for clip in clips
     ]

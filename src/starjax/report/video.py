@@ -12,6 +12,7 @@ from starjax.evaluation.result import Result
 from starjax.report import compare, encode, outcomes, results, scene_view, style
 from starjax.rollouts import trial_key
 from starjax.sim.names import SceneNames
+from starjax.types import Pose
 
 SIZE = 384  # pixels, side of one rollout's images
 _BAR = 44  # pixels, height of the caption
@@ -58,6 +59,13 @@ class Clip(NamedTuple):
     label: str
     result: Result
     rollout: results.TrialTrajectory
+
+    @property
+    def still(self) -> Pose | None:
+        """Poses `[K]` of the task's bodies at rest, or None."""
+        trial = self.rollout.trial
+        scene, seed = self.result.scene, self.result.seed
+        return trial_key.bodies_at_rest(scene, seed, trial.trocar, trial.trial)
 
 
 def choose(runs: Sequence[results.Run], max_clips: int = 4) -> list[Clip]:
@@ -127,8 +135,7 @@ def _clip(draw: scene_view.Draw, clip: Clip, note: str) -> Iterator[np.ndarray]:
     cut = "" if steps == total else f"first {steps / hz:.0f} s shown"
     text = f"{kind} trocar {rollout.trial.trocar}" + (f", {note}" if note else "")
     about = (text, _MUTED), (cut, _MUTED)
-    trial = rollout.trial.trocar, rollout.trial.trial
-    still = trial_key.bodies_at_rest(clip.result.scene, clip.result.seed, *trial)
+    still = clip.still
     for first in range(0, steps, scene_view.BATCH):
         drawn = draw(
             rollout.qpos, rollout.p_world_trocar, rollout.labels, first, rollout.endoscope, still
