@@ -21,9 +21,10 @@ def main(file: Path) -> None:
     tasks = {task: list(group) for task, group in itertools.groupby(found, key=lambda x: x["task"])}
     with style.use():
         figure = style.figure(3.2 * len(tasks), 3.0)
-        axes = figure.subplots(1, len(tasks), squeeze=False)[0]
+        axes = figure.subplots(1, len(tasks), squeeze=False, sharey=True)[0]
         for axis, (task, results) in zip(axes, tasks.items(), strict=True):
             draw(axis, task, results)
+        axes[0].set_ylabel("success in validation (%)")
         data = style.save(figure, "png")
     file.write_bytes(data)
 
@@ -38,12 +39,14 @@ def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
             [abs(100 * rate["ci95"][end] - y) for rate, y in zip(rates, middle, strict=True)]
             for end in (0, 1)
         )
-        label = f"{found['by']}, {found['weights'][:4]}"
+        label = f"{found['by']}, {finetuned.base(found)}"
         colour = WAYS[found["by"]]
         axis.errorbar(
             minutes, middle, (low, high), marker="o", ms=4, capsize=2, color=colour, label=label
         )
-    axis.set(title=task, xlabel="rollouts and training (min)", ylabel="validation success (%)")
+    goal = finetuned.goal_of(task)[0]
+    axis.axhline(goal, color="black", lw=0.8, ls="--", label=f"goal, {goal:.0f}%")
+    axis.set(title=task, xlabel="rollouts and training (min)")
     axis.legend(fontsize=7, loc="lower right")
 
 

@@ -16,7 +16,6 @@ PARTS = ("seen", "unseen")
 
 def goals(folder: Path = RESULTS) -> str:
     """Returns the goal of each policy, the way that came nearest, and the others, as markdown."""
-    known = tomllib.loads((HERE / "finetune_goals.toml").read_text())["goals"]
     header = ["Task, policy", "Goal", "Way", "Seen before", "Seen after", "Unseen before"]
     header += ["Unseen after", "Goal met", "RCM p99 (mm)", "Rollouts", "Minutes", "Other ways"]
     rows = [header]
@@ -24,13 +23,13 @@ def goals(folder: Path = RESULTS) -> str:
     for (task, weights), results in itertools.groupby(found, key=_policy):
         # The first result of the most successes at all trocars.
         won, *others = sorted(results, key=lambda x: -sum(_after(x)[p]["rate"] for p in PARTS))
-        goal = known.get(task, known["others"])
+        goal = goal_of(task)
         after, rounds = _after(won), won["rounds"][1:]
         missed = [g - 100 * after[part]["rate"] for g, part in zip(goal, PARTS, strict=True)]
         left = [f"{by:.1f} {part}" for by, part in zip(missed, PARTS, strict=True) if by > 1e-9]
         rows.append(
             [
-                f"{task}, {_base(won)} ({weights[:8]})",
+                f"{task}, {base(won)} ({weights[:8]})",
                 " / ".join(f"{x:.0f}" for x in goal),
                 won["by"] if won["best"] else f"{won['by']}: no round is better",
                 *(_rate(x[part]) for part in PARTS for x in (won["before"], after)),
@@ -42,6 +41,12 @@ def goals(folder: Path = RESULTS) -> str:
             ]
         )
     return formats.render(rows, names=1)
+
+
+def goal_of(task: str) -> list[float]:
+    """Returns the goal at seen and at unseen trocars in percent."""
+    known = tomllib.loads((HERE / "finetune_goals.toml").read_text())["goals"]
+    return known.get(task, known["others"])
 
 
 def runs(folder: Path = RESULTS) -> str:
@@ -90,6 +95,13 @@ def learning_seconds(found: dict[str, Any]) -> list[float]:
     return total
 
 
+def base(found: dict[str, Any]) -> str:
+    """Returns the name of the policy that a command fine-tunes."""
+    words = found["command"].removeprefix(COMMAND).split()
+    name = words[words.index("--policy") + 1] if "--policy" in words else words[0]
+    return Path(name).with_suffix("").as_posix().removeprefix("runs/").removeprefix("carried/")
+
+
 def _results(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in sorted(folder.glob("finetune_*.json"))]
 
@@ -105,13 +117,6 @@ def _after(found: dict[str, Any]) -> dict[str, Any]:
 def _flags(found: dict[str, Any]) -> str:
     """Returns a command without its first words and its directory."""
     return found["command"].removeprefix(COMMAND).partition(" --out")[0]
-
-
-def _base(found: dict[str, Any]) -> str:
-    """Returns the name of the policy that a command fine-tunes."""
-    words = found["command"].removeprefix(COMMAND).split()
-    name = words[words.index("--policy") + 1] if "--policy" in words else words[0]
-    return name.removeprefix("runs/")
 
 
 def _brief(found: dict[str, Any]) -> str:
