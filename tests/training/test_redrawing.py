@@ -67,7 +67,7 @@ def resident(dataset):
 def displaced_rows(setup) -> np.ndarray:
     """Samples with displaced cameras: the first ones of every device."""
     shares = np.arange(BATCH).reshape(setup.layout.mesh.size, -1)
-    return shares[:, : randomise.displaced_count(shares.shape[1])].ravel()
+    return shares[:, : randomise.redrawn_count(shares.shape[1])].ravel()
 
 
 def choice(setup, data, number) -> Any:
