@@ -1,13 +1,13 @@
 """Success of the dial's two experts by the turn of the needle, at the task's trocars and others.
 
-    python benchmarks/bench_turns.py [--per-trocar 60] [--sampled 600] [--seed 2026] [--c] [--tiny]
+    python benchmarks/bench_turns.py [--expert default] [--per-trocar 60] [--sampled 600] \\
+        [--seed 2026] [--c] [--tiny]
 
-The task is needle drive along the dial. One expert drives each needle in a plane that suits the
-trocar, the other in one plane for all: no policy that is not told the trocar can do more.
+The task is needle drive along the dial. One expert (`default`) drives each needle in a plane that
+suits the trocar, the other (`one_plane`) in one plane for all.
 """
 
 import argparse
-from typing import Any
 
 import _c_env
 import _timing
@@ -27,6 +27,7 @@ STEPS = 600  # control steps, 20 s
 def main() -> None:
     runtime.prepare_xla()
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--expert", choices=tuple(dial.TASK.experts), default="default")
     parser.add_argument("--per-trocar", type=int, default=60)
     parser.add_argument("--sampled", type=int, default=600)
     parser.add_argument("--seed", type=int, default=2026)
@@ -41,20 +42,18 @@ def main() -> None:
     twelve = rcm.Trocar(*(jnp.repeat(jnp.asarray(f), each, axis=0) for f in task.trocars))
     is_seen = np.repeat(task.is_seen, each)
     others = sampling.sample_trocars(jax.random.fold_in(key, 1), task, (drawn,))
-    found: dict[str, Any] = {}
-    for name in task.experts:
-        at_twelve, at_others = (
-            runs.run(environment, task.expert(name), trocars, jax.random.fold_in(key, k), STEPS)
-            for k, trocars in ((2, twelve), (3, others))
-        )
-        found[name] = {
-            "seen": _by_turn(at_twelve, is_seen),
-            "unseen": _by_turn(at_twelve, ~is_seen),
-            "others": _by_turn(at_others, np.ones(drawn, bool)),
-        }
-        print(name, found[name], flush=True)
+    at_twelve, at_others = (
+        runs.run(environment, task.expert(asked.expert), at, jax.random.fold_in(key, k), STEPS)
+        for k, at in ((2, twelve), (3, others))
+    )
+    found = {
+        "seen": _by_turn(at_twelve, is_seen),
+        "unseen": _by_turn(at_twelve, ~is_seen),
+        "others": _by_turn(at_others, np.ones(drawn, bool)),
+    }
+    print(found, flush=True)
     sizes = {"seed": asked.seed, "physics": "C MuJoCo" if asked.c else "ours"}
-    _timing.report("turns_c" if asked.c else "turns", {**sizes, "experts": found}, asked.tiny)
+    _timing.report(f"turns_{asked.expert}", {**sizes, "turns": found}, asked.tiny)
 
 
 def _by_turn(episodes: runs.ExpertEpisodes, chosen: np.ndarray) -> list[list[int]]:
