@@ -26,6 +26,14 @@ def test_the_plan_has_the_scene_the_observation_and_the_numbers():
     assert "image, 64 px" in said and "from scratch" in said and "state" not in said
 
 
+@pytest.mark.parametrize(("limit_s", "is_short"), [(49.0, True), (50.0, False)])
+def test_a_plan_says_if_trials_end_before_demonstrations_do(limit_s, is_short):
+    scene = dataclasses.replace(SMOKE.scene, task="suture_throw")
+    trials = dataclasses.replace(SMOKE.eval, time_limit_s=limit_s)
+    said = plan_text.plan(dataclasses.replace(SMOKE, scene=scene, eval=trials), messages.STAGES)
+    assert ("--eval.time-limit-s" in said) == is_short
+
+
 def test_the_plan_has_the_measured_time_of_an_unchanged_preset(monkeypatch):
     cpu = presets.PRESETS["cpu"]
     timing = presets.Timing("2 cores of a test", "cpu", 431.0, "result.json")

@@ -100,8 +100,12 @@ def _idle(batch_size: int) -> list[str]:
 
 
 def _evaluation(config: config_lib.RunConfig) -> str:
-    trocars, trials = len(_task(config).is_seen), config.eval.trials
-    limit = f"at most {config.eval.time_limit_s:g} s each"
+    from starjax.sim.tasks.base import CONTROL_HZ
+
+    task, trials = _task(config), config.eval.trials
+    trocars, limit = len(task.is_seen), f"at most {config.eval.time_limit_s:g} s each"
+    if config.eval.time_limit_s < (longest := task.least_steps / CONTROL_HZ):
+        limit += f" (--eval.time-limit-s; demonstrations take up to {longest:g} s)"
     averaged = ", plans averaged" if config.eval.ensemble else ""
     return f"  evaluation      {trocars} trocars x {trials} trials, {limit}{averaged}"
 
