@@ -4,7 +4,8 @@
         [--seed 2026] [--c] [--tiny]
 
 The task is needle drive along the dial. One expert (`default`) drives each needle in a plane that
-suits the trocar, the other (`one_plane`) in one plane for all.
+suits the trocar, the other (`one_plane`) in one plane for all. Beside the successes stand the
+episodes whose wrist stays within its limits in that plane, in closed form.
 """
 
 import argparse
@@ -46,22 +47,28 @@ def main() -> None:
         runs.run(environment, task.expert(asked.expert), at, jax.random.fold_in(key, k), STEPS)
         for k, at in ((2, twelve), (3, others))
     )
+    leans = dial.LEANS if asked.expert == "default" else np.array([dial.LEAN], np.float32)
     found = {
-        "seen": _by_turn(at_twelve, is_seen),
-        "unseen": _by_turn(at_twelve, ~is_seen),
-        "others": _by_turn(at_others, np.ones(drawn, bool)),
+        "seen": _by_turn(at_twelve, leans, is_seen),
+        "unseen": _by_turn(at_twelve, leans, ~is_seen),
+        "others": _by_turn(at_others, leans, np.ones(drawn, bool)),
     }
     print(found, flush=True)
     sizes = {"seed": asked.seed, "physics": "C MuJoCo" if asked.c else "ours"}
     _timing.report(f"turns_{asked.expert}", {**sizes, "turns": found}, asked.tiny)
 
 
-def _by_turn(episodes: runs.ExpertEpisodes, chosen: np.ndarray) -> list[list[int]]:
-    """Returns (successes, episodes) of each bin of the dial."""
-    turn = np.asarray(jax.vmap(dial.label)(episodes.last.layout)["turn"])
-    success = np.asarray(episodes.last.success)
+def _by_turn(
+    episodes: runs.ExpertEpisodes, leans: np.ndarray, chosen: np.ndarray
+) -> list[list[int]]:
+    """Returns (successes, within the wrist's limits, episodes) of each bin of the dial."""
+    layout, trocar = episodes.last.layout, episodes.last.trocar.p_world_trocar[:, 0]
+    each = jax.vmap(dial.margin, (None, None, 0))
+    margins = jax.jit(jax.vmap(each, (0, 0, None)))(layout.bite, trocar, jnp.asarray(leans))
+    served, success = np.asarray(margins).max(1) > 0, np.asarray(episodes.last.success)
+    turn = np.asarray(jax.vmap(dial.label)(layout)["turn"])
     bins = [chosen & (turn == k) for k in range(dial.BINS)]
-    return [[int(success[rows].sum()), int(rows.sum())] for rows in bins]
+    return [[int(success[rows].sum()), int(served[rows].sum()), int(rows.sum())] for rows in bins]
 
 
 if __name__ == "__main__":
