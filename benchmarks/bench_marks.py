@@ -1,4 +1,4 @@
-"""Pixels of both marks of needle drive by camera, at work: what a policy can see.
+"""Pixels of both marks of needle drive, by camera, before and during the drive.
 
     python benchmarks/bench_marks.py
 
