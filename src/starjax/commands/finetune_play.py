@@ -27,7 +27,7 @@ class NoisyEpisodes:
         if not len(steps):
             raise errors.UsageError("RUN", "a policy with some success", "none in validation")
         env, settings = work.base.env, work.config.policy
-        limits, _ = dagger.limits(steps, env.control_hz)
+        limits, _ = dagger.limits(steps, env.control_hz, env.task.stalled_s)
         self.settings = explore.ExploreSettings(
             settings.obs_horizon,
             settings.execute,

@@ -72,7 +72,8 @@ class Search:
         if not len(steps):
             raise errors.UsageError("RUN", "a policy with some success", "none in validation")
         self._work = work
-        self._limits, self._max_steps = dagger.limits(steps, work.base.env.control_hz)
+        env = work.base.env
+        self._limits, self._max_steps = dagger.limits(steps, env.control_hz, env.task.stalled_s)
 
     def collect(self, number: int, who: PolicyInEnv) -> dict[str, Any]:
         """Runs the trials of a round with the policy of the round before; returns their counts."""

@@ -26,15 +26,18 @@ REWINDS_S = (1.0, 2.0, 4.0)  # s before progress ended, at which the expert take
 ENDS = ("invalid", "collided", "lost")  # of an episode that no signal announced
 
 
-def limits(steps: np.ndarray, control_hz: float) -> tuple[takeover.TakeoverLimits, int]:
+def limits(
+    steps: np.ndarray, control_hz: float, stalled_s: float
+) -> tuple[takeover.TakeoverLimits, int]:
     """Returns the limits of a policy's part, and the control steps of a whole episode.
 
     Args:
       steps: `[n]` control steps of the policy's successes, at least one.
       control_hz: commands per second.
+      stalled_s: s without progress, see `Task`.
     """
     clock = math.ceil(np.quantile(steps, CLOCK_QUANTILE))
-    stalled = round(progress.STALLED_S * control_hz)
+    stalled = round(stalled_s * control_hz)
     return takeover.TakeoverLimits(clock, stalled), clock + max(
         clock, round(LEAST_RESCUE_S * control_hz)
     )

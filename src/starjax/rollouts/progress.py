@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 GAIN = 0.02  # of the reward, the least that counts as progress
-STALLED_S = 2.5  # s without progress
 
 CAUSES = ("none", "stalled", "clock", "nearly lost")  # of a takeover, by number
 

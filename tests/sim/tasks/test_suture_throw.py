@@ -76,6 +76,21 @@ def test_success_needs_every_condition(start):
     assert not bool(task.status(bound, layout, now).lost)
 
 
+def test_the_reward_grows_while_the_needle_is_turned_out(start):
+    bound, layout, _, now = start
+    yes = jnp.ones((), bool)
+    _, middle, end = expert.turns(layout.bite)
+
+    def reward(turn):
+        needle = needles.pose_on(task.SIZE, layout.bite, turn)
+        drive = now.drive.replace(needle=needle, held=yes, is_inside=yes, has_exited=yes)
+        moment = now.replace(drive=drive, in_block=~yes, by_point=yes)
+        return float(task.status(bound, layout, moment).reward)
+
+    rewards = [reward(turn) for turn in (0.5 * middle, middle, 0.95 * end)]
+    assert min(np.diff(rewards)) > 0.02 and 4 / 6 < rewards[0] < rewards[-1] < 5 / 6
+
+
 def test_the_point_is_turned_out_at_every_trocar_with_room_for_the_wrist():
     ref = np.array([slot.p_world_ref for slot in TASK.slots], np.float32)
     zero = np.zeros(1, np.float32)

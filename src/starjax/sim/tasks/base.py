@@ -233,6 +233,7 @@ class Task(NamedTuple):
       still: (Layout) -> Pose `[K]` of the MJCF's mocap bodies `still0`, .., visible without
         contacts, or None.
       least_steps: lower bound of the limit of a demonstration's control steps.
+      stalled_s: s without a larger reward after which an episode is in trouble.
       thread: (Measurements) -> `[N, 3]` m, points of a thread, whose links are the MJCF's geoms
         `thread0`, ..; or None. See `sim.thread`.
       coupling: forces of the task's own, or None.
@@ -271,6 +272,7 @@ class Task(NamedTuple):
     drive: Callable[..., jax.Array] = lambda bound, layout, ctrl, time: ctrl
     still: Callable[..., Pose] | None = None
     least_steps: int = 0
+    stalled_s: float = 2.5
     thread: Callable[..., jax.Array] | None = None
     coupling: Coupling | None = None
     endoscope: Endoscope | None = None

@@ -73,11 +73,6 @@ def turns(bite: needles.Bite) -> tuple[jax.Array, jax.Array, jax.Array]:
     return out, out + MIDDLE * (end - out), end
 
 
-def turn_out(turn: jax.Array) -> jax.Array:
-    """Returns a turn (rad) on the way out: the tail is past half a turn, and angles count on."""
-    return jnp.where(turn < 0.0, turn + 2.0 * jnp.pi, turn)
-
-
 def held(state: EnvState) -> Pose:
     """Returns pose_tip_needle as measured."""
     return wrist_script.held(state, state.measurements.drive.needle)
@@ -109,7 +104,7 @@ def enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScript
     }
     chosen = [goals.get(number, stays) for number in range(HOLD + 1)]
     turn = needles.turn_on(task.SIZE, bite, needle)
-    turn = jnp.where(phase == OUT, turn_out(turn), turn)
+    turn = jnp.where(phase == OUT, task.turn_out(turn), turn)
     script = phases.enter(
         script,
         TIMING,

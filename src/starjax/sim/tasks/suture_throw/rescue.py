@@ -24,7 +24,7 @@ def resume(key: jax.Array, state: EnvState) -> expert.ThrowScript:
     script, now, found = expert.AGENT.init(key, state), entry(state), state.measurements
     drive, bite = found.drive, state.layout.bite
     _, middle, _ = expert.turns(bite)
-    turn = expert.turn_out(needles.turn_on(task.SIZE, bite, drive.needle))
+    turn = task.turn_out(needles.turn_on(task.SIZE, bite, drive.needle))
     is_out = drive.emerged >= expert.OUT_ENOUGH
     is_late = is_out & (turn > middle - EARLY)
     # Held by the point: turned out, or let go after the first grasp's way or from an odd one.
