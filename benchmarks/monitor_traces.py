@@ -5,7 +5,7 @@
 Runs undisturbed trials with SAMPLED trocars, as `starjax calibrate` does, and EACH trials at every
 trocar of the task, undisturbed and under each disturbance. Scores can then be designed without a
 GPU: `read` returns the numbers of every decision. They are stored as int16 in steps of 0.1 mm and
-0.01, those of a long failure to 16 s.
+0.0001, those of a long failure to 16 s.
 """
 
 import functools
@@ -27,7 +27,7 @@ from starjax.runtime import files
 COLUMNS = ("success", "lost", "invalid", "steps", "stage", "trocar")
 EVERY, TIPS = 2, 2  # planned points that are kept, one of so many; measured tips of a decision
 FAILED_S = 16.0  # longer than any calibrated clock
-STEP_M, STEP = 1e-4, 0.01
+STEP = 1e-4  # m, and of openings in [-1, 1]
 _COMMANDED = "commanded_gripper"
 
 
@@ -70,9 +70,9 @@ def read(file: str, label: str) -> tuple[dict[str, np.ndarray], np.ndarray]:
     with np.load(file) as arrays:
         columns = {name: arrays[f"{label}/{name}"] for name in COLUMNS}
         lengths, packed = arrays[f"{label}/lengths"], arrays[f"{label}/decisions"]
-    rows = np.moveaxis(packed.astype(float), -1, 0)  # [R, A, K]
-    points = rows[..., :-2].reshape(*rows.shape[:2], -1, 3).cumsum(axis=-2) * STEP_M
-    rows = np.concatenate([points.reshape(*rows.shape[:2], -1), rows[..., -2:] * STEP], axis=-1)
+    rows = np.moveaxis(packed.astype(float), -1, 0) * STEP  # [R, A, K]
+    points = rows[..., :-2].reshape(*rows.shape[:2], -1, 3).cumsum(axis=-2)
+    rows = np.concatenate([points.reshape(*rows.shape[:2], -1), rows[..., -2:]], axis=-1)
     whole = np.full((len(lengths), lengths.max(), *rows.shape[1:]), np.nan)
     whole[np.arange(lengths.max()) < lengths[:, None]] = rows
     return columns, whole
@@ -118,9 +118,7 @@ def _stored(table: Any, settings: ScoreSettings) -> dict[str, np.ndarray]:
     arms = table.radius.shape[-1]
     kept = np.arange(table.scores.shape[1]) < lengths[:, None]
     rows = table.scores[kept].reshape(kept.sum(), arms, -1)
-    scale = np.full(rows.shape[-1], 1.0 / STEP_M)
-    scale[-2:] = 1.0 / STEP
-    packed = np.round(rows * scale).astype(np.int16)
+    packed = np.round(rows / STEP).astype(np.int16)
     packed[..., 3:-2] -= packed[..., :-5].copy()  # a point from the previous one: smaller files
     packed = np.moveaxis(packed, 0, -1)
     columns = {name: getattr(table, name) for name in COLUMNS}

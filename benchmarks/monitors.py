@@ -2,18 +2,21 @@
 
     python benchmarks/monitors.py silent POLICY STILL_S OUT.safetensors
     python benchmarks/monitors.py gather OUT.npz CALIBRATION STRESS
-    python benchmarks/monitors.py score POLICY TRIALS.npz
+    python benchmarks/monitors.py score POLICY TRIALS.npz [ALPHA WINDOWS SCORES...]
     python benchmarks/monitors.py insert POLICY
 
 `silent` writes a policy whose monitor never raises an alarm: its evaluations record scores before
 a calibration has ended. `gather` joins directories of `starjax calibrate` and `starjax stress`: of
 every evaluation the columns below, as `<evaluation>/<column>`, and the commands' JSON files.
-`score` calibrates a monitor from such a file and writes results/monitor_<POLICY>_gpu.json; `insert`
-puts the monitor of these results into the packaged file. Neither needs a GPU.
+`score` calibrates a monitor from such a file, at a rate of false alarms and with stillness over so
+many of the recorded windows, and writes results/monitor_<POLICY>_gpu.json; `insert` puts the
+monitor of these results next to the packaged file. Neither needs a GPU.
 """
 
+import functools
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +33,8 @@ from starjax.sim.tasks.peg_transfer_bimanual.task import DROPPED_STEPS
 
 COLUMNS = ("success", "lost", "invalid", "steps", "scores")
 _NEVER = 1e9  # a threshold beyond any score
+_STRICT = 0.01  # a second rate of false alarms
+_OPEN = 0.3  # of [-1, 1]: wider than around any object
 
 
 def silent(policy: str, still_s: str, out: str) -> None:
@@ -63,21 +68,28 @@ def gather(out: str, *folders: str) -> None:
     files.write_npz(Path(out), arrays)
 
 
-def score(policy: str, file: str) -> None:
+def score(policy: str, file: str, alpha: str = "0.05", windows: str = "1", *names: str) -> None:
     """Calibrates a monitor; writes its figures in the test's trials and under disturbances."""
     arrays = files.read_npz(Path(file))
     made, stress = (json.loads(arrays[f"{name}.json"].tobytes()) for name in ("monitor", "stress"))
-    whole = evaluation(arrays, "trials")
-    monitor, fewer = (calibrated(x, made["monitor"]) for x in (whole, without_closure(whole)))
+    read = functools.partial(evaluation, arrays, windows=int(windows))
+    settings = scores.ScoreSettings(**made["monitor"]["settings"])
+    settings = settings._replace(still=settings.still * int(windows))
+    digest, whole = made["monitor"]["digest"], read("trials")
+    chosen = names or scores.CALIBRATED
+    monitor, strict = (
+        calibrated(whole, x, settings, digest, chosen) for x in (float(alpha), _STRICT)
+    )
     tests = calibrate.parts(len(whole.success))[2]
     labels = {"nothing, trocars of the test": SimpleNamespace(**_at(whole, tests))}
-    labels["nothing, the task's trocars"] = evaluation(arrays, "0")
+    if "0/success" in arrays:
+        labels["nothing, the task's trocars"] = read("0")
     for name, kind in stress["disturbances"].items():
         for level in kind["levels"]:
             if float(level):
                 label = f"{name} {level} {kind['unit']}".strip()
-                labels[label] = evaluation(arrays, f"{name}-{level}")
-    rows = {label: figures(table, monitor, fewer) for label, table in labels.items()}
+                labels[label] = read(f"{name}-{level}")
+    rows = {label: figures(table, monitor, strict) for label, table in labels.items()}
     kept = ("version", "commit", "dirty", "versions", "hardware")
     content = {
         "policy": policy,
@@ -85,55 +97,71 @@ def score(policy: str, file: str) -> None:
         "commands": [made["command"], stress["command"]],
         **{name: made[name] for name in kept},
         "monitor": calibrate.to_json(monitor),
+        "strict": calibrate.to_json(strict),
         "rows": rows,
     }
     files.write_json(_timing.RESULTS / f"monitor_{policy}_gpu.json", content)
 
 
-def calibrated(table: Any, made: dict[str, Any]) -> calibrate.Monitor:
+def calibrated(
+    table: Any, alpha: float, settings: scores.ScoreSettings, digest: str, names: Sequence[str]
+) -> calibrate.Monitor:
     """Calibrates a monitor with the successes of a table, as `starjax calibrate` does."""
     fits, calibrates, _ = calibrate.parts(len(table.success))
-    settings = scores.ScoreSettings(**made["settings"])
     parts = [table.scores[table.success & part] for part in (fits, calibrates)]
-    return calibrate.calibrate(*parts, made["alpha"], settings, made["digest"])
+    return calibrate.calibrate(*parts, alpha, settings, digest, names)
 
 
-def without_closure(table: Any) -> Any:
-    """Returns the table with this score undefined."""
-    values = table.scores.copy()
-    values[..., scores.NAMES.index("closure")] = np.nan
-    return SimpleNamespace(**{**vars(table), "scores": values})
-
-
-def figures(table: Any, monitor: calibrate.Monitor, fewer: calibrate.Monitor) -> dict[str, Any]:
+def figures(table: Any, monitor: calibrate.Monitor, strict: calibrate.Monitor) -> dict[str, Any]:
     """Returns success, alarms, and the times of alarms on failures, null without one."""
     times, _ = calibrate.first_alarms(monitor, table.scores)
     raised = [round(float(x), 2) if np.isfinite(x) else None for x in times[~table.success]]
     # A trial is lost some control steps after the object left the last tool.
     drop_s = (table.steps - DROPPED_STEPS) / CONTROL_HZ
-    less = alarms.compose(without_closure(table), fewer)
+    let_go = table.lost & jaws_end_open(table)
+    others = ~table.success & ~let_go
+    few = alarms.compose(table, strict)
     return {
         "strict": statistics.rate(table.success),
         "alarms": alarms.compose(table, monitor),
         "before_drop": statistics.rate((times < drop_s)[table.lost]),
-        "without_closure": {name: less[name] for name in ("before_clock", "false_alarms")},
+        "let_go": statistics.rate(let_go[~table.success]),
+        "others_before_clock": statistics.rate((times < monitor.clock_s)[others]),
+        "at_strict": {name: few[name] for name in ("before_clock", "false_alarms")},
         "alarm_s": raised,
     }
 
 
+def jaws_end_open(table: Any) -> np.ndarray:
+    """Returns `[M]` True for trials whose jaws were all open at the last decision."""
+    closure = table.scores[..., scores.NAMES.index("closure")]
+    last = np.isfinite(closure).sum(axis=1) - 1
+    return closure[np.arange(len(closure)), last] < -_OPEN
+
+
 def insert(policy: str) -> None:
-    """Puts the monitor of the committed results into the packaged file."""
+    """Puts the monitor of the committed results next to the packaged file."""
     result = files.read_json(_timing.RESULTS / f"monitor_{policy}_gpu.json")
     path = packaged.find("policy", policy)
-    trained = policy_file.load(path)
-    monitor = calibrate.from_json(result["monitor"])
-    half = policy_file.is_half(trained.params)
-    policy_file.save(path, trained._replace(monitor=monitor), half=half)
+    files.write_json(policy_file.monitor_path(path), result["monitor"])
+    policy_file.load(path)  # raises for a monitor of other weights
 
 
-def evaluation(arrays: dict[str, np.ndarray], name: str) -> Any:
-    """Returns the columns of one gathered evaluation."""
-    return SimpleNamespace(**{column: arrays[f"{name}/{column}"] for column in COLUMNS})
+def evaluation(arrays: dict[str, np.ndarray], name: str, windows: int = 1) -> Any:
+    """Returns the columns of one gathered evaluation, with stillness over several windows."""
+    table = SimpleNamespace(**{column: arrays[f"{name}/{column}"] for column in COLUMNS})
+    column = scores.NAMES.index("stillness")
+    settings = json.loads(arrays["monitor.json"].tobytes())["monitor"]["settings"]
+    still, path = settings["still"], table.scores[..., column]
+    longer = np.full_like(path, np.nan)
+    first = still * (windows - 1)
+    parts = [path[:, first - still * k : path.shape[1] - still * k] for k in range(windows)]
+    longer[:, first:] = np.sum(parts, axis=0)
+    # Trials of the first version lack the last scores.
+    values = np.full((*path.shape, len(scores.NAMES)), np.nan, np.float32)
+    values[..., : table.scores.shape[-1]] = table.scores
+    values[..., column] = longer
+    return SimpleNamespace(**{**vars(table), "scores": values})
 
 
 def _at(table: Any, rows: np.ndarray) -> dict[str, np.ndarray]:

@@ -3,6 +3,7 @@
 import json
 import re
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,22 +44,31 @@ def monitor(name: str) -> str:
     """Returns the alarms of a packaged policy's monitor, of results/<name>_gpu.json."""
     found = _results(f"{name}_gpu")
     header = ["Disturbance", "Success", "Failures announced before the clock", "Median time"]
-    header += ["without `closure`", "False alarms on successes", "Success without alarm"]
+    header += ["False alarms on successes", "Success without alarm"]
     body = [[label, *_alarm_cells(row)] for label, row in found["rows"].items()]
+    more: dict[str, Callable[[dict[str, Any]], str]] = {}
     if any(row["before_drop"]["trials"] for row in found["rows"].values()):
-        header.append("Drops announced before the fall")
-        for cells, row in zip(body, found["rows"].values(), strict=True):
-            cells.append(_counted(row["before_drop"]))
+        more["Announced, of failures not let go"] = lambda row: _counted(row["others_before_clock"])
+        more["Drops announced before the fall"] = lambda row: _counted(row["before_drop"])
+    if found["monitor"]["alpha"] > found["strict"]["alpha"]:
+        name = f"At {100 * found['strict']['alpha']:.0f}%: announced, false alarms"
+        more[name] = lambda row: ", ".join(map(_percent, row["at_strict"].values()))
+    header += more
+    for cells, row in zip(body, found["rows"].values(), strict=True):
+        cells += [draw(row) for draw in more.values()]
     return formats.render([header, *body], names=1)
 
 
 def _alarm_cells(row: dict[str, Any]) -> list[str]:
-    alarms, fewer = row["alarms"], row["without_closure"]
+    alarms = row["alarms"]
     median = "\u2013" if alarms["median_s"] is None else f"{alarms['median_s']:.1f} s"
-    rates = [row["strict"], alarms["before_clock"], fewer["before_clock"]]
-    rates += [alarms["false_alarms"], alarms["silent"]]
-    success, early, less, false, silent = map(_counted, rates)
-    return [success, early, median, less, false, silent]
+    rates = [row["strict"], alarms["before_clock"], alarms["false_alarms"], alarms["silent"]]
+    success, early, false, silent = map(_counted, rates)
+    return [success, early, median, false, silent]
+
+
+def _percent(rate: dict[str, Any]) -> str:
+    return f"{100 * rate['rate']:.0f}%" if rate["trials"] else "\u2013"
 
 
 def _counted(rate: dict[str, Any]) -> str:

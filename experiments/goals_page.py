@@ -22,12 +22,9 @@ def stress() -> str:
     """Returns success of the earlier and the robust policy on the same trials."""
     rows = [["Disturbance", "`compact`", "`peg_transfer_robust`", "Goal (%)", "Met"]]
     for row in _goals()["stress"]:
-        new, old = _figure(row["new"]), "\u2013"
-        if "old" in row:
-            earlier = _figure(row["old"])
-            assert earlier["trials"] == new["trials"]
-            old = _rate(earlier)
-        rows.append([row["name"], old, _rate(new), f"{row['goal']}", _met(new, row["goal"])])
+        old, new = (_figure(row[name]) for name in ("old", "new"))
+        assert old["trials"] == new["trials"]
+        rows.append([row["name"], _rate(old), _rate(new), f"{row['goal']}", _met(new, row["goal"])])
     return formats.render(rows, names=1)
 
 
@@ -59,7 +56,7 @@ def monitor() -> str:
 def runs() -> str:
     """Returns the origin of every file of the tables above."""
     goals = _goals()
-    files = [row[name][0] for row in goals["stress"] for name in ("old", "new") if name in row]
+    files = [row[name][0] for row in goals["stress"] for name in ("old", "new")]
     files += [row["figure"][0] for row in goals["others"]]
     files += [f"benchmarks/results/monitor_{policy}_gpu.json" for policy in POLICIES]
     rows = [["Result", "Command", "Seed", "Commit", "On"]]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from starjax import errors
-from starjax.data import demos, load, redraw, schema, store
+from starjax.data import demos, episode_images, load, redraw, schema, store
 from starjax.data.placed_images import JoinedImages
 from starjax.rollouts import agent
 from starjax.sim import env as envs
@@ -83,6 +83,21 @@ def test_a_dataset_without_images_trains_at_any_size(scene, tmp_path):
         images = (kept.dataset.observation.images or {})[scene.names.cameras[0]]
         assert images.shape[1:] == (16, 16, 3)
         assert np.asarray(images[np.array([3, 7])]).std() > 5
+
+
+def test_images_of_moments_are_the_recorded_ones_or_drawn_at_any_size(scene, recorded, tmp_path):
+    key, camera = store.keys(recorded)[0], scene.names.cameras[0]
+    seen = episode_images.of_episode(recorded, key, [0, 9], 8)
+    whole = np.load(recorded / "episodes" / key / f"image_{camera}.npy")
+    np.testing.assert_array_equal(seen[camera], whole[[0, 9]])
+    root = collect(tmp_path / "demos", envs.without_images(scene))
+    for size in (SIZE, 24):
+        images = episode_images.of_episode(root, store.keys(root)[0], [0, 9], size)
+        assert {name: x.shape for name, x in images.items()} == dict.fromkeys(
+            scene.names.cameras, (2, size, size, 3)
+        )
+        if size == SIZE:
+            np.testing.assert_array_equal(images[camera], seen[camera])
 
 
 def test_another_scene_is_refused(scene, recorded):

@@ -1,5 +1,6 @@
 """The page of a recording: its figures are the motion's, and any dataset has one."""
 
+import io
 import json
 
 import mistakes
@@ -10,7 +11,7 @@ import recorded
 
 from starjax.commands import inspect_command, inspect_page
 from starjax.data import recordings
-from starjax.report import recording_page
+from starjax.report import recording_figures, recording_page
 
 HZ = 30.0
 
@@ -79,6 +80,17 @@ def test_the_page_shows_the_anomalies_and_escapes_them():
     assert "<script>odd" not in text and "&lt;script&gt;odd" in text
     assert "&lt;b&gt;mine" in text and text.count("data:image/png") == 6
     assert "http" not in text  # nothing is fetched
+
+
+def test_the_page_shows_images_of_every_camera_side_by_side():
+    import matplotlib.image
+
+    images = np.random.default_rng(0).integers(0, 256, (3, 8, 8, 3), np.uint8)
+    png = recording_figures.strip(images)
+    seen = matplotlib.image.imread(io.BytesIO(png), format="png")[..., :3]
+    np.testing.assert_array_equal(np.round(255 * seen), np.concatenate(list(images), axis=1))
+    text = recording_page.render("mine", [], [recording()], [], {"lens": images})
+    assert text.count("data:image/png") == 7 and "lens" in text
 
 
 def test_datasets_of_others_and_ours_have_a_page(tmp_path):

@@ -10,13 +10,15 @@ import tyro
 
 from starjax import errors
 from starjax.commands import checks, inspect_page, options
+from starjax.limits import Range
 from starjax.runtime import files, hub, xla
 
 DESCRIPTION = """Summarises a dataset, policy or result and flags anomalies.
 
 PATH is a directory of demonstrations, a dataset in a format of starjax list, a policy.safetensors
 or the name of a packaged policy, a result.json or a directory with one. --page writes a page with
-figures of a dataset: trocars and their wander, RCM error, reach, speed, jaws.
+figures of a dataset: trocars and their wander, RCM error, reach, speed, jaws, and images of one
+episode, drawn for it.
 
 Examples:
   starjax inspect runs/cpu/demos-0123456789ab
@@ -33,6 +35,8 @@ class InspectArgs:
 
     path: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     page: str = ""  # HTML file to write, with figures of a dataset's motions
+    # pixels per side of images of an episode that are drawn for --page; 0: none
+    image_size: Annotated[int, Range(0, 4_096)] = 256
     map: str = ""  # mapping of another dataset, as of starjax import; empty: the one that fits
 
 
@@ -52,7 +56,9 @@ def main(argv: Sequence[str]) -> int:
     summary = inspect(args.path)
     if args.page:
         path = hub.dataset("PATH", args.path)
-        odd = inspect_page.write(path, args.map, Path(args.page), summary.rows, summary.odd)
+        odd = inspect_page.write(
+            path, args.map, Path(args.page), summary.rows, summary.odd, args.image_size
+        )
         summary = Found([*summary.rows, ("page", args.page)], odd)
     width = max(len(name) for name, _ in summary.rows)
     for name, text in summary.rows:

@@ -7,12 +7,21 @@ from typing import TYPE_CHECKING
 from starjax import errors, extras
 from starjax.runtime import files, progress
 
-if TYPE_CHECKING:  # it imports jax
+if TYPE_CHECKING:
+    import numpy as np
+
     from starjax.data.recordings import EpisodeMotion
+
+_MOMENTS = 6  # images of an episode
 
 
 def write(
-    path: Path, map_name: str, page: Path, rows: Sequence[tuple[str, str]], odd: Sequence[str]
+    path: Path,
+    map_name: str,
+    page: Path,
+    rows: Sequence[tuple[str, str]],
+    odd: Sequence[str],
+    image_size: int = 0,
 ) -> list[str]:
     """Writes the page; returns all anomalies, those of the mapping too.
 
@@ -22,6 +31,7 @@ def write(
       page: the file.
       rows: summary of the dataset.
       odd: its anomalies.
+      image_size: pixels per side of drawn images of one episode, of a dataset of starjax; 0: none.
 
     Raises:
       errors.UsageError: no mapping fits, or no motion is left.
@@ -31,15 +41,28 @@ def write(
     from starjax.report import recording_page
 
     notes: list[str] = []
+    images: dict[str, np.ndarray] = {}
     if (path / "dataset.json").is_file():
         found = list(recordings.of_dataset(path))
+        images = _images(path, image_size) if image_size else {}
     else:
         found, notes = _mapped(path, map_name)
     if not found:
         raise errors.UsageError("PATH", "episodes with motions", f"none in {path}")
-    text = recording_page.render(path.name, rows, found, [*odd, *notes])
+    text = recording_page.render(path.name, rows, found, [*odd, *notes], images)
     files.write_bytes(page, text.encode())
     return [*odd, *notes]
+
+
+def _images(path: Path, size: int) -> "dict[str, np.ndarray]":
+    """Returns images of the first stored episode by camera, from its start to its end."""
+    from starjax.data import episode_images, store
+
+    records = [store.verify(path, key, arrays=False) for key in store.keys(path)]
+    record = next(record for record in records if record["files"])
+    last = record["length"] - 1
+    steps = [round(last * moment / (_MOMENTS - 1)) for moment in range(_MOMENTS)]
+    return episode_images.of_episode(path, record["key"], steps, size)
 
 
 def _mapped(path: Path, map_name: str) -> "tuple[list[EpisodeMotion], list[str]]":

@@ -21,6 +21,7 @@ from starjax.monitor.scores import ScoreSettings
 # Fractions of the trials for scale and threshold; the rest tests the monitor.
 _FIT, _CALIBRATE = 0.15, 0.425
 _SPREAD = (0.1, 0.9)  # quantiles whose distance is a score's width
+CLOCK_ALPHA = 0.05  # false alarms of the clock that monitors are compared with
 _TINY = 1e-9  # m and s, the least width: against a division by zero
 _ROUNDING = 1e-9  # of a rank: (n + 1)(1 - alpha) may exceed an integer by rounding
 
@@ -32,8 +33,8 @@ class Monitor(NamedTuple):
       center: `[S]`, of the scores, in their units; NaN of a score that raises no alarms.
       width: `[S]`, of the scores, in their units, NaN as the center.
       threshold: of the scaled scores.
-      clock_s: s, threshold of the clock if it were the only score; a monitor counts only where it
-        beats this.
+      clock_s: s, threshold of the clock if it were the only score, at alpha or `CLOCK_ALPHA`, the
+        larger; a monitor counts only where it beats this.
       alpha: nominal false alarm rate on successes.
       count: n, successes that the threshold comes from.
       settings: of the scores.
@@ -100,6 +101,7 @@ def calibrate(
     alpha: float,
     settings: ScoreSettings,
     digest: str = "",
+    names: Sequence[str] = scores_lib.CALIBRATED,
 ) -> Monitor:
     """Calibrates a monitor with two disjoint sets of successful trials.
 
@@ -109,6 +111,7 @@ def calibrate(
       alpha: nominal false alarm rate.
       settings: of the scores.
       digest: of the weights.
+      names: scores that raise alarms.
 
     Raises:
       errors.UsageError: there are too few successes for this alpha.
@@ -118,14 +121,14 @@ def calibrate(
         hint = "run more trials, or choose a larger alpha"
         raise errors.UsageError("successes", f"at least {least} for alpha {alpha:g}", got, hint)
     center, width = fit(fitted)
-    older = [name not in scores_lib.CALIBRATED for name in scores_lib.NAMES]
-    center[older] = width[older] = np.nan
+    others = [name not in names for name in scores_lib.NAMES]
+    center[others] = width[others] = np.nan
     clock = scores_lib.NAMES.index("clock")
     return Monitor(
         center=center,
         width=width,
         threshold=threshold(maxima(successes, center, width), alpha),
-        clock_s=threshold(_largest(successes[..., clock], axis=1), alpha),
+        clock_s=threshold(_largest(successes[..., clock], axis=1), max(alpha, CLOCK_ALPHA)),
         alpha=alpha,
         count=len(successes),
         settings=settings,

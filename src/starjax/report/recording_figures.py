@@ -1,5 +1,6 @@
 """Figures of recordings: paths about the trocar, one episode over time, spreads over episodes."""
 
+import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -94,3 +95,12 @@ def spreads(
             if axis.has_data():
                 axis.xaxis.set_major_locator(ticker.MaxNLocator(integer=True))
     return figure
+
+
+def strip(images: np.ndarray) -> bytes:
+    """Returns images `[n, h, w, 3]` uint8 side by side as PNG."""
+    import matplotlib.image
+
+    data = io.BytesIO()
+    matplotlib.image.imsave(data, np.concatenate(list(images), axis=1), format="png")
+    return data.getvalue()

@@ -1,7 +1,8 @@
 """The page of a recorded dataset: `starjax inspect DATASET --page`."""
 
 import statistics
-from collections.abc import Callable, Sequence
+import types
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,11 @@ _ROWS = 30  # episodes in the table
 
 
 def render(
-    title: str, rows: Sequence[tuple[str, str]], found: Sequence[EpisodeMotion], odd: Sequence[str]
+    title: str,
+    rows: Sequence[tuple[str, str]],
+    found: Sequence[EpisodeMotion],
+    odd: Sequence[str],
+    images: Mapping[str, np.ndarray] = types.MappingProxyType({}),
 ) -> str:
     """Renders the page.
 
@@ -25,6 +30,7 @@ def render(
       rows: names and texts of the summary.
       found: motions of its episodes, at least one.
       odd: anomalies, one per line.
+      images: `[n, h, w, 3]` uint8 of an episode by camera, shown side by side.
     """
     arms = [[recordings.figures(r, i) for i in range(r.p.shape[1])] for r in found]
     longest = int(np.argmax([len(r.p) for r in found]))
@@ -48,6 +54,7 @@ def render(
             cards=cards(found, arms),
             odd=odd,
             figures=figures,
+            strips={camera: recording_figures.strip(x) for camera, x in images.items()},
             shown=found[longest].number,
             count=len(found),
             episodes=table(found, arms),
