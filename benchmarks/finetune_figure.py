@@ -24,6 +24,7 @@ def main(file: Path) -> None:
         axes = figure.subplots(1, len(tasks), squeeze=False, sharey=True)[0]
         for axis, (task, results) in zip(axes, tasks.items(), strict=True):
             draw(axis, task, results)
+        axes[0].set_ylim(top=101)
         axes[0].set_ylabel("success in validation (%)")
         data = style.save(figure, "png")
     file.write_bytes(data)
@@ -47,7 +48,7 @@ def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
     goal = finetuned.goal_of(task)[0]
     axis.axhline(goal, color="black", lw=0.8, ls="--", label=f"goal, {goal:.0f}%")
     axis.set(title=task, xlabel="rollouts and training (min)")
-    axis.legend(fontsize=7, loc="lower right")
+    axis.legend(fontsize=7, loc="best")
 
 
 if __name__ == "__main__":
