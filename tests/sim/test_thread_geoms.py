@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from starjax.sim import render, thread, thread_geoms
+from starjax.sim.state import EnvState
 from starjax.viewer import stage
 
 LINKS = "".join(
@@ -38,6 +39,18 @@ def test_links_join_the_points():
     np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (31, 1, 1)), atol=1e-5)
     geoms = stage.kinematics(MODEL)(COORDINATES, np.zeros((0, 3)))
     np.testing.assert_allclose(geoms.p, data.geom_xpos, atol=1e-7)
+
+
+def test_coordinates_of_a_batch_are_those_of_its_states():
+    qpos = jnp.arange(12.0).reshape(3, 4)
+    points = jnp.arange(90.0).reshape(3, 10, 3)
+
+    def coordinates(qpos, points):
+        state = SimpleNamespace(physics=SimpleNamespace(qpos=qpos), thread=points)
+        return EnvState.coordinates.fget(state)
+
+    rows = [coordinates(*row) for row in zip(qpos, points, strict=True)]
+    np.testing.assert_array_equal(coordinates(qpos, points), rows)
 
 
 def test_camera_draws_the_thread_where_it_is():

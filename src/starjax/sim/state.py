@@ -140,9 +140,11 @@ class EnvState:
 
     @property
     def coordinates(self) -> jax.Array:
-        """Generalised coordinates `[Q]`, then those of the thread's points `[3 N]`, if any."""
+        """Generalised coordinates `[..., Q]`, then the thread's points `[..., 3 N]`, if any."""
         qpos = self.physics.qpos
-        return qpos if self.thread is None else jnp.append(qpos, self.thread)
+        if self.thread is None:
+            return qpos
+        return jnp.concatenate([qpos, self.thread.reshape(*qpos.shape[:-1], -1)], axis=-1)
 
 
 class Env(NamedTuple):
