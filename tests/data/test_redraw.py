@@ -37,6 +37,12 @@ def recorded(scene, tmp_path_factory):
     return collect(tmp_path_factory.mktemp("recorded") / "demos", scene)
 
 
+@pytest.fixture(scope="module")
+def unrecorded(scene, tmp_path_factory):
+    """The same episodes without images."""
+    return collect(tmp_path_factory.mktemp("unrecorded") / "demos", envs.without_images(scene))
+
+
 def drawn(root, env):
     """Images that are drawn although they were recorded."""
     records = [store.verify(root, key) for key in store.keys(root)]
@@ -74,8 +80,8 @@ def test_cameras_that_may_move_draw_the_recorded_images_where_they_are(scene, re
         assert np.mean(np.abs(np.asarray(moved[name]).astype(int) - image)) > 1.0
 
 
-def test_a_dataset_without_images_trains_at_any_size(scene, tmp_path):
-    root = collect(tmp_path / "demos", envs.without_images(scene))
+def test_a_dataset_without_images_trains_at_any_size(scene, unrecorded):
+    root = unrecorded
     assert not any("image" in name for name in store.read_description(root)["features"])
     other = envs.make("reach", image_size=16, cameras=scene.names.cameras)
     for residency in ("device", "host", "disk"):
@@ -85,14 +91,13 @@ def test_a_dataset_without_images_trains_at_any_size(scene, tmp_path):
         assert np.asarray(images[np.array([3, 7])]).std() > 5
 
 
-def test_images_of_moments_are_the_recorded_ones_or_drawn_at_any_size(scene, recorded, tmp_path):
+def test_images_of_moments_are_the_recorded_ones_or_drawn_at_any_size(scene, recorded, unrecorded):
     key, camera = store.keys(recorded)[0], scene.names.cameras[0]
     seen = episode_images.of_episode(recorded, key, [0, 9], 8)
     whole = np.load(recorded / "episodes" / key / f"image_{camera}.npy")
     np.testing.assert_array_equal(seen[camera], whole[[0, 9]])
-    root = collect(tmp_path / "demos", envs.without_images(scene))
     for size in (SIZE, 24):
-        images = episode_images.of_episode(root, store.keys(root)[0], [0, 9], size)
+        images = episode_images.of_episode(unrecorded, store.keys(unrecorded)[0], [0, 9], size)
         assert {name: x.shape for name, x in images.items()} == dict.fromkeys(
             scene.names.cameras, (2, size, size, 3)
         )
