@@ -1,6 +1,7 @@
 """Rounds of a policy gradient: episodes with noise and steps by turns, then the round's policy."""
 
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,17 +43,22 @@ class PolicyGradient:
         if file.exists() and told.exists():
             return file, files.read_json(told)
         print(f"\n[round {number}] policy gradient: into {folder}", flush=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        counts: dict[str, Any] = {"episodes": self._work.settings.episodes, "iterations": []}
         with stage_times.timed(self._work.out, f"round {number} policy gradient"):
             old = policy_file.load(before)
-            params, rows = self._iterate(number, old)
-        counts = {"episodes": self._work.settings.episodes, "iterations": rows}
-        folder.mkdir(parents=True, exist_ok=True)
-        files.write_json(told, counts)
-        policy_file.save(file, old._replace(params=params, monitor=None))
+            params = old.params
+            for trained, row in self._iterate(number, old):
+                params = {**old.params, **trained}
+                counts["iterations"].append(row)
+                files.write_json(told, counts)  # those of a stopped round, too
+        policy_file.save(file, old._replace(params=jax.device_get(params), monitor=None))
         return file, counts
 
-    def _iterate(self, number: int, old: policy_file.Trained) -> tuple[Any, list[dict[str, Any]]]:
-        """Returns the parameters after the last iteration, and the figures of all."""
+    def _iterate(
+        self, number: int, old: policy_file.Trained
+    ) -> Iterator[tuple[Any, dict[str, Any]]]:
+        """Yields the parameters after each iteration, and its figures."""
         settings = self._work.settings
         stats = mixing.with_reach(old.normalizer)
         vision = old.params.get("vision")
@@ -60,7 +66,7 @@ class PolicyGradient:
         root = jax.random.fold_in(jax.random.fold_in(jax.random.key(settings.seed), STREAM), number)
         key_reset, key_play, key_learn = jax.random.split(root, 3)
         draws = np.random.default_rng([settings.seed, STREAM, number])
-        learning, rows = None, []
+        learning = None
         failed = np.zeros((0, 2), np.int32)
         for i in range(settings.iterations):
             starts = self._episodes.starts(i, failed, draws)
@@ -83,11 +89,8 @@ class PolicyGradient:
                 "rcm_commanded_mm": 1e3 * float(played.rcm_commanded),
                 "rcm_executed_mm": 1e3 * float(played.rcm_executed),
             }
-            rows.append(row)
             messages.indented(
                 f"iteration {i + 1}: {row['success']:.1%} succeed, {row['steps']:.0f} steps, "
                 f"KL {row['kl']:.2g}, largest commanded RCM error {row['rcm_commanded_mm']:.2g} mm"
             )
-        assert learning is not None
-        trained = jax.device_get(learning.params)
-        return trained if vision is None else {**trained, "vision": vision}, rows
+            yield learning.params, row
