@@ -45,6 +45,7 @@ class State:
     collided: jax.Array
     stage: jax.Array
     reward: jax.Array
+    settled: jax.Array
     rcm_error: jax.Array
     rcm_error_within: jax.Array
     pose: Pose
@@ -148,6 +149,7 @@ def make_env(
             collided=no,
             stage=jnp.zeros((), jnp.int32),
             reward=jnp.zeros(()),
+            settled=jnp.zeros((), jnp.int32),
             rcm_error=jnp.zeros(arms),
             rcm_error_within=jnp.zeros(arms),
             pose=Pose(jnp.tile(jnp.eye(3), (arms, 1, 1)), p),

@@ -15,10 +15,12 @@ from starjax.sim.tasks.rescue import Rescuer
 from starjax.types import Command, Pose
 
 
-def stalls(rewards, steps=4):
+def stalls(rewards, steps=4, held=()):
     memory, found = progress.begin(), []
     for step, reward in enumerate(rewards):
-        state = types.SimpleNamespace(reward=jnp.float32(reward), step=jnp.int32(step))
+        state = types.SimpleNamespace(
+            reward=jnp.float32(reward), step=jnp.int32(step), settled=jnp.int32(step in held)
+        )
         memory, stalled = progress.update(memory, state, steps)
         found.append(bool(stalled))
     return found
@@ -31,6 +33,11 @@ def test_an_episode_stalls_once_its_best_reward_is_old():
     assert stalls([0.5, 0.51, 0.515, 0.519, 0.519])[-1]
     assert stalls([0.5, 0.3, 0.4, 0.5, 0.5])[-1]
     assert not stalls([0.5, 0.3, 0.4, 0.53, 0.5])[-1]
+
+
+def test_an_episode_has_not_stalled_while_the_conditions_of_success_hold():
+    assert not any(stalls([0.5] + 10 * [1.0], held=range(1, 11)))
+    assert stalls([1.0] * 6, held=[0, 1]) == [False] * 5 + [True]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ class BestReward(NamedTuple):
 
     Attributes:
       best: largest reward that counted as progress.
-      step: int32, control step at which it did.
+      step: int32, control step at which it did, or at which strict success's conditions last held.
     """
 
     best: jax.Array
@@ -35,7 +35,8 @@ def update(memory: BestReward, state: Any, stalled_steps: int) -> tuple[BestRewa
       state: EnvState.
       stalled_steps: control steps without progress after which it has.
     """
-    gains = state.reward > memory.best + GAIN
+    # Held for some seconds, they end in success without another gain.
+    gains = (state.reward > memory.best + GAIN) | (state.settled > 0)
     now = BestReward(
         jnp.where(gains, state.reward, memory.best), jnp.where(gains, state.step, memory.step)
     )
