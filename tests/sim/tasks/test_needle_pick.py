@@ -23,7 +23,7 @@ def test_a_needle_may_roll_away_for_a_minute_but_not_fly(away, speed, sound):
 
 @pytest.mark.parametrize(("angles", "last"), [(None, 5), (np.zeros((1, 2), np.float32), 4)])
 def test_wide_jaws_take_no_segment_beside_the_point(angles, last):
-    """Pads of a tool with a wrist would touch the point there, which is no success."""
+    """In C MuJoCo pads of a tool with a wrist touch the point there, which is no success."""
 
     def segment(key, yaw):
         measured = types.SimpleNamespace(

@@ -53,7 +53,8 @@ def _enter(script: NeedleScript, phase: jax.Array, state: EnvState) -> NeedleScr
     is_approach = phase == APPROACH
     attempt = script.attempt + is_approach
     normals = jnp.cross(jnp.asarray(TANGENTS), jnp.array([0.0, 0.0, 1.0])) @ needle.R.T
-    # Pads of a tool with a wrist are as wide as a segment: next to the point they would touch it.
+    # Pads of a tool with a wrist are as wide as a segment. In C MuJoCo, not in our physics, they
+    # touch the point from the segment next to it.
     last = task.SEGMENTS - (1 if state.wrist is None else 2)
     inner = (jnp.arange(task.SEGMENTS) > 0) & (jnp.arange(task.SEGMENTS) < last)
     score = jnp.where(inner, -jnp.abs(normals[:, 0]) / SKEW, -jnp.inf)
