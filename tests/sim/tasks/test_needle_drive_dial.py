@@ -24,7 +24,7 @@ def layouts():
 
 
 def a_layout(turn_deg):
-    """The first layout with a bite of this turn."""
+    """Returns the first layout with a bite of this turn."""
     first = jax.tree.map(lambda leaf: leaf[0], layouts())
     middle = 0.5 * (first.bite.entry + first.bite.exit)
     along = first.bite.exit - first.bite.entry
@@ -35,7 +35,7 @@ def a_layout(turn_deg):
 
 @functools.cache
 def margins():
-    """Degrees to the wrist's limits `[COUNT, trocars, leans]`."""
+    """Returns degrees to the wrist's limits `[COUNT, trocars, leans]`."""
 
     def of(bite, p_trocar, lean):
         return dial.margin(bite, p_trocar, lean)
@@ -88,7 +88,7 @@ def test_one_plane_serves_every_trocar_until_the_dial_turns_far():
 def test_the_expert_changes_its_lean_for_the_trocar_alone():
     @jax.jit
     def leaned(layout, p_trocar):
-        """The expert's lean, and how much margin it gains (rad)."""
+        """Returns the expert's lean, and how much margin it gains (rad)."""
         told = types.SimpleNamespace(p_world_trocar=p_trocar[None])
         up = dial.plane(types.SimpleNamespace(layout=layout, measured_trocar=told))
         along = layout.bite.exit - layout.bite.entry
