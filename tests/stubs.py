@@ -203,7 +203,7 @@ def make_env(
         camera=camera,
         draw=draw,
         labels=lambda state: state.layout.labels,
-        scene=types.SimpleNamespace(),
+        scene=types.SimpleNamespace(arms=()),
         task=make_task(arms),
         names=names.SceneNames("reach", ("point",) * arms, ("tip",) * arms, tuple(cameras)),
         p_world_ref=p_world_ref,

@@ -4,6 +4,7 @@ import types
 
 import fakes
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import stubs
@@ -12,7 +13,8 @@ from starjax import rcm
 from starjax.evaluation import alarms
 from starjax.monitor import calibrate, scores
 from starjax.rollouts import agent, engine, episodes, plans
-from starjax.sim import moving_trocars, registries
+from starjax.sim import arm_motion, ik, moving_trocars, registries, wrist_motion
+from starjax.sim import scene as scenes
 from starjax.types import Command
 from starjax.viewer import episode_alarm, simulation
 from starjax.viewer.frame import outcome
@@ -21,7 +23,7 @@ from starjax.viewer.frame import outcome
 def stubbed():
     """The point masses, with the scene fields that the page shows."""
     env = stubs.make_env(unlucky=0.0)
-    nothing = types.SimpleNamespace(bound=None, geom_rgb=np.zeros((1, 3)))
+    nothing = types.SimpleNamespace(bound=None, geom_rgb=np.zeros((1, 3)), arms=())
     task = env.task._replace(colours=lambda bound, layout, rgb: rgb)
     return env._replace(scene=nothing, task=task)
 
@@ -120,6 +122,40 @@ def test_a_planned_wrist_is_bent_anew_and_its_tip_stays():
     jax.tree.map(
         np.testing.assert_array_equal, moving_trocars.carried(task, free, before, now), free
     )
+
+
+def test_the_tip_of_a_mechanical_remote_centre_stays_where_its_trocar_moves():
+    env = simulation.sim_env.make("needle_drive", observation="state")
+    (bound,) = env.scene.arms
+    before, now = np.float32([[[0.01, 0.0, 0.15]], [[0.0105, -0.0005, 0.1502]]])
+    tip = rcm.Pose(np.float32(np.diag([1, -1, -1])), np.float32([0.005, 0.0, 0.01]))
+    place = jax.eval_shape(
+        lambda: env.reset(jax.random.key(0), simulation.sim_env.EnvParams(rcm.Trocar(*[[0.0]] * 3)))
+    )
+
+    @jax.jit
+    def moved():
+        shaft, angles = wrist_motion.carried(bound.tool.wrist, tip, before[0])
+        q, _ = arm_motion.solve(bound, before[0], shaft, None, 30)
+        q = jnp.concatenate([q, angles])
+        frame = moving_trocars.frame_at(env, before)
+        qpos = jnp.zeros(place.physics.qpos.shape).at[bound.q].set(q)
+        state = place.replace(
+            trocar=frame,
+            measured_trocar=frame,
+            pose=jax.tree.map(lambda leaf: leaf[None], tip),
+            physics=place.physics.replace(qpos=qpos),
+            q_target=(q,),
+        )
+        return [moving_trocars.move_trocars(env, state, p).physics.qpos for p in (before, now)]
+
+    same, after = moved()
+    for qpos, p in ((same, before), (after, now)):
+        chain = scenes.chain_at(bound, p[0])
+        found = arm_motion.tip_of(bound, ik.forward(chain, qpos[bound.q])[0], qpos[bound.q])
+        np.testing.assert_allclose(found.p, tip.p, atol=5e-6)
+        np.testing.assert_allclose(found.R, tip.R, atol=1e-4)
+    assert np.abs(after - same).max() > 1e-4
 
 
 def test_a_dragged_trocar_is_followed_and_the_task_is_done_through_it(expert):

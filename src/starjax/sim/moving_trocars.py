@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.sim import wrists
+from starjax.sim import arm_motion, wrist_motion, wrists
+from starjax.sim.scene import BoundArm
 from starjax.sim.state import Env, EnvState
 from starjax.sim.tasks.base import Task
 from starjax.types import Command
@@ -17,7 +18,8 @@ def move_trocars(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvSta
     """Returns the state with its true and measured trocars moved; unmoved ones keep their bits.
 
     The arms have not moved: until they do, their tools miss the trocars. The next steps bring them
-    back at the controller's own pace (`sim.control`).
+    back at the controller's own pace (`sim.control`). The base of a mechanical remote centre moves
+    with its trocar: its joints turn at once, and the tip stays without a pull at its object.
 
     Args:
       p_world_trocar: `[A, 3]` m.
@@ -28,7 +30,26 @@ def move_trocars(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvSta
         jax.tree.map(lambda new, old: jnp.where(is_moved, new, old), moved, frame)
         for frame in (state.trocar, state.measured_trocar)
     )
-    return state.replace(trocar=trocar, measured_trocar=measured_trocar)
+    state = state.replace(trocar=trocar, measured_trocar=measured_trocar)
+    for a, bound in enumerate(env.scene.arms):
+        if bound.arm.remote_centre:
+            dq = jnp.where(is_moved, _turn_about(bound, a, state), 0.0)
+            targets = (q + dq if arm == a else q for arm, q in enumerate(state.q_target))
+            physics = state.physics.replace(qpos=state.physics.qpos.at[bound.q].add(dq))
+            state = state.replace(physics=physics, q_target=tuple(targets))
+    return state
+
+
+def _turn_about(bound: BoundArm, a: int, state: EnvState) -> jax.Array:
+    """Returns the turn `[J]` rad of arm a that keeps its tip although its base has moved."""
+    p_trocar, q = state.trocar.p_world_trocar[a], state.physics.qpos[bound.q]
+    tip, angles = jax.tree.map(lambda leaf: leaf[a], state.pose), q[bound.joints :]
+    target = rcm.project(tip, p_trocar)
+    if bound.tool.wrist is not None:
+        target, angles = wrist_motion.carried(bound.tool.wrist, tip, p_trocar)
+    iterations = arm_motion.STEP_IK_ITERATIONS
+    wanted, _ = arm_motion.solve(bound, p_trocar, target, q[: bound.joints], iterations)
+    return jnp.concatenate([wanted, angles]) - q
 
 
 def frame_at(env: Env, p_world_trocar: jax.Array) -> rcm.TrocarFrame:
