@@ -30,8 +30,8 @@ def main(other: str) -> None:
     """Writes the film and a strip of its pictures."""
     runtime.prepare_xla()
     files = {
-        "through the near camera": packaged.locate("needle_drive"),
-        "through the usual camera": pathlib.Path(other),
+        "near camera": packaged.locate("needle_drive"),
+        "usual camera": pathlib.Path(other),
     }
     films = {label: pictures(file) for label, file in files.items()}
     count = max(map(len, films.values()))
