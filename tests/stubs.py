@@ -111,6 +111,7 @@ def make_task(arms: int = 1) -> base.Task:
         "is_seen": rcm.IS_SEEN,
         "least_steps": 0,
     }
+    given["stalled_s"] = base.Task._field_defaults["stalled_s"]
     return base.Task(**{**dict.fromkeys(base.Task._fields), **given})
 
 
