@@ -140,7 +140,7 @@ def test_commands_parse(page, root, flags):
 def test_links_lead_somewhere(page, root):
     """The site's own builder looks at them too, but for those of README and CONTRIBUTING."""
     made = {"config", "cli", "parts", "mjcf", "index", "benchmarks"} | {
-        folder.parent.name for folder in root.glob("experiments/*/claim.toml")
+        folder.parent.name for folder in root.glob("experiments/*/README.md")
     }
     for target in LINK.findall(FENCE.sub("", page.read_text())):
         if "://" in target or not page.is_relative_to(root / "docs"):
