@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from starjax.sim.tasks import scripting
-from starjax.sim.tasks.needle_drive import task
+from starjax.sim.tasks.needle_drive import grasps, task
 from starjax.sim.tissue import driving, prescribed
 from starjax.sim.tissue import needle as needles
 from starjax.types import Pose
@@ -29,7 +29,7 @@ ASIDE = (0.0, 0.001, 0.002)  # m, of the jaws at the end of the drive
 @jax.jit
 def driven(aside: jax.Array) -> tuple[prescribed.DriveMoment, jax.Array]:
     """Returns the moments of a drive whose jaws end `aside` m off the arc, and the turns (rad)."""
-    half, held = needles.entry_angle(SIZE, BITE), task.grasp(SIZE)
+    half, held = needles.entry_angle(SIZE, BITE), grasps.grasp(SIZE)
 
     def tip_at(share: jax.Array) -> tuple[Pose, jax.Array]:
         share = scripting.minimum_jerk(share)

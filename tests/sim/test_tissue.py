@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starjax.sim.tasks import scripting
-from starjax.sim.tasks.needle_drive import task
+from starjax.sim.tasks.needle_drive import grasps, task
 from starjax.sim.tissue import driving, hole, prescribed, rows
 from starjax.sim.tissue import needle as needles
 from starjax.sim.tissue.needle import Bite
@@ -72,7 +72,7 @@ def test_a_spring_alone_is_the_implicit_one():
 def driven(aside=0.0, gripper=-1.0):
     """Moves the jaws on the bite's path in 4 s, at its end `aside` m of it."""
     half = needles.entry_angle(SIZE, BITE)
-    held = task.grasp(SIZE)
+    held = grasps.grasp(SIZE)
 
     def tip_at(t):
         s = jnp.clip(t / 4.0, 0.0, 1.0)

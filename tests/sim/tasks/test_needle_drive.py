@@ -14,7 +14,7 @@ from starjax import rcm
 from starjax.sim import scene
 from starjax.sim.tasks import wrist_script
 from starjax.sim.tasks.base import Contacts, SimReadings
-from starjax.sim.tasks.needle_drive import expert, rescue, task
+from starjax.sim.tasks.needle_drive import expert, grasps, rescue, task
 from starjax.sim.tissue import driving, hole
 from starjax.sim.tissue import needle as needles
 from starjax.types import Pose
@@ -79,7 +79,7 @@ def test_one_grasp_is_within_the_wrist_at_every_trocar(name):
     _, bound = compiled(name)
     p_trocar = np.asarray(rcm.trocar_position(rcm.TROCARS, np.array([0.0, 0.0, 0.15])))
     p_trocar = p_trocar[np.arange(240) % 12].astype(np.float32)
-    held = task.grasp(bound.size)
+    held = grasps.grasp(bound.size)
 
     @jax.jit
     @jax.vmap
@@ -110,7 +110,7 @@ def measured(bound, layout, entry=0.0, out=0.0, force=0.1, emerged=0.004, collid
         exit=bite.exit + out * aside,
         max_force=jnp.asarray(force),
     )
-    tip = wrist_script.tip_of(pose, task.grasp(size))
+    tip = wrist_script.tip_of(pose, grasps.grasp(size))
     tips = Pose(tip.R[None], tip.p[None])
     tissue = driving.begin(size, tips, pose, jnp.ones(1, bool)).replace(hole=made)
     qpos = jnp.zeros(40)
@@ -148,7 +148,7 @@ def at(bound, layout, turn, height=0.0, **events):
     """A state of a needle on its path at `turn` rad, lifted by `height` m, its tip where it is."""
     pose = needles.pose_on(bound.size, layout.bite, jnp.asarray(turn))
     pose = pose._replace(p=pose.p.at[2].add(height))
-    tip = wrist_script.tip_of(pose, task.grasp(bound.size))
+    tip = wrist_script.tip_of(pose, grasps.grasp(bound.size))
     now = measured(bound, layout).replace(needle=pose, tip=tip.p, **events)
     trocar = types.SimpleNamespace(p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]))
     return types.SimpleNamespace(

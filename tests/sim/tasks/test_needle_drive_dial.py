@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim.tasks.needle_drive import dial, task
+from starjax.sim.tasks.needle_drive import dial, grasps
 from starjax.sim.tissue import needle as needles
 
 COUNT = 200
@@ -57,7 +57,7 @@ def test_turns_fill_the_dial_and_its_bins():
 def test_the_grasp_is_that_of_needle_drive_at_another_angle(turn):
     bite = a_layout(turn).bite
     angle = -float(needles.entry_angle(dial.SIZE, bite))
-    expected = task.grasp(dial.SIZE, angle, dial.GRASP_TURN, dial.GRASP_LEAN)
+    expected = grasps.grasp(dial.SIZE, angle, dial.GRASP_TURN, dial.GRASP_LEAN)
     found = dial.grasp(bite)
     np.testing.assert_allclose(found.R, expected.R, atol=1e-6)
     np.testing.assert_allclose(found.p, expected.p, atol=1e-8)

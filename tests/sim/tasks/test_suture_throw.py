@@ -11,6 +11,7 @@ from starjax import rcm
 from starjax.sim import physics, scene, thread
 from starjax.sim.tasks import wrist_script
 from starjax.sim.tasks.base import SimReadings
+from starjax.sim.tasks.needle_drive import grasps
 from starjax.sim.tasks.needle_drive import task as driven
 from starjax.sim.tasks.suture_throw import expert, far_grasp, rescue, task
 from starjax.sim.tissue import needle as needles
@@ -152,7 +153,7 @@ def test_the_expert_carries_on_wherever_the_needle_is(
     needle = needles.pose_on(task.SIZE, layout.bite, out + share * (middle - out))
     far = far_grasp.grasps(task.SIZE)
     first, second = (jax.tree.map(lambda leaf, k=k: leaf[k], far) for k in range(2))
-    held = {FIRST: first, SECOND: second}.get(grip, driven.grasp(task.SIZE))
+    held = {FIRST: first, SECOND: second}.get(grip, grasps.grasp(task.SIZE))
     tip = expert.tip_of(needle, held)
     tip = tip._replace(p=tip.p.at[2].add(height))
     # A needle in the jaws goes with them.

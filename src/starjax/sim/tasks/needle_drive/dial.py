@@ -14,7 +14,7 @@ import numpy as np
 
 from starjax import rcm
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.needle_drive import expert, task
+from starjax.sim.tasks.needle_drive import expert, grasps, task
 from starjax.sim.tasks.wrist_script import WRIST, tip_of
 from starjax.sim.tissue import needle as needles
 from starjax.sim.tissue.needle import Bite
@@ -50,7 +50,7 @@ def label(layout: task.DriveLayout) -> dict[str, jax.Array]:
 
 def grasp(bite: Bite) -> Pose:
     """Returns pose_tip_needle, the jaws as far before the arc's middle as the bite is wide."""
-    first, angle = task.grasp(SIZE, 0.0, GRASP_TURN, GRASP_LEAN), -needles.entry_angle(SIZE, bite)
+    first, angle = grasps.grasp(SIZE, 0.0, GRASP_TURN, GRASP_LEAN), -needles.entry_angle(SIZE, bite)
     R = first.R @ rcm.rotation_z(-angle)
     return Pose(R, -R @ needles.offset_at(SIZE, angle))
 

@@ -25,7 +25,7 @@ from starjax.sim.tasks.base import (
     Task,
     TaskStatus,
 )
-from starjax.sim.tasks.needle_drive import text
+from starjax.sim.tasks.needle_drive import grasps, text
 from starjax.sim.tissue import driving, hole
 from starjax.sim.tissue import needle as needles
 from starjax.sim.tissue.needle import Bite, Needle
@@ -36,12 +36,6 @@ SPREAD = 0.006  # of the bite's middle, either way
 DIRECTION = (float(np.deg2rad(150.0)), float(np.deg2rad(270.0)))
 TIP_HOME = (0.0, 0.0, 0.05)
 TIP_SPREAD = 0.008  # each axis, at most
-
-# The grasp, found by a search over trocars, bites and directions for the least wrist angles: angle
-# on the arc; turn of the jaws about the wire, and in the pads' plane (rad).
-GRASP_ANGLE = float(np.deg2rad(-35.0))
-GRASP_TURN = float(np.deg2rad(120.0))
-GRASP_LEAN = float(np.deg2rad(60.0))
 
 # Strict success, for SETTLE_STEPS control steps.
 ON_MARK = 0.001  # of entry and exit
@@ -135,21 +129,6 @@ def sample(bites: tuple[float, float], bound: DriveBound, key: jax.Array) -> Dri
         key_tip, (3,), minval=-TIP_SPREAD, maxval=TIP_SPREAD
     )
     return DriveLayout(Bite(jnp.append(middle - along, 0.0), jnp.append(middle + along, 0.0)), tip)
-
-
-def grasp(
-    size: Needle, a: float = GRASP_ANGLE, turn: float = GRASP_TURN, lean: float = GRASP_LEAN
-) -> Pose:
-    """Returns pose_tip_needle of a grasp at the angle `a` on the arc (all rad)."""
-    out = np.array([np.cos(a), np.sin(a), 0.0])
-    along = np.array([-np.sin(a), np.cos(a), 0.0])
-    z = np.cos(turn) * np.array([0.0, 0.0, -1.0]) - np.sin(turn) * out
-    x, z = np.cos(lean) * along - np.sin(lean) * z, np.cos(lean) * z + np.sin(lean) * along
-    R_tip_needle = np.stack([x, np.cross(z, x), z])
-    held = size.radius * out + np.array([size.centre, 0.0, 0.0])
-    return Pose(
-        jnp.asarray(R_tip_needle, jnp.float32), jnp.asarray(-R_tip_needle @ held, jnp.float32)
-    )
 
 
 def begin(
@@ -254,7 +233,7 @@ def is_sound(bound: DriveBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
 
 def _grasp(bound: DriveBound, bite: Bite) -> Pose:
     """Returns pose_tip_needle, the same for all bites."""
-    return grasp(bound.size)
+    return grasps.grasp(bound.size)
 
 
 def make(

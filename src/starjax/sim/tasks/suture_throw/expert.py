@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from starjax.sim.state import EnvState
 from starjax.sim.tasks import phases, scripting, wrist_script
-from starjax.sim.tasks.needle_drive import task as driven
+from starjax.sim.tasks.needle_drive import grasps
 from starjax.sim.tasks.suture_throw import far_grasp, task
 from starjax.sim.tasks.wrist_script import tip_of
 from starjax.sim.tissue import needle as needles
@@ -86,7 +86,7 @@ def enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScript
     again = (phase == OPEN) & (script.phase == OUT)
     leg = jnp.where(again, 1, script.leg).astype(jnp.int32)
     half = needles.entry_angle(task.SIZE, bite)
-    first = tip_of(needle, driven.grasp(task.SIZE))
+    first = tip_of(needle, grasps.grasp(task.SIZE))
     start = tip_of(needles.pose_on(task.SIZE, bite, -half - BEFORE), grip)
     far = tip_of(needle, jax.tree.map(lambda leaf: leaf[leg], far_grasp.grasps(task.SIZE)))
     up = jnp.array([0.0, 0.0, 1.0])

@@ -20,6 +20,7 @@ from starjax.sim.tasks.base import (
     StepReadings,
     TaskStatus,
 )
+from starjax.sim.tasks.needle_drive import grasps
 from starjax.sim.tasks.needle_drive import task as driven
 from starjax.sim.tasks.suture_throw import text
 from starjax.sim.tissue import driving
@@ -90,7 +91,7 @@ def begin(
     bound: driven.DriveBound, layout: ThrowLayout, qpos: jax.Array, tips: Pose
 ) -> tuple[jax.Array, driving.Tissue]:
     """Puts the needle into the block."""
-    held = driven.grasp(SIZE)
+    held = grasps.grasp(SIZE)
     R = jnp.asarray(R_BLOCK)
     pose = Pose(R @ held.R, jnp.asarray(P_BLOCK) + R @ held.p)
     start = bound.needle
