@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.sim import linear
+from starjax.sim import iteration, linear
 from starjax.sim.quiet_mjx import mjx
 
 MAX_ITERATIONS = 10
@@ -156,12 +156,10 @@ def solve(
     def at(x: jax.Array, Mx: jax.Array, r: jax.Array) -> Iterate:
         return Iterate(x, Mx, r, Mx - f + pull(problem, r) @ A)
 
-    def is_coarse(loop: tuple[jax.Array, Iterate]) -> jax.Array:
-        count, now = loop
-        return (count < max_iterations) & (jnp.sum(now.gradient**2 * weights) > limit)
+    def is_coarse(now: Iterate) -> jax.Array:
+        return jnp.sum(now.gradient**2 * weights) > limit
 
-    def improve(loop: tuple[jax.Array, Iterate]) -> tuple[jax.Array, Iterate]:
-        count, now = loop
+    def improve(now: Iterate) -> Iterate:
         # Newton direction: (M + B'B) p = -gradient. The cost's slope at x + s p is
         # (M x - f) p + s p M p + pull(r + s A p) A p.
         B = half_hessian(problem, now.r)
@@ -173,10 +171,10 @@ def solve(
             return slope_0 + fraction * bend + pull(problem, now.r + fraction * Ap) @ Ap
 
         fraction = line_search(slope, now.gradient @ p)
-        return count + 1, at(now.x + fraction * p, now.Mx + fraction * Mp, now.r + fraction * Ap)
+        return at(now.x + fraction * p, now.Mx + fraction * Mp, now.r + fraction * Ap)
 
     start = at(x, M @ x, A @ x - b)
-    _, end = jax.lax.while_loop(is_coarse, improve, (jnp.zeros((), jnp.int32), start))
+    end = iteration.improve_while(is_coarse, improve, start, max_iterations)
     error = 0.5 * timestep**2 * jnp.sum(end.gradient**2 * weights)
     return end.x, -pull(problem, end.r) @ A, error
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.sim import linear
+from starjax.sim import iteration, linear
 
 POINTS = 32
 LENGTH = 0.150  # m
@@ -102,15 +102,13 @@ def step(thread: Thread, tail: jax.Array, hole: Hole, ground: float, h: float) -
     floor = jnp.where(fixed, -jnp.inf, ground)
     free = jnp.where(fixed[:, 0], 0.0, 1.0)
 
-    def is_off(loop: tuple[jax.Array, jax.Array]) -> jax.Array:
-        count, p = loop
-        return (count < ITERATIONS) & (_worst(p, free) > TOLERANCE)
+    def is_off(p: jax.Array) -> jax.Array:
+        return _worst(p, free) > TOLERANCE
 
-    def improve(loop: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        count, p = loop
-        return count + 1, _spaced(p, free).at[:, 2].max(floor[:, 0])
+    def improve(p: jax.Array) -> jax.Array:
+        return _spaced(p, free).at[:, 2].max(floor[:, 0])
 
-    _, p = jax.lax.while_loop(is_off, improve, (jnp.zeros((), jnp.int32), p))
+    p = iteration.improve_while(is_off, improve, p, ITERATIONS)
     return thread.replace(p=p, v=(p - thread.p) / h)
 
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.spatial.transform import Rotation
 
-from starjax.sim import linear, solver
+from starjax.sim import iteration, linear, solver
 from starjax.types import Pose
 
 MAX_ITERATIONS = 12
@@ -101,14 +101,12 @@ def solve(
     def gradient(u: jax.Array) -> jax.Array:
         return inertia * (u - free) - impulses(rows.J @ u) @ rows.J
 
-    def is_coarse(loop: tuple[jax.Array, jax.Array]) -> jax.Array:
-        count, u = loop
+    def is_coarse(u: jax.Array) -> jax.Array:
         p = impulses(rows.J @ u)
         size = jnp.abs(inertia * (u - free)) + jnp.abs(p) @ jnp.abs(rows.J)
-        return (count < MAX_ITERATIONS) & jnp.any(jnp.abs(gradient(u)) > ACCURACY * size)
+        return jnp.any(jnp.abs(gradient(u)) > ACCURACY * size)
 
-    def improve(loop: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        count, u = loop
+    def improve(u: jax.Array) -> jax.Array:
         x, g = rows.J @ u, gradient(u)
         wanted = -(rest + slope * x)
         is_free = (wanted > low) & (wanted < high)
@@ -119,9 +117,9 @@ def solve(
         def slope_at(fraction: jax.Array) -> jax.Array:
             return first + fraction * bend - impulses(x + fraction * move) @ move
 
-        return count + 1, u + solver.line_search(slope_at, g @ step) * step
+        return u + solver.line_search(slope_at, g @ step) * step
 
-    _, u = jax.lax.while_loop(is_coarse, improve, (jnp.zeros((), jnp.int32), start))
+    u = iteration.improve_while(is_coarse, improve, start, MAX_ITERATIONS)
     return u, impulses(rows.J @ u) / h
 
 
