@@ -50,6 +50,8 @@ PHASES = {
     "peg_transfer": "raise approach descend close lift carry lower open retreat wait",
     "needle_pick": "raise approach descend close lift hold",
     "needle_regrasp": "raise approach descend close lift hold",
+    "needle_drive": "raise approach descend drive hold",
+    "needle_drive_dial": "raise approach descend drive hold",
     "ring_on_wire": "raise approach descend close lift carry lower open leave wait",
     "reach": "move rest",
     "endoscope_track": "find follow",
@@ -89,8 +91,9 @@ def main() -> None:
 
 def names(task: str) -> list[str]:
     """Names of the expert's phases."""
-    known = importlib.import_module(f"starjax.sim.tasks.{task}.expert")
-    return list(getattr(known, "PHASES", PHASES.get(task, "").split()))
+    if task in PHASES:
+        return PHASES[task].split()
+    return list(importlib.import_module(f"starjax.sim.tasks.{task}.expert").PHASES)
 
 
 def points(task: Task) -> list[str]:

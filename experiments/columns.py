@@ -1,5 +1,6 @@
 """Columns of the tables of results, and paired tests."""
 
+import functools
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,6 +10,8 @@ from starjax.evaluation.result import Trial, read_sweep
 from starjax.report import compare, formats, outcomes, results, stats
 
 HIGHEST = 8  # index of the unseen trocar above all seen ones
+TURN_WIDTH = 11  # degrees of a needle's turn, of the label `turn` of needle drive along the dial
+TURNS = range(84, 150, TURN_WIDTH)  # degrees, where its values begin
 
 
 class Scored(NamedTuple):
@@ -136,6 +139,28 @@ def _fraction(part: str, whole: str) -> Callable[[Scored], str]:
     return lambda scored: _served(scored, draw)
 
 
+def _seeds(scored: Scored) -> str:
+    trained = results.trained_seed(scored.run)
+    return f"{'–' if trained is None else trained}, {scored.run.result.seed}"
+
+
+def _code(scored: Scored) -> str:
+    result = scored.run.result
+    return formats.code(result.commit, result.dirty) or "–"
+
+
+def by_turn(scored: Scored, part: str, k: int) -> stats.Rate:
+    """Counts the successes in a sixth of the dial (0 to 5) at some of the trocars."""
+    trials = {"seen": _seen, "unseen": _unseen, "trocars": lambda x: _swept(x).trials}[part](scored)
+    return outcomes.tally([trial for trial in trials if trial.labels["turn"] == k])
+
+
+def _by_turn(part: str, k: int, scored: Scored) -> str:
+    found = by_turn(scored, part, k)
+    low, middle, high = (100 * x for x in (found.low, found.rate, found.high))
+    return f"{found.successes}/{found.trials}: {middle:.0f}% ({low:.0f}-{high:.0f})"
+
+
 COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "seen": ("seen", lambda x: rate(_seen(x))),
     "unseen": ("unseen", lambda x: rate(_unseen(x))),
@@ -171,6 +196,13 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
         lambda x: _served(x, lambda report: f"{report['rcm_commanded_mm']:.0e}"),
     ),
     "median": ("median success (s)", _median),
+    "seeds": ("seeds: training, trials", _seeds),
+    "code": ("code", _code),
+    **{
+        f"{part}_turn{k}": (f"{low}° to {low + TURN_WIDTH}°", functools.partial(_by_turn, part, k))
+        for part in ("seen", "unseen", "trocars")
+        for k, low in enumerate(TURNS)
+    },
 }
 
 

@@ -84,6 +84,8 @@ rescuers = Registry(
         },
         "needle_drive": "starjax.sim.tasks.needle_drive.rescue:RESCUER",
         "needle_drive_sh": "starjax.sim.tasks.needle_drive.rescue:SMALL",
+        "needle_drive_dial": "starjax.sim.tasks.needle_drive.rescue:DIAL",
+        "needle_drive_dial.one_plane": "starjax.sim.tasks.needle_drive.rescue:DIAL_ONE_PLANE",
         "peg_transfer.one_wall": "starjax.sim.tasks.peg_transfer.rescue:WITH_ONE_WALL",
     },
     "starjax.sim.tasks.rescue:Rescuer",

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim.tasks.needle_drive import dial, grasps
+from starjax.sim.tasks import wrist_script
+from starjax.sim.tasks.needle_drive import dial, expert, grasps, rescue
 from starjax.sim.tissue import needle as needles
+from starjax.types import Pose
 
 COUNT = 200
 P_TROCARS = np.asarray(rcm.trocar_position(rcm.TROCARS, np.float32([0.0, 0.0, 0.15])))
@@ -101,3 +103,43 @@ def test_the_expert_changes_its_lean_for_the_trocar_alone():
     np.testing.assert_allclose(near[:, 0], dial.LEAN, atol=1e-6)
     assert np.ptp(far[:, 0]) > np.deg2rad(14.0)
     assert far[:, 1].min() > -1e-5 and far[:, 1].max() > np.deg2rad(3.0)
+
+
+def in_the_pad(turn, trocar, lean):
+    """A state of a needle that another agent has driven to `turn` rad in a plane with `lean`."""
+    layout = a_layout(140.0)
+    needle = needles.pose_on(
+        dial.SIZE, layout.bite, jnp.asarray(turn), dial.up_of(layout.bite, lean)
+    )
+    tip = wrist_script.tip_of(needle, dial.grasp(layout.bite))
+    now = {
+        "needle": needle,
+        "tip": tip.p,
+        "is_inside": jnp.ones((), bool),
+        "emerged": jnp.zeros(()),
+    }
+    return types.SimpleNamespace(
+        pose=Pose(tip.R[None], tip.p[None]),
+        measurements=types.SimpleNamespace(**now),
+        layout=layout,
+        measured_trocar=types.SimpleNamespace(p_world_trocar=jnp.asarray(P_TROCARS[trocar])[None]),
+        step=jnp.asarray(50),
+    )
+
+
+@pytest.mark.parametrize(
+    ("rescuer", "plane"),
+    [(rescue.DIAL, dial.plane), (rescue.DIAL_ONE_PLANE, dial.one_plane)],
+)
+@pytest.mark.parametrize("trocar", [0, 11])
+def test_a_needle_in_another_plane_ends_in_the_experts(rescuer, plane, trocar):
+    state = in_the_pad(0.1, trocar, jnp.asarray(0.3))
+    script = rescuer.resume(jax.random.key(0), state)
+    command, _, _ = rescuer.act(script, state)
+    assert int(script.phase) == expert.DRIVE and float(script.jaws) == -1.0
+    assert float(jnp.linalg.norm(command.pose.p[0] - state.pose.p[0])) < 0.5e-3
+    assert float(jnp.abs(command.pose.R[0] - state.pose.R[0]).max()) < 0.02
+    end = expert._on_arc(dial.SIZE, script, jnp.ones(()), state, plane)
+    turn, up = expert._end(dial.SIZE, state), plane(state)
+    path = needles.pose_on(dial.SIZE, state.layout.bite, turn, up)
+    np.testing.assert_allclose(end.R, wrist_script.tip_of(path, script.held).R, atol=1e-5)
