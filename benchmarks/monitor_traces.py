@@ -14,15 +14,13 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import monitor_trials
 import numpy as np
 
-from starjax import config
-from starjax.commands import policy_args, policy_evaluation, scenes
 from starjax.evaluation import alarms, disturbances, sweep
-from starjax.evaluation.disturbances import base
 from starjax.monitor.scores import ScoreSettings
 from starjax.rollouts import plans
-from starjax.runtime import files
+from starjax.runtime import files, xla
 
 COLUMNS = ("success", "lost", "invalid", "steps", "stage", "trocar")
 EVERY, TIPS = 2, 2  # planned points that are kept, one of so many; measured tips of a decision
@@ -33,32 +31,24 @@ _COMMANDED = "commanded_gripper"
 
 def main(policy: str, out: str, sampled: str, each: str, *levels: str) -> None:
     """Runs the trials and writes their decisions."""
-    from starjax.runtime import xla
-
     xla.prepare_xla()
     kinds = disturbances.parse_levels("disturbance", levels)
-    path = policy_args.resolve(policy_args.PolicyArgs(policy=policy))
-    who, _ = policy_args.load(path)
-    env = scenes.disturbable(who.env, list(kinds), who.trained.policy)
-    who = who._replace(env=base.with_disturbances(env, list(kinds)))
+    who = monitor_trials.disturbable(policy, kinds)
     execute, task = who.trained.policy.execute, who.env.task
     settings = ScoreSettings(execute, who.env.control_hz, 1)
-    nothing = dict.fromkeys(kinds, 0.0)
-    sets = {"sampled": (sweep.sample(1, int(sampled), task), 1, 1, nothing)}
-    sets["nothing"] = (task.trocars, int(each), 0, nothing)
+    of = monitor_trials.Trials
+    sets = {"sampled": of(sweep.sample(1, int(sampled), task), 1, 1, {})}
+    sets["nothing"] = of(task.trocars, int(each), 0, {})
     for name, level in kinds.items():
-        sets[f"{name}={level:g}"] = (task.trocars, int(each), 0, {**nothing, name: level})
+        sets[f"{name}={level:g}"] = of(task.trocars, int(each), 0, {name: level})
     arrays: dict[str, np.ndarray] = {"execute": np.array(execute)}
     with (
         mock.patch.object(plans, "record", functools.partial(_record, plans.record)),
         mock.patch.object(alarms, "of_episodes", _decisions),
     ):
-        for label, (trocars, trials, seed, given) in sets.items():
-            run = config.EvalConfig(trials=trials, time_limit_s=30.0, video_trials=0)
-            folder = Path(out).with_suffix("") / label.replace("=", "-")
-            table = policy_evaluation.rollouts(folder, who, trocars, run, seed, given, settings)
+        folder = Path(out).with_suffix("")
+        for label, table in monitor_trials.evaluations(folder, who, settings, sets):
             arrays |= {f"{label}/{name}": x for name, x in _stored(table, settings).items()}
-            print(label, table.success.mean(), flush=True)
     files.write_npz(Path(out), arrays)
 
 

@@ -94,7 +94,7 @@ def score(policy: str, file: str, alpha: str = "0.05", windows: str = "1", *name
     content = {
         "policy": policy,
         "weights": made["weights"],
-        "commands": [made["command"], stress["command"]],
+        "commands": list(dict.fromkeys([made["command"], stress["command"]])),
         **{name: made[name] for name in kept},
         "monitor": calibrate.to_json(monitor),
         "strict": calibrate.to_json(strict),
