@@ -43,8 +43,13 @@ def checked(**named: tuple[Any, tuple[int, ...]]) -> list[jax.Array]:
       The values as arrays, in the order given.
 
     Raises:
-      ValueError: a trailing shape differs, or the leading axes do not broadcast.
+      ValueError: a value is a struct as `Trocar`, a trailing shape differs, or the leading axes do
+        not broadcast.
     """
+    for name, (value, _) in named.items():
+        # Its fields would be read as coordinates.
+        if hasattr(value, "_fields"):
+            raise ValueError(f"{name}: expected an array, got {type(value).__name__}")
     values = {name: jnp.asarray(value) for name, (value, _) in named.items()}
     leading = {}
     for name, (_, trailing) in named.items():

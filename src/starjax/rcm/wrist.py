@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from starjax.rcm import arrays, manifold, rotations
+from starjax.rcm import arrays, manifold, rotations, wrist_checks
 from starjax.types import Pose
 
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
@@ -78,6 +78,7 @@ def tip_of(wrist: Wrist, pose_world_shaft: Pose, angles: ArrayLike) -> Pose:
       pose_world_shaft: `[...]`, of {L}.
       angles: `[..., 2]` rad, pitch and yaw; not limited.
     """
+    wrist_checks.check_wrist(wrist)
     R, p, angles = _checked(pose_world_shaft, angles=(angles, (2,)))
     bend = bent(wrist, angles)
     return Pose(arrays.matmul(R, bend.R), p + arrays.matvec(R, bend.p))
@@ -92,6 +93,7 @@ def shaft_of(wrist: Wrist, pose_world_tip: Pose, angles: ArrayLike) -> Pose:
       pose_world_tip: `[...]`.
       angles: `[..., 2]` rad, pitch and yaw; not limited.
     """
+    wrist_checks.check_wrist(wrist)
     R, p, angles = _checked(pose_world_tip, angles=(angles, (2,)))
     bend = bent(wrist, angles)
     R = arrays.matmul(R, bend.R.mT)
@@ -110,6 +112,7 @@ def angles_through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike
     Returns:
       `[..., 2]` rad, pitch and yaw; NaN if an input is not finite.
     """
+    wrist_checks.check_wrist(wrist)
     R, p, p_world_trocar = _checked(pose_world_tip, p_world_trocar=(p_world_trocar, (3,)))
     unknown = _taint(R, p, p_world_trocar)
     angles = _angles(wrist, _rotation(R), _offset(p, p_world_trocar))
@@ -133,6 +136,7 @@ def through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike) -> Wr
     Returns:
       WristPose `[...]`; NaN and not feasible if an input is not finite.
     """
+    wrist_checks.check_wrist(wrist)
     R, p, o = _checked(pose_world_tip, p_world_trocar=(p_world_trocar, (3,)))
     unknown = _taint(R, p, o)
     R, o, offset = _rotation(R), arrays.bounded(o), _offset(p, o)

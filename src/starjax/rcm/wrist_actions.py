@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.rcm import actions, arrays, rotations
+from starjax import errors
+from starjax.rcm import actions, arrays, rotations, wrist_checks
 from starjax.rcm import wrist as wrists
 from starjax.types import Pose
 
@@ -29,6 +30,8 @@ def rcm6(wrist: wrists.Wrist) -> actions.ActionSpace:
     Args:
       wrist: sizes and limits.
     """
+
+    wrist_checks.check_wrist(wrist)
 
     def encode(pose: Pose, frame: actions.SpaceFrame) -> list[jax.Array]:
         angles = wrists.angles_through(wrist, pose, frame.p)
@@ -59,6 +62,8 @@ def se3_through(wrist: wrists.Wrist) -> actions.ActionSpace:
       wrist: sizes and limits.
     """
 
+    wrist_checks.check_wrist(wrist)
+
     def encode(pose: Pose, frame: actions.SpaceFrame) -> list[jax.Array]:
         return [pose.p, rotations.rot6d_encode(pose.R)]
 
@@ -76,6 +81,8 @@ def se3_wrist(wrist: wrists.Wrist) -> actions.ActionSpace:
     Args:
       wrist: sizes.
     """
+
+    wrist_checks.check_wrist(wrist)
 
     def encode(pose: Pose, frame: actions.SpaceFrame) -> list[jax.Array]:
         angles = wrists.angles_through(wrist, pose, frame.p)
@@ -99,8 +106,9 @@ def action_space(name: str, wrist: wrists.Wrist | None = None) -> actions.Action
       wrist: of the instrument, for the last three.
 
     Raises:
-      ValueError: one of these without a wrist.
+      ValueError: an unknown name, or one of these without a wrist.
     """
+    errors.choice("action_space", name, [*actions.ACTION_SPACES.registry.names(), *_WITH_WRIST])
     if name not in _WITH_WRIST:
         return actions.ACTION_SPACES[name]
     if wrist is None:
