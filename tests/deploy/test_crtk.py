@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starjax.deploy import crtk
+from starjax.deploy import crtk, psm
 from starjax.errors import UsageError
 from starjax.types import Pose
+
+AT = crtk.Frames(Pose(np.eye(3), np.zeros(3)), Pose(np.eye(3), np.zeros(3)))
 
 
 def message():
@@ -107,3 +109,42 @@ def test_joints_are_read_by_name_and_written_in_order():
     sent.position[1] = np.nan
     with mistakes.of("measured_js.position", "nan"):
         crtk.joints_of(sent, names)
+
+
+NAN = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("argument", "fill"),
+    [
+        ("servo_cp.position", lambda sent: crtk.fill_pose(sent, Pose(np.eye(3), [0, NAN, 0]), AT)),
+        (
+            "servo_cp.orientation",
+            lambda sent: crtk.fill_pose(sent, Pose(0 * np.eye(3), [0] * 3), AT),
+        ),
+        ("servo_cp.orientation", lambda sent: crtk.fill_pose(sent, Pose(-np.eye(3), [0] * 3), AT)),
+        ("gripper", lambda sent: crtk.fill_jaw(sent, NAN, crtk.Jaw(0.0, 1.0))),
+        ("servo_jp.position", lambda sent: crtk.fill_joints(sent, [NAN] * 6, psm.JOINTS)),
+        ("servo_jp.position", lambda sent: crtk.fill_joints(sent, [0.0] * 5, psm.JOINTS)),
+    ],
+)
+def test_what_no_robot_should_get_is_not_written(argument, fill):
+    sent, before = message(), message()
+    with mistakes.of(argument):
+        fill(sent)
+    assert sent == before
+
+
+def test_a_wrong_number_of_joints_is_named():
+    q = np.zeros(5)
+    uses = (
+        lambda: psm.tip_of(q, psm.PROGRASP),
+        lambda: psm.shaft_of(q, psm.PROGRASP),
+        lambda: psm.half_turn(q),
+    )
+    for use in uses:
+        with mistakes.of("q", "5"):
+            use()
+    short = types.SimpleNamespace(name=list(psm.JOINTS), position=[0.0] * 4)
+    with mistakes.of("measured_js.position", "0.0"):
+        crtk.joints_of(short, psm.JOINTS)

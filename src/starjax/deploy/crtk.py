@@ -60,10 +60,8 @@ def pose_of(message: Any, frames: Frames) -> Pose:
     """
     pose = getattr(message, "pose", message)
     position, wxyz = pose.position, pose.orientation
-    p = np.array([position.x, position.y, position.z], np.float64)
+    p = _finite("measured_cp.position", [position.x, position.y, position.z])
     xyzw = np.array([wxyz.x, wxyz.y, wxyz.z, wxyz.w], np.float64)
-    if not np.isfinite(p).all():
-        raise UsageError("measured_cp.position", "finite values", p.tolist())
     if not abs(np.linalg.norm(xyzw) - 1.0) < _MAX_NORM_ERROR:
         raise UsageError("measured_cp.orientation", "a unit quaternion", xyzw.tolist())
     pose_base_tool = _pose(Rotation.from_quat(xyzw).as_matrix(), p)
@@ -71,7 +69,15 @@ def pose_of(message: Any, frames: Frames) -> Pose:
 
 
 def fill_pose(message: Any, pose_world_tip: Pose, frames: Frames) -> Any:
-    """Fills `servo_cp`, a PoseStamped or Pose, and returns it; its header is the caller's."""
+    """Fills `servo_cp`, a PoseStamped or Pose, and returns it; its header is the caller's.
+
+    Raises:
+      UsageError: a value is not finite, or R is no rotation; the message is unchanged.
+    """
+    R = np.asarray(pose_world_tip.R, np.float64)
+    if not np.abs(R.T @ R - np.eye(3)).max() < _MAX_NORM_ERROR or np.linalg.det(R) < 0.0:
+        raise UsageError("servo_cp.orientation", "a rotation", R.tolist())
+    _finite("servo_cp.position", pose_world_tip.p)
     pose_world_tool = compose(pose_world_tip, inverse(frames.pose_tool_tip))
     pose = compose(inverse(frames.pose_world_base), pose_world_tool)
     x, y, z, w = Rotation.from_matrix(np.asarray(pose.R, np.float64)).as_quat(canonical=True)
@@ -96,7 +102,12 @@ def opening_of(message: Any, jaw: Jaw) -> float:
 
 
 def fill_jaw(message: Any, gripper: float, jaw: Jaw) -> Any:
-    """Fills `jaw/servo_jp`, a JointState, and returns it."""
+    """Fills `jaw/servo_jp`, a JointState, and returns it.
+
+    Raises:
+      UsageError: the opening is not finite.
+    """
+    _finite("gripper", gripper)
     fraction = (np.clip(gripper, -1.0, 1.0) + 1.0) / 2.0
     message.position = [float(jaw.closed + fraction * _range(jaw))]
     return message
@@ -116,19 +127,26 @@ def joints_of(message: Any, names: Sequence[str]) -> np.ndarray:
     Raises:
       UsageError: a joint is missing, or a position is not finite.
     """
-    positions = dict(zip(message.name, message.position, strict=False))
+    if len(message.name) != len(message.position):
+        expected = f"{len(message.name)} values, as names"
+        raise UsageError("measured_js.position", expected, list(message.position))
+    positions = dict(zip(message.name, message.position, strict=True))
     missing = [name for name in names if name not in positions]
     if missing:
         raise UsageError("measured_js.name", ", ".join(names), ", ".join(message.name) or "none")
-    q = np.array([positions[name] for name in names], np.float64)
-    if not np.isfinite(q).all():
-        raise UsageError("measured_js.position", "finite values", q.tolist())
-    return q
+    return _finite("measured_js.position", [positions[name] for name in names])
 
 
 def fill_joints(message: Any, q: Any, names: Sequence[str]) -> Any:
-    """Fills `servo_jp`, a JointState, with positions `[J]` (rad, m), and returns it."""
-    message.name, message.position = list(names), [float(x) for x in q]
+    """Fills `servo_jp`, a JointState, with positions `[J]` (rad, m), and returns it.
+
+    Raises:
+      UsageError: another number of positions, or one that is not finite.
+    """
+    positions = _finite("servo_jp.position", q).tolist()
+    if len(positions) != len(names):
+        raise UsageError("servo_jp.position", f"{len(names)} values", positions)
+    message.name, message.position = list(names), positions
     return message
 
 
@@ -153,6 +171,13 @@ def _range(jaw: Jaw) -> float:
     if not jaw.open > jaw.closed:
         raise UsageError("jaw.open", f"more than jaw.closed, {jaw.closed:g} rad", jaw.open)
     return jaw.open - jaw.closed
+
+
+def _finite(argument: str, values: Any) -> np.ndarray:
+    values = np.asarray(values, np.float64)
+    if not np.isfinite(values).all():
+        raise UsageError(argument, "finite values", values.tolist())
+    return values
 
 
 def _pose(R: Any, p: Any) -> Pose:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from starjax import rcm
 from starjax.deploy.crtk import compose
+from starjax.errors import UsageError
 from starjax.types import Pose
 
 JOINTS = (
@@ -45,16 +46,24 @@ PROGRASP = Instrument(rcm.PROGRASP, 0.4670 - 0.4318)
 
 
 def shaft_of(q: np.ndarray, instrument: Instrument) -> Pose:
-    """Returns pose_base_shaft of the joints `[6]`; its origin is on the pitch axis."""
-    yaw, pitch, insertion, roll = np.asarray(q, np.float64)[:4]
+    """Returns pose_base_shaft of the joints `[6]`; its origin is on the pitch axis.
+
+    Raises:
+      UsageError: another number of joints.
+    """
+    yaw, pitch, insertion, roll = _joints(q)[:4]
     R_base_arm = Rotation.from_euler("YXZ", [-yaw, -pitch, -roll]).as_matrix()
     R = R_base_arm @ _R_BASE_SHAFT
     return Pose(R, (insertion + instrument.depth) * R[:, 2])
 
 
 def tip_of(q: np.ndarray, instrument: Instrument) -> Pose:
-    """Returns pose_base_tip of the joints `[6]`."""
-    pitch, yaw = np.asarray(q, np.float64)[4:]
+    """Returns pose_base_tip of the joints `[6]`.
+
+    Raises:
+      UsageError: another number of joints.
+    """
+    pitch, yaw = _joints(q)[4:]
     bend = Rotation.from_euler("Y", pitch), Rotation.from_euler("YX", [pitch, yaw])
     clevis, tip = (rotation.as_matrix() for rotation in bend)
     wrist = instrument.wrist
@@ -82,6 +91,15 @@ def joints_of(pose_base_tip: Pose, instrument: Instrument) -> np.ndarray:
 
 def half_turn(q: np.ndarray) -> np.ndarray:
     """Returns the joints `[6]` whose tip is turned by half a turn about its own z axis."""
-    yaw, pitch, insertion, roll, wrist_pitch, wrist_yaw = np.asarray(q, np.float64)
+    yaw, pitch, insertion, roll, wrist_pitch, wrist_yaw = _joints(q)
     other = roll - np.copysign(np.pi, roll)
     return np.array([yaw, pitch, insertion, other, -wrist_pitch, -wrist_yaw])
+
+
+def _joints(q: np.ndarray) -> np.ndarray:
+    q = np.asarray(q, np.float64)
+    if q.shape != (len(JOINTS),):
+        raise UsageError(
+            "q", f"shape [{len(JOINTS)}]", list(q.shape), "one configuration at a time"
+        )
+    return q
