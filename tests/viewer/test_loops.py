@@ -146,7 +146,9 @@ def test_a_person_demonstrates_and_keeps_it(page, steered, hurried, tmp_path):
     told = trocars.select(steered.env.task.trocars, np.array([trocar]))
     np.testing.assert_allclose(np.asarray(data.trocar.trocar), np.asarray(told), rtol=1e-6)
 
-    dataset = browse.open_dataset(root)
+    dataset = browse.open_dataset(root, image_size=48)
+    drawn = browse.read(dataset, dataset.keys[0]).images
+    assert drawn is not None and drawn.shape[1:] == (48, 48, 3)
     episodes = browse.of_dataset(dataset)
     assert browse.run(page, episodes, after(20)).startswith("1 of 1")
 

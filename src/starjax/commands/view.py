@@ -36,6 +36,8 @@ class ViewArgs:
     run: str = ""  # directory of a method, such as runs/cpu/stardiff: its policy
     expert: bool = False  # the task's scripted demonstrator, the default
     dataset: str = ""  # directory of demonstrations: its episodes
+    # pixels per side of images that are drawn for --dataset
+    image_size: Annotated[int, Range(1, 4_096)] = 256
     # recorded.npz or invalid.npz of an evaluation: its trials
     trials: str = ""
     # second agent at the same trial: expert, or a policy as above
@@ -67,19 +69,19 @@ def main(argv: Sequence[str]) -> int:
     if args.trials:
         show = _trials(args.trials)
     else:
-        show = _dataset(args.dataset) if args.dataset else _live(args)
+        show = _dataset(args.dataset, args.image_size) if args.dataset else _live(args)
     with signals.stop_signals() as should_stop, page.serve(args.port) as server:
         print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
         print(show(server, should_stop))
     return 0
 
 
-def _dataset(folder: str) -> Show:
+def _dataset(folder: str, image_size: int) -> Show:
     """Returns the viewer of recorded episodes."""
     from starjax.viewer import browse
 
     try:
-        dataset = browse.open_dataset(hub.dataset("--dataset", folder))
+        dataset = browse.open_dataset(hub.dataset("--dataset", folder), image_size)
     except ValueError as error:  # of a damaged file, which it names
         raise errors.UsageError("--dataset", "a folder of demonstrations", error) from error
     episodes = browse.of_dataset(dataset)

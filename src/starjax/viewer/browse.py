@@ -21,8 +21,6 @@ from starjax.viewer.frame import Frame
 from starjax.viewer.plots import Plots
 from starjax.viewer.stage import Stage, aim
 
-IMAGE_SIZE = 256  # pixels per side of images that are drawn for the page
-
 
 class RecordedDataset(NamedTuple):
     """A folder of demonstrations.
@@ -78,8 +76,12 @@ class Recording(NamedTuple):
     outcome: str
 
 
-def open_dataset(root: Path) -> RecordedDataset:
+def open_dataset(root: Path, image_size: int = 256) -> RecordedDataset:
     """Reads the description of a dataset.
+
+    Args:
+      root: the folder.
+      image_size: pixels per side of images that were not recorded, which are drawn.
 
     Raises:
       errors.UsageError: the folder has no episode, or a part of its scene is unknown here.
@@ -96,7 +98,7 @@ def open_dataset(root: Path) -> RecordedDataset:
     camera, drawn = names.cameras[0], None
     is_recorded = f"{episodes.IMAGE}{camera}" in description["features"]
     if not is_recorded and redraw.is_possible(description):
-        env = redraw.scene_env(description, IMAGE_SIZE)
+        env = redraw.scene_env(description, image_size)
         drawn = redraw.images(root, description, records, env)[camera]
     first = np.cumsum([0, *(record["length"] for record in records)])
     model = scene.compose(names)
