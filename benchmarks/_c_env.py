@@ -20,6 +20,9 @@ from starjax.sim.scene import Scene
 from starjax.sim.tasks.base import Contacts
 
 ITERATIONS = 50  # of C MuJoCo's solver: the models' own are those of `sim.solver`
+# Contacts that touch and measurements may see: two tools on a needle have up to 50. Our own physics
+# keeps fewer, the nearest.
+CONTACTS = 64
 NO_FIELDS: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -53,9 +56,8 @@ def _advance(
     substeps = round(period / scene.mj_model.opt.timestep)
     target = physics.servo_targets(scene, q, dq, velocity, gripper, period, layout, time)
     ctrl = jax.vmap(target)(jnp.arange(substeps))
-    blank = physics.no_contacts(scene)
-    m, run = scene.mj_model, functools.partial(_run, scene, len(blank.dist), memory)
-    run = functools.partial(_each, run)
+    blank = Contacts(jnp.zeros((CONTACTS, 2), jnp.int32), jnp.ones(CONTACTS))
+    m, run = scene.mj_model, functools.partial(_each, functools.partial(_run, memory, scene))
 
     def steps(state: physics.PhysicsState, ctrl: jax.Array, applied: jax.Array) -> Any:
         bare = state.replace(memory=None)
@@ -92,9 +94,8 @@ def _each(run: Callable[..., Any], state: Any, ctrl: np.ndarray, *others: np.nda
 
 
 def _run(
-    scene: Scene,
-    most: int,
     memory: dict[str, Any],
+    scene: Scene,
     state: physics.PhysicsState,
     ctrl: np.ndarray,
     applied: np.ndarray,
@@ -114,8 +115,8 @@ def _run(
         before[i] = data.qpos
         data.ctrl[:] = ctrl[i]
         mujoco.mj_step(m, data)
-    geom, dist = np.zeros((most, 2), np.int32), np.ones(most, np.float32)
-    count = min(data.ncon, most)
+    geom, dist = np.zeros((CONTACTS, 2), np.int32), np.ones(CONTACTS, np.float32)
+    count = min(data.ncon, CONTACTS)
     geom[:count], dist[:count] = data.contact.geom[:count], data.contact.dist[:count]
     after = physics.PhysicsState(
         *(np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart))

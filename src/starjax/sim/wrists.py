@@ -1,13 +1,16 @@
 """Wrists of the tools that a task's slots hold."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
-from starjax import rcm
+from starjax import rcm, registry
 from starjax.sim import registries
 from starjax.sim.names import SceneNames
 from starjax.sim.tasks.base import Task
-from starjax.types import Command, Pose
+from starjax.types import Agent, Command, Pose
 
 
 def per_arm(task: Task) -> tuple[rcm.Wrist | None, ...]:
@@ -22,11 +25,38 @@ def common(task: Task) -> rcm.Wrist | None:
 
 
 def holding(task: Task, names: SceneNames) -> Task:
-    """Returns the task whose slots name the arms and tools of a scene."""
+    """Returns the task whose slots name the arms and tools of a scene.
+
+    Its experts bend the wrists of these tools: they are written for those of the task.
+    """
     slots = zip(task.slots, names.arms, names.tools, strict=True)
-    return task._replace(
+    held = task._replace(
         slots=tuple(slot._replace(arm=arm, tool=tool) for slot, arm, tool in slots)
     )
+    if per_arm(held) == per_arm(task):
+        return held
+    return held._replace(experts={name: _fitted(held, own) for name, own in task.experts.items()})
+
+
+def _fitted(task: Task, expert: str | Callable[[], Agent]) -> Callable[[], Agent]:
+    """Returns an expert whose commands bend the wrists of the task's tools."""
+
+    def make() -> Agent:
+        agent = registry.load(expert) if isinstance(expert, str) else expert()
+
+        def fitted(command: Command, state: Any) -> Command:
+            p_world_trocar = state.measured_trocar.p_world_trocar
+            return command if command.wrist is None else through(task, command, p_world_trocar)
+
+        def act(memory: Any, state: Any) -> tuple[Command, Any, Command]:
+            executed, memory, recorded = agent.act(memory, state)
+            return fitted(executed, state), memory, fitted(recorded, state)
+
+        return Agent(agent.init, act)
+
+    # The digest of a dataset covers the module of its expert.
+    make.__module__ = expert.partition(":")[0] if isinstance(expert, str) else expert.__module__
+    return make
 
 
 def through(task: Task, command: Command, p_world_trocar: jax.Array) -> Command:

@@ -71,6 +71,7 @@ class Play(NamedTuple):
       following: (HandoverScript, EnvState) -> int32, the next phase.
       goals: (HandoverScript, EnvState) -> positions `[P, 2, 3]` m, and the jaws' opening
         directions `[2, 3]`, or `[3]` for both.
+      command: (rolls `[2]`, tips `[2, 3]`, openings `[2]`, EnvState) -> Command.
     """
 
     choose: Callable[..., tuple[jax.Array, jax.Array, Any]]
@@ -82,6 +83,7 @@ class Play(NamedTuple):
     weight: Callable[[jax.Array, jax.Array], jax.Array]
     following: Callable[[HandoverScript, EnvState], jax.Array]
     goals: Callable[[HandoverScript, EnvState], tuple[jax.Array, jax.Array]]
+    command: Callable[..., Command] = scripting.command
 
 
 def agent(play: Play) -> Agent:
@@ -144,8 +146,8 @@ def _act(
     )
     moved = play.weight(script.phase, fraction) * noise[1].reshape(2, 4)
     roll, p = script.roll + moved[:, 3], script.p + moved[:, :3]
-    rough = scripting.command(roll, p, script.jaws, state)
-    return rough, script, scripting.command(script.roll, script.p, script.jaws, state)
+    rough = play.command(roll, p, script.jaws, state)
+    return rough, script, play.command(script.roll, script.p, script.jaws, state)
 
 
 def _enter(play: Play, script: HandoverScript, phase: jax.Array, state: EnvState) -> HandoverScript:
@@ -153,7 +155,7 @@ def _enter(play: Play, script: HandoverScript, phase: jax.Array, state: EnvState
     goals, normal = play.goals(script, state)
     goal = goals[phase]
     normals = jnp.where(jnp.asarray(play.looks)[phase][:, None], normal, script.normal)
-    at_zero = scripting.command(jnp.zeros(2), goal, script.jaws, state).pose.R
+    at_zero = play.command(jnp.zeros(2), goal, script.jaws, state).pose.R
     return script.replace(
         phase=phase,
         elapsed=jnp.zeros(()),

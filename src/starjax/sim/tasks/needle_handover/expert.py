@@ -74,7 +74,7 @@ def _weight(phase: jax.Array, fraction: jax.Array) -> jax.Array:
     return before + fraction * (weight - before)
 
 
-def _goals(
+def goals(
     above: float, script: handover.HandoverScript, state: EnvState
 ) -> tuple[jax.Array, jax.Array]:
     """Returns the tips' goals of every phase from the present state, and the wire's normals.
@@ -120,8 +120,6 @@ PLAY = handover.Play(
     looks=LOOKS,
     weight=_weight,
     following=_following,
-    goals=functools.partial(_goals, GRASP_ABOVE),
+    goals=functools.partial(goals, GRASP_ABOVE),
 )
 AGENT = handover.agent(PLAY)
-# For pads that end nearer to the tip, as those of the needle driver.
-DEEP = handover.agent(PLAY._replace(goals=functools.partial(_goals, 0.0)))

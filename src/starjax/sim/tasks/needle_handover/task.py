@@ -138,7 +138,7 @@ TASK = single.TASK._replace(
     text=text.TEXT,
     experts={
         "default": "starjax.sim.tasks.needle_handover.expert:AGENT",
-        "deep": "starjax.sim.tasks.needle_handover.expert:DEEP",
+        "wrist": "starjax.sim.tasks.needle_handover.expert_wrist:AGENT",
     },
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tips,
