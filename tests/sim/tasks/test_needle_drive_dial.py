@@ -140,6 +140,8 @@ def test_a_needle_in_another_plane_ends_in_the_experts(rescuer, plane, trocar):
     assert float(jnp.linalg.norm(command.pose.p[0] - state.pose.p[0])) < 0.5e-3
     assert float(jnp.abs(command.pose.R[0] - state.pose.R[0]).max()) < 0.02
     end = expert._on_arc(dial.SIZE, script, jnp.ones(()), state, plane)
-    turn, up = expert._end(dial.SIZE, state), plane(state)
-    path = needles.pose_on(dial.SIZE, state.layout.bite, turn, up)
+    turn, up, bite = expert._end(dial.SIZE, state), plane(state), state.layout.bite
+    begun = needles.turn_on(dial.SIZE, bite, state.measurements.needle, up)
+    np.testing.assert_allclose(script.turn, begun, atol=1e-6)
+    path = needles.pose_on(dial.SIZE, bite, turn, up)
     np.testing.assert_allclose(end.R, wrist_script.tip_of(path, script.held).R, atol=1e-5)
