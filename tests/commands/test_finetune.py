@@ -1,6 +1,9 @@
 """`starjax finetune` as a whole, with stubs of the simulator and of the networks."""
 
+import dataclasses
+import itertools
 import json
+import types
 from pathlib import Path
 
 import fakes
@@ -12,11 +15,12 @@ import pytest
 import stubs
 
 from starjax import config
-from starjax.commands import finetune, finetune_stages, policy_evaluation
+from starjax.commands import finetune, finetune_stages, finetune_work, policy_evaluation
 from starjax.data import normalizer
 from starjax.monitor import calibrate, scores
 from starjax.policies import in_env, policy_file
 from starjax.policies.base import Policy
+from starjax.policies.learners.onestep import OnestepConfig
 from starjax.registry import Registry
 from starjax.sim import registries
 from starjax.types import Command, Pose
@@ -46,14 +50,31 @@ def start():
     return {"learner": {"scale": jnp.full(3, TOO_SHORT)}}
 
 
+def generate(params, stats, keys, observation, trocar):
+    return goes(params, observation)[:, :, 0] / ACTION
+
+
+def execute(params, stats, actions, observation, trocar):
+    p = ACTION * actions[:, :, None]
+    return Command(Pose(jnp.broadcast_to(jnp.eye(3), (*p.shape, 3)), p), jnp.ones(p.shape[:-1]))
+
+
+ACTION = 0.1  # m, of an action of 1
 POLICY = Policy(lambda key: start(), lambda stats, key, batch: (batch.observation, batch.command),
-                loss, sample)  # fmt: skip
+                loss, sample, generate=generate, execute=execute)  # fmt: skip
+
+
+def make_env():
+    env = stubs.make_env(unlucky=0.1)
+    state = lambda bound, layout, measurements: jnp.tile(layout.goal[0], 4)  # noqa: E731
+    task = env.task._replace(state=state, relative=fakes.relative)
+    return env._replace(task=task, scene=types.SimpleNamespace(arms=(), bound=None))
 
 
 @pytest.fixture
 def file(tmp_path, monkeypatch):
     """A policy that stops short of its goals, with a monitor."""
-    monkeypatch.setattr(in_env.sim_env, "make", lambda *_, **__: stubs.make_env(unlucky=0.1))
+    monkeypatch.setattr(in_env.sim_env, "make", lambda *_, **__: make_env())
     monkeypatch.setattr(in_env.policies, "make", lambda *_, **__: POLICY)
     times = {"p50": 1.0, "p95": 1.0, "p99": 1.0}
     monkeypatch.setattr(policy_evaluation, "inference_ms", lambda *_: times)
@@ -73,6 +94,11 @@ def file(tmp_path, monkeypatch):
     )
     box = normalizer.MinMax(-0.1 * jnp.ones(5), 0.1 * jnp.ones(5))
     made = fakes.trained(
+        policy=dataclasses.replace(
+            fakes.TINY,
+            learner="onestep",
+            options=OnestepConfig(unet_channels=(16,), time_dim=16, groups=4),
+        ),
         params=params,
         normalizer=normalizer.Normalizer(box, None),
         train=TRAIN,
@@ -83,12 +109,16 @@ def file(tmp_path, monkeypatch):
     return tmp_path / "mine.safetensors"
 
 
-def tune(rounds=1):
+def tune(rounds=1, *more):
     flags = (
         f"--trials 6 --validation 6 --rounds {rounds} --steps 60 --eval.trials 2 --dtype float32"
     )
     limit = ["--eval.time-limit-s", "4", "--out", "tuned"]
-    return finetune.main(["--policy", "mine.safetensors", *flags.split(), *limit])
+    return finetune.main(["--policy", "mine.safetensors", *flags.split(), *limit, *more])
+
+
+def outcome():
+    return json.loads(Path("tuned/finetune.json").read_text())
 
 
 @pytest.mark.slow
@@ -143,3 +173,35 @@ def test_a_task_without_such_an_expert_is_refused(file, monkeypatch):
     monkeypatch.setattr(registries, "rescuers", Registry("rescuer", {"other": "stubs:RESCUER"}))
     with mistakes.of("--by dagger", "reach"):
         tune()
+
+
+RL = ("--by", "rl", "--iterations", "2", "--episodes", "20", "--noise", "0.02")
+
+
+@pytest.mark.slow
+def test_rounds_of_a_policy_gradient_go_on_with_what_the_critic_has_learned(file):
+    assert tune(2, *RL) == 0
+    first, second = outcome()["rounds"][1:]
+    assert [row["noise"] for row in first["noise_levels"]] == [0.0, 0.005, 0.01, 0.02, 0.04]
+    assert all(row["trials"] == 4 for row in first["noise_levels"])
+    steps = [row["steps"] for part in (first, second) for row in part["iterations"]]
+    assert steps[0] == 0 and all(count > 0 for count in steps[1:])  # the critic learns alone once
+    assert second["noise"] == first["noise"] and "noise_levels" not in second
+
+
+@pytest.mark.slow
+def test_a_policy_gradient_whose_time_is_up_has_an_outcome(file, monkeypatch):
+    calls = itertools.count()
+    monkeypatch.setattr(finetune_work.Work, "is_late", lambda work: next(calls) > 1)
+    assert tune(3, *RL, "--minutes", "5") == 0
+    (_, only) = outcome()["rounds"]
+    assert len(only["iterations"]) == 1 and only["validation"]["trials"] == 24
+    assert Path("tuned/policy.safetensors").exists()
+
+
+@pytest.mark.slow
+def test_no_round_begins_when_the_time_is_up(file):
+    assert tune(1, "--minutes", "1e-9") == 0
+    assert len(outcome()["rounds"]) == 1 and outcome()["best"] == 0
+    assert tune() == 0  # with more time, another round
+    assert len(outcome()["rounds"]) == 2

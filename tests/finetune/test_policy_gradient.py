@@ -13,10 +13,10 @@ import stubs
 
 from starjax import config, methods
 from starjax.data import normalizer
-from starjax.finetune import explore, policy_gradient
+from starjax.finetune import advantages, critic, explore, noise_level, policy_gradient
 from starjax.policies import policy as policies
 from starjax.policies.base import Policy
-from starjax.policies.learners.bc import BcConfig
+from starjax.policies.learners.onestep import OnestepConfig
 from starjax.types import Command, Pose
 
 TROCARS = stubs.trocars(0, 8)
@@ -33,10 +33,14 @@ def make_env():
     return env._replace(task=task, scene=types.SimpleNamespace(bound=None))
 
 
-def starts(first):
-    index = np.arange(COUNT, dtype=np.int32) % 2
+def starts(first, count=COUNT):
+    index = np.arange(count, dtype=np.int32) % 2
     trocar = type(TROCARS)(*(np.asarray(field)[index] for field in TROCARS))
-    return explore.Starts(trocar, index, first + np.arange(COUNT, dtype=np.int32))
+    return explore.Starts(trocar, index, first + np.arange(count, dtype=np.int32))
+
+
+def deviations(noise, count=COUNT):
+    return np.full(count, noise, np.float32)
 
 
 def learned(env, policy, params, stats, static, rate, iterations, demonstrations):
@@ -47,19 +51,18 @@ def learned(env, policy, params, stats, static, rate, iterations, demonstrations
     key, learning, found = jax.random.key(0), None, []
     for i in range(iterations):
         now = params if learning is None else learning.params
-        played = play(now, None, stats, starts(i * COUNT), key, jax.random.fold_in(key, i))
+        here = jax.random.fold_in(key, i)
+        played = play(now, None, stats, starts(i * COUNT), key, here, deviations(NOISE))
         if learning is None:
             learning = policy_gradient.begin(adam, params, key, played)
-        learning, metrics = learn(
-            learning, stats, played, demonstrations, jax.random.fold_in(key, i), i > 0
-        )
+        learning, metrics = learn(learning, stats, played, NOISE, demonstrations, here, i > 0)
         found.append((played, metrics))
     return learning.params, found
 
 
 SHORT = 0.9  # of the way to a goal: near ones are reached
 NOISE = 0.01
-STATIC = explore.ExploreSettings(obs_horizon=1, execute=8, decisions=5, noise=NOISE)
+STATIC = explore.ExploreSettings(obs_horizon=1, execute=8, decisions=5)
 
 
 def goes(params, stats, keys, observation, trocar):
@@ -128,12 +131,9 @@ def test_a_network_whose_plans_end_aside_learns_to_arrive(demonstrations):
     policy = STOPS_SHORT._replace(generate=aims)
     first = jax.jit(_trained_aside)(jax.random.key(0))
     params, found = learned(make_env(), policy, first, None, STATIC, 1e-3, 40, demonstrations)
-    quiet = explore.make(make_env(), policy, None, (), STATIC._replace(noise=1e-6))
-    key = jax.random.key(9)
-    before, after = (
-        np.mean([quiet(p, None, None, starts(i * COUNT), key, key).success for i in range(4)])
-        for p in (first, params)
-    )
+    play, key = explore.make(make_env(), policy, None, (), STATIC), jax.random.key(9)
+    quiet = [(None, None, starts(i * COUNT), key, key, deviations(0.0)) for i in range(4)]
+    before, after = (np.mean([play(p, *x).success for x in quiet]) for p in (first, params))
     assert before < 0.75 and after > 0.93, (before, after)
     assert found[0][1]["steps"] == 0 and float(found[0][1]["kl"]) < 1e-9  # the critic alone
 
@@ -157,7 +157,7 @@ def test_an_experience_is_what_happened(demonstrations):
     env = make_env()
     play = explore.make(env, STOPS_SHORT, None, (), STATIC)
     key = jax.random.key(1)
-    played = play(STOPS_SHORT.init(None), None, None, starts(0), key, key)
+    played = play(STOPS_SHORT.init(None), None, None, starts(0), key, key, deviations(NOISE))
     np.testing.assert_array_equal(played.reward.sum(1), played.success)
     assert played.alive[:, 0].all() and 0 < played.success.mean() < 1
     # Until the end, and never again.
@@ -172,13 +172,15 @@ def test_an_experience_is_what_happened(demonstrations):
 @pytest.mark.slow
 def test_commands_stay_on_the_manifold_at_every_step_of_learning(demonstrations):
     settings = dataclasses.replace(
-        fakes.TINY, learner="bc", options=BcConfig(mlp_width=16, mlp_blocks=1)
+        fakes.TINY,
+        learner="onestep",
+        options=OnestepConfig(unet_channels=(16,), time_dim=16, groups=4),
     )
     env = make_env()
     train = config.TrainConfig()
     policy = policies.make(methods.METHODS["stardiff"], settings, env.task, train)
     params = fakes.params(policy)
-    static = explore.ExploreSettings(settings.obs_horizon, settings.execute, 4, NOISE)
+    static = explore.ExploreSettings(settings.obs_horizon, settings.execute, 4)
     box = normalizer.MinMax(-ACTION * jnp.ones(5), ACTION * jnp.ones(5))
     fields = normalizer.MinMax(-jnp.ones(12), jnp.ones(12))
     stats = normalizer.Normalizer(box, fields)
@@ -204,3 +206,78 @@ def test_the_density_and_its_clipped_gain():
     gain = policy_gradient.surrogate(jnp.log(jnp.array([1.0, 1.5, 1.5, 0.5, 0.5])),
                                      jnp.array([2.0, 1.0, -1.0, 1.0, -1.0]))  # fmt: skip
     np.testing.assert_allclose(gain, [2.0, 1.2, -1.5, 0.5, -0.8], atol=1e-6)
+
+
+BATCH = 1024  # episodes of an iteration, as on a GPU
+ENDS_ASIDE = STOPS_SHORT._replace(
+    init=lambda key: {"aside": jnp.array([0.003, -0.001, 0.0])},  # m; the tolerance is 4 mm
+    generate=lambda params, stats, keys, seen, trocar: jnp.broadcast_to(
+        ((seen.state[:, -1, :3] + params["aside"]) / ACTION)[:, None], (len(keys), 8, 3)
+    ),
+)
+
+
+@pytest.mark.slow
+def test_the_estimate_is_the_derivative_of_success():
+    """By differences of the share of success, of the same starts with the same noise."""
+    play = explore.make(make_env(), ENDS_ASIDE, None, (), STATIC)
+    noise, key, params = deviations(NOISE, BATCH), jax.random.key(2), ENDS_ASIDE.init(None)
+
+    def played(aside, i):
+        here = jax.random.fold_in(key, i)
+        return play({"aside": aside}, None, None, starts(i * BATCH, BATCH), key, here, noise)
+
+    @jax.jit
+    def estimated(value, found):
+        """Returns the gradient of a batch, and the critic after some steps on it."""
+        guess = critic.values(value, found.seen)
+        estimates = advantages.estimate(found.reward, guess, found.alive)
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+
+        def gain(params):
+            plan = ENDS_ASIDE.generate(params, None, flat.key, flat.observation, None)
+            log = policy_gradient.log_density(flat.action, plan, NOISE)
+            log_ratio = log - jax.lax.stop_gradient(log)
+            each = policy_gradient.surrogate(log_ratio, estimates.advantage.reshape(-1))
+            return each.sum() / BATCH
+
+        seen, returns = flat.seen[::8], estimates.returns.reshape(-1)[::8]
+        steps = lambda _, value: critic.step(value, seen, returns)  # noqa: E731
+        return jax.grad(gain)(params)["aside"], jax.lax.fori_loop(0, 30, steps, value)
+
+    first = played(params["aside"], 0)
+    value, gradients = critic.begin(key, first.seen, first.alive), []
+    for i in range(30):
+        gradient, value = estimated(value, played(params["aside"], i))
+        gradients.append(gradient)
+    learned = np.array(gradients[6:])  # the critic has begun to tell states apart
+    error = learned.std(0)
+    half = 5e-4  # m
+    low, high = (
+        [
+            np.mean([played(params["aside"] + sign * half * axis, i).success for i in range(8)])
+            for axis in np.eye(3, dtype=np.float32)
+        ]
+        for sign in (-1, 1)
+    )
+    slope = (np.array(high) - low) / (2 * half)
+    doubt = 3 * error.max() / len(learned) ** 0.5
+    np.testing.assert_allclose(learned.mean(0), slope, rtol=0.15, atol=doubt)
+    # Even the batch of a single iteration has the sign of the largest one.
+    assert slope[0] < -2 * error[0]
+
+
+def test_the_noise_used_is_the_most_that_success_bears():
+    def tried(*rates):
+        return [{"noise": n, "rate": r} for n, r in zip(noise_level.LEVELS, rates, strict=True)]
+
+    assert noise_level.chosen(tried(0.8, 0.8, 0.75, 0.7, 0.6)) == 1.0
+    assert noise_level.chosen(tried(0.8, 0.5, 0.4, 0.3, 0.2)) == 0.25
+    assert noise_level.chosen(tried(0.8, 0.9, 0.8, 0.8, 0.8)) == 2.0
+    repeated, level = noise_level.repeated(starts(7, 64))
+    for n in range(len(noise_level.LEVELS)):  # every level has the same starts
+        np.testing.assert_array_equal(repeated.trial[level == n][:12], 7 + np.arange(12))
+    np.testing.assert_array_equal(repeated.index, (repeated.trial - 7) % 2)
+    np.testing.assert_array_equal(
+        repeated.trocar.radius, starts(0, 64).trocar.radius[repeated.index]
+    )

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from starjax.commands import finetune_stages, messages, stage_times
-from starjax.commands.finetune_play import NoisyEpisodes
+from starjax.commands.finetune_play import NoisyEpisodes, PolicyParams
 from starjax.commands.finetune_work import Work
 from starjax.finetune import distill, mixing, policy_gradient
 from starjax.policies import policy_file
@@ -63,7 +63,8 @@ class Distillation:
                 messages.indented(f"step {first + count} of {total}: error {float(error):.2g}")
         folder.mkdir(parents=True, exist_ok=True)
         params = {**old.params, **jax.device_get(student.average)}
-        policy_file.save(file, old._replace(params=params, monitor=None))
+        # With the reach of the rounds the validation's program is that of the policy itself.
+        policy_file.save(file, old._replace(params=params, normalizer=stats, monitor=None))
         return file, {"error": float(error), "success": success}
 
     def _play(self, number: int, params: Any, vision: Any, stats: Any, key: jax.Array) -> Any:
@@ -71,4 +72,5 @@ class Distillation:
         key_reset, key_play = jax.random.split(jax.random.fold_in(key, 0))
         draws = np.random.default_rng(number)
         starts = self._episodes.starts(number, np.zeros((0, 2), np.int32), draws)
-        return self._episodes.play(params, vision, stats, starts, key_reset, key_play)
+        keys, noise = (key_reset, key_play), self._work.settings.noise
+        return self._episodes.play(PolicyParams(params, vision, stats), starts, keys, noise)

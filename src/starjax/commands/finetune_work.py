@@ -11,6 +11,8 @@
 """
 
 import dataclasses
+import math
+import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +30,7 @@ from starjax.runtime import files
 _WARMUP = 500  # training steps, in which the new optimiser's averages settle
 _OF_ONE_STEP = ("rl", "distill")  # ways that need a learner of one evaluation
 _ONE_STEP = "onestep"  # that learner
-_MAY_CHANGE = ("rounds", "eval")  # settings that may change when a fine-tuning resumes
+_MAY_CHANGE = ("rounds", "minutes", "eval")  # settings that may change when a fine-tuning resumes
 
 
 class Work(NamedTuple):
@@ -43,6 +45,7 @@ class Work(NamedTuple):
       seen: trocars of rollouts and validation, those of the demonstrations.
       started: the session.
       share: of this process.
+      deadline: of `time.monotonic`, s, after which no round begins.
     """
 
     settings: FinetuneConfig
@@ -53,6 +56,7 @@ class Work(NamedTuple):
     seen: Trocar
     started: session.Session
     share: Any
+    deadline: float
 
     @property
     def out(self) -> Path:
@@ -62,6 +66,10 @@ class Work(NamedTuple):
     def folder(self, number: int) -> Path:
         """Returns the directory of a round; 0 is the policy itself."""
         return self.out / f"round_{number}"
+
+    def is_late(self) -> bool:
+        """Returns True once the time is up."""
+        return time.monotonic() > self.deadline
 
     def is_trained(self, number: int) -> bool:
         """Returns True if a round has its policy."""
@@ -99,6 +107,7 @@ def begin(
         seen=trocars.select(base.env.task.trocars, slice(config.demos.seen_trocars)),
         started=started,
         share=share,
+        deadline=time.monotonic() + 60.0 * (settings.minutes or math.inf),
     )
 
 

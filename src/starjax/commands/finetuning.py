@@ -55,6 +55,9 @@ def run(
         candidates, who = [path.file], work.base
         reports: dict[int, dict[str, Any]] = {}
         for number in range(1, settings.rounds + 1):
+            if work.is_late() and not work.is_trained(number):
+                messages.indented("time is up: no further round")
+                break
             made = improve(number, who, candidates[-1])
             if made is None:
                 break

@@ -17,6 +17,7 @@ from starjax import rcm
 from starjax.finetune import critic
 from starjax.policies.base import Policy
 from starjax.rcm.trocar import Trocar
+from starjax.runtime import precompile
 from starjax.sim import env as sim_env
 from starjax.types import Observation
 
@@ -30,13 +31,11 @@ class ExploreSettings(NamedTuple):
       obs_horizon: O.
       execute: E, commands per decision.
       decisions: R, of an episode.
-      noise: standard deviation of a plan's displacement in normalised actions.
     """
 
     obs_horizon: int
     execute: int
     decisions: int
-    noise: float
 
 
 class Starts(NamedTuple):
@@ -76,7 +75,7 @@ class Experience(NamedTuple):
 
 def make(
     env: Any, policy: Policy, see: See | None, cameras: tuple[str, ...], settings: ExploreSettings
-) -> Callable[..., Experience]:
+) -> precompile.Program:
     """Builds the program of a batch of episodes.
 
     Args:
@@ -87,12 +86,13 @@ def make(
       settings: of the episodes.
 
     Returns:
-      play(params, vision, stats, starts, key_reset, key), where a start is a function of
-      `key_reset`, its index and its number, and the noise one of `key`.
+      play(params, vision, stats, starts, key_reset, key, noise) -> Experience. A start is a
+      function of `key_reset`, its index and its number, and displacements are one of `key`.
+      `noise` `[N]` is their standard deviation in normalised actions, 0 for unchanged plans.
     """
     generate, execute = policy.generate, policy.execute
     assert generate is not None and execute is not None
-    horizon, commands, decisions, deviation = settings
+    horizon, commands, decisions = settings
     observe, step, inputs = jax.vmap(env.observe), jax.vmap(env.step), critic.inputs(env)
 
     def start(key: jax.Array, starts: Starts) -> Any:
@@ -112,8 +112,7 @@ def make(
 
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), jax.lax.map(one, past))
 
-    @jax.jit
-    def play(params, vision, stats, starts, key_reset, key):
+    def play(params, vision, stats, starts, key_reset, key, noise):
         state = jax.vmap(start, (None, 0))(key_reset, starts)
         trocar = state.measured_trocar
         keys = jax.vmap(jax.random.split, (0, None))(
@@ -127,8 +126,8 @@ def make(
             with jax.default_matmul_precision("highest"):
                 action = generate(params, stats, key_own, observation, trocar)
             size = action.shape[-1]
-            noise = jax.vmap(lambda k: jax.random.normal(k, (1, size)))(key_noise)
-            action = action + deviation * noise
+            moved = jax.vmap(lambda k: jax.random.normal(k, (1, size)))(key_noise)
+            action = action + noise[:, None, None] * moved
             plan = execute(params, stats, action, observation, trocar)
 
             def act(carry, command):
@@ -183,4 +182,4 @@ def make(
             rcm_commanded=errors[0], rcm_executed=errors[1],
         )  # fmt: skip
 
-    return play
+    return precompile.Program(play)

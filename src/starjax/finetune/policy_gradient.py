@@ -6,17 +6,18 @@ that the policy generates; the other commands never act. The shape of a plan is 
 loss on demonstrations holds it.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
+from jax.typing import ArrayLike
 
 from starjax.data import windows
 from starjax.finetune import advantages, critic
 from starjax.finetune.explore import Experience, ExploreSettings
 from starjax.policies.base import Params, Policy
+from starjax.runtime import precompile
 
 CLIP = 0.2  # of the ratio of densities of all executed commands
 EPOCHS = 4  # over the decisions of an iteration
@@ -27,7 +28,7 @@ MAX_KL = 0.02  # at which the policy's steps of an iteration end
 # Adam's length alone had 3.5.
 STEP_KL = 1e-3
 ANCHOR = 0.3  # weight of the loss on demonstrations
-ANCHOR_BATCH = 256  # windows
+ANCHOR_SHARE = 4  # decisions per window of its batch: its noise is then as that of the decisions
 _ALL = 2**31 - 1
 
 
@@ -71,13 +72,13 @@ def begin(
     return Learning(params, adam.init(params), values)
 
 
-def log_density(action: jax.Array, plan: jax.Array, noise: float) -> jax.Array:
+def log_density(action: jax.Array, plan: jax.Array, noise: ArrayLike) -> jax.Array:
     """Returns the log of the density of displaced plans `[B, E, D]`, without its constant."""
     moved = jnp.mean(action - plan, axis=-2)
     return -0.5 * jnp.sum((moved / noise) ** 2, axis=-1)
 
 
-def divergence(plan: jax.Array, other: jax.Array, noise: float) -> jax.Array:
+def divergence(plan: jax.Array, other: jax.Array, noise: ArrayLike) -> jax.Array:
     """Returns a bound of the KL divergence of the densities about two plans `[B, E, D]`.
 
     It is the divergence of single commands, averaged over B and E: that of their mean is smaller,
@@ -102,7 +103,7 @@ def surrogate(log_ratio: jax.Array, advantage: jax.Array) -> jax.Array:
 
 def make(
     policy: Policy, adam: optax.GradientTransformation, settings: ExploreSettings, horizon: int
-) -> Callable[..., tuple[Learning, dict[str, jax.Array]]]:
+) -> precompile.Program:
     """Builds the program of an iteration's steps.
 
     Args:
@@ -112,11 +113,12 @@ def make(
       horizon: of a demonstration's window.
 
     Returns:
-      learn(learning, stats, Experience, Demonstrations, key, trains_policy) -> Learning, metrics:
+      learn(learning, stats, Experience, noise, Demonstrations, key, trains_policy) -> Learning,
+      metrics, where `noise` is the deviation of all episodes, see `explore.make`:
       `kl` and `clipped` of the last step, `steps` of the policy, `explained`, the share of the
       returns' variance that the critic foresaw. `trains_policy` False trains the critic alone.
     """
-    generate, noise = policy.generate, settings.noise
+    generate = policy.generate
     assert generate is not None
 
     def rows_of(experience: Experience) -> tuple[Any, ...]:
@@ -131,21 +133,19 @@ def make(
         observation, keys, action, trocar = row
         return generate(params, stats, keys, observation, trocar)[:, : action.shape[1]]
 
-    def log_density_of(params: Any, stats: Any, row: tuple[Any, ...]) -> jax.Array:
-        return log_density(row[2], mean_of(params, stats, row), noise)
-
-    def anchor(params: Params, stats: Any, demonstrations: Demonstrations, key: jax.Array):
+    def anchor(
+        params: Params, stats: Any, demonstrations: Demonstrations, key: jax.Array, count: int
+    ):
         key_rows, key_loss = jax.random.split(key)
-        frames = jax.random.choice(key_rows, demonstrations.frames, (ANCHOR_BATCH,))
+        frames = jax.random.choice(key_rows, demonstrations.frames, (count,))
         batch = windows.gather(demonstrations.dataset, frames, settings.obs_horizon, horizon)
         return policy.loss(params, policy.prepare(stats, key_loss, batch))[0]
 
-    @jax.jit
-    def learn(learning, stats, experience, demonstrations, key, trains_policy):
+    def learn(learning, stats, experience, noise, demonstrations, key, trains_policy):
         with jax.default_matmul_precision("highest"):  # the density is sharp: the noise is small
-            return steps(learning, stats, experience, demonstrations, key, trains_policy)
+            return steps(learning, stats, experience, noise, demonstrations, key, trains_policy)
 
-    def steps(learning, stats, experience, demonstrations, key, trains_policy):
+    def steps(learning, stats, experience, noise, demonstrations, key, trains_policy):
         alive = experience.alive
         value = critic.values(learning.critic, experience.seen)
         estimates = advantages.estimate(experience.reward, value, alive)
@@ -153,10 +153,14 @@ def make(
         returns, seen = estimates.returns.reshape(-1), experience.seen.reshape(alive.size, -1)
         rows = rows_of(experience)
         batch = min(BATCH, alive.size)
+        anchored = max(batch // ANCHOR_SHARE, 1)
         whole = jnp.arange(-(-alive.size // batch) * batch).reshape(-1, batch) % alive.size
-        old = jax.lax.map(
-            lambda index: log_density_of(learning.params, stats, _taken(rows, index)), whole
-        ).reshape(-1)
+
+        def density(index: jax.Array) -> jax.Array:
+            row = _taken(rows, index)
+            return log_density(row[2], mean_of(learning.params, stats, row), noise)
+
+        old = jax.lax.map(density, whole).reshape(-1)
         (order,) = jnp.nonzero(alive.reshape(-1), size=alive.size, fill_value=0)
         count = jnp.sum(alive)
 
@@ -171,7 +175,7 @@ def make(
                 mean = mean_of(params, stats, row)
                 log_ratio = log_density(row[2], mean, noise) - old[index]
                 gain = jnp.mean(surrogate(log_ratio, advantage[index]))
-                held = anchor(params, stats, demonstrations, key_anchor)
+                held = anchor(params, stats, demonstrations, key_anchor, anchored)
                 # In these units the gradient of the density is that of the commands' squared error,
                 # which the loss on demonstrations is too.
                 return ANCHOR * held - mean.shape[1] * noise**2 * gain, (log_ratio, mean)
@@ -211,7 +215,7 @@ def make(
         explained = 1.0 - missed / jnp.maximum(jnp.var(estimates.returns, where=alive), 1e-8)
         return learning._replace(critic=values), {**metrics, "explained": explained}
 
-    return learn
+    return precompile.Program(learn)
 
 
 def _taken(tree: Any, index: jax.Array) -> Any:

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Annotated, Literal
 
 from starjax import config as config_lib
-from starjax.limits import Count, Range
+from starjax.limits import Count, NotNegative, Range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -18,13 +18,16 @@ class FinetuneConfig:
     # directory of a person's interventions, see starjax teleop --policy; dagger learns them too
     interventions: str = ""
     rounds: Annotated[int, Range(1, 100)] = 3  # rounds of rollouts and training
+    # wall-clock minutes, after which no round begins and one of rl ends with its iteration; 0: no
+    # limit
+    minutes: NotNegative = 0.0
     trials: Count = 1200  # trials per round and seen trocar; not of rl
     steps: Count = 8_000  # training steps per round; not of rl
     iterations: Count = 30  # iterations of rl per round
     # learning rate of rl
     gradient_rate: Annotated[float, Range(0.0, 1.0, "(]")] = 1e-5
     # standard deviation of the displacement of plans in episodes of rl and distill, in normalised
-    # actions
+    # actions; rl tries a quarter to twice of it first, and uses the most that success can bear
     noise: Annotated[float, Range(0.0, 1.0, "(]")] = 0.01
     episodes: Count = 1024  # per iteration of rl or round of distill, over all seen trocars
     # learning rate as a fraction of that of the policy's training
