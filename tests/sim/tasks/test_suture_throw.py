@@ -9,7 +9,7 @@ import pytest
 
 from starjax import rcm
 from starjax.sim import physics, scene, thread
-from starjax.sim.tasks import wrist_script
+from starjax.sim.tasks import scripting, wrist_script
 from starjax.sim.tasks.base import SimReadings
 from starjax.sim.tasks.needle_drive import grasps
 from starjax.sim.tasks.needle_drive import task as driven
@@ -126,6 +126,20 @@ TAKEN = {**OUT, "held": True, "by_point": True}
 THROUGH = {"held": True, "by_point": True, "has_exited": True, "is_through": True}
 
 
+def _state(tip, now, layout):
+    """Returns the parts of a state that the script reads, at a tip's pose."""
+    frame = types.SimpleNamespace(p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]), roll_zero=0.0)
+    return types.SimpleNamespace(
+        pose=Pose(tip.R[None], tip.p[None]),
+        measurements=now,
+        layout=layout,
+        measured_trocar=frame,
+        gripper_target=-jnp.ones(1),
+        touch=jnp.zeros(1, bool),
+        step=jnp.asarray(50),
+    )
+
+
 @pytest.mark.parametrize(
     ("grip", "share", "height", "events", "phase", "leg"),
     [
@@ -162,16 +176,7 @@ def test_the_expert_carries_on_wherever_the_needle_is(
     ours = {name: jnp.asarray(x) for name, x in events.items() if hasattr(now, name)}
     drives = {name: jnp.asarray(x) for name, x in events.items() if name not in ours}
     now = now.replace(drive=now.drive.replace(needle=needle, tip=tip.p, **drives), **ours)
-    frame = types.SimpleNamespace(p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]), roll_zero=0.0)
-    state = types.SimpleNamespace(
-        pose=Pose(tip.R[None], tip.p[None]),
-        measurements=now,
-        layout=layout,
-        measured_trocar=frame,
-        gripper_target=-jnp.ones(1),
-        touch=jnp.zeros(1, bool),
-        step=jnp.asarray(50),
-    )
+    state = _state(tip, now, layout)
     script = rescue.RESCUER.resume(jax.random.key(0), state)
     assert (int(script.phase), int(script.leg)) == (phase, leg)
     command, script, _ = rescue.RESCUER.act(script, state)
@@ -196,3 +201,48 @@ def test_a_needle_that_was_let_go_inside_is_taken_as_for_driving_and_driven_on(s
     assert following(expert.BACK, no) == expert.APPROACH
     assert following(expert.CLOSE, yes) == expert.DRIVE
     assert following(expert.CLOSE, no) == expert.APPROACH
+
+
+def test_a_sloped_way_begins_and_ends_at_rest_and_waits_less_than_minimum_jerk():
+    s = np.linspace(0.0, 1.0, 1001)
+    done = np.asarray(scripting.sloped(jnp.asarray(s), expert.SLOPE))
+    speed = np.gradient(done, s)
+    np.testing.assert_allclose(done[[0, 500, -1]], [0.0, 0.5, 1.0], atol=1e-6)
+    assert speed.min() > -1e-3 and max(speed[0], speed[-1]) < 0.01
+    inner = (s > expert.SLOPE + 0.01) & (s < 0.99 - expert.SLOPE)
+    np.testing.assert_allclose(speed[inner], 1.0 / (1.0 - expert.SLOPE), rtol=1e-3)
+    near = np.asarray(scripting.minimum_jerk(jnp.asarray(s))) > 0.99
+    assert (done > 0.99).sum() < 0.6 * near.sum()
+
+
+def test_jaws_close_off_the_recorded_grasp_and_the_script_goes_on_from_there(start):
+    _, layout, _, now = start
+    tip = expert.tip_of(now.drive.needle, grasps.grasp(task.SIZE))
+    now = now.replace(drive=now.drive.replace(held=jnp.ones((), bool), tip=tip.p))
+    state = _state(tip, now, layout)
+    script = expert.AGENT.init(jax.random.key(1), state)
+    script = script.replace(R=tip.R, at=tip.p)
+    script = expert.enter(script, jnp.asarray(expert.DESCEND, jnp.int32), state)
+    assert float(jnp.abs(script.miss).max()) > 1e-4
+    assert (np.abs(script.miss) <= np.array(expert.MISS)).all()
+    script = expert.enter(script, jnp.asarray(expert.CLOSE, jnp.int32), state)
+    rough, closing, label = expert.AGENT.act(script, state)
+    np.testing.assert_allclose(label.pose.p[0], tip.p, atol=1e-6)
+    np.testing.assert_allclose(label.pose.R[0], tip.R, atol=1e-5)
+    off = wrist_script.off(tip, closing.miss)
+    np.testing.assert_allclose(rough.pose.p[0], off.p, atol=1e-6)
+    np.testing.assert_allclose(rough.pose.R[0], off.R, atol=1e-5)
+    lifting = expert.enter(closing, jnp.asarray(expert.LIFT, jnp.int32), state)
+    np.testing.assert_allclose(lifting.start, off.p, atol=1e-6)
+    np.testing.assert_allclose(lifting.R_from, off.R, atol=1e-6)
+
+
+def test_the_state_shows_the_point_and_the_tip_from_the_needle(start):
+    bound, layout, _, now = start
+    seen = TASK.state(bound, layout, now)
+    held, needle = grasps.grasp(task.SIZE), now.drive.needle
+    tip = expert.tip_of(needle, held)
+    found = np.asarray(TASK.relative(seen, tip.p[None])[9:]) * driven.NEAR
+    point, bite = now.drive.point, layout.bite
+    expected = [point - tip.p, point - bite.entry, point - bite.exit, -held.R.T @ held.p]
+    np.testing.assert_allclose(found, np.concatenate(expected), atol=1e-6)

@@ -19,6 +19,17 @@ def minimum_jerk(fraction: jax.Array) -> jax.Array:
     return fraction**3 * (10.0 + fraction * (-15.0 + 6.0 * fraction))
 
 
+def sloped(fraction: jax.Array, slope: float) -> jax.Array:
+    """Returns the fraction of the way after a fraction `[...]` of the time, at constant speed.
+
+    Its speed grows and falls evenly during `slope` of the time at either end, so that it spends
+    less time near them than `minimum_jerk`.
+    """
+    left = jnp.minimum(fraction, 1.0 - fraction)
+    done = jnp.where(left < slope, left**2 / (2.0 * slope), left - slope / 2.0) / (1.0 - slope)
+    return jnp.where(fraction < 0.5, done, 1.0 - done)
+
+
 def jaws(before: jax.Array, target: jax.Array, elapsed: jax.Array) -> jax.Array:
     """Returns the openings `[...]` `elapsed` s after the start of a motion to `target`."""
     return before + jnp.clip(elapsed / JAW_TIME, 0.0, 1.0) * (target - before)

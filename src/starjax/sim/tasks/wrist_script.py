@@ -66,23 +66,35 @@ def from_start(script: WristScript, first: Pose, now: Pose, share: jax.Array) ->
     return Pose(R, now.p + (1.0 - share) * (script.start - first.p))
 
 
+def off(tip: Pose, by: jax.Array) -> Pose:
+    """Returns pose_world_tip moved along and turned about its own axes by `[6]` m and rad."""
+    return Pose(tip.R @ Rotation.from_rotvec(by[3:]).as_matrix(), tip.p + tip.R @ by[:3])
+
+
 def commands(
-    script: Any, tip: Pose, weight: jax.Array, fade: jax.Array | float, state: EnvState
+    script: Any,
+    tip: Pose,
+    weight: jax.Array,
+    fade: jax.Array | float,
+    state: EnvState,
+    miss: jax.Array | None = None,
 ) -> tuple[Command, Any, Command]:
     """Returns the disturbed command, the script at `tip`, and the command to record.
 
     Args:
       weight, fade: factors of the disturbance.
+      miss: `[6]` m and rad by which the disturbed tip is `off`; None for none.
     """
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
     script = script.replace(at=tip.p, R=tip.R, noise=noise)
-    moved = weight * noise[1, :3] * fade
-    return _command(script, tip.p + moved, state), script, _command(script, tip.p, state)
+    moved = tip._replace(p=tip.p + weight * noise[1, :3] * fade)
+    moved = moved if miss is None else off(moved, miss)
+    return _command(script, moved, state), script, _command(script, tip, state)
 
 
-def _command(script: WristScript, p: jax.Array, state: EnvState) -> Command:
-    """Returns the command `[1]` of the script's rotation at a tip `[3]` m."""
+def _command(script: WristScript, tip: Pose, state: EnvState) -> Command:
+    """Returns the command `[1]` of a tip's pose, with the script's jaws."""
     p_trocar: Any = state.measured_trocar.p_world_trocar[0]
-    found = rcm.through(WRIST, Pose(script.R, p), p_trocar)
+    found = rcm.through(WRIST, tip, p_trocar)
     pose = Pose(found.pose.R[None], found.pose.p[None])
     return Command(pose, script.jaws[None], found.wrist[None])

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from starjax import rcm
 from starjax.sim import bodies, thread
 from starjax.sim.tasks.base import (
     CONTROL_HZ,
@@ -197,6 +198,19 @@ def state(bound: driven.DriveBound, layout: ThrowLayout, now: ThrowMeasurements)
     )
 
 
+def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
+    """Returns `[..., 21]`: needle drive's, the point from tip and marks, the tip from the needle.
+
+    The last is in the needle's frame, in which a grasp is always at the same place.
+    """
+    needle = Pose(rcm.rot6d_decode(state[..., 3:9]), state[..., :3])
+    point = needle.p + needle.R @ needles.offset_at(SIZE, jnp.asarray(SIZE.end))
+    tip = tips[..., 0, :]
+    seen = jnp.einsum("...ji,...j->...i", needle.R, tip - needle.p)
+    parts = [point - tip, point - state[..., 9:12], point - state[..., 12:15], seen]
+    return jnp.concatenate([driven.relative(state, tips), *(x / driven.NEAR for x in parts)], -1)
+
+
 TASK = driven.TASK._replace(
     name="suture_throw",
     mjcf="tasks/suture_throw/suture_throw.xml",
@@ -211,6 +225,7 @@ TASK = driven.TASK._replace(
     measure=measure,
     status=status,
     state=state,
+    relative=relative,
     coupling=Coupling(begin, forces),
     thread=lambda measurements: measurements.thread.p,
     least_steps=DEMO_STEPS,
