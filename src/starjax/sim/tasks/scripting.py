@@ -22,8 +22,8 @@ def minimum_jerk(fraction: jax.Array) -> jax.Array:
 def sloped(fraction: jax.Array, slope: float) -> jax.Array:
     """Returns the fraction of the way after a fraction `[...]` of the time, at constant speed.
 
-    Its speed grows and falls evenly during `slope` of the time at either end, so that it spends
-    less time near them than `minimum_jerk`.
+    Its speed grows and falls evenly during `slope` of the time at either end; it spends less time
+    near them than `minimum_jerk`.
     """
     left = jnp.minimum(fraction, 1.0 - fraction)
     done = jnp.where(left < slope, left**2 / (2.0 * slope), left - slope / 2.0) / (1.0 - slope)
