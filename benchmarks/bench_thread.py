@@ -1,15 +1,19 @@
 """Physics steps per second of a straight tool, a wrist, and a wrist with a thread, in one run.
 
-    python benchmarks/bench_thread.py [--batch 16]
+    python benchmarks/bench_thread.py [--batches 360]
 
 Whole control periods of the environment with the arm at rest: control, physics, measurements. The
-scenes take turns, so that other work on the machine slows all of them.
+scenes take turns, so that other work on the machine slows all of them; a share is the median of
+the turns' own. Programs are compiled side by side.
 """
 
 import argparse
 import statistics
 import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
+import _peer
 import _timing
 import jax
 import jax.numpy as jnp
@@ -20,6 +24,7 @@ from starjax.sim import thread
 from starjax.types import Command
 
 PERIODS, ROUNDS = 20, 9  # control periods per call; calls of each scene
+BATCHES = {"cpu": [16], "gpu": [360]}  # environments
 SCENES = {
     "straight": ("needle_pick", "grasper"),
     "wrist": ("needle_pick", "needle_driver"),
@@ -30,34 +35,57 @@ SCENES = {
 def main() -> None:
     runtime.prepare_xla()
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--batch", type=int, default=16, help="environments")
-    batch = parser.parse_args().batch
-    runs, substeps = {}, 0
-    for name, (task, tool) in SCENES.items():
-        env = envs.make(task, ["psm"], [tool], observation="state")
-        substeps = round(1.0 / env.control_hz / env.scene.mj_model.opt.timestep)
-        runs[name] = _held(env, batch)
-        print(f"{name}: {task}, {tool}", flush=True)
-    runs["thread"] = _thread(batch)
-    for run, start in runs.values():
-        jax.block_until_ready(run(start))
-    times = {name: [] for name in runs}
-    for _ in range(ROUNDS):
+    usual = BATCHES[_peer.platform()]
+    parser.add_argument("--batches", type=int, nargs="+", default=usual, help="environments")
+    batches = parser.parse_args().batches
+    made = {
+        name: envs.make(task, ["psm"], [tool], observation="state")
+        for name, (task, tool) in SCENES.items()
+    }
+    with ThreadPoolExecutor() as pool:
+        waiting = {
+            batch: {name: pool.submit(_held, env, batch) for name, env in made.items()}
+            | {"thread": pool.submit(_thread, batch)}
+            for batch in batches
+        }
+        ready = {
+            batch: {name: job.result() for name, job in jobs.items()}
+            for batch, jobs in waiting.items()
+        }
+    substeps = {
+        name: round(1.0 / env.control_hz / env.scene.mj_model.opt.timestep)
+        for name, env in made.items()
+    }
+    rows = {str(batch): _row(runs, batch, substeps) for batch, runs in ready.items()}
+    for batch, row in rows.items():
+        figures = ", ".join(f"{name} {value:,.4g}" for name, value in row.items())
+        print(f"{batch} environments: {figures}", flush=True)
+    _timing.report("thread", {"results": rows}, tiny=False)
+
+
+def _row(runs: dict[str, Any], batch: int, substeps: dict[str, int]) -> dict[str, float]:
+    """Returns the figures of one number of environments, whose programs take turns."""
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for turn in range(1 + ROUNDS):
         for name, (run, start) in runs.items():
             begin = time.perf_counter()
             jax.block_until_ready(run(start))
-            times[name].append(time.perf_counter() - begin)
-    median = {name: statistics.median(values) for name, values in times.items()}
-    count = batch * PERIODS * substeps
-    row = {f"steps_per_s_{name}": count / median[name] for name in SCENES}
-    row |= {f"share_{name}": median["straight"] / median[name] for name in SCENES}
-    row["thread_over_a_wristed_step"] = median["thread"] / median["wrist"]
-    print(", ".join(f"{name} {value:,.4g}" for name, value in row.items()))
-    _timing.report("thread", {"results": {str(batch): row}}, tiny=False)
+            if turn > 0:  # the first one is not counted
+                times[name].append(time.perf_counter() - begin)
+    steps = {name: batch * PERIODS * count for name, count in substeps.items()}
+    row = {f"steps_per_s_{name}": steps[name] / statistics.median(times[name]) for name in SCENES}
+    row |= {f"share_{name}": _ratio(times["straight"], times[name]) for name in SCENES}
+    row["thread_over_a_wristed_step"] = _ratio(times["thread"], times["wrist"])
+    return row
+
+
+def _ratio(one: list[float], other: list[float]) -> float:
+    """Returns the median ratio of the times of one turn."""
+    return statistics.median(a / b for a, b in zip(one, other, strict=True))
 
 
 def _held(env: envs.Env, batch: int):
-    """Returns the program of some control periods at rest, and its start."""
+    """Returns the compiled program of some control periods at rest, and its start."""
     trocar = jax.tree.map(lambda field: jnp.asarray(field)[0], env.task.trocars)
     keys = jax.random.split(jax.random.key(0), batch)
     start = jax.jit(jax.vmap(lambda key: env.reset(key, envs.EnvParams(trocar))))(keys)
@@ -69,7 +97,7 @@ def _held(env: envs.Env, batch: int):
     def run(state):
         return jax.lax.fori_loop(0, PERIODS, lambda _, state: jax.vmap(hold)(state), state)
 
-    return run, start
+    return run.lower(start).compile(), start
 
 
 def _thread(batch: int):
@@ -87,7 +115,7 @@ def _thread(batch: int):
 
         return jax.lax.fori_loop(0, PERIODS, one, now)
 
-    return run, start
+    return run.lower(start).compile(), start
 
 
 if __name__ == "__main__":

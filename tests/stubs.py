@@ -219,6 +219,26 @@ def trocars(*rows: int, arms: int = 1) -> rcm.Trocar:
     )
 
 
+def measured_above() -> types.SimpleNamespace:
+    """A measured trocar above the middle of the board."""
+    return types.SimpleNamespace(
+        p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]), roll_zero=jnp.zeros(1)
+    )
+
+
+def one_tool(tip: Pose, measurements: Any, layout: Any) -> types.SimpleNamespace:
+    """A state, as scripts of one arm read it: closed jaws at `tip` that touch something."""
+    return types.SimpleNamespace(
+        pose=Pose(tip.R[None], tip.p[None]),
+        measurements=measurements,
+        layout=layout,
+        measured_trocar=measured_above(),
+        gripper_target=-jnp.ones(1),
+        touch=jnp.ones(1, bool),
+        step=jnp.asarray(50),
+    )
+
+
 def _act(key, state):
     key, key_noise = jax.random.split(key)
     noise = 0.002 * jax.random.normal(key_noise, state.pose.p.shape)

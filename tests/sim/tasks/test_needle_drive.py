@@ -2,13 +2,13 @@
 
 import functools
 import itertools
-import types
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import stubs
 
 from starjax import rcm
 from starjax.sim import scene
@@ -150,14 +150,7 @@ def at(bound, layout, turn, height=0.0, **events):
     pose = pose._replace(p=pose.p.at[2].add(height))
     tip = wrist_script.tip_of(pose, grasps.grasp(bound.size))
     now = measured(bound, layout).replace(needle=pose, tip=tip.p, **events)
-    trocar = types.SimpleNamespace(p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]))
-    return types.SimpleNamespace(
-        pose=Pose(tip.R[None], tip.p[None]),
-        measurements=now,
-        layout=layout,
-        measured_trocar=trocar,
-        step=jnp.asarray(50),
-    )
+    return stubs.one_tool(tip, now, layout)
 
 
 NO, YES, FAR = jnp.zeros((), bool), jnp.ones((), bool), jnp.asarray(0.004)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import stubs
 
 from starjax import rcm
 from starjax.sim import scene
@@ -143,18 +144,7 @@ def test_the_expert_lifts_a_needle_that_is_held_for_driving_and_lets_any_other_g
     tip = Pose(R, p)
     now = measured(bound, layout, tip, height)
     tip = tip._replace(p=p.at[2].add(height))
-    frame = types.SimpleNamespace(
-        p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]), roll_zero=jnp.zeros(1)
-    )
-    state = types.SimpleNamespace(
-        pose=Pose(tip.R[None], tip.p[None]),
-        measurements=now,
-        layout=layout,
-        measured_trocar=frame,
-        gripper_target=-jnp.ones(1),
-        touch=jnp.ones(1, bool),
-        step=jnp.asarray(50),
-    )
+    state = stubs.one_tool(tip, now, layout)
     script = rescue.RESCUER.resume(jax.random.key(0), state)
     assert int(script.phase) == phase and float(script.jaws) == -1.0
     command, _, _ = rescue.RESCUER.act(script, state)
@@ -166,9 +156,7 @@ def test_the_expert_lifts_a_needle_that_is_held_for_driving_and_lets_any_other_g
 def test_a_needle_on_its_other_side_is_taken_from_above(layouts):
     needle = jax.tree.map(lambda x: x[3], layouts.needle)
     over = needle._replace(R=needle.R @ jnp.diag(jnp.array([1.0, -1.0, -1.0])))
-    frame = types.SimpleNamespace(
-        p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]), roll_zero=jnp.zeros(1)
-    )
+    frame = stubs.measured_above()
     for pose in (needle, over):
         measurements = types.SimpleNamespace(pick=types.SimpleNamespace(needle=pose))
         state = types.SimpleNamespace(measured_trocar=frame, measurements=measurements)

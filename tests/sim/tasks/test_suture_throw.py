@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import stubs
 
 from starjax import rcm
 from starjax.sim import physics, scene, thread
@@ -126,20 +127,6 @@ TAKEN = {**OUT, "held": True, "by_point": True}
 THROUGH = {"held": True, "by_point": True, "has_exited": True, "is_through": True}
 
 
-def _state(tip, now, layout):
-    """Returns the parts of a state that the script reads, at a tip's pose."""
-    frame = types.SimpleNamespace(p_world_trocar=jnp.array([[0.0, 0.0, 0.15]]), roll_zero=0.0)
-    return types.SimpleNamespace(
-        pose=Pose(tip.R[None], tip.p[None]),
-        measurements=now,
-        layout=layout,
-        measured_trocar=frame,
-        gripper_target=-jnp.ones(1),
-        touch=jnp.zeros(1, bool),
-        step=jnp.asarray(50),
-    )
-
-
 @pytest.mark.parametrize(
     ("grip", "share", "height", "events", "phase", "leg"),
     [
@@ -176,7 +163,7 @@ def test_the_expert_carries_on_wherever_the_needle_is(
     ours = {name: jnp.asarray(x) for name, x in events.items() if hasattr(now, name)}
     drives = {name: jnp.asarray(x) for name, x in events.items() if name not in ours}
     now = now.replace(drive=now.drive.replace(needle=needle, tip=tip.p, **drives), **ours)
-    state = _state(tip, now, layout)
+    state = stubs.one_tool(tip, now, layout)
     script = rescue.RESCUER.resume(jax.random.key(0), state)
     assert (int(script.phase), int(script.leg)) == (phase, leg)
     command, script, _ = rescue.RESCUER.act(script, state)
@@ -219,7 +206,7 @@ def test_jaws_close_off_the_recorded_grasp_and_the_script_goes_on_from_there(sta
     _, layout, _, now = start
     tip = expert.tip_of(now.drive.needle, grasps.grasp(task.SIZE))
     now = now.replace(drive=now.drive.replace(held=jnp.ones((), bool), tip=tip.p))
-    state = _state(tip, now, layout)
+    state = stubs.one_tool(tip, now, layout)
     script = expert.AGENT.init(jax.random.key(1), state)
     script = script.replace(R=tip.R, at=tip.p)
     script = expert.enter(script, jnp.asarray(expert.DESCEND, jnp.int32), state)
