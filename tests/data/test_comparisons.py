@@ -11,7 +11,7 @@ from scipy.spatial import transform
 from strangers import ARM, MAP, P_WORLD_REF, TROCARS, bring, source
 
 from starjax.data.formats import doubts
-from starjax.data.formats.mapping import ArmColumns
+from starjax.data.formats.mapping import ArmColumns, ShaftColumns
 
 PAGE = pathlib.Path(__file__).parents[2] / "docs/howto/other-peoples-data.md"
 COMMANDS = {"command_position": "cp", "command_rotation": "R0"}
@@ -140,6 +140,13 @@ REFUSED = {
         added(time=lambda a: np.minimum(a["time"], 2.0)),
         "time",
         "at step",
+    ),
+    "degrees": (
+        "angles of a wrist, half a turn",
+        changed_arm(shaft=ShaftColumns(angles="wrist", instrument="prograsp")),
+        added(wrist=lambda a: np.full((len(a["p0"]), 2), 30.0)),
+        "angles",
+        "30",
     ),
     "axes": ("axes of all poses, one point", MAP, added(R0=skewed), "PATH", "miss any one point"),
 }

@@ -6,6 +6,7 @@ import threading
 import time
 
 import jax
+import mistakes
 import numpy as np
 import pytest
 import served
@@ -165,6 +166,16 @@ def test_a_tool_that_does_not_go_through_the_trocar_is_not_moved():
     with pytest.raises(UsageError) as caught:
         executor.begin(pose._replace(p=pose.p + np.float32([0.03, 0.0, 0.0])), 1.0)
     assert caught.value.argument == "observation.pose"
+
+
+@pytest.mark.parametrize("name", ["R", "p", "gripper"])
+def test_what_is_not_finite_is_no_first_command(name):
+    pose = poses(0.0, 0.1)
+    given = {"R": np.array(pose.R), "p": np.array(pose.p), "gripper": np.ones(())}
+    given[name] = np.full_like(given[name], np.nan)
+    executor = plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
+    with mistakes.of(f"observation.{name}", "nan"):
+        executor.begin(deploy.Pose(given["R"], given["p"]), given["gripper"])
 
 
 @pytest.mark.parametrize(("ahead", "limits"), [(9, (0.1, 0.1)), (-1, (0.1, 0.1)), (0, (0.0, 0.1))])

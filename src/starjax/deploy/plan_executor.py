@@ -187,16 +187,18 @@ class PlanExecutor:
         """Takes the measured pose `[*arms]` as the first to hold, its axis put through the trocar.
 
         Raises:
-          UsageError: that alone would exceed the limits.
+          UsageError: a value is not finite, or that alone would exceed the limits.
         """
-        sensors: list[Any] = [np.asarray(x, np.float32) for x in pose]
-        pose = Pose(*sensors)
+        sensors: list[Any] = [np.asarray(x, np.float32) for x in (*pose, gripper)]
+        for name, values in zip(("R", "p", "gripper"), sensors, strict=True):
+            if not np.isfinite(values).all():
+                raise UsageError(f"observation.{name}", "finite values", values.tolist())
+        pose, opening = Pose(*sensors[:2]), np.clip(sensors[2], -1.0, 1.0)
         held = jax.device_get(self._motion.hold(pose, self._p_world_trocar))
         _, move, turn = self._toward(pose, held)
         if self._exceeds(move, turn):
             got = f"one that must turn by {turn:.2g} rad"
             raise UsageError("observation.pose", "a tool through the trocar", got)
-        opening: Any = np.clip(np.asarray(gripper, np.float32), -1.0, 1.0)
         self.last = self._command(held, opening)
 
     def step(self) -> Command:

@@ -59,6 +59,8 @@ def shaft(
         return measured
     if columns.instrument:
         angles = maps.pick(arrays, columns.angles, 2)
+        if (largest := float(np.abs(angles).max(initial=0.0))) > np.pi:
+            raise errors.UsageError("angles", "pitch and yaw in rad, at most pi", f"{largest:.3g}")
         found = shafts.of_wrist(*measured, INSTRUMENTS[columns.instrument], angles)
         return TipPoses(np.asarray(found.R), np.asarray(found.p))
     offset = (0.0, 0.0, 0.0), columns.turn
