@@ -7,6 +7,7 @@ import time
 
 import fakes
 import jax
+import mistakes
 import numpy as np
 import pytest
 import served
@@ -263,6 +264,12 @@ def test_a_mistake_waits_for_nothing(argv, argument, monkeypatch):
     with pytest.raises(UsageError) as caught:
         serve.main(argv)
     assert caught.value.argument.lstrip("-") == argument.lstrip("-")
+
+
+def test_a_damaged_policy_is_one_line(tmp_path):
+    (tmp_path / "policy.safetensors").write_bytes(b"x")
+    with mistakes.of("--policy", "policy.safetensors"):
+        serve.main(["--port", "0", "--policy", str(tmp_path / "policy.safetensors")])
 
 
 def test_its_own_machine_needs_no_key():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import fakes
 import jax
@@ -87,10 +88,19 @@ def test_a_file_beside_the_weights_has_a_newer_monitor(tmp_path):
     assert calibrate.to_json(policy_file.load(path).monitor) == newer
     assert path.read_bytes() == before
     other = {"digest": policy_file.monitor_digest(trained(2.0).params)}
-    for content in (json.dumps(newer | other), json.dumps(newer | {"scores": ["temper"]}), "{"):
+    decisions = {"settings": newer["settings"] | {"execute": 4}}
+    for change in (other, {"scores": ["temper"]}, decisions, {"alpha": []}):
+        beside.write_text(json.dumps(newer | change))
+        refused(path, beside)
+    for content in ("{", "[]"):
         beside.write_text(content)
-        with pytest.raises(ValueError, match="monitor"):
-            policy_file.load(path)
+        refused(path, beside)
+
+
+def refused(path, named):
+    """Expects that a policy is not read, in one line that begins with the file at fault."""
+    with pytest.raises(ValueError, match=rf"^{re.escape(str(named))}[^\n]*$"):
+        policy_file.load(path)
 
 
 def about_of(path):

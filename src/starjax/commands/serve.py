@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
 
+from starjax import errors
 from starjax.commands import checks, options
 from starjax.limits import Count, Range
 from starjax.policies import packaged
@@ -49,7 +50,12 @@ def main(argv: Sequence[str]) -> int:
     from starjax import deploy
     from starjax.deploy import server
 
-    policy = deploy.load(path)
+    try:
+        policy = deploy.load(path)
+    except errors.UsageError:
+        raise
+    except ValueError as error:
+        raise errors.UsageError("--policy", "a policy of starjax", error) from error
     settings = server.ServerSettings(args.host, args.port, args.batch, args.clients)
     print(f"{args.policy}: compiling for batches of up to {args.batch}", flush=True)
 

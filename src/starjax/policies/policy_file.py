@@ -100,7 +100,7 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
         **({"packages": dict(trained.packages)} if trained.packages else {}),
     }
     if trained.monitor is not None:
-        _check_monitor(trained)
+        _check_monitor(trained, pathlib.Path(path))
         values = calibrate.to_json(trained.monitor)
         parts = {name: values.pop(name) for name in _MONITOR_ARRAYS}
         arrays |= dict(_flatten({_MONITOR: parts}))
@@ -138,14 +138,16 @@ def load(path: pathlib.Path | str) -> Trained:
         raise ValueError(f"{path}: expected schema {SCHEMA}, got {schema!r}; train it again")
     if _hash(about, arrays) != expected:
         raise ValueError(f"{path}: damaged, its content has another sha256")
+    separate = _separate_monitor(path)
     try:
-        monitor = _separate_monitor(path) or _monitor(about, arrays)
-        trained = _trained(about, _unflatten(arrays))._replace(monitor=monitor)
-        _check_monitor(trained)
-        return trained
+        trained = _trained(about, _unflatten(arrays))
+        monitor = separate or _monitor(about, arrays)
     except (KeyError, TypeError, ValueError) as error:
         why = f"no {error} in it" if isinstance(error, KeyError) else error
         raise ValueError(f"{path}: made by another version of starjax: {why}") from error
+    trained = trained._replace(monitor=monitor)
+    _check_monitor(trained, monitor_path(path) if separate else path)
+    return trained
 
 
 def is_policy(path: pathlib.Path | str) -> bool:
@@ -181,11 +183,17 @@ def is_half(params: Params) -> bool:
         return all(np.array_equal(x, np.float16(x)) for _, x in _flatten(params))
 
 
-def _check_monitor(trained: Trained) -> None:
-    """Raises ValueError if the monitor was calibrated with other parameters."""
+def _check_monitor(trained: Trained, where: pathlib.Path) -> None:
+    """Raises ValueError if the monitor was calibrated with other parameters or decisions."""
     monitor = trained.monitor
-    if monitor is not None and monitor.digest != (digest := monitor_digest(trained.params)):
-        raise ValueError(f"monitor: expected one of weights {digest[:8]}, got {monitor.digest[:8]}")
+    if monitor is None:
+        return
+    if monitor.digest != (digest := monitor_digest(trained.params)):
+        got = f"one of weights {monitor.digest[:8]}"
+        raise ValueError(f"{where}: expected a monitor of weights {digest[:8]}, got {got}")
+    if monitor.settings.execute != (execute := trained.policy.execute):
+        got = f"one of {monitor.settings.execute}"
+        raise ValueError(f"{where}: expected a monitor of {execute} executed commands, got {got}")
 
 
 def monitor_path(path: pathlib.Path) -> pathlib.Path:
@@ -200,10 +208,11 @@ def _separate_monitor(path: pathlib.Path) -> calibrate.Monitor | None:
     file = monitor_path(path)
     if not file.exists():
         return None
+    values = files.read_json(file)
     try:
-        return calibrate.from_json(files.read_json(file))
+        return calibrate.from_json(values)
     except ValueError as error:
-        raise ValueError(f"{file.name}: {error}") from error
+        raise ValueError(f"{file}: {error}") from error
 
 
 def _monitor(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> calibrate.Monitor | None:
