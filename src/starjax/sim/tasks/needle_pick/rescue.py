@@ -1,37 +1,71 @@
 """Expert of needle pick from any state: a held needle is lifted or held on, else taken up anew.
 
-Beyond rescue: a needle out of the tool's reach.
+One that is held by its point is put down first: dropped, it rolls away. Beyond rescue: a needle out
+of the tool's reach.
 """
 
 import jax
 import jax.numpy as jnp
 
 from starjax.sim.state import EnvState
+from starjax.sim.tasks import phases
 from starjax.sim.tasks.needle_pick import expert, task
 from starjax.sim.tasks.phases import APPROACH, RAISE
 from starjax.sim.tasks.rescue import Rescuer, entry
+
+PUT, FREE = expert.HOLD + 1, expert.HOLD + 2
+_TABLE = expert.TIMING
+TIMING = phases.PhaseTable(
+    duration=(*_TABLE.duration, 0.9, 0.4),
+    speed=(*_TABLE.speed, 0.02, 1.0),
+    jaws=(*_TABLE.jaws, -1.0, 1.0),
+    tempo=_TABLE.tempo,
+)
+
+
+def _enter(script: expert.NeedleScript, phase: jax.Array, state: EnvState) -> expert.NeedleScript:
+    """Begins `phase`, one of the expert's or its own."""
+    usual = expert._enter(script, jnp.minimum(phase, expert.HOLD), state)
+    needle, tip = state.measurements.needle, script.at
+    lowest = jnp.min(needle.p[2] + jnp.asarray(expert.MIDDLES) @ needle.R[2])
+    ground = state.layout.needle.p[2]
+    down = tip.at[2].set(jnp.maximum(tip[2] - (lowest - ground), ground + expert.GRASP_ABOVE))
+    own = phases.enter(script, TIMING, phase, [*[tip] * PUT, down, tip])
+    return jax.tree.map(lambda a, b: jnp.where(phase >= PUT, a, b), own, usual)
+
+
+def _following(script: expert.NeedleScript, state: EnvState) -> jax.Array:
+    usual = expert.GRASP.following(script, state)
+    own = jnp.where(script.phase == PUT, FREE, RAISE)
+    return jnp.where(script.phase >= PUT, own, usual).astype(jnp.int32)
 
 
 def resume(key: jax.Array, state: EnvState) -> expert.NeedleScript:
     """Starts the script at this state."""
     script, now, found = expert.init(key, state), entry(state), state.measurements
-    # A grasp of the point never succeeds.
-    is_held = now.holds[0] & ~found.sticks
     is_up = found.needle.p[2] > state.layout.needle.p[2] + task.LIFT
     is_low = now.p[0, 2] < expert.HOVER
     held = jnp.where(is_up, expert.HOLD, expert.LIFT)
-    phase = jnp.where(is_held, held, jnp.where(is_low, RAISE, APPROACH))
+    # A grasp of the point never succeeds.
+    held = jnp.where(found.sticks, PUT, held)
+    phase = jnp.where(now.holds[0], held, jnp.where(is_low, RAISE, APPROACH))
     script = script.replace(
         attempt=jnp.zeros((), jnp.int32),
         at=now.p[0],
         jaws_from=now.jaws[0],
         jaws=now.jaws[0],
         # The jaws' own direction: the roll of a held needle does not jump.
-        normal=jnp.where(is_held, state.pose.R[0, :, 1], script.normal),
+        normal=jnp.where(now.holds[0], state.pose.R[0, :, 1], script.normal),
         roll_from=now.roll[0],
         roll=now.roll[0],
     )
-    return expert._enter(script, phase.astype(jnp.int32), state)
+    return _enter(script, phase.astype(jnp.int32), state)
 
 
-RESCUER = Rescuer(resume, expert.AGENT.act)
+_GRASP = expert.GRASP._replace(
+    timing=TIMING,
+    disturbance=(*expert.GRASP.disturbance, 0.1, 0.0),
+    following=_following,
+    enter=_enter,
+)
+RESCUER = Rescuer(resume, phases.agent(expert.init, _GRASP).act)

@@ -1,0 +1,65 @@
+"""The rescuer of needle pick puts a needle down that its point holds, and lifts any other."""
+
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from starjax import rcm
+from starjax.sim.tasks import phases
+from starjax.sim.tasks.needle_pick import expert, rescue
+from starjax.types import Pose
+
+GROUND, HEIGHT = 0.0005, 0.03  # m, of the resting and of the lifted needle
+FRAME = rcm.trocar_frame(rcm.Trocar(*jnp.zeros((3, 1))), jnp.array([[0.0, 0.0, 0.15]]))
+
+
+def state_of(height, sticks, touch=True):
+    """State of a tool at a segment of the needle, its jaws commanded to close."""
+    p = jnp.array([0.01, -0.02, GROUND + height])
+    tip = p + jnp.asarray(expert.MIDDLES[5])
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(jnp.append(0.3, tip)[None], FRAME)
+    needle = Pose(jnp.eye(3), p)
+    found = types.SimpleNamespace(needle=needle, touch=jnp.array(touch), sticks=jnp.array(sticks))
+    return types.SimpleNamespace(
+        pose=pose,
+        measurements=found,
+        layout=types.SimpleNamespace(needle=needle._replace(p=p.at[2].set(GROUND))),
+        measured_trocar=FRAME,
+        gripper_target=-jnp.ones(1),
+        touch=jnp.array([touch]),
+        step=jnp.asarray(50),
+        wrist=None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("height", "sticks", "touch", "phase"),
+    [
+        (HEIGHT, False, True, expert.HOLD),
+        (0.0, False, True, expert.LIFT),
+        (HEIGHT, True, True, rescue.PUT),
+        (0.0, True, True, rescue.PUT),
+        (0.0, False, False, phases.RAISE),
+    ],
+)
+def test_the_phase_follows_from_the_grasp(height, sticks, touch, phase):
+    script = rescue.RESCUER.resume(jax.random.key(0), state_of(height, sticks, touch))
+    assert int(script.phase) == phase
+
+
+def test_a_needle_held_by_its_point_is_on_the_ground_before_the_jaws_open():
+    state = state_of(HEIGHT, sticks=True)
+    tip, act = state.pose.p[0], jax.jit(lambda script: rescue.RESCUER.act(script, state))
+    script = rescue.RESCUER.resume(jax.random.key(0), state)
+    seen = []
+    while int(script.phase) >= rescue.PUT:
+        _, script, label = act(script)
+        seen.append((float(label.pose.p[0, 2]), float(label.gripper[0]), int(script.phase)))
+    z, jaws, phase = np.array(seen[:-1]).T
+    assert (jaws[phase == rescue.PUT] == -1.0).all() and abs(z[0] - float(tip[2])) < 1e-3
+    np.testing.assert_allclose(z[phase == rescue.FREE], GROUND + expert.GRASP_ABOVE, atol=1e-4)
+    assert jaws[-1] == 1.0 and int(script.phase) == phases.RAISE
+    np.testing.assert_allclose(label.pose.p[0, :2], tip[:2], atol=1e-3)
