@@ -163,6 +163,8 @@ def _episode(
     state, _, command, hit, largest, finite = jax.lax.while_loop(
         lambda carry: ~carry[0].done & (carry[0].step < steps), step, start
     )
+    # Memories of disturbances hold keys, which no array on the host can.
+    state, hit = (one.replace(wrapper_state={}) for one in (state, hit))
     return state, command, hit, largest, finite
 
 

@@ -2,7 +2,8 @@
 
 It commands the needle's poses on the bite's path; the tip follows from the grasp as it is measured
 when a phase begins, and the wrist's angles from the measured trocar. It is disturbed on purpose on
-its way to the pad. A needle that is off its path returns to it on the arc.
+its way to the pad. A needle that is off its path returns to it on the arc, and a wrist with slack
+cables is led.
 """
 
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import phases, scripting, wrist_script
+from starjax.sim.tasks import phases, scripting, slack, wrist_script
 from starjax.sim.tasks.needle_drive import task
 from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE
 from starjax.sim.tasks.wrist_script import tip_of
@@ -44,10 +45,12 @@ class DriveScript(wrist_script.WristScript):
     Attributes:
       turn: rad, the needle's on the path at the start of the drive.
       held: pose_tip_needle at the phase's start.
+      lead: of the commands.
     """
 
     turn: jax.Array
     held: Pose
+    lead: slack.Lead
 
 
 Plane = Callable[[EnvState], ArrayLike]
@@ -62,7 +65,7 @@ def agent(size: Needle, plane: Plane = vertical) -> Agent:
     """Makes the demonstrator for a needle, whose arc is driven in a plane with `plane(state)`."""
 
     def init(key: jax.Array, state: EnvState) -> DriveScript:
-        own = {"turn": jnp.zeros(()), "held": _held(state)}
+        own = {"turn": jnp.zeros(()), "held": _held(state), "lead": slack.none(state)}
         own |= wrist_script.rotations(state.pose.R[0])
         script = phases.begin(DriveScript, TIMING, key, state.pose.p[0], **own)
         script = script.replace(jaws=-jnp.ones(()), jaws_from=-jnp.ones(()))
@@ -79,7 +82,11 @@ def agent(size: Needle, plane: Plane = vertical) -> Agent:
         tip = jax.tree.map(lambda a, b: jnp.where(drives, a, b), on_arc, straight)
         weight = jnp.asarray(DISTURBANCE)[script.phase]
         fade = jnp.where(script.phase == DESCEND, 1.0 - s, 1.0)
-        return wrist_script.commands(script, tip, weight, fade, state)
+        lead = slack.update(script.lead, state)
+        led = slack.led(lead, tip)
+        rough, script, label = wrist_script.commands(script, led, weight, fade, state)
+        script = script.replace(at=tip.p, R=tip.R, lead=slack.sent(lead, rough))
+        return rough, script, label
 
     return Agent(init, act)
 
