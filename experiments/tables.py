@@ -12,7 +12,7 @@ and `elsewhere` (the trocar benchmark); or of benchmarks/results: `speed`, `lear
 `sb3`,
 `monitor_<policy>`, `monitor_cost`,
 `through_lerobot`, `held_out`, `larger_than_memory`, `loaders`,
-`redraw`, `physics_goals`.
+`redraw`, `look`, `physics_goals`.
 """
 
 import re

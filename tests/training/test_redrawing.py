@@ -212,7 +212,8 @@ def test_a_dataset_of_others_has_no_displaced_cameras(dataset):
         data = (given, frames, np.int32(40))
         with mistakes.of("train.randomise"):
             stepper._displaced(setup, data, False, function)
-    assert randomise.redraws(config.TrainConfig(randomise=NAMES))
+    both = config.TrainConfig(randomise=(*NAMES, "look=1"))
+    assert randomise.redraws(both) and randomise.redrawn_names(both) == ["camera", "look"]
     assert not randomise.redraws(config.TrainConfig(randomise=NAMES[1:]))
     others = {"features": {"image_camera": {}}, "seed_rule": None}
     with mistakes.of("train.randomise"):

@@ -166,8 +166,9 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
         expected = f"nominal trocars at {env.p_world_ref.tolist()}"
         raise errors.UsageError(_FROM, expected, reference.tolist())
     size = [policy.image_size, policy.image_size, 3]
-    if randomise.redraws(config.train):
-        redraw.expect_possible(randomise.ARGUMENT, about)
+    if redrawn := randomise.redrawn_names(config.train):
+        hint = f"without {' and '.join(redrawn)} it trains on them"
+        redraw.expect_possible(randomise.ARGUMENT, about, hint)
     required = {f"{episodes.IMAGE}{camera}": size for camera in env.names.cameras}
     if policy.observation == "state":
         required = {"state": [sum(field.size for field in env.task.fields)]}

@@ -103,11 +103,11 @@ def is_possible(description: Mapping[str, Any]) -> bool:
     return is_ours and is_undisturbed and "qpos" in features
 
 
-def expect_possible(argument: str, description: Mapping[str, Any]) -> None:
-    """Raises UsageError for a dataset whose images cannot be drawn."""
+def expect_possible(argument: str, description: Mapping[str, Any], hint: str = "") -> None:
+    """Raises UsageError, with a hint, for a dataset whose images cannot be drawn."""
     if not is_possible(description):
         expected = "demonstrations of starjax, without recorded disturbances of observations"
-        raise errors.UsageError(argument, expected, "others, whose images cannot be drawn")
+        raise errors.UsageError(argument, expected, "others, whose images cannot be drawn", hint)
 
 
 def are_recorded(description: Mapping[str, Any], env: Any) -> bool:

@@ -61,7 +61,12 @@ def max_levels(
 
 def redraws(train_config: config.TrainConfig) -> bool:
     """Returns True if training draws images anew: of displaced cameras, or with another look."""
-    return any(DISTURBANCES.get(name).redraws for name in max_levels(train_config))
+    return bool(redrawn_names(train_config))
+
+
+def redrawn_names(train_config: config.TrainConfig) -> list[str]:
+    """Lists the disturbances of a training that draw images anew."""
+    return [name for name in max_levels(train_config) if DISTURBANCES.get(name).redraws]
 
 
 def disturbed_count(samples: int) -> int:
