@@ -68,6 +68,51 @@ def test_a_spring_alone_is_the_implicit_one():
     np.testing.assert_allclose(force[0], m * (v - 0.1) / H, rtol=1e-4)
 
 
+@pytest.mark.parametrize("scale", [1e-7, 1e-3, 1.0, 1e3])
+def test_the_line_search_ends_at_the_minimum_however_near_it_is(scale):
+    bends = jnp.array([0.5, 3.0, jnp.inf, 2.0]) * scale
+
+    def slope(t):
+        x = t / scale
+        return 1e-3 * x + 2.0 * jnp.minimum(x, 0.5) + 1.5 * jnp.clip(x - 2.0, 0.0, 1.0)
+
+    for first, found in ((-0.5, 0.25 / 1.0005), (-2.0, 2.0 + 0.998 / 1.501), (-3.0, 500.0)):
+        end = rows.line_search(lambda t, first=first: slope(t) + first, jnp.asarray(first), bends)
+        np.testing.assert_allclose(end / scale, found, rtol=1e-4)
+
+
+@jax.jit
+def carried(gripper, velocity):
+    """Speeds (m/s) of a needle, and True while jaws that move `[3]` m/s hold it."""
+    held, R = grasps.grasp(SIZE), jnp.diag(jnp.array([1.0, -1.0, -1.0]))
+    pose = Pose(R @ held.R, jnp.array([0.0, 0.0, 0.05]) + R @ held.p)
+    twist = jnp.concatenate([velocity, jnp.zeros(3)])[None]
+
+    def tip(k):
+        return Pose(R[None], jnp.array([[0.0, 0.0, 0.05]]) + k * H * velocity)
+
+    def step(now, k):
+        tissue, pose, u = now
+        tips = driving.Tips(tip(k), twist, gripper[None])
+        forces, tissue = driving.step(SIZE, BODY, tissue, pose, u, tips, H)
+        u = u + H * (forces.needle + driving.weight(BODY)) / BODY.inertia
+        turn = rows.rotation(H * u[3:])
+        pose = Pose(pose.R @ turn, pose.p + H * u[:3])
+        return (tissue, pose, u), (jnp.linalg.norm(u[:3]), tissue.patches.is_held[0])
+
+    start = driving.begin(SIZE, tip(0.0), pose, jnp.ones(1, bool)), pose, jnp.zeros(6)
+    return jax.lax.scan(step, start, jnp.arange(12.0))[1]
+
+
+@pytest.mark.parametrize("gripper", [-0.02, -0.2, -1.0])
+def test_jaws_carry_a_needle_at_their_own_speed_however_weakly_they_grip(gripper):
+    ways = jax.random.normal(jax.random.key(0), (24, 3))
+    velocity = 0.005 * ways / jnp.linalg.norm(ways, axis=1, keepdims=True)
+    speed, is_held = jax.vmap(carried, (None, 0))(jnp.asarray(gripper), velocity)
+    assert bool(is_held.all())
+    assert float(speed.max()) < 0.015
+
+
 @jax.jit
 def driven(aside=0.0, gripper=-1.0):
     """Moves the jaws on the bite's path in 4 s, at its end `aside` m of it."""
