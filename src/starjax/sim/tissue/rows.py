@@ -133,7 +133,7 @@ def line_search(
 ) -> jax.Array:
     """Finds the minimum of a convex, piecewise quadratic function on the positive axis, exactly.
 
-    Where every row slips, a step of Newton's method is as long as the body is light: the minimum
+    If every row slips, a step of Newton's method is as long as the body is light: the minimum
     can lie at a millionth of it, which no fixed set of candidates encloses.
 
     Args:
