@@ -202,7 +202,7 @@ def test_a_sloped_way_begins_and_ends_at_rest_and_waits_less_than_minimum_jerk()
     assert (done > 0.99).sum() < 0.6 * near.sum()
 
 
-def test_jaws_close_off_the_recorded_grasp_and_the_script_goes_on_from_there(start):
+def test_jaws_close_off_the_recorded_grasp_and_the_next_way_begins_there(start):
     _, layout, _, now = start
     tip = expert.tip_of(now.drive.needle, grasps.grasp(task.SIZE))
     now = now.replace(drive=now.drive.replace(held=jnp.ones((), bool), tip=tip.p))

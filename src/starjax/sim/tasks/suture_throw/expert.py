@@ -95,7 +95,7 @@ def enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScript
     again = (phase == OPEN) & (script.phase == OUT)
     leg = jnp.where(again, 1, script.leg).astype(jnp.int32)
     half = needles.entry_angle(task.SIZE, bite)
-    # The script goes on from the pose at which the jaws have closed.
+    # The next way begins at the pose in which the jaws have closed.
     closed = (script.phase == CLOSE) | (script.phase == TAKE)
     at = wrist_script.off(Pose(script.R, script.at), closed * script.miss)
     script = script.replace(R=at.R, at=at.p)
