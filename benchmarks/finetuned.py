@@ -60,15 +60,25 @@ def runs(folder: Path = RESULTS) -> str:
 
 
 def branches(folder: Path = RESULTS) -> str:
-    """Returns, for rounds with takeovers, the branches that the expert succeeded from."""
+    """Returns, for rounds with takeovers, what the expert finished, and the trials it could not."""
     told = [found for found in _results(folder) if "branches" in found["rounds"][-1]]
     names = list(told[0]["rounds"][-1]["branches"]) if told else []
-    rows = [["Fine-tuning", "Round", *names, "From none"]]
+    header = ["Fine-tuning", "Round", "Finished", *names, "From none", "Trocar-trial of these"]
+    rows = [header]
     for found in told:
         for row in found["rounds"][1:]:
-            left = sum(map(len, row["not_rescued"].values()))
-            cells = [str(row["branches"][name]) for name in names]
-            rows.append([f"`{_flags(found)}`", str(row["round"]), *cells, str(left)])
+            finished = [
+                f"{cause} {rate['successes']}/{rate['trials']}"
+                for cause, rate in row["takeovers"].items()
+            ]
+            left = [
+                f"{cause} {trocar}-{trial}"
+                for cause, pairs in row["not_rescued"].items()
+                for trocar, trial in pairs
+            ]
+            cells = [f"`{_flags(found)}`", str(row["round"]), "; ".join(finished)]
+            cells += [str(row["branches"][name]) for name in names]
+            rows.append([*cells, str(len(left)), "; ".join(left) or "–"])
     return formats.render(rows, names=1) if told else "No result has branches yet."
 
 

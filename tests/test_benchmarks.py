@@ -100,7 +100,8 @@ def test_branches_of_all_fine_tunings_are_counted(tmp_path, finetunings):
     begun = {name: found[name] for name in ("command", "rounds")}
     for name, content in {"a": found, "b": begun}.items():
         (tmp_path / f"finetune_{name}.json").write_text(json.dumps(content))
-    assert finetuned.branches(tmp_path).count("| 3 | 2 | 3 |") == 2
+    row = "| lost 2/3; stalled 1/5 | 3 | 2 | 3 | lost 0-1; stalled 0-2; stalled 1-3 |"
+    assert finetuned.branches(tmp_path).count(row) == 2
 
 
 @pytest.fixture
@@ -118,6 +119,7 @@ def finetunings(monkeypatch, pytestconfig):
             {
                 "round": 1,
                 "trials": 800,
+                "takeovers": {"lost": rate(2, 3), "stalled": rate(1, 5)},
                 "branches": {"takeover": 3, "1 s": 2},
                 "not_rescued": {"lost": [[0, 1]], "stalled": [[0, 2], [1, 3]]},
             },
