@@ -16,6 +16,9 @@ ROOT = HERE.parent
 POLICIES = ("compact", "needle_pick", "peg_transfer_bimanual")
 # Goals: failures announced before the clock, false alarms under a disturbance and without one.
 EARLY, FALSE, ALPHA = 0.9, 0.1, 0.05
+# Policies that can drop something, and the goal: what falls is announced before.
+DROPPING, BEFORE = ("peg_transfer_bimanual",), 0.5
+_NONE = {"trials": 0, "rate": None}
 
 
 def stress() -> str:
@@ -53,6 +56,16 @@ def monitor() -> str:
     return formats.render(rows, names=1)
 
 
+def drops() -> str:
+    """Returns, by disturbance and policy, what was dropped and announced before it fell."""
+    found = [_read(f"benchmarks/results/monitor_{policy}_gpu.json")["rows"] for policy in DROPPING]
+    rows = [["Disturbance", *(f"`{policy}`" for policy in DROPPING)]]
+    for label in dict.fromkeys(label for table in found for label in table):
+        cells = [table[label]["before_drop"] if label in table else _NONE for table in found]
+        rows.append([label, *(_counted(rate, (rate["rate"] or 0.0) >= BEFORE) for rate in cells)])
+    return formats.render(rows, names=1)
+
+
 def runs() -> str:
     """Returns the origin of every file of the tables above."""
     goals = _goals()
@@ -75,6 +88,7 @@ TABLES = {
     "goals_stress": stress,
     "goals_others": others,
     "goals_monitor": monitor,
+    "goals_drops": drops,
     "goals_runs": runs,
 }
 
@@ -106,13 +120,15 @@ def _met(found: dict[str, Any], goal: float) -> str:
 
 
 def _alarms(found: dict[str, Any], most: float) -> list[str]:
-    """Renders both rates, bold where the goal is met; `most` is that of false alarms."""
-    cells = []
-    for name in ("before_clock", "false_alarms"):
-        rate = found[name]
-        text = f"{rate['successes']:,}/{rate['trials']:,} = {100 * (rate['rate'] or 0):.0f}%"
-        value = rate["rate"] or 0.0
-        is_met = value <= most if name == "false_alarms" else value >= EARLY
-        text = f"**{text}**" if is_met else text
-        cells.append(text if rate["trials"] else "\u2013")
-    return cells
+    """Renders both rates; `most` is the goal of false alarms."""
+    early, false = found["before_clock"], found["false_alarms"]
+    is_early = (early["rate"] or 0.0) >= EARLY
+    return [_counted(early, is_early), _counted(false, (false["rate"] or 0.0) <= most)]
+
+
+def _counted(rate: dict[str, Any], is_met: bool) -> str:
+    """Renders a rate, bold where its goal is met."""
+    if not rate["trials"]:
+        return "\u2013"
+    text = f"{rate['successes']:,}/{rate['trials']:,} = {100 * rate['rate']:.0f}%"
+    return f"**{text}**" if is_met else text
