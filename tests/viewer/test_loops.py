@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from starjax import rcm
 from starjax.data import load
-from starjax.rollouts import trocars
+from starjax.rollouts import agent, trocars
 from starjax.viewer import (
     browse,
     devices,
@@ -181,6 +181,31 @@ def test_what_was_discarded_is_nowhere(page, steered, hurried, tmp_path):
         teleop.run(page, steered, kept, after(40, presses), device=directed(steered, 0), seed=SEED)
         assert kept.kept == 0
     assert len(list(root.glob("episodes/*"))) <= 1  # motion after it
+
+
+def test_a_policy_goes_from_trial_to_trial_until_a_hand_relieves_it(
+    page, env, hurried, tmp_path, monkeypatch
+):
+    begun, begin = [], teleop.OperatorEpisode.begin
+
+    def counted(self, configuration, trial):
+        begun.append(trial)
+        begin(self, configuration, trial)
+
+    monkeypatch.setattr(teleop.OperatorEpisode, "begin", counted)
+    policy = recorder.Relieved(agent.from_single(env.task.expert()), None, "digest", 2, 4)
+    watched = []
+    presses = {
+        400: lambda: (watched.append(begun[-1]), press(page, "Pass control")),
+        404: lambda: press(page, "Discard the episode"),
+        410: lambda: press(page, "Pass control"),
+        414: lambda: press(page, "Save the episode"),
+    }
+    with recorder.record_into(tmp_path / "relief", env, SEED, policy) as kept:
+        teleop.run(page, recorder.steer(env, policy), kept, after(420, presses), seed=SEED)
+        assert kept.saved == 1
+        assert kept.next_trial(0) == watched[0] + 1
+    assert begun == [*range(watched[0] + 1), watched[0], watched[0] + 1] and watched[0] >= 2
 
 
 def wristed(page, steered, start):

@@ -19,7 +19,7 @@ from starjax.viewer.frame import outcome, rcm_error_mm
 from starjax.viewer.recorder import Recorder, Steering
 from starjax.viewer.stage import Stage, aim
 from starjax.viewer.teleop_target import Pilot
-from starjax.viewer.view import trocar_names
+from starjax.viewer.view import REST_S, trocar_names
 
 _PICTURE_WIDTH = 480  # pixels
 _OVER = object()  # of a replay
@@ -57,6 +57,7 @@ class OperatorEpisode:
         """Sets up a trial that waits for the operator."""
         self.configuration, self.trial, self.end = configuration, trial, ""
         self.hand_acts = self._keeps = self._steering.policy is None
+        self._rest_steps = round(REST_S * self._steering.env.control_hz)
         start = self._steering.start(self._seed, configuration, trial)
         self._state, self.frame, *now = start
         frames = jax.device_get(self._state.env.measured_trocar)
@@ -81,6 +82,13 @@ class OperatorEpisode:
         recorder.add(moment)
         self.end = outcome(self.frame, recorder.length >= self._limit)
         self._draw(with_image=bool(self.end) or recorder.length % page.REDRAW_STEPS == 0)
+
+    def has_rested(self, recorder: Recorder) -> bool:
+        """Returns True some time after the end of a trial that the policy did alone."""
+        if not self.is_shared or not self.end or recorder.is_worth_saving:
+            return False
+        self._rest_steps -= 1
+        return self._rest_steps <= 0
 
     def pass_control(self) -> None:
         """Gives control to the hand at once, or back to the policy at its next plan."""
@@ -147,10 +155,10 @@ def run(
     steering.compile()  # not after the operator's first motion
     episode = OperatorEpisode(server, steering, pilot, seed)
 
-    def begin() -> None:
+    def begin(least: int = 0) -> None:
         recorder.discard()
         configuration = int(choices["trocar"].split()[0])
-        episode.begin(configuration, recorder.next_trial(configuration))
+        episode.begin(configuration, max(recorder.next_trial(configuration), least))
 
     begin()
     clock, replay = page.Clock(env.control_hz), iter(())
@@ -163,7 +171,10 @@ def run(
                 begin()
             clock.pause()
         elif requested & {"discard", "choice"}:
-            begin()
+            begin(0 if "choice" in requested else episode.trial)
+            clock.pause()
+        elif episode.has_rested(recorder):
+            begin(episode.trial + 1)
             clock.pause()
         if requested & {"save", "discard", "choice"}:
             replay = iter(())

@@ -19,7 +19,7 @@ from starjax.viewer.trocar_controls import TrocarControls
 
 OWN_ARMS = "their own"
 _COMPILING = "Compiling {}\nAbout a minute the first time, seconds later."
-_REST_S = 1.5  # pause between an episode and the next trial
+REST_S = 1.5  # pause between an episode and the next trial
 
 
 class ViewOptions(NamedTuple):
@@ -166,7 +166,7 @@ class Rollouts:
 
     def begin(self, seed: int, configuration: int, trial: int) -> None:
         """Starts a trial through a trocar configuration of the task, or the operator's own."""
-        self.trial, self._rest = trial, round(_REST_S * self.hz)
+        self.trial, self._rest = trial, round(REST_S * self.hz)
         trocar = self.trocars.own()
         starts = [one.start(seed, configuration, trial, trocar) for one in self._simulations]
         self._states, self._frames = map(list, zip(*starts))
