@@ -24,6 +24,10 @@ from starjax.types import Command, Pose
 LEAN = 0.5  # rad from straight down, as shafts through the middle trocars at the hand-over
 AXES = np.array([[np.sin(LEAN), 0, -np.cos(LEAN)], [-np.sin(LEAN), 0, -np.cos(LEAN)]], np.float32)
 BEND = 1.0  # s in which the straight wrists of the start come to their lean
+# Gentler and slower than a straight tool: in C MuJoCo pads that are fully closed, or carry a needle
+# along their opening direction twice as fast, squeeze the wire out.
+CARRY = 2.4  # s of the way to the hand-over
+GRIP = -0.6  # opening of jaws that hold
 ABOVE = 0.0  # m of the tip above the wire: these pads end nearer to it than those of the grasper
 
 
@@ -47,5 +51,10 @@ def _command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) ->
     return Command(found.pose, jaws, found.wrist)
 
 
-PLAY = expert.PLAY._replace(goals=functools.partial(expert.goals, ABOVE), command=_command)
+PLAY = expert.PLAY._replace(
+    duration=np.where(np.array(expert.PHASES) == "carry", CARRY, expert.DURATION),
+    jaws=np.where(expert.PLAY.jaws < 0, GRIP, expert.PLAY.jaws),
+    goals=functools.partial(expert.goals, ABOVE),
+    command=_command,
+)
 AGENT = handover.agent(PLAY)
