@@ -9,6 +9,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import goals_list
+
 from starjax.report import formats
 
 HERE = Path(__file__).resolve().parent
@@ -73,14 +75,7 @@ def runs() -> str:
     files += [row["figure"][0] for row in goals["others"]]
     files += [f"benchmarks/results/monitor_{policy}_gpu.json" for policy in POLICIES]
     rows = [["Result", "Command", "Seed", "Commit", "On"]]
-    for file in dict.fromkeys(files):
-        result = _read(file)
-        commands = result.get("commands") or [result["command"]]
-        text = "<br>".join(f"`{command}`" for command in commands)
-        commit = formats.code(result["commit"], result["dirty"])
-        on = formats.machine(result["hardware"])
-        seed = str(result.get("seed", 0))
-        rows.append([f"[{Path(file).name}](../../{file})", text, seed, commit, on])
+    rows += [goals_list.origin(file) for file in dict.fromkeys([*files, *goals_list.files()])]
     return formats.render(rows, names=len(rows[0]))
 
 

@@ -5,14 +5,12 @@
 
 A table stands between `<!-- table:NAME -->` and `<!-- /table -->`. NAME is `<claim>/<table>` of a
 claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list of claims);
-`presets` (from their values); `goals_...` (of goals_page.py); `leaderboard`, `leaderboard_apart`
-and `elsewhere` (the trocar benchmark); or of benchmarks/results: `speed`, `learners`, `experts`,
-`six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`, `stress_randomised`,
-`proposition`, `finetune`, `finetune_goals`, `finetune_runs`, `finetune_branches`, `ppo`, `ppo_gpu`,
-`sb3`,
-`monitor_<policy>`, `monitor_cost`,
-`through_lerobot`, `held_out`, `larger_than_memory`, `loaders`,
-`redraw`, `look`, `physics_goals`.
+`presets` (from their values); `goals_...` (of goals_page.py and goals_list.py); `leaderboard`,
+`leaderboard_apart` and `elsewhere` (the trocar benchmark); or of benchmarks/results: `speed`,
+`learners`, `experts`, `six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`,
+`stress_randomised`, `proposition`, `finetune`, `finetune_goals`, `finetune_runs`,
+`finetune_branches`, `ppo`, `ppo_gpu`, `sb3`, `monitor_<policy>`, `monitor_cost`, `through_lerobot`,
+`held_out`, `larger_than_memory`, `loaders`, `redraw`, `look`, `physics_goals`.
 """
 
 import re
@@ -26,6 +24,7 @@ sys.path[:0] = [str(HERE), str(ROOT / "benchmarks")]
 
 import claims  # noqa: E402
 import finetuned  # noqa: E402
+import goals_list  # noqa: E402
 import goals_page  # noqa: E402
 import leaderboard_page  # noqa: E402
 import newest  # noqa: E402
@@ -54,6 +53,8 @@ def table(name: str) -> str:
         return leaderboard_page.TABLES[name]()
     if name in goals_page.TABLES:
         return goals_page.TABLES[name]()
+    if name.startswith(goals_list.PREFIX):
+        return goals_list.table(name)
     if name in FINETUNED:
         return FINETUNED[name]()
     if name == "speed":
