@@ -79,3 +79,12 @@ def test_what_a_page_links_to_is_there(tables, pages):
             continue
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
             assert (page.parent / target).exists(), (page, target)
+
+
+def test_a_goal_is_met_where_no_figure_misses_its_bound(tables):
+    half, most = {"rate": 0.5, "successes": 1, "trials": 2}, {"rate": 0.9}
+    met = tables.goals_list._met
+    assert met({"least": [50, 90]}, [half, most]) == "yes"
+    assert met({"least": [95]}, [half, most]) == "missed by 45 and 5 points"
+    assert met({"most": [0.1]}, [0.1, 0.3]) == "missed by 0.2"
+    assert met({}, []) == "not measured" and met({"test": "tests"}, []) == "yes"
