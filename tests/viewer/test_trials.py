@@ -41,6 +41,10 @@ def test_a_trial_that_diverged_is_shown_to_its_last_sound_state(folder):
 def test_what_is_not_there_is_one_line(folder, tmp_path):
     with mistakes.of("--trials"):
         view._trials(str(folder / "other.npz"))
+    arrays = dict(np.load(folder / "invalid.npz"))
+    files.write_npz(folder / "flat.npz", arrays | {"qpos": arrays["qpos"][..., 0]})
+    with mistakes.of("--trials", "flat.npz"):
+        view._trials(str(folder / "flat.npz"))
     (folder / "invalid.npz").write_bytes(b"no")
     with mistakes.of("--trials"):
         view._trials(str(folder / "invalid.npz"))
