@@ -153,6 +153,33 @@ def test_the_expert_lifts_a_needle_that_is_held_for_driving_and_lets_any_other_g
     assert (float(command.gripper[0]) == -1.0) == is_kept
 
 
+@pytest.mark.parametrize(
+    ("turn", "low", "phase", "least"),
+    [(0.0, 0.0, expert.LIFT, expert.LIFT_HEIGHT), (0.0, 0.01, expert.LIFT, 0.033),
+     (0.0, -0.03, expert.HOLD, 0.0), (0.4, -0.03, expert.RAISE, 0.0)],
+)  # fmt: skip
+def test_a_rescued_needle_is_lifted_high_enough_and_let_go_if_it_is_askew(
+    bound, layouts, turn, low, phase, least
+):
+    """`low`: m that the needle lies lower than at first. `least`: m, how far the tip goes up."""
+    layout = jax.tree.map(lambda x: x[3], layouts)
+    angle = jnp.asarray(expert.GRASP_ANGLE)
+    x, z = task.wire_tangent(layout.needle, angle), -layout.needle.R[:, 2]
+    square = Pose(jnp.stack([x, jnp.cross(z, x), z], -1), task.wire_point(layout.needle, angle))
+    fallen = square._replace(p=square.p.at[2].add(-low))
+    state = stubs.one_tool(fallen, measured(bound, layout, square, -low), layout)
+    script = rescue.RESCUER.resume(jax.random.key(0), state)
+    assert int(script.phase) == (expert.LIFT if low >= 0.0 else expert.HOLD)
+    R = square.R @ rcm.rotation_z(jnp.asarray(turn))
+    askew = measured(bound, layout, Pose(R, square.p), -low)
+    state = stubs.one_tool(fallen._replace(R=R), askew, layout)
+    command, script, _ = rescue.RESCUER.act(script, state)
+    assert int(script.phase) == phase and (float(command.gripper[0]) == -1.0) == (turn == 0.0)
+    off = float(square.p[2] - layout.needle.p[2])  # of the wire there from the needle's centre
+    up = float(script.goal[2] - fallen.p[2])
+    assert up >= least - off - 1e-6
+
+
 def test_a_needle_on_its_other_side_is_taken_from_above(layouts):
     needle = jax.tree.map(lambda x: x[3], layouts.needle)
     over = needle._replace(R=needle.R @ jnp.diag(jnp.array([1.0, -1.0, -1.0])))
