@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import stubs
 
 from starjax import rcm
 from starjax.sim.tasks import phases
@@ -23,16 +24,10 @@ def state_of(height, sticks, touch=True):
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(jnp.append(0.3, tip)[None], FRAME)
     needle = Pose(jnp.eye(3), p)
     found = types.SimpleNamespace(needle=needle, touch=jnp.array(touch), sticks=jnp.array(sticks))
-    return types.SimpleNamespace(
-        pose=pose,
-        measurements=found,
-        layout=types.SimpleNamespace(needle=needle._replace(p=p.at[2].set(GROUND))),
-        measured_trocar=FRAME,
-        gripper_target=-jnp.ones(1),
-        touch=jnp.array([touch]),
-        step=jnp.asarray(50),
-        wrist=None,
-    )
+    lying = types.SimpleNamespace(needle=needle._replace(p=p.at[2].set(GROUND)))
+    state = stubs.one_tool(Pose(pose.R[0], tip), found, lying)
+    state.measured_trocar, state.touch, state.wrist = FRAME, jnp.array([touch]), None
+    return state
 
 
 @pytest.mark.parametrize(
