@@ -2,8 +2,8 @@
 
 python docs/draw_trials.py needle_drive "near camera:9/0=needle_drive" \\
     "usual camera:9/0=USUAL.safetensors"
-python docs/draw_trials.py needle_regrasp "STAR-Diff-Pose:9/0=POSE.safetensors" \\
-    "STAR-Diff-Wrist:9/0=WRIST.safetensors"
+python docs/draw_trials.py needle_regrasp "STAR-Diff-Pose:9/3=POSE.safetensors" \\
+    "same, other trial:9/22=POSE.safetensors" "STAR-Diff-Wrist:9/3=WRIST.safetensors"
 
 A row is LABEL:TROCAR/TRIAL=POLICY, of a packaged policy or a file; the trials are those of an
 evaluation with seed 0. `experiments/` has the commands that trained the policies.
