@@ -10,7 +10,7 @@ claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list 
 `learners`, `experts`, `six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`,
 `stress_randomised`, `proposition`, `finetune`, `finetune_goals`, `finetune_runs`,
 `finetune_branches`, `ppo`, `ppo_gpu`, `sb3`, `monitor_<policy>`, `monitor_cost`, `through_lerobot`,
-`held_out`, `larger_than_memory`, `loaders`, `redraw`, `look`, `physics_goals`.
+`held_out`, `larger_than_memory`, `loaders`, `redraw`, `look`, `physics_goals`, `gradient_noise`.
 """
 
 import re
