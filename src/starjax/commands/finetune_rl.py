@@ -63,6 +63,7 @@ class PolicyGradient:
             return file, files.read_json(told)
         print(f"\n[round {number}] policy gradient: into {folder}", flush=True)
         folder.mkdir(parents=True, exist_ok=True)
+        precompile.settle()  # a program that is called before it is traced would be compiled twice
         counts: dict[str, Any] = {"episodes": self._work.settings.episodes, "iterations": []}
         with stage_times.timed(self._work.out, f"round {number} policy gradient"):
             old = policy_file.load(before)
