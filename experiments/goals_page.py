@@ -19,7 +19,7 @@ POLICIES = ("compact", "needle_pick", "peg_transfer_bimanual")
 # Goals: failures announced before the clock, false alarms under a disturbance and without one.
 EARLY, FALSE, ALPHA = 0.9, 0.1, 0.05
 # Policies that can drop something, and the goal: what falls is announced before.
-DROPPING, BEFORE = ("peg_transfer_bimanual",), 0.5
+DROPPING, BEFORE = ("peg_transfer_bimanual", "needle_handover"), 0.5
 _NONE = {"trials": 0, "rate": None}
 
 
@@ -73,7 +73,7 @@ def runs() -> str:
     goals = _goals()
     files = [row[name][0] for row in goals["stress"] for name in ("old", "new")]
     files += [row["figure"][0] for row in goals["others"]]
-    files += [f"benchmarks/results/monitor_{policy}_gpu.json" for policy in POLICIES]
+    files += [f"benchmarks/results/monitor_{policy}_gpu.json" for policy in (*POLICIES, *DROPPING)]
     rows = [["Result", "Command", "Seed", "Commit", "On"]]
     rows += [goals_list.origin(file) for file in dict.fromkeys([*files, *goals_list.files()])]
     return formats.render(rows, names=len(rows[0]))
