@@ -17,7 +17,7 @@ from starjax.report import encode, outcomes, results, scene_view, video
 
 IMAGES = pathlib.Path(__file__).parent / "images"
 SIZE = 256  # pixels, side of a picture
-SPEED = 2  # times real time
+SPEED = 4  # times real time
 MOMENTS = (0.07, 0.3, 0.5, 0.7, 0.85, 1.0)  # fractions of a trial
 
 
@@ -31,7 +31,7 @@ def main(folder: str, *trials: str) -> None:
 
     def sides():
         nonlocal last
-        for now in itertools.zip_longest(*(film[::SPEED] for film in films)):
+        for now in itertools.zip_longest(*films):
             last = [old if new is None else new for new, old in zip(now, last or now)]
             yield np.concatenate(last, 1)
 
@@ -44,18 +44,18 @@ def main(folder: str, *trials: str) -> None:
 
 
 def pictures(clip: video.Clip) -> list[np.ndarray]:
-    """Draws a recorded trial `[SIZE + bar, SIZE, 3]`, with the time and at last the outcome."""
+    """Draws every SPEED-th step of a recorded trial, `[SIZE + bar, SIZE, 3]`, and its outcome."""
     rollout, hz, still = clip.rollout, clip.result.control_hz, clip.still
     draw = scene_view.camera(clip.result.scene, SIZE)
     won = outcomes.strict(rollout.trial)
     end = "success" if won else outcomes.SHORT[outcomes.failure(rollout.trial)]
-    count = len(rollout.qpos)
-    found = []
-    for first in range(0, count, scene_view.BATCH):
-        drawn = draw(rollout.qpos, rollout.p_world_trocar, {}, first, still=still)
-        for step, image in enumerate(drawn[: count - first], start=first):
+    steps = np.append(np.arange(0, len(rollout.qpos) - 1, SPEED), len(rollout.qpos) - 1)
+    qpos, found = rollout.qpos[steps], []
+    for first in range(0, len(steps), scene_view.BATCH):
+        drawn = draw(qpos, rollout.p_world_trocar, {}, first, still=still)
+        for step, image in zip(steps[first:], drawn):
             time = f"{step / hz:.0f} s"
-            text = f"{end}, {time}" if step == count - 1 else time
+            text = f"{end}, {time}" if step == steps[-1] else time
             found.append(np.concatenate([video.caption([[(text, "#e6e9ec")]], SIZE), image]))
     return found
 
