@@ -18,6 +18,9 @@ ROOT = HERE.parent
 POLICIES = ("compact", "needle_pick", "peg_transfer_bimanual")
 # Goals: failures announced before the clock, false alarms under a disturbance and without one.
 EARLY, FALSE, ALPHA = 0.9, 0.1, 0.05
+# Stress of further policies, on the trials of the goals.
+LOOK = "benchmarks/results/stress_look_gpu.json"
+INHERITED = "benchmarks/results/stress_inherited_gpu.json"
 # Policies that can drop something, and the goal: what falls is announced before.
 DROPPING, BEFORE = ("peg_transfer_bimanual", "needle_handover"), 0.5
 _NONE = {"trials": 0, "rate": None}
@@ -39,6 +42,19 @@ def others() -> str:
     for row in _goals()["others"]:
         found = _figure(row["figure"])
         rows.append([row["name"], f"{row['goal']}", _rate(found), _met(found, row["goal"])])
+    return formats.render(rows, names=1)
+
+
+def beside(file: str, label: str) -> str:
+    """Returns success of both policies and of a third, whose stress may lack some levels."""
+    rows, third = [["Disturbance", "`compact`", "`peg_transfer_robust`", label]], _read(file)
+    for row in _goals()["stress"]:
+        found = third
+        for key in row["old"][1:]:
+            found = found.get(key, {})
+        if found:
+            rates = (_figure(row["old"]), _figure(row["new"]), found)
+            rows.append([row["name"], *map(_rate, rates)])
     return formats.render(rows, names=1)
 
 
@@ -73,6 +89,7 @@ def runs() -> str:
     goals = _goals()
     files = [row[name][0] for row in goals["stress"] for name in ("old", "new")]
     files += [row["figure"][0] for row in goals["others"]]
+    files.append("experiments/goals/handover_fresh.json")
     files += [f"benchmarks/results/monitor_{policy}_gpu.json" for policy in (*POLICIES, *DROPPING)]
     rows = [["Result", "Command", "Seed", "Commit", "On"]]
     rows += [goals_list.origin(file) for file in dict.fromkeys([*files, *goals_list.files()])]
@@ -82,6 +99,8 @@ def runs() -> str:
 TABLES = {
     "goals_stress": stress,
     "goals_others": others,
+    "goals_look": lambda: beside(LOOK, "trained with `look` too"),
+    "goals_inherited": lambda: beside(INHERITED, "preset `gpu` on its encoder"),
     "goals_monitor": monitor,
     "goals_drops": drops,
     "goals_runs": runs,

@@ -10,7 +10,9 @@ import pytest
 import scipy.optimize
 
 from starjax.sim import assets, dynamics, linear, registries, scene, solver
+from starjax.sim import env as envs
 from starjax.sim.quiet_mjx import mjx
+from starjax.types import Command
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden"
 VELOCITIES, LIMITS, CONTACTS = 6, 3, 4
@@ -175,24 +177,40 @@ def test_pads_that_close_on_a_needle_need_the_iterations_of_their_scene():
 
 @pytest.fixture(scope="module")
 def large(tmp_path_factory):
-    """The scene of reach with nine loose balls: 62 velocities."""
+    """Reach with nine loose balls above a plane: 62 velocities."""
+    touches = 'condim="3" contype="1" conaffinity="1"'
     balls = "".join(
-        f'<body name="ball{i}" pos="{i / 50} 0 0.01"><freejoint/><geom size="0.004"/></body>'
+        f'<body name="ball{i}" pos="{i / 50 - 0.08} 0.03 0.006"><freejoint/>'
+        f'<geom size="0.004" {touches}/></body>'
         for i in range(9)
     )
+    balls += f'<geom type="plane" size="1 1 0.1" {touches}/>'
     file = tmp_path_factory.mktemp("large") / "balls.xml"
     reach = f'<include file="{assets.path("tasks/reach/reach.xml")}"/>'
     file.write_text(f"<mujoco>{reach}<worldbody>{balls}</worldbody></mujoco>")
-    task = registries.tasks.get("reach")._replace(mjcf=str(file))
-    return scene.compose(scene.name("reach"), task)
+    return registries.tasks.get("reach")._replace(mjcf=str(file))
 
 
 def test_a_scene_of_many_velocities_has_dense_matrices(large):
-    assert large.nv == 62 >= scene.SPARSE_FROM
-    solver.check(mjx.put_model(large, impl="jax"), mjx.make_data(large, impl="jax"))
-    large.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    m = scene.compose(scene.name("reach"), large)
+    assert m.nv == 62 >= scene.SPARSE_FROM
+    solver.check(mjx.put_model(m, impl="jax"), mjx.make_data(m, impl="jax"))
+    m.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
     with pytest.raises(ValueError, match=r"model: expected dense.*62 velocities"):
-        solver.check(mjx.put_model(large, impl="jax"), mjx.make_data(large, impl="jax"))
+        solver.check(mjx.put_model(m, impl="jax"), mjx.make_data(m, impl="jax"))
+
+
+@pytest.mark.slow
+def test_a_scene_of_many_velocities_runs(large):
+    env = envs.make("reach", observation="state", variant=large)
+    trocar = jax.tree.map(lambda field: jnp.asarray(field)[0], env.task.trocars)
+    state = jax.jit(env.reset)(jax.random.key(0), envs.EnvParams(trocar))
+    step = jax.jit(env.step)
+    for _ in range(10):
+        state = step(state, Command(state.pose, state.gripper))
+    assert not state.invalid and state.solver_error < dynamics.max_solver_error(env.scene)
+    heights = state.physics.qpos[2:63:7]  # of the balls, whose radius is 4 mm
+    assert ((heights > 0.003) & (heights < 0.005)).all()
 
 
 def test_the_limit_on_the_error_is_that_of_every_task_and_grows_beyond_them():
