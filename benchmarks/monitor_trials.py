@@ -61,29 +61,42 @@ def main(policy: str, out: str, still_s: str, batches: str, each: str, *levels: 
     for name, level in kinds.items():
         at_task[f"{name}-{level:g}"] = Trials(task.trocars, int(each), 0, {name: level})
     folder = Path(out).with_suffix("")
-    tables = dict(evaluations(folder, who, settings, {**sampled, **at_task}))
+    digest = policy_file.monitor_digest(who.trained.params)
+    about = {"weights": who.weights, "monitor": {"settings": settings._asdict(), "digest": digest}}
+    tables: dict[str, Any] = {}
+    for label, table in evaluations(folder, who, settings, {**sampled, **at_task}):
+        tables[label] = table
+        if sampled.keys() <= tables.keys():  # again after each set: a run may be cut off
+            ended = {name: x for name, x in kinds.items() if f"{name}-{x:g}" in tables}
+            files.write_npz(Path(out), _arrays(folder, tables, list(sampled), ended, about))
+
+
+def _arrays(
+    folder: Path,
+    tables: Mapping[str, Any],
+    sampled: list[str],
+    levels: Mapping[str, float],
+    about: dict[str, Any],
+) -> dict[str, np.ndarray]:
+    """Returns the columns of the ended sets, and the JSON files that monitors.py reads."""
     arrays = {
-        f"{label}/{name}": getattr(tables[label], name)
-        for label in at_task
+        f"{label}/{name}": getattr(table, name)
+        for label, table in tables.items()
+        if label not in sampled
         for name in monitors.COLUMNS
     }
     for name in monitors.COLUMNS:
         arrays[f"trials/{name}"] = np.concatenate([getattr(tables[x], name) for x in sampled])
     command = ["python", "benchmarks/monitor_trials.py", *sys.argv[1:]]
     made = session.Session(" ".join(command), folder)
-    digest = policy_file.monitor_digest(who.trained.params)
-    monitor = {"settings": settings._asdict(), "digest": digest}
     registry = disturbances.DISTURBANCES
     tested = {
         name: {"unit": registry.get(name).unit, "levels": [f"{level:g}"]}
-        for name, level in kinds.items()
+        for name, level in levels.items()
     }
-    for name, content in {
-        "monitor.json": {"weights": who.weights, "monitor": monitor},
-        "stress.json": {"disturbances": tested},
-    }.items():
+    for name, content in {"monitor.json": about, "stress.json": {"disturbances": tested}}.items():
         arrays[name] = np.frombuffer(made.write(name, content).read_bytes(), np.uint8)
-    files.write_npz(Path(out), arrays)
+    return arrays
 
 
 def disturbable(policy: str, levels: Mapping[str, float]) -> Any:
