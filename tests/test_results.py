@@ -88,3 +88,11 @@ def test_a_goal_is_met_where_no_figure_misses_its_bound(tables):
     assert met({"least": [95]}, [half, most]) == "missed by 45 and 5 points"
     assert met({"most": [0.1]}, [0.1, 0.3]) == "missed by 0.2"
     assert met({}, []) == "not measured" and met({"test": "tests"}, []) == "yes"
+
+
+def test_the_sixths_of_the_dial_hold_every_trial(tables):
+    columns, turns = tables.claims.columns, range(len(tables.claims.columns.TURNS))
+    for run in tables.claims.load(tables.HERE / "dial").runs.values():
+        parts = {"seen": 400, "unseen": 200} | ({"trocars": 600} if run.swept else {})
+        for part, count in parts.items():
+            assert sum(columns.by_turn(run, part, turn).trials for turn in turns) == count
