@@ -89,7 +89,7 @@ def runs() -> str:
     goals = _goals()
     files = [row[name][0] for row in goals["stress"] for name in ("old", "new")]
     files += [row["figure"][0] for row in goals["others"]]
-    files.append("experiments/goals/handover_fresh.json")
+    files.append("benchmarks/results/handover_fresh_gpu.json")
     files += [f"benchmarks/results/monitor_{policy}_gpu.json" for policy in (*POLICIES, *DROPPING)]
     rows = [["Result", "Command", "Seed", "Commit", "On"]]
     rows += [goals_list.origin(file) for file in dict.fromkeys([*files, *goals_list.files()])]
