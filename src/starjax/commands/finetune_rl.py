@@ -51,9 +51,8 @@ class PolicyGradient:
             finetune_stages.Lessons(work).demonstrations(), config.train.holdout_demos
         )
         precompile.start(lambda: self._prepare(player, *shapes))
-        self._progress: dict[
-            Path, GradientProgress
-        ] = {}  # of the file that the last round has made
+        # The key is the policy file that the last round has made.
+        self._progress: dict[Path, GradientProgress] = {}
 
     def round(self, number: int, who: PolicyInEnv, before: Path) -> finetune_stages.Round:
         """Runs the iterations of a round from the weights of a file, unless they are done."""

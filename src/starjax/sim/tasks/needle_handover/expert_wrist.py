@@ -47,8 +47,8 @@ def _command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) ->
     share = scripting.minimum_jerk(jnp.clip(state.step / (BEND * CONTROL_HZ), 0.0, 1.0))
     turn = share * jax.vmap(ik.rotation_between)(straight.pose.R, R)
     R = Rotation.from_rotvec(turn).as_matrix() @ straight.pose.R
-    found = rcm.through(WRIST, Pose(R, p), state.measured_trocar.p_world_trocar)
-    return Command(found.pose, jaws, found.wrist)
+    feasible = rcm.through(WRIST, Pose(R, p), state.measured_trocar.p_world_trocar)
+    return Command(feasible.pose, jaws, feasible.wrist)
 
 
 PLAY = expert.PLAY._replace(
