@@ -64,6 +64,7 @@ def task(arms: int = 1, **changed: Any) -> base.Task:
             base.Field("target.p", 3, "point"),
         ),
         "relative": relative,
+        "experts": {},
     }
     return base.Task(**{**nothing, **given, **changed})
 
