@@ -32,6 +32,7 @@ def main(file: Path) -> None:
 
 def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
     """Draws the fine-tunings of one task."""
+    lines = dict(zip(dict.fromkeys(map(finetuned.base, results)), ("-", ":", "--", "-.")))
     for found in results:
         minutes = [seconds / 60 for seconds in finetuned.learning_seconds(found)]
         rates = [row["validation"] for row in found["rounds"]]
@@ -41,12 +42,12 @@ def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
             for end in (0, 1)
         )
         label = f"{found['by']}, {finetuned.base(found)}"
-        colour = WAYS[found["by"]]
+        look = {"color": WAYS[found["by"]], "ls": lines[finetuned.base(found)]}
         axis.errorbar(
-            minutes, middle, (low, high), marker="o", ms=4, capsize=2, color=colour, label=label
+            minutes, middle, (low, high), marker="o", ms=4, capsize=2, label=label, **look
         )
-    goal = finetuned.goal_of(task)[0]
-    axis.axhline(goal, color="black", lw=0.8, ls="--", label=f"goal, {goal:.0f}%")
+    for goal in sorted({finetuned.goal_of(found)[0] for found in results}):
+        axis.axhline(goal, color="black", lw=0.8, ls="--", label=f"goal, {goal:.0f}%")
     axis.set(title=task, xlabel="rollouts and training (min)")
     axis.legend(fontsize=7, loc="best")
 

@@ -23,7 +23,7 @@ def goals(folder: Path = RESULTS) -> str:
     for (task, weights), results in itertools.groupby(found, key=_policy):
         # The first result of the most successes at all trocars.
         won, *others = sorted(results, key=lambda x: -sum(_after(x)[p]["rate"] for p in PARTS))
-        goal = goal_of(task)
+        goal = goal_of(won)
         after, rounds = _after(won), won["rounds"][1:]
         missed = [g - 100 * after[part]["rate"] for g, part in zip(goal, PARTS, strict=True)]
         left = [f"{by:.1f} {part}" for by, part in zip(missed, PARTS, strict=True) if by > 1e-9]
@@ -43,10 +43,10 @@ def goals(folder: Path = RESULTS) -> str:
     return formats.render(rows, names=1)
 
 
-def goal_of(task: str) -> list[float]:
-    """Returns the goal at seen and at unseen trocars in percent."""
+def goal_of(found: dict[str, Any]) -> list[float]:
+    """Returns the goal at seen and at unseen trocars in percent, of a policy or else its task."""
     known = tomllib.loads((HERE / "finetune_goals.toml").read_text())["goals"]
-    return known.get(task, known["others"])
+    return known.get(base(found)) or known.get(found["task"], known["others"])
 
 
 def runs(folder: Path = RESULTS) -> str:
