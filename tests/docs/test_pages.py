@@ -147,6 +147,7 @@ def test_links_lead_somewhere(page, root):
             assert "://" in target or (page.parent / target).exists(), target
         else:
             path = page.parent / target
+            assert path.resolve().is_relative_to(root.resolve() / "docs"), target
             assert path.exists() or path.stem in made or path.suffix in (".png", ".gif"), target
 
 
