@@ -83,8 +83,8 @@ class OperatorEpisode:
         self.end = outcome(self.frame, recorder.length >= self._limit)
         self._draw(with_image=bool(self.end) or recorder.length % page.REDRAW_STEPS == 0)
 
-    def has_rested(self, recorder: Recorder) -> bool:
-        """Returns True some time after the end of a trial that the policy did alone."""
+    def rest(self, recorder: Recorder) -> bool:
+        """Counts a step of the pause after a trial that the policy did alone; True at its end."""
         if not self.is_shared or not self.end or recorder.is_worth_saving:
             return False
         self._rest_steps -= 1
@@ -173,7 +173,7 @@ def run(
         elif requested & {"discard", "choice"}:
             begin(0 if "choice" in requested else episode.trial)
             clock.pause()
-        elif episode.has_rested(recorder):
+        elif episode.rest(recorder):
             begin(episode.trial + 1)
             clock.pause()
         if requested & {"save", "discard", "choice"}:
