@@ -18,6 +18,8 @@ from starjax import cli
         ("view --policy compact --compare-with expert --trocar 99", "--trocar"),
         ("view --arm noodle", "--arm"),
         ("view --port 70000", "--port"),
+        ("view --expert --record hand", "--record"),
+        ("view --policy compact --compare-with expert --record hand", "--compare-with"),
         ("teleop --task nothing", "task"),
         ("teleop --task reach --trocar 99 --out demos", "--trocar"),
         ("teleop --device joystick", "--device"),

@@ -7,12 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starjax import rcm
-from starjax.data import load
+from starjax.data import load, store
 from starjax.rollouts import agent, trocars
 from starjax.viewer import (
     browse,
     devices,
     recorder,
+    relief,
+    shared_control,
     simulation,
     teleop,
     teleop_target,
@@ -120,7 +122,7 @@ def directed(steered, trocar):
     state, _, action, _ = steered.start(SEED, trocar, 0)
     way = np.asarray(state.env.layout.p[0]) - action[0, 1:]
     count = int(np.ceil(np.linalg.norm(way) * 30 / (0.8 * teleop_target.SPEED)))
-    axes = teleop.view_axes(steered.env)
+    axes = shared_control.camera_axes(steered.env)
     deflection = axes.T @ way * 30 / (count * teleop_target.SPEED)
     steps = iter([np.array([0.0, *deflection])] * count)
     still = np.zeros(4)
@@ -206,6 +208,49 @@ def test_a_policy_goes_from_trial_to_trial_until_a_hand_relieves_it(
         assert kept.saved == 1
         assert kept.next_trial(0) == watched[0] + 1
     assert begun == [*range(watched[0] + 1), watched[0], watched[0] + 1] and watched[0] >= 2
+
+
+def test_in_the_view_too_a_hand_relieves_the_policy_where_it_is(page, env, hurried, tmp_path):
+    root, seen = tmp_path / "relief", {}
+    policy = recorder.Relieved(agent.from_single(env.task.expert()), None, "digest", 2, 4)
+    steered = recorder.steer(env, policy)
+    with recorder.record_into(root, env, SEED, policy) as kept:
+
+        def look(name):
+            seen[name] = [m.fields["actor"][0] for m in kept.moments]
+
+        presses = {
+            10: lambda: press(page, "Pass control"),
+            20: lambda: press(page, "Pass control"),
+            200: lambda: (look("shared"), press(page, "Save the episode")),
+            210: lambda: press(page, "Pass control"),
+            215: lambda: (look("again"), press(page, "Discard the episode")),
+            220: lambda: press(page, "Save the episode"),
+            230: lambda: look("alone"),
+        }
+        said = relief.run(page, "expert", steered, kept, after(232, presses), trocar=3, seed=SEED)
+        assert kept.saved == 1 and said.endswith("1 episodes saved, 1 of them successful")
+    # The hand acts from the very next step, the policy from its next plan; the end waits for Enter.
+    shared = [0] * 10 + [2] * 10
+    assert seen["shared"][:20] == shared and set(seen["shared"][20:]) == {0}
+    assert set(seen["again"]) == {0, 2} and set(seen["alone"]) == {0}
+    np.testing.assert_array_equal(load.actors(root), seen["shared"][9:])
+    (record,) = (store.verify(root, key) for key in store.keys(root))
+    assert record["source"] == "intervention" and (record["trocar"], record["trial"]) == (3, 0)
+
+
+def test_trials_without_a_hand_follow_one_another_in_a_recorded_view(page, env, hurried, tmp_path):
+    policy = recorder.Relieved(agent.from_single(env.task.expert()), None, "digest", 2, 4)
+    begun = []
+    with recorder.record_into(tmp_path / "relief", env, SEED, policy) as kept:
+        steered = recorder.steer(env, policy)
+        start = steered.start
+        counted = steered._replace(start=lambda *given: (begun.append(given), start(*given))[1])
+        said = relief.run(page, "expert", counted, kept, after(320), trocar=2, seed=SEED)
+        assert kept.saved == 0
+    trials = [trial for _, _, trial in begun]
+    assert trials == [*range(len(trials))] and len(trials) >= 3
+    assert {given[:2] for given in begun} == {(SEED, 2)} and "0 episodes saved" in said
 
 
 def wristed(page, steered, start):

@@ -93,26 +93,16 @@ def main(argv: Sequence[str]) -> int:
 
 def _scene(args: TeleopArgs, file: Path | None) -> tuple[Any, Any]:
     """Returns the environment, and the policy of a file as `recorder.Relieved`, or None."""
-    from starjax.policies import in_env
     from starjax.sim import env as sim_env
-    from starjax.viewer import recorder
+    from starjax.viewer import shared_control
 
-    if file is None:
-        made = sim_env.make(
-            args.task,
-            args.arm,
-            args.tool,
-            observation=args.observation,
-            image_size=args.image_size,
-        )
-        return made, None
-    who = in_env.place_in_own_scene(file, in_env.read(file), arms=args.arm)
-    trained = who.trained
-    policy = recorder.Relieved(
-        who.agent(),
-        (trained.params, trained.normalizer),
-        who.weights,
-        trained.policy.obs_horizon,
-        trained.policy.execute,
+    if file is not None:
+        return shared_control.relieved(file, args.arm)
+    made = sim_env.make(
+        args.task,
+        args.arm,
+        args.tool,
+        observation=args.observation,
+        image_size=args.image_size,
     )
-    return who.env, policy
+    return made, None

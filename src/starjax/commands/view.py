@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import folders, options
+from starjax.commands import checks, folders, options
 from starjax.limits import Range
 from starjax.policies import packaged
 from starjax.runtime import hub, jax_start, signals, xla
@@ -18,9 +18,13 @@ The page has the scene in 3D, the camera's image, the RCM error and the plan. Dr
 arrows, or set it by sliders, and the policy continues through it, also in the next trials. Ctrl-C
 closes the page.
 
+With --record, T passes control from the policy to your hand and back, as in starjax teleop
+--policy, and Enter saves the episode. Trials are then those of demonstrations, whose trocars stay.
+
 Examples:
   starjax view
-  starjax view --policy compact --compare-with expert --trocar 3"""
+  starjax view --policy compact --compare-with expert --trocar 3
+  starjax view --policy compact --record runs/interventions"""
 
 _RENAMED = {"--beside": "--compare-with"}  # flags of the previous release
 Port = Annotated[int, Range(0, 65_535)]
@@ -42,6 +46,8 @@ class ViewArgs:
     trials: str = ""
     # second agent at the same trial: expert, or a policy as above
     compare_with: str = ""
+    # directory of the episodes in which your hand relieved --policy or --run
+    record: str = ""
     # sweep.json of starjax sweep, whose trials are dots above a map; default: the one in --run
     sweep: str = ""
     task: str = config_lib.DEFAULT_TASK  # task of the expert
@@ -61,6 +67,8 @@ def main(argv: Sequence[str]) -> int:
         raise errors.UsageError(
             "--policy, --run, --expert, --dataset or --trials", "at most one of them", got
         )
+    if args.record:
+        _expect_recordable(args)
     xla.prepare_xla()
     jax_start.require_devices("starjax.viewer.view")
 
@@ -68,12 +76,53 @@ def main(argv: Sequence[str]) -> int:
 
     if args.trials:
         show = _trials(args.trials)
+    elif args.record:
+        show = _recorded(args)
     else:
         show = _dataset(args.dataset, args.image_size) if args.dataset else _live(args)
     with signals.stop_signals() as should_stop, page.serve(args.port) as server:
         print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
         print(show(server, should_stop))
     return 0
+
+
+def _expect_recordable(args: ViewArgs) -> None:
+    """Refuses --record without a policy of its own on the page."""
+    if not (args.policy or args.run):
+        raise errors.UsageError("--record", "--policy or --run", "neither")
+    for flag in ("compare_with", "sweep"):
+        if value := getattr(args, flag):
+            name = f"--{flag.replace('_', '-')}"
+            raise errors.UsageError(name, "none with --record", value)
+    checks.expect_folder("--record", args.record)
+
+
+def _recorded(args: ViewArgs) -> Show:
+    """Returns the view of a policy whose operator is recorded."""
+    from starjax.viewer import recorder, relief, shared_control
+
+    agent = _agent(args.policy, args.run, args.task)
+    _expect_scene(args, agent.task)
+    env, policy = shared_control.relieved(agent.file, (args.arm,) if args.arm else ())
+
+    def show(server: Any, should_stop: Callable[[], bool]) -> str:
+        with recorder.record_into(Path(args.record), env, args.seed, policy) as kept:
+            given = server, agent.label, recorder.steer(env, policy), kept, should_stop
+            summary = relief.run(*given, trocar=args.trocar, seed=args.seed)
+        return f"{summary}; dataset: {args.record}"
+
+    return show
+
+
+def _expect_scene(args: ViewArgs, task: str) -> None:
+    """Checks --arm and --trocar."""
+    from starjax.sim import registries
+
+    if args.arm:
+        errors.choice("--arm", args.arm, registries.arms.names())
+    count = len(registries.tasks.get(task).is_seen)
+    if args.trocar >= count:
+        raise errors.UsageError("--trocar", f"0 to {count - 1}", args.trocar)
 
 
 def _dataset(folder: str, image_size: int) -> Show:
@@ -103,7 +152,6 @@ def _trials(file: str) -> Show:
 
 def _live(args: ViewArgs) -> Show:
     """Makes the live view of one agent or two."""
-    from starjax.sim import registries
     from starjax.viewer import simulation, view
 
     agents = [_agent(args.policy, args.run, args.task)]
@@ -114,11 +162,7 @@ def _live(args: ViewArgs) -> Show:
         raise errors.UsageError(
             "--compare-with", f"one that does {agents[0].task}", agents[-1].task
         )
-    if args.arm:
-        errors.choice("--arm", args.arm, registries.arms.names())
-    count = len(registries.tasks.get(agents[0].task).is_seen)
-    if args.trocar >= count:
-        raise errors.UsageError("--trocar", f"0 to {count - 1}", args.trocar)
+    _expect_scene(args, agents[0].task)
     initial = view.ViewOptions(
         tuple(agents),
         args.arm or view.OWN_ARMS,

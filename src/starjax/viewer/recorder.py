@@ -15,6 +15,7 @@ import numpy as np
 from starjax import rcm
 from starjax.data import schema, store
 from starjax.finetune import dagger, rounds
+from starjax.monitor.calibrate import Monitor
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs, takeover, trial_key
 from starjax.rollouts import trocars as configurations
@@ -55,6 +56,7 @@ class Relieved(NamedTuple):
       digest: of its file.
       obs_horizon: O, moments that it observes.
       execute: commands of a plan that it executes.
+      monitor: its runtime monitor, if it has one.
     """
 
     agent: Any
@@ -62,6 +64,7 @@ class Relieved(NamedTuple):
     digest: str
     obs_horizon: int
     execute: int
+    monitor: Monitor | None = None
 
 
 class Steering(NamedTuple):
@@ -94,7 +97,7 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
     to_action = slice(None) if wrist is None else tip_handle.FROM_RCM6
     from_action = slice(None) if wrist is None else tip_handle.TO_RCM6
     camera, observe = simulation.camera(env), jax.vmap(env.observe)
-    params = None if policy is None else policy.params
+    params, execute = (None, 0) if policy is None else (policy.params, policy.execute)
 
     @jax.jit
     def start(params: Any, key: jax.Array, trocar: Trocar) -> Any:
@@ -134,7 +137,7 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
         now = space.encode(command.pose, before.measured_trocar)[0, :, to_action]
         now = now, command.gripper[0]
         status = programs.status(env, carry)
-        return live, Moment(simulation.frame(env, live), {**fields, **actor}, status, *now)
+        return live, Moment(simulation.frame(env, live, execute), {**fields, **actor}, status, *now)
 
     def begin(seed: int, configuration: int, trial: int) -> tuple[Any, Frame, Any, Any]:
         key = trial_key.of_trial(seed, configuration, trial, schema.STREAM)

@@ -6,17 +6,14 @@ With a policy at work, a key passes control to the hand and back.
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import jax
-import mujoco
 import numpy as np
 
 from starjax.rollouts import episodes
-from starjax.runtime import files
-from starjax.sim import wrists
-from starjax.viewer import goal_distance, page, teleop_target
+from starjax.viewer import goal_distance, page, shared_control
 from starjax.viewer.devices import Device
 from starjax.viewer.frame import outcome, rcm_error_mm
 from starjax.viewer.recorder import Recorder, Steering
+from starjax.viewer.shared_control import SharedControl
 from starjax.viewer.stage import Stage, aim
 from starjax.viewer.teleop_target import Pilot
 from starjax.viewer.view import REST_S, trocar_names
@@ -29,16 +26,14 @@ class OperatorEpisode:
     """The present trial: its state, and its view on the page.
 
     Attributes:
-      configuration: index of the task's trocar configuration.
-      trial: its number.
+      control: its state, and the hand or the policy that acts.
       frame: the present frame.
       end: outcome, empty while the trial runs.
       distances: name of a point of the task -> mm to the nearest tip.
-      hand_acts: True while the operator has control.
     """
 
     def __init__(self, server: Any, steering: Steering, pilot: Pilot, seed: int):
-        self._steering, self._pilot, self._seed = steering, pilot, seed
+        self._steering, self.control = steering, SharedControl(steering, pilot, seed)
         env = steering.env
         self._limit = round(env.task.time_limit_s * env.control_hz)
         self._stage = Stage(server.scene, env.scene.mj_model)
@@ -48,63 +43,29 @@ class OperatorEpisode:
             self._picture = page.Pictures(server.gui, [env.names.cameras[0]], _PICTURE_WIDTH)
         self._distances = goal_distance.make(env)
 
-    @property
-    def is_shared(self) -> bool:
-        """True with a policy that the operator relieves."""
-        return self._steering.policy is not None
-
     def begin(self, configuration: int, trial: int) -> None:
         """Sets up a trial that waits for the operator."""
-        self.configuration, self.trial, self.end = configuration, trial, ""
-        self.hand_acts = self._keeps = self._steering.policy is None
+        self.end = ""
         self._rest_steps = round(REST_S * self._steering.env.control_hz)
-        start = self._steering.start(self._seed, configuration, trial)
-        self._state, self.frame, *now = start
-        frames = jax.device_get(self._state.env.measured_trocar)
-        arms = range(self._steering.env.task.arms)
-        self._trocars = [jax.tree.map(lambda x, i=i: x[0, i], frames) for i in arms]
-        self._rest(*now)
+        self.frame = self.control.begin(configuration, trial)
         self._stage.clear()
         self._draw(with_image=True)
 
     def advance(self, recorder: Recorder) -> None:
         """Runs one control step; records from the first motion to the end of the trial."""
-        action, opening = self._pilot.read(1.0 / self._steering.env.control_hz)
-        policy = self._steering.policy
-        if self.end or (policy is None and not self._pilot.has_moved):
+        hand = self.control.read()
+        if self.end or self.control.is_waiting:
             return
-        if policy is not None and not self._keeps and recorder.length % policy.execute == 0:
-            self.hand_acts = False  # a new plan begins
-        self._state, moment = self._steering.step(self._state, action, opening, self.hand_acts)
-        if not self.hand_acts:
-            self._rest(moment.action, moment.opening)
-        self.frame = moment.frame
-        recorder.add(moment)
+        self.frame = self.control.step(hand, recorder)
         self.end = outcome(self.frame, recorder.length >= self._limit)
         self._draw(with_image=bool(self.end) or recorder.length % page.REDRAW_STEPS == 0)
 
     def rest(self, recorder: Recorder) -> bool:
         """Counts a step of the pause after a trial that the policy did alone; True at its end."""
-        if not self.is_shared or not self.end or recorder.is_worth_saving:
+        if not self.control.is_shared or not self.end or recorder.is_worth_saving:
             return False
         self._rest_steps -= 1
         return self._rest_steps <= 0
-
-    def pass_control(self) -> None:
-        """Gives control to the hand at once, or back to the policy at its next plan."""
-        if self._steering.policy is not None:
-            self._keeps = not self._keeps
-            self.hand_acts |= self._keeps
-
-    def _rest(self, actions: np.ndarray, openings: np.ndarray) -> None:
-        """Lets the hand begin at actions `[A, D]`, see `Steering`, and openings `[A]`."""
-        task = self._steering.env.task
-        wrist = wrists.common(task)
-        limits = [
-            teleop_target.bounds(slot, action[1:4], wrist)
-            for slot, action in zip(task.slots, actions, strict=True)
-        ]
-        self._pilot.rest(actions, openings, limits, self._trocars)
 
     def replay(self, recorder: Recorder) -> Iterator[None]:
         """Shows the recorded control steps one by one, then the present one again."""
@@ -120,9 +81,9 @@ class OperatorEpisode:
     def _draw(self, with_image: bool) -> None:
         self._stage.show(self.frame)
         if with_image:
-            images = self._steering.look(self._state)
+            images = self._steering.look(self.control.state)
             self._picture.show([np.asarray(next(iter(images.values())))])
-            self.distances = self._distances(self._state.env)
+            self.distances = self._distances(self.control.state.env)
 
 
 def run(
@@ -142,15 +103,11 @@ def run(
     hint = "Enter, Backspace, R: shows the episode before it is saved"
     buttons = gui.add_button_group("", ("Save", "Discard", "Replay"), hint=hint)
     buttons.on_click(lambda event: requests.add(event.target.value.lower()))
-    page.add_command(gui, "Save the episode", "enter", lambda: requests.add("save"))
-    page.add_command(gui, "Discard the episode", "backspace", lambda: requests.add("discard"))
+    shared_control.add_keys(gui, requests, steering.policy is not None)
     page.add_command(gui, "Replay the episode", "R", lambda: requests.add("replay"))
-    if steering.policy is not None:
-        gui.add_markdown("T: control to your hand, and back to the policy")
-        page.add_command(gui, "Pass control", "T", lambda: requests.add("pass"))
     names = trocar_names(env.task.name)
     choices = page.Choices(gui, requests, trocar=(names, names[trocar]))
-    pilot = Pilot(server, env.task.arms, view_axes(env), device, wrists.common(env.task))
+    pilot = shared_control.add_pilot(server, env, device)
     page.add_dark_mode(gui)
     steering.compile()  # not after the operator's first motion
     episode = OperatorEpisode(server, steering, pilot, seed)
@@ -165,16 +122,16 @@ def run(
     while not should_stop():
         requested = requests.pop()
         if "pass" in requested:
-            episode.pass_control()
+            episode.control.pass_control()
         if "save" in requested and recorder.is_worth_saving:
-            if _save(server, recorder, episode):
+            if shared_control.save(server, recorder, episode.control):
                 begin()
             clock.pause()
         elif requested & {"discard", "choice"}:
-            begin(0 if "choice" in requested else episode.trial)
+            begin(0 if "choice" in requested else episode.control.trial)
             clock.pause()
         elif episode.rest(recorder):
-            begin(episode.trial + 1)
+            begin(episode.control.trial + 1)
             clock.pause()
         if requested & {"save", "discard", "choice"}:
             replay = iter(())
@@ -190,18 +147,6 @@ def run(
     return f"{saved}; {clock.missed} of {clock.steps} control steps late"
 
 
-def _save(server: Any, recorder: Recorder, episode: OperatorEpisode) -> bool:
-    """Saves the episode and notifies the user; returns False if the disk refused it."""
-    try:
-        folder = recorder.save(episode.configuration, episode.trial)
-    except files.StorageError as error:
-        page.notify(server, "Not saved", str(error), is_error=True)
-        return False
-    note = "" if episode.frame.success else ", which training leaves out"
-    page.notify(server, "Saved", f"{folder}{note}")
-    return True
-
-
 def _status(
     env: Any, episode: OperatorEpisode, recorder: Recorder, clock: page.Clock, is_replay: bool
 ) -> str:
@@ -211,8 +156,8 @@ def _status(
     progress = episode.end or env.task.stages[int(frame.stage)]
     if not recorder.length:
         progress = "waits for your hand"
-    if episode.is_shared:
-        progress += ", your hand acts" if episode.hand_acts else ", the policy acts"
+    if episode.control.is_shared:
+        progress += ", your hand acts" if episode.control.hand_acts else ", the policy acts"
     progress = "replay" if is_replay else progress
     goals = ", ".join(f"to {name} {mm:.1f}" for name, mm in episode.distances.items())
     return (
@@ -222,13 +167,3 @@ def _status(
         f"{recorder.saved} episodes saved, {recorder.kept} of them successful; "
         f"{clock.missed} steps late"
     )
-
-
-def view_axes(env: Any) -> np.ndarray:
-    """Returns the axes of the first camera's image, see `teleop_target.view_axes`."""
-    model = env.scene.mj_model
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_camlight(model, data)
-    camera = data.cam(env.names.cameras[0])
-    return teleop_target.view_axes(camera.xmat.reshape(3, 3))

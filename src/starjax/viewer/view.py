@@ -19,6 +19,7 @@ from starjax.viewer.trocar_controls import TrocarControls
 
 OWN_ARMS = "their own"
 _COMPILING = "Compiling {}\nAbout a minute the first time, seconds later."
+_HAND = "No hand", "starjax view --policy NAME --record DIR lets T pass control to your hand."
 REST_S = 1.5  # pause between an episode and the next trial
 
 
@@ -46,6 +47,7 @@ def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> s
     status = page.Status(server.gui)
     player = page.Player(server.gui, requests)
     selection = Selection(server.gui, requests, options)
+    page.add_command(server.gui, "Pass control", "T", lambda: page.notify(server, *_HAND))
     page.add_dark_mode(server.gui)
     rollouts = _load(server, selection, status, options.sweep)
     rollouts.begin(options.seed, selection.trocar, 0)
@@ -143,7 +145,11 @@ class Rollouts:
         simulations: Sequence[Simulation],
         status: page.Status,
         sweep: SuccessMap | None = None,
+        *,
+        trocars: Any = None,
+        is_compiled: bool = False,
     ):
+        """Adds them to the page; `trocars` take the place of `TrocarControls`."""
         self._server, self._simulations, self._status = server, simulations, status
         env, gui = simulations[0].env, server.gui
         self.hz, self._limit = env.control_hz, round(env.task.time_limit_s * env.control_hz)
@@ -151,7 +157,7 @@ class Rollouts:
         models = [simulation.env.scene.mj_model for simulation in simulations]
         self._stages = [Stage(server.scene, model, i) for i, model in enumerate(models)]
         aim(server, len(simulations))
-        self.trocars = TrocarControls(server, env.task)
+        self.trocars = trocars or TrocarControls(server, env.task)
         self._map = []
         if sweep and sweep.task == env.task.name:
             self._map += success_map.add(server.scene, sweep)
@@ -162,7 +168,7 @@ class Rollouts:
             self._pictures = page.Pictures(gui, [f"{label} sees" for label in labels])
         self._alarms = [EpisodeAlarm(simulation.monitor) for simulation in simulations]
         self._tally = np.zeros((len(simulations), 2), int)  # succeeded, ended
-        self._is_compiled = self._is_paused = False
+        self._is_compiled, self._is_paused = is_compiled, False
 
     def begin(self, seed: int, configuration: int, trial: int) -> None:
         """Starts a trial through a trocar configuration of the task, or the operator's own."""
