@@ -42,7 +42,7 @@ def draw(axis: Any, found: dict[str, Any]) -> None:
     axis.axvline(clock_s, color="black", lw=1.0, ls="--", label=f"clock alone, {clock_s:.1f} s")
     axis.set(xlim=(0, UNTIL_S), ylim=(0, 1.02), title=found["policy"])
     axis.set(xlabel="time of the first alarm (s)", ylabel="failures announced")
-    axis.legend(fontsize=6, loc="lower right")
+    axis.legend(fontsize=6, loc="lower right", frameon=True, framealpha=0.9)
 
 
 if __name__ == "__main__":

@@ -61,7 +61,9 @@ def main(policy: str, out: str, still_s: str, batches: str, each: str, *levels: 
     for name, level in kinds.items():
         at_task[f"{name}-{level:g}"] = Trials(task.trocars, int(each), 0, {name: level})
     folder = Path(out).with_suffix("")
-    digest = policy_file.monitor_digest(who.trained.params)
+    path = policy_args.resolve(policy_args.PolicyArgs(policy=policy))
+    # Those of the file: a GPU's inference rounds them.
+    digest = policy_file.monitor_digest(policy_file.load(path.file).params)
     about = {"weights": who.weights, "monitor": {"settings": settings._asdict(), "digest": digest}}
     tables: dict[str, Any] = {}
     for label, table in evaluations(folder, who, settings, {**sampled, **at_task}):

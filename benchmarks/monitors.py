@@ -13,13 +13,12 @@ many of the recorded windows, and writes results/monitor_<POLICY>_gpu.json; `ins
 monitor of these results next to the packaged file. Neither needs a GPU.
 """
 
-import functools
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import _timing
 import numpy as np
@@ -32,8 +31,9 @@ from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.sim.tasks.peg_transfer_bimanual.task import DROPPED_STEPS
 
 COLUMNS = ("success", "lost", "invalid", "steps", "scores")
+TESTED, UNDISTURBED = "nothing, trocars of the test", "nothing, the task's trocars"
 _NEVER = 1e9  # a threshold beyond any score
-_STRICT = 0.01  # a second rate of false alarms
+STRICT = 0.01  # a second rate of false alarms
 _OPEN = 0.3  # of [-1, 1]: wider than around any object
 
 
@@ -71,25 +71,56 @@ def gather(out: str, *folders: str) -> None:
 def score(policy: str, file: str, alpha: str = "0.05", windows: str = "1", *names: str) -> None:
     """Calibrates a monitor; writes its figures in the test's trials and under disturbances."""
     arrays = files.read_npz(Path(file))
-    made, stress = (json.loads(arrays[f"{name}.json"].tobytes()) for name in ("monitor", "stress"))
-    read = functools.partial(evaluation, arrays, windows=int(windows))
-    settings = scores.ScoreSettings(**made["monitor"]["settings"])
-    settings = settings._replace(still=settings.still * int(windows))
-    digest, whole = made["monitor"]["digest"], read("trials")
-    chosen = names or scores.CALIBRATED
+    trials = read(arrays, int(windows))
+    digest = json.loads(arrays["monitor.json"].tobytes())["monitor"]["digest"]
     monitor, strict = (
-        calibrated(whole, x, settings, digest, chosen) for x in (float(alpha), _STRICT)
+        calibrated(trials.whole, x, trials.settings, digest, names or scores.CALIBRATED)
+        for x in (float(alpha), STRICT)
     )
-    tests = calibrate.parts(len(whole.success))[2]
-    labels = {"nothing, trocars of the test": SimpleNamespace(**_at(whole, tests))}
+    write(policy, arrays, trials.labels, monitor, strict)
+
+
+class Trials(NamedTuple):
+    """Gathered trials of a policy.
+
+    Attributes:
+      whole: table of the trials with a sampled trocar each.
+      labels: tables of the tested trials by disturbance.
+      settings: of their scores.
+    """
+
+    whole: Any
+    labels: dict[str, Any]
+    settings: scores.ScoreSettings
+
+
+def read(arrays: dict[str, np.ndarray], windows: int) -> Trials:
+    """Returns the trials of a gathered file, with stillness over several windows."""
+    made, stress = (json.loads(arrays[f"{name}.json"].tobytes()) for name in ("monitor", "stress"))
+    settings = scores.ScoreSettings(**made["monitor"]["settings"])
+    settings = settings._replace(still=settings.still * windows)
+    whole = evaluation(arrays, "trials", windows)
+    labels = {TESTED: select(whole, calibrate.parts(len(whole.success))[2])}
     if "0/success" in arrays:
-        labels["nothing, the task's trocars"] = read("0")
+        labels[UNDISTURBED] = evaluation(arrays, "0", windows)
     for name, kind in stress["disturbances"].items():
         for level in kind["levels"]:
             if float(level):
                 label = f"{name} {level} {kind['unit']}".strip()
-                labels[label] = read(f"{name}-{level}")
-    rows = {label: figures(table, monitor, strict) for label, table in labels.items()}
+                labels[label] = evaluation(arrays, f"{name}-{level}", windows)
+    return Trials(whole, labels, settings)
+
+
+def write(
+    policy: str,
+    arrays: dict[str, np.ndarray],
+    labels: dict[str, Any],
+    monitor: calibrate.Monitor,
+    strict: calibrate.Monitor,
+    **more: Any,
+) -> None:
+    """Writes results/monitor_<POLICY>_gpu.json: both monitors, figures of the tables, and more."""
+    made, stress = (json.loads(arrays[f"{name}.json"].tobytes()) for name in ("monitor", "stress"))
     kept = ("version", "commit", "dirty", "versions", "hardware")
     content = {
         "policy": policy,
@@ -98,7 +129,8 @@ def score(policy: str, file: str, alpha: str = "0.05", windows: str = "1", *name
         **{name: made[name] for name in kept},
         "monitor": calibrate.to_json(monitor),
         "strict": calibrate.to_json(strict),
-        "rows": rows,
+        **more,
+        "rows": {label: figures(table, monitor, strict) for label, table in labels.items()},
     }
     files.write_json(_timing.RESULTS / f"monitor_{policy}_gpu.json", content)
 
@@ -121,10 +153,12 @@ def figures(table: Any, monitor: calibrate.Monitor, strict: calibrate.Monitor) -
     let_go = table.lost & jaws_end_open(table)
     others = ~table.success & ~let_go
     few = alarms.compose(table, strict)
+    clock = np.nanmax(table.scores[..., scores.NAMES.index("clock")], axis=1)
     return {
         "strict": statistics.rate(table.success),
         "alarms": alarms.compose(table, monitor),
         "before_drop": statistics.rate((times < drop_s)[table.lost]),
+        "clock_false_alarms": statistics.rate(clock[table.success] > monitor.clock_s),
         "let_go": statistics.rate(let_go[~table.success]),
         "others_before_clock": statistics.rate((times < monitor.clock_s)[others]),
         "at_strict": {name: few[name] for name in ("before_clock", "false_alarms")},
@@ -164,8 +198,9 @@ def evaluation(arrays: dict[str, np.ndarray], name: str, windows: int = 1) -> An
     return SimpleNamespace(**{**vars(table), "scores": values})
 
 
-def _at(table: Any, rows: np.ndarray) -> dict[str, np.ndarray]:
-    return {name: column[rows] for name, column in vars(table).items()}
+def select(table: Any, rows: np.ndarray) -> Any:
+    """Returns the rows `[M]` bool of a table."""
+    return SimpleNamespace(**{name: column[rows] for name, column in vars(table).items()})
 
 
 def _columns(folder: Path) -> dict[str, np.ndarray]:

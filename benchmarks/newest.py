@@ -11,6 +11,7 @@ from starjax.report import formats
 from starjax.report import stress as broken
 
 HERE = Path(__file__).parent
+MONITORED = ("compact", "needle_pick", "peg_transfer_bimanual")
 _VALUE = re.compile(r"\{([^:{}]+):?([^{}]*)\}")
 
 
@@ -47,6 +48,8 @@ def monitor(name: str) -> str:
     header += ["False alarms on successes", "Success without alarm"]
     body = [[label, *_alarm_cells(row)] for label, row in found["rows"].items()]
     more: dict[str, Callable[[dict[str, Any]], str]] = {}
+    if all("clock_false_alarms" in row for row in found["rows"].values()):
+        more["False alarms of the clock"] = lambda row: _percent(row["clock_false_alarms"])
     if any(row["before_drop"]["trials"] for row in found["rows"].values()):
         more["Announced, of failures not let go"] = lambda row: _counted(row["others_before_clock"])
         more["Drops announced before the fall"] = lambda row: _counted(row["before_drop"])
@@ -57,6 +60,21 @@ def monitor(name: str) -> str:
     for cells, row in zip(body, found["rows"].values(), strict=True):
         cells += [draw(row) for draw in more.values()]
     return formats.render([header, *body], names=1)
+
+
+def monitor_attempts() -> str:
+    """Returns the goals that each way to make a monitor meets, of results/monitor_<policy>_gpu."""
+    found = {policy: _results(f"monitor_{policy}_gpu").get("attempts") for policy in MONITORED}
+    tried = {policy: attempts for policy, attempts in found.items() if attempts}
+    names = dict.fromkeys(name for attempts in tried.values() for name in attempts)
+    body = [[name, *(_attempt(tried[policy][name]) for policy in tried)] for name in names]
+    return formats.render([["Monitor", *(f"`{policy}`" for policy in tried)], *body], names=1)
+
+
+def _attempt(found: dict[str, Any]) -> str:
+    met = found["tested"]
+    how = f"{100 * found['alpha']:.0f}%, {found['still_s']:.1f} s"
+    return f"{how}: {met['early']}, {met['false']}, {met['both']} of {met['pairs']}"
 
 
 def _alarm_cells(row: dict[str, Any]) -> list[str]:

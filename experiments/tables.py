@@ -9,8 +9,9 @@ claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list 
 `leaderboard_apart` and `elsewhere` (the trocar benchmark); or of benchmarks/results: `speed`,
 `learners`, `experts`, `six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`,
 `stress_randomised`, `proposition`, `finetune`, `finetune_goals`, `finetune_runs`,
-`finetune_branches`, `ppo`, `ppo_gpu`, `sb3`, `monitor_<policy>`, `monitor_cost`, `through_lerobot`,
-`held_out`, `larger_than_memory`, `loaders`, `redraw`, `look`, `physics_goals`, `gradient_noise`.
+`finetune_branches`, `ppo`, `ppo_gpu`, `sb3`, `monitor_<policy>`, `monitor_cost`,
+`monitor_attempts`, `through_lerobot`, `held_out`, `larger_than_memory`, `loaders`, `redraw`,
+`look`, `physics_goals`, `gradient_noise`.
 """
 
 import re
@@ -63,6 +64,8 @@ def table(name: str) -> str:
         return newest.other(name)
     if name.startswith("stress"):
         return newest.stress(name)
+    if name == "monitor_attempts":
+        return newest.monitor_attempts()
     if name.startswith("monitor"):
         return newest.monitor(name)
     folder, _, rest = name.partition("/")
