@@ -19,6 +19,7 @@ from starjax.commands import evaluate, stress, sweep
 from starjax.deploy import approach, batching, connection_pool, inputs, wire
 from starjax.deploy import served as serving
 from starjax.evaluation import evaluate as evaluating
+from starjax.monitor import calibrate, scores
 from starjax.policies import in_env
 from starjax.rollouts import agent
 from starjax.sim import names
@@ -115,6 +116,32 @@ def test_it_is_scored_as_in_this_process(address, tmp_path):
     assert 0 < local.success.sum() < 12
     assert found["server"]["address"] == address and found["weights"] == Stub.digest
     assert found["server"]["metadata"]["horizon"] == 6 and found["method"] == "dp_ee"
+
+
+def late(execute):
+    """A monitor with an alarm at the first decision after half a second."""
+    width = np.where(np.array(scores.NAMES) == "clock", 1.0, 1e9)
+    settings = scores.ScoreSettings(execute, 30.0, 2)
+    return calibrate.Monitor(np.zeros(len(width)), width, 0.5, 0.5, 0.1, 20, settings, "weights")
+
+
+def test_the_monitor_of_a_server_scores_its_trials(tmp_path, monkeypatch):
+    monkeypatch.setenv("STARJAX_API_KEY", served.KEY)
+    monkeypatch.setattr(Stub, "monitor", late(execute=4))
+    with served.running(batching.Batches(Stub(), 2)) as ((host, port), _):
+        policy = ["--policy", f"ws://{host}:{port}", *TRIALS[:2]]
+        assert evaluate.main([*policy, "--out", "here", "--no-video"]) == 0
+        offset = ["--disturbance", "trocar_offset", "--levels", "5", "--out", "wrong"]
+        assert stress.main([*policy, *offset]) == 0
+    found = result(tmp_path / "here")
+    for name, is_success in (("announced", False), ("false_alarms", True)):
+        steps = [row["steps"] for row in found["trials"] if row["success"] == is_success]
+        raised = sum(count > 16 for count in steps)  # of 30 Hz; decisions are after every 4th
+        assert (raised, len(steps)) == tuple(found["alarms"][name].values())[:2]
+    assert found["alarms"]["false_alarms"]["successes"]
+    stressed = json.loads((tmp_path / "wrong" / "stress.json").read_text())
+    level = stressed["disturbances"]["trocar_offset"]["levels"]["5"]
+    assert level["alarms"]["announced"]["trials"] == 12 - level["strict"]["successes"]
 
 
 def test_a_sweep_of_a_server(address, tmp_path):
@@ -235,6 +262,9 @@ def test_a_lost_server_ends_it_in_one_line(tmp_path):
         ({"execute": 9}, "greeting.execute"),
         ({"action_space": "joints"}, "greeting.action_space"),
         ({"action_space": "rcm4"}, "answer.actions"),  # and eight columns
+        ({"monitor": 5}, "greeting.monitor"),
+        ({"monitor": {"scores": ["smell"]}}, "greeting.monitor"),
+        ({"monitor": calibrate.to_json(late(execute=4))}, "greeting.monitor"),  # plans have five
     ],
 )
 def test_a_greeting_is_checked(change, field):

@@ -18,7 +18,6 @@ from starjax.deploy.connection import Connection
 from starjax.deploy.inputs import InputSpec, RobotObservation, check_trocar
 from starjax.deploy.plan_executor import LIMITS, Limits, PlanExecutor, Report
 from starjax.errors import UsageError
-from starjax.monitor import calibrate
 from starjax.monitor.watch import Watch
 from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Command
@@ -106,7 +105,8 @@ class Client:
             self._trocar = _trocar(trocar, spec)
             p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)
             self.p_world_trocar = np.asarray(p_world_trocar, np.float32)
-            self._watch = _watch(self.metadata) if is_watched else None
+            monitor = greeting.read_monitor(self.metadata, execute) if is_watched else None
+            self._watch = Watch(monitor) if monitor else None
             self._executor = PlanExecutor(
                 self.p_world_trocar, horizon, execute, ahead, limits, spec.held_wrist
             )
@@ -212,15 +212,6 @@ class Client:
         if self._key is None:
             return None
         return np.asarray(jax.random.key_data(jax.random.fold_in(self._key, self._requests)))
-
-
-def _watch(metadata: dict[str, Any]) -> Watch | None:
-    if "monitor" not in metadata:
-        return None
-    try:
-        return Watch(calibrate.from_json(metadata["monitor"]))
-    except ValueError as error:
-        raise UsageError("address", "a server with a readable monitor", str(error)) from None
 
 
 def _read_timing(metadata: dict[str, Any]) -> tuple[float, int, int]:

@@ -10,6 +10,7 @@ from starjax.data.formats import peer_columns
 from starjax.deploy import wire
 from starjax.deploy.inputs import InputSpec
 from starjax.errors import UsageError
+from starjax.monitor import calibrate
 from starjax.sim import names, scene
 from starjax.sim.tasks.base import CONTROL_HZ
 
@@ -91,6 +92,28 @@ def read_spec(metadata: dict[str, Any]) -> InputSpec:
         return InputSpec(**fields)
     except (KeyError, TypeError, AttributeError) as error:
         raise UsageError("address", "a server of starjax", f"another one: {error!r}") from None
+
+
+def read_monitor(metadata: dict[str, Any], execute: int) -> calibrate.Monitor | None:
+    """Reads the runtime monitor of a policy, None without one.
+
+    Args:
+      metadata: the greeting.
+      execute: commands executed before the next plan.
+
+    Raises:
+      UsageError: it is malformed, or was calibrated with other decisions.
+    """
+    if "monitor" not in metadata:
+        return None
+    try:
+        monitor = calibrate.from_json(metadata["monitor"])
+    except (AttributeError, TypeError, ValueError) as error:
+        raise UsageError("greeting.monitor", "a runtime monitor", str(error)[:200]) from None
+    if monitor.settings.execute != execute:
+        got = f"one of {monitor.settings.execute}"
+        raise UsageError("greeting.monitor", f"one of {execute} executed commands", got)
+    return monitor
 
 
 def _scene(value: Any) -> names.SceneNames:

@@ -11,6 +11,7 @@ import numpy as np
 from starjax import config, config_json, rcm
 from starjax.deploy import batching, connection_pool, greeting, inputs, plain, remote_policy, wire
 from starjax.errors import UsageError
+from starjax.monitor.calibrate import Monitor
 from starjax.policies import in_env
 from starjax.policies.base import Policy
 from starjax.rollouts import agent
@@ -33,7 +34,7 @@ class ServedTraining(NamedTuple):
     train: config.TrainConfig = config.TrainConfig()
     demos: None = None
     preset: None = None
-    monitor: None = None
+    monitor: Monitor | None = None
 
 
 class ServedPolicy(NamedTuple):
@@ -134,7 +135,14 @@ def attach(connections: Any, arms: Sequence[str] = ()) -> ServedPolicy:
         {**config_json.as_json(settings), "horizon": horizon, "execute": execute},
     )
     origin = {"address": connections.address, "metadata": greeting.as_json(connections.metadata)}
-    trained = ServedTraining(hello.method, settings, np.zeros(1, bool), None, env.names)
+    trained = ServedTraining(
+        hello.method,
+        settings,
+        np.zeros(1, bool),
+        None,
+        env.names,
+        monitor=greeting.read_monitor(connections.metadata, execute),
+    )
     policy = _policy(remote, env.task)
     return ServedPolicy(trained, policy, env, greeting.identity(origin), origin, remote)
 
