@@ -13,18 +13,18 @@ import finetuned
 from starjax.report import style
 
 WAYS = {"dagger": "#2083C5", "self": "#D55E00", "rl": "#009E73", "distill": "#CC79A7"}
+AGAIN = 0.5  # opacity of a second line of the same policy and way
 
 
 def main(file: Path) -> None:
     """Writes the figure: a line per fine-tuning, with the 95% interval of every round."""
-    found = sorted((x for x in finetuned.complete() if "task" in x), key=lambda x: x["task"])
+    found = finetuned.finetunings()
     tasks = {task: list(group) for task, group in itertools.groupby(found, key=lambda x: x["task"])}
     with style.use():
-        figure = style.figure(3.2 * len(tasks), 3.0)
-        axes = figure.subplots(1, len(tasks), squeeze=False, sharey=True)[0]
+        figure = style.figure(2.6 * len(tasks), 4.0)
+        axes = figure.subplots(1, len(tasks), squeeze=False)[0]
         for axis, (task, results) in zip(axes, tasks.items(), strict=True):
             draw(axis, task, results)
-        axes[0].set_ylim(top=101)
         axes[0].set_ylabel("success in validation (%)")
         data = style.save(figure, "png")
     file.write_bytes(data)
@@ -33,6 +33,7 @@ def main(file: Path) -> None:
 def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
     """Draws the fine-tunings of one task."""
     lines = dict(zip(dict.fromkeys(map(finetuned.base, results)), ("-", ":", "--", "-.")))
+    labels = []
     for found in results:
         minutes = [seconds / 60 for seconds in finetuned.learning_seconds(found)]
         rates = [row["validation"] for row in found["rounds"]]
@@ -42,14 +43,27 @@ def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
             for end in (0, 1)
         )
         label = f"{found['by']}, {finetuned.base(found)}"
+        labels.append(label)
         look = {"color": WAYS[found["by"]], "ls": lines[finetuned.base(found)]}
+        look["alpha"] = AGAIN ** labels[:-1].count(label)
         axis.errorbar(
-            minutes, middle, (low, high), marker="o", ms=4, capsize=2, label=label, **look
+            minutes,
+            middle,
+            (low, high),
+            marker="o",
+            ms=4,
+            capsize=2,
+            label=label if label not in labels[:-1] else f"{label}, again",
+            **look,
         )
-    for goal in sorted({finetuned.goal_of(found)[0] for found in results}):
-        axis.axhline(goal, color="black", lw=0.8, ls="--", label=f"goal, {goal:.0f}%")
-    axis.set(title=task, xlabel="rollouts and training (min)")
-    axis.legend(fontsize=7, loc="best")
+    goals = sorted({finetuned.goal_of(found)[0] for found in results})
+    for goal in goals:
+        axis.axhline(goal, color="black", lw=0.8, ls="--")
+    named = ", ".join(f"{goal:.0f}%" for goal in goals)
+    axis.plot([], [], color="black", lw=0.8, ls="--", label=f"goals of policies: {named}")
+    axis.set(title=task.replace("_", " "), xlabel="rollouts and training (min)")
+    axis.set_ylim(top=101)
+    axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.22), borderaxespad=0.0)
 
 
 if __name__ == "__main__":

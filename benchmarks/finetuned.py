@@ -6,46 +6,58 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import continued
+
 from starjax.report import formats
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
 COMMAND = "starjax finetune "
 PARTS = ("seen", "unseen")
+MISSING = "–"
 
 
 def goals(folder: Path = RESULTS) -> str:
-    """Returns the goal of each policy, the way that came nearest, and the others, as markdown."""
-    header = ["Task, policy", "Goal", "Way", "Seen before", "Seen after", "Unseen before"]
-    header += ["Unseen after", "Goal met", "RCM p99 (mm)", "Rollouts", "Minutes", "Other ways"]
-    rows = [header]
-    found = sorted((x for x in complete(folder) if "task" in x), key=_policy)
-    for (task, weights), results in itertools.groupby(found, key=_policy):
-        # The first result of the most successes at all trocars.
-        won, *others = sorted(results, key=lambda x: -sum(_after(x)[p]["rate"] for p in PARTS))
-        goal = goal_of(won)
-        after, rounds = _after(won), won["rounds"][1:]
-        missed = [g - 100 * after[part]["rate"] for g, part in zip(goal, PARTS, strict=True)]
-        left = [f"{by:.1f} {part}" for by, part in zip(missed, PARTS, strict=True) if by > 1e-9]
-        rows.append(
-            [
-                f"{task}, {base(won)} ({weights[:8]})",
-                " / ".join(f"{x:.0f}" for x in goal),
-                won["by"] if won["best"] else f"{won['by']}: no round is better",
-                *(_rate(x[part]) for part in PARTS for x in (won["before"], after)),
-                "missed by " + ", ".join(left) if left else "yes",
-                formats.millimetres(after["rcm_error_mm"]["executed"]["p99"]),
-                f"{sum(row.get('trials', 0) for row in rounds):,}",
-                f"{_seconds(won) / 60:.0f}",
-                "; ".join(_brief(x) for x in others) or "–",
-            ]
-        )
+    """Returns, for each policy, its goal, the way of the highest success and the others."""
+    header = ["Task, policy", "Goal", "Way", "Before", "After", "Goal met", "Rollouts", "Minutes"]
+    rows = [[*header, "Other ways"]]
+    for label, results in itertools.groupby(finetunings(folder), key=_label):
+        won, *others = results
+        wanted = zip(PARTS, goal_of(won), strict=True)
+        gaps = [(goal - 100 * _after(won)[part]["rate"], part) for part, goal in wanted]
+        left = [f"{gap:.1f} {part}" for gap, part in gaps if gap > 1e-9]
+        cells = [label, " / ".join(f"{x:g}" for x in goal_of(won)), _way(won)]
+        cells += [_percent(won["before"]), _percent(_after(won))]
+        cells.append("missed by " + ", ".join(left) if left else "yes")
+        cells += [_rollouts(won), _minutes(won)]
+        rows.append([*cells, "; ".join(_brief(x) for x in others) or MISSING])
     return formats.render(rows, names=1)
+
+
+def ways(folder: Path = RESULTS) -> str:
+    """Returns success before and after every fine-tuning as markdown."""
+    header = ["Task, policy", "Way", "Seen before", "Seen after", "Unseen before", "Unseen after"]
+    rows = [[*header, "RCM p99 (mm)", "Rollouts", "Minutes"]]
+    for found in finetunings(folder):
+        cells = [_label(found), _way(found)]
+        for part in PARTS:
+            after = _rate(found["after"][part]) if found["best"] else MISSING
+            cells += [_rate(found["before"][part]), after]
+        cells.append(formats.millimetres(_after(found)["rcm_error_mm"]["executed"]["p99"]))
+        rows.append([*cells, _rollouts(found), _minutes(found)])
+    return formats.render(rows, names=2)
+
+
+def finetunings(folder: Path = RESULTS) -> list[dict[str, Any]]:
+    """Returns the complete fine-tunings by policy, continued ones joined, the best one first."""
+    found = {x["file"]: x for x in complete(folder) if "task" in x}
+    joined = continued.joined(found, _known()["continued"])
+    return sorted(joined, key=lambda x: (_label(x), -sum(_after(x)[p]["rate"] for p in PARTS)))
 
 
 def goal_of(found: dict[str, Any]) -> list[float]:
     """Returns the goal at seen and at unseen trocars in percent, of a policy or else its task."""
-    known = tomllib.loads((HERE / "finetune_goals.toml").read_text())["goals"]
+    known = _known()["goals"]
     return known.get(base(found)) or known.get(found["task"], known["others"])
 
 
@@ -78,7 +90,7 @@ def branches(folder: Path = RESULTS) -> str:
             ]
             cells = [f"`{_flags(found)}`", str(row["round"]), "; ".join(finished)]
             cells += [str(row["branches"][name]) for name in names]
-            rows.append([*cells, str(len(left)), "; ".join(left) or "–"])
+            rows.append([*cells, str(len(left)), "; ".join(left) or MISSING])
     return formats.render(rows, names=1) if told else "No result has branches yet."
 
 
@@ -113,11 +125,20 @@ def base(found: dict[str, Any]) -> str:
 
 
 def _results(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(path.read_text()) for path in sorted(folder.glob("finetune_*.json"))]
+    paths = sorted(folder.glob("finetune_*.json"))
+    return [{"file": path.stem, **json.loads(path.read_text())} for path in paths]
 
 
-def _policy(found: dict[str, Any]) -> tuple[str, str]:
-    return found["task"], found["weights"]
+def _known() -> dict[str, Any]:
+    return tomllib.loads((HERE / "finetune_goals.toml").read_text())
+
+
+def _label(found: dict[str, Any]) -> str:
+    return f"{found['task']}, {base(found)} ({found['weights'][:8]})"
+
+
+def _way(found: dict[str, Any]) -> str:
+    return found["by"] if found["best"] else f"{found['by']}: no round is better"
 
 
 def _after(found: dict[str, Any]) -> dict[str, Any]:
@@ -130,17 +151,30 @@ def _flags(found: dict[str, Any]) -> str:
 
 
 def _brief(found: dict[str, Any]) -> str:
-    after = _after(found)
-    rates = " and ".join(f"{100 * after[part]['rate']:.1f}" for part in PARTS)
-    return f"{found['by']} {rates}, {_seconds(found) / 60:.0f} min"
+    after = f" {_percent(_after(found))}" if found["best"] else ""
+    return f"{_way(found)}{after}, {_minutes(found)} min"
+
+
+def _percent(report: dict[str, Any]) -> str:
+    return " / ".join(f"{100 * report[part]['rate']:.1f}" for part in PARTS)
+
+
+def _rollouts(found: dict[str, Any]) -> str:
+    """Counts starts, or episodes of all iterations of a policy gradient."""
+    count = sum(
+        row.get("trials", 0) + row.get("episodes", 0) * len(row.get("iterations", ()))
+        for row in found["rounds"]
+    )
+    return f"{count:,}" if count else MISSING
+
+
+def _minutes(found: dict[str, Any]) -> str:
+    """Renders the time of all stages; compilation is a part of each."""
+    seconds = (s for name, s in found["timings_s"].items() if not name.endswith(": compile"))
+    return f"{sum(seconds) / 60:.0f}"
 
 
 def _rate(found: dict[str, Any]) -> str:
     low, high = (100 * x for x in found["ci95"])
     count = f"{found['successes']}/{found['trials']}"
     return f"{count}: {100 * found['rate']:.1f}% ({low:.1f}-{high:.1f})"
-
-
-def _seconds(found: dict[str, Any]) -> float:
-    """Returns the time of all stages; compilation is a part of each."""
-    return sum(s for name, s in found["timings_s"].items() if not name.endswith(": compile"))

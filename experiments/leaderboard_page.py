@@ -11,12 +11,15 @@ from starjax.report import formats, leaderboard, leaderboard_tables
 HERE = Path(__file__).parent
 # Claims whose results were recorded before the benchmark had versions, with its trials.
 BEFORE = ("task_methods", "all_methods", "learners")
+# Reports of fine-tunings: they name the steps of the fine-tuning, not those of the policy.
+FINETUNED = "finetuned"
 _ELSEWHERE = ("work", "figure", "n", "where", "differs", "ours", "source", "seen")
 
 
 def ours() -> str:
     """Returns the table of all results that name this version of the benchmark."""
-    named = [file for file in sorted(HERE.rglob("*.json")) if _version(file)]
+    files = [file for file in sorted(HERE.rglob("*.json")) if FINETUNED not in file.parts]
+    named = [file for file in files if _version(file)]
     rows = leaderboard_tables.current(leaderboard.read(named)[0])
     return leaderboard_tables.body(rows) if rows else "No committed result yet."
 

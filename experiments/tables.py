@@ -8,7 +8,7 @@ claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list 
 `presets` (from their values); `goals_...` (of goals_page.py and goals_list.py); `leaderboard`,
 `leaderboard_apart` and `elsewhere` (the trocar benchmark); or of benchmarks/results: `speed`,
 `learners`, `experts`, `six_blocks`, `scenes`, `stress_compact`, `stress_robust`, `stress_higher`,
-`stress_randomised`, `proposition`, `finetune`, `finetune_goals`, `finetune_runs`,
+`stress_randomised`, `proposition`, `finetune_goals`, `finetune_ways`, `finetune_runs`,
 `finetune_branches`, `ppo`, `ppo_gpu`, `sb3`, `monitor_<policy>`, `monitor_cost`,
 `monitor_attempts`, `through_lerobot`, `held_out`, `larger_than_memory`, `loaders`, `redraw`,
 `look`, `physics_goals`, `gradient_noise`.
@@ -33,6 +33,7 @@ import preset_table  # noqa: E402
 
 FINETUNED = {
     "finetune_goals": finetuned.goals,
+    "finetune_ways": finetuned.ways,
     "finetune_runs": finetuned.runs,
     "finetune_branches": finetuned.branches,
 }

@@ -84,10 +84,37 @@ def test_a_goal_is_met_by_the_best_way_and_missed_by_points(tmp_path, finetuning
         (tmp_path / f"finetune_{name}.json").write_text(json.dumps(content))
     _, _, needle, reach = finetuned.goals(tmp_path).splitlines()
     cells = [cell.strip() for cell in needle.strip("|").split("|")]
-    assert cells[0] == "needle_pick, a (eeeeeeee)" and cells[1] == "98 / 95" and cells[2] == "self"
-    assert cells[4].startswith("99/100") and cells[6].startswith("95/100") and cells[7] == "yes"
-    assert cells[9] == "800" and "dagger 80.0 and 70.0" in cells[11]
+    assert cells[:4] == ["needle_pick, a (eeeeeeee)", "98 / 95", "self", "80.0 / 70.0"]
+    assert cells[4:7] == ["99.0 / 95.0", "yes", "800"]
+    assert cells[8] == "dagger: no round is better, 2 min"
     assert "no round is better" in reach and "missed by 19.0 seen, 27.0 unseen" in reach
+    rows = finetuned.ways(tmp_path).splitlines()[2:]
+    assert len(rows) == 3 and "99/100" in rows[0] and "–" in rows[1]
+
+
+def test_rollouts_of_a_policy_gradient_are_its_episodes(tmp_path, finetunings):
+    found, finetuned = finetunings
+    rounds = [{}, {"episodes": 1024, "iterations": [{}] * 4}, {"episodes": 64, "iterations": [{}]}]
+    for name, more in {"rl": {"rounds": rounds}, "distill": {"rounds": [{}, {}]}}.items():
+        content = {**found, "by": name, "weights": name, **more}
+        (tmp_path / f"finetune_{name}.json").write_text(json.dumps(content))
+    counts = [row.split("|")[-3].strip() for row in finetuned.ways(tmp_path).splitlines()[2:]]
+    assert counts == ["–", "4,160"]
+
+
+def test_a_fine_tuning_that_continues_another_is_one_with_it(finetunings):
+    found, finetuned = finetunings
+    import continued
+
+    first = {**found, "best": 1, "after": report(90, 80)}
+    then = {**found, "weights": "d" * 64, "best": 1, "after": report(95, 85)}
+    (both,) = continued.joined({"a": first, "b": then}, {"a": ["b"], "other": ["c"]})
+    assert both["weights"] == first["weights"] and both["before"] == first["before"]
+    assert [row["round"] for row in both["rounds"]] == [0, 1, 2]
+    assert both["best"] == 2 and both["after"]["seen"]["successes"] == 95
+    assert finetuned.learning_seconds(both) == [0.0, 55.0, 110.0]
+    (both,) = continued.joined({"a": first, "b": {**then, "best": 0}}, {"a": ["b"]})
+    assert both["best"] == 1 and both["after"]["seen"]["successes"] == 90
 
 
 def test_the_time_of_a_round_is_that_of_learning(finetunings):
