@@ -19,8 +19,8 @@ MISSING = "–"
 
 def goals(folder: Path = RESULTS) -> str:
     """Returns, for each policy, its goal, the way of the highest success and the others."""
-    header = ["Task, policy", "Goal", "Way", "Before", "After", "Goal met", "Rollouts", "Minutes"]
-    rows = [[*header, "Other ways"]]
+    header = ["Task, policy", "Goal", "Way", "Before", "After", "Goal met", "RCM p99 (mm)"]
+    rows = [[*header, "Rollouts", "Minutes", "Other ways"]]
     for label, results in itertools.groupby(finetunings(folder), key=_label):
         won, *others = results
         wanted = zip(PARTS, goal_of(won), strict=True)
@@ -29,6 +29,7 @@ def goals(folder: Path = RESULTS) -> str:
         cells = [label, " / ".join(f"{x:g}" for x in goal_of(won)), _way(won)]
         cells += [_percent(won["before"]), _percent(_after(won))]
         cells.append("missed by " + ", ".join(left) if left else "yes")
+        cells.append(formats.millimetres(_after(won)["rcm_error_mm"]["executed"]["p99"]))
         cells += [_rollouts(won), _minutes(won)]
         rows.append([*cells, "; ".join(_brief(x) for x in others) or MISSING])
     return formats.render(rows, names=1)
@@ -37,13 +38,12 @@ def goals(folder: Path = RESULTS) -> str:
 def ways(folder: Path = RESULTS) -> str:
     """Returns success before and after every fine-tuning as markdown."""
     header = ["Task, policy", "Way", "Seen before", "Seen after", "Unseen before", "Unseen after"]
-    rows = [[*header, "RCM p99 (mm)", "Rollouts", "Minutes"]]
+    rows = [[*header, "Rollouts", "Minutes"]]
     for found in finetunings(folder):
-        cells = [_label(found), _way(found)]
+        cells = [_name(found), _way(found)]
         for part in PARTS:
             after = _rate(found["after"][part]) if found["best"] else MISSING
             cells += [_rate(found["before"][part]), after]
-        cells.append(formats.millimetres(_after(found)["rcm_error_mm"]["executed"]["p99"]))
         rows.append([*cells, _rollouts(found), _minutes(found)])
     return formats.render(rows, names=2)
 
@@ -88,7 +88,8 @@ def branches(folder: Path = RESULTS) -> str:
                 for cause, pairs in row["not_rescued"].items()
                 for trocar, trial in pairs
             ]
-            cells = [f"`{_flags(found)}`", str(row["round"]), "; ".join(finished)]
+            name = f"{_name(found)}, commit {found['commit'][:8]}"
+            cells = [name, str(row["round"]), "; ".join(finished)]
             cells += [str(row["branches"][name]) for name in names]
             rows.append([*cells, str(len(left)), "; ".join(left) or MISSING])
     return formats.render(rows, names=1) if told else "No result has branches yet."
@@ -134,7 +135,11 @@ def _known() -> dict[str, Any]:
 
 
 def _label(found: dict[str, Any]) -> str:
-    return f"{found['task']}, {base(found)} ({found['weights'][:8]})"
+    return f"{_name(found)} ({found['weights'][:8]})"
+
+
+def _name(found: dict[str, Any]) -> str:
+    return f"{found['task']}, {base(found)}"
 
 
 def _way(found: dict[str, Any]) -> str:
@@ -143,11 +148,6 @@ def _way(found: dict[str, Any]) -> str:
 
 def _after(found: dict[str, Any]) -> dict[str, Any]:
     return found["after"] if found["best"] else found["before"]
-
-
-def _flags(found: dict[str, Any]) -> str:
-    """Returns a command without its first words and its directory."""
-    return found["command"].removeprefix(COMMAND).partition(" --out")[0]
 
 
 def _brief(found: dict[str, Any]) -> str:

@@ -85,8 +85,8 @@ def test_a_goal_is_met_by_the_best_way_and_missed_by_points(tmp_path, finetuning
     _, _, needle, reach = finetuned.goals(tmp_path).splitlines()
     cells = [cell.strip() for cell in needle.strip("|").split("|")]
     assert cells[:4] == ["needle_pick, a (eeeeeeee)", "98 / 95", "self", "80.0 / 70.0"]
-    assert cells[4:7] == ["99.0 / 95.0", "yes", "800"]
-    assert cells[8] == "dagger: no round is better, 2 min"
+    assert cells[4:8] == ["99.0 / 95.0", "yes", "0.050", "800"]
+    assert cells[9] == "dagger: no round is better, 2 min"
     assert "no round is better" in reach and "missed by 19.0 seen, 27.0 unseen" in reach
     rows = finetuned.ways(tmp_path).splitlines()[2:]
     assert len(rows) == 3 and "99/100" in rows[0] and "–" in rows[1]
@@ -124,7 +124,7 @@ def test_the_time_of_a_round_is_that_of_learning(finetunings):
 
 def test_branches_of_all_fine_tunings_are_counted(tmp_path, finetunings):
     found, finetuned = finetunings
-    begun = {name: found[name] for name in ("command", "rounds")}
+    begun = {name: found[name] for name in ("command", "rounds", "task", "commit")}
     for name, content in {"a": found, "b": begun}.items():
         (tmp_path / f"finetune_{name}.json").write_text(json.dumps(content))
     row = "| lost 2/3; stalled 1/5 | 3 | 2 | 3 | lost 0-1; stalled 0-2; stalled 1-3 |"
@@ -139,6 +139,7 @@ def finetunings(monkeypatch, pytestconfig):
     found = {
         "by": "dagger",
         "task": "needle_pick",
+        "commit": "c" * 40,
         "weights": "e" * 64,
         "command": "starjax finetune runs/a --by dagger --out runs/b",
         "rounds": [
