@@ -1,18 +1,31 @@
-"""Expert of peg transfer from any state: a held block is carried on, any other is taken up.
+"""Expert of peg transfer from any state: a demonstration is continued from its middle.
 
-Beyond rescue: a block off the board, or overturned.
+A held block is carried to its target. Open jaws above or about a wall come down and grip; elsewhere
+a low tool rises first. A threaded block is let go. Beyond rescue: a block off the board, or
+overturned.
 """
 
 import jax
 import jax.numpy as jnp
 
 from starjax.sim.state import EnvState
+from starjax.sim.tasks import midway
 from starjax.sim.tasks.peg_transfer import expert, task
-from starjax.sim.tasks.phases import APPROACH, RAISE
+from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE
 from starjax.sim.tasks.rescue import Rescuer, entry
 
-HIGH = task.RIM_HEIGHT - expert.GRASP_DROP + expert.HOVER  # m, at which the tip goes sideways
-TOLERANCE = 0.002  # m below it that counts as high
+GRASP = task.RIM_HEIGHT - expert.GRASP_DROP  # m, of the tip
+HIGH = GRASP + expert.HOVER  # m, at which the tip goes sideways
+TOLERANCE = 0.002  # m below it that counts as high, and aside that counts as above the target
+# m of the tip above its grasp at which the pads, 2.5 mm longer, reach the top of the rim
+PADS = 0.0025 + task.WALL_RADIUS + expert.GRASP_DROP
+CLEARANCE = 0.0015  # m aside, at which open jaws pass a wall: 0.2 mm less than their room
+# m aside for each m above `PADS`: the expert's way in begins so far out, with its spread
+SLOPE = 0.6
+TURNED = 0.3  # rad from the wall's normal, within which low jaws go down
+SLOW = 0.01  # m/s
+TOWARDS = 0.6  # cosine between velocity and way, above which the tip goes there
+ABOVE = 0.003  # m over `HIGH` that still belongs to the way in: its spread
 
 
 def rescuer(middle: float = 0.0) -> Rescuer:
@@ -24,27 +37,75 @@ def rescuer(middle: float = 0.0) -> Rescuer:
         block, peg = state.measurements.block, state.layout.target_peg
         normals = task.wall_normals(block)
         off = jnp.linalg.norm(block.p + task.RIM_RADIUS * normals - tip, axis=-1)
-        is_held = now.holds[0] & (jnp.min(off) < expert.HELD)
+        is_near = jnp.min(off) < expert.HELD
+        is_held = now.holds[0] & is_near
         is_low = tip[2] < HIGH - TOLERANCE
-        reach = jnp.max(normals[:, :2] @ (peg - block.p[:2]))
-        is_over = reach < task.RIM_RADIUS - task.WALL_RADIUS
-        low = jnp.where(is_over, expert.LOWER, expert.LIFT)
-        held = jnp.where(is_low, low, expert.CARRY)
-        phase = jnp.where(is_held, held, jnp.where(is_low, RAISE, APPROACH))
+        wall, side, is_coming, is_about = _way_in(state)
         script = script.replace(
             attempt=jnp.zeros((), jnp.int32),
             at=tip,
             jaws_from=jaws,
             jaws=jaws,
-            wall=jnp.where(is_held, jnp.argmin(off), script.wall).astype(jnp.int32),
+            wall=jnp.where(is_held, jnp.argmin(off), wall).astype(jnp.int32),
+            side=side,
             # The jaws' own direction: the roll of a held block does not jump.
             normal=jnp.where(is_held, state.pose.R[0, :, 1], script.normal),
             roll_from=roll,
             roll=roll,
         )
-        return expert._enter(script, phase.astype(jnp.int32), state)
+        reach = jnp.max(normals[:, :2] @ (peg - block.p[:2]))
+        is_over = reach < task.RIM_RADIUS - task.WALL_RADIUS
+        over = expert._enter(script, jnp.asarray(expert.CARRY, jnp.int32), state).goal
+        is_above = jnp.linalg.norm((over - tip)[:2]) < TOLERANCE
+        low = jnp.where(is_over, expert.LOWER, expert.LIFT)
+        held = jnp.where(is_low, low, jnp.where(is_above, expert.LOWER, expert.CARRY))
+        free = jnp.where(is_coming, DESCEND, jnp.where(is_low, RAISE, APPROACH))
+        phase = jnp.where(is_held, held, free)
+        # Jaws that move about the wall finish that: they open about the target, else they close.
+        is_moving = jnp.abs(jaws) < midway.OPEN
+        phase = jnp.where(is_about & is_moving & ~is_over, expert.CLOSE, phase)
+        is_done = task.is_threaded(block, peg)
+        is_put = tip[2] < GRASP + expert.RELEASE_HEIGHT + midway.ARRIVED
+        lets_go = is_over & is_put & is_near & jnp.where(is_held, is_done, is_moving)
+        back = jnp.where(is_low & is_near, expert.RETREAT, expert.WAIT)
+        phase = jnp.where(is_done & ~is_held, back, phase)
+        phase = jnp.where(lets_go, expert.OPEN, phase).astype(jnp.int32)
+        return midway.enter(expert._enter, expert.GRASP, script, phase, state)
 
     return Rescuer(resume, expert.AGENT.act)
+
+
+def _way_in(state: EnvState) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Returns the grasp that the tip is nearest to, and where on the way to it the tip is.
+
+    Returns:
+      int32, the wall; the side of its middle; True on the way down with open jaws; True at the
+      grasp.
+    """
+    now, block = entry(state), state.measurements.block
+    normals = task.wall_normals(block)
+    skew = jnp.abs(normals[:, 0])
+    is_candidate = skew <= jnp.sort(skew)[expert.CANDIDATES - 1]
+    tangents = jnp.cross(block.R[:, 2], normals)
+    way = now.p[0] - block.p - task.RIM_RADIUS * normals
+    along, out = (jnp.sum(way * axis, axis=-1) for axis in (tangents, normals))
+    side = jnp.where(along < 0.0, -1.0, 1.0)
+    off = jnp.maximum(jnp.abs(out), jnp.abs(along - side * expert.GRASP_SIDE))
+    wall = jnp.argmin(jnp.where(is_candidate, off, jnp.inf))
+    above = now.p[0, 2] - (block.p[2] - expert.GRASP_DROP)
+    is_turned = jnp.abs(state.pose.R[0, :, 1] @ normals[wall]) > jnp.cos(TURNED)
+    is_between = off[wall] < CLEARANCE + SLOPE * jnp.maximum(above - PADS, 0.0)
+    is_beside = is_between & (is_turned | (above > PADS))
+    is_within = (above > -midway.ARRIVED) & (above < expert.HOVER + ABOVE)
+    # A fast tip that goes elsewhere has not come to the start of its way in.
+    velocity = state.velocity[0, :3]
+    down = -(along[wall] - side[wall] * expert.GRASP_SIDE) * tangents[wall]
+    down = down - out[wall] * normals[wall] - jnp.array([0.0, 0.0, above])
+    speed, far = jnp.linalg.norm(velocity), jnp.linalg.norm(down)
+    has_come = (speed < SLOW) | (velocity @ down > TOWARDS * speed * far)
+    has_come = has_come | (above < expert.HOVER - TOLERANCE)
+    is_coming = is_beside & is_within & has_come & (now.jaws[0] > 0.0)
+    return wall, side[wall], is_coming, is_beside & (jnp.abs(above) < midway.ARRIVED)
 
 
 RESCUER = rescuer()
