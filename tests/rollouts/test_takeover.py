@@ -98,3 +98,31 @@ def test_the_expert_begins_at_the_state_of_the_signal_and_stays(lost_at, limits,
             np.testing.assert_array_equal(executed.pose.p[:, 0, 0], begins)
             np.testing.assert_array_equal(executed.pose.p[:, 0, 1], step)
     assert {progress.CAUSES[number] for number in memory.cause.tolist()} == {cause}
+
+
+@pytest.mark.parametrize("bends", ("policy", "expert"))
+def test_one_of_the_two_may_leave_the_wrist_straight(bends):
+    angles = {"policy": None, "expert": None, bends: jnp.full((1, 2), 0.3)}
+
+    def policy_act(params, memory, state, observe, t):
+        turned = angles["policy"]
+        turned = None if turned is None else jnp.stack([turned, turned])
+        command = Command(state.pose, jnp.ones((2, 1)), turned)
+        return command, memory, command
+
+    def act(memory, state):
+        command = Command(state.pose, jnp.ones(1), angles["expert"])
+        return command, memory, command
+
+    policy = agent.BatchAgent(lambda params, keys, state, observe: jnp.zeros(2), policy_act, {})
+    both = takeover.from_policy(policy, Rescuer(lambda key, state: key, act))
+    env = stubs.make_env(unlucky=0.0)
+    trocar = rcm.Trocar(*(jnp.asarray(x) for x in stubs.trocars(0, 1)))
+    keys = jax.random.split(jax.random.key(0), 2)
+    state = jax.vmap(env.reset)(keys, sim_env.EnvParams(trocar))
+    params = (None, takeover.TakeoverLimits(np.array([0, 9]), np.int32(9)))
+    memory = both.init(params, keys, state, None)
+    executed, _, label = both.act(params, memory, state, None, 0)
+    bent = [0.3, 0.0] if bends == "expert" else [0.0, 0.3]
+    for command in (executed, label):
+        np.testing.assert_allclose(command.wrist[:, 0, 0], bent)

@@ -8,6 +8,7 @@ import pytest
 
 from starjax import rcm
 from starjax.sim import registries, scene, wrists
+from starjax.sim.tasks import rescue
 from starjax.types import Agent, Command, Pose
 
 TROCAR = jnp.array([[0.02, -0.03, 0.15]])
@@ -49,3 +50,19 @@ def test_straight_commands_and_the_tasks_own_tool_leave_an_expert_as_it_is():
         registries.tasks.get("needle_regrasp"), scene.name("needle_regrasp", ["psm"], ["prograsp"])
     )
     assert getattr(task.experts["default"], "__module__", "") == module
+
+
+def test_an_expert_that_takes_over_bends_the_wrist_of_the_tool_at_hand(monkeypatch):
+    angles = rcm.angles_through(rcm.LARGE_NEEDLE_DRIVER, TIP, TROCAR)
+    agent = shown(angles)()
+    written = rescue.Rescuer(agent.init, agent.act)
+    monkeypatch.setattr(registries, "rescuers", types.SimpleNamespace(get=lambda name: written))
+    own = registries.tasks.get("needle_regrasp")
+    assert wrists.rescuer(own, "needle_regrasp") is written
+    task = wrists.holding(own, scene.name("needle_regrasp", ["psm"], ["prograsp"]))
+    fitted = wrists.rescuer(task, "needle_regrasp")
+    assert wrists.rescuer(task, "needle_regrasp") is fitted  # else every round would compile
+    command = fitted.act((), STATE)[0]
+    shaft = rcm.shaft_of(rcm.PROGRASP, command.pose, command.wrist)
+    np.testing.assert_allclose(rcm.rcm_error(shaft, TROCAR), 0.0, atol=1e-6)
+    wrists._fitted_rescuer.cache_clear()

@@ -16,7 +16,7 @@ from starjax import config, errors
 from starjax.finetune.rounds import LearnedEpisode, Way
 from starjax.rollouts import episodes, progress, takeover
 from starjax.rollouts.agent import BatchAgent
-from starjax.sim import registries
+from starjax.sim import registries, wrists
 from starjax.sim.tasks.base import Task
 
 NAME, SOURCE = "dagger", "intervention"
@@ -70,7 +70,7 @@ def way(
     if name not in registries.rescuers.names():
         known = ", ".join(registries.rescuers.names())
         raise errors.UsageError("--by dagger", f"a task and expert of {known}", name)
-    agent = takeover.from_policy(policy, registries.rescuers.get(name))
+    agent = takeover.from_policy(policy, wrists.rescuer(task, name))
     stalled = np.int32(limits.stalled)
 
     def choose(found: Sequence[episodes.Episode]) -> LearnedEpisode | None:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from starjax.rollouts import episodes, placement, progress
 from starjax.rollouts.agent import BatchAgent, Observe
+from starjax.sim import wrists
 from starjax.sim.tasks.rescue import Rescuer
 
 POLICY, EXPERT, PERSON = range(3)  # values of the field `actor`, see `episodes.FIELDS`
@@ -84,6 +85,11 @@ def _functions(
         script = _where(begins, fresh, memory.script)
         *theirs, script_after = _last(jax.vmap(rescuer.act)(script, state))
         *ours, policy_after = _last(decide(params[0], memory.policy, state, observe, t))
+        # Either may leave the wrists straight, by commands without angles.
+        theirs, ours = (
+            [wrists.with_angles(command, other) for command, other in zip(one, another)]
+            for one, another in ((theirs, ours), (ours, theirs))
+        )
         executed, label = _where(number > 0, theirs, ours)
         script = _where(number > 0, script_after, script)
         return executed, Takeover(policy_after, memory.key, script, now, number), label

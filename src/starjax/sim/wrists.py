@@ -1,7 +1,8 @@
 """Wrists of the tools that a task's slots hold."""
 
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,13 @@ from starjax.sim.names import SceneNames
 from starjax.sim.tasks.base import Task
 from starjax.types import Agent, Command, Pose
 
+if TYPE_CHECKING:  # it imports the physics
+    from starjax.sim.tasks.rescue import Rescuer
 
-def per_arm(task: Task) -> tuple[rcm.Wrist | None, ...]:
+Held = tuple[rcm.Wrist | None, ...]  # the wrist of each arm's tool
+
+
+def per_arm(task: Task) -> Held:
     """Returns the wrist of each arm's tool, None for a straight one."""
     return tuple(registries.tools.get(slot.tool).wrist for slot in task.slots)
 
@@ -38,25 +44,44 @@ def holding(task: Task, names: SceneNames) -> Task:
     return held._replace(experts={name: _fitted(held, own) for name, own in task.experts.items()})
 
 
+def rescuer(task: Task, name: str) -> "Rescuer":
+    """Returns an expert of `registries.rescuers`; it bends the wrists of the task's tools."""
+    written = registries.tasks.get(task.name) if task.name in registries.tasks.names() else task
+    if per_arm(written) == per_arm(task):
+        return registries.rescuers.get(name)
+    return _fitted_rescuer(name, per_arm(task))
+
+
+@functools.lru_cache(maxsize=4)  # programs belong to the functions that they were made of
+def _fitted_rescuer(name: str, held: Held) -> "Rescuer":
+    found = registries.rescuers.get(name)
+    return found._replace(act=_fitted_act(held, found.act))
+
+
 def _fitted(task: Task, expert: str | Callable[[], Agent]) -> Callable[[], Agent]:
     """Returns an expert whose commands bend the wrists of the task's tools."""
 
     def make() -> Agent:
         agent = registry.load(expert) if isinstance(expert, str) else expert()
-
-        def fitted(command: Command, state: Any) -> Command:
-            p_world_trocar = state.measured_trocar.p_world_trocar
-            return command if command.wrist is None else through(task, command, p_world_trocar)
-
-        def act(memory: Any, state: Any) -> tuple[Command, Any, Command]:
-            executed, memory, recorded = agent.act(memory, state)
-            return fitted(executed, state), memory, fitted(recorded, state)
-
-        return Agent(agent.init, act)
+        return Agent(agent.init, _fitted_act(per_arm(task), agent.act))
 
     # The digest of a dataset covers the module of its expert.
     make.__module__ = expert.partition(":")[0] if isinstance(expert, str) else expert.__module__
     return make
+
+
+def _fitted_act(held: Held, act: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns an expert's `act` whose commands bend the wrists held."""
+
+    def fitted(command: Command, state: Any) -> Command:
+        p_world_trocar = state.measured_trocar.p_world_trocar
+        return command if command.wrist is None else _through(held, command, p_world_trocar)
+
+    def fitted_act(memory: Any, state: Any) -> tuple[Command, Any, Command]:
+        executed, memory, recorded = act(memory, state)
+        return fitted(executed, state), memory, fitted(recorded, state)
+
+    return fitted_act
 
 
 def through(task: Task, command: Command, p_world_trocar: jax.Array) -> Command:
@@ -70,7 +95,17 @@ def through(task: Task, command: Command, p_world_trocar: jax.Array) -> Command:
       command: `[..., A]`; its own angles are ignored.
       p_world_trocar: `[..., A, 3]` m.
     """
-    held = per_arm(task)
+    return _through(per_arm(task), command, p_world_trocar)
+
+
+def with_angles(command: Command, other: Command) -> Command:
+    """Returns a command with angles if the other one has some; without, its wrist is straight."""
+    if command.wrist is not None or other.wrist is None:
+        return command
+    return command._replace(wrist=jnp.zeros_like(other.wrist))
+
+
+def _through(held: Held, command: Command, p_world_trocar: jax.Array) -> Command:
     if not any(held):
         return command
     (R, p), angles = command.pose, []
