@@ -71,6 +71,9 @@ def monitor() -> str:
             missing = ["\u2013", "\u2013"]
             cells += _alarms(table[label]["alarms"], most) if label in table else missing
         rows.append([label, *cells])
+    rows.append(
+        ["goals met under a disturbance", *(cell for table in found for cell in _pairs(table))]
+    )
     return formats.render(rows, names=1)
 
 
@@ -138,6 +141,16 @@ def _alarms(found: dict[str, Any], most: float) -> list[str]:
     early, false = found["before_clock"], found["false_alarms"]
     is_early = (early["rate"] or 0.0) >= EARLY
     return [_counted(early, is_early), _counted(false, (false["rate"] or 0.0) <= most)]
+
+
+def _pairs(table: dict[str, Any]) -> list[str]:
+    """Counts the disturbances under which a policy meets each goal, and both."""
+    found = [row["alarms"] for label, row in table.items() if not label.startswith("nothing")]
+    early = [(row["before_clock"]["rate"] or 0.0) >= EARLY for row in found]
+    false = [row["false_alarms"] for row in found]
+    quiet = [bool(rate["trials"]) and rate["rate"] <= FALSE for rate in false]
+    both = sum(map(all, zip(early, quiet, strict=True)))
+    return [f"{sum(early)} of {len(found)}", f"{sum(quiet)} of {len(found)}, both {both}"]
 
 
 def _counted(rate: dict[str, Any], is_met: bool) -> str:
