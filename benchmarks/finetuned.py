@@ -63,17 +63,18 @@ def goal_of(found: dict[str, Any]) -> list[float]:
 
 def runs(folder: Path = RESULTS) -> str:
     """Returns the origin of every complete fine-tuning as markdown."""
-    rows = [["Command", "Seed", "Commit", "On"]]
+    rows = [["Commit", "On", "Seed", "Command"]]
     for found in complete(folder):
         seed = str(found.get("seed", "0"))
         on = formats.machine(found["hardware"])
-        rows.append([f"`{found['command']}`", seed, found["commit"][:10], on])
-    return formats.render(rows, names=1)
+        rows.append([found["commit"][:10], on, seed, f"`{found['command']}`"])
+    return formats.render(rows, names=4)
 
 
 def branches(folder: Path = RESULTS) -> str:
     """Returns, for rounds with takeovers, what the expert finished, and the trials it could not."""
     told = [found for found in _results(folder) if "branches" in found["rounds"][-1]]
+    told.sort(key=_name)
     names = list(told[0]["rounds"][-1]["branches"]) if told else []
     header = ["Fine-tuning", "Round", "Finished", *names, "From none", "Trocar-trial of these"]
     rows = [header]
