@@ -11,7 +11,7 @@ claim.toml, with some of its rows `<claim>/<table>:ROW,ROW`; `claims` (the list 
 `stress_randomised`, `proposition`, `finetune_goals`, `finetune_ways`, `finetune_runs`,
 `finetune_branches`, `ppo`, `ppo_gpu`, `sb3`, `monitor_<policy>`, `monitor_cost`,
 `monitor_attempts`, `through_lerobot`, `held_out`, `larger_than_memory`, `loaders`, `redraw`,
-`look`, `physics_goals`, `gradient_noise`.
+`look`, `physics_goals`, `gradient_noise`, `ring_starts`, `handover_passes`.
 """
 
 import re
