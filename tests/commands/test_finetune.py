@@ -15,8 +15,15 @@ import pytest
 import stubs
 
 from starjax import config
-from starjax.commands import finetune, finetune_stages, finetune_work, policy_evaluation
-from starjax.data import normalizer
+from starjax.commands import (
+    finetune,
+    finetune_checks,
+    finetune_stages,
+    finetune_work,
+    policy_evaluation,
+)
+from starjax.data import normalizer, store
+from starjax.finetune import dagger
 from starjax.monitor import calibrate, scores
 from starjax.policies import in_env, policy_file
 from starjax.policies.base import Policy
@@ -173,6 +180,37 @@ def test_a_task_without_such_an_expert_is_refused(file, monkeypatch):
     monkeypatch.setattr(registries, "rescuers", Registry("rescuer", {"other": "stubs:RESCUER"}))
     with mistakes.of("--by dagger", "reach"):
         tune()
+    assert not Path("tuned/plan.json").exists()
+
+
+@pytest.mark.parametrize("way", ["self", "rl", "distill"])
+def test_a_way_that_a_learner_does_not_permit_is_refused_before_anything_runs(file, way):
+    stored = policy_file.load(file)
+    act = config.with_learner(stored.policy, "act")
+    policy_file.save(file, stored._replace(policy=act, monitor=None))
+    with mistakes.of(f"--by {way}", "act"):
+        tune(1, "--by", way)
+    assert not Path("tuned/plan.json").exists()
+
+
+def test_interventions_are_for_dagger_alone(file):
+    with mistakes.of("--interventions", "--by rl"):
+        tune(1, "--by", "rl", "--interventions", "nowhere")
+    assert not Path("tuned/plan.json").exists()
+
+
+def test_the_expert_of_a_given_dataset_is_that_which_takes_over(tmp_path):
+    task = registries.tasks.get("needle_handover")
+    given = config.RunConfig(demos=config.DemosConfig(from_=str(tmp_path)))
+    assert finetune_checks.demonstrator(given, task) == ""  # loading the dataset names it
+    for name, expert in (("wrist", "wrist"), ("operator", "")):
+        store.create(tmp_path / name, {"schema": store.SCHEMA, "expert": name})
+        given = config.RunConfig(demos=config.DemosConfig(from_=str(tmp_path / name)))
+        assert finetune_checks.demonstrator(given, task) == expert
+    own = config.RunConfig(demos=config.DemosConfig(expert="wrist"))
+    assert finetune_checks.demonstrator(own, task) == "wrist"
+    with mistakes.of("--by dagger", "needle_handover.wrist"):
+        dagger.rescuer(task, "wrist")
 
 
 RL = ("--by", "rl", "--iterations", "2", "--episodes", "20", "--noise", "0.02")

@@ -13,6 +13,7 @@ from starjax import config as config_lib
 from starjax import errors, methods
 from starjax.commands import (
     demonstrations,
+    finetune_checks,
     finetune_counts,
     interventions,
     messages,
@@ -84,7 +85,7 @@ class Search:
             seed=work.settings.seed,
             trials=work.settings.trials,
             max_steps=self._max_steps,
-            expert=work.config.demos.expert,
+            expert=finetune_checks.demonstrator(work.config, work.base.env.task),
             policy=who.weights,
             about={"limits": self._limits._asdict(), "rewinds_s": dagger.REWINDS_S},
         )
@@ -112,7 +113,7 @@ class Search:
             policy = policies.make(row, hot, who.env.task, cameras=trained.scene.cameras)
             agent = in_env.batch_agent(trained.method, policy, hot)
             return self_imitation.way(agent, params, settings.observation)
-        expert = self._work.config.demos.expert
+        expert = finetune_checks.demonstrator(self._work.config, who.env.task)
         hz = who.env.control_hz
         return dagger.way(who.agent(), params, who.env.task, expert, settings, self._limits, hz)
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from starjax import config as config_lib
 from starjax import errors
-from starjax.commands import policy_args, session
+from starjax.commands import finetune_checks, policy_args, session
 from starjax.finetune import mixing
 from starjax.finetune.settings import FinetuneConfig
 from starjax.policies import in_env, policy_file
@@ -28,8 +28,6 @@ from starjax.rollouts import trocars
 from starjax.runtime import files
 
 _WARMUP = 500  # training steps, in which the new optimiser's averages settle
-_OF_ONE_STEP = ("rl", "distill")  # ways that need a learner of one evaluation
-_ONE_STEP = "onestep"  # that learner
 _MAY_CHANGE = ("rounds", "minutes", "eval")  # settings that may change when a fine-tuning resumes
 
 
@@ -86,16 +84,16 @@ def begin(
     """Reads the policy and claims the directory.
 
     Raises:
-      errors.UsageError: the directory is of other settings, or another method has the weights.
+      errors.UsageError: the directory is of other settings, another method has the weights, or
+        the way does not suit the policy.
     """
     base, config = policy_args.load(path)
     stored = policy_file.load(path.file)
     if stored.method != base.trained.method:
         got = f"{base.trained.method}, which runs those of {stored.method}"
         raise errors.UsageError("RUN", "a method with weights of its own", got)
-    if settings.by in _OF_ONE_STEP and stored.policy.learner != _ONE_STEP:
-        expected = f"a policy of the learner {_ONE_STEP}"
-        raise errors.UsageError(f"--by {settings.by}", expected, stored.policy.learner)
+    seen = trocars.select(base.env.task.trocars, slice(config.demos.seen_trocars))
+    finetune_checks.check(settings, config, stored.policy, base.env, seen)
     share.first("claimed", lambda: _claim(started.folder, settings, base.weights))
     stats = mixing.with_reach(base.trained.normalizer)
     return Work(
@@ -104,7 +102,7 @@ def begin(
         file=path.file,
         stored=stored,
         base=base._replace(trained=base.trained._replace(normalizer=stats)),
-        seen=trocars.select(base.env.task.trocars, slice(config.demos.seen_trocars)),
+        seen=seen,
         started=started,
         share=share,
         deadline=time.monotonic() + 60.0 * (settings.minutes or math.inf),
@@ -138,7 +136,7 @@ def _round_config(
 
 def _round_policy(settings: FinetuneConfig, policy: config_lib.PolicyConfig) -> Any:
     """Returns a policy's settings in a round; some ways freeze the encoder and use float32."""
-    if settings.by not in _OF_ONE_STEP:
+    if settings.by not in finetune_checks.OF_ONE_STEP:
         return dataclasses.replace(policy, dtype=settings.dtype)
     is_frozen = policy.observation == "image"
     return dataclasses.replace(policy, dtype="float32", freeze_encoder=is_frozen)

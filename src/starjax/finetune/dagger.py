@@ -43,6 +43,19 @@ def limits(
     )
 
 
+def rescuer(task: Task, expert: str) -> str:
+    """Returns the name in `registries.rescuers` of a task's expert.
+
+    Raises:
+      errors.UsageError: it begins in no other state than the first.
+    """
+    name = registries.rescuer_name(task, expert)
+    if name not in registries.rescuers.names():
+        known = ", ".join(registries.rescuers.names())
+        raise errors.UsageError(f"--by {NAME}", f"a task and expert of {known}", name)
+    return name
+
+
 def way(
     policy: BatchAgent,
     params: Any,
@@ -64,12 +77,9 @@ def way(
       control_hz: commands per second.
 
     Raises:
-      errors.UsageError: no expert of the task begins in any state.
+      errors.UsageError: the expert begins in no other state than the first.
     """
-    name = registries.rescuer_name(task, expert)
-    if name not in registries.rescuers.names():
-        known = ", ".join(registries.rescuers.names())
-        raise errors.UsageError("--by dagger", f"a task and expert of {known}", name)
+    name = rescuer(task, expert)
     agent = takeover.from_policy(policy, wrists.rescuer(task, name))
     stalled = np.int32(limits.stalled)
 

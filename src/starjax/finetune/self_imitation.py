@@ -15,7 +15,7 @@ from starjax.finetune.rounds import LearnedEpisode, Way
 from starjax.rollouts import attempts, episodes, progress, takeover
 from starjax.rollouts.agent import BatchAgent
 
-SOURCE = "success"
+NAME, SOURCE = "self", "success"
 ATTEMPTS = 3  # of each start
 TEMPERATURE = 1.0  # of the noise that a sample begins with, that of training
 
@@ -28,7 +28,7 @@ def noisy(policy: config.PolicyConfig) -> config.PolicyConfig:
     """
     if not hasattr(policy.options, "temperature"):
         expected = "a learner with a temperature (diffusion, flow, onestep)"
-        raise errors.UsageError("--by self", expected, policy.learner)
+        raise errors.UsageError(f"--by {NAME}", expected, policy.learner)
     return config.with_options(policy, temperature=TEMPERATURE)
 
 
