@@ -45,6 +45,7 @@ def state_of(taker, touch, jaws, lifted=True, away=(0.0, 0.0, 0.0)):
         gripper_target=target,
         gripper=jaws,
         touch=jnp.array(touch),
+        velocity=jnp.zeros((2, 7)),
         step=jnp.asarray(50),
     )
 

@@ -7,15 +7,19 @@ import jax
 import jax.numpy as jnp
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import handover
-from starjax.sim.tasks.handover_rescue import enter
+from starjax.sim.tasks import handover, midway
+from starjax.sim.tasks.handover_rescue import before_the_pass, enter, holders, missed
 from starjax.sim.tasks.peg_transfer import task as single
 from starjax.sim.tasks.peg_transfer_bimanual import expert
 from starjax.sim.tasks.rescue import Rescuer, entry
 
-ABOVE, LIFT, CARRY, NEAR, TAKE, OPEN, OVER, LOWER = map(
-    expert.PHASES.index, ("above", "lift", "carry", "near", "take", "open", "over", "lower")
-)
+ABOVE, LIFT, NEAR, TAKE, OPEN, AWAY, OVER, LOWER, RELEASE, RISE, WAIT = map(
+    expert.PHASES.index,
+    (
+        "above", "lift", "near", "take", "open", "away", "over", "lower", "release", "rise", "wait",
+    ),
+)  # fmt: skip
+BESIDE = 0.02  # m of a tip from the nearest wall, beyond which it has left it
 
 
 def _following(script: handover.HandoverScript, state: EnvState) -> jax.Array:
@@ -32,7 +36,7 @@ PLAY = expert.PLAY._replace(following=_following)
 def resume(key: jax.Array, state: EnvState) -> handover.HandoverScript:
     """Starts the script at this state."""
     script, now = expert.AGENT.init(key, state), entry(state)
-    block, (gives, takes) = state.measurements.block, now.holds
+    block, (gives, takes) = state.measurements.block, holders(now)
     normals = single.wall_normals(block)
     walls = block.p + single.RIM_RADIUS * normals
     tip = jnp.where(gives, now.p[0], now.p[1])
@@ -45,14 +49,30 @@ def resume(key: jax.Array, state: EnvState) -> handover.HandoverScript:
         jnp.where(is_held, block.R.T @ out, drawn_out),
         jnp.where(is_held, block.R.T @ along, drawn_along),
     )
-    is_up = block.p[2] > single.RIM_HEIGHT + single.LIFTED
+    is_up = _is_up(state)
     is_low = now.p[0, 2] < single.RIM_HEIGHT + expert.HOVER - expert.GRASP_DROP
-    # A low giver closes and rises; with empty jaws it starts over from there.
-    alone = jnp.where(gives & is_up, CARRY, jnp.where(gives | is_low, LIFT, ABOVE))
+    script = script.replace(held=held)
+    alone = before_the_pass(PLAY, expert.PHASES, script, state, is_up, is_low)
     reach = jnp.max(normals[:, :2] @ (state.layout.target_peg - block.p[:2]))
     is_over = reach < single.RIM_RADIUS - single.WALL_RADIUS
-    taken = jnp.where(gives, OPEN, jnp.where(is_over, LOWER, OVER))
-    return enter(PLAY, script, jnp.where(takes, taken, alone), held, state)
+    is_close = jnp.linalg.norm(walls - now.p[:, None], axis=-1).min(axis=-1) < BESIDE
+    onward = jnp.where(is_close[0], AWAY, jnp.where(is_over, LOWER, OVER))
+    opens = gives | (is_close[0] & (now.jaws[0] < midway.OPEN))
+    phase = jnp.where(takes, jnp.where(opens, OPEN, onward), alone)
+    # A threaded block is let go.
+    is_open = now.jaws[1] > midway.OPEN
+    left = jnp.where(is_close[1], jnp.where(is_open, RISE, RELEASE), WAIT)
+    is_done = single.is_threaded(block, state.layout.target_peg) & ~gives & ~takes
+    return enter(PLAY, script, jnp.where(is_done, left, phase), held, state)
 
 
-RESCUER = Rescuer(resume, handover.agent(PLAY).act)
+def nearly_lost(state: EnvState) -> jax.Array:
+    """Returns True if the taker has closed without the wall: the giver will let go next."""
+    return missed(state) & _is_up(state)
+
+
+def _is_up(state: EnvState) -> jax.Array:
+    return state.measurements.block.p[2] > single.RIM_HEIGHT + single.LIFTED
+
+
+RESCUER = Rescuer(resume, handover.agent(PLAY).act, nearly_lost)
