@@ -526,6 +526,6 @@ def test_a_disturbance_may_name_its_levels(file):
 
 def test_too_few_trials_write_no_policy(file):
     few = ["--trials=20", "--alpha=0.05", "--out=watched.safetensors"]
-    with mistakes.of("successes", "for the scale"):
+    with mistakes.of("trials", "for the scale"):
         calibrate.main([*CALIBRATE[:1], "--time-limit-s=1", *few])
     assert not (file.parent / "watched.safetensors").exists()

@@ -1,5 +1,7 @@
 """Content of figures, read back from their artists."""
 
+import warnings
+
 import mujoco
 import numpy as np
 import pytest
@@ -83,6 +85,14 @@ def test_runs_side_by_side_have_each_their_curve(one, several, tmp_path):
         assert len({(x.get_color(), x.get_linestyle()) for x in named}) == 5 == len(named)
     point = one._replace(curves=[{"step": 1, "loss": 0.5}])
     assert figures.training([point]).axes[0].lines[0].get_marker() == "o"  # or it would not show
+
+
+def test_an_error_that_is_always_zero_has_no_logarithmic_axis(one):
+    exact = [{"step": step, "loss": 1 / step, "roll_error_deg": 0.0} for step in (1, 2)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        axes = figures.training([one._replace(curves=exact)]).axes
+    assert [axis.get_yscale() for axis in axes if axis.lines] == ["log", "linear"]
 
 
 def test_labels_are_drawn_as_they_are_written_and_fit(several):

@@ -117,9 +117,10 @@ def calibrate(
       errors.UsageError: there are too few successes for this alpha.
     """
     if len(successes) < (least := required(alpha)) or not len(fitted):
+        expected = f"{least} successes for the threshold at alpha {alpha:g}, and 1 for the scale"
         got = f"{len(successes)}, and {len(fitted)} for the scale"
         hint = "run more trials, or choose a larger alpha"
-        raise errors.UsageError("successes", f"at least {least} for alpha {alpha:g}", got, hint)
+        raise errors.UsageError("trials", expected, got, hint)
     center, width = fit(fitted)
     others = [name not in names for name in scores_lib.NAMES]
     center[others] = width[others] = np.nan

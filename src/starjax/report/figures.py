@@ -69,6 +69,9 @@ def training(runs: Sequence[results.Run], dark: bool = False) -> Any | None:
                     axis.plot(*np.array(points).T, label=run.label, **line)
             axis.set_title(title)
             axis.set_xlabel(f"training step (from {compare.observed(runs)})")
+            lines = (line for run in runs for line in run.curves)
+            if not any(line.get(name, 0.0) > 0.0 for line in lines):
+                continue  # such as the roll of reach, which is always right
             axis.set_yscale("log")
             low, high = axis.get_ylim()
             subs = _TICKS if high > _TICKS[-1] * low else _CLOSE_TICKS
