@@ -29,6 +29,7 @@ from starjax.policies import in_env, policy_file
 from starjax.policies.base import Policy
 from starjax.policies.learners.onestep import OnestepConfig
 from starjax.registry import Registry
+from starjax.runtime import files
 from starjax.sim import registries
 from starjax.types import Command, Pose
 
@@ -173,6 +174,9 @@ def test_a_folder_of_other_settings_is_refused(file):
     Path("tuned").mkdir()
     Path("tuned/plan.json").write_text(json.dumps({"steps": 61}))
     with mistakes.of("steps", 60):
+        tune()
+    Path("tuned/plan.json").write_text(json.dumps({"weights": 64 * "0"}))
+    with mistakes.of("RUN", files.sha256(file)[:12]):
         tune()
 
 

@@ -28,6 +28,7 @@ from starjax.rollouts import trocars
 from starjax.runtime import files
 
 _WARMUP = 500  # training steps, in which the new optimiser's averages settle
+_DIGITS = 12  # of a digest in messages
 _MAY_CHANGE = ("rounds", "minutes", "eval")  # settings that may change when a fine-tuning resumes
 
 
@@ -154,6 +155,8 @@ def _claim(folder: Path, settings: FinetuneConfig, weights: str) -> None:
     for name, value in plan.items():
         if before.get(name, value) != value:
             hint = "choose another folder by --out, or remove that one"
-            made = f"{before[name]}, with which {folder} was made"
-            raise errors.UsageError(name, made, value, hint)
+            argument, was, now = name, before[name], value
+            if name == "weights":
+                argument, was, now = "RUN", f"the policy {was[:_DIGITS]}", now[:_DIGITS]
+            raise errors.UsageError(argument, f"{was}, with which {folder} was made", now, hint)
     files.write_json(folder / "plan.json", plan)
