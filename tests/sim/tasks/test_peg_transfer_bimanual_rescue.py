@@ -60,6 +60,7 @@ def state_of(block, giver, taker, touch, jaws):
         (UP, (0.0, 0.0, 0.0), PARKED, GIVER, (FULL, OPEN), "near"),
         ((-0.02, 0.0, 0.045), (0.0, 0.0, 0.0), PARKED, GIVER, (FULL, OPEN), "carry"),
         (UP, (0.0, 0.0, 0.0), (0.002, 0.0, 0.012), GIVER, (FULL, OPEN), "meet"),
+        (UP, (0.0, 0.0, 0.0), (0.0155, 0.0, 0.0205), GIVER, (FULL, OPEN), "near"),  # just parked
         (UP, (0.0, 0.0, 0.0), (0.002, 0.0, 0.006), GIVER, (FULL, EMPTY), "near"),  # missed
         (UP, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), BOTH, (FULL, FULL), "open"),
         (UP, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), TAKER, (OPEN, FULL), "away"),

@@ -19,6 +19,7 @@ REACH = 0.03  # m of a tip from its grasp, just beyond the start of its way in
 ASIDE = (
     0.0015  # m, horizontally from its grasp, at which a tip is above it: open jaws have more room
 )
+STEEP = 0.7  # m aside for each m above a grasp, just beyond the start of its way in: 0.65
 EMPTY = -0.65  # measured opening: about -0.5 on a wire, -0.3 on a wall, -0.8 or less without
 
 
@@ -108,7 +109,7 @@ def _is_above(off: jax.Array) -> jax.Array:
     """Returns True `[2]` for tips above their grasp, or about it, from their places `[2, 3]` m."""
     aside = jnp.linalg.norm(off[:, :2], axis=-1)
     is_within = (off[:, 2] > -midway.ARRIVED) & (jnp.linalg.norm(off, axis=-1) < REACH)
-    return is_within & (aside < jnp.maximum(off[:, 2], ASIDE))
+    return is_within & (aside < jnp.maximum(STEEP * off[:, 2], ASIDE))
 
 
 def _moving(
