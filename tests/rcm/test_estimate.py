@@ -152,6 +152,18 @@ def test_a_bent_wrist_is_no_straight_shaft(rng, estimate, degrees):
     assert "wrist" in why and "\n" not in why
 
 
+@pytest.mark.parametrize("degrees", [1.0, 2.0])
+def test_the_point_of_a_wrist_that_hardly_bends_is_off_by_the_residual_at_most(estimate, degrees):
+    """Angles that lean with the time are no independent errors: the covariance misses them."""
+    rng = np.random.default_rng(1)
+    shaft = moved(rng, over_the_board(rng))
+    swing = np.sin(np.linspace(0.0, 20.0, 300))[:, None] * [1.0, 0.7]
+    found = estimate(rcm.tip_of(WRIST, shaft, np.deg2rad(degrees * swing).astype(np.float32)))
+    off = np.linalg.norm(found.p_world_trocar - TRUE)
+    assert found.is_determined
+    assert np.sqrt(np.linalg.eigvalsh(found.covariance)[-1]) < off < found.residual
+
+
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 80.0])
 def test_with_angles_or_shafts_a_wrist_gives_the_trocar(rng, estimate, degrees):
     shaft, tip, angles = bent(rng, degrees)

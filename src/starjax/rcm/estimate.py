@@ -29,8 +29,9 @@ class TrocarEstimate(NamedTuple):
     Attributes:
       p_world_trocar: `[..., 3]` m; the median of the tips if undetermined.
       residual: `[...]` m, weighted root mean square of the lines' distances from the point (Eq. 3).
+        The point itself may be off by as much: a wrist that bends by 2 degrees leaves 3 to 4 mm.
       covariance: `[..., 3, 3]` m^2 of the point, for independent errors of the lines; very large if
-        undetermined.
+        undetermined. Those of a bending wrist are not independent.
       weight: `[..., T]` in [0, 1] of the lines: 0 for an outlier.
       is_determined: `[...]`, True if the axes spread by `MIN_SPREAD`, `MIN_LINES` are inliers and
         `is_straight`; see `why_undetermined`.
