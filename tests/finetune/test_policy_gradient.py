@@ -17,6 +17,7 @@ from starjax.finetune import advantages, critic, explore, noise_level, policy_gr
 from starjax.policies import policy as policies
 from starjax.policies.base import Policy
 from starjax.policies.learners.onestep import OnestepConfig
+from starjax.sim import wrists
 from starjax.types import Command, Pose
 
 TROCARS = stubs.trocars(0, 8)
@@ -190,6 +191,23 @@ def test_commands_stay_on_the_manifold_at_every_step_of_learning(demonstrations)
     moved = jax.tree.map(lambda x, y: float(jnp.abs(x - y).max()), params, after)
     assert max(jax.tree.leaves(moved)) > 1e-5  # steps of Adam, shortened to the divergence
     assert sum(int(metrics["steps"]) for _, metrics in found) > 0
+
+
+@pytest.mark.slow
+def test_the_manifold_of_a_wrist_is_that_of_its_shaft():
+    env = make_env()
+    slots = tuple(slot._replace(tool="needle_driver") for slot in env.task.slots)
+    env = env._replace(task=env.task._replace(slots=slots))
+
+    def bends(params, stats, actions, observation, trocar):
+        command = moves(params, stats, actions, observation, trocar)
+        return wrists.through(env.task, command, trocar.p_world_trocar[:, None])
+
+    policy = STOPS_SHORT._replace(execute=bends)
+    play = explore.make(env, policy, None, (), STATIC)
+    params, key = STOPS_SHORT.init(None), jax.random.key(0)
+    played = play(params, None, None, starts(0), key, key, deviations(NOISE))
+    assert played.rcm_commanded < 1e-6
 
 
 def test_the_density_and_its_clipped_gain():

@@ -119,17 +119,10 @@ class Search:
 
 
 def one_step_policy(work: Work, settings: config_lib.PolicyConfig) -> policies.Policy:
-    """Returns the policy of a round with other settings, whose samples have two parts.
-
-    Raises:
-      errors.UsageError: those of its method have not.
-    """
+    """Returns the policy of a round with other settings."""
     env, method = work.base.env, work.stored.method
     cameras = env.names.cameras
-    made = policies.make(methods.METHODS[method], settings, env.task, work.config.train, cameras)
-    if made.generate is None:
-        raise errors.UsageError(f"--by {work.settings.by}", "a method without a wrist", method)
-    return made
+    return policies.make(methods.METHODS[method], settings, env.task, work.config.train, cameras)
 
 
 class Lessons:

@@ -19,6 +19,7 @@ from starjax.policies.base import Policy
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import precompile
 from starjax.sim import env as sim_env
+from starjax.sim import wrists
 from starjax.types import Observation
 
 See = Callable[[Any, jax.Array], jax.Array]
@@ -137,7 +138,8 @@ def make(
                 past = jax.tree.map(
                     lambda old, new: jnp.concatenate([old[1:], new[None]]), past, after
                 )
-                error = rcm.rcm_error(command.pose, after.trocar.p_world_trocar)
+                shaft = wrists.shafts(env.task, command)
+                error = rcm.rcm_error(shaft, after.trocar.p_world_trocar)
                 alive = ~before.done[:, None]
                 commanded = jnp.maximum(commanded, jnp.max(error, where=alive, initial=0.0))
                 executed = jnp.maximum(
