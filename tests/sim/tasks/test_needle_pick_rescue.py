@@ -27,6 +27,7 @@ def state_of(height, sticks, touch=True):
     lying = types.SimpleNamespace(needle=needle._replace(p=p.at[2].set(GROUND)))
     state = stubs.one_tool(Pose(pose.R[0], tip), found, lying)
     state.measured_trocar, state.touch, state.wrist = FRAME, jnp.array([touch]), None
+    state.velocity = jnp.zeros((1, 7))
     return state
 
 
@@ -58,3 +59,26 @@ def test_a_needle_held_by_its_point_is_on_the_ground_before_the_jaws_open():
     np.testing.assert_allclose(z[phase == rescue.FREE], GROUND + expert.GRASP_ABOVE, atol=1e-4)
     assert jaws[-1] == 1.0 and int(script.phase) == phases.RAISE
     np.testing.assert_allclose(label.pose.p[0, :2], tip[:2], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("off", "phase"),
+    [
+        ((0.0, 0.0, 0.012), phases.DESCEND),
+        ((0.0, 0.0, 0.0002), expert.CLOSE),
+        ((0.0, 0.04, 0.012), phases.RAISE),
+        ((0.0, 0.0, 0.05), phases.APPROACH),
+    ],
+)
+def test_open_jaws_above_the_wire_come_down(off, phase):
+    state = state_of(0.0, sticks=False, touch=False)
+    tip = state.pose.p + jnp.array(off) + jnp.array([0.0, 0.0, expert.GRASP_ABOVE])
+    state.pose, state.gripper_target = state.pose._replace(p=tip), jnp.ones(1)
+    # Above the pads' height any roll will do; at the wire jaws are along its normal.
+    normal = jnp.cross(jnp.asarray(expert.TANGENTS)[5], jnp.array([0.0, 0.0, 1.0]))
+    R = state.pose.R.at[0, :, 1].set(normal)
+    state.pose = state.pose._replace(R=R)
+    script = rescue.RESCUER.resume(jax.random.key(0), state)
+    assert int(script.phase) == phase
+    if phase == phases.DESCEND:
+        assert int(script.segment) == 5 and float(script.goal[2]) < float(tip[0, 2])

@@ -61,6 +61,7 @@ def enter(
     way = jnp.linalg.norm(first.goal - first.at)
     last = len(grasp.timing.duration) - 1
     following = begin(script, jnp.minimum(phase + 1, last), state)
+    # A phase that stays in place has no way, and lasts its time.
     is_there = (way > 0.0) & (way < ARRIVED)
     script = jax.tree.map(lambda a, b: jnp.where(is_there, a, b), following, first)
     return _turning(grasp, _moving(grasp, script, state), state)

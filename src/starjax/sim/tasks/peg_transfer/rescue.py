@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import midway
+from starjax.sim.tasks import midway, way_in
 from starjax.sim.tasks.peg_transfer import expert, task
 from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE
 from starjax.sim.tasks.rescue import Rescuer, entry
@@ -17,15 +17,12 @@ from starjax.sim.tasks.rescue import Rescuer, entry
 GRASP = task.RIM_HEIGHT - expert.GRASP_DROP  # m, of the tip
 HIGH = GRASP + expert.HOVER  # m, at which the tip goes sideways
 TOLERANCE = 0.002  # m below it that counts as high, and aside that counts as above the target
-# m of the tip above its grasp at which the pads, 2.5 mm longer, reach the top of the rim
-PADS = 0.0025 + task.WALL_RADIUS + expert.GRASP_DROP
-CLEARANCE = 0.0015  # m aside, at which open jaws pass a wall: 0.2 mm less than their room
-# m aside for each m above `PADS`: the expert's way in begins so far out, with its spread
-SLOPE = 0.6
-TURNED = 0.3  # rad from the wall's normal, within which low jaws go down
-SLOW = 0.01  # m/s
-TOWARDS = 0.6  # cosine between velocity and way, above which the tip goes there
-ABOVE = 0.003  # m over `HIGH` that still belongs to the way in: its spread
+ROOM = way_in.Room(
+    # The pads are 2.5 mm longer than the tip.
+    pads=0.0025 + task.WALL_RADIUS + expert.GRASP_DROP,
+    clearance=0.0015,  # 0.2 mm less than there is
+    top=expert.HOVER,
+)
 
 
 def rescuer(middle: float = 0.0) -> Rescuer:
@@ -92,20 +89,10 @@ def _way_in(state: EnvState) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array
     side = jnp.where(along < 0.0, -1.0, 1.0)
     off = jnp.maximum(jnp.abs(out), jnp.abs(along - side * expert.GRASP_SIDE))
     wall = jnp.argmin(jnp.where(is_candidate, off, jnp.inf))
-    above = now.p[0, 2] - (block.p[2] - expert.GRASP_DROP)
-    is_turned = jnp.abs(state.pose.R[0, :, 1] @ normals[wall]) > jnp.cos(TURNED)
-    is_between = off[wall] < CLEARANCE + SLOPE * jnp.maximum(above - PADS, 0.0)
-    is_beside = is_between & (is_turned | (above > PADS))
-    is_within = (above > -midway.ARRIVED) & (above < expert.HOVER + ABOVE)
-    # A fast tip that goes elsewhere has not come to the start of its way in.
-    velocity = state.velocity[0, :3]
     down = -(along[wall] - side[wall] * expert.GRASP_SIDE) * tangents[wall]
-    down = down - out[wall] * normals[wall] - jnp.array([0.0, 0.0, above])
-    speed, far = jnp.linalg.norm(velocity), jnp.linalg.norm(down)
-    has_come = (speed < SLOW) | (velocity @ down > TOWARDS * speed * far)
-    has_come = has_come | (above < expert.HOVER - TOLERANCE)
-    is_coming = is_beside & is_within & has_come & (now.jaws[0] > 0.0)
-    return wall, side[wall], is_coming, is_beside & (jnp.abs(above) < midway.ARRIVED)
+    down = down - out[wall] * normals[wall]
+    down = down.at[2].set(block.p[2] - expert.GRASP_DROP - now.p[0, 2])
+    return wall, side[wall], *way_in.of(ROOM, down, off[wall], normals[wall], state)
 
 
 RESCUER = rescuer()
