@@ -5,8 +5,8 @@
 TRIALS.npz is of monitor_trials.py. Every second trocar of the task chooses, of `ALPHAS` and
 `WINDOWS`, the monitor that meets both goals under the most disturbances; among equals, the one
 that misses them by least. The other trocars, and the last sampled ones, test it. Writes
-results/monitor_<POLICY>_gpu.json, with the same for every one of `ATTEMPTS`. The packaged monitor
-is that of `PACKAGED`.
+results/monitor_<POLICY>_gpu.json, with the same for every one of `ATTEMPTS`. `PACKAGED` names
+those of the packaged monitors.
 """
 
 import json
@@ -28,7 +28,8 @@ ALPHAS = (0.01, 0.02, 0.03, 0.05)
 WINDOWS = (1, 2, 3)  # multiples of the recorded window of stillness
 TROCARS = 12  # of every task
 FIRST = ("disagreement", "stillness", "clock", "closure")
-PACKAGED = "new scores"
+FIRST_SCORES, NEW_SCORES = "first scores", "new scores"
+PACKAGED = {"compact": FIRST_SCORES}  # of the others: the new ones
 _HELD = 3  # decisions
 _LEAST = 0.25  # progress per time, of a divisor
 _STILLNESS, _CLOSURE, _PROGRESS = map(scores.NAMES.index, ("stillness", "closure", "progress"))
@@ -74,7 +75,7 @@ def main(policy: str, file: str) -> None:
             "tested": pairs(halved(best.trials.labels, is_test=True), best.monitor),
         }
         print(name, outcomes[name])
-        if name == PACKAGED:
+        if name == PACKAGED.get(policy, NEW_SCORES):
             trials, monitor = best
             strict = attempt.calibrated(
                 trials.whole, monitors.STRICT, settings, digest, attempt.names
@@ -168,8 +169,8 @@ def by_score(
 
 
 ATTEMPTS = {
-    "first scores": Attempt(FIRST),
-    PACKAGED: Attempt(),
+    FIRST_SCORES: Attempt(FIRST),
+    NEW_SCORES: Attempt(),
     "levels of scores": Attempt(calibrated=by_score),
     "path by progress": Attempt(change=by_progress),
     "jaws closed for three decisions": Attempt(change=held),
