@@ -72,10 +72,17 @@ def spy(lost_at):
 
 
 @pytest.mark.parametrize(
-    ("lost_at", "limits", "begins", "cause"),
-    [(99, (20, 6), 6, "stalled"), (99, (4, 6), 4, "clock"), (3, (20, 6), 3, "nearly lost")],
+    ("lost_at", "limits", "held", "begins", "cause"),
+    [
+        (99, (20, 6), (), 6, "stalled"),
+        (99, (4, 6), (), 4, "clock"),
+        (99, (4, 6), (3, 4, 5), 6, "clock"),
+        (3, (20, 6), (), 3, "nearly lost"),
+    ],
 )
-def test_the_expert_begins_at_the_state_of_the_signal_and_stays(lost_at, limits, begins, cause):
+def test_the_expert_begins_at_the_state_of_the_signal_and_stays(
+    lost_at, limits, held, begins, cause
+):
     def policy_act(params, memory, state, observe, t):
         command = Command(state.pose, -jnp.ones((2, 1)))
         return command, memory + 1, command
@@ -90,7 +97,8 @@ def test_the_expert_begins_at_the_state_of_the_signal_and_stays(lost_at, limits,
     params = (None, takeover.TakeoverLimits(np.full(2, clock), np.int32(stalled)))
     memory = both.init(params, keys, state, None)
     for step in range(9):
-        state = state.replace(step=jnp.full(2, step))
+        settled = jnp.full(2, step in held, jnp.int32)  # the conditions of success hold
+        state = state.replace(step=jnp.full(2, step), settled=settled)
         executed, memory, label = both.act(params, memory, state, None, step)
         np.testing.assert_array_equal(executed.gripper, 1.0 if step >= begins else -1.0)
         jax.tree.map(np.testing.assert_array_equal, executed, label)

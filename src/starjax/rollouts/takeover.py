@@ -25,7 +25,8 @@ class TakeoverLimits(NamedTuple):
     """Control steps; data, not part of a program.
 
     Attributes:
-      clock: `[N]` int32, step at which the expert takes over in any case.
+      clock: `[N]` int32, step from which the expert takes over, unless the conditions of strict
+        success hold: they end the episode soon, and its lesson would be to stay.
       stalled: int32, steps without progress.
     """
 
@@ -77,7 +78,8 @@ def _functions(
         update = functools.partial(progress.update, stalled_steps=limits.stalled)
         now, stalled = jax.vmap(update)(memory.progress, state)
         nearly_lost = jax.vmap(rescuer.nearly_lost)(state)
-        number = progress.cause(stalled, state.step >= limits.clock, nearly_lost)
+        late = (state.step >= limits.clock) & (state.settled == 0)
+        number = progress.cause(stalled, late, nearly_lost)
         number = jnp.where(memory.cause > 0, memory.cause, number)
         # The expert begins at this very state.
         begins = (number > 0) & (memory.cause == 0)
