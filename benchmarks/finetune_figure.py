@@ -13,6 +13,7 @@ import finetuned
 from starjax.report import style
 
 WAYS = {"dagger": "#2083C5", "self": "#D55E00", "rl": "#009E73", "distill": "#CC79A7"}
+COLUMNS = 3
 AGAIN = 0.5  # opacity of a second line of the same policy and way
 
 
@@ -21,11 +22,15 @@ def main(file: Path) -> None:
     found = finetuned.finetunings()
     tasks = {task: list(group) for task, group in itertools.groupby(found, key=lambda x: x["task"])}
     with style.use():
-        figure = style.figure(2.6 * len(tasks), 4.0)
-        axes = figure.subplots(1, len(tasks), squeeze=False)[0]
-        for axis, (task, results) in zip(axes, tasks.items(), strict=True):
+        rows = -(-len(tasks) // COLUMNS)
+        figure = style.figure(2.6 * COLUMNS, 3.4 * rows)
+        axes = figure.subplots(rows, COLUMNS, squeeze=False)
+        for axis in axes.flat[len(tasks) :]:
+            axis.set_axis_off()
+        for axis, (task, results) in zip(axes.flat, tasks.items(), strict=False):
             draw(axis, task, results)
-        axes[0].set_ylabel("success in validation (%)")
+        for axis in axes[:, 0]:
+            axis.set_ylabel("success in validation (%)")
         data = style.save(figure, "png")
     file.write_bytes(data)
 
@@ -33,8 +38,8 @@ def main(file: Path) -> None:
 def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
     """Draws the fine-tunings of one task."""
     lines = dict(zip(dict.fromkeys(map(finetuned.base, results)), ("-", ":", "--", "-.")))
-    labels = []
-    for found in results:
+    labels = [f"{found['by']}, {finetuned.base(found)}" for found in results]
+    for i, found in enumerate(results):
         minutes = [seconds / 60 for seconds in finetuned.learning_seconds(found)]
         rates = [row["validation"] for row in found["rounds"]]
         middle = [100 * rate["rate"] for rate in rates]
@@ -42,10 +47,9 @@ def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
             [abs(100 * rate["ci95"][end] - y) for rate, y in zip(rates, middle, strict=True)]
             for end in (0, 1)
         )
-        label = f"{found['by']}, {finetuned.base(found)}"
-        labels.append(label)
+        label, twice = labels[i], labels.count(labels[i]) > 1
         look = {"color": WAYS[found["by"]], "ls": lines[finetuned.base(found)]}
-        look["alpha"] = AGAIN ** labels[:-1].count(label)
+        look["alpha"] = AGAIN ** labels[:i].count(label)
         axis.errorbar(
             minutes,
             middle,
@@ -53,7 +57,7 @@ def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
             marker="o",
             ms=4,
             capsize=2,
-            label=label if label not in labels[:-1] else f"{label}, again",
+            label=f"{label}, {found['commit'][:8]}" if twice else label,
             **look,
         )
     goals = sorted({finetuned.goal_of(found)[0] for found in results})
