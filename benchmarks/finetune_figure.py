@@ -48,7 +48,7 @@ def draw(axis: Any, task: str, results: list[dict[str, Any]]) -> None:
             for end in (0, 1)
         )
         label, twice = labels[i], labels.count(labels[i]) > 1
-        look = {"color": WAYS[found["by"]], "ls": lines[finetuned.base(found)]}
+        look: dict[str, Any] = {"color": WAYS[found["by"]], "ls": lines[finetuned.base(found)]}
         look["alpha"] = AGAIN ** labels[:i].count(label)
         axis.errorbar(
             minutes,
