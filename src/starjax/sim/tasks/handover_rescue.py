@@ -11,15 +11,13 @@ import jax
 import jax.numpy as jnp
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import handover, midway, scripting
+from starjax.sim.tasks import handover, midway, scripting, way_in
 from starjax.sim.tasks.rescue import Entry, entry
 
 MET = 0.006  # m, distance of the object from the place of the pass, at which the taker comes
-REACH = 0.03  # m of a tip from its grasp, just beyond the start of its way in
 ASIDE = (
     0.0015  # m, horizontally from its grasp, at which a tip is above it: open jaws have more room
 )
-STEEP = 0.7  # m aside for each m above a grasp, just beyond the start of its way in: 0.65
 EMPTY = -0.65  # measured opening: about -0.5 on a wire, -0.3 on a wall, -0.8 or less without
 
 
@@ -78,8 +76,9 @@ def before_the_pass(
     above, down, close, lift, carry, near, meet, take = map(
         phases.index, ("above", "down", "close", "lift", "carry", "near", "meet", "take")
     )
-    off = now.p - jnp.stack([goals[down, 0], goals[meet, 1]])
-    is_coming = _is_above(off) & (now.jaws > 0.0)
+    grasps = jnp.stack([goals[down, 0], goals[meet, 1]])
+    off, starts = now.p - grasps, jnp.stack([goals[above, 0], goals[near, 1]]) - grasps
+    is_coming = _is_above(off, starts, state) & (now.jaws > 0.0)
     is_about = jnp.linalg.norm(off, axis=-1) < ASIDE
     is_closing = is_about & (jnp.abs(now.jaws) < midway.OPEN)
     is_met = jnp.linalg.norm(goals[carry, 0] - now.p[0]) < MET
@@ -105,11 +104,19 @@ def missed(state: EnvState) -> jax.Array:
     return gives & ~takes & (state.gripper_target[1] < 0.0) & (state.gripper[1] < EMPTY)
 
 
-def _is_above(off: jax.Array) -> jax.Array:
-    """Returns True `[2]` for tips above their grasp, or about it, from their places `[2, 3]` m."""
-    aside = jnp.linalg.norm(off[:, :2], axis=-1)
-    is_within = (off[:, 2] > -midway.ARRIVED) & (jnp.linalg.norm(off, axis=-1) < REACH)
-    return is_within & (aside < jnp.maximum(STEEP * off[:, 2], ASIDE))
+def _is_above(off: jax.Array, start: jax.Array, state: EnvState) -> jax.Array:
+    """Returns True `[2]` for tips on the way down to their grasp, or about it.
+
+    Args:
+      off: `[2, 3]` m, the tips from their grasps.
+      start: `[2, 3]` m from these, where the ways in begin.
+      state: at this moment.
+    """
+    aside, out = (jnp.linalg.norm(x[:, :2], axis=-1) for x in (off, start))
+    top = start[:, 2]
+    is_within = (off[:, 2] > -midway.ARRIVED) & (off[:, 2] < top + ASIDE)
+    is_between = aside < ASIDE + jnp.maximum(out / top, way_in.SLOPE) * off[:, 2]
+    return is_within & is_between & way_in.has_come(-off, top, state.velocity[:, :3])
 
 
 def _moving(

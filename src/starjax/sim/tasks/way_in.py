@@ -51,10 +51,19 @@ def of(
     is_between = aside < room.clearance + SLOPE * jnp.maximum(above - room.pads, 0.0)
     is_free = is_between & (is_turned | (above > room.pads))
     is_within = (above > -midway.ARRIVED) & (above < room.top + SPREAD)
-    # A fast tip that goes elsewhere has not come to the start of its way in.
-    velocity = state.velocity[0, :3]
-    speed, far = jnp.linalg.norm(velocity), jnp.linalg.norm(way)
-    has_come = (speed < SLOW) | (velocity @ way > TOWARDS * speed * far)
-    has_come = has_come | (above < room.top - TOLERANCE)
-    is_coming = is_free & is_within & has_come & (state.gripper_target[0] > 0.0)
+    is_here = has_come(way, jnp.asarray(room.top), state.velocity[0, :3])
+    is_coming = is_free & is_within & is_here & (state.gripper_target[0] > 0.0)
     return is_coming, is_free & (jnp.abs(above) < midway.ARRIVED)
+
+
+def has_come(way: jax.Array, top: jax.Array, velocity: jax.Array) -> jax.Array:
+    """Returns False `[...]` for a tip at the start of its way in that goes elsewhere, and fast.
+
+    Args:
+      way: `[..., 3]` m, from the tip to the grasp.
+      top: `[...]` m above the grasp, where the way in begins.
+      velocity: `[..., 3]` m/s of the tip.
+    """
+    speed, far = (jnp.linalg.norm(x, axis=-1) for x in (velocity, way))
+    goes_there = jnp.sum(velocity * way, axis=-1) > TOWARDS * speed * far
+    return (speed < SLOW) | goes_there | (-way[..., 2] < top - TOLERANCE)

@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import midway
+from starjax.sim.tasks import midway, way_in
 from starjax.sim.tasks.handover_rescue import before_the_pass, enter, holders, missed
 from starjax.sim.tasks.needle_handover import expert
 from starjax.sim.tasks.needle_pick import task as single
 from starjax.sim.tasks.rescue import Rescuer, entry
 
 OPEN, AWAY, HOLD = map(expert.PHASES.index, ("open", "away", "hold"))
+GONE = 0.012  # m of a giver at rest from the wire, beyond which it has gone
 _HELD, _CLOSE = 100, 10  # weights of a segment against the drawn one: held, next to a tool
 
 
@@ -33,7 +34,9 @@ def resume(key: jax.Array, state: EnvState) -> expert.handover.HandoverScript:
     script = script.replace(held=held)
     alone = before_the_pass(expert.PLAY, expert.PHASES, script, state, _is_up(state), is_low)
     opens = gives | (is_close[0] & (now.jaws[0] < midway.OPEN))
-    taken = jnp.where(opens, OPEN, jnp.where(is_close[0], AWAY, HOLD))
+    speed = jnp.linalg.norm(state.velocity[0, :3])
+    is_going = is_close[0] & ((off[0].min() < GONE) | (speed > way_in.SLOW))
+    taken = jnp.where(opens, OPEN, jnp.where(is_going, AWAY, HOLD))
     return enter(expert.PLAY, script, jnp.where(takes, taken, alone), held, state)
 
 

@@ -19,6 +19,7 @@ ABOVE, LIFT, NEAR, TAKE, OPEN, AWAY, OVER, LOWER, RELEASE, RISE, WAIT = map(
         "above", "lift", "near", "take", "open", "away", "over", "lower", "release", "rise", "wait",
     ),
 )  # fmt: skip
+TOLERANCE = 0.002  # m from its place above the target, at which the taker comes down
 BESIDE = 0.02  # m of a tip from the nearest wall, beyond which it has left it
 
 
@@ -56,6 +57,10 @@ def resume(key: jax.Array, state: EnvState) -> handover.HandoverScript:
     reach = jnp.max(normals[:, :2] @ (state.layout.target_peg - block.p[:2]))
     is_over = reach < single.RIM_RADIUS - single.WALL_RADIUS
     is_close = jnp.linalg.norm(walls - now.p[:, None], axis=-1).min(axis=-1) < BESIDE
+    goals, _ = PLAY.goals(script.replace(p=now.p), state)
+    off = now.p[1] - goals[OVER, 1]
+    has_come = (jnp.linalg.norm(off[:2]) < TOLERANCE) | (off[2] < -TOLERANCE)
+    is_over = is_over & has_come
     onward = jnp.where(is_close[0], AWAY, jnp.where(is_over, LOWER, OVER))
     opens = gives | (is_close[0] & (now.jaws[0] < midway.OPEN))
     phase = jnp.where(takes, jnp.where(opens, OPEN, onward), alone)
