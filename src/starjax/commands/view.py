@@ -107,8 +107,9 @@ def _recorded(args: ViewArgs) -> Show:
 
     def show(server: Any, should_stop: Callable[[], bool]) -> str:
         with recorder.record_into(Path(args.record), env, args.seed, policy) as kept:
-            given = server, agent.label, recorder.steer(env, policy), kept, should_stop
-            summary = relief.run(*given, trocar=args.trocar, seed=args.seed)
+            steering = recorder.steer(env, policy)
+            where = {"trocar": args.trocar, "seed": args.seed}
+            summary = relief.run(server, agent.label, steering, kept, should_stop, **where)
         return f"{summary}; dataset: {args.record}"
 
     return show
