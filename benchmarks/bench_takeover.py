@@ -24,7 +24,7 @@ from starjax.sim import registries
 from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.sim.tasks.rescue import Rescuer
 
-SEED, STEPS = 2026, 600
+SEED, STEPS = 31, 600  # a seed that no expert was adjusted on
 EVERY = 7  # control steps between two entries
 HORIZON = 8  # control steps that are compared: the executed part of a plan
 TOLERANCE = 0.02  # m/s, of a tip's mean commanded velocity over the horizon; ways reach 0.09
