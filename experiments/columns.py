@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from starjax.evaluation.result import Trial, read_sweep
 from starjax.report import compare, formats, outcomes, results, stats
+from starjax.sim import registries
 
 HIGHEST = 8  # index of the unseen trocar above all seen ones
 TURN_WIDTH = 11  # degrees of a needle's turn, of the label `turn` of needle drive along the dial
@@ -107,6 +108,14 @@ def _time(scored: Scored) -> str:
     return formats.duration(sum(s for name, s in spent.items() if not name.endswith(": compile")))
 
 
+def _stages(scored: Scored) -> str:
+    """Counts failed trials by their last stage."""
+    stages = registries.tasks.get(scored.run.result.scene.task).stages
+    failed = [trial.stage for trial in scored.run.trials if not outcomes.strict(trial)]
+    counted = ((name, failed.count(i)) for i, name in enumerate(stages))
+    return ", ".join(f"{name} {count}" for name, count in counted if count)
+
+
 def _running(scored: Scored) -> str:
     spent = scored.run.result.about.get("timings_s") or {}
     if "evaluate: compile" not in spent:
@@ -197,6 +206,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     ),
     "median": ("median success (s)", _median),
     "seeds": ("seeds: training, trials", _seeds),
+    "stages": ("failures by their last stage", _stages),
     "code": ("code", _code),
     **{
         f"{part}_turn{k}": (f"{low}° to {low + TURN_WIDTH}°", functools.partial(_by_turn, part, k))
