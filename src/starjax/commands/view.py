@@ -108,8 +108,15 @@ def _recorded(args: ViewArgs) -> Show:
     def show(server: Any, should_stop: Callable[[], bool]) -> str:
         with recorder.record_into(Path(args.record), env, args.seed, policy) as kept:
             steering = recorder.steer(env, policy)
-            where = {"trocar": args.trocar, "seed": args.seed}
-            summary = relief.run(server, agent.label, steering, kept, should_stop, **where)
+            summary = relief.run(
+                server,
+                agent.label,
+                steering,
+                kept,
+                should_stop,
+                trocar=args.trocar,
+                seed=args.seed,
+            )
         return f"{summary}; dataset: {args.record}"
 
     return show

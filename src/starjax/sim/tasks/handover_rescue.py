@@ -15,9 +15,8 @@ from starjax.sim.tasks import handover, midway, scripting, way_in
 from starjax.sim.tasks.rescue import Entry, entry
 
 MET = 0.006  # m, distance of the object from the place of the pass, at which the taker comes
-ASIDE = (
-    0.0015  # m, horizontally from its grasp, at which a tip is above it: open jaws have more room
-)
+# m, horizontally from its grasp, at which a tip is above it: open jaws have more room
+ASIDE = 0.0015
 EMPTY = -0.65  # measured opening: about -0.5 on a wire, -0.3 on a wall, -0.8 or less without
 
 
