@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
+from starjax.addons.suture.needle_regrasp import expert, task
 from starjax.sim import registries, sampling, scene
-from starjax.sim.tasks.needle_regrasp import expert, task
 from starjax.sim.tasks.wrist_script import WRIST
 
 SEED, ARM = 2026, "psm"

@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 
 from starjax import runtime
+from starjax.addons.suture import thread
 from starjax.sim import env as envs
-from starjax.sim import thread
 from starjax.types import Command
 
 PERIODS, ROUNDS = 20, 9  # control periods per call; calls of each scene

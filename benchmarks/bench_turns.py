@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
+from starjax.addons.suture.needle_drive import dial
 from starjax.evaluation import expert as runs
 from starjax.sim import env as envs
 from starjax.sim import sampling
-from starjax.sim.tasks.needle_drive import dial
 
 STEPS = 600  # control steps, 20 s
 

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.spatial import transform
 
 from starjax import runtime
-from starjax.data.formats import base
-from starjax.data.formats.base import Column, Source
+from starjax.addons.formats import base
+from starjax.addons.formats.base import Column, Source
 
 HZ, STEPS, EPISODES, TROCARS = 30, 150, 64, 8
 YIELD = 3e-4  # m, standard deviation of the wall's offset in an episode

@@ -24,9 +24,9 @@ import time
 import _timing
 import numpy as np
 
-from starjax.data.formats import foreign
-from starjax.data.formats.base import Column, Source
-from starjax.data.formats.mapping import ArmColumns, CameraColumn, Map
+from starjax.addons.formats import foreign
+from starjax.addons.formats.base import Column, Source
+from starjax.addons.formats.mapping import ArmColumns, CameraColumn, Map
 from starjax.runtime import xla
 from starjax.training import log as training_log
 

@@ -18,8 +18,8 @@ import numpy as np
 import pyarrow.parquet as parquet
 
 from starjax import runtime
+from starjax.addons.formats import base, exchange, foreign, mapping
 from starjax.data import load, store
-from starjax.data.formats import base, exchange, foreign, mapping
 from starjax.runtime import files
 
 MAP = """task = "peg_transfer"

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
+from starjax.addons.suture.needle_drive import grasps, task
+from starjax.addons.suture.tissue import driving, prescribed
+from starjax.addons.suture.tissue import needle as needles
 from starjax.sim.tasks import scripting
-from starjax.sim.tasks.needle_drive import grasps, task
-from starjax.sim.tissue import driving, prescribed
-from starjax.sim.tissue import needle as needles
 from starjax.types import Pose
 
 SIZE = needles.CT1

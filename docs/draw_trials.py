@@ -16,11 +16,11 @@ import numpy as np
 from PIL import Image
 
 from starjax import runtime
+from starjax.addons.viewer import frame as frames
+from starjax.addons.viewer import simulation
 from starjax.policies import packaged
 from starjax.report import encode, scene_view, video
 from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.viewer import frame as frames
-from starjax.viewer import simulation
 
 IMAGES = pathlib.Path(__file__).parent / "images"
 SIZE = 256  # pixels, side of a picture

@@ -163,7 +163,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     runtime.prepare_xla()  # before the first jax array, or physics on a CPU is slow
-    from starjax.envs import playground
+    from starjax.addons.playground import environment as playground
 
     env = playground.make(args.task, trocar=args.trocar, action_space=args.action_space)
     first, iterate, evaluate = make(env, args.envs, args.iterations, args.minibatches)

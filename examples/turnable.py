@@ -8,8 +8,8 @@ import pathlib
 
 import numpy as np
 
+from starjax.addons.viewer import frame, playback
 from starjax.sim import scene
-from starjax.viewer import frame, playback
 
 HZ, SECONDS = 30.0, 3.0
 

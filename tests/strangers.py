@@ -4,9 +4,9 @@ import numpy as np
 from scipy.spatial import transform
 
 from starjax import rcm
-from starjax.data.formats import foreign
-from starjax.data.formats.base import Column, Source
-from starjax.data.formats.mapping import ArmColumns, Map
+from starjax.addons.formats import foreign
+from starjax.addons.formats.base import Column, Source
+from starjax.addons.formats.mapping import ArmColumns, Map
 
 P_WORLD_REF = np.array([0.0, 0.0, 0.15])
 RNG = np.random.default_rng(0)

@@ -6,8 +6,8 @@ import pathlib
 SOURCE = pathlib.Path(__file__).parents[1] / "src" / "starjax"
 # From left to right; a layer may import itself and those of the rows before its own.
 ROWS = (
-    ("errors",),
-    ("extras", "types", "limits", "registry", "runtime"),
+    ("errors", "moved"),
+    ("extensions", "extras", "types", "limits", "registry", "runtime"),
     ("methods",),
     ("learners",),
     ("config", "rcm"),
@@ -18,11 +18,10 @@ ROWS = (
     ("policies",),
     ("evaluation",),
     ("training",),
-    ("finetune",),
     ("deploy", "envs"),
-    ("viewer",),
     ("report",),
     ("commands",),
+    ("addons",),
 )
 COMMANDS = {"commands", "experiments", "doctor", "cli", "__main__"}  # one layer
 PLACE = {name: row for row, names in enumerate(ROWS) for name in names}
@@ -38,16 +37,18 @@ def named(part: str) -> str:
 
 def imported(source: str) -> set[str]:
     """Layers of starjax that a module's source imports, wherever in it the import stands."""
-    found = set()
+    return {named(name.split(".")[1]) for name in names(source)} - {"__version__"}
+
+
+def names(source: str) -> set[str]:
+    """Modules and objects of starjax that a module's source imports."""
+    found: set[str] = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        found |= {named(name.split(".")[1]) for name in names if name.startswith("starjax.")}
-    return found - {"__version__"}
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in found if name.startswith("starjax.")}
 
 
 FILES = sorted(path for path in SOURCE.rglob("*.py") if layer(path) != "__init__")
@@ -58,6 +59,19 @@ def test_imports_point_to_the_left():
         name = layer(path)
         right = {other for other in imported(path.read_text()) if PLACE[other] >= PLACE[name]}
         assert right <= {name}, path
+
+
+def test_add_ons_do_not_know_each_other():
+    for path in (SOURCE / "addons").glob("*/**/*.py"):
+        own = path.relative_to(SOURCE / "addons").parts[0]
+        of_add_ons = {n for n in names(path.read_text()) if n.startswith("starjax.addons.")}
+        assert {name.split(".")[2] for name in of_add_ons} <= {own}, path
+
+
+def test_tables_of_add_ons_import_nothing_but_their_record():
+    for path in (SOURCE / "addons").glob("*/table.py"):
+        imports = [n for n in ast.walk(ast.parse(path.read_text())) if hasattr(n, "names")]
+        assert [node.module for node in imports] == ["starjax.extensions"], path
 
 
 def test_every_layer_has_a_place():

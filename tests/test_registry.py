@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from starjax import cli, config, errors, methods, rcm, registry
+from starjax.addons.formats import base
 from starjax.commands import policy_args, presets, run_settings
-from starjax.data.formats import base
 from starjax.sim import registries
 
 
@@ -81,7 +81,9 @@ def test_a_name_of_starjax_is_refused(install):
 
 
 def test_a_broken_format_leaves_the_others(install, tmp_path):
-    code = "from starjax.data.formats import zarr\nTABLES = zarr.FORMAT._replace(recognises=len)\n"
+    code = (
+        "from starjax.addons.formats import zarr\nTABLES = zarr.FORMAT._replace(recognises=len)\n"
+    )
     install("lab_f", code, formats="tables")
     install("lab_g", "1 / 0", formats="notes")
     (tmp_path / "d" / "meta").mkdir(parents=True)

@@ -5,3 +5,7 @@ their own import, so that `--help` and configuration errors answer at once.
 """
 
 __version__ = "0.2.0"
+
+from starjax import moved
+
+moved.install()

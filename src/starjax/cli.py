@@ -6,72 +6,73 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
-from starjax import __version__, errors, extras
+from starjax import __version__, errors, extensions, extras
+from starjax.extensions import Subcommand
+from starjax.registry import Registry
 from starjax.runtime import signals
 
 _LEARNING = ("sim", "train")
 _ALL = (*_LEARNING, "report")
 _EXCHANGE = (*_LEARNING, "formats")
-_VIEWER = (*_LEARNING, "viewer")
-# Subcommand -> (module with `main(argv) -> exit code`, or module:function; help; extras).
-_TABLE: dict[str, tuple[str, str, tuple[str, ...]]] = {
-    "run": ("commands.run", "run the full pipeline: collect, train, evaluate, report", _ALL),
-    "collect": ("commands.run:collect", "collect demonstrations only", _LEARNING),
-    "train": ("commands.run:train", "collect demonstrations and train", _LEARNING),
-    "evaluate": ("commands.evaluate", "evaluate a policy on its task's trocars", _LEARNING),
-    "sweep": ("commands.sweep", "evaluate a policy on a grid or sample of trocars", _LEARNING),
-    "finetune": ("commands.finetune", "improve a trained policy in the simulator", _LEARNING),
-    "calibrate": (
-        "commands.calibrate",
-        "add a runtime monitor to a trained policy",
-        _LEARNING,
+# The subcommands of the core; those of add-ons and of other packages follow in `COMMANDS`.
+CORE = {
+    "run": Subcommand(
+        "starjax.commands.run", "run the full pipeline: collect, train, evaluate, report", _ALL
     ),
-    "stress": ("commands.stress", "evaluate a policy under disturbances", _LEARNING),
-    "six-blocks": ("commands.six_blocks", "evaluate six successive bimanual transfers", _LEARNING),
-    "bench": ("commands.bench", "measure the inference latency of a policy (Table IV)", _LEARNING),
-    "serve": ("commands.serve", "serve a policy to robots over websockets", ("sim", "serve")),
-    "pack": ("commands.pack", "write a policy in half precision", _LEARNING),
-    "export": (
-        "commands.export_command",
-        "export demonstrations to LeRobot, robomimic or zarr",
-        _EXCHANGE,
+    "collect": Subcommand("starjax.commands.run:collect", "collect demonstrations only", _LEARNING),
+    "train": Subcommand(
+        "starjax.commands.run:train", "collect demonstrations and train", _LEARNING
     ),
-    "import": (
-        "commands.import_command",
-        "import a dataset from LeRobot, robomimic or zarr",
-        _EXCHANGE,
+    "evaluate": Subcommand(
+        "starjax.commands.evaluate", "evaluate a policy on its task's trocars", _LEARNING
     ),
-    "inspect": (
-        "commands.inspect_command",
+    "sweep": Subcommand(
+        "starjax.commands.sweep", "evaluate a policy on a grid or sample of trocars", _LEARNING
+    ),
+    "calibrate": Subcommand(
+        "starjax.commands.calibrate", "add a runtime monitor to a trained policy", _LEARNING
+    ),
+    "stress": Subcommand(
+        "starjax.commands.stress", "evaluate a policy under disturbances", _LEARNING
+    ),
+    "bench": Subcommand(
+        "starjax.commands.bench", "measure the inference latency of a policy (Table IV)", _LEARNING
+    ),
+    "serve": Subcommand(
+        "starjax.commands.serve", "serve a policy to robots over websockets", ("sim", "serve")
+    ),
+    "pack": Subcommand("starjax.commands.pack", "write a policy in half precision", _LEARNING),
+    "inspect": Subcommand(
+        "starjax.commands.inspect_command",
         "summarise a dataset, policy or result and flag anomalies",
         _EXCHANGE,
     ),
-    "report": (
-        "commands.report_command",
+    "report": Subcommand(
+        "starjax.commands.report_command",
         "draw tables, figures, video and page from results",
         ("sim", "report"),
     ),
-    "leaderboard": (
-        "commands.leaderboard",
-        "tabulate results by the trocar benchmark",
-        ("sim", "train"),
+    "leaderboard": Subcommand(
+        "starjax.commands.leaderboard", "tabulate results by the trocar benchmark", ("sim", "train")
     ),
-    "view": ("commands.view", "show a policy, an expert or a dataset in the browser", _VIEWER),
-    "teleop": ("commands.teleop", "record demonstrations by hand in the browser", _VIEWER),
-    "list": (
-        "commands.list_command",
+    "list": Subcommand(
+        "starjax.commands.list_command",
         "list tasks, arms, tools, methods, presets and policies",
         ("sim",),
     ),
-    "check": ("commands.check_command", "check a part, such as one of your package", _EXCHANGE),
-    "find-mount": ("commands.find_mount", "search the mount of an arm for a task", _LEARNING),
-    "doctor": ("doctor", "check the installation and suggest fixes", ("sim",)),
-    "completion": ("commands.completion", "print the completion script of a shell", ("sim",)),
+    "check": Subcommand(
+        "starjax.commands.check_command", "check a part, such as one of your package", _EXCHANGE
+    ),
+    "doctor": Subcommand("starjax.doctor", "check the installation and suggest fixes", ("sim",)),
+    "completion": Subcommand(
+        "starjax.commands.completion", "print the completion script of a shell", ("sim",)
+    ),
 }
-COMMANDS = {name: (f"starjax.{module}", *rest) for name, (module, *rest) in _TABLE.items()}
+COMMANDS = {**CORE, **extensions.commands()}
+_REGISTRY = Registry("command", COMMANDS, "starjax.extensions:Subcommand")
 
 # Names of the previous release; dropped in the next.
 _RENAMED = {"exercise": "six-blocks", "place": "find-mount"}
@@ -79,6 +80,7 @@ _WRITING = (errno.ENOSPC, errno.EROFS, errno.EDQUOT)
 _STORAGE = (
     *_WRITING, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG
 )  # fmt: skip
+_NAME_WIDTH = 11  # of subcommands in the help
 _STOPPED = 130  # exit code after a stop, see `signals`
 _BROKEN_PIPE = 141  # exit code if the output pipe is closed (128 + SIGPIPE), as by `| head`
 _OURS = os.path.join(os.path.dirname(os.path.abspath(__file__)), "")
@@ -162,10 +164,12 @@ def dispatch(argv: Sequence[str]) -> int:
     """Runs the subcommand that `argv` begins with."""
     name = argv[0] if argv else "--help"
     if name in ("-h", "--help"):
-        width = max(map(len, COMMANDS))
         print("usage: starjax COMMAND [OPTIONS]      (starjax COMMAND --help for its options)")
-        print("--traceback shows where a mistake was noticed\n")
-        print("\n".join(f"  {name:{width}}  {text}" for name, (_, text, _) in COMMANDS.items()))
+        print("--traceback shows where a mistake was noticed")
+        for title, commands in _groups().items():
+            print(f"\n{title}" if title else "")
+            for each, row in commands.items():
+                print(f"  {each:{_NAME_WIDTH}}  {row.summary}")
         return 0
     if name == "--version":
         print(__version__)
@@ -173,15 +177,40 @@ def dispatch(argv: Sequence[str]) -> int:
     if name in _RENAMED:
         errors.warn_renamed(name, _RENAMED[name])
         name = _RENAMED[name]
-    errors.choice("COMMAND", name, COMMANDS)
-    extras.require(name, *COMMANDS[name][2])
+    extras.require(name, *command(name).extras)
     return load(name)(argv[1:])
+
+
+def command(name: str) -> Subcommand:
+    """Returns a subcommand of starjax or of another package.
+
+    Raises:
+      errors.UsageError: it is unknown; names the add-ons that are here.
+    """
+    if name in COMMANDS:  # without a look at the entry points of all packages
+        return COMMANDS[name]
+    try:
+        errors.choice("COMMAND", name, _REGISTRY.names())
+    except errors.UsageError as error:
+        here = ", ".join(extensions.tables()) or "none"
+        hint = "; ".join(filter(None, (error.hint, f"add-ons here: {here}")))
+        raise errors.UsageError("COMMAND", error.expected, error.got, hint) from None
+    return _REGISTRY.get(name)
 
 
 def load(name: str) -> Callable[[Sequence[str]], int]:
     """Returns the function of a subcommand, `main(argv) -> exit code`."""
-    module, _, function = COMMANDS[name][0].partition(":")
+    module, _, function = command(name).path.partition(":")
     return getattr(importlib.import_module(module), function or "main")
+
+
+def _groups() -> dict[str, Mapping[str, Subcommand]]:
+    """Returns the subcommands by heading: those of the core first, without one."""
+    tables = extensions.tables()
+    added = {f"{name}: {table.summary}": table.commands for name, table in tables.items()}
+    others = [name for name in _REGISTRY.names() if name not in COMMANDS]
+    packages = {"of other packages": {name: command(name) for name in others}}
+    return {"": CORE, **{title: rows for title, rows in (added | packages).items() if rows}}
 
 
 def _raise_interrupts(ignored: Any) -> None:

@@ -13,6 +13,9 @@ import safetensors.numpy
 import stubs
 
 from starjax import config, config_json, rcm
+from starjax.addons.six_blocks import command as six_blocks
+from starjax.addons.six_blocks import environment as exercising
+from starjax.addons.six_blocks import task as six
 from starjax.commands import (
     calibrate,
     evaluate,
@@ -20,7 +23,6 @@ from starjax.commands import (
     policy_args,
     policy_evaluation,
     presets,
-    six_blocks,
     stress,
     sweep,
 )
@@ -31,8 +33,6 @@ from starjax.policies import in_env, packaged, policy_file
 from starjax.policies.base import Policy
 from starjax.report import video
 from starjax.runtime import files, gpu
-from starjax.sim import six_blocks as exercising
-from starjax.sim.tasks.peg_transfer_bimanual import six
 
 POLICY = dataclasses.replace(fakes.TINY, execute=4)
 

@@ -11,18 +11,17 @@ import mistakes
 import pytest
 
 from starjax import cli, config, extras
+from starjax.addons.formats.commands import export_command, import_command
+from starjax.addons.six_blocks import command as six_blocks
 from starjax.commands import (
     bench,
     completion,
     evaluate,
-    export_command,
-    import_command,
     options,
     pack,
     presets,
     report_command,
     run_settings,
-    six_blocks,
     stress,
     sweep,
 )

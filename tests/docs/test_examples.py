@@ -8,7 +8,7 @@ import pytest
 
 SHORT = {"ppo": ["--envs", "4", "--iterations", "2"]}
 SLOW = {"closed_loop", "far_robot", "ppo"}  # compile the simulation, a server
-PEERS = {"serve_lerobot"}  # needs LeRobot: tests/peers/lerobot_closed_loop.py runs it
+PEERS = {"serve_lerobot"}  # needs LeRobot: tests/addons/peers/lerobot_closed_loop.py runs it
 
 
 def pytest_generate_tests(metafunc):

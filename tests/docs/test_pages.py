@@ -11,8 +11,8 @@ import tomllib
 import pytest
 
 from starjax import cli, errors, methods, rcm
+from starjax.addons.formats import base, mapping
 from starjax.commands import presets
-from starjax.data.formats import base, mapping
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.learners import LEARNERS
 from starjax.sim import registries

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.envs import mdp, playground, ranges, settings
+from starjax.addons.playground import environment as playground
+from starjax.envs import mdp, ranges, settings
 from starjax.sim import registries
 from starjax.types import Command, Pose
 

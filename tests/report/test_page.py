@@ -11,13 +11,13 @@ import re
 import pytest
 from report.conftest import edited
 
+from starjax.addons.viewer import playback_3d
 from starjax.report import (
     build,
     captions,
     figures,
     outcomes,
     page,
-    playback_3d,
     results,
     sections,
     stats,

@@ -4,10 +4,10 @@ import jax
 import mujoco
 import numpy as np
 
+from starjax.addons.viewer import stage
 from starjax.rollouts import trial_key
 from starjax.sim import registries, scene, still_bodies
 from starjax.types import Pose
-from starjax.viewer import stage
 
 
 def test_the_marks_of_a_trial_are_where_its_needle_must_go():

@@ -9,7 +9,8 @@ import mistakes
 import pytest
 import recorded
 
-from starjax.commands import export_command, import_command, inspect_command
+from starjax.addons.formats.commands import export_command, import_command
+from starjax.commands import inspect_command
 from starjax.data import store
 from starjax.policies import packaged
 from starjax.runtime import hub

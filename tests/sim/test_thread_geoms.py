@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax.sim import render, thread, thread_geoms
+from starjax.addons.suture import thread
+from starjax.addons.viewer import stage
+from starjax.sim import render, thread_geoms
 from starjax.sim.state import EnvState
-from starjax.viewer import stage
 
 LINKS = "".join(
     f'<geom name="thread{i}" type="capsule" size="{thread.RADIUS * 4} {thread.LINK / 2}" '

@@ -8,11 +8,11 @@ from typing import Annotated, Any, NamedTuple
 import tyro
 
 from starjax import config as config_lib
-from starjax import errors, methods
+from starjax import errors, extensions, methods
 from starjax.commands import options, presets
 from starjax.learners import ENCODERS, LEARNERS
 from starjax.policies.external import POLICIES
-from starjax.registry import Registry
+from starjax.registry import Registry, load
 from starjax.runtime import jax_start, sources, xla
 from starjax.sim import registries
 
@@ -46,7 +46,7 @@ class Kind(NamedTuple):
     Attributes:
       registry: () -> its registry, or None for cameras.
       names: () -> names.
-      check: module of `part_checks`.
+      check: module with the checks, such as those of `part_checks`.
     """
 
     registry: Callable[[], Registry | None]
@@ -63,7 +63,7 @@ def main(argv: Sequence[str]) -> int:
     from starjax.commands.part_checks.base import FAILED
 
     print(_title(kind, name), flush=True)
-    module = importlib.import_module(f"{_HERE}.{_kinds()[kind].check}")
+    module = importlib.import_module(_kinds()[kind].check)
     count = 0
     for check in module.check(name, args.n):
         print(errors.printable(str(check)), flush=True)
@@ -98,7 +98,6 @@ def resolve(words: Sequence[str]) -> tuple[str, str]:
 
 
 def _kinds() -> dict[str, Kind]:
-    from starjax.data.formats.base import FORMATS
     from starjax.evaluation.disturbances import DISTURBANCES
     from starjax.rcm.actions import ACTION_SPACES
 
@@ -106,18 +105,18 @@ def _kinds() -> dict[str, Kind]:
         return Kind(lambda: registry, registry.names, module)
 
     return {
-        "task": row(registries.tasks, "tasks"),
-        "arm": row(registries.arms, "arms"),
-        "tool": row(registries.tools, "tools"),
-        "camera": Kind(lambda: None, lambda: list(cameras()), "cameras"),
-        "learner": row(LEARNERS, "learners"),
-        "format": row(FORMATS, "formats"),
-        "disturbance": row(DISTURBANCES, "disturbances"),
-        "method": row(methods.METHODS.registry, "methods"),
-        "action_space": row(ACTION_SPACES.registry, "action_spaces"),
-        "preset": row(presets.PRESETS.registry, "presets"),
-        "encoder": row(ENCODERS, "encoders"),
-        "policy": row(POLICIES, "policies"),
+        "task": row(registries.tasks, f"{_HERE}.tasks"),
+        "arm": row(registries.arms, f"{_HERE}.arms"),
+        "tool": row(registries.tools, f"{_HERE}.tools"),
+        "camera": Kind(lambda: None, lambda: list(cameras()), f"{_HERE}.cameras"),
+        "learner": row(LEARNERS, f"{_HERE}.learners"),
+        **{name: row(load(kind.registry), kind.check) for name, kind in extensions.kinds().items()},
+        "disturbance": row(DISTURBANCES, f"{_HERE}.disturbances"),
+        "method": row(methods.METHODS.registry, f"{_HERE}.methods"),
+        "action_space": row(ACTION_SPACES.registry, f"{_HERE}.action_spaces"),
+        "preset": row(presets.PRESETS.registry, f"{_HERE}.presets"),
+        "encoder": row(ENCODERS, f"{_HERE}.encoders"),
+        "policy": row(POLICIES, f"{_HERE}.policies"),
     }
 
 

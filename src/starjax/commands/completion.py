@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
-from starjax import cli, methods
+from starjax import cli, extensions, methods
 from starjax.commands import options
-from starjax.data.formats.base import FORMATS
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.learners import LEARNERS
 from starjax.policies import packaged
+from starjax.registry import load
 from starjax.sim import registries
 
 DESCRIPTION = """Prints the completion script of a shell: commands, flags and their values.
@@ -81,7 +81,7 @@ def _names() -> dict[str, list[str]]:
         "tool": registries.tools.names(),
         "method": [*methods.METHODS, "all"],
         "learner": LEARNERS.names(),
-        "format": FORMATS.names(),
+        **{kind: load(row.registry).names() for kind, row in extensions.kinds().items()},
         "disturbance": DISTURBANCES.names(),
         "policy": packaged.names(),
         "compare_with": ["expert", *packaged.names()],

@@ -1,14 +1,13 @@
 """`starjax inspect`: summarises a dataset, policy or result and its anomalies."""
 
 import dataclasses
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import tyro
 
-from starjax import errors
+from starjax import errors, extensions
 from starjax.commands import checks, inspect_page, options
 from starjax.limits import Range
 from starjax.runtime import files, hub, xla
@@ -25,7 +24,6 @@ Examples:
   starjax inspect their-dataset --page their-dataset.html
   starjax inspect compact"""
 
-_LOOKED_AT = 50  # episodes of a foreign dataset whose values are read
 _SHOWN = 20  # anomalies
 
 
@@ -80,15 +78,19 @@ def inspect(name: str) -> Found:
 
     is_policy = hub.is_name(name) and not hub.parse("PATH", name).is_dataset
     path = Path(name) if is_policy else hub.dataset("PATH", name)
-    look: Callable[[Path], Found]
+    look: Callable[[Path], Found] | None
     if is_policy or packaged.locate(name).suffix == ".safetensors":
         path, look = packaged.find("PATH", name), _policy
     elif (path / "dataset.json").is_file():
         look = _dataset
     elif path.suffix == ".json" or (path / "result.json").is_file():
         look = _result
-    else:
-        look = _others
+    elif (look := extensions.hook("inspect")) is None:
+        expected, hint = (
+            "a dataset of starjax, a policy or a result",
+            "others need the add-on formats",
+        )
+        raise errors.UsageError("PATH", expected, name, f"{hint}, which is absent here")
     try:
         return look(path)
     except (ValueError, KeyError) as error:
@@ -114,7 +116,7 @@ def _dataset(path: Path) -> Found:
         ("scene", _scene(scene)),
         ("episodes", f"{len(records)}: {sum(bool(r['success']) for r in records)} successful"),
         ("kept", f"{len(kept)}, {sum(lengths)} frames, {files.size(size)}"),
-        ("lengths", _spread(lengths, " control steps")),
+        ("lengths", spread(lengths, " control steps")),
         ("trocars", f"{len({r['trocar'] for r in kept})} used of {len(about['trocars'])}"),
         ("from", "import" if "imported" in about else f"expert {about['expert']}"),
     ]
@@ -182,81 +184,12 @@ def _result(path: Path) -> Found:
     return Found(rows, odd)
 
 
-def _others(path: Path) -> Found:
-    from starjax.data.formats import base
-
-    name = base.detect(path)
-    with base.open_dataset(path, name) as source:
-        lengths = sorted(source.lengths)
-        rate = f"{source.hz:g} Hz" if source.hz else "unknown"
-        comes = "starjax export: starjax import brings it back" if source.origin else "others"
-        rows = [
-            ("dataset", base.FORMATS.get(name).description),
-            ("from", comes),
-            ("task", source.task),
-            ("episodes", f"{len(lengths)}, {sum(lengths)} frames"),
-            ("lengths", _spread(lengths, " steps")),
-            ("rate", rate),
-        ]
-        low = [column for column, about in source.columns.items() if not about.is_image]
-        ranges = {column: _Numbers() for column in low}
-        unread = []
-        for episode in range(min(len(lengths), _LOOKED_AT)):  # one at a time in memory
-            try:
-                arrays = source.read(episode, low)
-            except errors.UsageError as error:
-                unread.append(str(error))
-                continue
-            for column, values in arrays.items():
-                ranges[column].add(episode, values)
-        rows += [
-            (f"  {column}", _said(about, ranges.get(column)))
-            for column, about in source.columns.items()
-        ]
-        return Found(rows, [*source.notes, *unread, *_odd(ranges)])
-
-
-@dataclasses.dataclass
-class _Numbers:
-    """Range of a column's finite numbers, and the episodes with others."""
-
-    low: float = math.inf
-    high: float = -math.inf
-    bad: list[int] = dataclasses.field(default_factory=list)
-
-    def add(self, episode: int, values: Any) -> None:
-        """Takes the values of an episode."""
-        import numpy as np
-
-        values = np.asarray(values, np.float64)  # integers have no infinite start of a minimum
-        is_finite = np.isfinite(values)
-        if not is_finite.all():
-            self.bad.append(episode)
-        self.low = float(np.min(values, initial=self.low, where=is_finite))
-        self.high = float(np.max(values, initial=self.high, where=is_finite))
-
-
-def _said(column: Any, numbers: _Numbers | None) -> str:
-    text = f"{column.dtype} {list(column.shape)}  {', '.join(column.names[:16])}"
-    is_flag = not column.shape and column.dtype == "bool"
-    if numbers is None or is_flag or numbers.low > numbers.high:
-        return text
-    return f"{text}  {numbers.low:.4g} to {numbers.high:.4g}"
-
-
-def _odd(ranges: Mapping[str, _Numbers]) -> Iterator[str]:
-    for name, numbers in ranges.items():
-        if numbers.bad:
-            first, *others = numbers.bad
-            yield f"{name} is not finite in episode {first} and {len(others)} more"
-
-
 def _scene(scene: dict[str, Any]) -> str:
     robots = ", ".join(f"{arm} with {tool}" for arm, tool in zip(scene["arms"], scene["tools"]))
     return "; ".join(filter(None, [scene["task"], robots, ", ".join(scene["cameras"])]))
 
 
-def _spread(sizes: Sequence[int], unit: str) -> str:
+def spread(sizes: Sequence[int], unit: str) -> str:
     if not sizes:
         return "none"
     return f"{sizes[0]} to {sizes[-1]}{unit}, half of them up to {sizes[len(sizes) // 2]}"

@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starjax import errors, extras
-from starjax.runtime import files, progress
+from starjax import errors, extensions, extras
+from starjax.runtime import files
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from starjax.data.recordings import EpisodeMotion
 
 _MOMENTS = 6  # images of an episode
 
@@ -46,7 +45,7 @@ def write(
         found = list(recordings.of_dataset(path))
         images = _images(path, image_size) if image_size else {}
     else:
-        found, notes = _mapped(path, map_name)
+        found, notes = extensions.hook("inspect_page")(path, map_name)
     if not found:
         raise errors.UsageError("PATH", "episodes with motions", f"none in {path}")
     text = recording_page.render(path.name, rows, found, [*odd, *notes], images)
@@ -63,14 +62,3 @@ def _images(path: Path, size: int) -> "dict[str, np.ndarray]":
     last = record["length"] - 1
     steps = [round(last * moment / (_MOMENTS - 1)) for moment in range(_MOMENTS)]
     return episode_images.of_episode(path, record["key"], steps, size)
-
-
-def _mapped(path: Path, map_name: str) -> "tuple[list[EpisodeMotion], list[str]]":
-    from starjax.data.formats import base, mapping, own_columns, ready, recorded
-
-    with base.open_dataset(path, base.detect(path)) as source:
-        own = None if map_name else own_columns.mapping(source)
-        file = ready.FOLDER if own else ready.find(map_name or ready.choose(source))
-        columns = own or mapping.load(file)
-        with progress.track("Inspect", len(source.lengths), unit="episodes") as advance:
-            return recorded.recordings(source, columns, file.parent, advance)

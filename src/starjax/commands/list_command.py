@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from starjax import errors, methods
+from starjax import errors, extensions, methods
 from starjax.commands import options, presets
 from starjax.config import RunConfig
 from starjax.learners import ENCODERS, LEARNERS
@@ -31,21 +31,19 @@ Row = tuple[str, str]  # name, description
 def main(argv: Sequence[str]) -> int:
     """Prints the tables."""
     options.parse("list", options.NoFlags, argv, DESCRIPTION)
-    from starjax.data.formats import base
     from starjax.evaluation.disturbances import DISTURBANCES
     from starjax.rcm import ACTION_SPACES
 
     tables = {
-        "tasks (--task, --camera, --demos.expert)": _parts(registries.tasks, _task),
-        "arms (--arm)": _parts(registries.arms, _arm),
-        "tools (--tool)": _parts(registries.tools, _tool),
+        "tasks (--task, --camera, --demos.expert)": described(registries.tasks, _task),
+        "arms (--arm)": described(registries.arms, _arm),
+        "tools (--tool)": described(registries.tools, _tool),
         "methods (--method)": _methods(),
-        "action spaces (of methods, Gymnasium)": _parts(ACTION_SPACES.registry, _space),
-        "learners (--policy.learner)": _parts(LEARNERS, _learner),
-        "formats (export --format, import)": _parts(base.FORMATS, _format),
-        "mappings (import --map)": _mappings(),
-        "disturbances (stress, --demos.randomise)": _parts(DISTURBANCES, _disturbance),
-        "encoders (--policy.encoder)": _parts(ENCODERS, _encoder),
+        "action spaces (of methods, Gymnasium)": described(ACTION_SPACES.registry, _space),
+        "learners (--policy.learner)": described(LEARNERS, _learner),
+        **(formats() if (formats := extensions.hook("list")) else {}),
+        "disturbances (stress, --demos.randomise)": described(DISTURBANCES, _disturbance),
+        "encoders (--policy.encoder)": described(ENCODERS, _encoder),
         "presets (--preset)": _presets(),
         "policies (--policy, --policy.encoder-weights)": _policies(),
     }
@@ -57,10 +55,10 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _parts(registry: Registry, described: Callable[[Any], str]) -> Iterator[Row]:
+def described(registry: Registry, describe: Callable[[Any], str]) -> Iterator[Row]:
     for name in registry.names():
         try:
-            yield name, described(registry.get(name))
+            yield name, describe(registry.get(name))
         except errors.UsageError as error:  # of a package that cannot be used
             yield name, f"cannot be used: {error.got}"
         except Exception as error:
@@ -88,7 +86,7 @@ def _tool(tool: Tool) -> str:
 
 
 def _methods() -> Iterator[Row]:
-    yield from _parts(methods.METHODS.registry, _method)
+    yield from described(methods.METHODS.registry, _method)
     yield "all", f"the {len(methods.TABLE_II)} of the paper's Table II"
 
 
@@ -112,25 +110,13 @@ def _learner(learner: Any) -> str:
     return ", ".join(field.name for field in dataclasses.fields(learner.settings))
 
 
-def _format(form: Any) -> str:
-    return form.description
-
-
-def _mappings() -> Iterator[Row]:
-    from starjax.data.formats import base, mapping, own_columns, ready
-
-    yield base.OURS, own_columns.ABOUT
-    for name in ready.names():
-        yield name, mapping.load(ready.find(name)).about
-
-
 def _disturbance(disturbance: Any) -> str:
     return disturbance.description
 
 
 def _presets() -> Iterator[Row]:
     yield "auto", "gpu where jax runs on one, else cpu"
-    yield from _parts(presets.PRESETS.registry, _preset)
+    yield from described(presets.PRESETS.registry, _preset)
 
 
 def _preset(preset: RunConfig) -> str:
@@ -150,4 +136,4 @@ def _policies() -> Iterator[Row]:
         )
         task = about["scene"]["task"]
         yield name, f"{label} for {task}; successes at trocars: {scores}"
-    yield from _parts(POLICIES, lambda policy: f"{policy.description}, for {policy.task}")
+    yield from described(POLICIES, lambda policy: f"{policy.description}, for {policy.task}")

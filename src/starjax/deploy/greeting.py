@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from starjax import config, config_json, errors, limits, methods
-from starjax.data.formats import peer_columns
+from starjax.data import pose_rows
 from starjax.deploy import wire
 from starjax.deploy.inputs import InputSpec
 from starjax.errors import UsageError
@@ -67,7 +67,7 @@ def read(metadata: Any) -> Greeting:
     execute = settings.execute if spec or "execute" in metadata else 0
     method = str(metadata.get("method")) if spec else methods.SERVED
     action_space = metadata.get("action_space", "pose")
-    errors.choice("greeting.action_space", str(action_space)[:80], peer_columns.ACTIONS)
+    errors.choice("greeting.action_space", str(action_space)[:80], pose_rows.ACTIONS)
     return Greeting(
         spec,
         _scene(metadata.get("scene")),

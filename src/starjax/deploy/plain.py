@@ -67,7 +67,7 @@ def decode(
 
     Args:
       spec: inputs of the policy.
-      action_space: key of `peer_columns.ACTIONS`.
+      action_space: key of `pose_rows.ACTIONS`.
       task: of the scene.
       value: the answer.
       trocar: measured trocars `[*arms]` of the request.

@@ -4,8 +4,8 @@
 >>> env = gymnasium.make("starjax/PegTransfer-v0", trocar="unseen", action_space="rcm4")
 
 Gymnasium reads no entry points, so the module is imported, by hand or in the name:
-`gymnasium.make("starjax.envs:starjax/PegTransfer-v0")`. `starjax.envs.playground` needs no
-Gymnasium.
+`gymnasium.make("starjax.envs:starjax/PegTransfer-v0")`. The add-on
+`playground` needs no Gymnasium.
 """
 
 import importlib.util

@@ -20,7 +20,7 @@ from gymnasium.vector.utils import batch_space
 
 from starjax import errors, rcm
 from starjax.data import pose_rows
-from starjax.data.formats.peer_columns import ACTIONS
+from starjax.data.pose_rows import ACTIONS
 from starjax.envs import batch, forked, mdp, settings, vector
 from starjax.sim import wrists
 from starjax.sim.tasks.base import Task

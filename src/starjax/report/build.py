@@ -5,12 +5,11 @@ import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from starjax import errors, methods
+from starjax import errors, extensions, methods
 from starjax.report import (
     compare,
     figures,
     page,
-    playback_3d,
     results,
     scene_view,
     stress,
@@ -121,12 +120,13 @@ def _film(
     return film
 
 
-def _playback(
-    runs: Sequence[results.Run], report: Callable[[str], None]
-) -> playback_3d.Playback | None:
+def _playback(runs: Sequence[results.Run], report: Callable[[str], None]) -> page.Playback | None:
     """Records rollouts in 3D; if that fails, reports the reason."""
+    record = extensions.hook("playback")
+    if record is None:
+        return None
     try:
-        return playback_3d.record(runs)
+        return record(runs)
     except (OSError, RuntimeError, errors.UsageError) as error:  # no trocar, or an unknown scene
         report(f"no rollouts in 3D: {error}")
         return None

@@ -6,6 +6,7 @@ The page links to no other file. Its only script is that of the rollouts in 3D, 
 import base64
 import statistics
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import jinja2
 
@@ -15,7 +16,6 @@ from starjax.report import (
     formats,
     notes,
     outcomes,
-    playback_3d,
     results,
     sections,
     stats,
@@ -27,12 +27,24 @@ from starjax.report import (
 Figures = Mapping[str, tuple[bytes, bytes]]
 
 
+class Playback(NamedTuple):
+    """A page with rollouts in 3D.
+
+    Attributes:
+      html: the page.
+      caption: names of the rollouts.
+    """
+
+    html: str
+    caption: str
+
+
 def render(
     runs: Sequence[results.Run],
     focus: results.Run,
     figures: Figures,
     video: bytes | None,
-    playback: playback_3d.Playback | None = None,
+    playback: Playback | None = None,
 ) -> str:
     """Renders the page of `runs`, whose headline numbers are those of `focus`."""
     return (

@@ -18,6 +18,7 @@ from starjax.sim.tasks.rescue import Rescuer
 
 POLICY, EXPERT, PERSON = range(3)  # values of the field `actor`, see `episodes.FIELDS`
 ACTOR, CAUSE = "actor", "cause"  # recorded fields, `[N]` uint8
+INTERVENTION = "intervention"  # source of records of an expert or a person who took over
 PROGRESSED = "progressed"  # the same, int32: step of the latest progress
 
 
@@ -125,3 +126,16 @@ RECORDS = {
     "image": episodes.SCORE._replace(fields=_fields),
     "state": episodes.SCORE._replace(fields=_fields, observes=True),
 }
+
+
+def with_actor(description: dict[str, Any], source: str, policy: str) -> dict[str, Any]:
+    """Returns the description of a dataset whose commands come from several agents.
+
+    Args:
+      description: see `schema.describe`.
+      source: of the episodes' records.
+      policy: digest of the policy.
+    """
+    actor = {"shape": [], "dtype": "|u1", "what": episodes.what(ACTOR)}
+    features = {**description["features"], ACTOR: actor}
+    return {**description, "features": features, "learned": source, "policy": policy}

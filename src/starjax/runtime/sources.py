@@ -16,7 +16,7 @@ from typing import Any
 
 _OURS = "starjax"
 # Of starjax, the modules of tasks alone: an edit of another module leaves demonstrations valid.
-_TASKS = "starjax.sim.tasks."
+_TASKS = ("starjax.sim.tasks.", "starjax.addons.")
 _SHARED = frozenset({"starjax.sim.tasks.base"})  # the interface
 _DIGITS = 16
 _SKIPPED = (tokenize.COMMENT, tokenize.NL)

@@ -9,6 +9,7 @@ dict from (arm, tool, workspace) to `Mount`, for arms of other packages; one of 
 import warnings
 from typing import TYPE_CHECKING
 
+from starjax import extensions
 from starjax.registry import Registry, entries
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.names import SceneNames
@@ -26,11 +27,7 @@ tasks = Registry(
         "needle_handover": "starjax.sim.tasks.needle_handover.task:TASK",
         "ring_on_wire": "starjax.sim.tasks.ring_on_wire.task:TASK",
         "endoscope_track": "starjax.sim.tasks.endoscope_track.task:TASK",
-        "needle_regrasp": "starjax.sim.tasks.needle_regrasp.task:TASK",
-        "needle_drive": "starjax.sim.tasks.needle_drive.task:TASK",
-        "needle_drive_sh": "starjax.sim.tasks.needle_drive.task:SMALL",
-        "needle_drive_dial": "starjax.sim.tasks.needle_drive.dial:TASK",
-        "suture_throw": "starjax.sim.tasks.suture_throw.task:TASK",
+        **extensions.parts("task"),
     },
     "starjax.sim.tasks.base:Task",
 )
@@ -67,27 +64,7 @@ workspaces = Registry(
 )
 rescuers = Registry(
     "rescuer",
-    {
-        **{
-            name: f"starjax.sim.tasks.{name}.rescue:RESCUER"
-            for name in (
-                "peg_transfer",
-                "needle_pick",
-                "ring_on_wire",
-                "reach",
-                "endoscope_track",
-                "needle_handover",
-                "peg_transfer_bimanual",
-                "needle_regrasp",
-                "suture_throw",
-            )
-        },
-        "needle_drive": "starjax.sim.tasks.needle_drive.rescue:RESCUER",
-        "needle_drive_sh": "starjax.sim.tasks.needle_drive.rescue:SMALL",
-        "needle_drive_dial": "starjax.sim.tasks.needle_drive.rescue:DIAL",
-        "needle_drive_dial.one_plane": "starjax.sim.tasks.needle_drive.rescue:DIAL_ONE_PLANE",
-        "peg_transfer.one_wall": "starjax.sim.tasks.peg_transfer.rescue:WITH_ONE_WALL",
-    },
+    extensions.parts("rescuer"),
     "starjax.sim.tasks.rescue:Rescuer",
 )
 

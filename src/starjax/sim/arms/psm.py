@@ -1,7 +1,7 @@
 """The dVRK's patient side manipulator: a mechanical remote centre, its joints named as in CRTK.
 
 With the tool `needle_driver` it is the robot of the Denavit-Hartenberg parameters in its public
-description (a test). `deploy.psm` has its closed forms, `deploy.crtk` its messages.
+description (a test). `addons.robots.psm` has its closed forms, `addons.robots.crtk` its messages.
 """
 
 import math

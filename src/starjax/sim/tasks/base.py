@@ -235,7 +235,7 @@ class Task(NamedTuple):
       least_steps: lower bound of the limit of a demonstration's control steps.
       stalled_s: s without a larger reward after which an episode is in trouble.
       thread: (Measurements) -> `[N, 3]` m, points of a thread, whose links are the MJCF's geoms
-        `thread0`, ..; or None. See `sim.thread`.
+        `thread0`, ..; or None. See `addons.suture.thread`.
       coupling: forces of the task's own, or None.
       endoscope: ranges of the camera `endoscope` in a trocar of its own, or None if `cameras` has
         no such one or a tool carries it.

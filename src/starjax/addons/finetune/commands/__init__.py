@@ -1,0 +1,1 @@
+"""Command `starjax finetune`."""

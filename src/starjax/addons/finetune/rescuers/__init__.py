@@ -1,0 +1,1 @@
+"""Experts that finish an episode which another agent began."""

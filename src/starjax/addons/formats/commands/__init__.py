@@ -1,0 +1,1 @@
+"""Commands `starjax export` and `starjax import`."""

@@ -1,0 +1,177 @@
+"""robomimic's HDF5: one file, a group an episode; any HDF5 of such groups is read.
+
+    data            attributes total, env_args
+    data/demo_<i>   attribute num_samples; actions [T, n] in [-1, 1], rewards, dones, obs/<name>
+    mask/<name>     episodes of a subset
+
+There is no next_obs: it would hold every image twice, and no imitation learner reads it.
+"""
+
+import contextlib
+import json
+import re
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from starjax.addons.formats import base
+from starjax.addons.formats.base import Column, Source
+from starjax.rollouts import episodes
+
+SUFFIXES = (".hdf5", ".h5")
+_NAMES = {
+    "state": "obs/state",
+    "action": "actions",
+    "trocar": "obs/trocar",
+    "environment_state": "obs/environment_state",
+    "reward": "rewards",
+    "done": "dones",
+}
+_DEMO = re.compile(r"(?:demo|episode|traj)_?(\d+)")
+_MAX_DEPTH = 6  # groups within groups
+
+
+def named(column: str) -> str:
+    """Returns robomimic's name of a starjax column."""
+    if column.startswith(episodes.IMAGE):
+        return f"obs/{column.removeprefix(episodes.IMAGE)}_image"
+    return _NAMES.get(column, column.replace(".", "/", 1))
+
+
+@contextlib.contextmanager
+def _open(path: Path) -> Iterator[Source]:
+    with h5py.File(path, "r") as file:
+        refuse_links(file)
+        data: Any = file.get("data", file)
+        base.require(isinstance(data, h5py.Group), "a group of episodes", data)
+        names = {int(match[1]): name for name in data if (match := _DEMO.fullmatch(name))}
+        demos = [data[names[number]] for number in sorted(names)]
+        base.require(bool(demos), "groups data/demo_<i>", sorted(data)[:5])
+        lengths = [episode_length(demo) for demo in demos]
+        first: dict[str, Any] = datasets(demos[0])
+        ours: Any = file.get(base.OURS)
+        columns = {
+            name: Column(dataset.shape[1:], dataset.dtype.name)
+            for name, dataset in first.items()
+            if dataset.shape[:1] == (lengths[0],) and dataset.dtype.kind in "biuf"
+        }
+
+        def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
+            arrays = {}
+            for name in names:
+                dataset = demos[episode][name]
+                base.require_fits(name, dataset.shape, dataset.dtype)
+                arrays[name] = dataset[()]
+            return arrays
+
+        origin = None
+        if _is_data(ours) and ours.dtype == np.uint8 and ours.ndim == 1:
+            base.require_fits(base.OURS, ours.shape, ours.dtype)
+            origin = json.loads(bytes(ours[()]))
+            base.require(isinstance(origin, dict), f"a map in {base.OURS}", type(origin).__name__)
+        about = _attribute(data, "env_args")
+        hz = base.origin_hz(origin) or float(_hz(about))
+        yield Source(hz, lengths, columns, read, origin, task=str(about.get("env_name", "")))
+
+
+def _write(path: Path, source: Source, video: bool) -> None:
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        names = []
+        for episode, length in enumerate(source.lengths):
+            names.append(f"demo_{episode}")
+            demo = data.create_group(names[-1])
+            demo.attrs["num_samples"] = length
+            for name, array in source.read(episode, source.columns).items():
+                if name == "actions":
+                    largest = float(np.abs(array).max())
+                    base.require(largest <= 1.0, "actions in [-1, 1] (m from the origin)", largest)
+                packed: dict[str, Any] = {}
+                if source.columns[name].is_image:  # a frame per chunk: they are read in any order
+                    packed = {"compression": "gzip", "compression_opts": 1}
+                    packed["chunks"] = (1, *array.shape[1:])
+                array = array.astype(np.uint8) if array.dtype == bool else array
+                demo.create_dataset(name, data=array, **packed)
+        data.attrs["total"] = sum(source.lengths)
+        about = {"env_name": source.task, "env_type": 2, "env_kwargs": {"robot": source.robot}}
+        data.attrs["env_args"] = np.bytes_(json.dumps(about | {"control_freq": source.hz}))
+        file.create_dataset("mask/train", data=np.array(names, h5py.string_dtype()))
+        if source.origin:
+            # Bytes of a dataset: attributes hold 64 kB, and a damaged string hangs HDF5.
+            text = json.dumps(source.origin).encode()
+            file.create_dataset(base.OURS, data=np.frombuffer(text, np.uint8))
+
+
+def _recognises(path: Path) -> bool:
+    return path.is_file() and path.suffix in SUFFIXES
+
+
+def refuse_links(file: h5py.File) -> None:
+    """Refuses files that lead out of themselves, in circles, or many ways to the same place."""
+    addresses = set()
+
+    def look(group: Any, depth: int) -> None:
+        base.require(depth <= _MAX_DEPTH, f"at most {_MAX_DEPTH} groups deep", group.name)
+        address = h5py.h5o.get_info(group.id).addr
+        # With sixty names a group, six deep, a file of 100 kB has more paths than can be walked.
+        base.require(address not in addresses, "one name a group", f"another: {group.name}")
+        addresses.add(address)
+        for name in group:
+            link = group.get(name, getlink=True)
+            plain = isinstance(link, h5py.HardLink)
+            base.require(plain, "no links", f"{type(link).__name__} {group.name}/{name}")
+            child = group[name]
+            if isinstance(child, h5py.Group):
+                look(child, depth + 1)
+            elif isinstance(child, h5py.Dataset):
+                outside = child.is_virtual or bool(child.external)
+                base.require(not outside, "data inside the file", f"{child.name} elsewhere")
+
+    look(file, 0)
+
+
+def datasets(group: Any) -> dict[str, Any]:
+    """Returns the datasets of a group by their paths."""
+    found = {}
+    group.visititems(lambda name, item: found.update({name: item} if _is_data(item) else {}))
+    return found
+
+
+def _is_data(item: Any) -> bool:
+    return isinstance(item, h5py.Dataset) and item.shape is not None
+
+
+def episode_length(demo: Any) -> int:
+    """Returns the control steps of an episode: those of its actions, or the most common length."""
+    base.require(isinstance(demo, h5py.Group), "a group an episode", f"a dataset {demo.name}")
+    name = next((name for name in ("actions", "action") if name in demo), None)
+    if name is not None:
+        actions = demo[name]
+        is_steps = _is_data(actions) and bool(actions.shape)
+        base.require(is_steps, "a dataset of control steps", actions.name)
+        return int(actions.shape[0])
+    counts = [dataset.shape[0] for dataset in datasets(demo).values() if dataset.shape]
+    base.require(bool(counts), "datasets of control steps", f"none in {demo.name}")
+    return int(max(set(counts), key=counts.count))
+
+
+def _attribute(data: Any, name: str) -> dict[str, Any]:
+    # HDF5 may hang over a damaged string of any length, so only those of a fixed one are read.
+    if name not in data.attrs or data.attrs.get_id(name).dtype.kind != "S":
+        return {}
+    try:
+        value = json.loads(data.attrs[name])
+    except (KeyError, TypeError, ValueError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _hz(about: dict[str, Any]) -> float:
+    kwargs = about.get("env_kwargs")
+    return about.get("control_freq") or (kwargs or {}).get("control_freq") or 0.0
+
+
+FORMAT = base.Format("HDF5 of robomimic", named, _recognises, _open, _write)

@@ -1,0 +1,1 @@
+"""The dVRK's patient side manipulator, CRTK's messages, and mounts of arms."""

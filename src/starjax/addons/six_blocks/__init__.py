@@ -1,0 +1,1 @@
+"""Six successive transfers with two arms, an exercise of surgeons."""

@@ -1,0 +1,1 @@
+"""Commands `starjax view` and `starjax teleop`."""

@@ -1,0 +1,279 @@
+"""The live view: an agent at work, or two side by side, through trocars that the user can drag."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from starjax import errors
+from starjax.addons.viewer import page, simulation, success_map
+from starjax.addons.viewer.episode_alarm import EpisodeAlarm
+from starjax.addons.viewer.frame import outcome, rcm_error_mm
+from starjax.addons.viewer.plots import Plots
+from starjax.addons.viewer.simulation import AgentSpec, Simulation
+from starjax.addons.viewer.stage import Stage, aim
+from starjax.addons.viewer.success_map import SuccessMap
+from starjax.addons.viewer.trocar_controls import TrocarControls
+from starjax.sim import registries
+
+OWN_ARMS = "their own"
+_COMPILING = "Compiling {}\nAbout a minute the first time, seconds later."
+_HAND = "No hand", "starjax view --policy NAME --record DIR lets T pass control to your hand."
+REST_S = 1.5  # pause between an episode and the next trial
+
+
+class ViewOptions(NamedTuple):
+    """Initial choices of the page.
+
+    Attributes:
+      agents: one agent, or two with the same task for a view side by side.
+      arm: robot in place of their own, or `OWN_ARMS`.
+      trocar: index of the task's trocar configuration.
+      seed: seed of the trials.
+      sweep: trials that are drawn as dots at their trocars, or None.
+    """
+
+    agents: tuple[AgentSpec, ...]
+    arm: str = OWN_ARMS
+    trocar: int = 0
+    seed: int = 0
+    sweep: SuccessMap | None = None
+
+
+def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> str:
+    """Shows rollouts until `should_stop()`; returns a summary line."""
+    requests = page.UiRequests()
+    status = page.Status(server.gui)
+    player = page.Player(server.gui, requests)
+    selection = Selection(server.gui, requests, options)
+    page.add_command(server.gui, "Pass control", "T", lambda: page.notify(server, *_HAND))
+    page.add_dark_mode(server.gui)
+    rollouts = _load(server, selection, status, options.sweep)
+    rollouts.begin(options.seed, selection.trocar, 0)
+    clock = page.Clock(rollouts.hz)
+    while not should_stop():
+        requested = requests.pop()
+        if "choice" in requested:
+            clock.pause()
+            if selection.is_changed():
+                rollouts.remove()
+                rollouts = _load(server, selection, status, options.sweep)
+            rollouts.trocars.release()
+            rollouts.begin(options.seed, selection.trocar, 0)
+        elif requested & {"again", "next"}:
+            clock.pause()
+            trial = rollouts.trial + ("next" in requested)
+            rollouts.begin(options.seed, selection.trocar, trial)
+        elif "step" in requested or player.is_playing:
+            if player.is_playing:
+                clock.wait(player.speed)
+            if rollouts.advance():
+                requests.add("next")
+        else:
+            clock.pause()
+            rollouts.idle()
+    return f"{rollouts.summary()}; {clock.missed} of {clock.steps} control steps late"
+
+
+class Selection:
+    """Task, agents, robot and trocar that the panel's dropdowns select."""
+
+    def __init__(self, gui: Any, requests: page.UiRequests, options: ViewOptions):
+        self._given = {spec.label: spec for spec in options.agents}
+        labels = [spec.label for spec in options.agents]
+        task = options.agents[0].task
+        names, trocars = list(self._agents(task)), trocar_names(task)
+        self._choices = page.Choices(
+            gui,
+            requests,
+            task=(registries.tasks.names(), task),
+            agent=(names, labels[0]),
+            compare_with=((page.NOBODY, *names), [*labels, page.NOBODY][1]),
+            arm=((OWN_ARMS, *registries.arms.names()), options.arm),
+            trocar=(trocars, trocars[options.trocar]),
+        )
+        self._before = self._values()
+
+    @property
+    def trocar(self) -> int:
+        """Index of the task's trocar configuration."""
+        return int(self._choices["trocar"].split()[0])
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """Robots in place of the agents' own."""
+        return () if self._choices["arm"] == OWN_ARMS else (self._choices["arm"],)
+
+    def agents(self) -> list[AgentSpec]:
+        """Returns the selected agent, or two with the same task."""
+        known = self._agents(self._choices["task"])
+        labels = [self._choices["agent"], self._choices["compare_with"]]
+        return [known[label] for label in labels if label in known]
+
+    def is_changed(self) -> bool:
+        """Returns True if another scene or agent was selected since the last call."""
+        task = self._choices["task"]
+        if task != self._before[0]:
+            names, trocars = list(self._agents(task)), trocar_names(task)
+            self._choices.offer("agent", names, names[0])
+            self._choices.offer("compare_with", (page.NOBODY, *names), page.NOBODY)
+            self._choices.offer("trocar", trocars, trocars[0])
+        before, self._before = self._before, self._values()
+        return before != self._before
+
+    def _values(self) -> tuple[str, ...]:
+        return tuple(self._choices[name] for name in ("task", "agent", "compare_with", "arm"))
+
+    def _agents(self, task: str) -> dict[str, AgentSpec]:
+        requested = {label: spec for label, spec in self._given.items() if spec.task == task}
+        return requested | {spec.label: spec for spec in simulation.available(task)}
+
+
+class Rollouts:
+    """One rollout or two of the same trial on the page, and a tally of the trials so far.
+
+    Attributes:
+      hz: control steps per second.
+      trial: number of the present trial.
+      trocars: their handles and sliders.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        simulations: Sequence[Simulation],
+        status: page.Status,
+        sweep: SuccessMap | None = None,
+        *,
+        trocars: Any = None,
+        is_compiled: bool = False,
+    ):
+        """Adds them to the page; `trocars` take the place of `TrocarControls`."""
+        self._server, self._simulations, self._status = server, simulations, status
+        env, gui = simulations[0].env, server.gui
+        self.hz, self._limit = env.control_hz, round(env.task.time_limit_s * env.control_hz)
+        labels = [simulation.label for simulation in simulations]
+        models = [simulation.env.scene.mj_model for simulation in simulations]
+        self._stages = [Stage(server.scene, model, i) for i, model in enumerate(models)]
+        aim(server, len(simulations))
+        self.trocars = trocars or TrocarControls(server, env.task)
+        self._map = []
+        if sweep and sweep.task == env.task.name:
+            self._map += success_map.add(server.scene, sweep)
+            self._map += [gui.add_markdown(success_map.LEGEND)]
+        self._panel, tab = page.side_panel(gui, "Measured")
+        with tab:
+            self._plots = Plots(gui, labels, self.hz)
+            self._pictures = page.Pictures(gui, [f"{label} sees" for label in labels])
+        self._alarms = [EpisodeAlarm(simulation.monitor) for simulation in simulations]
+        self._tally = np.zeros((len(simulations), 2), int)  # succeeded, ended
+        self._is_compiled, self._is_paused = is_compiled, False
+
+    def begin(self, seed: int, configuration: int, trial: int) -> None:
+        """Starts a trial through a trocar configuration of the task, or the operator's own."""
+        self.trial, self._rest = trial, round(REST_S * self.hz)
+        trocar = self.trocars.own()
+        starts = [one.start(seed, configuration, trial, trocar) for one in self._simulations]
+        self._states, self._frames = map(list, zip(*starts))
+        self._outcomes = [""] * len(starts)
+        self.trocars.place(self._frames[0].p_world_trocar)
+        self._plots.clear()
+        for stage in self._stages:
+            stage.clear()
+        for alarm in self._alarms:
+            alarm.reset()
+        self._draw(with_images=True)
+        if not self._is_compiled:
+            self._compile()
+
+    def advance(self) -> bool:
+        """Runs one control step; returns True once all have ended and rested."""
+        if all(self._outcomes):
+            self._rest -= 1
+            return self._rest <= 0
+        self._is_paused, target = False, self.trocars.target()
+        for i in [i for i, end in enumerate(self._outcomes) if not end]:
+            self._states[i], frame = self._simulations[i].step(self._states[i], target)
+            self._alarms[i].update(self._frames[i], self._states[i])
+            self._frames[i], self._outcomes[i] = frame, outcome(frame, frame.step >= self._limit)
+            self._tally[i] += bool(frame.success), bool(self._outcomes[i])
+        is_due = self._frames[0].step % page.REDRAW_STEPS == 0
+        self._draw(with_images=is_due or all(self._outcomes))
+        return False
+
+    def idle(self) -> None:
+        """Waits while the view is paused; released handles return."""
+        self.trocars.target()
+        if not self._is_paused:
+            self._is_paused = True
+            self._show_status()
+        time.sleep(page.PAUSED_S)
+
+    def summary(self) -> str:
+        """Returns the success so far."""
+        return "; ".join(
+            f"{simulation.label}: {successes} of {ended} trials succeeded"
+            for simulation, (successes, ended) in zip(self._simulations, self._tally)
+        )
+
+    def remove(self) -> None:
+        """Removes everything from the page."""
+        for part in (*self._stages, *self._map, self.trocars, self._panel):
+            part.remove()
+
+    def _draw(self, with_images: bool) -> None:
+        """Draws the 3D view and, if `with_images`, also plots, pictures and status."""
+        with self._server.atomic():
+            for stage, frame in zip(self._stages, self._frames):
+                stage.show(frame)
+        self._plots.add(self._frames)
+        if with_images:
+            self._plots.draw()
+            images = [one.look(state) for one, state in zip(self._simulations, self._states)]
+            self._pictures.show([np.asarray(next(iter(image.values()))) for image in images])
+            self._show_status()
+
+    def _compile(self) -> None:
+        """Compiles the control steps by taking one that is dropped."""
+        labels = " and ".join(one.label for one in self._simulations)
+        self._status.set(_COMPILING.format(f"the control step of {labels}"))
+        for one, state, frame in zip(self._simulations, self._states, self._frames):
+            one.step(state, frame.p_world_trocar)
+        self._is_compiled = True
+        self._show_status()
+
+    def _show_status(self) -> None:
+        self._status.set("\n\n".join(map(self._line, range(len(self._stages)))))
+
+    def _line(self, i: int) -> str:
+        frame, (successes, ended) = self._frames[i], self._tally[i]
+        progress = self._outcomes[i] or self._simulations[i].env.task.stages[int(frame.stage)]
+        lines = [
+            f"{self._simulations[i].label}, trial {self.trial}{', paused' * self._is_paused}: "
+            f"{frame.step / self.hz:.1f} s, {progress}",
+            f"RCM error {rcm_error_mm(frame):.2f} mm; success so far: {successes} of {ended}",
+            self._alarms[i].text,
+        ]
+        return "\n".join(filter(None, lines))
+
+
+def _load(
+    server: Any, selection: Selection, status: page.Status, sweep: SuccessMap | None
+) -> Rollouts:
+    """Loads the selected agents, on their own robots if the selected arm cannot do the task."""
+    specs = selection.agents()
+    labels = " and ".join(spec.label for spec in specs)
+    status.set(_COMPILING.format(labels))
+    try:
+        loaded = [simulation.load(spec, selection.arms) for spec in specs]
+    except errors.UsageError as error:  # an arm without a mount for this task
+        page.notify(server, "Not possible", str(error), is_error=True)
+        loaded = [simulation.load(spec) for spec in specs]
+    return Rollouts(server, loaded, status, sweep)
+
+
+def trocar_names(task: str) -> list[str]:
+    """Returns `INDEX (seen)` or `INDEX (unseen)` of each trocar configuration."""
+    seen = registries.tasks.get(task).is_seen
+    return [f"{i} ({'seen' if is_seen else 'unseen'})" for i, is_seen in enumerate(seen)]
