@@ -1,6 +1,5 @@
-"""Tables of fine-tunings, from results/finetune_*.json: success, goals, and branches."""
+"""Tables of fine-tunings, from results/finetune_*.json: success, and branches."""
 
-import itertools
 import json
 import tomllib
 from pathlib import Path
@@ -15,24 +14,6 @@ RESULTS = HERE / "results"
 COMMAND = "starjax finetune "
 PARTS = ("seen", "unseen")
 MISSING = "–"
-
-
-def goals(folder: Path = RESULTS) -> str:
-    """Returns, for each policy, its goal, the way of the highest success and the others."""
-    header = ["Task, policy", "Goal", "Way", "Before", "After", "Goal met", "RCM p99 (mm)"]
-    rows = [[*header, "Rollouts", "Minutes", "Other ways"]]
-    for label, results in itertools.groupby(finetunings(folder), key=_label):
-        won, *others = results
-        wanted = zip(PARTS, goal_of(won), strict=True)
-        gaps = [(goal - 100 * _after(won)[part]["rate"], part) for part, goal in wanted]
-        left = [f"{gap:.1f} {part}" for gap, part in gaps if gap > 1e-9]
-        cells = [label, " / ".join(f"{x:g}" for x in goal_of(won)), _way(won)]
-        cells += [_percent(won["before"]), _percent(_after(won))]
-        cells.append("missed by " + ", ".join(left) if left else "yes")
-        cells.append(formats.millimetres(_after(won)["rcm_error_mm"]["executed"]["p99"]))
-        cells += [_rollouts(won), _minutes(won)]
-        rows.append([*cells, "; ".join(_brief(x) for x in others) or MISSING])
-    return formats.render(rows, names=1)
 
 
 def ways(folder: Path = RESULTS) -> str:
@@ -149,15 +130,6 @@ def _way(found: dict[str, Any]) -> str:
 
 def _after(found: dict[str, Any]) -> dict[str, Any]:
     return found["after"] if found["best"] else found["before"]
-
-
-def _brief(found: dict[str, Any]) -> str:
-    after = f" {_percent(_after(found))}" if found["best"] else ""
-    return f"{_way(found)}{after}, {_minutes(found)} min"
-
-
-def _percent(report: dict[str, Any]) -> str:
-    return " / ".join(f"{100 * report[part]['rate']:.1f}" for part in PARTS)
 
 
 def _rollouts(found: dict[str, Any]) -> str:

@@ -1,87 +1,96 @@
-"""Pages generated with the site: from the settings, the results, the changelog."""
+"""Builds pages from files outside docs/, and rewrites links that lead there.
+
+Links are written as they work in a checkout. A page `<!-- generated: NAME -->` gets the tables of
+NAME in place of the mark, and a paragraph of one link to a film becomes a player.
+"""
 
 import re
+import sys
 from pathlib import Path
 
 import parts
 import settings
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "experiments"
+sys.path.insert(0, str(RESULTS))
+
+import claims  # noqa: E402
+
 IMAGES = (".png", ".gif")
-# Page -> file of its text.
+# Page of the site -> file of its text.
 COPIES = {
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
-    "explanation/benchmarks.md": "benchmarks/README.md",
+    "reference/benchmarks.md": "benchmarks/README.md",
     "reference/mjcf.md": "mjcf/README.md",
     "results/index.md": "experiments/README.md",
+} | {f"results/{page.name}.md": f"experiments/{page.name}/README.md" for page in claims.pages()}
+GENERATED = {
+    "commands": settings.commands,
+    "settings": settings.settings,
+    "parts": parts.page,
 }
 _LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s]+)(#[^)]*)?\)")
+_MARK = re.compile(r"<!-- generated: (\w+) -->")
+_FILM = re.compile(r"^\[([^\]]*)\]\((\S+\.mp4)\)$", re.MULTILINE)
+_PLAYER = '<video controls muted playsinline preload="metadata" src="{}" aria-label="{}"></video>'
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Lists the pages of results in the navigation: those of `docs/results/`, then the claims."""
-    pages = [f"results/{page.name}" for page in sorted((ROOT / "docs" / "results").glob("*.md"))]
-    pages += [{title(folder): f"results/{folder.name}.md"} for folder in claims()]
-    config.nav.append({"Results": ["results/index.md", *pages]})
-    config.nav.append({"Project": ["contributing.md", "changelog.md"]})
+    """Lists the pages of results in the navigation, in the order of the paper."""
+    groups = [
+        {group: [f"results/{name}.md" for name in names]} for group, names in claims.GROUPS.items()
+    ]
+    config.nav.append({"Results": ["results/index.md", *groups]})
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Adds the pages and their images."""
-    made = {
-        "reference/cli.md": settings.commands(),
-        "reference/config.md": settings.settings(),
-        "reference/parts.md": parts.page(),
-    }
-    made |= {page: relinked(ROOT / source, page) for page, source in COPIES.items()}
-    for folder in claims():
-        page = f"results/{folder.name}.md"
-        made[page] = relinked(folder / "README.md", page)
-        for image in (path for path in folder.rglob("*") if path.suffix in IMAGES):
-            name = f"results/{image.relative_to(RESULTS).as_posix()}"
-            files.append(File.generated(config, name, abs_src_path=str(image)))
-    for page, text in made.items():
+    """Adds the pages from outside docs/ and the pictures of results."""
+    for page, source in COPIES.items():
+        text = relinked((ROOT / source).read_text(), ROOT / source, page)
         files.append(File.generated(config, page, content=text))
+    for image in (path for path in RESULTS.rglob("*") if path.suffix in IMAGES):
+        name = f"results/{image.relative_to(RESULTS).as_posix()}"
+        files.append(File.generated(config, name, abs_src_path=str(image)))
     return files
 
 
-def claims() -> list[Path]:
-    """Returns the folders of results that have a page."""
-    return sorted(page.parent for page in RESULTS.glob("*/README.md"))
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Rewrites links, fills generated tables in, and makes films players."""
+    source = ROOT / "docs" / page.file.src_uri
+    if page.file.src_uri not in COPIES:
+        markdown = relinked(markdown, source, page.file.src_uri)
+    markdown = _MARK.sub(lambda match: GENERATED[match[1]](), markdown)
+    return _FILM.sub(lambda match: _PLAYER.format(match[2], match[1]), markdown)
 
 
-def title(folder: Path) -> str:
-    """Returns the heading of a claim's page."""
-    return (folder / "README.md").read_text().splitlines()[0].removeprefix("# ")
-
-
-def relinked(source: Path, page: str) -> str:
-    """Returns a text of the repository with links that hold in the site, and none to other files.
+def relinked(text: str, source: Path, page: str) -> str:
+    """Returns a text with links that hold in the site, and none to files outside it.
 
     Args:
-      source: the text.
+      text: Markdown with links that hold in a checkout.
+      source: its file.
       page: its path in the site, relative to `docs/`.
     """
     pages = {(ROOT / path).resolve(): name for name, path in COPIES.items()}
-    pages |= {(folder / "README.md").resolve(): f"results/{folder.name}.md" for folder in claims()}
     up = "../" * page.count("/")
 
     def link(match: re.Match) -> str:
-        text, path, place = match[1], match[2], match[3] or ""
+        label, path, place = match[1], match[2], match[3] or ""
         target = (source.parent / path).resolve()
         if "://" in path:
             return match[0]
         if target in pages:
-            return f"[{text}]({up}{pages[target]}{place})"
+            return f"[{label}]({up}{pages[target]}{place})"
         if target.is_relative_to(ROOT / "docs"):
-            return f"[{text}]({up}{target.relative_to(ROOT / 'docs').as_posix()}{place})"
+            return f"[{label}]({up}{target.relative_to(ROOT / 'docs').as_posix()}{place})"
         if target.suffix in IMAGES and target.is_relative_to(RESULTS):
-            return f"[{text}]({up}results/{target.relative_to(RESULTS).as_posix()})"
-        return text
+            return f"[{label}]({up}results/{target.relative_to(RESULTS).as_posix()})"
+        return label
 
-    return _LINK.sub(link, source.read_text())
+    return _LINK.sub(link, text)

@@ -6,9 +6,8 @@ from starjax.sim import registries
 
 
 def page() -> str:
-    """Returns the page of everything with a name, as `starjax list` shows it."""
-    lines = ["---", "hide: [toc]", "---", "# Tasks, arms, tools", ""]
-    lines += ["Names for `--task`, `--arm` and `--tool`.", "", "## Tasks", ""]
+    """Returns tables of everything with a name, as `starjax list` shows it."""
+    lines = ["## Tasks", ""]
     rows = []
     for name in registries.tasks.built_in:
         task = registries.tasks.get(name)

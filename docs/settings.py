@@ -86,17 +86,8 @@ def is_flags(kind: object, module: str) -> bool:
 
 
 def commands() -> str:
-    """Returns the page of all commands."""
-    parts = [
-        "---",
-        "hide: [toc]",
-        "---",
-        "# Commands",
-        "",
-        "`starjax COMMAND --help` prints the flags used most, `--help-all` those below. Ranges are "
-        "checked. `source <(starjax completion bash)` completes commands, flags and names; `zsh` "
-        "and `fish` likewise.",
-    ]
+    """Returns a section per command, with its flags."""
+    parts = []
     for name, (module, summary, needed) in cli.COMMANDS.items():
         module, _, function = module.partition(":")
         loaded = importlib.import_module(module)
@@ -119,15 +110,10 @@ def commands() -> str:
 
 
 def settings() -> str:
-    """Returns the page of all settings of a run, with the values of every preset."""
+    """Returns tables of all settings of a run, with the values of every preset."""
     names = list(presets.PRESETS)
     parts = [
-        *("---", "hide: [toc]", "---"),
-        "# Settings of a run",
-        "",
-        "Flags of `starjax run`, `collect` and `train`; `--demos.no-...` turns a switch off.",
         "Columns of presets show changes of the defaults, and – for options of other learners.",
-        "Defaults are the paper's values if it gives them.",
     ]
     groups: dict[str, list] = {}
     for row in rows(config.RunConfig, config.RunConfig()):

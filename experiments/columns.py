@@ -58,12 +58,17 @@ def paired(pairs: Sequence[Sequence[Scored]], part: str) -> formats.Table:
 
 
 def rate(trials: Sequence[Trial], test: Callable[..., bool] = outcomes.strict) -> str:
-    """Returns successes, trials and interval, such as `784/800: 98.0% (96.8-98.8)`."""
+    """Returns successes, trials and interval, such as `784/800: 98.0% (96.8–98.8)`."""
     if not trials:
         return "–"
     score = outcomes.tally(trials, test)
-    low, middle, high = (100 * x for x in (score.low, score.rate, score.high))
-    return f"{score.successes}/{score.trials}: {middle:.1f}% ({low:.1f}-{high:.1f})"
+    return counted(score.successes, score.trials, (score.low, score.high))
+
+
+def counted(successes: int, trials: int, interval: Sequence[float]) -> str:
+    """Returns successes, trials and their interval."""
+    low, high = (100 * x for x in interval)
+    return f"{successes}/{trials}: {100 * successes / trials:.1f}% ({low:.1f}–{high:.1f})"
 
 
 def _seen(scored: Scored) -> list[Trial]:
@@ -167,7 +172,7 @@ def by_turn(scored: Scored, part: str, k: int) -> stats.Rate:
 def _by_turn(part: str, k: int, scored: Scored) -> str:
     found = by_turn(scored, part, k)
     low, middle, high = (100 * x for x in (found.low, found.rate, found.high))
-    return f"{found.successes}/{found.trials}: {middle:.0f}% ({low:.0f}-{high:.0f})"
+    return f"{found.successes}/{found.trials}: {middle:.0f}% ({low:.0f}–{high:.0f})"
 
 
 COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
@@ -175,8 +180,8 @@ COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
     "unseen": ("unseen", lambda x: rate(_unseen(x))),
     "all": ("all", lambda x: rate(x.run.trials)),
     "loose": ("all, loose", lambda x: rate(x.run.trials, outcomes.loose)),
-    "safe": ("successes always within 2 mm", _safe),
-    "gap": ("gap, points", _gap),
+    "safe": ("successes within 2 mm of the trocar", _safe),
+    "gap": ("gap (percentage points)", _gap),
     "highest": ("highest trocar", lambda x: rate([t for t in _unseen(x) if t.trocar == HIGHEST])),
     "trocars": ("other trocars", _others),
     "near": ("within 10 mm", lambda x: _others(x, 0.0, 0.01)),

@@ -1,4 +1,4 @@
-"""Draws success along the dial: the claim's methods, and the experts, by the needle's turn.
+"""Draws success along the dial: the study's methods, and the experts, by the needle's turn.
 
     python experiments/dial_figure.py docs/images/dial_success.png
 
@@ -34,7 +34,7 @@ def main(file: Path) -> None:
 
 def draw() -> Any:
     """Draws a line per method, solid with the trocar as input of its generator, else dotted."""
-    scored = list(claims.load(HERE / "dial").runs.values())
+    scored = list(claims.load(HERE / "wrist" / "dial").runs.values())
     kinds = ([x for x in scored if METHODS[_method(x)].hierarchical == up] for up in (True, False))
     rows = list(filter(None, kinds))
     with style.use() as shades:

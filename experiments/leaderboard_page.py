@@ -1,18 +1,17 @@
-"""Tables of the trocar benchmark's page: our rows, rows apart, and figures of other papers."""
+"""Tables of the trocar benchmark's page: our rows, and figures of other papers."""
 
+import itertools
 import json
 import tomllib
 from pathlib import Path
 
-import claims
-
 from starjax.report import formats, leaderboard, leaderboard_tables
 
 HERE = Path(__file__).parent
-# Claims whose results were recorded before the benchmark had versions, with its trials.
-BEFORE = ("task_methods", "all_methods", "learners")
 # Reports of fine-tunings: they name the steps of the fine-tuning, not those of the policy.
-FINETUNED = "finetuned"
+FINETUNED = "fine_tuning"
+# Names of the row of another project's policy, which was scored over a socket.
+SERVED = {"Served policy": "ACT (LeRobot)", "ws://127.0.0.1:8765": "served, from states"}
 _ELSEWHERE = ("work", "figure", "n", "where", "differs", "ours", "source", "seen")
 
 
@@ -21,17 +20,15 @@ def ours() -> str:
     files = [file for file in sorted(HERE.rglob("*.json")) if FINETUNED not in file.parts]
     named = [file for file in files if _version(file)]
     rows = leaderboard_tables.current(leaderboard.read(named)[0])
-    return leaderboard_tables.body(rows) if rows else "No committed result yet."
-
-
-def apart() -> str:
-    """Returns the table of the claims' results without a version, and the sentence about them."""
-    runs = [run.run for name in BEFORE for run in claims.load(HERE / name).runs.values()]
-    files = [run.path for run in runs]
-    files += [file.with_name("sweep.json") for file in files if file.name == "result.json"]
-    known = sorted({file.resolve() for file in files if file.is_file()})
-    rows = leaderboard_tables.apart(leaderboard.read(known)[0])
-    return f"{leaderboard_tables.reason(rows)}\n\n{leaderboard_tables.body(rows)}"
+    drawn = [[SERVED.get(cell, cell) for cell in line] for line in leaderboard_tables.table(rows)]
+    filled = [
+        any(cell != leaderboard_tables.NONE for cell in column[1:])
+        for column in zip(*drawn, strict=True)
+    ]
+    table = [list(itertools.compress(line, filled)) for line in drawn]
+    numbered = enumerate(leaderboard_tables.commands(rows), 1)
+    commands = "\n".join(f"{number}. `{command}`" for number, command in numbered)
+    return f"{formats.render(table, names=3)}\n\n{commands}"
 
 
 def elsewhere() -> str:
@@ -46,4 +43,4 @@ def _version(file: Path) -> int | None:
     return json.loads(file.read_bytes()).get("benchmark_version")
 
 
-TABLES = {"leaderboard": ours, "leaderboard_apart": apart, "elsewhere": elsewhere}
+TABLES = {"leaderboard": ours, "elsewhere": elsewhere}

@@ -137,18 +137,10 @@ def test_commands_parse(page, root, flags):
                 assert not choices or value in choices.split(","), (word, value)
 
 
-def test_links_lead_somewhere(page, root):
-    """The site's own builder looks at them too, but for those of README and CONTRIBUTING."""
-    made = {"config", "cli", "parts", "mjcf", "index", "benchmarks"} | {
-        folder.parent.name for folder in root.glob("experiments/*/README.md")
-    }
+def test_links_lead_somewhere(page):
+    """Links work in a checkout; the site's builder rewrites those that leave docs/."""
     for target in LINK.findall(FENCE.sub("", page.read_text())):
-        if "://" in target or not page.is_relative_to(root / "docs"):
-            assert "://" in target or (page.parent / target).exists(), target
-        else:
-            path = page.parent / target
-            assert path.resolve().is_relative_to(root.resolve() / "docs"), target
-            assert path.exists() or path.stem in made or path.suffix in (".png", ".gif"), target
+        assert "://" in target or (page.parent / target).exists(), target
 
 
 def test_included_files_are_as_they_are(page, root):

@@ -70,7 +70,7 @@ _BUILT_IN: dict[str, RunConfig] = {
             checkpoint_every=1_000,
             log_every=100,
         ),
-        # No success in experiments/cpu_main_job took 19 s; a failure takes the whole limit.
+        # No success in experiments/main_job/cpu took 19 s; a failure takes the whole limit.
         eval=EvalConfig(trials=6, time_limit_s=20.0, video_trials=4),
     ),
     # One modern GPU, some minutes: the encoder of the compact policy, as in `cpu`, and a network of
@@ -96,7 +96,7 @@ _BUILT_IN: dict[str, RunConfig] = {
             ema_max=0.9995,
             checkpoint_every=4_000,
         ),
-        # No success in experiments/gpu_main_job took 10 s; a failure takes the whole limit.
+        # No success in experiments/main_job/gpu took 10 s; a failure takes the whole limit.
         eval=EvalConfig(time_limit_s=30.0),
     ),
     # One modern GPU, six minutes: the paper's learner and its encoder from scratch. With its
@@ -162,8 +162,8 @@ class Timing(NamedTuple):
 
 
 TIMINGS = {
-    "cpu": Timing("2 cores of an AMD EPYC", "cpu", 242.6, "cpu_main_job/run.json"),
-    "gpu": Timing("an NVIDIA H200 with 16 cores", "gpu", 195.3, "gpu_main_job/encoder_0.json"),
+    "cpu": Timing("2 cores of an AMD EPYC", "cpu", 242.6, "main_job/cpu/run.json"),
+    "gpu": Timing("an NVIDIA H200 with 16 cores", "gpu", 195.3, "main_job/gpu/encoder_0.json"),
 }
 
 
