@@ -1,4 +1,4 @@
-"""The script of docs/howto/add-arm.md makes a ready arm of a file like those of Menagerie."""
+"""The script of docs/extend/add-arm.md makes a ready arm of a file like those of Menagerie."""
 
 import re
 import sys

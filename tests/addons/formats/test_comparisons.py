@@ -13,7 +13,7 @@ from strangers import ARM, MAP, P_WORLD_REF, TROCARS, bring, source
 from starjax.addons.formats import doubts
 from starjax.addons.formats.mapping import ArmColumns, ShaftColumns
 
-PAGE = pathlib.Path(__file__).parents[3] / "docs/howto/other-peoples-data.md"
+PAGE = pathlib.Path(__file__).parents[3] / "docs/use/other-peoples-data.md"
 COMMANDS = {"command_position": "cp", "command_rotation": "R0"}
 
 

@@ -4,7 +4,7 @@
 
 The package is `tests/peers/lab`: a task with a hinge, a learner with a scalar parameter, a format,
 a disturbance, a method, a preset, and a policy that is a program. The arm is the one with slides of
-docs/howto/add-arm.md.
+docs/extend/add-arm.md.
 """
 
 import json

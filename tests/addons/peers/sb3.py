@@ -27,7 +27,7 @@ except ImportError:
 from starjax.runtime import provenance
 
 GAMMA = 0.9
-# Noise begins small: see docs/howto/reinforcement-learning.md. Steps and batches are those of
+# Noise begins small: see docs/use/reinforcement-learning.md. Steps and batches are those of
 # examples/ppo.py.
 LEARNERS = {
     "sac": (
