@@ -1,4 +1,4 @@
-"""The arm and the tool of docs/howto as installed packages, built from their pages' blocks."""
+"""The arm and the tool of docs/extend as installed packages, built from their pages' blocks."""
 
 import pathlib
 import re
@@ -10,7 +10,7 @@ _GROUP = re.compile(r'entry-points\."([\w.]+)"\]\n(\w+) = "([\w.]+):(\w+)"')
 
 def install(site: pathlib.Path, page: str = "add-arm") -> str:
     """Writes a page's package into `site`; returns the name of its part."""
-    blocks = dict(_FENCE.findall((ROOT / "docs" / "howto" / f"{page}.md").read_text()))
+    blocks = dict(_FENCE.findall((ROOT / "docs" / "extend" / f"{page}.md").read_text()))
     entries = _GROUP.findall(blocks["toml"])
     _, name, module, _ = entries[0]
     package = module.partition(".")[0]
