@@ -69,6 +69,9 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
             messages.indented(f"damaged, collected again: {error}")
             (root / "SEALED.json").unlink()
             return False
+        except errors.UsageError as error:
+            argument = _FROM if config.demos.from_ else error.argument
+            raise errors.UsageError(argument, error.expected, error) from error
         return True
 
     attempts = itertools.count()
@@ -211,7 +214,7 @@ def complete(
     """Collects missing and damaged demonstrations.
 
     Raises:
-      errors.UsageError: those of --demos.from are damaged.
+      errors.UsageError: those of --demos.from are damaged, or none is a success.
     """
     from starjax.data import load as loading
     from starjax.data import store
@@ -226,6 +229,9 @@ def complete(
             messages.indented(f"damaged, collected again: {error}")
             (root / "SEALED.json").unlink()
             return False
+        except errors.UsageError as error:
+            argument = _FROM if config.demos.from_ else error.argument
+            raise errors.UsageError(argument, error.expected, error) from error
         return True
 
     collect()

@@ -17,7 +17,7 @@ DESCRIPTION = """Summarises a dataset, policy or result and flags anomalies.
 PATH is a directory of demonstrations, a dataset in a format of starjax list, a policy.safetensors
 or the name of a packaged policy, a result.json or a directory with one. --page writes a page with
 figures of a dataset: trocars and their wander, RCM error, reach, speed, jaws, and images of one
-episode, drawn for it.
+episode, drawn for it. --map adds the notes of an import.
 
 Examples:
   starjax inspect runs/cpu/demos-0123456789ab
@@ -58,6 +58,9 @@ def main(argv: Sequence[str]) -> int:
             path, args.map, Path(args.page), summary.rows, summary.odd, args.image_size
         )
         summary = Found([*summary.rows, ("page", args.page)], odd)
+    elif args.map:
+        _, odd = inspect_page.mapped(hub.dataset("PATH", args.path), args.map)
+        summary = Found(summary.rows, list(dict.fromkeys([*summary.odd, *odd])))
     width = max(len(name) for name, _ in summary.rows)
     for name, text in summary.rows:
         print(errors.printable(f"{name:{width}}  {text}".rstrip()))

@@ -10,6 +10,7 @@ from starjax.runtime import files
 if TYPE_CHECKING:
     import numpy as np
 
+    from starjax.data.recordings import EpisodeMotion
 
 _MOMENTS = 6  # images of an episode
 
@@ -45,12 +46,18 @@ def write(
         found = list(recordings.of_dataset(path))
         images = _images(path, image_size) if image_size else {}
     else:
-        found, notes = extensions.hook("inspect_page")(path, map_name)
+        found, notes = mapped(path, map_name)
     if not found:
         raise errors.UsageError("PATH", "episodes with motions", f"none in {path}")
-    text = recording_page.render(path.name, rows, found, [*odd, *notes], images)
+    notes = list(dict.fromkeys([*odd, *notes]))
+    text = recording_page.render(path.name, rows, found, notes, images)
     files.write_bytes(page, text.encode())
-    return [*odd, *notes]
+    return notes
+
+
+def mapped(path: Path, map_name: str) -> "tuple[list[EpisodeMotion], list[str]]":
+    """Returns the first motions of another project's dataset, and the notes of its import."""
+    return extensions.hook("inspect_page")(path, map_name)
 
 
 def _images(path: Path, size: int) -> "dict[str, np.ndarray]":

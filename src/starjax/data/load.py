@@ -161,7 +161,7 @@ def _successful(root: Path, sealed: dict[str, Any], verify: bool) -> list[store.
     """Returns the records of successful episodes, once all episodes are verified."""
     records = [r for r in store.sealed_records(root, sealed, verify) if r["success"]]
     if not records:
-        raise ValueError(f"root: expected successful demonstrations, got none in {root}")
+        raise errors.UsageError("root", "successful demonstrations", f"none in {root}")
     return records
 
 

@@ -16,6 +16,7 @@ from starjax.rollouts import episodes, programs
 from starjax.runtime import jax_settings, sources, xla
 from starjax.sim import registries
 
+IMPORTED_FILES = "imported_files.json"  # bytes and time of each file of others
 IMPORTED = "imported.json"  # beside dataset.json: what was odd about the files of others
 # Demonstrations never start from the states that an evaluation with the same seed draws.
 STREAM = 0x64656D6F

@@ -27,7 +27,16 @@ from strangers import (
 )
 
 from starjax import errors, rcm
-from starjax.addons.formats import base, exchange, foreign, mapping, motion, tip_poses, trocars
+from starjax.addons.formats import (
+    base,
+    exchange,
+    foreign,
+    mapping,
+    motion,
+    timing,
+    tip_poses,
+    trocars,
+)
 from starjax.addons.formats.mapping import ArmColumns, CameraColumn, Map, ShaftColumns
 from starjax.data import anomalies, load, schema, store
 
@@ -194,11 +203,11 @@ def test_a_urdfs_tip_may_be_at_a_fixed_joint_and_its_links_without_mass(tmp_path
 def test_images_that_lose_their_ratio_of_sides_are_named():
     given = source(images=True)  # 12 x 16
     cameras = {"camera": CameraColumn(column="image", size=8)}
-    (line,) = foreign.squeezed(given, structs.replace(MAP, cameras=cameras))
+    (line,) = foreign._squeezed(given, structs.replace(MAP, cameras=cameras))
     assert "camera" in line and "12 x 16" in line
     for kept in ({"crop": (0, 2, 12, 12)}, {"size": 0}):
         camera = structs.replace(cameras["camera"], **kept)
-        assert not list(foreign.squeezed(given, structs.replace(MAP, cameras={"camera": camera})))
+        assert not list(foreign._squeezed(given, structs.replace(MAP, cameras={"camera": camera})))
 
 
 def test_uneven_times_with_small_gaps_are_filled_in_and_said(tmp_path):
@@ -218,7 +227,7 @@ def test_long_gaps_leave_the_episode_out():
     times = np.concatenate([np.arange(60) / 30, 3.0 + np.arange(60) / 30])
     made = structs.replace(MAP, time="time")
     given = source(times)
-    with pytest.raises(motion.Gap):
+    with pytest.raises(timing.Gap):
         motion.read(given.read(0, mapping.names(made)), made, 30.0, None)
     patient = structs.replace(made, max_gap_s=2.0)
     assert motion.read(given.read(0, mapping.names(made)), patient, 30.0, None).notes

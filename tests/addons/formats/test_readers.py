@@ -157,7 +157,7 @@ def write_bag(path, episode, storage):
             turn = types["geometry_msgs/msg/Quaternion"](*map(float, xyzw[i]))
             pose = types["geometry_msgs/msg/Pose"](point, turn)
             stamped = types["geometry_msgs/msg/PoseStamped"](header(t), pose)
-            image = types["sensor_msgs/msg/CompressedImage"](header(t), "jpeg", jpeg(SHADE))
+            image = types["sensor_msgs/msg/CompressedImage"](header(t), "jpeg", jpeg(SHADE + i))
             messages = (image, joints(t - 1e-3, q[i]), joints(t - 1e-3, jaw[i]), stamped)
             for connection, message in zip((to[3], to[1], to[2], to[0]), messages):
                 data = store.serialize_cdr(message, connection.msgtype)

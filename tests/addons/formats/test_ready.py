@@ -96,7 +96,8 @@ def _number(record):
 def test_texts_are_kept(written):
     *_, root = written("open-h-dvrk")
     about = json.loads((root / schema.IMPORTED).read_text())
-    assert len(about["columns"]) == 1 and not about["notes"]  # depth, which nobody maps
+    depth, squeezed = about["columns"]  # depth, which nobody maps
+    assert "depth" in depth and "side" in squeezed and not about["notes"]
     texts = about["texts"]
     assert texts["instruction.text"] == {"pick up the needle": 4}
     assert texts["observation.meta.tool.psm1"] == {"Large Needle Driver": 4}

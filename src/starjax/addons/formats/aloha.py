@@ -13,7 +13,6 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from PIL import Image
 
@@ -26,27 +25,18 @@ _IMAGES = "observations/images/"
 
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[Source]:
-    found = per_file.files(path, "episode_*.h*5")
-    lengths = []
-    columns: dict[str, Column] = {}
-    for file in found:
-        with _opened(file) as data:
-            length = robomimic.episode_length(data)
-            columns = columns or _columns(data, length)
-            lengths.append(length)
-
-    def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
-        with _opened(found[episode]) as data:
-            return {name: _array(data, name) for name in names}
-
-    yield Source(0.0, lengths, columns, read)
+    yield per_file.source(per_file.files(path, "episode_*.h*5"), _read, hz=0.0, look=_look)
 
 
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    with h5py.File(path, "r") as file:
-        robomimic.refuse_links(file)
-        yield file
+def _look(path: Path) -> tuple[int, dict[str, Column]]:
+    with robomimic.opened(path) as data:
+        length = robomimic.episode_length(data)
+        return length, _columns(data, length)
+
+
+def _read(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
+    with robomimic.opened(path) as data:
+        return {name: _array(data, name) for name in names if name in data}
 
 
 def _columns(data: Any, length: int) -> dict[str, Column]:

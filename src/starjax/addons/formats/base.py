@@ -51,6 +51,22 @@ class Column(NamedTuple):
         return self.dtype == "uint8" and len(self.shape) == 3 and self.shape[2] == 3
 
 
+class StepTimes(NamedTuple):
+    """Times of an episode's steps, and of the streams that they show.
+
+    Attributes:
+      times: `[T]` s.
+      ages: stream -> `[T]` s since its value at a step was stamped, infinite before the first.
+      periods: stream -> s between its values.
+      notes: on clocks that disagree.
+    """
+
+    times: np.ndarray
+    ages: Mapping[str, np.ndarray]
+    periods: Mapping[str, float]
+    notes: Sequence[str]
+
+
 class Source(NamedTuple):
     """A dataset of any format, read an episode at a time.
 
@@ -65,6 +81,10 @@ class Source(NamedTuple):
       notes: anomalies of the files, one per line.
       splits: name -> its episodes, e.g. `train`, `test`, `recovery`, `failure`.
       texts: (episode) -> texts by column: instructions, tools.
+      files: name -> its bytes and time of change in ns.
+      faults: episode -> reason why it cannot be read.
+      timing: (episode) -> times, of a format whose columns are streams with times of their own.
+      by: (columns) -> the source of these streams joined at the first; None if columns are rows.
     """
 
     hz: float
@@ -77,6 +97,10 @@ class Source(NamedTuple):
     notes: Sequence[str] = ()
     splits: Mapping[str, range] = {}
     texts: Callable[[int], Mapping[str, Sequence[str]]] = lambda episode: {}
+    files: Mapping[str, tuple[int, int]] = {}
+    faults: Mapping[int, str] = {}
+    timing: Callable[[int], StepTimes] | None = None
+    by: "Callable[[Sequence[str]], Source] | None" = None
 
 
 class Format(NamedTuple):
@@ -142,22 +166,49 @@ def open_dataset(path: Path, name: str) -> Iterator[Source]:
             require(bool(source.lengths), "episodes", 0)
             require(0.0 <= source.hz < _MAX_HZ, "steps per second", source.hz)
 
-        def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
+        yield _checked(source._replace(files=dict(_files(path))), path, name)
+
+
+def _files(path: Path) -> Iterator[tuple[str, tuple[int, int]]]:
+    """Yields names, bytes and times of the files of a dataset."""
+    for file in [path] if path.is_file() else sorted(path.rglob("*")):
+        if file.is_file():
+            about = file.stat()
+            yield file.relative_to(path.parent).as_posix(), (about.st_size, about.st_mtime_ns)
+
+
+def _checked(source: Source, path: Path, name: str) -> Source:
+    """Returns a source whose readers check their arrays and explain their errors."""
+
+    def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
+        for column in names:
+            errors.choice("column", column, source.columns)
+        with explained(path, name, episode):
+            if episode in source.faults:
+                raise Damaged(source.faults[episode])
+            require(source.lengths[episode] > 0, "control steps", 0)
+            _require_all_fit(source, episode, names)
+            arrays = source.read(episode, names)
             for column in names:
-                errors.choice("column", column, source.columns)
-            with explained(path, name, episode):
-                require(source.lengths[episode] > 0, "control steps", 0)
-                _require_all_fit(source, episode, names)
-                arrays = source.read(episode, names)
-                for column in names:
-                    _check(column, arrays[column], source, episode)
-            return arrays
+                _check(column, arrays[column], source, episode)
+        return arrays
 
-        def texts(episode: int) -> Mapping[str, Sequence[str]]:
-            with explained(path, name, episode):
-                return source.texts(episode)
+    def texts(episode: int) -> Mapping[str, Sequence[str]]:
+        with explained(path, name, episode):
+            return source.texts(episode)
 
-        yield source._replace(read=read, texts=texts)
+    def timing(episode: int) -> StepTimes:
+        assert source.timing is not None
+        with explained(path, name, episode):
+            return source.timing(episode)
+
+    def by(names: Sequence[str]) -> Source:
+        assert source.by is not None
+        return _checked(source.by(names), path, name)
+
+    return source._replace(
+        read=read, texts=texts, timing=source.timing and timing, by=source.by and by
+    )
 
 
 class Damaged(ValueError):
@@ -209,8 +260,12 @@ def explained(path: Path, name: str, episode: int | None = None) -> Iterator[Non
     # Damaged files make these libraries raise nearly anything.
     except Exception as error:
         where = f"{path}" if episode is None else f"{path}, episode {episode}"
-        text = " ".join(str(error).split())[:200] or type(error).__name__
-        raise errors.UsageError(where, f"a sound {name} dataset", text) from error
+        raise errors.UsageError(where, f"a sound {name} dataset", reason(error)) from error
+
+
+def reason(error: Exception) -> str:
+    """Returns the message of a library's error as one line."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _check(name: str, array: np.ndarray, source: Source, episode: int) -> None:

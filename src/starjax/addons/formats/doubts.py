@@ -9,7 +9,7 @@ from scipy import spatial
 
 from starjax.addons.formats import mapping as maps
 from starjax.addons.formats import tip_poses
-from starjax.addons.formats.mapping import ArmColumns, Map
+from starjax.addons.formats.mapping import Map
 from starjax.addons.formats.motion import Motion
 from starjax.addons.formats.trocars import MISSED
 from starjax.data import shafts
@@ -18,46 +18,9 @@ from starjax.sim import trocar_region
 _LEAST_MOTION = 5e-3  # m; the tips of a demonstration move farther
 _STEPS_AWAY = 10.0  # typical steps between a command and the next tip
 _LEAST_AWAY = 5e-3  # m; a command nearer to the next tip follows it
-_BEYOND = 0.05  # of a gripper's range, by which values may leave it
-_LEAST_USED = 0.5  # of a gripper's range, which a dataset uses
-_STILL = 1e-3  # of a gripper's range, by which jaws that stay closed, or open, move
 _OUTSIDE = 0.02  # m, from the region of a task's trocars
 _ELSEWHERE = 0.01  # m; estimates of one trocar in several episodes are nearer to each other
 _FEW = 2  # episodes, which may well have a trocar each
-
-
-class Jaws:
-    """Ranges of the grippers' values over a dataset, as shares of closed to open."""
-
-    def __init__(self, arms: Sequence[ArmColumns]):
-        self._arms = arms
-        self._low, self._high = np.full(len(arms), np.inf), np.full(len(arms), -np.inf)
-
-    def add(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Takes the columns of an episode."""
-        for i, arm in enumerate(self._arms):
-            if arm.gripper:
-                raw = maps.pick(arrays, arm.gripper, 1)
-                share = (raw - arm.gripper_closed) / (arm.gripper_open - arm.gripper_closed)
-                self._low[i] = min(self._low[i], share.min())
-                self._high[i] = max(self._high[i], share.max())
-
-    def notes(self) -> Iterator[str]:
-        """Yields a note for each gripper that leaves its range or uses little of it.
-
-        Jaws that stay closed, or open, are no doubt: a task may begin with a held needle.
-        """
-        for i, (arm, low, high) in enumerate(zip(self._arms, self._low, self._high)):
-            is_outside = low < -_BEYOND or high > 1.0 + _BEYOND
-            is_still = high < _STILL or low > 1.0 - _STILL
-            is_small = high - low < _LEAST_USED and not is_still
-            if np.isfinite(low) and (is_outside or is_small):
-                width = arm.gripper_open - arm.gripper_closed
-                first, last = (arm.gripper_closed + width * x for x in (low, high))
-                yield (
-                    f"the gripper of arm {i} is from {first:.3g} to {last:.3g}, where "
-                    f"gripper_closed = {arm.gripper_closed:g}, gripper_open = {arm.gripper_open:g}"
-                )
 
 
 def of_commands(found: Motion, mapping: Map) -> Iterator[str]:

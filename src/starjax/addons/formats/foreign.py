@@ -14,7 +14,7 @@ from PIL import Image
 
 from starjax import errors, rcm
 from starjax.addons.formats import mapping as maps
-from starjax.addons.formats import motion, selection, survey
+from starjax.addons.formats import motion, selection, stopped, survey
 from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import CameraColumn, Map
 from starjax.addons.formats.motion import HZ
@@ -34,6 +34,8 @@ class Imported(NamedTuple):
       p_world_trocar: `[E, A, 3]` m of the kept episodes.
       residual_mm: `[E, A]` root mean square of the shafts' distances from it.
       notes: anomalies, one per line.
+      remarks: on columns and images, no anomalies.
+      successes: of those that are kept.
     """
 
     digest: str
@@ -43,6 +45,8 @@ class Imported(NamedTuple):
     p_world_trocar: np.ndarray
     residual_mm: np.ndarray
     notes: list[str]
+    remarks: list[str]
+    successes: int
 
 
 def import_mapped(
@@ -63,7 +67,10 @@ def import_mapped(
       StorageError: `root` cannot be written, or holds another dataset.
     """
     task = registries.tasks.get(mapping.task)
-    _fits(source, mapping, task)
+    source, mapping = survey.prepared(source, mapping, folder)
+    _fits(mapping, task)
+    source = source._replace(notes=[*source.notes, *_squeezed(source, mapping)])
+    _require_same_files(root, source)
     found = survey.survey(source, mapping, folder, task, note)
     mapping, hz, kept, notes = found.mapping, found.hz, found.kept, found.notes
     description = _describe(source, mapping, task, kept, found.centres, hz)
@@ -96,7 +103,7 @@ def import_mapped(
             else:
                 try:
                     centre = found.centres[k.trocar]
-                    arrays = _fields(source, mapping, k, hz, folder, centre)
+                    arrays = _fields(source, mapping, k, hz, folder, centre, notes)
                 except errors.UsageError as error:  # of images, which only this pass reads
                     reason = str(error)
             if reason:
@@ -119,11 +126,20 @@ def import_mapped(
     digest = store.write(root, description, episodes_to_write(), size, note)
     count = len(kept) - len(unread)
     left_out = len(source.lengths) - count
-    return Imported(digest, count, left_out, frames, found.p_world_trocar, found.residual_mm, notes)
+    return Imported(
+        digest=digest,
+        episodes=count,
+        left_out=left_out,
+        frames=frames,
+        p_world_trocar=found.p_world_trocar,
+        residual_mm=found.residual_mm,
+        notes=notes,
+        remarks=list(source.notes),
+        successes=sum(k.success and k.episode not in unread for k in kept),
+    )
 
 
-def _fits(source: Source, mapping: Map, task: Any) -> None:
-    maps.check(mapping, source)
+def _fits(mapping: Map, task: Any) -> None:
     arms, slots = len(mapping.arms), len(task.slots)
     if arms != slots:
         raise errors.UsageError("--map: arms", f"{slots}, as task {mapping.task} has", arms)
@@ -133,7 +149,28 @@ def _fits(source: Source, mapping: Map, task: Any) -> None:
         raise errors.UsageError("--map", "cameras or a state, to learn from", "neither")
 
 
-def squeezed(source: Source, mapping: Map) -> Iterator[str]:
+def _require_same_files(root: Path, source: Source) -> None:
+    """Records sizes and times of the source's files; a stopped import needs the same ones.
+
+    Raises:
+      errors.UsageError: a file changed since the import began.
+    """
+    path, present = (
+        root / schema.IMPORTED_FILES,
+        {name: list(x) for name, x in source.files.items()},
+    )
+    if store.keys(root) and path.exists():
+        began = files.read_json(path)
+        changed = sorted(n for n in {**began, **present} if began.get(n) != present.get(n))
+        if changed:
+            got = f"{changed[0]}, which changed since, and {len(changed) - 1} more"
+            hint = f"remove {root} to begin anew"
+            raise errors.UsageError("OUT", "an import of the same files", got, hint)
+    elif present:
+        files.write_json(path, present)
+
+
+def _squeezed(source: Source, mapping: Map) -> Iterator[str]:
     """Yields a line for every camera whose images change their ratio of sides."""
     for name, camera in mapping.cameras.items():
         height, width = camera.crop[2:] or source.columns[camera.column].shape[:2]
@@ -203,11 +240,16 @@ def _shapes(source: Source, mapping: Map, arms: int) -> dict[str, tuple[tuple[in
 
 
 def _fields(
-    source: Source, mapping: Map, kept: Kept, hz: float, folder: Path, p_world_trocar: np.ndarray
+    source: Source,
+    mapping: Map,
+    kept: Kept,
+    hz: float,
+    folder: Path,
+    p_world_trocar: np.ndarray,
+    notes: list[str],
 ) -> dict[str, list[np.ndarray]]:
-    """Reads the fields of an episode."""
-    columns = source.read(kept.episode, maps.names(mapping))
-    poses = motion.read(columns, mapping, hz, folder)
+    """Reads the fields of an episode; notes images that stop."""
+    columns, poses = motion.of_episode(source, kept.episode, mapping, hz, folder)
     off = np.cross(poses.shaft.p - p_world_trocar, poses.shaft.R[..., 2])
     arrays = {
         "p": poses.pose.p,
@@ -221,12 +263,15 @@ def _fields(
     if maps.has_shaft(mapping):
         arrays |= {"shaft_p": poses.shaft.p, "shaft_R": poses.shaft.R}
     if mapping.state:
-        arrays["state"] = maps.pick(columns, mapping.state)[poses.nearest]
+        arrays["state"] = maps.pick(columns, mapping.state)[poses.nearest - poses.first]
     arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
     cameras = [camera.column for camera in mapping.cameras.values()]
     images = source.read(kept.episode, cameras) if cameras else {}
     for name, camera in mapping.cameras.items():
         shown = images[camera.column][poses.nearest]
+        times = np.arange(len(shown)) / HZ
+        odd = stopped.images(shown, times, poses.pose.p, name)
+        notes += [f"episode {kept.episode}: {line}" for line in odd]
         arrays[f"{episodes.IMAGE}{name}"] = pictures(shown, camera)
     return {name: [arrays[name]] for name in sorted(arrays)}
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax import errors
-from starjax.addons.formats import base, mapping, own_columns, ready
+from starjax.addons.formats import base, mapping, own_columns, ready, timing
 from starjax.commands import list_command
 from starjax.commands.inspect_command import Found, spread
 from starjax.commands.list_command import Row
@@ -32,7 +32,7 @@ def summary(path: Path) -> Found:
         ]
         low = [column for column, about in source.columns.items() if not about.is_image]
         ranges = {column: _Numbers() for column in low}
-        unread = []
+        unread, timed = [], []
         for episode in range(min(len(lengths), _LOOKED_AT)):  # one at a time in memory
             try:
                 arrays = source.read(episode, low)
@@ -41,11 +41,13 @@ def summary(path: Path) -> Found:
                 continue
             for column, values in arrays.items():
                 ranges[column].add(episode, values)
+            odd = timing.anomalies(source, episode, arrays)
+            timed += [f"episode {episode}: {line}" for line in odd]
         rows += [
             (f"  {column}", _said(about, ranges.get(column)))
             for column, about in source.columns.items()
         ]
-        return Found(rows, [*source.notes, *unread, *_odd(ranges)])
+        return Found(rows, [*source.notes, *unread, *timed, *_odd(ranges)])
 
 
 @dataclasses.dataclass

@@ -8,7 +8,7 @@ A folder of the release is read, that of a task (`Suturing`), or the one with th
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,7 @@ def _folder(path: Path) -> Path:
     return inside if inside.is_dir() else path
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
+def _read(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     base.require_fits(path.name, (path.stat().st_size,), np.uint8)
     rows = np.loadtxt(path, ndmin=2)
     base.require(rows.shape[1] == len(_ARMS) * _COUNT, "76 numbers per line", rows.shape[1])
@@ -41,7 +41,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 def _recognises(path: Path) -> bool:
     folder = _folder(path)
-    files = sorted(folder.glob("*.txt")) if folder.is_dir() else [folder]
+    files = per_file.listed(folder, "*.txt") if folder.is_dir() else [folder]
     if not files or files[0].suffix != ".txt":
         return False
     with open(files[0], errors="replace") as file:

@@ -5,12 +5,13 @@ TOML or JSON. A column is named as the files name it, with the numbers that are 
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import structs
 
 from starjax import errors
 from starjax.addons.formats.base import Source
@@ -29,6 +30,12 @@ NUMBERS = {
 _NEWER_MAP = {"about": "", "fits": {}, "skip": [], "splits": [], "place": "files"}
 _NEWER_ARM = {"trocar_at": []}
 _NOT_RECORDED = ("about", "fits")
+_OF_MAP = ("time", "state", "success")
+_OF_ARM = (
+    *("position", "rotation", "joints", "gripper", "trocar"),
+    *("command_position", "command_rotation", "command_gripper"),
+)
+_OF_SHAFT = ("angles", "position", "rotation")
 _PART = re.compile(r"(.+?)(?:\[(\d+)(?:(:)(\d+))?\])?")
 _FILE = "--map"
 
@@ -173,8 +180,8 @@ def pick(arrays: Mapping[str, np.ndarray], columns: Columns, count: int = 0) -> 
       errors.UsageError: there are others, or one is not finite.
     """
     parts = []
-    for text in _listed(columns):
-        name, low, high = _part(text)
+    for text in listed(columns):
+        name, low, high = part(text)
         array = np.asarray(arrays[name], np.float64)
         rows = array.reshape(len(array), -1)[:, low:high]
         bad = ~np.isfinite(rows).all(-1)
@@ -184,19 +191,26 @@ def pick(arrays: Mapping[str, np.ndarray], columns: Columns, count: int = 0) -> 
         parts.append(rows)
     entries = np.concatenate(parts, -1)
     if count and entries.shape[1] != count:
-        raise errors.UsageError(", ".join(_listed(columns)), f"{count} numbers", entries.shape[1])
+        raise errors.UsageError(", ".join(listed(columns)), f"{count} numbers", entries.shape[1])
     return entries
 
 
 def names(mapping: Map) -> list[str]:
-    """Returns the columns that a mapping reads, except images."""
-    columns = [mapping.time, mapping.state, mapping.success]
-    for arm in mapping.arms:
-        columns += [arm.position, arm.rotation, arm.joints, arm.gripper, arm.trocar]
-        columns += [arm.command_position, arm.command_rotation, arm.command_gripper]
-        if isinstance(arm.shaft, ShaftColumns):
-            columns += [arm.shaft.angles, arm.shaft.position, arm.shaft.rotation]
-    return list(dict.fromkeys(_part(text)[0] for some in columns for text in _listed(some)))
+    """Returns the columns that a mapping reads, those of arms first, except images."""
+    columns: list[Columns] = []
+
+    def take(some: Columns) -> Columns:
+        columns.append(some)
+        return some
+
+    with_columns(mapping, take)
+    return list(dict.fromkeys(part(text)[0] for some in columns for text in listed(some)))
+
+
+def signals(mapping: Map) -> list[str]:
+    """Returns the columns that move: all that a mapping reads but times and facts."""
+    arms = tuple(structs.replace(arm, trocar=()) for arm in mapping.arms)
+    return names(structs.replace(mapping, arms=arms, time=(), success=()))
 
 
 def has_shaft(mapping: Map) -> bool:
@@ -213,11 +227,27 @@ def check(mapping: Map, source: Source) -> None:
         errors.choice(f"{_FILE}: image column", camera.column, images or ["none: no images"])
 
 
-def _listed(columns: Columns) -> tuple[str, ...]:
+def with_columns(mapping: Map, change: Callable[[Columns], Columns]) -> Map:
+    """Returns a mapping with all its columns of numbers changed."""
+
+    def changed(table: Any, names: Sequence[str]) -> Any:
+        return structs.replace(table, **{name: change(getattr(table, name)) for name in names})
+
+    arms = []
+    for arm in mapping.arms:
+        arm = changed(arm, _OF_ARM)
+        if isinstance(arm.shaft, ShaftColumns):
+            arm = structs.replace(arm, shaft=changed(arm.shaft, _OF_SHAFT))
+        arms.append(arm)
+    return structs.replace(changed(mapping, _OF_MAP), arms=tuple(arms))
+
+
+def listed(columns: Columns) -> tuple[str, ...]:
+    """Returns the parts of columns."""
     return (columns,) if isinstance(columns, str) else columns
 
 
-def _part(text: str) -> tuple[str, int, int | None]:
+def part(text: str) -> tuple[str, int, int | None]:
     """Parses a column's name and its slice: first index, and index after the last or None."""
     match = _PART.fullmatch(text)
     assert match is not None

@@ -9,8 +9,9 @@ from msgspec import structs
 from scipy.spatial import transform
 
 from starjax import errors
+from starjax.addons.formats import clocks, timing, tip_poses
 from starjax.addons.formats import mapping as maps
-from starjax.addons.formats import tip_poses
+from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import ArmColumns, Map
 from starjax.addons.formats.tip_poses import TipPoses
 
@@ -29,6 +30,8 @@ class Motion(NamedTuple):
       shaft: `[T, A]`, that of the tip for a straight tool.
       gripper, command_gripper: `[T, A]` in [-1, 1].
       p_world_trocar: `[T, A, 3]` m, NaN where it is to be estimated.
+      times: `[N]` s of the files' steps.
+      first: step of the files from which on all columns have values.
       nearest: `[T]` step of the files whose images are shown.
       notes: anomalies, one per line.
     """
@@ -39,28 +42,52 @@ class Motion(NamedTuple):
     gripper: np.ndarray
     command_gripper: np.ndarray
     p_world_trocar: np.ndarray
+    times: np.ndarray
+    first: int
     nearest: np.ndarray
     notes: list[str]
 
 
-class Gap(ValueError):
-    """An episode that leaves too long a time unsaid."""
-
-
-def read(arrays: Mapping[str, np.ndarray], mapping: Map, hz: float, folder: Path) -> Motion:
-    """Makes an episode's columns a motion.
+def of_episode(
+    source: Source, episode: int, mapping: Map, hz: float, folder: Path
+) -> tuple[dict[str, np.ndarray], Motion]:
+    """Reads an episode: its columns from the first step that has all values, and its motion.
 
     Args:
       hz: of the files.
       folder: of the mapping file, where robots' models lie.
 
     Raises:
-      Gap: it has a gap longer than `max_gap_s`.
+      timing.Gap: it leaves more than `max_gap_s` without a value.
       errors.UsageError: a column is not what the mapping says.
     """
+    names = maps.names(mapping)
+    arrays = source.read(episode, list(dict.fromkeys([*names, *clocks.columns(source)])))
+    if source.timing is not None:
+        clocked = source.timing(episode)
+    else:
+        times = maps.pick(arrays, mapping.time, 1)[:, 0] if mapping.time else None
+        clocked = timing.of_rows(source, arrays, times, hz)
+    if clocked is None:
+        return arrays, read(arrays, mapping, hz, folder)
+    cameras = [camera.column for camera in mapping.cameras.values()]
+    signals = clocks.related(source, [*maps.signals(mapping), *cameras])
+    is_read = bool(mapping.time)
+    steps = timing.of_steps(clocked.times, hz, mapping.max_gap_s, is_strict=is_read)
+    first, notes = timing.usable(clocked, signals, mapping.max_gap_s)
+    notes += [] if is_read else steps  # `read` has those of its own times
+    arrays = {name: array[first:] for name, array in arrays.items()}
+    found = read(arrays, mapping, hz, folder)
+    return arrays, found._replace(
+        nearest=found.nearest + first, first=first, notes=notes + found.notes
+    )
+
+
+def read(arrays: Mapping[str, np.ndarray], mapping: Map, hz: float, folder: Path) -> Motion:
+    """Makes an episode's columns a motion; see `of_episode`."""
     length = len(next(iter(arrays.values())))
     times = maps.pick(arrays, mapping.time, 1)[:, 0] if mapping.time else np.arange(length) / hz
-    notes = _looked_at(times, hz, mapping)
+    notes = timing.of_steps(times, hz, mapping.max_gap_s)
     arms = [_arm(arrays, arm, mapping, folder) for arm in mapping.arms]
     for i, arm in enumerate(arms):
         notes += _jumps(times, arm.pose, f"arm {i}: " if len(arms) > 1 else "")
@@ -73,6 +100,8 @@ def read(arrays: Mapping[str, np.ndarray], mapping: Map, hz: float, folder: Path
         gripper=np.stack([arm.gripper for arm in sampled], 1),
         command_gripper=np.stack([arm.command_gripper for arm in sampled], 1),
         p_world_trocar=np.stack([arm.p_world_trocar for arm in sampled], 1),
+        times=times,
+        first=0,
         nearest=nearest,
         notes=notes,
     )
@@ -118,26 +147,6 @@ def _arm(arrays: Mapping[str, np.ndarray], arm: ArmColumns, mapping: Map, folder
         jaws(arm.command_gripper) if arm.command_gripper else None,
         trocar,
     )
-
-
-def _looked_at(times: np.ndarray, hz: float, mapping: Map) -> list[str]:
-    """Checks the times; returns notes on what is odd, raises for times that do not rise."""
-    steps = np.diff(times)
-    if (steps <= 0.0).any():
-        at = int(np.argmax(steps <= 0.0)) + 1
-        raise errors.UsageError("time", "times that rise", f"{times[at]:.4f} s at step {at}")
-    if not len(steps):
-        return []
-    usual, most = float(np.median(steps)), int(np.argmax(steps))
-    if steps[most] > mapping.max_gap_s:
-        raise Gap(f"a gap of {steps[most]:.2f} s at {times[most] - times[0]:.2f} s")
-    notes = []
-    if hz and abs(usual * hz - 1.0) > 0.05:
-        notes.append(f"its times show {1.0 / usual:.3g} Hz where {hz:g} is said")
-    count = int((steps > 1.5 * usual).sum())
-    if count:
-        notes.append(f"{count} gaps, the longest of {steps[most]:.2f} s; filled in")
-    return notes
 
 
 def _jumps(times: np.ndarray, pose: TipPoses, whose: str) -> list[str]:

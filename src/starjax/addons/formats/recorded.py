@@ -20,11 +20,11 @@ def recordings(
       folder: of the mapping file.
       note: called with 1 after every episode.
     """
+    source, mapping = survey.prepared(source, mapping, folder)
     found = survey.survey(source, mapping, folder, registries.tasks.get(mapping.task), note)
     made = []
     for kept, trocar in list(zip(found.kept, found.p_world_trocar))[:MAX_EPISODES]:
-        arrays = source.read(kept.episode, maps.names(found.mapping))
-        poses = motion.read(arrays, found.mapping, found.hz, folder)
+        _, poses = motion.of_episode(source, kept.episode, found.mapping, found.hz, folder)
         made.append(
             EpisodeMotion(
                 kept.episode,

@@ -17,7 +17,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from starjax.addons.formats import base
+from starjax.addons.formats import base, per_file
 from starjax.addons.formats.base import Column, Source
 from starjax.rollouts import episodes
 
@@ -43,20 +43,23 @@ def named(column: str) -> str:
 
 @contextlib.contextmanager
 def _open(path: Path) -> Iterator[Source]:
-    with h5py.File(path, "r") as file:
-        refuse_links(file)
+    with opened(path) as file:
         data: Any = file.get("data", file)
         base.require(isinstance(data, h5py.Group), "a group of episodes", data)
         names = {int(match[1]): name for name in data if (match := _DEMO.fullmatch(name))}
         demos = [data[names[number]] for number in sorted(names)]
         base.require(bool(demos), "groups data/demo_<i>", sorted(data)[:5])
-        lengths = [episode_length(demo) for demo in demos]
-        first: dict[str, Any] = datasets(demos[0])
+        summaries, faults = per_file.summarise(
+            [demo.name for demo in demos], lambda i: episode_length(demos[i])
+        )
+        lengths = [summaries.get(i, 0) for i in range(len(demos))]
+        sound = next(iter(summaries))
+        first: dict[str, Any] = datasets(demos[sound])
         ours: Any = file.get(base.OURS)
         columns = {
             name: Column(dataset.shape[1:], dataset.dtype.name)
             for name, dataset in first.items()
-            if dataset.shape[:1] == (lengths[0],) and dataset.dtype.kind in "biuf"
+            if dataset.shape[:1] == (lengths[sound],) and dataset.dtype.kind in "biuf"
         }
 
         def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
@@ -74,7 +77,8 @@ def _open(path: Path) -> Iterator[Source]:
             base.require(isinstance(origin, dict), f"a map in {base.OURS}", type(origin).__name__)
         about = _attribute(data, "env_args")
         hz = base.origin_hz(origin) or float(_hz(about))
-        yield Source(hz, lengths, columns, read, origin, task=str(about.get("env_name", "")))
+        task = str(about.get("env_name", ""))
+        yield Source(hz, lengths, columns, read, origin, task, faults=faults)
 
 
 def _write(path: Path, source: Source, video: bool) -> None:
@@ -109,7 +113,18 @@ def _recognises(path: Path) -> bool:
     return path.is_file() and path.suffix in SUFFIXES
 
 
-def refuse_links(file: h5py.File) -> None:
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """Opens an HDF5 file without links that lead out of it.
+
+    No lock is taken: network file systems may refuse it.
+    """
+    with h5py.File(path, "r", locking=False) as file:
+        _refuse_links(file)
+        yield file
+
+
+def _refuse_links(file: h5py.File) -> None:
     """Refuses files that lead out of themselves, in circles, or many ways to the same place."""
     addresses = set()
 

@@ -10,7 +10,17 @@ from msgspec import structs
 from scipy.spatial import transform
 
 from starjax import errors
-from starjax.addons.formats import doubts, motion, selection, trocars
+from starjax.addons.formats import (
+    clocks,
+    doubts,
+    labels,
+    motion,
+    ranges,
+    selection,
+    stopped,
+    timing,
+    trocars,
+)
 from starjax.addons.formats import mapping as maps
 from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import Map
@@ -52,6 +62,15 @@ class Survey(NamedTuple):
     notes: list[str]
 
 
+def prepared(source: Source, mapping: Map, folder: Path) -> tuple[Source, Map]:
+    """Returns the source joined at the steps of a mapping, and the mapping with names resolved."""
+    mapping = labels.resolve(mapping, source, folder)
+    if source.by is not None:
+        cameras = [camera.column for camera in mapping.cameras.values()]
+        source = source.by([*maps.names(mapping), *cameras])
+    return source, mapping
+
+
 def survey(
     source: Source,
     mapping: Map,
@@ -71,20 +90,24 @@ def survey(
     """
     hz = mapping.hz or source.hz
     if not hz and not mapping.time:
-        raise errors.UsageError("--map: hz", "steps per second, which the files do not say", "none")
-    kept, tips, commands, notes, jaws = [], [], [], [], doubts.Jaws(mapping.arms)
+        times = next(iter(clocks.named(source.columns)), None)
+        hint = f'time = "{times}" reads their times' if times else ""
+        expected = "steps per second, which the files do not say"
+        raise errors.UsageError("--map: hz", expected, "none", hint)
+    kept, tips, commands, notes = [], [], [], list(labels.doubts(mapping, source))
+    ends: list[float] = []
+    jaws, joints = ranges.Jaws(mapping.arms), ranges.Joints(mapping.arms, folder)
     first_error: errors.UsageError | None = None
     for episode in selection.chosen(source, mapping):
         note(1)
         try:
-            arrays = source.read(episode, maps.names(mapping))
-            poses = motion.read(arrays, mapping, hz, folder)
-            success = not mapping.success or bool(
-                maps.pick(arrays, mapping.success, 1)[-1, 0] > 0.5
-            )
+            arrays, poses = motion.of_episode(source, episode, mapping, hz, folder)
+            success = maps.pick(arrays, mapping.success, 1)[-1, 0] if mapping.success else 1.0
             odd = [*poses.notes, *doubts.of_commands(poses, mapping)]
+            odd += stopped.poses(arrays, poses.times, mapping)
             jaws.add(arrays)
-        except motion.Gap as gap:
+            joints.add(arrays)
+        except timing.Gap as gap:
             notes.append(f"episode {episode}: {gap}; omitted")
             continue
         except errors.UsageError as error:
@@ -99,7 +122,8 @@ def survey(
         tips.append(trocars.subsample(poses))
         R, p = poses.command.R, poses.command.p
         commands.append((shafts.subsample(R), shafts.subsample(p)))
-        is_success = success and not selection.is_failure(source, episode)
+        is_success = bool(success > 0.5) and not selection.is_failure(source, episode)
+        ends.append(float(success))
         kept.append(Kept(episode, len(poses.pose.p), -1, is_success))
     if not kept and first_error is not None:
         raise first_error
@@ -119,7 +143,15 @@ def survey(
     kept = [k._replace(trocar=int(group)) for k, group in zip(kept, groups)]
     numbers = [k.episode for k in kept]
     residual = trocars.residual(tips, centres[groups], numbers, notes)
-    notes += [*jaws.notes(), *doubts.of_dataset(tips, centres[groups], numbers, task, is_placed)]
+    if not any(k.success for k in kept):
+        column = ", ".join(maps.listed(mapping.success))
+        most = f": {column} ends at {max(ends):.3g} or less, above 0.5 counts" if column else ""
+        notes.append(f"no episode is a success{most}")
+    notes += [
+        *jaws.notes(),
+        *joints.notes(),
+        *doubts.of_dataset(tips, centres[groups], numbers, task, is_placed),
+    ]
     return Survey(kept, tips, centres[groups], centres, residual, mapping, hz, notes)
 
 

@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ from starjax.data import shafts
 
 INSTRUMENTS = {"large_needle_driver": rcm.LARGE_NEEDLE_DRIVER, "prograsp": rcm.PROGRASP}
 _TINY = 1e-6  # kg and kg m^2 of a model's bodies, at least
+_TURNS, _FAR = 4.0 * np.pi, 5.0  # rad and m, beyond which no joint without limits goes
 _UNIT = 0.1  # by which a quaternion's length may be off
 
 
@@ -24,6 +25,15 @@ class TipPoses(NamedTuple):
 
     R: np.ndarray
     p: np.ndarray
+
+
+class JointLimits(NamedTuple):
+    """Limits of a joint, in rad if it turns, otherwise in m."""
+
+    name: str
+    turns: bool
+    low: float
+    high: float
 
 
 Arrays = Mapping[str, np.ndarray]
@@ -183,9 +193,31 @@ def unmoved(arrays: Arrays, arm: ArmColumns, folder: Path) -> list[str]:
     return [joint.name for joint in found if joint.qposadr[0] not in places]
 
 
+def joint_names(path: Path) -> list[str]:
+    """Returns the names of a model's joints."""
+    model = _loaded(path)
+    return [model.joint(i).name for i in range(model.njnt)]
+
+
+def limits(arm: ArmColumns, folder: Path, count: int) -> list[JointLimits]:
+    """Returns the limits of the joints of an arm's columns."""
+    import mujoco
+
+    path = folder / arm.model
+    model, names = _loaded(path), arm.joint_names or joint_names(path)[:count]
+    rows = []
+    for name in names:
+        joint = model.joint(name)
+        turns = int(joint.type[0]) == mujoco.mjtJoint.mjJNT_HINGE
+        most = _TURNS if turns else _FAR
+        low, high = joint.range if model.jnt_limited[joint.id] else (-most, most)
+        rows.append(JointLimits(name, turns, float(low), float(high)))
+    return rows
+
+
 @functools.cache
-def _model(path: Path, joints: tuple[str, ...], tip: str, count: int) -> tuple:
-    """Loads a robot's model, its joints' addresses, and the id of the tip's site or body."""
+def _loaded(path: Path) -> Any:
+    """Loads a robot's model."""
     import mujoco
 
     try:
@@ -193,10 +225,17 @@ def _model(path: Path, joints: tuple[str, ...], tip: str, count: int) -> tuple:
         # Kinematics alone: links at fixed joints stay, masses and inertias are of no account.
         spec.compiler.fusestatic, spec.compiler.balanceinertia = False, True
         spec.compiler.boundmass = spec.compiler.boundinertia = _TINY
-        model = spec.compile()
+        return spec.compile()
     except ValueError as error:
         raise errors.UsageError("model", "an MJCF or URDF", f"{path}: {error}") from error
-    known = [model.joint(i).name for i in range(model.njnt)]
+
+
+@functools.cache
+def _model(path: Path, joints: tuple[str, ...], tip: str, count: int) -> tuple:
+    """Returns a robot's model, its joints' addresses, and the id of the tip's site or body."""
+    import mujoco
+
+    model, known = _loaded(path), joint_names(path)
     for name in joints:
         errors.choice("joint_names", name, known)
     chosen = joints or tuple(known[:count])

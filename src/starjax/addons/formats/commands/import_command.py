@@ -95,19 +95,19 @@ def _mapped(source: Any, args: ImportArgs, out: Path) -> int:
     columns = structs.replace(columns, **{key: value for key, value in given.items() if value})
     if map_path.parent == ready.FOLDER:
         print(f"mapping {name}: {columns.about}")
-    mapping.check(columns, source)
-    source = source._replace(notes=[*source.notes, *foreign.squeezed(source, columns)])
     with progress.track("Import", 2 * len(source.lengths), unit="readings") as advance:
         imported = foreign.import_mapped(source, columns, out, map_path.parent, advance)
-    for line in [*source.notes, *imported.notes][:_SHOWN]:
+    lines = [*imported.remarks, *imported.notes]
+    for line in lines[:_SHOWN]:
         messages.indented(line)
-    if (more := len(source.notes) + len(imported.notes) - _SHOWN) > 0:
+    if (more := len(lines) - _SHOWN) > 0:
         messages.indented(f"and {more} more, see {out / schema.IMPORTED}")
     worst = f"{imported.residual_mm.max():.2g} mm or less (root mean square)"
     counts = f"{imported.episodes} demonstrations, {imported.frames} frames"
     print(f"{out}: {counts}, {imported.left_out} left out")
     print(f"shafts pass their trocars at {worst}")
-    print(f"starjax train --demos.from {shlex.quote(str(out))} --task {columns.task} trains on it")
+    begin = f"starjax train --demos.from {shlex.quote(str(out))} --task {columns.task} trains on"
+    print(f"{begin} the {imported.successes} successes of {imported.episodes}")
     if imported.notes and not args.accept:
         print(f"{len(imported.notes)} notes: exit code 1 unless --accept")
         return 1
