@@ -30,7 +30,7 @@ def test_every_page_is_drawn_from_results(pages):
 
 
 def test_a_number_that_is_not_in_a_result_is_seen(tables):
-    marked = [tables.ROOT / page for page in ("README.md", "docs/understand/speed.md")]
+    marked = [tables.ROOT / page for page in ("README.md", "docs/understand/method.md")]
     text = "\n".join(page.read_text() for page in marked)
     drawn = [match.span() for match in tables._BLOCK.finditer(text)]
     assert len(drawn) == 2

@@ -41,7 +41,7 @@ def raw():
 @pytest.fixture
 def converted(pytestconfig, tmp_path, monkeypatch):
     """What the page's names hold after it ran, and the arm that it wrote."""
-    page = (pytestconfig.rootpath / "docs" / "howto" / "add-arm.md").read_text()
+    page = (pytestconfig.rootpath / "docs" / "extend" / "add-arm.md").read_text()
     (script,) = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     found = types.SimpleNamespace(spec=lambda entry: mujoco.MjSpec.from_string(raw()))
     stub = types.SimpleNamespace(get=lambda name: found)

@@ -58,7 +58,7 @@ def read_weights(path: str | pathlib.Path) -> dict[str, np.ndarray]:
             got = f"{path.name}, a pickle of torch's"
             hint = (
                 "convert it where torch is installed: safetensors.torch.save_file of the result of "
-                "torch.load (docs/use/encoder-weights.md)"
+                "torch.load (docs/start/train-gpu.md)"
             )
         raise errors.UsageError(str(path), expected, got, hint) from error
     except (AttributeError, KeyError, TypeError) as error:  # a type that numpy lacks

@@ -4,7 +4,7 @@ import pathlib
 
 from starjax.addons.formats import base
 
-PAGE = pathlib.Path(__file__).parents[3] / "docs" / "howto" / "formats.md"
+PAGE = pathlib.Path(__file__).parents[3] / "docs" / "use" / "formats.md"
 HEADER = "| format | read | written | byte-exact round trip |"
 
 
