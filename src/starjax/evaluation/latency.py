@@ -47,7 +47,8 @@ def policy_ms(
     Returns:
       {p50, p95, p99} in ms, and n, the number of calls.
     """
-    inputs = _inputs(policy_config, sensors, batch)
+    # In one program: called as they are, the maps would be a hundred.
+    inputs = precompile_lib.Program(lambda: _inputs(policy_config, sensors, batch))()
     # Weights on the host would be copied again at each call.
     params, stats = jax.device_put((params, stats))
     call = _program(policy.sample, _slots(sensors)).select(params, stats, *inputs)

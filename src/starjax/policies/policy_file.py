@@ -11,7 +11,7 @@ import types
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import safetensors
 import safetensors.numpy
@@ -278,8 +278,8 @@ def _unflatten(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         for parent in parents:
             node = node.setdefault(parent, {})
         is_number = np.issubdtype(array.dtype, np.floating)
-        node[name] = jnp.asarray(array, jnp.float32 if is_number else None)
-    return tree
+        node[name] = array.astype(np.float32) if is_number else array
+    return jax.device_put(tree)
 
 
 def _hash(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:

@@ -118,7 +118,7 @@ def _starter(env: _EnvFns, agent: _AgentFns) -> Callable[..., RolloutState]:
 
     def start(key: jax.Array, params: Any, trials: Trials, levels: Any) -> RolloutState:
         state, keys = jax.vmap(start_one, in_axes=(None, 0, None))(key, trials, levels)
-        memory = agent.init(params, keys, state, lambda: jax.vmap(env.observe)(state))
+        memory = agent.init(params, keys, state, lambda: _of_all(env.observe)(state))
         return RolloutState(state, memory, jnp.zeros(trials.active.shape, jnp.int32), trials.active)
 
     return start
@@ -127,7 +127,7 @@ def _starter(env: _EnvFns, agent: _AgentFns) -> Callable[..., RolloutState]:
 def _advancer(
     env: _EnvFns, agent: _AgentFns, max_steps: int, record: episodes.Record
 ) -> Callable[..., Any]:
-    observe, step_all = jax.vmap(env.observe), jax.vmap(env.step)
+    observe, step_all = _of_all(env.observe), jax.vmap(env.step)
 
     def step(
         params: Any, carry: RolloutState, t: jax.Array
@@ -169,11 +169,17 @@ def _advancer(
     return advance
 
 
+@functools.lru_cache(maxsize=4)
+def _of_all(observe: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns the observation of N states, traced once for all programs, for shapes too."""
+    return jax.jit(jax.vmap(observe), inline=True)
+
+
 def _fields(
     env: Any, record: episodes.Record, state: Any, memory: Any = None
 ) -> dict[str, jax.Array]:
     """Records N episodes that stand still, for the shapes."""
-    observed = jax.vmap(env.observe)(state) if record.observes else None
+    observed = _of_all(env.observe)(state) if record.observes else None
     command = Command(state.pose, state.gripper)
     return record.fields(episodes.Step(observed, command, command, state, state, memory))
 

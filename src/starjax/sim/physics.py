@@ -133,6 +133,10 @@ def advance(
         jnp.zeros((substeps, scene.mj_model.nq)),
         jnp.zeros(()),
     )
+    # The lanes of `state` from the beginning: `vmap` would trace the body again for a result that
+    # gets them in the loop. XLA folds a selection of equal values.
+    is_finite = jnp.isfinite(state.qpos[0])
+    blank = jax.tree.map(lambda x: jax.lax.select(is_finite, x, x), blank)
     return jax.lax.fori_loop(0, substeps, substep, (state, blank))
 
 
