@@ -93,7 +93,7 @@ def test_clients_that_share_a_call_get_their_own_plans_and_mistakes(batches):
     tip = requests[1].observation.pose._replace(p=np.full((2, 3), 9.0, np.float32))
     far = requests[1]._replace(observation=requests[1].observation.replace(pose=tip))
     no_port = requests[1]._replace(trocar=rcm.Trocar(*np.float32([-1.0, 0.0, 0.0])))
-    programs = batches.policy._infer._cache_size()
+    programs = batches.policy._infer._function._cache_size()
     for bad, argument in ((far, "observation.pose.p"), (no_port, "trocar")):
         first, wrong, last = batches.infer([requests[0], bad, requests[2]])
         assert isinstance(wrong, UsageError) and wrong.argument == argument
@@ -104,7 +104,7 @@ def test_clients_that_share_a_call_get_their_own_plans_and_mistakes(batches):
         np.testing.assert_allclose(got["actions"], wanted["actions"], atol=1e-4)
     assert np.abs(alone[0]["p"] - alone[1]["p"]).max() > 1e-3
     # Of 1, 2 and 3 robots, all of them compiled before.
-    assert batches.sizes == [1, 2, 3] and programs == batches.policy._infer._cache_size()
+    assert batches.sizes == [1, 2, 3] and programs == batches.policy._infer._function._cache_size()
 
 
 def test_a_trocar_is_a_position_in_the_world(batches, up):

@@ -1,7 +1,4 @@
-"""Programs that are compiled before they are called, in an order that no thread decides."""
-
-import functools
-import threading
+"""Programs that are compiled before they are called."""
 
 import jax
 import jax.numpy as jnp
@@ -21,26 +18,6 @@ def test_prepared_arguments_meet_their_executable_and_others_the_function():
     assert program(jnp.ones(2)).tolist() == [2.0] * 2
     assert traces == [(3,), (2,)]
     assert program.is_prepared(jnp.ones(3)) and not program.is_prepared(jnp.ones(3, jnp.int32))
-
-
-def test_jobs_are_traced_in_their_order_in_one_thread():
-    traces, held = [], threading.Event()
-
-    def traced(name):
-        def function(x):
-            held.wait(5.0)
-            traces.append((name, threading.get_ident()))
-            return x
-
-        return precompile.Program(function)
-
-    programs = [traced(name) for name in range(3)]
-    for program in programs:
-        precompile.start(functools.partial(program.prepare, ROW))
-    held.set()
-    precompile.settle()
-    assert [name for name, _ in traces] == [0, 1, 2]
-    assert len({thread for _, thread in traces}) == 1
 
 
 def test_an_error_is_raised_where_the_program_is_called():

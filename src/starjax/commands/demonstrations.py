@@ -218,7 +218,6 @@ def complete(
     """
     from starjax.data import load as loading
     from starjax.data import store
-    from starjax.runtime import precompile
 
     def is_whole() -> bool:
         try:
@@ -235,7 +234,6 @@ def complete(
         return True
 
     collect()
-    precompile.settle()  # what reads and trains traces programs too
     if not share.first("whole", is_whole):
         collect()
 

@@ -17,6 +17,7 @@ from starjax import errors
 from starjax.data import schema
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, workers
+from starjax.runtime.precompile import Program
 
 # Images per call: as many on each device, because the batch size may change last bits. A core's
 # cache holds 16; a GPU needs more to be busy.
@@ -174,7 +175,7 @@ def sources(
         return ImageSource(still, state.trocar.p_world_trocar, state.layout, state.cameras)
 
     trocars = schema.trocars_of(records)
-    starts = jax.jit(jax.vmap(start))(_keys(description, records), trocars)
+    starts = Program(jax.vmap(start))(_keys(description, records), trocars)
     folders = (root / "episodes" / record["key"] for record in records)
     joints = [np.load(folder / "qpos.npy", allow_pickle=False) for folder in folders]
     return Sources(np.concatenate(joints), starts)
@@ -199,7 +200,7 @@ def images_of(
 
     def drawn(camera: str) -> Callable[[Any, Any], jax.Array]:
         # An argument: as a constant it would make a program of its own for each seed.
-        @jax.jit
+        @Program
         def draw(episodes: Any, qpos: jax.Array, episode: jax.Array) -> jax.Array:
             source = jax.tree.map(lambda leaf: leaf[episode], episodes)
             return jax.vmap(env.draw)(source._replace(qpos=qpos))[camera].rgb

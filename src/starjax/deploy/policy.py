@@ -22,7 +22,7 @@ from starjax.monitor.calibrate import Monitor
 from starjax.policies import packaged, policy_file, sampling
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
-from starjax.runtime import files
+from starjax.runtime import files, precompile
 from starjax.sim import registries, trocar_region, wrists
 from starjax.sim.names import SceneNames
 from starjax.types import Command, Pose
@@ -221,7 +221,7 @@ def load(
         max_first_turn=float(max_first_turn),
         input_spec=input_spec,
         _source=(str(path.absolute()), files.sha256(path), {"method": method, **options}),
-        _infer=jax.jit(infer),
+        _infer=precompile.Program(infer),
         _weights=jax.device_put((params, trained.normalizer)),
         monitor=None if options or method != trained.method else trained.monitor,
     )

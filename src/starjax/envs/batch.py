@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from starjax import runtime
 from starjax.envs import forked, mdp
 from starjax.envs.settings import EnvSettings
+from starjax.runtime.precompile import Program
 
 
 class Lanes(NamedTuple):
@@ -114,7 +115,8 @@ def of_episodes(made: mdp.Episodes, lanes: int) -> EpisodeBatch:
         return Lanes(keys, jnp.zeros(lanes, jnp.int32), state)
 
     observed = jax.eval_shape(made.observe, one)
-    return EpisodeBatch(made, empty, jax.jit(advance), jax.jit(jax.vmap(made.camera)), observed)
+    advance, camera = Program(advance), Program(jax.vmap(made.camera))
+    return EpisodeBatch(made, empty, advance, camera, observed)
 
 
 def seeded(lanes: Lanes, seeds: Any, which: Any) -> Lanes:

@@ -1,9 +1,7 @@
-"""Programs compiled in the background, before their arguments exist.
+"""Programs traced once a machine, some of them compiled before their arguments exist.
 
-jax shares the traces of inner functions between programs. Two programs that are traced at once
-therefore divide these between them as the threads happen to run: their texts differ from process to
-process, and the cache of compiled programs does not have them. So all jobs of `start` are traced in
-one thread, in their order; only compilers, which hold no lock of Python, work side by side.
+All jobs of `start` are traced in one thread, as tracing holds Python's lock; compilers, which do
+not, work side by side.
 """
 
 import contextlib
@@ -16,7 +14,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from starjax.runtime import garbage, xla
+from starjax.runtime import stored, xla
 
 T = TypeVar("T")
 
@@ -30,10 +28,10 @@ _queued: list[Future] = []
 
 
 class Program:
-    """A jitted function, some of whose executables are compiled before it is called."""
+    """A jitted function whose trace is stored, and executables compiled before it is called."""
 
     def __init__(self, function: Callable[..., Any], **options: Any):
-        self._function = jax.jit(function, **options)
+        self._function = jax.jit(stored.program(function), **options)
         self._executables: dict[Hashable, Future] = {}
 
     def prepare(self, *args: Any) -> Any:
@@ -45,7 +43,7 @@ class Program:
         Returns:
           the result's shapes.
         """
-        with garbage.gc_paused():
+        with stored.arguments(args):
             lowered = self._function.lower(*args)
         executable = _submit(_compilers, _marked(lowered.compile))
         self._executables[_signature(args)] = executable
@@ -59,10 +57,19 @@ class Program:
     def select(self, *args: Any) -> Callable[..., Any]:
         """Returns the executable for arguments of these shapes, else the jitted function."""
         executable = self._executables.get(_signature(args)) if self._executables else None
-        return executable.result() if executable else self._function
+        return executable.result() if executable else self._call
 
     def __call__(self, *args: Any) -> Any:
         return self.select(*args)(*args)
+
+    def trace(self, *args: Any) -> None:
+        """Traces the program for arguments of these shapes."""
+        with stored.arguments(args):
+            self._function.trace(*args)
+
+    def _call(self, *args: Any) -> Any:
+        with stored.arguments(args):
+            return self._function(*args)
 
 
 def start(job: Callable[[], T]) -> Callable[[], T | None]:
@@ -89,11 +96,6 @@ def start(job: Callable[[], T]) -> Callable[[], T | None]:
         return result
 
     return wait
-
-
-def settle() -> None:
-    """Waits until every queued job has been traced; the next trace then runs alone."""
-    _tracer.submit(lambda: None).result()
 
 
 @contextlib.contextmanager

@@ -21,6 +21,7 @@ from starjax.policies import features as inputs
 from starjax.policies import generator
 from starjax.rollouts import workers
 from starjax.runtime import files, progress
+from starjax.runtime.precompile import Program
 from starjax.training.encoder import Encoder
 
 PART = 1024  # frames per file, lost at most by a kill
@@ -121,7 +122,7 @@ def _make_see(encoder: Encoder, policy_config: config.PolicyConfig) -> Callable[
     """Makes the function from frames `[B, h, w, 3]` uint8 to features `[B, d_v]`."""
     vision = generator.vision_encoder(policy_config)
 
-    @jax.jit
+    @Program
     def see(params: Any, frames: jax.Array) -> Any:
         return vision.apply(params, inputs.centre_crop(policy_config, frames))
 

@@ -21,6 +21,7 @@ from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs, takeover, trial_key
 from starjax.rollouts import trocars as configurations
 from starjax.runtime import files
+from starjax.runtime.precompile import Program
 from starjax.sim import env as sim_env
 from starjax.sim import wrists
 from starjax.types import Command
@@ -98,7 +99,7 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
     camera, observe = simulation.camera(env), jax.vmap(env.observe)
     params, execute = (None, 0) if policy is None else (policy.params, policy.execute)
 
-    @jax.jit
+    @Program
     def start(params: Any, key: jax.Array, trocar: Trocar) -> Any:
         key_env, key_agent = jax.random.split(key)
         state = env.reset(key_env, sim_env.EnvParams(trocar))
@@ -110,7 +111,7 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
         live = simulation.LiveState(state, memory, jnp.zeros((), jnp.int32))
         return live, simulation.frame(env, live), action, opening
 
-    @jax.jit
+    @Program
     def step(
         params: Any, live: simulation.LiveState, action: jax.Array, opening: jax.Array, acts: Any
     ) -> tuple[simulation.LiveState, Moment]:

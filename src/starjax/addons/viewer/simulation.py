@@ -19,6 +19,7 @@ from starjax.policies import in_env, packaged
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import agent as agents
 from starjax.rollouts import trial_key
+from starjax.runtime.precompile import Program
 from starjax.sim import env as sim_env
 from starjax.sim import moving_trocars, registries
 
@@ -121,7 +122,7 @@ def make(label: str, env: sim_env.Env, agent: agents.BatchAgent, params: Any = N
     observe = jax.vmap(env.observe)
     execute = agent.about.get("execute", 0)
 
-    @jax.jit
+    @Program
     def start(params: Any, key: jax.Array, trocar: Trocar) -> tuple[LiveState, Frame]:
         key_env, key_agent = jax.random.split(key)
         state = env.reset(key_env, sim_env.EnvParams(trocar))
@@ -130,7 +131,7 @@ def make(label: str, env: sim_env.Env, agent: agents.BatchAgent, params: Any = N
         live = LiveState(state, memory, jnp.zeros((), jnp.int32), state.trocar.p_world_trocar)
         return live, frame(env, live)
 
-    @jax.jit
+    @Program
     def step(params: Any, live: LiveState, target: jax.Array) -> tuple[LiveState, Frame]:
         def moved(state: sim_env.EnvState) -> sim_env.EnvState:
             p = state.trocar.p_world_trocar
@@ -164,7 +165,7 @@ def make(label: str, env: sim_env.Env, agent: agents.BatchAgent, params: Any = N
 def camera(env: sim_env.Env) -> Callable[[Any], dict[str, jax.Array]]:
     """Makes a compiled EnvState `[1]` -> camera's name -> `[h, w, 3]` uint8."""
 
-    @jax.jit
+    @Program
     def look(state: Any) -> dict[str, jax.Array]:
         images = env.camera(jax.tree.map(lambda x: x[0], state))
         return {name: image.rgb for name, image in images.items()}

@@ -51,7 +51,7 @@ class PolicyGradient:
         self._demonstrations = policy_gradient.demonstrated(
             finetune_stages.Lessons(work).demonstrations(), config.train.holdout_demos
         )
-        precompile.start(lambda: self._prepare(player, *shapes))
+        self._prepared = precompile.start(lambda: self._prepare(player, *shapes))
         # The key is the policy file that the last round has made.
         self._progress: dict[Path, GradientProgress] = {}
 
@@ -63,7 +63,7 @@ class PolicyGradient:
             return file, files.read_json(told)
         print(f"\n[round {number}] policy gradient: into {folder}", flush=True)
         folder.mkdir(parents=True, exist_ok=True)
-        precompile.settle()  # a program that is called before it is traced would be compiled twice
+        self._prepared()  # a program called before it is traced would be compiled twice
         counts: dict[str, Any] = {"episodes": self._work.settings.episodes, "iterations": []}
         with stage_times.timed(self._work.out, f"round {number} policy gradient"):
             old = policy_file.load(before)

@@ -1,0 +1,84 @@
+"""Digests of the files of import packages that may be edited under one version."""
+
+import functools
+import hashlib
+import importlib.metadata
+import importlib.util
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+_SUFFIXES = (".py", ".xml", ".toml", ".json")
+_INSTALLED = {"site-packages", "dist-packages"}
+
+
+class Missing(LookupError):
+    """A package whose files are not known."""
+
+
+def digests(modules: Iterable[str]) -> dict[str, str]:
+    """Returns the digests of the packages of modules, and of those whose parts these use.
+
+    Installed packages do not count, as their versions tell them apart, unless they provide parts of
+    starjax.
+
+    Raises:
+      Missing: one has no files.
+    """
+    waiting, total = {name.partition(".")[0] for name in modules}, {}
+    while waiting:
+        package = waiting.pop()
+        if package not in total and (files := _files(package)):
+            total[package] = _digest(files)
+            waiting |= _used(package)
+    return dict(sorted(total.items()))
+
+
+@functools.cache
+def providers() -> frozenset[str]:
+    """Returns the packages that provide parts of starjax by entry points."""
+    every = (entry for d in importlib.metadata.distributions() for entry in d.entry_points)
+    return frozenset(e.module.partition(".")[0] for e in every if e.group.startswith("starjax."))
+
+
+@functools.cache
+def _files(package: str) -> tuple[Path, ...]:
+    """Returns the files of a package; none of an installed one that provides nothing."""
+    if package in sys.stdlib_module_names:
+        return ()
+    try:
+        spec = importlib.util.find_spec(package)
+    except ValueError:  # its module was made by hand
+        spec = None
+    if spec is None or not (places := spec.submodule_search_locations or [spec.origin or ""]):
+        raise Missing(f"no files of {package}")
+    roots = [Path(place) for place in places]
+    if package not in providers() and any(_INSTALLED & {*root.parts} for root in roots):
+        return ()
+    inside = (path for root in roots for path in [root, *root.rglob("*")])
+    return tuple(sorted(path for path in inside if path.suffix in _SUFFIXES))
+
+
+@functools.cache
+def _digest(files: tuple[Path, ...]) -> str:
+    """Returns the digest of files, read once a process."""
+    total = hashlib.sha256()
+    for path in files:
+        content = path.read_bytes()
+        total.update(f"{path.name} {len(content)}\n".encode() + content)
+    return total.hexdigest()
+
+
+def _used(package: str) -> set[str]:
+    """Returns the packages of the objects that the loaded modules of a package name."""
+    modules = [m for name, m in list(sys.modules.items()) if name.partition(".")[0] == package]
+    values = [value for module in modules for value in list(vars(module).values())]
+    owners = {_owner(value).partition(".")[0] for value in values}
+    return {owner for owner in owners if owner in sys.modules}
+
+
+def _owner(value: Any) -> str:
+    name = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", "")
+    return name if isinstance(name, str) else ""
